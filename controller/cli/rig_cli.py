@@ -222,8 +222,6 @@ def _refuse(given: Mapping[str, object], *, rule: str) -> None:
 
 def _measured_before(path: Path, rig: "Rig") -> "MeasuredPlate":
     """Responses of a file, where they are what they claim to be; raises InputError."""
-    import numpy as np
-
     from controller.plate_measurement import MeasuredPlate
     from model.estimate.calibrate import check_consistency
     from model.estimate.measurement import measurement_of, read_measured
@@ -231,8 +229,7 @@ def _measured_before(path: Path, rig: "Rig") -> "MeasuredPlate":
     measured = measurement_of(read_measured(path), rig)
     screened = check_consistency(rig, measured)
     dead = [*compress(measured.names, screened.dead_sensors)]
-    live = measured.without(screened.dead_sensors)
-    live = replace(live, values=np.where(screened.dead_eras, np.nan, live.values))
+    live = screened.live(measured)
     return MeasuredPlate(
         live,
         None,
@@ -476,7 +473,6 @@ def check(
     responses are read from a file. Exit status 1 if the check fails.
     """
     import time
-    from dataclasses import replace
 
     from model.estimate import rig_check
     from model.estimate.rig_check import diagnose, judged_by_promises

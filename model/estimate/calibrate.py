@@ -78,7 +78,7 @@ _MAX_SIDE = 4.0  # tolerances by which a side of the plate may be off
 
 @dataclass(frozen=True, eq=False)
 class Screening:
-    """Result of a check of responses, for a calibration."""
+    """Result of a check of responses, for a fit to them."""
 
     dead_eras: NDArray[np.bool_]
     """Mask (e,) of the ERAs that do not move the plate."""
@@ -86,6 +86,11 @@ class Screening:
     """Mask (s,) of the sensors that hear next to nothing."""
     start: FloatArray
     """Fitted values (n,) of the most likely plate, as `SensedPlate.numbers` are in its space."""
+
+    def live(self, measured: Measurement) -> Measurement:
+        """Responses of the sensors and ERAs that are not dead."""
+        live = measured.without(self.dead_sensors)
+        return replace(live, values=np.where(self.dead_eras, np.nan, live.values))
 
 
 def check_consistency(rig: Rig, responses: Measurement) -> Screening:
@@ -624,22 +629,21 @@ def calibrate(
 
 def _fitted_with_scales(rig: Rig, measured: Measurement, screened: Screening) -> Calibration:
     """Fit with unknown scales of all sensors; leave out those of which most values are outliers."""
-    dead = screened.dead_sensors.copy()
     while True:
+        dead = screened.dead_sensors.copy()
         check_enough_sensors(~dead, measured)
-        live = measured.without(dead)
-        live = replace(live, values=np.where(screened.dead_eras, np.nan, live.values))
-        plate = plate_of(rig, live, has_form=True)
+        measurement = replace(screened.live(measured), gain_std=math.inf)
+        plate = plate_of(rig, measurement, has_form=True)
         space = plate.model.space
         start = np.zeros(space.size)
         start[plate.numbers] = screened.start
-        measurement = replace(live, gain_std=math.inf)
         std, scales = without_outliers(measurement.values, plate.responses(start))
         count = np.isfinite(measurement.values).sum(axis=(0, 2))
         heard = np.isfinite(std).sum(axis=(0, 2)) > count / 2
         if heard.all():
             break
         dead[~dead] = ~heard  # elsewhere, or loose
+        screened = replace(screened, dead_sensors=dead)
     measurement = replace(measurement, errors=std)
     start[space.groups["sensor_scale"]] = (scales - 1) / KINDS["sensor_scale"].std
     prior = _prior(plate, start, np.ones(len(scales), dtype=bool))

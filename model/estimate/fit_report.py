@@ -226,24 +226,27 @@ def identified_parameters(found: Identification) -> list[Parameter]:
 
     Per cent are those of the rig's value; places of a mass count from the middle of the plate.
     """
-    space = found.fitted.space
-    kinds = {number: kind for kind in space.groups for number in space.indices(kind)}
-    rows = []
-    for number, name in enumerate(space.names):
-        if not space.std[number]:
-            continue
-        kind = kinds[number]
-        is_place = kind == "masses" and (number - space.groups[kind].start) % 3
-        known = KINDS["place" if is_place else kind]
-        std, error = float(space.std[number]), float(found.std[number])
-        difference = std * float(found.fitted.x[number])
-        if known.unit == "%":  # of logarithms of factors
-            std, error = math.expm1(std), math.exp(difference) * error
-            difference = math.expm1(difference)
-        difference, error, std = (known.per_unit * each for each in (difference, error, std))
-        rows.append(
-            Parameter(kind, name, known.unit, value=difference, standard_error=error, prior=std)
-        )
+    space, rows = found.fitted.space, []
+    for kind, part in space.groups.items():
+        for number in np.arange(space.size)[part][space.uncertain[part]].tolist():
+            is_place = kind == "masses" and (number - part.start) % 3
+            known = space.kinds["place" if is_place else kind]
+            std, error = float(space.std[number]), float(found.std[number])
+            difference = std * float(found.fitted.x[number])
+            if known.unit == "%":  # of logarithms of factors
+                std, error = math.expm1(std), math.exp(difference) * error
+                difference = math.expm1(difference)
+            difference, error, std = (known.per_unit * each for each in (difference, error, std))
+            rows.append(
+                Parameter(
+                    kind,
+                    space.names[number],
+                    known.unit,
+                    value=difference,
+                    standard_error=error,
+                    prior=std,
+                )
+            )
     return rows
 
 

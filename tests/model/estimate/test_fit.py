@@ -123,50 +123,13 @@ def solved() -> SensedPlate:
     return sensed_plate(SENSED_PLATE_RIG, sensors_at(SENSED_PLATE_POINTS), SENSED_PLATE_FREQUENCIES)
 
 
-def _with(rig: Rig, *, modulus: float = 1.0, thickness: float = 1.0, loss: float = 1.0) -> Rig:
-    """Rig with factors on values of its plate."""
-    of = rig.plate
-    material = replace(of.material, E=modulus * of.material.E)
-    return replace(
-        rig,
-        plate=replace(
-            of,
-            material=material,
-            thickness=thickness * of.thickness,
-            loss_factor=loss * of.loss_factor,
-        ),
-    )
-
-
-def _mounted(rig: Rig, *, stiffness: float, damping: float, mass: float) -> Rig:
-    """Rig with factors on the values of its ERAs and fingers."""
-
-    def factors(stiffness_of: float, damping_of: float) -> dict[str, float]:
-        return {"stiffness": stiffness * stiffness_of, "damping": damping * damping_of}
-
-    eras = tuple(
-        replace(era, **factors(era.stiffness, era.damping), bolt_mass=mass * era.bolt_mass)
-        for era in rig.eras
-    )
-    masses = tuple(
-        replace(load, **factors(load.stiffness, load.damping), mass=mass * load.mass)
-        for load in rig.masses
-    )
-    return replace(rig, eras=eras, masses=masses)
-
-
-@pytest.mark.parametrize(
-    ("other", "within"),
-    [
-        (_with(SENSED_PLATE_RIG, modulus=1.15, loss=3.0), 1e-4),
-        (_mounted(SENSED_PLATE_RIG, stiffness=0.7, damping=2.0, mass=1.5), 1e-4),
-        (_with(SENSED_PLATE_RIG, thickness=1.01), 1e-3),
-        (_with(SENSED_PLATE_RIG, thickness=0.95), 5e-3),
-    ],
-    ids=["modulus and loss", "ERAs and finger", "1 % thicker", "5 % thinner"],
-)
-def test_responses_are_those_of_a_new_solve(solved, other, within):
-    """Relative L2 over frequencies, ERAs and points; shear and rotary inertia limit thickness."""
+@pytest.mark.parametrize(("factor", "within"), [(1.01, 1e-3), (0.95, 5e-3)])
+def test_responses_are_those_of_a_new_solve(
+    solved: SensedPlate, factor: float, within: float
+) -> None:
+    """Of another thickness, relative L2; shear and rotary inertia limit it."""
+    of = SENSED_PLATE_RIG.plate
+    other = replace(SENSED_PLATE_RIG, plate=replace(of, thickness=factor * of.thickness))
     found = solved.of(other).responses()
     exact = sensed_plate(other, solved.model.sensors, SENSED_PLATE_FREQUENCIES).responses()
     assert np.linalg.norm(found - exact) / np.linalg.norm(exact) < within

@@ -1,11 +1,10 @@
-"""The daemon's log, in JSON lines, written by a thread (`QueueListener`); rate limits.
+"""The daemon's log, in JSON lines, written by a thread (`QueueListener`).
 
 Logging never blocks: lines go into a bounded queue; lines that do not fit or cannot be written are
 lost. Each logging call in the code is limited to a few lines a second; the next line says how many
 were skipped. JSON escapes control characters, so that messages cannot forge lines.
 
-`RateLimiter` is a token bucket, of actions at a rate or of processor time at a share; the API's
-server and the gateway use it, too.
+`RateLimiter` is a token bucket, which the API's server uses, too.
 """
 
 import contextlib
@@ -17,8 +16,7 @@ import stat
 import sys
 import time
 from collections import Counter
-from collections.abc import Callable, Hashable
-from functools import partial
+from collections.abc import Callable
 from io import FileIO
 from logging.handlers import QueueHandler, QueueListener
 from pathlib import Path
@@ -26,14 +24,9 @@ from typing import Any
 
 from pythonjsonlogger.json import JsonFormatter
 
-_MAX_RATES = 256  # above which those that were not used lately are forgotten
-
 
 class RateLimiter:
-    """Allows `per_second` actions, or seconds, per second, and a burst; clock [s].
-
-    The burst is as many as a second allows, unless given.
-    """
+    """Allows `per_second` actions per second, and a burst, by default as many; clock [s]."""
 
     def __init__(
         self, per_second: float, *, burst: float | None = None, clock: Callable[[], float]
@@ -46,46 +39,13 @@ class RateLimiter:
 
     def take(self) -> bool:
         """Whether another action is allowed now; counts it."""
-        if self._saved() < 1:
-            return False
-        self._left -= 1
-        return True
-
-    def spend(self, amount: float) -> None:
-        """Subtract what was used; it can be overdrawn by as much as a burst."""
-        self._left = max(self._saved() - amount, -self._burst)
-
-    def pause(self) -> float:
-        """Time [s] until it is not overdrawn; 0 if it is not, or by less than a millionth."""
-        left = self._saved()
-        return -left / self._per_second if left < -1e-6 else 0.0
-
-    @property
-    def is_unused(self) -> bool:
-        """Whether a whole burst is allowed now."""
-        return self._saved() >= self._burst
-
-    def _saved(self) -> float:
         now = self._clock()
         saved = self._left + self._per_second * (now - self._counted_at)
         self._left, self._counted_at = min(self._burst, saved), now
-        return self._left
-
-
-class Rates:
-    """A token bucket for each key, such as a process or a host."""
-
-    def __init__(
-        self, per_second: float, *, burst: float | None = None, clock: Callable[[], float]
-    ) -> None:
-        self._make = partial(RateLimiter, per_second, burst=burst, clock=clock)
-        self._rates: dict[Hashable, RateLimiter] = {}
-
-    def of(self, key: Hashable) -> RateLimiter:
-        """The one of a key."""
-        if len(self._rates) >= _MAX_RATES:
-            self._rates = {key: each for key, each in self._rates.items() if not each.is_unused}
-        return self._rates.setdefault(key, self._make())
+        if self._left < 1:
+            return False
+        self._left -= 1
+        return True
 
 
 _MAX_QUEUED = 2000  # lines
@@ -137,7 +97,8 @@ class RateLimitFilter(logging.Filter):
 
     def __init__(self, *, clock: Callable[[], float] = time.monotonic) -> None:
         super().__init__()
-        self._rates = Rates(_RATE, burst=_BURST, clock=clock)
+        self._clock = clock
+        self._rates: dict[tuple[str, int], RateLimiter] = {}  # of each call
         self._skipped: Counter[tuple[str, int]] = Counter()  # since the last record of each call
 
     def filter(self, record: logging.LogRecord) -> bool:
@@ -145,7 +106,9 @@ class RateLimitFilter(logging.Filter):
         if getattr(record, "topic", None) == "state":
             return True
         call = record.pathname, record.lineno
-        is_written = self._rates.of(call).take()
+        if call not in self._rates:
+            self._rates[call] = RateLimiter(_RATE, burst=_BURST, clock=self._clock)
+        is_written = self._rates[call].take()
         if not is_written:
             self._skipped[call] += 1
         elif skipped := self._skipped.pop(call, 0):

@@ -19,7 +19,14 @@ import functools
 import itertools
 from collections import deque
 from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Iterator, Sequence
-from contextlib import ExitStack, asynccontextmanager, contextmanager, suppress
+from contextlib import (
+    AbstractAsyncContextManager,
+    AbstractContextManager,
+    ExitStack,
+    asynccontextmanager,
+    contextmanager,
+    suppress,
+)
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Concatenate, ParamSpec, Self, TypeVar
@@ -65,7 +72,7 @@ _T = TypeVar("_T")
 _ResultT = TypeVar("_ResultT", bound=ApiMessage)
 
 
-class AsyncClient:
+class AsyncClient(AbstractAsyncContextManager["AsyncClient"]):
     """A client of the daemon, made by `connect`; any number of calls may be pending.
 
     One that is constructed directly connects with its first call. After a lost connection, or one
@@ -109,9 +116,6 @@ class AsyncClient:
         client = cls(find_socket(path), name=name, timeout=timeout)
         await client._repeated(client._connected)
         return client
-
-    async def __aenter__(self) -> Self:
-        return self
 
     async def __aexit__(self, *_: object) -> None:
         await self.close()
@@ -484,7 +488,7 @@ def _blocking(
     return call
 
 
-class Client:
+class Client(AbstractContextManager["Client"]):
     """A client of the daemon, made by `connect`, for any thread; see `AsyncClient`."""
 
     def __init__(self, client: AsyncClient, loop: LoopThread) -> None:
@@ -512,9 +516,6 @@ class Client:
             loop.close()
             raise
         return cls(client, loop)
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(self, *_: object) -> None:
         self.close()

@@ -76,11 +76,17 @@ class RpcError(Exception):
     """
 
     def __init__(
-        self, code: ErrorCode, what: str, *, where: str | None = None, remedy: str | None = None
+        self,
+        code: ErrorCode,
+        what: str,
+        *,
+        where: str | None = None,
+        remedy: str | None = None,
+        amplifiers: dict[str, AmplifierSilence] | None = None,
     ) -> None:
         super().__init__(f"{what}; {remedy}" if remedy else what)
         self.code = code
-        self.data = ErrorData(what=what, where=where, remedy=remedy)
+        self.data = ErrorData(what=what, where=where, remedy=remedy, amplifiers=amplifiers)
 
 
 class NotSilent(RpcError):
@@ -93,10 +99,13 @@ class NotSilent(RpcError):
         what = "not confirmed silent: " + ", ".join(
             f"{name} ({each.words}: {each.cause})" for name, each in unconfirmed.items()
         )
-        remedy = "switch these amplifiers off"
-        super().__init__(ErrorCode.NOT_SILENT, what, remedy=remedy)
         self.amplifiers = dict(amplifiers)
-        self.data = ErrorData(what=what, remedy=remedy, amplifiers=self.amplifiers)
+        super().__init__(
+            ErrorCode.NOT_SILENT,
+            what,
+            remedy="switch these amplifiers off",
+            amplifiers=self.amplifiers,
+        )
 
 
 class InvalidRequest(RpcError):

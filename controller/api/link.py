@@ -187,19 +187,15 @@ def find_socket(given: Path | str | None) -> Path:
     if given is not None:
         return expect_path(given, what="path")
     own = default_socket()
-    is_named = bool(os.environ.get(SOCKET_VARIABLE))
-    return own if is_named or own.exists() or not _exists(SYSTEM_SOCKET) else SYSTEM_SOCKET
-
-
-def _exists(path: Path) -> bool:
-    """Whether a path exists, also in a folder that only other users may read."""
+    if os.environ.get(SOCKET_VARIABLE) or own.exists():
+        return own
     try:
-        path.stat()
+        SYSTEM_SOCKET.stat()
     except PermissionError:
-        return True  # connecting reports whose it is
+        pass  # its folder is another user's: connecting reports whose it is
     except OSError:
-        return False
-    return True
+        return own
+    return SYSTEM_SOCKET
 
 
 SERVICE_USER_VARIABLE = "ERA_HAPTICS_USER"

@@ -26,7 +26,6 @@ from pydantic import BaseModel, ValidationError
 
 from controller.play.layer_contents import Prediction
 from controller.play.planner import Observers, PlayReport, SilenceReport
-from controller.play.slots import Slot
 from controller.process.child import ended
 from controller.sources.touch import Change, Contact, ContactKey
 from drivers.errors import LinkError
@@ -520,7 +519,11 @@ async def _played(touch: _Touch, row: TouchRow) -> TouchRow:
     key = touch.contact.key
     applied = main_part.applied
     predicted = next(felt for felt in applied.targets if felt.contact.key == key)
-    played = _content_of(predicted, applied)
+    played = next(  # its own content, or the one that it shares
+        each
+        for each in applied.contents.values()
+        if any(contact.key == key for contact, _ in each.content.targets)
+    )
     pattern = played.layer
     vibration = await main_part.steady if main_part.steady else {}
     row = replace(
@@ -566,15 +569,6 @@ def _significance(pattern: _PlayedPattern) -> tuple[int, float, float]:
     """Order of patterns: by contents, then by steadiness, then by time."""
     applied = pattern.applied
     return len(applied.contents), min(pattern.duration, STEADY_DURATION), applied.time
-
-
-def _content_of(felt: Prediction, applied: PlayReport) -> Slot:
-    """What plays for a finger, its own or the one that it shares."""
-    return next(
-        played
-        for played in applied.contents.values()
-        if any(contact.key == felt.contact.key for contact, _ in played.content.targets)
-    )
 
 
 def _finger_row(felt: Prediction, vibration: Mapping[str, FingerVibration]) -> FingerRow:

@@ -299,8 +299,11 @@ def check_figure(
     figure = Figure(figsize=(18.0, rows * (5.0 * ratio + 1.6)), layout="constrained")
     panels: list[tuple[str, Callable[[CheckedEffect, SimulatedTouch], float | None]]] = [
         ("felt minus promised / dB", _off_level),
-        ("frequency / Hz", _frequency),
-        ("above a resting second finger\npromised / dB", _contrast),
+        ("frequency / Hz", lambda _, touch: touch.frequencies[0] if touch.frequencies else None),
+        (
+            "above a resting second finger\npromised / dB",
+            lambda _, touch: touch.promised_contrast_db,
+        ),
     ]
     low, high = float(table.frequencies[0]), float(table.frequencies[-1])
     scales: list[tuple[Normalize, str]] = [
@@ -359,14 +362,6 @@ def _off_level(each: CheckedEffect, touch: SimulatedTouch) -> float | None:
     if touch.felt_db_sl is None or each.promised_db_sl is None:
         return None
     return touch.felt_db_sl - each.promised_db_sl
-
-
-def _frequency(each: CheckedEffect, touch: SimulatedTouch) -> float | None:
-    return touch.frequencies[0] if touch.frequencies else None
-
-
-def _contrast(each: CheckedEffect, touch: SimulatedTouch) -> float | None:
-    return touch.promised_contrast_db
 
 
 def _draw_layout(axes: Axes, layout: SurfaceLayout, table: LocalizationTable) -> None:

@@ -141,7 +141,7 @@ desk-test: .venv/installed-test
 qt-test: .venv/installed-qt
 	$(BIN)/pytest -q tests/integration/test_people_at_a_plate.py
 
-# The whole chain in virtual time, thousands of seeds; `make test` takes a short one.
+# The whole chain in virtual time, by as many seeds as 40 minutes allow; `make test` takes seven.
 # Others: make soak SOAK='--minutes 10 --wire serial', or one again: make soak SOAK='--seed 17'
 soak: .venv/installed-test
 	$(BIN)/python tests/support/soak.py $(SOAK)

@@ -1,12 +1,11 @@
 """Soak: the whole chain in virtual time, thousands of times, each time by another number.
 
-python tests/support/soak.py --seeds 4000 --long 500             short ones and long ones
+python tests/support/soak.py --minutes 600                       4000 short ones and 500 long ones
 python tests/support/soak.py --seed 17 --trace trace.txt         one of the long again, all of it
 """
 
 import argparse
 import gc
-import math
 import os
 import resource
 import sys
@@ -21,7 +20,7 @@ from pathlib import Path
 for _variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ[_variable] = "1"  # before numpy loads
 
-from soak_runs import KINDS, PLATES, Outcome, Trace, make_plan, run_plan  # noqa: E402  # noqa: E402
+from soak_runs import KINDS, PLATES, Outcome, Trace, make_plan, run_plan  # noqa: E402
 
 _PROGRESS_INTERVAL = 250  # runs
 gc.freeze()  # what is loaded stays
@@ -74,7 +73,7 @@ def main() -> int:
     parser.add_argument("--seeds", type=int, default=4000, help="how many short ones")
     parser.add_argument("--long", type=int, default=500, help="how many long ones")
     parser.add_argument("--first", type=int, default=0, help="the first of each")
-    parser.add_argument("--minutes", type=float, default=math.inf, help="of real time at most")
+    parser.add_argument("--minutes", type=float, default=40.0, help="at most, of real time")
     parser.add_argument("--wire", choices=tuple(KINDS), help="on this kind of wire only")
     parser.add_argument("--plate", choices=PLATES, help="this plate only")
     parser.add_argument("--short", action="store_true", help="with --seed: the short one")

@@ -33,7 +33,7 @@ from virtual_lines import MemoryMachine, VirtualLoop, in_virtual_time
 
 LONGEST, STOPPED_WITHIN = 0.005, 0.020  # s of processor time
 ROUNDS = 2  # of which the quicker counts: the first of anything may be slower
-FILES = 12  # of 60 s, in each of two layouts
+FILES = 8  # of 60 s, in each of two layouts
 PLACE, THERE = (0.1, 0.02), 5  # in a region, with the file of that number
 TOUCHES = [(0.02 * (each % 10) + 0.01, 0.02 * (each // 10) + 0.05) for each in range(20)]
 
@@ -53,7 +53,7 @@ def write_layouts(folder: Path, level: float) -> str:
                 {"Event": {"Time": 0.05 * each, "EventType": "HapticTransient", **_intensity(each)}}
                 for each in range(1200)
             ]
-            pattern = [*parts, *(taps if number > 10 else [])]
+            pattern = [*parts, *(taps if number == FILES - 1 else [])]
             content = {"Version": 1.0, "Pattern": pattern}
             (folder / f"{name}{number}.ahap").write_text(json.dumps(content), encoding="utf-8")
             effects[f"e{number}"] = {

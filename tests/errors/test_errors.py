@@ -26,9 +26,17 @@ from controller.content.formats import read_content
 from controller.effects.layout import load_layout
 from controller.effects.strengths import read_strengths
 from controller.gateway.gateway_settings import read_token
+from controller.sources.touch import open_source
 from controller.sources.tuio import read_capture
 from drivers.errors import CommandError
-from era_haptics.lab.design.problem import area_of
+from drivers.wires.wire import address_of
+from era_haptics.lab.design.problem import (
+    DesignProblem,
+    anywhere,
+    area_of,
+    contact_rule,
+    layouts_of,
+)
 from era_haptics.lab.measuring.impedance import read_impedance
 from era_haptics.lab.measuring.loopback import read_stepped
 from era_haptics.lab.measuring.sound_card import Desk, WiredSensor, read_sensors
@@ -37,13 +45,17 @@ from error_cases import PAGE, Case, Quotation, cases, filled, provoke, quotation
 from error_cases import RIG as CASE_RIG
 from interrupted import full_disk, interrupted
 from long_form import shortly
+from model.config.units import parse_frequencies
 from model.errors import InputError
 from model.estimate import calibrate
 from model.estimate.following import load_learned
 from model.estimate.measurement import read_measured, read_places
 from model.files.array_file import UNREADABLE, read_arrays
+from model.processes import on_cluster
 from model.rig.rig_file import example_rig_path, load_rig
+from model.structure.material import material
 from model.table.table_file import load_table
+from yaml_files import read_yaml
 
 INTERNALS = re.compile(
     r"Traceback|File \"|<class |object at 0x|np\.\w+\(|PosixPath\(|\[Errno|Field required|"
@@ -269,6 +281,7 @@ def test_recording_fails_without_a_file_when_the_disk_is_full(home: Path) -> Non
 
 
 RIG = load_rig(example_rig_path())
+DESIGN = DesignProblem(RIG, 4, area_of("edge", RIG.plate), anywhere(RIG.plate))
 DESK = Desk(RIG, (WiredSensor("P1", 0.1, 0.1, 1, 1.0),))
 
 READERS: dict[str, Callable[[Path], object]] = {
@@ -289,6 +302,9 @@ READERS: dict[str, Callable[[Path], object]] = {
     "measured.uff": read_measured,
     "places.csv": lambda path: read_places(path, RIG.plate),
     "sensors.csv": lambda path: read_sensors(path, RIG.plate),
+    "moved.csv": lambda path: read_sensors(path, RIG.plate, may_move=True),
+    "contacts.yaml": lambda path: contact_rule(path, RIG.plate),
+    "layouts.yaml": lambda path: layouts_of(str(path), DESIGN),
     "free.zma": read_impedance,
     "P1-1.wav": lambda path: read_stepped(path, DESK),
     "P1-1.csv": lambda path: read_stepped(path, DESK),
@@ -296,6 +312,35 @@ READERS: dict[str, Callable[[Path], object]] = {
     "learned.npz": lambda path: load_learned(path, table=""),
 }
 """By a name of a file, what reads it."""
+
+PARSERS: dict[str, Callable[[str], object]] = {
+    "amplifier URL": address_of,
+    "touch URL": open_source,
+    "frequencies": parse_frequencies,
+    "scheduler": lambda text: [*on_cluster(text, divmod, 1, {0: 1})],
+    "material": material,
+    "area": lambda text: area_of(text, RIG.plate),
+}
+"""By what a text is, what reads it."""
+
+
+@pytest.mark.parametrize(
+    ("read", "named", "text", "pattern"),
+    [
+        (each["read"], each.get("named", each["read"]), text, pattern)
+        for each in read_yaml(Path(__file__).with_name("refused.yaml"))
+        for text, pattern in each["refused"].items()
+    ],
+)
+def test_what_is_wrong_is_said(
+    tmp_path: Path, read: str, named: str, text: str, pattern: str
+) -> None:
+    """Of a file with its name, line and key; nothing that a text asks for is opened."""
+    text = text.replace("<5000 digits>", 5000 * "9")
+    (tmp_path / named).write_text(text, "utf-8")
+    with pytest.raises((InputError, CommandError), match=pattern):
+        READERS[read](tmp_path / named) if read in READERS else PARSERS[read](text)
+
 
 _DIGITS = b"9" * 100_000
 

@@ -151,13 +151,6 @@ def test_cluster_without_scheduler_is_refused(monkeypatch) -> None:
         dict(on_cluster("tcp://127.0.0.1:1", divmod, 1, TASKS))
 
 
-@pytest.mark.parametrize("text", ["", "nonsense", "foo://x:1", "tcp://host", "tcp://host:port"])
-def test_address_that_dask_would_hang_over_is_refused(text: str) -> None:
-    """It never reaches Dask."""
-    with pytest.raises(InputError, match="dask scheduler"):
-        dict(on_cluster(text, divmod, 1, TASKS))
-
-
 def test_every_worker_checks_its_code() -> None:
     """Nothing is called on a worker that joins later, with other code."""
     with pytest.raises(InputError, match="same era-haptics"):

@@ -536,26 +536,6 @@ def test_what_no_transient_has_is_said(read: Read) -> None:
     assert read("ahap", {"Pattern": [lasting, given[2]]}).remarks == ()
 
 
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        ('{"Version": 2, "Pattern": []}', r":1: Version: must be below 2, got 2"),
-        ('{"Version": 1}', r":1: Pattern: missing; add it"),
-        ('{"Pattern": [\n{"Event":\n{"Time": "x"}}]}', r":3: Pattern\[0\]\.Event\.Time: must be"),
-        ('{"Pattern": [\n{"Event": {"Time": 1}}]}', r":2: Pattern\[0\]\.Event\.EventType: missing"),
-        (
-            '{"Pattern": [{}, \n{"Event": {"EventType": "HapticContinuous",'
-            ' "EventDuration": 61}}]}',
-            r":2: Pattern\[1\]: must end within 60 s, got 61 s",
-        ),
-    ],
-)
-def test_error_has_line_and_key(read: Read, text: str, words: str) -> None:
-    """A later version, what is missing, of another type, or too long."""
-    with pytest.raises(InputError, match=words):
-        read("ahap", text)
-
-
 PARTS = [
     b"[" * 30,
     b'{"a":' * 30,

@@ -32,7 +32,7 @@ from controller.sources.evdev import (
     eviocgmtslots,
     parse_events,
 )
-from controller.sources.touch import TouchFrame, open_source
+from controller.sources.touch import TouchFrame
 from model.errors import InputError
 from virtual_lines import run_virtual
 
@@ -368,17 +368,6 @@ def test_input_device_reads_a_panel_for_a_single_finger(monkeypatch: pytest.Monk
         *((2.5, 3, 0x35, 250), (2.5, 3, 0x36, 100), (2.5, 3, 0x3A, 9)),
         *((2.5, 3, 0x39, 0), (2.5, 3, 0x39, -1), (2.5, 0, 0, 0)),
     ]
-
-
-@pytest.mark.parametrize(
-    "url",
-    ["evdev:", "evdev:?grab=yes", "evdev:/dev/x?grab=no", "evdev:/dev/x?grab=yes&a=b"]
-    + [f"evdev:/dev/x?light_pressure={value}" for value in ("", "x", "-1", "nan", "inf")],
-)
-def test_evdev_source_refuses_bad_urls(url: str) -> None:
-    """The error shows the form of the URL."""
-    with pytest.raises(InputError, match=r"evdev:PATH.grab=yes"):
-        open_source(url)
 
 
 Shown: TypeAlias = list[tuple[float, dict[int, tuple[float, float]]]]

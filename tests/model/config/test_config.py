@@ -28,7 +28,6 @@ from model.config.units import (
     TEMPERATURE,
     Dimension,
     in_metres,
-    parse_frequencies,
     quantity,
     unit_scale,
 )
@@ -172,15 +171,6 @@ def test_in_metres_converts_places_that_smaller_units_put_on_the_plate(
 ) -> None:
     """The plate is 0.3 m by 0.2 m; no finger is half a centimetre from a corner."""
     assert in_metres(*place, length=0.3, width=0.2).rpartition(" ")[2] == remedy
-
-
-@pytest.mark.parametrize(
-    "text", ["0:100:10", "100:60:10", "60:320:0", "60:320:1e-9", "60:nan:10", "60,110,60", "sixty"]
-)
-def test_parse_frequencies_refuses_what_is_no_range_or_list(text: str) -> None:
-    """Ranges from zero, downwards or too fine, a frequency twice, and words are refused."""
-    with pytest.raises(InputError, match="--frequencies"):
-        parse_frequencies(text)
 
 
 SI = {

@@ -177,22 +177,6 @@ def test_material_accepts_spellings_of_a_name(written):
 
 
 @pytest.mark.parametrize(
-    ("name", "message"),
-    [
-        ("aluminum", "did you mean aluminium"),
-        ("polycarbonat", "did you mean polycarbonate"),
-        ("strengthened glass", "did you mean chemically-strengthened-glass"),
-        ("", "known are aluminium, steel"),
-        ("x" * 500, "unknown material 'x{40}'; known are"),
-    ],
-)
-def test_material_refuses_an_unknown_name_with_a_suggestion(name, message):
-    """The error says what may have been meant, and what there is."""
-    with pytest.raises(InputError, match=message):
-        material(name)
-
-
-@pytest.mark.parametrize(
     ("good", "values"),
     [
         (material("steel"), {"E": [0.0, math.nan], "rho": [-1.0], "nu": [0.5, -1.0, math.nan]}),

@@ -160,27 +160,6 @@ def test_picture_has_the_proportions_of_the_plate(tmp_path, rows, columns, is_re
         area_of(str(path), PLATE)
 
 
-@pytest.mark.parametrize(
-    "shape",
-    [
-        "rectangle: {start: [25 cm, 5 cm], end: [31 cm, 10 cm]}",
-        "circle: {at: [2 cm, 10 cm], radius: 3 cm}",
-        "polygon: [[1 cm, 1 cm], [5 cm, 23 cm], [5 cm, 1 cm]]",
-        "circle: {at: [50 cm, 50 cm], radius: 2 cm}",
-    ],
-)
-def test_regions_off_the_plate_are_refused(tmp_path, shape) -> None:
-    """In part or wholly, of a plate of 12 by 9 inches, by file, line, name and size."""
-    path = tmp_path / "contacts.yaml"
-    path.write_text(
-        "regions:\n"
-        "  on: {rectangle: {start: [0, 0], end: [12 in, 9 in]}}\n"
-        f"  off: {{{shape}}}\n"
-    )
-    with pytest.raises(InputError, match=r"contacts\.yaml:3: regions\.off.*0\.3048 m by 0\.2286 m"):
-        contact_rule(path, PLATE)
-
-
 def test_contacts_in_regions_of_a_layout(tmp_path) -> None:
     """Fingers are in the regions, so many of them, so far apart; effects are passed over."""
     path = tmp_path / "layout.yaml"
@@ -197,38 +176,6 @@ def test_contacts_in_regions_of_a_layout(tmp_path) -> None:
         assert (in_a | in_b).all()
         gaps = np.linalg.norm(contacts[:, None] - contacts, axis=-1)
         assert gaps[np.triu_indices(3, 1)].min() > 0.04
-
-
-@pytest.mark.parametrize(
-    "text",
-    [
-        "",
-        "sets: []",
-        "regions: {}",
-        "quiet: [3, 1]\nregions: {a: {circle: {at: [0.1, 0.1], radius: 0.02}}}",
-        "regions: {a: {on_press: click}}",
-        "sets: [{target: [9, 0.1], quiet: [[0.2, 0.1]]}]",
-        "sets: [{target: [0.1, 0.1], quiet: []}]",
-        "fingers: 3",
-    ],
-)
-def test_files_of_contacts_that_say_nothing_are_refused(tmp_path, text) -> None:
-    """No region, an order turned round, no shape, a place off the plate, no quiet finger."""
-    path = tmp_path / "contacts.yaml"
-    path.write_text(text)
-    with pytest.raises(InputError, match=r"contacts\.yaml"):
-        contact_rule(path, PLATE)
-
-
-@pytest.mark.parametrize(
-    "name", ["nowhere.png", "broken.png", "nowhere.yaml", "empty.yaml", "inside"]
-)
-def test_area_that_cannot_be_read_is_refused(tmp_path, name) -> None:
-    """A missing file, a picture that is none, a word that is neither."""
-    (tmp_path / "broken.png").write_bytes(b"not a picture")
-    (tmp_path / "empty.yaml").touch()
-    with pytest.raises(InputError):
-        area_of(str(tmp_path / name), PLATE)
 
 
 GAINS = Uncertainty(0.05, 5.0, 0.0, 0.0, 1.0, 0.0)
@@ -509,21 +456,3 @@ def test_layouts_on_a_small_raster_are_all_there_are(monkeypatch) -> None:
         any((np.sort(a, axis=0) == np.sort(b, axis=0)).all() for b in choices)
         for a in named[: len(named) - len(random)]
     ) == sum(map(some.are_apart, choices))
-
-
-@pytest.mark.parametrize(
-    "text",
-    [
-        "layouts: {}",
-        "layouts: {two: [[0, 0], [0.3, 0]]}",
-        "layouts: {off: [[0, 0], [0.3, 0], [0.9, 0.1]]}",
-        "layouts: {near: [[0, 0], [0.3, 0], [0.31, 0]]}",
-        "places: {}",
-    ],
-)
-def test_files_of_layouts_that_cannot_be_ranked_are_refused(tmp_path, text) -> None:
-    """None, too few ERAs, one off the plate, two too near, another key."""
-    path = tmp_path / "layouts.yaml"
-    path.write_text(text)
-    with pytest.raises(InputError, match=r"layouts\.yaml"):
-        layouts_of(str(path), problem())

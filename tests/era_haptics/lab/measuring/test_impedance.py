@@ -383,24 +383,3 @@ def test_impedance_of_other_programs_is_read_by_its_meaning(tmp_path: Path, text
     frequencies, impedance = read_impedance(path)
     assert frequencies == pytest.approx([f for f, _ in ROWS], rel=1e-4)
     assert impedance == pytest.approx(np.array([z for _, z in ROWS]), rel=1e-4)
-
-
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        ("1 2 3\n2 x 3\n", r":2: magnitude must be a finite number from 0, got 'x'"),
-        ("1 2\n2 3\n", r"columns must be frequency_hz, optionally real, imag"),
-        ("f,Z\n1,2\n", r"columns must have magnitude .* or real with imag"),
-        ("f,Z,phase\n1,-2,0\n", r"magnitude must be a finite number from 0"),
-        ("f,Z,phase\n1,1e19,0\n", r"magnitude must be a finite number from 0, got '1e19'"),
-        ("f,Z,phase\n0,2,0\n", r"frequency_hz must be above 0"),
-        ("f,Z,phase\n1,2,0\n2,3\n", r":3: line must have 3 values"),
-        ("* f Z phase\n", r"frequency_hz missing|at least one line"),
-    ],
-)
-def test_impedance_that_cannot_be_read_is_refused(tmp_path: Path, text: str, words: str) -> None:
-    """With what its columns must be, in a whole sentence."""
-    path = tmp_path / "coil.zma"
-    path.write_text(text)
-    with pytest.raises(InputError, match=words):
-        read_impedance(path)

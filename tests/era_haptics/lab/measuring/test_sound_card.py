@@ -734,30 +734,3 @@ def test_sensors_file_of_one_sensor(rig: Rig, tmp_path: Path) -> None:
     places = read_sensors(path, rig.plate, may_move=True)
     assert [place.mass for place in places] == [2.5e-3, 2.5e-3]
     assert read_sensors(path, rig.plate, may_move=True, mass=1.0)[1].mass == 1e-3
-
-
-@pytest.mark.parametrize(
-    ("text", "may_move", "cause"),
-    [
-        ("sensor,x_m,y_m,input\nP1,0,0,1\n", False, ":1:"),
-        (f"{PLAIN}P1,0.1,0.1,1,10\nP2,9,0.1,2,10\n", False, ":3:"),
-        (f"{PLAIN}P1,0.1,0.1,1,10\nP2,0.2,0.1,1,10\n", False, ":3: input"),
-        (f"{PLAIN}P1,0.1,0.1,1,0\n", False, ":2:"),
-        (f"{PLAIN}P1,0.1,x,1,10\n", False, ":2:"),
-        (f"{PLAIN}P1,0.1,0.1,1,10,2\n", False, ":2:"),
-        (f"{HEAD}P1,0.1,0.1,2,10,2.5\nP2,0.2,0.1,2,11,2.5\n", True, ":3: .*sensitivity"),
-        (f"{HEAD}P1,0.1,0.1,1,10,2.5\nP2,0.2,0.1,2,10,0\n", True, ": mass_g"),
-        (f"{HEAD}P1,0.1,0.1,1,10,2500\n", True, ":2: mass_g .*grams"),
-    ],
-)
-def test_sensors_files_are_refused_with_their_line(
-    rig: Rig, tmp_path: Path, text: str, may_move: bool, cause: str
-) -> None:
-    """A missing column, off the plate, an input twice, no sensitivity, no number, one too many.
-
-    Two sensitivities of one sensor that is moved, several masses at once, a mass in other units.
-    """
-    path = tmp_path / "sensors.csv"
-    path.write_text(text)
-    with pytest.raises(InputError, match=f"sensors.csv{cause}"):
-        read_sensors(path, rig.plate, may_move=may_move)

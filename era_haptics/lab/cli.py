@@ -52,11 +52,11 @@ def report(
         if not path.exists():
             raise InputError(f"{path}: no such file; check its name and folder")
     home = Path(os.path.expanduser("~"))  # noqa: PTH111  Path.home raises where there is none
-    collected = collect(configs or [], socket=socket, home=home)
-    write_report(output, collected)
-    for name, text in collected.files.items():
+    files, missing = collect(configs or [], socket=socket, home=home)
+    write_report(output, files, missing)
+    for name, text in files.items():
         print(f"  {name}: {len(text)} characters")
-    for what in collected.missing:
+    for what in missing:
         print(f"  skipped: {what}")
     print(f"wrote {output}\nNext: look before you send: names and causes are not hidden")
 

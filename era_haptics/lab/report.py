@@ -12,7 +12,6 @@ import re
 import shutil
 import sys
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
 from functools import cache
 from importlib.metadata import distributions, entry_points, version
 from pathlib import Path
@@ -51,16 +50,10 @@ _OF_FILES = (RigSection, DaemonSection, LayoutSection, StatusResult)
 _OTHERS = ("baud", "bitrate", "timeout")
 
 
-@dataclass(frozen=True)
-class ReportFiles:
-    """Files of a report by name, and descriptions of what is missing."""
-
-    files: Mapping[str, str]
-    missing: tuple[str, ...]
-
-
-def collect(configs: Iterable[Path], *, socket: Path | None, home: Path) -> ReportFiles:
-    """Collect a report; whatever is not available is listed as missing.
+def collect(
+    configs: Iterable[Path], *, socket: Path | None, home: Path
+) -> tuple[dict[str, str], list[str]]:
+    """Collect the files of a report, by name, and descriptions of what is missing.
 
     configs: rig, layout and daemon files, with the files, the log and the dumps that a daemon's
     file names; socket: the daemon's, the default if None; home: the folder that is replaced by ~.
@@ -85,11 +78,11 @@ def collect(configs: Iterable[Path], *, socket: Path | None, home: Path) -> Repo
     except (LinkError, RpcError) as error:
         missing.append(f"status of a daemon ({type(error).__name__})")
     files["versions.json"] = json.dumps(versions(), indent=2)
-    return ReportFiles(files, tuple(missing))
+    return files, missing
 
 
-def write_report(folder: Path, report: ReportFiles) -> None:
-    """Write a new folder of mode 0700, completely or not at all.
+def write_report(folder: Path, files: Mapping[str, str], missing: Iterable[str]) -> None:
+    """Write a new folder of mode 0700, completely or not at all; arguments as `collect` returns.
 
     Raises InputError if it exists already or cannot be created, OSError if writing fails.
     """
@@ -99,9 +92,9 @@ def write_report(folder: Path, report: ReportFiles) -> None:
         raise InputError(f"{folder}: exists already; choose another with -o") from error
     except OSError as error:
         raise InputError(f"{folder}: cannot write: {error.strerror}") from error
-    missing = "".join(f"{line}\n" for line in report.missing)
+    lines = "".join(f"{line}\n" for line in missing)
     try:
-        for name, text in {**report.files, "missing.txt": missing}.items():
+        for name, text in {**files, "missing.txt": lines}.items():
             (folder / name).write_text(text, "utf-8")
     except BaseException:
         shutil.rmtree(folder, ignore_errors=True)

@@ -58,20 +58,6 @@ class Part:
 
 
 @dataclass(frozen=True, eq=False)
-class PlayedContent:
-    """Content as it is played at a finger in time.
-
-    parts: of the rendition; rate [Hz]: of samples; accelerations (n, p) [m/s²]: at the points of
-    the fingertip, by 0.1 s or more longer than the rendition.
-    """
-
-    rendition: Rendition
-    parts: tuple[Part, ...]
-    rate: float
-    accelerations: FloatArray
-
-
-@dataclass(frozen=True, eq=False)
 class CheckedContent:
     """Content at a finger as it will be felt.
 
@@ -156,18 +142,19 @@ def check_content(
     level_db_sl: of intensity 1; at, quiet [m]: of the finger, and of others that are to feel
     nothing, beside which it is smoothed. Raises InputError for fingers off the plate or too close.
     """
-    played = play_content(pattern, table, level_db_sl, at=at, quiet=quiet)
-    rate, duration = played.rate, played.rendition.duration
-    times = np.arange(len(played.accelerations)) / rate
-    power = 2 * over_threshold(played.accelerations, rate, table.threshold) ** 2
+    rendition, parts, rate, accelerations = play_content(
+        pattern, table, level_db_sl, at=at, quiet=quiet
+    )
+    times = np.arange(len(accelerations)) / rate
+    power = 2 * over_threshold(accelerations, rate, table.threshold) ** 2
     over = [averaged(each, 1 / rate, SMOOTHING) for each in power.T]
     given = decibels(fingertip_weights(*at, table.plate) @ np.sqrt(over))
     power = 10 ** (requested_level(pattern, level_db_sl, times) / 10)
     expected = decibels(np.sqrt(np.maximum(averaged(power, 1 / rate, SMOOTHING), 0)))
     kept = kept_shares(expected, given, int(MAX_DELAY * rate) + 1)
     deviations = _deviations(expected, given, best_of(kept))
-    lost = (*played.rendition.remarks, *_weaker(played.parts), *_off_level(deviations))
-    return CheckedContent(duration, played.parts, lost, 1 / rate, expected, given, kept)
+    lost = (*rendition.remarks, *_weaker(parts), *_off_level(deviations))
+    return CheckedContent(rendition.duration, parts, lost, 1 / rate, expected, given, kept)
 
 
 def play_content(
@@ -177,8 +164,12 @@ def play_content(
     *,
     at: Position,
     quiet: Sequence[Position] = (),
-) -> PlayedContent:
-    """Play a pattern at a finger in time; arguments and errors as of `check_content`."""
+) -> tuple[Rendition, tuple[Part, ...], float, FloatArray]:
+    """Play a pattern at a finger in time; arguments and errors as of `check_content`.
+
+    Returns its rendition and the parts of that, the sample rate [Hz], and accelerations (n, p)
+    [m/s²] at the points of the fingertip, by 0.1 s or more longer than the rendition.
+    """
     check_level(level_db_sl)
     rendition = rendered(pattern, level_db_sl, table.frequencies)
     if quiet:
@@ -205,7 +196,7 @@ def play_content(
         sample_rate=rate,
         factors=np.ones(len(table.eras), dtype=complex),
     )
-    return PlayedContent(rendition, parts, rate, moved)
+    return rendition, parts, rate, moved
 
 
 def _signals(parts: Sequence[Part], table: LocalizationTable, times: FloatArray) -> FloatArray:

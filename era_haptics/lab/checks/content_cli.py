@@ -112,9 +112,9 @@ def _simulate(
     check_replaceable(output, is_own=begins_with(output, b"RIFF"), what="WAV file")
     table = load_table(table_file)
     given = STRONG_DB_SL if level is None else level
-    played = play_content(pattern, table, given, at=place)
-    felt = played.accelerations @ fingertip_weights(*place, table.plate)
-    sound = resample(felt, round(len(felt) * _RATE / played.rate))
+    _, _, rate, accelerations = play_content(pattern, table, given, at=place)
+    felt = accelerations @ fingertip_weights(*place, table.plate)
+    sound = resample(felt, round(len(felt) * _RATE / rate))
     full_scale = float(np.abs(sound).max()) / _PEAK or 1.0
     wavfile.write(output, _RATE, np.rint(_FULL / full_scale * sound).astype(np.int16))
     print_report(

@@ -380,26 +380,17 @@ def _draw_layout(axes: Axes, layout: SurfaceLayout, table: LocalizationTable) ->
 
 def _label_region(axes: Axes, name: str, corners: FloatArray) -> None:
     """Write the name above a region, or upright beside one that is much taller than wide."""
-    sides = np.ptp(corners, axis=0)
-    if sides[1] > 2 * sides[0]:
-        right = corners[corners[:, 0] >= corners[:, 0].max() - 1e-6]
-        axes.annotate(
-            name,
-            (right[0, 0], right[:, 1].mean()),
-            xytext=(2, 0),
-            textcoords="offset points",
-            va="center",
-            rotation=90,
-            fontsize=8,
-        )
-        return
-    top = corners[corners[:, 1] >= corners[:, 1].max() - 1e-6]
+    length, width = np.ptp(corners, axis=0)
+    is_beside = width > 2 * length
+    across = corners[:, 0 if is_beside else 1]
     axes.annotate(
         name,
-        (top[:, 0].mean(), top[0, 1]),
-        xytext=(0, 2),
+        corners[across >= across.max() - 1e-6].mean(axis=0),
+        xytext=(2, 0) if is_beside else (0, 2),
         textcoords="offset points",
-        ha="center",
+        ha="left" if is_beside else "center",
+        va="center" if is_beside else "baseline",
+        rotation=90 if is_beside else 0,
         fontsize=8,
     )
 

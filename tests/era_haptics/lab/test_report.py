@@ -70,16 +70,18 @@ def test_report_includes_files_of_daemon(tmp_path: Path, given: list[str]) -> No
     for number in range(MAX_DUMPS + 2):
         (tmp_path / "dumps" / f"era-fault-2026-{number}.jsonl").write_text(str(number), "utf-8")
     (tmp_path / "dumps" / "other.txt").write_text("x", "utf-8")
-    report = collect([tmp_path / name for name in given], socket=tmp_path / "no.sock", home=HOME)
+    files, missing = collect(
+        [tmp_path / name for name in given], socket=tmp_path / "no.sock", home=HOME
+    )
     dumps = [f"era-fault-2026-{number}.jsonl" for number in range(2, MAX_DUMPS + 2)]
-    assert set(report.files) == {"d.yaml", "rig.yaml", "era.out", *dumps, "versions.json"}
-    log = report.files["era.out"]
+    assert set(files) == {"d.yaml", "rig.yaml", "era.out", *dumps, "versions.json"}
+    log = files["era.out"]
     assert len(log) == MAX_FILE_SIZE
     assert log.endswith('x\n{"message": "link main: lost"}\n')
-    layout, daemon = report.missing
+    layout, daemon = missing
     assert "none.yaml" in layout
     assert "daemon" in daemon
-    found = json.loads(report.files["versions.json"])
+    found = json.loads(files["versions.json"])
     assert found["packages"]["numpy"][0].isdigit()
     assert set(found) >= {"packages", "plug-ins"}
 
@@ -108,10 +110,10 @@ def test_report_includes_invalid_files(tmp_path: Path) -> None:
     (tmp_path / "broken.yaml").write_text("rig: [\napi_token: abc\n\tx", "utf-8")
     (tmp_path / "bytes.yaml").write_bytes(b"\xff\x00: \x80")
     files = [tmp_path / name for name in ("broken.yaml", "bytes.yaml", "none.yaml")]
-    report = collect(files, socket=tmp_path / "no.sock", home=HOME)
-    assert set(report.files) == {"broken.yaml", "bytes.yaml", "versions.json"}
-    assert report.files["broken.yaml"] == "rig: [\napi_token: hidden\n\tx"
-    assert [sum(path.name in each for each in report.missing) for path in files] == [1, 1, 1]
+    found, missing = collect(files, socket=tmp_path / "no.sock", home=HOME)
+    assert set(found) == {"broken.yaml", "bytes.yaml", "versions.json"}
+    assert found["broken.yaml"] == "rig: [\napi_token: hidden\n\tx"
+    assert [sum(path.name in each for each in missing) for path in files] == [1, 1, 1]
 
 
 def test_report_command_writes_new_folder_for_owner_only(tmp_path: Path) -> None:

@@ -40,7 +40,9 @@ from era_haptics.lab.design.problem import (
 from era_haptics.lab.measuring.impedance import read_impedance
 from era_haptics.lab.measuring.loopback import read_stepped
 from era_haptics.lab.measuring.sound_card import Desk, WiredSensor, read_sensors
+from era_haptics.lab.paper_figures import paper_figures
 from era_haptics.lab.witness import capture
+from era_haptics.lab.witness.relay import parse_endpoint
 from error_cases import PAGE, Case, Quotation, cases, filled, provoke, quotations
 from error_cases import RIG as CASE_RIG
 from interrupted import full_disk, interrupted
@@ -52,9 +54,12 @@ from model.estimate.following import load_learned
 from model.estimate.measurement import read_measured, read_places
 from model.files.array_file import UNREADABLE, read_arrays
 from model.processes import on_cluster
-from model.rig.rig_file import example_rig_path, load_rig
+from model.rig.rig_file import example_rig_path, load_rig, mesh_of
 from model.structure.material import material
+from model.structure.plate import Plate
 from model.table.table_file import load_table
+from sim.far_ends.wire_assignment import SimulatedWire, assign_wires, choose_lines
+from sim.faults import load_faults
 from yaml_files import read_yaml
 
 INTERNALS = re.compile(
@@ -304,6 +309,7 @@ READERS: dict[str, Callable[[Path], object]] = {
     "sensors.csv": lambda path: read_sensors(path, RIG.plate),
     "moved.csv": lambda path: read_sensors(path, RIG.plate, may_move=True),
     "contacts.yaml": lambda path: contact_rule(path, RIG.plate),
+    "faults.yaml": lambda path: load_faults(path, amplifiers=["main"]),
     "layouts.yaml": lambda path: layouts_of(str(path), DESIGN),
     "free.zma": read_impedance,
     "P1-1.wav": lambda path: read_stepped(path, DESK),
@@ -313,12 +319,28 @@ READERS: dict[str, Callable[[Path], object]] = {
 }
 """By a name of a file, what reads it."""
 
+TEN_METRES, URL = Plate(10.0, 10.0, 0.002, material("float-glass")), "sim://"
+
+
+def simulated(url: str, *wires: str) -> dict[str, SimulatedWire]:
+    """The wire of the amplifier main at a URL, by options of `era sim`."""
+    usual = SimulatedWire("serial")
+    return assign_wires({"main": url}, common=None, options=wires, defaults=usual)
+
+
 PARSERS: dict[str, Callable[[str], object]] = {
     "amplifier URL": address_of,
     "touch URL": open_source,
     "frequencies": parse_frequencies,
     "scheduler": lambda text: [*on_cluster(text, divmod, 1, {0: 1})],
     "material": material,
+    "figure": lambda text: [*paper_figures(RIG, text)],
+    "mesh": lambda text: mesh_of(text, RIG.plate, frequency_max=500.0),
+    "mesh of ten metres": lambda text: mesh_of(text, TEN_METRES, frequency_max=500.0),
+    "wire": lambda text: simulated(URL, *text.split()),
+    "URL to simulate": simulated,
+    "line": lambda text: choose_lines(simulated("serial:///dev/ttyUSB0"), [text]),
+    "endpoint": parse_endpoint,
     "area": lambda text: area_of(text, RIG.plate),
 }
 """By what a text is, what reads it."""

@@ -13,7 +13,6 @@ from drivers.host.line import Line
 from drivers.opening import Lines
 from drivers.protocol.definition import FAULTS
 from drivers.wires.serial_line import SerialWire
-from model.errors import InputError
 from model.rig.rig import Rig
 from model.rig.rig_file import example_rig_path
 from plates import TWO_AMPLIFIERS, write_rig
@@ -170,23 +169,6 @@ def test_load_faults_reads_times_units_and_amplifiers(tmp_path: Path) -> None:
     assert [east.now("drop", time) for time in (101.9, 102.0, 103.4, 103.5)] == [
         *(False, True, True, False)
     ]
-
-
-def test_load_faults_reports_every_error_with_its_line(tmp_path: Path) -> None:
-    """Unknown faults, amplifiers and keys, and values out of range, all at once."""
-    path = write(
-        tmp_path,
-        "faults:\n"
-        "  - {fault: dropp}\n"
-        "  - {fault: arc, amplifier: mian}\n"
-        "  - {fault: arc, att: 3}\n"
-        "  - {fault: drop, share: 1.5}\n",
-    )
-    with pytest.raises(InputError) as caught:
-        load_faults(path, amplifiers=["main"])
-    message = str(caught.value)
-    for line, word in ((2, "dropp"), (3, "mian"), (4, "att"), (5, "share")):
-        assert any(f":{line}:" in row and word in row for row in message.splitlines()), message
 
 
 @pytest.mark.parametrize(

@@ -576,28 +576,3 @@ def test_plate_of_many_wavelengths_takes_one_high_degree():
     assert isinstance(mesh, SpectralMesh)
     assert mesh.nx > 110
     assert mesh.ny < 20
-
-
-@pytest.mark.parametrize("text", ["auto", "auto 5 %", "120x90 Legendre", "600x600", "120x120 Q5"])
-def test_meshes_that_would_take_minutes_or_all_memory_are_refused(text):
-    """Ten metres square of glass 2 mm thick, and meshes that are named."""
-    with pytest.raises(InputError):
-        mesh_of(text, Plate(10.0, 10.0, 0.002, STIFF_GLASS), frequency_max=500.0)
-
-
-@pytest.mark.parametrize(
-    "text",
-    [
-        "3x9 Legendre",
-        "201x9 Legendre",
-        "12x9 legendre",
-        "auto 1",
-        "auto 0 %",
-        "auto 50 %",
-        "auto x %",
-    ],
-)
-def test_degrees_and_accuracies_out_of_range_are_refused(text):
-    """Degrees below 4 and above 200, accuracies below 0.05 % and above 10 %, other spellings."""
-    with pytest.raises(InputError):
-        mesh_of(text, PAPER, frequency_max=500.0)

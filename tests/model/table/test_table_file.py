@@ -226,12 +226,6 @@ def test_build_states_the_discretisation_error_of_the_worst_era():
     np.testing.assert_allclose(table.discretisation_error, study.errors[0].response, rtol=0.1)
 
 
-def test_build_refuses_an_unknown_drive_mode(problem):
-    """The error lists those there are."""
-    with pytest.raises(InputError, match="switched, phased"):
-        solve_table(problem, drive_mode="loud")
-
-
 def quick_rig_on(nx, ny):
     """The paper's plate up to 100 Hz: five frequencies, solved quickly."""
     rig = make_paper_rig(nx, ny)

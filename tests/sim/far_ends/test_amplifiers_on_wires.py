@@ -11,7 +11,6 @@ from drivers.errors import CommandRefused, LinkError
 from drivers.protocol.definition import FAULTS, MESSAGES, STATES, STATUS, VERSION
 from drivers.urls import ADDRESS
 from drivers.wires.serial_frames import Frame, encode_frame
-from model.errors import InputError
 from model.rig.rig import Rig
 from real_wires import (
     SHARED_WIRES,
@@ -77,34 +76,6 @@ def test_assign_wires_prefers_own_option_to_common_to_url() -> None:
     assert assigned["c"] == SimulatedWire("slcan")
 
 
-@pytest.mark.parametrize(
-    "options",
-    [
-        ["main"],
-        ["mian=serial"],
-        ["main=serial", "main=slcan"],
-        ["main=serail"],
-        ["main=serial:3"],
-        ["main=modbus-tcp:65536"],
-        ["main=modbus-tcp:x"],
-    ],
-)
-def test_assign_wires_refuses_an_invalid_option(options: list[str]) -> None:
-    """The error names the option as given."""
-    with pytest.raises(InputError, match=f"--wire {options[-1]}"):
-        assign_wires({"main": "sim://"}, common=None, options=options, defaults=DEFAULTS)
-
-
-@pytest.mark.parametrize(
-    "url", ["sim://", "can+socketcan://can0#1", "modbus+tcp://10.0.0.1/1", "modbus+tcp://h:99999/1"]
-)
-def test_assign_wires_refuses_a_url_without_a_wire(url: str) -> None:
-    """The error names the amplifier and its URL."""
-    with pytest.raises(InputError, match="amplifier main: ") as problem:
-        assign_wires({"main": url}, common=None, options=[], defaults=DEFAULTS)
-    assert url in str(problem.value)
-
-
 def test_choose_lines_prefers_a_name_to_all_and_keeps_a_line_whole() -> None:
     """Amplifiers of one line have one kind, in whatever order the options come."""
     wires = assign_wires(URLS, common=None, options=[], defaults=DEFAULTS)
@@ -112,14 +83,6 @@ def test_choose_lines_prefers_a_name_to_all_and_keeps_a_line_whole() -> None:
     assert [wire.line_kind for wire in chosen.values()] == ["ftdi", "ftdi", *["native"] * 4]
     assert chosen["a"] == chosen["b"]
     assert choose_lines(wires, []) == wires
-
-
-@pytest.mark.parametrize("option", ["ftdy", "z=ftdi", "a=", ""])
-def test_choose_lines_refuses_an_invalid_option(option: str) -> None:
-    """The error names the option as given."""
-    wires = assign_wires(URLS, common=None, options=[], defaults=DEFAULTS)
-    with pytest.raises(InputError, match=f"--line {option}: "):
-        choose_lines(wires, [option])
 
 
 WAITS = {"/tmp/a": 125e-6, "/dev/ttyUSB0": 1e-3, "/dev/ttyACM0": 1e-3, "/dev/ttyS0": 0.0}

@@ -47,6 +47,7 @@ from error_cases import PAGE, Case, Quotation, cases, filled, provoke, quotation
 from error_cases import RIG as CASE_RIG
 from interrupted import full_disk, interrupted
 from long_form import shortly
+from model.config.document import read_document
 from model.config.units import parse_frequencies
 from model.errors import InputError
 from model.estimate import calibrate
@@ -358,10 +359,11 @@ def test_what_is_wrong_is_said(
     tmp_path: Path, read: str, named: str, text: str, pattern: str
 ) -> None:
     """Of a file with its name, line and key; nothing that a text asks for is opened."""
-    text = text.replace("<5000 digits>", 5000 * "9")
+    text = re.sub(r"<(\d+) (.+?)>", lambda found: int(found[1]) * found[2], text)
     (tmp_path / named).write_text(text, "utf-8")
+    files = READERS | {"document.yaml": read_document}  # which may hold any plain data
     with pytest.raises((InputError, CommandError), match=pattern):
-        READERS[read](tmp_path / named) if read in READERS else PARSERS[read](text)
+        files[read](tmp_path / named) if read in files else PARSERS[read](text)
 
 
 _DIGITS = b"9" * 100_000

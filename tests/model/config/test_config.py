@@ -403,49 +403,6 @@ def test_byte_order_mark_is_skipped(tmp_path: Path) -> None:
     assert read_document(write(tmp_path, b"\xef\xbb\xbfa: 1\r\nb: 2\r\n")).data == {"a": 1, "b": 2}
 
 
-@pytest.mark.parametrize(
-    ("content", "line", "key"),
-    [
-        (b"", None, ""),
-        (b"# only a comment\n", None, ""),
-        (b"a: 1\nb: \xff\n", 2, ""),
-        (b"a: \x00\n", 1, ""),
-        (b"a: 1\nb: [1\nc: 2\n", 2, ""),
-        (b"a: 1\n\tb: 2\n", 2, ""),
-        (b"- 1\n- 2\n", 1, ""),
-        (b"word\n", 1, ""),
-        (b"a: 1\nb: 2\na: 3\n", 3, "a"),
-        (b"s:\n  t: 1\n  t: 1\n", 3, "s.t"),
-        (b"a: 1\n---\nb: 2\n", 2, ""),
-        (b"a: &x 1\nb: 2\n", 1, "a"),
-        (b"a: 1\nb: *x\n", 2, "b"),
-        (b"a: &x [1]\nb: [*x, *x]\n", 1, "a"),
-        (b"&top\na: 1\n", 1, ""),
-        (b"a: 1\nb: !!python/object/apply:os.system [ls]\n", 2, "b"),
-        (b"a: !!int '3'\n", 1, "a"),
-        (b"a: ! 3\n", 1, "a"),
-        (b"? [1, 2]\n: 3\n", 1, ""),
-        (b"a: " + b"[" * 900, 1, "a[0][0]"),
-        (b"a: " + b"[" * 20_000, 1, ""),  # by libyaml
-        (b"%YAML 2.0\n---\na: 1\n", 1, ""),
-        (b"a: " + b"{a: " * 20_000, 1, "a.a.a"),
-        (b"a: 1\n" + b"#" * (1 << 20), None, ""),
-        (b"PK\x03\x04" + bytes(1 << 20), None, ""),
-    ],
-)
-def test_document_refuses_what_is_not_plain_data(
-    tmp_path: Path, content: bytes, line: int | None, key: str
-) -> None:
-    """The error has the line and key, and nothing is built of the content."""
-    path = write(tmp_path, content)
-    with pytest.raises(ConfigError) as caught:
-        read_document(path)
-    (problem,) = caught.value.problems
-    assert (problem.line, problem.key) == (line, key)
-    place = str(path) if line is None else f"{path}:{line}"
-    assert str(caught.value).startswith(f"{place}: ")
-
-
 def test_document_refuses_too_many_values(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """More than the limit, lowered here from 50 000, is refused as a whole."""
     monkeypatch.setattr("model.config.document._MAX_VALUES", 100)
@@ -462,25 +419,6 @@ def test_document_refuses_what_is_not_a_file(tmp_path: Path, name: str) -> None:
     with pytest.raises(ConfigError) as caught:
         read_document(tmp_path / name)
     assert caught.value.problems[0].line is None
-
-
-def test_document_reports_all_repeated_keys_in_order_of_lines(tmp_path: Path) -> None:
-    """Each has its own line, also where one is nested in another."""
-    path = write(tmp_path, "a: 1\nb:\n  c: 1\n  c: 2\na: 2\n")
-    with pytest.raises(ConfigError) as caught:
-        read_document(path)
-    assert [(each.line, each.key) for each in caught.value.problems] == [(4, "b.c"), (5, "a")]
-    assert [line.split(": ")[0] for line in str(caught.value).splitlines()[1:]] == [
-        f"  {path}:4",
-        f"  {path}:5",
-    ]
-
-
-def test_error_escapes_control_characters_of_a_key(tmp_path: Path) -> None:
-    """A key cannot send commands to a terminal."""
-    with pytest.raises(ConfigError) as caught:
-        read_document(write(tmp_path, '"\\e[2J": 1\n"\\e[2J": 2\n'))
-    assert "\x1b" not in str(caught.value)
 
 
 @given(st.binary(max_size=200) | st.text(alphabet="ab:-[]{}#&*!|>'\"%@ \n\t1.,?", max_size=80))

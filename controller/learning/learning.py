@@ -34,8 +34,8 @@ from controller.api.schema import (
     LearningSummary,
     PlateEvent,
 )
-from controller.learning.estimator import Estimator, PlateReport, Worker
-from controller.plate_measurement import PlateSensor, check_clocks, plate_sensors
+from controller.learning.worker import Worker, make, of_made
+from controller.plate_measurement import PlateSensor, check_clocks, plate_sensors, settling
 from controller.play.loop import Controller
 from controller.play.planner import Observers, PlayReport
 from controller.sources.touch import Contact
@@ -43,7 +43,7 @@ from drivers.errors import CommandError, DriverError, Preempted
 from drivers.host.amplifier import Reading, finish_reading, start_reading
 from model.answer.answer_report import Timing
 from model.errors import InputError
-from model.estimate.following import SettledPattern
+from model.estimate.following import LearnedTable, PlateReport, SettledPattern
 from model.estimate.forward import RestingFinger
 from model.rig.rig import Rig
 from model.table.table import LocalizationTable
@@ -400,18 +400,20 @@ class Learning:
         """
         worker = self.worker = Worker()
         try:
-            await worker.make(
+            table, heard = self._base[0], [sensor.place for sensor in self.readings.sensors]
+            band = float(table.frequencies[0]), float(table.frequencies[-1])
+            self.readings.settling = await worker.call(START_LIMIT, settling, self._rig, band)
+            await worker.call(
                 START_LIMIT,
-                Estimator,
+                make,
+                LearnedTable,
                 self._rig,
-                replace(self._base[0]),  # without what is prepared in it
-                [sensor.place for sensor in self.readings.sensors],
+                replace(table),  # without what is prepared in it
+                heard,
                 self._controller.drive_mode,
                 self._file.absolute(),
             )
-            self.readings.settling, report, self._cautious = await worker.call(
-                START_LIMIT, Estimator.start
-            )
+            report, self._cautious = await worker.call(START_LIMIT, of_made, LearnedTable.start)
             if self.event.cautious:
                 self._answer_by(*self._base, is_cautious=False)
             self._follow(report)
@@ -425,17 +427,17 @@ class Learning:
                         pattern = await self._waiting.get()
                 except TimeoutError:
                     keep_at = threads.now() + _KEEP_INTERVAL
-                    note, cautious = await worker.call(ESTIMATE_LIMIT, Estimator.keep)
+                    note, cautious = await worker.call(ESTIMATE_LIMIT, of_made, LearnedTable.keep)
                     self._note(note)
                     self._cautious = cautious or self._cautious
                     continue
                 self._in_hand = 1
-                report = await worker.call(ESTIMATE_LIMIT, Estimator.take, pattern)
+                report = await worker.call(ESTIMATE_LIMIT, of_made, LearnedTable.take, pattern)
                 self._in_hand = 0
                 self._follow(report, pattern)
         finally:
             with contextlib.suppress(Exception):
-                await worker.call(_CLOSE_LIMIT, Estimator.keep)
+                await worker.call(_CLOSE_LIMIT, of_made, LearnedTable.keep)
             worker.end()
 
     def _hand(self, pattern: SettledPattern) -> None:

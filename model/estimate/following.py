@@ -17,6 +17,9 @@ least in a fit of the held patterns, plus a cost for each changed parameter, and
 it still leaves residuals beyond chance, as for a crack or a hand that rests on the plate, the plate
 counts as changed until patterns fit it again as it was: its table is that of the plate as last
 known, with the errors of one that was not measured.
+
+A `LearnedTable` is a table in service that follows a `LivePlate`, says in words how the plate is
+known, and keeps in a file what was learned.
 """
 
 import json
@@ -25,13 +28,15 @@ import zipfile
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
+from functools import cached_property
 from pathlib import Path
-from typing import Any, Final, Self
+from typing import Any, Final, Literal, Self
 
 import numpy as np
 from scipy import linalg
 from scipy.special import chdtrc
 
+from model.answer.plan import prepare_answers
 from model.arrays import ComplexArray, FloatArray, best_of, ranked_by
 from model.errors import InputError
 from model.estimate.fit import Fit, best_gains, fit
@@ -47,7 +52,7 @@ from model.estimate.forward import (
 from model.estimate.identify import solved_for
 from model.estimate.measurement import Measurement
 from model.estimate.space import rig_with, space_of
-from model.files.array_file import UNREADABLE, read_arrays, write_arrays
+from model.files.array_file import UNREADABLE, read_arrays, remove_partial, write_arrays
 from model.files.output_paths import begins_with
 from model.finger import Grid
 from model.rig.rig import Rig, Uncertainty
@@ -99,6 +104,14 @@ _NOT_STATED = (
 )
 """Kinds whose uncertainty a rig does not state."""
 
+_IDENTIFIED = 0.5  # of the thickness error of a plate that was not measured
+_HELD = "the plate is not as known; the next patterns tell what has changed"
+_CHANGED_REMEDY = (
+    "run era rig check, and look for a loose mount, a crack or something on the plate; then "
+    "identify it (era rig identify), or discard what was learned (era forget)"
+)
+_IDENTIFY = "identify the plate (era rig identify)"
+
 _VERSION = 3
 _TYPES = {"header": "|u1", "x": "<f8", "covariance": "<f8"}
 _MAX_BYTES = 1 << 24
@@ -143,8 +156,8 @@ class PlateEstimate:
     """Covariance (p, p) of x."""
     time: float | None = None
     """When it was updated [s], since which it has drifted; None before the first pattern."""
-    is_explained: bool = True
-    """Whether an identification explains the plate, so that patterns update it, not only alarm."""
+    why_off: str = ""
+    """Why patterns only raise alarms, "" where they update what is known."""
     change: str = ""
     """How it has changed in a way that its parameters do not follow, "" where it has not."""
 
@@ -203,7 +216,11 @@ def widest(uncertainty: Uncertainty) -> Uncertainty:
 class PlateUpdate:
     """A plate after some patterns, with the innovation in standard deviations."""
 
+    before: PlateEstimate
+    """What was known before them."""
+    patterns: Sequence[SettledPattern]
     known: PlateEstimate
+    """What is known after them."""
     fit: Fit
     """Fit of plate and fingers."""
     innovation: FloatArray
@@ -223,6 +240,21 @@ class PlateUpdate:
         """Squared residuals after the update."""
         left, _ = self.fit.of_values
         return float(left @ left)
+
+    @cached_property
+    def directions(self) -> tuple[FloatArray, FloatArray, int]:
+        """Slopes (d,) and curvatures (d,) of half the nis by directions of change.
+
+        The last directions are masses, which can only grow: their number is returned, too.
+        """
+        best, points = self.fit, PLACES.centres(self.fit.model.rig.plate)
+        driven = best.measurement.driven
+        by_mass = driven(by_mass_at(best.plate, points))
+        _, _, _, masses = best_gains(driven(best.plate.responses), by_mass, best.measurement)
+        kinds = best.space.of(*_KINDS)[best.searched]
+        columns = np.hstack([best.of_values[1][:, kinds], np.vstack([masses.real, masses.imag])])
+        weighted = self.precision @ columns
+        return weighted.T @ self.innovation, (columns * weighted).sum(axis=0), len(points)
 
 
 def update(
@@ -287,6 +319,8 @@ def update(
     expected = H @ (P @ H.T + wrong[:, None] * H.T) + np.eye(len(left))
     covariance = (covariance + covariance.T) / 2
     return PlateUpdate(
+        before,
+        patterns,
         replace(before, x=found.x[:p], covariance=covariance, time=patterns[-1].time),
         found,
         H @ (found.x - mean) - left,
@@ -317,38 +351,6 @@ class NoiseLevel:
         self.relative = float(np.clip(np.sqrt(total / numbers), _MIN_NOISE, 1.0))
 
 
-@dataclass(frozen=True, eq=False)
-class Observation:
-    """A pattern with the plate before it and its innovation, along d directions of change."""
-
-    pattern: SettledPattern
-    before: PlateEstimate
-    nis: float
-    count: int
-    """Number of real numbers in the innovation."""
-    slopes: FloatArray
-    """Slope of half the squared innovation by each direction (d,)."""
-    curvatures: FloatArray
-    """Curvature of the same (d,)."""
-    masses: int
-    """Number of the last directions, masses, which can only grow."""
-
-    @classmethod
-    def of(cls, pattern: SettledPattern, before: PlateEstimate, found: PlateUpdate) -> Self:
-        """Make it of a pattern and its update."""
-        best = found.fit
-        driven = best.measurement.driven
-        points = PLACES.centres(best.model.rig.plate)
-        by_mass = driven(by_mass_at(best.plate, points))
-        _, _, _, masses = best_gains(driven(best.plate.responses), by_mass, best.measurement)
-        kinds = best.space.of(*_KINDS)[best.searched]
-        columns = np.hstack([best.of_values[1][:, kinds], np.vstack([masses.real, masses.imag])])
-        weighted = found.precision @ columns
-        slopes, curvatures = weighted.T @ found.innovation, (columns * weighted).sum(axis=0)
-        count = len(found.innovation)
-        return cls(pattern, before, found.nis, count, slopes, curvatures, len(points))
-
-
 class Alarm:
     """The last patterns of a plate, tested for being those of the plate as known.
 
@@ -356,7 +358,7 @@ class Alarm:
     """
 
     def __init__(self) -> None:
-        self._recent: deque[Observation] = deque(maxlen=WINDOW)
+        self._recent: deque[PlateUpdate] = deque(maxlen=WINDOW)
 
     @property
     def is_full(self) -> bool:
@@ -367,17 +369,17 @@ class Alarm:
     def is_odd(self) -> bool:
         """Whether the last pattern is unlikely on its own, as under a finger unlike any other."""
         last = self._recent[-1]
-        along = _squares(last.slopes, last.curvatures, last.masses).max()
-        return bool(chdtrc(last.count, last.nis) < _UNLIKELY_ALONE or along > _ALONG)
+        along = _squares(*last.directions).max()
+        return bool(chdtrc(len(last.innovation), last.nis) < _UNLIKELY_ALONE or along > _ALONG)
 
-    def take(self, observation: Observation) -> list[Observation] | None:
+    def take(self, update: PlateUpdate) -> list[PlateUpdate] | None:
         """Take a pattern; return the last patterns since the plate changed, None if it did not."""
-        self._recent.append(observation)
+        self._recent.append(update)
         last = list(self._recent)[::-1]
-        masses, along, confirmed = last[0].masses, np.zeros(len(last)), np.zeros(len(last))
+        of_each, by_each, of_masses = zip(*(each.directions for each in last), strict=True)
+        masses, along, confirmed = of_masses[0], np.zeros(len(last)), np.zeros(len(last))
         for number in range(len(last)):
-            slopes = np.array([each.slopes for each in last[: number + 1]])
-            weights = np.array([each.curvatures for each in last[: number + 1]])
+            slopes, weights = np.array(of_each[: number + 1]), np.array(by_each[: number + 1])
             total, weight = slopes.sum(axis=0), weights.sum(axis=0)
             squares = _squares(total, weight, masses)
             along[number] = squares.max()
@@ -386,13 +388,11 @@ class Alarm:
             confirmed[number] = np.where(rest > _ALONG_REST, squares, 0.0).max()
         if confirmed.max() > _ALONG:
             return last[: best_of(along) + 1][::-1]
-        squares = np.cumsum([each.nis for each in last])
-        numbers = np.cumsum([each.count for each in last])
+        counts = [len(each.innovation) for each in last]
+        squares, numbers = np.cumsum([each.nis for each in last]), np.cumsum(counts)
         rest = squares - np.maximum.accumulate([each.nis for each in last])
         unlikely = chdtrc(numbers, squares) < _UNLIKELY_TOGETHER
-        if np.any(
-            unlikely & (chdtrc(np.maximum(numbers - last[0].count, 1), rest) < _UNLIKELY_REST)
-        ):
+        if np.any(unlikely & (chdtrc(np.maximum(numbers - counts[0], 1), rest) < _UNLIKELY_REST)):
             return last[: best_of(squares - _REFERENCE * numbers) + 1][::-1]
         return None
 
@@ -527,18 +527,18 @@ class LivePlate:
         space = known.model.space
         theory = (space.of_kinds(lambda kind: kind.theory) / space.scale) ** 2
         after = update(known.at(pattern.time), [pattern], theory=theory)
-        suspect = self._alarm.take(Observation.of(pattern, known, after))
+        suspect = self._alarm.take(replace(after, before=known))  # from which drift counts
         report = PatternReport(after.nis, len(after.innovation))
         if suspect is not None:
             self._alarm = Alarm()
-            if known.is_explained and not known.change:
+            if not known.why_off and not known.change:
                 self.known = replace(suspect[0].before, change="")
-                self._held, self._suspects = [each.pattern for each in suspect], len(suspect)
+                self._held, self._suspects = [e.patterns[0] for e in suspect], len(suspect)
                 report = self._explained(pattern.time)
             return replace(report, alarm=not known.change)
         if known.change and self._alarm.is_full:
             known = self.known = replace(known, change="")
-        if known.is_explained and not known.change and not self._alarm.is_odd:
+        if not known.why_off and not known.change and not self._alarm.is_odd:
             self.known = replace(after.known, change="")
             self._noise.take(after.misfit, after.freedom)
         return report
@@ -559,79 +559,181 @@ class LivePlate:
         return PatternReport(explanation=found)
 
 
-class LearnedTable:
-    """A table in service, corrected by the settled patterns of its plate.
+@dataclass(frozen=True, eq=False)
+class PlateReport:
+    """The plate as a learned table knows it, after its start or a pattern."""
 
-    table: that of the rig as known when service began, which is never changed; file: keeps what was
-    learned.
+    state: Literal["following", "changed", "off"]
+    cause: str
+    remedy: str | None
+    is_alarm: bool = False
+    """Whether the pattern is not of the plate as known."""
+    table: LocalizationTable | None = None
+    """Corrected table, prepared for its first touch; None: answers stay as they are."""
+    note: str = ""
+    """A line for the log; else ""."""
+
+
+class LearnedTable:
+    """A table in service, corrected by the settled patterns of its plate; raises InputError.
+
+    table: of the rig as built, never changed; sensors: those that readings come from; drive_mode:
+    of the questions that answers are prepared for; file: keeps what is learned. One that is
+    damaged, of another plate, or of one that no table can follow is renamed.
     """
 
-    def __init__(self, table: LocalizationTable, known: PlateEstimate, *, file: Path) -> None:
-        self._table, self._file = table, file
+    def __init__(
+        self,
+        rig: Rig,
+        table: LocalizationTable,
+        sensors: Sequence[Sensor],
+        drive_mode: str,
+        file: Path,
+    ) -> None:
+        self._table, self._drive_mode, self._file = table, drive_mode, file
+        known = replace(PlateEstimate.of_rig(rig, sensors), why_off=why_only_alarms(rig))
         self.live = LivePlate(known)
         self.current = table
         """The table as corrected so far."""
+        self._cause, self._alarms = "the plate is followed from the rig as built on", 0
+        self._note, self._is_kept = "", True
+        remove_partial(file)
+        try:
+            if file.exists():
+                self._resume(known)
+        except ValueError as error:  # InputError and LinAlgError are such
+            self._note = f"learning anew: {error}; {_set_aside(file)}"
 
-    def resume(self, now: float) -> None:
-        """Resume with what the file holds, if it exists.
-
-        now: time [s] on the clock of the patterns; the plate has drifted since the file was
-        written. Raises InputError for another kind of file, or one of another table or of other
-        parameters.
-        """
-        if not self._file.exists():
-            return
+    def _resume(self, known: PlateEstimate) -> None:
+        """Resume with what the file holds; the plate has drifted since it was written."""
         header, x, covariance = load_learned(self._file, table=self._table.fingerprint)
-        known = self.live.known
-        expected = known.model.space.names, known.model.rig.fingerprint
-        if (tuple(header["names"]), header["base"]) != expected:
+        if (header["names"], header["base"]) != _identity(known):
             raise InputError(
                 f"{self._file}: parameters must be those of this rig and its sensors; remove the "
                 "file to learn anew"
             )
-        then = now - max(clock.time() - self._file.stat().st_mtime, 0.0)
+        then = clock.monotonic() - max(clock.time() - self._file.stat().st_mtime, 0.0)
         known = replace(known, x=x, covariance=covariance, time=then, change=header["change"])
-        self.live = LivePlate(known)
-        self.current = self._followed()
+        self.current, self.live = self._followed(known), LivePlate(known)
+        self._cause = "the plate is followed from what was learned before on"
 
-    def take(self, pattern: SettledPattern) -> tuple[PatternReport, LocalizationTable | None]:
-        """Take a settled pattern, and correct the table by it; None where that stays the same.
+    def start(self) -> tuple[PlateReport, LocalizationTable]:
+        """Report what was learned before, with the cautious table."""
+        found = None if self.current is self._table else self.current
+        return self._report(found, note=self._note), self._cautious()
 
-        Raises InputError or another ValueError for a pattern that leads to a plate that no table
-        can follow; what was known before is restored, suspect patterns are discarded.
+    def take(self, pattern: SettledPattern) -> PlateReport:
+        """Take a settled pattern, and correct the table by it.
+
+        One without readings, or one that leads to a plate that no table can follow, is not used,
+        and a note says so: what was known before is restored, suspect patterns are discarded.
         """
-        if not np.isfinite(pattern.values).all() or not np.any(pattern.values):
-            raise InputError("readings must be finite and not all 0, got others")
         before = self.live.known
         try:
-            report, known = self.live.take(pattern), self.live.known
-            if not np.isfinite(known.x).all() or not np.isfinite(known.covariance).all():
-                raise InputError("parameters must be finite after a pattern, got others")
-            if known.x is before.x and bool(known.change) == bool(before.change):
-                return report, None
-            self.current = self._followed()
-        except Exception:
+            if not np.isfinite(pattern.values).all() or not np.any(pattern.values):
+                raise InputError("readings must be finite and not all 0, got others")
+            found, known = self.live.take(pattern), self.live.known
+            is_new = known.x is not before.x or bool(known.change) != bool(before.change)
+            table = self._followed(known) if is_new else None
+        except Exception as error:
             self.live = LivePlate(before)
-            raise
-        return report, self.current
+            if not isinstance(error, ValueError):  # InputError and LinAlgError are such
+                raise
+            return self._report(None, note=f"a pattern is not used: {error}")
+        if table is not None:
+            self.current, self._is_kept = table, False
+        self._alarms += found.alarm
+        if found.explanation is not None:
+            self._cause = f"the plate has changed: {found.explanation}"
+        elif found.is_held:
+            self._cause = _HELD
+        elif found.alarm:
+            self._cause = f"the plate is not as the rig says (alarm {self._alarms})"
+        elif before.change or self._cause == _HELD:
+            self._cause = "the plate is again as it was"
+        return self._report(table, is_alarm=found.alarm)
 
-    def _followed(self) -> LocalizationTable:
-        """The table for the plate as it is known now."""
-        known = self.live.known
+    def keep(self) -> tuple[str, LocalizationTable | None]:
+        """Write what was learned since; return why it could not be, and the cautious table of it.
+
+        The next call tries again, with the same reason once only. None: the table is as before.
+        """
+        if self._is_kept:
+            return "", None
+        before, self._note = self._note, ""
+        try:
+            save_learned(self._file, self.live.known, table=self._table.fingerprint)
+        except OSError as error:
+            self._note = f"{self._file}: not written: {error}"
+        self._is_kept = not self._note
+        return "" if self._note == before else self._note, self._cautious()
+
+    def _followed(self, known: PlateEstimate) -> LocalizationTable:
+        """Return the table for a plate as it is known; raises InputError where there is none."""
+        if not np.isfinite(known.x).all() or not np.isfinite(known.covariance).all():
+            raise InputError("parameters must be finite, got others")
         return table_following(self._table, known.cautious_rig if known.change else known.rig)
 
-    def save(self) -> None:
-        """Write what was learned, atomically; raises OSError."""
-        known = self.live.known
-        header = {
-            "version": _VERSION,
-            "table": self._table.fingerprint,
-            "base": known.model.rig.fingerprint,
-            "names": known.model.space.names,
-            "change": known.change,
-        }
-        encoded = np.frombuffer(json.dumps(header).encode(), dtype=np.uint8)
-        write_arrays(self._file, {"header": encoded, "x": known.x, "covariance": known.covariance})
+    def _report(
+        self, table: LocalizationTable | None, *, is_alarm: bool = False, note: str = ""
+    ) -> PlateReport:
+        known, cause = self.live.known, self._cause
+        table = None if table is None else self._prepared(table)
+        if known.change:
+            return PlateReport("changed", known.change, _CHANGED_REMEDY, is_alarm, table, note)
+        if known.why_off:
+            cause = cause if self._alarms else f"answers stay as built: {known.why_off}"
+            return PlateReport("off", cause, _IDENTIFY, is_alarm, table, note)
+        return PlateReport("following", cause, None, is_alarm, table, note)
+
+    def _cautious(self) -> LocalizationTable:
+        return self._prepared(table_following(self._table, self.live.known.cautious_rig))
+
+    def _prepared(self, table: LocalizationTable) -> LocalizationTable:
+        table = replace(table)  # not the one that the next correction starts from
+        prepare_answers(table, self._drive_mode)
+        _ = table.in_time
+        return table
+
+
+def why_only_alarms(rig: Rig) -> str:
+    """Return why patterns may not correct answers of a rig, or nothing.
+
+    Corrections of a plate that was never measured would put its form errors into other parameters.
+    """
+    stated, built = rig.uncertainty.thickness, Uncertainty().thickness
+    if not stated:
+        return "the rig's uncertainty takes its thickness as known exactly"
+    if stated > _IDENTIFIED * built:
+        return (
+            f"the rig's uncertainty of thickness must be at most {100 * _IDENTIFIED * built:g} %, "
+            f"that of a plate that was measured, got {100 * stated:g} %"
+        )
+    return ""
+
+
+def _set_aside(file: Path) -> str:
+    """Rename a file that is not resumed; return what was done, or why not."""
+    old = file.with_name(f"{file.name}.old")
+    try:
+        file.replace(old)
+    except OSError as error:
+        return f"it could not be renamed and will be replaced: {error}"
+    return f"it is {old} now"
+
+
+def _identity(known: PlateEstimate) -> tuple[list[str], str]:
+    """Names of the parameters of a plate, and fingerprint of the rig that they count from."""
+    return [*known.model.space.names], known.model.rig.fingerprint
+
+
+def save_learned(file: Path, known: PlateEstimate, *, table: str) -> None:
+    """Write what was learned for a table by its fingerprint, atomically; raises OSError."""
+    names, base = _identity(known)
+    header = {"version": _VERSION, "table": table, "base": base, "names": names}
+    text = json.dumps({**header, "change": known.change})
+    encoded = np.frombuffer(text.encode(), dtype=np.uint8)
+    write_arrays(file, {"header": encoded, "x": known.x, "covariance": known.covariance})
 
 
 def load_learned(file: Path, *, table: str) -> tuple[dict[str, Any], FloatArray, FloatArray]:

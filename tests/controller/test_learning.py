@@ -16,15 +16,16 @@ import numpy as np
 import pytest
 
 from controller.api.schema import LatencySummary, LearningState, PlateEvent
-from controller.learning import estimator as estimator_module
 from controller.learning import learning as module
-from controller.learning.estimator import Estimator, PlateReport, Worker
 from controller.learning.learning import Learning
+from controller.learning.worker import MAX_MEMORY, Worker, make
+from controller.plate_measurement import settling
 from controller.play.loop import Controller
 from drivers.errors import CommandError, LinkError
 from model.answer.answer_report import Timing
 from model.errors import InputError
-from model.estimate.following import LearnedTable, SettledPattern
+from model.estimate import following
+from model.estimate.following import LearnedTable, PatternReport, PlateReport, SettledPattern
 from model.estimate.forward import Sensor
 from model.rig.rig_file import example_rig_path
 from model.table.table import LocalizationTable
@@ -79,16 +80,17 @@ class Workers:
         self.count += 1
         return self
 
-    async def make(self, limit: float, *arguments: object) -> None:
-        """Begin."""
-        if isinstance(self.started, Exception):
-            raise self.started
-
-    async def call(self, limit: float, method: Callable[..., object], *arguments: object) -> Any:
-        """Reply, or raise TimeoutError."""
-        if method is Estimator.start:
-            return 0.2, self.started, CAUTIOUS
-        if method is Estimator.keep:
+    async def call(self, limit: float, function: Callable[..., object], *arguments: object) -> Any:
+        """Reply, or raise an error, TimeoutError among them."""
+        if function is settling:
+            return 0.2
+        if function is make:
+            if isinstance(self.started, Exception):
+                raise self.started
+            return None
+        if arguments[0] is LearnedTable.start:
+            return self.started, CAUTIOUS
+        if arguments[0] is LearnedTable.keep:
             return "", None
         async with asyncio.timeout(limit):
             found = await self.reports.get()
@@ -427,17 +429,17 @@ async def test_patterns_wait_for_a_slow_estimator_up_to_a_number(
         assert counted(learning, "estimates", "discarded") == (17, 2)
 
 
-def estimator(file: Path) -> Estimator:
+def learned_table(file: Path) -> LearnedTable:
     """Of the paper's rig, with a sensor at each ERA."""
     rig = make_paper_rig(12, 9)
     sensors = tuple(Sensor(era.name, era.name) for era in rig.eras)
-    return Estimator(rig, small_table(), sensors, "switched", file)
+    return LearnedTable(rig, small_table(), sensors, "switched", file)
 
 
 def test_pattern_of_nothing_is_noted_and_leaves_no_file(tmp_path: Path) -> None:
     """Sensors that read 0 give a note, no alarm and no table; nothing is to be saved."""
     file = tmp_path / "learned.npz"
-    found = estimator(file)
+    found = learned_table(file)
     count = len(small_table().eras)
     nothing = SettledPattern(1.0, 110.0, np.full(count, 1e-5 + 0j), np.zeros(count, dtype=complex))
     report = found.take(nothing)
@@ -449,20 +451,19 @@ def test_pattern_of_nothing_is_noted_and_leaves_no_file(tmp_path: Path) -> None:
 
 def test_rig_that_was_not_measured_is_only_watched(tmp_path: Path) -> None:
     """Off, with the thickness that an identification would state, and how to get it."""
-    settled, report, cautious = estimator(tmp_path / "learned.npz").start()
+    report, cautious = learned_table(tmp_path / "learned.npz").start()
     assert report.state == "off"
     assert "thickness" in report.cause
     assert "identify" in str(report.remedy)
     assert report.table is None
-    assert 0.2 <= settled <= 1.0
     assert cautious.uncertainty == small_table().uncertainty
 
 
 def test_damaged_file_is_set_aside(tmp_path: Path) -> None:
-    """It is renamed, byte for byte, the note names it, and the estimator starts anew."""
+    """It is renamed, byte for byte, the note names it, and the plate is learned anew."""
     file = tmp_path / "learned.npz"
     file.write_bytes(b"something else")
-    _, report, _ = estimator(file).start()
+    report, _ = learned_table(file).start()
     assert not file.exists()
     assert (tmp_path / "learned.npz.old").read_bytes() == b"something else"
     assert "learned.npz.old" in report.note
@@ -474,18 +475,20 @@ def test_folder_without_room_is_noted_once(tmp_path: Path, monkeypatch: pytest.M
     errors: list[OSError | None] = [OSError(28, "No space left"), OSError(30, "Read-only"), None]
     written = 0
 
-    def save(learned: LearnedTable) -> None:
+    def save(*args: object, **more: object) -> None:
         nonlocal written
         if errors[0] is not None:
             raise errors[0]
         written += 1
 
-    def take(learned: LearnedTable, pattern: SettledPattern) -> tuple[object, LocalizationTable]:
-        return SimpleNamespace(alarm=False, is_held=False, explanation=None), small_table()
+    found = learned_table(tmp_path / "learned.npz")
 
-    monkeypatch.setattr(LearnedTable, "save", save)
-    monkeypatch.setattr(LearnedTable, "take", take)
-    found = estimator(tmp_path / "learned.npz")
+    def take(pattern: SettledPattern) -> PatternReport:
+        found.live.known = replace(found.live.known, x=found.live.known.x.copy())
+        return PatternReport()
+
+    monkeypatch.setattr(following, "save_learned", save)
+    monkeypatch.setattr(found.live, "take", take)
     found.take(PATTERN)
     notes = []
     for _ in range(3):
@@ -500,30 +503,28 @@ def test_files_of_writers_that_were_killed_are_removed(tmp_path: Path) -> None:
     left, other = tmp_path / ".learned.npz.0123456789ab", tmp_path / ".learned.npz.old"
     left.write_bytes(b"half")
     other.write_bytes(b"somebody's")
-    estimator(tmp_path / "learned.npz")
+    learned_table(tmp_path / "learned.npz")
     assert not left.exists()
     assert other.exists()
 
 
-class Busy:
-    """An object of a worker."""
+def nap(seconds: float) -> int:
+    """Sleep, and return the process number."""
+    time.sleep(seconds)
+    return os.getpid()
 
-    def nap(self, seconds: float) -> int:
-        """Sleep, and return the process number."""
-        time.sleep(seconds)
-        return os.getpid()
 
-    def grow(self, size: int) -> int:
-        """Take memory."""
-        return len(bytearray(size))
+def grow(size: int) -> int:
+    """Take memory."""
+    return len(bytearray(size))
 
 
 @asynccontextmanager
 async def working() -> AsyncIterator[Worker]:
-    """A worker with an object."""
+    """A worker that has started."""
     worker = Worker()
     try:
-        await worker.make(60.0, Busy)
+        await worker.call(60.0, nap, 0.0)
         yield worker
     finally:
         worker.end()
@@ -552,10 +553,10 @@ async def gone(*pids: int) -> bool:
 async def test_worker_that_hangs_holds_nothing() -> None:
     """Its call ends in time, the loop goes on meanwhile, and `end` returns at once and kills it."""
     async with working() as worker:
-        assert await worker.call(60.0, Busy.nap, 0.0) == worker.pid
+        assert await worker.call(60.0, nap, 0.0) == worker.pid
         ticks = asyncio.create_task(asyncio.sleep(0.1))
         with pytest.raises(TimeoutError, match=r"no reply within 0\.3 s"):
-            await worker.call(0.3, Busy.nap, 1e3)
+            await worker.call(0.3, nap, 1e3)
         assert ticks.done()
         began = time.monotonic()
         worker.end()
@@ -569,10 +570,10 @@ async def test_worker_that_dies_is_reported() -> None:
     """At the call that it was killed in, and at the next one."""
     async with working() as worker:
         assert worker.pid is not None
-        napping = asyncio.create_task(worker.call(60.0, Busy.nap, 1e3))
+        napping = asyncio.create_task(worker.call(60.0, nap, 1e3))
         await asyncio.sleep(0.1)
         os.kill(worker.pid, signal.SIGKILL)
-        for call in (napping, worker.call(60.0, Busy.nap, 0.0)):
+        for call in (napping, worker.call(60.0, nap, 0.0)):
             with pytest.raises(ChildProcessError):
                 await call
 
@@ -582,11 +583,11 @@ async def test_worker_may_not_take_all_memory() -> None:
     """Twice its limit is refused to it, and it goes on; the unit leaves 0.6 GB to the daemon."""
     unit = (example_rig_path().parent / "systemd" / "era-haptics.service").read_text("utf-8")
     assert "\nMemoryMax=1G\n" in unit
-    assert estimator_module.MAX_MEMORY <= 2**30 - 0.6e9
+    assert MAX_MEMORY <= 2**30 - 0.6e9
     async with working() as worker:
         with pytest.raises(MemoryError):
-            await worker.call(60.0, Busy.grow, 2 * estimator_module.MAX_MEMORY)
-        assert await worker.call(60.0, Busy.grow, 1000) == 1000
+            await worker.call(60.0, grow, 2 * MAX_MEMORY)
+        assert await worker.call(60.0, grow, 1000) == 1000
 
 
 @pytest.mark.real_time
@@ -596,16 +597,16 @@ async def test_signals_to_all_processes_of_a_daemon_do_not_end_a_worker() -> Non
         assert worker.pid is not None
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1):
             os.kill(worker.pid, number)
-        assert await worker.call(60.0, Busy.nap, 0.0) == worker.pid
+        assert await worker.call(60.0, nap, 0.0) == worker.pid
 
 
 PARENT = """
 import asyncio, os, time
-from controller.learning.estimator import Worker
+from controller.learning.worker import Worker
 
 async def main():
     worker = Worker()
-    await worker.make(60.0, dict)
+    await worker.call(60.0, dict)
     children = open(f"/proc/self/task/{os.getpid()}/children").read()
     print(worker.pid, children, flush=True)
     time.sleep(1000)

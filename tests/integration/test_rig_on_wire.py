@@ -33,7 +33,7 @@ from controller.cli.commands import app
 from controller.daemon.daemon import Daemon
 from controller.demo.recorder import FingerVibration, steady_contrast_db
 from controller.learning import learning as learning_module
-from controller.learning.estimator import Worker
+from controller.learning.worker import Worker
 from controller.process.daemon_process import SocketLock
 from daemons import PATIENCE, daemon_at, far_end, ready
 from drivers.errors import CommandError, LinkError
@@ -300,10 +300,11 @@ class BusyWorker(Worker):
 
     calls = 0
 
-    async def _result(self, limit: float, function: Callable[..., Any], *arguments: object) -> Any:
+    async def call(self, limit: float, function: Callable[..., Any], *arguments: object) -> Any:
+        """Return what a function returns in the process."""
         BusyWorker.calls += 1
         try:
-            return await super()._result(limit, function, *arguments)
+            return await super().call(limit, function, *arguments)
         finally:
             BusyWorker.calls -= 1
 

@@ -12,7 +12,8 @@ Settled patterns, and the alarm that follows them.
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any, cast
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
@@ -33,9 +34,10 @@ from model.estimate.following import (
     LearnedTable,
     LivePlate,
     NoiseLevel,
-    Observation,
     PlateEstimate,
+    PlateUpdate,
     SettledPattern,
+    save_learned,
     update,
 )
 from model.estimate.forward import Sensor
@@ -58,11 +60,9 @@ def table(known: PlateEstimate) -> LocalizationTable:
     return build_table(known.model.rig, frequencies=TONES, drive_mode="phased")
 
 
-def resumed(table: LocalizationTable, known: PlateEstimate, file: Path) -> LearnedTable:
-    """A table with what its file holds."""
-    found = LearnedTable(table, known, file=file)
-    found.resume(0.0)
-    return found
+def learned_table(table: LocalizationTable, known: PlateEstimate, file: Path) -> LearnedTable:
+    """A table of a plate and its sensors, with what its file holds."""
+    return LearnedTable(known.model.rig, table, known.model.sensors, "phased", file)
 
 
 @pytest.mark.long
@@ -70,13 +70,13 @@ def test_answers_wait_for_an_explanation(
     hidden: Hidden, known: PlateEstimate, table: LocalizationTable, tmp_path: Path
 ) -> None:
     """A quiet pattern gives a new table, odd ones that raise an alarm none."""
-    learned = LearnedTable(table, known, file=tmp_path / "learned.npz")
+    learned = learned_table(table, known, tmp_path / "learned.npz")
     quiet = played(learned.take, hidden, hidden.mounted, count=12)
-    assert all(table is not None for _, table in quiet)
+    assert all(each.table is not None for each in quiet)
     odd = replace(hidden.mounted, stiffness=hidden.mounted.stiffness * [0.5, 1.0, 2.0, 1.0])
     first, second = played(learned.take, hidden, odd, count=2, start=12)
-    assert second[0].alarm
-    assert (first[1], second[1]) == (None, None)
+    assert second.is_alarm
+    assert (first.table, second.table) == (None, None)
 
 
 @pytest.mark.long
@@ -85,21 +85,21 @@ def test_unexplained_change_widens_the_errors_of_answers(
 ) -> None:
     """Answers then allow for the errors of a plate that was not measured, also when resumed."""
     file = tmp_path / "learned.npz"
-    learned = LearnedTable(table, known, file=file)
+    learned = learned_table(table, known, file)
     played(learned.take, hidden, hidden.mounted, count=12)
     odd = replace(
         hidden.mounted,
         stiffness=hidden.mounted.stiffness * [0.5, 1.0, 2.0, 1.0],
         gain=hidden.mounted.gain * [1.0, 0.5j, 1.0, 1.0],
     )
-    report, last = played(learned.take, hidden, odd, count=7, start=12)[-1]
-    assert report.explanation is not None
-    assert report.explanation.resembles
-    assert last is learned.current
+    report = played(learned.take, hidden, odd, count=7, start=12)[-1]
+    assert report.state == "changed"
+    assert "most as if" in report.cause
+    assert report.table is not None
     wide, built = learned.current.uncertainty, Uncertainty()
     assert (wide.gain, wide.thickness, wide.damping) == (built.gain, built.thickness, built.damping)
-    learned.save()
-    again = resumed(table, known, file)
+    assert learned.keep()[0] == ""
+    again = learned_table(table, known, file)
     assert again.live.known.change == learned.live.known.change != ""
     assert again.current.uncertainty == wide
 
@@ -112,7 +112,7 @@ def test_pattern_that_no_table_follows_leaves_the_state(
     tmp_path: Path,
 ) -> None:
     """State, answers and time are those before a refused pattern, and the next one is taken."""
-    learned = LearnedTable(table, known, file=tmp_path / "learned.npz")
+    learned = learned_table(table, known, tmp_path / "learned.npz")
     first, second, third = settled_patterns(hidden, hidden.mounted, count=3)
     learned.take(first)
     state, current = learned.live.known, learned.current
@@ -122,42 +122,54 @@ def test_pattern_that_no_table_follows_leaves_the_state(
 
     with monkeypatch.context() as patch:
         patch.setattr(following, "table_following", refused)
-        with pytest.raises(InputError, match="thickness"):
-            learned.take(second)
+        report = learned.take(second)
+    assert "not used: thickness" in report.note
+    assert report.table is None
     assert learned.live.known is state
     assert learned.current is current
-    assert learned.take(third)[1] is not None
+    assert learned.take(third).table is not None
 
 
 def test_what_was_learned_is_resumed_for_its_table_only(
     hidden: Hidden, known: PlateEstimate, table: LocalizationTable, tmp_path: Path
 ) -> None:
-    """The same state and answers come back; another rig's table and a damaged file are refused."""
+    """The same state and answers come back; of anything else the plate is learned anew."""
     file = tmp_path / "learned.npz"
-    learned = resumed(table, known, file)
+    learned = learned_table(table, known, file)
     played(learned.take, hidden, hidden.mounted, count=3)
-    learned.live.known = replace(learned.live.known, change="a crack")
-    learned.save()
-    cautious = resumed(table, known, file)
-    assert cautious.live.known.change == "a crack"
+    after = learned.live.known
+    save_learned(file, replace(after, change="a crack"), table=table.fingerprint)
+    cautious = learned_table(table, known, file)
+    assert cautious.start()[0].cause == "a crack"
     assert cautious.current.uncertainty.thickness == Uncertainty().thickness
-    learned.live.known = replace(learned.live.known, change="")
-    learned.save()
-    again = resumed(table, known, file)
-    assert not again.live.known.change
-    np.testing.assert_array_equal(again.live.known.covariance, learned.live.known.covariance)
+    assert learned.keep()[0] == ""
+    again = learned_table(table, known, file)
+    assert again.start()[0].state == "following"
+    np.testing.assert_array_equal(again.live.known.covariance, after.covariance)
     np.testing.assert_array_equal(
         again.current.unit_fields(POINTS), learned.current.unit_fields(POINTS)
     )
-    with pytest.raises(InputError, match="this table"):
-        resumed(replace(table, masses=()), known, file)
-    with pytest.raises(InputError, match="this rig"):
-        resumed(table, PlateEstimate.of_rig(known.model.rig, known.model.sensors[:2]), file)
-    content = bytearray(file.read_bytes())
-    content[len(content) // 2] ^= 1
-    file.write_bytes(bytes(content))
-    with pytest.raises(InputError, match="remove the file"):
-        resumed(table, known, file)
+    kept = file.read_bytes()
+    damaged = bytearray(kept)
+    damaged[len(kept) // 2] ^= 1
+    few = PlateEstimate.of_rig(known.model.rig, known.model.sensors[:2])
+    thin = after.x.copy()
+    thin[after.model.space.groups["thickness"]] = -1e3
+    save_learned(file, replace(after, x=thin), table=table.fingerprint)
+    for content, of, state, said in (
+        (kept, replace(table, masses=()), known, "this table"),
+        (kept, table, few, "this rig"),
+        (bytes(damaged), table, known, "remove the file"),
+        (file.read_bytes(), table, known, "thickness"),
+    ):
+        file.write_bytes(content)
+        anew = learned_table(of, state, file)
+        report, _ = anew.start()
+        assert report.note.startswith("learning anew: ")
+        assert said in report.note
+        assert anew.current is of
+        assert not file.exists()
+        assert file.with_name("learned.npz.old").read_bytes() == content
 
 
 NE = 2  # number of that ERA
@@ -223,7 +235,7 @@ def test_heavy_finger_is_no_change(hidden: Hidden, known: PlateEstimate) -> None
 
 def test_plate_that_was_not_explained_is_not_updated(hidden: Hidden, known: PlateEstimate) -> None:
     """After an identification with chi² above 2 patterns leave the state as it was."""
-    live = LivePlate(replace(known, is_explained=False))
+    live = LivePlate(replace(known, why_off="it was not measured"))
     before = live.known.x
     played(live.take, hidden, hidden.mounted, count=2)
     assert live.known.x is before
@@ -459,10 +471,11 @@ def test_numbers_change_as_their_derivatives_say(
     assert np.abs(turn @ J).max() < 1e-6 * np.linalg.norm(turn) * np.linalg.norm(J)
 
 
-def taken(*, nis: float = 2.0, slope: float = 0.0, masses: int = 0) -> Observation:
+def taken(*, nis: float = 2.0, slope: float = 0.0, masses: int = 0) -> PlateUpdate:
     """A pattern of eight numbers with one direction of unit curvature."""
-    slopes, none = np.array([slope]), cast(Any, None)
-    return Observation(none, none, nis, 8, slopes, np.ones(1), masses)
+    directions = np.array([slope]), np.ones(1), masses
+    found = SimpleNamespace(nis=nis, innovation=np.zeros(8), directions=directions)
+    return cast(PlateUpdate, found)
 
 
 def test_change_along_one_direction_is_found_in_likely_patterns() -> None:

@@ -19,8 +19,9 @@ from benchmarks.identification.tables import PAGE
 from benchmarks.identification.thin_plate import Complexes
 from benchmarks.page import write_parts
 from benchmarks.setting import RIG, use_one_thread
+from model.estimate.findings import Verdict
 from model.estimate.measurement import Measurement, sensors_at
-from model.estimate.rig_check import Verdict, diagnose, judged_by_promises
+from model.estimate.rig_check import diagnose, judged_by_promises
 from model.rig.rig import Rig
 from model.rig.rig_file import load_rig
 
@@ -141,8 +142,10 @@ def main() -> None:
         lines.append(f"| {name} | {named} of {count} | {failed} of {count} |")
         print(lines[-1], flush=True)
     if options.report:
-        counts = f"--plates {options.plates} --sound {options.sound} --first {options.first}"
-        printed = f"Printed by `python -m benchmarks.identification.causes {counts} --report`."
+        printed = (
+            f"Printed by `python -m benchmarks.identification.causes --plates {options.plates} "
+            f"--sound {options.sound} --first {options.first} --report`."
+        )
         write_parts(PAGE, {"causes": "\n".join([printed, "", *lines])})
 
 

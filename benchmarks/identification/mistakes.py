@@ -23,8 +23,9 @@ from benchmarks.page import write_parts
 from benchmarks.setting import use_one_thread
 from benchmarks.weekend.chain import FOLDER, BuiltBoard
 from model.arrays import ComplexArray, FloatArray
+from model.estimate.findings import Verdict
 from model.estimate.measurement import Measurement
-from model.estimate.rig_check import Verdict, diagnose, judged_by_promises
+from model.estimate.rig_check import diagnose, judged_by_promises
 from model.rig.rig import Rig
 from model.rig.rig_file import load_rig
 
@@ -188,8 +189,10 @@ def main() -> None:
             lines.append(row(name, [each.result() for each in own]))
             print(lines[-1], flush=True)
     if options.report:
-        counts = f"--boards {options.boards} --sound {options.sound} --first {options.first}"
-        printed = f"Printed by `python -m benchmarks.identification.mistakes {counts} --report`."
+        printed = (
+            f"Printed by `python -m benchmarks.identification.mistakes --boards {options.boards} "
+            f"--sound {options.sound} --first {options.first} --report`."
+        )
         write_parts(PAGE, {"mistakes": "\n".join([printed, "", *lines])})
 
 

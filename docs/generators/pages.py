@@ -23,6 +23,7 @@ from amplifier_json import json_text
 from api_page import api_reference
 from client_stub import summaries
 from command_page import command_reference
+from findings_page import finding_kinds
 from firmware_header import header
 from firmware_records import records_header
 from metrics_page import metrics
@@ -88,6 +89,7 @@ WRITTEN: Mapping[str, Sequence[Writer]] = {
         for page in ("protocol", "serial", "modbus", "can")
     },
     "docs/pictures/weekend_wiring.svg": [whole(wiring)],
+    "docs/how-to/rig-check.md": [part("docs/generators/findings_page.py", finding_kinds)],
     "docs/reference/api.md": [part("docs/generators/api_page.py", api_reference)],
     "docs/reference/commands.md": [part("docs/generators/command_page.py", command_reference)],
     "docs/reference/metrics.md": [

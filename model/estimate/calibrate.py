@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from model.arrays import ComplexArray, FloatArray, Point, best_of, rms
 from model.config.document import KeyPath
 from model.errors import InputError
-from model.estimate.findings import MAX_FIT_ERROR
+from model.estimate.findings import Verdict, cycles
 from model.estimate.fit import (
     HELD_OUT_FOLDS,
     Fit,
@@ -45,7 +45,8 @@ from model.estimate.measurement import (
     Measurement,
     check_enough_sensors,
 )
-from model.estimate.rig_check import Verdict, cycles, diagnose
+from model.estimate.plate_match import MAX_FIT_ERROR
+from model.estimate.rig_check import diagnose
 from model.estimate.space import FORM, KINDS
 from model.files.csv_file import as_frame
 from model.processes import Progress, unseen

@@ -376,18 +376,15 @@ class Alarm:
         """Take a pattern; return the last patterns since the plate changed, None if it did not."""
         self._recent.append(update)
         last = list(self._recent)[::-1]
-        of_each, by_each, of_masses = zip(*(each.directions for each in last), strict=True)
-        masses, along, confirmed = of_masses[0], np.zeros(len(last)), np.zeros(len(last))
-        for number in range(len(last)):
-            slopes, weights = np.array(of_each[: number + 1]), np.array(by_each[: number + 1])
-            total, weight = slopes.sum(axis=0), weights.sum(axis=0)
-            squares = _squares(total, weight, masses)
-            along[number] = squares.max()
-            # Directions along which the others deviate without any one pattern.
-            rest = _squares(total - slopes, weight - weights, masses).min(axis=0)
-            confirmed[number] = np.where(rest > _ALONG_REST, squares, 0.0).max()
-        if confirmed.max() > _ALONG:
-            return last[: best_of(along) + 1][::-1]
+        masses = last[0].directions[2]
+        slopes, weights = (np.array([each.directions[n] for each in last]) for n in (0, 1))
+        total, weight = slopes.cumsum(axis=0), weights.cumsum(axis=0)
+        along = _squares(total, weight, masses)
+        # Directions along which the others deviate without any one pattern.
+        rest = _squares(total[:, None] - slopes, weight[:, None] - weights, masses)
+        rest[np.triu_indices(len(last), 1)] = np.inf
+        if np.where(rest.min(axis=1) > _ALONG_REST, along, 0.0).max() > _ALONG:
+            return last[: best_of(along.max(axis=1)) + 1][::-1]
         counts = [len(each.innovation) for each in last]
         squares, numbers = np.cumsum([each.nis for each in last]), np.cumsum(counts)
         rest = squares - np.maximum.accumulate([each.nis for each in last])

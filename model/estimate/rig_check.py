@@ -1,43 +1,35 @@
 """Rig check: compare measured responses with a rig.
 
-`diagnose` first finds what a rig's file says the wrong way round, then matches plate and wiring,
-and gives a `Verdict`: its findings, and a state for each channel. What is right or wrong is decided
-by the functions of `model.estimate.findings`.
+`diagnose` first finds what a rig's file says the wrong way round, then matches plate and wiring
+(`model.estimate.plate_match`), and gives a `Verdict`: a state for each channel, and its findings,
+which the functions of `model.estimate.findings` judge.
 
 Before a fit (`model.estimate.calibrate.check_consistency`) it refuses what is not what it claims to
 be. Each check looks for one error alone, in what the fit would leave free, and names it.
 """
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from itertools import compress
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from model.arrays import ComplexArray, FloatArray, best_by, best_of
+from model.arrays import ComplexArray, best_by, best_of
 from model.errors import InputError
 from model.estimate.findings import (
-    FALSE_ALARM,
-    MAX_FIT_ERROR,
     MAX_FORM_ERROR,
-    MIN_COST_REDUCTION,
-    MODEL_ERROR,
+    ChannelVerdict,
+    Correction,
     Finding,
-    Hypothesis,
-    Match,
-    ShapeMatch,
-    best_wiring,
-    compared,
+    Verdict,
+    cycles,
     exchanged_sensors,
-    match_plate,
-    match_responses,
-    match_shapes,
-    match_with_form,
+    judged,
+    match_beyond,
     other_meaning,
-    plate_finding,
     reversed_axes,
 )
 from model.estimate.fit import SensedPlate, gains_of, plate_of, row_rms
@@ -48,7 +40,22 @@ from model.estimate.measurement import (
     silent_sensors,
     typical,
 )
-from model.quantities import counted, percent
+from model.estimate.plate_match import (
+    FALSE_ALARM,
+    MAX_FIT_ERROR,
+    MIN_COST_REDUCTION,
+    MODEL_ERROR,
+    Hypothesis,
+    Match,
+    ShapeMatch,
+    best_wiring,
+    compared,
+    likeliest,
+    match_plate,
+    match_responses,
+    match_shapes,
+)
+from model.quantities import percent
 from model.rig.rig import Rig
 from model.structure.attachments import GRAVITY, Era, PointLoad
 from model.structure.exciter import Exciter
@@ -68,7 +75,6 @@ MISSED_DB = 1.0
 
 _LEAST_FREQUENCIES = 4
 _GAIN_STDS = 3.5  # of the rig's uncertainty, where that allows more
-_NEARLY_ALL = 0.75  # of the channels
 _MIN_COHERENCE = 0.6  # length of the mean of unit phasors of a reliable phase
 _MAX_PHASE_ERROR = 45.0  # degrees
 _DEAD = 0.03  # of the response that the rig predicts
@@ -104,84 +110,6 @@ They are factor * (i omega)^power times acceleration per displacement.
 """
 
 
-@dataclass(frozen=True)
-class ChannelVerdict:
-    """A channel: the ERA to which the rig wires it, the one that it drives, and its states."""
-
-    era: str
-    """ERA to which the rig wires it."""
-    amplifier: str
-    """Name of its amplifier."""
-    channel: int
-    """Its number there."""
-    states: tuple[str, ...]
-    """What is wrong with it, as kinds of findings; "well" alone if nothing is, and "not driven"."""
-    drives: str | None = None
-    """ERA that it drives, None for a dead channel or one that was not driven."""
-    gain: float | None = None
-    """Gain relative to the command and the rig's gains."""
-    phase: float | None = None
-    """Phase error [degrees], None if unknown."""
-    mac_own: float | None = None
-    """Median MAC with the rig's ERA."""
-    mac_found: float | None = None
-    """Median MAC with the ERA that it drives."""
-    confidence: float = 0.0
-    """Confidence 0..1 in `drives` and `states`."""
-
-    @property
-    def wiring(self) -> str:
-        """The channel in words."""
-        return f"channel {self.channel} of amplifier {self.amplifier} (ERA {self.era} in the rig)"
-
-
-@dataclass(frozen=True, eq=False)
-class Verdict:
-    """Result of a diagnosis."""
-
-    channels: tuple[ChannelVerdict, ...]
-    findings: tuple[Finding, ...]
-    """What was found, in the order in which to look at it."""
-    sensors: tuple[str, ...]
-    """Names of the sensors that were used."""
-    frequencies: FloatArray
-    """Tones that were used (f,) [Hz]."""
-    plate_matches: bool = True
-    """Whether the rig's plate within its priors explains the measurement."""
-    match: Match | None = None
-    """That plate."""
-    hypotheses: tuple[Hypothesis, ...] = ()
-    """Other plates that explain it if the rig's does not, most likely first."""
-    changes: Mapping[str, float] | None = None
-    """Relative differences from the rig as `plate_changes`, None without a plate that fits."""
-    promise_margins: tuple[float, ...] = ()
-    """Margins [dB] of the plate's contrasts over those that the rig's table promises; empty if they
-    were not compared."""
-
-    def of_kinds(self, *kinds: str) -> list[Finding]:
-        """The findings of some kinds."""
-        return [each for each in self.findings if each.kind in kinds]
-
-    def about(self, *what: str) -> list[Finding]:
-        """The findings about some of what `FindingKind.about` names."""
-        return [each for each in self.findings if each.about in what]
-
-    @property
-    def wiring_matches(self) -> bool:
-        """Whether every driven channel drives its ERA as the rig says."""
-        return all(set(channel.states) <= {"well", "not driven"} for channel in self.channels)
-
-    @property
-    def is_well(self) -> bool:
-        """Whether no fault was found."""
-        return not any(each.is_fault for each in self.findings)
-
-    @property
-    def kept_share(self) -> float | None:
-        """Share of the table's promises that the plate keeps, None where they were not compared."""
-        return float(np.mean(np.array(self.promise_margins) >= 0)) if self.promise_margins else None
-
-
 def diagnose(
     rig: Rig,
     observation: Measurement,
@@ -202,43 +130,46 @@ def diagnose(
     plate, observation, dead, silent = _heard(rig, observation)
     skipped += silent
 
-    def again(correction: Finding, rig: Rig, observation: Measurement, has_form: bool) -> Verdict:
+    def corrected(found: Correction, *, has_form: bool) -> Verdict:
+        """The verdict on what is put right, with what was wrong."""
+        correction, rig, observation = found
         if refuses:
             raise InputError(correction.rows[0].partition(": ")[2])
-        found = diagnose(
+        verdict = diagnose(
             rig, observation, false_alarm=false_alarm, has_form=has_form, skipped=skipped
         )
-        return replace(found, findings=(correction, *found.findings))
+        return replace(verdict, findings=(correction, *verdict.findings))
 
     live = replace(observation, values=np.where(dead, np.nan, observation.values))
-    of_live = match_shapes(plate, live.values)
-    if found := reversed_axes(plate, of_live, live, may_be_plugs=refuses):
-        return again(*found, has_form)
-    if other := other_meaning(plate, of_live, live):
-        verdict = again(*other, observation, False)
+    shapes = match_shapes(plate, live.values)
+    if reverse := reversed_axes(plate, shapes, live, may_be_plugs=refuses):
+        return corrected(reverse, has_form=has_form)
+    if other := other_meaning(plate, shapes, live):
+        verdict = corrected((*other[:2], observation), has_form=False)
         # The board of the file is corrected first.
-        kept = tuple(each for each in verdict.findings if each.kind not in ("plate", "outliers"))
+        kept = tuple(each for each in verdict.findings if each.about != "plate")
         return replace(verdict, findings=kept, plate_matches=False, changes=None)
-    values = observation.values
-    shapes = match_shapes(plate, values) if dead.any() else of_live
+    if dead.any():
+        shapes = match_shapes(plate, observation.values)
     if refuses:
-        _check_quantity(plate, shapes, values)
-        _check_phases(plate, shapes, values)
-    dead |= _dead_channels(plate, values, shapes)
-    values = np.where(dead, np.nan, values)
+        _check_quantity(plate, shapes, observation.values)
+        _check_phases(plate, shapes, observation.values)
+    dead |= _dead_channels(plate, observation.values, shapes)
+    values = np.where(dead, np.nan, observation.values)
     if not np.isfinite(values).any():
         channels = tuple(_without_response(rig, n, is_dead=bool(dead[n])) for n in range(len(dead)))
-        found_dead = (*_channel_findings(channels), *skipped)
-        return Verdict(channels, found_dead, observation.names, observation.frequencies)
+        return judged(Verdict(channels, observation.names, observation.frequencies, skipped))
     shapes = replace(shapes, mac=np.where(dead[:, None], np.nan, shapes.mac))
-    match, drives = best_wiring(plate, values, shapes)
-    if exchanged := exchanged_sensors(observation, match.responses[..., drives], values):
-        return again(exchanged[0], rig, exchanged[1], has_form)
+    match = best_wiring(plate, values, shapes)
+    if exchanged := exchanged_sensors(match, observation):
+        return corrected(exchanged, has_form=has_form)
     # With more noise than usual parameters are less certain.
     error = float(np.clip(1.2 * match.median_error, MODEL_ERROR, 0.3))
     if error > MODEL_ERROR:
-        match = match_plate(plate, values, drives=drives, model_error=error, starts=shapes.starts)
-    off = _off_scale(observation.names, values, match)
+        match = match_plate(
+            plate, values, drives=match.drives, model_error=error, starts=shapes.starts
+        )
+    off = _off_scale(match)
     if off and len(observation.names) - len(off) >= LEAST_SENSORS:
         wrong = np.isin(observation.names, [each.of for each in off])
         return diagnose(
@@ -248,14 +179,8 @@ def diagnose(
             has_form=has_form,
             skipped=(*skipped, *off),
         )
-    return _judged(
-        match,
-        replace(observation, values=values),
-        drives,
-        dead,
-        false_alarm=false_alarm,
-        has_form=has_form,
-        skipped=skipped,
+    return _matched_verdict(
+        match, observation, dead, has_form=has_form, false_alarm=false_alarm, skipped=skipped
     )
 
 
@@ -277,11 +202,9 @@ def _heard(
         )
     plate = plate_of(rig, observation)
     dead = _dead_channels(plate, observation.values)
-    alive = observation.values[:, :, ~dead]
-    if not np.isfinite(alive).any():
-        return plate, observation, dead, ()
-    silent = silent_sensors(replace(observation, values=alive))
-    if not silent.any():
+    live = replace(observation, values=np.where(dead, np.nan, observation.values))
+    silent = silent_sensors(live)
+    if not live.count or not silent.any():
         return plate, observation, dead, ()
     check_enough_sensors(~silent, observation)
     found = tuple(Finding("silent", name) for name in compress(observation.names, silent))
@@ -289,58 +212,40 @@ def _heard(
     return plate_of(rig, observation), observation, dead, found
 
 
-def _judged(
+def _matched_verdict(
     match: Match,
-    live: Measurement,
-    drives: Sequence[int],
+    observation: Measurement,
     dead: NDArray[np.bool_],
     *,
     false_alarm: float,
     has_form: bool,
-    skipped: Sequence[Finding],
+    skipped: tuple[Finding, ...],
 ) -> Verdict:
     """Judge the plate of a match, then the channels by the plate that explains them best.
 
-    live: what was measured of the channels that are not dead; further parameters as `diagnose`.
+    dead: mask (n,) of dead channels; further parameters as `diagnose`.
     """
-    plate, values = match.plate, live.values
-    rig, model_error = plate.rig, match.model_error
-    beyond: list[Finding] = []
+    rig, nominal, beyond = match.plate.rig, match, list[Finding]()
     if has_form:
-        with_form, beyond = match_with_form(plate, live, values, drives)
+        with_form, beyond = match_beyond(match)
         match = with_form if with_form.error <= MAX_FORM_ERROR else match
     # Values that stand in for a form error that is less likely say nothing of themselves.
     limit = min([false_alarm, *(each.chance for each in beyond)])
     matches = match.error <= MAX_FIT_ERROR and match.chance >= limit
-    hypotheses: list[Hypothesis] = []
-    if not matches:
-        hypotheses = compared(plate, live, values, drives=drives, model_error=model_error)
-    fitted = best_by([match, *(each.match for each in hypotheses)], lambda each: -each.fit.cost)
-    channels = _channels(rig, live, values, drives, fitted, dead)
-    if not matches:
-        channels = tuple(_loose(each, rig, match, hypotheses) for each in channels)
-    channels = tuple(
-        _as_loose(each) if is_behind else each
-        for each, is_behind in zip(channels, _behind_glue(fitted, values, drives), strict=True)
-    )
-    findings = [*_channel_findings(channels), *skipped]
-    if not matches and not any("loose" in each.states for each in channels):
-        findings.append(plate_finding(match, hypotheses))
-    elif match.outliers.any():
-        by_sensor = match.outliers.sum(axis=(0, 2))
-        worst, of_worst = best_of(by_sensor), int(by_sensor.max())
-        details = {"count": counted(int(by_sensor.sum()), "value")}
-        findings.append(Finding("outliers", live.names[worst], of_worst, details=details))
-    return Verdict(
-        channels,
-        (*findings, *(beyond if matches else ())),
-        live.names,
-        live.frequencies,
+    hypotheses = [] if matches else compared(nominal)
+    fitted = likeliest([match, *(each.match for each in hypotheses)])
+    loose = _behind_glue(fitted) | (set() if matches else _loosened(match, hypotheses))
+    verdict = Verdict(
+        tuple(_channels(fitted, rig, loose, dead, has_phases=observation.has_phases)),
+        observation.names,
+        observation.frequencies,
+        (*skipped, *(beyond if matches else ())),
         matches,
         match,
         tuple(hypotheses),
         plate_changes(rig, match) if match.error <= MAX_FIT_ERROR else None,
     )
+    return judged(verdict)
 
 
 def _dead_channels(
@@ -359,18 +264,18 @@ def _dead_channels(
     return np.asarray(dead)
 
 
-def _off_scale(sensors: Sequence[str], values: ComplexArray, match: Match) -> list[Finding]:
+def _off_scale(match: Match) -> list[Finding]:
     """Find sensors with a scale unlike that of the others, if the plate fits."""
     if match.median_error > MAX_FIT_ERROR:
         return []
-    known = np.isfinite(values) & np.isfinite(match.predicted) & ~match.outliers
-    model, measured = np.where(known, match.predicted, 0), np.where(known, values, 0)
+    known = np.isfinite(match.values) & np.isfinite(match.predicted) & ~match.outliers
+    model, measured = np.where(known, match.predicted, 0), np.where(known, match.values, 0)
     inner = model.conj() * measured
     inner = inner * np.exp(-1j * np.angle(inner.sum(axis=1, keepdims=True)))
     power = (np.abs(model) ** 2).sum(axis=(0, 2))
     scales = inner.real.sum(axis=(0, 2)) / np.maximum(power, 1e-300)
-    found = []
-    for name, scale in zip(sensors, (scales / np.median(scales)).tolist(), strict=True):
+    found, names = [], match.fit.measurement.names
+    for name, scale in zip(names, (scales / np.median(scales)).tolist(), strict=True):
         if not _SENSOR_SCALE[0] <= scale <= _SENSOR_SCALE[1]:
             kind = "mute" if abs(scale) < _MUTE else "off scale"
             found.append(Finding("upside down" if scale < _UPSIDE_DOWN else kind, name, scale))
@@ -378,35 +283,32 @@ def _off_scale(sensors: Sequence[str], values: ComplexArray, match: Match) -> li
 
 
 def _channels(
-    rig: Rig,
-    observation: Measurement,
-    values: ComplexArray,
-    drives: Sequence[int],
-    match: Match,
-    dead: NDArray[np.bool_],
-) -> tuple[ChannelVerdict, ...]:
-    """Judge all channels by the plate that fits best."""
-    shapes = match_responses(match.responses, values)
-    predicted = np.where(match.outliers, np.nan, match.predicted)
-    known = rig.uncertainty
-    found: list[ChannelVerdict] = []
-    for n, driven in enumerate(drives):
+    match: Match, rig: Rig, loose: set[int], dead: NDArray[np.bool_], *, has_phases: bool
+) -> Iterator[ChannelVerdict]:
+    """Judge all channels of a rig by the plate that fits best.
+
+    loose: numbers of channels whose exciter is loose; dead (n,): mask of channels; has_phases:
+    whether phases of values count from those of the drives.
+    """
+    shapes, values = match_responses(match.responses, match.values), match.values
+    predicted, known = np.where(match.outliers, np.nan, match.predicted), rig.uncertainty
+    for n, driven in enumerate(match.drives):
         era, own = rig.eras[n], rig.eras[driven]
         if dead[n] or not np.isfinite(values[..., n]).any():
-            found.append(_without_response(rig, n, is_dead=bool(dead[n])))
+            yield _without_response(rig, n, is_dead=bool(dead[n]))
             continue
         # Commands are shares of the stroke of the ERA to which the rig wires the channel.
         gain = float(match.gains[n]) * era.full_level / own.full_level
-        gain /= float(np.median(np.abs(own.gain(observation.frequencies))))
-        others = (other for other in range(len(drives)) if other != driven)
+        gain /= float(np.median(np.abs(own.gain(match.plate.model.frequencies))))
+        others = (other for other in range(len(dead)) if other != driven)
         confidence = min(shapes.confidence(n, driven, other) for other in others)
+        phase, coherence = None, 0.0
+        if has_phases:
+            phase, coherence = mean_phase(values[..., n], predicted[..., n])
+        states = ["other ERA"] if driven != n else []
         # No response tells a force factor from a gain.
         varies = 0.0 if isinstance(era, Era) else known.stiffness
         strong = max(STRONG, math.exp(_GAIN_STDS * math.hypot(known.gain, varies)))
-        phase, coherence = None, 0.0
-        if observation.has_phases:
-            phase, coherence = mean_phase(values[..., n], predicted[..., n])
-        states = ["other ERA"] if driven != n else []
         if not 1 / strong <= gain <= strong:
             states.append("weak" if gain < 1 else "strong")
         if phase is not None and abs(phase) >= 90:
@@ -414,22 +316,21 @@ def _channels(
             confidence = min(confidence, coherence)
         elif phase is not None and abs(phase) > _MAX_PHASE_ERROR:
             states.append("out of phase")
+        if n in loose:
+            states = ["loose", *(each for each in states if each != "weak")]
         wired, mac = rig.wiring[era.name], shapes.medians[n]
-        found.append(
-            ChannelVerdict(
-                era.name,
-                wired.amplifier,
-                wired.number,
-                tuple(states) or ("well",),
-                own.name,
-                gain,
-                phase,
-                float(mac[n]),
-                float(mac[driven]),
-                confidence,
-            )
+        yield ChannelVerdict(
+            era.name,
+            wired.amplifier,
+            wired.number,
+            tuple(states) or ("well",),
+            own.name,
+            gain,
+            phase,
+            float(mac[n]),
+            float(mac[driven]),
+            confidence,
         )
-    return tuple(found)
 
 
 def _without_response(rig: Rig, number: int, *, is_dead: bool) -> ChannelVerdict:
@@ -453,65 +354,50 @@ def mean_phase(measured: ComplexArray, predicted: ComplexArray) -> tuple[float |
     return (math.degrees(np.angle(mean)) if reliable else None), abs(mean)
 
 
-def _loose(
-    channel: ChannelVerdict, rig: Rig, match: Match, hypotheses: Sequence[Hypothesis]
-) -> ChannelVerdict:
-    """Mark a channel as loose if its exciter deviates most, or is the likeliest hypothesis.
+def _loosened(match: Match, hypotheses: Sequence[Hypothesis]) -> set[int]:
+    """Numbers of the channels of exciters that deviate most, or are the likeliest hypothesis.
 
-    It must act with less than its own stiffness.
+    Each acts with less than its own stiffness.
     """
-    drives = channel.drives
-    if drives is None or isinstance(rig.era(drives), Era):
-        return channel
-    shares = [each.value / each.expected for each in hypotheses[:1] if each.era == drives]
-    if match.plate.rows[best_of(np.abs(match.z))].era == drives:
-        acts = [row for row in match.plate.rows if row.era == drives and row.is_factor]
-        shares += [row.of(match.rig) / row.of(rig) for row in acts]
-    return channel if min(shares, default=1.0) > LOOSE else _as_loose(channel)
+    rig, rows = match.plate.rig, match.plate.rows
+    farthest = rows[best_of(np.abs(match.z))].era
+    shares = [(each.era, each.value / each.expected) for each in hypotheses[:1] if each.era]
+    acts = [row for row in rows if row.era and row.era == farthest and row.is_factor]
+    shares += [(row.era, row.of(match.rig) / row.of(rig)) for row in acts]
+    found = {era for era, share in shares if share <= LOOSE and isinstance(rig.era(era), Exciter)}
+    return {n for n, number in enumerate(match.drives) if rig.eras[number].name in found}
 
 
-def _as_loose(channel: ChannelVerdict) -> ChannelVerdict:
-    """Mark a channel as loose, in place of weak."""
-    others = (each for each in channel.states if each not in ("well", "weak", "loose"))
-    return replace(channel, states=("loose", *others))
-
-
-def _behind_glue(match: Match, values: ComplexArray, drives: Sequence[int]) -> list[bool]:
-    """Whether the exciter of each channel clearly acts through a spring of glue.
+def _behind_glue(match: Match) -> set[int]:
+    """Numbers of the channels whose exciter clearly acts through a spring of glue.
 
     What comes through a spring z between coil and plate is g_f ~ G |z / (z + D(w_f))|, with the
     gains g_f of a channel and the dynamic stiffness D of its exciter, which falls above the
     resonance of the magnet: the gain rises with frequency. What all channels have in common is the
-    amplifier's. values (f, s, n), NaN for channels to be skipped.
+    amplifier's.
     """
-    kept = np.where(match.outliers, np.nan, values)
-    gains = np.abs(gains_of(match.responses[..., list(drives)], kept))
+    drives, kept = match.drives, np.where(match.outliers, np.nan, match.values)
+    gains = np.abs(gains_of(match.responses[..., drives], kept))
     sizes = np.log(np.where(gains > 0, gains, np.nan))
     driven: NDArray[np.bool_] = np.asarray(np.isfinite(sizes).any(axis=0))
     if driven.sum() < _MIN_CHANNELS:
-        return [False] * len(drives)
+        return set()
     sizes[:, driven] -= np.nanmedian(sizes[:, driven], axis=0)
-    found = []
-    for n, number in enumerate(drives):
-        era, others = match.rig.eras[number], driven & (np.arange(len(drives)) != n)
+    found = set()
+    for n in np.flatnonzero(driven).tolist():
+        era, others = match.rig.eras[drives[n]], driven & (np.arange(len(drives)) != n)
         own = sizes[:, n] - np.nanmedian(sizes[:, others], axis=1)
-        found.append(
-            bool(driven[n])
-            and isinstance(era, Exciter)
-            and _rises_behind_glue(own, era.dynamic_stiffness(match.plate.model.omega))
-        )
+        if isinstance(era, Exciter):
+            stiffness = era.dynamic_stiffness(match.plate.model.omega)
+            through = -np.log(np.abs(1 + stiffness / _GLUES[:, None]))  # (glues, f)
+            left = np.vstack([own, own - through])
+            left -= np.nanmedian(left, axis=1, keepdims=True)
+            without, *behind = np.nanmedian(np.abs(left), axis=1).tolist()
+            best = int(np.argmin(behind))
+            rise = np.ptp(through[best][np.isfinite(own)])
+            if behind[best] < _EXPLAINS * without and rise > _RISES:
+                found.add(n)
     return found
-
-
-def _rises_behind_glue(sizes: FloatArray, stiffness: ComplexArray) -> bool:
-    """Whether logarithms of gains (f,) rise as those of an exciter [N/m] behind a spring."""
-    shares = -np.log(np.abs(1 + stiffness / _GLUES[:, None]))  # (glues, f)
-    left = np.vstack([sizes, sizes - shares])
-    left -= np.nanmedian(left, axis=1, keepdims=True)
-    without, *behind = np.nanmedian(np.abs(left), axis=1).tolist()
-    best = int(np.argmin(behind))
-    rise = np.ptp(shares[best][np.isfinite(sizes)])
-    return bool(behind[best] < _EXPLAINS * without and rise > _RISES)
 
 
 def plate_changes(rig: Rig, match: Match) -> dict[str, float]:
@@ -525,51 +411,6 @@ def plate_changes(rig: Rig, match: Match) -> dict[str, float]:
         if rows:
             changes[kind] = float(np.mean([row.of(match.rig) / row.of(rig) - 1 for row in rows]))
     return changes
-
-
-def cycles(channels: Sequence[ChannelVerdict]) -> list[list[ChannelVerdict]]:
-    """Cycles of channels that drive each other's ERAs, each from its first channel."""
-    by_era = {each.era: each for each in channels}
-    found: list[list[ChannelVerdict]] = []
-    for channel in channels:
-        cycle = [channel]
-        while (after := cycle[-1].drives) is not None and by_era[after] not in cycle:
-            cycle.append(by_era[after])
-        is_known = any(channel in each for each in found)
-        if after == channel.era and len(cycle) > 1 and not is_known:
-            found.append(cycle)
-    return found
-
-
-def _channel_findings(channels: Sequence[ChannelVerdict]) -> Iterator[Finding]:
-    """Find what is wrong with channels: what they have in common first."""
-    swapped = cycles(channels)
-    for cycle in swapped:
-        names, confidence = [each.era for each in cycle], min(each.confidence for each in cycle)
-        details = {"one": cycle[0].wiring, "other": cycle[1].wiring}
-        details |= {"first": names[0], "second": names[1]}
-        kind = "swapped" if len(cycle) == 2 else "cycle"
-        yield Finding(kind, ", ".join(names), confidence=confidence, details=details)
-    driven = [each for each in channels if each.drives is not None]
-    common = set()
-    for state in ("strong", "weak"):
-        gains = {each.era: each.gain for each in driven if state in each.states and each.gain}
-        if len(gains) > 1 and len(gains) >= _NEARLY_ALL * len(driven):
-            sizes, said = [*gains.values()], {"state": state.upper(), "least": min(gains.values())}
-            yield Finding("all strong or weak", ", ".join(gains), max(sizes), details=said)
-            common.add(state)
-            break
-    inverted = ["inverted" in each.states for each in driven]
-    if len(inverted) > 1 and all(inverted):
-        yield Finding("all inverted", "all")
-        common.add("inverted")
-    in_cycle = [each for cycle in swapped for each in cycle]
-    for each in channels:
-        known = {"well", "not driven", *common} | ({"other ERA"} if each in in_cycle else set())
-        values = {**vars(each), "wiring": each.wiring}
-        for state in each.states:
-            if state not in known:
-                yield Finding(state, each.era, each.gain or 0.0, each.confidence, details=values)
 
 
 def judged_by_promises(verdict: Verdict, rig: Rig) -> Verdict:
@@ -630,8 +471,7 @@ def _check_quantity(plate: SensedPlate, shapes: ShapeMatch, values: ComplexArray
 
 def _check_phases(plate: SensedPlate, shapes: ShapeMatch, values: ComplexArray) -> None:
     """Raise InputError for conjugated phases."""
-    match, _ = best_wiring(plate, values, shapes)
-    other, _ = best_wiring(plate, values.conj(), shapes)
+    match, other = (best_wiring(plate, each, shapes) for each in (values, values.conj()))
     if other.fit.cost < match.fit.cost - MIN_COST_REDUCTION:
         raise InputError(
             "phases must be for exp(+i omega t), got conjugated ones, as it looks: with the signs "
@@ -644,11 +484,11 @@ def _check_phases(plate: SensedPlate, shapes: ShapeMatch, values: ComplexArray) 
 def verdict_rows(verdict: Verdict) -> list[str]:
     """Lines of findings with their remedies, or one that all is well."""
     rows = [row for each in verdict.findings for row in each.rows]
-    if not verdict.is_well or verdict.about("sensor"):
-        return rows
-    if difference_rows(verdict):
-        return [*rows, "WIRING WELL: every channel that was driven drives its ERA as the rig says"]
-    return [*rows, "ALL WELL: plate and channels match the rig"]
+    if verdict.is_well and not verdict.about("sensor"):
+        wiring = "WIRING WELL: every channel that was driven drives its ERA as the rig says"
+        all_well = "ALL WELL: plate and channels match the rig"
+        rows.append(wiring if difference_rows(verdict) else all_well)
+    return rows
 
 
 def difference_rows(verdict: Verdict) -> list[str]:
@@ -752,7 +592,13 @@ def as_json(verdict: Verdict) -> dict[str, Any]:
             ],
         },
         "bad_sensors": [
-            {"sensor": each.of, "problem": each.problem} for each in verdict.about("sensor")
+            {
+                "sensor": each.of,
+                "problem": each.rows[0]
+                .removeprefix(f"SENSOR {each.of} ")
+                .removesuffix(": left out"),
+            }
+            for each in verdict.about("sensor")
         ],
         "sensor_count": len(verdict.sensors),
         "drive_frequencies_hz": verdict.frequencies.tolist(),

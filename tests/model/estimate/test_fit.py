@@ -23,7 +23,7 @@ from benchmarks.calibration.hidden_plates import (
     true_values,
 )
 from model.arrays import ComplexArray, FloatArray
-from model.estimate import findings
+from model.estimate import plate_match
 from model.estimate.calibrate import calibrate
 from model.estimate.fit import SensedPlate, fit, sensed_plate
 from model.estimate.forward import MASS_CELLS, reduced_modes
@@ -72,7 +72,7 @@ def match_a_plate() -> None:
     values = measured(replace(RIG, plate=RIG.plate.scaled(modulus=1.1)))
     values[:, 1] = np.nan
     plate = sensed_plate(RIG, sensors_at(POINTS), FREQUENCIES)
-    findings.match_plate(plate, values.swapaxes(1, 2), drives=[0, 2, 1, 3])
+    plate_match.match_plate(plate, values.swapaxes(1, 2), drives=[0, 2, 1, 3])
 
 
 @pytest.mark.parametrize(

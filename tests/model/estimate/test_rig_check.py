@@ -26,9 +26,9 @@ from controller.cli.main import run
 from controller.plate_measurement import MeasuredPlate
 from long_form import shortly
 from model.errors import InputError
-from model.estimate import findings
+from model.estimate import plate_match
 from model.estimate.calibrate import MAX_OUTLIERS, calibrate, check_consistency
-from model.estimate.findings import KINDS, MAX_FIT_ERROR, ShapeMatch, match_plate
+from model.estimate.findings import KINDS, Verdict
 from model.estimate.fit import sensed_plate, without_outliers
 from model.estimate.measurement import (
     Measurement,
@@ -37,8 +37,8 @@ from model.estimate.measurement import (
     sensors_at,
     write_responses,
 )
+from model.estimate.plate_match import MAX_FIT_ERROR, ShapeMatch, match_plate
 from model.estimate.rig_check import (
-    Verdict,
     as_json,
     channel_table,
     check_meaning,
@@ -261,7 +261,7 @@ def solved_once():
         return solved[key]
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(findings, "sensed_plate", solve)
+        patch.setattr(plate_match, "sensed_plate", solve)
         yield
 
 
@@ -481,9 +481,9 @@ def test_plate_of_another_length_is_refused_by_its_length(
 
     Of few sizes and causes; whole searches are tested with diagnoses.
     """
-    monkeypatch.setattr(findings, "_SIZES", (0.82, 1.21))
-    monkeypatch.setattr(findings, "_FITTED", 3)
-    monkeypatch.setattr(findings, "_REFINED", 1)
+    monkeypatch.setattr(plate_match, "_SIZES", (0.82, 1.21))
+    monkeypatch.setattr(plate_match, "_FITTED", 3)
+    monkeypatch.setattr(plate_match, "_REFINED", 1)
     found = measured_by_plates(
         perturbed(larger(consistency_rig, 1.2), frequencies=FREQUENCIES), frequencies=FREQUENCIES
     )

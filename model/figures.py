@@ -150,7 +150,7 @@ def calibration_figure(calibration: Calibration) -> Figure:
         if era.name not in calibration.dead_eras
         and np.isfinite(calibration.measured[:, :, number]).any()
     ][:4]
-    sensors = np.linspace(0, len(calibration.sensors) - 1, _ROWS).round().astype(int)
+    sensors = np.linspace(0, len(calibration.measurement.names) - 1, _ROWS).round().astype(int)
     figure = Figure(figsize=(3.2 * len(eras), 2.6 * _ROWS + 0.6), layout="constrained")
     axes = figure.subplots(_ROWS, len(eras), sharex=True, sharey=True, squeeze=False)
     size = 1e-6  # m, base displacement
@@ -163,9 +163,10 @@ def calibration_figure(calibration: Calibration) -> Figure:
                 ("measured", calibration.measured, {"color": "C3", "marker": ".", "ls": "none"}),
             ):
                 magnitude = size * np.abs(values[:, sensor, era])
-                axis.semilogy(calibration.frequencies, magnitude, label=label, **style)
+                axis.semilogy(calibration.measurement.frequencies, magnitude, label=label, **style)
             axis.set_title(
-                f"{calibration.rig.eras[era].name} to {calibration.sensors[sensor]}", fontsize=9
+                f"{calibration.rig.eras[era].name} to {calibration.measurement.names[sensor]}",
+                fontsize=9,
             )
             axis.grid(True, which="both", alpha=0.2)
     for axis in axes[-1]:

@@ -210,7 +210,7 @@ class Calibration:
         """The calibrated rig: without form errors, with its gains and its uncertainty."""
         eras = []
         for era, gains in zip(self._fitted.eras, self._gains.T.tolist(), strict=True):
-            rows = zip(self.frequencies.tolist(), gains, strict=True)
+            rows = zip(self.measurement.frequencies.tolist(), gains, strict=True)
             stated = tuple((f, abs(g), float(np.angle(g))) for f, g in rows if abs(g) > 0)
             eras.append(replace(era, gains=stated or era.gains))
         return replace(self._fitted, eras=tuple(eras), uncertainty=self._uncertainty)
@@ -276,23 +276,29 @@ class Calibration:
         Relative to the median of the others.
         """
         errors = self.plate.model.space.values(self.fit.errors, "sensor_scale").tolist()
-        rows = zip(self.sensors, self.sensor_scales.tolist(), errors, self.is_rescaled, strict=True)
+        rows = zip(
+            self.measurement.names,
+            self.sensor_scales.tolist(),
+            errors,
+            self.is_rescaled,
+            strict=True,
+        )
         return {name: (scale, error) for name, scale, error, is_free in rows if is_free}
 
     @property
     def outlier_count(self) -> int:
         """Number of measured values left out of the fit."""
-        return self.value_count - int(self.fit.measurement.known.sum())
+        return self.value_count - int(self.measurement.known.sum())
 
     @property
     def value_count(self) -> int:
         """Number of measured values."""
-        return int(np.isfinite(self.fit.measurement.values).sum())
+        return int(np.isfinite(self.measurement.values).sum())
 
     @property
     def error(self) -> float:
         """Error of the fit with its form errors, relative as in `HeldOutSensors`."""
-        return self._relative_error(self.fit.predicted, self.fit.measurement.known)
+        return self._relative_error(self.fit.predicted, self.measurement.known)
 
     @property
     def chi2(self) -> float:
@@ -300,24 +306,19 @@ class Calibration:
         return self.fit.chi2
 
     @property
-    def sensors(self) -> tuple[str, ...]:
-        """Names of the sensors with a signal (s,)."""
-        return self.fit.measurement.names
-
-    @property
-    def frequencies(self) -> FloatArray:
-        """Frequencies of the measurement (f,) [Hz]."""
-        return self.plate.model.frequencies
+    def measurement(self) -> Measurement:
+        """Responses of the sensors with a signal, with the errors of the fit."""
+        return self.fit.measurement
 
     @property
     def measured(self) -> ComplexArray:
         """Measured responses (f, s, eras) [1/s²], divided by the scales of the sensors."""
-        return np.asarray(self.fit.measurement.values / self.sensor_scales[:, None])
+        return np.asarray(self.measurement.values / self.sensor_scales[:, None])
 
     @property
     def before(self) -> ComplexArray:
         """Responses of the rig as it was (f, s, eras) [1/s²]."""
-        gains = np.array([era.gain(self.frequencies) for era in self.plate.rig.eras]).T
+        gains = np.array([era.gain(self.measurement.frequencies) for era in self.plate.rig.eras]).T
         return np.asarray(gains[:, None] * self.plate.responses())
 
     @property
@@ -332,7 +333,7 @@ class Calibration:
         The prediction is that of the rig as its file has it, without other form errors. None where
         too few sensors are left to fit.
         """
-        count, space = len(self.sensors), self.plate.model.space
+        count, space = len(self.measurement.names), self.plate.model.space
         candidates = np.flatnonzero(~self.is_rescaled | self.is_rescaled.all())
         wanted = max(round(count / HELD_OUT_FOLDS), 1)
         if count - wanted < LEAST_SENSORS or len(candidates) <= wanted:
@@ -342,21 +343,21 @@ class Calibration:
         searched = self.fit.searched.copy()
         searched[space.groups["sensor_scale"]] &= ~unseen
         searched[space.groups["sensor_place"]] &= np.repeat(~unseen, 2)
-        seen = self.fit.measurement.part(~unseen[:, None])
+        seen = self.measurement.part(~unseen[:, None])
         part = replace(self, fit=replace(self.fit, measurement=seen)).fitted_again(
             searched, self.fit.x
         )
-        scales, which = self.sensor_scales[:, None], self.fit.measurement.known & unseen[:, None]
-        measured, predicted = self.fit.measurement.values, part.after * scales
+        scales, which = self.sensor_scales[:, None], self.measurement.known & unseen[:, None]
+        measured, predicted = self.measurement.values, part.after * scales
         size = row_rms(measured)
         error = np.abs(predicted - measured) / size
         own = space.of("sensor_scale", "sensor_place")
         read = jacobian(self.plate.model.at(self.fit.x), own)[..., own]
         variance = (np.abs(part._gains[:, None, :, None] * read) ** 2).sum(axis=-1)
-        variance = variance + 2 * self.fit.measurement.std**2
+        variance = variance + 2 * self.measurement.std**2
         left = np.median(error[which] ** 2) - np.median((variance / size**2)[which])
         return HeldOutSensors(
-            tuple(compress(self.sensors, unseen)),
+            tuple(compress(self.measurement.names, unseen)),
             self._relative_error(self.before * scales, np.isfinite(measured) & unseen[:, None]),
             self._relative_error(predicted, which),
             float(np.median(error[which])),
@@ -384,7 +385,7 @@ class Calibration:
         """Fit the parameters of a mask (p,) from a start (p,) of all of them."""
         found = fit_to_noise(
             self.plate.model,
-            self.fit.measurement,
+            self.measurement,
             searched=searched,
             start=start,
             prior=self.prior,
@@ -399,7 +400,7 @@ class Calibration:
 
     def _relative_error(self, predicted: ComplexArray, which: NDArray[np.bool_]) -> float:
         """Rms error at the values of a mask, relative to rows' rms; infinite for an empty mask."""
-        values = self.fit.measurement.values
+        values = self.measurement.values
         error = np.abs(predicted - values) / row_rms(values)
         return rms(error[which]) if which.any() else math.inf
 
@@ -419,7 +420,7 @@ class Calibration:
         mine = space.of("modulus", "loss_added", "sensor_scale", "sensor_place")
         form = space.of(*FORM, "mode_shifts") & ~mine
         x[form | (space.of("place") & ~self.is_clear)] = 0.0
-        searched, measurement = self.fit.searched & mine, self.fit.measurement
+        searched, measurement = self.fit.searched & mine, self.measurement
         return fit(self.plate.model, measurement, searched=searched, start=x, prior=self.prior)
 
     @cached_property
@@ -441,13 +442,13 @@ class Calibration:
 
     def _gains_for(self, model: ComplexArray) -> ComplexArray:
         """Gains (f, eras) of responses (f, s, eras) that fit best, NaN where not measured."""
-        return gains_of(model, self.fit.measurement.values, self.fit.measurement.weight)
+        return gains_of(model, self.measurement.values, self.measurement.weight)
 
     @cached_property
     def _gain_changes(self) -> tuple[ComplexArray, FloatArray]:
         """Relative changes of the gains by what is searched (f, eras, q); variances by noise."""
         fit, space = self.fit, self.plate.model.space
-        power = (np.abs(self.fit.measurement.weight * fit.predicted) ** 2).sum(axis=1)
+        power = (np.abs(self.measurement.weight * fit.predicted) ** 2).sum(axis=1)
         with np.errstate(divide="ignore", invalid="ignore"):
             slopes = fit.gain_slopes / fit.gains[..., None]
             of_noise = np.where(power > 0, max(fit.chi2, 1.0) / power, np.nan)
@@ -545,7 +546,7 @@ class Calibration:
         field = max(rms(lacking[known]), left)
         # The best gain of a field that is off by so much at n sensors: but at resonances, masses
         # and stiffness that are off change a field in phase with it.
-        off = field / np.sqrt(self.fit.measurement.known.sum(axis=1)[known])
+        off = field / np.sqrt(self.measurement.known.sum(axis=1)[known])
         turned = rms(np.hypot(math.sqrt(0.5) * off, phase[known]))
         return {
             "gain": max(rms(np.hypot(off, magnitude[known])), _LEAST),
@@ -561,7 +562,7 @@ class Calibration:
         ERAs stay at the places of the fit, since a rig states the errors of places.
         """
         at_places = np.where(self.plate.model.space.of("place"), self.fit.x, self._plain.x)
-        model, known = self.plate.responses(at_places), self.fit.measurement.known
+        model, known = self.plate.responses(at_places), self.measurement.known
         lacks = self._gains_for(model)[:, None] * model - self.fit.predicted
         squares, all_squares = (
             np.where(known, np.abs(each) ** 2, 0.0).sum(axis=1)

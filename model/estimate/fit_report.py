@@ -168,8 +168,8 @@ def calibration_json(calibration: Calibration, before: Rig) -> dict[str, Any]:
             name: {"scale": scale, "standard_error": error}
             for name, (scale, error) in calibration.scales.items()
         },
-        "sensors": list(calibration.sensors),
-        "drive_frequencies_hz": calibration.frequencies.tolist(),
+        "sensors": list(calibration.measurement.names),
+        "drive_frequencies_hz": calibration.measurement.frequencies.tolist(),
         "values": calibration.value_count,
         "outliers": calibration.outlier_count,
         "fit_error": calibration.error,

@@ -34,7 +34,7 @@ from functools import cached_property
 
 import numpy as np
 
-from model.arrays import ComplexArray, FloatArray, best_of, ranked_by, rms
+from model.arrays import FloatArray, best_of, ranked_by, rms
 from model.config.document import KeyPath
 from model.errors import InputError
 from model.estimate.fit import (
@@ -434,29 +434,28 @@ def _check_gains(rig: Rig, measurement: Measurement, values: Values, space: Spac
     A response tells only the product of a drive's and a sensor's gain, so that the fit shares an
     error of either among both, and its residuals do not show a wrong unit or sign.
     """
-    drives = [f"drive {era.name}" for era in rig.eras]
-    sensors = [f"sensor {sensor.name}" for sensor in measurement.sensors]
-    wrong = [
-        *_wrong_gains(drives, values["gain"], space, ""),
-        *_wrong_gains(sensors, values["sensor_gain"], space, "sensor_"),
-    ]
+    wrong = []
+    for kind, names in (
+        ("gain", [f"drive {era.name}" for era in rig.eras]),
+        ("sensor_gain", [f"sensor {sensor.name}" for sensor in measurement.sensors]),
+    ):
+        gains = values[kind]
+        size, phase = (
+            max(allowed, _GAIN_STDS * space.std[space.groups[each]].max())
+            for each, allowed in (
+                (kind, _GAIN_ALLOWED),
+                (kind.replace("gain", "phase"), _PHASE_ALLOWED),
+            )
+        )
+        wrong += [
+            f"{names[n]} {abs(gains[n]):.2f} at {np.degrees(np.angle(gains[n])):.0f}°"
+            for n in np.flatnonzero(are_impossible(gains, size, phase))
+        ]
     if wrong:
         raise InputError(
             "measurement must be acceleration in m/s² along the drives' motion, got gains of "
             f"{'; '.join(wrong)}; check unit, sign and plug of each sensor and drive"
         )
-
-
-def _wrong_gains(names: list[str], gains: ComplexArray, space: Space, whose: str) -> list[str]:
-    """Those whose gain is beyond what is usual, in words."""
-    size, phase = (
-        max(allowed, _GAIN_STDS * space.std[space.groups[whose + kind]].max())
-        for kind, allowed in (("gain", _GAIN_ALLOWED), ("phase", _PHASE_ALLOWED))
-    )
-    return [
-        f"{names[n]} {abs(gains[n]):.2f} at {np.degrees(np.angle(gains[n])):.0f}°"
-        for n in np.flatnonzero(are_impossible(gains, size, phase))
-    ]
 
 
 def relevant(space: Space) -> dict[str, FloatArray]:

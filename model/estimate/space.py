@@ -623,13 +623,15 @@ def rig_with(rig: Rig, values: Values, uncertainty: Uncertainty) -> Rig:
     masses = list(rig.masses)
     for foot, factor in zip(rig.feet, values["supports"].tolist(), strict=True):
         masses[foot] = replace(masses[foot], stiffness=factor * masses[foot].stiffness)
+    found = [each for each in values["masses"].tolist() if each[0] > _MIN_MASS]
+    masses += [PointLoad(x, y, mass=mass) for mass, x, y in found]
     return replace(
         rig,
         plate=plate_with(rig.plate, values),
         laminate=rig.laminate
         and rig.laminate.scaled(modulus=values["modulus"], thickness=values["thickness"]),
         eras=eras,
-        masses=(*masses, *additional_masses(values)),
+        masses=tuple(masses),
         uncertainty=uncertainty,
     )
 
@@ -649,15 +651,6 @@ def plate_with(plate: Plate, values: Values) -> Plate:
     )
 
 
-def additional_masses(values: Values) -> Sequence[PointLoad]:
-    """The additional masses on the plate, without those that weigh nothing."""
-    return [
-        PointLoad(float(x), float(y), mass=float(mass))
-        for mass, x, y in values["masses"]
-        if mass > _MIN_MASS
-    ]
-
-
 def _gains(rig: Rig, values: Values, number: int) -> tuple[Gain, ...]:
     """Gains of an ERA: those of the rig times what was identified.
 
@@ -665,7 +658,10 @@ def _gains(rig: Rig, values: Values, number: int) -> tuple[Gain, ...]:
     where its drive or the clock of its amplifier lags.
     """
     era, gain = rig.eras[number], values["gain"][number]
-    lags, delay = values["inertia"][number] or values["drag"][number], _delay(era.name, rig, values)
+    lags = values["inertia"][number] or values["drag"][number]
+    names = sorted({channel.amplifier for channel in rig.wiring.values()})
+    delays = dict(zip(names, values["delay"].tolist(), strict=False))  # none where clocks agree
+    delay = delays.get(rig.wiring[era.name].amplifier, 0.0)
     if gain == 1 and not (lags or delay):
         return era.gains
     before = era.gains or ((LOSS_FREQUENCY, 1.0, 0.0),)
@@ -680,11 +676,3 @@ def _gains(rig: Rig, values: Values, number: int) -> tuple[Gain, ...]:
         (f, magnitude * float(abs(factor)), turned + float(np.angle(factor)))
         for (f, magnitude, turned), factor in zip(before, factors.tolist(), strict=True)
     )
-
-
-def _delay(era: str, rig: Rig, values: Values) -> float:
-    """Delay of an ERA by its amplifier's clock [s]."""
-    if not len(values["delay"]):
-        return 0.0
-    names = sorted({channel.amplifier for channel in rig.wiring.values()})
-    return float(values["delay"][names.index(rig.wiring[era].amplifier)])

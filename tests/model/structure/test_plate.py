@@ -103,12 +103,12 @@ def test_errors_of_the_suspension_act_as_its_changes_say(held: bool) -> None:
 def test_response_on_a_board_against_magnet_and_current_solved_beside_it(magnet: str) -> None:
     """Finite elements with the magnets' and the coils' own equations: within 0.3 % of the field.
 
-    Of four exciters on acrylic on foam, under a finger, from 40 to 500 Hz.
+    Of four exciters on acrylic on foam, under a finger, at four frequencies from 40 to 500 Hz.
     """
     keys = f"type: DAEX25FHE-4, magnet: {magnet}"
     rig = exciter_rig(keys, frequency="[40, 500]", more="mesh: auto 0.1 %")
     finger = FingertipLoad(0.11, 0.09, Fingertip())
-    frequencies = np.array([40.0, 70.0, 107.0, 160.0, 240.0, 330.0, 420.0, 500.0])
+    frequencies = np.array([40.0, 107.0, 240.0, 500.0])
     points = lattice(np.linspace(0, 0.3, 13), np.linspace(0, 0.23, 10))
     free = solve_free_plate(rig.plate, rig.mesh, frequency_max=500.0)
     loads = (*rig.masses, finger)

@@ -215,6 +215,12 @@ KINDS = {
         "no plate within the tolerances of the rig explains the measurement",
         "plate",
     ),
+    "detached": FindingKind(
+        "DETACHED: ERA {of} holds the plate with {value:.2f} of its stiffness: tighten its bolt, "
+        "or look for a spring that came off",
+        "an ERA whose stiffness, less than a tenth of the rig's, explains the plate best",
+        "plate",
+    ),
     "outliers": FindingKind(
         "OUTLIERS: {count} left out, {value} of them of sensor {of}: check for loose "
         "contacts if they are many",
@@ -526,7 +532,7 @@ class Verdict:
 
 def judged(verdict: Verdict) -> Verdict:
     """The verdict with the findings that follow from it, besides those that it has."""
-    found = [*_of_channels(verdict), *_of_plate(verdict), *verdict.findings]
+    found = [*_of_channels(verdict), *_of_plate(verdict), *_of_mounts(verdict), *verdict.findings]
     ordered = sorted(found, key=lambda each: _ORDER.index(each.about))
     return replace(verdict, findings=tuple(ordered))
 
@@ -613,6 +619,13 @@ def _of_plate(verdict: Verdict) -> Iterator[Finding]:
         )
     details = {"why": why, "hypotheses": "\n".join(rows)}
     yield Finding("plate", good[0].key if good else "", match.worst, details=details)
+
+
+def _of_mounts(verdict: Verdict) -> Iterator[Finding]:
+    """Find an ERA that hardly holds the plate."""
+    for each in verdict.hypotheses[:1]:
+        if each.era and each.explains and each.value < 0.1 * each.expected:
+            yield Finding("detached", each.era, each.value / each.expected)
 
 
 def match_beyond(match: Match) -> tuple[Match, list[Finding]]:

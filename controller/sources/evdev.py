@@ -23,6 +23,7 @@ from urllib.parse import parse_qsl
 from controller.sources.touch import (
     LIGHT_FORCE,
     LIGHT_MAJOR,
+    MAX_FRAME_AGE,
     LightPress,
     Touch,
     TouchFrame,
@@ -213,7 +214,6 @@ _AXIS = struct.Struct("6i")  # struct input_absinfo: value, minimum, maximum, fu
 _INT = struct.Struct("i")
 _EVENTS_AT_ONCE = 64
 _KEYS = 0x300 // 8  # bytes of a set of keys, KEY_CNT bits
-_MAX_AGE = 1.0  # s; of an event, else its time is of another clock
 
 
 def _request(direction: int, number: int, size: int) -> int:
@@ -267,7 +267,7 @@ class InputDevice:
             measured = (*self.ranges, ABS_MT_PRESSURE, ABS_MT_TOUCH_MAJOR)
             self.resolutions = {axis: self._axis(axis)[3] for axis in measured}  # 0: no axis
             self._slot_count = self._axis(ABS_MT_SLOT)[2] + 1
-            with contextlib.suppress(OSError):  # of an older kernel: see _MAX_AGE
+            with contextlib.suppress(OSError):  # of an older kernel: see MAX_FRAME_AGE
                 fcntl.ioctl(self._descriptor, CLOCK, _INT.pack(time.CLOCK_MONOTONIC))
             if grab:
                 fcntl.ioctl(self._descriptor, GRAB, 1)
@@ -445,7 +445,7 @@ class EvdevSource(TouchSource):
     ) -> None:
         """Deliver a frame of what happened at a time [s], now if that is not of this clock."""
         now = asyncio.get_running_loop().time()
-        time = happened if now - _MAX_AGE <= happened <= now else now
+        time = happened if now - MAX_FRAME_AGE <= happened <= now else now
         deliver(TouchFrame(self._name, time, touches))
 
 

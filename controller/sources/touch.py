@@ -380,12 +380,15 @@ Most sources repeat their frames at least every 100 ms; others state their own t
 MAX_CONTACT_TIMEOUT = 60.0
 """Longest time [s] for which a sensor may be silent under a resting finger."""
 
+MAX_FRAME_AGE = 1.0
+"""Age [s] beyond which the time of a frame is that of another clock, or of one that was set."""
+
 MAX_GLIMPSE = 0.005
-"""Time [s] after which no finger leaves the plate: earlier frames were held up and came
-together."""
+"""A contact that ends within this time [s] was longer on the plate: its frames were held up and
+came together."""
 
 TAP_TIME = 0.060
-"""Time [s] for which such a contact is kept, so that a click is decided, loaded and felt."""
+"""Such a contact is kept for this time [s], so that a click is decided, loaded and felt."""
 
 
 class ContactKey(NamedTuple):

@@ -22,6 +22,7 @@ from typing import ClassVar, NamedTuple, TypeAlias
 from controller.sources.touch import (
     CONTACT_TIMEOUT,
     MAX_CONTACT_TIMEOUT,
+    MAX_FRAME_AGE,
     TouchFrame,
     TouchSource,
     number_option,
@@ -54,7 +55,6 @@ _TIMESTAMPS = 35  # SO_TIMESTAMPNS and SCM_TIMESTAMPNS of Linux, which Python do
 _TIMESPEC = struct.Struct("@ll")
 _ANCILLARY = 64  # bytes; room for a timestamp and its header
 _CLOCK_READS, _MAX_READ_TIME = 3, 0.00005  # s; clocks read further apart are read again
-_MAX_AGE = 1.0  # s; a step of the system clock must not make touches old
 
 
 class Datagrams:
@@ -128,7 +128,7 @@ class Datagrams:
             if (level, kind) == (socket.SOL_SOCKET, _TIMESTAMPS) and len(content) == _TIMESPEC.size:
                 seconds, nanoseconds = _TIMESPEC.unpack(content)
                 arrived = seconds + nanoseconds * 1e-9 + offset
-        if not now - _MAX_AGE <= arrived <= now:
+        if not now - MAX_FRAME_AGE <= arrived <= now:
             arrived = now
         self._latest = max(self._latest, arrived)
         return self._latest

@@ -5,6 +5,7 @@ on a package index (constraints.txt, reference/licences.md) and what is measured
 written by targets of its own.
 """
 
+import os
 import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -126,6 +127,10 @@ def main(arguments: Sequence[str], *, root: Path = ROOT) -> int:
         elif text != before:
             path.write_text(text, encoding="utf-8")
             sys.stdout.write(f"wrote {name}\n")
+            if path.suffix == ".py" and root == ROOT:
+                # What follows is written from this module, which a new process loads.
+                sys.stdout.flush()
+                os.execv(sys.executable, [sys.executable, __file__, *arguments])  # noqa: S606
     return status
 
 

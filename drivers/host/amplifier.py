@@ -72,9 +72,9 @@ _WIRE_ROUNDING = 0.5  # steps of the wire, beside half a step of the amplifier
 class _Stop:
     """A stop along a ramp of the wire, repeated until it is confirmed, or for a time [s].
 
-    ends: when [s] that has passed, which counts from when the first request goes out; is_sent: it
-    has, so that what comes later needs a stop of its own; requested: the first one, queued when
-    the stop was begun; latch: the newest one when it was requested last.
+    ends: end [s] of that time, which starts when the first request goes out; is_sent: whether the
+    first request went out, so that whatever is played later needs a stop of its own; requested: the
+    first request, queued when the stop was asked for; latch: the newest latch at the last request.
     """
 
     ramp: int

@@ -115,26 +115,47 @@ def armed_problem(status: Values, latch: int | None) -> str | None:
 
 
 WINDOW = 8.0
-"""Seconds of readings that count: less is noisier, and over more a crystal that warms up bends."""
-_PARTS, _MIN_PART = 32, 2.0**-8  # of what was read, lowest ones are kept; s of each, or twice that
-_MARKED = 1.0  # s of Marks by which clocks are compared: over more a crystal bends
-_AGREEING = 3  # Marks at least: of two none tells which is false
-_ROUNDS = 3  # of laying the line, and choosing what it goes through
-_RECENT = 8  # all above the line: by so much it may be wrong; far above: the clock was moved
-_BULK, _FAR_OUT = 64, 2.0  # readings; times what they lie within, but for an eighth either way
-_ERRORS = 1.4  # the lowest of some readings depend on each other: by simulation
-_EXPECTED_RATE = 50e-6  # of a crystal against the host's; more needs to be seen well
-_MAX_CRYSTAL = 0.01  # no oscillator is so far off: the clock stands still, or runs backwards
-_EXPECTED_BEND = 2e-7  # 1/s; half of that by which its rate changes, while it warms up
-_LEAST = 5e-7  # s; of a reading, and of the time of this process
-_FAR, _FAR_ERRORS = 100e-6, 10.0  # s, and errors; what is beyond is a clock that was moved
-_TOO_FAST = 1e-3  # s; of readings that are a little wrong
-_GENTLE = 0.5, 1e-4  # s to lead an error to zero, and by which rate at most: not felt
-_FAST = 0.2, 2.8e-3  # four Pings, or lost ones overshoot; all together a Ping can say
-_TOGETHER = 0.5, 5e-4  # all of a line, one after another: faster they would part
-_NEAR = 20e-6  # s; or its error: what is led to zero
-_SURELY = 4.0  # standard errors
-_STEP = CLOCK_TURN / SPAN  # s; of a clock on the wire
+"""Readings count for so long [s]: fewer are noisier, and over longer a warming crystal bends."""
+_PARTS, _MIN_PART = 32, 2.0**-8
+"""Parts of that time, of each of which the lowest reading is kept; shortest length of one [s]."""
+_MARKED = 1.0
+"""Marks count for so long [s] where clocks are compared: over more a crystal bends."""
+_AGREEING = 3
+"""Fewest Marks by which clocks are compared: of two that differ, either may be false."""
+_ROUNDS = 3
+"""How often a line is fitted and the readings that it goes through are chosen anew."""
+_RECENT = 8
+"""Latest readings. The line may be wrong by as much as all of these lie above it; where they lie
+far above it, the clock was moved."""
+_BULK, _FAR_OUT = 64, 2.0
+"""Latest readings of any height. Without the highest and lowest eighth of them they span a height;
+readings that lie further below them than so many times that height are few and doubtful."""
+_ERRORS = 1.4
+"""Factor of a standard error, from a simulation: the lowest of several readings are correlated."""
+_EXPECTED_RATE = 50e-6
+"""Expected rate of a crystal against the host's; a greater one must be measured well."""
+_MAX_CRYSTAL = 0.01
+"""Rate that no oscillator has: beyond it a clock stands still, or runs backwards."""
+_EXPECTED_BEND = 2e-7
+"""Half of the expected change of a crystal's rate [1/s] while it warms up."""
+_LEAST = 5e-7
+"""Least error [s] of a reading, and of the time that this process reads."""
+_FAR, _FAR_ERRORS = 100e-6, 10.0
+"""A reading that is further off, in seconds plus standard errors, shows a clock that was moved."""
+_TOO_FAST = 1e-3
+"""What a clock may gain [s] beside its crystal, since readings are a little wrong."""
+_GENTLE = 0.5, 1e-4
+"""Time [s] in which an error is led to zero, and the highest rate for it, which is not felt."""
+_FAST = 0.2, 2.8e-3
+"""The same while nothing plays: four Pings, since lost ones would overshoot; a Ping's highest."""
+_TOGETHER = 0.5, 5e-4
+"""The same of all clocks of a line, whose Pings go one after another: faster they would part."""
+_NEAR = 20e-6
+"""A clock is led to zero where it is within so much [s], or within its error."""
+_SURELY = 4.0
+"""Standard errors beyond which a difference is no chance."""
+_STEP = CLOCK_TURN / SPAN
+"""Step [s] of a clock on the wire."""
 _PER_RATE, _PER_ERROR = QUANTITIES["rate"].per_unit, QUANTITIES["clock_error"].per_unit
 
 

@@ -68,8 +68,9 @@ class Heartbeats:
         One that has committed nothing since it was armed is fed by an empty set on a line that it
         shares, so that all have committed the same: the line feeds them together by that.
         A status shows how a watchdog runs down only if it is read before any of its line are fed.
-        On a line that is slow or late of one alone, so that none waits for long; of none where one
-        may reply again, which is to be heard before.
+        On a line that is slow or late the status of one amplifier is read at a time, so that none
+        waits for long; no status is read on a line where a mute amplifier may reply again, since
+        that one must be heard first.
         """
         by_line: dict[Line, list[Amplifier]] = {}
         mute: set[Line] = set()

@@ -287,8 +287,7 @@ class Cycle:
         """Report what plays after a plan, or silence; sent_at [s]: None if nothing was sent."""
         now = threads.now()
         if plan.selection.contents and plan.sets.silence is None:
-            playing, timing = planner.slots.contents, planner.slots.timing
-            applied = play_report(plan, playing, sent_at=sent_at, now=now, timing=timing)
+            applied = play_report(plan, planner.slots.contents, sent_at=sent_at, now=now)
             _report(self.observers.pattern_applied, applied)
             return
         silenced = silence_report(plan, sent_at=sent_at, now=now)

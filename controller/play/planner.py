@@ -9,7 +9,7 @@ import logging
 import math
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
+from functools import partial
 
 from controller.play.intent import IntentSource, Pulse
 from controller.play.layer_contents import (
@@ -40,9 +40,6 @@ ENDED = (
 
 _CLOCKS_INTERVAL = 2 * HEARTBEAT  # s; after which clocks are counted though fingers change
 
-# s; after a vibration a plate first rings louder than the next onset is at a quiet finger.
-_RING_DOWN = 0.4
-
 _logger = logging.getLogger(__name__)
 
 
@@ -52,8 +49,6 @@ class Plan:
 
     contacts: tuple[Contact, ...]
     selection: Selection
-    from_rest: bool
-    """Whether nothing has played for 0.4 s, so that the plate is at rest."""
     made_at: float
     """[s]"""
     answered: Mapping[ContactKey | None, float]
@@ -118,7 +113,6 @@ class Planner:
         self._arrived, self._too_late = arrived, too_late
         self._seen: Sequence[Contact] = ()  # by the last plan
         self._awaited: dict[int, Pulse] = {}  # by identity: planned, and not known to have started
-        self._played_until = -math.inf  # s; as far as known
         self._requested = 0  # how many choices have been begun that take longer
         self._waiting: dict[ContactKey | None, float] = {}  # fingers that the last is for
 
@@ -173,8 +167,7 @@ class Planner:
         band = self.capabilities.limits.frequencies
         (layer,) = query(table, placed, MIN_LEVEL_DB_SL, drive_mode=mode, band_hz=band).layers
         onset, ending = support.onset_knots > 0, support.ending_knots > 0
-        layer = timing.with_envelopes(layer, placed, onset=onset, ending=ending)
-        timing.transient_contrast_db(layer, placed)
+        timing.with_envelopes(layer, placed, onset=onset, ending=ending)
 
     @property
     def due(self) -> float:
@@ -257,16 +250,12 @@ class Planner:
 
     def plan(self, now: float) -> Plan | None:
         """Plan at a time [s], for the contacts as of `expire`; None if nothing changes."""
-        for each in self.slots.contents.values():
-            if each.drive:
-                self._played_until = now
         for number, pulse in [*self._awaited.items()]:
             if pulse.started_at is not None or now >= pulse.end:
                 del self._awaited[number]
                 if pulse.started_at is None:
                     self._too_late(1)
-        before, contacts = self._plan, self._tracker.contacts
-        from_rest, has_failed = now - self._played_until >= _RING_DOWN, False
+        before, contacts, has_failed = self._plan, self._tracker.contacts, False
         try:
             # Where fingers change only if none was counted for long: their answer waits for it.
             if now >= self._clocks_due or not self._tracker.changed:
@@ -306,7 +295,7 @@ class Planner:
         for pulse in self._pulses(sets.started):
             self._awaited[id(pulse)] = pulse
         answered = self._answered(sets.started)
-        self._plan = plan = Plan(contacts, selection, from_rest, now, answered, sets)
+        self._plan = plan = Plan(contacts, selection, now, answered, sets)
         if sets or not (is_felt or is_awaited):
             return plan
         is_said = is_awaited or _predicted(plan) == _predicted(before)
@@ -407,15 +396,12 @@ class PlayReport:
     """Time [s] from the touch frame to the last byte of the command; None if none was needed."""
     time: float
     """When [s] that byte was sent, or the report made."""
-    from_rest: bool
-    """Whether the plate was at rest."""
     settled_after: float
     """Time [s] until the last fade or envelope has ended."""
     lasts: bool
     """Whether all contents play until their contacts change."""
     is_touch: bool
     """As of the plan."""
-    timing: Timing = field(repr=False, compare=False)
 
     @property
     def newest(self) -> Slot:
@@ -431,24 +417,6 @@ class PlayReport:
     def drive(self) -> Drive:
         """The tones of the newest content, by ERA, without silent ones."""
         return self.newest.drive
-
-    @property
-    def placement(self) -> Placement:
-        """Where the fingers of the newest content are, and all others."""
-        return self.newest.content.placement
-
-    @cached_property
-    def transient_contrast_db(self) -> float | None:
-        """Predicted contrast over the first 100 ms [dB], with the onset as it is played.
-
-        Computed when it is first read, in about two milliseconds, so that no touch waits for it.
-        None without quiet contacts, beside other contents, or within 0.4 s of another pattern,
-        whose ringing it does not include.
-        """
-        is_alone = self.from_rest and len(self.contents) == 1
-        if not (is_alone and self.quiet):
-            return None
-        return self.timing.transient_contrast_db(self.layer, self.placement)
 
     @property
     def felt(self) -> Prediction | None:
@@ -473,12 +441,7 @@ class SilenceReport:
 
 
 def play_report(
-    plan: Plan,
-    playing: Mapping[int, Slot],
-    *,
-    sent_at: float | None,
-    now: float,
-    timing: Timing,
+    plan: Plan, playing: Mapping[int, Slot], *, sent_at: float | None, now: float
 ) -> PlayReport:
     """Report what plays after a plan, by layer; sent_at [s]: when it starts, None if before."""
     selection = plan.selection
@@ -496,13 +459,11 @@ def play_report(
         contents={number: replace(playing[number]) for number in order},
         latency=None if sent_at is None else sent_at - plan.since,
         time=now if sent_at is None else sent_at,
-        from_rest=plan.from_rest,
         settled_after=plan.sets.settled_after,
         lasts=all(
             target.pulse is None for each in selection.contents for _, target in each.targets
         ),
         is_touch=plan.is_touch,
-        timing=timing,
     )
 
 

@@ -151,11 +151,6 @@ class Acted(Taken, Chain):
         return "OPERATION_ENABLED" in self.amplifiers.split(", ")
 
     @property
-    def from_rest(self) -> list[bool]:
-        """Of each pattern, whether the plate was at rest before."""
-        return [each.from_rest for each in self.applied]
-
-    @property
     def latencies_ms(self) -> list[float]:
         """Of each pattern."""
         return [round(1e3 * (each.latency or math.nan), 2) for each in self.applied]

@@ -226,10 +226,6 @@ class SetTiming:
         """Return it as it is."""
         return layer
 
-    def transient_contrast_db(self, layer: Layer, placed: Placement) -> float | None:
-        """Of nothing."""
-        return None
-
 
 def only(
     table: LocalizationTable, placed: Placement, level_db_sl: float = 20.0, **more: Any

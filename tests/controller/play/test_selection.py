@@ -344,10 +344,6 @@ class Shapes(SetTiming):
             ending=_along(pattern, 1.0, down) if ending else pattern.ending,
         )
 
-    def transient_contrast_db(self, pattern: Layer, placed: Placement) -> float | None:
-        """30 dB with an onset, 10 without."""
-        return 30.0 if pattern.onset else 10.0
-
 
 def _along(pattern: Layer, start: float, shares: Sequence[float]) -> dict[str, BaseEnvelope]:
     tones = {
@@ -416,8 +412,6 @@ async def test_touch_starts_along_its_onset(shapes: Shapes) -> None:
         assert applied.layer.onset is not None
         # It plays with its last byte: of 60 words and 12 bytes, of ten bits at 921 600 baud.
         assert applied.time - begin == pytest.approx(132 / 92_160, abs=1e-6)
-        assert applied.from_rest
-        assert applied.transient_contrast_db == 30.0
 
 
 @in_virtual_time
@@ -516,7 +510,6 @@ async def test_continued_tone_has_no_onset(shapes: Shapes) -> None:
         assert len(levels_of(follows.ending)) == 7
         _, reported = chain.applied
         assert reported.layer.onset is None
-        assert reported.transient_contrast_db is None
 
 
 class Always:
@@ -529,14 +522,13 @@ class Always:
 
 @in_virtual_time
 async def test_ramps_replace_envelopes_when_amplifiers_cannot_play_them(shapes: Shapes) -> None:
-    """None is sent; ramp and its contrast are reported."""
+    """None is sent; the ramp is reported."""
     async with set_running(timing=shapes) as chain:
         await chain.hold(0.3, down=[FINGER, OTHER])
         assert [each.onset for each in sets(chain)[0].layer.commands] == [None] * 3
         (applied,) = chain.applied
         assert applied.layer.onset is None
         assert (applied.layer.ramp, sets(chain)[0].layer.ramp) == (0.015, 15)
-        assert applied.transient_contrast_db == 10.0
 
 
 @in_virtual_time
@@ -549,7 +541,6 @@ async def test_ramp_replaces_an_onset_that_the_ledger_refuses(shapes: Shapes) ->
         assert (played.layer.commands[0].onset, played.layer.commands[0].level) == (None, 2000)
         (applied,) = chain.applied
         assert applied.layer.onset is None
-        assert applied.transient_contrast_db == 10.0
         assert chain.refused == []
 
 

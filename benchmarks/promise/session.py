@@ -29,8 +29,7 @@ from benchmarks.promise.cases import (
 from benchmarks.promise.clicked import Clicked, clicks, measured, owner_of
 from benchmarks.promise.heard import STRONGEST, Heard, Log, Span
 from benchmarks.setting import random_contacts, support
-from controller.play.intent import HapticIntent, Target
-from controller.play.layer_contents import Prediction
+from controller.play.intent import HapticIntent, Prediction, Target
 from controller.play.planner import PlayReport
 from controller.play.slots import CROSSFADE, FALL_AFTER
 from model.answer.answer_report import Timing

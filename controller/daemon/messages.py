@@ -58,8 +58,7 @@ from controller.effects.strengths import UNNAMED
 from controller.learning.learning import Learning
 from controller.operation.operation_states import DaemonState, Loss, Operation
 from controller.operation.supervisor import LinkChange
-from controller.play.intent import NO_CONTACTS
-from controller.play.layer_contents import BEING_CHOSEN, leaks_db_sl
+from controller.play.intent import BEING_CHOSEN, NO_CONTACTS, leaks_db_sl
 from controller.play.planner import Observers, PlayReport, SilenceReport
 from controller.play.routing import Drive
 from controller.sources.touch import Change, Contact, ContactKey

@@ -24,7 +24,7 @@ from urllib.parse import quote
 import numpy as np
 from pydantic import BaseModel, ValidationError
 
-from controller.play.layer_contents import Prediction
+from controller.play.intent import Prediction
 from controller.play.planner import Observers, PlayReport, SilenceReport
 from controller.process.child import ended
 from controller.sources.touch import Change, Contact, ContactKey

@@ -25,8 +25,16 @@ from typing import Any
 
 import numpy as np
 
-from controller.play.intent import MAX_DB_SL, Target, band_of_table
-from controller.play.layer_contents import Content, Prediction, Selection, Targets, not_served
+from controller.play.intent import (
+    MAX_DB_SL,
+    Content,
+    Prediction,
+    Selection,
+    Target,
+    Targets,
+    band_of_table,
+    not_served,
+)
 from controller.play.routing import PlaybackCapabilities
 from controller.sources.touch import Contact, ContactKey
 from model.answer.answer import (

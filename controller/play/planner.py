@@ -11,9 +11,10 @@ from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 
-from controller.play.intent import IntentSource, Pulse
-from controller.play.layer_contents import (
+from controller.play.intent import (
+    IntentSource,
     Prediction,
+    Pulse,
     Selection,
     no_layer_free,
     not_served,

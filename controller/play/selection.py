@@ -18,7 +18,19 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from operator import itemgetter
 
-from controller.play.intent import FADED_AFTER, HapticIntent, Target
+from controller.play.intent import (
+    BEING_CHOSEN,
+    FADED_AFTER,
+    Content,
+    HapticIntent,
+    Prediction,
+    Selection,
+    Target,
+    Targets,
+    foreign_at,
+    no_layer_free,
+    not_served,
+)
 from controller.play.joint_answers import (
     LIMITS_LEAVE_NOTHING,
     STRETCH,
@@ -26,16 +38,6 @@ from controller.play.joint_answers import (
     Shape,
     answered,
     selection_of,
-)
-from controller.play.layer_contents import (
-    BEING_CHOSEN,
-    Content,
-    Prediction,
-    Selection,
-    Targets,
-    foreign_at,
-    no_layer_free,
-    not_served,
 )
 from controller.play.routing import PlaybackCapabilities
 from controller.play.slots import CROSSFADE, FALL_AFTER

@@ -12,8 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
-from controller.play.intent import CLICK, FADED_AFTER, Pulse
-from controller.play.layer_contents import Content
+from controller.play.intent import CLICK, FADED_AFTER, Content, Pulse
 from controller.play.routing import (
     BESIDE_CLICK,
     HELD,

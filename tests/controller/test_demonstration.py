@@ -23,7 +23,7 @@ from controller.demo.recorder import (
     simulated_plate,
     steady_contrast_db,
 )
-from controller.play.layer_contents import Prediction, not_served
+from controller.play.intent import Prediction, not_served
 from controller.play.planner import Observers, PlayReport, SilenceReport
 from controller.sources.touch import Change, Contact, ContactKey
 from daemons import ENABLED, ready_daemon, until, until_state

@@ -27,9 +27,8 @@ from controller.effects.layout import SurfaceLayout
 from controller.effects.player import EffectPlayer
 from controller.operation.operation_states import DaemonEvent, DaemonState, Lease, Trigger
 from controller.operation.supervisor import Supervisor
-from controller.play.intent import Target
+from controller.play.intent import Content, Selection, Target
 from controller.play.joint_answers import answered, selection_of
-from controller.play.layer_contents import Content, Selection
 from controller.play.planner import PlayReport
 from controller.play.routing import RAMPS_ONLY, PlaybackCapabilities
 from controller.sources.touch import Contact, ContactKey, Touch, TouchFrame

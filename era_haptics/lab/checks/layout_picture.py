@@ -17,9 +17,8 @@ from matplotlib.patches import Polygon as Outline
 
 from controller.effects.effect import Region
 from controller.effects.layout import SurfaceLayout
-from controller.play.intent import Target
+from controller.play.intent import Selection, Target
 from controller.play.joint_answers import fingers_of, selection_of
-from controller.play.layer_contents import Selection
 from controller.play.selection import Question
 from controller.sources.touch import Contact, ContactKey
 from era_haptics.lab.checks.layout_check import (

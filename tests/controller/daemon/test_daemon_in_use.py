@@ -33,8 +33,7 @@ from controller.operation.fault_dumps import (
     FaultDumps,
     write_dump,
 )
-from controller.play.intent import NO_CONTACTS
-from controller.play.layer_contents import BEING_CHOSEN
+from controller.play.intent import BEING_CHOSEN, NO_CONTACTS
 from controller.play.selection import GIVEN_UP
 from courses import Planted
 from daemons import (

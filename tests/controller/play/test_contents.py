@@ -18,8 +18,7 @@ from controller.content.pattern import Pattern, Transient
 from controller.effects.effect import Region
 from controller.effects.kinds import Buzz, Click, File
 from controller.effects.layout import SurfaceLayout
-from controller.play.intent import CLICK, HapticIntent, Pulse, Target
-from controller.play.layer_contents import Content, Selection
+from controller.play.intent import CLICK, Content, HapticIntent, Pulse, Selection, Target
 from controller.play.routing import PlaybackCapabilities
 from controller.play.selection import Chooser, Selector
 from controller.play.slots import Sets, Slot, Slots

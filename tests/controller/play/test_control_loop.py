@@ -21,11 +21,14 @@ from controller.daemon.messages import PlateView
 from controller.effects.effect import Region
 from controller.effects.kinds import Buzz, Click
 from controller.effects.layout import SurfaceLayout, default_effects
-from controller.play.intent import CLICK, HapticIntent, Pulse, Target
-from controller.play.layer_contents import (
+from controller.play.intent import (
     BEING_CHOSEN,
+    CLICK,
+    HapticIntent,
     Prediction,
+    Pulse,
     Selection,
+    Target,
     sums_db,
 )
 from controller.play.loop import Controller

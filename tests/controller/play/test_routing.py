@@ -20,7 +20,7 @@ import pytest
 
 from chain import FarEnd
 from controller.effects.player import EffectPlayer
-from controller.play.layer_contents import leaks_db_sl
+from controller.play.intent import leaks_db_sl
 from controller.play.routing import (
     RAMPS_ONLY,
     CountedClocks,

@@ -23,8 +23,7 @@ from controller.effects.effect import Effect, Region
 from controller.effects.kinds import Buzz, Click
 from controller.effects.layout import SurfaceLayout
 from controller.effects.player import EffectPlayer
-from controller.play.intent import HapticIntent
-from controller.play.layer_contents import Prediction
+from controller.play.intent import HapticIntent, Prediction
 from controller.play.selection import Chooser, Selector
 from controller.sources.touch import Contact, ContactKey
 from era_haptics.lab.checks import layout_picture

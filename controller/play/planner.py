@@ -114,7 +114,7 @@ class Planner:
         self._arrived, self._too_late = arrived, too_late
         self._seen: Sequence[Contact] = ()  # by the last plan
         self._awaited: dict[int, Pulse] = {}  # by identity: planned, and not known to have started
-        self._requested = 0  # how many choices have been begun that take longer
+        self._asked: object = None  # the last question in the thread
         self._waiting: dict[ContactKey | None, float] = {}  # fingers that the last is for
 
     def replace_answers(self, table: LocalizationTable, timing: Timing) -> None:
@@ -343,9 +343,9 @@ class Planner:
         While contents are being chosen, only lifts and pulses that start are answered, and with a
         content that lasts also the fingers of the choice before.
         """
-        changed, requests = self._tracker.changed, self._selector.requests
+        changed, asked = self._tracker.changed, self._selector.asked
         answered = {**changed, **self._waiting}
-        if not self._selector.is_choosing:
+        if asked is None:
             self._waiting = {}
             changed.clear()
         else:
@@ -355,14 +355,14 @@ class Planner:
                     lasts = lasts or not target.is_short
                     keys |= {contact.key} if target.is_short else set()
             answered = {key: at for key, at in answered.items() if key in keys}
-            if requests == self._requested:
+            if asked is self._asked:
                 changed.pop(None, None)
             else:
                 waiting = {key: at for key, at in changed.items() if key not in keys}
                 answered |= self._waiting if lasts else {}
                 self._waiting = waiting if lasts else {**waiting, **self._waiting}
                 changed.clear()
-        self._requested = requests
+        self._asked = asked
         return answered
 
     def _pulses(self, numbers: Iterable[int]) -> list[Pulse]:

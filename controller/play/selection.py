@@ -15,7 +15,7 @@ import math
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
+from functools import cached_property
 from operator import itemgetter
 
 from controller.play.intent import (
@@ -366,12 +366,6 @@ def _has_set_out(now: Contact, then: Contact) -> bool:
     return has_moved and now.motion.is_under_way and not then.motion.is_under_way
 
 
-def _is_among(intended: Question, chosen: Selection) -> bool:
-    """Whether all contacts were there when it was chosen, and have not lifted since."""
-    then = {(each.key, each.since) for each in chosen.contacts.values()}
-    return all((each.key, each.since) in then for each in intended.contacts)
-
-
 def _targets_of(targets: Targets) -> set[Target]:
     return set(map(itemgetter(1), targets))
 
@@ -382,59 +376,6 @@ def _of_any_course(targets: Targets) -> set[Target]:
         replace(target, level_db_sl=None, pulse=None, modulation_hz=None, course=None)
         for _, target in targets
     }
-
-
-class AnswerThread:
-    """Makes one choice at a time in a thread, since some take longer than the control loop may.
-
-    A choice that hangs cannot be ended, only given up: its thread holds up neither the next choice
-    nor the end of the process, and what it returns at last is dropped. arrived: called in the loop
-    when there is something to `take`; freed: called before that when a choice that was given up has
-    ended.
-    """
-
-    def __init__(self, arrived: Callable[[], None], freed: Callable[[], None]) -> None:
-        self._arrived, self._freed = arrived, freed
-        self._threads = DaemonThreads()
-        self.is_busy = False
-        """Whether an answer is computed, or not taken yet: one at a time is asked of the table."""
-        self._answer: asyncio.Future[Choice] | None = None
-        self._late = set[asyncio.Future[Choice]]()  # given up, and still computed
-
-    @property
-    def is_blocked(self) -> bool:
-        """Whether too many answers that were given up are still computed."""
-        return len(self._late) >= MAX_LATE
-
-    def compute(self, question: Callable[[], Choice], *, instead: Choice) -> None:
-        """Compute in a thread, if neither busy nor blocked; instead: taken if that is late."""
-        loop = asyncio.get_running_loop()
-        self._answer, self.is_busy = loop.run_in_executor(self._threads, question), True
-        self._answer.add_done_callback(self._note)
-        loop.call_later(TIME_LIMIT, self._give_up, self._answer, instead)
-
-    def take(self) -> Choice | None:
-        """Return the answer that was not taken yet; None without any; raises its error."""
-        answer = self._answer
-        if answer is None or not answer.done():
-            return None
-        self._answer, self.is_busy = None, False
-        return None if answer.cancelled() else answer.result()
-
-    def _give_up(self, answer: "asyncio.Future[Choice]", instead: Choice) -> None:
-        if not answer.done():
-            _logger.warning("loop: answer given up, still computed after %g s", TIME_LIMIT)
-            self._late.add(answer)
-            self._answer = asyncio.get_running_loop().create_future()
-            self._answer.set_result(instead)
-            self._arrived()
-
-    def _note(self, answer: "asyncio.Future[Choice]") -> None:
-        if answer in self._late:
-            self._late.remove(answer)
-            answer.exception()  # of no interest any more
-            self._freed()
-        self._arrived()
 
 
 class Selector:
@@ -463,8 +404,11 @@ class Selector:
         arrived: Callable[[], None] = lambda: None,
         may_lead: Callable[[Sequence[Content], float], bool] = lambda contents, now: True,
     ) -> None:
-        self.chooser, self._may_lead = chooser, may_lead
-        self._thread = AnswerThread(arrived, self._request_again)
+        self.chooser, self._arrived, self._may_lead = chooser, arrived, may_lead
+        self._threads = DaemonThreads()
+        self.asked: asyncio.Future[Choice] | None = None
+        """The choice that is made in the thread, or not taken yet: one at a time."""
+        self._late = set[asyncio.Future[Choice]]()  # given up, and still computed
         self._lasting = _NOTHING  # as it was chosen, for fingers that have left it, too
         self._short: dict[ContactKey, Selection] = {}
         self._fingers: dict[ContactKey, float] = {}  # of what lasts, down since [s]
@@ -474,15 +418,13 @@ class Selector:
         self._steps: Sequence[Selection] = ()  # to a better answer
         self._led_at = -math.inf  # s; by the last step
         self._fading = _NOTHING  # what plays until that has been taken
-        self.requests = 0
-        """Number of choices begun in the thread."""
         self.due = math.inf
         """Time [s] to select anew though no contact changes: all rest, or pulses have ended."""
 
     @property
     def is_choosing(self) -> bool:
-        """Whether the thread computes."""
-        return self._thread.is_busy
+        """Whether a choice is made in the thread, or not taken yet."""
+        return self.asked is not None
 
     def select(
         self,
@@ -503,28 +445,26 @@ class Selector:
         # Lists: a generator would be a call for each.
         targets = tuple([(one, each) for one in contacts for each in by_key.get(one.key, ())])
         served, skipped = _within_layers(targets, capabilities)
-        lasting, short = list[tuple[Contact, Target]](), list[tuple[Contact, Target]]()
-        before, self._fingers, came = self._fingers, {}, set[ContactKey]()
-        for contact, target in served:
-            if target.is_short:
-                short.append((contact, target))
-                continue
-            lasting.append((contact, target))
-            self._fingers[contact.key] = contact.since
-            if before.get(contact.key) != contact.since:
-                came.add(contact.key)
-        intended = Question(tuple(contacts), tuple(lasting), tuple(short), intent.protected)
-        back = came.intersection([contact.key for contact, _ in self._lasting.targets])
+        lasting = tuple([each for each in served if not each[1].is_short])
+        short = tuple([each for each in served if each[1].is_short])
+        intended = Question(tuple(contacts), lasting, short, intent.protected)
+        before, self._fingers = self._fingers, {one.key: one.since for one, _ in lasting}
+        back = dict(self._fingers.items() - before.items()).keys() & self._lasting.target_keys
         if back and not _is_met_by(intended, self._lasting):  # who has come back may be elsewhere
             self._lasting = _felt(self._lasting, self._lasting.target_keys - back)
-        situation = *_situation_of(intended), self.chooser.table, capabilities
+        fingers = frozenset([(each.key, each.since, each.load) for each in contacts])  # not places
+        wanted = _targets_of(lasting), intent.protected
+        situation = fingers, *wanted, self.chooser.table, capabilities
         if situation != self._situation:
             self._situation = situation
             self._rest_again(now)
-        arrived = self._thread.take() if self._thread.is_busy else None
-        if arrived is not None:
-            is_late = self._requested is None or not self._is_intended(arrived, intended)
-            self._take(arrived, now, is_late=is_late)
+        arrived = None
+        if self.asked is not None and self.asked.done():
+            asked, self.asked = self.asked, None
+            if not asked.cancelled():
+                arrived = asked.result()
+                is_late = self._requested is None or not self._is_intended(arrived, intended)
+                self._take(arrived, now, is_late=is_late)
         pulses, self._short = self._short, {}
         for contact, target in short:
             pulse = pulses.get(contact.key)
@@ -532,29 +472,52 @@ class Selector:
                 self._short[contact.key] = pulse
         if not contacts:
             self._lasting = _NOTHING
-        if self._thread.is_busy:
-            self.due = now + _RESTS_AFTER if self.due <= now else self.due
-        else:
-            chooser = self.chooser
+        if self.asked is None:
             for question in self._questions(intended, pulses, now, has_waited=arrived is not None):
                 if question.lasting:
                     self._requested = situation
-                if not question.takes_long:
-                    self._take(chooser.choose(question, capabilities), now)
-                elif self._thread.is_blocked:
-                    self._take(question.unanswered(BLOCKED), now)
-                else:
-                    self.requests += 1
-                    self._thread.compute(
-                        partial(chooser.choose, question, capabilities),
-                        instead=question.unanswered(GIVEN_UP),
-                    )
+                self._ask(question, capabilities, now)
+        elif self.due <= now:
+            self.due = now + _RESTS_AFTER
         parts = [_felt(self._lasting, self._fingers.keys()), *self._short.values()]
         found = _together(contacts, targets, parts, skipped, intent.reason, self.chooser.table)
-        if self._thread.is_busy and len(found.predictions) < len(by_key):
+        if self.asked is not None and len(found.predictions) < len(by_key):
             reason = found.reason or (None if found.contents else BEING_CHOSEN)
             found = replace(found, is_pending=True, reason=reason)
         return found
+
+    def _ask(self, question: Question, capabilities: PlaybackCapabilities, now: float) -> None:
+        """Have a question answered at a time [s]: at once, or in the thread where it takes long.
+
+        A choice in the thread that hangs cannot be ended, only given up: its thread holds up
+        neither the next choice nor the end of the process, and what it returns is dropped.
+        """
+        if not question.takes_long:
+            self._take(self.chooser.choose(question, capabilities), now)
+        elif len(self._late) >= MAX_LATE:
+            self._take(question.unanswered(BLOCKED), now)
+        else:
+            loop, choose = asyncio.get_running_loop(), self.chooser.choose
+            asked = loop.run_in_executor(self._threads, choose, question, capabilities)
+            self.asked = asked
+            asked.add_done_callback(self._note)
+            loop.call_later(TIME_LIMIT, self._give_up, asked, question)
+
+    def _give_up(self, asked: "asyncio.Future[Choice]", question: Question) -> None:
+        if not asked.done():
+            _logger.warning("loop: answer given up, still computed after %g s", TIME_LIMIT)
+            self._late.add(asked)
+            self.asked = asyncio.get_running_loop().create_future()
+            self.asked.set_result(question.unanswered(GIVEN_UP))
+            self._arrived()
+
+    def _note(self, asked: "asyncio.Future[Choice]") -> None:
+        if asked in self._late:
+            self._late.remove(asked)
+            asked.exception()  # of no interest any more
+            if self._lasting.reason in _UNANSWERED:  # asked again
+                self._lasting = _NOTHING
+        self._arrived()
 
     def choose_anew(self) -> None:
         """Choose anew what lasts: silent until then, and not by a choice that is under way."""
@@ -577,11 +540,6 @@ class Selector:
         self._lasting = step
         self.due = now + CROSSFADE_INTERVAL if self._steps else math.inf
 
-    def _request_again(self) -> None:
-        """Choose anew for fingers whose choice was given up, since a late one has ended."""
-        if self._lasting.reason in _UNANSWERED:
-            self._lasting = _NOTHING
-
     def _questions(
         self,
         intended: Question,
@@ -595,49 +553,40 @@ class Selector:
         pulses: selections of pulses until now. A pulse that has waited for the thread goes before
         what lasts, after which it would be late.
         """
-        lasting = intended.lasting
+        lasting, playing, is_rested = intended.lasting, self._playing(now), False
         is_kept = not lasting or _is_met_by(intended, self._lasting)
         new = tuple([each for each in intended.short if each[0].key not in self._short])
-        is_due = self.due < math.inf and self.due <= now
-        if is_due:
+        if self.due < math.inf and self.due <= now:
             self.due = math.inf
-            is_kept = is_kept and not self._is_limited  # by pulses that have ended
-            if self._requested != self._situation and any(
-                each.contact.key in self._fingers for each in self._lasting.not_served
-            ):
-                is_kept = False
-        is_rested = is_due and is_kept and intended.takes_long
-        if is_rested and any(target.course for _, target in lasting):  # which no cross-fade follows
-            is_rested = False
-        if is_rested:
+            held_back = [each.contact.key in self._fingers for each in self._lasting.not_served]
+            if self._is_limited or (self._requested != self._situation and any(held_back)):
+                is_kept = is_kept and not lasting  # by pulses that have ended, or limits of before
+            # No cross-fade follows a course.
+            is_rested = is_kept and intended.takes_long and not any(to.course for _, to in lasting)
             velocities = [each.motion.velocity(now) for each in intended.contacts]
-            if new or self._playing(now) or any(map(any, velocities)):
+            if is_rested and (new or playing or any(map(any, velocities))):
                 self._rest_again(now)
                 is_rested = False
         if is_rested and self._steps:
             self._lead(now)
             return
-        if is_kept and not is_rested and not new:
+        if is_kept and not (is_rested or new):
             return
         felt = _felt(self._lasting, self._fingers.keys())
         parts = [felt] if is_rested else [felt, *pulses.values()]
         before = {each.key: each for part in parts for each in part.contents}
         if new and (has_waited or is_kept):
-            yield replace(
-                intended,
-                lasting=(),
-                short=new,
-                before=before,
-                kept=(felt, *self._playing(now)),
-                fading=self._fading if now < self._led_at + _FADES_FOR else _NOTHING,
-            )
-            new = ()
+            fading = self._fading if now < self._led_at + _FADES_FOR else _NOTHING
+            kept = felt, *playing
+            yield replace(intended, lasting=(), short=new, before=before, kept=kept, fading=fading)
+            new, playing = (), self._playing(now)
         if is_kept and not is_rested:
             return
         if not is_rested:
             self._rest_again(now)
-        kept = self._playing(now)
-        yield replace(intended, short=new, before=before, kept=kept, is_rested=is_rested, now=now)
+        yield replace(
+            intended, short=new, before=before, kept=playing, is_rested=is_rested, now=now
+        )
 
     def _playing(self, now: float) -> tuple[Selection, ...]:
         """Return the short pulses that have not ended at a time [s]."""
@@ -647,9 +596,9 @@ class Selector:
     def _is_intended(self, chosen: Choice, intended: Question) -> bool:
         """Whether a late choice of what lasts still serves the contacts on the plate.
 
-        Places, levels and courses may have changed since, or such a finger would get nothing; the
-        layout may not. It is dropped if what plays will do again, since a finger that came has
-        lifted meanwhile.
+        All must have been there when it was chosen, and not have lifted since. Places, levels and
+        courses may have changed, or such a finger would get nothing; the layout may not. It is
+        dropped if what plays will do again, since a finger that came has lifted meanwhile.
         """
         found = chosen.lasting
         if found is not None and found.reason in _UNANSWERED:
@@ -661,7 +610,8 @@ class Selector:
                 or self._requested == self._situation
                 or not _is_met_by(intended, self._lasting)
             )
-            and _is_among(intended, found)
+            and {(each.key, each.since) for each in intended.contacts}
+            <= {(each.key, each.since) for each in found.contacts.values()}
             and intended.protected <= found.protected
             and _of_any_course(intended.lasting) <= _of_any_course(found.targets)
         )
@@ -680,12 +630,6 @@ class Selector:
                 self.due = max(ends) + FADED_AFTER
 
 
-def _situation_of(intended: Question) -> tuple[object, ...]:
-    """Return a value that changes with the fingers or their targets that last, not with places."""
-    contacts = frozenset([(each.key, each.since, each.load) for each in intended.contacts])
-    return contacts, _targets_of(intended.lasting), intended.protected
-
-
 def _together(
     contacts: Sequence[Contact],
     targets: Targets,
@@ -695,15 +639,12 @@ def _together(
     table: LocalizationTable,
 ) -> Selection:
     """Join selections made apart, contacts as they were then; reason: why there are no targets."""
-    chosen: list[Selection] = []
-    for part in parts:
-        if part.targets:
-            chosen.append(part)
+    chosen = [part for part in parts if part.targets]
     if len(chosen) == 1 and len(chosen[0].targets) == len(targets):
         return chosen[0]
-    restated = []
-    for part in chosen:
-        restated.append(part.beside([each for each in chosen if each is not part], table))
+    restated = [
+        part.beside([each for each in chosen if each is not part], table) for part in chosen
+    ]
     then = {key: each for part in chosen for key, each in part.contacts.items()}
     keys = {contact.key for contact, _ in targets}
     quiet = [then.get(each.key, each) for each in contacts if each.key not in keys]
@@ -720,24 +661,20 @@ def _together(
 
 def _felt(chosen: Selection, keys: Set[ContactKey]) -> Selection:
     """Return a selection with the contents of some fingers alone, by key."""
-    targets, quiet, contents = list[tuple[Contact, Target]](), [*chosen.quiet], list[Content]()
-    for contact, target in chosen.targets:
-        if contact.key in keys:
-            targets.append((contact, target))
-        else:
-            quiet.append(contact)
-    if len(targets) == len(chosen.targets):
+    if chosen.target_keys <= keys:
         return chosen
-    for content in chosen.contents:
-        for contact, _ in content.targets:
-            if contact.key in keys:
-                contents.append(content)
-                break
+    targets = tuple([each for each in chosen.targets if each[0].key in keys])
     return replace(
         chosen,
-        targets=tuple(targets),
-        quiet=tuple(quiet),
-        contents=tuple(contents),
+        targets=targets,
+        quiet=(*chosen.quiet, *[one for one, _ in chosen.targets if one.key not in keys]),
+        contents=tuple(
+            [
+                content
+                for content in chosen.contents
+                if not keys.isdisjoint([contact.key for contact, _ in content.targets])
+            ]
+        ),
         not_served=tuple([each for each in chosen.not_served if each.contact.key in keys]),
     )
 
@@ -760,12 +697,11 @@ def _within_layers(
     sharing = Counter([target.shared_as for _, target in targets])
     layers: list[str | bool | None] = []
     served, lasting = set[int](), {target.key for _, target in targets if not target.is_short}
-
-    def rank(number: int) -> tuple[bool, int, int]:
-        _, target = targets[number]
-        return not (target.is_short and target.key in lasting), target.priority, number
-
-    for at in sorted(range(len(targets)), key=rank, reverse=True):
+    ranks = [
+        (not (target.is_short and target.key in lasting), target.priority, number)
+        for number, (_, target) in enumerate(targets)
+    ]
+    for _, _, at in sorted(ranks, reverse=True):
         name = targets[at][1].shared_as
         is_one = name is not None and sharing[name] > MAX_SEPARATE and mode == UNRESTRICTED
         if is_one and name in layers:

@@ -15,7 +15,7 @@ import math
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from operator import itemgetter
 
 from controller.play.intent import (
@@ -498,7 +498,7 @@ class Selector:
             self._take(question.unanswered(BLOCKED), now)
         else:
             loop, choose = asyncio.get_running_loop(), self.chooser.choose
-            asked = loop.run_in_executor(self._threads, choose, question, capabilities)
+            asked = loop.run_in_executor(self._threads, partial(choose, question, capabilities))
             self.asked = asked
             asked.add_done_callback(self._note)
             loop.call_later(TIME_LIMIT, self._give_up, asked, question)

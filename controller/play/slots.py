@@ -30,7 +30,7 @@ from controller.play.routing import (
 from controller.sources.touch import MAX_CONTACT_TIMEOUT, ContactKey
 from drivers.errors import CommandRefused
 from drivers.host.joint_sets import PlayedSet
-from drivers.playing import AmplifierLayer, AmplifierTone
+from drivers.playing import AmplifierLayer
 from drivers.protocol.definition import QUANTITIES
 from drivers.protocol.sets import is_vibrating
 from model.answer import answer
@@ -208,16 +208,23 @@ class Slots:
         while True:
             for is_shaped in (True, False):
                 sets, playing = self._sets(left, now, is_shaped=is_shaped)
+                driven = [number for number, one in self.contents.items() if one.drive]
+                if len(sets.layers) > len(sets.started) or not sets.started.isdisjoint(driven):
+                    self._fades_until = now + FADED_AFTER
                 refusal = self.check(sets.by_amplifier) if sets.started else None
                 if refusal is None:
                     if sets.layers:
-                        self.start(sets, playing, now)
+                        self.contents, self.is_silent = playing, False
+                        self._layer_of = {
+                            one.content.key: number
+                            for number, one in playing.items()
+                            if not one.is_falling
+                        }
+                        self.may_play |= sets.started
                     if skipped:
                         sets = replace(sets, skipped=skipped, reason=reason, retry_at=retry_at)
                     return sets
                 _logger.info("loop: a ledger refuses what plays shaped, then plain: %s", refusal)
-                if self._fades(sets):
-                    self._fades_until = now + FADED_AFTER
                 reason, until = str(refusal), refusal.until
             retry_at = self._faded_by(contents, now) if until is None else until
             newest = max([playing[number] for number in sets.started], key=_requested_at).content
@@ -253,8 +260,7 @@ class Slots:
         ledger refuses fades later; one that gives way to another falls. The next pieces of courses
         are among them, while sources confirm the contacts.
         """
-        layers: dict[int, PlateLayer] = {}
-        endings: dict[int, answer.Layer] = {}
+        layers, endings = dict[int, PlateLayer](), dict[int, answer.Layer]()
         due = {number: one for number, one in self.contents.items() if one.ending_due <= now}
         urgent = min(
             [one.course_until for one in due.values() if one.content.course], default=math.inf
@@ -304,8 +310,8 @@ class Slots:
 
     def have_settled(self, now: float) -> bool:
         """Whether all that may play has settled, so that endings lead from there."""
-        may_end = [self._may_end_shaped(number, now) for number in self.may_play]
-        return bool(may_end) and all(may_end)
+        settled = [self._may_end_shaped(number, now) for number in self.may_play]
+        return bool(settled) and all(settled)
 
     def confirm(self, sets: Sets, played: PlayedSet, now: float) -> None:
         """Note what the amplifiers play of sets that were committed by now [s].
@@ -353,10 +359,10 @@ class Slots:
         """
         over = list[Content]()
         for number, one in [*self.contents.items()]:
-            goes_on = one.content.course is not None and one.ending_due <= now
-            if goes_on and now < self._confirmed_until(one.content):
+            if not one.drive or now < one.ends_at:
                 continue
-            if not (one.drive and now >= one.ends_at):
+            is_due = one.content.course is not None and one.ending_due <= now
+            if is_due and now < self._confirmed_until(one.content):
                 continue
             if one.is_falling:
                 self.may_play -= {number}
@@ -382,10 +388,11 @@ class Slots:
         A content that another gives way to gets a free layer. So does a short pulse if it can,
         since what ends in its layer would fade along its short ramp.
         """
-        numbers: dict[int, Content] = {}
-        for number, one in self.contents.items():
-            if one.content in contents:  # what is predicted of it may differ
-                numbers[number] = contents[contents.index(one.content)]
+        numbers = {
+            number: contents[contents.index(one.content)]  # what is predicted of it may differ
+            for number, one in self.contents.items()
+            if one.content in contents
+        }
         kept, new = [*numbers.values()], list[Content]()
         for content in contents:
             if content in kept:
@@ -409,39 +416,22 @@ class Slots:
                 numbers[some.pop(0)] = content
         return numbers
 
-    def starting(self, numbers: Mapping[int, Content]) -> list[int]:
-        """Return the layers whose contents start.
-
-        Side bands join a carrier that plays: all count their phases on one clock.
-        """
-        changed = []
-        for number, content in numbers.items():
-            if number not in self.contents or self.contents[number].content != content:
-                changed.append(number)
-        return changed
-
-    def start(self, sets: Sets, playing: dict[int, Slot], now: float) -> None:
-        """Note that sets are sent at a time [s], and what all layers play."""
-        if self._fades(sets):
-            self._fades_until = now + FADED_AFTER
-        self.contents, self.is_silent = playing, False
-        self._layer_of = {
-            one.content.key: number for number, one in playing.items() if not one.is_falling
-        }
-        self.may_play |= sets.started
-
     def _sets(
         self, contents: Sequence[Content], now: float, *, is_shaped: bool
     ) -> tuple[Sets, dict[int, Slot]]:
         """Return the sets for these contents, and what all layers play then."""
         numbers = self.numbered(contents)
-        starting = self.starting(numbers)
-        layers: dict[int, PlateLayer] = {}
-        playing: dict[int, Slot] = {}
-        for number, one in self.contents.items():
-            if number in numbers and number not in starting:
-                content = numbers[number]
-                playing[number] = one if one.content is content else replace(one, content=content)
+        starting = [  # side bands join a carrier that plays: all count their phases on one clock
+            number
+            for number, content in numbers.items()
+            if number not in self.contents or self.contents[number].content != content
+        ]
+        layers = dict[int, PlateLayer]()
+        playing = {
+            number: replace(one, content=numbers[number])
+            for number, one in self.contents.items()
+            if number in numbers and number not in starting
+        }
         settled, among = [0.0], len(starting)
         for number in starting:
             content = numbers[number]
@@ -619,30 +609,17 @@ class Slots:
                 return replace(one, is_falling=True, ending_due=due, renewal_due=math.inf)
         return None
 
-    def _fades(self, sets: Sets) -> bool:
-        """Whether anything that plays is ended or replaced."""
-        if len(sets.layers) > len(sets.started):
-            return True
-        for number in sets.started:
-            if number in self.contents and self.contents[number].drive:
-                return True
-        return False
-
     def _faded_by(self, contents: Sequence[Content], now: float) -> float:
         """Return when [s] pulses that play, or what was ended, have faded; after RETRY if none."""
-        pulses = [target.pulse for one in contents for _, target in one.targets]
-        started = [each for each in pulses if each is not None and each.started_at is not None]
-        ends = [each.end for each in started if each.end > now]
+        pulses = [to.pulse for one in contents for _, to in one.targets if to.pulse is not None]
+        ends = [each.end for each in pulses if each.started_at is not None and each.end > now]
         if now < self._fades_until:
             ends.append(now)
         return max(ends, default=now + RETRY) + FADED_AFTER
 
     def _confirmed_until(self, content: Content) -> float:
         """Return when [s] the first target of a content is lifted unless a frame arrives."""
-        until = math.inf
-        for contact, _ in content.targets:
-            until = min(until, self._expiry_of(contact.key))
-        return until
+        return min([self._expiry_of(contact.key) for contact, _ in content.targets])
 
     def _lasts(self, content: Content, now: float) -> float:
         """Return for how long [s] a content may last by itself from a time [s] on.
@@ -660,13 +637,14 @@ class Slots:
 
     def _drive_of(self, number: int) -> Drive:
         """Return what plays in a layer, at frequencies not rounded by wire and amplifier."""
-        drive: dict[str, AmplifierTone] = {}
         if (one := self.contents.get(number)) is None:
-            return drive
-        for name, tone in one.drive.items():
-            if name in one.layer.excitation:
-                drive[name] = replace(tone, frequency=one.layer.excitation[name].frequency)
-        return drive
+            return {}
+        tones = one.layer.excitation
+        return {
+            name: replace(tone, frequency=tones[name].frequency)
+            for name, tone in one.drive.items()
+            if name in tones
+        }
 
 
 def _requested_at(one: Slot) -> float:

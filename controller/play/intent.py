@@ -340,7 +340,7 @@ class Selection:
             found[contact.key] = contact
         return found
 
-    @property
+    @cached_property
     def target_keys(self) -> set[ContactKey]:
         """Contacts of the targets."""
         return {contact.key for contact, _ in self.targets}
@@ -372,15 +372,10 @@ class Selection:
             gain = gains[each.targets]
             others = [other for targets, other in gains.items() if targets != each.targets]
             loudest = max(others, default=gain)
-            contents.append(
-                replace(
-                    each,
-                    layer=each.layer.scaled(gain),
-                    predictions=tuple([one.weakened(gain, loudest) for one in each.predictions]),
-                    gain_db=gain,
-                )
-            )
-        loudest = max(gains.values(), default=0.0)
+            felt = tuple([one.weakened(gain, loudest) for one in each.predictions])
+            scaled = each.layer.scaled(gain)
+            contents.append(replace(each, layer=scaled, predictions=felt, gain_db=gain))
+        loudest = max(gains.values())
         levels = {
             key: [level + loudest for level in by_set]
             for key, by_set in self.foreign_levels.items()
@@ -406,13 +401,12 @@ class Selection:
 
         table: has the sets of thresholds.
         """
-        levels, total = dict[ContactKey, list[float]](), {**self.foreign_levels}
-        for key in self.target_keys:
-            of_others = foreign_at(key, others)
-            if max(of_others, default=-math.inf) > -math.inf:
-                levels[key], total[key] = of_others, foreign_at(key, (self, *others))
+        levels = {key: foreign_at(key, others) for key in self.target_keys}
+        levels = {key: each for key, each in levels.items() if max(each, default=0) > -math.inf}
         if not levels:
             return self
+        total = {**self.foreign_levels}
+        total |= {key: foreign_at(key, (self, *others)) for key in levels}
 
         def together(each: Prediction, above: Sequence[float] = (0.0,)) -> Prediction:
             key = each.contact.key

@@ -447,7 +447,7 @@ class Controller:
                 intent_source=self._intent_source,
                 timing=self._timing,
                 check=self.group.sets.refusal_of,
-                arrived=cycle.wake,
+                arrived=cycle.request_update,
                 too_late=cycle.count_too_late,
                 clock_errors=lambda: self.group.clock_errors,
             )

@@ -74,9 +74,9 @@ class Planner:
     """Plans what the contacts on one plate feel; synchronous, times are arguments.
 
     A plan never raises: it falls back to silence on any exception. check: asks the ledgers;
-    arrived: called when contents have been chosen in the thread; too_late: called with the number
-    of clicks that came too late to be felt; clock_errors: returns the clock errors of the
-    amplifiers by name, rms [s].
+    arrived: called when contents have been chosen in the thread; it calls `look_again` and plans.
+    too_late: called with the number of clicks that came too late to be felt; clock_errors: returns
+    the clock errors of the amplifiers by name, rms [s].
     """
 
     def __init__(
@@ -102,7 +102,7 @@ class Planner:
         """The clock errors of the amplifiers, as answers count them."""
         self._selector = Selector(
             self._chooser_of(table),
-            arrived=self._note_answer,
+            arrived=arrived,
             may_lead=self.slots.may_lead,
         )
         self._selected: Selection | None = None  # the last, before limits left contents out of it
@@ -111,7 +111,7 @@ class Planner:
         self._intent_due = math.inf  # s; when the intent may change without a touch
         self._retry_at = math.inf  # s; when a ledger may admit what it refused
         self._clocks_due = -math.inf  # s; though fingers change
-        self._arrived, self._too_late = arrived, too_late
+        self._too_late = too_late
         self._seen: Sequence[Contact] = ()  # by the last plan
         self._awaited: dict[int, Pulse] = {}  # by identity: planned, and not known to have started
         self._asked: object = None  # the last question in the thread
@@ -299,8 +299,8 @@ class Planner:
         self._plan = plan = Plan(contacts, selection, now, answered, sets)
         if sets or not (is_felt or is_awaited):
             return plan
-        is_said = is_awaited or _predicted(plan) == _predicted(before)
-        return self._go_on(plan, now) if is_said else plan
+        said = () if before is None else before.selection.predictions
+        return self._go_on(plan, now) if is_awaited or selection.predictions == said else plan
 
     def _go_on(self, plan: Plan, now: float) -> Plan | None:
         """Plan what is due where nothing changes: contents have ended or are to be prolonged."""
@@ -312,10 +312,6 @@ class Planner:
             return self._plan
         renewal = self.slots.renewal(now)
         return replace(plan, sets=renewal, is_reported=False) if renewal else None
-
-    def _note_answer(self) -> None:
-        self.look_again()
-        self._arrived()
 
     def _playable(self, selection: Selection) -> Selection:
         """Return a selection without what has ended by itself, and what has no layer."""
@@ -344,40 +340,33 @@ class Planner:
         content that lasts also the fingers of the choice before.
         """
         changed, asked = self._tracker.changed, self._selector.asked
-        answered = {**changed, **self._waiting}
-        if asked is None:
-            self._waiting = {}
-            changed.clear()
-        else:
-            keys, lasts = set[ContactKey | None]([None]), False
-            for number in started:
-                for contact, target in self.slots.contents[number].content.targets:
-                    lasts = lasts or not target.is_short
-                    keys |= {contact.key} if target.is_short else set()
+        before, waiting = self._waiting, dict[ContactKey | None, float]()
+        answered = {**changed, **before}
+        if asked is not None:
+            contents = [self.slots.contents[number].content for number in started]
+            short = [each for each in contents if each.targets[0][1].is_short]
+            keys = {None, *[contact.key for each in short for contact, _ in each.targets]}
             answered = {key: at for key, at in answered.items() if key in keys}
             if asked is self._asked:
                 changed.pop(None, None)
+                return answered
+            waiting = {key: at for key, at in changed.items() if key not in keys}
+            if len(short) < len(contents):
+                answered |= before
             else:
-                waiting = {key: at for key, at in changed.items() if key not in keys}
-                answered |= self._waiting if lasts else {}
-                self._waiting = waiting if lasts else {**waiting, **self._waiting}
-                changed.clear()
-        self._asked = asked
+                waiting |= before
+        changed.clear()
+        self._asked, self._waiting = asked, waiting
         return answered
 
     def _pulses(self, numbers: Iterable[int]) -> list[Pulse]:
         """Return the pulses that play in layers."""
-        pulses = []
-        for number in numbers:
-            for _, target in self.slots.contents[number].content.targets:
-                if target.pulse is not None:
-                    pulses.append(target.pulse)
-        return pulses
-
-
-def _predicted(plan: Plan | None) -> Sequence[Prediction]:
-    """Return the predictions of a plan."""
-    return () if plan is None else plan.selection.predictions
+        return [
+            target.pulse
+            for number in numbers
+            for _, target in self.slots.contents[number].content.targets
+            if target.pulse is not None
+        ]
 
 
 @dataclass(frozen=True)

@@ -476,11 +476,11 @@ def restarted_by(excitation: physics.Excitation, playing: Drive) -> set[float]:
 
     All ERAs of one frequency must count its phase from one moment, or their field differs.
     """
-    restarted = set()
-    for name, tone in excitation.items():
-        if name not in playing or playing[name].frequency != tone.frequency:
-            restarted.add(tone.frequency)
-    return restarted
+    return {
+        tone.frequency
+        for name, tone in excitation.items()
+        if name not in playing or playing[name].frequency != tone.frequency
+    }
 
 
 def thinned(envelopes: Envelopes, *, knots: int) -> Envelopes:

@@ -402,7 +402,9 @@ class Selection:
         table: has the sets of thresholds.
         """
         levels = {key: foreign_at(key, others) for key in self.target_keys}
-        levels = {key: each for key, each in levels.items() if max(each, default=0) > -math.inf}
+        levels = {
+            key: each for key, each in levels.items() if max(each, default=-math.inf) > -math.inf
+        }
         if not levels:
             return self
         total = {**self.foreign_levels}

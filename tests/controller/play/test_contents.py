@@ -21,7 +21,7 @@ from controller.effects.layout import SurfaceLayout
 from controller.play.intent import CLICK, Content, HapticIntent, Pulse, Selection, Target
 from controller.play.routing import PlaybackCapabilities
 from controller.play.selection import Chooser, Selector
-from controller.play.slots import Sets, Slot, Slots
+from controller.play.slots import Slot, Slots
 from controller.sources.touch import Contact, ContactKey
 from model.answer.answer import Layer
 from model.answer.answer_report import Timing
@@ -170,13 +170,12 @@ def test_a_shared_content_that_changes_beside_a_click_of_its_finger_keeps_its_la
     alone = ((contacts[0], click),)
     clicking = Content((contacts[0].key, 0), alone, Placement((LEFT,)), pattern)
     playing = Slots(smooth_rig(), playable(4), Timing(table()), expiry_of=lambda key: 0.0)
-    contents = {
+    playing.contents = {
         number: Slot(one, pattern, drive={}) for number, one in ((1, clicking), (0, lasting))
     }
-    playing.start(Sets(started=frozenset({0})), contents, 0.0)
-    numbers = playing.numbered([lasting, clicking])
-    assert numbers == {0: lasting, 1: clicking}
-    assert playing.starting(numbers) == []
+    playing.may_play = frozenset({0})
+    assert playing.numbered([lasting, clicking]) == {0: lasting, 1: clicking}
+    assert not playing.plan([lasting, clicking], 0.0).started
 
 
 CONTACTS = [Contact(ContactKey("a", n), *at, since=0.0) for n, at in enumerate((LEFT, RIGHT))]

@@ -114,7 +114,7 @@ class Planner:
         self._too_late = too_late
         self._seen: Sequence[Contact] = ()  # by the last plan
         self._awaited: dict[int, Pulse] = {}  # by identity: planned, and not known to have started
-        self._asked: object = None  # the last question in the thread
+        self._pending: object = None  # the last question in the thread
         self._waiting: dict[ContactKey | None, float] = {}  # fingers that the last is for
 
     def replace_answers(self, table: LocalizationTable, timing: Timing) -> None:
@@ -339,15 +339,15 @@ class Planner:
         While contents are being chosen, only lifts and pulses that start are answered, and with a
         content that lasts also the fingers of the choice before.
         """
-        changed, asked = self._tracker.changed, self._selector.asked
+        changed, pending = self._tracker.changed, self._selector.pending
         before, waiting = self._waiting, dict[ContactKey | None, float]()
         answered = {**changed, **before}
-        if asked is not None:
+        if pending is not None:
             contents = [self.slots.contents[number].content for number in started]
             short = [each for each in contents if each.targets[0][1].is_short]
             keys = {None, *[contact.key for each in short for contact, _ in each.targets]}
             answered = {key: at for key, at in answered.items() if key in keys}
-            if asked is self._asked:
+            if pending is self._pending:
                 changed.pop(None, None)
                 return answered
             waiting = {key: at for key, at in changed.items() if key not in keys}
@@ -356,7 +356,7 @@ class Planner:
             else:
                 waiting |= before
         changed.clear()
-        self._asked, self._waiting = asked, waiting
+        self._pending, self._waiting = pending, waiting
         return answered
 
     def _pulses(self, numbers: Iterable[int]) -> list[Pulse]:

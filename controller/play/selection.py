@@ -406,7 +406,7 @@ class Selector:
     ) -> None:
         self.chooser, self._arrived, self._may_lead = chooser, arrived, may_lead
         self._threads = DaemonThreads()
-        self.asked: asyncio.Future[Choice] | None = None
+        self.pending: asyncio.Future[Choice] | None = None
         """The choice that is made in the thread, or not taken yet: one at a time."""
         self._late = set[asyncio.Future[Choice]]()  # given up, and still computed
         self._lasting = _NOTHING  # as it was chosen, for fingers that have left it, too
@@ -424,7 +424,7 @@ class Selector:
     @property
     def is_choosing(self) -> bool:
         """Whether a choice is made in the thread, or not taken yet."""
-        return self.asked is not None
+        return self.pending is not None
 
     def select(
         self,
@@ -453,16 +453,16 @@ class Selector:
         if back and not _is_met_by(intended, self._lasting):  # who has come back may be elsewhere
             self._lasting = _felt(self._lasting, self._lasting.target_keys - back)
         fingers = frozenset([(each.key, each.since, each.load) for each in contacts])  # not places
-        wanted = _targets_of(lasting), intent.protected
-        situation = fingers, *wanted, self.chooser.table, capabilities
+        requested = _targets_of(lasting), intent.protected
+        situation = fingers, *requested, self.chooser.table, capabilities
         if situation != self._situation:
             self._situation = situation
             self._rest_again(now)
         arrived = None
-        if self.asked is not None and self.asked.done():
-            asked, self.asked = self.asked, None
-            if not asked.cancelled():
-                arrived = asked.result()
+        if self.pending is not None and self.pending.done():
+            pending, self.pending = self.pending, None
+            if not pending.cancelled():
+                arrived = pending.result()
                 is_late = self._requested is None or not self._is_intended(arrived, intended)
                 self._take(arrived, now, is_late=is_late)
         pulses, self._short = self._short, {}
@@ -472,21 +472,21 @@ class Selector:
                 self._short[contact.key] = pulse
         if not contacts:
             self._lasting = _NOTHING
-        if self.asked is None:
+        if self.pending is None:
             for question in self._questions(intended, pulses, now, has_waited=arrived is not None):
                 if question.lasting:
                     self._requested = situation
-                self._ask(question, capabilities, now)
+                self._answer(question, capabilities, now)
         elif self.due <= now:
             self.due = now + _RESTS_AFTER
         parts = [_felt(self._lasting, self._fingers.keys()), *self._short.values()]
         found = _together(contacts, targets, parts, skipped, intent.reason, self.chooser.table)
-        if self.asked is not None and len(found.predictions) < len(by_key):
+        if self.pending is not None and len(found.predictions) < len(by_key):
             reason = found.reason or (None if found.contents else BEING_CHOSEN)
             found = replace(found, is_pending=True, reason=reason)
         return found
 
-    def _ask(self, question: Question, capabilities: PlaybackCapabilities, now: float) -> None:
+    def _answer(self, question: Question, capabilities: PlaybackCapabilities, now: float) -> None:
         """Have a question answered at a time [s]: at once, or in the thread where it takes long.
 
         A choice in the thread that hangs cannot be ended, only given up: its thread holds up
@@ -498,23 +498,23 @@ class Selector:
             self._take(question.unanswered(BLOCKED), now)
         else:
             loop, choose = asyncio.get_running_loop(), self.chooser.choose
-            asked = loop.run_in_executor(self._threads, partial(choose, question, capabilities))
-            self.asked = asked
-            asked.add_done_callback(self._note)
-            loop.call_later(TIME_LIMIT, self._give_up, asked, question)
+            pending = loop.run_in_executor(self._threads, partial(choose, question, capabilities))
+            self.pending = pending
+            pending.add_done_callback(self._note)
+            loop.call_later(TIME_LIMIT, self._give_up, pending, question)
 
-    def _give_up(self, asked: "asyncio.Future[Choice]", question: Question) -> None:
-        if not asked.done():
+    def _give_up(self, pending: "asyncio.Future[Choice]", question: Question) -> None:
+        if not pending.done():
             _logger.warning("loop: answer given up, still computed after %g s", TIME_LIMIT)
-            self._late.add(asked)
-            self.asked = asyncio.get_running_loop().create_future()
-            self.asked.set_result(question.unanswered(GIVEN_UP))
+            self._late.add(pending)
+            self.pending = asyncio.get_running_loop().create_future()
+            self.pending.set_result(question.unanswered(GIVEN_UP))
             self._arrived()
 
-    def _note(self, asked: "asyncio.Future[Choice]") -> None:
-        if asked in self._late:
-            self._late.remove(asked)
-            asked.exception()  # of no interest any more
+    def _note(self, pending: "asyncio.Future[Choice]") -> None:
+        if pending in self._late:
+            self._late.remove(pending)
+            pending.exception()  # of no interest any more
             if self._lasting.reason in _UNANSWERED:  # asked again
                 self._lasting = _NOTHING
         self._arrived()

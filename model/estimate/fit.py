@@ -26,6 +26,7 @@ from scipy import linalg
 from model.arrays import ComplexArray, FloatArray, IntArray, best_by, best_first
 from model.config.document import KeyPath
 from model.estimate.forward import (
+    MASS_CELLS,
     ForwardModel,
     PlateAt,
     Sensor,
@@ -33,13 +34,14 @@ from model.estimate.forward import (
     Values,
     by_mass_at,
     jacobian,
-    reduced_modes,
 )
 from model.estimate.measurement import Measurement
 from model.estimate.space import KINDS, MAX_GUESSED, VALUE_UNITS, rig_with, space_by_sheets
 from model.reduction.free_plate import solve_free_plate
+from model.reduction.reduced_plate import reduced_modes
 from model.rig.actuator_keys import KINDS as ACTUATOR_KEYS
 from model.rig.rig import Rig
+from model.structure.attachments import footprints_of
 
 HELD_OUT_FOLDS = 5
 """One path or sensor in so many is held out."""
@@ -672,7 +674,10 @@ def sensed_plate(
     """
     rig.mesh.check_frequencies(rig.plate, frequencies)
     free = solve_free_plate(rig.plate, rig.mesh, frequency_max=float(max(frequencies.max(), 200.0)))
-    form = reduced_modes(rig, free) if has_form else None
+    form = None
+    if has_form:
+        supports = footprints_of(rig.eras, rig.masses)
+        form = reduced_modes(free, supports, MASS_CELLS.centres(rig.plate))
     space = space_by_sheets(rig, (), None)
     return SensedPlate(rig, ForwardModel(rig, sensors, frequencies, space, free, form=form)).of(rig)
 

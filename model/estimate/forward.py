@@ -29,10 +29,9 @@ for.
 A plate may also have form errors, which a rig file does not describe: a cable glued to it, sides
 that are not cut to size. Left out, they bias fitted values by far more than noise does, and no
 residual shows by how much. They change stiffness and mass between the modes of the free plate, and
-so its mode shapes (`ReducedModes`).
+so its mode shapes (`ReducedModes` of `model.reduction`).
 """
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -43,12 +42,10 @@ from numpy.typing import NDArray
 from scipy import linalg
 
 from model.arrays import ComplexArray, FloatArray, IntArray
-from model.fem import Mesh, element_slopes
 from model.finger import Grid
-from model.reduction.free_plate import TERMS, FreeModes, FreePlate, FreeReceptance, combined
-from model.reduction.reduced_plate import place_slopes, reduce_free_plate
+from model.reduction.free_plate import TERMS, FreePlate, FreeReceptance, combined
+from model.reduction.reduced_plate import AttachmentPoints, Modes, ReducedModes, places_of
 from model.rig.rig import Rig, Uncertainty
-from model.spectral.direct_solution import stiffness_slopes
 from model.structure.attachments import (
     Fingertip,
     attached_stiffness,
@@ -59,7 +56,6 @@ from model.structure.attachments import (
 from model.structure.exciter import Actuator, Exciter
 from model.structure.modal_elasticity import (
     WITHOUT_PART,
-    Dispersion,
     ModalElasticity,
     check_scales,
     lowest_elastic,
@@ -315,102 +311,6 @@ class Values:
         """
         f = 1e-3 * np.asarray(frequencies)[:, None]
         return np.asarray(1 / (1 - self["inertia"] * f**2 + 1j * self["drag"] * f))
-
-
-@dataclass(frozen=True, eq=False)
-class ReducedModes:
-    """A plate's modes and residual vectors at all that is attached, for one with form errors.
-
-    No further modes count as truncated.
-    """
-
-    eigenvalues: FloatArray
-    """omega² (r,) [rad²/s²]."""
-    losses: FloatArray
-    """Their imaginary part beside the plate's own loss factor (r,)."""
-    dispersion: Dispersion | None
-    """How they change with frequency, None where they do not."""
-    shapes_at: Callable[[FloatArray], FloatArray]
-    """Shapes at points or footprints [m], (n, r)."""
-    cells: FloatArray
-    """Shapes where foreign mass may lie (c, r)."""
-    stiffening: FloatArray
-    """Derivatives (3, r, r) [rad²/s²] of the stiffness between coordinates by length, width
-    (relative) and Poisson's ratio."""
-
-    def truncated_terms(self, points: FloatArray, others: FloatArray) -> FloatArray:
-        """Sums over truncated modes: zero, (TERMS, n, m)."""
-        return np.zeros((TERMS, len(points), len(others)))
-
-
-def reduced_modes(rig: Rig, free: FreePlate) -> ReducedModes:
-    """Reduce a rig's free plate to coordinates in which it may have form errors."""
-    plate = rig.plate
-    reduced = reduce_free_plate(free, footprints_of(rig.eras, rig.masses))
-    cells = MASS_CELLS.centres(plate)
-    unknowns = reduced.unknowns()
-    if isinstance(free.mesh, Mesh):
-        stiffening = element_slopes(plate, free.mesh, unknowns[0])
-    else:
-        degrees = free.mesh.nx, free.mesh.ny
-        frequency = math.sqrt(plate.lowest_bending_frequency * free.frequency_max)
-        stiffening = stiffness_slopes(plate, degrees, unknowns, frequency=frequency)
-    return ReducedModes(
-        np.asarray(reduced.omega**2),
-        reduced.losses,
-        reduced.dispersion,
-        reduced.at,
-        reduced.at(cells),
-        stiffening,
-    )
-
-
-Modes: TypeAlias = FreeModes | ReducedModes
-
-
-@dataclass(frozen=True, eq=False)
-class AttachmentPoints:
-    """Shapes at a points of attachment and observation, v of which may move along x and y."""
-
-    footprints: FloatArray
-    """Place and radius of each (a, 3) [m]."""
-    shapes: FloatArray
-    """Mode shapes (a, r)."""
-    truncated: FloatArray
-    """Sums over truncated modes (TERMS, a, a)."""
-    shape_slopes: FloatArray
-    """Derivatives of the shapes by x and y of each movable point in turn (2 v, r) [1/m]."""
-    truncated_slopes: FloatArray
-    """Derivatives of the sums by the place of the first point (TERMS, 2 v, a) [1/m]."""
-
-    def moved(self, footprints: FloatArray, movable: IntArray) -> "AttachmentPoints":
-        """The same for other footprints (a, 3), by the slopes of the shapes alone."""
-        off = (footprints - self.footprints)[movable, :2].reshape(-1, 2, 1)
-        slopes = self.shape_slopes.reshape(len(movable), 2, self.shapes.shape[1])
-        shapes = self.shapes.copy()
-        shapes[movable] += (off * slopes).sum(axis=1)
-        return replace(self, footprints=footprints, shapes=shapes)
-
-
-def places_of(
-    modes: Modes, footprints: FloatArray, movable: IntArray, sides: FloatArray
-) -> AttachmentPoints:
-    """Solve for footprints (a, 3) on a plate of some sides (2,) [m].
-
-    movable (v,): numbers of those that may move.
-    """
-    moving, shapes = footprints[movable], modes.shapes_at(footprints)
-    truncated = modes.truncated_terms(footprints, footprints)
-    by_place = place_slopes(
-        lambda points: modes.truncated_terms(points, footprints).swapaxes(0, 1), moving, sides
-    )
-    return AttachmentPoints(
-        footprints,
-        shapes,
-        truncated,
-        place_slopes(modes.shapes_at, moving, sides).reshape(-1, shapes.shape[1]),
-        np.moveaxis(by_place, 2, 0).reshape(len(truncated), -1, len(footprints)),
-    )
 
 
 @dataclass(frozen=True, eq=False)

@@ -33,19 +33,25 @@ of second order, inwards at edges. Closed forms would be simple for polynomials,
 that an edge cuts adds integrals along that edge, and the compliance of unresolved waves is fitted,
 with limits beside edges. Over this step differences are right to 1e-6 of the largest, and the
 rounding of another processor changes them by 3e-8.
+
+A plate with form errors, which a rig file does not describe, is the same coordinates with other
+stiffness and mass between them (`ReducedModes`): an estimate fits these to measured responses.
 """
 
+import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, TypeAlias
 
 import numpy as np
 from scipy import linalg
 
-from model.arrays import FloatArray
+from model.arrays import FloatArray, IntArray
 from model.errors import InputError, shown
+from model.fem import Mesh, element_slopes
 from model.files.csv_file import as_frame
-from model.reduction.free_plate import FreePlate, solve_free_plate
+from model.reduction.free_plate import TERMS, FreeModes, FreePlate, solve_free_plate
+from model.spectral.direct_solution import stiffness_slopes
 from model.spectral.modes import PlateMesh
 from model.structure.attachments import (
     Fingertip,
@@ -379,3 +385,100 @@ def place_slopes(
     weights = weights.reshape(*weights.shape, *[1] * (found.ndim - 2))
     taken = found[:, [[0, 0], [1, 2], [3, 4]]].swapaxes(0, 1)  # (3, n, 2, ...)
     return np.asarray((weights * taken).sum(axis=0))
+
+
+@dataclass(frozen=True, eq=False)
+class ReducedModes:
+    """A plate's modes and residual vectors at all that is attached, for one with form errors.
+
+    No further modes count as truncated.
+    """
+
+    eigenvalues: FloatArray
+    """omega² (r,) [rad²/s²]."""
+    losses: FloatArray
+    """Their imaginary part beside the plate's own loss factor (r,)."""
+    dispersion: Dispersion | None
+    """How they change with frequency, None where they do not."""
+    shapes_at: Callable[[FloatArray], FloatArray]
+    """Shapes at points or footprints [m], (n, r)."""
+    cells: FloatArray
+    """Shapes where foreign mass may lie (c, r)."""
+    stiffening: FloatArray
+    """Derivatives (3, r, r) [rad²/s²] of the stiffness between coordinates by length, width
+    (relative) and Poisson's ratio."""
+
+    def truncated_terms(self, points: FloatArray, others: FloatArray) -> FloatArray:
+        """Sums over truncated modes: zero, (TERMS, n, m)."""
+        return np.zeros((TERMS, len(points), len(others)))
+
+
+def reduced_modes(free: FreePlate, footprints: FloatArray, cells: FloatArray) -> ReducedModes:
+    """Reduce a free plate to coordinates in which it may have form errors.
+
+    footprints (n, 3) [m]: of its supports; cells (c, 2) [m]: where foreign mass may lie.
+    """
+    plate, reduced = free.plate, reduce_free_plate(free, footprints)
+    unknowns = reduced.unknowns()
+    if isinstance(free.mesh, Mesh):
+        stiffening = element_slopes(plate, free.mesh, unknowns[0])
+    else:
+        degrees = free.mesh.nx, free.mesh.ny
+        frequency = math.sqrt(plate.lowest_bending_frequency * free.frequency_max)
+        stiffening = stiffness_slopes(plate, degrees, unknowns, frequency=frequency)
+    return ReducedModes(
+        np.asarray(reduced.omega**2),
+        reduced.losses,
+        reduced.dispersion,
+        reduced.at,
+        reduced.at(cells),
+        stiffening,
+    )
+
+
+Modes: TypeAlias = FreeModes | ReducedModes
+
+
+@dataclass(frozen=True, eq=False)
+class AttachmentPoints:
+    """Shapes at a points of attachment and observation, v of which may move along x and y."""
+
+    footprints: FloatArray
+    """Place and radius of each (a, 3) [m]."""
+    shapes: FloatArray
+    """Mode shapes (a, r)."""
+    truncated: FloatArray
+    """Sums over truncated modes (TERMS, a, a)."""
+    shape_slopes: FloatArray
+    """Derivatives of the shapes by x and y of each movable point in turn (2 v, r) [1/m]."""
+    truncated_slopes: FloatArray
+    """Derivatives of the sums by the place of the first point (TERMS, 2 v, a) [1/m]."""
+
+    def moved(self, footprints: FloatArray, movable: IntArray) -> "AttachmentPoints":
+        """The same for other footprints (a, 3), by the slopes of the shapes alone."""
+        off = (footprints - self.footprints)[movable, :2].reshape(-1, 2, 1)
+        slopes = self.shape_slopes.reshape(len(movable), 2, self.shapes.shape[1])
+        shapes = self.shapes.copy()
+        shapes[movable] += (off * slopes).sum(axis=1)
+        return replace(self, footprints=footprints, shapes=shapes)
+
+
+def places_of(
+    modes: Modes, footprints: FloatArray, movable: IntArray, sides: FloatArray
+) -> AttachmentPoints:
+    """Solve for footprints (a, 3) on a plate of some sides (2,) [m].
+
+    movable (v,): numbers of those that may move.
+    """
+    moving, shapes = footprints[movable], modes.shapes_at(footprints)
+    truncated = modes.truncated_terms(footprints, footprints)
+    by_place = place_slopes(
+        lambda points: modes.truncated_terms(points, footprints).swapaxes(0, 1), moving, sides
+    )
+    return AttachmentPoints(
+        footprints,
+        shapes,
+        truncated,
+        place_slopes(modes.shapes_at, moving, sides).reshape(-1, shapes.shape[1]),
+        np.moveaxis(by_place, 2, 0).reshape(len(truncated), -1, len(footprints)),
+    )

@@ -26,13 +26,14 @@ from model.arrays import ComplexArray, FloatArray
 from model.estimate import plate_match
 from model.estimate.calibrate import calibrate
 from model.estimate.fit import SensedPlate, fit, sensed_plate
-from model.estimate.forward import MASS_CELLS, reduced_modes
+from model.estimate.forward import MASS_CELLS
 from model.estimate.measurement import Measurement, sensors_at
 from model.estimate.space import KINDS
 from model.reduction.free_plate import solve_free_plate
+from model.reduction.reduced_plate import reduced_modes
 from model.rig.rig import Rig
 from model.spectral.modes import SpectralMesh, stretched
-from model.structure.attachments import PointLoad
+from model.structure.attachments import PointLoad, footprints_of
 from plates import extrapolated_slopes, make_paper_rig
 
 RIG = make_paper_rig(12, 9)
@@ -275,10 +276,13 @@ def test_stiffening_does_not_depend_on_rounding(rig: Rig) -> None:
     Relative to the modes' own stiffness, as couplings are that move a mode's frequency.
     """
 
+    cells = MASS_CELLS.centres(rig.plate)
+
     def couplings(share: float) -> FloatArray:
         material = replace(rig.plate.material, E=rig.plate.material.E * (1 + share))
         other = replace(rig, plate=replace(rig.plate, material=material))
-        modes = reduced_modes(other, solve_free_plate(other.plate, other.mesh))
+        free = solve_free_plate(other.plate, other.mesh)
+        modes = reduced_modes(free, footprints_of(rig.eras, rig.masses), cells)
         size = np.sqrt(modes.eigenvalues + 4e4)  # of a rigid body on springs of some 30 Hz
         return np.abs(modes.stiffening) / np.outer(size, size)
 

@@ -107,6 +107,7 @@ async def _to_browser(
 
 CLIENT_TIMEOUT = 5.0  # s; from a response, which is to be read, to the end of the next request
 MAX_WAITING = 128  # connections that wait for a request
+_TURNS = 8  # of the event loop, from a connection to its first request; as many are read at a time
 MAX_KEPT = 8  # connections to the daemon of clients over HTTP; the daemon has 32
 
 
@@ -118,7 +119,6 @@ class ClientConnection:
     """
 
     _transport: asyncio.Transport
-    _ending: "asyncio.Task[None]"
 
     def __init__(
         self,
@@ -132,7 +132,8 @@ class ClientConnection:
         self._waiting = waiting
         self._kept = kept
         self._requesting = asyncio.Lock()
-        self._is_refused = False  # whether the rest of a request is discarded, unparsed
+        # Whether a request has come, and whether the rest of one is discarded, unparsed.
+        self._has_requested = self._is_refused = False
 
     def __getattr__(self, name: str) -> Any:
         """What a transport needs of the web server's protocol, but for what is defined here."""
@@ -168,17 +169,29 @@ class ClientConnection:
         self._ending = asyncio.create_task(self._end())
 
     def wait(self) -> None:
-        """Wait for the next request; of too many that wait, the oldest is closed."""
-        if len(self._waiting) >= MAX_WAITING:
-            oldest = next(iter(self._waiting))
-            oldest.stop_waiting()
-            oldest._transport.abort()
+        """Wait for the next request; of too many that wait, the oldest are closed."""
         if not self._transport.is_closing():
-            timer = asyncio.get_running_loop().call_later(CLIENT_TIMEOUT, self._transport.abort)
-            self._waiting[self] = timer
+            self._waiting[self] = asyncio.get_running_loop().call_later(
+                CLIENT_TIMEOUT, self._transport.abort
+            )
+        if len(self._waiting) == MAX_WAITING + 1:
+            self._making_room = asyncio.create_task(self._make_room())
+
+    async def _make_room(self) -> None:
+        """Close the oldest of too many, once what has come of them is read: it may be a stop.
+
+        Those that have had an answer come first: a new client may be the one that stops.
+        """
+        for _ in range(_TURNS):
+            await asyncio.sleep(0)
+        beyond = max(len(self._waiting) - MAX_WAITING, 0)
+        for each in sorted(self._waiting, key=lambda each: not each._has_requested)[:beyond]:
+            each.stop_waiting()
+            each._transport.abort()
 
     def stop_waiting(self) -> None:
         """Take as much time as a request takes, which has come."""
+        self._has_requested = True
         if self in self._waiting:
             self._waiting.pop(self).cancel()
 

@@ -12,6 +12,7 @@ Exit status 1 for anything missed or stale that is not among them, or found thou
 """
 
 import argparse
+import ast
 import contextlib
 import json
 import os
@@ -162,12 +163,22 @@ def _run_pytest(folder: Path, tests: Sequence[str], sending: Connection) -> None
 
 
 def stale_edits(fault: PlantedFault, tree: Path) -> dict[str, str]:
-    """Return what is wrong with the files of a tree that do not have a text to change once."""
-    return {
-        file: "must contain the text to change once"
-        for file, find, _ in fault.edits
-        if not (tree / file).is_file() or _text(tree / file).count(find) != 1
-    }
+    """Return what is wrong with the files of a tree in which a fault cannot be planted.
+
+    A text must occur once; a module in which several lines replace it must still be Python.
+    """
+    stale, planted = dict[str, str](), dict[str, str]()
+    for file, find, replace in fault.edits:
+        text = planted.get(file) or (_text(tree / file) if (tree / file).is_file() else "")
+        planted[file] = text.replace(find, replace)
+        if text.count(find) != 1:
+            stale[file] = "must contain the text to change once"
+        elif file.endswith(".py") and "\n" in replace:
+            try:
+                ast.parse(planted[file])
+            except SyntaxError as error:
+                stale[file] = f"must be Python once it is changed, got {error}"
+    return stale
 
 
 def collected(*arguments: str) -> set[str]:

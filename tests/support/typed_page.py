@@ -123,7 +123,7 @@ def read_steps(page: Path) -> list[Step]:
                     steps.append(Interrupted(line, value))
                 elif key in _OF_A_FENCE:
                     said[key] = value
-                else:
+                elif key != "begin":  # of a part that is written from the code
                     raise PageError(f"{where}: no comment is called {key!r}")
         elif token.type == "fence":
             kind = token.info.strip()

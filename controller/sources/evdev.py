@@ -23,11 +23,11 @@ from urllib.parse import parse_qsl
 from controller.sources.touch import (
     LIGHT_FORCE,
     LIGHT_MAJOR,
-    MAX_FRAME_AGE,
     LightPress,
     Touch,
     TouchFrame,
     TouchSource,
+    moment_of,
     number_option,
 )
 from model.errors import InputError
@@ -267,7 +267,7 @@ class InputDevice:
             measured = (*self.ranges, ABS_MT_PRESSURE, ABS_MT_TOUCH_MAJOR)
             self.resolutions = {axis: self._axis(axis)[3] for axis in measured}  # 0: no axis
             self._slot_count = self._axis(ABS_MT_SLOT)[2] + 1
-            with contextlib.suppress(OSError):  # of an older kernel: see MAX_FRAME_AGE
+            with contextlib.suppress(OSError):  # of an older kernel: see `moment_of`
                 fcntl.ioctl(self._descriptor, CLOCK, _INT.pack(time.CLOCK_MONOTONIC))
             if grab:
                 fcntl.ioctl(self._descriptor, GRAB, 1)
@@ -445,8 +445,7 @@ class EvdevSource(TouchSource):
     ) -> None:
         """Deliver a frame of what happened at a time [s], now if that is not of this clock."""
         now = asyncio.get_running_loop().time()
-        time = happened if now - MAX_FRAME_AGE <= happened <= now else now
-        deliver(TouchFrame(self._name, time, touches))
+        deliver(TouchFrame(self._name, moment_of(happened, now), touches))
 
 
 def _panel_options(options: str) -> tuple[dict[str, str], dict[int, float]]:

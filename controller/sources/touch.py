@@ -102,6 +102,15 @@ class TouchFrame:
     """Host or client, which may have several sources; None: the source itself."""
 
 
+MAX_FRAME_AGE = 1.0
+"""Age [s] beyond which the time of a frame is that of another clock, or of one that was set."""
+
+
+def moment_of(stated: float, now: float) -> float:
+    """Return when [s] a frame happened: as stated, or now where that is of another clock."""
+    return stated if now - MAX_FRAME_AGE <= stated <= now else now
+
+
 class TouchSource(ABC):
     """A source of touch frames, repeated at least every 100 ms while there are touches.
 
@@ -379,9 +388,6 @@ Most sources repeat their frames at least every 100 ms; others state their own t
 
 MAX_CONTACT_TIMEOUT = 60.0
 """Longest time [s] for which a sensor may be silent under a resting finger."""
-
-MAX_FRAME_AGE = 1.0
-"""Age [s] beyond which the time of a frame is that of another clock, or of one that was set."""
 
 MAX_GLIMPSE = 0.005
 """A contact that ends within this time [s] was longer on the plate: its frames were held up and

@@ -22,9 +22,9 @@ from typing import ClassVar, NamedTuple, TypeAlias
 from controller.sources.touch import (
     CONTACT_TIMEOUT,
     MAX_CONTACT_TIMEOUT,
-    MAX_FRAME_AGE,
     TouchFrame,
     TouchSource,
+    moment_of,
     number_option,
 )
 from model.errors import InputError
@@ -128,9 +128,7 @@ class Datagrams:
             if (level, kind) == (socket.SOL_SOCKET, _TIMESTAMPS) and len(content) == _TIMESPEC.size:
                 seconds, nanoseconds = _TIMESPEC.unpack(content)
                 arrived = seconds + nanoseconds * 1e-9 + offset
-        if not now - MAX_FRAME_AGE <= arrived <= now:
-            arrived = now
-        self._latest = max(self._latest, arrived)
+        self._latest = max(self._latest, moment_of(arrived, now))
         return self._latest
 
 

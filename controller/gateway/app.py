@@ -323,7 +323,7 @@ async def _continue_later(_: web.Request) -> None:
 
 
 async def _body(request: web.Request) -> bytes:
-    """A request's body on one line, by default an empty object; raises RpcError, web.HTTPException.
+    """A request's body, by default an empty object; raises RpcError, web.HTTPException.
 
     It is parsed here, so that lines and columns of an error are those of the body.
     """
@@ -341,7 +341,7 @@ async def _body(request: web.Request) -> bytes:
     except TimeoutError as error:
         raise web.HTTPRequestTimeout(text="the body is not complete") from error
     parse_json(body or b"{}")
-    return body.replace(b"\n", b"\r") or b"{}"  # both are spaces, and neither is within a text
+    return body or b"{}"
 
 
 _MAX_LINE = 1 << 13  # bytes; of the head of a request

@@ -107,7 +107,7 @@ async def _to_browser(
 
 CLIENT_TIMEOUT = 5.0  # s; from a response, which is to be read, to the end of the next request
 MAX_WAITING = 128  # connections that wait for a request
-_TURNS = 8  # of the event loop, from a connection to its first request; as many are read at a time
+_TURNS = 8  # of the event loop, within which the first request of a new connection is read
 MAX_KEPT = 8  # connections to the daemon of clients over HTTP; the daemon has 32
 
 

@@ -666,7 +666,7 @@ class LearnedTable:
         return "" if self._note == before else self._note, self._cautious()
 
     def _followed(self, known: PlateEstimate) -> LocalizationTable:
-        """Return the table for a plate as it is known; raises InputError where there is none."""
+        """Return the table for a plate as it is known; raises InputError if none can follow it."""
         if not np.isfinite(known.x).all() or not np.isfinite(known.covariance).all():
             raise InputError("parameters must be finite, got others")
         return table_following(self._table, known.cautious_rig if known.change else known.rig)

@@ -77,11 +77,6 @@ def _loses(scope: SearchScope, std: float) -> float:
     return std * float(scope.uncertainty.damping > 1 and scope.rig.plate.loss_factor > 0)
 
 
-def _exciters(scope: SearchScope) -> Sequence[str]:
-    """Names of all ERAs where one is an exciter, else none."""
-    return scope.eras if scope.excites.any() else ()
-
-
 def _lags(scope: SearchScope, std: float) -> Number:
     """A deviation of the drives whose lag nothing states.
 
@@ -99,12 +94,6 @@ def _of_form(scope: SearchScope, std: float) -> Range:
 def _factors(scope: SearchScope, std: Number, largest: float) -> Range:
     """Range of logarithms of factors on values of parts as sold, of which a rig knows the error."""
     return np.maximum(std, scope.rig.uncertainty.stiffness), -largest, largest
-
-
-def _exciter_factors(scope: SearchScope, std: float, largest: float) -> Range:
-    """Range of logarithms of factors on values of exciters, which other ERAs have not."""
-    of_all, low, high = _factors(scope, std, largest)
-    return of_all * scope.excites, low, high
 
 
 def _added(value: Number, std: Number, largest: Number) -> Range:
@@ -165,6 +154,31 @@ def _on_plate(values: Values) -> FloatArray:
     return masses
 
 
+def _scaled(values: Values, key: str) -> FloatArray:
+    """Values of all ERAs by their key, times the factors of the kind of that name (n,)."""
+    return values_of_eras(values.rig, key) * np.exp(values.own(key))
+
+
+def _of_exciters(key: str, *, largest: float, drift: float = 0.0) -> Kind:
+    """The kind of factors on a value of exciters, which other ERAs do not have."""
+
+    def by_sheet(scope: SearchScope, std: float) -> Range:
+        of_all, low, high = _factors(scope, std, largest)
+        return of_all * scope.excites, low, high
+
+    return Kind(
+        _BUILT.stiffness,
+        names=lambda scope: [
+            f"{key.replace('_', ' ')} {name}" for name in scope.eras if scope.excites.any()
+        ],
+        slope=lambda plate: plate.by_sources(key),
+        value=lambda values: _scaled(values, key),
+        stated=lambda scope, std: scope.uncertainty.stiffness * scope.excites,
+        by_sheet=by_sheet,
+        drift=drift,
+    )
+
+
 KINDS: dict[str, Kind] = {
     "thickness": Kind(
         _BUILT.thickness,
@@ -195,9 +209,7 @@ KINDS: dict[str, Kind] = {
         _BUILT.stiffness,
         names=lambda scope: [f"stiffness {name}" for name in scope.eras],
         slope=lambda plate: plate.by_sources("stiffness"),
-        value=lambda values: (
-            values_of_eras(values.rig, "stiffness") * np.exp(values.own("stiffness"))
-        ),
+        value=lambda values: _scaled(values, "stiffness"),
         stated=lambda scope, std: scope.uncertainty.stiffness,
         by_sheet=lambda scope, std: _factors(scope, 0.10, math.log(10.0)),
         drift=0.03,
@@ -372,28 +384,9 @@ KINDS: dict[str, Kind] = {
         unit="g",
         per_unit=1e3,
     ),
-    "magnet_mass": Kind(
-        _BUILT.stiffness,
-        names=lambda scope: [f"magnet mass {name}" for name in _exciters(scope)],
-        slope=lambda plate: plate.by_sources("magnet_mass"),
-        value=lambda values: (
-            values_of_eras(values.rig, "magnet_mass") * np.exp(values.own("magnet_mass"))
-        ),
-        stated=lambda scope, std: scope.uncertainty.stiffness * scope.excites,
-        by_sheet=lambda scope, std: _exciter_factors(scope, std, math.log(10.0)),
-    ),
+    "magnet_mass": _of_exciters("magnet_mass", largest=math.log(10.0)),
     # It damps as the suspension of its exciter does, and no response tells them apart.
-    "force_factor": Kind(
-        _BUILT.stiffness,
-        names=lambda scope: [f"force factor {name}" for name in _exciters(scope)],
-        slope=lambda plate: plate.by_sources("force_factor"),
-        value=lambda values: (
-            values_of_eras(values.rig, "force_factor") * np.exp(values.own("force_factor"))
-        ),
-        stated=lambda scope, std: scope.uncertainty.stiffness * scope.excites,
-        by_sheet=lambda scope, std: _exciter_factors(scope, std, math.inf),
-        drift=0.01,
-    ),
+    "force_factor": _of_exciters("force_factor", largest=math.inf, drift=0.01),
     # Of an ERA, on each axis. With form errors it may leave the plate, whose shapes go on by their
     # slopes.
     "place": Kind(

@@ -171,7 +171,8 @@ class Adapter:
         )
         due = min(amplifier.next_event - self._loop.time(), STEP if is_moving else BEAT)
         with contextlib.suppress(TimeoutError):
-            await asyncio.wait_for(self._changed.wait(), max(due, 0.0))
+            async with asyncio.timeout(max(due, 0.0)):  # wait_for may swallow a cancellation
+                await self._changed.wait()
 
 
 def tone_of(voices: tuple[Voice, ...], now: float) -> Tone | None:

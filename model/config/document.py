@@ -192,7 +192,8 @@ def parse_document(source: str, text: str, *, if_empty: str = IF_EMPTY) -> Docum
         raise ConfigError(source, reader.repeated)
     if data is None:
         raise _whole(source, f"is empty; {if_empty}")
-    return Document(source, text, data, lambda: reader.lines)
+    # A method of a dictionary can be pickled, as documents are for other processes.
+    return Document(source, text, data, reader.lines.copy)
 
 
 def _whole(source: str, message: str) -> ConfigError:

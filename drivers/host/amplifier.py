@@ -1,7 +1,8 @@
 """One amplifier of protocol 4 on any wire: its identity, its requests and its measurements.
 
-`Amplifier` identifies, arms, silences, disarms and stops it. Measurements, of its channels and of
-tones at its sensors, need no session, do not feed the watchdog and do not change what plays.
+`Amplifier` identifies, arms, silences, disarms and stops one amplifier. The functions below it
+measure its channels, and tones at its sensors; these requests need no session, do not feed the
+watchdog and do not change what plays.
 """
 
 import asyncio
@@ -56,12 +57,12 @@ from registry.limits import GuardLimits
 
 WATCHDOG = 0.25  # s; five heartbeats of 50 ms
 DISARM_RAMP = 0.05  # s; long enough to avoid a click
-OPEN_TIMEOUT = 0.5  # s; of each request while it is opened, on a busy machine and in a far network
-_ARM_WITHIN = 3.0  # s; from the request to arm until it is sent, on the slowest wire
+OPEN_TIMEOUT = 0.5  # s; for each reply while an amplifier is opened, also on a busy machine
+_ARM_WITHIN = 3.0  # s; an Arm that is sent later than this after it was asked for is too late
 CONFIRM_TIMEOUT = 0.3  # s; three replies of the slowest wire
-LISTENING = 0.3  # s; to an amplifier that is found armed
-SECOND_REPLY = 0.02  # s; for one of another amplifier at the same address
-_INTERVAL = 0.005  # s; between attempts to stop, in addition to the ramp
+LISTENING = 0.3  # s; how long the host listens for another one if it finds an armed amplifier
+SECOND_REPLY = 0.02  # s; how long it waits for a second amplifier at the same address
+_INTERVAL = 0.005  # s; between two attempts to stop, in addition to the ramp
 _RAMP, _WATCHDOG = QUANTITIES["ramp"], QUANTITIES["watchdog"]
 _ENERGISED = (STATES["SWITCHED_ON"], ENABLED)
 _FULL_LEVEL = ("motion of a stiff source", "output of a linear amplifier")
@@ -70,24 +71,25 @@ _WIRE_ROUNDING = 0.5  # steps of the wire, beside half a step of the amplifier
 
 @dataclass(eq=False, slots=True)
 class _Stop:
-    """A stop along a ramp of the wire, repeated until it is confirmed, or for a time [s].
-
-    ends: end [s] of that time, which starts when the first request goes out; is_sent: whether the
-    first request went out, so that whatever is played later needs a stop of its own; requested: the
-    first request, queued when the stop was asked for; latch: the newest latch at the last request.
-    """
+    """A stop, which is repeated until the amplifier has confirmed it or a timeout has passed."""
 
     ramp: int
+    """In units of the wire."""
     timeout: float
+    """How long it is repeated after the first request has gone out [s]."""
     ends: float
+    """When the timeout passes [s]."""
     is_sent: bool = False
+    """Whether the first request has gone out; what is played later needs a stop of its own."""
     limit: asyncio.Timeout | None = None
     requested: "asyncio.Future[Values] | None" = None
+    """The first request, which is queued as soon as the stop is asked for."""
     latch: int | None = None
+    """The newest latch that was known when the last request was made."""
     result: "asyncio.Future[StopOutcome]" = field(init=False)
 
     def sent(self) -> list[Values]:
-        """Return the values of the request, which goes out now."""
+        """Return the values of the request, and note that it goes out now."""
         if not self.is_sent:
             self.is_sent = True
             self.ends = threads.now() + self.timeout
@@ -97,11 +99,11 @@ class _Stop:
 
 
 class Amplifier(Dialogue):
-    """An amplifier on a line that is open.
+    """An amplifier on an open line.
 
-    limits: configured. serial_number: the expected one, None for any. is_output: what the rig says
-    of full level: the output of a linear amplifier, else the motion of a stiff source; None for
-    either.
+    limits: the configured ones. serial_number: the expected one; None for any. is_output: what full
+    level means by the rig: True for the output of a linear amplifier, False for the motion of a
+    stiff source, None for either.
     """
 
     def __init__(
@@ -121,14 +123,15 @@ class Amplifier(Dialogue):
         self._stop: _Stop | None = None
 
     def go_on_from(self, before: "Amplifier") -> None:
-        """Know what was known of it when its line was opened before, and may have been lost."""
+        """Adopt what was known of the same amplifier before its line was opened again."""
         self.known = replace(before.what_may_play(), is_confirmed=before.known.is_confirmed)
         self.may_be_armed = before.may_be_armed
 
     async def open(self) -> None:
-        """Identify it and leave it disarmed; a latched stop or fault stays.
+        """Identify the amplifier and leave it disarmed; a latched stop or fault stays latched.
 
-        Raises LinkError for another amplifier or version, or another host that drives it.
+        Raises LinkError if it is another amplifier, speaks another version, or is driven by another
+        host.
         """
         status = await self.identify()
         if status["state"] == ENABLED:
@@ -138,8 +141,8 @@ class Amplifier(Dialogue):
     async def identify(self, *, timeout: float = OPEN_TIMEOUT) -> Values:
         """Read identity and capabilities, and return the status; raises LinkError.
 
-        timeout [s]: of a reply. Its latch is that of the status from now on: it may have lost its
-        supply meanwhile.
+        timeout: for each reply [s]. The newest latch is then that of this status, since the
+        amplifier may have lost its supply before.
         """
         self._are_several = False
         try:
@@ -149,7 +152,8 @@ class Amplifier(Dialogue):
             self._check_alone()
             raise
         self._check_alone()
-        shown, self.capabilities = self.capabilities, {}  # another one's silence confirms nothing
+        # Until it is identified it may be another amplifier, whose silence confirms nothing.
+        shown, self.capabilities = self.capabilities, {}
         check_identity(identity, self.name, self._serial_number)
         self.capabilities = shown
         can = await self.request("GetCaps", {}, Priority.OTHER, timeout=timeout)
@@ -167,7 +171,7 @@ class Amplifier(Dialogue):
         return await self.read_status()
 
     def _check_alone(self) -> None:
-        """Raise LinkError where several replied; the silence of one confirms nothing."""
+        """Raise LinkError if several amplifiers replied: the silence of one confirms nothing."""
         if self._are_several:
             self.capabilities = {}
             raise WrongAmplifier(
@@ -176,16 +180,17 @@ class Amplifier(Dialogue):
             )
 
     def arm(self, session: int, watchdog: float = WATCHDOG) -> Coroutine[Any, Any, Values]:
-        """Switch the high voltage on at level zero; watchdog [s]. Returns the status.
+        """Switch the high voltage on at level zero, and return the status; watchdog [s].
 
-        It is identified anew: it may have lost its supply, and come back with other limits. What
-        silences it from this call on comes first, also before this is awaited.
+        The amplifier is identified anew, since it may have lost its supply and come back with other
+        limits. A stop or disarm that comes after this call goes first, even before it is awaited.
         """
         self.arming = self.silences, threads.now() + _ARM_WITHIN
         return self._arm(session, watchdog)
 
     async def _arm(self, session: int, watchdog: float) -> Values:
-        await self.identify(timeout=REPLY_TIMEOUT)  # before the watchdogs of others that are armed
+        # The timeout is short so that the watchdogs of other armed amplifiers do not run down.
+        await self.identify(timeout=REPLY_TIMEOUT)
         wire = _WATCHDOG.to_wire(watchdog)
         low, high = (self.ledger.capabilities[f"watchdog_{end}"] for end in ("min", "max"))
         if not low <= wire <= high:
@@ -213,10 +218,10 @@ class Amplifier(Dialogue):
         return status
 
     async def read_achieved(self, one: LayerSet, token: int) -> LayerSet:
-        """Read what plays of a layer of the set with this token; the ledger goes on with it.
+        """Read what the amplifier plays of a layer of the set with this token.
 
-        A layer that goes on with an earlier set is returned as it was sent. Raises CommandRefused
-        where the amplifier contradicts the set, as it did the last one.
+        The ledger uses the result from then on. A layer that continues an earlier set is returned
+        as it was sent. Raises CommandRefused if the amplifier contradicts two sets in a row.
         """
         shown = await self.request("GetAchieved", {"layer": one.layer}, Priority.SET)
         if one.renew or shown["token"] != token:
@@ -235,7 +240,7 @@ class Amplifier(Dialogue):
         return achieved
 
     async def silence(self, ramp: float) -> Values:
-        """Let all layers fall silent along a ramp [s]; it stays armed."""
+        """Let all layers fall silent along a ramp [s]; the amplifier stays armed."""
         return await self.request(
             "Silence",
             {"session": self.session, "ramp": self.wire_ramp(ramp)},
@@ -243,9 +248,9 @@ class Amplifier(Dialogue):
         )
 
     async def disarm(self, ramp: float = DISARM_RAMP) -> None:
-        """Ramp [s] to silence, then switch the high voltage off; read back until it is silent.
+        """Ramp to silence [s] and switch the high voltage off; read back until it is silent.
 
-        Raises CommandRefused if it is not silent soon after the ramp, or still armed.
+        Raises CommandRefused if the amplifier is not silent soon after the ramp, or is still armed.
         """
         status = await self.request("Disarm", {"ramp": self.wire_ramp(ramp)}, Priority.SILENCE)
         end = threads.now() + ramp + CONFIRM_TIMEOUT
@@ -257,9 +262,9 @@ class Amplifier(Dialogue):
         self.may_be_armed = False
 
     def ping(self) -> "asyncio.Future[Values]":
-        """Feed the watchdog and steer the clock; the future has the status.
+        """Feed the watchdog and steer the clock; returns a future of the status.
 
-        Or CommandRefused if it is not armed.
+        The future raises CommandRefused if the amplifier is not armed.
         """
 
         def make() -> list[Values]:
@@ -270,13 +275,13 @@ class Amplifier(Dialogue):
         return self.line.submit(self, Priority.HEARTBEAT, "Ping", make)
 
     def read_status(self, priority: Priority = Priority.OTHER) -> "asyncio.Future[Values]":
-        """Read the status, which feeds nothing."""
+        """Read the status; this does not feed the watchdog."""
         return self.line.submit(self, priority, "GetStatus", {})
 
     async def clear(self) -> Values:
-        """Acknowledge the newest stop or fault that was shown.
+        """Acknowledge the newest stop or fault that the amplifier has shown.
 
-        It is identified anew: one that has lost its supply since counts its latches from 1 again.
+        The amplifier is identified anew: if it has lost its supply it counts latches from 1 again.
         """
         before, shown = self.silences, self.latch
         status = await self.identify(timeout=REPLY_TIMEOUT)
@@ -290,21 +295,22 @@ class Amplifier(Dialogue):
     def stop(
         self, ramp: float = STOP_RAMP, *, timeout: float = CONFIRM_TIMEOUT
     ) -> "asyncio.Future[StopOutcome]":
-        """Stop along a ramp [s], latched; its request is queued when this returns.
+        """Stop along a ramp [s] and latch; the request is queued when this returns.
 
-        The future ends once silence is confirmed, or a time [s] after the request has gone out.
-        Until then all stops are one, which goes on if the caller is cancelled.
+        The future ends once silence is confirmed, or when a timeout [s] has passed after the
+        request went out. Calls before that join the same stop, which goes on if a caller is
+        cancelled.
         """
         stop = self._stop
         if stop is None or stop.is_sent or stop.result.done():
             members, wire_ramp = len(self.line.members), self.wire_ramp(ramp)
-            # On a line that others share each has three exchanges: a stop and two statuses.
+            # On a shared line each amplifier has three exchanges: a stop and two statuses.
             timeout += ATTEMPTS * members * self.exchange_time("GetStatus")
             timeout += _RAMP.from_wire(wire_ramp)
-            ends = threads.now() + timeout * (members + 1)  # on a line that others keep busy
+            ends = threads.now() + timeout * (members + 1)  # others may keep the line busy
             self._stop = stop = _Stop(wire_ramp, timeout, ends)
             stop.result = asyncio.ensure_future(self._confirm_stop(stop))
-            with contextlib.suppress(Exception):  # then it is requested in `_confirm_stop`
+            with contextlib.suppress(Exception):  # then `_confirm_stop` makes the request
                 stop.requested = self._request_stop(stop)
         return asyncio.shield(stop.result)
 
@@ -313,10 +319,10 @@ class Amplifier(Dialogue):
         return self.line.submit(self, Priority.STOP, "Stop", stop.sent)
 
     async def _confirm_stop(self, stop: _Stop) -> StopOutcome:
-        """Repeat a stop until its silence is confirmed, or its time is over.
+        """Repeat a stop until its silence is confirmed, or its timeout has passed.
 
-        By a status in a latched state whose latch is newer than every one seen before, with the
-        levels of all channels at zero: another one may be old, kept on its way.
+        A status confirms it if its state is latched, its latch is newer than each one seen before,
+        and the levels of all channels are zero. Any other status may be old and only late.
         """
         cause, pause = "", _RAMP.from_wire(stop.ramp) + _INTERVAL
         try:
@@ -331,7 +337,7 @@ class Amplifier(Dialogue):
                                 return self.known
                             await asyncio.sleep(_INTERVAL)
                             status = await self.read_status(Priority.STOP)
-                    except Exception as error:  # whatever it is, the stop goes on
+                    except Exception as error:  # the stop goes on, whatever has failed
                         cause = str(error) or type(error).__name__
                     await asyncio.sleep(pause)
         except TimeoutError:
@@ -346,16 +352,16 @@ class Amplifier(Dialogue):
         *,
         timeout: float = REPLY_TIMEOUT,
     ) -> Values:
-        """Send a request that needs nothing of the ledger; returns the values of its reply."""
+        """Send a request that the ledger need not admit; returns the values of its reply."""
         return await self.line.submit(self, priority, name, values, timeout=timeout)
 
     @property
     def statistics(self) -> LinkStatistics:
-        """Counts of its requests, and of all frames on its line."""
+        """Counts of the requests to this amplifier, and of all frames on its line."""
         return replace(self.counts, **vars(self.line.wire.counters))
 
     async def _listen_for_another_host(self, status: Values) -> None:
-        """Wait for a watchdog that rises unasked; raises LinkError."""
+        """Raise LinkError if its watchdog is fed by somebody else while this listens."""
         end = threads.now() + LISTENING
         left = status["watchdog_left"]
         while threads.now() < end and status["state"] == ENABLED:
@@ -368,16 +374,16 @@ class Amplifier(Dialogue):
 
 
 def _is_stopping(status: Values, before: int | None) -> bool:
-    """Whether a status shows that a stop was carried out since a latch was the newest."""
+    """Whether a status shows a stop that was carried out after this latch was the newest."""
     if before is None or status["state"] not in LATCHED:
         return False
     return status["latch"] > 0 and is_newer_token(status["latch"], before)
 
 
 def check_identity(identity: Values, name: str, serial_number: str | None) -> None:
-    """Raise LinkError unless an amplifier of a name speaks this version and is the expected one.
+    """Raise LinkError unless an amplifier speaks this version and has the expected serial number.
 
-    serial_number: the expected one, None for any.
+    name: of the amplifier, for the message. serial_number: None for any.
     """
     if not identity["versions"] >> VERSION & 1:  # bit n: version n
         spoken = map(str, bits_of(identity["versions"]))
@@ -394,10 +400,9 @@ def check_identity(identity: Values, name: str, serial_number: str | None) -> No
 
 
 def check_capabilities(can: Values, name: str, *, is_output: bool | None) -> None:
-    """Raise LinkError for capabilities that no amplifier can have, or other than the rig's.
+    """Raise LinkError for capabilities that no amplifier can have, or that contradict the rig.
 
-    is_output: what the rig says of full level: the output of a linear amplifier, else a motion;
-    None where there is no rig.
+    is_output: as of `Amplifier`; None also where there is no rig.
     """
     for each, low, stated, high in capability_ranges(can):
         if not low <= stated <= high:
@@ -410,8 +415,8 @@ def check_capabilities(can: Values, name: str, *, is_output: bool | None) -> Non
         )
 
 
-_MARGIN = 0.002  # s; of the amplifier's clock
-_MAX_OVERDUE = 2.0  # s; after the end of the window: an emulator stands still meanwhile
+_MARGIN = 0.002  # s; by which the amplifier's clock may be late at the end of a window
+_MAX_OVERDUE = 2.0  # s; after the end of the window; an emulator may stand still for a while
 _ROUNDING = 1e-6  # periods
 _Q = QUANTITIES
 _VIOLATION = "the amplifier does not keep the protocol"
@@ -419,46 +424,52 @@ _VIOLATION = "the amplifier does not keep the protocol"
 
 @dataclass(frozen=True, slots=True)
 class AmplifierSensor:
-    """A sensor: its unit (a name of SENSOR_UNITS), and its range in it; frequency_max [Hz].
-
-    channel: whose actuator it sits at, or None; x, y [m]: None where unknown.
-    """
+    """A sensor of an amplifier, as it describes it."""
 
     unit: str
+    """A name of `SENSOR_UNITS`."""
     channel: int | None
+    """The channel whose actuator it sits at; None if it sits at none."""
     x: float | None
+    """Place on the plate [m]; None if the amplifier does not know it."""
     y: float | None
+    """As x."""
     range: float
+    """Largest amplitude that it measures, in its unit."""
     frequency_max: float
+    """Highest frequency that it measures [Hz]."""
 
 
 @dataclass(frozen=True, slots=True)
 class SensorReading:
-    """What a sensor measured: amplitude in its unit and phase [degrees] of each tone."""
+    """What a sensor measured."""
 
     is_overloaded: bool
     tones: tuple[tuple[float, float], ...]
+    """Amplitude in the sensor's unit and phase [degrees] of each tone."""
 
 
 @dataclass(frozen=True, slots=True)
 class Reading:
-    """A reading: its number, its state (a name of READING_STATES), and what is left of it [s].
-
-    start: the amplifier's clock at the start of its window, on which phases count. token: of what
-    played then. sensors: empty until it is complete.
-    """
+    """A measurement of tones at all sensors of an amplifier over a window."""
 
     number: int
     state: str
+    """A name of `READING_STATES`."""
     left: float
+    """Time until its window ends [s]."""
     start: int
+    """The amplifier's clock at the start of the window, from which phases count."""
     token: int
+    """Token of the set that played then."""
     tones: int
+    """Number of tones."""
     sensors: tuple[SensorReading, ...]
+    """Empty until the reading is complete."""
 
 
 async def read_sensors(amplifier: Amplifier) -> tuple[AmplifierSensor, ...]:
-    """Read what its sensors measure, and where; empty if it has none."""
+    """Read the descriptions of an amplifier's sensors; empty if it has none."""
     if not has_feature(amplifier.ledger.capabilities, "sensors"):
         return ()
     found: list[AmplifierSensor] = []
@@ -487,10 +498,10 @@ async def read_measured(amplifier: Amplifier) -> list[tuple[float, float]]:
 async def start_reading(
     amplifier: Amplifier, frequencies: Sequence[float], window: float
 ) -> Reading:
-    """Begin to measure tones [Hz] at all sensors, over a window [s] from now on.
+    """Begin to measure tones [Hz] at all sensors over a window [s] that starts now.
 
-    Raises CommandError for tones that the window does not tell apart, CommandRefused for those
-    beyond the sensors.
+    Raises CommandError for tones that the window cannot tell apart, and CommandRefused for tones
+    that the sensors cannot measure.
     """
     check_tones(frequencies, window)
     number = random.randint(_Q["reading"].minimum, _Q["reading"].maximum)  # noqa: S311  no secret
@@ -507,10 +518,11 @@ async def start_reading(
 async def measure_tones(
     amplifier: Amplifier, frequencies: Sequence[float], window: float
 ) -> Reading:
-    """Measure tones [Hz] at all sensors over a window [s] from now on, and wait for its end.
+    """Measure tones [Hz] at all sensors over a window [s] that starts now, and wait for its end.
 
-    Tones are in the order of the frequencies. The caller feeds the watchdog meanwhile, and has
-    waited until the plate has settled. Raises what `start_reading` and `finish_reading` raise.
+    The tones of the result are in the order of the frequencies. The caller must wait until the
+    plate has settled before, and feed the watchdog during the reading. Raises what `start_reading`
+    and `finish_reading` raise.
     """
     return await finish_reading(amplifier, await start_reading(amplifier, frequencies, window))
 
@@ -518,8 +530,8 @@ async def measure_tones(
 async def finish_reading(amplifier: Amplifier, started: Reading) -> Reading:
     """Wait for the end of a reading, and return it with all its sensors.
 
-    Raises CommandRefused if another host has started one meanwhile, and FrameError if it does not
-    end in time or lacks sensors.
+    Raises CommandRefused if another host has started a reading meanwhile, and FrameError if this
+    one does not end in time or lacks sensors.
     """
     found = started
     end = threads.now() + started.left + _MAX_OVERDUE
@@ -543,7 +555,7 @@ async def finish_reading(amplifier: Amplifier, started: Reading) -> Reading:
 
 
 def check_tones(frequencies: Sequence[float], window: float) -> None:
-    """Raise CommandError for tones [Hz] that a window [s] does not tell apart."""
+    """Raise CommandError for tones [Hz] that a window [s] cannot tell apart."""
     limit = _Q["tone_count"].maximum
     if not 1 <= len(frequencies) <= limit:
         raise CommandError(f"a reading must have 1 to {limit} tones, got {len(frequencies)}")
@@ -556,7 +568,7 @@ def check_tones(frequencies: Sequence[float], window: float) -> None:
 
 
 async def _same_reading(amplifier: Amplifier, started: Reading, first: int) -> Reading:
-    """Read the reading that was started, its sensors from one on."""
+    """Read a reading that was started, with its sensors from this index on."""
     found = await amplifier.request("GetReading", {"first": first}, Priority.READING)
     return _reading(found, number=started.number, tones=started.tones)
 
@@ -578,9 +590,9 @@ def _place(at: int) -> float | None:
 
 
 def _reading(values: Values, *, number: int, tones: int) -> Reading:
-    """Read a reading of a number of tones, with its sensors.
+    """Return the reading that a reply describes.
 
-    Raises CommandRefused for a reading of another number, FrameError for other tones.
+    Raises CommandRefused if its number is another one, FrameError for another count of tones.
     """
     if values["reading"] != number:
         raise CommandRefused(

@@ -1,14 +1,14 @@
-"""Limits of one amplifier, and how close a set may come to them at the worst.
+"""Limits of one amplifier, and how close a set comes to them in the worst case.
 
-`wire_limits` combines the limits of rig, amplifier, channels and ceilings to the least of each.
-`Rounding` turns layers into integers of the wire: levels, frequencies and phases to the nearest
-step, ramps upward, and `valid_for` never to 0, which means without end. It refuses what the wire
-cannot have or the limits forbid. `Budget` keeps rate, on-time and duty.
+`wire_limits` combines the limits of the rig, the amplifier, its channels and this module to the
+least of each. `Rounding` turns layers into integers of the wire: levels, frequencies and phases to
+the nearest step, ramps upward, and `valid_for` never to 0, which would mean without end. It refuses
+what the wire cannot carry or the limits forbid. `Budget` keeps rate, on-time and duty.
 
-`Bounds` gives the largest level, power and rise over all layers. A set plays from an unknown moment
-in the next tenth of a second: the voices are those of `drivers.playing` after a commit that is that
-uncertain. Along a straight line in the complex plane a magnitude is a convex function, so sums are
-largest where each transition is at one of its points.
+`Bounds` gives the largest level, power and rise over all layers. A set starts at an unknown moment
+within the next tenth of a second, so the voices are those of `drivers.playing` after a commit that
+is so uncertain. The magnitude of an amplitude that moves along a straight line in the complex plane
+is a convex function; therefore sums are largest where each transition is at one of its points.
 """
 
 import math
@@ -44,22 +44,23 @@ _NONE: Sequence[LayerSet] = ()
 
 
 class _Course(NamedTuple):
-    """A voice, and the amplitudes from which it may set out.
-
-    sets: of its layer, unless it has ended; is_new: it is led by one, is_late: that waits, goes_on:
-    as one voice with what the layer plays of its frequency.
-    """
+    """A voice and how it may change."""
 
     voice: Voice
     starts: Sequence[complex]
+    """Amplitudes from which it may set out."""
     sets: Sequence[LayerSet] = ()
+    """Sets of its layer; empty once the voice has ended."""
     is_new: bool = True
+    """Whether one of these sets changes it."""
     is_late: bool = False
+    """Whether that set waits for another one to end."""
     goes_on: bool = False
+    """Whether it continues the voice of its frequency that the layer plays."""
 
 
 class Bounds:
-    """What channels may play once layers are committed between two times [s]."""
+    """What channels may play if layers are committed at any moment between two times [s]."""
 
     def __init__(
         self, playback: Playback, layers: Sequence[LayerSet], since: float, until: float
@@ -94,19 +95,19 @@ class Bounds:
             courses += [self._course(old, each) for old, each in zip_longest(olds, voices)]
 
     def _late(self, voice: Voice, olds: Sequence[Voice]) -> _Course:
-        """Return a voice that waits, from wherever one of the old that it continues is then."""
+        """Return the course of a voice that waits: it may start anywhere on an old one's way."""
         name = voice.layer, voice.frequency
         continued = [old.transition for old in olds if (old.layer, old.frequency) == name]
         points = [(0j,), *(way.points(self._since) for way in continued)]
         return _Course(voice, [*chain(*points)], is_late=True)
 
     def _course(self, old: Voice | None, voice: Voice) -> _Course:
-        """Return a voice once all sets play; old: as which it has played, None for a new one."""
+        """Return the course of a voice after all sets; old: that before, None for a new one."""
         starts, sets, is_new = _SILENCE, self._of_layer.get(voice.layer, _NONE), True
         if old is not None:
             starts = old.transition.points(self._since)
             is_new = old.transition is not voice.transition
-            # One that falls silent by itself goes on if it is silent before a fade would end.
+            # A voice that is falling silent goes on so if that ends before a fade would.
             latest = voice.transition.end + self._half + SAME
             is_fading = is_new and voice.has_ended and not voice.transition.knots
             if is_fading and not old.transition.last and old.transition.end <= latest:
@@ -115,10 +116,10 @@ class Bounds:
         return _Course(voice, starts, sets, is_new)
 
     def worst(self) -> tuple[list[float], float]:
-        """Return the largest level of each channel and the largest sum of their squares.
+        """Return the largest level of each channel, and the largest sum of their squares.
 
-        Between two points all magnitudes are convex functions of the way, and so are their sums
-        where all go the same way; else each may be at either end.
+        Between two points each magnitude is a convex function of the way. So is their sum while all
+        follow the same way; otherwise each may be at either of its ends.
         """
         steady, ways = [0.0] * len(self._courses), []
         going_on = dict[tuple[int, int, float], float]()
@@ -148,13 +149,13 @@ class Bounds:
         return [*map(max, levels)], power
 
     def rise(self, channel: int) -> float:
-        """Return the steepest rise of a level [full levels/s]; of one frequency also by beats."""
+        """Return the steepest rise of a level [full levels/s]; voices of one frequency may beat."""
         rises: dict[float, list[tuple[float, float]]] = {}  # by frequency: rise, change
         for course in self._courses[channel]:
             of_voice = rises.setdefault(course.voice.frequency, [])
             of_voice.append(self._steepest(course))
             for one in course.sets:
-                if one.after or not course.is_new:  # it may fade along that ramp, at another time
+                if one.after or not course.is_new:  # it may fade along the ramp of that set later
                     of_voice.append(
                         _steepest_of(course.starts, along(None, 0.0, one.ramp / _PER_RAMP, 0j, 0j))
                     )
@@ -165,13 +166,13 @@ class Bounds:
         return steepest_rise
 
     def _steepest(self, course: _Course) -> tuple[float, float]:
-        """Return the steepest rise and the fastest change of a voice, and of its ending."""
+        """Return the steepest rise and the fastest change of a voice, including its ending."""
         voice, starts, way = course.voice, course.starts, course.voice.transition
         if course.is_new:
             ways = [_steepest_of(starts, way)]
             starts = (*starts, *way.knots, way.last)
         else:
-            # Also where it does not change: another voice of its frequency may cease to cancel it.
+            # A steady voice counts too: another voice of its frequency may cease to cancel it.
             change = way.slope(self._since) if way.end > self._since else 0.0
             ways = [(change if way.last or way.knots else 0.0, change)]
         if not voice.has_ended:
@@ -185,7 +186,7 @@ class Bounds:
 
 
 def _magnitudes(course: _Course) -> VoiceTransition:
-    """Return the way of a voice in magnitudes; its ending follows, or may begin amid it."""
+    """Return the way of a voice in magnitudes; its ending may begin before the way is over."""
     voice, way = course.voice, course.voice.transition
     ending = 0.0 if voice.has_ended else peak_of(voice.ending)
     first, *knots, last = map(abs, (way.first, *way.knots, way.last))
@@ -197,7 +198,7 @@ def _magnitudes(course: _Course) -> VoiceTransition:
 
 
 def _of_several_ways(ways: Sequence[VoiceTransition], times: Sequence[float]) -> list[int]:
-    """Return the intervals between times in which not all go the same way, by index."""
+    """Return the indices of the intervals between times in which not all follow the same way."""
     kinds = {(way.end, None if way.knots else way.step) for way in ways}
     if len(kinds) < 2:
         return []
@@ -206,30 +207,33 @@ def _of_several_ways(ways: Sequence[VoiceTransition], times: Sequence[float]) ->
 
 
 def _steepest_of(starts: Sequence[complex], way: VoiceTransition) -> tuple[float, float]:
-    """Return the steepest rise and the fastest change along a way from any of some amplitudes."""
+    """Return the steepest rise and the fastest change along a way from any of these amplitudes."""
     course = (*way.knots, way.last)
     ways = (*product(starts, course[:1]), *pairwise(course))
     return steepest(ways, way.step, is_cosine=not way.knots)
 
 
 FREQUENCY_FLOOR = 10.0
-"""Below it a plate on springs only moves as a rigid body, and nothing is felt [Hz]."""
+"""Lowest frequency [Hz]; below it a plate on springs moves as a rigid body, and nothing is felt."""
 RATE_CEILING = 2000.0
-"""No wire carries more sets a second, so a higher rate can only be a runaway loop."""
+"""Sets a second; no wire carries more, so a higher rate can only be a runaway loop."""
 DUTY_WINDOW = 10.0
-"""Window of the duty limit [s]; short against the thermal time constant of an amplifier."""
+"""Window of the duty limit [s]; it is short against an amplifier's thermal time constant."""
 COMMIT_DELAY = 0.1
-"""Longest time [s] from sending a set until it is played: three attempts of 30 ms each."""
+"""Longest time from sending a set until it plays [s]: three attempts of 30 ms each."""
 _RATE_WINDOW = 1.0  # s
-_SLACK = 1e-6  # of a step; sums of floats
+_SLACK = 1e-6  # of a step, for sums of floats
 
 Vibration: TypeAlias = tuple[float | None, float]
-"""Earliest start [s] of a vibration, None without one, and its latest end [s]."""
+"""Earliest start [s] of a vibration, or None if there is none, and its latest end [s]."""
 
 
 @dataclass(frozen=True, slots=True)
 class WireLimits:
-    """What a set may contain: frequencies and levels of the wire; slew, power as in GuardLimits."""
+    """What a set may contain: frequencies and levels in integers of the wire, slew, and power.
+
+    slew and power are those of `GuardLimits`.
+    """
 
     frequency_min: int
     frequency_max: int
@@ -239,10 +243,10 @@ class WireLimits:
 
 
 def wire_limits(configured: GuardLimits, capabilities: Values) -> WireLimits:
-    """Combine configured limits with an amplifier's and its channels'.
+    """Combine configured limits with those of an amplifier and its channels.
 
-    Where channels differ the least of all holds for each, since a pattern needs all. Raises
-    CommandError for limits that are no numbers, or leave nothing to play.
+    If the channels differ, the least limit holds for all of them, since a pattern needs all. Raises
+    CommandError for limits that are no numbers, or that leave nothing to play.
     """
     for name in ("frequency_min", "frequency_max", "level"):
         if not math.isfinite(value := getattr(configured, name)):
@@ -294,7 +298,7 @@ _NO_KNOTS = ((0, 0),)
 
 
 class Rounding:
-    """Rounds layers for one amplifier. limits: in force; capabilities: values of its record."""
+    """Rounds layers for one amplifier; capabilities: values of its record."""
 
     def __init__(self, limits: WireLimits, capabilities: Values) -> None:
         self._limits, self._can = limits, capabilities
@@ -302,7 +306,7 @@ class Rounding:
         self._layers: int = capabilities["layers"]
         self._ramp_max = _RAMP.from_wire(capabilities["ramp_max"])
         self.achieved: dict[tuple[int, int], int] = {}
-        """Frequencies that the amplifier plays in place of others, by channel and frequency."""
+        """Frequency that the amplifier plays in place of another one, by channel and frequency."""
 
     def layers(self, layers: Sequence[AmplifierLayer]) -> tuple[LayerSet, ...]:
         """Return layers in integers of the wire; raises CommandRefused with channel and reason."""
@@ -339,7 +343,7 @@ class Rounding:
         return tuple(rounded)
 
     def _commands(self, tones: Sequence[AmplifierTone]) -> dict[int, Command]:
-        """Return the commands of tones by channel; few calls, since every set has some."""
+        """Return the commands of tones by channel; it runs with each set, so it makes few calls."""
         limits, commands, shaped = self._limits, dict[int, Command](), list[AmplifierTone]()
         for tone in tones:
             channel, level, onset = index(tone.channel), tone.level, tone.onset
@@ -404,7 +408,7 @@ class Rounding:
                     )
                 try:
                     levels, phases = zip(*(shape.knots or _NO_KNOTS), strict=True)
-                    array("q", (*levels, *phases))  # which has no numbers with a fraction
+                    array("q", (*levels, *phases))  # raises for numbers that are no integers
                 except (TypeError, ValueError) as error:
                     raise refused(
                         tone.channel, f"knots of an envelope must be pairs of integers: {error}"
@@ -418,12 +422,12 @@ class Rounding:
 
 
 def refused(channel: int, text: str) -> CommandRefused:
-    """Return the error of a channel that must not play something: why, as `X must be Y`."""
+    """Return the error of a channel that must not play something; text: why, as `X must be Y`."""
     return CommandRefused(f"channel {channel}: {text}", channel=channel)
 
 
 class Budget:
-    """Sets sent and the longest time they may vibrate; times [s] are arguments."""
+    """Counts the sets that were sent, and how long they may have vibrated; times are in s."""
 
     def __init__(self, limits: GuardLimits) -> None:
         self._limits, self._rate = limits, min(limits.rate, RATE_CEILING)
@@ -438,10 +442,10 @@ class Budget:
         self._end = 0.0  # its latest end
 
     def remaining(self, now: float, *, fade: float, delay: float) -> float:
-        """Longest valid_for [s] of a vibration that is sent now, infinite if unlimited.
+        """Return the longest valid_for [s] of a vibration that is sent now; infinite if unlimited.
 
-        fade [s]: how long it takes to end after that; delay [s]: allowance until it is played,
-        while the current vibration goes on. Raises CommandRefused if no time is left or the rate is
+        fade: how long it takes to end after that [s]. delay: longest time until it plays [s], while
+        the current vibration goes on. Raises CommandRefused if no time is left or the rate is
         exceeded.
         """
         if len(self._sent) == self._sent.maxlen and now < self._sent[0] + self._window:
@@ -461,14 +465,14 @@ class Budget:
         )
 
     def fade_left(self, now: float) -> float:
-        """Longest time [s] in which the current vibration may fade if silence is sent now."""
+        """Return how long the current vibration may fade [s] if silence is sent now."""
         if self._start is None or now >= self._end:
             return math.inf
         used = max(self._used(now) - self._duty_time, now - self._start - self._limits.on_time)
         return max(0.0, -used - COMMIT_DELAY)
 
     def sent(self, now: float, *, lasts: float) -> Vibration | None:
-        """Note a set that vibrates for at most a time [s], fade included; what vibrated before."""
+        """Note a set that vibrates for `lasts` [s] at most; returns the vibration before it."""
         self._sent.append(now)
         if self.is_unlimited:
             return None
@@ -480,12 +484,12 @@ class Budget:
         return before
 
     def restore(self, before: Vibration | None) -> None:
-        """Note that the set sent last was refused; before: as `sent` returned."""
+        """Note that the set that was sent last was refused; before: what `sent` returned."""
         if before is not None:
             self._start, self._end = before
 
     def confirm(self, sent_at: float, now: float, *, end: float) -> None:
-        """Note that the set sent at a time [s] plays, and ends at another at the latest."""
+        """Note that the set sent at a time [s] plays, and when it ends at the latest [s]."""
         self._close(now)
         if self._start is None and now < end:
             self._start = sent_at
@@ -500,7 +504,7 @@ class Budget:
             self._vibrations.popleft()
 
     def _used(self, now: float) -> float:
-        """Vibration time within the window before now [s]."""
+        """Return the time of vibration within the window that ends now [s]."""
         opened = now - DUTY_WINDOW
         current = () if self._start is None else ((self._start, min(now, self._end)),)
         spans = [end - max(start, opened) for start, end in (*self._vibrations, *current)]
@@ -508,7 +512,7 @@ class Budget:
 
 
 def _left(name: str, used: float, limit: float, spent: float) -> float:
-    """Return the time [s] of a limit that is not spent; CommandRefused if none."""
+    """Return how much time is left of a limit [s]; raises CommandRefused if none is."""
     left = limit - used - spent
     if left <= 0:
         raise CommandRefused(

@@ -1,20 +1,24 @@
 """The clock of one amplifier: how the host reads and steers it, and what its statuses report.
 
-A Status reads the clock between the last bit of its request and the first of its reply. USB frames,
-other traffic and operating systems add to the time of the bits and never take from it, so a reading
-less the soonest arrival of its request is at least the lead of the clock, and the lowest readings
-are nearly right. The way back, with its latency timers, does not count. Of each part of the time
-that was read, at most a quarter of a second, the lowest reading is kept, and a line is fitted by
-least squares to the lower half of these: the lowest alone are best where frames add to the time,
-their mean where the operating system does. Readings above the line show how late they may be. Shift
-and rate of the host are taken off before, so that steering does not feed back into the measurement.
+Reading. An amplifier reads its clock for a Status between the last bit of the request and the first
+bit of the reply. The *lead* of a reading is what the clock shows less the time at which the request
+arrives at the soonest. USB frames, other traffic and operating systems delay a request and never
+speed it up, so a reading shows at least the true lead, and the lowest readings are nearly right.
+The way back, with its latency timers, plays no part. The time that counts is divided into parts of
+at most a quarter of a second, the lowest reading of each part is kept, and a line is fitted by
+least squares to the lower half of these. (The lowest readings alone are best where frames delay
+requests; their mean is best where the operating system does.) Readings above the line show how late
+they may be. The shift and rate that the host has sent are subtracted before, so that steering does
+not feed back into the measurement.
 
-The shift goes with Arm, to the nearest step of 305 us. The rate goes with each Ping: it cancels the
-crystal's and leads the rest to zero, fast while nothing plays, else too slowly to be felt. A clock
-that cannot be steered or trusted has an infinite error, and stops nothing.
+Steering. The shift is sent with Arm, to the nearest step of 305 us. The rate is sent with each
+Ping: it cancels the rate of the crystal and leads the remaining lead to zero, fast while nothing
+plays, and otherwise too slowly to be felt. A clock that cannot be steered or trusted has an
+infinite error, and stops nothing.
 
-A Mark lets all clocks of a line keep the same byte, whatever delays it, so their differences are
-known as exactly as they state them. One clock is held to the host's, the others to that one.
+Comparing. At a Mark all amplifiers of a line note their clocks at the same byte, whatever delays
+it, so the differences between the clocks are known as exactly as the amplifiers state them. One
+clock of the line is held to the host's, and the others are held to that one.
 """
 
 import math
@@ -38,17 +42,17 @@ from drivers.protocol.definition import (
 )
 from drivers.protocol.records import Values
 
-_HOT = 70.0  # °C, above which it is said; one that must not go on reports a fault
+_HOT = 70.0  # °C; a hotter amplifier is reported, and stops itself with a fault if it must
 REPORT_LIFE = 10.0
-"""For how long [s] a report is shown after the last status that had it."""
+"""How long a report is shown after the last status that had it [s]."""
 _PER_DEGREE = QUANTITIES["temperature"].per_unit
 _LIMITED, _OPEN = 1 << STATUS_FLAGS["limited"], 1 << STATUS_FLAGS["interlock_open"]
 _HIGH_VOLTAGE = 1 << STATUS_FLAGS["high_voltage"]
 
 CLOCK_SETTLING = 3.0
-"""Seconds within which a clock must follow, and for which one that has jumped is not trusted."""
+"""Time within which a clock must follow [s]; one that has jumped is not trusted for as long."""
 MAX_CLOCK_RATE = 2e-4
-"""Of a crystal against the host's; one that is faster or slower is broken."""
+"""Largest rate of a crystal against the host's; a faster or slower one is broken."""
 
 ClockProblem = Literal["clock_not_steered", "clock_jumped", "clock_rate", "clock_unsettled"]
 ReportKind = Literal["limited", "interlock_open", "hot", ClockProblem]
@@ -80,13 +84,13 @@ REPORTS: dict[ReportKind, tuple[str, str]] = {
         "check that it obeys shift and rate: era amp conformance; less is promised meanwhile",
     ),
 }
-"""Cause and remedy of what a status shows that is no fault, by kind."""
+"""Cause and remedy of each kind of report: what a status shows that is no fault."""
 
 
 def reports_of(status: Values, of_clock: ClockProblem | None = None) -> Sequence[ReportKind]:
-    """Return the kinds of reports of a status; few calls, since every heartbeat has one.
+    """Return the kinds of reports of a status; of_clock: the problem of its clock.
 
-    of_clock: what is known of its clock by now.
+    It makes few calls, since it runs with every heartbeat.
     """
     kinds: list[ReportKind] = [] if of_clock is None else [of_clock]
     if status["flags"] & _LIMITED:
@@ -99,9 +103,10 @@ def reports_of(status: Values, of_clock: ClockProblem | None = None) -> Sequence
 
 
 def armed_problem(status: Values, latch: int | None) -> str | None:
-    """Describe what no armed amplifier may report; None if nothing.
+    """Say what a status shows that no armed amplifier may report; None if nothing.
 
-    latch: that of the reply to Arm, None before: a stop or fault since would have disarmed it.
+    latch: the one in the reply to Arm, or None before that; a newer stop or fault would have
+    disarmed the amplifier.
     """
     if not status["flags"] & _HIGH_VOLTAGE:
         return "high voltage must be on, got off"
@@ -160,67 +165,80 @@ _PER_RATE, _PER_ERROR = QUANTITIES["rate"].per_unit, QUANTITIES["clock_error"].p
 
 
 class _Line(NamedTuple):
-    """Lead [s] at a time [s] and rate of a clock that is not steered; their standard errors."""
+    """The lead of a clock as a function of time, without what steering has added."""
 
     time: float
+    """The moment to which the other values refer [s]."""
     lead: float = 0.0
+    """Lead at that moment [s]."""
     rate: float = 0.0
+    """Change of the lead [s/s]."""
     bend: float = 0.0
+    """Half of the change of the rate [1/s]."""
     error: float = math.inf
+    """Standard error of the lead [s]."""
     rate_error: float = _EXPECTED_RATE
+    """Standard error of the rate."""
 
     def at(self, time: float) -> "_Line":
-        """Return it at another time [s]."""
+        """Return the line with its values at another time [s]."""
         later = time - self.time
         error = self.error + self.rate_error * max(0.0, later)
         return _Line(time, self.lead + self.rate * later, self.rate, 0.0, error, self.rate_error)
 
 
 class HeldClock:
-    """The clock of an amplifier, by its messages; times [s] are of the host's clock."""
+    """The clock of an amplifier, as its messages show it; times [s] are of the host's clock."""
 
     def __init__(self) -> None:
-        self._has_bits = True  # no network, and no USB: they take their time
+        # Whether messages take the time of their bits; False once a reply came sooner than that,
+        # as over a network or USB.
+        self._has_bits = True
         self.identified(CLOCK_UNKNOWN, bits=0.0)
-        self._promptest = math.inf  # exchange, less its bits [s]
+        self._promptest = math.inf  # s; the shortest exchange, less its bits
         self.is_alone = True
-        """Whether it is held together with no other one: then nothing is read of it."""
-        self._other: HeldClock | None = None  # to which it is held, see `compare`
+        """Whether there is no other clock to hold it together with; then it is hardly read."""
+        self._other: HeldClock | None = None  # the clock that it is held to, see `compare`
         self._is_first = False  # whether others are held to it
-        self._pace = 0.0  # seconds a second, by the rate of a Ping
-        self._requested = 0.0, 0.0  # when what a Status shows was sent, and arrives at the soonest
-        self._shown = 0, -math.inf, 0.0  # a clock of one alone, and between which times
-        self._marks = 0  # since a Status, which may show any of them
-        self._pinged: tuple[float, float] | None = None  # when Pings without reply arrive
-        self._arming = 0  # the shift of an Arm without a reply
+        self._pace = 0.0  # s/s; by the rate of the last Ping
+        # When the request for a Status was sent, and when it arrives at the soonest [s].
+        self._requested = 0.0, 0.0
+        # What a clock that is alone has shown last, and the times [s] between which it did.
+        self._shown = 0, -math.inf, 0.0
+        self._marks = 0  # sent since the last Status; the next one may show any of them
+        # When the first and the last Ping without reply arrive [s]; None without one.
+        self._pinged: tuple[float, float] | None = None
+        self._arming = 0  # the shift of an Arm that has no reply yet
         self._is_armed = False
         self._jumped_at = -math.inf
-        self._near_at = 0.0  # when it was led to zero last
+        self._near_at = 0.0  # s; when its lead was last near zero
         self._forget(0.0)
 
     def _forget(self, time: float) -> None:
-        """Begin anew at a time, as with a clock that was never read."""
-        self._lowest: list[tuple[float, float, float]] = []  # time, lead, and how late at the most
+        """Drop all readings, as if the clock had never been read before this time."""
+        # Time, lead, and how late the reading may be at most; all in s.
+        self._lowest: list[tuple[float, float, float]] = []
         self._all = deque[tuple[float, float]](maxlen=_BULK)  # times and leads
         self._line = _Line(time)
-        self._marked: dict[float, float] = {}  # leads, by when a Mark arrived
-        self._beside = _Line(-math.inf)  # to the other's, from the newest Mark of both
-        self._added = -self._pace * time  # s; with pace * time what shifts and rates have added
-        self._is_doubted = False  # whether the last reading was too early, as none before
+        self._marked: dict[float, float] = {}  # lead at each Mark, by the time of its arrival
+        self._beside = _Line(-math.inf)  # lead against the other, at their newest Mark
+        # Shifts and rates have added `_added + _pace * time` [s] to the clock.
+        self._added = -self._pace * time
+        self._is_doubted = False  # whether only the last reading was impossibly early
 
     def identified(self, stated: int, *, bits: float) -> None:
-        """Note its `clock_error` as of the wire, and how long the bits of its Status take [s]."""
+        """Note its `clock_error` in units of the wire; bits: how long a Status takes [s]."""
         self.stated, self.can_be_steered = stated, stated != CLOCK_UNKNOWN
         self._bits = bits if self._has_bits else 0.0
 
     @property
     def shortest(self) -> float:
-        """Its promptest exchange beside the bits [s]: within it lies what no exchange shows."""
+        """Its shortest exchange less the bits [s]; how its two ways share it is unknown."""
         return max(self._promptest, 0.0)
 
     @property
     def is_compared(self) -> bool:
-        """Whether it is known by Marks how it differs from the clock to which it is held."""
+        """Whether Marks have shown how it differs from the clock to which it is held."""
         return self._first is not None
 
     @property
@@ -230,17 +248,16 @@ class HeldClock:
         return other if other is not None and self._beside.time in other._marked else None
 
     def compare(self, other: "HeldClock | None") -> None:
-        """Hold it to another clock of its line, by Marks that both have shown.
+        """Hold it to another clock of its line, by Marks that both have shown; None: to the host's.
 
-        None: to the host's. What delays a Mark is the same for all, so that nothing of it is in
-        their difference.
+        A delay of a Mark is the same for both clocks, so it does not affect their difference.
         """
         if other is not self._other:
             self._other, self._beside = other, _Line(-math.inf)
         self._is_first = other is None
 
     def _seen(self, time: float) -> _Line:
-        """Return its line at a time [s]."""
+        """Return its line at a time [s], by way of the other clock if it is held to that one."""
         if (first := self._first) is None:
             return self._line.at(time)
         line, beside = first._line.at(time), self._beside.at(time)
@@ -248,19 +265,20 @@ class HeldClock:
         return _Line(time, line.lead + beside.lead, line.rate + beside.rate, 0.0, error, rate_error)
 
     def lead(self, time: float) -> float:
-        """Return by how much it is ahead of the host's clock at a time [s], 0 before it is read."""
+        """Return how far it is ahead of the host's clock at a time [s]; 0 before it is read."""
         unsteered = self._seen(time).lead
         return math.remainder(unsteered + self._added + self._pace * time, CLOCK_TURN)
 
     def scatter(self, time: float) -> float:
-        """Return the standard error of its lead as it is read [s]; infinite if it must be."""
+        """Return the standard error of its measured lead [s]; infinite if it must be read again."""
         return math.inf if self._is_doubted else self._seen(time).error
 
     def error(self, time: float, *, off: float | None = None, is_common: bool = False) -> float:
-        """Return its error [s rms] with what it states; infinite if unknown.
+        """Return its error [s rms], which includes what the amplifier states; infinite if unknown.
 
-        off: by how much it is ahead of others [s], None: of the host's; counts while armed, as it
-        is led to zero. is_common: against others of its line that are held to the same clock.
+        off: how far it is ahead of the others [s]; None: of the host's clock. This counts only
+        while it is armed, since it is led to zero. is_common: whether the error is wanted against
+        others of its line that are held to the same clock.
         """
         if not self.can_be_steered or self.problem(time) in ("clock_jumped", "clock_unsettled"):
             return math.inf
@@ -271,7 +289,7 @@ class HeldClock:
         return math.hypot(self.stated / _PER_ERROR / math.sqrt(3), seen, lead)
 
     def problem(self, time: float) -> ClockProblem | None:
-        """Return what ails it at a time [s]; None if nothing."""
+        """Return what is wrong with it at a time [s]; None if nothing is."""
         has_jumped = time - self._jumped_at < CLOCK_SETTLING
         if self.is_alone:
             return "clock_jumped" if has_jumped else None
@@ -301,7 +319,7 @@ class HeldClock:
         if is_trusted and (first is not None or self._is_first):
             common = lead if first is None else first.lead(time)
         own, seen = lead - common, self._line if first is None else self._beside
-        near = max(_NEAR, 2 * line.error)  # what is not seen accuses none
+        near = max(_NEAR, 2 * line.error)  # a lead within its error is no fault of the clock
         if abs(own) <= near and (first or abs(common) <= max(near, _TOGETHER[1] * CLOCK_SETTLING)):
             self._near_at = time
         is_gentle = is_playing or abs(own) <= max(_NEAR, seen.error)
@@ -313,7 +331,7 @@ class HeldClock:
         return round((led - crystal) * _PER_RATE)
 
     def sent(self, name: str, values: Values, now: float, arrives: float) -> None:
-        """Note a request that is sent now and arrives at a time [s] at the soonest."""
+        """Note a request that is sent now; arrives: when it does so at the soonest [s]."""
         arrives = arrives if self._has_bits else now
         if name == "Mark":
             self._marks += 1
@@ -334,40 +352,41 @@ class HeldClock:
             is_reported = was_armed and self._is_armed and name != "Arm" and not marks
             self._check_pace(status["clock"], sent, received, is_reported=is_reported)
             return
-        # Those of a reply may be fewer than stated, as CAN stuffs less; those of a request are not.
+        # A reply may have fewer bits than stated, because CAN may stuff less; a request may not.
         if self._has_bits and received < arrives:
             self._has_bits, self._bits, self._promptest, arrives = False, 0.0, math.inf, sent
             self._forget(sent)
         time = min(arrives, received)
-        if time - self._beside.time > _MARKED:  # what it differs by is no longer seen
+        if time - self._beside.time > _MARKED:  # the last common Mark is too old
             self._beside = _Line(-math.inf)
         has_left = was_armed and not self._is_armed and name not in ("Stop", "Disarm")
         if name == "Arm" and self._is_armed:
             self._added += values["shift"] * HIGH_TIME
             self._near_at = time
-        elif self._arming or has_left:  # whether it was shifted, or since when its rate is 0
+        elif self._arming or has_left:  # it is unknown if it was shifted, or when its rate ended
             self._forget(time)
         self._arming = 0
         self._promptest = min(self._promptest, received - time - self._bits)
-        # Whether a Ping without reply was heard is not known before that to the next one.
+        # The reply to the next Ping shows whether one without reply was heard. Until then the rate
+        # is unknown, and readings do not count.
         is_kept = self._pinged is None or name == "Ping"
         if marks <= 1 and (is_kept or not self._lowest):
             is_reported = was_armed and self._is_armed
-            # A reply that is here before its request can be: the bits take less than they should.
+            # The difference is negative if the bits take less time than they should.
             late = abs(received - arrives)
             lead = self._read(status["clock"], time, time - sent, late, is_reported=is_reported)
             if is_kept and marks:
                 self._compare(time, lead)
-            if not is_kept:  # until the first that counts
+            if not is_kept:  # this reading stands only until the first one that counts
                 self._lowest.clear()
         if name == "Ping" or not self._is_armed:
             pace = values["rate"] / _PER_RATE if self._is_armed else 0.0
-            since = sum(self._pinged or (time, time)) / 2  # any attempt may be the first heard
+            since = sum(self._pinged or (time, time)) / 2  # any of them may be the first heard
             self._added += (self._pace - pace) * since
             self._pace, self._pinged = pace, None
 
     def _check_pace(self, clock: int, sent: float, received: float, *, is_reported: bool) -> None:
-        """Compare what has passed on a clock that is alone with the host's, of some seconds."""
+        """Compare the time that has passed on a clock that is alone with the host's, every 3 s."""
         shown, earliest, latest = self._shown
         if is_reported and received - earliest < CLOCK_SETTLING:
             passed = ahead(clock, shown)
@@ -380,29 +399,30 @@ class HeldClock:
     def _read(
         self, clock: int, time: float, earlier: float, later: float, *, is_reported: bool
     ) -> float:
-        """Take a reading of a time, so much earlier [s] at the most, or so much later.
+        """Process a reading of the clock, and return the lead that it shows without steering [s].
 
-        Returns its lead if it was not steered [s].
-
-        is_reported: whether a jump is said, since no restart explains it.
+        time: when the request arrives at the soonest [s]. earlier, later: by how much the clock may
+        have been read earlier or later than that at most [s]. is_reported: whether a jump is a
+        problem, since no restart of the amplifier can explain it.
         """
         line, shown = self._line, clock * _STEP - time - self._added - self._pace * time
         lead = line.lead + line.rate * (time - line.time)
         off = math.remainder(shown - lead, CLOCK_TURN)
         error = self._seen(time).error
         far = _FAR + _FAR_ERRORS * error + self.stated / _PER_ERROR
-        # What was read before came late where it is above, each by no more than its exchange took.
+        # No earlier reading was later than its exchange took: this is a lower bound of the lead.
         sure = max(
             [low - late - line.rate * (at - time) for at, low, late in self._lowest],
             default=-math.inf,
         )
-        # And early nowhere: what is above by more than any crystal gains runs too fast.
+        # No reading shows less than the true lead, so if this one is above an earlier one by more
+        # than any crystal gains, the clock runs too fast.
         highest = min(
             [low + _MAX_CRYSTAL * (time - at) for at, low, _ in self._lowest], default=math.inf
         )
         is_early = off < sure - lead - far - earlier
         self._is_doubted = is_early and not self._is_doubted
-        if self._is_doubted:  # one alone may show a Mark that came twice
+        if self._is_doubted:  # a single such reading may show a Mark that came twice
             return lead + off
         if is_early or off > later + far or off > later + highest - lead + _TOO_FAST:
             if is_reported:
@@ -413,7 +433,7 @@ class HeldClock:
             for number, (at, low, late) in enumerate(self._lowest):
                 above = max(line.lead + line.rate * (at - line.time) - low, 0.0)
                 self._lowest[number] = at, low + min(off + above, 0.0), late
-        # Less what its exchange took longer than the promptest one: by so much it may be late.
+        # It may be late by as much as its exchange took longer than the shortest one.
         self._all.append((time, lead + off - max(later - self._promptest - self._bits, 0.0)))
         part = _MIN_PART
         self._lowest = [each for each in self._lowest if time - each[0] <= WINDOW]
@@ -431,16 +451,17 @@ class HeldClock:
         return lead + off
 
     def _compare(self, time: float, lead: float) -> None:
-        """Note a Mark, and lay a line through what it differs by from the other clock.
+        """Note a Mark, and fit a line to the differences from the other clock.
 
-        What is likely of two crystals counts as if it were measured, too. Marks that most others
-        contradict do not count.
+        The rate that is likely between two crystals serves as a prior. Marks that contradict most
+        others do not count.
         """
         self._marked = {at: each for at, each in self._marked.items() if time - at <= _MARKED}
         self._marked[time] = lead
         others = {} if self._other is None else self._other._marked
         both = [(at, each - others[at]) for at, each in self._marked.items() if at in others]
-        # Where a Mark or the reply that showed it was lost the present clock is shown: by median.
+        # If a Mark or the reply that showed it was lost, the clock of another moment is shown. Only
+        # differences near the median count.
         rate, near = self._beside.rate, _NEAR + 2 * self.stated / _PER_ERROR
         level, middle = median_low([(each - rate * at, at) for at, each in both] or [(0.0, time)])
         both = [
@@ -463,17 +484,18 @@ class HeldClock:
         self._beside = _Line(newest, mean + rate * middle, rate, 0.0, error, rate_error)
 
     def _fit(self, time: float) -> None:
-        """Lay a line that may bend through the lower half of what is kept, by least squares.
+        """Fit a line, which may bend, to the lower half of the kept readings by least squares.
 
-        What is likely of crystals counts as if it were measured, too.
+        The rate and the bend that are likely for crystals serve as priors.
         """
         rate, bend = self._line.rate, self._line.bend
         aged = [(time - at, lead, late) for at, lead, late in self._lowest]
         count = max(len(aged) // 2, 1)
-        # One alone may be as late as its whole exchange, few nearly so, though they lie on a line.
+        # A single reading may be as late as its whole exchange, and few readings nearly so, even if
+        # they lie on a line.
         delay = self.shortest if count > 1 else self._lowest[0][2] - self._bits
         least = (delay / len(aged) ** 2) ** 2 / 12 + _LEAST**2
-        for _ in range(_ROUNDS):  # what leads are at that time
+        for _ in range(_ROUNDS):  # `above`: leads brought to this time, the lowest first
             above = sorted([(lead + (rate - bend * age) * age, age) for age, lead, _ in aged])
             lowest = above[:count]
             mean = middle = breadth = scatter = slope = curve = wide = 0.0
@@ -494,7 +516,7 @@ class HeldClock:
             warp = (curve - bend * error / _EXPECTED_BEND**2) / wide
             rate, bend = rate + tilt + 2 * warp * middle, bend + warp
             lead = mean + tilt * middle + warp * square
-        # Where readings lie on a line by chance those above it show how late they may be.
+        # Readings may lie on a line by chance; the next one above it shows how late they may be.
         scatter = (above[min(count, len(aged) - 1)][0] - mean) ** 2 + least
         errors = _ERRORS + min(_RECENT / len(aged), 1.0)
         rate_error = errors * math.sqrt(scatter * (1 / breadth + (2 * middle) ** 2 / wide))
@@ -503,11 +525,13 @@ class HeldClock:
             (high + (rate - bend * age) * age - lead, late - self._promptest - self._bits)
             for age, high, late in aged[-_RECENT:]
         ]
-        # None is later than its exchange took longer than the promptest one.
+        # If even the recent readings that cannot be late lie far above the line, the clock was
+        # moved, and the older readings are dropped.
         if min([off - late for off, late in recent]) > _FAR / 2:
             del self._lowest[:-_RECENT]
         error = max(error, min(recent)[0])
-        # Few far before most: most are late, or few are read wrong. Each is half the gap away.
+        # A few readings far below most: either most are late, or the few are wrong. The line goes
+        # through the middle, and its error includes half the gap.
         bulk = sorted([each + (rate - bend * (time - at)) * (time - at) for at, each in self._all])
         eighth = len(bulk) // 8
         low, high = above[0][0], bulk[eighth]

@@ -1,9 +1,9 @@
 """The exchanges with one amplifier: what it was sent, what it replied, and until when it may play.
 
 `Dialogue` keeps session, latch, status and ledger of the amplifier, and raises CommandRefused once
-its replies contradict its requests. `Feeding` counts its watchdog: when it was fed, and when it
-must have silenced the amplifier. At the end, the words of the clocks of several amplifiers for one
-moment: a steered clock shows the host's time, another one its own, by its readings.
+its replies contradict the requests. `Feeding` follows its watchdog: when it was fed, and when it
+must have silenced the amplifier. The functions at the end express one moment in the clocks of
+several amplifiers: a steered clock shows the host's time, any other one its own.
 """
 
 import asyncio
@@ -86,36 +86,41 @@ from drivers.wires.wire import (
 )
 
 SILENCING = 0.005 + REACTION
-"""From the expiry of a watchdog until the outputs are silent, at the most [s]."""
+"""Longest time from the expiry of a watchdog until the outputs are silent [s]."""
 
 
 @dataclass
 class Feeding:
-    """When its watchdog was fed, as far as the host knows: what may have, and what surely did.
+    """When the watchdog of an amplifier was fed: by requests that may have, and that surely have.
 
-    delay, is_kept: of the wire; watchdog [s]. may: when [s] the last request that may have fed went
-    out. plays: the last such that does not also silence it, arrives: when it arrives unless it is
-    delayed: how long the amplifier may play follows from it. fade [s]: longest ramp since, of a
-    silence without reply, a stop or a disarm. since, confirmed_at: when the last request that
-    surely did went out, and its reply came.
+    Times are in s.
     """
 
     delay: float = 0.0
+    """How late a request may arrive on the wire."""
     is_kept: bool = False
+    """Whether an adapter on the wire may keep requests and deliver them later."""
     watchdog: float = 0.0
+    """Time of the watchdog."""
     may: float = -math.inf
+    """When the last request that may have fed the watchdog went out."""
     plays: float = -math.inf
+    """When the last such request went out that does not also silence the amplifier."""
     arrives: float = -math.inf
+    """When that request arrives, unless it is delayed."""
     fade: float = 0.0
+    """Longest ramp of a stop, a disarm or an unanswered silence since then."""
     since: float = -math.inf
+    """When the last request that surely fed the watchdog went out."""
     confirmed_at: float = -math.inf
+    """When the reply to that request came."""
 
     @property
     def lost_from(self) -> float:
-        """When the watchdog has silenced it, and one that does not reply is lost [s].
+        """When an amplifier that does not reply must be silent by its watchdog, and is lost [s].
 
-        A request without reply may still be under way; what is confirmed came before its reply, and
-        not always in the time of the line: a busy machine may have kept it.
+        A request without reply may still be under way. One with a reply arrived before that reply,
+        but perhaps later than the line takes, since a busy machine may have held it.
         """
         is_confirmed = self.plays <= self.since
         arrival = self.confirmed_at if is_confirmed else self.arrives + self.delay
@@ -123,25 +128,27 @@ class Feeding:
 
     @property
     def may_play_until(self) -> float:
-        """When the watchdog must have silenced it, even where it is fed once more [s].
+        """When the watchdog must have silenced it even if a kept request feeds it once more [s].
 
-        What an adapter has kept comes at any time, all at once: after the watchdog without effect.
-        Of several attempts without reply one may have arrived, and the next been kept.
+        An adapter may deliver all that it has kept at any time; after the watchdog has expired this
+        has no effect. Of several attempts without reply one may have arrived and the next been
+        kept.
         """
         may_be_fed_again = self.is_kept and self.plays > self.since
         return self.lost_from + (self.watchdog if may_be_fed_again else 0.0)
 
     def tells(self, sent_at: float) -> bool:
-        """Whether a status asked for at a time [s] would show a watchdog that stands still."""
+        """Whether a status that is requested at a time [s] shows if the watchdog runs down."""
         return self.may <= self.since and sent_at - self.confirmed_at > REACTION
 
     def problem(self, left: float, sent_at: float, now: float) -> str | None:
-        """Describe an impossible time that is left [s] in a reply to a request; None if possible.
+        """Say what is wrong with the watchdog's time left [s] in a status; None if it is possible.
 
-        sent_at: of the request, which is not one that feeds; now: of the reply.
+        sent_at: when the request for the status went out, which does not feed; now: when the status
+        came.
         """
         lowest = self.watchdog - (now - self.since) - REACTION
-        # One that may have fed and was not confirmed may have come just before this request.
+        # An unconfirmed request that may have fed may have arrived just before this one.
         fed_at = self.confirmed_at if self.may <= self.since else sent_at
         highest = min(self.watchdog, self.watchdog - (sent_at - fed_at)) + REACTION
         if lowest <= left <= highest:
@@ -151,17 +158,17 @@ class Feeding:
 
 @dataclass(frozen=True, slots=True)
 class StopOutcome:
-    """What an amplifier may play: confirmed silent, or until when [s] it may play, and why.
-
-    may_play_until: infinite where nothing is known to silence it.
-    """
+    """What an amplifier may still play after a stop."""
 
     is_confirmed: bool
+    """Whether the amplifier has confirmed that it is silent."""
     may_play_until: float
+    """Until when it may play [s]; infinite if nothing is known to silence it."""
     cause: str = ""
+    """Why no more is known."""
 
     def rows(self, now: float) -> dict[str, Any]:
-        """Return it in words at a time [s]: `silence`, `may_play_for_s` and `cause`."""
+        """Return `silence`, `may_play_for_s` and `cause` as the API has them; now [s]."""
         left = self.may_play_until - now
         silence = "may_play" if left > 0 else "watchdog_elapsed"
         is_bounded = not self.is_confirmed and left < math.inf
@@ -177,21 +184,21 @@ UNREACHED = StopOutcome(False, math.inf, "it has not replied since the start")
 
 
 MAX_CONTRADICTIONS = 2
-"""Contradictions in a row that are a fault; a single one may be a moment between two sets."""
-_SAME_MOMENT = 0.01  # s; statuses that are closer show a contradiction once
+"""So many contradictions in a row are a fault; a single one may be a moment between two sets."""
+_SAME_MOMENT = 0.01  # s; contradictions of statuses closer to each other than this count once
 _RAMP, _WATCHDOG = QUANTITIES["ramp"], QUANTITIES["watchdog"]
 _LEFT = QUANTITIES["watchdog_left"]
 _SILENCING = ("Stop", "Disarm", "Silence")
 _CHANGING = ("Arm", "Disarm", "Stop", "Clear")
-_EVENT_WORDS = (
-    EVENT_RECORD.words + 7
-)  # with a frame of its own, which precedes the reply to what changes the state
-_SURELY, _MAX_START_ERROR = 3.0, 0.003  # errors of a clock; s, of a moment by it
+# A request that changes the state may be preceded by an event, in a frame of its own of 7 words.
+_EVENT_WORDS = EVENT_RECORD.words + 7
+_SURELY = 3.0  # standard errors of a clock
+_MAX_START_ERROR = 0.003  # s; if a start is known worse than this, statuses are not compared
 COMMITTING = 0.1
 """Time [s] within which a commit arrives and is carried out."""
-_CHECKED_FOR = 0.005  # s; for which what was checked holds, unless anything is sent or received
+_CHECKED_FOR = 0.005  # s; a check holds for so long unless anything is sent or received
 IsPreempted: TypeAlias = Callable[[], bool]
-"""Whether what waits preempts a set, as long as no amplifier is to play it."""
+"""Tells whether something more urgent waits, so that a set that does not play yet is dropped."""
 _Checked: TypeAlias = tuple[tuple[LayerSet, ...], list[int]]
 _UNCHECKED: tuple[Sequence[AmplifierLayer] | None, float, float, _Checked] = (
     None,
@@ -204,84 +211,86 @@ _logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class StagedSet:
-    """A set that an amplifier has staged, or plays at once: as the wire has it.
-
-    is_exact: to the word; until: when [s] it must have been committed.
-    """
+    """A set that an amplifier has staged, or plays at once."""
 
     token: int
     layers: tuple[LayerSet, ...]
+    """Its layers in integers of the wire."""
     is_exact: bool
+    """Whether the amplifier plays exactly these integers, and not others near them."""
     until: float
+    """When it must have been committed [s]."""
 
 
 class Dialogue:
-    """The exchanges with one amplifier, whose line is open; as it sees it."""
+    """The exchanges with one amplifier on an open line."""
 
     def __init__(self, line: Line, address: int, name: str) -> None:
         self.line, self.address, self.name = line, address, name
         self.capabilities: Values = {}
-        """Empty until it is identified, or while it is not sure who replies: see its ledger."""
+        """Values of its capabilities record; empty until it is identified, or if several reply."""
         self.session = 0
         self.may_be_armed = False
-        """Whether an Arm of this host may have been carried out since it was disarmed."""
+        """Whether it may have carried out an Arm of this host since it was last disarmed."""
         self.latch: int | None = None
         """Newest latch that a status has shown since it was identified."""
         self.status: Values | None = None
-        """The last one."""
+        """The last status."""
         self.status_at: float | None = None
-        """When [s] it was read."""
+        """When the last status came [s]."""
         self.arming = (0, -math.inf)
-        """Stops and disarms before Arm was requested, and until when [s] it may go out."""
+        """`silences` when Arm was requested, and the time [s] until which the Arm may go out."""
         self.armed_latch: int | None = None
-        """That of the reply to the last Arm."""
+        """Latch in the reply to the last Arm."""
         self.reported_at: dict[ReportKind, float] = {}
-        """When [s] a status had a report last."""
+        """When a status last had a report of each kind [s]."""
         self.played_at = -math.inf
-        """When [s] a set that was sent last starts at the soonest, or silence was sent."""
+        """When the set that was sent last starts at the soonest, or when silence was sent [s]."""
         self.starts = -math.inf
-        """When [s] the set that it has staged starts by its next commit; before now: at once."""
-        self._may_wait_until = -math.inf  # s; the last set, by a clock that is not held so well
-        self._is_start_known = True  # within what statuses are compared with
+        """When the staged set starts if it is committed next [s]; a time in the past: at once."""
+        self._may_wait_until = -math.inf  # s; the last set may start so late by a poor clock
+        self._is_start_known = True  # well enough that statuses can be compared with what was sent
         self.committed = 0
-        """Token of the set that it committed last, 0 for none since it was armed."""
+        """Token of the set that it committed last; 0 if it committed none since it was armed."""
         self.feeding = Feeding(line.wire.delay, line.wire.is_kept)
         self.known = UNREACHED
-        """What it may play by what is known beside its statuses and what fed it."""
+        """What it may play, apart from what its statuses and its watchdog tell."""
         self.clock = HeldClock()
         """Its clock, which is held to that of the line."""
         self.counts = LinkStatistics()
-        self.exchange_time = cache(self._exchange_time)  # of the wire, and what was identified
+        self.exchange_time = cache(self._exchange_time)  # cleared when it is identified
         self.silence_cause: str | None = None
         """Why it is degraded: it did not reply to a request, and may still play."""
         self.listeners: list[Callable[[Values], None]] = []
+        """They are called with the values of each event."""
         self.silences = 0
-        """Stops and disarms that were sent to it."""
+        """Number of stops and disarms that were sent to it."""
         self._time = line.time
         self._ledger: Ledger | None = None
         self._admitted: StagedSet | None = None
-        self._checked = _UNCHECKED  # what was checked, until when [s], and the outcome
-        self._contradictions = self._misachieved = 0  # in a row: statuses, achieved layers
+        self._checked = _UNCHECKED  # the layers checked last, until when [s] that holds, the result
+        self._contradictions = 0  # of statuses, in a row
+        self._misachieved = 0  # contradictions of achieved layers, in a row
         self._contradicted_at = -math.inf
-        self._was_unfed = False  # the status of the last contradiction
-        self._other_host_at = -math.inf  # when it was heard last
-        self._are_several = False  # two amplifiers have replied since this was reset
+        self._was_unfed = False  # whether the last contradiction was in a status that does not feed
+        self._other_host_at = -math.inf  # when another host was heard last
+        self._are_several = False  # whether two amplifiers have replied since this was reset
         line.members[address] = self
 
     @property
     def ledger(self) -> Ledger:
-        """Its ledger, known once it is identified."""
+        """The ledger; raises CommandError before the amplifier is identified."""
         if self._ledger is None:
             raise CommandError(f"amplifier {self.name} must be opened first")
         return self._ledger
 
     @property
     def is_in_doubt(self) -> bool:
-        """Whether a set was sent to it that it has not confirmed, so that it may play."""
+        """Whether it has not confirmed the last set, which it may or may not play."""
         return self._ledger is not None and self._ledger.doubt is not None
 
     def _exchange_time(self, name: str) -> float:
-        """Return how long the longest request of a name and its reply take on the wire [s]."""
+        """Return how long the longest request with this name and its reply take on the wire [s]."""
         can = self.capabilities
         size = (can["channels"], can["layers"]) if can else WIDEST
         event = _EVENT_WORDS if name in _CHANGING else 0
@@ -296,11 +305,11 @@ class Dialogue:
         priority: Priority = Priority.SET,
         is_preempted: IsPreempted | None = None,
     ) -> StagedSet:
-        """Stage a set under a token, or play it at once.
+        """Stage a set under a token, or play it at once if `now`.
 
-        It is admitted by the ledger when its turn on the line has come, unless it is preempted
-        then. Raises CommandRefused with the reason; Preempted where a stop came first; FrameError
-        for two replies in a row with another token.
+        The ledger admits it when its turn on the line comes, unless it is preempted then. Raises
+        CommandRefused with the reason; Preempted if a stop came first; FrameError if two replies in
+        a row have another token.
         """
         staged: StagedSet
 
@@ -322,7 +331,7 @@ class Dialogue:
                 break
         else:
             problem = f"a set with token {token} must be taken, got token {taken['token']}"
-            # No refusal: all are stopped.
+            # This is no refusal: the group stops all amplifiers for it.
             raise FrameError(str(contradicted(self.name, problem)))
         if not (taken["played"] or (taken["staged"] and not now and self._admitted is staged)):
             raise Preempted(f"amplifier {self.name}: set {token} was not staged")
@@ -331,7 +340,8 @@ class Dialogue:
     def refusal_of(self, layers: Sequence[AmplifierLayer]) -> CommandRefused | None:
         """Return why the ledger would not admit layers now; None if it would.
 
-        They are not checked again if they are staged within 5 ms, nothing sent or received since.
+        The result is used again if the layers are staged within 5 ms and nothing is sent or
+        received meanwhile.
         """
         moment = self._time()
         try:
@@ -344,9 +354,9 @@ class Dialogue:
     def _check(
         self, layers: Sequence[AmplifierLayer], moment: float, *, longer: float = 0.0
     ) -> tuple[float, _Checked]:
-        """Return layers as the ledger admits them, and their words; raises CommandRefused.
+        """Return the longest time until layers are committed [s], and the layers as admitted.
 
-        With the longest time [s] until they are committed; longer [s]: until they are staged.
+        longer: time until they are staged [s]. Raises CommandRefused.
         """
         takes = len(self.line.members) * self.exchange_time("Set")
         delay = max(COMMIT_DELAY, ATTEMPTS * takes)
@@ -357,7 +367,7 @@ class Dialogue:
                 for shape in (tone.onset, tone.ending):
                     if shape is not None:
                         words += ENVELOPE.words + KNOT.words * len(shape.knots)
-        if words > PART_WORDS:  # parts of all of the line, and those again
+        if words > PART_WORDS:  # parts for all amplifiers of the line, each perhaps repeated
             delay += 2 * words / PART_WORDS * takes
         admitted = self.ledger.admit(layers, moment, delay=delay + longer)
         stream = pack_layers(admitted)
@@ -368,10 +378,10 @@ class Dialogue:
         return delay, (admitted, stream)
 
     def commit(self, token: int, at: int) -> asyncio.Future[Values]:
-        """Play the staged set; the future has the status, which shows its tokens.
+        """Play the staged set; returns a future of the status, which shows the tokens.
 
-        at: high word of its clock when it starts. Or raises Preempted where a stop or disarm came
-        first, CommandRefused where it is too late for what the ledger has admitted.
+        at: high word of the amplifier's clock at which it starts. The future raises Preempted if a
+        stop or disarm came first, CommandRefused if it is too late for what the ledger admitted.
         """
         values = {"session": self.session, "token": token, "at": at}
         return self.line.submit(self, Priority.SET, "Commit", values)
@@ -379,12 +389,13 @@ class Dialogue:
     def next_request(self, name: str, values: Values, priority: Priority) -> float:
         """Return how long a request and its reply take on the wire [s].
 
-        Raises for what plays or feeds, while it must not go out: LinkError while degraded or beside
-        another host, CommandRefused once a status has shown that it is not armed any more; of a set
-        Preempted once it is not admitted any more, CommandRefused where it is too late.
+        Raises if the request would play or feed and must not be sent: LinkError while the amplifier
+        is degraded or driven by another host, CommandRefused once a status has shown that it is not
+        armed. For a set and its commit it raises Preempted if the set is no longer admitted, and
+        CommandRefused if it is too late.
         """
         takes = self.exchange_time(name)
-        if name == "Set" and takes > FAST:  # much shorter, nearly always
+        if name == "Set" and takes > FAST:  # most sets are much shorter than the longest one
             words = SET_WORDS + len(values["stream"])
             takes = self.line.wire.exchange_time(words, reply_words("Set"))
         if name in ("Hello", "Silence") or not MESSAGES[name].feeds:
@@ -403,7 +414,7 @@ class Dialogue:
             silences, until = self.arming
             if self.silences != silences:
                 raise Preempted(f"amplifier {self.name}: a stop or disarm came first")
-            if self._time() > until:  # this machine slept: it is too late for the caller
+            if self._time() > until:  # this machine slept, and the caller does not expect it now
                 raise LinkTimeout(f"amplifier {self.name}: identified too late; arm again")
         if self._other_host_at > -math.inf:
             self.check_other_host()
@@ -417,18 +428,18 @@ class Dialogue:
         return takes
 
     def note_sent(self, name: str, values: Values, now: float, arrives: float) -> None:
-        """Note a request that is sent now and may reach it, at a time [s] unless it is delayed."""
+        """Note a request that is sent now; `arrives`: when it arrives [s] unless it is delayed."""
         self._checked = _UNCHECKED
-        if name != "Set":  # whose reply shows no clock
-            # What was sent before may be lost: it may arrive as soon as its own bits have passed.
+        if name != "Set":  # the reply to a Set shows no clock
+            # What was sent before may be lost, so this may arrive as soon as its bits have passed.
             self.clock.sent(name, values, now, now + self.line.wire.takes)
         if name == "Hello":
             return
         feeding = self.feeding
         if MESSAGES[name].feeds and (name == "Arm" or values["session"] == self.session):
             if name == "Silence" and self.silence_cause is not None:
-                # If it is heard that is within the time of the watchdog, and the ramp follows:
-                # repeated without reply, it does not put off when the amplifier must be silent.
+                # If it arrives, it does so within the time of the watchdog, and its ramp follows.
+                # Repeating it without reply does not put off when the amplifier must be silent.
                 feeding.may = now
                 feeding.fade = max(feeding.fade, _RAMP.from_wire(values["ramp"]))
             else:
@@ -462,7 +473,7 @@ class Dialogue:
     def note_reply(self, name: str, values: Values, reply: Values, sent_at: float) -> None:
         """Note the reply to a request that was sent at a time [s].
 
-        Raises CommandRefused once its statuses contradict what was sent, twice in a row.
+        Raises CommandRefused if two statuses in a row contradict what was sent.
         """
         now, self._checked = self._time(), _UNCHECKED
         self.counts.last_round_trip = now - sent_at
@@ -483,7 +494,8 @@ class Dialogue:
         ):
             self.latch = latch
         self.status, self.status_at = reply, now
-        # Beside heartbeats a Commit's tells nothing more, unless it may show a Mark, or an end.
+        # The status of a Commit tells no more than those of heartbeats, except where it may show a
+        # Mark, or that the amplifier is not armed any more.
         if name != "Commit" or len(self.line.members) > 1 or reply["state"] != ENABLED:
             self.clock.replied(name, values, reply, now)
         for kind in reports_of(reply, self.clock.problem(now)):
@@ -493,7 +505,8 @@ class Dialogue:
             ledger.silenced(_RAMP.from_wire(values["ramp"]), sent_at, now)
             self.committed = reply["token"]
             return
-        # A set plays some time after its commit: a status of before says that it does, or nothing.
+        # A set plays some time after its commit. An earlier status may show that it plays, but not
+        # that it does not.
         is_sure = reply["token"] != self.committed or sent_at >= self.played_at + COMMITTING
         if ledger is not None and is_sure:
             self._confirm(reply["token"], now)
@@ -501,14 +514,14 @@ class Dialogue:
             raise disarmed(self.name, reply)
         if ledger is None or not self.session or name in ("Arm", "Clear") or not is_enabled:
             return
-        # A status after a request that feeds says nothing of how the watchdog runs down.
+        # The reply to a request that feeds does not show how the watchdog runs down.
         tells = not fed and self.feeding.tells(sent_at)
         problem = armed_problem(reply, self.armed_latch)
         if problem is None and not fed:
             left = reply["watchdog_left"] / _LEFT.per_unit
             problem = self.feeding.problem(left, sent_at, now)
         plays_wrong = None if problem else ledger.problem_of(reply, sent_at, now)
-        # By a clock that is not held a set may wait, whatever its commit says.
+        # If its clock is not held, a set may wait even though it was committed.
         if plays_wrong and (
             sent_at >= self._may_wait_until
             or (self._is_start_known and self.clock.error(now) < math.inf)
@@ -525,7 +538,7 @@ class Dialogue:
                 raise contradicted(self.name, problem)
 
     def note_unasked(self, arrival: Event | OtherHost | DuplicateAddress) -> None:
-        """Note what came without a request; an event is handed on."""
+        """Note a message that came without a request; an event is passed to the listeners."""
         if isinstance(arrival, OtherHost):
             self._other_host_at = self._time()
         elif isinstance(arrival, DuplicateAddress):
@@ -538,39 +551,42 @@ class Dialogue:
                     _logger.exception("amplifier %s: a listener failed", self.name)
 
     def _note_report(self, kind: ReportKind, now: float) -> None:
-        """Note a report of a status, and log it unless the last was a short time ago."""
+        """Note a report of a status, and log it unless there was one a short time ago."""
         if now - self.reported_at.get(kind, -math.inf) > REPORT_LIFE:
             cause, remedy = REPORTS[kind]
             _logger.warning("amplifier %s: %s", self.name, cause, extra={"remedy": remedy})
         self.reported_at[kind] = now
 
     def wire_ramp(self, ramp: float) -> int:
-        """Return the nearest ramp that the amplifier has: silence is never refused for it."""
+        """Return the nearest ramp [s] that the amplifier can play, in units of the wire.
+
+        Any number is accepted, since silence must never be refused for its ramp.
+        """
         highest = self.capabilities.get("ramp_max", _RAMP.maximum)
         if math.isnan(ramp):
             return _RAMP.to_wire(STOP_RAMP)
         return min(_RAMP.to_wire(min(max(ramp, 0.0), _RAMP.high)), int(highest))
 
     def is_silent(self, status: Values) -> bool:
-        """Whether a status has the levels of all channels, and all are zero."""
+        """Whether a status shows the levels of all channels, and all of them are zero."""
         known = self.capabilities.get("channels")
         return known == len(status["levels"]) and not any(status["levels"])
 
     def what_may_play(self, cause: str = "") -> StopOutcome:
-        """Return until when it may play by all that is known of it.
+        """Return until when it may play, by all that is known of it.
 
-        cause: why no more is known, by default what ails its line. Over is what confirmed a stop,
-        and was sent neither Clear nor Arm since. Else the watchdog ends what was fed, and what was
-        never fed is over once it has shown that it is silent. One that shows more after it was
-        confirmed, or its watchdog must have silenced it, is fed by another, or broken. A status
-        after the stop alone confirms it.
+        cause: why no more is known; by default the reason why it is mute, or its line lost. An
+        amplifier that confirmed a stop, and was sent neither Clear nor Arm since, is silent. Else
+        the watchdog ends what plays; one that was never fed is silent once a status has shown it.
+        If it plays although it has confirmed silence, or although its watchdog must have silenced
+        it, another host feeds it or it is broken: then nothing is known to silence it.
         """
         status, at, until = self.status, self.status_at, self.known.may_play_until
         if not self.known.is_confirmed:
             until = max(until, self.feeding.may_play_until)
         if status is not None and at is not None:
             is_armed = status["state"] == ENABLED
-            if self.is_silent(status) and not is_armed:  # and identified
+            if self.is_silent(status) and not is_armed:
                 until = at if until == math.inf else max(until, at)
             elif (is_armed or any(status["levels"])) and at >= until:
                 until = math.inf
@@ -578,12 +594,12 @@ class Dialogue:
         return StopOutcome(False, math.inf if until == -math.inf else until, cause)
 
     def check_other_host(self) -> None:
-        """Raise LinkError if another host drives it, which must feed within the longest time."""
+        """Raise LinkError if another host was heard within the longest time of a watchdog."""
         if self._time() - self._other_host_at <= _WATCHDOG.high:
             raise driven_by_another(self.name)
 
     def _confirm(self, token: int, now: float) -> None:
-        """Note that the amplifier plays the set with this token, as it says."""
+        """Note that the amplifier has reported the set with this token as the one it plays."""
         self.committed = token
         if self._ledger is not None:
             self._ledger.resolve(token, now)
@@ -592,11 +608,11 @@ class Dialogue:
 
 
 _Amplifier = TypeVar("_Amplifier", bound=Dialogue)
-_STEP = AHEAD_MAX // 2  # from a high word that is tried to the next
+_STEP = AHEAD_MAX // 2  # between two high words that are tried
 
 
 def words_of(moment: float, amplifiers: Sequence[_Amplifier]) -> dict[_Amplifier, int]:
-    """Return the high words of the clocks of amplifiers at a moment [s], the nearest ones."""
+    """Return the nearest high word of the clock of each amplifier at a moment [s]."""
     word = high_word(clock_at(moment + HIGH_TIME / 2))
     return {
         each: word if each.clock.can_be_steered else high_word(clock_at(_shown(each, moment)))
@@ -605,7 +621,10 @@ def words_of(moment: float, amplifiers: Sequence[_Amplifier]) -> dict[_Amplifier
 
 
 def word_passed_by_all(now: float, amplifiers: Sequence[Dialogue]) -> int:
-    """Return a high word that is no moment ahead for amplifiers, now [s] and a little later."""
+    """Return a high word that is no moment ahead by the clocks of amplifiers, now [s] and soon.
+
+    A commit with it starts at once.
+    """
     at = word_passed(now)
     others = [each for each in amplifiers if not each.clock.can_be_steered]
     times = [_shown(each, now + later) for each in others for later in (0.0, COMMITTING)]

@@ -1,11 +1,12 @@
 """All amplifiers of a plate: they play together or not at all, and their watchdogs are fed here.
 
-`Group` is the state of all amplifiers: a failure of one stops all, and nothing arms by itself.
+`Group` holds the state of all amplifiers: a failure of one stops all, and nothing arms by itself.
 
-`Heartbeats` alone decides which amplifier is fed, when and by what. A status read just before a
-heartbeat shows that the watchdog runs down, and so would silence its amplifier: this is read five
-times a second, less often on a slow wire or where replies come late. Where late replies let one
-exchange take a third of a watchdog, all amplifiers of a line are fed ahead of a request to one.
+`Heartbeats` alone decides which amplifier is fed, when, and by which request. A status that is read
+just before a heartbeat shows that the watchdog runs down, and so would silence its amplifier. Such
+a status is read five times a second, less often on a slow wire or where replies come late. Where
+replies are so late that one exchange takes a third of a watchdog, all amplifiers of a line are fed
+before each request to one of them.
 """
 
 import asyncio
@@ -36,47 +37,47 @@ from drivers.protocol.records import Values
 from drivers.protocol.sets import is_newer_token, token_after
 from registry import threads
 
-_STATUS_INTERVAL = 0.19  # s at least, between statuses that show if the watchdog runs down
-_MAX_STATUS_LOAD = 0.05  # of the line's time, for these
-_UNFED = 1.5 * HEARTBEAT  # s; beside a set to each, longest time between feedings of one
+_STATUS_INTERVAL = 0.19  # s; at least, between two statuses that show whether the watchdog runs
+_MAX_STATUS_LOAD = 0.05  # share of the line's time that these statuses may take
+_UNFED = 1.5 * HEARTBEAT  # s; longest time without feeding, beside a set to each amplifier
 
 Feed: TypeAlias = Callable[[], Awaitable[object]]
-"""What feeds an amplifier."""
+"""A function that sends the request by which an amplifier is fed."""
 
 
 class Heartbeats:
-    """Feeds the watchdogs of a group. restored: called where one that was mute replies again."""
+    """Feeds the watchdogs of a group; calls `restored` when a mute amplifier replies again."""
 
     def __init__(
         self, members: Members, sets: JointSets, clocks: Clocks, restored: Callable[[], None]
     ) -> None:
         self._members, self._sets, self._restored = members, sets, restored
         self._clocks = clocks
-        self._running_due: dict[Amplifier, float] = {}  # statuses just before a heartbeat
-        self._readings: dict[Amplifier, asyncio.Future[Values]] = {}  # of those that are mute
+        self._running_due: dict[Amplifier, float] = {}  # s; of the next status before a heartbeat
+        self._readings: dict[Amplifier, asyncio.Future[Values]] = {}  # of mute amplifiers
 
     def follow(self) -> None:
-        """Know those of a line from now on, who are fed ahead of one's sets."""
+        """Have all amplifiers of each shared line fed before a set to one of them."""
         every = self._members.amplifiers.values()
         for line in self._members.lines:
             of_line = [each for each in every if each.line is line]
             line.ahead = partial(self._ahead, line, of_line) if len(of_line) > 1 else None
 
     def beat(self) -> Awaitable[Sequence[object]]:
-        """Feed every amplifier that replies, and read the status of any other meanwhile.
+        """Feed every amplifier that replies, and read the status of each mute one meanwhile.
 
-        One that has committed nothing since it was armed is fed by an empty set on a line that it
-        shares, so that all have committed the same: the line feeds them together by that.
-        A status shows how a watchdog runs down only if it is read before any of its line are fed.
-        On a line that is slow or late the status of one amplifier is read at a time, so that none
-        waits for long; no status is read on a line where a mute amplifier may reply again, since
-        that one must be heard first.
+        On a shared line, an amplifier that has committed nothing since it was armed is fed by an
+        empty set; then all have committed the same token, and a broadcast commit feeds them all.
+        A status shows how a watchdog runs down only if it is read before any amplifier of its line
+        is fed. On a slow or late line, one such status is read at a time, so that no amplifier
+        waits for long; on a line with a mute amplifier, none is read, since that amplifier must be
+        heard first.
         """
         by_line: dict[Line, list[Amplifier]] = {}
         mute: set[Line] = set()
         for each in self._members.by_need:
             if (each.silence_cause or each.line.loss) and is_lost(each):
-                # Before the others are waited for: they stop then.
+                # This is raised before the others are awaited, so that they are stopped at once.
                 raise LinkTimeout(each.line.loss or each.silence_cause)
             by_line.setdefault(each.line, []).append(each)
             if each.silence_cause is not None:
@@ -102,14 +103,14 @@ class Heartbeats:
                     may_read = not is_late and all_of_line <= HEARTBEAT
                     reading = each.read_status(Priority.HEARTBEAT)
                     feed = partial(self._feed_after, each, self._members.epoch, reading)
-                elif is_late and not each.clock.is_alone:  # heartbeats alone are readings of it
+                elif is_late and not each.clock.is_alone:  # only heartbeats read this clock
                     pause = asyncio.sleep(self._clocks.later())
                     feed = partial(self._feed_after, each, self._members.epoch, pause)
                 feeds.append(feed)
         return self._members.all([feed() for feed in feeds])
 
     def _first_token(self, of_line: Sequence[Amplifier]) -> int:
-        """Return the token that one of a line has committed, or else a new one."""
+        """Return the token that an amplifier of a line has committed, or else a new one."""
         committed = max([each.committed for each in of_line])
         if not committed:
             self._sets.token = token_after(self._sets.token)
@@ -118,13 +119,16 @@ class Heartbeats:
     async def _feed_after(
         self, amplifier: Amplifier, before: int, awaited: Awaitable[object]
     ) -> Values:
-        """Feed one after a reading or a pause, unless a stop or disarm came since an epoch."""
+        """Feed an amplifier after a reading or a pause, unless a stop or disarm came meanwhile.
+
+        before: the epoch when this was decided.
+        """
         await awaited
         self._members.check_none_since(before)
         return await amplifier.ping()
 
     def _listen(self, amplifier: Amplifier) -> None:
-        """Read the status of one that is mute, until it replies or is lost."""
+        """Read the status of a mute amplifier until it replies or is lost."""
         reading = self._readings.get(amplifier)
         if reading is None or reading.done():
             read = partial(amplifier.read_status, Priority.READING)
@@ -139,11 +143,11 @@ class Heartbeats:
     def _ahead(
         self, line: Line, of_line: Sequence[Amplifier], name: str, priority: Priority
     ) -> Make | None:
-        """Return what feeds all of a line ahead of a request of the control loop to one.
+        """Return what feeds all amplifiers of a line before a request to one; None if not needed.
 
-        Where one was surely fed long ago. By a commit of the newest token: it changes nothing on
-        those that have committed it, and the others may have their commit now. Not ahead of a
-        status: it shows how a watchdog runs down only if none was fed before it.
+        It is needed if one of them was surely fed only long ago. It commits the newest token again,
+        which changes nothing on those that have committed it, and is due on the others anyway.
+        Nothing is fed before a status, which would then not show how a watchdog runs down.
         """
         if priority not in (Priority.HEARTBEAT, Priority.SET) or name == "GetStatus":
             return None
@@ -178,24 +182,25 @@ _logger = logging.getLogger(__name__)
 
 
 class GroupState(Enum):
-    """State of all amplifiers together: CLOSED until opened and in the end, LOST by a LinkError.
-
-    STOPPED: disarmed by a stop, which is to be cleared before they are armed.
-    """
+    """State of all amplifiers together."""
 
     CLOSED = auto()
+    """Not opened yet, or closed again."""
     DISARMED = auto()
     STOPPED = auto()
+    """Disarmed by a stop, which must be cleared before they can be armed."""
     ARMED = auto()
     LOST = auto()
+    """A LinkError has shown that an amplifier is lost."""
 
 
 class Group:
-    """Amplifiers by name, their lines open. A failure of one stops all; nothing arms by itself.
+    """Amplifiers by name, on open lines. A failure of one stops all; nothing arms by itself.
 
-    A stop runs to completion even if its caller is cancelled. watchdog [s]: of armed amplifiers.
-    restored: called where one that did not reply does again; its watchdog has run down meanwhile.
-    draw: of session numbers and of the first token, so that none of an earlier host is repeated.
+    A stop runs to completion even if its caller is cancelled. watchdog: of armed amplifiers [s].
+    restored: is called when an amplifier that did not reply does so again; its watchdog has run
+    down meanwhile. draw: draws session numbers and the first token at random, so that those of an
+    earlier host are not repeated.
     """
 
     def __init__(
@@ -208,16 +213,16 @@ class Group:
     ) -> None:
         self.state = GroupState.CLOSED
         self.members = Members(amplifiers)
-        """Which of them reply, and which are lost."""
+        """Knows which amplifiers reply, and which are lost."""
         self.amplifiers = self.members.amplifiers
         self.sets = JointSets(self.members, draw(_TOKEN.minimum, _TOKEN.maximum))
-        """What they play together."""
+        """Lets them play together."""
         self._clocks = Clocks(self.members)
         self._heartbeats = Heartbeats(self.members, self.sets, self._clocks, restored)
         self._watchdog, self._draw = watchdog, draw
         self._arming = asyncio.Lock()  # a second arm waits for the first
         self._closing = asyncio.Lock()  # a second close waits for the first
-        self._limit: asyncio.Timeout | None = None  # of an exchange in progress
+        self._limit: asyncio.Timeout | None = None  # ends an exchange in progress when it is moved
 
     @property
     def clock_errors(self) -> Mapping[str, float]:
@@ -226,7 +231,7 @@ class Group:
 
     @property
     def is_open(self) -> bool:
-        """Whether all reply as far as is known: neither closed nor lost."""
+        """Whether they are neither closed nor lost."""
         return self.state not in (GroupState.CLOSED, GroupState.LOST)
 
     @property
@@ -237,7 +242,7 @@ class Group:
     async def open(self) -> None:
         """Identify all amplifiers and leave them disarmed.
 
-        Raises LinkError, and CommandError for a wire that is too slow for the watchdog.
+        Raises LinkError, or CommandError if a wire is too slow for the watchdog.
         """
         members, before = self.members, self.members.epoch
         members.gives_up_at = math.inf
@@ -246,16 +251,16 @@ class Group:
             check_watchdog(self._watchdog, amplifier.exchange_time("Set"))
         self._clocks.follow()
         self._heartbeats.follow()
-        # Each amplifier says itself what it has latched before.
+        # What an amplifier has latched before is in its own status.
         self.state = GroupState.DISARMED if members.epoch == before else GroupState.STOPPED
 
     async def arm(self) -> None:
         """Switch the high voltage on at level zero: on all amplifiers, or none stays armed.
 
-        Each line has a session of its own: a broadcast reaches all of it, and one whose cable was
-        exchanged for another line's neither plays nor is fed. If all are armed, also by a request
-        that came first, nothing changes. Raises DriverError, LinkDegraded where one only does not
-        reply for now.
+        Each line has a session of its own: a broadcast reaches all amplifiers of a line, and one
+        whose cable was moved to another line neither plays nor is fed. If all are armed already,
+        nothing changes. Raises DriverError, and LinkDegraded if an amplifier only does not reply
+        for the moment.
         """
         members, before = self.members, self.members.epoch
         async with self._arming:
@@ -264,9 +269,9 @@ class Group:
                     f"amplifiers must be open to be armed, got {self.state.name}; close and open "
                     "all of them again"
                 )
-            if self.state is GroupState.STOPPED:  # an amplifier that restarted does not know
+            if self.state is GroupState.STOPPED:  # an amplifier that restarted has forgotten it
                 raise CommandRefused("a stop must be cleared before arming; clear, then arm again")
-            if members.silencing:  # the result would depend on the order of frames
+            if members.silencing:  # otherwise the order of frames would decide the result
                 raise CommandRefused(
                     "amplifiers are being stopped or disarmed; arm again if that is still wanted"
                 )
@@ -282,7 +287,8 @@ class Group:
                 await members.silence(self._disarm, amplifiers, STOP_RAMP)
                 members.check_none_since(before)
             for amplifier in amplifiers:
-                amplifier.check_other_host()  # before a disarm of what failed ends its vibration
+                # If this came later, the disarm after a failure would end another host's vibration.
+                amplifier.check_other_host()
             await self._clocks.settle()
             members.check_none_since(before)
             drawn = self._draw(_SESSION.minimum, _SESSION.maximum)
@@ -309,7 +315,7 @@ class Group:
             self.state = GroupState.ARMED
 
     async def _disarm_armed(self, arming: "asyncio.Future[Any]") -> None:
-        """Disarm what may have been armed by this; any other may be another host's."""
+        """Disarm the amplifiers that this may have armed; another host may use the others."""
         await arming
         retried = self.members.retried
         disarms = [
@@ -317,14 +323,14 @@ class Group:
             for each in self.amplifiers.values()
             if each.may_be_armed
         ]
-        # One that is mute stops none.
+        # An amplifier that is only mute does not stop the others.
         if not all(isinstance(each, LinkError | None) for each in await outcomes(disarms)):
             await self.stop()
 
     def beat(self) -> Coroutine[Any, Any, Sequence[object]]:
         """Feed the watchdog of every amplifier that replies; raises as `apply`.
 
-        Of one that does not reply the status is read meanwhile; one that replies again must still
+        The status of each other amplifier is read meanwhile; if it replies again, it must still
         play its set.
         """
         return self._exchange(self._heartbeats.beat)
@@ -334,22 +340,22 @@ class Group:
         layers: Mapping[str, Sequence[AmplifierLayer]],
         is_preempted: IsPreempted | None = None,
     ) -> Coroutine[Any, Any, PlayedSet]:
-        """Play layers on the amplifiers of these names, all from one moment on.
+        """Play layers on the amplifiers with these names; all start at one moment.
 
-        Refused on one means committed on none, and CommandRefused; silence alone is not staged. One
-        that is no longer armed does not refuse a set: it stops all.
-        Raises Preempted where a stop, disarm or `abort_exchange` came first, and LinkDegraded where
-        one does not reply: then it is unknown whether the set plays. What else fails stops all
-        amplifiers before it is raised.
-        is_preempted: asked before one is sent the set, and before they are to play it; if so,
-        Overtaken, and what plays goes on.
+        If one amplifier refuses its set, none commits, and CommandRefused is raised; a set that
+        only silences is not staged first. An amplifier that is no longer armed stops all.
+        Raises Preempted if a stop, disarm or `abort_exchange` came first, and LinkDegraded if an
+        amplifier does not reply, so that it is unknown whether the set plays. Any other failure
+        stops all amplifiers before it is raised.
+        is_preempted: is asked before a set is sent, and again before it is committed; if it returns
+        True, Overtaken is raised and what plays goes on.
         """
         return self._exchange(partial(self.sets.play, layers, is_preempted))
 
     async def silence(self, ramp: float) -> float:
         """Let all layers of all amplifiers fall silent along a ramp [s]; they stay armed.
 
-        Returns when [s] the last request went out. Raises as `apply`.
+        Returns the time [s] at which the last request went out. Raises as `apply`.
         """
         await self._exchange(partial(self.sets.silence, ramp))
         return self.members.last_sent_at
@@ -357,15 +363,15 @@ class Group:
     def abort_exchange(self) -> None:
         """End an `apply`, `silence` or `beat` in progress, so that silence can be sent next.
 
-        What was not sent is not sent any more; a request on the wire is waited for at most 8 ms.
+        Requests that were not sent yet are dropped; one on the wire is awaited for at most 8 ms.
         """
         if self._limit is not None and not self._limit.expired():
             self._limit.reschedule(threads.now())
 
     async def _exchange(self, exchange: Callable[[], Awaitable[_T | DriverError]]) -> _T:
-        """Run an exchange of the control loop; any unexplained failure stops all amplifiers.
+        """Run an exchange of the control loop; an unexplained failure stops all amplifiers.
 
-        An error that it returns stops none.
+        An error that the exchange returns, in place of raising it, stops none.
         """
         if not self.is_armed:
             raise CommandRefused("the amplifiers must be armed; clear a stop, then arm")
@@ -389,7 +395,7 @@ class Group:
                 raise Preempted("a stop or disarm came first") from error
             replying = [name for name, each in self.amplifiers.items() if not each.silence_cause]
             await self.stop(waits_for=replying)
-            if has_lost:  # also where it was degraded when this began
+            if has_lost:  # even if the amplifier was only degraded when the exchange began
                 raise LinkTimeout(next(iter(members.lost_by.values()), str(error))) from error
             raise
         if isinstance(done, DriverError):
@@ -397,9 +403,9 @@ class Group:
         return done
 
     async def disarm(self, ramp: float = DISARM_RAMP) -> None:
-        """Ramp [s] to silence and switch the high voltage off, read back from every amplifier.
+        """Ramp to silence [s] and switch the high voltage off, confirmed by every amplifier.
 
-        It goes on to its end if its caller is cancelled. Where one fails all are stopped.
+        It runs to completion if its caller is cancelled. If one amplifier fails, all are stopped.
         """
         self._leave_armed()
         await self.members.silence(self._disarm, [*self.amplifiers.values()], ramp)
@@ -417,8 +423,9 @@ class Group:
     ) -> Coroutine[Any, Any, Mapping[str, StopOutcome]]:
         """Stop every amplifier along a ramp [s], lost ones too; latched until `clear`.
 
-        The requests are queued when this returns. Await it for what became of each, by name: of
-        those of some names, None for all. It goes on to its end if its caller is cancelled.
+        The requests are queued when this returns. It is awaited for the outcome of each amplifier
+        by name; waits_for: the names of those that are awaited, None for all. It runs to completion
+        if its caller is cancelled.
         """
         self._leave_armed()
         if self.is_open:
@@ -428,7 +435,7 @@ class Group:
             if len(line.members) > 1:  # so that none waits for the reply of another
                 try:
                     members.broadcast_stop(line, ramp)
-                except Exception:  # each amplifier is stopped by itself as well
+                except Exception:  # each amplifier is also stopped by a request of its own
                     _logger.exception("%s: the broadcast of a stop failed", line.name)
         for name, amplifier in self.amplifiers.items():
             try:
@@ -442,7 +449,7 @@ class Group:
     async def clear(self) -> None:
         """Acknowledge stops, and faults whose cause has gone.
 
-        Raises Preempted while amplifiers are being stopped or disarmed: nothing precedes that.
+        Raises Preempted while amplifiers are being stopped or disarmed.
         """
         if self.members.silencing:
             raise Preempted("amplifiers are being stopped or disarmed; clear again afterwards")
@@ -460,9 +467,9 @@ class Group:
             self.state = GroupState.DISARMED
 
     async def statuses(self, priority: Priority = Priority.OTHER) -> dict[str, Values]:
-        """Read the status of every amplifier, by name; again while one does not reply.
+        """Read the status of every amplifier, by name; repeated while an amplifier does not reply.
 
-        Raises LinkError once that one is lost.
+        Raises LinkError once an amplifier is lost.
         """
         amplifiers, retried = self.amplifiers.values(), self.members.retried
         statuses = await self._all(
@@ -471,14 +478,14 @@ class Group:
         return dict(zip(self.amplifiers, statuses, strict=True))
 
     async def close(self, ramp: float = DISARM_RAMP) -> None:
-        """Ramp [s] to silence, confirm it by reading back, and disarm; may be called twice.
+        """Ramp to silence [s], confirm it by reading back, and disarm; may be called twice.
 
-        A failure stops all amplifiers and is logged. The lines are left to their owner.
+        A failure stops all amplifiers and is logged. The owner of the lines closes them.
         """
         is_armed, now = self.is_armed, threads.now()
         self._leave_armed()
         self.state = GroupState.CLOSED
-        # Of one that does not reply by then a stop is all that is left.
+        # An amplifier that does not reply by then can only be stopped.
         self.members.gives_up_at = min(self.members.gives_up_at, now + CONFIRM_TIMEOUT)
         async with self._closing:
             amplifiers = [
@@ -496,11 +503,11 @@ class Group:
                     await self.members.silence(self._disarm, amplifiers, ramp)
             except DriverError as error:
                 _logger.error("amplifiers: stopped, because closing failed: %s", error)
-            if self.members.silencing:  # only then is a line closed
+            if self.members.silencing:  # no line may be closed before that has ended
                 await asyncio.wait({*self.members.silencing})
 
     def _leave_armed(self) -> None:
-        """Leave ARMED for DISARMED, if armed, so that nothing more is played."""
+        """Change from ARMED to DISARMED, so that nothing more is played."""
         self.members.epoch += 1
         if self.is_armed:
             self.state = GroupState.DISARMED
@@ -511,13 +518,13 @@ class Group:
             self.state = GroupState.LOST
 
     def _note(self, error: BaseException) -> None:
-        """Note an error of a request: it may show that an amplifier is lost."""
+        """Note the error of a request, which may show that an amplifier is lost."""
         if isinstance(error, LinkError) and not self.members.is_degraded_only(error):
             error.lost = tuple(self.members.lost_by)
             self._lose()
 
     async def _all(self, requests: Sequence[Awaitable[_T]]) -> list[_T]:
-        """Await all requests to their ends, then raise the most severe error, noted."""
+        """Await all requests to their ends, then note and raise the most severe error."""
         try:
             return await self.members.all(requests)
         except LinkError as error:

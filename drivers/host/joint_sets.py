@@ -1,18 +1,18 @@
 """Sets that several amplifiers play together, the amplifiers of a group, and their clocks.
 
-A set is staged on all amplifiers that it names, then committed at one moment on all or on none: by
-one broadcast on a line that they share, on several lines for a moment that is ahead for the
-slowest. On one amplifier it plays with its last part. A token is newer than another by less than
-half of 2^16 (RFC 1982), so an amplifier that was left out of 40 000 sets would take the next one
-for an older one: it commits an empty set before.
+A set is staged on all amplifiers that it names, and then committed on all or on none: by one
+broadcast if they share a line, or on several lines for a moment that leaves enough time for the
+slowest line. A set for one amplifier plays with its last part. A token is newer than another one if
+it is ahead by less than half of 2^16 (RFC 1982); so an amplifier that was left out of 40 000 sets
+would take the next one for an old one. It commits an empty set before that.
 
 `Members` tells which amplifiers reply and which are lost, and which of several errors counts. Stops
-and disarms begin at once and go on to their end.
+and disarms begin at once and run to completion.
 
 `Clocks` compares the clocks of all amplifiers. Where heartbeats do not show them well enough, as on
-full-speed USB or in a busy network, it reads statuses between them, less often the better a clock
-is known; any other request preempts these. On a line that several amplifiers share a Mark lets all
-clocks keep the same byte.
+full-speed USB or in a busy network, it reads statuses between the heartbeats, less often the better
+a clock is known; any other request preempts these. On a line that several amplifiers share, a Mark
+makes all of them note the clock at the same byte.
 """
 
 import asyncio
@@ -54,28 +54,28 @@ _silence_cause = attrgetter("silence_cause")
 
 
 class Members:
-    """Amplifiers by name, which is that of each."""
+    """The amplifiers of a group, by name."""
 
     def __init__(self, amplifiers: Mapping[str, Amplifier]) -> None:
         self.amplifiers = dict(amplifiers)
         self.epoch = 0
-        """Stops, disarms and closes so far: nothing from before arms, plays or feeds after one."""
+        """Number of stops, disarms and closes; what began before one must not arm, play or feed."""
         self.has_joint_set = False
-        """Whether they have a set that several lines are to play: no clock is read meanwhile."""
+        """Whether a set for several lines is under way; no clock is read meanwhile."""
         self.gives_up_at = math.inf
-        """When [s] nothing is repeated any more, since all is being closed."""
+        """When requests are no longer repeated [s], because all is being closed."""
         self.silencing: set[asyncio.Future[Any]] = set()
-        """Stops and disarms that go on."""
-        self._broadcasts: dict[Line, asyncio.Future[Values]] = {}  # of stops
+        """Stops and disarms in progress."""
+        self._broadcasts: dict[Line, asyncio.Future[Values]] = {}  # the last stop of each line
 
     @property
     def lines(self) -> tuple[Line, ...]:
-        """Their lines, each once, in the order of the amplifiers, so that runs can be repeated."""
+        """Each of their lines once, in the order of the amplifiers: so runs are reproducible."""
         return tuple(dict.fromkeys([each.line for each in self.amplifiers.values()]))
 
     @property
     def by_need(self) -> list[Amplifier]:
-        """All, first the one that was fed longest ago: replies may come late."""
+        """All amplifiers; the one that was fed longest ago is first, since replies may be late."""
         return sorted(self.amplifiers.values(), key=need)
 
     @property
@@ -86,7 +86,7 @@ class Members:
 
     @property
     def lost_by(self) -> Mapping[str, str]:
-        """Causes by name of amplifiers that must be silent without a reply, or without a line."""
+        """Why each lost amplifier is lost, by name."""
         return {
             name: each.line.loss or each.silence_cause or ""
             for name, each in self.amplifiers.items()
@@ -95,13 +95,13 @@ class Members:
 
     @property
     def lost_from(self) -> float:
-        """When [s] the next beat stops all, since one that does not reply must be silent."""
+        """When an amplifier that does not reply is lost [s]; the next beat then stops all."""
         mute = filter(_silence_cause, self.amplifiers.values())
         return min(map(_lost_from, mute), default=math.inf)
 
     @property
     def last_sent_at(self) -> float:
-        """When [s] a set or silence was last sent to any amplifier."""
+        """When a set or silence was last sent to any amplifier [s]."""
         return max((each.played_at for each in self.amplifiers.values()), default=-math.inf)
 
     def check_none_since(self, before: int) -> None:
@@ -113,7 +113,7 @@ class Members:
             )
 
     def is_degraded_only(self, error: BaseException) -> bool:
-        """Whether an error says no more than that an amplifier does not reply for now."""
+        """Whether an error only says that an amplifier does not reply for the moment."""
         return isinstance(error, LinkTimeout) and not self.lost_by
 
     async def all(self, requests: Sequence[Awaitable[_T]]) -> list[_T]:
@@ -121,9 +121,9 @@ class Members:
         return self.checked(await outcomes(requests))
 
     def checked(self, results: list[_T | BaseException]) -> list[_T]:
-        """Return results; raises the most severe error.
+        """Return results, or raise the most severe error among them.
 
-        A lost link is first; last are what others have preempted and, after it, a degraded link.
+        A lost link is the most severe; the least are a preempted request and a degraded link.
         """
         if errors := [each for each in results if isinstance(each, BaseException)]:
             raise min(errors, key=self._severity)
@@ -132,7 +132,7 @@ class Members:
     def _severity(self, error: BaseException) -> int:
         if self.is_degraded_only(error):
             return 3
-        if isinstance(error, Preempted):  # by the cause, which is to be told
+        if isinstance(error, Preempted):  # what preempted it is the error that people should see
             return 2
         return 0 if isinstance(error, LinkError) else 1
 
@@ -149,8 +149,8 @@ class Members:
     def silence(
         self, work: Callable[_P, Coroutine[Any, Any, _T]], *args: _P.args, **kwargs: _P.kwargs
     ) -> Coroutine[Any, Any, _T]:
-        """Start a stop or disarm, which goes on to its end whatever is cancelled meanwhile."""
-        task = asyncio.ensure_future(work(*args, **kwargs))  # begun wherever it was made
+        """Start a stop or disarm, which runs to completion whatever is cancelled meanwhile."""
+        task = asyncio.ensure_future(work(*args, **kwargs))  # it starts even if nobody awaits it
         self.silencing.add(task)
         task.add_done_callback(self.silencing.discard)
         return _to_completion(task)
@@ -161,14 +161,14 @@ class Members:
         if queued is None or queued.done():
             first = next(iter(self.amplifiers.values()))
             sent = line.submit(None, Priority.STOP, "Stop", {"ramp": first.wire_ramp(ramp)})
-            # What each amplifier says afterwards decides.
+            # Its error does not matter: the replies of the amplifiers to their own stops decide.
             sent.add_done_callback(lambda sent: sent.cancelled() or sent.exception())
             self._broadcasts[line] = sent
 
     async def stopped(
         self, stops: Mapping[str, "asyncio.Future[StopOutcome]"]
     ) -> Mapping[str, StopOutcome]:
-        """Await stops by name; of one that failed by itself it is said what it may play."""
+        """Await stops by name; the outcome of one that failed is what its amplifier may play."""
         said: dict[str, StopOutcome] = {}
         for name, result in zip(stops, await outcomes([*stops.values()]), strict=True):
             if isinstance(result, BaseException):
@@ -179,7 +179,7 @@ class Members:
 
 
 async def _to_completion(task: "asyncio.Future[_T]") -> _T:
-    """Await work, however often the caller is cancelled meanwhile; re-raise that at the end."""
+    """Await a task to its end even if the caller is cancelled; then raise the cancellation."""
     cancellation = None
     while not task.done():
         try:
@@ -187,7 +187,7 @@ async def _to_completion(task: "asyncio.Future[_T]") -> _T:
         except asyncio.CancelledError as error:
             cancellation = error
     if cancellation is not None:
-        task.exception()  # retrieved: what has failed is said by the amplifiers
+        task.exception()  # so that asyncio does not report it; the amplifiers' own errors are
         raise cancellation
     return task.result()
 
@@ -197,7 +197,7 @@ async def outcomes(requests: Sequence[Awaitable[_T]]) -> list[_T | BaseException
     if len(requests) > 1:
         return await asyncio.gather(*requests, return_exceptions=True)
     results = list[_T | BaseException]()
-    for request in requests:  # without a further iteration of the event loop
+    for request in requests:  # `gather` would take a further iteration of the event loop
         try:
             results.append(await request)
         except Exception as error:
@@ -206,50 +206,49 @@ async def outcomes(requests: Sequence[Awaitable[_T]]) -> list[_T | BaseException
 
 
 def is_lost(amplifier: Amplifier) -> bool:
-    """Whether it cannot be reached: its line is gone, or it is mute beyond its watchdog."""
+    """Whether an amplifier cannot be reached: its line is gone, or it is mute past its watchdog."""
     if amplifier.silence_cause is None or amplifier.line.loss is not None:
         return amplifier.line.loss is not None
     return threads.now() >= amplifier.feeding.lost_from
 
 
 INTERVAL = 1 << 12
-"""Tokens after which the gaps are looked at again."""
+"""Number of tokens after which the gaps are checked again."""
 _MAX_GAP = 1 << 14
 _SPAN = 1 << 16
 
 
 @dataclass(frozen=True)
 class PlayedSet:
-    """What amplifiers play of a set, by name, as they have achieved it; token: of the set.
-
-    starts_at [s]: at the soonest, the last of them.
-    """
+    """A set that amplifiers play."""
 
     token: int
     layers: Mapping[str, tuple[LayerSet, ...]]
+    """What each amplifier plays, by name, as it has achieved it."""
     starts_at: float
+    """When the last of them starts at the soonest [s]."""
 
 
 class JointSets:
-    """The sets of the amplifiers of a group, under tokens from a first one on."""
+    """The sets of the amplifiers of a group; token: the one before the first set's."""
 
     def __init__(self, members: Members, token: int) -> None:
         self._members = members
         self.token = token
-        """Of the last set."""
+        """Token of the last set."""
         self.is_incomplete = False
-        """Whether possibly only some amplifiers have committed the last set."""
+        """Whether perhaps only some amplifiers have committed the last set."""
 
     @property
     def is_in_doubt(self) -> bool:
-        """Whether it is unknown if the last set plays, on all amplifiers: it is silenced first."""
+        """Whether it is unknown if all amplifiers play the last set, which is then silenced."""
         every = self._members.amplifiers.values()
         return self.is_incomplete or any(map(attrgetter("is_in_doubt"), every))
 
     def refusal_of(self, layers: Mapping[str, Sequence[AmplifierLayer]]) -> CommandRefused | None:
         """Return why ledgers would not admit layers by amplifier now; None if all would.
 
-        Not while a set is in doubt, which is silenced first.
+        It returns None also while a set is in doubt, since that set is silenced first.
         """
         if self.is_in_doubt:
             return None
@@ -268,8 +267,8 @@ class JointSets:
     ) -> PlayedSet | DriverError:
         """Stage and commit layers by amplifier; a refusal before the first commit is returned.
 
-        Preempted where a commit that was lost is too late to be repeated: then all are silent.
-        Overtaken where it is preempted before that.
+        Preempted is returned if a lost commit is too late to be repeated; all are silent then.
+        Overtaken is returned if the set is preempted before its commit.
         """
         amplifiers = sorted([self._members.amplifiers[name] for name in layers], key=need)
         self._members.has_joint_set = len({each.line for each in amplifiers}) > 1
@@ -299,7 +298,7 @@ class JointSets:
             refusal = _merged(refusals)
             return await self._silenced(refusal, amplifiers, began) if is_now else refusal
         try:
-            if refusals:  # of which nothing is told where anything worse happened
+            if refusals:  # a worse failure of another amplifier is raised in place of them
                 several = zip(amplifiers, results, strict=True)
                 self._members.checked([one for each, one in several if each.name not in refusals])
             staged = dict(zip(amplifiers, self._members.checked(results), strict=True))
@@ -332,7 +331,10 @@ class JointSets:
     async def _silenced(
         self, refusal: CommandRefused, amplifiers: Sequence[Amplifier], began: float
     ) -> CommandRefused:
-        """Silence a set that may play since a time [s], and came too late; returns why it ended."""
+        """Silence a set that came too late if it may play; returns the error that says why.
+
+        began: when it was begun to be sent [s].
+        """
         if refusal.until is None or not any(each.played_at >= began for each in amplifiers):
             self.is_incomplete = False
             return refusal
@@ -341,22 +343,22 @@ class JointSets:
 
     async def silence(self, ramp: float) -> None:
         """Let all layers of all amplifiers fall silent along a ramp [s]; they stay armed."""
-        # On a line that they share none waits for one that does not reply: that comes last.
+        # Those that do not reply come last, so that no other one on the same line waits for them.
         amplifiers = self._members.by_need
         amplifiers.sort(key=lambda each: each.silence_cause is not None)
         await self._members.all([each.silence(ramp) for each in amplifiers])
         self.is_incomplete = False
 
     async def _commit(self, staged: Mapping[Amplifier, StagedSet]) -> None:
-        """Commit on every line for one moment, by one broadcast where amplifiers share it.
+        """Commit on all lines for one moment, by one broadcast for amplifiers that share a line.
 
-        Raises CommandRefused where one does not play its set then.
+        Raises CommandRefused if an amplifier does not play its set afterwards.
         """
         by_line: dict[Line, list[Amplifier]] = {}
         for each in staged:
             by_line.setdefault(each.line, []).append(each)
         token = self.token
-        moment: float | None = None  # at once
+        moment: float | None = None  # None: at once
         if len(by_line) > 1:
             await _freed([*by_line], until=min([one.until for one in staged.values()]))
             moment = moment_behind(max([line.commit_arrives() for line in by_line]))
@@ -371,33 +373,33 @@ class JointSets:
         for line, sharing in by_line.items():
             at = words[sharing[0]]
             if len(sharing) == 1 or any(words[each] != at for each in sharing):
-                for each in sharing:  # alone, or with a clock that is not steered
+                for each in sharing:  # it is alone on the line, or a clock is not steered
                     requests[each] = each.commit(token, words[each])
                 continue
             make = partial(_commit_of, sharing, token, at)
             broadcasts.append(line.submit(None, Priority.SET, "Commit", make))
-            for each in sharing:  # by a heartbeat: where replies are late the watchdogs run
+            for each in sharing:  # a heartbeat confirms it, and feeds the watchdog meanwhile
                 requests[each] = each.ping()
-        # With the broadcasts: one that waits is not sent where this is given up.
+        # The broadcasts are awaited too: one that is still queued is not sent if this is given up.
         statuses = await self._members.all([*requests.values(), *broadcasts])
         for each, status in zip(requests, statuses, strict=False):
             if status["token"] != token or status["state"] in LATCHED:
                 await _check_plays(each, status, token)
 
     async def _close_gaps(self) -> None:
-        """Have amplifiers whose token is far behind commit an empty set, which changes nothing."""
+        """Let amplifiers whose token is far behind commit an empty set, which changes nothing."""
         behind = [
             each
             for each in self._members.amplifiers.values()
             if each.committed > 0 and (self.token - each.committed) % _SPAN > _MAX_GAP
         ]
-        if behind:  # not of those that have committed none: any is newer
+        if behind:  # those that have committed nothing take any token for a newer one
             self.token = token_after(self.token)
             await self._members.all([each.stage(self.token, (), now=True) for each in behind])
 
 
 async def _freed(lines: Sequence[Line], *, until: float) -> None:
-    """Wait until a commit can be sent on all lines at once, or for a time [s]."""
+    """Wait until a commit can be sent on all lines at once, or until a time [s]."""
     while threads.now() < until and (
         busy := [line.current.result for line in lines if line.current is not None]
     ):
@@ -405,7 +407,7 @@ async def _freed(lines: Sequence[Line], *, until: float) -> None:
 
 
 def _merged(refusals: Mapping[str, CommandRefused]) -> CommandRefused:
-    """Join refusals by amplifier; `until` is known only if all of them pass by themselves."""
+    """Join refusals by amplifier; `until` is known only if all of them end by themselves."""
     known = [each.until for each in refusals.values() if each.until is not None]
     return CommandRefused(
         "; ".join(f"{name}: {refusal}" for name, refusal in refusals.items()),
@@ -415,7 +417,7 @@ def _merged(refusals: Mapping[str, CommandRefused]) -> CommandRefused:
 
 
 def _commit_of(several: Sequence[Amplifier], token: int, at: int) -> list[Values]:
-    """Return the commit of all amplifiers of a line; raises unless each may have it now."""
+    """Return a commit for several amplifiers of a line; raises unless all of them may have it."""
     values = {"session": several[0].session, "token": token, "at": at}
     for amplifier in several:
         amplifier.next_request("Commit", values, Priority.SET)
@@ -423,10 +425,10 @@ def _commit_of(several: Sequence[Amplifier], token: int, at: int) -> list[Values
 
 
 async def _check_plays(amplifier: Amplifier, status: Values, token: int) -> None:
-    """Raise CommandRefused unless a status has shown the token of a set, or does once repeated.
+    """Raise CommandRefused unless an amplifier plays the set with this token.
 
-    status: of a heartbeat, which may have gone before the commit: another may have shown it since.
-    What its layers play is compared with every status.
+    status: of a heartbeat, which may have been sent before the commit. If no status has shown the
+    token, the commit is repeated once. The ledger compares what its layers play with each status.
     """
     if amplifier.committed != token and status["state"] not in LATCHED:
         amplifier.starts = -math.inf
@@ -439,33 +441,33 @@ async def _check_plays(amplifier: Amplifier, status: Values, token: int) -> None
 
 
 async def _achieved(amplifier: Amplifier, staged: StagedSet) -> tuple[LayerSet, ...]:
-    """Read the layers of a set that plays, as the amplifier has achieved them."""
+    """Read how an amplifier has achieved the layers of a set that it plays."""
     return tuple([await amplifier.read_achieved(one, staged.token) for one in staged.layers])
 
 
-# s; an error that costs nothing of a promise, one that costs a tenth of a dB, and more.
+# Errors of a clock [s]: a good one costs nothing of a promise, a fair one a tenth of a dB.
 _GOOD, _FAIR, _POOR = 5e-6, 8e-6, 12e-6
-_MAX_LOAD = 0.2  # of the line's time, for readings beside heartbeats
-_INTERVAL = 0.01  # s, at least, between these; half where an error is poor, longer where near good
-_SETTLING = 0.2  # s, at most, for readings before clocks are needed
-_FRAME = 1e-3  # s, of USB: readings come at all its phases, however steady the heartbeats are
+_MAX_LOAD = 0.2  # share of the line's time for readings beside heartbeats
+_INTERVAL = 0.01  # s; between readings of a fair clock; half for a poor one, more for a better
+_SETTLING = 0.2  # s; at most, for readings before clocks are needed
+_FRAME = 1e-3  # s; a frame of USB, at all phases of which readings shall come
 _GOLDEN = (math.sqrt(5) - 1) / 2  # its multiples fill a circle evenly
 
 
 class Clocks:
-    """The clocks of the amplifiers of a group, whose lines are open."""
+    """The clocks of the amplifiers of a group, on open lines."""
 
     def __init__(self, members: Members) -> None:
         self._members, self._amplifiers = members, members.amplifiers
-        self._are_alike = True  # and so are their lines
+        self._are_alike = True  # the amplifiers, and so are their lines
         self._dither = 0.0
         self._readings: dict[Amplifier, asyncio.Future[Any]] = {}
         self._turns: dict[Line, Iterator[Amplifier]] = {}
-        self._marked: set[Line] = set()  # all on which know Mark, and are several
-        self._firsts: dict[Line, HeldClock | None] = {}  # to which the others of a line are held
+        self._marked: set[Line] = set()  # lines of several amplifiers, all of which know Mark
+        self._firsts: dict[Line, HeldClock | None] = {}  # the clock that the others are held to
 
     def follow(self) -> None:
-        """Know all from now on: one alone, or by which lines and amplifiers they differ."""
+        """Adopt the amplifiers and lines as they were identified just now."""
         every = self._amplifiers.values()
         self._are_alike = len({_kind(each) for each in every}) == 1
         for line in self._members.lines:
@@ -479,11 +481,11 @@ class Clocks:
 
     @property
     def errors(self) -> Mapping[str, float]:
-        """Errors of the clocks against each other [s rms] by amplifier; infinite: not held.
+        """Errors of the clocks against each other [s rms] by amplifier; infinite where not held.
 
-        That which an amplifier states, that of what is seen of its clock, and where lines or
-        amplifiers differ half of the shortest exchange less its bits, of which no exchange shows
-        how it is shared by its two ways. 0 for one alone.
+        Each is made up of what the amplifier states, of what is seen of its clock, and, where lines
+        or amplifiers differ, of half of the shortest exchange less its bits: no exchange shows how
+        that time is shared by the two ways. A single amplifier has 0.
         """
         every = self._amplifiers
         if len(every) < 2:
@@ -494,7 +496,7 @@ class Clocks:
         is_common &= sum(not each.clock.is_compared for each in held) == 1
         leads = {each: each.clock.lead(now) for each in every.values()}
         common = median([leads[each] for each in held] or [0.0])
-        # So that the rms of what is known is no less than that of their differences.
+        # With this factor the rms of the errors is no less than that of their differences.
         wider = math.sqrt(len(held) / max(len(held) - 1, 1))
         return {
             name: math.hypot(
@@ -505,9 +507,9 @@ class Clocks:
         }
 
     async def settle(self) -> None:
-        """Read clocks that are known poorly time and again, before anything plays: it costs none.
+        """Read poorly known clocks repeatedly while nothing plays, so that nothing is delayed.
 
-        No more once one does not reply, or a stop or disarm has come.
+        It ends early once an amplifier does not reply, or a stop or disarm has come.
         """
         lines = self._members.lines if len(self._amplifiers) > 1 else ()
         now = asyncio.get_running_loop().time()
@@ -515,7 +517,7 @@ class Clocks:
             async with asyncio.TaskGroup() as settling:
                 for line in lines:
                     settling.create_task(self._settle(line, now + _SETTLING))
-        except* DriverError:  # as arming says, too
+        except* DriverError:  # arming finds the same error, and reports it
             pass
 
     async def _settle(self, line: Line, until: float) -> None:
@@ -538,12 +540,12 @@ class Clocks:
                 await asyncio.sleep(self.later())
 
     def _compare(self, of_line: Sequence[Amplifier], now: float) -> None:
-        """Hold clocks of a line to one as long as nothing ails it, else to the best known."""
+        """Hold the clocks of a line to one of them: the same as before, or else the best known."""
         line = of_line[0].line
         before = self._firsts.get(line)
 
         def rank(one: HeldClock) -> tuple[bool, bool, bool, float]:
-            # One that has jumped is led back by itself: no other follows it.
+            # No other clock follows one that has jumped.
             error = one.error(now)
             return error == math.inf, one.problem(now) is not None, one is not before, error
 
@@ -553,9 +555,10 @@ class Clocks:
             each.clock.compare(None if each.clock is first else first)
 
     def look(self, by_line: Mapping[Line, Sequence[Amplifier]]) -> None:
-        """Read clocks of lines beside their heartbeats, which go out next: more where needed.
+        """Schedule readings of clocks between the heartbeats, which go out next.
 
-        Of all lines as often: how far the lowest of some readings is above a lead depends on it.
+        All lines are read equally often, because the lowest of several readings is the closer to
+        the lead the more there are.
         """
         if len(self._amplifiers) == 1:
             return
@@ -567,7 +570,7 @@ class Clocks:
             busy[line] = sum(map(max, takes, shown))
             if line in self._marked:
                 self._compare(of_line, now)
-                # Behind the heartbeats: what waits for a reply is sent in step with frames.
+                # A time of its own: what waits for a reply would go out in step with frames of USB.
                 later = self.later(_INTERVAL + busy[line])
                 loop.call_later(later, line.submit, None, Priority.HEARTBEAT, "Mark", {})
                 continue
@@ -581,7 +584,7 @@ class Clocks:
         least = _INTERVAL * (longer if worst <= _POOR else 0.5)
         for line, of_line in unmarked:
             if line.late <= GRACE:
-                # Each by itself: one behind the reply to another is sent in step with frames.
+                # Each at a time of its own: behind another's reply it would be in step with frames.
                 interval = max(least, busy[line] / _MAX_LOAD) / len(of_line)
                 for number in range(1, int(HEARTBEAT / interval)):
                     loop.call_later(
@@ -589,12 +592,12 @@ class Clocks:
                     )
 
     def later(self, duration: float = 0.0) -> float:
-        """Return a duration [s] and some of a frame."""
+        """Return a duration [s] plus a varying part of a frame."""
         self._dither = (self._dither + _GOLDEN) % 1.0
         return duration + self._dither * _FRAME
 
     def _read(self, amplifier: Amplifier) -> None:
-        """Read the status of an amplifier that replies, can be steered and is not being read."""
+        """Read the status of an amplifier, if it replies, can be steered and is not being read."""
         reading = self._readings.get(amplifier)
         is_free = amplifier.clock.can_be_steered and (reading is None or reading.done())
         is_heard = amplifier.silence_cause is None and amplifier.line.loss is None
@@ -603,8 +606,8 @@ class Clocks:
 
 
 def _kind(amplifier: Amplifier) -> tuple[Any, ...]:
-    """Return what amplifiers and lines have in common whose requests are as late at the least."""
+    """Return what must be equal for two amplifiers to receive their requests equally late."""
     line, of = amplifier.line, amplifier.identity
-    device = re.match(r"/.*/(\D*)", line.name)  # without its number; none for a network
+    device = re.match(r"/.*/(\D*)", line.name)  # without its number; None for a network
     made = of.get("vendor"), of.get("product"), of.get("firmware")
     return type(line.wire), device and device[1], made

@@ -1,9 +1,9 @@
 """The ledger of one amplifier: what it was sent and may play.
 
-It is the only maker of the sets that go over the wire. A set is checked when its turn on the line
-has come, as the wire rounds it, against what plays then over the sum of all layers. A set that was
-sent and is not confirmed is a doubt: until that is resolved only silence is admitted. Times [s] are
-of any one clock.
+Only the ledger makes the sets that go over the wire. It checks a set when its turn on the line
+comes, as the wire rounds it, together with all that plays then. A set that was sent and is not
+confirmed yet is a doubt: until it is resolved, only silence is admitted. All times [s] are those of
+one clock, which may be any.
 """
 
 import logging
@@ -33,52 +33,55 @@ from registry.limits import GuardLimits
 _LEVEL, _STEP = QUANTITIES["level"], QUANTITIES["envelope_step"]
 _RAMP, _VALID_FOR = QUANTITIES["ramp"], QUANTITIES["valid_for"]
 _FREQUENCY = QUANTITIES["frequency"]
-_STEPS = 2  # of levels, by which a status may differ
-_MEASURING_ERROR = 0.002  # of full level, where an amplifier measures its levels
-_WEAK = 0.25  # largest measuring error, relative to a weak level
+_STEPS = 2  # steps of levels by which a status may differ
+_MEASURING_ERROR = 0.002  # of full level, if the amplifier measures its levels
+_WEAK = 0.25  # largest measuring error, as a share of a weak level
 _logger = logging.getLogger(__name__)
 
 
 class Doubt(NamedTuple):
-    """A set that was sent at a time [s]; before: what vibrated then."""
+    """A set that was sent and is not confirmed yet."""
 
     token: int
     layers: tuple[LayerSet, ...]
     sent_at: float
+    """When it may have begun to play [s]."""
     before: Vibration | None
+    """The vibration that the budget counted before it."""
 
 
 class Ledger:
-    """The ledger of one amplifier, at first silent.
+    """The ledger of one amplifier, which is silent at first.
 
-    limits: configured; capabilities: values of its record. Raises CommandError for limits that
-    leave nothing to play.
+    limits: the configured ones; capabilities: values of the amplifier's record. Raises CommandError
+    if the limits leave nothing to play.
     """
 
     def __init__(self, limits: GuardLimits, capabilities: Values) -> None:
         self._configured = limits
-        self.adopt(capabilities)  # which refuses limits that are none
+        self.adopt(capabilities)  # refuses limits that are no numbers
         self._budget = Budget(limits)
 
     def adopt(self, capabilities: Values) -> None:
-        """Go on with other capabilities, silent; what was spent of on-time and duty stays spent."""
+        """Adopt new capabilities of the silent amplifier; spent on-time and duty stay spent."""
         self.limits, self.capabilities = wire_limits(self._configured, capabilities), capabilities
         self._is_measured = has_feature(capabilities, "levels_measured")
         self._rounding = Rounding(self.limits, capabilities)
         self.forget()
 
     def forget(self) -> None:
-        """Start anew: the amplifier is silent, armed or not."""
-        # Which fades the amplifier cuts short depends on when it plays: for upper bounds, none.
+        """Begin with silence: nothing plays, whether the amplifier is armed or not."""
+        # An amplifier may cut fades short, depending on when it plays. Upper bounds assume that it
+        # cuts none.
         self.playback = Playback(self.capabilities["channels"], voices=sys.maxsize)
-        self.lag = 0.0  # s; by which what plays may be later than `playback` says
+        self.lag = 0.0  # s; the amplifier may be later than `playback` by this
         self._starts, self._start_error = -math.inf, 0.0  # s; the moment of the last commit
-        self._advanced_to = -math.inf  # s; what was due by then was carried out
+        self._advanced_to = -math.inf  # s; what was due by then has been carried out
         self.may_be_silent = set[int]()
-        """Layers that may be silent: by a silence without a reply, or a renewal that was late."""
+        """Layers that may be silent, after a silence without a reply or a renewal that was late."""
         self.doubt: Doubt | None = None
-        """What was committed and is not confirmed."""
-        self._first_sent = 0, 0.0  # token of the last set, and when [s] its first commit went out
+        """The set that was committed and is not confirmed."""
+        self._first_sent = 0, 0.0  # token of the last set, and when its first commit went out [s]
 
     def go_on_from(self, earlier: "Ledger") -> None:
         """Count the vibrations of an earlier ledger of the same rig, as after a reconnection."""
@@ -88,10 +91,10 @@ class Ledger:
     def admit(
         self, layers: Sequence[AmplifierLayer], now: float, *, delay: float = COMMIT_DELAY
     ) -> tuple[LayerSet, ...]:
-        """Return layers as the wire has them, `valid_for` shortened to what time is left.
+        """Return layers in integers of the wire, with `valid_for` cut to the time that is left.
 
-        delay [s]: within which they are committed. Raises CommandRefused with channel and reason,
-        whatever fails in checking; nothing changes then.
+        delay: time within which they are committed [s]. Raises CommandRefused with channel and
+        reason, whatever fails in the checks; nothing changes then.
         """
         try:
             requested = self._rounding.layers(layers)
@@ -114,7 +117,7 @@ class Ledger:
                     else one
                     for one in requested
                 )
-            self._check_sums(requested, now, delay)  # an ending may come amid a ramp
+            self._check_sums(requested, now, delay)
             return requested
         except CommandRefused:
             raise
@@ -133,12 +136,11 @@ class Ledger:
         starts: float | None = None,
         error: float = 0.0,
     ) -> None:
-        """Note that a set may play from now on: it was committed, and is in doubt.
+        """Note that a set was committed, so that it may play from now on and is in doubt.
 
-        starts: the moment [s] that its commit names, None for at once; error [s]: of that by the
-        clock of the amplifier, at the most. Again, where its commit is
-        repeated: it may have played since the first time, also where a status said that it did
-        not, which may have overtaken the commit.
+        starts: the moment that its commit names [s]; None for at once. error: largest error of that
+        moment by the amplifier's clock [s]. If a commit is repeated, the set may have played since
+        the first one, even if a status has said that it did not: the status may be older.
         """
         if self.doubt is not None and self.doubt.token == token:
             return
@@ -152,9 +154,9 @@ class Ledger:
         self.doubt = Doubt(token, layers, self._first_sent[1], before)
 
     def resolve(self, token: int, now: float) -> None:
-        """Resolve the doubt at a time [s] by the token that the amplifier says it committed last.
+        """Resolve the doubt at a time [s] by the token that the amplifier has committed last.
 
-        That set plays, since it was sent at the earliest; another one was not played.
+        If it is the set in doubt, that plays, perhaps since it was sent; else it was not played.
         """
         if self.doubt is None:
             return
@@ -180,10 +182,10 @@ class Ledger:
             self._budget.confirm(sent_at, now, end=self.playback.ends_by + self.lag)
 
     def correct(self, sent: LayerSet, achieved: LayerSet, token: int) -> None:
-        """Go on with a layer of the set with this token as the amplifier says it plays it.
+        """Adopt a layer of the set with this token as the amplifier reports that it plays it.
 
-        Its frequencies, if allowed, are sent from now on in place of those that it rounds, so that
-        it and the ledger keep the phase of the same tones.
+        Frequencies that the amplifier has rounded are sent rounded from now on, if the limits allow
+        it, so that amplifier and ledger keep the phase of the same tones.
         """
         self.playback.correct(achieved, token)
         for one, played in zip(sent.commands, achieved.commands, strict=True):
@@ -199,13 +201,13 @@ class Ledger:
             self._budget.confirm(sent_at, now, end=self.playback.ends_by + self.lag)
 
     def problem_of(self, status: Values, sent_at: float, now: float) -> str | None:
-        """Describe what the status of an armed one contradicts; None if it agrees.
+        """Say what the status of an armed amplifier contradicts; None if it agrees.
 
-        sent_at, now [s]: of the request and its reply. Levels of voices that change are bounded
-        from above alone: their commit is known as an interval.
+        sent_at, now: when the request for it went out, and when it came [s]. Levels of voices that
+        change have only an upper bound, since it is not known exactly when they were committed.
         """
         playback, late = self.playback, sent_at - self.lag
-        # It may show what played before.
+        # Until then a status may show what played before.
         if sent_at < self._starts + self._start_error or late < self._advanced_to:
             return None
         self._advance(late)
@@ -214,7 +216,7 @@ class Ledger:
         if len(status["tokens"]) != self.capabilities["layers"]:
             return f"layers must be {self.capabilities['layers']}, got {len(status['tokens'])}"
         unsure, by = {*self.may_be_silent}, now + 2 * self.lag
-        if playback.changes_at <= by:  # a layer may have ended, or started what waits, or not yet
+        if playback.changes_at <= by:  # some layer may or may not have changed yet
             unsure |= playback.unsure(by)
         expected = playback.tokens
         for layer, token in enumerate(status["tokens"]):
@@ -237,7 +239,7 @@ class Ledger:
                 tones = [each for each in one.commands if each.channel == channel]
                 highest += sum([each.peak for each in tones]) / _LEVEL.per_unit
             high = round(min(highest, 1.0) * _LEVEL.per_unit)
-            if is_settled and high - tolerance <= level <= high + tolerance:  # nearly always
+            if is_settled and high - tolerance <= level <= high + tolerance:  # the usual case
                 continue
             low = 0
             if is_settled:
@@ -259,7 +261,7 @@ class Ledger:
     def _silence(
         self, layers: tuple[LayerSet, ...], now: float, delay: float
     ) -> tuple[LayerSet, ...]:
-        """Return silent layers, their ramps within the time that is left, endings only if safe."""
+        """Return silent layers with ramps cut to the time that is left, endings only if safe."""
         left = math.floor(min(self._budget.fade_left(now), _RAMP.high) * _RAMP.per_unit)
         silent = tuple(replace(one, ramp=min(one.ramp, left)) for one in layers)
         try:
@@ -275,7 +277,7 @@ class Ledger:
         return tuple(replace(one, commands=commands) for one in silent)
 
     def _check_sums(self, layers: Sequence[LayerSet], now: float, delay: float) -> None:
-        late, until = now - self.lag, now + delay + self.lag  # ends are as late as they can be
+        late, until = now - self.lag, now + delay + self.lag  # the latest possible ends
         self._advance(late)
         if self.limits.slew == math.inf and self._is_within_at_most(layers, late, until):
             return
@@ -290,7 +292,7 @@ class Ledger:
     def _refusal_of_sums(
         self, layers: Sequence[LayerSet], late: float, until: float
     ) -> CommandRefused | None:
-        """Return why layers must not play from a time between two on [s]; None if they may."""
+        """Return why layers must not start between `late` and `until` [s]; None if they may."""
         bounds = Bounds(self.playback, layers, late, until)
         levels, power = bounds.worst()
         highest = self.limits.level / _LEVEL.per_unit
@@ -316,18 +318,19 @@ class Ledger:
         return None
 
     def _waits(self, layers: Sequence[LayerSet], now: float) -> float:
-        """Return how long [s] from now on layers wait at most for the ends of onsets."""
+        """Return how long layers wait at most for the ends of onsets [s]."""
         if self._budget.is_unlimited:
             return 0.0
         ends = [self.playback.onsets_end(one.layer, now) for one in layers if one.after]
         return max(ends, default=now) - now
 
     def _is_within_at_most(self, layers: Sequence[LayerSet], late: float, until: float) -> bool:
-        """Whether the limits hold with all that may play at its largest at once: nearly always.
+        """Whether the limits hold even if all that may play has its largest level at once.
 
-        Of one layer, a tone that rises along the ramp and the one that falls along it meanwhile are
-        together at most the larger of both, unless the new one has an ending, which may come amid.
-        One that waits and keeps its phase goes on as the voice that it waits for.
+        This quick check decides in nearly all cases. Within a layer, a tone that rises along the
+        ramp and the one that falls along it are together at most as large as the larger of both,
+        unless the new one has an ending, which may begin during the ramp. A tone that waits and
+        keeps its phase continues the voice that it waits for.
         """
         playback, full = self.playback, _LEVEL.per_unit
         levels, rising = [0.0] * playback.channels, dict[tuple[int, int], float]()
@@ -338,7 +341,7 @@ class Ledger:
             for command in one.commands:
                 peak = command.level
                 for shape in (command.onset, command.ending):
-                    if shape is not None and shape.knots:  # as `Envelope.peak`, without a call
+                    if shape is not None and shape.knots:  # `Envelope.peak`, written out for speed
                         peak = max(peak, max(shape.knots)[0])
                 if is_kept and command.keep_phase:
                     name = one.layer, command.channel, _FREQUENCY.from_wire(command.frequency)
@@ -367,7 +370,7 @@ class Ledger:
 
 
 def _fade(one: LayerSet) -> float:
-    """Return how long a layer takes to end [s]: along its ramp or its longest ending."""
+    """Return how long a layer takes to end [s], along its ramp or its longest ending."""
     fade = _RAMP.from_wire(one.ramp)
     for command in one.commands:
         if command.ending is not None:
@@ -377,7 +380,7 @@ def _fade(one: LayerSet) -> float:
 
 
 def _lasts(one: LayerSet) -> float:
-    """Return how long a layer vibrates at most [s], fade included."""
+    """Return how long a layer vibrates at most [s], with its fade."""
     if not is_vibrating(one):
         return _fade(one)
     return _fade(one) + (_VALID_FOR.from_wire(one.valid_for) or math.inf)
@@ -385,7 +388,7 @@ def _lasts(one: LayerSet) -> float:
 
 def is_silence(layers: Sequence[AmplifierLayer]) -> bool:
     """Whether layers only fall silent."""
-    for layer in layers:  # noqa: SIM110  a generator would be a call for each
+    for layer in layers:  # noqa: SIM110  a generator is slower
         if layer.tones or layer.renew:
             return False
     return True

@@ -1,10 +1,10 @@
 """One physical line: the requests of all amplifiers on it, one at a time, by priority.
 
-The pump is a function, called on each submission, arrival and timer; no request waits in a task of
-its own. A request is made when its turn has come, so that it is checked once, against what really
-went out before. The parts of a set go out without a pause; only the last has a reply, and is
-repeated. Stop-class requests preempt and supersede all others. Times [s] are of the event loop's
-clock.
+`Line.pump` is called with each submission, arrival and timer; no request has a task of its own. The
+values of a request are made when its turn comes, so that they are checked once, against what really
+went out before. The parts of a set are sent without a pause between them; only the last part has a
+reply, and only that one is repeated. Requests of the stop class preempt and supersede all others.
+Times [s] are those of the event loop's clock.
 """
 
 import asyncio
@@ -59,7 +59,10 @@ _REMEDIES = {
 
 
 def refused_by_amplifier(where: str, refusal: Nak, *, may_play: bool) -> CommandRefused:
-    """Return the error of a request that was refused on a line; may_play: see `CommandRefused`."""
+    """Return the error of a request that an amplifier refused; may_play: see `CommandRefused`.
+
+    where: the line and the amplifier, as the message begins.
+    """
     channel = "" if refusal.channel is None else f", channel {refusal.channel}"
     return CommandRefused(
         f"{where}: the amplifier refused the request: {refusal.code}{channel}"
@@ -73,10 +76,11 @@ def refused_by_amplifier(where: str, refusal: Nak, *, may_play: bool) -> Command
 def no_reply(
     where: str, name: str, timeout: float, remark: str, *, before: float, boot_time: float
 ) -> str:
-    """Return why a request of a name on a line had no reply within a time [s].
+    """Return why the request with this name had no reply within a timeout [s].
 
-    remark: what came instead; before [s]: for how long the reply before was awaited; boot_time [s]:
-    of a board behind a port that was opened just now, else 0.
+    where: the line, as the message begins. remark: what arrived instead. before: how long the
+    previous reply took [s]. boot_time: how long a board may take to boot [s] if its port was
+    opened just now, else 0.
     """
     if not remark and before > timeout:
         remark = f"the reply before took {1e3 * before:.0f} ms: check what delays frames on the way"
@@ -102,7 +106,10 @@ def contradicted(name: str, problem: str) -> CommandRefused:
 
 
 def disarmed(name: str, status: Values) -> CommandRefused:
-    """Return the error of what plays or feeds, once a status shows that it is not armed."""
+    """Return the error of a request that needs an armed amplifier, if a status shows another state.
+
+    name: of the amplifier.
+    """
     return CommandRefused(
         f"amplifier {name} is not armed but in {name_of(STATES, status['state'])}, fault "
         f"{name_of(FAULTS, status['fault'])}; once the cause is gone, clear and arm again",
@@ -115,11 +122,11 @@ def driven_by_another(name: str) -> WrongAmplifier:
     return WrongAmplifier(f"amplifier {name} is driven by another host; end that one first")
 
 
-MAX_WAIT = 0.05  # s; after which a request goes before newer sets and heartbeats
+MAX_WAIT = 0.05  # s; a request that has waited for longer is sent before newer sets and heartbeats
 
 
 class Priority(IntEnum):
-    """Priority of a request: the smaller is sent first."""
+    """Priority of a request: the smallest is sent first."""
 
     STOP = 0
     SILENCE = 1
@@ -139,9 +146,9 @@ _SUPERSEDED = {
 
 
 Make: TypeAlias = Callable[[], list[Values]]
-"""What a request says, known once its turn has come.
+"""A function that makes a request when its turn comes.
 
-Called once, then; returns the values of its messages, or raises CommandRefused.
+It is called once, and returns the values of each message of the request or raises CommandRefused.
 """
 
 
@@ -149,83 +156,96 @@ Called once, then; returns the values of its messages, or raises CommandRefused.
 class LinkStatistics(WireCounters):
     """Statistics of a link at one moment.
 
-    Inherited counters restart when the link is opened, the following count since its construction.
-    retries: repeated requests; timeouts: requests without a reply in time; refusals: Naks.
-    last_round_trip [s].
+    The inherited counters restart when the link is opened; those below never do.
     """
 
     retries: int = 0
+    """Number of requests that were repeated."""
     timeouts: int = 0
+    """Number of requests that had no reply in time."""
     refusals: int = 0
+    """Number of requests that the amplifier refused by a Nak."""
     last_round_trip: float | None = None
+    """Time from the last request that was answered to its reply [s]."""
 
 
 class Member(Protocol):
-    """An amplifier on a line, which notes what is sent to it and what comes from it."""
+    """An amplifier as its line sees it: it notes what is sent to it and what it sends."""
 
     name: str
     address: int
     counts: LinkStatistics
     silence_cause: str | None
-    """Why it counts as mute: it did not reply to a request."""
+    """Why the amplifier counts as mute, by a request without reply; None if it does not."""
 
     def next_request(self, name: str, values: Values, priority: Priority) -> float:
-        """Return how long it and its reply take on the wire [s]; raises if it must not go out."""
+        """Return how long a request and its reply take on the wire [s].
+
+        Raises DriverError if the request must not be sent.
+        """
 
     def note_sent(self, name: str, values: Values, now: float, arrives: float) -> None:
-        """Note a request that is sent now and arrives at a time [s]."""
+        """Note a request that is sent now and reaches the amplifier at a time [s]."""
 
     def note_reply(self, name: str, values: Values, reply: Values, sent_at: float) -> None:
         """Note the reply to a request that was sent at a time [s]."""
 
     def note_unasked(self, arrival: Event | OtherHost | DuplicateAddress) -> None:
-        """Note what came without a request."""
+        """Note a message that the amplifier sent without a request."""
 
 
 @dataclass(eq=False, slots=True)
 class Job:
-    """A request from its queueing to its result; member: None for a broadcast.
-
-    values: of the message on the line, or next. make: until its turn has come; parts: the messages
-    that it made, the last of which is replied to; part: number of the one on the line, or next.
-    reached: the first part that was missing when the last reply came. attempts: left. started_at
-    [s]: when it went out behind what was sent before. takes: on the wire with its reply [s].
-    delays: of this process, while its reply is awaited. had_no_reply: to an earlier attempt.
-    """
+    """A request, from the time when it is queued to its result."""
 
     member: Member | None
+    """The amplifier that it is for; None for a broadcast."""
     priority: Priority
     name: str
     values: Values
+    """Values of the message that is on the line, or is sent next."""
     timeout: float
+    """How long its reply is awaited on a fast wire [s]."""
     queued_at: float
     make: Make | None = None
+    """Makes the messages; None once it has been called."""
     result: "asyncio.Future[Values]" = field(default_factory=asyncio.Future)
     parts: Sequence[Values] = ()
+    """The messages that were made; only the last has a reply."""
     part: int = 0
+    """Index of the part that is on the line, or is sent next."""
     reached: int = 0
+    """Index of the first part that was missing when the last reply came."""
     attempts: int = ATTEMPTS
+    """How many more times it may be sent."""
     is_pausing: bool = False
     sent_at: float = 0.0
+    """When it was last handed to the port [s]."""
     started_at: float = 0.0
+    """When its first bit was last on the wire [s], behind what was sent before it."""
     due: float = 0.0
+    """When it is given up if there is no reply [s]."""
     takes: float = 0.0
+    """How long it and its reply take on the wire [s]."""
     delays: int = 0
+    """How often this process was delayed while the reply was awaited."""
     is_last_look: bool = False
+    """Whether the port was read once more after it had become due."""
     had_no_reply: bool = False
+    """Whether an earlier attempt had no reply."""
 
     @property
     def has_further_parts(self) -> bool:
-        """Whether the message on the line is no last part, and so has no reply."""
+        """Whether parts follow the one on the line, which then has no reply."""
         return self.part < len(self.parts) - 1
 
     def reach(self, part: int) -> None:
-        """Note that all before a part have arrived: one that is farther than ever begins anew."""
+        """Note that all parts before this one have arrived; any progress restores all attempts."""
         if part > self.reached:
             self.reached, self.attempts = part, ATTEMPTS
 
     def is_missing(self, taken: Values) -> bool:
-        """Go back to the first part that a reply to the last says is missing; False if none is."""
+        """Go back to the first part that a reply reports as missing; returns False if none is."""
         missing = taken["missing"]
         if taken["staged"] or taken["played"] or missing >= self.part:
             return False
@@ -235,52 +255,55 @@ class Job:
 
     @property
     def is_stop_class(self) -> bool:
-        """Whether it silences the amplifier: sent and repeated before all others."""
+        """Whether it silences the amplifier, and so is sent and repeated before all others."""
         return self.priority <= Priority.SILENCE
 
     def has_waited(self, now: float) -> bool:
-        """Whether it is as urgent as a heartbeat by now [s], for it waits for long."""
+        """Whether it has waited for so long that it is as urgent as a heartbeat; now [s]."""
         is_minor = Priority.HEARTBEAT < self.priority < Priority.READING
         return is_minor and now - self.queued_at > MAX_WAIT
 
     def is_superseded_by(self, priority: Priority, member: Member | None) -> bool:
-        """Whether a request for an amplifier, None for all, makes it obsolete."""
+        """Whether a request with a priority makes it obsolete; member: None for a broadcast."""
         return self.priority in _SUPERSEDED.get(priority, ()) and member in (self.member, None)
 
 
 class JobQueue:
-    """Jobs that wait for one line."""
+    """The requests that wait for one line."""
 
     def __init__(self) -> None:
         self.jobs: list[Job] = []
-        """In the order in which they were queued, as those of one rank are sent."""
+        """The jobs in the order in which they were queued; those of one rank are sent in it."""
         self.add = self.jobs.append
-        self._had_waited = False  # the last one that was taken
+        self._had_waited = False  # whether the job that was taken last had waited for long
 
     def remove(self, job: Job) -> None:
-        """Take a job out, if it waits."""
+        """Remove a job if it is waiting."""
         if job in self.jobs:
             self.jobs.remove(job)
 
     def take(self, job: Job, now: float) -> None:
-        """Take the one out whose turn it is."""
+        """Remove the job whose turn it is."""
         self.jobs.remove(job)
         self._had_waited = job.has_waited(now)
 
     def _rank(self, job: Job, now: float) -> tuple[int, int]:
-        """Place at a time [s]: of those that have waited for long one before a heartbeat."""
+        """Return the rank of a job; now [s].
+
+        One job that has waited for long goes before the heartbeats, the next one after them.
+        """
         if job.has_waited(now):
             return Priority.HEARTBEAT, 2 if self._had_waited else 1
         is_reading = job.priority is Priority.READING
         return job.priority if is_reading else min(job.priority, Priority.ARM), 1
 
     def has_before(self, job: Job, now: float) -> bool:
-        """Whether a job that waits goes before another one at a time [s]."""
+        """Whether any waiting job goes before this one; now [s]."""
         first = self.next(now) if self.jobs else None
         return first is not None and self._rank(first, now) < self._rank(job, now)
 
     def next(self, now: float) -> Job | None:
-        """Return the job whose turn it is; None while all pause, or a stop does."""
+        """Return the job whose turn it is, or None while all of them pause, or a stop does."""
         first: Job | None = self.jobs[0]
         if len(self.jobs) > 1:
             ready = [job for job in self.jobs if job.is_stop_class or not job.is_pausing]
@@ -289,28 +312,28 @@ class JobQueue:
 
 
 GRACE = 0.008  # s; how long a stop waits for the reply to another request
-BUSY_PAUSE = 0.005  # s; before a request goes again to a busy amplifier
-_AHEAD = 0.005  # s; what is on its way when the next part of a set follows: a stop waits for it
-_FULL_PAUSE = 0.0005  # s; before a port that is blocked is looked at again
-_LOOK_INTERVAL = 0.01  # s; in which a delay of this process is noticed
-_LATE = 0.005  # s; a timer later than this means that this process was delayed
+BUSY_PAUSE = 0.005  # s; before a request is repeated to a busy amplifier
+_AHEAD = 0.005  # s; the next part of a set is written so early; a stop waits for what is under way
+_FULL_PAUSE = 0.0005  # s; before a blocked port is looked at again
+_LOOK_INTERVAL = 0.01  # s; between two looks, each of which would notice a delay of this process
+_LATE = 0.005  # s; if a timer fires later than this, this process was delayed
 MAX_LATE = 0.032
-"""By so much longer [s] than on a prompt wire a reply is awaited where replies have come late.
+"""How much longer [s] a reply is awaited at most where replies have come late.
 
-An adapter may keep what passes for 16 ms, each way.
+An adapter may hold what passes for 16 ms, each way.
 """
-_LATE_DECAY = 0.9  # with each reply
-_MAX_COMMIT_LATE = 0.003  # s; frames of USB at full speed, 1 ms, of port, hub and adapter
-_SENDING = 0.0005  # s; until this process has written to all lines
-_DELAYS = 4  # of this process that prolong the wait for one reply
+_LATE_DECAY = 0.9  # of the lateness of replies, with each reply
+_MAX_COMMIT_LATE = 0.003  # s; one frame of full-speed USB, 1 ms, for each of port, hub and adapter
+_SENDING = 0.0005  # s; this process needs it to write to all lines
+_DELAYS = 4  # delays of this process that prolong the wait for one reply
 SUPERSEDED = "superseded by a newer set, or by a stop or disarm"
 
 
 class Line:
-    """A line of a port that takes what is received to `received`, and a loss to `lose`.
+    """One physical line: its port calls `received` with what arrives, and `lose` when it is lost.
 
-    boot_time [s]: for which Hello is repeated once it is open, until an amplifier has replied: its
-    board may restart when its port is opened.
+    boot_time: how long Hello is repeated after the port was opened [s], until an amplifier has
+    replied: a board may restart when its port is opened.
     """
 
     def __init__(self, wire: Wire, name: str, *, boot_time: float = 0.0) -> None:
@@ -319,25 +342,31 @@ class Line:
         self.loss: str | None = None
         self.members: dict[int, Member] = {}
         self.seen: Callable[[str, int, str, object], None] | None = None
-        """Called with each message: out, in, event or none; address, name, content. Must return."""
+        """Called with each message: its direction (out, in, event, none), address, name, content.
+
+        It must not raise.
+        """
         self.ahead: Callable[[str, Priority], Make | None] | None = None
-        """Called with each request to one amplifier: what to commit on all of the line ahead."""
+        """Called before each request to one amplifier.
+
+        It returns the commit that is broadcast on the line first, or None.
+        """
         self._queue = JobQueue()
         self.current: Job | None = None
-        """The request on the line; None if it is free."""
+        """The request on the line; None if the line is free."""
         self._timer: asyncio.TimerHandle | None = None
         self._loop = asyncio.get_running_loop()
         self.time = self._loop.time
         """The clock of the line [s]."""
         self._boot_time, self._boots_until = boot_time, -math.inf
         self._is_pumping = False
-        self._sent_until = 0.0  # s; before, what was sent is still on its way
-        self._free_at = 0.0  # s; before, a reply may still take the line
+        self._sent_until = 0.0  # s; until then what was sent is still under way
+        self._free_at = 0.0  # s; until then a reply may still occupy the line
         self.late = 0.0
-        """By how much later [s] than the wire takes replies have come, at most `MAX_LATE`."""
+        """How much later replies have come [s] than the wire alone explains, at most `MAX_LATE`."""
 
     def open(self, port: OpenPort) -> None:
-        """Send by a port that is open."""
+        """Use this open port from now on."""
         self._port = port
         self._commit_takes = self.wire.transit(MESSAGES["Commit"].request.words)
         self._boots_until = self.time() + self._boot_time
@@ -351,11 +380,11 @@ class Line:
         *,
         timeout: float = REPLY_TIMEOUT,
     ) -> "asyncio.Future[Values]":
-        """Queue a request of an amplifier; the future has the values of its last reply.
+        """Queue a request to an amplifier; returns a future of the values of its reply.
 
-        Or raises LinkError, LinkTimeout, FrameError, CommandRefused; Preempted where another
-        request came first. member: None for a broadcast, which has no reply: the future ends once
-        it was sent.
+        The future raises LinkError, LinkTimeout, FrameError, CommandRefused, or Preempted if a
+        request with a higher priority made this one obsolete. member: None for a broadcast, which
+        has no reply; its future ends once it was sent.
         """
         make, values = (values, Values()) if callable(values) else (None, values)
         job = Job(member, priority, name, values, timeout, self.time(), make)
@@ -378,17 +407,17 @@ class Line:
         return future
 
     def commit_arrives(self) -> float:
-        """Return by when [s] a commit arrives that is sent next.
+        """Return when a commit arrives at the latest [s] if it is sent next.
 
-        As late as replies have come, by three frames of USB at the most. One that is lost is not
-        waited for: it is repeated 30 ms later.
+        It may be as late as replies have been, but by three frames of USB at the most. The time of
+        a repetition is not included: a lost commit is repeated 30 ms later.
         """
         begins = max(self.time(), self._free_at, self._sent_until)
         late = min(self.late, _MAX_COMMIT_LATE) + _SENDING
         return begins + self._commit_takes + late
 
     def received(self, data: bytes) -> None:
-        """Take bytes from the port."""
+        """Process bytes that the port has received."""
         arrivals = self.wire.received(data)
         if trace.is_active():
             trace.frame(Direction.IN, data, self.name, lambda: ", ".join(map(repr, arrivals)))
@@ -402,7 +431,7 @@ class Line:
             job = self.current
             if job is None or (member := job.member) is None:  # no broadcast is on the line
                 continue
-            self._sent_until = 0.0  # what is replied to has arrived
+            self._sent_until = 0.0  # a request that has a reply has arrived
             if isinstance(arrival, Continuation):
                 self.late = max(self.late, min(self.time() - self._free_at, MAX_LATE))
                 if self._queue.jobs and self._must_yield(job):
@@ -424,10 +453,10 @@ class Line:
             self._boots_until = -math.inf
             try:
                 member.note_reply(job.name, job.values, arrival.values, job.sent_at)
-            except Exception as error:  # whatever it is, no caller may wait for ever
+            except Exception as error:  # no caller may wait for ever, whatever has failed
                 self._fail(job, error)
                 continue
-            if job.result.done():  # its caller has gone
+            if job.result.done():  # its caller was cancelled
                 continue
             if len(job.parts) > 1 and job.is_missing(arrival.values):
                 if job.attempts > 0:
@@ -440,7 +469,7 @@ class Line:
         if self._queue.jobs:
             self.pump()
         elif self.current is None and self._timer is not None:
-            self._timer.cancel()  # nothing is awaited: it would wake the process for nothing
+            self._timer.cancel()  # no reply is awaited, so that nothing needs to be looked at
             self._timer = None
 
     def lose(self, cause: str) -> None:
@@ -453,7 +482,7 @@ class Line:
             self._timer.cancel()
 
     def pump(self) -> None:
-        """Put the next request on the line, if it is free."""
+        """Send the next request if the line is free."""
         if self._is_pumping:
             return
         self._is_pumping = True
@@ -464,16 +493,17 @@ class Line:
                     break
                 self._queue.take(job, self.time())
                 if job.result.done():
-                    self._fail(job, Preempted(SUPERSEDED))  # its caller has gone: so have others
+                    self._fail(job, Preempted(SUPERSEDED))  # its caller was cancelled
                 else:
                     self._start(job)
         finally:
             self._is_pumping = False
 
     def _start(self, job: Job, rest: bytes = b"", *, is_present: bool = False) -> None:
-        """Make a request in its turn and send it, noted for all that it reaches: no other way.
+        """Make a request and send it, and note it for each amplifier that it reaches.
 
-        rest: of the request that is on the line already. is_present: its reply is made by that.
+        Nothing is sent in another way. rest: what is still to be sent of the request that is on the
+        line. is_present: whether the amplifier acts on the request with that.
         """
         member, data = job.member, rest
         address = BROADCAST if member is None else member.address
@@ -496,7 +526,7 @@ class Line:
                 has_reply = member is not None and job.part >= len(job.parts) - 1
                 data = self.wire.request(address, job.name, job.values, has_reply=has_reply)
             now = self.time()
-            begins = max(now, self._sent_until)  # behind what is still on its way
+            begins = max(now, self._sent_until)  # behind what is still under way
             if not rest:
                 job.sent_at, job.started_at, job.due = now, begins, 0.0
                 for each in self.members.values():
@@ -510,13 +540,13 @@ class Line:
             self._sent_until, self._free_at = begins + self.wire.takes, begins + self.wire.busy
             try:
                 self._port.write(data)
-            except LinkTimeout as error:  # it takes nothing: the amplifier counts as degraded
+            except LinkTimeout as error:  # the port accepts nothing: the amplifier is degraded
                 if member is not None:
                     member.silence_cause = str(error)
                 raise
-            if self.loss is not None:  # by what the port did
+            if self.loss is not None:  # the port was lost while it was written
                 raise LinkError(self.loss)
-        except Exception as error:  # no caller may wait for ever
+        except Exception as error:  # no caller may wait for ever, whatever has failed
             self.current = None
             self.wire.withdraw()
             self._fail(job, error)
@@ -525,23 +555,25 @@ class Line:
             job.result.set_result({})
             return
         if not rest:
-            # A slow wire: as long as on others until it counts as degraded. But each of several
-            # parts is lost as easily: heartbeats, which go between them, find one that is mute.
+            # On a slow wire one attempt less is made, so that an amplifier counts as degraded as
+            # soon as on others. A set of several parts keeps its attempts, since each part may be
+            # lost; the heartbeats between the parts find an amplifier that is mute.
             is_cut = job.takes > FAST and job.attempts == ATTEMPTS and len(job.parts) < 2
             job.attempts -= 2 if is_cut else 1
-        # Each of the two responses on Modbus may begin late.
+        # On Modbus each of the two responses may begin late.
         late = self.late if self.late > GRACE else 0.0
         longer = job.takes - FAST if job.takes > FAST else 0.0
         job.due = max(job.due, begins + longer + job.timeout + late)
         job.delays, job.is_last_look = 0, False
         self.current = job
-        if job.part < len(job.parts) - 1 and not self.wire.confirms_parts:  # often: without a call
+        # This is `has_further_parts`, written out because it runs with every message.
+        if job.part < len(job.parts) - 1 and not self.wire.confirms_parts:
             self._send_further(job)
         elif self._timer is None:
             self._timer = self._loop.call_at(min(job.due, now + _LOOK_INTERVAL), self._look)
 
     def _send_further(self, job: Job) -> None:
-        """Send the next part of a set once what is under way has nearly arrived, or give way."""
+        """Send the next part of a set once the last one has nearly arrived."""
         now = self.time()
         due = max(self._sent_until - _AHEAD, now + _FULL_PAUSE * self._port.is_blocked)
         if due <= now or (self._queue.jobs and self._queue.has_before(job, now)):
@@ -550,9 +582,9 @@ class Line:
             self._look_by(due)
 
     def _go_on(self, job: Job) -> None:
-        """Go on with the next part of a set, unless a request that waits comes before it."""
+        """Send the next part of a set, unless a waiting request goes before it."""
         self.current = None
-        job.attempts += 1  # this part has not been awaited in vain
+        job.attempts += 1  # the attempt for this part did not fail
         job.part, job.values = job.part + 1, job.parts[job.part + 1]
         if self.wire.confirms_parts:
             job.reach(job.part)
@@ -562,11 +594,11 @@ class Line:
             self._start(job)
 
     def _must_yield(self, job: Job) -> bool:
-        """Whether a request gives way to one that silences."""
+        """Whether a request must give way to one that silences."""
         return not job.is_stop_class and any(other.is_stop_class for other in self._queue.jobs)
 
     def _refused(self, job: Job, member: Member, arrival: Nak | BrokenReply) -> None:
-        """End the request that was on the line with an error, or repeat it to a busy amplifier."""
+        """Repeat a request that a busy amplifier refused; fail any other one."""
         if isinstance(arrival, BrokenReply):
             self._fail(job, FrameError(f"{self.name}: {arrival.reason}"))
             return
@@ -577,16 +609,16 @@ class Line:
             self._fail(job, refused_by_amplifier(self.name, arrival, may_play=job.had_no_reply))
 
     def _queue_again(self, job: Job) -> bool:
-        """Queue a request again, unless another one of its amplifier comes before it."""
+        """Queue a request again, and return True, unless a waiting request makes it obsolete."""
         if any(job.is_superseded_by(other.priority, other.member) for other in self._queue.jobs):
             self._fail(job, Preempted(SUPERSEDED))
             return False
-        # Behind those of its priority, so that a mute amplifier does not keep others waiting.
+        # It goes behind those of its priority, so that a mute amplifier does not delay others.
         self._queue.add(job)
         return True
 
     def _repeat(self, job: Job, member: Member, *, pause: float = 0.0) -> None:
-        """Send a request once more in its turn, after a pause [s]."""
+        """Queue a request once more, to be sent after a pause [s] when its turn comes."""
         if self._queue_again(job):
             member.counts.retries += 1
             if pause:
@@ -594,19 +626,19 @@ class Line:
                 self._loop.call_later(pause, self._resume, job)
 
     def _resume(self, job: Job) -> None:
-        """Send a request that has paused in its turn."""
+        """End the pause of a request."""
         job.is_pausing = False
         self.pump()
 
     def _fail(self, job: Job, error: Exception) -> None:
-        """End a request with an error, unless its caller has gone."""
+        """End a request with an error, unless its caller was cancelled."""
         self._queue.remove(job)
         if not job.result.done():
             job.result.set_exception(error)
-            job.result.exception()  # retrieved, where nobody waits for it
+            job.result.exception()  # so that asyncio does not report it where nobody waits
 
     def _preempt(self, current: Job) -> None:
-        """Shorten the time of the request on the line for one that must not wait."""
+        """Shorten the wait for the current reply where a more urgent request is waiting."""
         if current.is_stop_class:
             return
         if current.has_further_parts and not self.wire.confirms_parts:  # no reply is due
@@ -617,24 +649,24 @@ class Line:
         free_at = max(self.time(), self._free_at)
         if first <= Priority.SILENCE:
             current.due = min(current.due, free_at + (0.0 if is_reading else GRACE))
-        # Where replies come late one that is cut short would never end.
+        # Where replies come late, a reading that is cut short each time would never end.
         elif is_reading and first <= Priority.SET and self.late <= GRACE:
             begins_by = max(current.started_at + current.takes, self._free_at) + REACTION
-            current.due = min(current.due, max(self.time(), begins_by))  # none begins from then on
+            current.due = min(current.due, max(self.time(), begins_by))  # no reply begins later
         self._look_by(current.due)
 
     def _look_by(self, due: float) -> None:
-        """Look at the request on the line at a time [s], or before."""
+        """Look at the current request at a time [s] or earlier."""
         if self._timer is None or self._timer.when() > due:
             if self._timer is not None:
                 self._timer.cancel()
             self._timer = self._loop.call_at(due, self._look)
 
     def _look(self) -> None:
-        """Give up the request on the line if it is due, once the port was read once more.
+        """Give up the current request if it is due and a last reading of the port brings no reply.
 
-        By what the timer is late this process was delayed, and the reply has as much time left as
-        it had then.
+        If the timer fires late, this process was delayed by as much; the reply then keeps the time
+        that it had left when the delay began.
         """
         timer, self._timer = self._timer, None
         job, now = self.current, self.time()
@@ -662,7 +694,7 @@ class Line:
             self._timer = self._loop.call_at(due, self._look)
 
     def _not_answered(self, job: Job) -> None:
-        """Take the request off the line, and repeat it or give it up."""
+        """Repeat the current request, which had no reply in time, or give it up."""
         self.current = None
         self.wire.withdraw()
         member = job.member
@@ -684,7 +716,7 @@ class Line:
         self._give_up(job, member, boot_time=self._boot_time if is_first else 0.0)
 
     def _give_up(self, job: Job, member: Member, *, boot_time: float = 0.0) -> None:
-        """End a request that has had no reply, or whose parts do not arrive."""
+        """Fail a request that had no reply, or whose parts do not arrive."""
         remark = self.wire.blocked if self._port.is_blocked else self.wire.counters.remark
         member.silence_cause = no_reply(
             self.name,
@@ -698,7 +730,7 @@ class Line:
 
 
 def _trace(job: Job, result: "asyncio.Future[Values]") -> None:
-    """Trace a request with its reply or error, and how long it took since it was queued."""
+    """Trace a request with its reply or error, and the time since it was queued."""
     outcome: object = "cancelled"
     if not result.cancelled():
         outcome = result.exception() or result.result()

@@ -302,10 +302,10 @@ class Group:
                 members.checked(await asyncio.shield(arming))
                 members.check_none_since(before)
             except BaseException as error:
-                self._note(error)
                 await members.silence(self._disarm_armed, arming)
                 if isinstance(error, DriverError):
                     members.check_none_since(before)
+                self._note(error)  # only now: one that has replied to the disarm is not lost
                 if members.is_degraded_only(error):
                     raise LinkDegraded(str(error)) from error
                 if members.lost_by:

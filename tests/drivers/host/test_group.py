@@ -7,16 +7,17 @@ long its bits take, what is late, and what a delay of this process costs.
 import asyncio
 from collections import Counter
 from collections.abc import Awaitable, Callable, Sequence
+from random import Random
 
 import pytest
 
-from drivers.errors import CommandRefused, DriverError, LinkError, LinkTimeout
+from drivers.errors import CommandRefused, DriverError, LinkDegraded, LinkError, LinkTimeout
 from drivers.host.amplifier import Amplifier
 from drivers.host.dialogue import SILENCING
 from drivers.host.group import Group
 from drivers.host.line import Priority
 from drivers.playing import AmplifierLayer, AmplifierTone
-from drivers.protocol.definition import MESSAGES, STATES
+from drivers.protocol.definition import ATTEMPTS, MESSAGES, STATES
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Envelope, LayerSet
 from drivers.wires.modbus import ModbusWire
@@ -29,6 +30,7 @@ from virtual_lines import (
     grouped,
     in_virtual_time,
     layer,
+    losing,
     tone,
     unaltered,
     with_group,
@@ -497,3 +499,18 @@ async def test_commit_of_a_set_that_is_given_up_is_not_sent(
     await asyncio.sleep(0.01)
     assert end.sent == []
     assert (end.levels("a"), end.levels("b")) == ([0.5, 0.0], [0.5, 0.0])
+
+
+@in_virtual_time
+async def test_amplifier_that_misses_only_its_arming_can_be_armed_next() -> None:
+    """Stopped long ago, it counts as lost, but replies to the disarm that follows at once."""
+    ends = [MemoryLine("serial", "a"), MemoryLine("serial", "b")]
+    group = await group_of(*ends, draw=Random(1).randint)
+    await group.stop()
+    await group.clear()
+    await asyncio.sleep(1.0)
+    ends[0].inward = losing("Hello", count=ATTEMPTS)
+    with pytest.raises(LinkDegraded):
+        await group.arm()
+    await group.arm()
+    assert group.is_armed

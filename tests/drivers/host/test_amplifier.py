@@ -16,7 +16,6 @@ import pytest
 from drivers.errors import (
     CommandError,
     CommandRefused,
-    DriverError,
     FrameError,
     LinkError,
     LinkTimeout,
@@ -178,52 +177,6 @@ def loud(level: float) -> AmplifierLayer:
     return AmplifierLayer(0, (AmplifierTone(0, 100.0, level),), 0.001)
 
 
-def restart(end: MemoryLine, **changes: object) -> None:
-    """Switch the amplifier off and on again, as one with other capabilities: it boots on CAN."""
-    far = end.far["a"]
-    far.capabilities = {**far.capabilities, **changes}
-    far.restart(end.loop.time())
-    far.latch = 0
-    if end.kind is KINDS["can"]:
-        end.boot(1)
-
-
-@in_virtual_time
-async def test_amplifier_that_was_switched_off_is_armed_with_its_new_limits(wire: str) -> None:
-    """It plays at most 0.3 since: 0.4 is refused here, before anything is sent."""
-    end = MemoryLine(wire, "a")
-    group = await group_of(end, is_armed=False)
-    restart(end, level_max=3000)
-    await group.arm()
-    end.sent.clear()
-    with pytest.raises(CommandRefused):
-        await group.apply({"a": [loud(0.4)]})
-    assert end.sent == []
-    await group.apply({"a": [loud(0.3)]})
-
-
-@in_virtual_time
-async def test_amplifier_that_restarts_amid_a_session_can_be_cleared_and_armed(wire: str) -> None:
-    """Its latches begin anew, so that the stop is not confirmed; clear and arm know it again."""
-    end = MemoryLine(wire, "a")
-    group = await group_of(end)
-    assert (await group.stop())["a"].is_confirmed
-    await group.clear()
-    group._draw = lambda low, high: 78
-    await group.arm()
-    await group.apply({"a": [loud(0.5)]})
-    restart(end)
-    with pytest.raises(DriverError):
-        await group.beat()
-    await group.stop()
-    group._draw = lambda low, high: 79
-    await group.clear()
-    await group.arm()
-    await group.apply({"a": [loud(0.5)]})
-    await group.stop()
-    assert end.levels("a") == [0.0, 0.0]
-
-
 @in_virtual_time
 async def test_reply_that_comes_twice_is_not_of_two_amplifiers(wire: str) -> None:
     """The same amplifier's, doubled on its way."""
@@ -283,28 +236,6 @@ def test_request_that_waits_on_a_busy_machine_contradicts_nothing(wire: str) -> 
         run_virtual(run(is_answered))
 
 
-@in_virtual_time
-async def test_ping_that_a_network_delivers_late_is_accounted_for() -> None:
-    """It arrives 0.2 s late: the amplifier plays for longer than its watchdog after the last one.
-
-    By hand: the last of three attempts goes out at 60 ms and feeds at 260 ms, for 250 ms.
-    """
-    end = MemoryLine("tcp", "a")
-    group = await group_of(end)
-    await group.apply({"a": [loud(0.5)]})
-    (host,) = end.hosts.values()
-    end.inward = lambda name, data: [(0.2, data)]
-    end.outward = lambda name, data: []
-    began = end.loop.time()
-    with pytest.raises(LinkTimeout):
-        await host.ping()
-    await asyncio.sleep(began + 0.5 - end.loop.time())
-    assert end.levels("a") == [0.5, 0.0]
-    assert began + 0.515 < host.feeding.may_play_until < began + 1.4
-    await asyncio.sleep(0.02)
-    assert end.levels("a") == [0.0, 0.0]
-
-
 class Twins:
     """Two amplifiers at each address, which hear and reply at the same time."""
 
@@ -328,22 +259,6 @@ async def test_second_amplifier_at_an_address_is_told(kind: str) -> None:
     with pytest.raises(LinkError, match="several amplifiers reply at address 2"):
         await line.hosts["b"].open()
     await line.hosts["a"].open()
-
-
-@in_virtual_time
-async def test_amplifier_that_is_not_identified_plays_nothing_and_is_silenced(wire: str) -> None:
-    """It is named by what is planned for it; what it plays is silenced as before."""
-    end = MemoryLine(wire, "a")
-    group = await group_of(end)
-    await group.apply({"a": [loud(0.5)]})
-    end.hosts["a"].capabilities = {}  # as of a stop that found its line closed
-    refusal = group.sets.refusal_of({"a": [loud(0.5)]})
-    assert "a must be identified" in str(refusal)
-    with pytest.raises(CommandRefused, match="a must be identified"):
-        await group.apply({"a": [loud(0.4)]})
-    await group.silence(0.005)
-    await asyncio.sleep(0.01)
-    assert end.levels("a") == [0.0, 0.0]
 
 
 SENT = LayerSet(2, 20, 0, (Command(0, 2000, 5000, 17_990), Command(1, 2000, 0, 0)))

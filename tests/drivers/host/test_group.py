@@ -5,21 +5,20 @@ long its bits take, what is late, and what a delay of this process costs.
 """
 
 import asyncio
-from collections import Counter
-from collections.abc import Awaitable, Callable, Sequence
+from collections.abc import Awaitable, Callable
 from random import Random
 
 import pytest
 
-from drivers.errors import CommandRefused, DriverError, LinkDegraded, LinkError, LinkTimeout
+from drivers.errors import DriverError, LinkDegraded, LinkError, LinkTimeout
 from drivers.host.amplifier import Amplifier
 from drivers.host.dialogue import SILENCING
 from drivers.host.group import Group
 from drivers.host.line import Priority
 from drivers.playing import AmplifierLayer, AmplifierTone
-from drivers.protocol.definition import ATTEMPTS, MESSAGES, STATES
+from drivers.protocol.definition import ATTEMPTS, STATES
 from drivers.protocol.records import Values
-from drivers.protocol.sets import Envelope, LayerSet
+from drivers.protocol.sets import Envelope
 from drivers.wires.modbus import ModbusWire
 from drivers.wires.serial_line import SerialWire
 from drivers.wires.wire import BrokenReply, Wire
@@ -75,29 +74,6 @@ async def test_lines_come_in_the_order_of_the_amplifiers(
 
 
 @grouped(("a",))
-async def test_stop_does_not_wait_for_a_reply_that_is_lost(
-    group: Group, ends: list[MemoryLine], wire: str
-) -> None:
-    """It is sent within 9 ms of the request, which is given up.
-
-    On RTU within 8 ms of when the response to a write of 11 characters would have ended.
-    """
-    latest = 0.009 + (19 * 11 / 115_200 + 2 * 0.00175 if wire == "rtu" else 0.0)
-    (host,) = group.amplifiers.values()
-    ends[0].outward = lambda name, data: []
-    reading = asyncio.ensure_future(host.read_status())
-    await asyncio.sleep(0.001)
-    began = ends[0].loop.time()
-    stopping = asyncio.ensure_future(group.stop())
-    await asyncio.sleep(0.02)
-    sent = next(at for at, each in ends[0].sent if each == "1:8" and at >= began)
-    assert sent - began <= latest
-    ends[0].outward = lambda name, data: [(0.0002, data)]
-    assert (await stopping)["a"].is_confirmed
-    await reading
-
-
-@grouped(("a",))
 async def test_stop_is_repeated_after_a_reply_that_is_none(
     group: Group, ends: list[MemoryLine], wire: str
 ) -> None:
@@ -107,22 +83,6 @@ async def test_stop_is_repeated_after_a_reply_that_is_none(
     host_side.received = lambda data: next(broken, None) or received(data)
     assert (await group.stop())["a"].is_confirmed
     assert [each for _, each in ends[0].sent][-2:] == ["1:8", "1:8"]
-
-
-@grouped(("a",))
-async def test_watchdog_is_seen_to_run_down_five_times_a_second(
-    group: Group, ends: list[MemoryLine]
-) -> None:
-    """Before one of four heartbeats, or less on a slow wire: their own reply shows a full one."""
-    status, ping = (MESSAGES[name].number for name in ("GetStatus", "Ping"))
-    before = len(ends[0].sent)
-    for _ in range(20):
-        await group.beat()
-        await asyncio.sleep(0.05)
-    kinds = Counter(each.partition(":")[2] for _, each in ends[0].sent[before:])
-    assert kinds.keys() == {f"{status}", f"{ping}"}
-    assert kinds[f"{ping}"] == 20
-    assert 2 <= kinds[f"{status}"] <= 5
 
 
 @in_virtual_time
@@ -158,38 +118,6 @@ async def test_another_amplifier_or_version_is_refused(wire: str, name: str) -> 
     host = Amplifier(end.line, 1, end.hosts["a"].limits, name="a", serial_number="SIM-a")
     with pytest.raises(LinkError):
         await host.open()
-
-
-@grouped(("a",), wire="serial")
-async def test_set_that_plays_in_part_stops(group: Group, ends: list[MemoryLine]) -> None:
-    """An amplifier that commits one of two layers says the token of the set all the same.
-
-    The status of a heartbeat is the first that contradicts, that of the next one the last.
-    """
-    far = ends[0].far["a"].playback
-    commit = far.commit
-
-    def first_alone(layers: Sequence[LayerSet], token: int, time: float) -> None:
-        commit(layers[:1], token, time)
-
-    far.commit = first_alone  # type: ignore[method-assign]
-    await group.apply({"a": [layer(0, tone()), layer(1, AmplifierTone(0, 150.0, 0.2))]})
-    await group.beat()
-    await asyncio.sleep(0.05)
-    with pytest.raises(CommandRefused):
-        await group.beat()
-    assert (ends[0].levels("a"), group.is_armed) == ([0.0, 0.0], False)
-
-
-@grouped(("a",), wire="serial")
-async def test_listener_that_fails_loses_no_reply(group: Group, ends: list[MemoryLine]) -> None:
-    """An event and the reply of the stop that caused it come in one read."""
-
-    def fail(values: Values) -> None:
-        raise RuntimeError("listener")
-
-    group.amplifiers["a"].listeners.append(fail)
-    assert (await group.stop())["a"].is_confirmed
 
 
 @grouped(("a",))

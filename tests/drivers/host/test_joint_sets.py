@@ -24,7 +24,6 @@ from courses import Acted
 from drivers.errors import (
     CommandRefused,
     DriverError,
-    LinkDegraded,
     LinkTimeout,
     Overtaken,
     Preempted,
@@ -155,21 +154,6 @@ async def test_sets_start_together_by_clocks_that_cannot_be_steered(lines: tuple
 
 
 @in_virtual_time
-async def test_amplifier_that_does_not_start_at_its_moment_is_found() -> None:
-    """By two statuses, 1 and 12 ms after the moment, that show nothing of the set."""
-    ends = [MemoryLine("serial", "a"), MemoryLine("serial", "b")]
-    group = await group_of(*ends)
-    ends[1].far["b"].playback.commit = lambda *_: None  # type: ignore[method-assign]
-    applied = await group.apply({"a": [LAYER], "b": [LAYER]})
-    read_status = group.amplifiers["b"].read_status
-    await asyncio.sleep(applied.starts_at + 0.001 - ends[0].loop.time())
-    await read_status()
-    await asyncio.sleep(0.011)
-    with pytest.raises(CommandRefused):
-        await read_status()
-
-
-@in_virtual_time
 async def test_set_that_starts_as_late_as_its_clock_is_behind_is_no_fault() -> None:
     """Requests took 6 ms until it was armed: it is behind by as much, and known to be.
 
@@ -242,19 +226,6 @@ async def test_line_that_is_busy_for_too_long_commits_nothing_and_is_no_fault() 
     await group.amplifiers["b"].read_status()
     await group.apply({name: [LAYER] for name in group.amplifiers})
     assert [*map(len, await started(*ends))] == [1, 1]
-
-
-@in_virtual_time
-async def test_a_set_that_is_too_late_beside_one_without_reply_stops_nothing() -> None:
-    """Replies to parts are lost: three times 30 ms of one alone, of two on a line beyond 100 ms."""
-    ends = [MemoryLine("serial", "a"), MemoryLine("serial", "b", "c")]
-    group = await group_of(*ends, watchdog=1.0)
-    for end in ends:
-        end.outward = lambda name, data: [] if name == "Set" else [(0.0002, data)]
-    with pytest.raises(LinkDegraded):
-        await group.apply({name: [LAYER] for name in group.amplifiers})
-    assert await started(*ends) == [[], []]
-    assert group.is_armed
 
 
 @pytest.mark.parametrize(("names", "fails"), [(("slow serial", "tcp"), 0), (("serial",) * 2, 1)])

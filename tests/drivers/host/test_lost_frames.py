@@ -7,6 +7,7 @@ feel is read from the simulated amplifiers themselves.
 
 import asyncio
 import contextlib
+import itertools
 import random
 from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import asynccontextmanager, suppress
@@ -19,7 +20,7 @@ from typing import Any
 import pytest
 
 from courses import Taken, courses, follow
-from drivers.errors import CommandRefused, DriverError, LinkDegraded, LinkTimeout, Preempted
+from drivers.errors import CommandRefused, DriverError, LinkTimeout
 from drivers.host.amplifier import read_measured
 from drivers.host.dialogue import StopOutcome
 from drivers.host.group import Group
@@ -31,7 +32,6 @@ from drivers.wires.serial_frames import REPLY_BIT, FrameReader, encode_frame, pa
 from sim.amplifier.simulated_amplifier import SimulatedAmplifier as FarEnd
 from virtual_lines import (
     KINDS,
-    Alter,
     MemoryLine,
     group_of,
     grouped,
@@ -134,48 +134,6 @@ def test_sets_play_whole_and_once_though_frames_are_lost(kind: str, lines: str, 
     """One frame of ten either way, of sets of 1 to 8 parts; the long form: 20 000 on each wire."""
     rng = random.Random(count)
     assert run_virtual(_play(kind, lines, rng, count), rng=rng) == []
-
-
-def _without(*numbers: int) -> Alter:
-    """Loses the Set requests with these numbers, counted from 0."""
-    sent = -1
-
-    def alter(name: str, data: bytes) -> list[tuple[float, bytes]]:
-        nonlocal sent
-        sent += name == "Set"
-        return [] if name == "Set" and sent in numbers else unaltered(name, data)
-
-    return alter
-
-
-@pytest.mark.parametrize("wire", ["serial", "can"])
-@grouped(("a",))
-async def test_missing_part_is_sent_again_with_those_behind_it(
-    group: Group, ends: list[MemoryLine]
-) -> None:
-    """Of four parts the second is lost: they are 0 1 2 3, then 1 2 3."""
-    (end,) = ends
-    end.sent.clear()
-    end.inward = _without(1)
-    await group.apply({"a": of_parts(4)})
-    assert [each for _, each in end.sent] == [f"1:{SET}"] * 7
-    assert end.retries == 1
-    await asyncio.sleep(0.06)
-    assert end.levels("a")[0] > 0.1
-
-
-@pytest.mark.parametrize("wire", ["serial", "can"])
-@grouped(("a",))
-async def test_last_part_alone_is_repeated_without_a_reply(
-    group: Group, ends: list[MemoryLine]
-) -> None:
-    """Its reply is lost twice: the set plays since the first, and is confirmed by the third."""
-    (end,) = ends
-    end.sent.clear()
-    lost = iter([True, True])
-    end.outward = lambda name, data: [] if next(lost, False) else unaltered(name, data)
-    await group.apply({"a": of_parts(4)})
-    assert [each for _, each in end.sent] == [f"1:{SET}"] * 6
 
 
 @pytest.mark.parametrize("wire", ["serial", "can", "tcp"])
@@ -305,32 +263,6 @@ async def test_renewal_that_comes_as_its_layer_ends_may_be_too_late() -> None:
     assert shown == {False, True}
 
 
-@grouped(("a",), wire="serial")
-async def test_silence_without_a_reply_may_have_been_heard(
-    group: Group, ends: list[MemoryLine]
-) -> None:
-    """Three times: all that plays is over, as statuses say afterwards; a wrong token contradicts.
-
-    Once a silence is confirmed another layer that is not played contradicts as ever.
-    """
-    (end,), host = ends, group.amplifiers["a"]
-    await group.apply({"a": [layer(0, tone())]})
-    end.outward = losing("Silence", count=3)
-    with pytest.raises(LinkDegraded):
-        await group.silence(0.005)
-    for _ in range(3):
-        await asyncio.sleep(0.02)
-        assert (await host.read_status())["tokens"][0] == 0
-        await host.ping()
-    assert host._contradictions == 0
-    await group.silence(0.005)
-    await group.apply({"a": [layer(0, tone())]})
-    await asyncio.sleep(0.02)
-    end.far["a"].playback.silence(end.loop.time(), 0.0)
-    with pytest.raises(CommandRefused, match="token of layer 0"):
-        await read(group)
-
-
 @pytest.mark.parametrize("what", ["token", "level"])
 @in_virtual_time
 async def test_layer_that_is_dropped_is_found_where_statuses_are_late(what: str) -> None:
@@ -379,147 +311,6 @@ async def test_reply_that_cannot_be_noted_keeps_nobody_waiting(
     monkeypatch.setattr(group.amplifiers["b"].ledger, "silenced", fail)
     async with asyncio.timeout(1.0):
         await group.stop()
-
-
-@grouped(("a", "b"), wire="serial")
-async def test_stop_is_sent_to_each_where_the_broadcast_fails(
-    group: Group, ends: list[MemoryLine], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Whatever fails in the broadcast, which comes first."""
-    await group.apply({name: [layer(0, tone())] for name in "ab"})
-    submit = ends[0].line.submit
-
-    def fail(member: object, *values: object, **other: object) -> object:
-        if member is None:
-            raise ZeroDivisionError("planted")
-        return submit(member, *values, **other)  # type: ignore[arg-type]
-
-    monkeypatch.setattr(ends[0].line, "submit", fail)
-    stopped = await group.stop()
-    assert all(each.is_confirmed for each in stopped.values())
-    assert (ends[0].levels("a"), ends[0].levels("b")) == ([0.0, 0.0], [0.0, 0.0])
-
-
-@grouped(("a",), wire="serial")
-async def test_arm_that_was_busy_after_a_lost_reply_does_not_stay_armed(
-    group: Group, ends: list[MemoryLine]
-) -> None:
-    """The first attempt has armed it, the repeated ones are refused: it is disarmed."""
-    await group.disarm()
-    ends[0].far["a"].session = 1  # that of the test never changes, and is not taken twice
-    asked = 0
-
-    def busy(name: str, values: Values, now: float, handle: Callable[..., Values]) -> Values:
-        nonlocal asked
-        if name == "Arm":
-            asked += 1
-            if asked > 1:
-                raise Refusal("busy", "BUSY")
-        return handle(name, values, now)
-
-    ends[0].outward = losing("Arm", count=2)  # its event, and the reply
-    altered(ends[0].far["a"], busy)
-    with pytest.raises(CommandRefused):
-        await group.arm()
-    assert asked > 1
-    assert ends[0].far["a"].state != "OPERATION_ENABLED"
-
-
-@grouped(("a",), ("b",), wire="serial")
-async def test_amplifier_that_is_not_armed_after_arm_is_not_said_to_be(
-    group: Group, ends: list[MemoryLine]
-) -> None:
-    """It tells a fault in its reply: none stays armed, not even the one that was."""
-    await group.disarm()
-    for end in ends:
-        for far in end.far.values():
-            far.session = 1  # that of the test never changes, and is not taken twice
-    far = ends[1].far["b"]
-
-    def trip(name: str, values: Values, now: float, handle: Callable[..., Values]) -> Values:
-        reply = handle(name, values, now)
-        if name != "Arm":
-            return reply
-        far.trip("OVER_VOLTAGE", now)
-        return far.status(now)
-
-    altered(far, trip)
-    with pytest.raises(CommandRefused, match="OVER_VOLTAGE"):
-        await group.arm()
-    assert not group.is_armed
-    assert ends[0].far["a"].state != "OPERATION_ENABLED"
-
-
-@grouped(("a",), wire="serial")
-async def test_ramp_of_a_disarm_may_play_on_after_the_watchdog(
-    group: Group, ends: list[MemoryLine]
-) -> None:
-    """One of 1 s is heard once, no reply comes: it is not lost while it fades."""
-    (end,) = ends
-    await group.apply({"a": [layer(0, tone())]})
-    end.outward = lambda name, data: []
-    disarming = asyncio.ensure_future(group.disarm(1.0))
-    for _ in range(100):
-        await asyncio.sleep(0.001)
-        if end.far["a"].state != "OPERATION_ENABLED":
-            break
-    end.inward = lambda name, data: []
-    while end.levels("a")[0]:
-        assert not group.members.lost_by
-        await asyncio.sleep(0.005)
-    with pytest.raises(DriverError):
-        await disarming
-
-
-@pytest.mark.parametrize("wire", ["serial", "can", "tcp"])
-@grouped(("a",))
-async def test_reading_that_gives_way_to_a_set_is_no_silence(
-    group: Group, ends: list[MemoryLine]
-) -> None:
-    """Its reply takes 8 ms, the set has several parts: all are played, then it is read."""
-    (end,) = ends
-    end.outward = lambda name, data: [(0.008 if name == "GetMeasured" else 0.0002, data)]
-    reading = asyncio.ensure_future(read_measured(group.amplifiers["a"]))
-    await asyncio.sleep(0.001)
-    onset = Envelope(20, ((100, 0),) * 12)
-    await group.apply({"a": [layer(number, tone(level=0.05, onset=onset)) for number in range(4)]})
-    assert not group.members.degraded
-    await reading
-
-
-@pytest.mark.parametrize("wire", ["serial", "can", "rtu"])
-@grouped(("a",))
-async def test_heartbeats_and_stops_go_between_the_parts_of_a_set(
-    group: Group, ends: list[MemoryLine]
-) -> None:
-    """What comes while parts are on the line is sent next; after a stop no other part is."""
-    (end,) = ends
-    end.outward = lambda _, data: [(0.002, data)]
-    tones = [tone(each, 0.05, onset=Envelope(20, ((100, 0),) * 12)) for each in (0, 1)]
-    layers = {"a": [layer(number, *tones) for number in range(8)]}
-    kinds = [f"1:{MESSAGES[name].number}" for name in ("Set", "Ping", "Stop")]
-    part, heartbeat, stop = kinds
-
-    def sent() -> list[str]:
-        return [each for _, each in end.sent]
-
-    playing = asyncio.ensure_future(group.apply(layers))
-    await asyncio.sleep(0.001)
-    assert sent()[-1] == part
-    end.sent.clear()
-    await group.amplifiers["a"].ping()
-    await playing
-    assert sent()[:2] == [heartbeat, part]
-    assert sent()[-1] == part
-    playing = asyncio.ensure_future(group.apply(layers))
-    await asyncio.sleep(0.001)
-    end.sent.clear()
-    await group.stop()
-    with pytest.raises(Preempted):
-        await playing
-    assert sent()[0] == stop
-    assert part not in sent()
-    assert end.far["a"].state == "QUICK_STOP_ACTIVE"
 
 
 @grouped(("a",), wire="serial")
@@ -634,6 +425,36 @@ class OnLines(Taken):
         return {name: each.ledger.playback.tokens for name, each in self.group.amplifiers.items()}
 
     @property
+    def is_loud(self) -> bool:
+        """Whether any amplifier plays."""
+        return any(map(any, self.levels.values()))
+
+    @property
+    def shown(self) -> int:
+        """The token of layer 0 that the last status of the first amplifier shows."""
+        return int((self.hosts.a.status or {})["tokens"][0])
+
+    @property
+    def contradictions(self) -> int:
+        """How many statuses of the first amplifier have contradicted its requests, in a row."""
+        return int(self.hosts.a._contradictions)
+
+    @property
+    def retries(self) -> int:
+        """Requests that were repeated."""
+        return sum(line.retries for line in self.lines)
+
+    @property
+    def degraded(self) -> list[str]:
+        """Amplifiers that do not reply but may play."""
+        return [*self.group.members.degraded]
+
+    @property
+    def plays_for(self) -> float:
+        """How long after `forget` the first amplifier may play [s]."""
+        return float(self.hosts.a.feeding.may_play_until) - self.since
+
+    @property
     def may_play(self) -> list[str]:
         """What the last stop said may play on, with a time and a cause."""
         left = {name: each for name, each in self.stopped.items() if not each.is_confirmed}
@@ -659,6 +480,32 @@ class OnLines(Taken):
         assert (
             next(at for at, each in self.lines[0].sent if each == request) <= self.since + seconds
         )
+
+    def was_sent(self, *requests: str) -> None:
+        """Require that a line was sent these first since `forget`."""
+        assert self.sent[0][: len(requests)] == [*requests]
+
+    def sends(self, **bounds: Sequence[int]) -> None:
+        """Require numbers of requests on the first line since `forget`: at least, at most."""
+        found = {request: self.sent[0].count(request) for request in bounds}
+        assert all(low <= found[each] <= high for each, (low, high) in bounds.items()), found
+
+    def is_between(self, **bounds: Sequence[float]) -> None:
+        """Require values of properties: more than the one, less than the other."""
+        found = {what: getattr(self, what) for what in bounds}
+        assert all(low < found[each] < high for each, (low, high) in bounds.items()), found
+
+    async def applies_parts(self, count: int) -> None:
+        """Apply a set of about so many parts to the first amplifier."""
+        await self.group.apply({"a": of_parts(count)})
+
+    async def measures(self, name: str) -> None:
+        """Read the voltages of one."""
+        await read_measured(self.group.amplifiers[name])
+
+    def plans_nothing(self, text: str) -> None:
+        """Require that what is planned is refused, with this text."""
+        assert text in str(self.group.sets.refusal_of({"a": [_layer(0, 0, 0.5, 100.0)]}))
 
     async def applies(self, **rows: Sequence[Sequence[float]]) -> None:
         """Apply rows of layer, channel, level, frequency [Hz], by amplifier; a layer alone ends."""
@@ -720,9 +567,37 @@ class OnLines(Taken):
         """Lose so many requests of a name on a line."""
         self.lines[line].inward = losing(name, count=count)
 
-    def loses_reply(self, name: str) -> None:
-        """Lose a reply to a request of a name on the first line."""
-        self.lines[0].outward = losing(name)
+    def misses_parts(self, *numbers: int) -> None:
+        """Lose the parts of sets on the first line that have these numbers, from 0 on."""
+        counted = itertools.count()
+        self.lines[0].inward = lambda name, data: (
+            [] if name == "Set" and next(counted) in numbers else unaltered(name, data)
+        )
+
+    def loses_replies(self, name: str, count: int) -> None:
+        """Lose so many replies to requests of a name on each line."""
+        for line in self.lines:
+            line.outward = losing(name, count=count)
+
+    def is_late(self, **delays: float) -> None:
+        """Let replies to requests of these names come after these times, on the first line."""
+        self.lines[0].outward = lambda name, data: [(delays.get(name, 0.0002), data)]
+
+    def arrives_after(self, seconds: float) -> None:
+        """Let requests on the first line arrive so much later."""
+        self.lines[0].inward = lambda _, data: [(seconds, data)]
+
+    def broadcasts_fail(self) -> None:
+        """Let a bug end each broadcast on the first line."""
+        (line, *_) = self.lines
+        submit = line.line.submit
+
+        def fail(member: object, *values: Any, **other: Any) -> Any:
+            if member is None:
+                raise ZeroDivisionError("planted")
+            return submit(member, *values, **other)  # type: ignore[arg-type]
+
+        line.line.submit = fail  # type: ignore[method-assign]
 
     def cuts(self, line: int) -> None:
         """Cut a line."""
@@ -745,6 +620,52 @@ class OnLines(Taken):
             return handle(instead.get(name, name), given, now, **options)
 
         far.handle = obey
+
+    def commits(self, name: str, count: int) -> None:
+        """Let an amplifier play so many layers of each set, and say that it plays the set."""
+        playback = getattr(self.far, name).playback
+        commit = playback.commit
+        playback.commit = lambda layers, *when: count and commit(layers[:count], *when)
+
+    def is_busy_after(self, name: str, count: int) -> None:
+        """Let the first amplifier refuse requests of a name once it has taken so many."""
+        left = [count]
+
+        def busy(asked: str, values: Values, now: float, handle: Callable[..., Values]) -> Values:
+            left[0] -= asked == name
+            if asked == name and left[0] < 0:
+                raise Refusal("busy", "BUSY")
+            return handle(asked, values, now)
+
+        altered(self.far.a, busy)
+
+    def trips_at(self, name: str, fault: str) -> None:
+        """Let the first amplifier trip as it carries out requests of a name, and say so."""
+
+        def trip(asked: str, values: Values, now: float, handle: Callable[..., Values]) -> Values:
+            reply = handle(asked, values, now)
+            if asked == name:
+                self.far.a.trip(fault, now)
+            return self.far.a.status(now) if asked == name else reply
+
+        altered(self.far.a, trip)
+
+    def restarts(self, **capabilities: Any) -> None:
+        """Switch the first amplifier off and on again, with other capabilities: CAN nodes boot."""
+        (line, *_), far = self.lines, self.far.a
+        far.capabilities = {**far.capabilities, **capabilities}
+        far.restart(line.loop.time())
+        far.latch = 0
+        if line.kind is KINDS["can"]:
+            line.boot(1)
+
+    def falls_silent(self) -> None:
+        """Let the first amplifier end all that it plays, by itself."""
+        self.far.a.playback.silence(self.lines[0].loop.time(), 0.0)
+
+    def draws(self, session: int) -> None:
+        """Let the session that is armed next have a number."""
+        self.group._draw = lambda low, high: session
 
     def trips(self, name: str, fault: str) -> None:
         """Let an amplifier trip."""

@@ -1,17 +1,17 @@
 """Tones and layers of an amplifier, and what its channels play at a time.
 
 The host states `AmplifierLayer`s in physical units; the ledger (`drivers.host.ledger`) checks them
-and rounds them to the integers of the wire. `Playback` is a pure function of these sets and their
-commits. A channel plays the sum of its voices, each one tone of one layer until it has faded:
+and rounds them to the integers of the wire. `Playback` follows from these sets and their commits
+alone. A channel plays the sum of its voices. A voice is one tone of one layer until it has faded:
 
     Im[A(t) exp(2 pi i n clock(t) / 2^32)], A(t) along its transition, in full levels
 
-The angle is that of the amplifier's clock (`drivers.protocol.definition`), with n the frequency
-word: it does not depend on when the voice began. The simulated amplifier takes samples from it, the
-ledger the worst case, witness and conformance checks what to expect.
+The angle is that of the amplifier's clock (`drivers.protocol.definition`) times the frequency word
+n, so it does not depend on when the voice began. The simulated amplifier computes samples from
+this, the ledger the worst case, and the witness and the conformance checks what they expect.
 
-Amplitudes are complex, in full levels; times [s] are of any one clock and never go back. Loops are
-plain and calls few, since host and far end play every set.
+Amplitudes are complex, in full levels. Times [s] are of any one clock, and never go back. Loops are
+plain and make few calls, because both host and far end play every set.
 """
 
 import cmath
@@ -31,18 +31,18 @@ _PER_FULL, _PER_DEGREE = QUANTITIES["level"].per_unit, QUANTITIES["phase"].per_u
 _PER_HERTZ = QUANTITIES["frequency"].per_unit
 _SILENCE = Command(channel=0, frequency=0, level=0, phase=0)
 SAME = 1e-6
-"""Ends of fades that are nearer than that are one, so that rounding decides nothing [s]."""
+"""Ends of fades that are closer than this count as equal, so that rounding decides nothing [s]."""
 
 
-@lru_cache(maxsize=256)  # of a set's command asked for by its limits, its playback and its commit
+@lru_cache(maxsize=256)  # limits, playback and commit of a set each ask for the same command
 def amplitude_of(level: int, phase: int) -> complex:
     """Return the complex amplitude in full levels of a level and phase of the wire."""
     return _amplitudes_at([(level, phase)])[0]
 
 
-@lru_cache(maxsize=256)  # a set names an envelope several times, and its commit again
+@lru_cache(maxsize=256)  # a set names an envelope several times, and its commit does again
 def amplitudes_of(envelope: Envelope | None) -> tuple[complex, ...]:
-    """Return the complex amplitudes of the knots of an envelope in full levels, if there is one."""
+    """Return the complex amplitudes of the knots of an envelope in full levels, if any."""
     return () if envelope is None else _amplitudes_at(envelope.knots)
 
 
@@ -54,30 +54,33 @@ def _amplitudes_at(knots: Sequence[tuple[int, ...]]) -> tuple[complex, ...]:
 
 
 def peak_of(envelope: Envelope | None) -> float:
-    """Return the largest magnitude of the knots of an envelope in full levels, 0 without one."""
+    """Return the largest magnitude of the knots of an envelope in full levels; 0 without one."""
     return 0.0 if envelope is None else envelope.peak / _PER_FULL
 
 
-@dataclass(slots=True)  # frozen, each takes three times as long to make, and every set makes many
+@dataclass(slots=True)  # not frozen, which would take three times as long to make
 class VoiceTransition:
-    """From one complex amplitude to another, from start [s] on until end.
+    """The way of a voice from one complex amplitude to another.
 
-    Along straight lines through knots a step [s] apart, or without knots along a raised cosine that
-    lasts one step; a step of 0 changes at once. half [s], radius: by which its start and its first
-    amplitude may differ, see `era_haptics.lab.expected_output`.
+    It follows straight lines through its knots, or without knots a raised cosine of one step.
     """
 
     start: float
+    """When it begins [s]."""
     step: float
+    """Time between two knots, or of the raised cosine [s]; 0 changes at once."""
     first: complex
     last: complex
     end: float
+    """When it has reached the last amplitude [s]."""
     knots: tuple[complex, ...] = ()
     half: float = 0.0
+    """By how much its start may differ [s], see `era_haptics.lab.expected_output`."""
     radius: float = 0.0
+    """By how much its first amplitude may differ."""
 
     def at(self, time: float) -> complex:
-        """Return the amplitude at a time [s], before start the first one."""
+        """Return the amplitude at a time [s]; before the start it is the first one."""
         if time >= self.end:
             return self.last
         if time <= self.start:
@@ -90,7 +93,7 @@ class VoiceTransition:
         return points[index] + (points[index + 1] - points[index]) * (steps - index)
 
     def reached(self, time: float, uncertainty: float) -> complex:
-        """Return the amplitude at a time, or the largest within an uncertainty [s] around it."""
+        """Return the largest amplitude within an uncertainty [s] around a time [s]."""
         if time - uncertainty >= self.end:
             return self.last
         if not uncertainty:
@@ -99,7 +102,10 @@ class VoiceTransition:
         return max(self.points(since, until), key=abs)
 
     def points(self, since: float, until: float = math.inf) -> tuple[complex, ...]:
-        """Return the amplitudes at two times [s] and at the knots between: others are between."""
+        """Return the amplitudes at two times [s] and at the knots between them.
+
+        All other amplitudes between these times lie between two of them.
+        """
         between = []
         for number, knot in enumerate(self.knots, 1):
             if since < self.start + self.step * number < until:
@@ -108,7 +114,7 @@ class VoiceTransition:
 
     def peak(self, time: float) -> float:
         """Return the largest magnitude from a time on."""
-        if time <= self.start:  # nearly always: just committed
+        if time <= self.start:  # the usual case: it was committed just now
             return max(map(abs, (self.first, *self.knots, self.last)))
         return max(map(abs, self.points(time)))
 
@@ -135,9 +141,10 @@ def along(
 def steepest(
     ways: Iterable[tuple[complex, complex]], step: float, *, is_cosine: bool
 ) -> tuple[float, float]:
-    """Return the steepest rise of the magnitude, and the fastest change, of ways between points.
+    """Return the steepest rise of the magnitude and the fastest change on ways between points.
 
-    Both in full levels a second; each way takes a step [s], on a straight line or a raised cosine.
+    Both are in full levels a second. Each way takes a step [s] and follows a straight line or a
+    raised cosine.
     """
     rise = change = 0.0
     for one, other in ways:
@@ -145,7 +152,7 @@ def steepest(
             continue
         fastest = abs(other - one) / step if step else math.inf
         change = max(change, fastest)
-        # The way rises only where its end is farther out than the foot of the perpendicular.
+        # The magnitude rises only if the end is farther out than the foot of the perpendicular.
         if ((other - one) * other.conjugate()).real > 0:
             rise = max(rise, fastest)
     factor = math.pi / 2 if is_cosine else 1.0
@@ -154,33 +161,33 @@ def steepest(
 
 @dataclass(frozen=True, slots=True)
 class Voice:
-    """A tone of a layer until it has faded: frequency [Hz], and when it began [s].
-
-    has_ended: it falls silent and nothing continues it, unlike an onset that leads to level 0.
-    ending: how it falls silent, None for the ramp.
-    """
+    """A tone of a layer until it has faded."""
 
     layer: int
     frequency: float
+    """In Hz."""
     began: float
+    """When it began [s]."""
     transition: VoiceTransition
     has_ended: bool = False
+    """Whether it is falling silent for good, unlike an onset that leads to level 0."""
     ending: Envelope | None = None
+    """How it falls silent; None for the ramp of its layer."""
 
     @property
     def silent_from(self) -> float:
-        """Time of silence [s]; infinite for a tone that lasts."""
+        """When it is silent [s]; infinite for a tone that lasts."""
         return math.inf if self.transition.last else self.transition.end
 
     def peak(self, time: float) -> float:
-        """Return the largest magnitude from a time on, its ending included."""
+        """Return the largest magnitude from a time on, including its ending."""
         return max(self.transition.peak(time), peak_of(self.ending))
 
     def faded(self, time: float, ramp: float, uncertainty: float = 0.0) -> "Voice":
-        """Return it falling silent along a ramp [s], or as it does if that is no later.
+        """Return it as it falls silent along a ramp [s], or on its present way if that ends sooner.
 
-        uncertainty [s]: see `Playback`. Where it decides which of both is sooner, the largest
-        amplitude of either lasts until both are over.
+        uncertainty: see `Playback` [s]. If it is uncertain which ends sooner, the largest amplitude
+        of both lasts until both are over.
         """
         transition, end = self.transition, time + ramp
         if transition.last or transition.end > end + uncertainty + SAME:
@@ -193,14 +200,14 @@ class Voice:
         return Voice(self.layer, self.frequency, self.began, transition, True, self.ending)
 
     def ended(self, time: float, ramp: float, uncertainty: float = 0.0) -> "Voice":
-        """Return it falling silent along its ending, or along a ramp [s] without one."""
+        """Return it as it falls silent along its ending, or without one along a ramp [s]."""
         if self.ending is None or self.has_ended:
             return self.faded(time, ramp, uncertainty)
         first = self.transition.reached(time, uncertainty)
         return replace(self, transition=along(self.ending, time, ramp, first, 0j), has_ended=True)
 
     def scaled(self, time: float, factor: float, ramp: float) -> "Voice":
-        """Return it led to a factor of its level along a ramp [s], its ending scaled too."""
+        """Return it with its level and its ending scaled by a factor, along a ramp [s]."""
         transition = self.transition
         last = transition.last * factor
         led = VoiceTransition(time, ramp, transition.at(time), last, time + ramp)
@@ -208,7 +215,7 @@ class Voice:
         return replace(self, transition=led, ending=ending)
 
     def corrected(self, command: Command | None) -> "Voice":
-        """Return it leading to what a command says, None for silence, as far as it lasts."""
+        """Return it as it leads to the level and phase of a command; None: to silence."""
         if command is None:
             return replace(self, transition=replace(self.transition, last=0j))
         last = amplitude_of(command.level, command.phase)
@@ -224,11 +231,14 @@ def voices_after(
     ramp: float,
     uncertainty: float,
 ) -> list[tuple[Voice, ...]]:
-    """Return the voices of all channels once a layer plays commands by channel, else is silent."""
+    """Return the voices of all channels after a layer has been set to commands by channel.
+
+    The layer falls silent in each channel without a command.
+    """
     all_after: list[tuple[Voice, ...]] = []
     for channel, voices in enumerate(channels):
         command = commands.get(channel, _SILENCE)
-        # As `Command.is_driven`, without a call.
+        # This is `Command.is_driven`, written out for speed.
         is_driven = is_new = command.level > 0 or command.onset is not None
         last, frequency = amplitude_of(command.level, command.phase), command.frequency / _PER_HERTZ
         after: list[Voice] = []
@@ -246,7 +256,7 @@ def voices_after(
                 after.append(voice.ended(time, ramp, uncertainty))
         if is_new:
             transition = VoiceTransition(time, ramp, 0j, last, time + ramp)
-            if command.onset is not None:  # seldom: without a call
+            if command.onset is not None:  # this is rare, so the usual case is without a call
                 transition = along(command.onset, time, ramp, 0j, last)
             after.append(Voice(layer, frequency, time, transition, False, command.ending))
         all_after.append(tuple(after))
@@ -254,9 +264,9 @@ def voices_after(
 
 
 def cut_to(voices: Sequence[Voice], time: float, max_voices: int, slew: float) -> list[Voice]:
-    """Cut the oldest fades short where a channel has more voices than there are.
+    """Cut the oldest fades short if a channel has more than `max_voices`.
 
-    slew: steepest change of a level that the amplifier has [full levels/s].
+    slew: the steepest change of a level that the amplifier can make [full levels/s].
     """
     uncut = [voice for voice in voices if voice.silent_from > time + SHORTENED_FADE]
     fades = sorted(
@@ -267,48 +277,51 @@ def cut_to(voices: Sequence[Voice], time: float, max_voices: int, slew: float) -
 
 
 def _cut_short(voice: Voice, time: float, slew: float) -> Voice:
-    """Let a voice fall silent as soon as it can: a raised cosine is steepest at its middle."""
+    """Let a voice fall silent as soon as the slew allows."""
+    # A raised cosine is steepest in the middle.
     steepest_fade = math.pi / 2 * abs(voice.transition.at(time)) / slew
     return voice.faded(time, max(SHORTENED_FADE, steepest_fade))
 
 
 @dataclass(frozen=True, slots=True)
 class AmplifierTone:
-    """What a channel plays in a layer: frequency [Hz], level 0..1 of full level, phase [degrees].
-
-    keep_phase: continue the phase of the same frequency in this layer; skip_ending: fall silent
-    along the ramp of the layer, not along the ending of before. onset, ending: None for the ramp.
-    """
+    """What a channel plays in a layer."""
 
     channel: int
     frequency: float
+    """In Hz."""
     level: float
+    """From 0 to 1, full level."""
     phase: float = 0.0
+    """In degrees."""
     keep_phase: bool = False
+    """Whether it continues the phase of the same frequency in this layer."""
     skip_ending: bool = False
+    """Whether the tone before it falls silent along the layer's ramp, and not along its ending."""
     onset: Envelope | None = None
+    """How it begins; None for the layer's ramp."""
     ending: Envelope | None = None
+    """How it falls silent; None for the layer's ramp."""
 
 
 @dataclass(frozen=True, slots=True)
 class AmplifierLayer:
-    """What one layer is to play; without tones it falls silent, or with renew is prolonged.
-
-    Channels without a tone are silent in this layer. ramp [s] of all changes; valid_for [s]: the
-    layer ends by itself then, 0 for never; after: the tones start when the onsets that the layer
-    plays have ended.
-    """
+    """What one layer is to play; channels without a tone are silent in it."""
 
     number: int
     tones: tuple[AmplifierTone, ...] = ()
     ramp: float = 0.02
+    """Duration of all changes [s]."""
     valid_for: float = 0.0
+    """Time after which the layer ends by itself [s]; 0 for never."""
     after: bool = False
+    """Whether the tones start only when the onsets that the layer plays have ended."""
     renew: bool = False
+    """Whether the layer, named without tones, goes on for another `valid_for`."""
 
 
 LAYERS_MAX = QUANTITIES["layer_count"].maximum
-"""Layers of an amplifier, at the most."""
+"""Largest number of layers of an amplifier."""
 _LEVEL, _PHASE = QUANTITIES["level"], QUANTITIES["phase"]
 _FREQUENCY, _SLEW = QUANTITIES["frequency"], QUANTITIES["slew"]
 _PER_RAMP, _PER_VALID_FOR = QUANTITIES["ramp"].per_unit, QUANTITIES["valid_for"].per_unit
@@ -316,38 +329,40 @@ _PER_RAMP, _PER_VALID_FOR = QUANTITIES["ramp"].per_unit, QUANTITIES["valid_for"]
 
 @dataclass
 class _Layer:
-    """What a layer plays: ends [s] by valid_for; waiting: a set that starts at a time [s]."""
+    """What a layer plays."""
 
     token: int = 0
-    ramp: int = 0  # of the wire, as valid_for
-    valid_for: int = 0
-    ends: float = math.inf
-    waiting: tuple[float, LayerSet, int] | None = None
+    ramp: int = 0  # in units of the wire
+    valid_for: int = 0  # in units of the wire
+    ends: float = math.inf  # s; by `valid_for`
+    waiting: tuple[float, LayerSet, int] | None = None  # when a set starts [s], and its token
 
 
 @dataclass
 class Playback:
-    """Voices of all channels, and the layers that they belong to; silent at first.
-
-    voices: how many a channel has for tones that are not cut short. slew: steepest change of a
-    level that the amplifier has [full levels/s]. uncertainty [s]: by which commits may come sooner
-    or later; fades begin at the largest amplitude within it, and layers end as late as they can, so
-    that levels are upper bounds.
-    """
+    """The voices of all channels and the layers that they belong to; silent at first."""
 
     channels: int
+    """Number of channels."""
     voices: int
+    """How many voices a channel may have before the oldest fades are cut short."""
     slew: float = math.inf
+    """The steepest change of a level that the amplifier can make [full levels/s]."""
     uncertainty: float = 0.0
+    """By how much commits may come sooner or later [s].
+
+    Fades begin at the largest amplitude within it, and layers end as late as they can, so that
+    levels are upper bounds.
+    """
     next_due: float = field(default=math.inf, init=False)
-    """Time of the next end of `valid_for`, or start of a set that waits [s]; infinite: none."""
+    """When a layer next ends by `valid_for` or starts a waiting set [s]; infinite if none does."""
     all_voices: list[tuple[Voice, ...]] = field(init=False)
     """Voices by channel, the oldest first."""
     _layers: dict[int, _Layer] = field(default_factory=dict)
     changes_at: float = field(default=math.inf, init=False)
     """Before this time [s] advancing changes nothing."""
     settles_at: float = field(default=-math.inf, init=False)
-    """From this time [s] on nothing changes but by the ends of layers."""
+    """From this time [s] on, only the ends of layers change anything."""
     tokens: Mapping[int, int] = field(default_factory=dict, init=False)
     """Token of each layer that plays."""
     waiting: Sequence[LayerSet] = field(default_factory=list, init=False)
@@ -358,7 +373,7 @@ class Playback:
         self.all_voices = [()] * self.channels
 
     def copied(self) -> "Playback":
-        """Return it as it is, to look ahead while the original stays."""
+        """Return a copy, with which one can look ahead."""
         copied = replace(self)
         copied.all_voices = [*self.all_voices]
         copied._layers = {number: replace(layer) for number, layer in self._layers.items()}
@@ -366,8 +381,8 @@ class Playback:
         return copied
 
     def commit(self, layers: Sequence[LayerSet], token: int, time: float) -> None:
-        """Play a set from a time on."""
-        if time >= self.changes_at:  # else without a call
+        """Play a set from a time [s] on."""
+        if time >= self.changes_at:  # otherwise the call would change nothing
             self.advance(time)
         for one in layers:
             layer = self._layers.setdefault(one.layer, _Layer())
@@ -381,7 +396,7 @@ class Playback:
         self._note_changes()
 
     def silence(self, time: float, ramp: float) -> None:
-        """Fade all layers along a ramp [s], without endings; nothing waits any longer."""
+        """Fade all layers along a ramp [s] without their endings, and drop the sets that wait."""
         self.advance(time)
         self._layers.clear()
         self.all_voices = [
@@ -391,7 +406,7 @@ class Playback:
         self._note_changes()
 
     def advance(self, time: float) -> None:
-        """Carry out what is due by a time: ends of `valid_for`, sets that wait, faded voices."""
+        """Carry out what is due by a time [s]: ends of layers, starts of sets, faded voices."""
         if time < self.changes_at:
             return
         while self.next_due <= time:
@@ -400,9 +415,10 @@ class Playback:
         self._note_changes()
 
     def carry_out(self, at: float, number: int) -> None:
-        """End a layer at a time, or start what waits there; others may be due sooner."""
+        """End a layer at a time [s], or start its waiting set; other layers may be due sooner."""
         layer = self._layers[number]
-        # What has faded before is gone; a set that waited for its end may continue a voice.
+        # Voices that have faded before this are dropped. One that fades just now stays, because a
+        # set that waited for its end may continue it.
         self._drop_faded(math.nextafter(at - self.uncertainty, -math.inf), number)
         if layer.waiting is not None and layer.waiting[0] <= at:
             _, one, token = layer.waiting
@@ -413,7 +429,7 @@ class Playback:
         self._note_changes()
 
     def _drop_faded(self, time: float, layer: int | None = None) -> None:
-        """Drop the voices that are silent from a time on, of one layer or of all."""
+        """Drop the voices that are silent from a time [s] on; layer: of which, None for all."""
         for channel, voices in enumerate(self.all_voices):
             kept = []
             for voice in voices:
@@ -424,7 +440,7 @@ class Playback:
                 self.all_voices[channel] = tuple(kept)
 
     def _note_changes(self) -> None:
-        """Note what plays, and when a voice has faded, or a layer ends or starts, next."""
+        """Note what plays, and when the next voice has faded or the next layer ends or starts."""
         first, settles, waiting = math.inf, -math.inf, []
         for layer in self._layers.values():
             first = min(first, layer.ends)
@@ -443,9 +459,9 @@ class Playback:
         self.changes_at, self.settles_at, self.tokens = first, settles, tokens
 
     def add_ends(self, layer: int, time: float) -> None:
-        """Add copies of the voices of a layer that end by themselves at a time [s].
+        """Add copies of the voices of a layer that fall silent at a time [s].
 
-        For bounds, where a set may have come before that or after.
+        Bounds need both, if a set may have come before or after the end of the layer.
         """
         ramp = self.ramp_of(layer)
         for channel, voices in enumerate(self.all_voices):
@@ -457,7 +473,7 @@ class Playback:
             self.all_voices[channel] = (*voices, *ends)
 
     def correct(self, one: LayerSet, token: int) -> None:
-        """Have a layer lead to what an amplifier says it plays of the set with this token."""
+        """Let a layer lead to what an amplifier says it plays of the set with this token."""
         if one.layer not in self._layers or self._layers[one.layer].token != token:
             return
         commands = {command.channel: command for command in one.commands}
@@ -471,7 +487,7 @@ class Playback:
         self._note_changes()
 
     def scale(self, time: float, factor: float, ramp: float) -> None:
-        """Take all tones that last to a factor of their level along a ramp [s], endings too."""
+        """Scale all lasting tones and their endings by a factor, along a ramp [s]."""
         self.advance(time)
         self.all_voices = [
             tuple(
@@ -482,7 +498,7 @@ class Playback:
         self._note_changes()
 
     def playing(self, layer: int) -> LayerSet:
-        """Return the set to which the voices of a layer lead, without envelopes; empty: silent."""
+        """Return the set that the voices of a layer lead to, without envelopes; empty if silent."""
         commands = tuple(
             Command(
                 channel,
@@ -510,15 +526,15 @@ class Playback:
         return sum(abs(voice.transition.last) for voice in self.all_voices[channel])
 
     def next_tokens(self, layer: int) -> set[int]:
-        """Return the tokens that a layer may have now, or once what is due of it has happened."""
+        """Return the tokens that a layer may have now, or after what is due of it."""
         known = self._layers.get(layer)
         waiting = () if known is None or known.waiting is None else known.waiting[2:]
         return {0, self.tokens.get(layer, 0), *waiting}
 
     def unsure(self, by: float, half: Sequence[float] = (0.0,) * LAYERS_MAX) -> set[int]:
-        """Return the layers that end, or start what waits, by a time [s].
+        """Return the layers that may end or start a waiting set by a time [s].
 
-        half [s]: by how much sooner each may, for transitions by that of their own.
+        half: by how much sooner each layer may do so [s]; transitions have a value of their own.
         """
         unsure = {layer for due, layer in self.dues if due - half[layer] <= by}
         for voice in chain.from_iterable(self.all_voices):
@@ -561,7 +577,7 @@ class Playback:
         return max(ends, default=-math.inf)
 
     def faded_from(self, time: float) -> float:
-        """Return when the fades that go on at a time have ended [s], or that time."""
+        """Return when the fades that go on at a time have ended [s]; without fades that time."""
         ends = [
             voice.transition.end
             for voices in self.all_voices
@@ -572,7 +588,7 @@ class Playback:
 
     @property
     def dues(self) -> list[tuple[float, int]]:
-        """When layers end by themselves or start what waits [s], the next of each, and which."""
+        """When each layer next ends by itself or starts its waiting set [s], and its number."""
         dues = []
         for number, layer in self._layers.items():
             due = layer.ends if layer.waiting is None else min(layer.ends, layer.waiting[0])
@@ -581,7 +597,7 @@ class Playback:
         return dues
 
     def onsets_end(self, layer: int, time: float) -> float:
-        """Return when the onsets with knots of a layer have ended [s]; a time without any."""
+        """Return when the onsets with knots of a layer have ended [s]; `time` if there are none."""
         ends = (
             voice.transition.end
             for voices in self.all_voices
@@ -591,7 +607,7 @@ class Playback:
         return max(ends, default=time)
 
     def _end(self, layer: int, time: float) -> None:
-        """Let a layer fall silent by its endings."""
+        """Let a layer fall silent along its endings."""
         ramp = self._layers.pop(layer).ramp / _PER_RAMP
         self.all_voices = [
             tuple(
@@ -621,7 +637,7 @@ class Playback:
 
 
 def playback_of(capabilities: Values) -> Playback:
-    """Return the playback of an amplifier with these capabilities, silent."""
+    """Return the silent playback of an amplifier with these capabilities."""
     slew = _SLEW.from_wire(capabilities["slew"]) or math.inf
     return Playback(capabilities["channels"], capabilities["voices"], slew)
 

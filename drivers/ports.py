@@ -1,9 +1,9 @@
 """Ports: serial devices of this machine and TCP connections that carry the bytes of a line.
 
-The event loop reads a device that it can watch, a thread any other. A serial port never blocks the
-loop: what it does not take at once follows as soon as it does, unless a newer frame replaces it,
-since bytes that the line delivers late must not delay a stop. `PORT_OPENER` replaces serial ports,
-as by a simulation in virtual time.
+The event loop reads each device that it can watch; a thread reads any other. A serial port never
+blocks the loop: bytes that it does not take at once are sent as soon as it does, unless a newer
+frame replaces them, because late bytes must not delay a stop. `PORT_OPENER` replaces serial ports,
+for example by a simulation in virtual time.
 """
 
 import asyncio
@@ -29,20 +29,21 @@ from registry.threads import close_in_thread, in_thread
 
 
 class OpenPort(Protocol):
-    """What a line needs of a port that is open; it is told of data and loss."""
+    """What a line needs of an open port, which reports data and loss to it."""
 
     @property
     def is_blocked(self) -> bool:
-        """Whether it has not taken all bytes yet."""
+        """Whether the device has not taken all bytes yet."""
 
     def write(self, data: bytes) -> None:
-        """Send bytes without waiting, as soon as the line takes them; LinkError if it is lost.
+        """Send bytes as soon as the device takes them, without waiting.
 
-        They replace the unsent rest of earlier ones.
+        They replace those that were not sent yet. Raises LinkError if the port is lost, LinkTimeout
+        if it stays blocked.
         """
 
     def poll(self) -> None:
-        """Hand over what has come and was not read yet."""
+        """Deliver bytes that have arrived and were not read yet."""
 
 
 class Port(OpenPort, Protocol):
@@ -58,26 +59,29 @@ class Port(OpenPort, Protocol):
 PortOpener: TypeAlias = Callable[
     [str, Callable[[bytes], None], Callable[[str], None]], Awaitable[Port]
 ]
-"""Opens a serial port by its name, with what takes its data and its loss; raises LinkError."""
+"""A function that opens a serial port: by its name, and the callbacks of data and of a loss.
+
+It raises LinkError.
+"""
 
 PORT_OPENER: ContextVar[PortOpener | None] = ContextVar("PORT_OPENER", default=None)
-"""Who opens serial ports in this context; None: the machine itself."""
+"""Opens serial ports in this context; None: the machine itself does."""
 
 
 FAILURES: tuple[type[Exception], ...] = (OSError, ValueError, TypeError)
-"""Of a device that is gone; TypeError: of pyserial, closed during a read."""
+"""What a device raises once it is gone; pyserial raises TypeError if it is closed during a read."""
 
 
 class DevicePort(ABC):
-    """A device of this name, which may hang; implements `Port`.
+    """A device, which may hang; implements `Port`.
 
-    descriptor: watched by the event loop; None where a thread must read, which may block.
-    on_data: called with what is received; on_loss: called once with the cause of a loss; shut:
-    closes the device, also a lost one.
+    name: of the device. descriptor: the one that the event loop watches; None if a thread must read
+    the device, because reading may block. on_data: is called with received bytes. on_loss: is
+    called once with the cause of a loss. shut: closes the device, even if it is lost.
     """
 
     kind: ClassVar[str]
-    """What it is, in messages."""
+    """Kind of the device, as messages name it."""
     failures = FAILURES
 
     def __init__(
@@ -102,17 +106,17 @@ class DevicePort(ABC):
 
     @abstractmethod
     def read_watched(self) -> bytes:
-        """Return what has come; raises one of `failures`."""
+        """Return the bytes that have arrived; raises one of `failures`."""
 
     def read_waiting(self) -> bytes:
-        """Return what comes within a short time; raises one of `failures`. Reader thread.
+        """Return the bytes that arrive within a short time; raises one of `failures`.
 
-        Of a device without a descriptor.
+        The thread of a device without a descriptor calls it.
         """
         raise NotImplementedError
 
     def poll(self) -> None:
-        """Hand over what has come and was not read yet; a reader thread has done so."""
+        """Deliver bytes that have arrived; a reader thread delivers them by itself."""
         if self.descriptor is None:
             return
         try:
@@ -120,15 +124,15 @@ class DevicePort(ABC):
         except self.failures as error:
             self.lose(error)
             return
-        self.received(data)  # whatever fails in that is no loss of the port
+        self.received(data)  # outside of `try`: what fails there is no loss of the port
 
     def received(self, data: bytes) -> None:
-        """Hand over what has come."""
+        """Deliver received bytes."""
         if data and not self.closing.is_set():
             self._on_data(data)
 
     def lose(self, problem: Exception) -> LinkError:
-        """Close the port and report its loss, once; returns the error of a request."""
+        """Close the port and report its loss once; returns the error for the current request."""
         loss = (
             f"{self.kind} {self.name} was lost ({problem}): check the cable and the adapter, then "
             "open the amplifier again"
@@ -139,15 +143,15 @@ class DevicePort(ABC):
         return LinkError(loss)
 
     def close(self) -> None:
-        """Stop reading and writing; `wait_closed` closes the device."""
+        """Stop reading and writing; `wait_closed` then waits until the device is closed."""
         self.closing.set()
         watched, self.descriptor = self.descriptor, None
         if watched is not None:
             self.loop.remove_reader(watched)
 
     async def wait_closed(self) -> None:
-        """Wait until it is closed, but not for a device that hangs."""
-        # The system waits half a minute for a device that takes no more bytes.
+        """Wait until the device is closed, but only briefly if it hangs."""
+        # For a device that takes no more bytes, the system would wait half a minute.
         await close_in_thread(self._close_device, name=f"era-close {self.name}")
 
     def _close_device(self) -> None:
@@ -157,33 +161,33 @@ class DevicePort(ABC):
             self._shut()
 
     def _run(self) -> None:
-        """Read until the port is closed or lost; reader thread."""
+        """Read until the port is closed or lost; this is the reader thread."""
         post = self.loop.call_soon_threadsafe
-        with contextlib.suppress(RuntimeError):  # of a closed loop
+        with contextlib.suppress(RuntimeError):  # a closed loop raises it
             try:
                 while not self.closing.is_set():
                     if data := self.read_waiting():
                         post(self.received, data)
-            except Exception as error:  # whatever it is, nothing more is read
+            except Exception as error:  # whatever has failed, nothing more is read
                 post(self.lose, error)
 
 
 NETWORK_DELAY = 1.0
-"""Time [s] after which a port gives up a connection that has not taken what was sent.
+"""Time [s] after which a port gives up a connection that does not take what was sent.
 
-What a broken network delivers later than that is not accounted for.
+Delivery by a broken network after that time is not accounted for.
 """
 _CONNECT_TIMEOUT = 1.0  # s; a hundred times the delay within a building
-_NEXT_AFTER = 0.25  # s; RFC 8305, section 5; an address that is refused is not waited for
+_NEXT_AFTER = 0.25  # s; RFC 8305, section 5; if an address refuses, the next follows at once
 _NUMERIC = socket.NI_NUMERICHOST | socket.NI_NUMERICSERV
-_READ_MAX = 4096  # bytes at once; others have their turn between
+_READ_MAX = 4096  # bytes at once, so that other connections have their turn
 _UNSENT_MAX = 4096  # bytes; sixteen unsent frames mean a blocked connection
 
 
 async def open_connection(
     host: str, port: int, on_data: Callable[[bytes], None], on_loss: Callable[[str], None]
 ) -> Port:
-    """Connect to the first address of a host that accepts; LinkError with a remedy."""
+    """Connect to the first address of a host that accepts; raises LinkError with a remedy."""
     endpoint = f"{host}:{port}"
     try:
         async with asyncio.timeout(_CONNECT_TIMEOUT):
@@ -214,10 +218,10 @@ class _Connection(asyncio.BufferedProtocol):
         self._transport: asyncio.Transport  # set when connected
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """Send small frames at once, and give up the connection that does not take them in time.
+        """Set the connection to send small frames at once, and to be given up if they do not pass.
 
-        Without it a frame waits up to 40 ms for the acknowledgement of the one before, and what a
-        broken network keeps may arrive minutes later.
+        Otherwise a frame may wait 40 ms for the acknowledgement of the one before, and a broken
+        network may deliver frames minutes later.
         """
         self._transport, self.is_made = cast(asyncio.Transport, transport), True
         connection = transport.get_extra_info("socket")
@@ -247,7 +251,7 @@ class _Connection(asyncio.BufferedProtocol):
         return self._transport.get_write_buffer_size() > 0
 
     def poll(self) -> None:
-        """Nothing to do: the loop reads before it runs timers that are due later."""
+        """Do nothing: the loop reads before it runs timers that are due later."""
 
     def write(self, data: bytes) -> None:
         if self._transport.get_write_buffer_size() > _UNSENT_MAX:
@@ -259,18 +263,18 @@ class _Connection(asyncio.BufferedProtocol):
         self._transport.abort()  # discards unsent bytes
 
     async def wait_closed(self) -> None:
-        """Return at once: abort does not block."""
+        """Return at once, because `abort` does not block."""
 
 
 async def _first_to_accept(host: str, port: int, connection: _Connection) -> Port:
     """Connect to the first address of a host that accepts (RFC 8305); raises OSError."""
     connect = asyncio.get_running_loop().create_connection
-    take = [connection].pop  # the first address that accepts has it, any other an IndexError
+    take = [connection].pop  # the first address that accepts gets it, any other an IndexError
     attempts = [partial(connect, take, each, port) for each in await _addresses(host)]
     try:
         _, index, failures = await staggered_race(attempts, _NEXT_AFTER)
     except BaseException:
-        if connection.is_made:  # given up just after it was accepted
+        if connection.is_made:  # this was cancelled just after an address had accepted
             connection.close()
         raise
     if index is None and failures[-1] is not None:
@@ -283,11 +287,11 @@ async def _addresses(host: str) -> list[str]:
     try:
         return [str(ipaddress.ip_address(host))]
     except ValueError:
-        # asyncio resolves in a thread that delays the end of the program.
+        # asyncio would resolve it in a thread that delays the end of the program.
         found = await in_thread(
             lambda: socket.getaddrinfo(host, None, type=socket.SOCK_STREAM), name=f"era-name {host}"
         )
-        # With the zone of a link-local address.
+        # The result includes the zone of a link-local address.
         return [socket.getnameinfo(each, _NUMERIC)[0] for *_, each in found]
 
 
@@ -309,9 +313,9 @@ _REMEDIES = {
 async def open_port(
     place: Endpoint, on_data: Callable[[bytes], None], on_loss: Callable[[str], None]
 ) -> Port:
-    """Open a device, exclusively if the system can, or connect; raises LinkError.
+    """Open a device, exclusively if the system can, or connect to a server; raises LinkError.
 
-    on_data: called with received bytes; on_loss: called once with the cause of a loss.
+    on_data: is called with received bytes; on_loss: is called once with the cause of a loss.
     """
     if place.host:
         return await open_connection(place.host, place.port, on_data, on_loss)
@@ -346,22 +350,23 @@ def _open_device(place: Endpoint) -> serial.Serial:
         exclusive=True,
     )
     try:
-        # USB adapters delay bytes by 16 ms unless low latency is set; most support it.
+        # USB adapters delay bytes by 16 ms unless low latency is set, which most of them support.
         with contextlib.suppress(OSError, ValueError, AttributeError, NotImplementedError):
             port.set_low_latency_mode(True)
-        # DTR stays up when it is closed: a board that it restarts does so at one opening alone.
+        # DTR stays set when the port is closed, so that a board that is restarted by DTR restarts
+        # at the first opening only.
         settings = termios.tcgetattr(port.fileno())
         settings[2] &= ~termios.HUPCL
         termios.tcsetattr(port.fileno(), termios.TCSANOW, settings)
         port.reset_input_buffer()
     except BaseException:
-        port.close()  # else it stays this program's, which could not open it again
+        port.close()  # otherwise this program would keep it and could not open it again
         raise
     return port
 
 
 def remedy_of(error: BaseException | None) -> str:
-    """Return the remedy for an opening error by the error code of it or its cause."""
+    """Return the remedy for an error of opening, by its error code or that of its cause."""
     while error is not None:
         code = getattr(error, "errno", None)
         if code is not None:
@@ -432,7 +437,7 @@ class SerialPort(DevicePort):
             raise self.lose(error) from error
 
     def _send_rest(self) -> None:
-        """Send the rest, for which there is room; nothing, where a newer frame has gone whole."""
+        """Send the rest as soon as there is room; a newer frame may have replaced it."""
         with contextlib.suppress(LinkError):  # reported as a loss
             self._send()
         if not self._unsent and self.descriptor is not None:

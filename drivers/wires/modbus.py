@@ -3,9 +3,9 @@
     modbus+tcp://HOST:PORT/UNIT
     modbus+rtu:///dev/ttyS1?baud=115200#UNIT
 
-A message is written, then its reply is read. Responses are matched by the transaction number over
-TCP, by unit, function and length over RTU, and by the tag. `SilentPort` keeps an RTU line silent
-before each frame.
+A message is written, and then its reply is read. Responses are matched with requests by the
+transaction number over TCP, by unit, function and length over RTU, and by the tag. `SilentPort`
+keeps an RTU line silent before each frame.
 """
 
 import asyncio
@@ -65,41 +65,41 @@ _TO_ALL = b"\0"
 
 @final
 class SilentPort(PortAbove):
-    """A port that sends a frame once the line was silent for a time [s]; implements `Port`.
+    """A port that sends a frame after the line was silent for a time [s]; implements `Port`.
 
-    byte_time [s]; on_data: called with what is received. A frame waits at most for the longest
-    other one, so that noise does not keep a stop waiting, but always for one of its own.
-    Of those that wait a newer one replaces the older: its request was given up. Broadcasts stay,
-    which have no reply to wait for.
+    byte_time: of a byte on the line [s]; on_data: is called with received bytes. A frame always
+    waits for the last frame of this port, and for others no longer than the longest one takes, so
+    that noise does not delay a stop. A newer frame replaces an older one that still waits, because
+    the request of that one was given up; broadcasts have no reply, and are all sent.
     """
 
     def __init__(self, silence: float, byte_time: float, on_data: Callable[[bytes], None]) -> None:
         self._silence, self._byte_time, self._on_data = silence, byte_time, on_data
         self._loop = asyncio.get_running_loop()
         self._free_from = self._loop.time() + silence
-        self._sent_until = 0.0  # s; the end of the last frame of its own, and silence
-        self._waiting: list[tuple[float, bytes]] = []  # until when [s] at most, frame
+        self._sent_until = 0.0  # s; the end of the last frame of this port and its silence
+        self._waiting: list[tuple[float, bytes]] = []  # frames, and when [s] they go at the latest
         self._timer: asyncio.TimerHandle | None = None
 
     def write(self, data: bytes) -> None:
-        """Send a frame as soon as the line was silent; raises LinkError."""
+        """Send a frame as soon as the line has been silent; raises LinkError."""
         latest = self._loop.time() + RTU_MAX * self._byte_time + self._silence
         kept = [each for each in self._waiting if each[1].startswith(_TO_ALL)]
         self._waiting = [*kept, (latest, data)]
         self._send()
 
     def close(self) -> None:
-        """Close it; what waits is not sent."""
+        """Close it; frames that wait are not sent."""
         self._waiting.clear()
         super().close()
 
     def received(self, data: bytes) -> None:
-        """Take what was received, and count it as noise on the line."""
+        """Deliver received bytes, after which the line must be silent again."""
         self._free_from = max(self._free_from, self._loop.time() + self._silence)
         self._on_data(data)
 
     def _send(self) -> None:
-        """Send what may go now; the timer sends the rest."""
+        """Send the frames that may go now; a timer sends the rest."""
         while self._waiting:
             latest, frame = self._waiting[0]
             due = max(self._sent_until, min(self._free_from, latest))
@@ -119,9 +119,9 @@ class SilentPort(PortAbove):
             self._send()
 
 
-_BITS = 11  # of a byte, with start, parity and stop
+_BITS = 11  # bits of a byte, with start, parity and stop bits
 _GAP = 3.5  # characters of silence before a frame
-_SHORTEST_GAP = 0.00175  # s; by the standard above 19 200 baud
+_SHORTEST_GAP = 0.00175  # s; the standard's value above 19 200 baud
 _NO_SUCH_REGISTERS = (1, 2, 3, 4)
 _GATEWAY = {10: "path to", 11: "response of"}
 _RTU_CHECKS = "baud rate, parity, cable and protocol, and whether the adapter echoes"
@@ -130,19 +130,21 @@ _TCP_CHECKS = "that the server speaks Modbus TCP; of RTU the URL is modbus+rtu:/
 
 @dataclass(slots=True)
 class _Request:
-    """A request of a name and its transaction on the wire; tag: 0 for one that only reads."""
+    """A request and its transaction on the wire."""
 
     name: str
     tag: int
+    """0 for a request that only reads."""
     message: Pdu
     frame: bytes
     has_reply: bool = True
 
 
 class ModbusWire(Wire):
-    """A line at a speed [baud], 0 for a network; number: of the last tag and transaction.
+    """The host's side of a Modbus line or connection.
 
-    silence: before each frame of a serial line [s], kept by its port; delay [s]: of a network.
+    baud: speed of the line; 0 for a network. number: of the last tag and transaction. delay: how
+    late a network may deliver a frame [s].
     """
 
     def __init__(self, baud: int, *, is_rtu: bool, number: int, delay: float = 0.0) -> None:
@@ -154,19 +156,19 @@ class ModbusWire(Wire):
         self.confirms_parts = is_rtu or baud > 0
         self._number = number
         self._request: _Request | None = None
-        self._write: _Request | None = None  # of a set, whose read is on the wire as well
-        self._last: _Request | None = None  # that was replied to, and how
-        self._replied = Response()
+        self._write: _Request | None = None  # the write of a set that was sent with its read
+        self._last: _Request | None = None  # the last request that had a response
+        self._replied = Response()  # that response
         self._reader = AduReader(is_rtu=is_rtu, of_requests=False, is_host=True)
-        self._damaged = b""  # behind the last valid frame, no more than tells it from a frame
-        self._damaged_size = 0  # bytes of it
-        self._unawaited: set[int] = set()  # transactions whose responses are passed over
+        self._damaged = b""  # first bytes that follow the last valid frame and are no frame
+        self._damaged_size = 0  # number of all such bytes
+        self._unawaited: set[int] = set()  # transactions whose responses are ignored
         self._sizes: dict[int, tuple[int, int]] = {}  # channels and layers of each unit
 
     def request(self, address: int, name: str, values: Values, *, has_reply: bool = True) -> bytes:
-        """Return the frame of a request, which is on the wire from now on; address 0: of all.
+        """Return the frame of a request, which counts as sent; address 0: a broadcast.
 
-        Over TCP a request of all is a frame to each unit that was sent something before.
+        Over TCP, a broadcast is a frame to each unit that was sent something before.
         """
         self._request = self._last = self._write = None
         if address == BROADCAST:
@@ -174,7 +176,7 @@ class ModbusWire(Wire):
                 return self._written(BROADCAST, name, values).frame
             sent = [self._written(unit, name, values) for unit in self._sizes]
             self._unawaited.update(each.message.transaction_id for each in sent)
-            if self._baud and sent:  # a gateway sends a write once the one before was replied to
+            if self._baud and sent:  # a gateway sends each write after the reply to the last one
                 echo = self._time(ECHO_SIZE) + self.silence + REACTION
                 self.takes += (len(sent) - 1) * (self.takes + echo)
             return b"".join(each.frame for each in sent)
@@ -190,7 +192,7 @@ class ModbusWire(Wire):
         return self._request.frame
 
     def _without_pause(self, write: _Request) -> bytes:
-        """Return the frames of a part of a set over a network: of the last one the read, too."""
+        """Return the frames of a part of a set over a network; the last part includes its read."""
         if write.has_reply:
             self._write, self._request = write, self._read_of(write)
             return write.frame + self._request.frame
@@ -199,14 +201,14 @@ class ModbusWire(Wire):
         return write.frame
 
     def _read_of(self, write: _Request) -> _Request:
-        """Return the request that reads the reply to one that is written."""
+        """Return the request that reads the reply to a written one."""
         unit = write.message.dev_id
         first = MESSAGES[write.name].number * BOX + REPLY_OFFSET
         count = HEAD + reply_words(write.name, *self._sizes[unit])
         return self._sent(write.name, write.tag, Read(dev_id=unit, address=first, count=count))
 
     def received(self, data: bytes) -> list[Arrival]:
-        """Return what these bytes complete."""
+        """Return the arrivals that these bytes complete."""
         request = self._request or self._last
         sent = None if request is None else request.message
         arrivals: list[Arrival] = []
@@ -251,20 +253,20 @@ class ModbusWire(Wire):
         return arrivals
 
     def withdraw(self) -> None:
-        """Take the request off the wire: its reply will be unexpected."""
-        for adu in self._reader.end():  # a damaged length would take the next responses
+        """Give up the request on the wire, so that its reply will count as unexpected."""
+        for adu in self._reader.end():  # a damaged length would swallow the next responses
             self._count_damaged(adu.raw)
         self._request = self._write = None
         self._damaged = b""
 
     def transit(self, words: int) -> float:
-        """Return how long a request of so many words takes to arrive [s]: its write."""
+        """Return how long the write of a request with this number of words takes to arrive [s]."""
         return self._time(WRITE_SIZE + 2 * (1 + words)) + self.silence
 
     def exchange_time(self, words: int, reply: int) -> float:
-        """Return how long a request and a reply of so many words take [s]; 0 over a network.
+        """Return how long a request and a reply with these numbers of words take [s].
 
-        Two transactions, with the silences before all four frames.
+        They are two transactions, with a silence before each of the four frames; 0 over a network.
         """
         rest = self._time(ECHO_SIZE + READ_SIZE + RESPONSE_SIZE + 2 * (HEAD + reply))
         return self.transit(words) + rest + 3 * self.silence
@@ -289,7 +291,7 @@ class ModbusWire(Wire):
         return _Request(name, tag, message, TCP.buildFrame(message))
 
     def _written(self, unit: int, name: str, values: Values) -> _Request:
-        """Return a request whose write goes first."""
+        """Return a request that begins with a write."""
         message = MESSAGES[name]
         tag = self._number % 0xFFFF + 1
         registers = message.request.append([tag], values)
@@ -297,7 +299,7 @@ class ModbusWire(Wire):
         return self._sent(name, tag, write)
 
     def _count_damaged(self, data: bytes) -> None:
-        """Count bytes that are no frame, once between two frames."""
+        """Count bytes that are no frame; all that come between two frames count once."""
         self.counters.invalid_frames += not self._damaged
         self._damaged_size = len(data) + (self._damaged_size if self._damaged else 0)
         self._damaged = (self._damaged + data[: RTU_MAX + 5])[: RTU_MAX + 5]
@@ -308,8 +310,8 @@ class ModbusWire(Wire):
         self.counters.remark = f"{what}: check {_RTU_CHECKS if self._is_rtu else _TCP_CHECKS}"
 
     def _arrival(self, request: _Request, response: Response) -> Arrival | None:
-        """Return what a response to the transaction on the wire means."""
-        if response.exception in _GATEWAY:  # as no response
+        """Return what a response to the transaction on the wire means; None: it does not count."""
+        if response.exception in _GATEWAY:  # it counts as no response
             self.counters.remark = (
                 f"the gateway has no {_GATEWAY[response.exception]} unit {request.message.dev_id} "
                 f"(exception {response.exception}): check the unit, its supply and its line"
@@ -384,7 +386,7 @@ class ModbusAddress(WireAddress):
         }
 
     def make_wire(self) -> ModbusWire:
-        """Make the wire; a random start, so that a reply to an earlier host does not match."""
+        """Make the wire with a random number, so that a reply to an earlier host does not match."""
         delay = 0.0 if self.place.device else NETWORK_DELAY
         number = random.getrandbits(16)
         return ModbusWire(self.place.baud, is_rtu=self._is_rtu, number=number, delay=delay)

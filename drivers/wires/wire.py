@@ -57,22 +57,24 @@ class Reply:
 
 @dataclass(frozen=True, slots=True)
 class Nak:
-    """The amplifier refused the request: name of the code, and the channel at fault."""
+    """The amplifier refused the request."""
 
     code: str
+    """Name of the refusal."""
     channel: int | None
+    """The channel at fault; None if it is none in particular."""
 
 
 @dataclass(frozen=True, slots=True)
 class BrokenReply:
-    """The reply to the request is none of the protocol: why."""
+    """The reply to the request is not one of the protocol, and the reason."""
 
     reason: str
 
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """A change that an amplifier tells unasked: its address, the values of the Event."""
+    """A change that the amplifier at an address reports without a request."""
 
     address: int
     values: Values
@@ -80,32 +82,30 @@ class Event:
 
 @dataclass(frozen=True, slots=True)
 class OtherHost:
-    """Another host drives the amplifier at an address: its request was heard."""
+    """A request of another host to the amplifier at an address was heard."""
 
     address: int
 
 
 @dataclass(frozen=True, slots=True)
 class DuplicateAddress:
-    """Several amplifiers have an address: two replies to one request differ."""
+    """Several amplifiers have the same address, since two replies to one request differ."""
 
     address: int
 
 
 @dataclass(frozen=True, slots=True)
 class Continuation:
-    """The request goes on with these bytes, as on Modbus.
-
-    is_present: its reply is of the moment at which they arrive.
-    """
+    """The request continues with these bytes, as the read behind a write on Modbus."""
 
     data: bytes
     is_present: bool = False
+    """Whether the reply shows the moment at which these bytes arrive."""
 
 
 @dataclass(frozen=True, slots=True)
 class WrittenPart:
-    """The part of a set on the wire, which has no reply, was written, as on Modbus."""
+    """The part of a set that was sent last has arrived, as the echo of a write shows on Modbus."""
 
 
 Arrival: TypeAlias = (
@@ -116,7 +116,7 @@ Arrival: TypeAlias = (
 def read_event(
     address: int, kind: int, words: Sequence[int], counters: WireCounters
 ) -> list[Arrival]:
-    """Read an unasked message of an amplifier, and count it; nothing where it is no event."""
+    """Read and count a message that came without a request; returns [] if it is no event."""
     try:
         if kind != EVENT:
             raise Refusal(f"type must be {EVENT}, got {kind}")
@@ -129,7 +129,7 @@ def read_event(
 
 
 def read_nak(words: Sequence[int], *, is_strict: bool = False) -> Nak:
-    """Read the words of a Nak; is_strict: nothing may follow them. Raises Refusal."""
+    """Read the words of a Nak; raises Refusal. is_strict: whether nothing may follow them."""
     values = NAK_RECORD.unpack(words, is_strict=is_strict)
     channel = None if values["channel"] == NO_CHANNEL else values["channel"]
     return Nak(_CODES.get(values["code"], f"code {values['code']}"), channel)
@@ -137,13 +137,13 @@ def read_nak(words: Sequence[int], *, is_strict: bool = False) -> Nak:
 
 @cache
 def request_words(name: str) -> int:
-    """Return the most words of a request."""
+    """Return the largest number of words of a request."""
     return 0 if name == "Hello" else _words(MESSAGES[name].request, {})
 
 
 @cache
 def reply_words(name: str, channels: int = WIDEST[0], layers: int = WIDEST[1]) -> int:
-    """Return the most words of a reply of an amplifier with so many channels and layers."""
+    """Return the largest number of words of a reply; channels, layers: of the amplifier."""
     if name in ("Hello", "GetCaps"):
         channels, layers = WIDEST
     rows = {"channels": channels, "layers": layers}
@@ -153,7 +153,7 @@ def reply_words(name: str, channels: int = WIDEST[0], layers: int = WIDEST[1]) -
 
 
 def _words(record: Record, rows: Mapping[str, int]) -> int:
-    """Return the most words of a record; rows: how many there are, by the name of their count."""
+    """Return the largest number of words of a record; rows: how many, by the field of the count."""
     words = 0
     for field in record.fields:
         match field:
@@ -175,57 +175,57 @@ class Wire(Protocol):
 
     counters: WireCounters
     delay: float
-    """By which a frame may arrive later than its bits take [s]: `NETWORK_DELAY` over a network."""
+    """How much later a frame may arrive than its bits take [s]; `NETWORK_DELAY` over a network."""
     is_kept: bool = False
-    """Whether a frame is sent again until another node takes it, as by an adapter on a CAN bus."""
+    """Whether a frame is repeated until another node takes it, as by an adapter on a CAN bus."""
     takes: float = 0.0
-    """How long what was sent last takes to arrive [s]; 0 over a network."""
+    """How long the request that was sent last takes to arrive [s]; 0 over a network."""
     blocked: str = "the port takes no bytes: check flow control and the adapter"
-    """What a port that is blocked means, and what to check."""
+    """What it means if the port is blocked, and what to check."""
     confirms_parts: bool = False
-    """Whether each part of a set has a response, the next one being sent behind it."""
+    """Whether each part of a set has a response, after which the next part is sent."""
     busy: float = 0.0
-    """For how long what was sent last and its reply take a line in turn [s]; 0 on others."""
+    """How long the last request and its reply occupy a line [s]; 0 if they do not share one."""
 
     def request(self, address: int, name: str, values: Values, *, has_reply: bool = True) -> bytes:
-        """Return the bytes of a request, which is on the wire from now on; address 0: of all.
+        """Return the bytes of a request, which counts as sent; address 0: a broadcast.
 
-        has_reply: whether one is awaited: of no request of all, nor of an earlier part of a set.
+        has_reply: whether a reply is awaited; a broadcast and an earlier part of a set have none.
         """
 
     def received(self, data: bytes) -> list[Arrival]:
-        """Return what these bytes complete."""
+        """Return the arrivals that these bytes complete."""
 
     def withdraw(self) -> None:
-        """Take the request off the wire: its reply will be unexpected."""
+        """Give up the request on the wire, so that its reply will count as unexpected."""
 
     def follow(self, before: "Wire") -> None:
-        """Number requests on from those of the line as it was open before; before any request.
+        """Continue the numbers of requests of the same line as it was open before.
 
-        By default by numbers of its own, which amplifiers take.
+        It is called before any request. By default a wire starts with numbers of its own, which
+        amplifiers accept.
         """
         return
 
     def transit(self, words: int) -> float:
-        """Return how long a request of so many words takes to arrive [s]."""
+        """Return how long a request with this number of words takes to arrive [s]."""
 
     def exchange_time(self, words: int, reply: int) -> float:
-        """Return how long a request and a reply of so many words take [s]; 0 if unknown."""
+        """Return how long a request and a reply of these numbers of words take [s]; 0: unknown."""
         return self.transit(words) + self.transit(reply)
 
 
 class WireAddress(ABC):
-    """An amplifier on one kind of wire, made of its URL; CommandError for one that is invalid.
-
-    line: name of the port, connection or bus, which amplifiers of one name share; settings: what
-    they must agree in, by name; number: of the amplifier there.
-    """
+    """The place of an amplifier on one kind of wire, made from its URL; raises CommandError."""
 
     line: str
+    """Name of the port, connection or bus; amplifiers with the same name share it."""
     settings: Mapping[str, object]
+    """Settings in which all amplifiers of a line must agree, by name."""
     number: int
+    """Address, unit or node of the amplifier on its line."""
     boot_time: float = 0.0
-    """How long what is behind the port may take to start once that is opened [s]."""
+    """How long a board behind the port may take to boot after the port is opened [s]."""
 
     @abstractmethod
     def __init__(self, url: str) -> None:
@@ -236,7 +236,7 @@ class WireAddress(ABC):
         """Make the host's side of the wire, without I/O."""
 
     def check_agrees(self, settings: Mapping[str, object]) -> None:
-        """Raise LinkError unless its settings are those of the others on its line."""
+        """Raise LinkError unless its settings are those of the other amplifiers on its line."""
         for setting, value in settings.items():
             if (got := self.settings.get(setting)) != value:
                 raise LinkError(
@@ -250,16 +250,16 @@ class WireAddress(ABC):
     ) -> Port:
         """Open the port of the line, for this program alone if the system can; raises LinkError.
 
-        on_data: called with what is received, as the wire takes it; on_loss: called once, with the
-        cause.
+        on_data: is called with received bytes, as `Wire.received` takes them; on_loss: is called
+        once with the cause of a loss.
         """
 
 
 class PortAbove:
-    """What a port on another one, below, leaves as it is; see `Port`."""
+    """A port that passes on to another one, below it, what it does not change; see `Port`."""
 
     below: Port
-    """Set once it is open."""
+    """The other port, which is set once it is open."""
 
     @property
     def is_blocked(self) -> bool:
@@ -267,7 +267,7 @@ class PortAbove:
         return self.below.is_blocked
 
     def poll(self) -> None:
-        """Hand over what has come and was not read yet."""
+        """Deliver bytes that have arrived and were not read yet."""
         self.below.poll()
 
     def close(self) -> None:

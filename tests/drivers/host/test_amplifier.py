@@ -44,9 +44,8 @@ from real_wires import WORD_WIRES
 from registry.limits import GuardLimits
 from sim.amplifier.readings import capabilities
 from sim.amplifier.simulated_amplifier import SimulatedAmplifier
-from virtual_lines import KINDS, MemoryLine, group_of, in_virtual_time, run_virtual
+from virtual_lines import KINDS, MemoryLine, group_of, in_virtual_time
 from virtual_lines import LIMITS as WIRE_LIMITS
-from virtual_lines import unaltered as unaltered_reply
 
 FREQUENCIES = [110.0, 173.5]
 ROW = {"unit": 1, "channel": 255, "x": 1000, "y": 2000, "range": 512.0, "frequency_max": 20_000}
@@ -208,32 +207,6 @@ async def test_full_level_must_be_what_the_rig_says(wire: str, is_output: bool) 
         await host.open()
     end.far["a"].capabilities = capabilities(2, is_output=is_output)
     await host.open()
-
-
-def test_request_that_waits_on_a_busy_machine_contradicts_nothing(wire: str) -> None:
-    """It waits 25 ms, ten times what the line needs, before it feeds; two statuses follow.
-
-    Answered or not: a watchdog that was fed later has more left.
-    """
-
-    async def run(is_answered: bool) -> None:
-        end = MemoryLine(wire, "a")
-        await group_of(end)
-        (host,) = end.hosts.values()
-        end.inward = lambda name, data: [(0.025, data)]
-        if is_answered:
-            await host.ping()
-        else:
-            end.outward = lambda name, data: []
-            with pytest.raises(LinkTimeout):
-                await host.ping()
-        end.inward = end.outward = unaltered_reply
-        for _ in range(2):
-            await host.read_status()
-            await asyncio.sleep(0.02)
-
-    for is_answered in (True, False):
-        run_virtual(run(is_answered))
 
 
 class Twins:

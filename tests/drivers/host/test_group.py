@@ -5,7 +5,7 @@ long its bits take, what is late, and what a delay of this process costs.
 """
 
 import asyncio
-from collections.abc import Awaitable, Callable
+from collections.abc import Callable
 from random import Random
 
 import pytest
@@ -15,7 +15,7 @@ from drivers.host.amplifier import Amplifier
 from drivers.host.dialogue import SILENCING
 from drivers.host.group import Group
 from drivers.host.line import Priority
-from drivers.playing import AmplifierLayer, AmplifierTone
+from drivers.playing import AmplifierTone
 from drivers.protocol.definition import ATTEMPTS, STATES
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Envelope
@@ -23,7 +23,6 @@ from drivers.wires.modbus import ModbusWire
 from drivers.wires.serial_line import SerialWire
 from drivers.wires.wire import BrokenReply, Wire
 from virtual_lines import (
-    KINDS,
     MemoryLine,
     group_of,
     grouped,
@@ -118,21 +117,6 @@ async def test_another_amplifier_or_version_is_refused(wire: str, name: str) -> 
     host = Amplifier(end.line, 1, end.hosts["a"].limits, name="a", serial_number="SIM-a")
     with pytest.raises(LinkError):
         await host.open()
-
-
-@grouped(("a",))
-async def test_nothing_is_armed_by_what_a_stop_of_the_same_moment_overtakes(
-    group: Group, ends: list[MemoryLine], wire: str
-) -> None:
-    """The stop comes between the call and the first request of it: no Arm goes out."""
-    await group.disarm()
-    ends[0].sent.clear()
-    arming, stops = asyncio.ensure_future(group.arm()), list[Awaitable[object]]()
-    ends[0].loop.call_soon(lambda: stops.append(group.stop()))
-    with pytest.raises(DriverError):
-        await arming
-    await stops[0]
-    assert "1:3" not in {each for _, each in ends[0].sent}
 
 
 @grouped(("a", "b"))
@@ -363,70 +347,6 @@ async def test_reply_that_never_comes_to_a_process_that_is_often_delayed_is_give
             await group.amplifiers["a"].read_status()
     assert end.loop.time() - began < 3 * 8 * 0.031
     stalling.cancel()
-
-
-@grouped(("a",), wire="tcp")
-async def test_port_that_takes_nothing_leaves_an_amplifier_degraded(
-    group: Group, ends: list[MemoryLine], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Nothing new is played, its line is not lost, and it counts again once it replies."""
-    (end,) = ends
-
-    def block(data: bytes) -> None:
-        raise LinkTimeout("write blocked; check the network")
-
-    await group.apply({"a": [layer(0, tone())]})
-    with monkeypatch.context() as blocked:
-        blocked.setattr(end, "write", block)
-        with pytest.raises(LinkTimeout, match="write blocked"):
-            await group.beat()
-        assert group.members.degraded == ("a",)
-    write, count = end.write, 0
-
-    def block_the_read(data: bytes) -> None:
-        nonlocal count
-        count += 1
-        if count == 2:
-            block(data)
-        write(data)
-
-    await group.amplifiers["a"].read_status()
-    assert not group.members.degraded
-    with monkeypatch.context() as blocked:
-        blocked.setattr(end, "write", block_the_read)
-        with pytest.raises(LinkTimeout, match="write blocked"):
-            await group.amplifiers["a"].read_status()
-        assert group.members.degraded == ("a",)
-        assert end.line.loss is None
-    assert (await group.stop())["a"].is_confirmed
-
-
-@pytest.mark.parametrize("wire", KINDS)
-@grouped(("a", "b"))
-async def test_commit_of_a_set_that_is_given_up_is_not_sent(
-    group: Group, ends: list[MemoryLine]
-) -> None:
-    """It waits behind a reading of the line that two amplifiers share."""
-    (end,) = ends
-    await group.apply({each: [layer(0, tone())] for each in "ab"})
-    applying = asyncio.ensure_future(
-        group.apply({each: [AmplifierLayer(0, (tone(level=0.3),), 0.001)] for each in "ab"})
-    )
-    end.outward = lambda name, data: [(0.02 if name == "GetStatus" else 0.0002, data)]
-    for _ in range(1000):
-        await asyncio.sleep(0.0001)
-        if end.sent[-1][1] == "2:5":
-            break
-    reading = asyncio.ensure_future(group.amplifiers["a"].read_status())
-    await asyncio.sleep(0.005)
-    end.sent.clear()
-    group.abort_exchange()
-    with pytest.raises(DriverError):
-        await applying
-    await reading
-    await asyncio.sleep(0.01)
-    assert end.sent == []
-    assert (end.levels("a"), end.levels("b")) == ([0.5, 0.0], [0.5, 0.0])
 
 
 @in_virtual_time

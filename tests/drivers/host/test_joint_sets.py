@@ -22,11 +22,8 @@ import drivers
 from chain import set_running
 from courses import Acted
 from drivers.errors import (
-    CommandRefused,
     DriverError,
-    LinkTimeout,
     Overtaken,
-    Preempted,
 )
 from drivers.playing import AmplifierLayer, AmplifierTone
 from drivers.protocol.definition import CLOCK_UNKNOWN, MESSAGES
@@ -206,49 +203,6 @@ async def test_a_set_is_checked_once_unless_what_plays_may_be_another(
     refusal = group.sets.refusal_of({"a": [AmplifierLayer(0, (AmplifierTone(0, 100.0, 2.0),))]})
     assert refusal is not None
     assert refusal.channel == 0
-
-
-@in_virtual_time
-async def test_line_that_is_busy_for_too_long_commits_nothing_and_is_no_fault() -> None:
-    """Three statuses without reply take 270 ms, a set is admitted for 100: refused until later."""
-    ends = [MemoryLine("serial", "a"), MemoryLine("serial", "b")]
-    group = await group_of(*ends, watchdog=1.0)
-    ends[1].outward = lambda name, data: [] if name == "GetStatus" else [(0.0002, data)]
-    reads = [asyncio.ensure_future(group.amplifiers["b"].read_status()) for _ in range(3)]
-    with pytest.raises(CommandRefused) as refused:
-        await group.apply({name: [LAYER] for name in group.amplifiers})
-    assert not isinstance(refused.value, Preempted)  # nothing came first: it is to be told
-    assert refused.value.until is not None
-    await asyncio.gather(*reads, return_exceptions=True)
-    assert await started(*ends) == [[], []]
-    assert group.is_armed
-    ends[1].outward = lambda name, data: [(0.0002, data)]
-    await group.amplifiers["b"].read_status()
-    await group.apply({name: [LAYER] for name in group.amplifiers})
-    assert [*map(len, await started(*ends))] == [1, 1]
-
-
-@pytest.mark.parametrize(("names", "fails"), [(("slow serial", "tcp"), 0), (("serial",) * 2, 1)])
-@in_virtual_time
-async def test_set_of_which_a_commit_fails_is_known_to_play_in_part(
-    names: tuple[str, str], fails: int
-) -> None:
-    """A port does not take it: what the other plays is silenced before the next set."""
-    ends = [timed_line(name, each) for name, each in zip(names, "ab", strict=True)]
-    group = await group_of(*ends, watchdog=1.0)
-    write = ends[fails].write
-
-    def block(data: bytes) -> None:
-        if ends[fails].kind.request_of(data) == (1, MESSAGES["Commit"].number):
-            raise LinkTimeout("write blocked; check the adapter")
-        write(data)
-
-    ends[fails].write = block  # type: ignore[method-assign]
-    with pytest.raises(DriverError, match="write blocked"):
-        await group.apply({"a": [LAYER], "b": [LAYER]})
-    assert group.sets.is_incomplete
-    starts = await started(*ends)
-    assert (starts[fails], len(starts[1 - fails])) == ([], 1)
 
 
 @in_virtual_time

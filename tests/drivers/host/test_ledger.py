@@ -531,21 +531,6 @@ async def test_request_that_has_waited_for_50_ms_goes_before_newer_heartbeats(
     await asyncio.wait(beating)
 
 
-@grouped(("a", "b"), wire="serial")
-async def test_heartbeat_waits_for_one_request_that_has_waited(
-    group: Group, ends: list[MemoryLine]
-) -> None:
-    """Of eight statuses that nobody has answered for 50 ms, each of 20 ms on the line."""
-    (end,), (first, second) = ends, group.amplifiers.values()
-    end.outward = lambda name, data: [(0.02, data)]
-    reading = [asyncio.ensure_future(second.read_status()) for _ in range(8)]
-    await asyncio.sleep(0.065)
-    began = end.loop.time()
-    await first.ping()
-    assert end.loop.time() - began < 0.065
-    await asyncio.gather(*reading)
-
-
 @pytest.mark.parametrize(("baud", "attempts"), [(921_600, 3), (9600, 2)])
 @in_virtual_time
 async def test_request_is_repeated_twice_and_once_on_a_slow_line(baud: int, attempts: int) -> None:

@@ -136,20 +136,6 @@ def test_sets_play_whole_and_once_though_frames_are_lost(kind: str, lines: str, 
     assert run_virtual(_play(kind, lines, rng, count), rng=rng) == []
 
 
-@pytest.mark.parametrize("wire", ["serial", "can", "tcp"])
-@grouped(("a",))
-async def test_part_that_never_arrives_is_given_up(group: Group, ends: list[MemoryLine]) -> None:
-    """An amplifier that says so for ever is sent it three times, and counts as degraded."""
-    (end,) = ends
-    far = end.far["a"]
-    said = {"token": 0, "exact": 0, "staged": 0, "played": 0, "missing": 0}
-    far._take = lambda part, now: {**said, "token": part["token"]}  # type: ignore[method-assign]
-    async with asyncio.timeout(1.0):
-        with pytest.raises(LinkTimeout):
-            await group.apply({"a": of_parts(3)})
-    assert group.members.degraded == ("a",)
-
-
 @grouped(("a",), wire="serial")
 async def test_reply_to_a_part_but_the_last_is_none_of_its_set(
     group: Group, ends: list[MemoryLine]
@@ -365,16 +351,6 @@ async def test_lines_that_are_exchanged_while_armed_are_silenced(
             assert far.state != "OPERATION_ENABLED"
 
 
-@grouped(("a", "b"), ("c",), wire="serial")
-async def test_session_is_one_on_each_line(group: Group, ends: list[MemoryLine]) -> None:
-    """A broadcast commit carries it to all amplifiers of its line, and plays on no other's."""
-    await group.apply({name: [layer(0, tone())] for name in "abc"})
-    await asyncio.sleep(0.01)
-    assert [ends[0].levels("a"), ends[0].levels("b"), ends[1].levels("c")] == [[0.5, 0.0]] * 3
-    a, b, c = (far.session for end in ends for far in end.far.values())
-    assert a == b != c
-
-
 def _layer(
     number: float, channel: float = 0, level: float = 0, frequency: float = 0
 ) -> AmplifierLayer:
@@ -495,6 +471,11 @@ class OnLines(Taken):
         found = {what: getattr(self, what) for what in bounds}
         assert all(low < found[each] < high for each, (low, high) in bounds.items()), found
 
+    async def waits_until_sent(self, request: str) -> None:
+        """Wait until a request is the last that was sent on the first line."""
+        while self.sent[0][-1] != request:  # noqa: ASYNC110
+            await asyncio.sleep(0.0001)
+
     async def applies_parts(self, count: int) -> None:
         """Apply a set of about so many parts to the first amplifier."""
         await self.group.apply({"a": of_parts(count)})
@@ -574,6 +555,11 @@ class OnLines(Taken):
             [] if name == "Set" and next(counted) in numbers else unaltered(name, data)
         )
 
+    def misses_all_parts(self) -> None:
+        """Let the first amplifier say that no part of a set has come."""
+        said = {"exact": 0, "staged": 0, "played": 0, "missing": 0}
+        self.far.a._take = lambda part, now: {**said, "token": part["token"]}
+
     def loses_replies(self, name: str, count: int) -> None:
         """Lose so many replies to requests of a name on each line."""
         for line in self.lines:
@@ -586,6 +572,17 @@ class OnLines(Taken):
     def arrives_after(self, seconds: float) -> None:
         """Let requests on the first line arrive so much later."""
         self.lines[0].inward = lambda _, data: [(seconds, data)]
+
+    def blocks_writes(self, line: int, *numbers: int) -> None:
+        """Let the port of a line take none of the writes with these numbers, from 1 on."""
+        end, counted = self.lines[line], itertools.count(1)
+
+        def write(data: bytes) -> None:
+            if next(counted) in numbers:
+                raise LinkTimeout("write blocked; check the network")
+            MemoryLine.write(end, data)
+
+        end.write = write  # type: ignore[method-assign]
 
     def broadcasts_fail(self) -> None:
         """Let a bug end each broadcast on the first line."""

@@ -232,7 +232,7 @@ class SimulatedAddress(WireAddress):
         self.settings = {"protocol": "serial"}
 
     def make_wire(self) -> SerialWire:
-        """Make the wire; a random start, so that a reply to an earlier host does not match."""
+        """Make the wire with a random number, so that a reply to an earlier host does not match."""
         return SerialWire(0, sequence=random.getrandbits(16))
 
     async def open_port(

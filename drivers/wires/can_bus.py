@@ -108,7 +108,7 @@ class CanWire(Wire):
         self._events: dict[int, Assembler] = {}
 
     def request(self, address: int, name: str, values: Values, *, has_reply: bool = True) -> bytes:
-        """Return the frames of a request, which is on the wire from now on; address 0: of all.
+        """Return the frames of a request, which counts as sent; address 0: a broadcast.
 
         Hello sets the node operational first, and reads its versions from an object, which one of
         another version has too.
@@ -132,20 +132,20 @@ class CanWire(Wire):
         return pack_frames(frames)
 
     def received(self, data: bytes) -> list[Arrival]:
-        """Return what these frames complete."""
+        """Return the arrivals that these frames complete."""
         return [arrival for frame in unpack_frames(data) for arrival in self._arrivals(frame)]
 
     def withdraw(self) -> None:
-        """Take the request off the wire: its reply will be unexpected."""
+        """Give up the request on the wire, so that its reply will count as unexpected."""
         self._pending = None
 
     def follow(self, before: Wire) -> None:
-        """Number requests on: within 0.1 s amplifiers discard what is older."""
+        """Continue the numbers, since amplifiers discard older ones for 0.1 s."""
         if isinstance(before, CanWire):
             self._numbers.update(before._numbers)
 
     def transit(self, words: int) -> float:
-        """Return how long a request of so many words takes to arrive [s]."""
+        """Return how long a request with this number of words takes to arrive [s]."""
         return frames_of(words) * self._frame_time
 
     def _arrivals(self, frame: CanFrame) -> list[Arrival]:
@@ -403,7 +403,7 @@ class CanAddress(WireAddress):
         self.settings = {"protocol": "CAN", "bitrate": self.bitrate, **settings}
 
     def make_wire(self) -> CanWire:
-        """Make the wire; a random start, so that a reply to an earlier host does not match."""
+        """Make the wire with a random number, so that a reply to an earlier host does not match."""
         sequence = random.randint(0, NUMBER_MAX)  # noqa: S311  no secret
         return CanWire(self.bitrate, sequence=sequence, delay=self._delay)
 

@@ -52,7 +52,7 @@ class SerialWire(Wire):
         self._reader = FrameReader(on_invalid=self._count_invalid)
 
     def request(self, address: int, name: str, values: Values, *, has_reply: bool = True) -> bytes:
-        """Return the frame of a request, which is on the wire from now on; address 0: of all."""
+        """Return the frame of a request, which counts as sent; address 0: a broadcast."""
         self._sequence = (self._sequence + 1) & 0xFFFF
         kind, version, words = HELLO, NEUTRAL, list[int]()
         if name != "Hello":
@@ -66,7 +66,7 @@ class SerialWire(Wire):
         return data
 
     def received(self, data: bytes) -> list[Arrival]:
-        """Return what these bytes complete."""
+        """Return the arrivals that these bytes complete."""
         arrivals: list[Arrival] = []
         for frame in self._reader.feed(data):
             self.counters.frames_in += 1
@@ -116,13 +116,13 @@ class SerialWire(Wire):
         return [DuplicateAddress(frame.address)] if is_same else []
 
     def withdraw(self) -> None:
-        """Take the request off the wire: its reply will be unexpected."""
+        """Give up the request on the wire, so that its reply will count as unexpected."""
         self._pending = None
         if self._reader.rest:
             self._remark_invalid(self._reader.rest)
 
     def transit(self, words: int) -> float:
-        """Return how long a request of so many words takes to arrive [s]."""
+        """Return how long a request with this number of words takes to arrive [s]."""
         return self._byte_time * frame_length(2 * words)
 
     def _count_invalid(self, piece: bytes) -> None:
@@ -158,7 +158,7 @@ class SerialAddress(WireAddress):
         self.settings = {"protocol": "serial", "baud": self.place.baud}
 
     def make_wire(self) -> SerialWire:
-        """Make the wire; a random start, so that a reply to an earlier host does not match."""
+        """Make the wire with a random number, so that a reply to an earlier host does not match."""
         delay = 0.0 if self.place.device else NETWORK_DELAY
         return SerialWire(self.place.baud, sequence=random.getrandbits(16), delay=delay)
 

@@ -51,9 +51,21 @@ def _feet() -> str:
     )
 
 
+def _weather() -> str:
+    """Changes of moduli with temperature and moisture, by material."""
+    rows = [
+        f"| `{name}` | {100 * each.by_kelvin:g} % | "
+        f"{f'{each.by_moisture:g} %' if each.by_moisture else '-'} | {each.weather} |"
+        for name, each in KNOWN_MATERIALS.items()
+    ]
+    head = ["| material | modulus by a kelvin | by 1 % of moisture | source |", "|---|---|---|---|"]
+    return "\n".join([*head, *rows])
+
+
 PARTS: Mapping[str, Callable[[], str]] = {
     **{name: partial(key_table, each) for name, each in SECTIONS.items()},
     "own_losses": _own_losses,
     "types": _types,
     "feet": _feet,
+    "weather": _weather,
 }

@@ -203,7 +203,7 @@ def attach(
     frequencies (f,) [Hz]; dispersion: how omega² changes with them. Raises InputError for a plate
     that does not scale with one thickness.
     """
-    check_scales(plate, 1 + uncertainty.thickness)
+    check_scales(plate, 1 + uncertainty.frequency)
     w = 2 * np.pi * frequencies
     elasticity = ModalElasticity.of(plate, omega**2, losses, dispersion)
     return AttachedPlate(

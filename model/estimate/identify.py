@@ -224,6 +224,7 @@ class Identification:
             place=by_kind["place"],
             harmonic=before.harmonic,
             supports=rms(self.std[space.groups["supports"]]),
+            weather=before.weather,
         )
 
 

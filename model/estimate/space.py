@@ -199,8 +199,8 @@ KINDS: dict[str, Kind] = {
         names=lambda scope: ["modulus"],
         slope=lambda plate: plate.by_log_rigidity,
         value=lambda values: float(np.exp(values.own("modulus")[0])),
-        stated=lambda scope, std: (
-            max(std, scope.uncertainty.modulus) * (scope.uncertainty.thickness > 0)
+        stated=lambda scope, std: max(
+            std * (scope.uncertainty.thickness > 0), scope.uncertainty.elasticity
         ),
         by_sheet=lambda scope, std: (0.07, -math.log(3.0), math.log(3.0)),
         is_listed=True,

@@ -44,6 +44,7 @@ BOUNDS = {
     "place": (0.0, 0.01),
     "harmonic": (0.0, 0.2),
     "supports": (0.0, 0.5),
+    "weather": (0.0, 0.5),
 }
 """What a rig may state of each parameter: exactly known, and the most."""
 
@@ -51,6 +52,7 @@ _RELATIVE = (
     "gain",
     "thickness",
     "modulus",
+    "weather",
     "stiffness",
     "supports",
     "common_gain",
@@ -95,6 +97,9 @@ class Uncertainty:
     any phase."""
     supports: float = 0.0
     """Of the logarithm of the stiffness of each foot; 0.3 of a rig file with feet by default."""
+    weather: float = 0.0
+    """Of the plate's modulus by temperature and moisture, relative, also where the thickness is
+    known; of a rig file by default what `plate.temperature` and `plate.humidity` make of it."""
 
     def __post_init__(self) -> None:
         """Refuse values that are not finite, negative ones, and a factor below 1."""
@@ -141,8 +146,8 @@ class Uncertainty:
 
     @property
     def elasticity(self) -> float:
-        """Of the modulus, relative: it is known where the thickness is, as a plate that stays."""
-        return self.modulus if self.thickness > 0 else 0.0
+        """Of the modulus, relative: known where the thickness is, but for the weather."""
+        return math.hypot(self.modulus if self.thickness > 0 else 0.0, self.weather)
 
     @property
     def frequency(self) -> float:

@@ -475,7 +475,8 @@ def rig_of(document: Document, *, mesh: str | None = None) -> Rig:
         supports=tuple(supports),
         laminate=section.plate.laminate,
         uncertainty=section.uncertainty.made(
-            has_feet=any(foot.at is not None for foot in section.supports.values())
+            has_feet=any(foot.at is not None for foot in section.supports.values()),
+            weather=section.plate.weather,
         ),
         fingertip=None if isinstance(fingertip, str) else Fingertip(**fingertip.model_dump()),
         threshold=section.threshold,

@@ -362,7 +362,7 @@ def _check(document: Document) -> CheckedFile:
     line, lost, more = clock_costs(rig, urls)
     warnings = [*exciter_notes(rig), *warnings]
     costs = [
-        *(*lost, *gain_notes(rig), *_plate_notes(rig)),
+        *(*lost, *gain_notes(rig), *_plate_notes(rig), *_weather_notes(rig)),
         *(*_mount_notes(rig), *_span_notes(rig)),
     ]
     return CheckedFile(_summary(rig) + line, [*warnings, *costs, *([note] if note else [])], more)
@@ -432,6 +432,27 @@ def _plate_notes(rig: Rig) -> Iterator[str]:
         )
 
 
+def _weather_notes(rig: Rig) -> Iterator[str]:
+    """Yield what the weather of use costs, if the rig states any."""
+    if weather := rig.uncertainty.weather:
+        with contextlib.suppress(InputError):  # no place for two fingers
+            cost = resolve_name(_WEATHER_COST)(rig)
+            yield (
+                f"plate: temperature and humidity change its modulus by {100 * weather:.2g} %, one "
+                f"standard deviation; two contents keep {cost.kept_db:.1f} of {cost.exact_db:.1f} "
+                "dB; narrow the range, or measure anew when the season has changed"
+            )
+        return
+    plate: Any = rig.document.data["plate"] if rig.document else {}
+    if any(key in plate for key in _WEATHER):
+        yield (
+            f"plate.{' and plate.'.join(_WEATHER)}: nothing is known of how "
+            f"{rig.plate.material.name} changes, so that promises do not count it; state "
+            "uncertainty.weather, or give the material the name of a known one"
+        )
+
+
+_WEATHER = ("temperature", "humidity")
 _SMALL_SPAN = 1 / 3  # of the plate
 
 
@@ -552,6 +573,7 @@ def _notes(era: Source, low: float, high: float) -> list[str]:
 
 _ARRANGEMENT = "drivers.by_hand.reaching:arrangement_of"
 _COST = "model.study.overview:clock_cost"
+_WEATHER_COST = "model.study.overview:weather_cost"
 _LOST_DB = 0.1  # contrast that is worth a warning
 
 

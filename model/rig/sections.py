@@ -7,6 +7,7 @@ values in the wrong unit.
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, replace
+from itertools import product
 from typing import Annotated, Any, Literal
 
 from pydantic import (
@@ -35,6 +36,7 @@ from model.config.units import (
     RATIO,
     SLEW,
     STIFFNESS,
+    TEMPERATURE,
     TIME,
     Dimension,
 )
@@ -68,6 +70,8 @@ from model.structure.attachments import (
     edge_points,
 )
 from model.structure.material import (
+    STANDARD_HUMIDITY,
+    STANDARD_TEMPERATURE,
     KnownMaterial,
     Material,
     Orthotropy,
@@ -196,6 +200,14 @@ class MaterialSection(Section):
 MaterialOrName = Annotated[MaterialSection | KnownMaterial, _MaterialByName()]
 
 
+def _named(material: MaterialSection | KnownMaterial | None) -> KnownMaterial | None:
+    """Return the known material that one is, or has the name of; None for another one."""
+    if isinstance(material, MaterialSection):
+        is_known = material.name in material_names()
+        return known_material(material.name) if is_known else None
+    return material
+
+
 class LayerSection(Section):
     """One layer of a laminate."""
 
@@ -241,6 +253,22 @@ class AirGapSection(Section):
 
     Limits: `true`, `false`
     """
+
+
+def _ascending(ends: tuple[float, float]) -> tuple[float, float]:
+    """Return the lower and the higher value; raises ValueError for others."""
+    if ends[0] > ends[1]:
+        raise ValueError(f"must be the lower and the higher value, got {ends[0]:g} and {ends[1]:g}")
+    return ends
+
+
+Temperature = Annotated[float, Quantity(TEMPERATURE, at_least=-40, at_most=120)]
+Humidity = Annotated[float, Quantity(RATIO, at_least=0, at_most=1)]
+_PAIR = (Strict(strict=False), AfterValidator(_ascending))
+Temperatures = Annotated[tuple[Temperature, Temperature], *_PAIR]
+Humidities = Annotated[tuple[Humidity, Humidity], *_PAIR]
+
+_AT_ENDS = 0.8  # benchmarks.promise.errors --weather: 86 to 94 % at both ends
 
 
 class PlateSection(Section):
@@ -303,6 +331,24 @@ class PlateSection(Section):
     ] = 0.0
     """`loss_factor` is that at 150 Hz and varies as this power of the frequency."""
 
+    temperature: Temperatures | None = None
+    """Lowest and highest one at which it is used, see [weather](#weather); °C, °F and K are read.
+
+    Limits: ascending, -40 °C to 120 °C
+    """
+
+    measured_temperature: Temperature = STANDARD_TEMPERATURE
+    """That at which the numbers of this file hold: when the plate was measured."""
+
+    humidity: Humidities | None = None
+    """Lowest and highest relative humidity of the air at which it is used, such as [35 %, 65 %].
+
+    Limits: ascending, 0 to 1
+    """
+
+    measured_humidity: Humidity = STANDARD_HUMIDITY
+    """That at which the numbers of this file hold: of the weeks before the plate was measured."""
+
     modes: Annotated[list[ModeRow], Field(max_length=64, default_factory=list), MODES]
     """Natural frequency and loss factor of the lowest elastic modes of the free plate, ascending,
     relative to those of its theory, as an identification finds them; shapes and higher modes
@@ -310,6 +356,22 @@ class PlateSection(Section):
 
     Limits: rows of [0.8 to 1.25, 0.01 to 100]
     """
+
+    @property
+    def weather(self) -> float:
+        """Standard deviation of the plate's modulus over density by its weather, relative.
+
+        That at which nine of ten plates keep a promise at both ends; 0 where no range is stated. Of
+        layers that of the one that changes most, of materials by numbers as of the one of the name.
+        """
+        if self.temperature is None and self.humidity is None:
+            return 0.0
+        when = self.measured_temperature, self.measured_humidity
+        ends = [*product(self.temperature or when[:1], self.humidity or when[1:])]
+        parts = [self.material, *(each.material for each in self.layers or ())]
+        known = [one for part in parts if (one := _named(part)) is not None]
+        changes = [one.by_weather(*end) - one.by_weather(*when) for one in known for end in ends]
+        return _AT_ENDS * max(map(abs, changes), default=0.0)
 
     @property
     def laminate(self) -> Laminate | None:
@@ -581,9 +643,18 @@ class UncertaintySection(Section):
     Default: 0.3 where a rig has feet, else 0
     """
 
-    def made(self, *, has_feet: bool) -> Uncertainty:
-        """Make the uncertainty of a rig; that of its feet, if none is stated, as `FEET_DEVIATE`."""
-        unknown = {"supports": FEET_DEVIATE} if has_feet else {}
+    weather: Annotated[float, _within("weather")] | None = None
+    """Of the plate's modulus by temperature and moisture, relative, also where `thickness` is 0.
+
+    Default: by `plate.temperature` and `plate.humidity`, see [weather](#weather), else 0
+    """
+
+    def made(self, *, has_feet: bool, weather: float) -> Uncertainty:
+        """Make the uncertainty of a rig; that of its feet, if none is stated, as `FEET_DEVIATE`.
+
+        weather: that of its plate, if none is stated.
+        """
+        unknown = {"supports": FEET_DEVIATE if has_feet else 0.0, "weather": weather}
         return Uncertainty(**(unknown | self.model_dump(exclude_none=True)))
 
 

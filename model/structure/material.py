@@ -13,6 +13,9 @@ gives any. A resonance is that of the light coil against the magnet (`free`). Me
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
 
 from model.errors import InputError, expect_values
 from registry.plugins import PluginRegistry
@@ -123,10 +126,48 @@ class KnownMaterial:
     by_thickness: Callable[[float], Material] | None = None
     """The material of a board of a thickness [m]; `material` is then that of one thickness."""
 
+    by_kelvin: float = 0.0
+    """Relative change of its moduli by a kelvin."""
+
+    by_moisture: float = 0.0
+    """Relative change of its moduli by moisture, a share of the dry mass; 0 for what takes none."""
+
+    weather: str = "none counted"
+    """Source of both."""
+
     def of_thickness(self, thickness: float) -> Material:
         """The material of a board of a thickness [m]."""
         return self.material if self.by_thickness is None else self.by_thickness(thickness)
 
+    def by_weather(self, temperature: float, humidity: float) -> float:
+        """Relative change of modulus over density at rest in air of a temperature and a humidity.
+
+        Twice that of natural frequencies, from 20 °C and 65 %, the climate of tests of wood
+        (EN 408). temperature [°C]; humidity: relative, 0 to 1.
+        """
+        found = self.by_kelvin * (temperature - STANDARD_TEMPERATURE)
+        if self.by_moisture:
+            now, standard = np.interp([humidity, STANDARD_HUMIDITY], *_MOISTURE).tolist()
+            found += (self.by_moisture - 1 / (1 + standard)) * (now - standard)
+        return found
+
+
+STANDARD_TEMPERATURE, STANDARD_HUMIDITY = 20.0, 0.65
+"""Climate [°C] of a material's numbers."""
+
+_MOISTURE = (
+    [0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.65, 0.7, 0.8, 0.9, 1.0],
+    [0.0, 0.025, 0.045, 0.062, 0.077, 0.092, 0.11, 0.12, 0.131, 0.16, 0.205, 0.28],
+)
+"""Moisture of wood at rest in air of a humidity at 21 °C (Wood Handbook FPL-GTR-282, table 4-2)."""
+
+_WOOD: Any = {
+    "by_kelvin": -0.0023,
+    "by_moisture": -1.5,
+    "weather": "Wood Handbook FPL-GTR-282, from memory: modulus along the grain 9 % more at 6 % of "
+    "moisture than at 12 %, and 7 % less at 50 °C than at 20 °C; across it twice as much by "
+    "moisture",
+}
 
 VENEER = 1.4e-3  # m; before the faces are sanded to boards of 1.4 n - 0.6 mm
 _SANDED = 0.6e-3
@@ -173,18 +214,24 @@ _KNOWN = (
         source="section 3 of the founding paper; E and rho also EN 1999-1-1 (Eurocode 9), 3.2.5",
         variation="E 68 to 73 GPa, rho 2640 to 2830 kg/m³, nu 0.30 to 0.34 over the wrought alloys",
         loss_factor="0.0001",
+        by_kelvin=-0.0004,
+        weather="EN 1999-1-2, table 2: 70 GPa at 20 °C, 67.9 at 100 °C",
     ),
     KnownMaterial(
         Material("steel", E=210e9, rho=7850.0, nu=0.3),
         source="EN 1993-1-1 (Eurocode 3), 3.2.6; rho EN 1991-1-1, Table A.4",
         variation="E 195 to 210 GPa, rho 7700 to 8000 kg/m³; stainless steel: lower E, higher rho",
         loss_factor="0.0002 to 0.0006",
+        by_kelvin=-0.00025,
+        weather="tuning forks of plain steel, from memory; EN 1993-1-2 has none below 100 °C",
     ),
     KnownMaterial(
         Material("soda-lime-glass", E=70e9, rho=2500.0, nu=0.2),
         source="EN 572-1, general physical properties of soda-lime silicate (float) glass",
         variation="E 69 to 74 GPa, nu 0.20 to 0.23 in makers' data; tempering changes neither",
         loss_factor="0.0006 to 0.002",
+        by_kelvin=-0.0001,
+        weather="from memory: 0.01 % a kelvin, of silicate glasses",
     ),
     KnownMaterial(
         Material("chemically-strengthened-glass", E=71.5e9, rho=2420.0, nu=0.21),
@@ -192,6 +239,8 @@ _KNOWN = (
         variation="E 66 to 77 GPa, rho 2390 to 2480 kg/m³, nu 0.21 to 0.23 over aluminosilicate "
         "cover glasses; give the numbers of your own",
         loss_factor="0.0006 to 0.002",
+        by_kelvin=-0.0001,
+        weather="as soda-lime glass, assumed",
     ),
     KnownMaterial(
         Material("acrylic", E=4.6e9, rho=1190.0, nu=0.37),
@@ -202,6 +251,9 @@ _KNOWN = (
         loss_factor="0.075, 0.06 and 0.045 at 10, 100 and 1000 Hz, assumed; taken as its own, "
         "beside that of the plate",
         by_frequency=((10.0, 4.2 / 4.6, 0.075), (100.0, 1.0, 0.06), (1000.0, 5.0 / 4.6, 0.045)),
+        by_kelvin=-0.004,
+        weather="its modulus by frequency, a decade for 21 K: activation energy of the beta "
+        "relaxation 78 kJ/mol, from memory; its loss factor then rises by 1.2 % a kelvin",
     ),
     KnownMaterial(
         Material("polycarbonate", E=2.4e9, rho=1200.0, nu=0.38),
@@ -209,6 +261,8 @@ _KNOWN = (
         "for the polymer",
         variation="E 2.1 to 2.4 GPa, rho 1190 to 1220 kg/m³, nu 0.37 to 0.40",
         loss_factor="0.01",
+        by_kelvin=-0.002,
+        weather="assumed, as the ISO 527 modulus of its makers falls to 60 °C",
     ),
     KnownMaterial(
         plywood(6.4e-3),
@@ -222,6 +276,7 @@ _KNOWN = (
         loss_factor="0.01 to 0.03, assumed",
         own_loss=0.02,
         by_thickness=plywood,
+        **_WOOD,
     ),
     KnownMaterial(
         _wood("pine", 11.0, 0.8, rho=520.0, nu=0.35, G=(0.85, 0.85, 0.14)),
@@ -231,6 +286,7 @@ _KNOWN = (
         "550 kg/m³",
         loss_factor="0.01 to 0.02, assumed",
         own_loss=0.015,
+        **_WOOD,
     ),
     KnownMaterial(
         _wood("spruce", 10.0, 0.45, rho=430.0, nu=0.42, G=(0.8, 0.8, 0.04)),
@@ -241,6 +297,7 @@ _KNOWN = (
         "0.37 to 0.47, rho 400 to 450 kg/m³",
         loss_factor="0.006 to 0.01 along the grain, 0.02 across, assumed",
         own_loss=0.015,
+        **_WOOD,
     ),
     KnownMaterial(
         Material("mdf", E=3.4e9, rho=780.0, nu=0.3),
@@ -249,6 +306,7 @@ _KNOWN = (
         variation="E 2.7 to 4 GPa, rho 700 (8.1 mm) to 830 (2.6 mm) kg/m³, nu 0.25 to 0.3",
         loss_factor="0.01 to 0.03, assumed",
         own_loss=0.02,
+        **_WOOD,
     ),
     KnownMaterial(
         _wood("carbon", 66.0, 66.0, rho=1550.0, nu=0.06, G=(3.5, 3.0, 3.0)),

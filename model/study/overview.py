@@ -1,8 +1,9 @@
-"""Overview of a table: its map and summary, the cost of clock errors, and export to other programs.
+"""Overview of a table: map and summary, costs of clocks and weather, export to other programs.
 
 - `find_overview`, `summarize`: cells of the map, and felt contrast of random contacts.
-- `clock_cost`: the contrast that two contents keep while amplifiers' clocks have some error, by
-  answers of the rig's own plate at a few places and frequencies, in a second.
+- `clock_cost`, `weather_cost`: the contrast that two contents keep while amplifiers' clocks have
+  some error, and in the rig's weather, by answers of the rig's own plate at a few places and
+  frequencies, in a second.
 - `export_mat`, `export_csv`: a .mat file of everything, or .csv files of patterns or fields;
   `docs/reference/table-file.md` lists every name with its shape and unit.
 """
@@ -10,7 +11,7 @@
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass, fields, is_dataclass, replace
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -144,29 +145,47 @@ _STEP, _HIGHEST = 20.0, 250.0  # Hz; fingers feel most there, and a table of mor
 
 
 @dataclass(frozen=True)
-class ClockCost:
-    """Contrast [dB] promised to the worst of two fingers: with exact clocks, and with errors."""
+class PromiseCost:
+    """Contrast [dB] promised to the worst of two fingers: without a kind of error, and with it."""
 
     exact_db: float
     kept_db: float
 
 
-def clock_cost(rig: Rig, errors: Mapping[str, float]) -> ClockCost:
+def clock_cost(rig: Rig, errors: Mapping[str, float]) -> PromiseCost:
     """Compute the contrast of two contents with exact clocks, and with rms errors [s] by amplifier.
 
     Median over places. Raises InputError for a plate too small for two fingers, or without a table.
     """
+    table = _coarse_table(rig)
+    clocks = ClockErrors.of([era.name for era in table.eras], rig.wiring, errors)
+    exact = _promised_db(table)
+    # Made now: it shares what answers have computed.
+    return _cost(exact, _promised_db(table.with_clocks(clocks)))
+
+
+def weather_cost(rig: Rig) -> PromiseCost:
+    """Compute the contrast of two contents as if the weather stayed, and in the rig's weather.
+
+    Median over places; raises as `clock_cost`.
+    """
+    table = _coarse_table(rig)
+    still = replace(table, uncertainty=replace(rig.uncertainty, weather=0.0))
+    return _cost(_promised_db(still), _promised_db(table))
+
+
+def _coarse_table(rig: Rig) -> LocalizationTable:
     low, high = rig.limits.frequency_min, rig.limits.frequency_max
     frequencies = np.arange(low, max(min(high, _HIGHEST), low) + 1e-9, _STEP)
     problem = TableProblem(rig, frequencies, PAPER_GRID)
-    table = solve_table(problem, drive_mode=UNRESTRICTED, is_estimated=False)
-    clocks = ClockErrors.of([era.name for era in table.eras], rig.wiring, errors)
-    exact = _promised_db(table)
-    kept = _promised_db(table.with_clocks(clocks))  # made now: it shares what answers have computed
+    return solve_table(problem, drive_mode=UNRESTRICTED, is_estimated=False)
+
+
+def _cost(exact: FloatArray, kept: FloatArray) -> PromiseCost:
     # The loss is taken place by place, since places differ by far more.
     lost = max(float(np.median(exact - kept)), 0.0)
     median = float(np.median(exact))
-    return ClockCost(median, median - lost)
+    return PromiseCost(median, median - lost)
 
 
 def _promised_db(table: LocalizationTable) -> FloatArray:

@@ -294,7 +294,7 @@ class TableProblem:
             check_has_threshold(frequencies, each)
         check_supported(self.rig.plate, self.rig.eras, loads=self.rig.masses)
         plate = self.rig.plate
-        check_scales(plate, 1 + self.rig.uncertainty.thickness)
+        check_scales(plate, 1 + self.rig.uncertainty.frequency)
         wavelength = plate.bending_wavelength(2 * float(self.frequencies[-1]))
         modes = math.pi * plate.length * plate.width / wavelength**2
         size = 4 * self.raster.point_count * modes

@@ -454,6 +454,33 @@ def test_config_check_refuses_an_unsupported_plate(tmp_path: Path) -> None:
     assert [(each.line, each.key) for each in caught.value.problems] == [(7, "eras")]
 
 
+@pytest.mark.parametrize(
+    ("material", "keys", "change"),
+    [
+        # by hand: 0.4 % a kelvin for 15 K; 1.5 % and the share of mass for 2 % of moisture
+        ("acrylic", "temperature: [73.4 degF, 311.15 K]; measured_temperature: 23 °C", 0.06),
+        ("plywood", "humidity: [50 %, 61 %]; measured_humidity: 50 %", 0.02 * (1.5 + 1 / 1.12)),
+        ("{name: plywood, E: 8 GPa, nu: 0.3, rho: 700}", "humidity: [0.5, 0.65]", 0.067),
+        ("{E: 8 GPa, nu: 0.3, rho: 700}", "humidity: [50 %, 70 %]", 0.0),
+        ("acrylic", "measured_temperature: 35 °C", 0.0),
+    ],
+)
+def test_weather_is_an_uncertainty_of_what_was_measured(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], material: str, keys: str, change: float
+) -> None:
+    """0.8 of the largest change, also where the thickness is known; a check says what it costs."""
+    of_plate = "\n  ".join([f"material: {material}", *keys.split("; ")])
+    text = GOOD.replace("material: aluminium", of_plate).replace("48x36", "auto")
+    known = parse_rig("rig", text + "uncertainty: {thickness: 0}\n").uncertainty
+    assert 2 * known.frequency == pytest.approx(0.8 * change, rel=0.01)
+    assert parse_rig("rig", text + "uncertainty: {weather: 0.01}\n").uncertainty.weather == 0.01
+    on_feet = text + FEET.replace("[0, 0]", "[0, 228.6 mm]")
+    assert run(["config", "check", str(write(tmp_path, on_feet))]) == 0
+    said = capsys.readouterr().out
+    assert ("change its modulus by" in said) == (change > 0)
+    assert ("nothing is known" in said) == ("humidity" in keys and not change)
+
+
 def test_uncertainty_is_shown_to_three_digits() -> None:
     """What an identification leaves uncertain has no digits in a report beyond those known."""
     shown = str(Uncertainty(gain=0.0101507, phase_deg=1.00303, damping=1.03340))

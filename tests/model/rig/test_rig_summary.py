@@ -33,7 +33,7 @@ from model.rig.rig import Rig, differences
 from model.rig.rig_file import example_rig_path, load_rig, parse_rig, rig_of
 from model.rig.rig_summary import RIG, exciter_notes, excursion_notes, plate_summary
 from model.rig.rig_writing import stated as keys_of
-from model.rig.sections import PlateSection
+from model.rig.sections import PLAIN_KEYS, PlateSection
 from model.structure.attachments import rigid_body_frequencies
 from model.structure.exciter import Exciter
 from model.structure.material import EXCITER_TYPES, KNOWN_MATERIALS, Material
@@ -89,7 +89,7 @@ PLATE = {"length": 0.3, "width": 0.2, "thickness": 0.002}
 GLASS = {"E": 70e9, "rho": 2500.0, "nu": 0.2}
 CORNERS = {"SW": [0, 0], "SE": [0.3, 0], "NE": [0.3, 0.2], "NW": [0.01, 0.2]}
 FIELDS = PlateSection.model_fields
-PLAIN = {key: each for key, field in FIELDS.items() for each in quantities(field)}
+PLAIN = {key: each for key in PLAIN_KEYS for each in quantities(FIELDS[key])}
 
 
 def rig_with(key: str, mesh: str, stiffness: float = 17e3, more: float = 0.02) -> Rig:

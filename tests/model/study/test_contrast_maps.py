@@ -37,8 +37,8 @@ from model.study.contrast_maps import (
 )
 from model.study.overview import (
     CONTACT_SETS,
-    ClockCost,
     Overview,
+    PromiseCost,
     clock_cost,
     export_csv,
     export_mat,
@@ -79,7 +79,7 @@ def test_contrast_falls_with_the_error_and_stays_with_one_amplifier() -> None:
     assert kept == sorted(kept, reverse=True)
     assert kept[0] - kept[1] < 2 < kept[0] - kept[3]
     one = replace(rig, wiring={era.name: Channel("a", n) for n, era in enumerate(rig.eras)})
-    assert clock_cost(one, {"a": math.inf}) == ClockCost(costs[0].exact_db, costs[0].exact_db)
+    assert clock_cost(one, {"a": math.inf}) == PromiseCost(costs[0].exact_db, costs[0].exact_db)
 
 
 @pytest.mark.parametrize(("length", "width", "said"), [("60 cm", "40 cm", 1), ("12 in", "9 in", 0)])

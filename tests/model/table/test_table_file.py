@@ -456,6 +456,15 @@ for era in RIGS["plain"]["eras"].values():
     era |= {"stiffness": 17e3, "bolt_mass": 0.003, "stroke": 1e-4, "foot": 0.004}
     era["gains"] = [[40, 1, 0], [500, 1.1, 10]]
 
+RIGS["weather"] = copy.deepcopy(RIGS["plain"]) | {"mesh": "18x14 Legendre"}
+del RIGS["weather"]["plate"]["air_gap"]
+RIGS["weather"]["plate"] |= {
+    "material": "plywood",
+    "thickness": 0.004,
+    "temperature": [10, 30],
+    "humidity": [0.3, 0.6],
+}
+WEATHER = ("temperature", "measured_temperature", "humidity", "measured_humidity")
 SECTIONS: dict[type[Section], tuple[str, tuple[Any, ...]]] = {
     sections.RigSection: ("plain", ()),
     sections.PlateSection: ("plain", ("plate",)),
@@ -477,6 +486,7 @@ ELSEWHERE: dict[tuple[type[Section], str], tuple[str, tuple[Any, ...]]] = {
     (sections.PlateSection, "bond"): ("sheets", ("plate",)),
     (sections.PlateSection, "layers"): ("layers", ("plate",)),
     (sections.PlateSection, "grain"): ("board", ("plate",)),
+    **{(sections.PlateSection, key): ("weather", ("plate",)) for key in WEATHER},
     **{
         (sections.MaterialSection, key): ("board", ("plate", "material"))
         for key in sections.ORTHOTROPIC
@@ -512,6 +522,8 @@ OTHERS: dict[str, Any] = {
     "air_gap": None,
     "layers": [{"material": GLASS, "thickness": 0.003}],
     "bond": "none",
+    "temperature": [5, 30],
+    "humidity": [0.2, 0.6],
     "modes": [[1.02, 1.1]],
     "by_frequency": [[1, 1, 0.1], [900, 2.1, 0.1]],
     "closed": True,
@@ -599,5 +611,5 @@ def test_a_rig_that_differs_in_a_key_is_refused(
         return
     with pytest.raises(InputError) as refused:
         load_table(files[name], rig=rig)
-    named = place[0] if place else key
+    named = "uncertainty" if key in WEATHER else place[0] if place else key
     assert f" {'masses' if named == 'supports' else named}" in str(refused.value)

@@ -464,6 +464,7 @@ def test_config_check_refuses_an_unsupported_plate(tmp_path: Path) -> None:
         ("{E: 8 GPa, nu: 0.3, rho: 700}", "humidity: [50 %, 70 %]", 0.0),
         ("acrylic", "measured_temperature: 35 °C", 0.0),
     ],
+    ids=["acrylic", "plywood", "by name", "by numbers", "not stated"],
 )
 def test_weather_is_an_uncertainty_of_what_was_measured(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], material: str, keys: str, change: float

@@ -1,29 +1,57 @@
-"""A simulation as a process: its command, its run loop, and its view on a terminal."""
+"""A simulation as a process: its command, its run loop, its view on a terminal, its control socket.
+
+Also the command of the witness, which relays real wires and writes a report, with its errors.
+"""
 
 import asyncio
+import contextlib
+import json
+import os
 import signal
+import socket
+import stat
 import sys
 import tempfile
-from collections.abc import Sequence
+from collections.abc import AsyncIterator, Iterator, Sequence
+from contextlib import asynccontextmanager
 from pathlib import Path
+from resource import RLIM_INFINITY, RLIMIT_FSIZE, prlimit
+from typing import Any
 
 import numpy as np
 import pytest
 from rich.console import Console
+from typer.testing import CliRunner
 
 from controller.cli.main import run
-from daemons import SESSION, far_end_process, playing
-from drivers.playing import AmplifierTone
+from daemons import SESSION as DAEMONS_SESSION
+from daemons import far_end_process, playing
+from drivers.by_hand.reaching import random_session
+from drivers.errors import CommandError, LinkError
+from drivers.opening import Lines
+from drivers.playing import AmplifierLayer, AmplifierTone
 from drivers.protocol.definition import QUANTITIES, STATES
+from era_haptics.lab.cli import app
+from era_haptics.lab.witness.capture import read_capture
+from era_haptics.lab.witness.relay import parse_endpoint, relays
+from era_haptics.lab.witness.witness import Witness
 from firmware_machine import play
 from long_form import shortly
+from model.errors import InputError
 from model.rig.rig import Rig
 from model.rig.rig_file import example_rig_path
+from model.structure.attachments import PointLoad
+from plate_witness import witness_config
 from plates import write_rig
+from real_wires import WIRES, far_side
 from recordings import read_recording
+from registry.limits import GuardLimits
 from sim.bench.bench import Bench
-from sim.control import SimulationContext
+from sim.control import LINE_MAX, SimulationContext, carry_out, control_socket
+from sim.far_ends.wire_assignment import SimulatedWire
+from sim.plant.imperfections import Imperfections, PlateErrors
 from sim.process.simulation import SimulationView, draw
+from virtual_lines import in_virtual_time
 
 ROOT = example_rig_path().parent.parent
 TIMEOUT = 120  # s; for a loaded machine, not an expectation
@@ -183,7 +211,7 @@ async def test_simulation_in_virtual_time_advances_only_by_steps(tmp_path: Path)
             assert (await far_end.ask("state"))["amplifiers"]["main"]["fault"] == "WATCHDOG"
             await amplifier.read_status()
             await amplifier.clear()
-            await amplifier.arm(SESSION + 1, 0.5)
+            await amplifier.arm(DAEMONS_SESSION + 1, 0.5)
             assert (await far_end.ask("inject_fault", fault="arc", amplifier="main"))["ok"]
             assert (await far_end.ask("state"))["amplifiers"]["main"]["fault"] == "ARC"
             begin = (await far_end.ask("state"))["time_s"]
@@ -261,3 +289,400 @@ async def test_simulation_exits_on_a_signal_while_it_starts(tmp_path: Path, afte
         # -SIGINT: CPython exits so where the signal interrupts an exec(), as of dataclasses.
         assert process.returncode in (0, 130, -signal.SIGTERM, -signal.SIGINT)
         assert err == b""
+
+
+@pytest.fixture
+def socket_path() -> Iterator[Path]:
+    """A path short enough for a Unix socket, wherever tests keep their files."""
+    with tempfile.TemporaryDirectory() as folder:
+        yield Path(folder) / "control"
+
+
+def mode(path: Path) -> int | None:
+    """Who may use a file, None where there is none."""
+    return stat.S_IMODE(path.stat().st_mode) if path.exists() else None
+
+
+async def ask(bench: Bench, now: float, **request: Any) -> dict[str, Any]:
+    """One line of control."""
+    return await carry_out(SimulationContext(bench), json.dumps(request).encode(), now=now)
+
+
+async def test_control_keeps_loads_of_fingers(coarse_rig: Rig) -> None:
+    """Until they lift or get another one; a finger that touches has 1 where none is given."""
+    bench = Bench(coarse_rig, now=0.0)
+    loads = []
+    for request in (
+        {"op": "fingers", "fingers": {"a": [0.1, 0.08], "b": [0, 0]}, "loads": {"a": 2}},
+        {"op": "touch", "finger": "c", "at_m": [0.2, 0.1], "load": 0.5},
+        {"op": "move", "finger": "a", "at_m": [0.1, 0.09]},
+        {"op": "move", "finger": "c", "at_m": [0.2, 0.1], "load": 3},
+        {"op": "lift", "finger": "a"},
+        {"op": "touch", "finger": "a", "at_m": [0.1, 0.08]},
+        {"op": "fingers", "fingers": {"c": [0.1, 0.08]}},
+    ):
+        assert (await ask(bench, 1.0, **request))["ok"]
+        loads.append(dict(bench.loads))
+    assert loads == [
+        {"a": 2.0},
+        {"a": 2.0, "c": 0.5},
+        {"a": 2.0, "c": 0.5},
+        {"a": 2.0, "c": 3.0},
+        {"c": 3.0},
+        {"c": 3.0},
+        {},
+    ]
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        b'{"op": "fingers", "fingers": {"a": [0.1, 0.1]}, "loads": {"b": 1}}\n',
+        b'{"op": "fingers", "fingers": {"a": [0.1, 0.1]}, "loads": {"a": 0}}\n',
+        b'{"op": "fingers", "fingers": {"a": [0.1, 0.1]}, "loads": [1]}\n',
+        b'{"op": "touch", "finger": "a", "at_m": [0.1, 0.1], "load": "much"}\n',
+        b"\n",
+        b"\xff\xfe\n",
+        b"[1]\n",
+        b"{}\n",
+        b'{"op": "stop"}\n',
+        b'{"op": "fingers"}\n',
+        b'{"op": "fingers", "fingers": {"b": 3}}\n',
+        b'{"op": "fingers", "fingers": {"b": [0.1]}}\n',
+        b'{"op": "fingers", "fingers": {"b": [0.1, NaN]}}\n',
+        b'{"op": "fingers", "fingers": {"b": [0.1, true]}}\n',
+        b'{"op": "fingers", "fingers": {"b": [0.1, 0.5]}}\n',
+        b'{"op": "fingers", "fingers": {"b": [0.1, 1' + b"0" * 400 + b"]}}\n",
+        b'{"op": "felt", "since_s": 2, "until_s": 1}\n',
+        b'{"op": "felt", "since_s": "0", "until_s": 1}\n',
+        b"[" * 60_000 + b"\n",
+    ],
+)
+async def test_control_refuses_an_invalid_line(coarse_rig: Rig, line: bytes) -> None:
+    """The response is a short error, and nothing changes."""
+    bench = Bench(coarse_rig, now=1.0)
+    await ask(bench, 1.0, op="fingers", fingers={"a": [0.1, 0.1]})
+    reply = await carry_out(SimulationContext(bench), line, now=1.0)
+    assert reply.keys() == {"error"}
+    assert len(reply["error"]) < 300
+    assert bench.fingers.layout.positions == {"a": (0.1, 0.1)}
+
+
+async def test_control_socket_is_private_and_removed(coarse_rig: Rig, socket_path: Path) -> None:
+    """Mode 0600; several lines per connection; no file is left."""
+    bench = Bench(coarse_rig, now=0.0)
+    async with control_socket(SimulationContext(bench), socket_path):
+        assert mode(socket_path) == 0o600
+        reader, writer = await asyncio.open_unix_connection(socket_path)
+        writer.write(b'{"op": "state"}\nnonsense\n{"op": "state"}\n')
+        replies = [json.loads(await reader.readline()) for _ in range(3)]
+        assert ["error" in reply for reply in replies] == [False, True, False]
+        with pytest.raises(LinkError, match=str(socket_path)):
+            async with control_socket(SimulationContext(bench), socket_path):
+                pass
+        writer.close()
+        await writer.wait_closed()
+    assert mode(socket_path) is None
+
+
+async def test_control_closes_on_an_endless_line(coarse_rig: Rig, socket_path: Path) -> None:
+    """The client gets an error; other connections continue."""
+    bench = Bench(coarse_rig, now=0.0)
+    async with control_socket(SimulationContext(bench), socket_path):
+        reader, writer = await asyncio.open_unix_connection(socket_path)
+        writer.write(b" " * (2 * LINE_MAX))
+        assert str(LINE_MAX) in json.loads(await reader.readline())["error"]
+        writer.close()
+        with contextlib.suppress(ConnectionError):
+            await writer.wait_closed()
+        again, other = await asyncio.open_unix_connection(socket_path)
+        other.write(b'{"op": "state"}\n')
+        assert "amplifiers" in json.loads(await again.readline())
+        other.close()
+        await other.wait_closed()
+
+
+async def test_control_replaces_a_stale_socket(coarse_rig: Rig, socket_path: Path) -> None:
+    """A killed simulation leaves one behind."""
+    with socket.socket(socket.AF_UNIX) as dead:
+        dead.bind(str(socket_path))
+    async with control_socket(SimulationContext(Bench(coarse_rig, now=0.0)), socket_path):
+        _, writer = await asyncio.open_unix_connection(socket_path)
+        writer.close()
+        await writer.wait_closed()
+
+
+async def test_control_refuses_an_unusable_path(coarse_rig: Rig, socket_path: Path) -> None:
+    """A missing folder, a long path and a plain file are refused by name."""
+    bench = Bench(coarse_rig, now=0.0)
+    plain = socket_path.parent / "plain"
+    plain.write_text("kept")
+    for path in (socket_path / "deeper", socket_path.parent / ("x" * 200), plain):
+        with pytest.raises(LinkError, match=str(path)):
+            async with control_socket(SimulationContext(bench), path):
+                pass
+    assert plain.read_text() == "kept"
+
+
+async def test_plate_operation_changes_what_is_felt_and_can_be_undone(coarse_rig: Rig) -> None:
+    """A softer mount and 50 g change the amplitude under a finger; without keys it is as at first.
+
+    Amplitudes of the changed plate are those of a bench that was built with these errors.
+    """
+    name = coarse_rig.eras[2].name
+    mass = PointLoad(0.2, 0.06, mass=0.05)
+    errors = PlateErrors(modulus=0.9, stiffness={name: 0.8}, masses=(mass,))
+    changes = {"modulus": 0.9, "stiffness": {name: 0.8}, "masses": [[0.2, 0.06, 0.05]]}
+    first = await felt_after(coarse_rig, Imperfections())
+    built = await felt_after(coarse_rig, Imperfections(plate=errors))
+    changed = await felt_after(coarse_rig, Imperfections(), changes)
+    restored = await felt_after(coarse_rig, Imperfections(), changes, {})
+    assert changed == pytest.approx(built, rel=1e-4)
+    assert abs(changed / first - 1) > 0.05
+    assert restored == pytest.approx(first, rel=1e-4)
+
+
+async def felt_after(rig: Rig, imperfections: Imperfections, *changes: dict[str, Any]) -> float:
+    """Amplitude under a finger [m/s²] of a vibration on the plate after some changes of it."""
+    bench = Bench(rig, now=0.0, imperfections=imperfections)
+    context = SimulationContext(bench)
+
+    async def asked(now: float, **request: Any) -> dict[str, Any]:
+        reply = await carry_out(context, json.dumps(request).encode(), now=now)
+        assert "error" not in reply, reply
+        return reply
+
+    await asked(0.1, op="fingers", fingers={"1": [0.1, 0.08]})
+    for change in changes:
+        await asked(0.1, op="plate", **change)
+    play(bench, AmplifierTone(0, 110.0, 0.5), now=0.2, token=9, watchdog=2.0)
+    reply = await asked(2.0, op="felt", since_s=1.5, until_s=2.0)
+    return float(reply["fingers"]["1"]["amplitude_m_s2"][0][0])
+
+
+@pytest.mark.parametrize(
+    "request_",
+    [
+        {"stiffness": {"nowhere": 1.0}},
+        {"stiffness": {"NE": 0.0}},
+        {"modulus": -1},
+        {"masses": [[0.1, 0.1]]},
+        {"masses": [[9.0, 0.1, 0.001]]},
+        {"thickness": 1.0},
+    ],
+)
+async def test_plate_operation_refuses_what_is_no_plate(
+    coarse_rig: Rig, request_: dict[str, Any]
+) -> None:
+    """An error, and the plate stays."""
+    bench = Bench(coarse_rig, now=5.0)
+    assert "error" in await ask(bench, 5.1, op="plate", **request_)
+    assert bench.imperfections == Imperfections()
+
+
+def _witness(url: str, *, level: float) -> Witness:
+    return Witness(witness_config({"main": url}, level=level))
+
+
+async def _drive(url: str) -> None:
+    lines = Lines()
+    try:
+        amplifier = await lines.amplifier(url, GuardLimits(40.0, 500.0, 1.0), name="main")
+        await amplifier.open()
+        assert (await amplifier.arm(random_session()))["state"] == STATES["OPERATION_ENABLED"]
+        tone = AmplifierTone(0, 110.0, 0.4, 90.0)
+        await amplifier.stage(1, [AmplifierLayer(0, (tone,), ramp=0.01)], now=True)
+        await amplifier.ping()
+        assert (await amplifier.stop()).is_confirmed
+        assert (await amplifier.clear())["state"] == STATES["SWITCH_ON_DISABLED"]
+    finally:
+        await lines.close()
+
+
+@pytest.mark.parametrize("wire", WIRES)
+@in_virtual_time
+async def test_relay_shows_a_session_to_the_witness(wire: str, coarse_rig: Rig) -> None:
+    """A session passes at a limit of 0.5, and breaks a limit of 0.3."""
+    for level, broken in ((0.5, set()), (0.3, {"limits"})):
+        async with far_side(WIRES[wire], coarse_rig) as far:
+            witness = _witness(far.url, level=level)
+            endpoint = parse_endpoint(far.url)
+            async with relays([endpoint], [endpoint.location], witness) as (url,):
+                assert url != far.url
+                await _drive(url)
+            found = witness.finish()
+            assert {one.invariant for one in found} == broken, [str(one) for one in found]
+            assert witness.frames > 10
+
+
+@pytest.mark.parametrize(
+    ("url", "place", "address"),
+    [
+        ("serial:///dev/ttyUSB0?baud=921600&address=3", "/dev/ttyUSB0", 3),
+        ("modbus+tcp://127.0.0.1:5020/2", "127.0.0.1:5020", 2),
+        ("modbus+rtu:///dev/ttyS1?baud=19200#7", "/dev/ttyS1", 7),
+        ("can+slcan:///dev/ttyACM0?bitrate=500000#5", "/dev/ttyACM0", 5),
+        ("can+socketcand://localhost:29536/can0#1", "localhost:29536", 1),
+    ],
+)
+def test_parse_endpoint_splits_a_url(url: str, place: str, address: int) -> None:
+    """Location and address are parsed; the relayed URL keeps all else."""
+    taken = parse_endpoint(url)
+    assert (taken.location, taken.address) == (place, address)
+    assert taken.url_via("X").replace("X", place) == url
+
+
+async def test_relay_closes_connections_when_the_server_refuses(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    """The log names the location."""
+    with socket.socket() as bound:
+        bound.bind(("127.0.0.1", 0))
+        url = f"modbus+tcp://127.0.0.1:{bound.getsockname()[1]}/1"
+        endpoint, witness = parse_endpoint(url), _witness(url, level=0.5)
+        async with relays([endpoint], [endpoint.location], witness) as (end,):
+            host, _, port = parse_endpoint(end).location.rpartition(":")
+            reader, writer = await asyncio.open_connection(host, int(port))
+            assert await reader.read() == b""
+            writer.close()
+    (record,) = caplog.records
+    assert parse_endpoint(url).location in record.getMessage()
+
+
+URL = "serial:///dev/ttyUSB0"
+# docs/reference/serial.md: Hello and Arm with their replies, and the Event of Arm.
+SESSION = """
+0.000 wire1 > 00 02 01 03 01 06 05 1C 13 DA AC 00   # Hello
+0.002 wire1 < 00028103010602102D0B6572612D6861707469637313
+0.003 wire1 < 73696D756C6174656420616D706C69666965720553494D2D6101310A6E605200
+0.010 wire1 > 00 05 03 04 01 07 04 17 2A FA 01 01 05 88 99 49 9A 00
+0.011 wire1 < 00051E0401010204010102FF010105626B903600   # Event
+0.012 wire1 < 000583040107020401010201010102FA02FA0308070260010101030804010101
+0.012 wire1 < 0101010101010101010101010101010101010101055A35DF5500
+"""
+DAMAGED = "0.020 wire1 > 00 05 0C 04 01 08 02 07 01 01 05 20 58 84 54 00\n"
+
+
+def _replay(tmp_path: Path, text: str, *options: str) -> tuple[int, str]:
+    capture = tmp_path / "capture.txt"
+    capture.write_text(text, encoding="utf-8")
+    arguments = ["witness", URL, "--replay", str(capture), "--json", *options]
+    result = CliRunner().invoke(app, arguments)
+    if isinstance(result.exception, InputError | CommandError):
+        return 2, str(result.exception)
+    return result.exit_code, result.stdout
+
+
+def test_witness_replay_reports_a_damaged_frame_only(tmp_path: Path) -> None:
+    """Five good frames break no rule; a damaged one is named, with the frames before it."""
+    status, out = _replay(tmp_path, SESSION)
+    assert (status, json.loads(out)) == (0, {"frames": 5, "violations": []})
+    status, out = _replay(tmp_path, SESSION + DAMAGED)
+    (found,) = json.loads(out)["violations"]
+    assert status == 1
+    assert (found["invariant"], found["wire"], found["time_s"]) == ("garbage", "wire1", 0.02)
+    assert len(found["frames"]) == 6
+
+
+@pytest.mark.parametrize(
+    ("text", "line"),
+    [
+        ("", None),
+        ("0.1 wire1 > 0Z\n", 1),
+        ("0.1 wire1 = 00\n", 1),
+        ("0.2 wire1 > 00\n0.1 wire1 > 00\n", 2),
+        ("nan wire1 > 00\n", 1),
+        ("# begin\n0.1 wire1 > 00\n0.1 other > 00\n", 3),
+        ("0.1 wire1 > 00\n\udcff\n", 2),
+        ("0.1 wire1 > 00 04\n", None),
+    ],
+)
+def test_witness_replay_refuses_an_invalid_capture(
+    tmp_path: Path, text: str, line: int | None
+) -> None:
+    """The error names file and line."""
+    capture = tmp_path / "capture.txt"
+    capture.write_bytes(text.encode("utf-8", errors="surrogateescape"))
+    result = CliRunner().invoke(app, ["witness", URL, "--replay", str(capture)])
+    assert isinstance(result.exception, InputError | CommandError)
+    place = str(capture) if line is None else f"{capture}:{line}:"
+    assert str(result.exception).startswith(place)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        (["--frequency", "500,40"], "--frequency"),
+        (["--frequency", "nan,40"], "--frequency"),
+        (["--level", "7"], "--level"),
+        (["--level", "nan"], "--level"),
+        (["--slew", "-1"], "--slew"),
+        (["--slack", "-4"], "--slack"),
+        (["--slack", "inf"], "--slack"),
+        (["--replay", "missing.txt"], "missing.txt"),
+        (["--replay", "capture.txt", "--record", "capture.txt"], "--record"),
+        (["--replay", "."], "."),
+        ([f"{URL}?address=1"], f"{URL}?address=1"),
+        (["modbus+rtu:///dev/ttyUSB0"], "modbus+rtu:///dev/ttyUSB0"),
+    ],
+)
+def test_witness_refuses_invalid_arguments(
+    arguments: list[str], named: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The option, file or URL is named before anything is opened."""
+    monkeypatch.chdir(tmp_path)
+    result = CliRunner().invoke(app, ["witness", URL, *arguments])
+    assert isinstance(result.exception, InputError | CommandError)
+    assert named in str(result.exception)
+
+
+@pytest.mark.parametrize("room", shortly([RLIM_INFINITY, 64], [64]))
+async def test_witness_relays_a_wire_until_interrupted(
+    coarse_rig: Rig, tmp_path: Path, room: int
+) -> None:
+    """A session through the relay passes; a full disk only makes the capture incomplete."""
+    capture = tmp_path / "capture.txt"
+    async with far_side(SimulatedWire("serial"), coarse_rig) as far:
+        options = ("--slack", "5000", "--record", str(capture))
+        code = "import sys; from controller.cli.main import main; sys.exit(main())"
+        process = await asyncio.create_subprocess_exec(
+            # -B: bytecode would be cut off, too, and Python does not notice
+            *(sys.executable, "-B", "-P", "-c", code, "witness", far.url, *options),
+            stdout=asyncio.subprocess.PIPE,
+            stderr=asyncio.subprocess.PIPE,
+            cwd=example_rig_path().parent.parent,
+        )
+        assert process.stdout is not None
+        line = await asyncio.wait_for(process.stdout.readline(), TIMEOUT)
+        prlimit(process.pid, RLIMIT_FSIZE, (room, RLIM_INFINITY))
+        url = line.decode().split()[1]
+        lines = Lines()
+        amplifier = await lines.amplifier(url, GuardLimits(40.0, 500.0, 1.0), name="main")
+        await amplifier.open()
+        await amplifier.read_status()
+        await lines.close()
+        process.send_signal(signal.SIGINT)
+        out, err = await asyncio.wait_for(process.communicate(), TIMEOUT)
+    assert int(out.split()[0]) >= 8  # more where a busy machine has a request repeated
+    if room == RLIM_INFINITY:
+        assert process.returncode == 0
+        assert sum(len(piece.data) > 0 for piece in read_capture(capture, wires=["wire1"])) >= 6
+    else:
+        assert process.returncode == 2
+        _, error = err.decode().splitlines()
+        assert "capture.txt" in error
+
+
+def test_witness_without_frames_has_checked_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A relay that nothing passed is an error, not "no rule was broken"."""
+
+    @asynccontextmanager
+    async def ended_at_once(*_: object) -> AsyncIterator[list[str]]:
+        os.kill(os.getpid(), signal.SIGTERM)
+        yield ["serial:///dev/pts/9"]
+
+    monkeypatch.setattr("era_haptics.lab.witness.relay.relays", ended_at_once)
+    result = CliRunner().invoke(app, ["witness", URL])
+    assert isinstance(result.exception, InputError | CommandError)
+    assert "nothing was checked" in str(result.exception)
+    assert "Ctrl-C ends" in result.stderr

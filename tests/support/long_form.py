@@ -37,7 +37,7 @@ SLOWEST = (
     "test_daemon_faults_process.py",
     "test_calibrate.py",
     "test_rig_on_wire.py",
-    "test_loop_is_free.py",
+    "test_daemon_inputs.py",
     "test_decoders.py",
     "test_identify.py",
     "test_firmware.py",

@@ -1,10 +1,17 @@
-"""How a layout will feel: by its check and by reports, against the plate in time behind wires."""
+"""How layouts and content will feel: checks and reports, against the plate in time behind wires.
 
+Content is compared with the plate in time that is solved piece by piece; of fingers in two and
+three regions that are touched at once it is checked what they are promised.
+"""
+
+import asyncio
 import json
 import math
-from collections.abc import Callable
+import wave
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -13,23 +20,44 @@ import pytest
 from typer.testing import CliRunner
 
 from controller.cli.main import run as run_era
-from controller.content.pattern import Pattern
+from controller.content.pattern import Pattern, Transient
 from controller.effects.effect import Effect, Region
 from controller.effects.kinds import BUILT_IN, Buzz, Click, Detents, Dial, File, Ramp, Texture
 from controller.effects.layout import SurfaceLayout, load_layout
+from controller.effects.player import EffectPlayer
+from controller.play.intent import HapticIntent, Prediction
+from controller.play.selection import Chooser, Selector
+from controller.sources.touch import Contact, ContactKey
 from era_haptics.lab.checks import layout_check, layout_picture
-from era_haptics.lab.checks.layout_check import CheckedEffect, check_layout, strongest_target
+from era_haptics.lab.checks.content_check import check_content, kept_shares
+from era_haptics.lab.checks.layout_check import (
+    CheckedEffect,
+    check_layout,
+    loaded_plate,
+    strongest_target,
+)
+from era_haptics.lab.checks.layout_picture import JointTouch, check_together, close_pairs, matrix_of
 from era_haptics.lab.cli import app
 from long_form import in_turn, shortly
 from model.config.fields import Circle, Rectangle
 from model.config.file_kinds import KINDS
+from model.errors import InputError
+from model.finger import (
+    decibels,
+    detection_threshold,
+    fingertip_points,
+    fingertip_weights,
+    over_threshold,
+)
 from model.rig.rig import Uncertainty
 from model.table.table import LocalizationTable
 from model.table.table_file import build_table, save_table
+from model.transients.base_motion import along_lines, raised_cosine
+from model.transients.shaping import SAMPLE_RATE, Transients
 from plates import smooth_rig
-from several_fingers import WIRES, Felt, Pressed
-
-pytestmark = pytest.mark.usefixtures("plain_pictures")
+from set_table import phased, wants
+from several_fingers import WIRES, Felt, Pressed, playable
+from several_fingers import table as paper_table
 
 EXAMPLE = Path(__file__).parents[4] / "examples" / "panel_layout.yaml"
 BUTTON = Rectangle(0.05, 0.04, 0.012, 0.012)
@@ -61,6 +89,7 @@ def checked(region: Region, effect: Effect) -> CheckedEffect:
     return found
 
 
+@pytest.mark.usefixtures("plain_pictures")
 @pytest.mark.parametrize("resting", shortly([False, True], [True]))
 @pytest.mark.parametrize("effect", [Click(duration=0.02), Click(), Buzz(level=15.0)])
 def test_check_says_what_the_plate_behind_a_wire_makes_felt(effect: Effect, resting: bool) -> None:
@@ -87,6 +116,7 @@ def test_check_says_what_the_plate_behind_a_wire_makes_felt(effect: Effect, rest
     assert expected - 0.5 <= touch.felt_db_sl <= expected + 2.0
 
 
+@pytest.mark.usefixtures("plain_pictures")
 def test_check_says_by_how_much_a_level_cannot_be_had() -> None:
     """Of 10 dB more than the full stroke gives, 10 dB are missing."""
     region = Region("button", BUTTON, on_press="it", band=(90.0, 110.0))
@@ -101,6 +131,7 @@ def test_check_says_by_how_much_a_level_cannot_be_had() -> None:
     assert "100 % of the region (1.4 cm²)" in problem
 
 
+@pytest.mark.usefixtures("plain_pictures")
 @pytest.mark.parametrize(
     ("level", "count"), [pytest.param(None, 0, marks=pytest.mark.long), (16.9, 1), (17.0, 0)]
 )
@@ -113,6 +144,7 @@ def test_check_wants_notches_noticed_above_what_lasts(level: float | None, count
     assert len(found.problems) == count
 
 
+@pytest.mark.usefixtures("plain_pictures")
 def test_check_wants_a_frequency_for_notches_that_differ() -> None:
     """A slider without a band plays any frequency of the table; with one it stays in it."""
     free = checked(Region("slider", SLIDER, on_move="it"), Detents())
@@ -124,6 +156,7 @@ def test_check_wants_a_frequency_for_notches_that_differ() -> None:
     assert max(abs(level - 20.0) for level in tuned.felt) <= 2.0
 
 
+@pytest.mark.usefixtures("plain_pictures")
 def test_check_names_a_frequency_that_the_table_does_not_have() -> None:
     """700 Hz is not among 60 to 340 Hz; 200 Hz is as far from 180 as from 220 Hz."""
     for frequency in (700.0, 200.0):
@@ -152,6 +185,7 @@ STRONGEST: list[tuple[Effect, float, float | None]] = [
 """An effect of each kind, its level and the duration of its pulses."""
 
 
+@pytest.mark.usefixtures("plain_pictures")
 @pytest.mark.parametrize(("effect", "level", "duration"), STRONGEST)
 def test_strongest_target_of_every_kind(
     effect: Effect, level: float, duration: float | None
@@ -165,6 +199,7 @@ def test_strongest_target_of_every_kind(
     assert (felt.pulse and felt.pulse.duration) == duration
 
 
+@pytest.mark.usefixtures("plain_pictures")
 @pytest.mark.long
 def test_a_better_known_rig_feels_no_worse(monkeypatch: pytest.MonkeyPatch) -> None:
     """No problem is new, and contrasts promised for the example do not fall by 0.3 dB or more."""
@@ -198,6 +233,7 @@ def run(folder: Path, text: str, *options: str) -> tuple[int, str]:
     return result.exit_code, result.stdout
 
 
+@pytest.mark.usefixtures("plain_pictures")
 def test_command_prints_one_object_and_writes_a_picture(tmp_path: Path) -> None:
     """One region falls short: exit status 1; its keys as documented."""
     picture = tmp_path / "preview.png"
@@ -223,6 +259,7 @@ def test_command_prints_one_object_and_writes_a_picture(tmp_path: Path) -> None:
     assert len(both["at_m"]) == 2
 
 
+@pytest.mark.usefixtures("plain_pictures")
 @pytest.mark.parametrize("kind", shortly(KINDS, {*KINDS} - {"layout"}))
 def test_files_that_config_init_writes_fit_each_other(
     kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
@@ -244,6 +281,7 @@ def test_files_that_config_init_writes_fit_each_other(
         assert min(each["promised_worst_db"] for each in together) >= 4
 
 
+@pytest.mark.usefixtures("plain_pictures")
 def test_command_ends_with_zero_for_a_good_layout(tmp_path: Path) -> None:
     """With a band for the slider, too."""
     status, output = run(tmp_path, LAYOUT.replace("notches}\n", "notches, band: [130, 190]}\n"))
@@ -295,6 +333,7 @@ CASES = {
 }
 
 
+@pytest.mark.usefixtures("plain_pictures")
 def test_every_kind_has_its_rows() -> None:
     """In both lists of this file; a texture is felt where a finger moves, not where it stops."""
     assert {type(effect) for effect, *_ in STRONGEST} == {*BUILT_IN}, "a row in STRONGEST each"
@@ -315,6 +354,7 @@ def pressed(case: Case, wire: str) -> list[Felt]:
     return [felt for (felt,) in presses]
 
 
+@pytest.mark.usefixtures("plain_pictures")
 @pytest.mark.parametrize(("name", "wire"), in_turn(CASES, [*WIRES]))
 def test_effect_is_felt_as_promised_and_alike_at_every_press(name: str, wire: str) -> None:
     """Within 3 dB of what layout and report promise, all presses within 2 dB, on the plate."""
@@ -327,6 +367,7 @@ def test_effect_is_felt_as_promised_and_alike_at_every_press(name: str, wire: st
     assert max(levels) - min(levels) <= 2.0
 
 
+@pytest.mark.usefixtures("plain_pictures")
 def test_check_states_the_exposure_of_raised_levels() -> None:
     """A buzz of 100 Hz: 45 dB SL are 0.249 m/s² times 178, 0.160 of its rms by ISO 5349-1 or more.
 
@@ -336,3 +377,321 @@ def test_check_states_the_exposure_of_raised_levels() -> None:
     least = 0.249 * 10 ** (45 / 20) * 0.160 / math.sqrt(2)
     found = checked(region, Buzz(level=45.0))
     assert least * 10 ** (-2 / 20) <= found.exposure_m_s2 <= 3 * least
+
+
+SIZE = 0.03
+WEST, EAST, NEXT, NORTH = (0.03, 0.06), (0.2448, 0.06), (0.075, 0.06), (0.1374, 0.18)
+"""South-west corners [m] of regions on a plate of 0.3048 m by 0.2286 m; west and east mirrored."""
+
+
+def region(name: str, corner: tuple[float, float]) -> Region:
+    """A square region with a buzz of its name."""
+    return Region(name, Rectangle(*corner, SIZE, SIZE), on_press=name)
+
+
+def layout(*regions: Region) -> SurfaceLayout:
+    """A layout of regions."""
+    effects = {each.name: Buzz(level=14.0) for each in regions}
+    return SurfaceLayout(regions, effects, elsewhere=None)
+
+
+def fingers_at(places: Sequence[tuple[float, float]]) -> list[Contact]:
+    """Fingers down at once."""
+    return [Contact(ContactKey("test", n), *at, since=0.0) for n, at in enumerate(places)]
+
+
+def promised_by_the_loop(contacts: Sequence[Contact], intent: HapticIntent) -> list[float]:
+    """Contrast that the control loop promises each finger, of amplifiers with eight layers."""
+
+    async def predicted() -> tuple[Prediction, ...]:
+        arrived = asyncio.Event()
+        selector = Selector(Chooser(paper_table()), arrived=arrived.set)
+        selector.select(contacts, intent, playable())
+        if selector.is_choosing:
+            await arrived.wait()
+        return selector.select(contacts, intent, playable()).predictions
+
+    found = asyncio.run(predicted())
+    by_key = {each.contact.key: each.promised_contrast_db or math.nan for each in found}
+    return [by_key[each.key] for each in contacts]
+
+
+def test_mirrored_regions_are_promised_the_same() -> None:
+    """The plate and its ERAs are symmetric: east and west of north alike, but for the draws."""
+    found = check_together(
+        layout(region("west", WEST), region("east", EAST), region("north", NORTH)),
+        paper_table(),
+    )
+    worst = {each.regions: each.worst_db for each in found}
+    assert len(worst) == 4
+    assert worst["west", "north"] == pytest.approx(worst["east", "north"], abs=1.5)
+    # A third finger leaves no two more than they had.
+    assert worst["west", "east", "north"] < min(worst[pair] for pair in [*worst][:3]) + 0.5
+
+
+def test_places_are_the_worst_of_their_regions() -> None:
+    """Within both, and promised less than the centres, if anything; nearer regions less."""
+    west, near, east = region("west", WEST), region("near", NEXT), region("east", EAST)
+    found = check_together(layout(west, near, east), paper_table())
+    by_name = {each.regions: each for each in found}
+    for pair, each in by_name.items():
+        shapes = [one.shape for one in (west, near, east) if one.name in pair]
+        assert all(shape.contains(*at) for shape, at in zip(shapes, each.at, strict=True))
+        if len(pair) == 2:
+            fingers = [wants(shape.centre, level_db_sl=14.0) for shape in shapes]
+            centred = phased(paper_table(), fingers, min_contrast_db=-math.inf)
+            assert centred.promised_worst_db is not None
+            assert each.worst_db <= centred.promised_worst_db
+            assert each.worst_db <= min(each.contrasts)
+    assert by_name["west", "near"].worst_db < by_name["west", "east"].worst_db
+
+
+def test_pairs_that_are_felt_as_one_are_named() -> None:
+    """Those below 6 dB, the rule's bound of what is mixed, the worst first; none of three."""
+    at, worst = (0.0, 0.0), {"ab": 3.2, "ac": 6.0, "bc": -1.0, "abc": -5.0}
+    found = [JointTouch((*names,), (at, at), (db, db), db, ()) for names, db in worst.items()]
+    said = close_pairs(found)
+    assert "2 of 3 pairs" in said
+    assert said.index("b with c -1.0 dB") < said.index("a with b 3.2 dB")
+    assert close_pairs(found[1:2]) == ""
+
+
+def test_verdicts_follow_the_rule_and_what_regions_say() -> None:
+    """Below 12 dB mixed; where a region requires its own or is protected another is held back."""
+    near = region("near", (0.12, 0.06))
+    (mixed,) = check_together(layout(region("west", WEST), near), paper_table())
+    assert 6 < mixed.worst_db < 12
+    assert "mixed" in mixed.verdicts
+    for said in (replace(near, is_own=True), replace(near, is_protected=True)):
+        (found,) = check_together(
+            layout(region("west", WEST), replace(said, priority=1)), paper_table()
+        )
+        assert found.verdicts[0] == "held back"
+        assert (found.at, found.worst_db) == (mixed.at, mixed.worst_db)
+
+
+@pytest.mark.parametrize(
+    "effect", [Buzz(level=14.0, modulation=20.0), Click(level=14.0)], ids=["rough", "click"]
+)
+def test_what_comes_and_goes_is_promised_as_the_daemon_promises_it(effect: Effect) -> None:
+    """Side bands and short effects leak more than a steady tone, by what a selection says."""
+    steady = layout(region("west", WEST), region("north", NORTH))
+    changed = replace(steady, effects={**steady.effects, "west": effect})
+    (before,), (found,) = (check_together(each, paper_table()) for each in (steady, changed))
+    assert found.at == before.at
+    assert found.worst_db < before.worst_db - 0.2
+    contacts, player = fingers_at(found.at), EffectPlayer(changed)
+    promised = promised_by_the_loop(contacts, player.intent(contacts, 0.0))
+    assert found.contrasts[0] == pytest.approx(promised[0], abs=0.3)
+    assert promised[1] <= found.contrasts[1] + 0.3  # less while a click plays
+
+
+def test_matrix_has_two_below_and_three_above_the_diagonal() -> None:
+    """Of three above it the least with any third."""
+    regions = [region(name, at) for name, at in zip("abcd", (WEST, EAST, NEXT, NORTH), strict=True)]
+    found = check_together(layout(*regions), paper_table())
+    names, promised = matrix_of(found)
+    assert names == [*"abcd"]
+    assert np.isnan(np.diag(promised)).all()
+    for one, other in pairwise(range(4)):
+        (pair,) = (each for each in found if each.regions == (names[one], names[other]))
+        third = min(
+            each.worst_db
+            for each in found
+            if len(each.regions) == 3 and {names[one], names[other]} <= {*each.regions}
+        )
+        assert (promised[other, one], promised[one, other]) == (pair.worst_db, third)
+
+
+def test_of_many_regions_the_nearest_are_checked(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A bound on what is computed keeps the pair that is hardest to tell apart."""
+    monkeypatch.setattr(layout_picture, "MAX_PAIRS", 1)
+    monkeypatch.setattr(layout_picture, "MAX_TRIPLES", 0)
+    regions = [region(name, at) for name, at in zip("abcd", (WEST, EAST, NEXT, NORTH), strict=True)]
+    silent = Region("silent", Rectangle(0.03, 0.10, SIZE, SIZE))
+    (found,) = check_together(layout(*regions, silent), paper_table())
+    assert found.regions == ("a", "c")
+
+
+AT, QUIET = (0.11, 0.13), (0.21, 0.06)
+SWELL = Pattern(
+    0.4, ((0.0, 0.4), (0.3, 1.0), (0.4, 0.0)), ((0.0, 0.5),), (Transient(0.15, 1.0, 0.2),)
+)
+
+
+@cache
+def content_check_table() -> LocalizationTable:
+    """Frequencies 20 Hz apart, which is quick to solve."""
+    return build_table(smooth_rig(), frequencies=np.arange(60.0, 321.0, 20.0), drive_mode="phased")
+
+
+@pytest.mark.usefixtures("plain_pictures")
+def test_felt_level_is_that_of_the_plate_in_time() -> None:
+    """A swell and a tap in it, also as terms of the bases, each between two knots by itself."""
+    found = check_content(SWELL, content_check_table(), 20.0, at=AT)
+    lasting, tap = found.parts
+    bases = []
+    for era in content_check_table().eras:
+        swell, click = (each.answer.layers[0].excitation[era.name] for each in found.parts)
+        ramp, omega = tap.answer.layers[0].ramp, 2 * math.pi * click.frequency
+        course = lasting.stimulus.course
+        assert course is not None
+        end = click.phasor * np.exp(0.04j * omega)
+        bases.append(
+            (
+                *along_lines(
+                    0.0,
+                    course.times[1],
+                    2 * math.pi * swell.frequency,
+                    [share * swell.phasor for share in course.shares],
+                ),
+                *raised_cosine(0.15, ramp, omega, 0, click.phasor),
+                *raised_cosine(0.19, ramp, omega, 0, -end),
+            )
+        )
+    transients = Transients(loaded_plate(content_check_table(), [AT]))
+    points = fingertip_points(*AT, content_check_table().plate)
+    moved = transients.acceleration(tuple(bases), points, duration=0.4)
+    felt = over_threshold(moved, SAMPLE_RATE, content_check_table().threshold)
+    for time in (0.06, 0.11, 0.17, 0.3):
+        around = np.arange(-159, 160)
+        window = np.cos(np.pi / 2 * around / 160) ** 2  # 20 ms wide at half its height
+        some = felt[round(time * SAMPLE_RATE) + around]
+        power = 2 * (window[:, None] * some**2).sum(axis=0) / window.sum()
+        expected = decibels(np.sqrt(power) @ fingertip_weights(*AT, content_check_table().plate))
+        assert found.given[round(time / found.step)] == pytest.approx(float(expected), abs=0.3)
+
+
+@pytest.mark.usefixtures("plain_pictures")
+def test_what_lasts_has_its_level_and_taps_theirs() -> None:
+    """20 dB SL for a second, the plate's rise apart; then a tap of 15 dB SL alone."""
+    pattern = Pattern(
+        1.5, ((0.0, 1.0), (1.0, 1.0), (1.0, 0.0)), ((0.0, 0.5),), (Transient(1.3, 0.5, 0.5),)
+    )
+    found = check_content(pattern, content_check_table(), 20.0, at=AT)
+    middle = found.given[round(0.2 / found.step) : round(0.9 / found.step)]
+    assert np.median(middle) == pytest.approx(20.0, abs=1.0)
+    assert found.given[round(1.3 / found.step) :].max() == pytest.approx(15.0, abs=2.0)
+    assert found.kept_share > 0.9
+    assert found.delay <= 0.01
+
+
+@pytest.mark.usefixtures("plain_pictures")
+def test_long_content_that_jumps_has_its_level() -> None:
+    """Five seconds of 20 dB SL; by less than 2 dB more the plate overshoots after the jump."""
+    pattern = Pattern(5.0, ((0.0, 0.0), (0.005, 1.0), (5.0, 1.0)))
+    found = check_content(pattern, content_check_table(), 20.0, at=AT)
+    assert np.median(found.given[: round(4.5 / found.step)]) == pytest.approx(20.0, abs=2.0)
+    assert found.kept_share > 0.95
+
+
+@pytest.mark.usefixtures("plain_pictures")
+def test_kept_share_counts_levels_within_3_db_where_20_below_the_highest_are_asked() -> None:
+    """Of 100 steps 40 count; 10 of these are 4 dB off; given 3 steps late."""
+    expected = np.concatenate([np.full(30, 20.0), np.full(10, 5.0), np.full(60, -1.0)])
+    given = np.roll(expected + np.where(np.arange(100) < 10, 4.0, 2.0), 3)
+    assert kept_shares(expected, given, 5)[3] == pytest.approx(0.75)
+    assert kept_shares(expected, given, 5).argmax() == 3
+
+
+@pytest.mark.usefixtures("plain_pictures")
+def test_taps_too_close_to_be_clicks_are_felt_in_what_lasts() -> None:
+    """Of two equal taps 50 ms apart the second is in what lasts, from 30 ms after the first on."""
+    taps = Transient(0.1, 1.0, 0.5), Transient(0.15, 1.0, 0.5)
+    found = check_content(Pattern(0.3, transients=taps), content_check_table(), 20.0, at=AT)
+    assert [each.stimulus.course is None for each in found.parts] == [False, True]
+    assert found.kept_share > 0.9
+    assert "1 of 2 taps" in found.lost[0]
+
+
+@pytest.mark.usefixtures("plain_pictures")
+def test_beside_a_quiet_finger_content_is_smoothed_and_promised() -> None:
+    """The course starts and ends at rest; each part has a promise, the least counts."""
+    found = check_content(SWELL, content_check_table(), 20.0, at=AT, quiet=[QUIET])
+    course = found.parts[0].stimulus.course
+    assert course is not None
+    assert course.shares[0] == course.shares[-1] == 0
+    promises = [each.answer.fingers[0].promised_contrast_db for each in found.parts]
+    assert found.as_json()["promised_contrast_db"] == min(each for each in promises if each)
+
+
+@pytest.mark.usefixtures("plain_pictures")
+def test_command_says_what_is_kept_and_fails_below_the_least(tmp_path: Path) -> None:
+    """Exit status 0 and 1 of the same content, its levels over time, and a picture."""
+    save_table(content_check_table(), tmp_path / "table.npz")
+    picture, place = tmp_path / "picture.png", "0.11,0.13"
+    arguments = [
+        "content",
+        "check",
+        "success",
+        "--table",
+        str(tmp_path / "table.npz"),
+        "--at",
+        place,
+    ]
+    result = CliRunner().invoke(app, [*arguments, "-o", str(picture), "--json"])
+    assert result.exit_code == 0
+    found = json.loads(result.stdout)
+    assert found["kept_share"] >= 0.8
+    assert found["level_db_sl"]["step_s"] == pytest.approx(0.005, abs=0.001)
+    assert max(each for each in found["level_db_sl"]["given"] if each) > 15
+    assert [each["time_s"] for each in found["parts"]] == sorted(
+        each["time_s"] for each in found["parts"]
+    )
+    assert found["files"] == [str(picture)]
+    assert picture.stat().st_size > 0
+    result = CliRunner().invoke(app, [*arguments, "--least", "1", "--quiet", "0.21,0.06"])
+    assert result.exit_code == 1
+    assert "lost too much, at least 100 % must be" in result.stdout
+    assert "dB above quiet fingers" in result.stdout
+
+
+@pytest.mark.usefixtures("plain_pictures")
+def test_command_tries_several_places_and_says_what_a_tap_loses(tmp_path: Path) -> None:
+    """The median of five is shown, never the worst; of all its time all that is off its level."""
+    save_table(content_check_table(), tmp_path / "table.npz")
+    arguments = ["content", "check", "tick", "--table", str(tmp_path / "table.npz")]
+    shares, sides = [], (content_check_table().plate.length, content_check_table().plate.width)
+    for at in (None, (0.5, 0.5), (0.2, 0.3), (0.35, 0.75), (0.65, 0.2), (0.8, 0.6)):
+        x, y = (each * side for each, side in zip(at or (0, 0), sides, strict=True))
+        more = ["--at", f"{x},{y}"] if at else []
+        found = json.loads(CliRunner().invoke(app, [*arguments, *more, "--json"]).stdout)
+        off = sum(int(each.partition(" %")[0]) for each in found["lost"] if "wanted" in each)
+        assert off / 100 == pytest.approx(1 - found["kept_share"], abs=0.06)
+        shares.append(found["kept_share"])
+    assert shares[0] == np.median(shares[1:])
+
+
+@pytest.mark.usefixtures("plain_pictures")
+def test_level_beyond_all_is_refused_as_it_was_given() -> None:
+    """Not as what becomes of it in the file."""
+    with pytest.raises(InputError, match="level must be between -100 and 60 dB SL, got 70;"):
+        check_content(Pattern(0.3, ((0.0, 0.5), (0.3, 0.5))), content_check_table(), 70.0, at=AT)
+
+
+@pytest.mark.usefixtures("plain_pictures")
+def test_what_is_felt_is_written_as_sound(tmp_path: Path) -> None:
+    """Intensity 1 for a second at 20 dB SL: ten times the threshold at its frequency, sampled.
+
+    In 16 bits at 48 kHz, which Python's own module reads, of which full scale is as printed.
+    """
+    save_table(content_check_table(), tmp_path / "table.npz")
+    envelope = {"amplitude": [{"time": 0, "amplitude": 1}, {"time": 1, "amplitude": 1}]}
+    content = {"version": {"major": 1, "minor": 0, "patch": 0}, "metadata": {}}
+    signals = {"signals": {"continuous": {"envelopes": envelope}}}
+    (tmp_path / "even.haptic").write_text(json.dumps(content | signals))
+    arguments = ["play", str(tmp_path / "even.haptic"), "--at", "0.11,0.13", "--json", "--simulate"]
+    sound = tmp_path / "felt.wav"
+    result = CliRunner().invoke(app, [*arguments, str(tmp_path / "table.npz"), "-o", str(sound)])
+    assert result.exit_code == 0
+    with wave.open(str(sound)) as file:
+        assert (file.getsampwidth(), file.getnchannels(), file.getframerate()) == (2, 1, 48000)
+        rate, samples = 48000, np.frombuffer(file.readframes(file.getnframes()), "<i2")
+    assert np.abs(samples).max() == pytest.approx(0.9 * 32768, abs=1)
+    middle = samples[int(0.3 * rate) : int(0.7 * rate)] / 32768
+    middle *= json.loads(result.stdout)["full_scale_m_s2"]
+    spectrum = np.abs(np.fft.rfft(middle))
+    frequency = np.fft.rfftfreq(len(middle), 1 / rate)[spectrum.argmax()]
+    threshold = float(detection_threshold(np.array(frequency), content_check_table().threshold))
+    level = decibels(math.sqrt(2) * middle.std() / threshold)
+    assert level == pytest.approx(20.0, abs=1.0)

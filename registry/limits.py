@@ -27,3 +27,12 @@ class GuardLimits:
     on_time: float = math.inf
     duty: float = 1.0
     rate: float = math.inf
+
+
+HAND_LOAD = 12.0
+"""Load of a hand that rests on a plate, in fingertips.
+
+That of the heel of a hand with part of its weight lies between its force, to the power of two
+thirds (7 fingertips for 10 N), and its area (30 for 20 cm²). docs/concepts/people.md has the
+sources, and how well this is known.
+"""

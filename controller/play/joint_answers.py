@@ -500,7 +500,7 @@ def felt_on_ways(found: Answer, count: int) -> list[Sensation]:
 def foreign_on_ways(found: Answer, count: int) -> list[list[float]]:
     """Return the highest foreign levels [dB SL] of these fingers, by set of thresholds."""
     levels = found.tones.foreign_db_sl
-    heard = np.where(np.isnan(levels), -math.inf, levels)
+    heard = np.where(np.isnan(levels), -math.inf, levels)[: len(found.asked)]
     if len(heard) == count:
         return heard.tolist()  # type: ignore[no-any-return]
     return [(heard[way].max(axis=0) + MARGIN_DB).tolist() for way in _ways(found, count)]

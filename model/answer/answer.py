@@ -109,7 +109,7 @@ class Contents:
     """K contents for k fingers on a plate."""
 
     places: tuple[Point, ...]
-    """Places of all fingers [m]."""
+    """Places of all fingers [m], then of the further patches of hands."""
     loads: tuple[float, ...]
     """Load of each finger relative to the rig's fingertip, empty for 1 each."""
     streams: tuple[Stream, ...]
@@ -585,7 +585,7 @@ class Answer:
     @property
     def disturbed(self) -> list[int]:
         """Fingers, by number, at which others' vibrations are stronger than they allow."""
-        levels = enumerate(zip(self.tones.foreign_db_sl, self.asked, strict=True))
+        levels = enumerate(zip(self.tones.foreign_db_sl, self.asked, strict=False))
         return [finger for finger, (by, each) in levels if by[0] > each.max_foreign_db_sl]
 
     @property

@@ -249,7 +249,7 @@ def exposures(table: LocalizationTable, found: Answer) -> list[float]:
     """
     tones, contents = found.tones, found.contents
     if not tones.rows:
-        return [0.0] * len(contents.places)
+        return [0.0] * len(found.asked)
     rows, gains = np.array(tones.rows), np.array(tones.gains)
     fingers = FingersOnPlate.of(table, contents.places, contents.loads)
     drawn = PROMISED_DRAWS, rows, np.array(tones.weights, dtype=np.complex64)
@@ -262,7 +262,7 @@ def exposures(table: LocalizationTable, found: Answer) -> list[float]:
     harmonics = fingers.harmonics(*drawn) * of_harmonics.astype(np.float32)[:, None, None]
     return [
         promise(np.sqrt(loudest_power(power, harmonics, rows, finger)), 100 - PROMISED_PERCENTILE)
-        for finger in range(len(contents.places))
+        for finger in range(len(found.asked))
     ]
 
 

@@ -53,6 +53,7 @@ from model.arrays import NEARLY, FloatArray, Point, best_by, best_of
 from model.drive_modes import UNRESTRICTED, checked_mode
 from model.errors import InputError
 from model.finger import FELT_DB_SL, STRONG_DB_SL, decibels
+from model.structure.attachments import MAX_LOAD, with_patches
 from model.table.table import SAME_FREQUENCY, LocalizationTable
 
 MAX_SEPARATE = 5
@@ -301,7 +302,7 @@ class _Answering:
         return [
             number
             for number, each in enumerate(self.fingers)
-            if number not in felt and (each.stimulus is None or each.is_protected)
+            if number not in felt and (each.is_protected if each.stimulus else not each.is_hand)
         ]
 
     def _in_turn(self, plan: _Plan, tried: Sequence[Answer], min_contrast_db: float) -> Answer:
@@ -427,9 +428,13 @@ class _Answering:
             background = self.table.background(places)
         rows = [{*range(*band)} for stream in streams for band in stream.bands]
         leaves_none = any(each <= self.avoided for each in rows)
+        places, loads = [each.at for each in self.fingers], [each.load for each in self.fingers]
+        if max(loads) > MAX_LOAD:
+            size = self.table.plate.length, self.table.plate.width
+            places, loads = with_patches(places, loads, size)
         return Contents(
-            tuple([each.at for each in self.fingers]),
-            tuple([each.load for each in self.fingers]),
+            tuple(places),
+            tuple(loads),
             tuple(streams),
             quiet,
             self.apart_hz,
@@ -573,7 +578,7 @@ def _alone_at(table: LocalizationTable, found: Answer, number: int) -> Callable[
     stream, contents = found.contents.streams[number], found.contents
     (finger,), course = stream.targets, stream.course
     level_db_sl = stream.level_db_sl - (0.0 if course is None else course.strongest_db)
-    others = tuple(n for n in range(len(contents.places)) if n != finger)
+    others = tuple(n for n, each in enumerate(found.asked) if n != finger and not each.is_hand)
     background = None if others else table.background([contents.places[finger]])
 
     def alone(row: int) -> Tones:

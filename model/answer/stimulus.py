@@ -21,7 +21,7 @@ from model.arrays import FloatArray, Point
 from model.config.units import in_metres
 from model.errors import InputError, expect_number, shown
 from model.finger import FINGERTIP_RADIUS, STRONG_DB_SL
-from model.structure.attachments import check_loads
+from model.structure.attachments import MAX_HAND_LOAD, MAX_LOAD, check_loads
 from model.structure.plate import Plate
 from model.transients.base_motion import rise
 from model.transients.excursions import CLICKS_APART, DECAYED, Swing
@@ -139,7 +139,11 @@ class Finger:
     stimulus: Stimulus | None = None
     """What it is to feel, None for nothing."""
     load: float = 1.0
-    """Its load on the plate, relative to the rig's fingertip."""
+    """Its load on the plate, relative to the rig's fingertip.
+
+    A load above 10 is that of a hand that rests (`HAND_LOAD`): it changes what others feel, is
+    known within a factor of 2.5 only, and has neither a stimulus nor protection.
+    """
     priority: int = 0
     """Vibrations of lower priority are given up or lowered first."""
     sharing: str = BY_NAME
@@ -189,6 +193,11 @@ class Finger:
             raise InputError(
                 f"sharing must be one of {', '.join(SHARING)}, got {shown(self.sharing)}"
             )
+
+    @property
+    def is_hand(self) -> bool:
+        """Whether it is a hand that rests, rather than a finger."""
+        return self.load > MAX_LOAD
 
     @property
     def name(self) -> str | None:
@@ -257,19 +266,21 @@ def check_on_plate(what: str, places: Iterable[Point], plate: Plate) -> None:
 
 def check_fingers(fingers: Sequence[Finger], plate: Plate) -> None:
     """Raise InputError for fingers that contradict each other or are not on the plate."""
-    loads = [finger.load for finger in fingers]
+    hands = [finger.load for finger in fingers if finger.is_hand and finger.stimulus is None]
+    loads = [finger.load for finger in fingers if not finger.is_hand or finger.stimulus]
     if all(finger.stimulus is None for finger in fingers):
         raise InputError("an answer must have at least one finger with a stimulus, got none")
     if len(fingers) > MAX_CONTACTS:
         raise InputError(f"an answer must have up to {MAX_CONTACTS} fingers, got {len(fingers)}")
     if loads.count(1.0) < len(loads):
         check_loads(loads)
+    check_loads(hands, highest=MAX_HAND_LOAD)
     check_on_plate("finger", [finger.at for finger in fingers], plate)
     for number, finger in enumerate(fingers):
         x, y = finger.at
         for other in fingers[:number]:
             gap = math.dist(other.at, finger.at)
-            if gap >= FINGERTIP_RADIUS:
+            if gap >= FINGERTIP_RADIUS or finger.is_hand or other.is_hand:
                 continue
             is_one = finger.stimulus == other.stimulus is None or finger.must_feel_one_with(other)
             if not (is_one and gap > 0):

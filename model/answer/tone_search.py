@@ -127,6 +127,7 @@ def choose_tones(table: LocalizationTable, contents: Contents) -> Tones:
         places=at.buffer_info()[0],
         stiffness=stiffness[0].ctypes.data,
         at_harmonics=stiffness[1].ctypes.data,
+        load_std=stiffness[2].ctypes.data,
         background=None if background is None else background.ctypes.data,
         judging=addressof(judging),
         promise=addressof(promise),
@@ -158,8 +159,11 @@ def choose_tones(table: LocalizationTable, contents: Contents) -> Tones:
     )
 
 
-_Fingers: TypeAlias = tuple[PlateDraws, PlateDraws, Complex64Array, Complex64Array]
-"""Draws that judge and that promise; stiffness of fingers of load 1, also for harmonics."""
+_Loads: TypeAlias = tuple[Complex64Array, Complex64Array, Float32Array]
+"""Stiffness of fingers, also for harmonics, and how uncertain their loads are."""
+
+_Fingers: TypeAlias = tuple[PlateDraws, PlateDraws, *_Loads]
+"""Draws that judge and that promise; loads of fingers of load 1."""
 
 _Kept: TypeAlias = tuple[TouchedPlates, GivenRaster, Rules, dict[int, _Fingers]]
 """Structures of a table: plate, raster, rules, and those for each number of fingers."""
@@ -221,14 +225,13 @@ def _with_fingers(table: LocalizationTable, fingers: int) -> _Fingers:
     return judging, promise, *_stiffness(table, fingers)
 
 
-def _stiffness(
-    table: LocalizationTable, fingers: int, loads: tuple[float, ...] = ()
-) -> tuple[Complex64Array, Complex64Array]:
-    """Return the stiffness of fingers at a table's frequencies, and for harmonics at twice."""
-    stiffness = table.attached.finger_stiffness(fingers, loads)
+def _stiffness(table: LocalizationTable, fingers: int, loads: tuple[float, ...] = ()) -> _Loads:
+    """Return fingers' stiffness at a table's frequencies, at twice these, and deviations."""
+    attached = table.attached
+    stiffness, stds = attached.finger_stiffness(fingers, loads), attached.load_stds(fingers, loads)
     if not table.uncertainty.harmonic:
-        return stiffness, stiffness
-    return stiffness, table.at_harmonics.plate.finger_stiffness(fingers, loads)
+        return stiffness, stiffness, stds
+    return stiffness, table.at_harmonics.plate.finger_stiffness(fingers, loads), stds
 
 
 def _method(of: drive_modes.LawsonMethod) -> WeightSearch:

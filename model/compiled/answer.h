@@ -38,6 +38,7 @@ typedef struct {
     const double *places;       /* (k, 2) [m] */
     const float *stiffness;     /* (f, k) of fingers */
     const float *at_harmonics;  /* the same at twice the frequencies */
+    const float *load_std;      /* (k) of the logarithm of their loads */
     const float *background;    /* (f, n, n) form of the rest of the plate, for no other finger */
     const draws *judging, *promise;
 } asked;

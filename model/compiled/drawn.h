@@ -146,7 +146,7 @@ INLINE void find_changes(value *forces, value *lost, const touched *of, const pl
     for (size_t j = n; j < (size_t)on->off; j++) own[j] = subtract_product(ZERO, by_stiffness[j], moved[j]);
     for (size_t j = 0; j < a; j++) {
         value by = j < b ? attached[j] : of->D[j - b];
-        if (j >= b) own[j] = scaled(times(by, moved[j]), filled(-on->load_std));
+        if (j >= b) own[j] = scaled(times(by, moved[j]), filled(-on->load_std[j - b]));
         held[j] = subtract_product(gains[j], by, moved[j]);
     }
     for (size_t s = 0; s < r; s++) {

@@ -8,12 +8,11 @@ typedef struct {
     int n, b, k, r, t;          /* ERAs; these and masses; fingers; reduced coordinates; thicknesses */
     int off;                    /* ERAs, and masses up to the last foot whose stiffness deviates */
     int rows, lanes, kept;      /* frequencies; lanes and thicknesses of the blocks below */
-    float load_std;
     const float *receptance, *by_force, *coupling, *moved; /* (f, t, ...) g (r), T (b, r), Y (b, b), (b, n) */
     const float *minus_omega2, *drives, *strokes;          /* (f), (f, n), (f, n) */
     const float *by_damping, *by_stiffness;                /* (f, n), (f, off) */
     const float *by_loss, *attached, *shapes;              /* (f, t, r); (f, b) Z; (b, r) */
-    const float *centres, *stiffness;                      /* (k, r); (f, k) D */
+    const float *centres, *stiffness, *load_std;           /* (k, r); (f, k) D; (k) of its logarithm */
     value *of_blocks; /* (blocks of LANES frequencies, the first thicknesses, b, r) T, as `load` gives it */
 } plates;
 

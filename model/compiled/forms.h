@@ -88,7 +88,7 @@ SHARED void find_forms(formed *to, const plates *on, const grouped *of, const in
     for (size_t i = 0; i < k; i++)
         for (size_t e = 0; e < n; e++)
             changes[(off + i) * n + e] =
-                scaled(times(now.D[i], moved[(b + i) * n + e]), filled(on->load_std));
+                scaled(times(now.D[i], moved[(b + i) * n + e]), filled(on->load_std[i]));
     product(h + at * n, t, a, damped, at, n, n);
 
     /* Plates thicker and thinner, each counting half, at points that count. */

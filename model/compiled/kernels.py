@@ -69,9 +69,9 @@ class TouchedPlates(Structure):
     """The plate on its ERAs with fingers on it: `plates` in C."""
 
     _fields_ = [
-        *_fields(i="n b k r t off rows lanes kept", f="load_std"),
+        *_fields(i="n b k r t off rows lanes kept"),
         *_fields(p="receptance by_force coupling moved minus_omega2 forces strokes by_damping"),
-        *_fields(p="by_stiffness by_loss attached shapes centres stiffness of_blocks"),
+        *_fields(p="by_stiffness by_loss attached shapes centres stiffness load_std of_blocks"),
     ]
 
 
@@ -136,7 +136,8 @@ class GivenQuestion(Structure):
 
     _fields_ = [
         *_fields(i="contents bands fingers quiet_count candidates combinations", f="apart"),
-        *_fields(p="numbers level places stiffness at_harmonics background judging promise"),
+        *_fields(p="numbers level places stiffness at_harmonics load_std background"),
+        *_fields(p="judging promise"),
     ]
 
 

@@ -44,6 +44,8 @@ import numpy as np
 from model.arrays import Complex64Array, ComplexArray, Float32Array, FloatArray
 from model.rig.rig import Uncertainty
 from model.structure.attachments import (
+    HAND_STD,
+    MAX_LOAD,
     Fingertip,
     PointLoad,
     Source,
@@ -162,8 +164,13 @@ class AttachedPlate(Mounts):
         if self.fingertip is not None:
             for number, load in enumerate(loads):
                 if load != 1:
-                    found[:, number] = self.fingertip.scaled(load).dynamic_stiffness(self.omega)
+                    found[:, number] = self.fingertip.under(load).dynamic_stiffness(self.omega)
         return found.astype(np.complex64)
+
+    def load_stds(self, count: int, loads: Sequence[float] = ()) -> Float32Array:
+        """Standard deviation of the logarithm of loads as of `finger_stiffness`, (count,)."""
+        is_hand = np.array(loads or (1.0,) * count) > MAX_LOAD
+        return np.where(is_hand, HAND_STD, self.uncertainty.fingertip).astype(np.float32)
 
     def driven_less(self, shares: FloatArray) -> "AttachedPlate":
         """Return the plate with ERAs at shares (f,) of full level."""

@@ -112,6 +112,8 @@ class TouchedPlate:
     """Mode shapes (k, r) at the fingers."""
     stiffness: Complex64Array
     """Dynamic stiffness (f, k) of the fingers [N/m]."""
+    load_std: Float32Array
+    """Standard deviation (k,) of the logarithm of their loads."""
     clocks: ClockErrors = EXACT_CLOCKS
     """Errors of the amplifiers' clocks."""
 
@@ -179,7 +181,7 @@ class TouchedPlate:
                 changes.append((other[:, :, :n] * forces - h) * np.float32(math.sqrt(0.5)))
         a, k, s = moved.shape[1], len(self.centres), plate.by_stiffness.shape[1]
         uncertain = np.concatenate([np.arange(s), np.arange(a - k, a)])
-        load = np.float32(plate.uncertainty.fingertip) * self.stiffness[rows]
+        load = self.load_std * self.stiffness[rows]
         by_one = np.concatenate([plate.by_stiffness[rows], load], axis=1)
         deformed = stretched[:, uncertain] * by_one[:, :, None]
         reach = power_of(by_force[:, :, uncertain]).reshape(f, g, p, -1)
@@ -219,7 +221,7 @@ class TouchedPlate:
         damping[:, :n] = plate.by_damping[rows] * stretched[:, :n]
         b, s = plate.stiffness.shape[1], plate.by_stiffness.shape[1]
         own[:, :s] = plate.by_stiffness[rows] * stretched[:, :s]
-        by_load = np.float32(plate.uncertainty.fingertip) * self.stiffness[rows]
+        by_load = self.load_std * self.stiffness[rows]
         own[:, b:] = by_load * stretched[:, b:]
         held = np.asarray(drives - stiffness * moved, dtype=np.complex64)
         by_loss = self.on.by_loss[rows, nodes]
@@ -348,7 +350,7 @@ class TouchedByKernel(TouchedPlate):
         """The plate as kernels read it."""
         found = TouchedPlates.from_buffer_copy(plates_structure(self.on))
         found.k = len(self.centres)
-        found.point(centres=self.centres, stiffness=self.stiffness)
+        found.point(centres=self.centres, stiffness=self.stiffness, load_std=self.load_std)
         return found
 
     def forms(
@@ -422,10 +424,11 @@ def touch(
     centres (k, r): shapes there; loads (k,): relative to the rig's fingertip, empty for 1 each;
     clocks: errors of the amplifiers' clocks.
     """
-    by, stiffness = kernels(), on.plate.finger_stiffness(len(centres), loads)
-    if by is None or not len(centres):
-        return TouchedPlate(on, centres, stiffness, clocks)
-    return TouchedByKernel(on, centres, stiffness, clocks, kernels=by)
+    by, plate, count = kernels(), on.plate, len(centres)
+    stiffness, stds = plate.finger_stiffness(count, loads), plate.load_stds(count, loads)
+    if by is None or not count:
+        return TouchedPlate(on, centres, stiffness, stds, clocks)
+    return TouchedByKernel(on, centres, stiffness, stds, clocks, kernels=by)
 
 
 def drawn_on(
@@ -516,7 +519,6 @@ def plates_structure(on: PlateOnEras) -> TouchedPlates:
         off=plate.by_stiffness.shape[1],
         rows=f,
         kept=kept,
-        load_std=plate.uncertainty.fingertip,
     )
     found.point(
         **{name: getattr(on, name) for name in _OF_CASES},

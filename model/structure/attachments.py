@@ -33,7 +33,7 @@ from numpy.polynomial.legendre import leggauss
 from numpy.typing import NDArray
 from scipy import sparse
 
-from model.arrays import ComplexArray, FloatArray
+from model.arrays import ComplexArray, FloatArray, Point
 from model.errors import InputError, expect_values
 from model.structure.plate import Plate
 
@@ -258,7 +258,16 @@ def damping_from_ratio(
 
 
 MIN_LOAD, MAX_LOAD = 0.1, 10.0
-"""Of a contact relative to the rig's fingertip; beyond, no finger is meant."""
+"""Of a finger relative to the rig's fingertip."""
+
+MAX_HAND_LOAD = 40.0
+"""Of a hand that rests (`HAND_LOAD`); a load above MAX_LOAD is a hand's."""
+
+HAND_STD = 1.1
+"""Standard deviation of the logarithm of the load of each patch of a hand, a factor of 3."""
+
+HAND_PATCHES = ((-0.0125, -0.0125), (0.0125, -0.0125), (-0.0125, 0.0125), (0.0125, 0.0125))
+"""Patches on which a hand rests, each with a quarter of its load, from its middle [m]."""
 
 
 @dataclass(frozen=True)
@@ -307,6 +316,12 @@ class Fingertip:
             contact_mass=factor * self.contact_mass,
         )
 
+    def under(self, load: float) -> "Fingertip":
+        """A finger of a load, or a patch of a hand of it, whose mass behind is larger, too."""
+        if load <= MAX_LOAD:
+            return self.scaled(load)
+        return self.multiplied(load / len(HAND_PATCHES))
+
     def multiplied(self, factor: float) -> "Fingertip":
         """The fingertip with a dynamic stiffness larger by a factor at every frequency."""
         return Fingertip(**{key: factor * value for key, value in asdict(self).items()})
@@ -326,14 +341,37 @@ class FingertipLoad:
         return self.fingertip.dynamic_stiffness(omega)
 
 
-def check_loads(loads: Iterable[float]) -> None:
-    """Raise InputError for a load, relative to a fingertip, that no finger has."""
+def check_loads(loads: Iterable[float], *, highest: float = MAX_LOAD) -> None:
+    """Raise InputError for a load, relative to a fingertip, that no finger has.
+
+    highest: MAX_HAND_LOAD where hands may rest.
+    """
     for load in loads:
-        if not MIN_LOAD <= load <= MAX_LOAD:  # False for NaN
+        if not MIN_LOAD <= load <= highest:  # False for NaN
             raise InputError(
-                f"load must be between {MIN_LOAD:g} and {MAX_LOAD:g} times the rig's fingertip, "
+                f"load must be between {MIN_LOAD:g} and {highest:g} times the rig's fingertip, "
                 f"got {load}"
             )
+
+
+def with_patches(
+    contacts: Sequence[Point], loads: Sequence[float], size: Point
+) -> tuple[list[Point], list[float]]:
+    """Return places [m] and loads of contacts on a plate of a size [m], hands by their patches.
+
+    The first patch of a hand takes its place, the others follow all contacts.
+    """
+    places, by = [*contacts], [*loads]
+    for number, ((x, y), load) in enumerate(zip(contacts, loads, strict=True)):
+        if load > MAX_LOAD:
+            patches = [
+                (min(max(x + a, 0.0), size[0]), min(max(y + b, 0.0), size[1]))
+                for a, b in HAND_PATCHES
+            ]
+            places[number] = patches[0]
+            places += patches[1:]
+            by += [load] * len(patches[1:])
+    return places, by
 
 
 def fingertip_loads(
@@ -347,7 +385,7 @@ def fingertip_loads(
     """
     if fingertip is None:
         return []
-    tips = [fingertip.scaled(load) for load in loads] or [fingertip] * len(contacts)
+    tips = [fingertip.under(load) for load in loads] or [fingertip] * len(contacts)
     return [FingertipLoad(*at, tip) for at, tip in zip(contacts, tips, strict=True)]
 
 

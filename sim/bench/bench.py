@@ -41,7 +41,15 @@ from model.arrays import FloatArray
 from model.fem import Mesh
 from model.reduction.reduced_plate import ReducedPlate, reduce_plate
 from model.rig.rig import Rig
-from model.structure.attachments import FingertipLoad, PointLoad, Source, check_loads, footprints_of
+from model.structure.attachments import (
+    MAX_HAND_LOAD,
+    MAX_LOAD,
+    FingertipLoad,
+    PointLoad,
+    Source,
+    check_loads,
+    footprints_of,
+)
 from model.structure.plate import Plate
 from model.transients.base_motion import Motion
 from registry import threads
@@ -498,7 +506,7 @@ class Bench:
         The amplifiers go on; the plate waits at this time until `unsolved` is solved or read.
         """
         self._fingers.check(positions)
-        check_loads(loads.values())
+        check_loads(loads.values(), highest=MAX_HAND_LOAD)
         self.advance(now)
         self.observers = frozenset(observers) & positions.keys()
         self.loads = {name: load for name, load in loads.items() if name in positions}
@@ -580,14 +588,13 @@ class Bench:
         fingertip = self.rig.fingertip
         if fingertip is None:
             return {}
-        return {
-            name: FingertipLoad(
-                *at,
-                self.imperfections.load_of(name, fingertip.scaled(self.loads.get(name, 1.0))),
-            )
-            for name, at in positions.items()
-            if name not in self.observers
-        }
+        found = dict[str, FingertipLoad]()
+        for name, at in positions.items():
+            if name not in self.observers:
+                load = self.loads.get(name, 1.0)  # a hand acts at a point here
+                tip = (fingertip.scaled if load <= MAX_LOAD else fingertip.multiplied)(load)
+                found[name] = FingertipLoad(*at, self.imperfections.load_of(name, tip))
+        return found
 
     def _sample_plate(self, until: float = math.inf, *, solves: bool = True) -> None:
         """Advance the plate to a time [s] or the present one.

@@ -20,10 +20,12 @@ from model.answer.tone_search import choose_tones
 from model.cli import app
 from model.errors import InputError
 from model.finger import detection_threshold
+from model.structure.attachments import HAND_PATCHES, HAND_STD
 from model.study.verification import Plates, draw_plates, harmonics_on, powers_on
 from model.table.table import read_fingertips
 from model.table.table_file import build_table, save_table
 from plates import SMALL_TABLE_HZ, contact_sets, smooth_rig, smooth_table
+from registry.limits import HAND_LOAD
 from set_table import drives, only, wants
 from set_table import phased as answer
 
@@ -31,10 +33,12 @@ NEAR, FAR, THIRD, FOURTH = (0.09, 0.07), (0.25, 0.18), (0.05, 0.19), (0.24, 0.06
 QUIET = (0.16, 0.20)
 
 
-def given(table, found, quiet, plates):
+def given(table, found, quiet, plates, loads=None):
     """Contrast of each finger (fingers, d) as amplitudes, contents first, on exact plates."""
+    loads = loads or (1.0,) * len(quiet)
     layers = found.layers
-    placed = Placement(tuple(each.at for each in found.asked if each.stimulus), tuple(quiet))
+    own = tuple(each.at for each in found.asked if each.stimulus)
+    placed = Placement(own, tuple(quiet), (1.0,) * len(own) + loads)
     tips = read_fingertips(table, placed.contacts)
     count, points = tips.fine_weights.shape
     powers = []
@@ -106,6 +110,43 @@ def test_figures_as_modelled_are_those_of_the_exact_plate():
     contrast, level = given(table, found, [QUIET], as_modelled(4))
     assert [each.contrast_db for each in found.fingers] == pytest.approx(contrast[:, 0], abs=0.02)
     assert [each.level_db_sl for each in found.fingers[:3]] == pytest.approx(level[:, 0], abs=0.02)
+
+
+HAND = (0.17, 0.13)
+
+
+def test_a_hand_that_rests_is_counted_and_not_protected():
+    """Beside four patches 25 mm apart, a quarter of twelve fingertips each, solved exactly.
+
+    Its weight costs contrast, which is promised, and nine of ten plates keep it, though the load of
+    each patch is known within a factor of three; without it they do not.
+    """
+    table, patches = smooth_table(), [(HAND[0] + x, HAND[1] + y) for x, y in HAND_PATCHES]
+    fingers, loads = [wants(NEAR, level_db_sl=12), wants(FAR, level_db_sl=12)], (HAND_LOAD,) * 4
+    found = answer(table, fingers, [Finger(HAND, load=HAND_LOAD)], min_contrast_db=-99)
+    nominal, _ = given(table, found, patches, as_modelled(6), loads)
+    assert [each.contrast_db for each in found.fingers[:2]] == pytest.approx(
+        nominal[:2, 0], abs=0.02
+    )
+    assert found.fingers[2].foreign_level_db_sl is found.fingers[2].contrast_db is None
+    rng = np.random.default_rng(3)
+    plates = draw_plates(rng, table.uncertainty, of=table, count=300, contact_count=6)
+    pressed = np.exp(HAND_STD * rng.standard_normal((300, 4)))
+    plates = replace(plates, load=np.concatenate([plates.load[:, :2], pressed], axis=1))
+    unaware = answer(table, fingers, min_contrast_db=-99)
+    kept = [
+        (given(table, each, patches, plates, loads)[0][:2].min(axis=0) >= each.promised_worst_db)
+        for each in (found, unaware)
+    ]
+    assert 0.84 <= kept[0].mean() <= 0.97
+    assert kept[1].mean() < 0.8
+
+
+def test_a_hand_has_no_stimulus():
+    """Loads above ten fingertips are those of hands, which are to feel nothing."""
+    fingers = [Finger(NEAR, Stimulus(12), load=HAND_LOAD)]
+    with pytest.raises(InputError, match=r"between 0\.1 and 10 times"):
+        answer(smooth_table(), fingers)
 
 
 def test_drive_mode_of_the_table_is_obeyed():

@@ -1,0 +1,257 @@
+"""Whether promises are kept beside a hand that rests, under fingers that press, and by a person.
+
+    python -m benchmarks.promise.everyday [--sets 20] [--plates 60] [--only WORD ...] [--rigs N ...]
+
+Two contents of 14 dB SL at fingers at least 5 cm apart, on plates solved exactly and drawn within
+the uncertainty of a rig. The heel of a hand is four patches 25 mm apart, whose loads together are
+so many fingertips'; the hand that is far is one. Each row: the promise at the worst finger (median,
+worst tenth) [dB], share of the promises that is kept, and what nine of ten plates lack to it [dB].
+"""
+
+import argparse
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+from benchmarks.setting import use_one_thread
+from controller.sources.touch import LIGHT_FORCE
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from model.answer.answer import Answer
+    from model.arrays import FloatArray, Point
+    from model.study.verification import Plates
+    from model.table.table import LocalizationTable
+
+RIGS = (("paper_plate", False), ("paper_plate", True), ("car_display", True))
+PATCH = 0.0125  # m; of a patch of the heel from its middle, along x and along y
+OH_AND_CHOI = ((40.0, 3.5), (250.0, -7.0))
+"""Thresholds of pressing fingers above those of the probe, by frequency [Hz] in dB."""
+STUDIED = (40.0, 100.0, 250.0, 500.0)
+"""Frequencies [Hz] at which a person deviates from the mean on their own, by 4 dB."""
+
+
+@dataclass(frozen=True)
+class Situation:
+    """What differs from what the answer counts.
+
+    hand: how many fingertips' load it has, 0 for none; distance [m]: of its middle from the nearer
+    finger, 0 for the corner farthest from both; is_counted: whether the answer counts a hand there;
+    force [N]: of all fingers; person: how their thresholds differ; fingertip: of the uncertainty
+    that the answer counts, None for that of the rig.
+    """
+
+    name: str
+    hand: float = 0.0
+    distance: float = 0.0
+    force: float = LIGHT_FORCE
+    person: str = ""
+    is_counted: bool = True
+    fingertip: float | None = None
+
+
+def situations() -> Iterator[Situation]:
+    """The rows of a rig."""
+    yield Situation("as asked")
+    for load, distance, where in (
+        (20, 0.09, "9 cm away"),
+        (5, 0.09, "9 cm away"),
+        (10, 0.0, "far"),
+    ):
+        for is_counted in (False, True):
+            known = "seen" if is_counted else "unseen"
+            yield Situation(
+                f"hand of {load} fingertips, {where}, {known}",
+                load,
+                distance,
+                is_counted=is_counted,
+            )
+    for newtons in (0.3, 1.0, 2.0, 3.0):
+        yield Situation(f"force of {newtons:g} N", force=newtons)
+        yield Situation(f"force of {newtons:g} N, fingertip: 0.9", force=newtons, fingertip=0.9)
+    yield Situation("person, as Oh and Choi 2019", person="tilted")
+    yield Situation("person, 4 dB at four frequencies", person="drawn")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.promise.everyday",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--sets", type=int, default=20)
+    parser.add_argument("--plates", type=int, default=60)
+    parser.add_argument("--only", nargs="+", default=[""], help="words in the names of rows")
+    parser.add_argument("--rigs", nargs="+", type=int, default=[*range(len(RIGS))])
+    options = parser.parse_args()
+    use_one_thread()
+    import numpy as np
+
+    from benchmarks.promise.cases import Case
+
+    print("| rig | | promised (10 %) | kept | nine of ten lack |\n|---|---|---|---|---|")
+    for name, known in [RIGS[number] for number in options.rigs]:
+        case = Case("", None, name, is_identified=known)
+        title = f"{len(case.rig.eras)} {'identified' if known else 'default'}"
+        for each in situations():
+            if not any(word in each.name for word in options.only):
+                continue
+            promised, above = [], []
+            for seed in range(options.sets):
+                rng = np.random.default_rng([seed, 14])
+                found, plates = _row(case.table, each, rng, options.plates)
+                worst = min(x.promised_contrast_db or np.nan for x in found.fingers[:2])
+                promised.append(worst)
+                above.append(plates)
+            below = -np.percentile(np.concatenate(above, axis=1), 10)
+            print(
+                f"| {title} | {each.name} | {np.median(promised):.1f} "
+                f"({np.percentile(promised, 10):.1f}) | "
+                f"{100 * np.mean(np.array(above) >= 0):.0f} % | {below:+.1f} |",
+                flush=True,
+            )
+
+
+def _row(
+    table: "LocalizationTable", of: Situation, rng: "np.random.Generator", count: int
+) -> "tuple[Answer, FloatArray]":
+    """An answer, and by how much plates are above its promises (2, d) [dB]."""
+    import numpy as np
+
+    from benchmarks.setting import random_contacts
+    from model.answer.plan import answer
+    from model.answer.stimulus import Finger, Stimulus
+    from model.finger import FINGERTIP_RADIUS
+    from model.study.verification import draw_plates
+    from registry.limits import HAND_LOAD
+
+    size = table.plate.length, table.plate.width
+    margin = FINGERTIP_RADIUS + 0.001
+    hand: Point | None = None
+    while True:
+        places = [(float(x), float(y)) for x, y in random_contacts(rng, 2, size, margin=margin)]
+        if not of.hand:
+            break
+        if (hand := _hand_at(rng, places, size, of.distance)) is not None:
+            break
+    if of.fingertip is not None:
+        table = replace(table, uncertainty=replace(table.uncertainty, fingertip=of.fingertip))
+    fingers = [Finger(at, Stimulus(14.0)) for at in places]
+    quiet = [Finger(hand, load=HAND_LOAD)] if hand is not None and of.is_counted else []
+    found = answer(table, [*fingers, *quiet], drive_mode="phased", min_contrast_db=-np.inf)
+    patches = _patches(hand, of, size)
+    plates = draw_plates(
+        rng,
+        replace(
+            table.uncertainty, fingertip=0.0 if of.force != 0.5 else table.uncertainty.fingertip
+        ),
+        of=table,
+        count=count,
+        contact_count=2 + len(patches),
+    )
+    promised = np.array([x.promised_contrast_db for x in found.fingers[:2]], dtype=float)
+    contrasts = contrasts_on(table, found, plates, of, patches, rng)
+    return found, contrasts - promised[:, None]
+
+
+def _hand_at(
+    rng: "np.random.Generator",
+    places: "Sequence[Point]",
+    size: tuple[float, float],
+    distance: float,
+) -> "Point | None":
+    """Where a hand rests: so far from the nearer finger, or in the corner farthest from both."""
+    import numpy as np
+
+    margin = 2 * PATCH
+    if not distance:
+        corners = [(x, y) for x in (margin, size[0] - margin) for y in (margin, size[1] - margin)]
+        return max(corners, key=lambda at: min(np.hypot(*np.subtract(at, p)) for p in places))
+    for _ in range(100):
+        angle = rng.uniform(0, 2 * np.pi)
+        x, y = np.array(places[0]) + distance * np.array([np.cos(angle), np.sin(angle)])
+        is_on = margin <= x <= size[0] - margin and margin <= y <= size[1] - margin
+        if is_on and np.hypot(x - places[1][0], y - places[1][1]) >= distance:
+            return float(x), float(y)
+    return None
+
+
+def _patches(
+    hand: "Point | None", of: Situation, size: tuple[float, float]
+) -> "list[tuple[Point, float]]":
+    """Places of a hand's patches, with their loads."""
+    if hand is None:
+        return []
+    x, y = hand
+    if not of.distance:
+        return [(hand, of.hand)]
+    return [((x + a, y + b), of.hand / 4) for a in (-PATCH, PATCH) for b in (-PATCH, PATCH)]
+
+
+def contrasts_on(
+    table: "LocalizationTable",
+    found: "Answer",
+    plates: "Plates",
+    of: Situation,
+    patches: "list[tuple[Point, float]]",
+    rng: "np.random.Generator",
+) -> "FloatArray":
+    """Contrast [dB] of both fingers to the other's content on plates solved exactly, (2, d).
+
+    The least over all sets of thresholds; by those of a person if there is one.
+    """
+    import numpy as np
+
+    from model.finger import decibels
+    from model.structure.attachments import Fingertip, FingertipLoad
+    from model.study.verification import accelerations_on
+    from model.table.table import read_fingertips
+    from model.vibration import base_amplitudes
+
+    tip, places = table.fingertip or Fingertip(), [each.at for each in found.asked[:2]]
+    pressed = tip.scaled((of.force / LIGHT_FORCE) ** (2 / 3))
+    loads = [FingertipLoad(*at, pressed) for at in places]
+    loads += [FingertipLoad(*at, tip.multiplied(load)) for at, load in patches]
+    tips = read_fingertips(table, [*places, *[at for at, _ in patches]])
+    shares, discs = tips.fine_weights[:2], tips.fine.astype(float)
+    count = len(plates.thickness)
+    sets = [*range(len(table.threshold_sets))]
+    power = np.zeros((len(sets), 2, 2, discs.shape[1], count))  # set, layer, finger, point, plate
+    offsets = rng.normal(scale=4.0, size=(count, len(STUDIED)))
+    for number, layer in enumerate(found.layers):
+        hertz, bases = base_amplitudes(layer.excitation, table.eras)
+        rows = table.rows_of(hertz)
+        at = discs, loads
+        one = accelerations_on(table, *at, table.attached, rows, bases[:, None], plates)
+        distorted = replace(plates, gain=plates.gain * plates.harmonic)
+        twice = table.at_harmonics.plate
+        two = accelerations_on(table, *at, twice, rows, bases[:, None], distorted)
+        errors = np.abs(bases) / table.highest_drives[rows]
+        error = np.sqrt((table.field_error_power[rows] * errors**2).sum(axis=1))
+        one = one[:, :, 0].reshape(count, len(rows), len(loads), -1)
+        one = one + plates.deviation[:, None, :, None] * error[None, :, None, None]
+        two = two[:, :, 0].reshape(count, len(rows), len(loads), -1)
+        person = np.zeros(count)
+        if of.person == "tilted":
+            f, db = np.log(np.array(OH_AND_CHOI).T[0]), np.array(OH_AND_CHOI).T[1]
+            person += np.interp(np.log(hertz[0]), f, db)
+        elif of.person == "drawn":
+            at_f = np.log(hertz[0])
+            person += [np.interp(at_f, np.log(STUDIED), each) for each in offsets]
+        for s in sets:
+            by = (table.thresholds / table.sensitivities[s])[rows]
+            by_two = (table.compared_harmonic_thresholds / table.harmonic_sensitivities[s])[rows]
+            total = (np.abs(one) ** 2 / by[None, :, None, None] ** 2).sum(axis=1)
+            total += (np.abs(two) ** 2 / by_two[None, :, None, None] ** 2).sum(axis=1)
+            power[s, number] = (total / 10 ** (person / 10)[:, None, None]).transpose(1, 2, 0)[:2]
+    contrast = []
+    for s in sets if not of.person else [0]:
+        own = [shares[k] @ np.sqrt(power[s, k, k]) for k in range(2)]
+        other = [np.sqrt(power[s, 1 - k, k].max(axis=0)) for k in range(2)]
+        contrast.append(decibels(np.array(own) / np.array(other)))
+    return np.asarray(np.min(contrast, axis=0))
+
+
+if __name__ == "__main__":
+    main()

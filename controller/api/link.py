@@ -144,7 +144,7 @@ def touches_at(positions: Iterable[tuple[float, float]]) -> list[TouchPoint]:
             f"touch: positions must be a list of x, y in metres, got {shown(positions)}"
         )
     return [
-        TouchPoint(id=id, x_m=x, y_m=y)
+        TouchPoint(id=id, x_m=x, y_m=y, radius_m=None)
         for id, (x, y) in enumerate(map(as_position, positions), start=1)
     ]
 

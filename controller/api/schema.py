@@ -149,6 +149,9 @@ class TouchPoint(ApiMessage):
     )
     x_m: float = Field(description="from the plate's south-west corner")
     y_m: float = Field(description="from the plate's south-west corner, upwards")
+    radius_m: float | None = Field(
+        None, description="of the contact, where it is known; a hand rests from 12.5 mm on"
+    )
 
 
 class TouchInputStatus(ApiMessage):
@@ -172,8 +175,10 @@ class ContactStatus(ApiMessage):
     id: int
     x_m: float
     y_m: float
-    role: Literal["target", "quiet"] | None = Field(
-        None, description="whether it is to feel the pattern; null before the first decision"
+    role: Literal["target", "quiet", "hand"] | None = Field(
+        None,
+        description="whether it is to feel the pattern, or is a hand that rests, whose load alone "
+        "counts; null before the first decision",
     )
     level_db_sl: float | None = Field(
         None, description="predicted sensation level of a target; null if unknown"

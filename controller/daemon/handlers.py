@@ -56,7 +56,7 @@ from controller.operation.operation_states import (
 from controller.operation.supervisor import LEASE_OVER, Supervisor
 from controller.play.intent import MAX_DB_SL
 from controller.play.loop import Controller
-from controller.sources.touch import Contact, Touch, TouchFrame
+from controller.sources.touch import LIGHT_MAJOR, Contact, LightPress, Touch, TouchFrame
 from drivers.host.dialogue import StopOutcome
 from model.compiled.kernels import why_slow
 from model.errors import InputError
@@ -67,6 +67,9 @@ from registry.plugins import did_you_mean
 from registry.threads import in_thread
 
 _logger = logging.getLogger(__name__)
+
+BY_RADIUS = LightPress(touch_major=LIGHT_MAJOR)
+"""What the radius of a contact over the API says of its load."""
 
 PLAY_RADIUS = 0.020
 """Largest distance [m] from the position of a requested effect to the finger that feels it."""
@@ -285,7 +288,12 @@ class ApiService:
             self._clients.add(client)
         plate, origin = self._config.rig.plate, _origin(client)
         touches = tuple(
-            Touch(point.id, point.x_m / plate.length, 1 - point.y_m / plate.width)
+            Touch(
+                point.id,
+                point.x_m / plate.length,
+                1 - point.y_m / plate.width,
+                BY_RADIUS.load(pressure=0.0, touch_major=2e3 * (point.radius_m or 0.0)),
+            )
             for point in params.touches
         )
         # The same source name of two clients denotes two sources.

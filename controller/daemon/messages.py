@@ -380,6 +380,8 @@ def _contact_status(
             "foreign_level_db_sl": _finite(highest),
             "is_foreign_felt": is_felt(highest),
         }
+    if contact.is_hand:
+        status |= {"role": "hand", "held_back": None, "is_foreign_felt": False}
     return ContactStatus.model_validate(status)
 
 

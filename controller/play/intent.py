@@ -19,6 +19,7 @@ from model.answer.answer import HELD_BACK, MIXED, OWN, Layer, is_felt, verdict_o
 from model.answer.stimulus import SHAPED_FROM, Course, Placement
 from model.arrays import FloatArray, best_of
 from model.finger import STRONG_DB_SL, detection_threshold, fingertips_on
+from model.structure.attachments import with_patches
 from model.table.table import LocalizationTable
 
 _MIN_WAIT = 0.001  # s
@@ -475,11 +476,11 @@ def leaks_db_sl(
     if not contacts:  # lifted, while what plays is not known to have ended
         return {}
     places = [(each.x, each.y) for each in contacts]
-    loads = [each.load for each in contacts]
     length, width = table.plate.length, table.plate.width
+    resting = with_patches(places, [each.load for each in contacts], (length, width))
     points, _ = fingertips_on(np.array(places), length=length, width=width)
     power = np.zeros(points.shape[:2])  # by contact and point
-    fields = table.unit_fields(points.reshape(-1, 2), contacts=places, loads=loads)
+    fields = table.unit_fields(points.reshape(-1, 2), contacts=resting[0], loads=resting[1])
     for content in contents:
         frequencies, felt = table.driven(content.layer.excitation, fields)
         sensed = np.abs(felt) / detection_threshold(frequencies, table.threshold)[:, None]

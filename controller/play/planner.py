@@ -266,7 +266,8 @@ class Planner:
                 return self._go_on(before, now)
             self._seen = contacts
             self._intent_due = math.inf
-            intent = self._intent_source.intent(contacts, now)
+            fingers = tuple([each for each in contacts if not each.is_hand])
+            intent = self._intent_source.intent(fingers, now)
             self._intent_due = intent.due(now)
             chosen = self._selector.select(contacts, intent, self.capabilities, now=now)
             selected = chosen.weakened(intent.gains_db)

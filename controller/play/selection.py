@@ -349,7 +349,8 @@ def _is_met_by(intended: Question, chosen: Selection) -> bool:
     if not (had and (requested == had or (requested < had and is_whole))):
         return False
     now = {each.key: each for each in intended.contacts}
-    same = now.keys() <= then.keys() if is_whole else now.keys() == then.keys()
+    hands = {key for key, contact in then.items() if contact.is_hand}
+    same = hands <= now.keys() <= then.keys() if is_whole else now.keys() == then.keys()
     follows = not intended.is_alone
     return same and all(
         math.dist((contact.x, contact.y), (then[key].x, then[key].y)) <= MOVE_TOLERANCE

@@ -31,6 +31,7 @@ from controller.sources.touch import (
     number_option,
 )
 from model.errors import InputError
+from registry.limits import HAND_LOAD
 
 TYPE_A = (
     "multi-touch protocol must be type B (slots), got type A, which does not say which contact is "
@@ -43,7 +44,7 @@ SYN_REPORT, SYN_MT_REPORT, SYN_DROPPED = 0, 2, 3
 ABS_X, ABS_Y, ABS_PRESSURE, BTN_TOUCH = 0x00, 0x01, 0x18, 0x14A
 ABS_MT_SLOT, ABS_MT_POSITION_X, ABS_MT_POSITION_Y, ABS_MT_TRACKING_ID = 0x2F, 0x35, 0x36, 0x39
 ABS_MT_TOUCH_MAJOR, ABS_MT_TOOL_TYPE, ABS_MT_PRESSURE, ABS_MT_DISTANCE = 0x30, 0x37, 0x3A, 0x3B
-MT_TOOL_FINGER = 0  # others are a pen, a palm, a dial
+MT_TOOL_FINGER, MT_TOOL_PALM = 0, 2  # others are a pen, a dial
 
 Range: TypeAlias = tuple[int, int]  # lowest and highest value of an axis
 InputEvent: TypeAlias = tuple[float, int, int, int]
@@ -90,7 +91,7 @@ class SlotState:
     """None until reported, as y."""
     y: int | None = None
     tool: int = MT_TOOL_FINGER
-    """Palms and pens are no fingers."""
+    """Palms are hands, pens are no touches."""
     distance: int = 0
     """Above 0 while hovering."""
     pressure: int = 0
@@ -113,8 +114,8 @@ class SlotReader:
     """Decodes events into reports, without I/O.
 
     A contact appears once both its coordinates are known. A slot keeps the coordinates of its last
-    contact, since the kernel omits values that did not change. Palms, pens and hovering fingers are
-    no touches: a finger that becomes a palm is lifted. ranges: of the axes ABS_MT_POSITION_X and
+    contact, since the kernel omits values that did not change. Pens and hovering fingers are no
+    touches; a palm is a hand that rests, with its load. ranges: of the axes ABS_MT_POSITION_X and
     _Y; light_press: values of force and size under a finger that presses lightly.
     """
 
@@ -177,13 +178,15 @@ class SlotReader:
         """Return the touch in a slot, None unless a finger with known coordinates is there."""
         if slot.tracking_id < 0 or slot.x is None or slot.y is None:
             return None
-        if slot.tool != MT_TOOL_FINGER or slot.distance > 0:
+        if slot.tool not in (MT_TOOL_FINGER, MT_TOOL_PALM) or slot.distance > 0:
             return None
         return Touch(
             slot.tracking_id,
             self._share(ABS_MT_POSITION_X, slot.x),
             self._share(ABS_MT_POSITION_Y, slot.y),
-            self._light_press.load(pressure=slot.pressure, touch_major=slot.touch_major),
+            HAND_LOAD
+            if slot.tool == MT_TOOL_PALM
+            else self._light_press.load(pressure=slot.pressure, touch_major=slot.touch_major),
         )
 
     def _share(self, code: int, value: int) -> float:

@@ -27,7 +27,7 @@ from urllib.parse import parse_qsl
 
 from model.errors import InputError
 from registry import threads
-from registry.limits import MAX_CONTACTS
+from registry.limits import HAND_LOAD, MAX_CONTACTS
 from registry.plugins import PluginRegistry
 
 if TYPE_CHECKING:  # numpy is slow to import
@@ -84,7 +84,7 @@ class Touch:
     """0..1 downwards."""
     load: float | None = None
     """Load on the plate relative to the rig's fingertip, not bounded; None where nothing is
-    reported."""
+    reported, HAND_LOAD of a hand that rests."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -268,6 +268,9 @@ They are two standard deviations of the rig's default `uncertainty` of a load. R
 say more about the panel than about the finger.
 """
 
+MAX_FINGER_MAJOR = 25.0
+"""Longer axis [mm] of a contact beyond which it is a hand: the largest of fingers have 20 mm."""
+
 LANDING = 0.1
 """Time [s] after which a finger that lands has its area of contact; loads before it are ignored."""
 
@@ -290,8 +293,10 @@ class LightPress:
     def load(self, *, pressure: float, touch_major: float) -> float | None:
         """Return the load of a contact with these values, not bounded; force is preferred.
 
-        None without a positive value of an axis.
+        None without a positive value of an axis, HAND_LOAD for what is larger than a finger.
         """
+        if touch_major > (self.touch_major or math.inf) * MAX_FINGER_MAJOR / LIGHT_MAJOR:
+            return HAND_LOAD
         if self.pressure is not None and pressure > 0:
             return float((pressure / self.pressure) ** _BY_FORCE)
         if self.touch_major is not None and touch_major > 0:
@@ -304,8 +309,7 @@ def followed(known: float, reported: float) -> float:
     if not reported > 0:  # NaN is not
         return known
     bounded = min(max(reported, MIN_REPORTED), MAX_REPORTED)
-    change = max(bounded / known, known / bounded)
-    return bounded if change >= MIN_CHANGE else known
+    return bounded if max(bounded / known, known / bounded) >= MIN_CHANGE else known
 
 
 OVER = 0.060
@@ -419,6 +423,11 @@ class Contact:
     """Relative to the rig's fingertip, bounded and in steps; 1 where nothing is reported."""
     motion: Motion = field(default=AT_REST, compare=False)
     """Its recent way."""
+
+    @property
+    def is_hand(self) -> bool:
+        """Whether it is a hand that rests: its load is on the plate, and it feels nothing."""
+        return self.load >= HAND_LOAD
 
 
 @dataclass(frozen=True, slots=True)
@@ -557,12 +566,15 @@ class ContactTracker:
     ) -> Contact:
         """Return the contact of a touch, down since a time [s] unless it is known.
 
-        One whose panel stops reporting loads keeps its own.
+        One whose panel stops reporting loads keeps its own; a hand is one until it is lifted, so
+        that what is left of it as it lifts is no finger.
         """
         since, load = (time, 1.0) if known is None else (known.since, known.load)
+        x, y = touch.x * self._plate.length, (1 - touch.y) * self._plate.width
+        if load >= HAND_LOAD or touch.load == HAND_LOAD:
+            return Contact(key, x, y, since, HAND_LOAD)
         if touch.load is not None and time - since >= LANDING:
             load = followed(load, touch.load)
-        x, y = touch.x * self._plate.length, (1 - touch.y) * self._plate.width
         motion = AT_REST if known is None else known.motion
         return Contact(key, x, y, since, load, motion.followed(time, x, y))
 
@@ -604,8 +616,12 @@ def _source_of(frame: TouchFrame) -> _Source:
     timeout = frame.timeout
     if timeout is None or not 0 < timeout <= MAX_CONTACT_TIMEOUT:  # NaN is not
         timeout = CONTACT_TIMEOUT
-    origin = frame.source if frame.origin is None else frame.origin
-    return _Source(frame.time, timeout, frame.time + timeout, origin)
+    return _Source(
+        frame.time,
+        timeout,
+        frame.time + timeout,
+        frame.source if frame.origin is None else frame.origin,
+    )
 
 
 def _valid_touches(

@@ -415,8 +415,8 @@ export interface ContactStatus {
   id: number;
   x_m: number;
   y_m: number;
-  /** whether it is to feel the pattern; null before the first decision */
-  role?: "target" | "quiet" | null;
+  /** whether it is to feel the pattern, or is a hand that rests, whose load alone counts; null before the first decision */
+  role?: "target" | "quiet" | "hand" | null;
   /** predicted sensation level of a target; null if unknown */
   level_db_sl?: number | null;
   /** felt contrast, target over loudest quiet finger, that nine of ten plates within the rig's uncertainty give; null for a single finger */
@@ -551,6 +551,8 @@ export interface TouchPoint {
   x_m: number;
   /** from the plate's south-west corner, upwards */
   y_m: number;
+  /** of the contact, where it is known; a hand rests from 12.5 mm on */
+  radius_m?: number | null;
 }
 
 /** An effect that `play` accepts. */

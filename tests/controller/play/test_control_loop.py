@@ -47,6 +47,7 @@ from model.config.fields import Rectangle
 from model.errors import InputError
 from model.rig.rig import Channel
 from plates import small_problem, small_table
+from registry.limits import HAND_LOAD
 from set_table import BuzzNewestContact, SetTiming
 from several_fingers import (
     ABOVE,
@@ -92,6 +93,23 @@ async def test_controller_decides_anew_for_a_load_that_doubles_not_for_one_that_
             assert len(chain.table.asked) == decisions
         asked = [tuple(each.load for each in fingers) for fingers in chain.table.asked]
     assert asked == [(1.0, 1.0), (pytest.approx(2 / 1.15), 1.0), (pytest.approx(1.2 / 1.15), 1.0)]
+
+
+@in_virtual_time
+async def test_a_hand_is_asked_for_with_its_load_and_feels_nothing() -> None:
+    """The newest contact is to buzz: a hand that comes after a finger is none of those."""
+
+    def touch(*hands: float) -> None:
+        touches = (Touch(1, 0.5, 0.5), *(Touch(2, 0.9, 0.9, load=each) for each in hands))
+        chain.deliver(TouchFrame("panel", now(), touches))
+
+    async with set_running() as chain:
+        for hands in ((), (HAND_LOAD,), ()):
+            for _ in range(10):
+                touch(*hands)
+                await asyncio.sleep(0.01)
+        asked = [[(each.load, each.stimulus is None) for each in one] for one in chain.table.asked]
+    assert asked == [[(1.0, False)], [(1.0, False), (HAND_LOAD, True)], [(1.0, False)]]
 
 
 @in_virtual_time

@@ -37,6 +37,7 @@ from model.table.table import LocalizationTable
 from model.transients.base_motion import BaseEnvelope
 from model.vibration import Excitation, Tone
 from plates import small_table
+from registry.limits import HAND_LOAD
 from set_table import SetTiming, set_answer
 from virtual_lines import in_virtual_time
 
@@ -250,6 +251,11 @@ COURSES: Mapping[str, Sequence[Chosen]] = {
     "a quiet contact lifts": [
         Chosen((ONE, TWO), wanting(c2=20.0), True),
         Chosen((TWO,), wanting(c2=20.0), False),
+    ],
+    # So is its load, without which the plate answers otherwise.
+    "a hand lifts": [
+        Chosen((loaded(ONE, HAND_LOAD), TWO), wanting(c2=20.0), True, loads=(1.0, HAND_LOAD)),
+        Chosen((TWO,), wanting(c2=20.0), True, loads=(1.0,)),
     ],
     # The reason is that of the table; contacts that change cause another query: without the quiet
     # one it might have been possible.

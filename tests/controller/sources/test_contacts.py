@@ -22,7 +22,7 @@ from controller.sources.touch import (
 )
 from model.structure.material import Material
 from model.structure.plate import Plate
-from registry.limits import MAX_CONTACTS
+from registry.limits import HAND_LOAD, MAX_CONTACTS
 
 PLATE = Plate(0.3, 0.2, 0.0015, Material("aluminium", 70e9, 2700.0, 0.33))
 
@@ -415,3 +415,16 @@ def test_a_finger_that_is_reported_no_more_rests() -> None:
     motion = moved(np.column_stack([0.2 * times, 0 * times]))
     assert motion.velocity(0.02)[0] == pytest.approx(0.2)
     assert motion.velocity(OVER) == (0.0, 0.0)
+
+
+def test_a_hand_is_one_until_it_is_lifted() -> None:
+    """A finger that becomes one has its load at once; what is left of it as it lifts is no finger.
+
+    It never moves by itself: its place counts as it is reported.
+    """
+    tracker, seen = ContactTracker(PLATE), []
+    for time, load in ((0.0, None), (0.01, HAND_LOAD), (0.02, 0.5), (0.5, None)):
+        tracker.update(TouchFrame("a", time, (Touch(1, 0.5 + time / 10, 0.5, load),)))
+        (contact,) = tracker.contacts
+        seen.append((contact.is_hand, contact.load, contact.motion.is_under_way))
+    assert seen == [(False, 1.0, False), *[(True, HAND_LOAD, False)] * 3]

@@ -34,6 +34,7 @@ from controller.sources.evdev import (
 )
 from controller.sources.touch import TouchFrame
 from model.errors import InputError
+from registry.limits import HAND_LOAD
 from virtual_lines import run_virtual
 
 EMPTY = SlotState(-1, 0, 0)
@@ -172,8 +173,8 @@ def test_evdev_source_repeats_resting_fingers() -> None:
     assert touches_of(seen) == [{}, *[{7: (0.0, 0.0)}] * 3, {}]
 
 
-def test_evdev_source_lifts_a_finger_that_becomes_a_palm() -> None:
-    """Palms, pens and what hovers over the panel are no touches, by events and by polling.
+def test_evdev_source_knows_palms_and_no_pens() -> None:
+    """Pens and what hovers are no touches, palms have a hand's load, by events and by polling.
 
     Tools 1 and 2 are a pen and a palm in the kernel's input-event-codes.h; a distance above zero is
     a hovering contact, by its multi-touch-protocol.rst.
@@ -192,12 +193,15 @@ def test_evdev_source_lifts_a_finger_that_becomes_a_palm() -> None:
         await asyncio.sleep(0.05)
 
     middle, corner = (0.5, 0.5), (0.25, 0.2)
-    assert touches_of(run_virtual(follow([panel], play))) == [
-        {},
-        *({5: middle}, {}, {}, {6: middle}, {}),
-        *({}, {}, {}, {9: corner}),
-        {},
+    seen = run_virtual(follow([panel], play))
+    assert touches_of(seen) == [
+        {5: middle},
+        *({5: middle}, {5: middle}, {}, {6: middle}, {}),
+        *({}, {7: corner}, {8: corner}, {9: corner}),
+        {9: corner},
     ]
+    loads = [touch.load for frame in seen for touch in frame.touches]
+    assert loads == [HAND_LOAD, None, HAND_LOAD, None, HAND_LOAD, HAND_LOAD, None, HAND_LOAD]
 
 
 @pytest.mark.parametrize(
@@ -211,6 +215,7 @@ def test_evdev_source_lifts_a_finger_that_becomes_a_palm() -> None:
         ("?light_pressure=0", {0x3A: 5, 0x35: 10}, 4.0),  # 188 units are 18.8 mm
         ("?light_major=94", {}, 4.0),
         ("", {0x35: 10, 0x30: 20}, 1.0),
+        ("", {0x35: 7, 0x3A: 5}, HAND_LOAD),  # 27 mm, whatever its force
     ],
 )
 def test_evdev_source_reports_loads(
@@ -453,7 +458,10 @@ SEQUENCES: dict[str, tuple[list[tuple[float, str]], Shown]] = {
             (2, "tool 2 slot 1 id 2 distance 5 x 200 y 0"),
             (3, "distance 0"),
         ],
-        [(0.0, {}), (1.0, {1: (0.1, 0.5)}), (2.0, {}), (3.0, {2: (0.2, 0.5)})],
+        [
+            *((time, {1: (0.1, 0.5)}) for time in (0.0, 1.0, 2.0)),
+            (3.0, {1: (0.1, 0.5), 2: (0.2, 0.5)}),
+        ],
     ),
     "two slots with one tracking id, and a negative slot": (
         [

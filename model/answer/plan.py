@@ -53,7 +53,7 @@ from model.arrays import NEARLY, FloatArray, Point, best_by, best_of
 from model.drive_modes import UNRESTRICTED, checked_mode
 from model.errors import InputError
 from model.finger import FELT_DB_SL, STRONG_DB_SL, decibels
-from model.structure.attachments import MAX_LOAD, with_patches
+from model.structure.attachments import with_patches
 from model.table.table import SAME_FREQUENCY, LocalizationTable
 
 MAX_SEPARATE = 5
@@ -429,9 +429,8 @@ class _Answering:
         rows = [{*range(*band)} for stream in streams for band in stream.bands]
         leaves_none = any(each <= self.avoided for each in rows)
         places, loads = [each.at for each in self.fingers], [each.load for each in self.fingers]
-        if max(loads) > MAX_LOAD:
-            size = self.table.plate.length, self.table.plate.width
-            places, loads = with_patches(places, loads, size)
+        size = self.table.plate.length, self.table.plate.width
+        places, loads = with_patches(places, loads, size)
         return Contents(
             tuple(places),
             tuple(loads),

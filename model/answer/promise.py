@@ -102,8 +102,9 @@ class FingersOnPlate:
             if by_kernel:
                 return touch(on, centres, loads, table.clocks)
             stiffness = on.plate.finger_stiffness(len(centres), loads)
-            stds = on.plate.load_stds(len(centres), loads)
-            return TouchedPlate(on, centres, stiffness, stds, table.clocks)
+            return TouchedPlate(
+                on, centres, stiffness, on.plate.load_stds(len(centres), loads), table.clocks
+            )
 
         has_harmonics = table.uncertainty.harmonic > 0
         twice = touched(table.at_harmonics) if has_harmonics else None

@@ -266,15 +266,14 @@ def check_on_plate(what: str, places: Iterable[Point], plate: Plate) -> None:
 
 def check_fingers(fingers: Sequence[Finger], plate: Plate) -> None:
     """Raise InputError for fingers that contradict each other or are not on the plate."""
-    hands = [finger.load for finger in fingers if finger.is_hand and finger.stimulus is None]
-    loads = [finger.load for finger in fingers if not finger.is_hand or finger.stimulus]
+    loads = [finger.load for finger in fingers]
     if all(finger.stimulus is None for finger in fingers):
         raise InputError("an answer must have at least one finger with a stimulus, got none")
     if len(fingers) > MAX_CONTACTS:
         raise InputError(f"an answer must have up to {MAX_CONTACTS} fingers, got {len(fingers)}")
     if loads.count(1.0) < len(loads):
-        check_loads(loads)
-    check_loads(hands, highest=MAX_HAND_LOAD)
+        check_loads([each.load for each in fingers if each.stimulus])
+        check_loads([each.load for each in fingers if not each.stimulus], highest=MAX_HAND_LOAD)
     check_on_plate("finger", [finger.at for finger in fingers], plate)
     for number, finger in enumerate(fingers):
         x, y = finger.at

@@ -227,8 +227,8 @@ def _with_fingers(table: LocalizationTable, fingers: int) -> _Fingers:
 
 def _stiffness(table: LocalizationTable, fingers: int, loads: tuple[float, ...] = ()) -> _Loads:
     """Return fingers' stiffness at a table's frequencies, at twice these, and deviations."""
-    attached = table.attached
-    stiffness, stds = attached.finger_stiffness(fingers, loads), attached.load_stds(fingers, loads)
+    stiffness = table.attached.finger_stiffness(fingers, loads)
+    stds = table.attached.load_stds(fingers, loads)
     if not table.uncertainty.harmonic:
         return stiffness, stiffness, stds
     return stiffness, table.at_harmonics.plate.finger_stiffness(fingers, loads), stds

@@ -318,9 +318,7 @@ class Fingertip:
 
     def under(self, load: float) -> "Fingertip":
         """A finger of a load, or a patch of a hand of it, whose mass behind is larger, too."""
-        if load <= MAX_LOAD:
-            return self.scaled(load)
-        return self.multiplied(load / len(HAND_PATCHES))
+        return self.scaled(load) if load <= MAX_LOAD else self.multiplied(load / len(HAND_PATCHES))
 
     def multiplied(self, factor: float) -> "Fingertip":
         """The fingertip with a dynamic stiffness larger by a factor at every frequency."""
@@ -364,13 +362,12 @@ def with_patches(
     places, by = [*contacts], [*loads]
     for number, ((x, y), load) in enumerate(zip(contacts, loads, strict=True)):
         if load > MAX_LOAD:
-            patches = [
+            places[number], *others = [
                 (min(max(x + a, 0.0), size[0]), min(max(y + b, 0.0), size[1]))
                 for a, b in HAND_PATCHES
             ]
-            places[number] = patches[0]
-            places += patches[1:]
-            by += [load] * len(patches[1:])
+            places += others
+            by += [load] * len(others)
     return places, by
 
 

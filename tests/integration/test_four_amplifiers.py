@@ -279,6 +279,7 @@ TILE = "document.querySelector('.tile')?.innerText ?? ''"
 PROBES = (Path(dashboard_pictures.__file__).with_name("page_probes.js")).read_text(encoding="utf-8")
 
 
+@pytest.mark.long
 @pytest.mark.asyncio(loop_scope="module")
 async def test_lost_link_is_one_event_with_its_attempts(tab: Page, tmp_path: Path) -> None:
     """The banner has the watchdog time; outdated values are hidden; attempts and the return are

@@ -179,22 +179,6 @@ async def test_stop_says_what_is_known(state: str) -> None:
         await daemon.waits(8)
 
 
-@pytest.mark.parametrize("amid", ["DISARM", {"waits": 0.1}])
-@in_virtual_time
-async def test_end_does_not_wait_for_a_mute_amplifier(amid: Step) -> None:
-    """Armed, on a network that may deliver for 1 s: it is stopped, and all ends within a second."""
-    async with watched(wire="modbus-tcp", breaks="plate") as daemon:
-        await daemon.does("ARM")
-        await daemon.take(MUTE)
-        await daemon.begins(amid)
-        await daemon.waits(0.1)
-        began = threads.now()
-        await daemon.supervisor.close("the end")
-        assert threads.now() - began < 0.9
-        await daemon.ends_anyhow(amid)
-        daemon.recovers()
-
-
 # The whole table by hand, from the states and the fault table of the wire protocol: the next state
 # (= for the same) and the actions in order. A dot: nothing changes. Conditions have tests of their
 # own.

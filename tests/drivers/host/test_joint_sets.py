@@ -361,7 +361,7 @@ def unlogged() -> Iterator[None]:
 
 @pytest.mark.parametrize(
     ("programme", "share", "least"),
-    [*zip(PROGRAMMES, (PER_CHAIN, 6, 6), (0.25, 0.25, 1 / 3), strict=True)],
+    [*zip(PROGRAMMES, (PER_CHAIN, 12, 12), (0.25, 0.25, 1 / 3), strict=True)],
 )
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")  # coroutines that were never awaited
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")

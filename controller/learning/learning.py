@@ -134,9 +134,10 @@ class SettledReadings:
             self._wait_for(threads.now())
 
     def _wait_for(self, since: float) -> None:
-        """Read a settling time after a moment [s] with the contacts of now."""
+        """Read a settling time after a moment [s] with the contacts of now, unless a hand rests."""
         self._settled_contacts = self._contacts
-        self._due = math.inf if self._playing is None else since + self.settling
+        has_hand = any(each.is_hand for each in self._contacts)  # its load is hardly known
+        self._due = math.inf if self._playing is None or has_hand else since + self.settling
         self._change.set()
 
     async def run(self) -> None:

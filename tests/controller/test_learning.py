@@ -17,10 +17,12 @@ import pytest
 
 from controller.api.schema import LatencySummary, LearningState, PlateEvent
 from controller.learning import learning as module
-from controller.learning.learning import Learning
+from controller.learning.learning import Learning, SettledReadings
 from controller.learning.worker import MAX_MEMORY, Worker, make
 from controller.plate_measurement import settling
 from controller.play.loop import Controller
+from controller.play.planner import Observers
+from controller.sources.touch import Contact, ContactKey
 from drivers.errors import CommandError, LinkError
 from model.answer.answer_report import Timing
 from model.errors import InputError
@@ -30,6 +32,7 @@ from model.estimate.forward import Sensor
 from model.rig.rig_file import example_rig_path
 from model.table.table import LocalizationTable
 from plates import make_paper_rig, small_table
+from registry.limits import HAND_LOAD
 from virtual_lines import in_virtual_time
 
 
@@ -427,6 +430,35 @@ async def test_patterns_wait_for_a_slow_estimator_up_to_a_number(
             workers.reports.put_nowait(FOLLOWED)
         await asyncio.sleep(1.0)
         assert counted(learning, "estimates", "discarded") == (17, 2)
+
+
+@pytest.mark.parametrize(("load", "count"), [(1.0, 1), (HAND_LOAD, 0)])
+@in_virtual_time
+async def test_nothing_is_read_while_a_hand_rests(load: float, count: int) -> None:
+    """Its load is hardly known, so that it would be taken for a change of the plate."""
+    read, observers = list[Any](), Observers()
+    readings = SettledReadings(make_paper_rig(12, 9), cast(Any, None), take=read.append)
+    readings.sensors = [cast(Any, SimpleNamespace(frequency_max=500.0))]
+    playing = SimpleNamespace(
+        lasts=True,
+        contents={0: None},
+        drive={"SW": SimpleNamespace(frequency=100.0)},
+        contacts=(Contact(ContactKey("a", 1), 0.1, 0.1, 0.0, load),),
+        time=0.0,
+        settled_after=0.1,
+    )
+
+    async def settled(applied: Any, contacts: object) -> Any:
+        return applied
+
+    cast(Any, readings)._read = settled
+    readings.observe(observers)
+    running = asyncio.create_task(readings.run())
+    for callback in observers.pattern_applied:
+        callback(cast(Any, playing))
+    await asyncio.sleep(1.0)
+    running.cancel()
+    assert len(read) == count
 
 
 def learned_table(file: Path) -> LearnedTable:

@@ -489,7 +489,7 @@ def _exciter_rows(exciters: list[dict[str, Any]], reach: dict[str, Any] | None) 
         yield (
             f"    {each['name']}  magnet {each['magnet']}, "
             f"glued at {each['magnet_resonance_hz']:.1f} Hz, "
-            f"Q {each['q']:.1f}; {each['force_at_1_w_n']:.2f} N at 1 W, "
+            f"Q {each['q']:.1f} (viscous); {each['force_at_1_w_n']:.2f} N at 1 W, "
             f"{each['full_level_force_n']:.2f} N at full level, {each['full_level_v']:.3g} V; "
             f"{1e3 * each['excursion_at_lowest_m']:.2g}{of} mm"
         )

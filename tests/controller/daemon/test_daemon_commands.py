@@ -14,7 +14,8 @@ from typer.testing import CliRunner
 
 from controller.api.jsonrpc import ErrorCode, RpcError
 from controller.api.link import Notification
-from controller.api.methods import TOPICS
+from controller.api.methods import TOPICS, TouchParams
+from controller.api.schema import TouchPoint
 from controller.cli.commands import app
 from controller.cli.main import run
 from controller.cli.status_text import show_event, show_status
@@ -414,3 +415,17 @@ async def test_daemon_plays_effects_by_region_and_by_name(
             await era.play(steady, ON_QUIET, level_db_sl=12, loop=True)
             assert await level_of("points") == pytest.approx(12, abs=0.5)
             assert (await era.status()).silence_reason is None
+
+
+@in_virtual_time
+async def test_a_radius_beyond_a_fingers_is_a_hand_in_the_status(tmp_path: Path) -> None:
+    """Of 13 mm, over the API, beside a finger of 5 mm and one without a radius."""
+    touches = [
+        TouchPoint(id=number, x_m=0.05 * number, y_m=0.1, radius_m=radius)
+        for number, radius in enumerate((0.013, 0.005, None), start=1)
+    ]
+    async with ready_daemon(tmp_path) as (_, era):
+        await era.request("touch", TouchParams(source="pad", touches=touches))
+        status = await era.status()
+        assert [each.role for each in status.contacts] == ["hand", None, None]
+        assert "m: hand, load 12.0" in show_status(status)

@@ -42,7 +42,7 @@ from registry.plugins import PluginRegistry
 
 
 class Buzz(Effect):
-    """As long as the finger stays, or for a duration."""
+    """A vibration that lasts as long as the finger stays, or for a duration."""
 
     kind: ClassVar[str] = "buzz"
     is_for_motion: ClassVar[bool] = False
@@ -141,7 +141,7 @@ class Detents(Effect):
     """Direction in which they are spaced."""
 
     duration: Annotated[float, Quantity(TIME, at_least=MIN_DURATION, at_most=0.2)] = 0.030
-    """Of each click."""
+    """Duration of each click."""
 
     def start(self, contact: Contact, now: float, *, level_db_sl: float | None) -> EffectRun:
         """Start halfway between two detents."""
@@ -174,7 +174,7 @@ class Dial(Effect):
     """Angle between detents."""
 
     duration: Annotated[float, Quantity(TIME, at_least=MIN_DURATION, at_most=0.2)] = 0.030
-    """Of each click."""
+    """Duration of each click."""
 
     def start(self, contact: Contact, now: float, *, level_db_sl: float | None) -> EffectRun:
         """Start outside of all regions: nothing is felt."""
@@ -312,7 +312,7 @@ class Texture(Effect):
     """How many dB below `level` at `slow`."""
 
     modulation: Modulation = None
-    """As of `buzz`."""
+    """Modulation, as of `buzz`."""
 
     @model_validator(mode="after")
     def _check_speeds(self) -> Self:
@@ -393,7 +393,7 @@ class File(Effect):
     """Whether it begins anew at its end, as long as the finger stays."""
 
     channel: Annotated[int, Field(ge=1, le=64)] | None = None
-    """Of a file that has several; none: the first."""
+    """Channel of a file that has several; the first by default."""
 
     _pattern: Pattern = PrivateAttr(default=Pattern(0.0))
     _frequencies: tuple[float, ...] = PrivateAttr(default=_FREQUENCIES)

@@ -34,7 +34,7 @@ HELLO: Final = 1
 BROADCAST: Final = 0
 """The address of all amplifiers on a line."""
 MAX_WORDS: Final = 120
-"""Of a message: what one frame of the serial line and one write of Modbus carry."""
+"""Largest number of words of a message: those of one serial frame, or one write of Modbus."""
 CLOCK_TURN: Final = 20.0
 """Seconds in which the clock of an amplifier, of 32 bits, goes round once."""
 CLOCK_UNKNOWN: Final = 0xFFFF
@@ -282,9 +282,9 @@ NAK_RECORD = Record(*_numbers("request:code", "code", "channel:code"))
 IDENTITY = Record(
     *_numbers("versions:flags"), *map(Text, ("vendor", "product", "serial_number", "firmware"))
 )
-"""Of CAN objects and Modbus registers; on a serial line Hello keeps the bytes of version 2."""
+"""The identity in CAN objects and Modbus registers; a serial Hello keeps the bytes of version 2."""
 TEXTS = [field for field in IDENTITY.fields if isinstance(field, Text)]
-"""Of an identity, in their order."""
+"""The texts of an identity, in their order."""
 
 
 def sensor_reading(tones: int) -> Record:
@@ -467,7 +467,7 @@ REPLY_TIMEOUT = 0.030
 FAST = REPLY_TIMEOUT - REACTION
 """Longest exchange [s] whose reply is here by then."""
 ATTEMPTS = 3
-"""Of a request; one less where the wire is slow."""
+"""Number of times that a request is sent; one less on a slow wire."""
 STOP_RAMP = 0.005
 """Shortest ramp without a step [s]."""
 HEARTBEAT = 0.05
@@ -477,7 +477,7 @@ MAX_LOSS_DETECTION_TIME = 3 * HEARTBEAT
 _HEARTBEATS = 3  # a watchdog must outlast this many intervals
 
 SET_WORDS = MESSAGES["Set"].request.words
-"""Of a part of a set, before its stream."""
+"""Number of words of a part of a set before its stream."""
 
 
 def shortest_watchdog(round_trip: float) -> float:

@@ -220,7 +220,7 @@ class EraSection(ActuatorSection):
     """An ERA, unless it is an [exciter](#exciters)."""
 
     stiffness: Annotated[float, Quantity(STIFFNESS, above=0, at_most=1e12)]
-    """Of its spring, k_b."""
+    """Stiffness of its spring, k_b."""
 
     damping_ratio: Annotated[float, Quantity(RATIO, at_least=0, at_most=2)] = 0.05
     """Zeta of its damper: c = 2 zeta sqrt(k_b m / n), m the bare plate's mass, n the number of
@@ -289,26 +289,26 @@ class ExciterSection(ActuatorSection):
     """
 
     coil_mass: Annotated[float, Quantity(MASS, at_least=0, at_most=0.1)] | None = None
-    """Of the coil and what is glued with it, m_c: moves with the plate.
+    """Mass of the coil and what is glued with it, m_c, which moves with the plate.
 
     Default: of the type
     """
 
     weight: Annotated[float, Quantity(MASS, above=0, at_most=10)] | None = None
-    """Of the part that moves when the coil is glued, M: the magnet, and mostly the housing.
+    """Mass of the part that moves if the coil is glued, M: the magnet, and mostly the housing.
 
     Default: of the type
     """
 
     resonance: Annotated[float, Quantity(FREQUENCY, above=0, at_most=2000)] | None = None
-    """Of coil and magnet on the suspension, without the current.
+    """Resonance frequency of coil and magnet on the suspension, without current.
 
     Default: of the type
     """
 
     resonance_is: Literal["free", "mounted"] | None = None
-    """Of which: the coil alone, held by the magnet, as on most data sheets (`free`), or the magnet
-    behind a coil that is glued (`mounted`).
+    """Whose resonance this is: that of the coil with the magnet held, as on most data sheets
+    (`free`), or that of the magnet behind a glued coil (`mounted`).
 
     Default: required with `resonance`
     """
@@ -320,10 +320,10 @@ class ExciterSection(ActuatorSection):
     """
 
     stiffness: Annotated[float, Quantity(STIFFNESS, above=0, at_most=1e9)] | None = None
-    """Of the suspension, k, instead of `resonance`: as a fit finds it."""
+    """Stiffness of the suspension, k, as a fit finds it; it replaces `resonance`."""
 
     damping: Annotated[float, Quantity(DAMPING, at_least=0, at_most=1e6)] | None = None
-    """Of the suspension, c, without the current, instead of `q`."""
+    """Damping of the suspension, c, without current; it replaces `q`."""
 
     force_factor: Annotated[float, Quantity(FORCE_FACTOR, above=0, at_most=1000)] | None = None
     """Force by current, Bl.
@@ -332,22 +332,22 @@ class ExciterSection(ActuatorSection):
     """
 
     resistance: Annotated[float, Quantity(RESISTANCE, above=0, at_most=1e4)] | None = None
-    """Of the coil, R_e.
+    """Resistance of the coil, R_e.
 
     Default: of the type
     """
 
     inductance: Annotated[float, Quantity(INDUCTANCE, at_least=0, at_most=0.1)] | None = None
-    """Of the coil, L.
+    """Inductance of the coil, L.
 
     Default: of the type, or 0
     """
 
     source_resistance: Annotated[float, Quantity(RESISTANCE, at_least=0, at_most=1e4)] = 0.1
-    """Of the amplifier's output and the cable, R_g; assumed where it is not given."""
+    """Resistance of the amplifier's output and the cable, R_g; the default is an assumption."""
 
     power: Annotated[float, Quantity(POWER, above=0, at_most=1e4)] | None = None
-    """Of the coil at level 1, the mean over a sine: the rated one, or less.
+    """Power in the coil at level 1, averaged over a sine: the rated power, or less.
 
     Default: of the type
     """

@@ -61,7 +61,7 @@ _RELATIVE = (
 )
 
 MAX_UNCERTAINTY = 1000.0
-"""Of any of them, also in a study of plates beyond BOUNDS."""
+"""Largest value of any uncertainty, also in a study of plates beyond BOUNDS."""
 
 
 @dataclass(frozen=True)
@@ -72,34 +72,36 @@ class Uncertainty:
     """
 
     gain: float = 0.05
-    """Of each channel, relative."""
+    """Gain of each channel, relative."""
     phase_deg: float = 5.0
-    """Of each channel [degrees]."""
+    """Phase of each channel [degrees]."""
     thickness: float = 0.02
-    """Of the plate, relative."""
+    """Thickness of the plate, relative."""
     stiffness: float = 0.1
-    """Of each ERA, relative."""
+    """Stiffness of each ERA, relative."""
     damping: float = 1.5
     """A factor, of the ERAs' damping and of the plate's loss factor; 1 for none."""
     fingertip: float = 0.5
-    """Of the logarithm of each finger's load."""
+    """Logarithm of each finger's load."""
     common_gain: float = 0.0
-    """Of all channels together, relative."""
+    """Gain of all channels together, relative."""
     field: float = 0.0
-    """Of what an ERA alone does at a finger, relative to its root mean square over the plate,
-    beside all others."""
+    """Motion that one ERA causes at a finger, relative to its root mean square over the
+    plate, beside all other uncertainties."""
     modulus: float = 0.02
-    """Of the plate's modulus of elasticity, relative, and known where the thickness is."""
+    """Modulus of elasticity of the plate, relative; 0 counts if the thickness is known."""
     place: float = 0.001
-    """Of each ERA along x and along y [m]."""
+    """Place of each ERA, along x and along y [m]."""
     harmonic: float = 0.01
     """Second harmonic of each ERA's motion, root mean square as a share of its own amplitude, of
     any phase."""
     supports: float = 0.0
-    """Of the logarithm of the stiffness of each foot; 0.3 of a rig file with feet by default."""
+    """Logarithm of the stiffness of each foot; 0.3 of a rig file with feet by default."""
     weather: float = 0.0
-    """Of the plate's modulus by temperature and moisture, relative, also where the thickness is
-    known; of a rig file by default what `plate.temperature` and `plate.humidity` make of it."""
+    """Modulus of the plate by temperature and moisture, relative, even if the thickness is known.
+
+    A rig file derives its default from `plate.temperature` and `plate.humidity`.
+    """
 
     def __post_init__(self) -> None:
         """Refuse values that are not finite, negative ones, and a factor below 1."""
@@ -146,12 +148,12 @@ class Uncertainty:
 
     @property
     def elasticity(self) -> float:
-        """Of the modulus, relative: known where the thickness is, but for the weather."""
+        """Relative standard deviation of the modulus; only by weather if the thickness is known."""
         return math.hypot(self.modulus if self.thickness > 0 else 0.0, self.weather)
 
     @property
     def frequency(self) -> float:
-        """Of the plate's natural frequencies, relative: as the thickness and the modulus' root."""
+        """Relative standard deviation of natural frequencies, by thickness and modulus."""
         return math.hypot(self.thickness, self.elasticity / 2)
 
     @staticmethod
@@ -192,9 +194,9 @@ class Rig:
     masses: tuple[PointLoad, ...] = ()
     """On the plate, and what supports it without being driven: last, ERAs without an amplifier."""
     laminate: Laminate | None = None
-    """Of which the plate is made, also where its layers are solved as a homogeneous one."""
+    """Layers of the plate, even if it is solved as a homogeneous one; None if it has one layer."""
     uncertainty: Uncertainty = field(default_factory=Uncertainty)
-    """Of its parameters."""
+    """How well its parameters are known."""
     fingertip: Fingertip | None = field(default_factory=Fingertip)
     """Load of each finger on the plate; None for weightless ones."""
     threshold: str = DEFAULT_THRESHOLD

@@ -174,7 +174,7 @@ class MaterialSection(Section):
     """Transverse shear modulus across it, of wood the rolling shear."""
 
     by_frequency: ModulusRows | None = None
-    """As that of a [layer](#layers), of a plate of an isotropic material that depends on it.
+    """Modulus by frequency, as of a [layer](#layers), for an isotropic material.
 
     Limits: 2 rows or more, by ascending frequency
     """
@@ -215,7 +215,7 @@ class LayerSection(Section):
     """A name, or numbers."""
 
     thickness: Thickness
-    """Of this layer."""
+    """Thickness of this layer."""
 
     loss_factor: Annotated[float, Quantity(RATIO, at_least=0, at_most=2)] | None = None
     """Eta of the layer itself, E (1 + i eta), beside the `loss_factor` of the plate."""
@@ -244,7 +244,7 @@ class AirGapSection(Section):
     """Air between the plate and a rigid wall behind it."""
 
     depth: Annotated[float, Quantity(LENGTH, at_least=1e-5, at_most=0.1)]
-    """Of the gap; the wall behind it does not move."""
+    """Depth of the gap; the wall behind it does not move."""
 
     closed: bool = False
     """`true` for a gap sealed along all edges; otherwise it is open along all of them.
@@ -479,13 +479,13 @@ class MassSection(Section):
     """`edges` for a frame that is bonded to all of them, in place of `at`."""
 
     mass_per_length: Annotated[float, Quantity(LINE_MASS, at_least=0, at_most=100)] | None = None
-    """Of such a frame.
+    """Mass of such a frame per length.
 
     Default: required with `along`
     """
 
     points: Points = DEFAULT_POINTS
-    """Of each edge, at which a frame acts; more for many waves along it."""
+    """Number of points of each edge at which a frame acts; more for many waves along it."""
 
     def made(self, plate: Plate) -> tuple[PointLoad, ...]:
         """Make the mass on a plate, or those of a frame along its edges."""
@@ -509,10 +509,10 @@ class SupportSection(Section):
     """
 
     kind: FootKind | None = None
-    """Of a foot, with the stiffness [below](#supports), which `stiffness` replaces."""
+    """Kind of a foot with the stiffness [below](#supports), unless `stiffness` is given."""
 
     stiffness: Annotated[float, Quantity(STIFFNESS, above=0, at_most=1e12)] | None = None
-    """Of its spring.
+    """Stiffness of its spring.
 
     Default: required with `at`, or `kind`
     """
@@ -524,7 +524,7 @@ class SupportSection(Section):
     """
 
     damping: Annotated[float, Quantity(DAMPING, at_least=0, at_most=1e6)] | None = None
-    """Of a viscous damper, in place of a loss factor, or beside one that is given."""
+    """Damping of a viscous damper, in place of a loss factor or beside one that is given."""
 
     foot: Foot = 0.0
     """Radius of the disc on which it presses, 0 for a point; required from 1 MN/m on."""
@@ -535,13 +535,13 @@ class SupportSection(Section):
     stiffness_per_length: (
         Annotated[float, Quantity(LINE_STIFFNESS, above=0, at_most=1e9)] | None
     ) = None
-    """Of what holds the edges.
+    """Stiffness per length of what holds the edges.
 
     Default: required with `along`
     """
 
     points: Points = DEFAULT_POINTS
-    """Of each edge, at which it acts; more for many waves along it."""
+    """Number of points of each edge at which it acts; more for many waves along it."""
 
     def made(self, plate: Plate) -> tuple[PointLoad, ...]:
         """Make the foot under a plate, or springs along its edges."""
@@ -609,36 +609,36 @@ class UncertaintySection(Section):
     """Phase of each channel, in degrees."""
 
     thickness: Annotated[float, _within("thickness")] = Uncertainty.thickness
-    """Of the plate, relative."""
+    """Thickness of the plate, relative."""
 
     stiffness: Annotated[float, _within("stiffness")] = Uncertainty.stiffness
-    """Of each ERA, relative."""
+    """Stiffness of each ERA, relative."""
 
     damping: Annotated[float, _within("damping")] = Uncertainty.damping
     """A factor, of the ERAs' damping and, independently, of the plate's loss factor."""
 
     fingertip: Annotated[float, _within("fingertip")] = Uncertainty.fingertip
-    """Of the natural logarithm of each finger's load."""
+    """Natural logarithm of each finger's load."""
 
     common_gain: Annotated[float, _within("common_gain")] = Uncertainty.common_gain
     """Gain of all channels together, relative: of levels only."""
 
     field: Annotated[float, _within("field")] = Uncertainty.field
-    """Of the acceleration at a finger by each ERA, relative to its root mean square over the plate:
-    what no other key says of the plate.
+    """Acceleration that each ERA causes at a finger, relative to its root mean square over
+    the plate, by whatever no other key describes.
     """
 
     modulus: Annotated[float, _within("modulus")] = Uncertainty.modulus
-    """Of the plate's modulus of elasticity, relative; known where `thickness` is 0."""
+    """Modulus of elasticity of the plate, relative; it counts as 0 if `thickness` is 0."""
 
     place: Annotated[float, _within("place", LENGTH)] = Uncertainty.place
-    """Of each ERA, along x and along y."""
+    """Place of each ERA, along x and along y."""
 
     harmonic: Annotated[float, _within("harmonic")] = Uncertainty.harmonic
     """Second harmonic of each ERA's motion as a share of its own amplitude, of any phase."""
 
     supports: Annotated[float, _within("supports")] | None = None
-    """Of the natural logarithm of the stiffness of each foot.
+    """Natural logarithm of the stiffness of each foot.
 
     Default: 0.3 where a rig has feet, else 0
     """
@@ -662,22 +662,22 @@ class FingertipSection(Section):
     """The load of a fingertip, see `Fingertip`; a key left out has the default's value."""
 
     stiffness: Annotated[float, Quantity(STIFFNESS, at_least=0, at_most=1e6)] = 1000.0
-    """Of the pulp."""
+    """Stiffness of the pulp."""
 
     damping: Annotated[float, Quantity(DAMPING, above=0, at_most=1e4)] = 2.0
-    """Of the pulp."""
+    """Damping of the pulp."""
 
     contact_mass: Annotated[float, Quantity(MASS, at_least=0, at_most=0.1)] = 0.0002
     """Mass that moves with the plate."""
 
     phalanx_mass: Annotated[float, Quantity(MASS, at_least=1e-5, at_most=1)] = 0.005
-    """Of the bone behind the pulp."""
+    """Mass of the bone behind the pulp."""
 
     joint_stiffness: Annotated[float, Quantity(STIFFNESS, at_least=0, at_most=1e6)] = 500.0
-    """Of the joint that holds it."""
+    """Stiffness of the joint that holds the bone."""
 
     joint_damping: Annotated[float, Quantity(DAMPING, at_least=0, at_most=1e4)] = 2.0
-    """Of the joint."""
+    """Damping of that joint."""
 
 
 class LimitsSection(Section):

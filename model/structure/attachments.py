@@ -41,7 +41,7 @@ Gain: TypeAlias = tuple[float, float, float]
 """Frequency [Hz], magnitude, phase [rad]."""
 
 Factor: TypeAlias = float | FloatArray
-"""Of a parameter that deviates, one or several."""
+"""Factor of a parameter, or one for each of several plates."""
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,7 @@ class Source(ABC):
     """Fields that measurements of a plate change."""
 
     UNIT: ClassVar[str]
-    """Of its drive: m of an ERA's base, V of an exciter."""
+    """Unit of its drive: m for an ERA's base, V for an exciter."""
 
     name: str
     """Its name in the rig."""
@@ -258,10 +258,10 @@ def damping_from_ratio(
 
 
 MIN_LOAD, MAX_LOAD = 0.1, 10.0
-"""Of a finger relative to the rig's fingertip."""
+"""Load of a finger relative to the rig's fingertip."""
 
 MAX_HAND_LOAD = 40.0
-"""Of a hand that rests (`HAND_LOAD`); a load above MAX_LOAD is a hand's."""
+"""Largest load of a hand that rests (`HAND_LOAD`); a load above `MAX_LOAD` is a hand's."""
 
 HAND_STD = 1.1
 """Standard deviation of the logarithm of the load of each patch of a hand, a factor of 3."""
@@ -275,17 +275,17 @@ class Fingertip:
     """Load of one fingertip; the defaults are those of a finger that presses lightly."""
 
     stiffness: float = 1000.0
-    """Of the pulp [N/m]."""
+    """Stiffness of the pulp [N/m]."""
     damping: float = 2.0
-    """Of the pulp [N s/m]."""
+    """Damping of the pulp [N s/m]."""
     contact_mass: float = 0.0002
     """Mass that moves with the plate [kg]."""
     phalanx_mass: float = 0.005
-    """Of the bone behind the pulp [kg]."""
+    """Mass of the bone behind the pulp [kg]."""
     joint_stiffness: float = 500.0
-    """Of the joint that holds the bone to the rest plane [N/m]."""
+    """Stiffness of the joint that holds the bone to the rest plane [N/m]."""
     joint_damping: float = 2.0
-    """Of that joint [N s/m]."""
+    """Damping of that joint [N s/m]."""
 
     def __post_init__(self) -> None:
         """Refuse values not finite or negative, no damping of the pulp, and no phalanx."""

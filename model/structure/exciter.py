@@ -246,4 +246,4 @@ Actuator: TypeAlias = Era | Exciter
 """Any of them, each a `Source`; further kinds are listed here and in `model.rig.actuator_keys`."""
 
 OneKind = TypeVar("OneKind", Era, Exciter, Actuator)
-"""Of a function that gives the kind of actuator that it is given."""
+"""Kind of actuator that a function takes and returns."""

@@ -266,10 +266,10 @@ class Plate(Sheet):
     """Along y [m]."""
 
     thickness: float = field(metadata=_meaning("mass as h, bending stiffness as h³"))
-    """Of a laminate that of the equivalent homogeneous plate [m]."""
+    """Thickness [m]; for a laminate that of the equivalent homogeneous plate."""
 
     material: Material = field(metadata=_meaning("stiffness as E"))
-    """Of a laminate that of the equivalent homogeneous plate."""
+    """Material; for a laminate that of the equivalent homogeneous plate."""
 
     loss_factor: float = field(
         default=0.01, metadata=_meaning("a share of the stiffness", is_of_theory=False)
@@ -288,8 +288,9 @@ class Plate(Sheet):
     mode_deviations: tuple[tuple[float, float], ...] = field(
         default=(), metadata=_meaning("factors of the stiffness", is_of_theory=False)
     )
-    """Of the lowest elastic modes, ascending: logarithms of eigenvalue and of loss factor relative
-    to those of the theory, as `era rig identify` finds them (`model.structure.modal_elasticity`).
+    """Logarithms of eigenvalue and loss factor of the lowest elastic modes, relative to those of
+    the theory, in ascending order, as `era rig identify` finds them (see
+    `model.structure.modal_elasticity`).
     """
 
     laminate: Laminate | None = field(

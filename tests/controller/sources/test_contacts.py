@@ -423,7 +423,7 @@ def test_a_hand_is_one_until_it_is_lifted() -> None:
     It never moves by itself: its place counts as it is reported.
     """
     tracker, seen = ContactTracker(PLATE), []
-    for time, load in ((0.0, None), (0.01, HAND_LOAD), (0.02, 0.5), (0.5, None)):
+    for time, load in ((0.0, None), (0.01, HAND_LOAD), (0.3, 0.5), (0.5, None)):
         tracker.update(TouchFrame("a", time, (Touch(1, 0.5 + time / 10, 0.5, load),)))
         (contact,) = tracker.contacts
         seen.append((contact.is_hand, contact.load, contact.motion.is_under_way))

@@ -140,6 +140,8 @@ def test_a_hand_that_rests_is_counted_and_not_protected():
     ]
     assert 0.84 <= kept[0].mean() <= 0.97
     assert kept[1].mean() < 0.8
+    stds = table.attached.load_stds(2, (1.0, HAND_LOAD))
+    assert stds.tolist() == pytest.approx([table.uncertainty.fingertip, np.log(3)], rel=0.01)
 
 
 def test_a_hand_has_no_stimulus():

@@ -15,8 +15,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
-import numpy as np
-
 from model.errors import InputError, expect_values
 from registry.plugins import PluginRegistry
 
@@ -145,6 +143,8 @@ class KnownMaterial:
         Twice that of natural frequencies, from 20 °C and 65 %, the climate of tests of wood
         (EN 408). temperature [°C]; humidity: relative, 0 to 1.
         """
+        import numpy as np  # which plug-ins of materials do without
+
         found = self.by_kelvin * (temperature - STANDARD_TEMPERATURE)
         if self.by_moisture:
             now, standard = np.interp([humidity, STANDARD_HUMIDITY], *_MOISTURE).tolist()

@@ -29,11 +29,13 @@ from model.processes import Progress, unseen
 from model.quantities import counted
 from model.reduction.free_plate import FreePlate, SpectralModes, solve_free_plate
 from model.reduction.reduced_plate import on_springs, reduce_free_plate
+from model.reduction.surface_modes import SurfaceModes
 from model.rig.rig import Rig
 from model.rig.rig_file import mesh_of
 from model.spectral.modes import PlateMesh, SpectralMesh
 from model.structure.attachments import PointLoad, Source, footprints_of
 from model.structure.exciter import Actuator
+from model.structure.modal_elasticity import check_is_plate
 from model.structure.plate import Plate
 
 
@@ -237,6 +239,8 @@ def natural_modes(
     gap = rig.plate.air_gap
     # Air that is sealed in resists motion up and down; under tilts it only flows to and fro.
     rigid = RIGID_BODY_MODES - (gap is not None and gap.closed) if support == "free" else 0
+    if rig.plate.surface is not None and support == "free":
+        rigid = rig.plate.surface.rigid
     highest = rig.limits.frequency_max
     while True:
         solved = free or solve_free_plate(rig.plate, chosen, frequency_max=highest)
@@ -270,12 +274,13 @@ def _modes_with(free: FreePlate, attached: list[Source | PointLoad]) -> NaturalM
 
 def _simply_supported(rig: Rig, count: int, mesh: PlateMesh) -> NaturalModes:
     """Solve modes of finite elements, whose shapes are given at the nodes."""
+    check_is_plate(rig.plate, "simply-supported modes")
     if rig.plate.is_layered:
         raise InputError(
             "support must be free or eras for a plate of layers or with an air gap, got "
             "simply-supported: finite elements of it are not solved"
         )
-    if isinstance(mesh, SpectralMesh):
+    if not isinstance(mesh, Mesh):
         mesh = Mesh.accurate(rig.plate, frequency_max=rig.limits.frequency_max)
     matrices = assemble(rig.plate, mesh)
     frequencies, unknowns = simply_supported_modes(matrices, count, rig.masses)
@@ -341,6 +346,7 @@ def meshes_to_compare(rig: Rig) -> tuple[PlateMesh, ...]:
     three degrees in place of meshes of elements.
     """
     plate, high = rig.plate, rig.limits.frequency_max
+    check_is_plate(plate, "a study of meshes")
     stiffness = rig.largest_stiffness
     foot = min(era.foot for era in rig.eras)
     automatic = mesh_of("auto", plate, frequency_max=high, stiffness=stiffness, foot=foot)
@@ -469,7 +475,7 @@ def finer_mesh(
     For polynomials it has two further degrees; for elements it is one of polynomials, or of
     elements if there were too many of these. stiffness [N/m]: of the stiffest ERA.
     """
-    if isinstance(mesh, SpectralMesh):
+    if not isinstance(mesh, Mesh):
         return mesh.finer()
     polynomials = SpectralMesh.accurate(
         plate, frequency_max=frequency_max, accuracy=_ACCURACY, stiffness=stiffness
@@ -492,8 +498,10 @@ def estimate_error(
 
     finer: of `finer_mesh`; frequencies (f,) [Hz]. Each ERA is driven alone.
     """
-    plates = [solve_free_plate(free.plate, finer, frequency_max=free.frequency_max), free]
-    if isinstance(free.modes, SpectralModes):
+    plates = [free]
+    if finer != free.mesh:
+        plates = [solve_free_plate(free.plate, finer, frequency_max=free.frequency_max), free]
+    if isinstance(free.modes, SpectralModes | SurfaceModes):
         plates.append(replace(free, modes=free.modes.softer()))
     squares = np.zeros((len(plates), len(frequencies), len(eras)))
     # A few points at a time: whole fields of sixteen ERAs take a gigabyte.

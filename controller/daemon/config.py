@@ -268,7 +268,8 @@ def _rig(validation: Validation[DaemonSection], file: Path | None) -> tuple[Rig 
         document = with_base(read_document(file))
         rig = rig_of(document)
         check_supported(rig.plate, rig.eras, loads=rig.masses)
-        return rig, document.whole_text
+        assert rig.document is not None  # noqa: S101  it was made of one
+        return rig, rig.document.whole_text
     except ConfigError as error:
         validation.add(("rig",), "invalid rig:\n    " + str(error).replace("\n", "\n  "))
     except (InputError, OSError) as error:

@@ -13,6 +13,7 @@ from model.structure.material import EXCITER_TYPES, KNOWN_MATERIALS
 SECTIONS: Mapping[str, type[Section]] = {
     "rig": sections.RigSection,
     "plate": sections.PlateSection,
+    "surface": sections.SurfaceSection,
     "layers": sections.LayerSection,
     "air_gap": sections.AirGapSection,
     "material": sections.MaterialSection,

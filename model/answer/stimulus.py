@@ -262,6 +262,8 @@ def check_on_plate(what: str, places: Iterable[Point], plate: Plate) -> None:
                 f"{what} must be on the plate, from (0, 0) to ({length:g}, {width:g}) m, got "
                 f"({x:g}, {y:g}) m{in_metres(x, y, length=length, width=width)}"
             )
+        if not plate.contains(x, y):
+            raise InputError(f"{what} must be within the outline, got ({x:g}, {y:g}) m")
 
 
 def check_fingers(fingers: Sequence[Finger], plate: Plate) -> None:

@@ -71,6 +71,7 @@ def build(
     from model.drive_modes import checked_mode
     from model.finger import Grid
     from model.rig.rig_file import load_rig
+    from model.structure.surface import WELL_KNOWN
     from model.table.table import default_drive_frequencies
     from model.table.table_file import ZIP, TableProblem, save_table, solve_table
 
@@ -92,7 +93,9 @@ def build(
         f"{counted(len(table.frequencies), 'frequency', plural='frequencies')} for "
         f"{counted(table.grid.cell_count, 'cell')}, built in {timed.elapsed:.2f} s",
         f"mesh {table.mesh}: error of the fields {error:.3g} %, estimated with "
-        f"{table.reference_mesh}",
+        f"{table.reference_mesh}"
+        if rig.plate.surface is None
+        else f"{table.mesh}: error of the fields {error:.3g} %, by what others may add",
         rig.uncertainty_note,
         f"wrote {output} ({output.stat().st_size / 1e6:.1f} MB)",
         next_line("era", "table", "show", output),
@@ -116,6 +119,13 @@ def build(
         f"mesh {table.mesh} is coarse: its fields are wrong by {error:.3g} %; what is promised "
         "takes this error into account and is lower for it; `mesh: auto` chooses one for about 1 %"
     )
+    if rig.plate.surface is not None:
+        wanted = WELL_KNOWN * chosen[-1]
+        coarse = (
+            f"surface: fields by {table.mesh} are wrong by {error:.3g} %; what is promised takes "
+            "this error into account and is lower for it; export modes up to "
+            f"{max(wanted, 2 * table.mesh.highest_frequency(rig.plate)):.0f} Hz"
+        )
     for warning in (coarse if error >= _COARSE_ERROR else None, why_slow()):
         if warning:
             typer.echo(f"era: warning: {warning}", err=True)

@@ -168,7 +168,7 @@ class Validation(Generic[SectionT]):
     def __init__(self, document: Document, root: type[SectionT]) -> None:
         """Find every key that is unknown, missing, or has a value that its section refuses."""
         self._section: SectionT | None = None
-        self._document = document
+        self.document = document
         self._problems: list[ConfigProblem] = []
         try:
             self._section = root.model_validate(document.data)
@@ -178,7 +178,7 @@ class Validation(Generic[SectionT]):
     def part(self, path: KeyPath, section: type[PartT]) -> PartT | None:
         """A section if it is valid on its own, for checks across sections; else None."""
         try:
-            return section.model_validate(self._document.value(path))
+            return section.model_validate(self.document.value(path))
         except (KeyError, ValidationError):
             return None
 
@@ -196,33 +196,33 @@ class Validation(Generic[SectionT]):
     def field(self, path: KeyPath, section: type[Section]) -> Any:
         """One field of a section if it is valid on its own; else None."""
         try:
-            return _field_reader(section, str(path[-1])).validate_python(self._document.value(path))
+            return _field_reader(section, str(path[-1])).validate_python(self.document.value(path))
         except (KeyError, ValidationError):
             return None
 
     def mapping(self, path: KeyPath) -> Mapping[str, Value]:
         """A mapping of the file, unchecked; empty if missing."""
         try:
-            value = self._document.value(path)
+            value = self.document.value(path)
         except KeyError:
             return {}
         return value if isinstance(value, dict) else {}
 
     def add(self, path: KeyPath, message: str) -> None:
         """Add a problem at a key."""
-        self._problems.append(self._document.problem(path, message))
+        self._problems.append(self.document.problem(path, message))
 
     def _add_errors(
         self, error: ValidationError, section: type[Section], *, below: KeyPath = ()
     ) -> None:
         """Add the errors of a section below a path, as many as are reported and one more."""
         for details in error.errors(include_url=False)[: MAX_PROBLEMS + 1]:
-            self._problems.append(_problem(self._document, section, details, below=below))
+            self._problems.append(_problem(self.document, section, details, below=below))
 
     def finish(self) -> SectionT:
         """Return the root section; raises ConfigError with all problems."""
         if self._problems or self._section is None:
-            raise ConfigError(self._document.source, self._problems)
+            raise ConfigError(self.document.source, self._problems)
         return self._section
 
 

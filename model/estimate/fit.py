@@ -42,6 +42,7 @@ from model.reduction.reduced_plate import reduced_modes
 from model.rig.actuator_keys import KINDS as ACTUATOR_KEYS
 from model.rig.rig import Rig
 from model.structure.attachments import footprints_of
+from model.structure.modal_elasticity import check_is_plate
 
 HELD_OUT_FOLDS = 5
 """One path or sensor in so many is held out."""
@@ -672,6 +673,7 @@ def sensed_plate(
     has_form: whether the plate may have form errors. Raises InputError for frequencies too high for
     its mesh.
     """
+    check_is_plate(rig.plate, "a fit or a check by measurements")
     rig.mesh.check_frequencies(rig.plate, frequencies)
     free = solve_free_plate(rig.plate, rig.mesh, frequency_max=float(max(frequencies.max(), 200.0)))
     form = None

@@ -56,7 +56,7 @@ from model.rig.rig import Rig, Uncertainty
 from model.rig.rig_file import mesh_of
 from model.spectral.direct_solution import grain_slopes
 from model.spectral.modes import PlateMesh, SpectralMesh
-from model.structure.modal_elasticity import check_measurable, lowest_elastic
+from model.structure.modal_elasticity import check_is_plate, check_measurable, lowest_elastic
 from model.structure.plate import Plate
 
 MAX_CHI2 = 2.0
@@ -284,6 +284,7 @@ def _check(rig: Rig, measurement: Measurement) -> None:
 
 def solved_for(rig: Rig, frequency_max: float) -> FreePlate:
     """The free plate of a rig, solved for tones up to a frequency [Hz]."""
+    check_is_plate(rig.plate, "a fit or a check by measurements")
     mesh: PlateMesh = rig.mesh
     if not isinstance(mesh, SpectralMesh):
         # Places move freely only where a plate is solved in functions over all of it.

@@ -130,26 +130,23 @@ def read_universal(path: Path) -> Universal:
     """
     import pyuff
 
-    content = read_bytes(path)
-    if content.startswith(BYTE_ORDER_MARKS):  # text, as an editor saved it
-        content = text_of(path, content).encode()
-    if b"\n" not in content:
-        content = content.replace(b"\r", b"\n")
-    blocks = [each for each in _blocks(path, content) if each.kind in _READ]
+    wanted = [each for each in blocks(path, read_bytes(path)) if each.kind in _READ]
     nodes: dict[int, tuple[float, float, float]] = {}
     functions, length = [], 1.0
     with tempfile.TemporaryDirectory(prefix="era-") as folder:
         copy = Path(folder) / "copy.uff"
-        copy.write_bytes(b"".join(each.plain for each in blocks))
+        copy.write_bytes(b"".join(each.plain for each in wanted))
         file = pyuff.UFF(str(copy))
-        for number, block in enumerate(blocks):
+        for number, block in enumerate(wanted):
             place = f"{path}:{block.line}"
             try:
                 found = file.read_sets(number, header_only=True)
                 if block.kind == 58:
                     functions.append(_function(path, block, found))
                 elif block.kind == 164:
-                    length = _lengths_in_si(place, found)
+                    label = found["units_description"]
+                    code = int(found["units_code"])
+                    length = lengths_in_si(place, float(found["length"]), code, label)
                 else:
                     xyz = zip(found["x"], found["y"], found["z"], strict=True)
                     nodes.update(zip(map(int, found["node_nums"]), xyz, strict=True))
@@ -187,7 +184,7 @@ def read_bytes(path: Path) -> bytes:
 
 
 @dataclass(frozen=True)
-class _Block:
+class DatasetBlock:
     """One dataset: the line of its opening mark, its number, the content between its marks."""
 
     line: int
@@ -218,8 +215,12 @@ class _Block:
         return b"    -1\n" + text + b"\n    -1\n"
 
 
-def _blocks(path: Path, content: bytes) -> Iterator[_Block]:
+def blocks(path: Path, content: bytes) -> Iterator[DatasetBlock]:
     """Datasets of a file, between lines of `    -1` alone."""
+    if content.startswith(BYTE_ORDER_MARKS):  # text, as an editor saved it
+        content = text_of(path, content).encode()
+    if b"\n" not in content:
+        content = content.replace(b"\r", b"\n")
     start = _MARK.search(content)
     if start is None:
         raise InputError(
@@ -245,7 +246,7 @@ def _blocks(path: Path, content: bytes) -> Iterator[_Block]:
                 f"{path}:{line}: dataset has no end; the file was cut off, export it again"
             )
         kind = int(head["kind"])
-        yield _Block(line, kind, bool(head["binary"]), content[begin : end.start()])
+        yield DatasetBlock(line, kind, bool(head["binary"]), content[begin : end.start()])
         start = _MARK.search(content, end.end())
 
 
@@ -275,7 +276,7 @@ def _as_58(function: Function) -> dict[str, Any]:
     }
 
 
-def _function(path: Path, block: _Block, found: Mapping[str, Any]) -> Function:
+def _function(path: Path, block: DatasetBlock, found: Mapping[str, Any]) -> Function:
     place, count = f"{path}:{block.line}", int(found["num_pts"])
     is_complex, is_even = found["ord_data_type"] in (5, 6), found["abscissa_spacing"] == 1
     shape = (count, 1 + is_complex + (not is_even))
@@ -316,7 +317,7 @@ def _function(path: Path, block: _Block, found: Mapping[str, Any]) -> Function:
     )
 
 
-def _bytes_of(path: Path, block: _Block, found: Mapping[str, Any], count: int) -> FloatArray:
+def _bytes_of(path: Path, block: DatasetBlock, found: Mapping[str, Any], count: int) -> FloatArray:
     """So many numbers of a binary record, or all that it has."""
     data = block.content.split(b"\n", _HEADER_LINES)[-1]
     order = "<" if found["byte_ordering"] == 1 else ">"
@@ -330,7 +331,9 @@ def _bytes_of(path: Path, block: _Block, found: Mapping[str, Any], count: int) -
     return np.frombuffer(data[:whole], dtype=f"{order}f{size}").astype(float)
 
 
-def _numbers_of(path: Path, block: _Block, found: Mapping[str, Any], count: int) -> FloatArray:
+def _numbers_of(
+    path: Path, block: DatasetBlock, found: Mapping[str, Any], count: int
+) -> FloatArray:
     """So many numbers of a record in ASCII, or all; what fills their last line is left out."""
     numbers: list[float] = []
     for line, row in enumerate(block.rows[_HEADER_LINES:], start=block.line + 1 + _HEADER_LINES):
@@ -340,19 +343,22 @@ def _numbers_of(path: Path, block: _Block, found: Mapping[str, Any], count: int)
                 f"{path}:{line}: data must be numbers, {count} in all, got {shown!r}; export the "
                 "damaged file again"
             )
-        for word in _NUMBER.findall(row):
-            plain = word.upper().replace(b"D", b"E")
-            numbers.append(float(_NO_LETTER.sub(b"E", plain)))
+        numbers += numbers_in(row)
     return np.array(numbers[:count])
 
 
-def _lengths_in_si(place: str, found: Mapping[str, Any]) -> float:
-    """By what lengths of the file are divided to have metres."""
-    length, code = float(found["length"]), int(found["units_code"])
+def numbers_in(row: bytes) -> list[float]:
+    """All numbers of a row, in any spelling of Fortran."""
+    words = (each.upper().replace(b"D", b"E") for each in _NUMBER.findall(row))
+    return [float(_NO_LETTER.sub(b"E", word)) for word in words]
+
+
+def lengths_in_si(place: str, length: float, code: int, label: str) -> float:
+    """By what lengths of the file are divided to have metres; raises InputError."""
     if not 0 < length < math.inf or (length == 1 and code in _NOT_METRES):
         raise InputError(
             f"{place}: factor of lengths (dataset 164) must be positive and that of units code "
-            f"{code} {found['units_description']!r}, got {length:g}; export it in SI"
+            f"{code} {label!r}, got {length:g}; export it in SI"
         )
     return length
 

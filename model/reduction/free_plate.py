@@ -55,8 +55,10 @@ from model.fem import (
     factorise,
     lowest_modes,
 )
+from model.reduction.surface_modes import RESIDUAL_ORDER, SurfaceModes
 from model.spectral.modes import (
     Band,
+    KnownModes,
     PlateMesh,
     SpectralMesh,
     SpectralPlate,
@@ -84,12 +86,6 @@ from model.structure.modal_elasticity import (
     modal_receptance,
 )
 from model.structure.plate import Plate, short_wave_plate
-
-RESIDUAL_ORDER = 4
-"""Residual vectors of each point.
-
-A field has this many terms, a receptance between points twice as many, from inner products.
-"""
 
 
 def truncation_weights(
@@ -330,7 +326,7 @@ class SpectralModes:
         return self._known[key]
 
 
-FreeModes: TypeAlias = SpectralModes | FiniteElementModes
+FreeModes: TypeAlias = SpectralModes | FiniteElementModes | SurfaceModes
 """Modes phi of a free plate up to a cut-off, and all truncated ones together by their sums.
 
 A truncated mode of eigenvalue lambda counts with u = 1 / (lambda + shift), in units of
@@ -556,9 +552,19 @@ def solve_free_plate(plate: Plate, mesh: PlateMesh, *, frequency_max: float = 50
     shift = (2 * math.pi * min(plate.lowest_bending_frequency, frequency_max / 3)) ** 2
     cutoff_frequency = FREQUENCY_MARGIN * frequency_max
     modes: FreeModes
-    if isinstance(mesh, Mesh):
+    if plate.surface is not None:
+        KnownModes.of(plate, plate.surface).check_frequencies(plate, np.array([frequency_max]))
+        modes = SurfaceModes(
+            plate,
+            plate.surface,
+            shift=shift,
+            cutoff_frequency=cutoff_frequency,
+            frequency_max=frequency_max,
+        )
+    elif isinstance(mesh, Mesh):
         modes = FiniteElementModes(plate, mesh, shift=shift, cutoff_frequency=cutoff_frequency)
     else:
+        assert isinstance(mesh, SpectralMesh)  # noqa: S101  other meshes are of surfaces
         modes = SpectralModes(
             plate,
             mesh,

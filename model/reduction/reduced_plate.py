@@ -63,7 +63,12 @@ from model.structure.attachments import (
     check_supported,
     footprints_of,
 )
-from model.structure.modal_elasticity import Dispersion, ModalElasticity, loss_factors
+from model.structure.modal_elasticity import (
+    Dispersion,
+    ModalElasticity,
+    check_is_plate,
+    loss_factors,
+)
 from model.structure.plate import Plate
 
 RESIDUAL_VECTORS = 3  # for each attachment
@@ -418,6 +423,7 @@ def reduced_modes(free: FreePlate, footprints: FloatArray, cells: FloatArray) ->
 
     footprints (n, 3) [m]: of its supports; cells (c, 2) [m]: where foreign mass may lie.
     """
+    check_is_plate(free.plate, "form errors")
     plate, reduced = free.plate, reduce_free_plate(free, footprints)
     unknowns = reduced.unknowns()
     if isinstance(free.mesh, Mesh):

@@ -330,6 +330,7 @@ MAY_DIFFER = {
     "Rig.document": "all that it says is in the other fields",
     "Rig.laminate": "all that is solved of it is in the plate",
     "Material.name": "displayed only",
+    "Surface.file": "its content is known by its digest",
 }
 """What a table's rig may have otherwise, by class and field, each with the reason.
 

@@ -13,6 +13,8 @@ from dataclasses import replace
 from pathlib import Path, PurePath
 from typing import Any, NamedTuple, NoReturn
 
+from pydantic_core import to_jsonable_python
+
 from model.config.document import (
     ConfigError,
     Document,
@@ -38,14 +40,23 @@ from model.rig.sections import (
     PlateSection,
     RigSection,
     SupportSection,
+    SurfaceSection,
 )
-from model.spectral.modes import MAX_DEGREE, MAX_POLYNOMIALS, POLYNOMIALS, PlateMesh, SpectralMesh
+from model.spectral.modes import (
+    MAX_DEGREE,
+    MAX_POLYNOMIALS,
+    POLYNOMIALS,
+    KnownModes,
+    PlateMesh,
+    SpectralMesh,
+)
 from model.structure.attachments import (
     Fingertip,
 )
 from model.structure.plate import (
     Plate,
 )
+from model.structure.surface import LEAST_KNOWN
 from registry.plugins import did_you_mean
 
 _MAX_ELEMENTS_PER_SIDE = 1000
@@ -65,6 +76,12 @@ def mesh_of(
     stiffness [N/m]: of the stiffest ERA; foot [m]: radius of the smallest, 0 for a point.
     """
     words = text.split()
+    if plate.surface is not None:
+        if words != ["auto"]:
+            raise InputError(
+                f"mesh must not be given of a surface, whose modes are known, got {text[:40]!r}"
+            )
+        return KnownModes.of(plate, plate.surface)
     if words[:1] != ["auto"]:
         mesh = parse_mesh(text, plate)
         if isinstance(mesh, Mesh) and max(mesh.nx, mesh.ny) > _MAX_ELEMENTS_PER_SIDE:
@@ -97,6 +114,8 @@ def parse_mesh(text: str, plate: Plate) -> PlateMesh:
     Elements may be `with strips of` a length, as a mesh is printed. Raises InputError for other
     text, an unknown element, and no elements.
     """
+    if plate.surface is not None:
+        return KnownModes.of(plate, plate.surface)
     match = re.fullmatch(
         rf"\s*(\d{{1,6}})\s*[xX×]\s*(\d{{1,6}})(?:\s+(\S{{1,40}}))?(?:{_STRIPS}(.{{1,40}}))?\s*",
         text,
@@ -133,7 +152,7 @@ def check_across(validation: Validation[RigSection], *, mesh_given: bool) -> Non
     limits = validation.field(("limits", "frequency"), LimitsSection)
     high = (limits or LimitsSection().frequency)[1]
     plate = _check_plate(validation, frequency_max=high)
-    if plate is not None and not mesh_given:
+    if plate is not None and plate.surface is None and not mesh_given:
         _check_mesh(validation, plate, frequency_max=high)
     eras = {}
     for name, keys in validation.mapping(("eras",)).items():
@@ -185,6 +204,10 @@ def _check_way(validation: Validation[RigSection], path: KeyPath, this: Way, oth
 def _check_plate(validation: Validation[RigSection], *, frequency_max: float) -> Plate | None:
     """The plate if its section is valid: thickness and material, or layers."""
     given = _given(validation, ("plate",))
+    if "surface" in (whole := validation.mapping(())):
+        return _check_surface(validation, frequency_max=frequency_max)
+    if "plate" not in whole:
+        validation.add(("plate",), "missing; add it, or surface instead")
     if not given:
         return None
     is_layered = "layers" in given
@@ -211,6 +234,34 @@ def _check_plate(validation: Validation[RigSection], *, frequency_max: float) ->
             f"must be less than the plate's sides, got {thickness:g} m; if in mm, write "
             f"{thickness:g} mm",
         )
+    return plate
+
+
+def _modes_of(section: SurfaceSection, document: Document) -> Path:
+    """The file of a surface's modes, beside the rig file or the one that a link leads to."""
+    return replace(document, source=str(Path(document.source).resolve())).beside(section.modes)
+
+
+def _check_surface(validation: Validation[RigSection], *, frequency_max: float) -> Plate | None:
+    """The plate of a surface if its section is valid, and its modes are enough."""
+    for key in validation.mapping(()).keys() & {"plate", "mesh"}:
+        validation.add((key,), "must not be given with surface; remove it")
+    section: SurfaceSection | None = validation.field(("surface",), RigSection)
+    if section is None:
+        return None
+    try:
+        plate = section.made(_modes_of(section, validation.document))
+    except InputError as error:
+        validation.add(("surface",), str(error))
+        return None
+    known = mesh_of("auto", plate, frequency_max=frequency_max)
+    if frequency_max > known.highest_frequency(plate):
+        validation.add(
+            ("surface",),
+            f"modes must be known up to {LEAST_KNOWN:g} times the {frequency_max:g} Hz of "
+            f"limits.frequency, got {known}; export more, or lower the limit",
+        )
+        return None
     return plate
 
 
@@ -281,6 +332,8 @@ def _check_on_plate(
             f"must be on the plate, from (0, 0) to ({length:g}, {width:g}) m, got ({x:g}, {y:g}) "
             "m; move it",
         )
+    elif not plate.contains(min(max(x, 0.0), length), min(max(y, 0.0), width)):
+        validation.add((*path, "at"), f"must be within the outline, got ({x:g}, {y:g}) m; move it")
 
 
 def _check_wiring(
@@ -434,14 +487,23 @@ def parse_rig(source: str, text: str) -> Rig:
 def rig_of(document: Document, *, mesh: str | None = None) -> Rig:
     """Make the rig of a document, with another mesh if one is given; raises as `load_rig`."""
     document = with_base(document)
-    if "plate" not in document.data:
+    if not {"plate", "surface"} & document.data.keys():
         check_is_rig(document)
     validation = Validation(document, RigSection)
     check_across(validation, mesh_given=mesh is not None)
     section = validation.finish()
     if mesh is not None:
         document = replace(document, text="", data=document.data | {"mesh": mesh}, find_lines=dict)
-    plate = section.plate.made(frequency_max=section.limits.frequency[1])
+    if section.surface is not None:
+        modes = _modes_of(section.surface, document)
+        plate = section.surface.made(modes)
+        # The keys of a rig go to other folders and processes, its modes do not.
+        named = section.surface.model_dump(exclude_none=True) | {"modes": str(modes)}
+        stated = document.data | {"surface": to_jsonable_python(named)}
+        document = replace(document, text="", data=stated, find_lines=dict)
+    else:
+        assert section.plate is not None  # noqa: S101  see check_across
+        plate = section.plate.made(frequency_max=section.limits.frequency[1])
     wanted = section.mesh if mesh is None else mesh
     fingertip: FingertipSection | str = section.fingertip
     everything = {
@@ -473,7 +535,7 @@ def rig_of(document: Document, *, mesh: str | None = None) -> Rig:
             *(era.support for era in supports.values()),
         ),
         supports=tuple(supports),
-        laminate=section.plate.laminate,
+        laminate=None if section.plate is None else section.plate.laminate,
         uncertainty=section.uncertainty.made(
             has_feet=any(foot.at is not None for foot in section.supports.values()),
             weather=section.plate.weather,

@@ -31,6 +31,7 @@ from model.rig.actuator_keys import STIFF_MOUNT, ExciterSection
 from model.rig.rig import Rig
 from model.rig.rig_file import example_rig_path, rig_of, with_base
 from model.rig.sections import PLAIN_KEYS, LimitsSection, RigSection
+from model.spectral.modes import KnownModes
 from model.structure.attachments import (
     DEFAULT_POINTS,
     GRAVITY,
@@ -52,6 +53,7 @@ from model.structure.plate import (
     slide_frequency,
     wavenumber_of,
 )
+from model.structure.surface import WELL_KNOWN
 from registry.limits import GuardLimits
 
 _EXCURSIONS = "model.transients.excursions:excursions_of"
@@ -399,7 +401,7 @@ def _partial(schema: Any) -> Any:
 
 RIG = ConfigKind(
     "A rig of era-haptics",
-    recognises=lambda document: "plate" in document.data,
+    recognises=lambda document: not {"plate", "surface"}.isdisjoint(document.data),
     check=_check,
     example_file=example_rig_path(),
     keys=_keys,
@@ -407,11 +409,17 @@ RIG = ConfigKind(
 
 
 _THICK = 0.02  # m; of one material
+_NEARLY_ALL = 0.9  # of the modes up to a frequency the highest may be so far below it
 
 
 def _plate_notes(rig: Rig) -> Iterator[str]:
     """Yield warnings of a plate in the wrong unit, and of what air and soft layers cost."""
     plate, low, high = rig.plate, rig.limits.frequency_min, rig.limits.frequency_max
+    if isinstance(rig.mesh, KnownModes) and rig.mesh.frequency < _NEARLY_ALL * WELL_KNOWN * high:
+        yield (
+            f"surface: {rig.mesh} leave fields uncertain at {high:g} Hz (limits.frequency); export "
+            f"those up to {WELL_KNOWN * high:g} Hz, {WELL_KNOWN:g} times as high"
+        )
     if rig.laminate is None and plate.thickness > _THICK:
         yield (
             f"plate.thickness: {1e3 * plate.thickness:g} mm is thick for a plate that is to be "
@@ -512,9 +520,13 @@ def _summary(rig: Rig) -> str:
     made_of = plate.material.name
     if laminate is not None and len(laminate.layers) > 1:
         made_of = f"laminate ({', '.join(layer.material.name for layer in laminate.layers)})"
+    whole, solved = f"{sizes} mm of {made_of}", f"mesh {rig.mesh}"
+    if plate.surface is not None:
+        whole = f"{1e3 * plate.length:g} x {1e3 * plate.width:g} mm of a surface"
+        solved = f"{rig.mesh} of {Path(plate.surface.file).name}, {plate.mass:.3g} kg"
     parts = [
-        f"{sizes} mm of {made_of}",
-        f"mesh {rig.mesh}",
+        whole,
+        solved,
         f"ERAs {', '.join(era.name for era in rig.eras)}",
     ]
     gap = plate.air_gap

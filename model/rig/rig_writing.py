@@ -38,6 +38,7 @@ from model.rig.rig_file import (
 )
 from model.rig.sections import PlateSection, RigSection
 from model.structure.material import known_material
+from model.structure.modal_elasticity import check_is_plate
 from model.structure.plate import FOLLOWED_FIELDS
 
 _SAME, _NONE = 1e-9, 1e-12  # relative; and what counts as nothing of every quantity
@@ -214,8 +215,9 @@ def _values(rig: Rig, section: RigSection) -> dict[KeyPath, Any]:
     found: dict[KeyPath, Any] = {
         ("uncertainty", key): value for key, value in asdict(rig.uncertainty).items()
     }
-    of_plate = section.plate.stated(rig.plate, rig.laminate)
-    found |= {("plate", *path): value for path, value in of_plate.items()}
+    if section.plate is not None:
+        of_plate = section.plate.stated(rig.plate, rig.laminate)
+        found |= {("plate", *path): value for path, value in of_plate.items()}
     for era in rig.eras:
         of_era = KINDS[type(era)].stated(era)
         found |= {("eras", era.name, key): value for key, value in of_era.items()}
@@ -345,6 +347,7 @@ def save_rig(rig: Rig, path: Path | str) -> None:
 
 def replaced(rig: Rig, changes: Mapping[str, Any]) -> Rig:
     """Make a rig with other keys, see `Rig.replaced`."""
+    check_is_plate(rig.plate, "rig.replaced")
     data: dict[str, Any] = {**stated(rig).data}
     for key in {"plate", "eras"} & changes.keys():
         expect(changes[key], Mapping, what=key, made_by='{"thickness": 0.002} or era.Era')

@@ -8,10 +8,12 @@ import math
 from collections.abc import Mapping
 from dataclasses import asdict, replace
 from itertools import product
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import (
     AfterValidator,
+    BeforeValidator,
     ConfigDict,
     Field,
     GetCoreSchemaHandler,
@@ -86,6 +88,15 @@ from model.structure.plate import (
     LaminateLayer,
     Plate,
     equivalent_plate,
+)
+from model.structure.surface import (
+    NU,
+    THICKNESS,
+    Surface,
+    deviating_losses,
+    digest_of_file,
+    homogeneous,
+    surface_shapes,
 )
 from registry.limits import GuardLimits
 
@@ -447,6 +458,81 @@ PLAIN_KEYS: Mapping[str, Dimension] = {
 """Dimensions of the keys of a plate that are quantities with the value of a field of `Plate`."""
 
 
+Corner = Annotated[
+    tuple[
+        Annotated[float, Quantity(LENGTH, at_least=-10, at_most=10)],
+        Annotated[float, Quantity(LENGTH, at_least=-10, at_most=10)],
+    ],
+    Strict(strict=False),
+]
+Ring = Annotated[list[Corner], Field(min_length=3, max_length=1000)]
+
+
+class SurfaceSection(Section):
+    """A surface by the modes of another program, in place of a plate."""
+
+    modes: Annotated[str, Field(min_length=1, max_length=1000)]
+    """File of its modes beside the rig file: a universal file, or .npz; see [surfaces](#surface).
+
+    Limits: a file
+    """
+
+    normal: Literal["x", "y", "z", "-x", "-y", "-z", "local x", "local y", "local z"] = "z"
+    """Direction out of the surface towards fingers, in axes of the file; `local z` for the normal
+    at each node, of a curved surface.
+    """
+
+    mass: Annotated[float, Quantity(MASS, above=0, at_most=1000)] | None = None
+    """That moves along the normal.
+
+    Default: of the rigid modes in the file; required without them
+    """
+
+    loss_factor: Annotated[float, Quantity(RATIO, at_least=0, below=1)] | None = None
+    """Structural damping of all modes.
+
+    Default: twice the damping ratio of each mode in the file, else 0.01
+    """
+
+    outline: Annotated[list[Ring], Field(min_length=1, max_length=100)] | None = None
+    """Rings of points `[x, y]`: edges and cut-outs of the surface.
+
+    Default: of the shells in the file, else the rectangle around all nodes
+    """
+
+    def made(self, path: Path) -> Plate:
+        """Make the plate of the modes of a file; raises InputError for what are none."""
+        digest = digest_of_file(path)
+        shapes = surface_shapes(str(path), digest, self.normal)
+        modulus, density, loss = homogeneous(shapes, self.mass)
+        rings = shapes.outline if self.outline is None else self.outline
+        surface = Surface(
+            str(path),
+            digest,
+            self.normal,
+            count=len(shapes.frequencies),
+            rigid=shapes.rigid,
+            frequency=float(shapes.frequencies[-1]),
+            modulus=modulus,
+            outline=tuple(tuple((float(x), float(y)) for x, y in ring) for ring in rings),
+        )
+        length, width = shapes.size.tolist()
+        return Plate(
+            length,
+            width,
+            THICKNESS,
+            Material("surface", E=modulus, rho=density, nu=NU),
+            loss if self.loss_factor is None else self.loss_factor,
+            mode_deviations=() if self.loss_factor is not None else deviating_losses(shapes, loss),
+            surface=surface,
+        )
+
+
+def _named_modes(value: object) -> object:
+    """The keys of a surface of which only the file is given."""
+    return {"modes": value} if isinstance(value, str) else value
+
+
 Edges = Literal["edges"]
 Points = Annotated[int, Field(ge=3, le=40)]
 
@@ -734,8 +820,20 @@ class RigSection(Section):
     promised_thresholds: those by which promises hold.
     """
 
-    plate: PlateSection
-    """The plate, see [plate](#plate)."""
+    plate: PlateSection | None = None
+    """The plate, see [plate](#plate).
+
+    Default: required, or `surface`
+    """
+
+    surface: Annotated[
+        SurfaceSection | None,
+        BeforeValidator(_named_modes, json_schema_input_type=SurfaceSection | str | None),
+    ] = None
+    """Modes of another program in place of a plate, see [surface](#surface).
+
+    Limits: a mapping, or a file of modes
+    """
 
     mesh: str = "auto"
     """`auto A %` uses polynomials over the plate for an error of the response of A % up to the

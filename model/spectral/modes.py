@@ -69,6 +69,7 @@ from model.structure.plate import (
     section_of,
     shear_corrections,
 )
+from model.structure.surface import LEAST_KNOWN, THICKNESS, Surface
 
 NODES = 12
 """Frequencies of a band at which modes state their stiffness."""
@@ -612,8 +613,77 @@ class SpectralMesh(Discretisation):
         return 0.0
 
 
-PlateMesh: TypeAlias = Mesh | SpectralMesh
-"""Elements, or polynomials over the whole plate: they have the same properties and methods."""
+@dataclass(frozen=True)
+class KnownModes(Discretisation):
+    """In place of a mesh: nx modes of a surface up to a frequency [Hz], in one row."""
+
+    frequency: float
+    element_name: ClassVar[str] = "modes"
+    strip: ClassVar[float] = 0.0
+
+    @classmethod
+    def of(cls, plate: Plate, surface: Surface) -> Self:
+        """Those that a file has of a surface; plate: that stands for it."""
+        faster = plate.thickness / THICKNESS * math.sqrt(plate.material.E / surface.modulus)
+        highest = faster * surface.frequency
+        return cls(surface.count, 1, plate.length, plate.width, highest)
+
+    def __str__(self) -> str:
+        return f"{self.nx} modes up to {self.frequency:.0f} Hz"
+
+    @property
+    def dof(self) -> int:
+        """Number of degrees of freedom, one for each mode."""
+        return self.nx
+
+    @property
+    def raster(self) -> tuple[int, int]:
+        """Numbers of evenly spaced points along x and y that show its highest mode."""
+        points = (
+            math.ceil(2 * _POINTS_PER_DEGREE * side / self.shortest_wavelength)
+            for side in (self.length, self.width)
+        )
+        nx, ny = points
+        return nx + 1, ny + 1
+
+    @property
+    def shortest_wavelength(self) -> float:
+        """The bending wavelength [m] of its highest mode, by their number."""
+        return math.sqrt(1.25 * math.pi * self.length * self.width / self.nx)
+
+    def highest_frequency(self, plate: Plate) -> float:
+        """The highest frequency [Hz] at which enough modes are known."""
+        return self.frequency / LEAST_KNOWN
+
+    def check_frequencies(self, plate: Plate, frequencies: FloatArray) -> None:
+        """Raise InputError for frequencies (f,) [Hz] not above zero, or too high for the modes."""
+        highest = self.highest_frequency(plate)
+        for frequency in frequencies:
+            if not 0 < frequency <= highest:
+                raise InputError(
+                    f"frequency must be above zero and at most {highest:.4g} Hz, got {frequency:g} "
+                    f"Hz: the surface has {self}, {LEAST_KNOWN:g} times that; export more modes"
+                )
+
+    def finer(self) -> Self:
+        """Itself: there is no other solution to compare with."""
+        return self
+
+    def resolving(self, plate: Plate, frequency: float) -> Self:
+        """The modes that would be enough at a frequency [Hz]."""
+        known = LEAST_KNOWN * frequency
+        return replace(self, nx=math.ceil(self.nx * known / self.frequency), frequency=known)
+
+    def interpolation_error(self, plate: Plate, frequency: float) -> float:
+        """0: splines through its nodes are evaluated wherever they are asked for."""
+        return 0.0
+
+
+PlateMesh: TypeAlias = Mesh | SpectralMesh | KnownModes
+"""Elements, polynomials over the whole plate, or the modes of another program.
+
+They have the same properties and methods.
+"""
 
 
 def stretched(mesh: PlateMesh, plate: Plate) -> PlateMesh:

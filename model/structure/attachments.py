@@ -673,6 +673,8 @@ def support_problem(
     plate: Plate, eras: Sequence[Source], *, loads: Sequence[PointLoad] = ()
 ) -> str | None:
     """Why ERAs and loads do not support a plate, with the remedy; None if they do."""
+    if plate.surface is not None and not plate.surface.rigid:
+        return None  # its modes are of what holds it
     lowest = rigid_body_frequencies(plate, eras, loads=loads)[0]
     if lowest >= MIN_RIGID_BODY_FREQUENCY:
         return None

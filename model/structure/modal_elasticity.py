@@ -149,7 +149,17 @@ def check_scales(
 
 def check_measurable(plate: Plate) -> None:
     """Raise InputError for a plate with a part that stays: no measurement finds such a plate."""
+    check_is_plate(plate, "a fit of thickness, size and modulus")
     check_scales(plate, np.inf, remedy=WITHOUT_PART)
+
+
+def check_is_plate(plate: Plate, what: str) -> None:
+    """Raise InputError for a surface by its modes, of which something cannot be done."""
+    if plate.surface is not None:
+        raise InputError(
+            f"surface: {what} must be of a plate, got a surface by its modes, which has no "
+            "thickness, size or modulus; give plate in its place, or export other modes"
+        )
 
 
 def modal_receptance(

@@ -37,10 +37,12 @@ from dataclasses import dataclass, field, fields, replace
 from enum import StrEnum
 
 import numpy as np
+from numpy.typing import NDArray
 
 from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError, expect_between, expect_values
 from model.structure.material import Material
+from model.structure.surface import Surface, is_within
 
 
 class Bond(StrEnum):
@@ -305,6 +307,11 @@ class Plate(Sheet):
     )
     """Air between the plate and a rigid wall; None for a plate in the open."""
 
+    surface: Surface | None = field(
+        default=None, metadata=_meaning("all natural frequencies as h, all modal masses as h")
+    )
+    """Modes of another program that take the place of its own; the plate is like them."""
+
     def __post_init__(self) -> None:
         """Refuse dimensions out of range."""
         expect_values(self, "plate", above="length width thickness")
@@ -392,7 +399,14 @@ class Plate(Sheet):
 
     def contains(self, x: float, y: float) -> bool:
         """Whether a point [m] lies on the plate, its edges included."""
-        return 0 <= x <= self.length and 0 <= y <= self.width
+        is_near = 0 <= x <= self.length and 0 <= y <= self.width
+        return is_near and bool(self.covers(np.array([[x, y]]))[0])
+
+    def covers(self, points: FloatArray) -> NDArray[np.bool_]:
+        """Whether points (p, 2) [m] of its rectangle are within the outline of a surface, (p,)."""
+        if self.surface is None or not self.surface.outline:
+            return np.ones(len(points), dtype=bool)
+        return is_within(self.surface.outline, points)
 
 
 FOLLOWED_FIELDS = tuple(

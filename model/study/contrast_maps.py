@@ -56,7 +56,7 @@ def random_contacts(
     sides = np.array([plate.length, plate.width])
     for _ in range(tries):
         places = rng.uniform(margin, sides - margin, (count, 2))
-        if least_gap(places) >= apart:
+        if least_gap(places) >= apart and plate.covers(places).all():
             return tuple((float(x), float(y)) for x, y in places)
     raise InputError(
         f"{count} fingers must be {1000 * apart:g} mm apart, got a plate of {plate.length:g} x "
@@ -379,6 +379,7 @@ def map_contrast(
         (row, cell): Placement((at,), fingers)
         for cell, at in enumerate((float(x), float(y)) for x, y in centres)
         if min(math.dist(at, finger) for finger in fingers) >= FINGERTIP_RADIUS
+        and table.plate.contains(*at)
         for row in range(len(modes))
     }
     check_on_plate("quiet finger", fingers, table.plate)

@@ -389,8 +389,9 @@ class LocalizationTable:
 
     @cached_property
     def cell_centres(self) -> FloatArray:
-        """Centres of the grid's cells [m], (cells, 2)."""
-        return self.grid.centres(self.plate)
+        """Centres of the grid's cells [m] that are on the plate, (cells, 2)."""
+        centres = self.grid.centres(self.plate)
+        return centres[self.plate.covers(centres)]
 
     @cached_property
     def in_time(self) -> PlateInTime:
@@ -554,7 +555,8 @@ class LocalizationTable:
         by_field = [isinstance(each, Exciter) for each in self.eras]
         # Without the edges, which bend most, and where few fingers rest.
         points = self.raster.points
-        shapes = self.shapes[(np.abs(points / points[-1] - 0.5) < 0.5 - EDGE).all(axis=1)]
+        inner = (np.abs(points / points[-1] - 0.5) < 0.5 - EDGE).all(axis=1)
+        shapes = self.shapes[inner & self.plate.covers(points)]
         gram = np.asarray(shapes.T @ shapes / np.float32(len(shapes)))
         return with_places(found, self._shifts_of_eras, gram, by_field)
 
@@ -610,7 +612,8 @@ class LocalizationTable:
 
     @cached_property
     def _gram(self) -> Float32Array:
-        return np.asarray(self.shapes.T @ self.shapes / np.float32(self.raster.point_count))
+        shapes = self.shapes[self.plate.covers(self.raster.points)]
+        return np.asarray(shapes.T @ shapes / np.float32(len(shapes)))
 
     @cached_property
     def _everywhere(self) -> tuple[FloatArray, Complex64Array, Complex64Array]:
@@ -619,6 +622,7 @@ class LocalizationTable:
         side = min(BACKGROUND_CELL, wavelength / CELLS_PER_WAVELENGTH)
         sides = self.plate.length, self.plate.width
         points = Grid(*(min(max(round(each / side), 1), 200) for each in sides)).centres(self.plate)
+        points = points[self.plate.covers(points)]
         fields = self.unit_fields(points)
         return points, fields, _power(fields)
 

@@ -421,7 +421,7 @@ def _discretisation(problem: TableProblem) -> Arrays:
         problem.reference_mesh,
         problem.rig.eras,
         problem.frequencies,
-        problem.raster.points,
+        problem.raster.points[problem.rig.plate.covers(problem.raster.points)],
         loads=problem.rig.masses,
     )
     return {"discretisation_error": error.max(axis=1)}

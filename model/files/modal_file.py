@@ -1,0 +1,332 @@
+"""Modes of a surface from another program: universal files (UFF) and NumPy files (.npz).
+
+Of a universal file nodes (datasets 15 and 2411), shell elements (2412), modes (55 and 2414) and
+units (164) are read by position, as the definitions of the format state them (Structural Dynamics
+Research Laboratory, University of Cincinnati); other datasets are passed over. Values may be in any
+spelling of Fortran. A .npz has the arrays nodes (n, 3) [m], frequencies (r,) [Hz] and shapes
+(r, n, 3), or (r, n) along the normal, [1/sqrt(kg)]; further damping_ratios (r,), places (n, 2) [m]
+of the nodes in coordinates of touches, and faces (k, 3 or more), rows of node numbers from 0.
+"""
+
+import math
+import zipfile
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from io import BytesIO
+from pathlib import Path
+
+import numpy as np
+
+from model.arrays import ComplexArray, FloatArray
+from model.errors import InputError
+from model.files.uff import DatasetBlock, blocks, lengths_in_si, numbers_in, read_bytes
+
+_SHELLS = frozenset(range(40, 100)) | {171, 172}  # plane stress, plates, membranes, thin shells
+_BEAMS = frozenset(range(11, 38))  # whose elements have a further row
+_NORMAL_MODES, _COMPLEX_MODES = 2, (3, 7)  # types of analysis
+_DISPLACEMENT = (0, 8)  # unknown, displacement
+_MAX_COMPLEX = 0.3  # imaginary part that a turned shape may have, relative to its real part
+_VALUES_A_ROW = 6
+_HEAD = {55: (9, 6), 2414: (14, 9)}
+"""Rows before the first node of a mode, and of these the row of its types, by dataset."""
+
+_ARRAYS = {"nodes", "frequencies", "shapes"}
+_FURTHER = {"damping_ratios", "places", "faces"}
+_BINARY_ZIP = b"PK\x03\x04"
+
+
+@dataclass(frozen=True, eq=False)
+class ModeShapes:
+    """Modes as a file has them, in SI and of unit modal mass."""
+
+    nodes: FloatArray
+    """Positions (n, 3) [m]."""
+
+    frequencies: FloatArray
+    """Natural frequencies (r,) [Hz]."""
+
+    shapes: FloatArray
+    """Displacements (r, n, 3), or (r, n) along the normal, [1/sqrt(kg)]."""
+
+    damping_ratios: FloatArray
+    """(r,), NaN where the file has none."""
+
+    faces: Sequence[Sequence[int]] = ()
+    """Nodes of each face in turn, by their rows."""
+
+    places: FloatArray | None = None
+    """Nodes in coordinates of touches (n, 2) [m]; None where they are projected."""
+
+
+def read_modes(path: Path) -> ModeShapes:
+    """Read modes; raises InputError with file and line for what are none."""
+    content = read_bytes(path)
+    found = _from_arrays if content.startswith(_BINARY_ZIP) else _from_universal
+    modes = found(path, content)
+    for name in ("nodes", "frequencies", "shapes"):
+        if not np.isfinite(getattr(modes, name)).all():
+            raise InputError(f"{path}: {name} of modes must be finite; export them again")
+    return modes
+
+
+def _from_arrays(path: Path, content: bytes) -> ModeShapes:
+    try:
+        with np.load(BytesIO(content), allow_pickle=False) as file:
+            held = {name: file[name] for name in file.files}
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        raise InputError(
+            f"{path}: .npz of modes must be readable, got {error}; write it again"
+        ) from error
+    unknown = held.keys() - _ARRAYS - _FURTHER
+    if unknown or _ARRAYS - held.keys():
+        raise InputError(
+            f"{path}: .npz of modes must have {', '.join(sorted(_ARRAYS))} and may have "
+            f"{', '.join(sorted(_FURTHER))}, got {', '.join(sorted(held)) or 'none'}"
+        )
+    n, r = (held[name].shape[:1] or (0,) for name in ("nodes", "frequencies"))
+    expected = {"nodes": [(*n, 3)], "frequencies": [r], "shapes": [(*r, *n, 3), (*r, *n)]}
+    expected |= {"damping_ratios": [r], "places": [(*n, 2)]}
+    for name, shapes in expected.items():
+        if name in held and (held[name].shape not in shapes or held[name].dtype.kind not in "fiu"):
+            raise InputError(
+                f"{path}: {name} must be real numbers of shape {' or '.join(map(str, shapes))}, "
+                f"got {held[name].dtype} of {held[name].shape}"
+            )
+    faces = held.get("faces", np.empty((0, 3), dtype=int))
+    if faces.dtype.kind not in "iu" or faces.ndim != 2 or ((faces < 0) | (faces >= n[0])).any():
+        raise InputError(f"{path}: faces must be rows of node numbers from 0 to {n[0] - 1}")
+    places = held.get("places")
+    return ModeShapes(
+        held["nodes"].astype(float),
+        held["frequencies"].astype(float),
+        held["shapes"].astype(float),
+        held.get("damping_ratios", np.full(r, math.nan)).astype(float),
+        faces.tolist(),
+        None if places is None else places.astype(float),
+    )
+
+
+def _from_universal(path: Path, content: bytes) -> ModeShapes:
+    scale = 1.0, 1.0
+    nodes: dict[int, tuple[float, ...]] = {}
+    turned: set[int] = set()
+    modes: list[_Mode] = []
+    faces: list[list[int]] = []
+    kinds = set()
+    for block in blocks(path, content):
+        kinds.add(block.kind)
+        if block.kind == 164:
+            scale = _units(path, block)
+        elif block.kind in (15, 2411):
+            _read_nodes(path, block, nodes, turned)
+        elif block.kind == 2412:
+            faces += _read_faces(path, block)
+        elif block.kind in _HEAD and (mode := _read_mode(path, block)) is not None:
+            modes.append(mode)
+    if not nodes:
+        raise InputError(
+            f"{path}: must have nodes (dataset 15 or 2411), got datasets {sorted(kinds)}; export "
+            "them with the modes"
+        )
+    if not modes:
+        raise InputError(
+            f"{path}: must have normal modes (dataset 55 or 2414), got datasets {sorted(kinds)}; "
+            "export shapes of modes, not records"
+        )
+    numbers = modes[0].nodes
+    for mode in modes:
+        if mode.nodes != numbers:
+            raise InputError(
+                f"{mode.place}: all modes must be at the same nodes, got {len(mode.nodes)} of "
+                f"which {len(set(mode.nodes) & set(numbers))} are among the {len(numbers)} of the "
+                "first mode; export one component"
+            )
+    missing = [each for each in numbers if each not in nodes]
+    if missing:
+        raise InputError(
+            f"{modes[0].place}: node {missing[0]} of the modes must have coordinates (dataset 15 "
+            f"or 2411), got none of {len(missing)} nodes; export all nodes"
+        )
+    if local := turned & set(numbers):
+        raise InputError(
+            f"{path}: displacements must be in the global system, got a local one of node "
+            f"{min(local)}; export shapes in global coordinates"
+        )
+    rows = {number: row for row, number in enumerate(numbers)}
+    length, force = scale
+    # Modal masses are in the file's unit of mass, force s² / length.
+    heavier = math.sqrt(force / length)
+    return ModeShapes(
+        np.array([nodes[each] for each in numbers]) / length,
+        np.array([mode.frequency for mode in modes]),
+        np.array([mode.shape for mode in modes]) * heavier,
+        np.array([mode.damping_ratio for mode in modes]),
+        [[rows[each] for each in face] for face in faces if rows.keys() >= set(face)],
+    )
+
+
+@dataclass(frozen=True)
+class _Mode:
+    """One mode of a universal file, its shape (n, 3) or (n,) of unit modal mass."""
+
+    place: str
+    frequency: float
+    damping_ratio: float
+    nodes: list[int]
+    shape: FloatArray
+
+
+def _units(path: Path, block: DatasetBlock) -> tuple[float, float]:
+    """By what lengths and forces of the file are divided to have metres and newtons."""
+    place, rows = f"{path}:{block.line}", block.rows[1:]
+    factors = [each for row in rows[1:] for each in numbers_in(row)]
+    code = numbers_in(rows[0][:10]) if rows else []
+    if not code or len(factors) < 2:
+        raise InputError(f"{place}: units (dataset 164) must have a code and factors; export again")
+    label = rows[0][10:30].decode("ascii", "replace").strip()
+    length = lengths_in_si(place, factors[0], int(code[0]), label)
+    if not 0 < factors[1] < math.inf:
+        raise InputError(f"{place}: factor of forces must be positive, got {factors[1]:g}")
+    return length, factors[1]
+
+
+def _rows_of(path: Path, block: DatasetBlock, size: int) -> Iterator[list[list[float]]]:
+    """Yield the numbers of records of so many rows each."""
+    rows = block.rows[1:]
+    if len(rows) % size:
+        raise InputError(
+            f"{path}:{block.line + len(rows) + 1}: dataset {block.kind} must have {size} rows for "
+            f"each entry, got {len(rows)} in all; the file is damaged, export it again"
+        )
+    for first in range(0, len(rows), size):
+        yield [numbers_in(row) for row in rows[first : first + size]]
+
+
+def _read_nodes(
+    path: Path,
+    block: DatasetBlock,
+    nodes: dict[int, tuple[float, ...]],
+    turned: set[int],
+) -> None:
+    """Add the nodes of a dataset, and the numbers of those with local displacements."""
+    size = 1 if block.kind == 15 else 2
+    for count, record in enumerate(_rows_of(path, block, size)):
+        numbers = [each for row in record for each in row]
+        if len(numbers) != 7 or not np.isfinite(numbers).all():
+            raise InputError(
+                f"{path}:{block.line + 2 + size * count}: node must have a number, three codes and "
+                f"three finite coordinates, got {len(numbers)} numbers; export it again"
+            )
+        nodes[int(numbers[0])] = tuple(numbers[4:])
+        if numbers[2]:
+            turned.add(int(numbers[0]))
+
+
+def _read_faces(path: Path, block: DatasetBlock) -> Iterator[list[int]]:
+    """Yield the nodes of each shell element in turn."""
+    rows, at = [numbers_in(row) for row in block.rows[1:]], 0
+    while at < len(rows):
+        if len(rows[at]) < 6:
+            raise InputError(
+                f"{path}:{block.line + 2 + at}: element must have six numbers, got "
+                f"{len(rows[at])}; export it again"
+            )
+        kind, count = int(rows[at][1]), int(rows[at][5])
+        at += 1 + (kind in _BEAMS)
+        found: list[float] = []
+        while at < len(rows) and len(found) < count:
+            found += rows[at]
+            at += 1
+        if kind in _SHELLS:
+            yield [int(each) for each in found]
+
+
+def _read_mode(path: Path, block: DatasetBlock) -> _Mode | None:
+    """Read a dataset 55 or 2414; None for one that is no mode."""
+    place, rows = f"{path}:{block.line}", block.rows
+    head, types = _HEAD[block.kind]
+    if len(rows) <= head + 1:
+        raise InputError(f"{place}: dataset {block.kind} must have a mode, got {len(rows)} rows")
+    # The row of types is the sixth of a dataset 55 and the ninth of a dataset 2414.
+    kinds = [int(each) for each in numbers_in(rows[types])]
+    if block.kind == 2414:
+        location = numbers_in(rows[3])
+        if location and int(location[0]) != 1:
+            return None  # at elements
+    if len(kinds) < 6 or kinds[1] not in (_NORMAL_MODES, *_COMPLEX_MODES):
+        return None
+    _, analysis, _, result, data, count = kinds[:6]
+    if result not in _DISPLACEMENT:
+        raise InputError(
+            f"{place}: shapes of modes must be displacements (8), got type {result}; export these"
+        )
+    if count not in (1, 3, 6):
+        raise InputError(
+            f"{place}: a mode must have 1, 3 or 6 values at each node, got {count}; export "
+            "displacements"
+        )
+    reals = [each for row in rows[types + 2 : head] for each in numbers_in(row)]
+    if block.kind == 2414:
+        reals = reals[2:]  # behind two counts
+    frequency, mass, damping = _modal(place, block.kind, analysis, reals)
+    is_complex = data in (5, 6)
+    numbers, values = _values(path, block, head, count * (1 + is_complex))
+    shape: FloatArray | ComplexArray = values
+    if is_complex:
+        shape = _real(place, values[:, ::2] + 1j * values[:, 1::2])
+    shape = shape[:, 0] if count == 1 else shape[:, :3]
+    return _Mode(place, frequency, damping, numbers, np.asarray(shape / math.sqrt(mass)))
+
+
+def _modal(
+    place: str, kind: int, analysis: int, reals: Sequence[float]
+) -> tuple[float, float, float]:
+    """Frequency [Hz], modal mass and damping ratio of a mode, NaN for none."""
+    found: Sequence[float] = [*reals, *[0.0] * 8]
+    if kind == 55 and analysis == _NORMAL_MODES:
+        frequency, mass, viscous, hysteretic = found[:4]
+    elif kind == 55:
+        pole, mass, hysteretic = complex(found[0], found[1]), 0.0, 0.0
+        frequency, viscous = abs(pole) / (2 * math.pi), -pole.real / max(abs(pole), 1e-30)
+    else:
+        _, frequency, _, mass, viscous, hysteretic = found[:6]
+    if not (math.isfinite(frequency) and frequency >= 0 and mass >= 0):
+        raise InputError(
+            f"{place}: frequency and modal mass must be finite and at least 0, got {frequency:g} "
+            f"Hz and {mass:g}; export it again"
+        )
+    return frequency, mass or 1.0, viscous or hysteretic / 2 or math.nan
+
+
+def _values(path: Path, block: DatasetBlock, head: int, count: int) -> tuple[list[int], FloatArray]:
+    """Numbers of the nodes (n,), and so many values at each (n, count)."""
+    rows = block.rows[head:]
+    size = 1 + math.ceil(count / _VALUES_A_ROW)
+    if len(rows) % size:
+        raise InputError(
+            f"{path}:{block.line + head + len(rows)}: a mode must have {size} rows for each node, "
+            f"got {len(rows)} in all; the file is damaged, export it again"
+        )
+    numbers, values = [], []
+    for first in range(0, len(rows), size):
+        number = numbers_in(rows[first])
+        own = [each for row in rows[first + 1 : first + size] for each in numbers_in(row)]
+        if len(number) != 1 or len(own) != count:
+            raise InputError(
+                f"{path}:{block.line + 1 + head + first}: a node must have its number and then "
+                f"{count} values, got {len(own)}; the file is damaged, export it again"
+            )
+        numbers.append(int(number[0]))
+        values.append(own)
+    return numbers, np.array(values)
+
+
+def _real(place: str, shape: ComplexArray) -> FloatArray:
+    """A complex shape turned by the phase that leaves least of it imaginary."""
+    turned = shape * np.exp(-0.5j * np.angle((shape**2).sum()))
+    if np.abs(turned.imag).max() > _MAX_COMPLEX * np.abs(turned.real).max():
+        raise InputError(
+            f"{place}: a mode must be nearly real, got a complex one, whose nodes move at other "
+            "times; export normal modes"
+        )
+    return np.asarray(turned.real)

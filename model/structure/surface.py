@@ -1,0 +1,251 @@
+"""A surface that another program solved, or a test measured: its modes along the normal.
+
+It takes the place of a plate in a rig (`surface` in place of `plate`). What the rest asks a plate
+by itself for, wavelengths, weight and its rectangle, is then that of a homogeneous plate with as
+many modes and the same mass. Touches have coordinates in the plane across the normal, from the
+corner of the rectangle around all nodes, or those that the file states.
+
+The mass is that of the rigid motion along the normal: with modes phi of unit modal mass and c so
+that sum c phi = 1, it is |c|². Mounts that hold the surface must be in its modes or in the rig, not
+in both.
+
+Not modelled: forces and motion within the surface, of its actuators, too.
+"""
+
+import hashlib
+import math
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model.arrays import FloatArray, Point
+from model.errors import InputError
+from model.files.modal_file import read_modes
+from model.files.uff import read_bytes
+
+Rings: TypeAlias = tuple[tuple[Point, ...], ...]
+
+THICKNESS, NU, _EDGES = 2e-3, 0.25, 1.25
+"""Of the homogeneous plate: thickness [m] and Poisson's ratio, both arbitrary; and its modes over
+those of the area alone (`Plate.modes_below`)."""
+
+LEAST_KNOWN, WELL_KNOWN = 1.15, 3.0
+"""Multiples of the highest frequency up to which modes must be known, and should be: with fewer,
+fields were wrong by a fifth; with those up to three times by 3 %."""
+
+_RIGID_FREQUENCY = 1.0  # Hz; below it a mode is of the rigid body
+_HELD = 0.2  # motion along the normal of a rigid mode, to that of the one with most
+_SEEN = 1e-3  # the same of elastic modes, to their median; others move within the surface
+_FEWEST = 6  # nodes, and elastic modes
+_BESIDE = 9  # nodes beside each other, whose plane has the normal
+_ON_OUTLINE = 1e-3  # m; a place so near to it is on the surface
+_SAME_MASS = 0.1
+_SAME_LOSS = 0.01
+_MAX_DEVIATING = 64  # modes
+
+
+@dataclass(frozen=True)
+class Surface:
+    """What a plate is by the modes of a file; `surface_modes` reads them."""
+
+    file: str
+    digest: str
+    """SHA-256 of the file's content."""
+
+    normal: str
+    """Direction of touches: an axis of the file, -z for one downwards, or `local z`."""
+
+    count: int
+    """Number of modes, those of the rigid body among them."""
+
+    rigid: int
+    """Number of modes of the rigid body; 0 for a surface that its modes hold."""
+
+    frequency: float
+    """Natural frequency [Hz] of the highest mode."""
+
+    modulus: float
+    """Modulus of elasticity [Pa] of the homogeneous plate."""
+
+    outline: Rings = ()
+    """Edges and cut-outs as rings of points [m]; none for the whole rectangle."""
+
+
+@dataclass(frozen=True, eq=False)
+class SurfaceShapes:
+    """Modes along the normal at n nodes, of unit modal mass; those of the rigid body come first."""
+
+    points: FloatArray
+    """Nodes (n, 2) in coordinates of touches [m]."""
+
+    frequencies: FloatArray
+    """Natural frequencies (r,) [Hz], ascending, 0 of the rigid body."""
+
+    shapes: FloatArray
+    """(n, r) [1/sqrt(kg)]."""
+
+    damping_ratios: FloatArray
+    """(r,), NaN where the file has none."""
+
+    rigid: int
+    """Number of modes of the rigid body."""
+
+    mass: float
+    """Mass that moves along the normal [kg], NaN without a rigid motion."""
+
+    size: FloatArray
+    """Sides (2,) of the rectangle around the surface [m]."""
+
+    outline: Rings
+    """Edges of its faces, none where the file has no faces."""
+
+
+def digest_of_file(path: Path) -> str:
+    """SHA-256 of a file's content; raises InputError where it cannot be read."""
+    return hashlib.sha256(read_bytes(path)).hexdigest()
+
+
+@lru_cache(maxsize=4)
+def surface_shapes(file: str, digest: str, normal: str) -> SurfaceShapes:
+    """Read the modes of a file of a digest along a normal; raises InputError for what are none."""
+    path = Path(file)
+    if digest_of_file(path) != digest:
+        raise InputError(f"{file}: modes have changed since the rig was read; start again")
+    read = read_modes(path)
+    axis = "xyz".index(normal[-1])
+    upwards = -1.0 if "-" in normal else 1.0
+    along = (read.shapes if read.shapes.ndim == 2 else upwards * read.shapes[:, :, axis]).T
+    w = along
+    if normal.startswith("local") and read.shapes.ndim == 3:
+        normals = upwards * _normals(read.nodes, axis)
+        w = np.einsum("rnk,nk->nr", read.shapes, normals)
+    order = np.argsort(read.frequencies, kind="stable")
+    frequencies, w, along = read.frequencies[order], w[:, order], along[:, order]
+    is_rigid = frequencies < _RIGID_FREQUENCY
+    elastic, ratios = w[:, ~is_rigid], read.damping_ratios[order][~is_rigid]
+    size = np.sqrt((elastic**2).mean(axis=0))
+    seen = size > _SEEN * np.median(size) if len(size) else np.empty(0, dtype=bool)
+    if seen.sum() < _FEWEST or len(w) < _FEWEST:
+        raise InputError(
+            f"{file}: modes must be {_FEWEST} elastic ones or more that move along {normal}, at "
+            f"{_FEWEST} nodes or more, got {seen.sum()} at {len(w)}; export more, or give "
+            "surface.normal"
+        )
+    # Mixtures of rigid motions that go along the normal; nothing would hold the others.
+    _, sizes, mixtures = np.linalg.svd(w[:, is_rigid], full_matrices=False)
+    held = sizes > _HELD * sizes.max(initial=0.0)
+    rigid, others = int(held.sum()), [a for a in range(3) if a != axis]
+    places = read.nodes[:, others] if read.places is None else read.places
+    corner = places.min(axis=0)
+    points = places - corner
+    return SurfaceShapes(
+        points,
+        np.concatenate([np.zeros(rigid), frequencies[~is_rigid][seen]]),
+        np.hstack([w[:, is_rigid] @ mixtures[held].T, elastic[:, seen]]),
+        np.concatenate([np.full(rigid, math.nan), ratios[seen]]),
+        rigid,
+        _mass(along[:, is_rigid]),
+        np.ptp(points, axis=0),
+        rings_of(read.faces, points),
+    )
+
+
+def _normals(nodes: FloatArray, axis: int) -> FloatArray:
+    """Unit normals (n, 3) at nodes: of the plane nearest to those beside each, along an axis."""
+    from scipy.spatial import cKDTree  # only curved surfaces need it
+
+    _, near = cKDTree(nodes).query(nodes, k=min(_BESIDE, len(nodes)))
+    beside = nodes[near] - nodes[near].mean(axis=1, keepdims=True)
+    found = np.linalg.svd(beside)[2][:, 2]
+    return np.asarray(found * np.where(found[:, [axis]] < 0, -1.0, 1.0))
+
+
+def _mass(rigid: FloatArray) -> float:
+    """Mass [kg] by rigid modes (n, r) of unit modal mass, NaN where they make no even motion."""
+    # Six digits of a file leave directions that are rounding, and would be light.
+    shares, *_ = np.linalg.lstsq(rigid, np.ones(len(rigid)), rcond=1e-4)
+    is_even = rigid.size > 0 and np.abs(rigid @ shares - 1).max() < 0.05
+    return float(shares @ shares) if is_even else math.nan
+
+
+def rings_of(faces: Iterable[Sequence[int]], points: FloatArray) -> Rings:
+    """Edges that only one of the faces has, in rings of points [m]: outline and cut-outs."""
+    count = Counter(
+        frozenset(edge)
+        for face in faces
+        for edge in zip(face, (*face[1:], face[0]), strict=True)
+        if edge[0] != edge[1]
+    )
+    beside = defaultdict[int, list[int]](list)
+    for a, b in (sorted(edge) for edge, times in count.items() if times == 1):
+        beside[a].append(b)
+        beside[b].append(a)
+    rings = []
+    while beside:
+        ring = [min(beside)]
+        while nexts := beside.get(ring[-1]):
+            after = nexts.pop()
+            beside[after].remove(ring[-1])
+            ring.append(after)
+        for each in ring:
+            if not beside.get(each, True):
+                del beside[each]
+        rings.append(tuple((float(x), float(y)) for x, y in points[ring[:-1]]))
+    return tuple(rings)
+
+
+def is_within(outline: Rings, points: FloatArray) -> NDArray[np.bool_]:
+    """Whether points (p, 2) [m] are inside of rings by the even-odd rule, or on them, (p,)."""
+    inside, on_edge = np.zeros((2, len(points)), dtype=bool)
+    x, y = points.T
+    for ring in outline:
+        for (x0, y0), (x1, y1) in zip(ring, (*ring[1:], ring[0]), strict=True):
+            crosses = (y0 > y) != (y1 > y)
+            inside ^= crosses & (x < x0 + (x1 - x0) * (y - y0) / ((y1 - y0) or 1.0))
+            along = np.array([x1 - x0, y1 - y0])
+            share = ((points - (x0, y0)) @ along / (along @ along or 1.0)).clip(0, 1)
+            on_edge |= np.hypot(*(points - (x0, y0) - share[:, None] * along).T) < _ON_OUTLINE
+    return np.asarray(inside | on_edge)
+
+
+def homogeneous(shapes: SurfaceShapes, mass: float | None) -> tuple[float, float, float]:
+    """Modulus [Pa], density [kg/m³] and loss factor of the plate that stands for a surface.
+
+    Its modes are N(f) = 1.25 S / 2 sqrt(mu / D) f. mass [kg]: stated, None where the modes have
+    it; raises InputError where both contradict each other, and without either.
+    """
+    own = shapes.mass
+    if mass is None and math.isnan(own):
+        raise InputError(
+            "mass must be stated for modes without an even rigid motion, got none; add the mass "
+            "that moves along the normal"
+        )
+    if mass is not None and abs(own / mass - 1) > _SAME_MASS:
+        raise InputError(
+            f"mass must be that of the modes, {own:.4g} kg, got {mass:.4g} kg; check the units of "
+            "the file and its modal masses, or leave it out"
+        )
+    elastic, area = shapes.frequencies[shapes.rigid :], float(np.prod(shapes.size))
+    mu = (own if mass is None else mass) / area
+    rigidity = mu / (2 * len(elastic) / (_EDGES * elastic[-1] * area)) ** 2
+    ratios = shapes.damping_ratios[np.isfinite(shapes.damping_ratios)]
+    return (
+        float(12 * rigidity * (1 - NU**2) / THICKNESS**3),
+        float(mu / THICKNESS),
+        float(2 * np.median(ratios)) if len(ratios) else 0.01,
+    )
+
+
+def deviating_losses(shapes: SurfaceShapes, loss_factor: float) -> tuple[tuple[float, float], ...]:
+    """Deviations of the lowest elastic modes whose damping is not a plate's (`mode_deviations`)."""
+    ratios = shapes.damping_ratios[shapes.rigid :][:_MAX_DEVIATING]
+    known = np.where(ratios > 0, 2 * ratios, loss_factor) / max(loss_factor, 1e-12)
+    if np.abs(known - 1).max() < _SAME_LOSS:
+        return ()
+    return tuple((0.0, float(each)) for each in np.log(known))

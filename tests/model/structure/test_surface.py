@@ -1,0 +1,214 @@
+"""Surfaces by their modes: the paper's plate through its own, odd files, cut-outs and curvature."""
+
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from controller.cli.main import run
+from model.answer.stimulus import check_on_plate
+from model.arrays import FloatArray, lattice
+from model.errors import InputError
+from model.reduction.free_plate import solve_free_plate
+from model.rig.rig import Rig
+from model.rig.rig_file import load_rig, parse_rig
+from model.rig.rig_writing import save_rig
+from model.structure.surface import is_within, rings_of
+from model.study.verification import verify_table
+from model.table.table import LocalizationTable
+from model.table.table_file import build_table, load_table, save_table
+from yaml_files import read_yaml
+
+ERAS = """
+eras:
+  SW: {at: [0, 0], stiffness: 17000, amplifier: main, channel: 0}
+  SE: {at: [0.3048, 0], stiffness: 17000, amplifier: main, channel: 1}
+  NE: {at: [0.3048, 0.2286], stiffness: 17000, amplifier: main, channel: 2}
+  NW: {at: [0, 0.2286], stiffness: 17000, amplifier: main, channel: 3}
+amplifiers: {main: {url: "sim://"}}
+limits: {frequency: [40, 150]}
+"""
+PLATE = "plate: {length: 0.3048, width: 0.2286, thickness: 1.5 mm, material: aluminium}" + ERAS
+HIGHEST = 900.0  # Hz; modes are exported up to it, six times the highest frequency
+ODD = read_yaml(Path(__file__).parent / "odd_modes.yaml")
+
+
+@pytest.fixture(scope="module")
+def plate() -> Rig:
+    """The paper's plate up to 150 Hz, by its sizes and material."""
+    return parse_rig("plate.yaml", PLATE)
+
+
+@pytest.fixture(scope="module")
+def own(plate: Rig) -> LocalizationTable:
+    """The table of that plate."""
+    return build_table(plate)
+
+
+@pytest.fixture(scope="module")
+def modes(plate: Rig) -> Mapping[str, FloatArray]:
+    """Its modes at 15 x 12 nodes as another program would export them, along z."""
+    free = solve_free_plate(plate.plate, plate.mesh, frequency_max=HIGHEST / 2)
+    nodes = lattice(np.linspace(0, 0.3048, 15), np.linspace(0, 0.2286, 12))
+    order = np.argsort(free.modes.eigenvalues)
+    return {
+        "nodes": np.column_stack([nodes, np.zeros(len(nodes))]),
+        "frequencies": np.sqrt(free.modes.eigenvalues[order].clip(0)) / (2 * np.pi),
+        "shapes": free.modes.shapes_at(nodes)[:, order].T,
+    }
+
+
+def _universal(modes: Mapping[str, FloatArray], *, kind: int, length: float) -> str:
+    """A universal file of modes, datasets 55 or 2414, in a unit of length per metre."""
+    rows = ["    -1", "   164", f"{1:10d}{'SI':<20}{2:10d}", f"{length:25.16E}{1.0:25.16E}"]
+    rows += [f"{0.0:25.16E}", "    -1", "    -1", "  2411"]
+    for number, node in enumerate(modes["nodes"], start=1):
+        at = "".join(f"{length * each:25.16E}" for each in node)
+        rows += [f"{number:10d}{0:10d}{0:10d}{1:10d}", at]
+    types = "".join(f"{each:10d}" for each in (1, 2, 2, 8, 2, 3))
+    for frequency, shape in zip(modes["frequencies"], modes["shapes"], strict=True):
+        reals = [frequency, 1 / length, 0.005, 0.0]
+        head = ["NONE"] * 5 + [types, f"{2:10d}{4:10d}{0:10d}{1:10d}"]
+        if kind == 2414:
+            head = [f"{1:10d}", "modes", f"{1:10d}", *head[:5], types, "0 0 0 0 0 1 0 0", "0 0"]
+            reals = [0.0, frequency, 0.0, *reals[1:]]
+        rows += ["    -1", f"{kind:6d}", *head, "".join(f"{each:13.5E}" for each in reals)]
+        rows += [f"{0.0:13.5E}" * 6] if kind == 2414 else []
+        for number, w in enumerate(shape, start=1):
+            rows += [f"{number:10d}", f"{0.0:13.5E}{0.0:13.5E}{w:13.5E}"]
+        rows.append("    -1")
+    return "\n".join(["", *rows, ""])[1:]
+
+
+def _write(folder: Path, modes: Mapping[str, Any], **further: Any) -> Path:
+    """Write a rig of modes in a .npz, with further arrays."""
+    np.savez(folder / "modes.npz", **(dict(modes) | further))
+    rig = folder / "rig.yaml"
+    rig.write_text("surface: modes.npz" + ERAS)
+    return rig
+
+
+def _difference(own: LocalizationTable, other: LocalizationTable) -> float:
+    """Relative L2 error of the fields at cells, the worst of all frequencies and ERAs."""
+    points = own.cell_centres
+    first, second = own.unit_fields(points), other.unit_fields(points)
+    size = np.linalg.norm(first, axis=-1)
+    return float((np.linalg.norm(first - second, axis=-1) / size).max())
+
+
+@pytest.mark.parametrize(("kind", "length"), [(55, 1.0), (2414, 1.0), (55, 1000.0)])
+def test_plate_by_its_own_modes_has_the_fields_of_its_table(
+    modes: Mapping[str, FloatArray],
+    own: LocalizationTable,
+    kind: int,
+    length: float,
+    tmp_path: Path,
+) -> None:
+    """Modes of another program give the fields of the plate that they are of, in m and in mm."""
+    (tmp_path / "modes.uff").write_text(_universal(modes, kind=kind, length=length))
+    (tmp_path / "rig.yaml").write_text("surface: modes.uff" + ERAS)
+    rig = load_rig(tmp_path / "rig.yaml")
+    assert rig.plate.mass == pytest.approx(own.plate.mass, rel=1e-3)
+    assert _difference(own, build_table(rig)) < 0.03
+
+
+def test_table_of_a_surface_is_verified_and_read_again(
+    modes: Mapping[str, FloatArray], tmp_path: Path
+) -> None:
+    """Fields, answers, promises and motion in time agree; table and rig need no other folder."""
+    rig = load_rig(_write(tmp_path, modes))
+    table = build_table(rig)
+    assert verify_table(table, rig, samples=3).failed_count == 0
+    save_table(table, tmp_path / "table.npz")
+    (elsewhere := tmp_path / "elsewhere").mkdir()
+    save_rig(rig, elsewhere / "rig.yaml")
+    load_table(tmp_path / "table.npz", rig=load_rig(elsewhere / "rig.yaml"))
+    _write(tmp_path, modes, shapes=1.01 * modes["shapes"])
+    with pytest.raises(InputError, match="must be a table of this rig: plate"):
+        load_table(tmp_path / "table.npz", rig=load_rig(tmp_path / "rig.yaml"))
+
+
+def test_curved_surface_counts_along_its_arc(
+    modes: Mapping[str, FloatArray], own: LocalizationTable, tmp_path: Path
+) -> None:
+    """The same motion along the normals of a cylinder is that of the plate, unrolled."""
+    radius, (x, y, _) = 0.4, modes["nodes"].T
+    angle = x / radius
+    normals = np.column_stack([np.sin(angle), 0 * angle, np.cos(angle)])
+    places = modes["nodes"][:, :2]
+    nodes = radius * normals + np.column_stack([0 * x, y, 0 * x])
+    shapes = modes["shapes"][:, :, None] * normals
+    path = _write(tmp_path, modes, nodes=nodes, shapes=shapes, places=places)
+    path.write_text("surface: {modes: modes.npz, normal: local z, mass: 282 g}" + ERAS)
+    assert _difference(own, build_table(load_rig(path))) < 0.06
+
+
+def test_cut_out_has_no_fingers(modes: Mapping[str, FloatArray], tmp_path: Path) -> None:
+    """Faces around a hole give two rings; a finger in the hole is refused, no cell is there."""
+    corner = np.arange(11 * 14).reshape(11, 14)[4:6, 5:9]
+    first = np.array([row * 15 + column for row in range(11) for column in range(14)])
+    kept = np.delete(first, corner.ravel())
+    faces = kept[:, None] + [0, 1, 16, 15]
+    rig = load_rig(_write(tmp_path, modes, faces=faces))
+    assert rig.plate.surface is not None
+    assert len(rig.plate.surface.outline) == 2
+    with pytest.raises(InputError, match=r"finger must be within the outline"):
+        check_on_plate("finger", [(0.152, 0.1)], rig.plate)
+    table = build_table(rig)
+    assert len(table.cell_centres) < table.grid.cell_count
+    assert rig.plate.covers(table.cell_centres).all()
+
+
+def test_even_odd_rule_counts_holes_and_edges() -> None:
+    """A square ring has neither its hole nor the outside, but both of its edges."""
+    points = np.array([[x, y] for y in range(4) for x in range(4)], dtype=float)
+    faces = [(a, a + 1, a + 5, a + 4) for a in (0, 1, 2, 4, 6, 8, 9, 10)]
+    rings = rings_of(faces, points)
+    asked = np.array([[0.5, 0.5], [1.5, 1.5], [3.5, 1], [1, 1.5], [3, 2]])
+    assert is_within(rings, asked).tolist() == [True, False, False, True, True]
+
+
+@pytest.mark.parametrize("odd", ODD, ids=str)
+def test_odd_modes_are_read_or_refused_with_their_place(
+    odd: Mapping[str, Any],
+    modes: Mapping[str, FloatArray],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """A damaged or unusual file of modes is read rightly, or one message says what and where."""
+    text, keys = _universal(modes, kind=55, length=1.0), "surface: modes.uff" + ERAS
+    old, new = odd.get("modes", ("", ""))
+    everywhere = old in ("E+", "\n")
+    if old == "cut":
+        text = text[: int(new)]
+    elif old:
+        assert old in text
+        text = text.replace(old, new, -1 if everywhere else 1)
+    keys = keys.replace(*odd.get("rig", ("", "")), 1)
+    (tmp_path / "modes.uff").write_bytes(text.encode())
+    (tmp_path / "rig.yaml").write_text(keys)
+    status = run(["config", "check", str(tmp_path / "rig.yaml")])
+    said = capsys.readouterr()
+    assert status == (2 if odd["said"] else 0), said.err
+    assert re.search(odd["said"] or "good: ", said.err if odd["said"] else said.out)
+
+
+@pytest.mark.parametrize(
+    "command",
+    ["plate convergence rig.yaml", "rig identify rig.yaml -o new.yaml --yes --url sim://"],
+)
+def test_what_needs_a_plate_says_so(
+    command: str,
+    modes: Mapping[str, FloatArray],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """Thickness, size and modulus of a surface are refused by name."""
+    _write(tmp_path, modes)
+    monkeypatch.chdir(tmp_path)
+    assert run(command.split()) == 2
+    assert "a surface by its modes, which has no thickness, size or" in capsys.readouterr().err

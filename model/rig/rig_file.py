@@ -538,7 +538,7 @@ def rig_of(document: Document, *, mesh: str | None = None) -> Rig:
         laminate=None if section.plate is None else section.plate.laminate,
         uncertainty=section.uncertainty.made(
             has_feet=any(foot.at is not None for foot in section.supports.values()),
-            weather=section.plate.weather,
+            weather=0.0 if section.plate is None else section.plate.weather,
         ),
         fingertip=None if isinstance(fingertip, str) else Fingertip(**fingertip.model_dump()),
         threshold=section.threshold,

@@ -15,7 +15,7 @@ from scipy import sparse
 from model.arrays import ComplexArray, FloatArray
 from model.fem import Mesh, PlateMatrices, assemble, factorise
 from model.spectral.direct_solution import Responder, direct_spectral_acceleration
-from model.spectral.modes import PlateMesh
+from model.spectral.modes import PlateMesh, SpectralMesh
 from model.structure.attachments import Era, FingertipLoad, PointLoad, footprints_of
 from model.structure.exciter import Actuator, Exciter
 from model.structure.modal_elasticity import loss_factors
@@ -26,6 +26,7 @@ def direct_responder(plate: Plate, mesh: PlateMesh) -> Responder:
     """Direct solution of a plate on a mesh."""
     if isinstance(mesh, Mesh):
         return partial(direct_acceleration, assemble(plate, mesh))
+    assert isinstance(mesh, SpectralMesh)  # noqa: S101  a surface has no other solution
     return partial(direct_spectral_acceleration, plate, mesh)
 
 

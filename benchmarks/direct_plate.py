@@ -26,7 +26,7 @@ def direct_responder(plate: Plate, mesh: PlateMesh) -> Responder:
     """Direct solution of a plate on a mesh."""
     if isinstance(mesh, Mesh):
         return partial(direct_acceleration, assemble(plate, mesh))
-    assert isinstance(mesh, SpectralMesh)  # noqa: S101  a surface has no other solution
+    assert isinstance(mesh, SpectralMesh)  # a surface has no other solution
     return partial(direct_spectral_acceleration, plate, mesh)
 
 

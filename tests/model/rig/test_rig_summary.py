@@ -59,7 +59,7 @@ def test_tables_of_keys_are_those_of_the_sections() -> None:
         "| `channel` | | none | 0 to 255 | its channel;",
         "| `bond` | | `full` | `full`, `none` | whether",
         "| `frequency` | Hz | `[40, 500]` | at least 1, at most 2000 | lowest and highest",
-        "| `resonance_is` | | required with `resonance` | `free`, `mounted` | of which",
+        "| `resonance_is` | | required with `resonance` | `free`, `mounted` | whose resonance",
         "| `kind` | | none | `foam`, `rubber` | of a foot",
         "| `E` | Pa | required, or those with a grain | at least 1000, at most 1e+13 | Young's",
     ):

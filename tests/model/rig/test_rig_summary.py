@@ -60,7 +60,7 @@ def test_tables_of_keys_are_those_of_the_sections() -> None:
         "| `bond` | | `full` | `full`, `none` | whether",
         "| `frequency` | Hz | `[40, 500]` | at least 1, at most 2000 | lowest and highest",
         "| `resonance_is` | | required with `resonance` | `free`, `mounted` | whose resonance",
-        "| `kind` | | none | `foam`, `rubber` | of a foot",
+        "| `kind` | | none | `foam`, `rubber` | kind of",
         "| `E` | Pa | required, or those with a grain | at least 1000, at most 1e+13 | Young's",
     ):
         assert f"\n{row}" in PAGE

@@ -140,7 +140,11 @@ class Request(BaseModel):
 
 def read_request(line: bytes) -> Request:
     """Read one line; raises InvalidRequest."""
-    document = parse_json(line)
+    return request_of(parse_json(line))
+
+
+def request_of(document: Any) -> Request:
+    """Validate the document of a line; raises InvalidRequest."""
     return _validated(
         Request,
         document,

@@ -32,8 +32,7 @@ from controller.api.jsonrpc import (
     error_line,
     parse_json,
     read_params,
-    read_request,
-    request_line,
+    request_of,
     unknown_method,
 )
 from controller.api.link import RESPONSE_TIMEOUT, Unreachable
@@ -260,13 +259,13 @@ class Gateway:
                 status=HTTP_STATUS[error.code],
             )
 
-    async def _request(self, method: str, body: bytes) -> Any:
-        """The daemon's result, over the connection that the client's keeps.
+    async def _request(self, method: str, body: object) -> Any:
+        """The daemon's result, over the connection that the client's keeps; body: as parsed.
 
         What silences goes over the own one, from any client. Raises RpcError and Unreachable.
         """
         connection = CONNECTION.get()
-        request = read_request(request_line(None, method, body))
+        request = request_of({"jsonrpc": "2.0", "method": method, "params": body})
         params = read_params(METHODS[method].params, request)
         if method not in SILENCING:
             return await connection.request(method, params)
@@ -322,11 +321,8 @@ async def _continue_later(_: web.Request) -> None:
     """Leave 100 Continue to `_body`: aiohttp would send it before the token is checked."""
 
 
-async def _body(request: web.Request) -> bytes:
-    """A request's body, by default an empty object; raises RpcError, web.HTTPException.
-
-    It is parsed here, so that lines and columns of an error are those of the body.
-    """
+async def _body(request: web.Request) -> Any:
+    """A request's body, by default an empty object; raises RpcError, web.HTTPException."""
     media = request.headers.get("Content-Type", "").partition(";")[0].strip().lower()
     if media != "application/json" and (media or request.can_read_body):
         raise web.HTTPUnsupportedMediaType(text="the content type must be application/json")
@@ -340,8 +336,7 @@ async def _body(request: web.Request) -> bytes:
             body = await request.read()
     except TimeoutError as error:
         raise web.HTTPRequestTimeout(text="the body is not complete") from error
-    parse_json(body or b"{}")
-    return body or b"{}"
+    return parse_json(body or b"{}")
 
 
 _MAX_LINE = 1 << 13  # bytes; of the head of a request

@@ -3,7 +3,7 @@
 An intent says which contacts shall feel something, how strongly, and until when: it is the
 interface between effects and playback. All other contacts are kept quiet. A content is what a layer
 plays, for its own finger and those that share it; predictions say what fingers feel of it, and a
-selection has the contents of all fingers.
+selection has the contents of all fingers. A question asks for the contents of some.
 """
 
 import math
@@ -441,6 +441,65 @@ class Selection:
                 each if felt is None else replace(felt, held_back=each.held_back)
             )
         return tuple(found.values())
+
+
+NOTHING = Selection((), ())
+"""The selection of no contents."""
+
+_SOON = 5.0  # s; longer courses take longer to answer than the control loop may wait
+
+
+@dataclass(frozen=True)
+class Question:
+    """The targets that contents are to be chosen for, among all contacts, and what plays."""
+
+    contacts: tuple[Contact, ...]
+    """All on the plate."""
+    lasting: Targets
+    """Targets of contents that last."""
+    short: Targets
+    """Targets of short pulses."""
+    protected: frozenset[ContactKey] = frozenset()
+    """Contacts that must not notice the contents of others."""
+    before: Mapping[tuple[ContactKey, int], Content] = field(default_factory=dict)
+    """Contents that are felt now, by finger and voice."""
+    kept: tuple[Selection, ...] = ()
+    """Selections that play on beside the new ones."""
+    is_rested: bool = False
+    """Whether what plays would do, too, but may be led to what promises more."""
+    now: float = math.inf
+    """[s]"""
+    fading: Selection = NOTHING
+    """What played before a cross-fade that goes on."""
+
+    @cached_property
+    def is_alone(self) -> bool:
+        """Whether what lasts is one, steady, beside no other finger that is protected."""
+        if len(self.lasting) != 1:
+            return False
+        ((contact, target),) = self.lasting
+        return self.protected <= {contact.key} and target.modulation_hz is None
+
+    @cached_property
+    def takes_long(self) -> bool:
+        """Whether what lasts takes longer than the control loop may wait."""
+        if self.lasting and not self.is_alone:
+            return True
+        courses = [each.course for _, each in self.lasting if each.course is not None]
+        return any(each.duration > _SOON for each in courses)
+
+    def quiet_beside(self, targets: Targets) -> tuple[Contact, ...]:
+        """Return the contacts that are not among some targets."""
+        quiet = [*self.contacts]
+        for contact, _ in targets:
+            quiet.remove(contact)
+        return tuple(quiet)
+
+    def silent(self, targets: Targets, reason: str) -> Selection:
+        """Return the selection of targets that feel nothing, for a reason."""
+        skipped = tuple(not_served(contact, reason) for contact, _ in targets)
+        quiet = self.quiet_beside(targets)
+        return Selection(targets, quiet, (), reason, skipped, protected=self.protected)
 
 
 def foreign_at(key: ContactKey, parts: Sequence[Selection]) -> list[float]:

@@ -29,6 +29,7 @@ from controller.play.intent import (
     MAX_DB_SL,
     Content,
     Prediction,
+    Question,
     Selection,
     Target,
     Targets,
@@ -107,25 +108,23 @@ _Voices = Mapping[ContactKey, tuple[Content, ...]]
 
 def answered(
     table: LocalizationTable,
-    targets: Sequence[tuple[Contact, Target]],
-    quiet: Sequence[Contact],
+    question: Question,
+    targets: Targets,
     capabilities: PlaybackCapabilities,
     *,
-    before: Mapping[tuple[ContactKey, int], Content],
-    protected: frozenset[ContactKey] = frozenset(),
     keeps: bool = True,
     now: float = math.inf,
     avoided_hz: Sequence[float] = (),
 ) -> Answer:
-    """Answer the fingers of targets and of quiet contacts, moving ones on their ways.
+    """Answer the fingers of some targets, moving ones on their ways; all others are quiet.
 
-    before: contents that play, by finger and voice; keeps: whether their frequencies are kept,
-    unless others serve more fingers, or more strongly. now [s]: infinite where all rest;
-    avoided_hz: frequencies that play beside the answer. Raises InputError for fingers that are too
-    close.
+    keeps: whether frequencies that are felt now are kept, unless others serve more fingers, or more
+    strongly. now [s]: infinite where all rest; avoided_hz: frequencies that play beside the answer.
+    Raises InputError for fingers that are too close.
     """
+    quiet = question.quiet_beside(targets)
     is_shaped = capabilities.envelope_support.onset_knots > 0
-    fingers = fingers_of(table, targets, quiet, capabilities, protected)
+    fingers = fingers_of(table, targets, quiet, capabilities, question.protected)
     if len(targets) > 1 or targets[0][1].modulation_hz is not None:
         fingers = _as_layers_allow(fingers, len(targets), capabilities)
     if math.isfinite(now):
@@ -139,7 +138,7 @@ def answered(
         limits=capabilities.limits,
         avoided_hz=avoided_hz,
     )
-    kept = _kept(fingers, targets, before) if keeps else fingers
+    kept = _kept(fingers, targets, question.before) if keeps else fingers
     if kept == fingers:
         return request(fingers)
     found = request(kept)
@@ -259,21 +258,19 @@ def _lowered_db(found: Answer) -> float:
 
 def selection_of(
     table: LocalizationTable,
+    question: Question,
     found: Answer,
-    targets: Sequence[tuple[Contact, Target]],
-    quiet: Sequence[Contact],
+    targets: Targets,
     *,
-    before: Mapping[tuple[ContactKey, int], Content],
     shape: Shape | None = None,
-    protected: frozenset[ContactKey] = frozenset(),
     is_in_phase: bool = True,
 ) -> Selection:
-    """Return the contents of an answer to the fingers of targets and quiet contacts.
+    """Return the contents of an answer to some targets of a question.
 
-    before: contents that play, by finger and voice; their phases are kept if is_in_phase. shape:
-    adds envelopes; protected: contacts that must not notice the contents of others.
+    The phases of contents that play are kept if is_in_phase; shape: adds envelopes.
     """
-    count = len(targets) + len(quiet)
+    before, quiet = question.before, question.quiet_beside(targets)
+    count = len(question.contacts)
     sensed = felt_on_ways(found, count)
     here = replace(found, asked=found.asked[:count])  # without the ends of ways
     fields: Complex64Array | None = None  # seldom needed
@@ -322,13 +319,13 @@ def selection_of(
     contacts = [*[contact for contact, _ in targets], *quiet]
     levels = zip(contacts, foreign_on_ways(found, count), strict=True)
     return Selection(
-        tuple(targets),
-        tuple(quiet),
+        targets,
+        quiet,
         tuple(contents),
         None if contents else skipped[0].held_back,
         tuple(skipped),
         foreign_levels={contact.key: by_set for contact, by_set in levels},
-        protected=protected,
+        protected=question.protected,
     )
 
 
@@ -536,16 +533,12 @@ def _on_way(places: Sequence[Sensation]) -> Sensation:
 class Crossfades:
     """Finds the way from what plays to a better answer for the same fingers.
 
-    targets, quiet: contacts where they rest; playing: contents by finger and voice; shape: adds
-    envelopes.
+    question: what lasts, where its fingers rest; shape: adds envelopes.
     """
 
     table: LocalizationTable
-    targets: Targets
-    quiet: Sequence[Contact]
+    question: Question
     capabilities: PlaybackCapabilities
-    playing: Mapping[tuple[ContactKey, int], Content]
-    protected: frozenset[ContactKey] = frozenset()
     shape: Shape | None = None
 
     def steps(self) -> tuple[Selection, ...]:
@@ -558,17 +551,10 @@ class Crossfades:
         """
         if self.capabilities.drive_mode != UNRESTRICTED:
             return ()
-        playing, same = _by_finger(self.playing.values()), tuple[Selection, ...]()
+        question, same = self.question, tuple[Selection, ...]()
+        playing = _by_finger(question.before.values())
         for keeps in (False, True):
-            goal = answered(
-                self.table,
-                self.targets,
-                self.quiet,
-                self.capabilities,
-                before=self.playing,
-                protected=self.protected,
-                keeps=keeps,
-            )
+            goal = answered(self.table, question, question.lasting, self.capabilities, keeps=keeps)
             found = _by_finger(self._selection(goal, shape=self.shape).contents)
             if _served(found) != _served(playing) or len(goal.layers) != len(playing):
                 continue
@@ -586,7 +572,7 @@ class Crossfades:
     def _restated(self, now: Answer, playing: _Voices) -> tuple[Selection, ...]:
         """Return what plays with its present promises; nothing if they are known."""
         found, said = self._felt(now, playing), dict[ContactKey, float]()
-        for content in self.playing.values():
+        for content in self.question.before.values():
             for each in content.predictions:
                 said[each.contact.key] = each.promised_contrast_db or 0.0
         for each in found.predictions:
@@ -638,7 +624,7 @@ class Crossfades:
         drives, owners = [], list[int]()
         rows, table = list[int](), self.table
         for number, stream in enumerate(goal.contents.streams):
-            for one in voices[self.targets[stream.targets[0]][0].key]:
+            for one in voices[self.question.lasting[stream.targets[0]][0].key]:
                 frequencies, bases = base_amplitudes(one.layer.excitation, table.eras)
                 at = table.rows_of(frequencies)
                 rows += at.tolist()
@@ -658,8 +644,8 @@ class Crossfades:
         return replace(found, contents=tuple(contents))
 
     def _selection(self, found: Answer, *, shape: Shape | None = None) -> Selection:
-        given = self.table, found, self.targets, self.quiet
-        chosen = selection_of(*given, before=self.playing, shape=shape, protected=self.protected)
+        targets = self.question.lasting
+        chosen = selection_of(self.table, self.question, found, targets, shape=shape)
         led = [replace(each, is_led=True) for each in chosen.contents]
         return replace(chosen, contents=tuple(led))
 

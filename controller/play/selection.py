@@ -14,16 +14,19 @@ import logging
 import math
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
-from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
+from dataclasses import dataclass, replace
+from functools import partial
 from operator import itemgetter
+from typing import Self
 
 from controller.play.intent import (
     BEING_CHOSEN,
     FADED_AFTER,
+    NOTHING,
     Content,
     HapticIntent,
     Prediction,
+    Question,
     Selection,
     Target,
     Targets,
@@ -51,71 +54,9 @@ from model.table.table import SAME_FREQUENCY, LocalizationTable
 from registry.plugins import failure_text
 from registry.threads import DaemonThreads
 
-_NOTHING = Selection((), ())
 _USED_UP = "the contents of other fingers use the whole stroke; lift a finger"
 
 _logger = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True)
-class Question:
-    """The targets that contents are to be chosen for, among all contacts, and what plays."""
-
-    contacts: tuple[Contact, ...]
-    """All on the plate."""
-    lasting: Targets
-    """Targets of contents that last."""
-    short: Targets
-    """Targets of short pulses."""
-    protected: frozenset[ContactKey] = frozenset()
-    """Contacts that must not notice the contents of others."""
-    before: Mapping[tuple[ContactKey, int], Content] = field(default_factory=dict)
-    """Contents that are felt now, by finger and voice."""
-    kept: tuple[Selection, ...] = ()
-    """Selections that play on beside the new ones."""
-    is_rested: bool = False
-    """Whether what plays would do, too, but may be led to what promises more."""
-    now: float = math.inf
-    """[s]"""
-    fading: Selection = _NOTHING
-    """What played before a cross-fade that goes on."""
-
-    @cached_property
-    def is_alone(self) -> bool:
-        """Whether what lasts is one, steady, beside no other finger that is protected."""
-        if len(self.lasting) != 1:
-            return False
-        ((contact, target),) = self.lasting
-        return self.protected <= {contact.key} and target.modulation_hz is None
-
-    @cached_property
-    def takes_long(self) -> bool:
-        """Whether what lasts takes longer than the control loop may wait."""
-        if self.lasting and not self.is_alone:
-            return True
-        courses = [each.course for _, each in self.lasting if each.course is not None]
-        return any(each.duration > _SOON for each in courses)
-
-    def quiet_beside(self, targets: Targets) -> tuple[Contact, ...]:
-        """Return the contacts that are not among some targets."""
-        quiet = [*self.contacts]
-        for contact, _ in targets:
-            quiet.remove(contact)
-        return tuple(quiet)
-
-    def silent(self, targets: Targets, reason: str) -> Selection:
-        """Return the selection of targets that feel nothing, for a reason."""
-        skipped = tuple(not_served(contact, reason) for contact, _ in targets)
-        quiet = self.quiet_beside(targets)
-        return Selection(targets, quiet, (), reason, skipped, protected=self.protected)
-
-    def unanswered(self, reason: str) -> "Choice":
-        """Return a choice in place of one not made: nothing is felt, unless what plays would do."""
-        return Choice(
-            self,
-            None if self.is_rested else self.silent(self.lasting, reason),
-            {each[0].key: self.silent((each,), reason) for each in self.short},
-        )
 
 
 @dataclass(frozen=True)
@@ -131,6 +72,15 @@ class Choice:
     steps: tuple[Selection, ...] = ()
     """Selections on the way to a better answer for what lasts, one after the other."""
 
+    @classmethod
+    def unanswered(cls, question: Question, reason: str) -> Self:
+        """Return a choice in place of one not made: nothing is felt, unless what plays would do."""
+        return cls(
+            question,
+            None if question.is_rested else question.silent(question.lasting, reason),
+            {each[0].key: question.silent((each,), reason) for each in question.short},
+        )
+
 
 @dataclass(frozen=True)
 class Chooser:
@@ -140,9 +90,17 @@ class Chooser:
     shape: Shape | None = None
 
     def choose(self, question: Question, capabilities: PlaybackCapabilities) -> Choice:
-        """Choose for the targets of a question, those that last first."""
+        """Choose for the targets of a question, those that last first.
+
+        Where all rest, choose the steps from what plays to what promises more; none on any failure.
+        """
         if question.is_rested:
-            return Choice(question, None, {}, steps=self._steps(question, capabilities))
+            steps: tuple[Selection, ...] = ()
+            try:
+                steps = Crossfades(self.table, question, capabilities, self.shape).steps()
+            except Exception as error:
+                _logger.error("loop: table failed, keeping what plays", exc_info=error)
+            return Choice(question, None, {}, steps=steps)
         kept, lasting, is_limited = [*question.kept], None, False
         if question.lasting:
             lasting, is_limited = self._lasting(question, capabilities)
@@ -182,18 +140,6 @@ class Chooser:
             limited = question.silent(targets, _USED_UP)
         return limited, True
 
-    def _steps(
-        self, question: Question, capabilities: PlaybackCapabilities
-    ) -> tuple[Selection, ...]:
-        """Choose the steps from what plays to what promises more; none on any failure."""
-        targets, quiet = question.lasting, question.quiet_beside(question.lasting)
-        given = self.table, targets, quiet, capabilities, question.before, question.protected
-        try:
-            return Crossfades(*given, shape=self.shape).steps()
-        except Exception as error:
-            _logger.error("loop: table failed, keeping what plays", exc_info=error)
-            return ()
-
     def _left_by(
         self, contents: Sequence[Content], capabilities: PlaybackCapabilities
     ) -> PlaybackCapabilities:
@@ -213,34 +159,28 @@ class Chooser:
 
         beside: selections that a pulse is felt beside.
         """
-        table, before = self.table, question.before
         raised = tuple([(contact, _over(target, contact, beside)) for contact, target in targets])
         excitations = [content.layer.excitation.values() for content in _contents(beside)]
         avoided = [*{tone.frequency for tones in excitations for tone in tones}]
-        quiet, protected = question.quiet_beside(targets), question.protected
         is_long = question.takes_long and not targets[0][1].is_short
         try:
             answer = answered(
-                table,
+                self.table,
+                question,
                 raised,
-                quiet,
                 capabilities,
-                before=before,
-                protected=protected,
-                keeps=is_long or _is_step(targets, before),
+                keeps=is_long or _is_step(targets, question.before),
                 now=question.now if is_long else math.inf,
                 avoided_hz=avoided,
             )
             if not is_long:
                 answer = _alike(answer, raised[0][1])
             found = selection_of(
-                table,
+                self.table,
+                question,
                 answer,
                 targets,
-                quiet,
-                before=before,
                 shape=self.shape if is_long else None,
-                protected=protected,
                 is_in_phase=is_long,
             )
             if avoided:
@@ -337,7 +277,6 @@ BLOCKED = (
 
 _UNANSWERED = (GIVEN_UP, BLOCKED)
 
-_SOON = 5.0  # s; longer courses take longer to answer than the control loop may wait
 _FADES_FOR = FALL_AFTER + CROSSFADE + FADED_AFTER  # s; what a step leads away from
 
 
@@ -410,7 +349,7 @@ class Selector:
         self.pending: asyncio.Future[Choice] | None = None
         """The choice that is made in the thread, or not taken yet: one at a time."""
         self._late = set[asyncio.Future[Choice]]()  # given up, and still computed
-        self._lasting = _NOTHING  # as it was chosen, for fingers that have left it, too
+        self._lasting = NOTHING  # as it was chosen, for fingers that have left it, too
         self._short: dict[ContactKey, Selection] = {}
         self._fingers: dict[ContactKey, float] = {}  # of what lasts, down since [s]
         self._is_limited = False  # what lasts, by pulses that play
@@ -418,7 +357,7 @@ class Selector:
         self._requested: object = None  # the situation in which what lasts was requested last
         self._steps: Sequence[Selection] = ()  # to a better answer
         self._led_at = -math.inf  # s; by the last step
-        self._fading = _NOTHING  # what plays until that has been taken
+        self._fading = NOTHING  # what plays until that has been taken
         self.due = math.inf
         """Time [s] to select anew though no contact changes: all rest, or pulses have ended."""
 
@@ -472,7 +411,7 @@ class Selector:
             if pulse is not None and pulse.targets[0][1] == target:
                 self._short[contact.key] = pulse
         if not contacts:
-            self._lasting = _NOTHING
+            self._lasting = NOTHING
         if self.pending is None:
             for question in self._questions(intended, pulses, now, has_waited=arrived is not None):
                 if question.lasting:
@@ -496,7 +435,7 @@ class Selector:
         if not question.takes_long:
             self._take(self.chooser.choose(question, capabilities), now)
         elif len(self._late) >= MAX_LATE:
-            self._take(question.unanswered(BLOCKED), now)
+            self._take(Choice.unanswered(question, BLOCKED), now)
         else:
             loop, choose = asyncio.get_running_loop(), self.chooser.choose
             pending = loop.run_in_executor(self._threads, partial(choose, question, capabilities))
@@ -509,7 +448,7 @@ class Selector:
             _logger.warning("loop: answer given up, still computed after %g s", TIME_LIMIT)
             self._late.add(pending)
             self.pending = asyncio.get_running_loop().create_future()
-            self.pending.set_result(question.unanswered(GIVEN_UP))
+            self.pending.set_result(Choice.unanswered(question, GIVEN_UP))
             self._arrived()
 
     def _note(self, pending: "asyncio.Future[Choice]") -> None:
@@ -517,12 +456,12 @@ class Selector:
             self._late.remove(pending)
             pending.exception()  # of no interest any more
             if self._lasting.reason in _UNANSWERED:  # asked again
-                self._lasting = _NOTHING
+                self._lasting = NOTHING
         self._arrived()
 
     def choose_anew(self) -> None:
         """Choose anew what lasts: silent until then, and not by a choice that is under way."""
-        self._lasting, self._steps, self._requested = _NOTHING, (), None
+        self._lasting, self._steps, self._requested = NOTHING, (), None
 
     def _rest_again(self, now: float) -> None:
         """Leave the way to a better answer, if any, until all have rested."""
@@ -577,7 +516,7 @@ class Selector:
         parts = [felt] if is_rested else [felt, *pulses.values()]
         before = {each.key: each for part in parts for each in part.contents}
         if new and (has_waited or is_kept):
-            fading = self._fading if now < self._led_at + _FADES_FOR else _NOTHING
+            fading = self._fading if now < self._led_at + _FADES_FOR else NOTHING
             kept = felt, *playing
             yield replace(intended, lasting=(), short=new, before=before, kept=kept, fading=fading)
             new, playing = (), self._playing(now)

@@ -27,7 +27,7 @@ from controller.effects.layout import SurfaceLayout
 from controller.effects.player import EffectPlayer
 from controller.operation.operation_states import DaemonEvent, DaemonState, Lease, Trigger
 from controller.operation.supervisor import Supervisor
-from controller.play.intent import Content, Selection, Target
+from controller.play.intent import Content, Question, Selection, Target
 from controller.play.joint_answers import answered, selection_of
 from controller.play.planner import PlayReport
 from controller.play.routing import RAMPS_ONLY, PlaybackCapabilities
@@ -66,6 +66,14 @@ LAYOUT = SurfaceLayout(
 )
 
 
+def asked(
+    targets: Sequence[tuple[Contact, Target]],
+    before: Mapping[tuple[ContactKey, int], Content] = MappingProxyType({}),
+) -> Question:
+    """A question for fingers that feel what lasts, among no others."""
+    return Question(tuple([contact for contact, _ in targets]), tuple(targets), (), before=before)
+
+
 def chosen_for(
     targets: Sequence[tuple[Contact, Target]],
     capabilities: PlaybackCapabilities,
@@ -73,8 +81,9 @@ def chosen_for(
     before: Mapping[tuple[ContactKey, int], Content] = MappingProxyType({}),
 ) -> Selection:
     """What is chosen for fingers that feel what lasts, among no others."""
-    found = answered(table(), targets, (), capabilities, before=before)
-    return selection_of(table(), found, targets, (), before=before)
+    question = asked(targets, before)
+    found = answered(table(), question, question.lasting, capabilities)
+    return selection_of(table(), question, found, question.lasting)
 
 
 def answers_take(patch: pytest.MonkeyPatch, *seconds: float) -> list[float]:

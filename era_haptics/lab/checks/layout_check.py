@@ -10,7 +10,7 @@ import numpy as np
 from controller.effects.effect import ON_RELEASE, Effect, EffectStimulus, Region
 from controller.effects.layout import ELSEWHERE, SurfaceLayout
 from controller.effects.player import CLICK_ABOVE_DB, NOTICED_ABOVE_DB
-from controller.play.intent import Target, band_problem
+from controller.play.intent import Question, Target, band_problem
 from controller.play.joint_answers import answered
 from controller.play.routing import RAMPS_ONLY, PlaybackCapabilities
 from controller.play.selection import Chooser
@@ -95,7 +95,8 @@ class TouchSimulator:
             Contact(ContactKey("quiet", number), *place, since=0.0)
             for number, place in enumerate(quiet)
         ]
-        return answered(self.table, [(finger, target)], others, self.capabilities, before={})
+        question = Question((finger, *others), ((finger, target),), ())
+        return answered(self.table, question, question.lasting, self.capabilities)
 
     def touch(self, target: Target, at: Position, resting: Position | None) -> SimulatedTouch:
         """Play a target's content at a finger."""

@@ -17,9 +17,8 @@ from matplotlib.patches import Polygon as Outline
 
 from controller.effects.effect import Region
 from controller.effects.layout import SurfaceLayout
-from controller.play.intent import Selection, Target
+from controller.play.intent import Question, Selection, Target
 from controller.play.joint_answers import fingers_of, selection_of
-from controller.play.selection import Question
 from controller.sources.touch import Contact, ContactKey
 from era_haptics.lab.checks.layout_check import (
     CheckedEffect,
@@ -232,15 +231,16 @@ def _felt(
     What is short plays beside what lasts, one at a time, all other fingers quiet. protected: None
     to play all contents, whatever they reach.
     """
-    lasting = [each for each in fingers if not each[1].is_short]
-    short = [each for each in fingers if each[1].is_short]
+    lasting = tuple(each for each in fingers if not each[1].is_short)
+    short = tuple(each for each in fingers if each[1].is_short)
     found: dict[ContactKey, tuple[float, str]] = {}
     worst, beside = math.inf, list[Selection]()
     if lasting:
         quiet = [contact for contact, _ in short]
         together = _answered(simulator, lasting, quiet, protected)
+        question = Question((*[one for one, _ in lasting], *quiet), lasting, short)
         worst = math.inf if together.promised_worst_db is None else together.promised_worst_db
-        beside = [selection_of(simulator.table, together, lasting, quiet, before={})]
+        beside = [selection_of(simulator.table, question, together, lasting)]
         for (contact, _), each in zip(lasting, together.fingers, strict=False):
             found[contact.key] = each.promised_contrast_db or 0.0, each.verdict
     contacts = tuple(contact for contact, _ in fingers)

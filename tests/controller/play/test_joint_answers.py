@@ -49,7 +49,7 @@ from model.table.table import LocalizationTable
 from model.table.table_file import build_table
 from plates import contact_sets, smooth_rig
 from real_wires import on_two_amplifiers
-from several_fingers import LAYOUT, LEFT, RIGHT, Fingers, chosen_for, fingers_on, playable
+from several_fingers import LAYOUT, LEFT, RIGHT, Fingers, asked, chosen_for, fingers_on, playable
 from several_fingers import table as paper_table
 from sim.far_ends.wire_assignment import SimulatedWire
 from virtual_lines import in_virtual_time, run_virtual
@@ -303,12 +303,14 @@ def test_ends_of_ways_are_fingers_where_they_can_be(
 def test_what_is_promised_is_the_least_on_the_way_and_2_db_less() -> None:
     """Of three places that are answered as fingers of their own; beside it 2 dB less as well."""
     contacts = [contact(1, MOVER, vx=0.2), contact(2, OTHER)]
-    targets = [(each, Target(each.key, 14.0, content=str(each.key.id))) for each in contacts]
-    found = answered(paper_table(), targets, (), playable(), before={}, now=NOW)
+    question = asked(
+        [(each, Target(each.key, 14.0, content=str(each.key.id))) for each in contacts]
+    )
+    found = answered(paper_table(), question, question.lasting, playable(), now=NOW)
     middle, other, *ends = found.fingers
     promised = [each.promised_contrast_db or 0.0 for each in (middle, *ends)]
     levels = [each.promised_level_db_sl for each in (middle, *ends)]
-    moving, resting = selection_of(paper_table(), found, targets, (), before={}).predictions
+    moving, resting = selection_of(paper_table(), question, found, question.lasting).predictions
     assert moving.promised_contrast_db == pytest.approx(min(promised) - MARGIN_DB)
     assert moving.level_db_sl == pytest.approx(min(levels))
     assert resting.promised_contrast_db == pytest.approx((other.promised_contrast_db or 0) - 2.0)
@@ -323,9 +325,11 @@ def test_a_promise_for_a_way_holds_at_places_between() -> None:
     At a place that the answer is not for, 30 mm behind, it does not.
     """
     contacts = [contact(1, MOVER, vx=0.2), contact(2, OTHER)]
-    targets = [(each, Target(each.key, 14.0, content=str(each.key.id))) for each in contacts]
-    found = answered(paper_table(), targets, (), playable(), before={}, now=NOW)
-    moving, _ = selection_of(paper_table(), found, targets, (), before={}).predictions
+    question = asked(
+        [(each, Target(each.key, 14.0, content=str(each.key.id))) for each in contacts]
+    )
+    found = answered(paper_table(), question, question.lasting, playable(), now=NOW)
+    moving, _ = selection_of(paper_table(), question, found, question.lasting).predictions
     least = []
     for way in [*(0.008 + 0.001 * step for step in range(9)), -0.022]:
         at = (MOVER[0] + way, MOVER[1])
@@ -558,7 +562,7 @@ def test_every_step_keeps_30_hz_between_all_that_sounds() -> None:
             continue
         beside = {each.contact.key: each.frequency or 0.0 for each in landed.predictions}
         beside = {key: beside[key] for key in keys}
-        for step in Crossfades(paper_table(), resting, (), playable(), felt).steps():
+        for step in Crossfades(paper_table(), asked(resting, felt), playable()).steps():
             after = {each.contact.key: each.frequency or 0.0 for each in step.predictions}
             changed = [key for key in keys if after[key] != beside[key]]
             assert len(changed) <= 1
@@ -584,8 +588,8 @@ def test_what_does_not_fit_beside_what_plays_is_not_led_to() -> None:
     limited = replace(
         playable(), limits=Limits((40.0, 320.0), {n: 1.2 * each for n, each in drives.items()})
     )
-    assert Crossfades(paper_table(), targets, (), playable(), felt).steps()
-    assert not Crossfades(paper_table(), targets, (), limited, felt).steps()
+    assert Crossfades(paper_table(), asked(targets, felt), playable()).steps()
+    assert not Crossfades(paper_table(), asked(targets, felt), limited).steps()
     moving = {
         key: [
             replace(one, promised_contrast_db=one.promised_contrast_db - 2.0)
@@ -595,7 +599,7 @@ def test_what_does_not_fit_beside_what_plays_is_not_led_to() -> None:
         for key, each in felt.items()
     }
     felt = {key: replace(each, predictions=tuple(moving[key])) for key, each in felt.items()}
-    (rested,) = Crossfades(paper_table(), targets, (), limited, felt).steps()
+    (rested,) = Crossfades(paper_table(), asked(targets, felt), limited).steps()
     assert rested.contents == landed.contents
     for one, other in zip(rested.predictions, landed.predictions, strict=True):
         assert one.promised_contrast_db == pytest.approx(other.promised_contrast_db, abs=0.1)

@@ -15,6 +15,7 @@ from benchmarks.setting import support
 from controller.effects.layout import SurfaceLayout, default_effects
 from controller.effects.player import EffectPlayer
 from controller.play.loop import Controller
+from controller.play.planner import PlayReport
 from controller.sources.touch import Touch, TouchFrame
 from drivers.host.amplifier import Amplifier
 from drivers.host.line import Line
@@ -96,7 +97,12 @@ async def measure(rig: Rig) -> list[str]:
         timing=Timing(table),
         watchdog=2.0,
     )
-    controller.cycle.observers.pattern_applied.append(lambda applied: played.set())
+
+    def reported(report: PlayReport) -> None:
+        if report.contents:
+            played.set()
+
+    controller.cycle.observers.reported.append(reported)
     await controller.open()
     await controller.arm()
     running = asyncio.create_task(controller.cycle.run())

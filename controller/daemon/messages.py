@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from importlib.metadata import version
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
@@ -49,6 +49,7 @@ from controller.api.schema import (
     PlayedTone,
     RigSummary,
     TableSummary,
+    Topic,
 )
 from controller.api.server import Hub
 from controller.daemon.config import DaemonConfig
@@ -59,7 +60,7 @@ from controller.learning.learning import Learning
 from controller.operation.operation_states import DaemonState, Loss, Operation
 from controller.operation.supervisor import LinkChange
 from controller.play.intent import BEING_CHOSEN, NO_CONTACTS, leaks_db_sl
-from controller.play.planner import Observers, PlayReport, SilenceReport
+from controller.play.planner import Observers, PlayReport
 from controller.play.routing import Drive
 from controller.sources.touch import Change, Contact, ContactKey
 from drivers.host.amplifier import Amplifier
@@ -131,8 +132,7 @@ class EventPublisher:
     def observe(self, loop: Observers) -> None:
         """Subscribe to the reports of the control loop."""
         loop.contacts_changed.append(self._contacts_changed)
-        loop.pattern_applied.append(partial(self._reported, "pattern"))
-        loop.silenced.append(partial(self._reported, "silence"))
+        loop.reported.append(self._reported)
         loop.refused.append(self._refused)
 
     def state_changed(self, old: Operation, new: Operation) -> None:
@@ -221,16 +221,14 @@ class EventPublisher:
         self._noted({"time_s": threads.now(), "contacts": contacts})
         self.hub.publish("contacts", self.view.contacts_event)
 
-    def _reported(
-        self, topic: Literal["pattern", "silence"], report: PlayReport | SilenceReport
-    ) -> None:
+    def _reported(self, report: PlayReport) -> None:
         """Publish what plays or that nothing does, and count its latency.
 
         Latencies of touches are counted apart from all others.
         """
         self.view.report = report
-        why = report.reason if isinstance(report, SilenceReport) else ""
-        self._noted({"time_s": report.time, topic: report.targets, "reason": why})
+        topic: Topic = "pattern" if report.contents else "silence"
+        self._noted({"time_s": report.time, topic: report.targets, "reason": report.reason})
         if report.latency is not None:
             latencies = self.latencies if report.is_touch else self.lift_latencies
             latencies.add(report.latency)
@@ -255,7 +253,7 @@ class PlateView:
     effect_of: Callable[[ContactKey], str | None]
     """Returns the effect that plays for a contact."""
     contacts: tuple[Contact, ...] = ()
-    report: PlayReport | SilenceReport | None = None
+    report: PlayReport | None = None
     """The last report of the control loop.
 
     None before the first one, and after another part of the daemon has silenced the plate.
@@ -266,7 +264,7 @@ class PlateView:
     @property
     def applied(self) -> PlayReport | None:
         """The report of the pattern that plays; None while nothing plays."""
-        return self.report if isinstance(self.report, PlayReport) else None
+        return self.report if self.report and self.report.contents else None
 
     def contact_statuses(self) -> list[ContactStatus]:
         """Describe all contacts with their roles."""
@@ -282,7 +280,7 @@ class PlateView:
 
     def _statuses(self, contacts: Iterable[Contact]) -> list[ContactStatus]:
         report, reason = self.report, ""
-        if isinstance(report, SilenceReport) and not report.targets:  # as by a failure
+        if report and not report.targets:  # as by a failure
             reason = report.reason
         known = {(each.key, each.since) for each in report.contacts} if report and reason else ()
         return [
@@ -332,7 +330,7 @@ class PlateView:
     def silence_event(self) -> SilenceEvent | None:
         """Return the event of topic `silence`; None while something plays or before a decision."""
         silenced = self.report
-        if not isinstance(silenced, SilenceReport):
+        if silenced is None or silenced.contents:
             return None
         return SilenceEvent(
             contacts=self._statuses(silenced.contacts),
@@ -342,7 +340,7 @@ class PlateView:
 
 
 def _contact_status(
-    contact: Contact, report: PlayReport | SilenceReport | None, effect: str | None, *, why_not: str
+    contact: Contact, report: PlayReport | None, effect: str | None, *, why_not: str
 ) -> ContactStatus:
     """Describe a contact, its predicted sensation and its effect.
 
@@ -373,7 +371,7 @@ def _contact_status(
                     "is_foreign_felt": felt.is_foreign_felt,
                     "held_back": felt.held_back,
                 }
-    if isinstance(report, PlayReport) and any(each.key == contact.key for each in report.quiet):
+    if report and any(each.key == contact.key for each in report.quiet):
         highest = max(report.quiet_levels.get(contact.key, ()), default=None)
         status |= {
             "role": "quiet",

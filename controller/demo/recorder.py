@@ -25,7 +25,7 @@ import numpy as np
 from pydantic import BaseModel, ValidationError
 
 from controller.play.intent import Prediction
-from controller.play.planner import Observers, PlayReport, SilenceReport
+from controller.play.planner import Observers, PlayReport
 from controller.process.child import ended
 from controller.sources.touch import Change, Contact, ContactKey
 from drivers.errors import LinkError
@@ -398,8 +398,7 @@ class TouchRecorder:
     def observe(self, loop: Observers) -> None:
         """Observe what the control loop reports."""
         loop.contacts_changed.append(self._contacts_changed)
-        loop.pattern_applied.append(self._pattern_applied)
-        loop.silenced.append(self._silenced)
+        loop.reported.append(self._reported)
 
     async def start(self) -> None:
         """Wait until the plate is armed, and set the start of the recording to then."""
@@ -432,27 +431,22 @@ class TouchRecorder:
             touch.contact, touch.until = contact, threads.now()
             self._complete(touch)
 
-    def _pattern_applied(self, applied: PlayReport) -> None:
+    def _reported(self, applied: PlayReport) -> None:
         self._end_pattern(applied.time)
-        for each in self.touches.values():
-            each.reason = each.reason or _NOT_THE_TARGET
+        if applied.contents:
+            for each in self.touches.values():
+                each.reason = each.reason or _NOT_THE_TARGET
         touches = []
         for felt in applied.targets:
             touch = self.touches.get(felt.contact.key)
             if touch is not None and felt.verdict == HELD_BACK:
-                touch.reason = felt.held_back
+                touch.reason = applied.reason or felt.held_back
             elif touch is not None:  # not lifted meanwhile
                 touches.append(touch)
         if touches:
             self._playing = _PlayedPattern(applied, touches)
         for touch in touches:
             touch.patterns.append(cast(_PlayedPattern, self._playing))
-
-    def _silenced(self, silenced: SilenceReport) -> None:
-        self._end_pattern(silenced.time)
-        for each in silenced.targets:
-            if touch := self.touches.get(each.contact.key):
-                touch.reason = silenced.reason
 
     def _end_pattern(self, now: float, *, is_measured: bool = True) -> None:
         """Close the playing pattern and measure its end."""

@@ -110,16 +110,18 @@ class SettledReadings:
     def observe(self, loop: Observers) -> None:
         """Observe what the control loop reports."""
         loop.contacts_changed.append(lambda contacts, change: self._contacts_changed(contacts))
-        loop.pattern_applied.append(self._pattern_applied)
-        loop.silenced.append(lambda silenced: self.ended())
+        loop.reported.append(self._reported)
 
     def ended(self) -> None:
         """Read no more of what played."""
         self._playing, self._due = None, math.inf
         self._change.set()
 
-    def _pattern_applied(self, applied: PlayReport) -> None:
+    def _reported(self, applied: PlayReport) -> None:
         """Follow a pattern that the amplifiers have confirmed, if it can be read."""
+        if not applied.contents:
+            self.ended()
+            return
         highest = min((each.frequency_max for each in self.sensors), default=0.0)
         frequencies = {command.frequency for command in applied.drive.values()}
         is_one = applied.lasts and len(applied.contents) == len(frequencies) == 1

@@ -11,7 +11,7 @@ from contextlib import suppress
 from typing import Any, ParamSpec
 
 from controller.play.intent import IntentSource
-from controller.play.planner import Observers, Plan, Planner, play_report, silence_report
+from controller.play.planner import Observers, Plan, Planner, play_report
 from controller.play.routing import limits_of, playback_capabilities
 from controller.play.slots import RELEASE_RAMP
 from controller.sources.touch import Change, ContactTracker, RejectCounter, TouchFrame
@@ -151,7 +151,8 @@ class Cycle:
             _report(self.observers.refused, reason)
         if plan.is_reported:
             sent_at = outcome if isinstance(outcome, float) else None
-            self._report_playing(planner, plan, sent_at=sent_at)
+            applied = play_report(plan, planner.slots.contents, sent_at=sent_at, now=threads.now())
+            _report(self.observers.reported, applied)
 
     async def _play(self, planner: Planner, plan: Plan) -> float | CommandRefused | None:
         """Play the sets of a plan on all amplifiers, from one moment on.
@@ -282,16 +283,6 @@ class Cycle:
         """Lift contacts that no source has confirmed in time; called before every plan."""
         if (change := self.tracker.expire(now)).up:
             self._follow(change)
-
-    def _report_playing(self, planner: Planner, plan: Plan, *, sent_at: float | None) -> None:
-        """Report what plays after a plan, or silence; sent_at [s]: None if nothing was sent."""
-        now = threads.now()
-        if plan.selection.contents and plan.sets.silence is None:
-            applied = play_report(plan, planner.slots.contents, sent_at=sent_at, now=now)
-            _report(self.observers.pattern_applied, applied)
-            return
-        silenced = silence_report(plan, sent_at=sent_at, now=now)
-        _report(self.observers.silenced, silenced)
 
     async def _wait_for_event(self) -> None:
         """Wait for a change, a heartbeat, or the expiry of an intent."""

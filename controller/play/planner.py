@@ -372,27 +372,30 @@ class Planner:
 
 @dataclass(frozen=True)
 class PlayReport:
-    """The contents that amplifiers play since their last confirmed set."""
+    """The contents that amplifiers play since their last confirmed set, or why they are silent."""
 
     contacts: tuple[Contact, ...]
     """All contacts, in order of arrival."""
     targets: tuple[Prediction, ...]
-    """A prediction for each target."""
-    quiet: tuple[Contact, ...]
-    quiet_levels: Mapping[ContactKey, Sequence[float]]
-    """Foreign levels at quiet contacts (`Selection.foreign_levels`)."""
-    contents: Mapping[int, Slot]
-    """Copies of the slots as they are played, by layer, the newest one last."""
+    """A prediction for each contact that is to feel something; of silence with the reason."""
     latency: float | None
     """Time [s] from the touch frame to the last byte of the command; None if none was needed."""
     time: float
     """When [s] that byte was sent, or the report made."""
-    settled_after: float
-    """Time [s] until the last fade or envelope has ended."""
-    lasts: bool
-    """Whether all contents play until their contacts change."""
-    is_touch: bool
+    is_touch: bool = False
     """As of the plan."""
+    reason: str = ""
+    """Why all channels are silent."""
+    contents: Mapping[int, Slot] = field(default_factory=dict)
+    """Copies of the slots as they are played, by layer, the newest one last; none in silence."""
+    quiet: tuple[Contact, ...] = ()
+    """Contacts that are to feel nothing of what plays."""
+    quiet_levels: Mapping[ContactKey, Sequence[float]] = field(default_factory=dict)
+    """Foreign levels at quiet contacts (`Selection.foreign_levels`)."""
+    settled_after: float = 0.0
+    """Time [s] until the last fade or envelope has ended."""
+    lasts: bool = True
+    """Whether all contents play until their contacts change."""
 
     @property
     def newest(self) -> Slot:
@@ -416,63 +419,39 @@ class PlayReport:
         return every[-1] if every else None
 
 
-@dataclass(frozen=True)
-class SilenceReport:
-    """The silence of all channels, and its reason."""
-
-    contacts: tuple[Contact, ...]
-    targets: tuple[Prediction, ...]
-    """A prediction for each contact that was to feel something, with the reason."""
-    reason: str
-    latency: float | None
-    """Time [s] up to the last byte of the command; None if none was needed."""
-    time: float
-    """[s]"""
-    is_touch: bool = False
-
-
 def play_report(
     plan: Plan, playing: Mapping[int, Slot], *, sent_at: float | None, now: float
 ) -> PlayReport:
     """Report what plays after a plan, by layer; sent_at [s]: when it starts, None if before."""
     selection = plan.selection
+    known = partial(
+        PlayReport,
+        plan.contacts,
+        latency=None if sent_at is None else sent_at - plan.since,
+        is_touch=plan.is_touch,
+    )
+    if plan.sets.silence is not None or not selection.contents:
+        reason = plan.sets.reason or selection.reason or ""
+        said = {each.contact.key: each for each in selection.not_served}
+        targets = dict.fromkeys([contact for contact, _ in selection.targets])
+        silent = tuple([said.get(each.key) or not_served(each, reason) for each in targets])
+        return known(silent, time=now, reason=reason)
     order = sorted(
-        (number for number, one in playing.items() if one.content in selection.contents),
+        [number for number, one in playing.items() if one.content in selection.contents],
         key=plan.sets.started.__contains__,
     )
-    return PlayReport(
-        contacts=plan.contacts,
-        targets=selection.predictions,
+    return known(
+        selection.predictions,
+        time=now if sent_at is None else sent_at,
+        contents={number: replace(playing[number]) for number in order},
         quiet=selection.quiet,
         quiet_levels={
             each.key: selection.foreign_levels.get(each.key, ()) for each in selection.quiet
         },
-        contents={number: replace(playing[number]) for number in order},
-        latency=None if sent_at is None else sent_at - plan.since,
-        time=now if sent_at is None else sent_at,
         settled_after=plan.sets.settled_after,
         lasts=all(
             target.pulse is None for each in selection.contents for _, target in each.targets
         ),
-        is_touch=plan.is_touch,
-    )
-
-
-def silence_report(plan: Plan, *, sent_at: float | None, now: float) -> SilenceReport:
-    """Report a plan for silence; sent_at [s]: of its last byte, None if nothing was sent."""
-    selection = plan.selection
-    reason = plan.sets.reason or selection.reason or ""
-    known = {each.contact.key: each for each in selection.not_served}
-    return SilenceReport(
-        contacts=plan.contacts,
-        targets=tuple(
-            known.get(contact.key) or not_served(contact, reason)
-            for contact in dict.fromkeys(contact for contact, _ in selection.targets)
-        ),
-        reason=reason,
-        latency=None if sent_at is None else sent_at - plan.since,
-        time=now,
-        is_touch=plan.is_touch,
     )
 
 
@@ -486,8 +465,7 @@ class Observers:
     contacts_changed: list[Callable[[tuple[Contact, ...], Change], object]] = field(
         default_factory=list
     )
-    pattern_applied: list[Callable[[PlayReport], object]] = field(default_factory=list)
-    silenced: list[Callable[[SilenceReport], object]] = field(default_factory=list)
+    reported: list[Callable[[PlayReport], object]] = field(default_factory=list)
     refused: list[Callable[[str], object]] = field(default_factory=list)
     link_lost: list[Callable[[str], object]] = field(default_factory=list)
     cycle_completed: list[Callable[[], object]] = field(default_factory=list)

@@ -24,7 +24,7 @@ from controller.demo.recorder import (
     steady_contrast_db,
 )
 from controller.play.intent import Prediction, not_served
-from controller.play.planner import Observers, PlayReport, SilenceReport
+from controller.play.planner import Observers, PlayReport
 from controller.sources.touch import Change, Contact, ContactKey
 from daemons import ENABLED, ready_daemon, until, until_state
 from drivers.errors import LinkError
@@ -166,11 +166,11 @@ async def test_rows_after_a_fault_name_it_until_the_plate_is_armed_again() -> No
     async with recorder_of(rows) as recorder:
         loop = Observers()
         recorder.observe(loop)
-        (changed,), (silence,) = loop.contacts_changed, loop.silenced
+        (changed,), (reported,) = loop.contacts_changed, loop.reported
         changed((near,), Change(down=(near,)))
         reason = "too close to an edge"
-        silenced = SilenceReport((near,), (not_served(near, reason),), reason, None, threads.now())
-        silence(silenced)
+        held_back = (not_served(near, reason),)
+        reported(PlayReport((near,), held_back, None, threads.now(), reason=reason))
         changed((), Change(up=(near,)))
         changed((down,), Change(down=(down,)))
         recorder.failed(f"{FAULT}; once the cause is gone, clear and arm again")
@@ -200,7 +200,7 @@ async def test_pattern_is_measured_while_no_finger_moves(monkeypatch: pytest.Mon
     async with recorder_of([], vibration) as recorder:
         start, loop = threads.now(), Observers()
         recorder.observe(loop)
-        (changed,), (applied_now,) = loop.contacts_changed, loop.pattern_applied
+        (changed,), (applied_now,) = loop.contacts_changed, loop.reported
         finger = contact(1)
         changed((finger,), Change(down=(finger,)))
         for quiet in ((), (contact(2),), (contact(2),)):
@@ -209,6 +209,7 @@ async def test_pattern_is_measured_while_no_finger_moves(monkeypatch: pytest.Mon
                 targets=(Prediction(finger, 20.0),),
                 layer=SimpleNamespace(ramp=0.04),
                 quiet=quiet,
+                contents=(1,),
             )
             applied_now(cast(PlayReport, applied))
             await asyncio.sleep(1.0)

@@ -454,7 +454,7 @@ async def test_nothing_is_read_while_a_hand_rests(load: float, count: int) -> No
     cast(Any, readings)._read = settled
     readings.observe(observers)
     running = asyncio.create_task(readings.run())
-    for callback in observers.pattern_applied:
+    for callback in observers.reported:
         callback(cast(Any, playing))
     await asyncio.sleep(1.0)
     running.cancel()

@@ -27,7 +27,7 @@ from controller.daemon.messages import PlateView
 from controller.effects.layout import SurfaceLayout, default_effects
 from controller.effects.player import EffectPlayer
 from controller.play.loop import Controller
-from controller.play.planner import Observers, PlayReport, SilenceReport
+from controller.play.planner import Observers, PlayReport
 from controller.sources.touch import Touch, TouchFrame
 from drivers.host.amplifier import Amplifier as AmplifierAmplifier
 from drivers.opening import Lines
@@ -86,7 +86,7 @@ class Chain:
     table: Any = field(init=False)
     far_ends: "list[FarEnd]" = field(init=False)
     applied: list[PlayReport] = field(default_factory=list)
-    silenced: list[SilenceReport] = field(default_factory=list)
+    silenced: list[PlayReport] = field(default_factory=list)
     refused: list[str] = field(default_factory=list)
     lost: list[str] = field(default_factory=list)
     contacts: list[int] = field(default_factory=list)
@@ -108,8 +108,9 @@ class Chain:
         self.turning.set()
         loop = cycle.observers
         loop.contacts_changed.append(lambda contacts, change: self.contacts.append(len(contacts)))
-        loop.pattern_applied.append(self.applied.append)
-        loop.silenced.append(self.silenced.append)
+        loop.reported.append(
+            lambda each: (self.applied if each.contents else self.silenced).append(each)
+        )
         loop.refused.append(self.refused.append)
         loop.link_lost.append(self.lost.append)
 
@@ -587,7 +588,7 @@ class Streamed(Chain):
         super().__post_init__()
         self.is_felt = False
         self._counted: list[tuple[float, Mapping[str, float]]] = []
-        self.controller.cycle.observers.pattern_applied.append(self._note_clocks)
+        self.controller.cycle.observers.reported.append(self._note_clocks)
         self._sensors = Accelerometers(self.far.bench)
         self._sensors.place([Accelerometer(name, *at) for name, at in SENSORS.items()])
 

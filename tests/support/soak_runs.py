@@ -573,7 +573,7 @@ class Soak(Chain):
         super().make_host(connected=supervisor.connected, **more)
         loop = self.controller.cycle.observers
         supervisor.observe(loop)
-        loop.pattern_applied.append(self._applied)
+        loop.reported.append(self._applied)
         loop.refused.append(lambda why: self.note("observer refused", why))
         supervisor.controller = self.controller
 
@@ -586,6 +586,8 @@ class Soak(Chain):
         self.counts["links lost"] += change == "lost"
 
     def _applied(self, applied: PlayReport) -> None:
+        if not applied.contents:
+            return
         self.counts["patterns"] += 1
         drive = dict(sorted(applied.drive.items()))
         self.note("pattern", f"{applied.latency or 0.0:.9f}", drive)

@@ -82,7 +82,7 @@ async def _touched(folder: Path) -> Way:
                 loop.seen = seen
                 played.set()
 
-            bench.daemon._controller.cycle.observers.pattern_applied.append(applied)
+            bench.daemon._controller.cycle.observers.reported.append(applied)
             coming = datagram(_RESTING, _COMING)
             with recorder:
                 loop.call_soon(received[0], *coming)

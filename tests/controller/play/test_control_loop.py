@@ -117,13 +117,12 @@ async def test_lift_as_a_set_is_confirmed_precedes_a_due_heartbeat() -> None:
     """It comes when the set is reported as playing, by replies as late as the heartbeat is due."""
     before: list[int] = []  # requests to each amplifier before the lift
 
-    def lift(_: object) -> None:
-        before.extend(len(end.asked) for end in chain.far_ends)
-        chain.put()
+    def lift(report: PlayReport) -> None:
+        if report.contents:
+            before.extend(len(end.asked) for end in chain.far_ends)
+            chain.put()
 
-    async with set_running(
-        "a", "b", observe=lambda loop: loop.pattern_applied.append(lift)
-    ) as chain:
+    async with set_running("a", "b", observe=lambda loop: loop.reported.append(lift)) as chain:
         await asyncio.sleep(0.046)
         for end in chain.far_ends:
             end.delay(0.002)
@@ -140,7 +139,7 @@ async def test_controller_survives_a_failing_observer(caplog: pytest.LogCaptureF
         raise RuntimeError("no disk space for this row")
 
     def observe(loop: Observers) -> None:
-        for callbacks in (loop.contacts_changed, loop.pattern_applied, loop.silenced):
+        for callbacks in (loop.contacts_changed, loop.reported):
             callbacks.append(fail)
 
     async with set_running(observe=observe) as chain:

@@ -149,7 +149,7 @@ def _print_row(
         asked.append((max(tried, key=_worst), places[contents:]))
     for number, (found, left) in enumerate(asked):  # afterwards: a live answer follows another
         worst.append(_worst(found))
-        kept.append(_kept(table, found, left, seed=number))
+        kept.append(share_kept(table, found, left, seed=number))
     print(
         f"{names[0]:12} {names[1]:11} {contents:4d}+{quiet:<2d} {np.median(worst):10.1f} "
         f"({np.percentile(worst, 10):.1f}) {100 * np.mean(kept):5.0f} % {np.median(times):6.1f} ms",
@@ -307,7 +307,7 @@ def _print_distorted(
     )
 
 
-def _kept(
+def share_kept(
     table: "LocalizationTable", found: "Answer", quiet: list[tuple[float, float]], *, seed: int
 ) -> float:
     """Share of held-out plates on which the worst finger has what is promised."""

@@ -26,8 +26,6 @@ from numpy.typing import NDArray
 
 from model.arrays import FloatArray, Point
 from model.errors import InputError
-from model.files.modal_file import read_modes
-from model.files.uff import read_bytes
 
 Rings: TypeAlias = tuple[tuple[Point, ...], ...]
 
@@ -107,13 +105,17 @@ class SurfaceShapes:
 
 
 def digest_of_file(path: Path) -> str:
-    """SHA-256 of a file's content; raises InputError where it cannot be read."""
+    """Return the SHA-256 of a file's content; raises InputError if it cannot be read."""
+    from model.files.uff import read_bytes  # only a surface needs it
+
     return hashlib.sha256(read_bytes(path)).hexdigest()
 
 
 @lru_cache(maxsize=4)
 def surface_shapes(file: str, digest: str, normal: str) -> SurfaceShapes:
-    """Read the modes of a file of a digest along a normal; raises InputError for what are none."""
+    """Read modes along a normal from a file with this digest; raises InputError if it has none."""
+    from model.files.modal_file import read_modes  # only a surface needs it
+
     path = Path(file)
     if digest_of_file(path) != digest:
         raise InputError(f"{file}: modes have changed since the rig was read; start again")

@@ -132,6 +132,27 @@ def test_table_of_a_surface_is_verified_and_read_again(
         load_table(tmp_path / "table.npz", rig=load_rig(tmp_path / "rig.yaml"))
 
 
+@pytest.mark.parametrize(
+    "other",
+    [
+        "{modes: modes.npz, normal: -z}",
+        "{modes: modes.npz, mass: 290 g}",
+        "{modes: modes.npz, loss_factor: 0.02}",
+        "{modes: modes.npz, outline: [[[0, 0], [0.3048, 0], [0.3048, 0.2], [0, 0.2]]]}",
+    ],
+)
+def test_table_of_another_surface_is_refused(
+    other: str, modes: Mapping[str, FloatArray], tmp_path: Path
+) -> None:
+    """By any key of the surface."""
+    rig = _write(tmp_path, modes)
+    save_table(build_table(load_rig(rig)), tmp_path / "table.npz")
+    rig.write_text(f"surface: {other}" + ERAS)
+    changed = load_rig(rig)
+    with pytest.raises(InputError, match="must be a table of this rig: plate"):
+        load_table(tmp_path / "table.npz", rig=changed)
+
+
 def test_curved_surface_counts_along_its_arc(
     modes: Mapping[str, FloatArray], own: LocalizationTable, tmp_path: Path
 ) -> None:

@@ -138,7 +138,7 @@ def test_table_of_a_surface_is_verified_and_read_again(
         "{modes: modes.npz, normal: -z}",
         "{modes: modes.npz, mass: 290 g}",
         "{modes: modes.npz, loss_factor: 0.02}",
-        "{modes: modes.npz, outline: [[[0, 0], [0.3048, 0], [0.3048, 0.2], [0, 0.2]]]}",
+        "{modes: modes.npz, outline: [[[0, 0], [0.31, 0], [0.31, 0.23], [0, 0.23]]]}",
     ],
 )
 def test_table_of_another_surface_is_refused(

@@ -146,9 +146,9 @@ def _print_row(
             for bands in choices
         ]
         times.append(1e3 * (time.process_time() - started))
-        asked.append((max(tried, key=_worst), places[contents:]))
+        asked.append((max(tried, key=promised_worst), places[contents:]))
     for number, (found, left) in enumerate(asked):  # afterwards: a live answer follows another
-        worst.append(_worst(found))
+        worst.append(promised_worst(found))
         kept.append(share_kept(table, found, left, seed=number))
     print(
         f"{names[0]:12} {names[1]:11} {contents:4d}+{quiet:<2d} {np.median(worst):10.1f} "
@@ -157,7 +157,7 @@ def _print_row(
     )
 
 
-def _worst(found: "Answer") -> float:
+def promised_worst(found: "Answer") -> float:
     if found.promised_worst_db is None:
         raise ValueError("a set must have two fingers")
     return found.promised_worst_db

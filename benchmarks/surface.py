@@ -15,13 +15,14 @@ import argparse
 import tempfile
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from benchmarks.contents import share_kept
+from benchmarks.contents import promised_worst, share_kept
 from benchmarks.page import write_parts
 from benchmarks.setting import RIG, random_contacts, use_one_thread
 
 if TYPE_CHECKING:
+    from model.arrays import FloatArray
     from model.rig.rig import Rig
 
 PAGE = Path(__file__).parents[1] / "docs" / "how-to" / "surface.md"
@@ -58,7 +59,7 @@ def main() -> None:
             surface = build_table(_as_surface(rig, highest, Path(folder)), drive_mode="phased")
         fields, others = (each.unit_fields(own.cell_centres) for each in (own, surface))
         off = np.linalg.norm(others - fields, axis=-1) / np.linalg.norm(fields, axis=-1)
-        promised, kept = list[tuple[float, float]](), list[list[float]]()
+        promised, kept = list[list[float]](), list[list[float]]()
         rng = np.random.default_rng(1)
         for number in range(options.sets):
             places = [(float(x), float(y)) for x, y in random_contacts(rng, 2 + number % 3, size)]
@@ -73,10 +74,7 @@ def main() -> None:
                 )
                 for each in (own, surface)
             ]
-            worst = [each.promised_worst_db for each in found]
-            if None in worst:
-                continue
-            promised.append((worst[0] or 0.0, worst[1] or 0.0))
+            promised.append([promised_worst(each) for each in found])
             kept.append([share_kept(own, each, places[1:], seed=number) for each in found])
         by_plate, by_surface = np.median(promised, axis=0)
         shares = 100 * np.mean(kept, axis=0)
@@ -95,28 +93,38 @@ def _as_surface(rig: "Rig", highest: float, folder: Path) -> "Rig":
     import numpy as np
     import yaml
 
-    from model.arrays import lattice
-    from model.reduction.free_plate import FREQUENCY_MARGIN, solve_free_plate
     from model.rig.rig_file import load_rig
 
-    plate = rig.plate
-    free = solve_free_plate(plate, rig.mesh, frequency_max=highest / FREQUENCY_MARGIN)
-    nodes = lattice(np.linspace(0, plate.length, NODES[0]), np.linspace(0, plate.width, NODES[1]))
-    order = np.argsort(free.modes.eigenvalues)
-    frequencies = np.sqrt(free.modes.eigenvalues[order].clip(0)) / (2 * np.pi)
-    np.savez(
-        folder / "modes.npz",
-        nodes=np.column_stack([nodes, np.zeros(len(nodes))]),
-        frequencies=frequencies,
-        shapes=free.modes.shapes_at(nodes)[:, order].T,
-        damping_ratios=np.full(len(frequencies), plate.loss_factor / 2),
-    )
+    arrays: dict[str, Any] = {**exported_modes(rig, highest, NODES)}
+    arrays["damping_ratios"] = np.full(len(arrays["frequencies"]), rig.plate.loss_factor / 2)
+    np.savez(folder / "modes.npz", **arrays)
     keys = yaml.safe_load(RIG.read_text("utf-8"))
     keys.pop("mesh", None)
     del keys["plate"]
     file = folder / "rig.yaml"
     file.write_text(yaml.safe_dump({**keys, "surface": "modes.npz"}, sort_keys=False), "utf-8")
     return replace(load_rig(file), uncertainty=rig.uncertainty)
+
+
+def exported_modes(rig: "Rig", highest: float, nodes: tuple[int, int]) -> "dict[str, FloatArray]":
+    """Return the modes of a rig's free plate up to a frequency [Hz], as another program has them.
+
+    nodes: numbers of nodes along x and y, at which shapes along z are given.
+    """
+    import numpy as np
+
+    from model.arrays import lattice
+    from model.reduction.free_plate import FREQUENCY_MARGIN, solve_free_plate
+
+    plate = rig.plate
+    free = solve_free_plate(plate, rig.mesh, frequency_max=highest / FREQUENCY_MARGIN)
+    places = lattice(np.linspace(0, plate.length, nodes[0]), np.linspace(0, plate.width, nodes[1]))
+    order = np.argsort(free.modes.eigenvalues)
+    return {
+        "nodes": np.column_stack([places, np.zeros(len(places))]),
+        "frequencies": np.sqrt(free.modes.eigenvalues[order].clip(0)) / (2 * np.pi),
+        "shapes": free.modes.shapes_at(places)[:, order].T,
+    }
 
 
 if __name__ == "__main__":

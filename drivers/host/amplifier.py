@@ -361,7 +361,7 @@ class Amplifier(Dialogue):
         return replace(self.counts, **vars(self.line.wire.counters))
 
     async def _listen_for_another_host(self, status: Values) -> None:
-        """Raise LinkError if its watchdog is fed by somebody else while this listens."""
+        """Raise LinkError if another host feeds its watchdog while this one listens."""
         end = threads.now() + LISTENING
         left = status["watchdog_left"]
         while threads.now() < end and status["state"] == ENABLED:

@@ -225,7 +225,7 @@ _RATE_WINDOW = 1.0  # s
 _SLACK = 1e-6  # of a step, for sums of floats
 
 Vibration: TypeAlias = tuple[float | None, float]
-"""Earliest start [s] of a vibration, or None if there is none, and its latest end [s]."""
+"""Earliest start [s] of a vibration, None without a vibration, and its latest end [s]."""
 
 
 @dataclass(frozen=True, slots=True)

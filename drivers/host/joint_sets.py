@@ -150,7 +150,7 @@ class Members:
         self, work: Callable[_P, Coroutine[Any, Any, _T]], *args: _P.args, **kwargs: _P.kwargs
     ) -> Coroutine[Any, Any, _T]:
         """Start a stop or disarm, which runs to completion whatever is cancelled meanwhile."""
-        task = asyncio.ensure_future(work(*args, **kwargs))  # it starts even if nobody awaits it
+        task = asyncio.ensure_future(work(*args, **kwargs))  # it starts even if it is not awaited
         self.silencing.add(task)
         task.add_done_callback(self.silencing.discard)
         return _to_completion(task)

@@ -635,7 +635,7 @@ class Line:
         self._queue.remove(job)
         if not job.result.done():
             job.result.set_exception(error)
-            job.result.exception()  # so that asyncio does not report it where nobody waits
+            job.result.exception()  # so that asyncio does not report it as never retrieved
 
     def _preempt(self, current: Job) -> None:
         """Shorten the wait for the current reply where a more urgent request is waiting."""

@@ -62,7 +62,7 @@ class Nak:
     code: str
     """Name of the refusal."""
     channel: int | None
-    """The channel at fault; None if it is none in particular."""
+    """The channel at fault; None if the refusal names no channel."""
 
 
 @dataclass(frozen=True, slots=True)

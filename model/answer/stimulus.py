@@ -142,7 +142,7 @@ class Finger:
     """Its load on the plate, relative to the rig's fingertip.
 
     A load above 10 is that of a hand that rests (`HAND_LOAD`): it changes what others feel, is
-    known within a factor of 2.5 only, and has neither a stimulus nor protection.
+    known within a factor of 3 only, and has neither a stimulus nor protection.
     """
     priority: int = 0
     """Vibrations of lower priority are given up or lowered first."""

@@ -19,7 +19,7 @@ import numpy as np
 
 from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError
-from model.files.uff import DatasetBlock, blocks, lengths_in_si, numbers_in, read_bytes
+from model.files.uff import DatasetBlock, blocks, lengths_in_si, numbers_in
 
 _SHELLS = frozenset(range(40, 100)) | {171, 172}  # plane stress, plates, membranes, thin shells
 _BEAMS = frozenset(range(11, 38))  # whose elements have a further row
@@ -58,9 +58,8 @@ class ModeShapes:
     """Nodes in coordinates of touches (n, 2) [m]; None where they are projected."""
 
 
-def read_modes(path: Path) -> ModeShapes:
-    """Read modes; raises InputError with file and line for what are none."""
-    content = read_bytes(path)
+def read_modes(path: Path, content: bytes) -> ModeShapes:
+    """Read the modes of a file with this content; raises InputError with file and line."""
     found = _from_arrays if content.startswith(_BINARY_ZIP) else _from_universal
     modes = found(path, content)
     for name in ("nodes", "frequencies", "shapes"):

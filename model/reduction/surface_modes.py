@@ -79,7 +79,8 @@ class SurfaceModes:
 
         read = surface_shapes(surface.file, surface.digest, surface.normal)
         thicker = plate.thickness / THICKNESS
-        frequencies = thicker * math.sqrt(plate.material.E / surface.modulus) * read.frequencies
+        faster = surface.frequency_factor(plate.thickness, plate.material.E)
+        frequencies = faster * read.frequencies
         highest = float(frequencies[-1])
         cut = min(cutoff_frequency, max(LEAST_KNOWN * frequency_max, _TRUNCATED * highest))
         # One is left to be truncated, since sums over these need some.

@@ -89,7 +89,7 @@ class Uncertainty:
     """Motion that one ERA causes at a finger, relative to its root mean square over the
     plate, beside all other uncertainties."""
     modulus: float = 0.02
-    """Modulus of elasticity of the plate, relative; 0 counts if the thickness is known."""
+    """Modulus of elasticity of the plate, relative; it counts as 0 if `thickness` is 0."""
     place: float = 0.001
     """Place of each ERA, along x and along y [m]."""
     harmonic: float = 0.01

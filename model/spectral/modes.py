@@ -69,7 +69,7 @@ from model.structure.plate import (
     section_of,
     shear_corrections,
 )
-from model.structure.surface import LEAST_KNOWN, THICKNESS, Surface
+from model.structure.surface import EDGES, LEAST_KNOWN, Surface
 
 NODES = 12
 """Frequencies of a band at which modes state their stiffness."""
@@ -624,7 +624,7 @@ class KnownModes(Discretisation):
     @classmethod
     def of(cls, plate: Plate, surface: Surface) -> Self:
         """Those that a file has of a surface; plate: that stands for it."""
-        faster = plate.thickness / THICKNESS * math.sqrt(plate.material.E / surface.modulus)
+        faster = surface.frequency_factor(plate.thickness, plate.material.E)
         highest = faster * surface.frequency
         return cls(surface.count, 1, plate.length, plate.width, highest)
 
@@ -649,7 +649,7 @@ class KnownModes(Discretisation):
     @property
     def shortest_wavelength(self) -> float:
         """The bending wavelength [m] of its highest mode, by their number."""
-        return math.sqrt(1.25 * math.pi * self.length * self.width / self.nx)
+        return math.sqrt(EDGES * math.pi * self.length * self.width / self.nx)
 
     def highest_frequency(self, plate: Plate) -> float:
         """The highest frequency [Hz] at which enough modes are known."""

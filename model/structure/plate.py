@@ -42,7 +42,7 @@ from numpy.typing import NDArray
 from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError, expect_between, expect_values
 from model.structure.material import Material
-from model.structure.surface import Surface, is_within
+from model.structure.surface import EDGES, Surface, is_within
 
 
 class Bond(StrEnum):
@@ -395,7 +395,7 @@ class Plate(Sheet):
         """
         stretch = math.sqrt(self.least_rigidity / self.flexural_rigidity)
         area = self.length * self.width * stretch / self.bending_wavelength(frequency) ** 2
-        return math.ceil(1.25 * math.pi * area)
+        return math.ceil(EDGES * math.pi * area)
 
     def contains(self, x: float, y: float) -> bool:
         """Whether a point [m] lies on the plate, its edges included."""

@@ -29,9 +29,11 @@ from model.errors import InputError
 
 Rings: TypeAlias = tuple[tuple[Point, ...], ...]
 
-THICKNESS, NU, _EDGES = 2e-3, 0.25, 1.25
-"""Of the homogeneous plate: thickness [m] and Poisson's ratio, both arbitrary; and its modes over
-those of the area alone (`Plate.modes_below`)."""
+THICKNESS, NU = 2e-3, 0.25
+"""Thickness [m] and Poisson's ratio of the homogeneous plate, both arbitrary."""
+
+EDGES = 1.25
+"""Number of modes of a plate with free edges over that of its area alone."""
 
 LEAST_KNOWN, WELL_KNOWN = 1.15, 3.0
 """Multiples of the highest frequency up to which modes must be known, and should be: with fewer,
@@ -74,6 +76,13 @@ class Surface:
     outline: Rings = ()
     """Edges and cut-outs as rings of points [m]; none for the whole rectangle."""
 
+    def frequency_factor(self, thickness: float, modulus: float) -> float:
+        """Return the factor of its natural frequencies for a homogeneous plate that deviates.
+
+        thickness [m], modulus [Pa]: those of the plate that stands for it.
+        """
+        return thickness / THICKNESS * math.sqrt(modulus / self.modulus)
+
 
 @dataclass(frozen=True, eq=False)
 class SurfaceShapes:
@@ -114,12 +123,13 @@ def digest_of_file(path: Path) -> str:
 @lru_cache(maxsize=4)
 def surface_shapes(file: str, digest: str, normal: str) -> SurfaceShapes:
     """Read modes along a normal from a file with this digest; raises InputError if it has none."""
-    from model.files.modal_file import read_modes  # only a surface needs it
+    from model.files.modal_file import read_modes  # only a surface needs these
+    from model.files.uff import read_bytes
 
-    path = Path(file)
-    if digest_of_file(path) != digest:
+    content = read_bytes(Path(file))
+    if hashlib.sha256(content).hexdigest() != digest:
         raise InputError(f"{file}: modes have changed since the rig was read; start again")
-    read = read_modes(path)
+    read = read_modes(Path(file), content)
     axis = "xyz".index(normal[-1])
     upwards = -1.0 if "-" in normal else 1.0
     along = (read.shapes if read.shapes.ndim == 2 else upwards * read.shapes[:, :, axis]).T
@@ -235,7 +245,7 @@ def homogeneous(shapes: SurfaceShapes, mass: float | None) -> tuple[float, float
         )
     elastic, area = shapes.frequencies[shapes.rigid :], float(np.prod(shapes.size))
     mu = (own if mass is None else mass) / area
-    rigidity = mu / (2 * len(elastic) / (_EDGES * elastic[-1] * area)) ** 2
+    rigidity = mu / (2 * len(elastic) / (EDGES * elastic[-1] * area)) ** 2
     ratios = shapes.damping_ratios[np.isfinite(shapes.damping_ratios)]
     return (
         float(12 * rigidity * (1 - NU**2) / THICKNESS**3),

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from benchmarks.surface import exported_modes
 from controller.cli.main import run
 from model.answer.stimulus import check_on_plate
-from model.arrays import FloatArray, lattice
+from model.arrays import FloatArray
 from model.errors import InputError
-from model.reduction.free_plate import solve_free_plate
 from model.rig.rig import Rig
 from model.rig.rig_file import load_rig, parse_rig
 from model.rig.rig_writing import save_rig
@@ -51,14 +51,7 @@ def own(plate: Rig) -> LocalizationTable:
 @pytest.fixture(scope="module")
 def modes(plate: Rig) -> Mapping[str, FloatArray]:
     """Its modes at 21 x 16 nodes as another program would export them, along z."""
-    free = solve_free_plate(plate.plate, plate.mesh, frequency_max=HIGHEST / 2)
-    nodes = lattice(np.linspace(0, 0.3048, 21), np.linspace(0, 0.2286, 16))
-    order = np.argsort(free.modes.eigenvalues)
-    return {
-        "nodes": np.column_stack([nodes, np.zeros(len(nodes))]),
-        "frequencies": np.sqrt(free.modes.eigenvalues[order].clip(0)) / (2 * np.pi),
-        "shapes": free.modes.shapes_at(nodes)[:, order].T,
-    }
+    return exported_modes(plate, HIGHEST, (21, 16))
 
 
 def _universal(modes: Mapping[str, FloatArray], *, kind: int, length: float) -> str:

@@ -12,15 +12,15 @@ from typing import Any
 from benchmarks.setting import support
 from era_haptics.lab.conformance.judge_client import TooLate
 
-judged_line: Any = support("judged_line")
+virtual_lines: Any = support("virtual_lines")
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.conformance")
     parser.add_argument("--reply", type=float, default=0.4)
-    judged_line.DELAY = parser.parse_args().reply / 2000
-    for kind, name in judged_line.PROTOCOLS.items():
-        results = judged_line.judged(kind)
+    virtual_lines.DELAY = parser.parse_args().reply / 2000
+    for kind, name in virtual_lines.PROTOCOLS.items():
+        results = virtual_lines.judged(kind)
         late = sum(isinstance(each.finding, TooLate) for each in results)
         print(f"{name:11} {sum(each.seconds for each in results):5.1f} s, {late} without a verdict")
 

@@ -22,11 +22,12 @@ from registry import threads
 from sim.far_ends.wire_assignment import SimulatedWire
 from sim.plant.imperfections import draw_imperfections
 
-_rig_on_wire: Any = support("rig_on_wire")
-_small_table: Any = support("small_table").small_table
-_intents: Any = support("newest_contact").BuzzNewestContact
-_paper_rig: Any = support("paper_plate").make_paper_rig
-run_virtual: Any = support("virtual_loop").run_virtual
+_far_side: Any = support("real_wires").far_side
+_on_amplifiers: Any = support("real_wires").on_amplifiers
+_small_table: Any = support("plates").small_table
+_paper_rig: Any = support("plates").make_paper_rig
+_intents: Any = support("set_table").BuzzNewestContact
+run_virtual: Any = support("virtual_lines").run_virtual
 
 NAMES = ("west", "middle", "east")
 SPEEDS = {"serial": 921_600, "modbus-rtu": 115_200, "slcan": 500_000, "socketcand": 500_000}
@@ -82,7 +83,7 @@ class Session:
 
 def make_rig(names: tuple[str, ...]) -> Rig:
     """The paper's plate, its ERAs on amplifiers of these names in turn."""
-    return _rig_on_wire.on_amplifiers(_paper_rig(12, 9), names)  # type: ignore[no-any-return]
+    return _on_amplifiers(_paper_rig(12, 9), names)  # type: ignore[no-any-return]
 
 
 def make_controller(rig: Rig, urls: Mapping[str, str], **more: Any) -> Controller:
@@ -101,7 +102,7 @@ async def armed(
     """Open and arm a host."""
     rig = make_rig(names)
     drawn = draw_imperfections(rig, seed=seed)
-    async with _rig_on_wire.far_side(lines.wires(names, seed), rig, imperfections=drawn) as far:
+    async with _far_side(lines.wires(names, seed), rig, imperfections=drawn) as far:
         far.machine.be_prompt()
         for amplifier in () if lines.has_mark else far.bench.amplifiers.values():
             amplifier.capabilities["features"] &= ~(1 << FEATURES["mark"])

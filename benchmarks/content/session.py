@@ -29,7 +29,7 @@ from sim.plant.imperfections import draw_imperfections
 from sim.transport.simulated_line import PROMPT
 
 _chain: Any = support("chain").Chain
-_run_virtual: Any = support("virtual_loop").run_virtual
+_run_virtual: Any = support("virtual_lines").run_virtual
 
 CASE = Case("files", None)
 _BEFORE, _AFTER = 0.3, 0.3  # s; of the quiet finger alone, and after the file

@@ -30,8 +30,8 @@ from sim.amplifier.simulated_amplifier import SimulatedAmplifier as SimulatedAmp
 from sim.far_ends.serial_amplifiers import SerialAmplifiers
 
 _ROOT = Path(__file__).parents[2]
-_run_virtual: Any = support("virtual_loop").run_virtual
-_Recorder: Any = support("own_calls").Recorder
+_run_virtual: Any = support("virtual_lines").run_virtual
+_Recorder: Any = support("courses").Recorder
 _FRAME_INTERVAL, _RESTING = 0.05, 2.0  # s
 _LEVEL = 15.0  # dB SL
 

@@ -40,7 +40,7 @@ from sim.plant.imperfections import draw_imperfections
 from sim.transport.simulated_line import PROMPT
 
 _chain: Any = support("chain").Chain
-_run_virtual: Any = support("virtual_loop").run_virtual
+_run_virtual: Any = support("virtual_lines").run_virtual
 
 SETTLING, STEADY, FIRST, NEXT = 2.0, 0.25, 0.100, 0.080  # s
 EARLY = 0.020  # s; by which amplifiers may start before another: less than between two cross-fades

@@ -1,4 +1,4 @@
-"""What benchmarks compute beside their timing.
+"""What benchmarks compute beside their timing, and that each of them starts.
 
 The comparison of the answers of two checkouts; the data set of the contrast benchmark, how its
 entries are read, and its scores.
@@ -7,6 +7,8 @@ entries are read, and its scores.
 import hashlib
 import json
 import runpy
+import subprocess
+import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -23,6 +25,18 @@ from benchmarks.contrast.score import SetScore, score, summary
 from model.errors import InputError
 from model.table.table_file import build_table
 from plates import smooth_rig
+
+ROOT = Path(__file__).parents[2]
+_OTHER_SOLVERS = "benchmarks.plate.peers"  # need packages of their own
+
+
+def test_each_benchmark_starts() -> None:
+    """Every module of the benchmarks imports, as the commands of pages do first."""
+    files = sorted((ROOT / "benchmarks").rglob("*.py"))
+    names = [".".join(each.relative_to(ROOT).with_suffix("").parts) for each in files]
+    own = [each for each in names if not each.startswith(_OTHER_SOLVERS)]
+    program = f"import importlib\nfor each in {own}: importlib.import_module(each)"
+    subprocess.run([sys.executable, "-c", program], cwd=ROOT, check=True)
 
 
 def run(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> None:
@@ -57,7 +71,6 @@ def test_report_says_what_other_answers_lose(
     assert changes[1] < -3.0
 
 
-ROOT = Path(__file__).parents[2]
 SET = "paper_plate/1-00"
 DRIVE = {"SW": [200, 1.0, 0.0], "NE": [200, 0.7, 135.0]}
 TURNED = {"SW": [200, 1.0, 90.0], "NE": [200, 0.7, 225.0]}

@@ -343,7 +343,8 @@ async def test_few_of_a_flood_of_touches_become_sets(tmp_path: Path) -> None:
         assert len(journal.raising_since(begin)) < count / 4
 
 
-LONGEST, STOPPED_WITHIN = 0.005, 0.020  # s of processor time
+LONGEST, STOPPED_WITHIN = 5, 20  # ms of processor time, of a machine that does `unit` in one
+_JOB = [{"number": each, "values": [0.1 * each] * 8} for each in range(180)]
 ROUNDS = 2  # of which the quicker counts: the first of anything may be slower
 FILES = 8  # of 60 s, in each of two layouts
 PLACE, THERE = (0.1, 0.02), 5  # in a region, with the file of that number
@@ -433,6 +434,16 @@ def iterations() -> Iterator[list[float]]:
         for owner, name in _LEFT_OUT:
             patch.setattr(owner, name, left_out(getattr(owner, name)))
         yield times
+
+
+def unit() -> float:
+    """Processor time [s] of a job in plain Python, beside what else this machine does now."""
+    times = []
+    for _ in range(15):
+        before = time.thread_time()
+        json.loads(json.dumps(_JOB))
+        times.append(time.thread_time() - before)
+    return float(np.median(times))
 
 
 LoopIsFreePanel = Callable[[bytes], None]
@@ -538,7 +549,10 @@ def calls(
 
 @in_virtual_time
 async def test_nothing_from_outside_holds_the_loop(tmp_path: Path) -> None:
-    """Each method of the API and each source, with as much as it may bring, for 5 ms at most."""
+    """Each method of the API and each source, with as much as it may bring, for 5 ms at most.
+
+    These are of a machine that does the job of `unit` in one.
+    """
     worst = dict[str, float]()
     async with touched(tmp_path) as (bench, era, panel):
         sent = calls(tmp_path, bench, era, panel)
@@ -554,7 +568,8 @@ async def test_nothing_from_outside_holds_the_loop(tmp_path: Path) -> None:
                     longest.append(max(times))
                 worst[name] = min(longest)
         assert (await era.status()).state == ENABLED
-    assert {name: each for name, each in worst.items() if each > LONGEST} == {}
+    longest = LONGEST * unit()
+    assert {name: each for name, each in worst.items() if each > longest} == {}
 
 
 async def soon(holds: Callable[[], object]) -> None:
@@ -582,7 +597,7 @@ async def test_stop_amid_a_reload_is_sent_at_once(tmp_path: Path) -> None:
             loop.seen = noted
             stopping = asyncio.create_task(other.stop())
             await written.wait()
-        assert sum(times) <= STOPPED_WITHIN
+        assert sum(times) <= STOPPED_WITHIN * unit()
         assert not any(each.done() for each in reloads)
         await stopping
         assert all(each.reloaded for each in await asyncio.gather(*reloads))

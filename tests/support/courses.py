@@ -58,24 +58,24 @@ class Taken:
 
     async def begins(self, step: Step) -> None:
         """Begin a step, and let the loop turn."""
-        self.under_way[str(step)] = asyncio.create_task(self.take(step))
+        self.under_way[_name(step)] = asyncio.create_task(self.take(step))
         await asyncio.sleep(0)
 
     async def ends(self, step: Step) -> None:
         """Wait until a step was taken."""
-        await self.under_way.pop(str(step))
+        await self.under_way.pop(_name(step))
 
     async def ends_anyhow(self, step: Step) -> None:
         """Wait until a step was taken, or refused."""
-        await asyncio.gather(self.under_way.pop(str(step)), return_exceptions=True)
+        await asyncio.gather(self.under_way.pop(_name(step)), return_exceptions=True)
 
     def cancels(self, step: Step) -> None:
         """Cancel a step that has begun."""
-        self.under_way[str(step)].cancel()
+        self.under_way[_name(step)].cancel()
 
     def says(self, what: str, text: str) -> None:
         """Require a part of a text."""
-        assert text in attrgetter(what)(self)
+        assert text in attrgetter(what)(self), attrgetter(what)(self)
 
     def counts(self, **numbers: int) -> None:
         """Require the numbers of what was reported."""
@@ -313,6 +313,11 @@ class Acted(Taken, Chain):
         kinds = self.far_end.names()
         found = [kinds.index(name) for name in names]
         assert found == sorted(found), kinds
+
+
+def _name(step: Step) -> str:
+    """The name of a step, without what it is given."""
+    return step if isinstance(step, str) else next(iter(step))
 
 
 _OF_A_STEP = ("refuses", "begins", "ends", "ends anyhow", "cancels")

@@ -3,17 +3,13 @@
 import asyncio
 import logging
 import threading
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 import serial
 
 from controller.api.jsonrpc import ErrorCode, RpcError
-from controller.api.methods import ArmParams
-from controller.daemon.daemon import Daemon
 from controller.daemon.handlers import check_lease
 from controller.operation.operation_states import (
     ENERGISED,
@@ -24,63 +20,17 @@ from controller.operation.operation_states import (
     Trigger,
     step,
 )
-from controller.operation.supervisor import Supervisor
 from daemons import (
-    ENABLED,
     PATIENCE,
     READY,
     daemon_at,
-    error_code,
     far_end,
     next_event,
     ready_daemon,
     running_daemon,
     until,
-    until_state,
 )
-from drivers.errors import LinkError
 from virtual_lines import in_virtual_time
-
-
-def delay_arming(
-    daemon: Daemon, monkeypatch: pytest.MonkeyPatch, *, then: Callable[[], None] = lambda: None
-) -> asyncio.Event:
-    """Let the daemon's arming wait for the returned event, and call `then` before it continues."""
-    arm, released = daemon._controller.arm, asyncio.Event()
-
-    async def slow() -> None:
-        await released.wait()
-        then()
-        await arm()
-
-    monkeypatch.setattr(daemon._controller, "arm", slow)
-    return released
-
-
-@in_virtual_time
-async def test_clear_acknowledges_no_stop_that_its_client_has_not_seen(tmp_path: Path) -> None:
-    """Another client's after its own, until it has read the status; its own it has seen."""
-    async with ready_daemon(tmp_path) as (bench, era), await bench.client() as other:
-        await era.stop()
-        await other.stop()
-        with pytest.raises(RpcError, match="another stop"):
-            await era.clear()
-        assert (await era.status()).state == "QUICK_STOP_ACTIVE"
-        await era.clear()
-        assert (await other.status()).state == READY
-
-
-@in_virtual_time
-async def test_client_that_follows_events_may_clear_after_a_second_stop(tmp_path: Path) -> None:
-    """Which changes no state, but what an acknowledgement must name."""
-    async with ready_daemon(tmp_path) as (bench, era), await bench.client() as other:
-        await era.subscribe("state")
-        await other.stop()
-        epoch = (await other.stop()).epoch
-        while (await next_event(era, "state")).data["epoch"] != epoch:
-            pass
-        await era.clear()
-        assert (await other.status()).state == READY
 
 
 @in_virtual_time
@@ -100,88 +50,6 @@ async def test_event_read_late_takes_nothing_back_that_was_seen(tmp_path: Path) 
         assert (await next_event(era, "state")).data["epoch"] >= epoch - 1
         await era.clear()
         assert (await era.status()).state == READY
-
-
-@in_virtual_time
-async def test_lease_lasts_from_armed_state_when_arming_takes_longer(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The armed state has a lease at every moment, and no other client gets one meanwhile."""
-    async with ready_daemon(tmp_path) as (bench, era):
-        supervisor = bench.daemon._supervisor
-
-        released = delay_arming(bench.daemon, monkeypatch, then=lambda: expire(supervisor))
-        arming = asyncio.ensure_future(era.arm("me", lease_s=1))
-        await until_state(era, "SWITCHED_ON")
-        async with await bench.client("other") as other:
-            assert await error_code(other.arm("you")) is ErrorCode.LEASE
-        released.set()
-        lease = await arming
-        status = await era.status()
-        assert (status.state, status.armed_by) == (ENABLED, "me")
-        assert 0.5 < (status.lease_left_s or 0) <= 1
-        await era.renew(lease.lease)
-        await until_state(era, READY)
-        assert bench.far.summary().state == "SWITCH_ON_DISABLED"
-
-
-@pytest.mark.parametrize("is_cancelled", [False, True])
-@in_virtual_time
-async def test_daemon_disarms_when_arming_client_left(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, is_cancelled: bool
-) -> None:
-    """Disconnected or cancelled before it got its lease of a minute, which is ended at once."""
-    async with ready_daemon(tmp_path) as (bench, era), await bench.client("other") as other:
-        released = delay_arming(bench.daemon, monkeypatch)
-
-        async def use() -> None:
-            async with other.armed("other", lease_s=60):
-                raise AssertionError("must not be armed")
-
-        using = asyncio.create_task(use())
-        await until_state(era, "SWITCHED_ON")
-        if is_cancelled:
-            using.cancel()
-            await asyncio.sleep(0)
-        else:
-            await other.close()
-        released.set()
-        with pytest.raises((asyncio.CancelledError, LinkError)):
-            await using
-        async with asyncio.timeout(20):  # before the lease would end by itself
-            await until_state(era, READY)
-        assert (await era.status()).armed_by is None
-        assert bench.far.summary().state == "SWITCH_ON_DISABLED"
-
-
-@pytest.mark.parametrize("latches", [True, False])
-@in_virtual_time
-async def test_stop_that_fails_on_its_way_stops_all_and_ends_the_lease(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, latches: bool
-) -> None:
-    """By a bug in its method, and one in the transition as well: the amplifier stops anyhow."""
-    async with ready_daemon(tmp_path) as (bench, era):
-        await era.arm("me", lease_s=60)
-        supervisor, after = bench.daemon._supervisor, list[Operation]()
-        stop_all = bench.daemon._server._stop_all
-
-        def fail(*_: object) -> None:
-            raise ZeroDivisionError("a bug")
-
-        def note() -> None:
-            stop_all()
-            after.append(supervisor.operation)
-
-        monkeypatch.setattr(bench.daemon._server, "_stop_all", note)
-        with monkeypatch.context() as broken:
-            broken.setattr(supervisor, "stop", fail)
-            if not latches:
-                broken.setattr(supervisor, "_step", fail)
-            assert await error_code(era.stop()) is ErrorCode.INTERNAL
-            await until(lambda: bench.far.summary().state == "QUICK_STOP_ACTIVE")
-        (operation,) = after
-        assert (operation.state.value == "QUICK_STOP_ACTIVE") is latches
-        assert (operation.lease is None) is latches
 
 
 @in_virtual_time
@@ -261,52 +129,6 @@ async def test_log_event_escapes_bytes_that_are_not_text(tmp_path: Path) -> None
         while "wrote" not in (event := await next_event(era, "log")).data["message"]:
             pass
         assert event.data["message"] == r"wrote /tmp/\udcff"
-
-
-def expire(supervisor: Supervisor) -> None:
-    """Let the lease have expired."""
-    assert supervisor.operation.lease is not None
-    lease = replace(supervisor.operation.lease, expires_at=0.0)
-    supervisor.operation = replace(supervisor.operation, lease=lease)
-
-
-@in_virtual_time
-async def test_client_that_arms_after_the_end_of_a_lease_inherits_nothing(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Between the end of a lease and its event: disarmed first, then armed anew."""
-    async with ready_daemon(tmp_path) as (bench, era):
-        supervisor = bench.daemon._supervisor
-        monkeypatch.setattr(supervisor, "check_lease", lambda: None)  # its event comes later
-        states: list[str] = []
-        await era.arm("me", lease_s=60)
-        expire(supervisor)
-        monkeypatch.setattr(
-            bench.daemon._publisher, "state_changed", lambda old, new: states.append(new.state.name)
-        )
-        async with await bench.client() as other:
-            await other.arm("you", lease_s=60)
-            assert (await other.status()).state == "OPERATION_ENABLED"
-        assert "READY_TO_SWITCH_ON" in states
-
-
-@in_virtual_time
-async def test_arming_that_is_cancelled_leaves_nothing_armed_without_a_lease(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Its lease ends with the transition to disarmed, before another client may arm."""
-    async with ready_daemon(tmp_path) as (bench, era):
-        api, released = bench.daemon._api, delay_arming(bench.daemon, monkeypatch)
-        client = SimpleNamespace(has_left=False)
-        arming = asyncio.create_task(api.arm(client, ArmParams(owner="me", lease_s=60)))  # type: ignore[arg-type]
-        await until_state(era, "SWITCHED_ON")
-        arming.cancel()
-        with pytest.raises(asyncio.CancelledError):
-            await arming
-        assert bench.daemon._supervisor.operation.state not in ENERGISED
-        assert bench.daemon._supervisor.operation.lease is None
-        released.set()
-        await until_state(era, "READY_TO_SWITCH_ON")
 
 
 def test_lease_lasts_its_duration_from_each_renewal() -> None:

@@ -1,7 +1,6 @@
-"""A daemon in use, in virtual time: dumps, layouts, signals and the service manager, strengths.
+"""A daemon in use, in virtual time: dumps, commands of layouts, signals, the service manager.
 
-Dumps have what came before the plate was stopped; layouts are chosen by name; strengths of touch
-sources, clients and regions act from the API to the skin.
+Dumps have what came before the plate was stopped; names and files of strengths are bounded.
 """
 
 import asyncio
@@ -12,20 +11,15 @@ import os
 import signal
 import socket
 import time
-from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
-from contextlib import asynccontextmanager
-from dataclasses import replace
-from functools import cache
+from collections.abc import Awaitable, Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 from controller.api.client import AsyncClient, Client
 from controller.api.jsonrpc import ErrorCode, RpcError
 from controller.cli.main import BAD_INPUT, run
-from controller.demo.demonstration import layout_of_people
 from controller.effects.strengths import MAX_NAMES
 from controller.operation.fault_dumps import (
     MAX_LINE,
@@ -33,8 +27,6 @@ from controller.operation.fault_dumps import (
     FaultDumps,
     write_dump,
 )
-from controller.play.intent import BEING_CHOSEN, NO_CONTACTS
-from controller.play.selection import GIVEN_UP
 from courses import Planted
 from daemons import (
     ENABLED,
@@ -47,23 +39,15 @@ from daemons import (
     error_code,
     far_end,
     holding,
-    next_event,
     ready_daemon,
     silent_from,
     until,
     until_state,
 )
 from drivers.host.amplifier import WATCHDOG
-from drivers.protocol.definition import QUANTITIES
 from gateway_bench import real_daemon
-from model.arrays import FloatArray
-from model.errors import InputError
-from model.rig.rig import Rig
-from model.table.table import LocalizationTable
-from model.table.table_file import build_table
-from plates import TWO_AMPLIFIERS, make_paper_rig
+from plates import TWO_AMPLIFIERS
 from registry import threads
-from several_fingers import answers_take
 from sim.faults import FaultWindow
 from virtual_lines import in_virtual_time
 
@@ -157,63 +141,18 @@ def test_what_is_kept_for_a_dump_is_bounded(tmp_path: Path) -> None:
 
 
 LAYOUTS = "layouts: {home: home.yaml, climate: climate.yaml}\n"
-WEST, EAST = (0.08, 0.1), (0.22, 0.1)
-TICK = 0.2  # s
 
 
 def write_layouts(folder: Path) -> None:
     """At home the west hums and the east ticks; for the climate all of it hums low."""
     half = "{rectangle: {start: [%s m, 0 m], end: [%s m, 0.2 m]}, on_press: %s}"
     (folder / "home.yaml").write_text(
-        f"effects: {{tick: {{kind: click, duration: {TICK} s}}, hum: {{kind: buzz, level: 14}}}}\n"
+        f"effects: {{tick: {{kind: click, duration: 0.2 s}}, hum: {{kind: buzz, level: 14}}}}\n"
         f"regions: {{west: {half % (0, 0.15, 'hum')}, east: {half % (0.15, 0.3, 'tick')}}}\n",
         "utf-8",
     )
     low = "effects: {low: {kind: buzz, level: 10}}\nelsewhere: low\n"
     (folder / "climate.yaml").write_text(low, "utf-8")
-
-
-@in_virtual_time
-async def test_next_finger_feels_the_chosen_layout_and_a_tick_goes_on(tmp_path: Path) -> None:
-    """Within 10 ms of the reply; at a finger that rests, what ends by itself plays to its end.
-
-    An unknown name changes nothing, nor does that of the layout in use.
-    """
-    write_layouts(tmp_path)
-    async with ready_daemon(tmp_path, LAYOUTS) as (bench, era):
-        await era.arm("me", lease_s=60)
-        view = bench.daemon._publisher.view
-
-        def felt() -> list[str | None]:
-            return [each.feels for each in view.contact_statuses()]
-
-        status = await era.status()
-        assert (status.layout, status.layouts) == ("home", ["home", "climate"])
-        await era.subscribe("layout")
-        assert (await next_event(era, "layout")).data["name"] == "home"
-        async with holding(era, EAST):
-            await until(lambda: felt() == ["tick"])
-            began = threads.now()
-            with pytest.raises(RpcError, match="did you mean climate") as caught:
-                await era.layout("climat")
-            assert caught.value.code is ErrorCode.INVALID_PARAMS
-            assert (await era.layout("home")).layout == "home"
-            assert (await era.layout("climate")).layout == "climate"
-            assert threads.now() - began < 0.01
-            await until(lambda: felt() == ["low"])
-            assert threads.now() - began == pytest.approx(TICK, abs=0.02)
-            assert (await next_event(era, "layout")).data["name"] == "climate"
-            assert (await era.status()).layout == "climate"
-        await era.touch([])
-        for name, effect in (("home", "hum"), ("climate", "low")):
-            await until(lambda: not any(bench.far.summary().levels))
-            await era.layout(name)
-            replied = threads.now()
-            async with holding(era, WEST):
-                await until(lambda effect=effect: felt() == [effect])
-                assert any(bench.far.summary().levels)
-                assert threads.now() - replied < 0.01
-            await era.touch([])
 
 
 @pytest.mark.real_time
@@ -365,257 +304,6 @@ async def test_daemon_notifies_systemd(tmp_path: Path) -> None:
             assert has_heard("STOPPING=1")
 
 
-LEFT, RIGHT = (0.08, 0.1), (0.22, 0.1)
-_HALF = "{rectangle: {start: [%s m, 0 m], end: [%s m, 0.2 m]}, on_press: %s}"
-_LAYOUT = f"regions: {{west: {_HALF % (0, 0.15, 'buzz')}, east: {_HALF % (0.15, 0.3, '%s')}}}\n"
-
-
-async def said(era: AsyncClient) -> set[str | None]:
-    """Why fingers feel nothing; the status says the same where nothing plays though it is armed."""
-    status = await era.status()
-    reasons = {each.held_back for each in status.contacts}
-    if status.state == ENABLED:
-        assert {status.silence_reason} == reasons
-    return reasons
-
-
-@in_virtual_time
-async def test_a_daemon_goes_on_while_answers_hang(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Every reason is the present one; a stop is at once, and the end within a second."""
-    layout = tmp_path / "layout.yaml"
-    layout.write_text(_LAYOUT % "buzz", "utf-8")
-    async with ready_daemon(tmp_path, "layouts: {panel: layout.yaml}\n") as (bench, era):
-        asked = answers_take(monkeypatch, 1e6)
-        async with holding(era, LEFT, RIGHT):
-            await until(lambda: bench.daemon._controller.cycle.tracker.contacts)
-            assert await said(era) == {"ready: arm first (era arm)"}
-            await era.arm("test", lease_s=60)
-            await until(lambda: asked)
-            assert await said(era) == {BEING_CHOSEN}
-            begin = threads.now()
-            await until(lambda: threads.now() > begin + 1.1)
-            assert await said(era) == {GIVEN_UP}
-            begin = threads.now()
-            await era.stop()
-            assert threads.now() - begin < 0.05
-            assert await said(era) == {"stopped: clear (era clear), then arm again"}
-            layout.write_text(_LAYOUT % "click", "utf-8")
-            os.kill(os.getpid(), signal.SIGHUP)
-            await until(lambda: bench.daemon._layouts.player.layout.regions[1].on_press == "click")
-            await era.clear()
-            await until_state(era, READY)
-            await era.arm("test", lease_s=60)
-            assert len(asked) == 1
-        await until(lambda: not bench.daemon._controller.cycle.tracker.contacts)
-        await until(lambda: not any(bench.far.summary().levels))
-        assert (await era.status()).silence_reason == NO_CONTACTS
-        async with holding(era, LEFT, far=bench.far):  # one alone needs no thread
-            assert await said(era) == {None}
-        layout.write_text(_LAYOUT % "buzz", "utf-8")
-        os.kill(os.getpid(), signal.SIGHUP)
-        await until(lambda: bench.daemon._layouts.player.layout.regions[1].on_press == "buzz")
-        async with holding(era, LEFT, RIGHT):
-            await until(lambda: len(asked) == 2)
-            begin = threads.now()
-            os.kill(os.getpid(), signal.SIGTERM)
-            await until(bench.running.done)
-            assert threads.now() - begin < 1
-
-
-PLACES = {"left": (0.03, 0.11), "right": (0.216, 0.0572)}
-FADE, WINDOW, STEP = 0.100, 0.050, 0.001  # s
-LOWER = 10 ** (-6 / 20)  # of -6 dB
-STEEPEST = (1 - LOWER) * math.pi / 2 * STEP / FADE
-"""Largest change of an envelope of 1 along the raised cosine, within a step."""
-LEVEL_STEP = 1 / QUANTITIES["level"].per_unit
-
-
-@cache
-def phased_table() -> LocalizationTable:
-    """For two contents at once, of levels that a step on the wire does not round by much."""
-    frequencies, rig = np.arange(60.0, 301.0, 20.0), make_paper_rig(12, 9)
-    rig = replace(rig, promised_thresholds=(rig.threshold,))
-    return build_table(rig, frequencies=frequencies, drive_mode="phased")
-
-
-@asynccontextmanager
-async def seats(folder: Path, more: str = "") -> AsyncIterator[tuple[DaemonBench, AsyncClient]]:
-    """An armed daemon with a region for each of two, whose fingers lie on its plate."""
-    layout = layout_of_people(make_paper_rig(12, 9).plate, dict.fromkeys(PLACES))
-    (folder / "layout.yaml").write_text(json.dumps(layout), encoding="utf-8")
-
-    def table(rig: Rig) -> LocalizationTable:
-        return phased_table()
-
-    async with ready_daemon(folder, f"layouts: {{panel: layout.yaml}}\n{more}", table=table) as (
-        bench,
-        era,
-    ):
-        bench.far.bench.place_fingers(PLACES, now=threads.now())
-        await era.arm("test", lease_s=60)
-        yield bench, era
-
-
-async def hold(seconds: float, *touching: tuple[AsyncClient, str, str]) -> None:
-    """Let clients report a finger each for a time [s]: their sources, and where."""
-    end = threads.now() + seconds
-    while threads.now() < end:
-        for era, source, place in touching:
-            await era.touch([PLACES[place]], source=source)
-        await asyncio.sleep(0.02)
-
-
-def envelope(bench: DaemonBench, finger: str, frequency: float, at: FloatArray) -> FloatArray:
-    """Amplitude of one tone at a fingertip [m/s²] at times [s], under a Hann window."""
-    records, _ = bench.far.bench.records(at[0] - WINDOW, at[-1] + WINDOW)
-    felt = records[finger]
-    turned = np.exp(-2j * np.pi * frequency * felt.times) * (felt.accelerations @ felt.weights)
-    weights = np.cos(np.pi * np.clip((felt.times - at[:, None]) / WINDOW, -0.5, 0.5)) ** 2
-    return np.asarray(np.abs(weights @ turned) / weights.sum(axis=1))
-
-
-@in_virtual_time
-async def test_gain_of_a_source_is_felt_at_its_finger_alone_along_a_fade(tmp_path: Path) -> None:
-    """6 dB less within 100 ms and back, monotone and as steep as a raised cosine; others as before.
-
-    On the amplifier exactly, at the skin as the plate follows.
-    """
-    async with seats(tmp_path) as (bench, era):
-        both = [(era, name, name) for name in PLACES]
-        await hold(1.0, *both)
-        tones = {each.effect: each.frequency_hz for each in (await era.status()).contacts}
-        planner = bench.daemon._controller.cycle.planner
-        assert planner is not None
-        (sent,) = [
-            n for n, one in planner.slots.contents.items() if "right" in one.content.key[0].source
-        ]
-        settled_at = planner.slots.contents[sent].settled_at
-        for gain, first, last in ((-6.0, 1.0, LOWER), (0.0, LOWER, 1.0)):
-            set_at = threads.now()
-            await era.strength(name="left", gain_db=gain)
-            await hold(0.02, *both)
-            led = np.arange(threads.now(), set_at + 0.2, STEP)
-            moving = [
-                np.array([abs(tone.transition.at(time)) for time in led])
-                for channel in bench.far.amplifier.outputs
-                for tone in channel
-                if tone.frequency == pytest.approx(tones["left"], abs=0.01)
-            ]
-            await hold(0.4, *both)
-            at = np.arange(set_at, set_at + 0.3, STEP)
-            for name, frequency in tones.items():
-                found = envelope(bench, name or "", frequency or 0.0, at)
-                if name == "left":
-                    moving.append(found)
-                    reached = found[round((FADE + WINDOW / 2 + 0.01) / STEP) :]
-                    assert 20 * np.log10(reached / found[0]) == pytest.approx(gain or 6.0, abs=0.2)
-                    assert 20 * np.log10(found[-1] / found[0]) == pytest.approx(gain or 6, abs=0.05)
-                else:
-                    assert 20 * np.log10(found / found[0]) == pytest.approx(0.0, abs=0.1)
-            assert planner.slots.contents[sent].settled_at == settled_at  # not sent again
-            assert len(moving) == 5
-            for course in moving:
-                changes = np.diff(course / course[-1] * last) * math.copysign(1, last - first)
-                rounded = LEVEL_STEP / np.abs(course).min() / (1 - LOWER)
-                slack = 0.1 if course is moving[-1] else 0.01 + rounded
-                assert -slack * STEEPEST <= changes.min()
-                assert changes.max() <= (1 + slack) * STEEPEST
-
-
-@in_virtual_time
-async def test_strengths_are_kept_by_name(tmp_path: Path) -> None:
-    """A client's for all its sources and those of its namesakes, and for what it plays elsewhere.
-
-    Each name counts once, also after its client and the daemon have come back; what they leave
-    below the threshold is held back. What is no strength, or not a known name, is refused.
-    """
-
-    async def levels(era: AsyncClient) -> list[float]:
-        await asyncio.sleep(0.4)
-        return [round(each.level_db_sl or 0.0, 1) for each in (await era.status()).contacts]
-
-    async with seats(tmp_path, "strengths: kept.json\n") as (bench, era):
-        one, other = await bench.client("seat"), await bench.client("seat")
-        held = asyncio.create_task(hold(1e3, (one, "pen", "left"), (other, "seat", "right")))
-        assert await levels(era) == [20, 20]
-        await era.strength(name="pen", gain_db=-3)
-        await era.strength(name="seat", gain_db=-6)
-        assert await levels(era) == [11, 14]
-        await era.strength(name="test", gain_db=-2)
-        await era.play("buzz", PLACES["right"])
-        assert await levels(era) == [11, 12]
-        for gain, what in ((3.0, "at most 0"), (-41.0, "at least -40"), (math.nan, "finite")):
-            with pytest.raises(InputError, match=f"^strength: gain_db must be .*{what}.*, got"):
-                await era.strength(name="pen", gain_db=gain)
-        with pytest.raises(RpcError, match=r"^name must be .*, got 'pan'; did you mean pen\? "):
-            await era.strength(name="pan", gain_db=-6)
-        held.cancel()
-        await asyncio.gather(one.close(), other.close())
-    async with seats(tmp_path, "strengths: kept.json\n") as (bench, era):
-        regions = dict.fromkeys(PLACES, 0.0)
-        kept = {"pen": -3, "seat": -6, "test": -2}
-        assert (await era.status()).strengths == {**regions, **kept}
-        one, other = await bench.client("seat"), await bench.client("another")
-        held = asyncio.create_task(hold(1e3, (one, "pen", "left"), (other, "finger", "right")))
-        assert await levels(era) == [11, 20]
-        await other.hello("seat")  # another name by now, while its finger rests
-        assert await levels(era) == [11, 14]
-        await other.hello("another")
-        await era.strength(name="another", gain_db=0)
-        await era.strength(name="pen", gain_db=-40)
-        assert await levels(era) == [-26, 20]
-        weak, felt = (await era.status()).contacts
-        assert (weak.verdict, felt.verdict) == ("held back", "own")
-        assert "-46 dB" in (weak.held_back or "")
-        held.cancel()
-        await asyncio.gather(one.close(), other.close())
-    async with seats(tmp_path, "strengths: kept.json\n") as (bench, era):
-        assert (await era.strength(name="another", gain_db=-1)).strengths == {"another": -1}
-        await bench.client("era")
-        assert (await era.status()).strengths.keys() == {"another", *PLACES, "pen", "seat", "test"}
-
-
-@in_virtual_time
-async def test_two_people_at_one_panel_differ_by_region(tmp_path: Path) -> None:
-    """6 dB less where one of them sits, for what is felt and what is played there; kept by name.
-
-    Gains of source and region add up.
-    """
-
-    async def levels(era: AsyncClient) -> dict[str, float]:
-        await asyncio.sleep(0.4)
-        places = {x: name for name, (x, _) in PLACES.items()}
-        contacts = (await era.status()).contacts
-        return {places[each.x_m]: round(each.level_db_sl or 0.0, 1) for each in contacts}
-
-    async def both(panel: AsyncClient) -> None:
-        while True:
-            await panel.touch([*PLACES.values()], source="panel")
-            await asyncio.sleep(0.02)
-
-    kept = "strengths: kept.json\n"
-    for gains, expected in (
-        ({"right": -6}, {"left": 20, "right": 14}),
-        ({"panel": -3}, {"left": 17, "right": 11}),  # and the region's, which was kept
-    ):
-        async with seats(tmp_path, kept) as (bench, era):
-            panel = await bench.client("seats")
-            held = asyncio.create_task(both(panel))
-            await asyncio.sleep(0.1)
-            for name, gain in gains.items():
-                await era.strength(name, gain)
-            assert await levels(era) == expected
-            await era.play("buzz", PLACES["right"])
-            assert await levels(era) == expected
-            with pytest.raises(RpcError, match=r"got 'rigt'; did you mean right\? "):
-                await era.strength("rigt", -6)
-            held.cancel()
-            await panel.close()
-    assert json.loads((tmp_path / "kept.json").read_text()) == {"right": -6, "panel": -3}
-
-
 @in_virtual_time
 async def test_a_disk_that_hangs_delays_no_other_request(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
@@ -632,11 +320,12 @@ async def test_a_disk_that_hangs_delays_no_other_request(
             raise OSError(28, "No space left on device")
         work(file)
 
-    async with seats(tmp_path, "strengths: kept.json\n") as (_, era):
+    async with ready_daemon(tmp_path, "strengths: kept.json\n") as (_, era):
+        await era.arm("test", lease_s=60)
         monkeypatch.setattr(asyncio, "to_thread", hangs)
         setting = [era.strength(name="test", gain_db=-1.0 - gain) for gain in range(10)]
         await asyncio.wait_for(asyncio.gather(*setting), 0.5)
-        await era.touch([PLACES["left"]])
+        await era.touch([PLACE])
         await era.disarm()
         disk.set()
         await asyncio.sleep(0.1)
@@ -652,7 +341,7 @@ async def test_names_with_a_strength_are_bounded(tmp_path: Path) -> None:
     async with ready_daemon(tmp_path, "strengths: kept.json\n") as (_, era):
         names = [f"{number} {'x' * 70}" for number in range(MAX_NAMES + 1)]
         for name in names:
-            await era.touch([PLACES["left"]], source=name)
+            await era.touch([PLACE], source=name)
             await asyncio.sleep(0.01)
             if name is names[-1]:
                 with pytest.raises(RpcError, match=r"^strengths must be of at most 64 names"):

@@ -1,0 +1,534 @@
+"""Courses of a daemon with clients, in virtual time: arming and leases, stops, layouts, strengths.
+
+A step `era.METHOD` is a call of a client; `hang` and `recovers` are of amplifiers. What is required
+`is` of the daemon at once, of the `status`, or in events that a client `hears`.
+"""
+
+import asyncio
+import contextlib
+import json
+import math
+import os
+import re
+import signal
+from collections.abc import AsyncIterator, Callable, Mapping, Sequence
+from contextlib import AsyncExitStack, asynccontextmanager
+from dataclasses import dataclass, field, replace
+from functools import cache
+from operator import attrgetter
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from types import SimpleNamespace
+from typing import Any, cast
+from unittest.mock import Mock
+
+import numpy as np
+import pytest
+
+from controller.api.client import AsyncClient
+from controller.api.jsonrpc import ErrorCode, RpcError
+from controller.api.link import Notification
+from controller.api.methods import ArmParams, StatusResult, TouchParams
+from controller.cli.status_text import show_status
+from controller.demo.demonstration import layout_of_people
+from controller.operation.operation_states import ENERGISED, Operation
+from courses import Planted, Step, Taken, courses, follow
+from daemons import (
+    PATIENCE,
+    READY,
+    DaemonBench,
+    daemon_at,
+    daemon_table,
+    error_code,
+    far_end,
+    until_state,
+)
+from drivers.protocol.definition import QUANTITIES
+from model.arrays import FloatArray
+from model.errors import InputError
+from model.table.table import LocalizationTable
+from model.table.table_file import build_table
+from plates import TWO_AMPLIFIERS, make_paper_rig
+from registry import threads
+from several_fingers import answers_take
+from sim.faults import FaultWindow
+from virtual_lines import in_virtual_time
+
+PLACES = {
+    "pad": (0.1, 0.1),
+    "beside": (0.25, 0.1),
+    "west": (0.08, 0.1),
+    "east": (0.22, 0.1),
+    "left": (0.03, 0.11),
+    "right": (0.216, 0.0572),
+}
+"""Places [m] by name."""
+SEATS = ("left", "right")
+"""Where two people sit."""
+FADE, WINDOW, STEP = 0.100, 0.050, 0.001  # s
+LOWER = 10 ** (-6 / 20)  # of -6 dB
+STEEPEST = (1 - LOWER) * math.pi / 2 * STEP / FADE
+"""Largest change of an envelope of 1 along the raised cosine, within a step."""
+LEVEL_STEP = 1 / QUANTITIES["level"].per_unit
+
+
+@cache
+def phased_table() -> LocalizationTable:
+    """For two vibrations at once, of levels that a step on the wire does not round by much."""
+    frequencies, rig = np.arange(60.0, 301.0, 20.0), make_paper_rig(12, 9)
+    rig = replace(rig, promised_thresholds=(rig.threshold,))
+    return build_table(rig, frequencies=frequencies, drive_mode="phased")
+
+
+@dataclass
+class Served(Taken):
+    """A daemon that is ready, with two clients, era and other.
+
+    shown: the status that was read last; heard: the data of the last event; began [s]: the last
+    mark; asked: when an answer was asked for, of those that take a time.
+    """
+
+    folder: Path = Path()
+    patch: pytest.MonkeyPatch = field(default_factory=pytest.MonkeyPatch)
+    options: Mapping[str, Any] = field(default_factory=dict)
+    stack: AsyncExitStack = field(default_factory=AsyncExitStack)
+    bench: DaemonBench = field(init=False)
+    era: AsyncClient = field(init=False)
+    other: AsyncClient = field(init=False)
+    shown: StatusResult = field(init=False)
+    heard: SimpleNamespace = field(init=False)
+    events: list[Notification] = field(default_factory=list)
+    held: "list[asyncio.Task[None]]" = field(default_factory=list)
+    going_on: asyncio.Event = field(default_factory=asyncio.Event)
+    began: float = 0.0
+    asked: Sequence[float] = ()
+
+    @property
+    def operation(self) -> Operation:
+        """What the supervisor knows."""
+        return self.bench.daemon._supervisor.operation
+
+    @property
+    def is_energised(self) -> bool:
+        """Whether the daemon takes the amplifiers for armed."""
+        return self.operation.state in ENERGISED
+
+    @property
+    def amplifiers(self) -> str:
+        """The state of the first amplifier."""
+        return self.bench.far.summary().state
+
+    @property
+    def is_loud(self) -> bool:
+        """Whether the first amplifier plays."""
+        return any(self.bench.far.summary().levels)
+
+    @property
+    def level(self) -> float:
+        """What the configuration in use has at its key [dB SL]."""
+        return self.bench.daemon._config.section.level_db_sl
+
+    @property
+    def feels(self) -> list[str | None]:
+        """What the fingers feel."""
+        return [each.feels for each in self.bench.daemon._publisher.view.contact_statuses()]
+
+    @property
+    def silence_event(self) -> object:
+        """What clients that subscribe to silences get."""
+        return self.bench.daemon._publisher.view.silence_event()
+
+    @property
+    def on_press(self) -> str | None:
+        """The effect of the second region of the layout in use."""
+        return self.bench.daemon._layouts.player.layout.regions[1].on_press
+
+    @property
+    def has_ended(self) -> bool:
+        """Whether the daemon has."""
+        return self.bench.running.done()
+
+    @property
+    def levels(self) -> list[float]:
+        """Of the fingers shown [dB SL]."""
+        return [round(each.level_db_sl or 0.0, 1) for each in self.shown.contacts]
+
+    @property
+    def whole_levels(self) -> list[int]:
+        """The same, in whole dB."""
+        return [*map(round, self.levels)]
+
+    @property
+    def held_back(self) -> list[str | None]:
+        """Why the fingers shown feel nothing, each reason once; a silent plate says the same."""
+        reasons = list(dict.fromkeys(each.held_back for each in self.shown.contacts))
+        if self.shown.state == "OPERATION_ENABLED":
+            assert reasons == [self.shown.silence_reason]
+        return reasons
+
+    @property
+    def effects(self) -> list[str | None]:
+        """Of the fingers shown."""
+        return [each.effect for each in self.shown.contacts]
+
+    @property
+    def verdicts(self) -> list[str | None]:
+        """Of the fingers shown."""
+        return [each.verdict for each in self.shown.contacts]
+
+    @property
+    def roles(self) -> list[str | None]:
+        """Of the fingers shown."""
+        return [each.role for each in self.shown.contacts]
+
+    @property
+    def least_level(self) -> float:
+        """Of the fingers shown [dB SL]."""
+        return min(self.levels)
+
+    @property
+    def is_exchange_told(self) -> bool:
+        """Whether the cause names another amplifier."""
+        return "A1" in self.operation.cause
+
+    @property
+    def tells_of_cables(self) -> bool:
+        """Whether the remedy shown does."""
+        return "cables" in (self.shown.remedy or "")
+
+    @property
+    def losses(self) -> dict[str, str]:
+        """Of the amplifiers shown: whether each is lost, closed with another or present."""
+        return {
+            each.name: ("lost" if each.lost else "") + ("closed" if each.closed_with_lost else "")
+            or "present"
+            for each in self.shown.amplifiers
+        }
+
+    async def starts(self) -> None:
+        """Start a daemon, which becomes ready, and connect the clients."""
+        of_rig = {"changes": self.options["changes"]}
+        far = await self.stack.enter_async_context(far_end(self.folder, **of_rig))
+        made = daemon_at(far, self.folder, **self.options)
+        self.bench = await self.stack.enter_async_context(made)
+        for client in ("era", "other"):
+            await self.connects(client, "test")
+        await until_state(self.era, READY)
+
+    async def connects(self, client: str, name: str) -> None:
+        """Connect a client by this name."""
+        made = await self.stack.enter_async_context(await self.bench.client(name))
+        setattr(self, client, made)
+
+    async def restarts(self) -> None:
+        """End the daemon and start another."""
+        self.lifts()
+        await self.stack.aclose()
+        await self.starts()
+
+    async def reaches(self, state: str) -> None:
+        """Wait until the daemon is in a state."""
+        await until_state(self.era, state)
+
+    def _differ(self, expected: Mapping[str, object]) -> dict[str, object]:
+        """Those values of properties, or of the status shown, that are not as expected."""
+        found = {}
+        for what, value in expected.items():
+            owner = self if hasattr(type(self), what.partition(".")[0]) else self.shown
+            if (each := attrgetter(what)(owner)) != value:
+                found[what] = each
+        return found
+
+    async def status(self, **expected: object) -> None:
+        """Read the status, and require values of it."""
+        self.shown = await self.era.status()
+        assert not self._differ(expected), self._differ(expected)
+
+    async def becomes(self, **expected: object) -> None:
+        """Read the status until it has these values."""
+        async with asyncio.timeout(PATIENCE):
+            self.shown = await self.era.status()
+            while self._differ(expected):
+                await asyncio.sleep(0.01)
+                self.shown = await self.era.status()
+
+    async def stays(self, seconds: float, **expected: object) -> None:
+        """Require values of the status for so long."""
+        end = threads.now() + seconds
+        while threads.now() < end:
+            await self.status(**expected)
+            await asyncio.sleep(0.01)
+
+    async def until(self, **expected: object) -> None:
+        """Wait until properties have these values."""
+        async with asyncio.timeout(PATIENCE):
+            while self._differ(expected):  # noqa: ASYNC110
+                await asyncio.sleep(0.005)
+
+    def between(self, least: float, most: float, what: str) -> None:
+        """Require that a value is within these bounds."""
+        assert least <= attrgetter(what)(self) <= most
+
+    def shows(self, *patterns: str) -> None:
+        """Require that `era status` prints a match of each pattern."""
+        for pattern in patterns:
+            assert re.search(pattern, show_status(self.shown)), show_status(self.shown)
+
+    async def hears(self, topic: str, **expected: object) -> None:
+        """Wait for the next event of a topic, and require its data."""
+        while not (found := [each for each in self.events if each.topic == topic]):
+            event = await self.era.next_event(timeout=PATIENCE)
+            assert event is not None, f"no event of {topic}"
+            self.events.append(event)
+        self.events.remove(found[0])
+        self.heard = SimpleNamespace(**found[0].data)
+        assert found[0].data.items() >= expected.items(), found[0].data
+
+    async def hears_at_last(self, topic: str, **expected: object) -> None:
+        """Wait for an event of a topic with these data."""
+        await self.hears(topic)
+        while not vars(self.heard).items() >= expected.items():
+            await self.hears(topic)
+
+    async def hears_of_the_last_stop(self) -> None:
+        """Let a client stop, and the other hear of it."""
+        await self.hears_at_last("state", epoch=(await self.other.stop()).epoch)
+
+    async def refused(self, code: str, step: Step) -> None:
+        """Require that the daemon refuses a step with this code."""
+        assert await error_code(self.take(step)) is ErrorCode[code]
+
+    async def refuses_saying(self, text: str, step: Step) -> None:
+        """Require that a step is refused by the daemon, or by its client, with this text."""
+        with pytest.raises((RpcError, InputError), match=text):
+            await self.take(step)
+
+    async def renews(self) -> None:
+        """Renew the lease, as its client does."""
+        assert self.operation.lease is not None
+        await self.era.renew(self.operation.lease.token)
+
+    def expires(self) -> None:
+        """Let the lease be over."""
+        supervisor = self.bench.daemon._supervisor
+        assert supervisor.operation.lease is not None
+        lease = replace(supervisor.operation.lease, expires_at=0.0)
+        supervisor.operation = replace(supervisor.operation, lease=lease)
+
+    async def uses(self) -> None:
+        """Arm as the other client for a minute, which is never reached."""
+        async with self.other.armed("other", lease_s=60):
+            raise AssertionError("must not be armed")
+
+    async def arms_within(self) -> None:
+        """Arm as the server does for a client."""
+        client = cast(Any, SimpleNamespace(has_left=False))
+        await self.bench.daemon._api.arm(client, ArmParams(owner="me", lease_s=60))
+
+    def arming_waits(self) -> None:
+        """Let the amplifiers be armed only when it goes on."""
+        arm = self.bench.daemon._controller.arm
+
+        async def slow() -> None:
+            await self.going_on.wait()
+            await arm()
+
+        self.patch.setattr(self.bench.daemon._controller, "arm", slow)
+
+    def goes_on(self) -> None:
+        """Let go on what waits."""
+        self.going_on.set()
+
+    def skips(self, *methods: str, work: Callable[..., None] = lambda *_: None) -> None:
+        """Let methods of the daemon do nothing from now on, or this work."""
+        for owner, _, method in (each.rpartition(".") for each in methods):
+            self.patch.setattr(attrgetter(owner)(self.bench.daemon), method, work)
+
+    def fails(self, *methods: str) -> None:
+        """Let methods of the daemon fail from now on."""
+        self.skips(*methods, work=Mock(side_effect=Planted(*methods)))
+
+    def repairs(self) -> None:
+        """Let all that was changed work again."""
+        self.patch.undo()
+
+    def hang(self, amplifier: str = "main") -> None:
+        """Let an amplifier reply no more."""
+        self.bench.far.devices[amplifier].inject_fault(FaultWindow(fault="hang"))
+
+    def recovers(self, amplifier: str = "main") -> None:
+        """Let it reply again."""
+        self.bench.far.devices[amplifier].recover()
+
+    def is_exchanged(self, serial_number: str) -> None:
+        """Have another amplifier in place of the first."""
+        self.bench.far.device.identity["serial_number"] = serial_number
+
+    def holds(self, **fingers: Sequence[str]) -> None:
+        """Let clients, by source where one is named, report fingers at these places from now on."""
+        for client, places in fingers.items():
+            self.held.append(asyncio.create_task(self._holds(client, places)))
+
+    async def _holds(self, client: str, places: Sequence[str]) -> None:
+        name, _, source = client.partition(".")
+        given = {"source": source} if source else {}
+        with contextlib.suppress(ConnectionError):
+            while True:
+                await getattr(self, name).touch([PLACES[each] for each in places], **given)
+                await asyncio.sleep(0.02)
+
+    def lifts(self) -> None:
+        """Let no client report fingers any more."""
+        while self.held:
+            self.held.pop().cancel()
+
+    async def touches(self, *places: str) -> None:
+        """Report fingers several times, or that there is none."""
+        for _ in range(4):
+            await self.era.touch([PLACES[each] for each in places])
+            await asyncio.sleep(0.05)
+
+    async def touches_with(self, *radii: float | None) -> None:
+        """Report touches of these radii [m], 5 cm apart."""
+        touches = [
+            {"id": number, "x_m": 0.05 * number, "y_m": 0.1, "radius_m": radius}
+            for number, radius in enumerate(radii, start=1)
+        ]
+        given = TouchParams.model_validate({"source": "pad", "touches": touches})
+        await self.era.request("touch", given)
+
+    async def plays(self, effect: Any, at: str, **more: Any) -> None:
+        """Play an effect, or points, at a place."""
+        await self.era.play(effect, PLACES[at], **more)
+
+    def writes(self, **layouts: str) -> None:
+        """Write layouts."""
+        for name, text in layouts.items():
+            (self.folder / f"{name}.yaml").write_text(text, "utf-8")
+
+    async def reloads(self, edit: Mapping[str, str], refused: str = "") -> None:
+        """Reload with a configuration that is edited, which is done unless a reason is named."""
+        path = self.folder / "daemon.yaml"
+        original = text = path.read_text("utf-8")
+        for old, new in edit.items():
+            assert old in text
+            text = text.replace(old, new)
+        path.write_text(text, "utf-8")
+        verdict = await self.era.reload()
+        path.write_text(original, "utf-8")
+        assert verdict.reloaded is not bool(refused)
+        assert refused in verdict.reasons[0]
+
+    def signals(self, name: str) -> None:
+        """Send a signal to the daemon."""
+        os.kill(os.getpid(), signal.Signals[name])
+
+    def marks(self) -> None:
+        """Begin to measure a time."""
+        self.began = threads.now()
+
+    def since(self, least: float, most: float) -> None:
+        """Require that so much time [s] has passed since the mark."""
+        assert least <= threads.now() - self.began <= most
+
+    def answers_take(self, seconds: float) -> None:
+        """Let answers of the thread take so long."""
+        self.asked = answers_take(self.patch, seconds)
+
+
+@asynccontextmanager
+async def served(
+    *amplifiers: str, more: str = "", layouts: Mapping[str, str] | None = None, seats: bool = False
+) -> AsyncIterator[Served]:
+    """A daemon that is ready; amplifiers: with a second one, side, if any are named.
+
+    more: further lines of its file; layouts: their texts by name; seats: whether it has the layout
+    of two people.
+    """
+    if seats:
+        people = layout_of_people(make_paper_rig(12, 9).plate, dict.fromkeys(SEATS))
+        layouts = {"panel": json.dumps(people)}
+    used = ", ".join(f"{name}: {name}.yaml" for name in layouts or {})
+    options = {
+        "more": f"layouts: {{{used}}}\n{more}" if used else more,
+        "changes": TWO_AMPLIFIERS if amplifiers else (),
+        "table": lambda rig: phased_table() if seats else daemon_table(),
+    }
+    with TemporaryDirectory() as folder, pytest.MonkeyPatch.context() as patch:
+        made = Served(folder=Path(folder), patch=patch, options=options)
+        made.writes(**layouts or {})
+        await made.starts()
+        try:
+            yield made
+        finally:
+            made.lifts()
+            await made.stack.aclose()
+
+
+COURSES = courses(Path(__file__).with_name("courses.yaml"))
+
+
+@pytest.mark.parametrize("name", COURSES)
+def test_daemon_keeps_to_its_course(name: str) -> None:
+    """Every step is as it is in the file."""
+    follow(COURSES[name], served)
+
+
+def envelope(bench: DaemonBench, finger: str, frequency: float, at: FloatArray) -> FloatArray:
+    """Amplitude of one tone at a fingertip [m/s²] at times [s], under a Hann window."""
+    records, _ = bench.far.bench.records(at[0] - WINDOW, at[-1] + WINDOW)
+    felt = records[finger]
+    turned = np.exp(-2j * np.pi * frequency * felt.times) * (felt.accelerations @ felt.weights)
+    weights = np.cos(np.pi * np.clip((felt.times - at[:, None]) / WINDOW, -0.5, 0.5)) ** 2
+    return np.asarray(np.abs(weights @ turned) / weights.sum(axis=1))
+
+
+@in_virtual_time
+async def test_gain_of_a_source_is_felt_at_its_finger_alone_along_a_fade() -> None:
+    """6 dB less within 100 ms and back, monotone and as steep as a raised cosine; others as before.
+
+    On the amplifier exactly, at the skin as the plate follows.
+    """
+    async with served(seats=True) as daemon:
+        bench, era = daemon.bench, daemon.era
+        bench.far.bench.place_fingers({each: PLACES[each] for each in SEATS}, now=threads.now())
+        await era.arm("test", lease_s=60)
+        daemon.holds(**{f"era.{each}": [each] for each in SEATS})
+        await asyncio.sleep(1.0)
+        tones = {each.effect: each.frequency_hz for each in (await era.status()).contacts}
+        planner = bench.daemon._controller.cycle.planner
+        assert planner is not None
+        (sent,) = [
+            n for n, one in planner.slots.contents.items() if "right" in one.content.key[0].source
+        ]
+        settled_at = planner.slots.contents[sent].settled_at
+        for gain, first, last in ((-6.0, 1.0, LOWER), (0.0, LOWER, 1.0)):
+            set_at = threads.now()
+            await era.strength(name="left", gain_db=gain)
+            await asyncio.sleep(0.02)
+            led = np.arange(threads.now(), set_at + 0.2, STEP)
+            moving = [
+                np.array([abs(tone.transition.at(time)) for time in led])
+                for channel in bench.far.amplifier.outputs
+                for tone in channel
+                if tone.frequency == pytest.approx(tones["left"], abs=0.01)
+            ]
+            await asyncio.sleep(0.4)
+            at = np.arange(set_at, set_at + 0.3, STEP)
+            for name, frequency in tones.items():
+                found = envelope(bench, name or "", frequency or 0.0, at)
+                if name == "left":
+                    moving.append(found)
+                    reached = found[round((FADE + WINDOW / 2 + 0.01) / STEP) :]
+                    assert 20 * np.log10(reached / found[0]) == pytest.approx(gain or 6.0, abs=0.2)
+                    assert 20 * np.log10(found[-1] / found[0]) == pytest.approx(gain or 6, abs=0.05)
+                else:
+                    assert 20 * np.log10(found / found[0]) == pytest.approx(0.0, abs=0.1)
+            assert planner.slots.contents[sent].settled_at == settled_at  # not sent again
+            assert len(moving) == 5
+            for course in moving:
+                changes = np.diff(course / course[-1] * last) * math.copysign(1, last - first)
+                rounded = LEVEL_STEP / np.abs(course).min() / (1 - LOWER)
+                slack = 0.1 if course is moving[-1] else 0.01 + rounded
+                assert -slack * STEEPEST <= changes.min()
+                assert changes.max() <= (1 + slack) * STEEPEST

@@ -52,7 +52,7 @@ nightly: .venv/installed-test
 	echo "nightly: failed:$${failed:- none}"; test -z "$$failed"
 
 # Whole programmes of which `make test` has a short form: every command of the pages typed from an
-# empty folder, conformance of the examples, an identified plate, the firmware on the plate; and those
+# empty folder, conformance of the examples, an identified plate; and those
 # cases of heavy tests that `make test` leaves out.
 test-long: .venv/installed-test
 	.ci/install caddy:caddy nginx:nginx openssl:openssl

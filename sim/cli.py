@@ -43,8 +43,7 @@ def sim(
         bool,
         typer.Option(
             "--firmware",
-            help="Run the firmware of `make firmware` for each amplifier; its samples move the "
-            "plate.",
+            help="Run the firmware of `make firmware` for each amplifier; the plate does not move.",
         ),
     ] = False,
     wire: Annotated[
@@ -152,8 +151,11 @@ def sim(
             raise InputError("--virtual-time needs --control PATH, which advances the time")
         loaded = load_rig(rig)
         _check_rate(rate, frequency_max=loaded.limits.frequency_max)
-        if firmware and (common is not None or wire or line or faults or virtual_time):
-            raise InputError("--firmware has a serial line and real time; omit the other options")
+        if firmware and (common is not None or wire or line or faults or virtual_time or record):
+            raise InputError(
+                "--firmware has a serial line, real time and a plate that does not move; omit the "
+                "other options"
+            )
         programs = find_firmware() if firmware else None
         to_wire = {} if firmware else loaded.amplifiers
         wires = assign_wires(to_wire, common=common, options=wire or [], defaults=defaults)

@@ -33,7 +33,8 @@ def demo(
         str,
         typer.Option(
             help="Wire: serial (a pseudo-terminal), modbus (TCP), can (socketcand), firmware (the "
-            "amplifier in C on serial, after `make firmware`) or sim (none)."
+            "amplifier in C on serial, after `make firmware`, whose plate does not move) or sim "
+            "(none)."
         ),
     ] = "serial",
     touches: Annotated[
@@ -161,7 +162,8 @@ def _line(row: "TouchRow") -> str:
     figures = "  ".join(f"{_number(one):>6s} {_number(other):>6s}" for one, other in pairs)
     note = "" if row.steady else "  still ringing"
     if row.measured_level_db_sl is None:
-        note = f"  not measured: it played for {row.played_s:.2f} s"
+        short = "" if row.steady else f": it played for {row.played_s:.2f} s"
+        note = f"  not measured{short}"
     for finger in row.fingers:
         if finger.at_m == row.targets_m[0]:
             note += f"  {finger.verdict}, of {counted(len(row.contents), 'content')}"

@@ -629,36 +629,24 @@ class Bench:
         self._is_sampling = True
         try:
             self._sampled_until = end
-            self._sample(end)
+            if not (self._fingers.layout.positions or self._probes):
+                self._plant.skip(end)
+                return
+            shapes = [self._fingers.layout.shapes, *(probe.shapes for probe in self._probes)]
+            times, felt = self._plant.advance(
+                end,
+                sample_rate=self.sample_rate,
+                shapes=np.concatenate(shapes),
+                precision=np.float64 if self._probes else np.float32,  # of what fingers keep
+            )
+            if len(times):
+                ends = np.cumsum([len(each) for each in shapes])[:-1]
+                under_fingers, *others = np.split(felt, ends, axis=1)
+                self._fingers.record(times, under_fingers)
+                for probe, part in zip([*self._probes], others, strict=True):
+                    probe.record(times, part)
         finally:
             self._is_sampling = False
-
-    def _sample(self, end: float) -> None:
-        if not (self._fingers.layout.positions or self._probes):
-            self._plant.skip(end)
-            return
-        shapes = self._listening()
-        times, accelerations = self._plant.advance(
-            end,
-            sample_rate=self.sample_rate,
-            shapes=np.concatenate(shapes),
-            precision=np.float64 if self._probes else np.float32,  # of what is kept of fingers
-        )
-        self._pass_on(times, accelerations, shapes)
-
-    def _listening(self) -> list[FloatArray]:
-        """Shapes of the fingers, then of each probe."""
-        return [self._fingers.layout.shapes, *(probe.shapes for probe in self._probes)]
-
-    def _pass_on(self, times: FloatArray, felt: FloatArray, shapes: Sequence[FloatArray]) -> None:
-        """Hand samples at these shapes over to the fingers and to each probe, if there are any."""
-        if not len(times):
-            return
-        ends = np.cumsum([len(each) for each in shapes])[:-1]
-        under_fingers, *others = np.split(felt, ends, axis=1)
-        self._fingers.record(times, under_fingers)
-        for probe, part in zip([*self._probes], others, strict=True):
-            probe.record(times, part)
 
     def _update_plant(self) -> None:
         """Pass on to the plant what channels play, and by which clock, after their delay."""

@@ -10,7 +10,6 @@ import contextlib
 import os
 import selectors
 import signal
-import tempfile
 import threading
 from collections.abc import AsyncIterator, Callable, Coroutine, Mapping, Sequence
 from contextlib import asynccontextmanager
@@ -32,7 +31,7 @@ from sim.bench.bench import Bench, keep_time
 from sim.control import SimulationContext, control_socket
 from sim.far_ends.wire_assignment import SimulatedWire, open_wires
 from sim.faults import FaultFile
-from sim.firmware import FirmwareBench, running
+from sim.firmware import running
 from sim.plant.fingers import Accelerometer, Position
 from sim.plant.imperfections import Imperfections
 from sim.plant.plant import SAMPLE_RATE
@@ -63,7 +62,6 @@ class SteppedLoop(asyncio.SelectorEventLoop):
 
 
 _VIEW_INTERVAL = 0.2  # s
-_NICE = 5  # beside firmware: its replies are due in milliseconds, while its samples can wait
 
 
 @dataclass(frozen=True)
@@ -131,8 +129,6 @@ async def run_simulation(
 
 def _make_bench(simulation: Simulation, *, now: float) -> Bench:
     rig, imperfections = simulation.rig, simulation.imperfections
-    if simulation.firmware is not None:
-        return FirmwareBench(rig, now=now, imperfections=imperfections)
     rate = simulation.sample_rate
     return Bench(rig, now=now, sample_rate=rate, imperfections=imperfections)
 
@@ -148,14 +144,11 @@ async def _serve(
     """Open the wires and serve until the end."""
     bench = context.bench
     async with contextlib.AsyncExitStack() as stack:
-        if isinstance(bench, FirmwareBench) and simulation.firmware is not None:
-            folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="era-")))
-            bench.firmware = {
-                name: await stack.enter_async_context(running(simulation.firmware, folder, name))
+        if simulation.firmware is not None:
+            context.urls = {
+                name: await stack.enter_async_context(running(simulation.firmware, name))
                 for name in bench.amplifiers
             }
-            os.nice(_NICE)
-            context.urls = {name: each.url for name, each in bench.firmware.items()}
         else:
             await _open_devices(stack, simulation, context)
         context.urls = stack.enter_context(linked_urls(context.urls, simulation.links))

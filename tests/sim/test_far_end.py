@@ -10,6 +10,7 @@ import signal
 import statistics
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -22,9 +23,9 @@ from interrupted import full_disk
 from model.errors import InputError
 from model.rig.rig import Rig
 from recordings import read_recording
+from registry import threads
 from sim import firmware
 from sim.bench.bench import Bench
-from sim.firmware import ending_with_parent, frequencies_in
 from sim.plant.fingers import Accelerometer, readings
 from sim.sensors import Recorder, Recording, write_recording
 from sim.transport.far_end import linked_urls, links_by_amplifier
@@ -331,26 +332,6 @@ def test_a_line_has_one_link_and_a_network_none(tmp_path: Path, terminal: str) -
     assert not any(path.is_symlink() for path in tmp_path.iterdir())
 
 
-PROGRAM_RATE = 16_000.0
-
-
-@pytest.mark.parametrize("frequency", [40.0, 128.45, 270.0, 499.95])
-def test_frequency_of_a_steady_tone_is_found_to_the_step_of_the_wire(frequency: float) -> None:
-    """In a quarter of a second, on channels of other levels and phases; silent ones have none."""
-    t = np.arange(4000) / PROGRAM_RATE
-    tones = [0.9 * np.sin(2 * np.pi * frequency * t), 0.01 * np.cos(2 * np.pi * frequency * t)]
-    samples = np.column_stack([*tones, np.zeros((len(t), 2))])
-    assert frequencies_in(samples, rate=PROGRAM_RATE) == pytest.approx([frequency], abs=0.051)
-
-
-def test_frequencies_of_channels_and_of_a_cross_fade_are_told_apart() -> None:
-    """Two channels with a tone each, one of which changes to another."""
-    t = np.arange(4000) / PROGRAM_RATE
-    changing = np.where(t < 0.12, np.sin(2 * np.pi * 100 * t), 0.5 * np.sin(2 * np.pi * 180 * t))
-    samples = np.column_stack([changing, np.sin(2 * np.pi * 130 * t)])
-    assert frequencies_in(samples, rate=PROGRAM_RATE) == pytest.approx([100, 130, 180], abs=0.5)
-
-
 def test_missing_firmware_is_told_with_the_remedy(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -364,26 +345,31 @@ def test_missing_firmware_is_told_with_the_remedy(
 
 
 PARENT = """
-import subprocess, sys, time
-from sim.firmware import ending_with_parent
-child = [sys.executable, "-c", "import time; print('here', flush=True); time.sleep(60)"]
-subprocess.Popen(ending_with_parent(child))
-time.sleep(60)
+import asyncio, pathlib, sys
+from sim.firmware import running
+async def main():
+    async with running(pathlib.Path(sys.argv[1]), "main") as url:
+        print(url, flush=True)
+        await asyncio.sleep(60)
+asyncio.run(main())
+"""
+PROGRAM = """#!/bin/sh
+echo serial:///dev/pts/7
+cat
+echo ended >&3
 """
 
 
-def test_child_ends_when_its_parent_is_killed() -> None:
-    """Its output is at its end then, although nobody has told it."""
-    with subprocess.Popen([sys.executable, "-c", PARENT], stdout=subprocess.PIPE) as parent:
+def test_firmware_ends_when_its_parent_is_killed(tmp_path: Path) -> None:
+    """Its standard input is at its end then; its URL is the line that it has printed."""
+    program, notes = tmp_path / "era-firmware", tmp_path / "notes"
+    program.write_text(PROGRAM.replace("&3", str(notes)))
+    program.chmod(0o755)
+    with subprocess.Popen([sys.executable, "-c", PARENT, program], stdout=-1) as parent:
         assert parent.stdout is not None
-        assert parent.stdout.readline() == b"here\n"
+        assert parent.stdout.readline() == b"serial:///dev/pts/7\n"
         parent.send_signal(signal.SIGKILL)
-        assert parent.stdout.read() == b""
-
-
-def test_child_whose_parent_is_gone_does_not_start() -> None:
-    """As if the parent had been killed before the child could ask to be told."""
-    command = ending_with_parent([sys.executable, "-c", "print('here')"])
-    command[3] = str(os.getpid() + 1)
-    done = subprocess.run(command, capture_output=True, check=False)
-    assert done.stdout == b""
+    until = threads.now() + 10
+    while not notes.exists() and threads.now() < until:
+        time.sleep(0.02)
+    assert notes.exists()

@@ -32,6 +32,7 @@ from model.structure.plate import Plate
 from model.table.table_file import build_table
 from model.transients.base_motion import Term, raised_cosine
 from model.transients.shaping import ONSET_WINDOW
+from model.transients.time_response import from_rest
 from plates import BASES as MOVED_BASES
 from plates import (
     FINGERTIP,
@@ -47,7 +48,7 @@ from plates import (
 from plates import STROKE as BASE_STROKE
 from set_table import only
 from sim.plant.excited_plate import play
-from sim.plant.plant import Plant, SampledPlant
+from sim.plant.plant import Plant
 
 PLATE = Plate(0.3048, 0.2286, 0.0015, Material("aluminium", 70e9, 2700.0, 0.33), loss_factor=0.01)
 CORNERS = [(0.0, 0.0), (0.3048, 0.0), (0.3048, 0.2286), (0.0, 0.2286)]
@@ -174,8 +175,12 @@ def test_contrast_of_an_onset_behind_actuators_that_lag(
             bases[:, number] = moved[1:]
         plant = Plant(table.in_time.reduced, coarse_rig.eras)
         discs = [fingertip_points(*at, rig.plate) for at in (target, quiet)]
-        felt = SampledPlant(plant, rate=RATE).advance(
-            bases, shapes=plant.reduced.at(np.concatenate(discs))
+        felt = from_rest(
+            plant.loaded.plate,
+            bases.T / [[era.full_level] for era in coarse_rig.eras],
+            plant.reduced.at(np.concatenate(discs)),
+            sample_rate=RATE,
+            factors=np.ones(len(bases.T), dtype=complex),
         )
         peaks = np.split(np.abs(felt_part(felt, RATE)).max(axis=0), [len(discs[0])])
         weights = [fingertip_weights(*target, rig.plate)]
@@ -299,29 +304,6 @@ def test_plant_sampling_rate_may_change(coarse_rig: Rig, reduced: ReducedPlate) 
     assert_allclose(found, expected[rows], rtol=0, atol=1e-9 * np.abs(expected).max())
 
 
-def test_bases_given_as_samples_move_the_plate_as_their_formulas(
-    coarse_rig: Rig, reduced: ReducedPlate
-) -> None:
-    """At 48 kHz, with fingers that come and go: of what skin can feel within 1 %."""
-    rate = 48_000
-    exact, followed = vibrating(reduced, coarse_rig, until=0.0), Plant(reduced, coarse_rig.eras)
-    made = SampledPlant(followed, rate=rate)
-    pieces = []
-    for number, contacts in enumerate(({}, THREE, ONE)):
-        for plant in (exact, followed):
-            plant.set_contacts(contacts)
-        made.follow()
-        times = (np.arange(2400) + 1 + 2400 * number) / rate
-        bases = np.zeros((len(times), len(coarse_rig.eras)))
-        bases[:, :3] = [[base.motion(time)[0] for base in BASES] for time in times]
-        shapes = exact.reduced.at(POINTS)
-        samples = made.advance(bases, shapes=shapes)
-        _, halfway = exact.advance(times[-1], sample_rate=2 * rate, shapes=shapes)
-        pieces.append((samples, halfway[::2]))
-    found, expected = (felt_part(np.concatenate(each), rate) for each in zip(*pieces, strict=True))
-    assert_allclose(found, expected, rtol=0, atol=0.01 * np.abs(expected).max())
-
-
 COARSE_RATE = 10_000.0
 AT = np.array([[0.11, 0.09]])
 
@@ -363,20 +345,6 @@ def test_a_finger_that_comes_while_exciters_play() -> None:
     assert [x[-1], v[-1]] == pytest.approx([0, 0], abs=1e-12)
     there, from_rest = settled(plant, 1.5, 95.0), settled(before, 1.5, 95.0)
     assert there == pytest.approx(from_rest, rel=1e-3)
-
-
-def test_samples_of_a_waveform_drive_as_tones_do() -> None:
-    """Amplifiers that make waveforms: a sine by samples settles at the amplitude of the tone."""
-    rig, frequency = exciter_rig(), 120.0
-    by_tones, by_samples = plant_of(rig), SampledPlant(plant_of(rig), rate=48_000.0)
-    by_tones.set_input(1, raised_cosine(0.0, 0.0, 2 * math.pi * frequency, 1j, 1.0))
-    times = np.arange(48_000) / 48_000.0
-    volts: FloatArray = np.zeros((len(times), 4))
-    volts[:, 1] = np.sin(2 * math.pi * frequency * times)
-    felt = by_samples.advance(volts, shapes=by_tones.reduced.at(AT))
-    last = times > 0.8
-    sampled = complex(lock_in(times[last] - 0.5 / 48_000.0, felt[last], frequency)[0])
-    assert sampled == pytest.approx(settled(by_tones, 1.0, frequency), rel=2e-3)
 
 
 def test_answers_are_felt_on_the_exact_board() -> None:

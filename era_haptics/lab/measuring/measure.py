@@ -1,12 +1,11 @@
 """Responses of a rig's plate: measured through a sound card by multisines, or simulated.
 
-Stepped tones check a measurement, and lines of text show it while it runs. For identification one
-run is repeated at half the level and at the whole one. A simulated plate deviates from its rig's
-file.
+For identification one run is repeated at half the level and at the whole one. A simulated plate
+deviates from its rig's file.
 """
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import AbstractContextManager, closing, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -32,7 +31,6 @@ from era_haptics.lab.measuring.sound_card import (
     Multisine,
     Run,
     SoundCard,
-    WiredSensor,
     are_positions,
     converters,
     default_frequencies,
@@ -45,79 +43,11 @@ from era_haptics.lab.measuring.sound_card import (
 from model.arrays import ComplexArray, FloatArray, best_first
 from model.commands.options import Stopwatch, progress_bar
 from model.estimate.measurement import Measurement, Repeat, write_responses
-from model.processes import Progress
+from model.processes import Progress, unseen
 from model.reduction.free_plate import solve_free_plate
 from model.rig.rig import Rig
 from model.structure.attachments import PointLoad
 from sim.plant.imperfections import draw_imperfections
-
-Show = Callable[[Sequence[FloatArray]], None]
-"""Takes what was recorded so far: whole periods of each run, (n, inputs)."""
-
-STEPS = "▁▂▃▄▅▆▇█"
-_RANGE = 60.0  # dB from the highest step to the lowest
-_BESIDE = 40  # columns of names and numbers
-_LINES = 5  # of a screen that are not of sensors
-
-
-def plot(
-    multisine: Multisine,
-    recorded: Sequence[FloatArray],
-    sensors: Sequence[WiredSensor],
-    *,
-    width: int,
-    height: int,
-) -> str:
-    """Lines of text, at most so many of so many columns.
-
-    Each sensor with its response over frequency, the highest of all sensors the full step, and its
-    largest sample, 100 % is full scale.
-    """
-    shown = sensors[: max(1, height - _LINES)]
-    columns = [sensor.input - 1 for sensor in shown]
-    heard = np.array([multisine.found(each[:, columns]).T for each in recorded])
-    # To all sources together, a sample by a sample: the turns of their phases are orthogonal.
-    power = (np.abs(heard) ** 2).mean(axis=0) / np.abs(multisine.played(0)[:, 0]) ** 2
-    found = 10 * np.log10(np.maximum(power, 1e-30))  # (sensors, f) [dB]
-    groups = np.array_split(np.arange(found.shape[1]), min(found.shape[1], max(8, width - _BESIDE)))
-    drawn = np.array([found[:, group].max(axis=1) for group in groups]).T  # (sensors, columns)
-    top = drawn.max()
-    step = np.clip((drawn - top) / _RANGE * len(STEPS) + len(STEPS), 0, len(STEPS) - 1)
-    peaks = np.max([np.abs(each[:, columns]).max(axis=0) for each in recorded], axis=0)
-    low, high = (f"{multisine.frequencies[end]:g} Hz" for end in (0, -1))
-    rows = [
-        f"{sensor.name[:10]:10s} {''.join(STEPS[int(each)] for each in one)} "
-        f"{float(loudest) - top:6.1f} dB, input {100 * float(peak):5.1f} %"
-        for sensor, one, loudest, peak in zip(shown, step, drawn.max(axis=1), peaks, strict=True)
-    ]
-    rows.append(f"{'':10s} {low}{high.rjust(len(groups) - len(low))}")
-    hidden = len(sensors) - len(shown)
-    rows.append(
-        f"{len(recorded)} of {multisine.sources} runs; a step is {_RANGE / len(STEPS):g} dB"
-        + (f"; {hidden} more sensors" if hidden else "")
-    )
-    return "\n".join(rows)
-
-
-@contextmanager
-def live_plot(multisine: Multisine, sensors: Sequence[WiredSensor]) -> Iterator[Show]:
-    """Yield what draws the runs anew after each, on standard error if that is a terminal."""
-    from rich.console import Console
-    from rich.live import Live
-    from rich.text import Text
-
-    console = Console(stderr=True)
-    if not console.is_terminal:
-        yield lambda recorded: None
-        return
-    with Live(console=console) as live:
-
-        def show(recorded: Sequence[FloatArray]) -> None:
-            width, height = console.size
-            text = plot(multisine, recorded, sensors, width=width, height=height)
-            live.update(Text(text, no_wrap=True, overflow="crop"), refresh=True)
-
-        yield show
 
 
 def loopback_gain(
@@ -224,15 +154,14 @@ def measure(
     multisine: Multisine,
     *,
     periods: int = 2,
-    show: Show = lambda recorded: None,
+    progress: Progress = unseen,
     is_heard: bool = False,
 ) -> MeasuredResponses:
     """Play all runs of a multisine and estimate the responses.
 
-    periods: of each run that are analysed. show: called with the runs recorded so far, after each.
-    is_heard: whether every ERA was heard before, at another place of a sensor that is moved.
-    Raises InputError, LinkError for what is clipped, silent, swapped, incoherent, or lost three
-    times.
+    periods: of each run that are analysed. progress: called with the runs done and all. is_heard:
+    whether every ERA was heard before, at another place of a sensor that is moved. Raises
+    InputError, LinkError for what is clipped, silent, swapped, incoherent, or lost three times.
     """
     seconds = run_time(periods, settling=desk.settling)
     desk.check_times(seconds=seconds, slew=multisine.slew)
@@ -245,7 +174,7 @@ def measure(
             play_run(desk, card, multisine, number, periods=periods, before=before, tries=tries)
         )
         recorded.append(runs[-1].recorded)
-        show(recorded)
+        progress(len(recorded), multisine.sources)
     found = estimate(multisine, recorded)
     # Another signal than the loop-back's, or another clock, looks like lost blocks; that is the
     # cause to be told.
@@ -267,96 +196,32 @@ def measure(
     )
 
 
-_PERIODS = 2
-_TONES = 5
-_LOUD = 0.05  # of the largest at a frequency; maxima sit in antiresonances
-
-
-def check_by_steps(
-    desk: Desk,
-    card: SoundCard,
-    measured: MeasuredResponses,
-    *,
-    level: float,
-    progress: Progress,
-) -> dict[str, Any]:
-    """Play some of the frequencies on each ERA alone; raises LinkError for lost blocks.
-
-    Return, for programs, the frequencies and the root mean square and largest difference of
-    responses above 5 % of the largest at their frequency.
-    """
-    known = measured.responses
-    rows = np.unique(np.linspace(0, len(known.frequencies) - 1, _TONES).round().astype(int))
-    frequencies = known.frequencies[rows]
-    values = np.empty((len(rows), desk.input, len(desk.eras) + 1), dtype=complex)
-    for era in range(len(desk.eras)):
-        for row, frequency in enumerate(frequencies):
-            values[row, :, era] = _played(desk, card, era, frequency, level)
-            progress(era * len(rows) + row + 1, len(desk.eras) * len(rows))
-    found = desk.responses(frequencies, values, measured.looped[rows])
-    one = known.values[rows]
-    size = np.abs(one)
-    ratio = (found.values / one)[size > _LOUD * size.max(axis=(1, 2), keepdims=True)]
-    decibels = np.asarray(np.abs(20 * np.log10(np.abs(ratio))))
-    degrees = np.asarray(np.abs(np.degrees(np.angle(ratio))))
-    return {
-        "frequencies_hz": frequencies.tolist(),
-        "level_rms_db": float(np.sqrt((decibels**2).mean())),
-        "level_max_db": float(decibels.max()),
-        "phase_rms_deg": float(np.sqrt((degrees**2).mean())),
-        "phase_max_deg": float(degrees.max()),
-    }
-
-
-def _played(desk: Desk, card: SoundCard, era: int, frequency: float, level: float) -> ComplexArray:
-    """Amplitudes (inputs,) by full scale of one ERA; the loop-back shows lost blocks."""
-    tone = Multisine(np.array([frequency]), 1, card.rate, level)
-    signal = tone.signal(0, periods=run_time(_PERIODS, settling=desk.settling) / PERIOD)
-    sources = np.zeros((len(signal), len(desk.eras) + 1))
-    sources[:, [era, -1]] = signal
-    run = play(
-        card,
-        desk.on_outputs(sources),
-        settling=desk.settling,
-        seconds=_PERIODS * PERIOD,
-        is_whole=lambda kept: is_whole(kept[:, desk.input - 1], samples=tone.samples),
-    )
-    return np.asarray(tone.found(run.whole)[0] / tone.played(0)[0])
-
-
 def measure_at_once(
     desk: Desk,
     opened: AbstractContextManager[tuple[SoundCard, Multisine]],
     output: Path,
     *,
     periods: int,
-    is_stepped: bool,
 ) -> tuple[list[str], dict[str, Any]]:
-    """Measure, write the responses, and return the report; is_stepped: with single tones, too.
+    """Measure, write the responses, and return the report.
 
     Raises InputError, LinkError, OSError.
     """
-    check = None
-    with Stopwatch() as timed, opened as (card, multisine):
-        with live_plot(multisine, desk.sensors) as show:
-            found = measure(desk, card, multisine, periods=periods, show=show)
-        if is_stepped:
-            with progress_bar("tones") as progress:
-                check = check_by_steps(desk, card, found, level=multisine.level, progress=progress)
+    with Stopwatch() as timed, opened as (card, multisine), progress_bar("runs") as progress:
+        found = measure(desk, card, multisine, periods=periods, progress=progress)
     write_responses(output, found.responses, desk.rig)
     written = f"measured in {timed.elapsed:.1f} s; wrote {output}"
-    return [*_rows(found, check, rate=card.rate), written], {
+    return [*_rows(found, rate=card.rate), written], {
         "frequencies_hz": found.responses.frequencies.tolist(),
         "latency_s": found.latency,
         "repeated_runs": found.repeated,
         "sensors": {name: found.quality(n) for n, name in enumerate(found.responses.names)},
-        "stepped": check,
         "measure_time_s": timed.elapsed,
         "files": [str(output)],
     }
 
 
-def _rows(found: MeasuredResponses, check: dict[str, Any] | None, *, rate: float) -> Iterator[str]:
+def _rows(found: MeasuredResponses, *, rate: float) -> Iterator[str]:
     """Yield how well responses were measured."""
     lines = found.responses.frequencies
     yield (
@@ -370,11 +235,6 @@ def _rows(found: MeasuredResponses, check: dict[str, Any] | None, *, rate: float
             f"{name:10s} {np.median(found.coherence[:, n]):10.4f} "
             f"{found.coherence[:, n].min():8.4f} {100 * np.median(found.std[:, n]):6.2f} % "
             f"{100 * found.even[n]:8.2f} %"
-        )
-    if check is not None:
-        yield (
-            "stepped tones differ by {level_rms_db:.3f} dB rms, {level_max_db:.2f} dB at most, and "
-            "{phase_rms_deg:.2f}° rms, {phase_max_deg:.1f}° at most".format(**check)
         )
 
 
@@ -416,7 +276,7 @@ def measure_through(
         card,
         multisine,
         periods=periods,
-        show=lambda recorded: progress(len(recorded), runs + 2),
+        progress=lambda done, _all: progress(done, runs + 2),
     )
     repeats = []
     for number, factor in enumerate((0.5, 1.0), start=1):

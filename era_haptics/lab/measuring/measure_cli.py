@@ -88,9 +88,6 @@ def measure(
             "--y-cable", help="No output is left: that of the last ERA is the cable's, too."
         ),
     ] = False,
-    stepped: Annotated[
-        bool, typer.Option("--stepped", help="Check with single tones, one ERA at a time.")
-    ] = False,
     seed: Annotated[
         int, typer.Option(metavar="N", help="Draw other phases, or another plate.", min=0)
     ] = 0,
@@ -130,11 +127,8 @@ def measure(
         )
     for option, is_wrong, needs in (
         ("--frequencies", source is not None and lines is not None, "--device"),
-        ("--stepped", device is None and stepped, "--device"),
         ("--resume", device is None and resume, "--device"),
         ("--resume", resume and not is_moved, "one sensor that is moved, one input in all lines"),
-        ("--stepped", stepped and is_moved, "sensors that stay where they are"),
-        ("--stepped", stepped and y_cable, "an output of the cable's own"),
         ("--y-cable", device is None and y_cable, "--device"),
     ):
         if is_wrong:
@@ -158,9 +152,7 @@ def measure(
                 desk, opened, output, periods=periods, is_resumed=resume
             )
         else:
-            rows, answer = measure_at_once(
-                desk, opened, output, periods=periods, is_stepped=stepped
-            )
+            rows, answer = measure_at_once(desk, opened, output, periods=periods)
     if is_whole:
         next_words = ("calibrate", rig_file, output, "-o", output.with_name("calibrated.yaml"))
         rows = [*rows, next_line("era", *next_words)]

@@ -19,7 +19,7 @@ from controller.cli.main import run
 from drivers.errors import LinkError
 from era_haptics.lab.measuring import measure
 from era_haptics.lab.measuring.loopback import check_wiring, latency
-from era_haptics.lab.measuring.measure import STEPS, MeasuredResponses, check_by_steps, plot
+from era_haptics.lab.measuring.measure import MeasuredResponses
 from era_haptics.lab.measuring.measure import measure as measure_measure
 from era_haptics.lab.measuring.sound_card import (
     Desk,
@@ -32,7 +32,6 @@ from era_haptics.lab.measuring.sound_card import (
 from examples.make_measured import record_responses
 from model.errors import InputError
 from model.estimate.measurement import measurement_of, read_measured
-from model.processes import unseen
 from model.rig.rig import Rig, Uncertainty
 from model.rig.rig_file import example_rig_path, load_rig, parse_rig
 from model.structure.attachments import PointLoad
@@ -81,7 +80,7 @@ def test_one_command_measures_a_plate_that_deviates_as_its_seed_draws_it(
     assert np.abs(found[2] / found[0] - 1).max() > 0.05
 
 
-@pytest.mark.parametrize("option", [("--device", "jack"), ("--stepped",), ("--y-cable",)])
+@pytest.mark.parametrize("option", [("--device", "jack"), ("--resume",), ("--y-cable",)])
 def test_what_only_a_sound_card_does_is_refused(option: tuple[str, ...], tmp_path: Path) -> None:
     """Exit status 2, and nothing is written."""
     sensors, output = tmp_path / "sensors.csv", tmp_path / "measured.csv"
@@ -195,17 +194,6 @@ def test_a_card_without_an_output_to_spare_measures_by_a_y_cable(
     ):
         with pytest.raises(InputError, match=cause):
             measure_measure(desk, card(truth, **wires), sines)
-
-
-def test_stepped_tones_agree(rig: Rig, truth: Truth) -> None:
-    """Single tones of single ERAs give the responses that all ERAs gave at once."""
-    desk = Desk(rig, SENSORS)
-    sound = card(truth)
-    found = measure_measure(desk, sound, sines(desk, np.array([61.0, 233.0])))
-    check = check_by_steps(desk, sound, found, level=LEVEL, progress=unseen)
-    assert check["frequencies_hz"] == [61.0, 233.0]
-    assert check["level_rms_db"] < 0.1
-    assert check["phase_rms_deg"] < 1.0
 
 
 @pytest.mark.parametrize(
@@ -329,34 +317,6 @@ def test_delay_follows_from_the_slope_of_phases() -> None:
     drawn = np.exp(2j * np.pi * np.random.default_rng(0).uniform(size=len(lines)))
     with pytest.raises(LinkError, match="loop-back"):
         latency(drawn, lines)
-
-
-PLOT_RATE = 2000.0
-MULTISINE = Multisine(np.array([61.0, 121.0, 181.0, 241.0]), 3, PLOT_RATE, 0.3)
-PLOTTED = tuple(WiredSensor(f"P{n}", 0.1, 0.1, n, 1.0) for n in (1, 2))
-GAINS = np.array([[0.5, -0.25, 1.0], [0.05, 0.0, 0.0]])  # of inputs by sources
-
-
-def recorded(runs: int) -> list[np.ndarray]:
-    """Two periods of each run, of inputs that are sums of the sources."""
-    periods = [MULTISINE.signal(run, periods=3)[round(PLOT_RATE * 0.5) :] for run in range(runs)]
-    return [each[: round(2 * PLOT_RATE)] @ GAINS.T for each in periods]
-
-
-def test_plot_has_a_line_for_each_sensor_and_fits() -> None:
-    """The loudest sensor at the highest step, the other 27 dB lower; inputs by their peaks."""
-    runs = recorded(3)
-    first, second, axis, count = plot(MULTISINE, runs, PLOTTED, width=80, height=24).splitlines()
-    assert first.count(STEPS[-1]) == 4
-    difference = 10 * np.log10((0.25 + 0.0625 + 1) / 0.0025)  # 27.2 dB, in steps of 7.5
-    assert second.count(STEPS[int(8 - difference / 7.5)]) == 4
-    assert f"{-difference:.1f} dB" in second
-    peak = max(np.abs(each[:, 0]).max() for each in runs)
-    assert f"{100 * peak:.1f} %" in first
-    assert "61 Hz" in axis
-    assert count.startswith("3 of 3 runs")
-    few = plot(MULTISINE, runs, PLOTTED, width=80, height=6).splitlines()
-    assert (len(few), "1 more" in few[-1]) == (3, True)
 
 
 FRAMES = 64

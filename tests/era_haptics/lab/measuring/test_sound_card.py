@@ -690,12 +690,11 @@ def test_place_that_fails_a_check_is_told_and_asked_for_again(
     ("more", "cause"),
     [
         (["--resume"], "to go on from"),
-        (["--stepped"], "--stepped needs sensors that stay"),
         (["--sensor-mass", "900"], "mass_g must be from 0"),
     ],
 )
 def test_options_that_do_not_fit_are_refused(make: Make, more: list[str], cause: str) -> None:
-    """Nothing to resume, single tones of a moved sensor, a mass in other units."""
+    """Nothing to resume, a mass in other units."""
     bench = make()
     assert bench.measure(*more) == 2
     assert cause in bench.said

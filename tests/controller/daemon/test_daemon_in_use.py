@@ -1,35 +1,60 @@
-"""A daemon in use, in virtual time: dumps, commands of layouts, signals, the service manager.
+"""A daemon in use, in virtual time: its start and end, its commands, dumps and requests of clients.
 
-Dumps have what came before the plate was stopped; names and files of strengths are bounded.
+Dumps have what came before the plate was stopped; a reload may be interrupted; leases have a token
+and an end; names and files of strengths are bounded.
 """
 
 import asyncio
 import contextlib
 import json
+import logging
 import math
 import os
+import re
+import resource
 import signal
 import socket
+import subprocess
+import sys
+import threading
 import time
 from collections.abc import Awaitable, Callable, Sequence
+from dataclasses import replace
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
 import pytest
+import serial
+from typer.testing import CliRunner
 
 from controller.api.client import AsyncClient, Client
 from controller.api.jsonrpc import ErrorCode, RpcError
+from controller.api.link import Notification
+from controller.api.methods import TOPICS
+from controller.cli.commands import app
 from controller.cli.main import BAD_INPUT, run
+from controller.cli.status_text import show_event, show_status
+from controller.daemon.children import gateway_options
+from controller.daemon.daemon import run_daemon
+from controller.daemon.handlers import check_lease
 from controller.effects.strengths import MAX_NAMES
-from controller.operation.fault_dumps import (
-    MAX_LINE,
-    MAX_RECORDS,
-    FaultDumps,
-    write_dump,
+from controller.gateway.gateway_settings import read_token
+from controller.operation.fault_dumps import MAX_LINE, MAX_RECORDS, FaultDumps, write_dump
+from controller.operation.operation_states import (
+    ENERGISED,
+    DaemonEvent,
+    DaemonState,
+    Lease,
+    Operation,
+    Trigger,
+    step,
 )
+from controller.process.log import LogThread
 from courses import Planted
 from daemons import (
     ENABLED,
+    PATIENCE,
     PLACE,
     READY,
     DaemonBench,
@@ -39,13 +64,18 @@ from daemons import (
     error_code,
     far_end,
     holding,
+    next_event,
     ready_daemon,
+    running_daemon,
     silent_from,
     until,
     until_state,
+    write_daemon,
 )
+from drivers.errors import CommandError
 from drivers.host.amplifier import WATCHDOG
-from gateway_bench import real_daemon
+from gateway_bench import UNCONFIRMED, ScriptedDaemon, real_daemon
+from model.errors import InputError
 from plates import TWO_AMPLIFIERS
 from registry import threads
 from sim.faults import FaultWindow
@@ -359,3 +389,282 @@ async def test_every_name_that_is_listed_can_be_set(tmp_path: Path) -> None:
         sender = f"table:tuio:10.0.0.2/{chr(0x1F600) * 100!a}"
         bench.daemon._layouts.player.strengths.note(sender)
         assert (await era.strength(name=sender, gain_db=-6)).strengths == {sender: -6}
+
+
+@in_virtual_time
+async def test_event_read_late_takes_nothing_back_that_was_seen(tmp_path: Path) -> None:
+    """Of this connection or one before, even if this daemon counts from less."""
+    async with ready_daemon(tmp_path) as (bench, era):
+        await era.subscribe("state")
+        await era.stop()
+        epoch = (await era.stop()).epoch
+        assert (await next_event(era, "state")).data["epoch"] < epoch
+        await era.clear()
+        supervisor = bench.daemon._supervisor
+        supervisor.operation = replace(supervisor.operation, epoch=0)
+        assert era._link is not None
+        era._link.abort()
+        await era.stop()
+        assert (await next_event(era, "state")).data["epoch"] >= epoch - 1
+        await era.clear()
+        assert (await era.status()).state == READY
+
+
+@in_virtual_time
+async def test_reload_ends_after_unexpected_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The service manager gets the end of it, and the next reload works."""
+    async with ready_daemon(tmp_path) as (bench, _):
+        notices: list[str] = []
+        await bench.daemon._supervisor.started.wait()
+        for _ in range(10):  # the start is reported within three cycles of the event loop
+            await asyncio.sleep(0)
+        manager = bench.daemon._manager
+        monkeypatch.setattr(manager, "notify", lambda first, *_: notices.append(first))
+
+        def fail(*_: object) -> None:
+            raise RuntimeError("injected")
+
+        with monkeypatch.context() as patched:
+            patched.setattr("controller.daemon.layouts.read_in_child", fail)
+            await bench.daemon.reload()
+        await bench.daemon.reload()
+        assert notices == ["RELOADING=1", "READY=1"] * 2
+
+
+@in_virtual_time
+async def test_shutdown_cancels_reload(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One whose configuration is still being read applies nothing."""
+    async with running_daemon(tmp_path) as bench:
+        daemon, is_reading = bench.daemon, asyncio.Event()
+
+        async def read_for_ever(load: object, *, name: str) -> object:
+            is_reading.set()
+            await asyncio.Event().wait()
+            raise AssertionError("unreachable")
+
+        monkeypatch.setattr("controller.daemon.daemon.in_thread", read_for_ever)
+        daemon._reload_requested.set()
+        await is_reading.wait()
+        daemon.shut_down("end of the test")
+        await until(daemon._reloading.cancelled)
+
+
+async def test_shutdown_while_a_port_is_opened_leaves_none_open(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The system takes its time; the port is closed at last, free for others, not opened again."""
+    opened: list[serial.Serial] = []
+    may_open, open_now = threading.Event(), serial.Serial.open
+
+    def slow(port: serial.Serial) -> None:
+        opened.append(port)
+        assert may_open.wait(PATIENCE)
+        open_now(port)
+
+    monkeypatch.setattr("serial.Serial.open", slow)
+    async with far_end(tmp_path) as far:
+        async with daemon_at(far, tmp_path) as bench:
+            await until(lambda: opened)
+            bench.daemon.shut_down("end of the test")
+            await until(lambda: bench.daemon._supervisor._closing.is_set())
+            asyncio.get_running_loop().call_later(0.1, may_open.set)
+        await until(lambda: not opened[0].is_open)
+        assert len(opened) == 1
+        with serial.Serial(opened[0].port, exclusive=True):
+            pass
+
+
+@in_virtual_time
+async def test_log_event_escapes_bytes_that_are_not_text(tmp_path: Path) -> None:
+    """A file name that is not UTF-8 reaches subscribers."""
+    async with running_daemon(tmp_path) as bench, await bench.client() as era:
+        await era.subscribe("log")
+        record = logging.makeLogRecord({"msg": "wrote %s", "args": ("/tmp/\udcff",)})
+        record.levelno, record.levelname = logging.WARNING, "WARNING"
+        bench.daemon._publisher.logged(record)
+        while "wrote" not in (event := await next_event(era, "log")).data["message"]:
+            pass
+        assert event.data["message"] == r"wrote /tmp/\udcff"
+
+
+def test_lease_lasts_its_duration_from_each_renewal() -> None:
+    """5 s from when it is armed and 5 s from the renewal, but not from an attempt after its end."""
+    lease = Lease("me", 5).renewed(100)
+    assert check_lease(lease, lease.token, 104.999) == lease
+    renewed = check_lease(lease, lease.token, 104).renewed(104)
+    assert (renewed.token, renewed.expires_at) == (lease.token, 109)
+    with pytest.raises(RpcError) as caught:
+        check_lease(renewed, lease.token, 109)
+    assert caught.value.code is ErrorCode.LEASE
+
+
+@pytest.mark.parametrize("token", ["", "x", "ü" * 32])
+def test_lease_is_renewed_by_its_token_only(token: str) -> None:
+    """A refusal names the owner, not the token; without a lease every token is refused."""
+    lease = Lease("me", 5).renewed(0)
+    with pytest.raises(RpcError, match="'me'") as caught:
+        check_lease(lease, token, 1)
+    assert caught.value.code is ErrorCode.LEASE
+    assert lease.token not in str(caught.value)
+    with pytest.raises(RpcError) as caught:
+        check_lease(None, token, 1)
+    assert caught.value.code is ErrorCode.LEASE
+
+
+@pytest.mark.parametrize("state", DaemonState)
+@pytest.mark.parametrize("trigger", Trigger)
+def test_lease_exists_while_energised_alone(state: DaemonState, trigger: Trigger) -> None:
+    """Whatever happens; and what may not go on afterwards is told by the epoch."""
+    lease = Lease("me", 5, expires_at=10.0) if state in ENERGISED else None
+    before = Operation(state, lease=lease, epoch=7)
+    after, _ = step(before, DaemonEvent(trigger, "a test", lease=Lease("you", 3)), 6.0)
+    if after.state in ENERGISED:
+        is_new = after.state is not state
+        owner = "you" if is_new and trigger is Trigger.ARM else "me"
+        end = {"you": 9.0, "me": 11.0}[owner] if is_new else 10.0
+        assert after.lease is not None
+        assert (after.lease.owner, after.lease.expires_at) == (owner, end)
+    else:
+        assert after.lease is None
+    if state in ENERGISED and after.state not in ENERGISED:
+        assert after.epoch == 8
+
+
+def test_event_is_shown_by_wall_clock_without_unknown_values() -> None:
+    """On the second day of 1970 at 0:01:05.25 local time; figures are rounded."""
+    finger = {"source": "panel", "id": 1, "x_m": 0.1 + 0.2, "role": None, "effect": "buzz"}
+    ahead = datetime(1970, 1, 2).timestamp() + 60.0
+    drive = {"SW": {"frequency_hz": 110.0, "level": 0.05}}
+    event = Notification("pattern", 5.25, 3, {"contacts": [finger], "drive": drive})
+    assert show_event(event, ahead=ahead) == (
+        "00:01:05.250  pattern    contacts source panel, id 1, x_m 0.3, effect buzz, "
+        "drive (SW (frequency_hz 110, level 0.05))  (3 lost)"
+    )
+    empty = Notification("contacts", 0.0, 0, {"contacts": []})
+    assert show_event(empty, ahead=ahead).split()[2:] == ["contacts", "none"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "address"),
+    [
+        ([], None),
+        (["--dashboard"], "127.0.0.1:8137"),
+        (["--dashboard", "127.0.0.1:9000"], "127.0.0.1:9000"),
+        (["--dashboard=localhost:9000"], "localhost:9000"),
+    ],
+)
+def test_dashboard_option_has_optional_address(
+    monkeypatch: pytest.MonkeyPatch, arguments: list[str], address: str | None
+) -> None:
+    """Before and behind the configuration; the default is the gateway's."""
+    calls: list[tuple[str, str | None]] = []
+    monkeypatch.setattr(
+        "controller.daemon.daemon.run_daemon",
+        lambda config, *, dashboard, trace: calls.append((config.name, dashboard)),
+    )
+    for line in (["daemon", "d.yaml", *arguments], ["daemon", *arguments, "d.yaml"]):
+        result = CliRunner().invoke(app, line)
+        assert result.exit_code == 0, result.output
+    assert calls == [("d.yaml", address)] * 2
+
+
+def test_daemon_goes_on_without_the_page_of_its_file_when_not_installed(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """It says once what to install, and starts no gateway that could only end."""
+    pages: list[str | None] = []
+    monkeypatch.setattr("controller.gateway.gateway_settings.find_spec", lambda name: None)
+    monkeypatch.setattr(
+        "controller.daemon.daemon._run",
+        lambda config, lock, *, log, dashboard: pages.append(dashboard),
+    )
+    monkeypatch.setattr(
+        "controller.daemon.daemon.start_log", lambda file, *, level: LogThread(file)
+    )
+    more = 'dashboard: "127.0.0.1:0"\n'
+    run_daemon(write_daemon(tmp_path, {"main": "sim://"}, more), dashboard=None)
+    assert pages == [None]
+    (line,) = caplog.messages
+    assert "pip install -e '.[gateway]'" in line
+
+
+def test_daemon_refuses_to_start_with_few_descriptors(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Below 64 its own files and 40 clients would use them up."""
+    monkeypatch.setattr("controller.daemon.daemon.allow_many_descriptors", lambda: 63)
+    with pytest.raises(InputError, match="64, got 63"):
+        run_daemon(Path("missing.yaml"), dashboard=None)
+
+
+def test_daemon_refuses_to_start_with_little_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Within 300 MB of addresses a library waits for more of them for ever."""
+    limits = {resource.RLIMIT_AS: (300 << 20, resource.RLIM_INFINITY)}
+    others = resource.getrlimit
+    monkeypatch.setattr(resource, "getrlimit", lambda what: limits.get(what) or others(what))
+    with pytest.raises(InputError, match="512 MB, got 300 MB"):
+        run_daemon(Path("missing.yaml"), dashboard=None)
+
+
+def test_daemon_refuses_pipe_as_log_or_trace(tmp_path: Path) -> None:
+    """A named pipe is not waited for, whether it is read or not."""
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    reader = os.open(pipe, os.O_RDONLY | os.O_NONBLOCK)
+    for is_read in (True, False):
+        with pytest.raises(InputError, match=r"daemon\.yaml: log\.file: .*pipe"):
+            run_daemon(
+                write_daemon(tmp_path, {"main": "sim://"}, "log: {file: pipe}\n"), dashboard=None
+            )
+        with pytest.raises(CommandError, match="pipe"):
+            run_daemon(write_daemon(tmp_path, {"main": "sim://"}), dashboard=None, trace=pipe)
+        if is_read:
+            os.close(reader)
+    assert not (tmp_path / "era.sock").exists()
+
+
+def test_daemon_imports_no_package_of_other_commands() -> None:
+    """Its start does not wait for optimisers, pictures or web servers."""
+    program = "import sys, controller.daemon.daemon; print(*sys.modules)"
+    modules = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True
+    ).stdout.split()
+    assert "scipy.linalg" in modules
+    assert not set(modules) & {"scipy.optimize", "scipy.ndimage", "matplotlib", "aiohttp"}
+
+
+def test_stop_exits_with_3_and_names_amplifiers_unless_all_are_silent(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Success only if every amplifier is confirmed silent, or else the unconfirmed ones."""
+    modules = ["controller.cli.commands"]
+    with ScriptedDaemon(tmp_path) as daemon:
+        command = ["stop", "--socket", str(daemon.socket)]
+        assert run(command, modules) == 0
+        daemon.silence = UNCONFIRMED
+        assert run(command, modules) == 3
+        errors = capsys.readouterr().err
+        assert re.search(r"side .*0\.20 s.*rear", errors)
+        assert "main" not in errors
+    assert run(command, modules) == 3
+
+
+def test_help_of_watch_names_every_topic() -> None:
+    """Those of the API, though help does not load it."""
+    said = CliRunner().invoke(app, ["watch", "--help"]).output
+    assert [topic for topic in TOPICS if topic not in said] == []
+
+
+@in_virtual_time
+async def test_readings_are_shown_with_their_unit_to_their_step(tmp_path: Path) -> None:
+    """A temperature in steps of 0.1 °C, by `era status` and by a page."""
+    async with ready_daemon(tmp_path) as (_, era):
+        assert (await era.hello("test")).readings["temperature_c"] == ("Temperature", "°C", 1)
+        assert "temperature 25.0 °C" in show_status(await era.status())
+
+
+def test_gateway_keeps_its_token_out_of_a_log(tmp_path: Path) -> None:
+    """Not on a terminal, it reads it from a file of the owner instead of printing it."""
+    *_, option, file = gateway_options("127.0.0.1:0", tmp_path / "era.sock")
+    assert option == "--token-file"
+    assert len(read_token(Path(file))) >= 32  # which refuses a file that others may read

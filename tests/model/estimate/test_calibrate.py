@@ -1,29 +1,47 @@
-"""Feet of unknown stiffness in a calibration and its report.
+"""A calibration and its report: feet, places of sources, form errors of a plate.
 
-How far sources are off the places of a calibrated rig, as the rig states it.
-
-Fitting a rig to responses of a plate that is known, solved without the fit's own model.
+Rigs are fitted to responses of plates that are known, solved without the fit's own model; Jacobians
+are those of extrapolated differences, and responses with other values those of a plate solved anew.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 import pytest
+from scipy import optimize
 
 import plates as calibration_plates
-from benchmarks.calibration.hidden_plates import draw_plate, gains_of, measure, true_values
+from benchmarks.calibration.hidden_plates import (
+    FORM,
+    SENSORS,
+    draw_plate,
+    field_deviations,
+    fields_of,
+    gains_of,
+    measure,
+    true_values,
+)
 from benchmarks.weekend import chain
-from model.arrays import FloatArray
+from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError
+from model.estimate import plate_match
 from model.estimate.calibrate import Calibration, calibrate
+from model.estimate.fit import SensedPlate, fit, sensed_plate
 from model.estimate.fit_report import calibration_json, change_rows, finding_rows
-from model.estimate.measurement import Measurement
+from model.estimate.forward import MASS_CELLS
+from model.estimate.measurement import Measurement, sensors_at
+from model.estimate.space import KINDS
+from model.reduction.free_plate import solve_free_plate
+from model.reduction.reduced_plate import reduced_modes
 from model.rig.rig import Rig
 from model.rig.rig_file import example_rig_path, load_rig
-from model.structure.attachments import PointLoad
-from plates import NAMES, make_paper_rig, perturbed
+from model.spectral.modes import SpectralMesh, stretched
+from model.structure.attachments import PointLoad, footprints_of
+from plates import NAMES as PLATES_NAMES
+from plates import extrapolated_slopes, make_paper_rig, perturbed
 from plates import measured as plates_measured
 
 FREQUENCIES = np.arange(40.0, 321.0, 40.0)
@@ -125,26 +143,26 @@ measured = partial(calibration_plates.measured, frequencies=CALIBRATION_FREQUENC
 
 
 @pytest.fixture(scope="module")
-def rig() -> Rig:
+def coarse() -> Rig:
     """The paper's plate on the coarsest mesh that resolves 500 Hz well enough."""
     return make_paper_rig(16, 12)
 
 
 @pytest.fixture(scope="module")
-def truth(rig: Rig) -> Rig:
+def truth(coarse: Rig) -> Rig:
     """What was measured."""
-    return perturbed(rig, frequencies=CALIBRATION_FREQUENCIES)
+    return perturbed(coarse, frequencies=CALIBRATION_FREQUENCIES)
 
 
 @pytest.fixture(scope="module")
-def fitted(rig: Rig, truth: Rig) -> Calibration:
+def fitted(coarse: Rig, truth: Rig) -> Calibration:
     """With 1 % noise, one wrong scale and one dead sensor."""
-    return calibrated(rig, measured(truth, scales={"P3": 1.25, "P8": 0.0}))
+    return calibrated(coarse, measured(truth, scales={"P3": 1.25, "P8": 0.0}))
 
 
-def calibrated(rig: Rig, responses: Measurement, *, all_scales: bool = False) -> Calibration:
+def calibrated(coarse: Rig, responses: Measurement, *, all_scales: bool = False) -> Calibration:
     """As `era calibrate` does it."""
-    return calibrate(rig, responses, all_scales=all_scales)
+    return calibrate(coarse, responses, all_scales=all_scales)
 
 
 def test_calibrate_finds_every_parameter(truth, fitted):
@@ -205,7 +223,7 @@ def test_calibrate_predicts_held_out_sensors_to_the_noise(fitted):
     assert fitted.is_good
 
 
-def test_calibrate_finds_a_dead_era_despite_gaps_and_outliers(rig, truth):
+def test_calibrate_finds_a_dead_era_despite_gaps_and_outliers(coarse, truth):
     """An ERA that moves nothing is named; its spring is still found by the others' responses.
 
     So is a sensor that has come off and hears next to nothing. One in twenty of the other values is
@@ -217,10 +235,10 @@ def test_calibrate_finds_a_dead_era_despite_gaps_and_outliers(rig, truth):
     values[rng.random(values.shape) < 0.3] = np.nan
     wild = rng.random(values.shape) < 0.05
     wild &= np.isfinite(values)
-    wild[:, 2] = wild[:, :, NAMES.index("P4")] = False
+    wild[:, 2] = wild[:, :, PLATES_NAMES.index("P4")] = False
     values[wild] *= rng.uniform(2, 20, wild.sum()) * np.exp(2j * np.pi * rng.random(wild.sum()))
     values[:, 2] *= 1e-4
-    found = calibrated(rig, replace(clean, values=values.swapaxes(1, 2)))
+    found = calibrated(coarse, replace(clean, values=values.swapaxes(1, 2)))
     assert 0.9 * wild.sum() <= found.outlier_count <= 1.1 * wild.sum()
     assert found.scales == {}
     assert found.dead_eras == ("NE",)
@@ -231,7 +249,7 @@ def test_calibrate_finds_a_dead_era_despite_gaps_and_outliers(rig, truth):
     )
 
 
-def test_calibrate_leaves_out_a_sensor_that_is_elsewhere(rig: Rig, truth: Rig) -> None:
+def test_calibrate_leaves_out_a_sensor_that_is_elsewhere(coarse: Rig, truth: Rig) -> None:
     """P6 stands beside P1, and reads what that one does with less noise: the others find the plate.
 
     So each fits the place of P1 better than the own of P6, and only one of both is elsewhere.
@@ -239,8 +257,8 @@ def test_calibrate_leaves_out_a_sensor_that_is_elsewhere(rig: Rig, truth: Rig) -
     full = measured(truth)
     values = full.values.copy()
     silent = measured(truth, noise=0.0).values
-    values[:, NAMES.index("P6")] = 1.05 * silent[:, NAMES.index("P1")]
-    found = calibrated(rig, replace(full, values=values))
+    values[:, PLATES_NAMES.index("P6")] = 1.05 * silent[:, PLATES_NAMES.index("P1")]
+    found = calibrated(coarse, replace(full, values=values))
     assert found.dead_sensors == ("P6",)
     assert found.outlier_count == 0
     np.testing.assert_allclose(
@@ -248,11 +266,11 @@ def test_calibrate_leaves_out_a_sensor_that_is_elsewhere(rig: Rig, truth: Rig) -
     )
 
 
-def test_calibrate_keeps_what_is_not_identified(rig):
+def test_calibrate_keeps_what_is_not_identified(coarse):
     """From 40 to 44 Hz springs outweigh bolts and dampers: these are kept and reported."""
     frequencies = np.linspace(40.0, 44.0, 4)
-    truth = perturbed(rig, frequencies=frequencies)
-    found = calibrated(rig, measured(truth, frequencies=frequencies, noise=0.05))
+    truth = perturbed(coarse, frequencies=frequencies)
+    found = calibrated(coarse, measured(truth, frequencies=frequencies, noise=0.05))
     held = [one for one in found.parameters if not one.is_identified]
     assert {one.kind for one in held} >= {"bolt_mass", "damping"}
     assert all(one.value == one.before for one in held)
@@ -263,40 +281,343 @@ def test_calibrate_keeps_what_is_not_identified(rig):
 
 @pytest.mark.long
 @pytest.mark.parametrize(("count", "held_out"), [(3, 0), (4, 1)])
-def test_calibrate_is_good_only_where_a_sensor_is_left_to_check_it(rig, truth, count, held_out):
+def test_calibrate_is_good_only_where_a_sensor_is_left_to_check_it(coarse, truth, count, held_out):
     """Of four places one is predicted from three; three leave none, as two tell nothing."""
     full = measured(truth)
-    few = full.without(~np.isin(NAMES, ["P1", "P4", "P7", "P9"][:count]))
-    found = calibrated(rig, few)
+    few = full.without(~np.isin(PLATES_NAMES, ["P1", "P4", "P7", "P9"][:count]))
+    found = calibrated(coarse, few)
     assert len(found.held_out.sensors if found.held_out else ()) == held_out
     assert found.is_good == bool(held_out)
 
 
-def test_calibrate_refuses_gains_that_no_drive_has(rig, truth):
+def test_calibrate_refuses_gains_that_no_drive_has(coarse, truth):
     """Eight times the response at one frequency of one ERA, at all sensors alike."""
     full = measured(truth)
     values = full.values.copy()
     values[5, :, 1] *= 8
     with pytest.raises(InputError, match=r"gains of ERA SE .* factor of 5 .* to [78]\.\d of it"):
-        calibrated(rig, replace(full, values=values))
+        calibrated(coarse, replace(full, values=values))
 
 
 @pytest.mark.long
-def test_calibrate_estimates_all_scales_when_requested(rig, truth):
+def test_calibrate_estimates_all_scales_when_requested(coarse, truth):
     """Every sensor's scale relative to their median, also of one mounted upside down."""
-    found = calibrated(rig, measured(truth, scales={"P2": -1.0, "P5": 1.01}), all_scales=True)
+    found = calibrated(coarse, measured(truth, scales={"P2": -1.0, "P5": 1.01}), all_scales=True)
     scales = {name: scale for name, (scale, _) in found.scales.items()}
-    assert list(scales) == list(NAMES)
+    assert list(scales) == list(PLATES_NAMES)
     assert scales["P2"] == pytest.approx(-1.0, abs=0.005)
     assert scales["P5"] == pytest.approx(1.01, abs=0.005)
     assert scales["P12"] == pytest.approx(1.0, abs=0.005)
 
 
-def test_calibrate_refuses_too_few_sensors_and_silence(rig, truth):
+def test_calibrate_refuses_too_few_sensors_and_silence(coarse, truth):
     """Two live sensors, and silence."""
     full = measured(truth)
-    two = full.without(np.arange(len(NAMES)) > 1)
+    two = full.without(np.arange(len(PLATES_NAMES)) > 1)
     with pytest.raises(InputError, match="got 2"):
-        calibrated(rig, two)
+        calibrated(coarse, two)
     with pytest.raises(InputError, match="zero"):
-        calibrated(rig, replace(full, values=0 * full.values))
+        calibrated(coarse, replace(full, values=0 * full.values))
+
+
+RIG = make_paper_rig(12, 9)
+POINTS = np.random.default_rng(0).uniform(0.02, 0.2, (5, 2))
+NAMES = tuple(f"P{number}" for number in range(len(POINTS)))
+FIT_FREQUENCIES = np.array([70.0, 130.0, 260.0, 410.0])
+
+
+def fit_measured(rig: Rig) -> ComplexArray:
+    """Responses (f, e, s) of the rig with other gains, noise, and one value left out."""
+    rng = np.random.default_rng(3)
+    values = sensed_plate(rig, sensors_at(POINTS), FIT_FREQUENCIES).responses().swapaxes(1, 2)
+    values = values * rng.uniform(0.8, 1.2, (*values.shape[:2], 1))
+    values = values * (1 + 0.1 * rng.standard_normal(values.shape))
+    values[1, 2, 3] = np.nan
+    return np.asarray(values)
+
+
+def fit_a_rig() -> None:
+    """Search with gains free, and with a prior that holds the mean of all scales."""
+    plate = sensed_plate(RIG, sensors_at(POINTS), FIT_FREQUENCIES, has_form=True)
+    values = fit_measured(RIG).swapaxes(1, 2)
+    measurement = Measurement(sensors_at(POINTS, NAMES), FIT_FREQUENCIES, values)
+    space, count = plate.model.space, len(POINTS)
+    covariance, own = np.eye(space.size), np.arange(space.size)[space.groups["sensor_scale"]]
+    covariance[np.ix_(own, own)] += 1e2 * (np.eye(count) - 1 / count)
+    fit(
+        plate.model,
+        replace(measurement, gain_std=np.inf),
+        searched=space.uncertain & ~space.of("gain"),
+        prior=(np.zeros(space.size), covariance),
+    )
+
+
+def match_a_plate() -> None:
+    """Search for a plate with one channel that was not driven."""
+    values = fit_measured(replace(RIG, plate=RIG.plate.scaled(modulus=1.1)))
+    values[:, 1] = np.nan
+    plate = sensed_plate(RIG, sensors_at(POINTS), FIT_FREQUENCIES)
+    plate_match.match_plate(plate, values.swapaxes(1, 2), drives=[0, 2, 1, 3])
+
+
+@pytest.mark.parametrize(
+    "searched",
+    [fit_a_rig, match_a_plate],
+    ids=["rig and all scales", "plate"],
+)
+def test_jacobians_of_searches_are_exact(
+    searched: Callable[[], None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By every argument at the first start of each size, to 1e-6 of the column's largest."""
+    solver: Callable[..., Any] = vars(optimize)["least_squares"]
+    checked: set[int] = set()
+
+    def checking(
+        residuals: Callable[[FloatArray], FloatArray],
+        start: FloatArray,
+        jacobian: Callable[[FloatArray], FloatArray],
+        **options: Any,
+    ) -> Any:
+        if len(start) not in checked:
+            at = start + 0.05
+            exact = extrapolated_slopes(residuals, at, step=1e-3)
+            size = np.abs(exact).max(axis=1, keepdims=True)
+            np.testing.assert_allclose(jacobian(at).T / size, exact / size, atol=1e-6)
+            checked.add(len(start))
+        return solver(residuals, start, jacobian, **options)
+
+    monkeypatch.setattr(optimize, "least_squares", checking)
+    searched()
+    assert checked
+
+
+FINGER = PointLoad(0.1, 0.08, stiffness=500.0, damping=2.0, mass=0.003)
+PAPER = make_paper_rig(12, 9)
+SENSED_PLATE_RIG = replace(
+    PAPER,
+    mesh=SpectralMesh(12, 9, PAPER.plate.length, PAPER.plate.width),
+    masses=(FINGER,),
+)
+SENSED_PLATE_FREQUENCIES = np.arange(60.0, 321.0, 10.0)
+SENSED_PLATE_POINTS = np.random.default_rng(0).uniform(0.01, 0.2, (30, 2))
+
+
+@pytest.fixture(scope="module")
+def solved() -> SensedPlate:
+    """Solved as the rig has it."""
+    return sensed_plate(SENSED_PLATE_RIG, sensors_at(SENSED_PLATE_POINTS), SENSED_PLATE_FREQUENCIES)
+
+
+@pytest.mark.parametrize(("factor", "within"), [(1.01, 1e-3), (0.95, 5e-3)])
+def test_responses_are_those_of_a_new_solve(
+    solved: SensedPlate, factor: float, within: float
+) -> None:
+    """Of another thickness, relative L2; shear and rotary inertia limit it."""
+    of = SENSED_PLATE_RIG.plate
+    other = replace(SENSED_PLATE_RIG, plate=replace(of, thickness=factor * of.thickness))
+    found = solved.of(other).responses()
+    exact = sensed_plate(other, solved.model.sensors, SENSED_PLATE_FREQUENCIES).responses()
+    assert np.linalg.norm(found - exact) / np.linalg.norm(exact) < within
+
+
+@pytest.mark.parametrize("loss_factor", np.linspace(0.001, 0.05, 20).tolist())
+def test_lower_bounds_are_no_loss_and_no_damping(solved, loss_factor):
+    """A fit that ends at them has a rig: by rounding values would be just below zero."""
+    eras = [
+        replace(era, damping=1e3 * loss_factor * share)
+        for era, share in zip(SENSED_PLATE_RIG.eras, (0.02, 0.03, 0.07, 0.11), strict=True)
+    ]
+    plate = replace(SENSED_PLATE_RIG.plate, loss_factor=loss_factor)
+    other = solved.of(replace(SENSED_PLATE_RIG, plate=plate, eras=tuple(eras)))
+    values = other.values(other.model.space.lower)
+    is_factor = [row.is_factor for row in other.rows]
+    np.testing.assert_allclose(values[np.logical_not(is_factor)], 0, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("stated", "expected"),
+    [
+        # ln 3 / ln 1.7, since 70 % is what sheets leave; -0.5 / 0.7; ln 1.2 / (0.1² + 0.02²)^½
+        (SENSED_PLATE_RIG.uncertainty, (2.070, -0.714, 1.788)),
+        # ln 3 / (ln² 3 + 0.2²)^½, -0.5 of that, ln 1.2 / (0.3² + 0.02²)^½
+        (replace(SENSED_PLATE_RIG.uncertainty, damping=3.0, stiffness=0.3), (0.984, -0.448, 0.606)),
+    ],
+    ids=["as sheets leave", "as the rig states"],
+)
+def test_deviations_are_those_of_factors_where_losses_are_more(solved, stated, expected):
+    """A damper three times as strong, one half as strong, and a spring 20 % stiffer."""
+    plate = solved.of(replace(SENSED_PLATE_RIG, uncertainty=stated))
+    z = np.zeros(plate.model.space.size)
+    z[plate.model.space.groups["damping_added"]] = 2.0 / 0.7, -0.5 / 0.7, 0.0, 0.0
+    stiffer = np.log(1.2) / max(stated.stiffness, 0.1)
+    z[plate.model.space.groups["stiffness"]] = 0.0, 0.0, stiffer, 0.0
+    by_name = dict(zip([row.name for row in plate.rows], plate.deviations(z), strict=True))
+    first, second, third, _ = (era.name for era in SENSED_PLATE_RIG.eras)
+    found = [by_name[f"{first} damping"], by_name[f"{second} damping"]]
+    found.append(by_name[f"{third} stiffness"])
+    np.testing.assert_allclose(found, expected, atol=1e-3)
+
+
+FORM_ERRORS_FREQUENCIES = np.arange(50.0, 491.0, 40.0)
+
+CELL = 10
+
+USUAL = {
+    "place": 1.5e-3,
+    "side": 0.5e-3,
+    "poisson": 0.01,
+    "sensor_place": 0.3e-3,
+    "sensor_scale": 0.005,
+    "mass": 0.01,
+}
+"""Form errors of a plate that was built with some care, as `FORM`."""
+
+
+def _longer(rig: Rig) -> Rig:
+    """The rig with a plate 1 mm longer, all that is on it moved and grown in proportion.
+
+    No response tells of a factor on all masses, springs and dampers.
+    """
+    share = 1 + 1e-3 / rig.plate.length
+    plate = replace(rig.plate, length=share * rig.plate.length)
+    eras = tuple(
+        replace(
+            era,
+            x=share * era.x,
+            stiffness=share * era.stiffness,
+            damping=share * era.damping,
+            bolt_mass=share * era.bolt_mass,
+        )
+        for era in rig.eras
+    )
+    masses = tuple(replace(one, x=share * one.x, mass=share * one.mass) for one in rig.masses)
+    return replace(rig, plate=plate, mesh=stretched(rig.mesh, plate), eras=eras, masses=masses)
+
+
+def _of_another_ratio(rig: Rig) -> Rig:
+    """The rig with 0.02 more of Poisson's ratio."""
+    material = replace(rig.plate.material, nu=rig.plate.material.nu + 0.02)
+    return replace(rig, plate=replace(rig.plate, material=material))
+
+
+def _heavier_in_one_cell(rig: Rig) -> Rig:
+    """The rig with 0.5 % of its plate's mass taken from all of it, and put on a cell."""
+    plate = rig.plate
+    material = replace(plate.material, rho=0.995 * plate.material.rho)
+    x, y = MASS_CELLS.centres(plate)[CELL]
+    load = PointLoad(float(x), float(y), mass=0.005 * plate.mass)
+    return replace(rig, plate=replace(plate, material=material), masses=(*rig.masses, load))
+
+
+def _moved(rig: Rig) -> Rig:
+    """The rig with its first ERA half a millimetre inwards along both sides."""
+    first = replace(rig.eras[0], x=rig.eras[0].x + 5e-4, y=rig.eras[0].y + 5e-4)
+    return replace(rig, eras=(first, *rig.eras[1:]))
+
+
+@pytest.mark.parametrize(
+    ("kind", "values", "other"),
+    [
+        ("side", [1e-3, 0.0], _longer),
+        ("poisson", [0.02], _of_another_ratio),
+        ("foreign_mass", 0.005 * np.eye(48)[CELL], _heavier_in_one_cell),
+        ("place", [5e-4, 5e-4, *[0.0] * 6], _moved),
+        ("sensor_place", np.tile([5e-4, -5e-4], 12), lambda rig: rig),
+    ],
+    ids=["longer", "another ratio", "heavier in one cell", "ERA moved", "sensors moved"],
+)
+def test_form_errors_are_those_of_a_plate_solved_anew(
+    rig: Rig, kind: str, values: list[float] | FloatArray, other: Callable[[Rig], Rig]
+) -> None:
+    """They move the responses as on a plate that is built so, to a fifth of what that changes.
+
+    ERAs move by slopes alone here, and a mass couples modes up to twice the highest frequency.
+    Without form errors responses in coordinates of the reduced plate are those of the free plate's
+    modes, also with a mass on it and where modes deviate from their theory.
+    """
+    points = SENSORS * [rig.plate.length, rig.plate.width]
+    rig = replace(rig, masses=(PointLoad(0.1, 0.05, mass=0.004),))
+    plate = replace(rig.plate, loss_exponent=0.3, mode_deviations=((0.02, 0.3), (-0.01, 0.0)))
+    rig = replace(rig, plate=plate)
+    sensed = sensed_plate(rig, sensors_at(points), FORM_ERRORS_FREQUENCIES, has_form=True)
+    nominal = sensed_plate(rig, sensors_at(points), FORM_ERRORS_FREQUENCIES).responses()
+    np.testing.assert_allclose(sensed.responses(), nominal, atol=2e-5 * np.abs(nominal).max())
+
+    space, z = sensed.model.space, np.zeros(sensed.model.space.size)
+    z[space.groups[kind]] = values / space.std[space.groups[kind]]
+    found = sensed.responses(z)
+    built = other(rig)
+    points = points * [built.plate.length / plate.length, 1]
+    if kind == "sensor_place":
+        points += np.array([5e-4, -5e-4])
+    change = sensed_plate(built, sensors_at(points), FORM_ERRORS_FREQUENCIES).responses() - nominal
+    np.testing.assert_allclose(found - nominal, change, atol=0.2 * np.abs(change).max())
+
+
+def test_stiffening_does_not_depend_on_rounding(rig: Rig) -> None:
+    """Moduli that differ in the eleventh digit give derivatives by the sides that agree to 1e-4.
+
+    Relative to the modes' own stiffness, as couplings are that move a mode's frequency.
+    """
+
+    cells = MASS_CELLS.centres(rig.plate)
+
+    def couplings(share: float) -> FloatArray:
+        material = replace(rig.plate.material, E=rig.plate.material.E * (1 + share))
+        other = replace(rig, plate=replace(rig.plate, material=material))
+        free = solve_free_plate(other.plate, other.mesh)
+        modes = reduced_modes(free, footprints_of(rig.eras, rig.masses), cells)
+        size = np.sqrt(modes.eigenvalues + 4e4)  # of a rigid body on springs of some 30 Hz
+        return np.abs(modes.stiffening) / np.outer(size, size)
+
+    exact = couplings(0.0)
+    for share in (1e-11, 2e-11, 3e-11):
+        np.testing.assert_allclose(couplings(share), exact, atol=1e-4)
+
+
+def test_a_fit_allows_for_what_plates_are_drawn_with() -> None:
+    """The mass of one place is that of all cells together, in the root mean square."""
+    allowed = {kind: KINDS[kind].std for kind in FORM if kind != "mass"}
+    allowed["mass"] = KINDS["foreign_mass"].std * MASS_CELLS.cell_count**0.5
+    assert allowed == pytest.approx(FORM)
+
+
+@pytest.mark.parametrize(
+    ("sensors", "plates", "share"),
+    [
+        pytest.param(6, 1, 0.7, id="6-sensors"),
+        pytest.param(12, 1, 0.7, id="12-sensors", marks=pytest.mark.long),
+        pytest.param(12, 2, 0.8, id="two-plates", marks=pytest.mark.long),
+    ],
+)
+def test_intervals_hold_the_truth_on_plates_with_form_errors(
+    rig: Rig, sensors: int, plates: int, share: float
+) -> None:
+    """ERAs 1.5 mm off, a foreign mass, sides and Poisson's ratio off, by finite elements.
+
+    Of the 28 true values of two plates four in five or more lie within two standard errors and none
+    beyond four, of the 14 of one plate seven in ten; without form errors in the fit it is a third.
+    So do three in four of the gains and phases of what ERAs do to the plate within the interval of
+    90 % by the uncertainty of the new rig, which says within a factor of two how far its fields are
+    off besides. No sensor within its tolerance counts as one of a wrong scale. The benchmark has
+    more plates.
+    """
+    deviations, fields = [], []
+    for seed in range(plates):
+        hidden = draw_plate(rig, USUAL, seed=seed, frequencies=FORM_ERRORS_FREQUENCIES)
+        responses = measure(
+            hidden, rig, seed=seed, frequencies=FORM_ERRORS_FREQUENCIES, count=sensors
+        )
+        found = calibrate(rig, responses)
+        assert found.outlier_count == 0
+        assert found.scales == {}
+        fields.append(field_deviations(found.rig, fields_of(hidden)))
+        for one, true in zip(found.parameters, true_values(hidden.rig), strict=True):
+            if one.standard_error is not None:
+                deviations.append(abs(one.value - true) / one.standard_error)
+    assert len(deviations) > 12 * plates
+    assert np.mean(np.array(deviations) < 2) > share
+    assert max(deviations) < 4
+    gains, phases, besides = np.stack(fields, axis=1)
+    assert np.mean(np.array([gains, phases]) < 1.645) > 0.75
+    assert 0.5 < np.sqrt(np.mean(besides**2)) < 2

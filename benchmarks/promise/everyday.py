@@ -1,11 +1,13 @@
-"""Whether promises are kept beside a hand that rests, under fingers that press, and by a person.
+"""Whether promises are kept beside hands and objects, under fingers that press, and by a person.
 
     python -m benchmarks.promise.everyday [--sets 20] [--plates 60] [--only WORD ...] [--rigs N ...]
 
 Two contents of 14 dB SL at fingers at least 5 cm apart, on plates solved exactly and drawn within
 the uncertainty of a rig. The heel of a hand is four patches 25 mm apart, whose loads together are
-so many fingertips'; the hand that is far is one. Each row: the promise at the worst finger (median,
-worst tenth) [dB], share of the promises that is kept, and what nine of ten plates lack to it [dB].
+so many fingertips'; the hand that is far is one. An object lies anywhere, 3 cm from fingers or
+more: its mass on a contact spring of 100 kN/m; expected, `uncertainty.foreign_mass` says so. Each
+row: the promise at the worst finger (median, worst tenth) [dB], share of the promises that is kept,
+and what nine of ten plates lack to it [dB].
 """
 
 import argparse
@@ -21,10 +23,12 @@ if TYPE_CHECKING:
 
     from model.answer.answer import Answer
     from model.arrays import FloatArray, Point
+    from model.structure.attachments import FingertipLoad
     from model.study.verification import Plates
     from model.table.table import LocalizationTable
 
 RIGS = (("paper_plate", False), ("paper_plate", True), ("car_display", True))
+OBJECT_AWAY = 0.03  # m
 PATCH = 0.0125  # m; of a patch of the heel from its middle, along x and along y
 OH_AND_CHOI = ((40.0, 3.5), (250.0, -7.0))
 """Thresholds of pressing fingers above those of the probe, by frequency [Hz] in dB."""
@@ -39,7 +43,8 @@ class Situation:
     hand: how many fingertips' load it has, 0 for none; distance [m]: of its middle from the nearer
     finger, 0 for the corner farthest from both; is_counted: whether the answer counts a hand there;
     force [N]: of all fingers; person: how their thresholds differ; fingertip: of the uncertainty
-    that the answer counts, None for that of the rig.
+    that the answer counts, None for that of the rig; mass [kg]: of an object that lies anywhere, 0
+    for none, which the answer counts as a hand.
     """
 
     name: str
@@ -49,6 +54,7 @@ class Situation:
     person: str = ""
     is_counted: bool = True
     fingertip: float | None = None
+    mass: float = 0.0
 
 
 def situations() -> Iterator[Situation]:
@@ -70,6 +76,11 @@ def situations() -> Iterator[Situation]:
     for newtons in (0.3, 1.0, 2.0, 3.0):
         yield Situation(f"force of {newtons:g} N", force=newtons)
         yield Situation(f"force of {newtons:g} N, fingertip: 0.9", force=newtons, fingertip=0.9)
+    for name, mass in (("pen", 0.005), ("phone", 0.05), ("cup", 0.2)):
+        for is_counted in (False, True):
+            known = "expected" if is_counted else "not expected"
+            grams = f"{1000 * mass:g} g"
+            yield Situation(f"{name} of {grams}, {known}", mass=mass, is_counted=is_counted)
     yield Situation("person, as Oh and Choi 2019", person="tilted")
     yield Situation("person, 4 dB at four frequencies", person="drawn")
 
@@ -135,12 +146,15 @@ def _row(
             break
         if (hand := _hand_at(rng, places, size, of.distance)) is not None:
             break
-    if of.fingertip is not None:
-        table = replace(table, uncertainty=replace(table.uncertainty, fingertip=of.fingertip))
+    changed = {} if of.fingertip is None else {"fingertip": of.fingertip}
+    if of.mass and of.is_counted:
+        changed["foreign_mass"] = of.mass
+    if changed:
+        table = replace(table, uncertainty=replace(table.uncertainty, **changed))
     fingers = [Finger(at, Stimulus(14.0)) for at in places]
     quiet = [Finger(hand, load=HAND_LOAD)] if hand is not None and of.is_counted else []
     found = answer(table, [*fingers, *quiet], drive_mode="phased", min_contrast_db=-np.inf)
-    patches = _patches(hand, of, size)
+    patches = _patches(table, places, hand, of, rng)
     plates = draw_plates(
         rng,
         replace(
@@ -150,6 +164,8 @@ def _row(
         count=count,
         contact_count=2 + len(patches),
     )
+    if of.mass:
+        plates.load[:, 2:] = 1.0
     promised = np.array([x.promised_contrast_db for x in found.fingers[:2]], dtype=float)
     contrasts = contrasts_on(table, found, plates, of, patches, rng)
     return found, contrasts - promised[:, None]
@@ -178,15 +194,29 @@ def _hand_at(
 
 
 def _patches(
-    hand: "Point | None", of: Situation, size: tuple[float, float]
-) -> "list[tuple[Point, float]]":
-    """Places of a hand's patches, with their loads."""
+    table: "LocalizationTable",
+    places: "Sequence[Point]",
+    hand: "Point | None",
+    of: Situation,
+    rng: "np.random.Generator",
+) -> "list[FingertipLoad]":
+    """Loads of a hand's patches, or of an object at least 3 cm from fingers."""
+    import math
+
+    from model.structure.attachments import Fingertip, FingertipLoad, object_load
+
+    if of.mass:
+        sides, at = (table.plate.length, table.plate.width), places[0]
+        while min(math.dist(at, each) for each in places) < OBJECT_AWAY:
+            at = float(rng.uniform(0, sides[0])), float(rng.uniform(0, sides[1]))
+        return [FingertipLoad(*at, object_load(of.mass))]
     if hand is None:
         return []
-    x, y = hand
+    (x, y), tip = hand, table.fingertip or Fingertip()
     if not of.distance:
-        return [(hand, of.hand)]
-    return [((x + a, y + b), of.hand / 4) for a in (-PATCH, PATCH) for b in (-PATCH, PATCH)]
+        return [FingertipLoad(x, y, tip.multiplied(of.hand))]
+    quarter, ways = tip.multiplied(of.hand / 4), (-PATCH, PATCH)
+    return [FingertipLoad(x + a, y + b, quarter) for a in ways for b in ways]
 
 
 def contrasts_on(
@@ -194,7 +224,7 @@ def contrasts_on(
     found: "Answer",
     plates: "Plates",
     of: Situation,
-    patches: "list[tuple[Point, float]]",
+    patches: "list[FingertipLoad]",
     rng: "np.random.Generator",
 ) -> "FloatArray":
     """Contrast [dB] of both fingers to the other's content on plates solved exactly, (2, d).
@@ -211,9 +241,8 @@ def contrasts_on(
 
     tip, places = table.fingertip or Fingertip(), [each.at for each in found.asked[:2]]
     pressed = tip.scaled((of.force / LIGHT_FORCE) ** (2 / 3))
-    loads = [FingertipLoad(*at, pressed) for at in places]
-    loads += [FingertipLoad(*at, tip.multiplied(load)) for at, load in patches]
-    tips = read_fingertips(table, [*places, *[at for at, _ in patches]])
+    loads = [*(FingertipLoad(*at, pressed) for at in places), *patches]
+    tips = read_fingertips(table, [(each.x, each.y) for each in loads])
     shares, discs = tips.fine_weights[:2], tips.fine.astype(float)
     count = len(plates.thickness)
     sets = [*range(len(table.threshold_sets))]

@@ -61,7 +61,10 @@ class Timing:
         self._table, self._eras = table, table.eras
         variance = table.uncertainty.gain_variance
         self._shaper = shaper or Shaper(
-            table.in_time, gain_variance=variance, fingertips=partial(_few_points, table)
+            table.in_time,
+            gain_variance=variance,
+            fingertips=partial(_few_points, table),
+            magnets=table.magnets,
         )
 
     def following(self, table: LocalizationTable) -> "Timing":

@@ -225,6 +225,7 @@ class Identification:
             harmonic=before.harmonic,
             supports=rms(self.std[space.groups["supports"]]),
             weather=before.weather,
+            foreign_mass=before.foreign_mass,
         )
 
 

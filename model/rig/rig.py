@@ -45,6 +45,7 @@ BOUNDS = {
     "harmonic": (0.0, 0.2),
     "supports": (0.0, 0.5),
     "weather": (0.0, 0.5),
+    "foreign_mass": (0.0, 2.0),
 }
 """What a rig may state of each parameter: exactly known, and the most."""
 
@@ -102,6 +103,8 @@ class Uncertainty:
 
     A rig file derives its default from `plate.temperature` and `plate.humidity`.
     """
+    foreign_mass: float = 0.0
+    """Mass [kg] of an object that may lie anywhere on the plate, 0 where none is expected."""
 
     def __post_init__(self) -> None:
         """Refuse values that are not finite, negative ones, and a factor below 1."""
@@ -135,6 +138,7 @@ class Uncertainty:
             f"damping x {self.damping:.4g}" if self.damping > 1 else "",
             f"fingertip x {math.exp(self.fingertip):.2g}" if self.fingertip else "",
             f"place {1e3 * self.place:.3g} mm" if self.place else "",
+            f"foreign mass {1e3 * self.foreign_mass:.3g} g" if self.foreign_mass else "",
         ]
         return ", ".join([*percents, *filter(None, others)]) or "none"
 

@@ -364,7 +364,7 @@ def _check(document: Document) -> CheckedFile:
     line, lost, more = clock_costs(rig, urls)
     warnings = [*exciter_notes(rig), *warnings]
     costs = [
-        *(*lost, *gain_notes(rig), *_plate_notes(rig), *_weather_notes(rig)),
+        *(*lost, *gain_notes(rig), *_plate_notes(rig), *_cost_notes(rig)),
         *(*_mount_notes(rig), *_span_notes(rig)),
     ]
     return CheckedFile(_summary(rig) + line, [*warnings, *costs, *([note] if note else [])], more)
@@ -440,11 +440,19 @@ def _plate_notes(rig: Rig) -> Iterator[str]:
         )
 
 
-def _weather_notes(rig: Rig) -> Iterator[str]:
-    """Yield what the weather of use costs, if the rig states any."""
+def _cost_notes(rig: Rig) -> Iterator[str]:
+    """Yield what the weather of use and an object cost, if the rig states any."""
+    if mass := rig.uncertainty.foreign_mass:
+        with contextlib.suppress(InputError):  # no place for two fingers
+            cost = resolve_name(_UNCERTAINTY_COST)(rig, "foreign_mass")
+            yield (
+                f"uncertainty.foreign_mass: with {1e3 * mass:.3g} g anywhere on the plate two "
+                f"contents keep {cost.kept_db:.1f} of {cost.exact_db:.1f} dB; what always lies at "
+                "one place belongs under masses"
+            )
     if weather := rig.uncertainty.weather:
         with contextlib.suppress(InputError):  # no place for two fingers
-            cost = resolve_name(_WEATHER_COST)(rig)
+            cost = resolve_name(_UNCERTAINTY_COST)(rig, "weather")
             yield (
                 f"plate: temperature and humidity change its modulus by {100 * weather:.2g} %, one "
                 f"standard deviation; two contents keep {cost.kept_db:.1f} of {cost.exact_db:.1f} "
@@ -585,7 +593,7 @@ def _notes(era: Source, low: float, high: float) -> list[str]:
 
 _ARRANGEMENT = "drivers.by_hand.reaching:arrangement_of"
 _COST = "model.study.overview:clock_cost"
-_WEATHER_COST = "model.study.overview:weather_cost"
+_UNCERTAINTY_COST = "model.study.overview:uncertainty_cost"
 _LOST_DB = 0.1  # contrast that is worth a warning
 
 

@@ -735,6 +735,11 @@ class UncertaintySection(Section):
     Default: by `plate.temperature` and `plate.humidity`, see [weather](#weather), else 0
     """
 
+    foreign_mass: Annotated[float, _within("foreign_mass", MASS)] = Uncertainty.foreign_mass
+    """Mass of an object that may lie anywhere on the plate, such as a cup of 200 g; see
+    [what lies on the plate](../concepts/people.md#what-lies-on-the-plate).
+    """
+
     def made(self, *, has_feet: bool, weather: float) -> Uncertainty:
         """Make the uncertainty of a rig; that of its feet, if none is stated, as `FEET_DEVIATE`.
 

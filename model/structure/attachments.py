@@ -325,6 +325,16 @@ class Fingertip:
         return Fingertip(**{key: factor * value for key, value in asdict(self).items()})
 
 
+OBJECT_STIFFNESS, OBJECT_DAMPING_RATIO = 1e5, 0.1
+"""Contact of an object that lies on the plate, as of a cup or a phone: assumed [N/m]."""
+
+
+def object_load(mass: float) -> Fingertip:
+    """Load of an object of a mass [kg] that lies on the plate: the mass on a contact spring."""
+    damping = 2 * OBJECT_DAMPING_RATIO * math.sqrt(OBJECT_STIFFNESS * mass)
+    return Fingertip(OBJECT_STIFFNESS, damping, 0.0, mass, 0.0, 0.0)
+
+
 @dataclass(frozen=True)
 class FingertipLoad:
     """A fingertip that rests on the plate at x, y [m]; it acts at a point, of foot 0."""

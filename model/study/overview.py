@@ -1,9 +1,9 @@
 """Overview of a table: map and summary, costs of clocks and weather, export to other programs.
 
 - `find_overview`, `summarize`: cells of the map, and felt contrast of random contacts.
-- `clock_cost`, `weather_cost`: the contrast that two contents keep while amplifiers' clocks have
-  some error, and in the rig's weather, by answers of the rig's own plate at a few places and
-  frequencies, in a second.
+- `clock_cost`, `uncertainty_cost`: the contrast that two contents keep while clocks of amplifiers
+  have some error, and in the rig's weather or beside an object, by answers of the rig's own plate
+  at a few places and frequencies, in a second.
 - `export_mat`, `export_csv`: a .mat file of everything, or .csv files of patterns or fields;
   `docs/reference/table-file.md` lists every name with its shape and unit.
 """
@@ -164,13 +164,13 @@ def clock_cost(rig: Rig, errors: Mapping[str, float]) -> PromiseCost:
     return _cost(exact, _promised_db(table.with_clocks(clocks)))
 
 
-def weather_cost(rig: Rig) -> PromiseCost:
-    """Compute the contrast of two contents as if the weather stayed, and in the rig's weather.
+def uncertainty_cost(rig: Rig, key: str) -> PromiseCost:
+    """Compute the contrast of two contents as if a key of the uncertainty were 0, and as it is.
 
     Median over places; raises as `clock_cost`.
     """
     table = _coarse_table(rig)
-    still = replace(table, uncertainty=replace(rig.uncertainty, weather=0.0))
+    still = replace(table, uncertainty=replace(rig.uncertainty, **{key: 0.0}))
     return _cost(_promised_db(still), _promised_db(table))
 
 

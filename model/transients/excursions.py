@@ -10,25 +10,31 @@ exactly, for straight lines between steps; those far above follow the level at o
 envelopes rise above their final amplitude; as much of their difference to a plain ramp is kept as
 the magnets allow.
 
+All of that is of the board as modelled. How much further those of boards within the rig's
+uncertainty move is found from a few that are drawn, at each frequency: nine of ten stay within.
+
 `reach_of` finds from which frequency on a rig reaches a level over its whole plate. At each place,
 as the mean over a finger that rests there, all actuators add in phase, at full level or at the
 share of it that the rig's limits and the magnets' excursion allow.
 """
 
 import math
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
 
 import numpy as np
 
 from model.arrays import ComplexArray, FloatArray, lattice
+from model.errors import InputError
 from model.finger import FIVE_POINTS, STRONG_DB_SL, decibels, detection_threshold, fingertips_on
 from model.reduction.free_plate import FreePlate, solve_free_plate
 from model.reduction.reduced_plate import reduce_free_plate
-from model.rig.rig import Rig
+from model.rig.rig import Rig, Uncertainty
 from model.rig.rig_summary import Excursions, exciters_of
-from model.structure.attachments import footprints_of
+from model.structure.attachments import PointLoad, footprints_of
 from model.transients.base_motion import KNOT_STEP, rise
 from model.transients.knots import RISE, SAMPLES
 from model.transients.time_response import PlateInTime, plate_in_time
@@ -89,6 +95,13 @@ def motions_along(
     return np.asarray(largest)
 
 
+BOARDS, _SEED = 12, 4
+"""Boards that are drawn, and of which seed."""
+
+_NINE_OF_TEN = 1.28  # standard deviations
+_SOFTEST = 0.1  # times the stiffness of the file
+_FAR_WITHIN = 1 / 3  # of the excursion
+
 _JUMP_STEP = 0.0005  # s; between samples after a jump
 _AFTER = 20  # steps that are followed after the last knot
 _KEPT, _SWINGS_KEPT = 16, 256  # sizes of caches
@@ -104,19 +117,36 @@ class MagnetMotions:
     """Displacement (m, 2 r) of the coil in the magnet, in each eigenvector."""
     excursions: FloatArray
     """Excursion (m,) of each magnet [m]."""
+    boards: tuple["MagnetMotions", ...] = ()
+    """The same of boards within the uncertainty; none of a board that is known."""
 
     @classmethod
-    def of(cls, plate: PlateInTime) -> "MagnetMotions":
-        """Make the motions of a plate's magnets; empty if no source is limited."""
+    def of(
+        cls,
+        plate: PlateInTime,
+        uncertainty: Uncertainty | None = None,
+        loads: Sequence[PointLoad] = (),
+    ) -> "MagnetMotions":
+        """Make the motions of a plate's magnets; empty if no source is limited.
+
+        uncertainty: of the plate with its loads, None where it is known.
+        """
         limits = np.array([each.excursion for each in plate.eras])
         some = np.isfinite(limits)
-        return cls(plate, plate.stretches[some] @ plate.displacement, limits[some])
+        drawn = _drawn(plate, uncertainty, loads) if uncertainty and some.any() else ()
+        rows = plate.stretches[some] @ plate.displacement
+        return cls(plate, rows, limits[some], tuple(cls.of(each) for each in drawn))
+
+    def allowed(self, *frequencies: float) -> FloatArray:
+        """Motions (f, m) [m] on the modelled board with which nine of ten boards stay within."""
+        return self.excursions / _further(self, frequencies)[:, None]
 
     def shares(self, frequencies: FloatArray) -> FloatArray:
         """Share (f,) of full level, 1 at most, to which all may jump at frequencies [Hz]."""
         if not len(self.rows):
             return np.ones(len(frequencies))
-        least: FloatArray = (self.excursions / self.by_jumps(frequencies)).min(axis=1)
+        allowed = self.allowed(*frequencies.tolist())
+        least: FloatArray = (allowed / self.by_jumps(frequencies)).min(axis=1)
         return np.asarray(np.minimum(least, 1.0))
 
     def share_along(self, frequency: float, swing: Swing) -> float:
@@ -155,7 +185,7 @@ class MagnetMotions:
         part = max(np.abs(first).max(), np.abs(last).max()) / full
         times = KNOT_STEP * np.arange(len(knots), dtype=float)
         plain = first + rise(times, min(RISE, times[-1]))[:, None] * (last - first)
-        allowed = part * self.excursions
+        (allowed,) = part * self.allowed(frequency)
         moved, least = (self.largest(frequency, each) for each in (knots, plain))
         if (moved <= allowed).all():
             return knots
@@ -181,7 +211,54 @@ class MagnetMotions:
 @lru_cache(_SWINGS_KEPT)  # the same answer is computed several times
 def _share_along(magnets: MagnetMotions, frequency: float, swing: Swing) -> float:
     moved = motions_along(magnets.plate, magnets.rows, frequency, swing)
-    return min(1.0, float((magnets.excursions / moved).min()))
+    return min(1.0, float((magnets.allowed(frequency) / moved).min()))
+
+
+@lru_cache(_SWINGS_KEPT)
+def _further(magnets: MagnetMotions, frequencies: tuple[float, ...]) -> FloatArray:
+    """How much further magnets move on the last of nine of ten boards (f,), 1 at least.
+
+    1 where jumps to full level are far within the excursion.
+    """
+    at, found = np.array(frequencies), np.ones(len(frequencies))
+    own = (magnets.by_jumps(at) / magnets.excursions).max(axis=1)
+    is_near = (own > _FAR_WITHIN) & bool(magnets.boards)
+    if is_near.any():
+        moved = [(each.by_jumps(at[is_near]) / each.excursions) for each in magnets.boards]
+        ratios = np.log(np.array(moved).max(axis=2) / own[is_near])
+        last = ratios.mean(axis=0) + _NINE_OF_TEN * ratios.std(axis=0)
+        found[is_near] = np.exp(np.maximum(last, 0.0))
+    return found
+
+
+def _drawn(
+    plate: PlateInTime, known: Uncertainty, loads: Sequence[PointLoad]
+) -> Iterator[PlateInTime]:
+    """Yield boards within the uncertainty of a plate with loads, BOARDS at most."""
+    n, of = len(plate.eras), plate.reduced
+    numbers = np.random.default_rng(_SEED).standard_normal((BOARDS, 3 + 2 * n + len(loads)))
+    numbers = (numbers - numbers.mean(axis=0)) / numbers.std(axis=0)
+    for drawn in numbers:
+        (q, loss, damping), own, gain, feet = np.split(drawn, [3, 3 + n, 3 + 2 * n])
+        springs = np.maximum(1 + known.stiffness * own, _SOFTEST)
+        softer = np.exp(known.supports * feet)
+        board = replace(
+            of,
+            plate=replace(of.plate, loss_factor=of.plate.loss_factor * known.damping**loss),
+            omega=of.omega * (1 + known.frequency * q),
+        )
+        eras = [
+            era.varied(stiffness=by, damping=known.damping**damping)
+            for era, by in zip(plate.eras, springs.tolist(), strict=True)
+        ]
+        resting = [
+            replace(load, stiffness=by * load.stiffness) if load.is_foot else load
+            for load, by in zip(loads, softer.tolist(), strict=True)
+        ]
+        with suppress(InputError):  # nothing holds it
+            found = plate_in_time(board, eras, loads=resting)
+            driven = found.participation * (1 + known.gain * gain)
+            yield replace(found, participation=driven)
 
 
 @lru_cache(_KEPT)
@@ -203,7 +280,8 @@ def _ramps_of(magnets: MagnetMotions, frequency: float) -> tuple[ComplexArray, C
 def magnets_of(rig: Rig, free: FreePlate) -> MagnetMotions:
     """Make the motions of a rig's magnets; free: the rig's plate."""
     reduced = reduce_free_plate(free, footprints_of(rig.eras, rig.masses))
-    return MagnetMotions.of(plate_in_time(reduced, rig.eras, loads=rig.masses))
+    plate = plate_in_time(reduced, rig.eras, loads=rig.masses)
+    return MagnetMotions.of(plate, rig.uncertainty, rig.masses)
 
 
 def relative_motions(rig: Rig, free: FreePlate, frequencies: FloatArray) -> ComplexArray:
@@ -232,7 +310,9 @@ def excursions_of(rig: Rig, free: FreePlate | None = None) -> Excursions:
     largest = np.zeros((len(frequencies), len(exciters)))
     some = [number for number, one in enumerate(exciters) if math.isfinite(one.excursion)]
     if some:
-        largest[:, some] = limits.level * magnets_of(rig, free).by_jumps(frequencies)
+        magnets = magnets_of(rig, free)
+        further = magnets.excursions / magnets.allowed(*frequencies.tolist())
+        largest[:, some] = limits.level * further * magnets.by_jumps(frequencies)
     passed = largest > np.array([one.excursion for one in exciters])
     rows = np.flatnonzero(passed.any(axis=1))
     allowed = low

@@ -212,19 +212,25 @@ class Shaper:
     """
 
     def __init__(
-        self, plate: PlateInTime, *, gain_variance: float, fingertips: Fingertips | None = None
+        self,
+        plate: PlateInTime,
+        *,
+        gain_variance: float,
+        fingertips: Fingertips | None = None,
+        magnets: MagnetMotions | None = None,
     ) -> None:
         """Prepare for a plate.
 
         gain_variance: of the ERAs' complex gains (`Uncertainty.gain_variance`); fingertips: reads
-        shapes under fingertips, None to read them point by point.
+        shapes under fingertips, None to read them point by point; magnets: of its exciters, None
+        for those of the plate as modelled.
         """
         self._plate = plate
         self._read_fingertips = fingertips or partial(_fingertips_on, plate)
         self._gain_variance = gain_variance
         self._names = [era.name for era in plate.eras]
         self._strokes = np.array([era.full_level for era in plate.eras])
-        self._magnets = MagnetMotions.of(plate)
+        self._magnets = magnets or MagnetMotions.of(plate)
         self._full = lru_cache(_KEPT)(self._full_share)
         self._residual_form = mean_square(plate, ENDING_WINDOW)
         self._carriers: dict[float, Carrier] = {}

@@ -28,7 +28,7 @@ from model.answer.answer_report import Timing
 from model.answer.stimulus import STRONGEST
 from model.arrays import ComplexArray
 from model.config.fields import Circle, Rectangle
-from model.rig.rig import Rig
+from model.rig.rig import Rig, Uncertainty
 from model.rig.rig_file import load_rig, parse_rig
 from model.table.table import LocalizationTable
 from model.table.table_file import build_table
@@ -144,14 +144,18 @@ PLACES = ((0.3, 0.2), (0.1, 0.1), (0.3, 0.07))
 
 @cache
 def rig(name: str) -> Rig:
-    """The weekend's as it is, down to 60 Hz, or with the larger exciters at all that they bear."""
+    """The weekend's as it is, down to 60 Hz, or with the larger exciters at all that they bear.
+
+    It is known exactly, so that magnets may use all of their excursion.
+    """
     path = Path(__file__).parents[3] / "examples/weekend/rig.yaml"
     text, reach = path.read_text(), "frequency: [100 Hz, 300 Hz]"
     assert reach in text
     if name == "large":
         text = text.replace("DAEX25CT-4", "DAEX25FHE-4").replace("power: 1 W", "power: 24 W")
     low = {"weekend": 90, "low": 60, "large": 40}[name]
-    return parse_rig("rig.yaml", text.replace(reach, f"frequency: [{low} Hz, 300 Hz]"))
+    found = parse_rig("rig.yaml", text.replace(reach, f"frequency: [{low} Hz, 300 Hz]"))
+    return replace(found, uncertainty=Uncertainty.none())
 
 
 @cache

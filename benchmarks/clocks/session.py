@@ -12,7 +12,7 @@ from itertools import combinations
 from typing import Any
 
 from benchmarks.setting import support
-from controller.play.loop import Controller
+from controller.operation.plate_controller import Controller
 from controller.sources.touch import Touch, TouchFrame
 from drivers.opening import Lines
 from drivers.protocol.definition import CLOCK_TURN, FEATURES

@@ -14,8 +14,8 @@ from typing import Any
 from benchmarks.setting import support
 from controller.effects.layout import SurfaceLayout, default_effects
 from controller.effects.player import EffectPlayer
-from controller.play.loop import Controller
-from controller.play.planner import PlayReport
+from controller.operation.plate_controller import Controller
+from controller.play.loop import PlayReport
 from controller.sources.touch import Touch, TouchFrame
 from drivers.host.amplifier import Amplifier
 from drivers.host.line import Line

@@ -16,7 +16,7 @@ import numpy as np
 from benchmarks.promise.heard import Heard, Log, Span
 from controller.effects.player import CLICK_ABOVE_DB
 from controller.play.intent import CLICK, Prediction, Pulse, Target
-from controller.play.planner import PlayReport
+from controller.play.loop import PlayReport
 from controller.sources.touch import ContactKey
 from registry import threads
 

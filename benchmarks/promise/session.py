@@ -30,7 +30,7 @@ from benchmarks.promise.clicked import Clicked, clicks, measured, owner_of
 from benchmarks.promise.heard import STRONGEST, Heard, Log, Span
 from benchmarks.setting import random_contacts, support
 from controller.play.intent import HapticIntent, Prediction, Target
-from controller.play.planner import PlayReport
+from controller.play.loop import PlayReport
 from controller.play.slots import CROSSFADE, FALL_AFTER
 from model.answer.answer_report import Timing
 from model.finger import FINGERTIP_RADIUS

@@ -29,9 +29,9 @@ from controller.gateway.gateway_settings import require_gateway
 from controller.learning.learning import Learning
 from controller.operation.fault_dumps import FaultDumps
 from controller.operation.operation_states import ENERGISED, DaemonState, Operation
+from controller.operation.plate_controller import Controller
 from controller.operation.supervisor import Supervisor
-from controller.play.loop import Controller
-from controller.play.planner import Observers
+from controller.play.loop import Observers
 from controller.process.daemon_process import (
     MIN_DESCRIPTORS,
     ServiceManager,

@@ -53,9 +53,9 @@ from controller.operation.operation_states import (
     Operation,
     Trigger,
 )
+from controller.operation.plate_controller import Controller
 from controller.operation.supervisor import LEASE_OVER, Supervisor
 from controller.play.intent import MAX_DB_SL
-from controller.play.loop import Controller
 from controller.sources.touch import LIGHT_MAJOR, Contact, LightPress, Touch, TouchFrame
 from drivers.host.dialogue import StopOutcome
 from model.compiled.kernels import why_slow

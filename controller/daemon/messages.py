@@ -60,7 +60,7 @@ from controller.learning.learning import Learning
 from controller.operation.operation_states import DaemonState, Loss, Operation
 from controller.operation.supervisor import LinkChange
 from controller.play.intent import BEING_CHOSEN, NO_CONTACTS, leaks_db_sl
-from controller.play.planner import Observers, PlayReport
+from controller.play.loop import Observers, PlayReport
 from controller.play.routing import Drive
 from controller.sources.touch import Change, Contact, ContactKey
 from drivers.host.amplifier import Amplifier

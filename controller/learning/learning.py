@@ -35,9 +35,9 @@ from controller.api.schema import (
     PlateEvent,
 )
 from controller.learning.worker import Worker, make, of_made
+from controller.operation.plate_controller import Controller
 from controller.plate_measurement import PlateSensor, check_clocks, plate_sensors, settling
-from controller.play.loop import Controller
-from controller.play.planner import Observers, PlayReport
+from controller.play.loop import Observers, PlayReport
 from controller.sources.touch import Contact
 from drivers.errors import CommandError, DriverError, Preempted
 from drivers.host.amplifier import Reading, finish_reading, start_reading

@@ -34,8 +34,8 @@ from controller.operation.operation_states import (
     is_any_armed,
     step,
 )
-from controller.play.loop import Controller
-from controller.play.planner import Observers
+from controller.operation.plate_controller import Controller
+from controller.play.loop import Observers
 from drivers.errors import (
     CommandRefused,
     DriverError,

@@ -1,20 +1,39 @@
-"""The control loop of a plate, and the controller that opens, arms and stops its amplifiers.
+"""The control loop of a plate: a cycle plans, sends what changes, then feeds the watchdogs.
 
-A cycle of the loop plans, sends what changes, then feeds the watchdogs of the amplifiers.
+plan(now):  fingers -> intent -> contents -> the layers that change, on every amplifier
+
+The planner never waits, and reads no clock; the cycle waits and sends. Reports say what a plan
+plays or silences; observers of the control loop get them.
 """
 
 import asyncio
 import logging
 import math
-from collections.abc import Awaitable, Callable, Coroutine, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
-from typing import Any, ParamSpec
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import ParamSpec
 
-from controller.play.intent import IntentSource
-from controller.play.planner import Observers, Plan, Planner, play_report
-from controller.play.routing import limits_of, playback_capabilities
-from controller.play.slots import RELEASE_RAMP
-from controller.sources.touch import Change, ContactTracker, RejectCounter, TouchFrame
+from controller.play.intent import (
+    IntentSource,
+    Prediction,
+    Pulse,
+    Selection,
+    no_layer_free,
+    not_served,
+)
+from controller.play.routing import CountedClocks, Drive, PlaybackCapabilities
+from controller.play.selection import Chooser, Selector
+from controller.play.slots import RELEASE_RAMP, RETRY, Check, Sets, Slot, Slots
+from controller.sources.touch import (
+    Change,
+    Contact,
+    ContactKey,
+    ContactTracker,
+    RejectCounter,
+    TouchFrame,
+)
 from drivers.errors import (
     CommandError,
     CommandRefused,
@@ -24,26 +43,462 @@ from drivers.errors import (
     Overtaken,
     Preempted,
 )
-from drivers.host.amplifier import CONFIRM_TIMEOUT, WATCHDOG, Amplifier
-from drivers.host.dialogue import UNREACHED, StopOutcome
-from drivers.host.group import Group, GroupState
-from drivers.opening import Lines
-from drivers.protocol.definition import HEARTBEAT, REPLY_TIMEOUT
-from model.answer.answer import Limits
+from drivers.host.group import Group
+from drivers.host.joint_sets import PlayedSet
+from drivers.protocol.definition import HEARTBEAT
+from model.answer.answer import Layer, Limits
 from model.answer.answer_report import Timing
-from model.drive_modes import DRIVE_MODES
-from model.errors import InputError
+from model.answer.plan import prepare_answers, query
+from model.answer.stimulus import FADE_RAMP, MIN_LEVEL_DB_SL, Placement
 from model.quantities import counted
 from model.rig.rig import Rig
 from model.structure.plate import Plate
 from model.table.table import LocalizationTable
 from registry import threads
+from registry.plugins import failure_text
+
+ENDED = (
+    "the vibration has ended by itself: it was not renewed, or a limit of time was reached; touch "
+    "there again"
+)
+
+_CLOCKS_INTERVAL = 2 * HEARTBEAT  # s; after which clocks are counted though fingers change
+
+_logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What contacts feel from a moment on, and the sets for it."""
+
+    contacts: tuple[Contact, ...]
+    selection: Selection
+    made_at: float
+    """[s]"""
+    answered: Mapping[ContactKey | None, float]
+    """When [s] the fingers changed that the plan answers; None: the first that lifted."""
+    sets: Sets = field(default_factory=Sets)
+    """Empty where nothing changes."""
+    is_reported: bool = True
+    """Whether what is felt changes."""
+
+    @property
+    def since(self) -> float:
+        """When [s] the first finger changed that it answers; when it was made, if none did."""
+        return min([self.made_at, *self.answered.values()])
+
+    @property
+    def is_touch(self) -> bool:
+        """Whether it answers a finger that came, moved or pressed, not lifts alone."""
+        return len(self.answered) > (None in self.answered)
+
+
+class Planner:
+    """Plans what the contacts on one plate feel; synchronous, times are arguments.
+
+    A plan never raises: it falls back to silence on any exception. check: asks the ledgers;
+    arrived: called when contents have been chosen in the thread; it calls `look_again` and plans.
+    too_late: called with the number of clicks that came too late to be felt; clock_errors: returns
+    the clock errors of the amplifiers by name, rms [s].
+    """
+
+    def __init__(
+        self,
+        rig: Rig,
+        table: LocalizationTable,
+        *,
+        tracker: ContactTracker,
+        capabilities: PlaybackCapabilities,
+        intent_source: IntentSource,
+        timing: Timing,
+        check: Check,
+        arrived: Callable[[], None] = lambda: None,
+        too_late: Callable[[int], None] = lambda clicks: None,
+        clock_errors: Callable[[], Mapping[str, float]],
+    ) -> None:
+        self.capabilities = capabilities
+        """The capabilities of the amplifiers together."""
+        self._tracker, self._intent_source = tracker, intent_source
+        self.slots = Slots(rig, capabilities, timing, check=check, expiry_of=tracker.expiry_of)
+        """What each layer plays."""
+        self.clocks = CountedClocks(rig, clock_errors)
+        """The clock errors of the amplifiers, as answers count them."""
+        self._selector = Selector(
+            self._chooser_of(table),
+            arrived=arrived,
+            may_lead=self.slots.may_lead,
+        )
+        self._selected: Selection | None = None  # the last, before limits left contents out of it
+        self._unplayed: Mapping[ContactKey | None, float] = {}  # answered by what was refused
+        self._plan: Plan | None = None  # the last, None where what plays is unknown
+        self._intent_due = math.inf  # s; when the intent may change without a touch
+        self._retry_at = math.inf  # s; when a ledger may admit what it refused
+        self._clocks_due = -math.inf  # s; though fingers change
+        self._too_late = too_late
+        self._seen: Sequence[Contact] = ()  # by the last plan
+        self._awaited: dict[int, Pulse] = {}  # by identity: planned, and not known to have started
+        self._pending: object = None  # the last question in the thread
+        self._waiting: dict[ContactKey | None, float] = {}  # fingers that the last is for
+
+    def replace_answers(self, table: LocalizationTable, timing: Timing) -> None:
+        """Answer by another table of this plate from now on; what plays is kept until all rest."""
+        self.slots.timing = timing
+        self._answer_by(self._chooser_of(self.clocks.counted_by(table)))
+
+    def replace_limits(self, limits: Limits) -> None:
+        """Answer within other limits from now on: an amplifier was identified again."""
+        if limits != self.capabilities.limits:
+            self.capabilities = replace(self.capabilities, limits=limits)
+            self._answer_by(self._selector.chooser)
+
+    def _count_clocks(self) -> None:
+        """Answer by the clocks as they are now; what plays is kept until all rest.
+
+        It is chosen anew at once if a clock is no longer held.
+        """
+        chooser, known = self._selector.chooser, self.clocks.known
+        is_one_lost = self.clocks.is_one_lost(known)
+        counted = self.clocks.counted_by(chooser.table, known)
+        if counted is not chooser.table:
+            self._answer_by(replace(chooser, table=counted), at_once=is_one_lost)
+
+    def _chooser_of(self, table: LocalizationTable) -> Chooser:
+        """Make a chooser by a table, whose envelopes are of the timing in use."""
+        shape = partial(self.capabilities.envelope_support.shape, self.slots.timing)
+        return Chooser(table, shape)
+
+    def _answer_by(self, chooser: Chooser, *, at_once: bool = False) -> None:
+        """Answer by another chooser once all rest, or at once; at once where nothing plays, too."""
+        selector = self._selector
+        selector.chooser = chooser
+        if at_once or not (self.slots.may_play or selector.is_choosing):
+            selector.choose_anew()
+        self.look_again()
+
+    def prepare(self) -> None:
+        """Precompute what the first touch would have to wait for; seconds, of a large rig.
+
+        The table without clock errors, by which statuses say what leaks, shares all of that with
+        the one with them. Raises InputError for a table without a pattern for these amplifiers.
+        """
+        mode, timing = self.capabilities.drive_mode, self.slots.timing
+        prepare_answers(self._selector.chooser.table, mode)
+        self._count_clocks()
+        table = self._selector.chooser.table
+        timing.prepare(table.frequencies.tolist())
+        plate, support = table.plate, self.capabilities.envelope_support
+        placed = Placement(((plate.length / 2, plate.width / 2),), ((0.0, 0.0),))
+        band = self.capabilities.limits.frequencies
+        (layer,) = query(table, placed, MIN_LEVEL_DB_SL, drive_mode=mode, band_hz=band).layers
+        onset, ending = support.onset_knots > 0, support.ending_knots > 0
+        timing.with_envelopes(layer, placed, onset=onset, ending=ending)
+
+    @property
+    def due(self) -> float:
+        """When [s] to plan next even if nothing arrives.
+
+        Then an intent expires, a ledger may admit what it refused, or a finger that moved rests.
+        """
+        return min(self._intent_due, self._retry_at, self._selector.due)
+
+    @property
+    def is_waiting(self) -> bool:
+        """Whether a change of fingers is not answered yet, or contents are being chosen."""
+        return bool(self._tracker.changed) or self._selector.is_choosing
+
+    @property
+    def is_silence_pending(self) -> bool:
+        """Whether the last contact has lifted and silence has not been commanded yet."""
+        return not self._tracker.contacts and not self.slots.is_silent
+
+    def note_lifts(self, up: Sequence[Contact]) -> None:
+        """Note that contacts have lifted."""
+        seen = {each.key for each in self._seen}
+        if unseen := sum(each.key not in seen for each in up):
+            self._too_late(unseen)
+
+    def look_again(self) -> None:
+        """Note that the next plan may differ though no contact has changed."""
+        self._intent_due = -math.inf
+
+    def forget(self) -> None:
+        """Discard the known playback: the next plan has a set; fingers keep their layers."""
+        self._plan, self._retry_at = None, math.inf
+        self.slots.forget()
+
+    def not_played(self, plan: Plan) -> None:
+        """Discard what plays, since a plan has not been played; its fingers wait for the next."""
+        self.forget()
+        if plan.is_reported:
+            self._tracker.wait_again(plan.answered)
+
+    def only_ends(self, plan: Plan) -> Plan:
+        """Return a plan that starts and prolongs nothing; what it would start is planned again."""
+        if not plan.is_reported:
+            return replace(plan, sets=Sets())
+        if not plan.sets.started:
+            return plan
+        self.not_played(plan)
+        layers, started = plan.sets.layers, plan.sets.started
+        ends = {number: each for number, each in layers.items() if number not in started}
+        return replace(plan, sets=Sets(ends), is_reported=False)
+
+    def confirm(self, sets: Sets, played: PlayedSet, *, now: float) -> None:
+        """Note what the amplifiers play of sets by now [s].
+
+        Pulses start where the last amplifier does.
+        """
+        for pulse in self._pulses(sets.started):
+            if pulse.started_at is None:
+                if played.starts_at > pulse.end:
+                    self._too_late(1)
+                pulse.started_at = played.starts_at
+                self._intent_due = min(self._intent_due, pulse.end)
+        self.slots.confirm(sets, played, now)
+
+    def refused(self, plan: Plan, refusal: CommandRefused, *, now: float) -> Plan:
+        """Return silence in place of a plan that amplifiers refused though the ledgers admit it.
+
+        It is planned again when the refusal ends, or after RETRY where that is unknown.
+        """
+        if not plan.is_reported and self.slots.contents:
+            self.slots.not_renewed(plan.sets, refusal)
+            return replace(plan, sets=Sets())
+        if refusal.until is None or refusal.until > now:  # not of a wire that is too slow or busy
+            self._awaited.clear()
+        until = now + RETRY if refusal.until is None else refusal.until
+        self._retry_at = max(until, now + HEARTBEAT)
+        self._unplayed = plan.answered
+        silence = replace(self.slots.silence(FADE_RAMP, now), reason=str(refusal))
+        return replace(plan, sets=silence, is_reported=True)
+
+    def plan(self, now: float) -> Plan | None:
+        """Plan at a time [s], for the contacts as of `expire`; None if nothing changes."""
+        for number, pulse in [*self._awaited.items()]:
+            if pulse.started_at is not None or now >= pulse.end:
+                del self._awaited[number]
+                if pulse.started_at is None:
+                    self._too_late(1)
+        before, contacts, has_failed = self._plan, self._tracker.contacts, False
+        try:
+            # Where fingers change only if none was counted for long: their answer waits for it.
+            if now >= self._clocks_due or not self._tracker.changed:
+                self._clocks_due = now + _CLOCKS_INTERVAL
+                self._count_clocks()
+            if before is not None and not (self._tracker.changed or now >= self.due):
+                return self._go_on(before, now)
+            self._seen = contacts
+            self._intent_due = math.inf
+            fingers = tuple([each for each in contacts if not each.is_hand])
+            intent = self._intent_source.intent(fingers, now)
+            self._intent_due = intent.due(now)
+            chosen = self._selector.select(contacts, intent, self.capabilities, now=now)
+            selected = chosen.weakened(intent.gains_db)
+            if before is not None and selected == self._selected and now < self._retry_at:
+                self._answered(())
+                return self._go_on(before, now)
+            if self._unplayed:
+                down = {each.key for each in contacts}
+                self._tracker.wait_again({k: at for k, at in self._unplayed.items() if k in down})
+                self._unplayed = {}
+            selection, sets = self._playable(selected), Sets()
+            if is_felt := len(selection.contents) > 0:
+                sets = self.slots.plan(selection.contents, now)
+                if sets.skipped:
+                    selection = selection.without(sets.skipped, sets.reason)
+        except Exception as error:
+            has_failed, is_felt, sets = True, False, Sets(retry_at=now + HEARTBEAT)
+            self._selector.due, self._retry_at = math.inf, sets.retry_at
+            selected = selection = Selection((), contacts, (), failure_text(error))
+            if before is not None and selected == self._selected:
+                return None
+            _logger.exception("loop: plan failed, silencing all channels")
+        self._retry_at, self._selected = sets.retry_at, selected
+        is_awaited = not is_felt and selected.is_pending and not self.slots.may_play
+        if not (is_felt or is_awaited):
+            sets = self._end(contacts, now, has_failed=has_failed)
+        for pulse in self._pulses(sets.started):
+            self._awaited[id(pulse)] = pulse
+        answered = self._answered(sets.started)
+        self._plan = plan = Plan(contacts, selection, now, answered, sets)
+        if sets or not (is_felt or is_awaited):
+            return plan
+        said = () if before is None else before.selection.predictions
+        return self._go_on(plan, now) if is_awaited or selection.predictions == said else plan
+
+    def _go_on(self, plan: Plan, now: float) -> Plan | None:
+        """Plan what is due where nothing changes: contents have ended or are to be prolonged."""
+        if now < self.slots.due:
+            return None
+        if contents := self.slots.ended(now):
+            selection = plan.selection.without(contents, ENDED)
+            self._plan = replace(plan, selection=selection, sets=Sets(), made_at=now, answered={})
+            return self._plan
+        renewal = self.slots.renewal(now)
+        return replace(plan, sets=renewal, is_reported=False) if renewal else None
+
+    def _playable(self, selection: Selection) -> Selection:
+        """Return a selection without what has ended by itself, and what has no layer."""
+        if over := self.slots.over_of(selection.contents):
+            selection = selection.without(over, ENDED)
+        count = self.capabilities.layers
+        if len(selection.contents) > count:  # of each content all voices have one, or none
+            served = [*self.slots.numbered(selection.contents).values()]
+            lacking = [each.targets for each in selection.contents if each not in served]
+            left = [each for each in selection.contents if each.targets in lacking]
+            selection = selection.without(left, no_layer_free(count))
+        return selection
+
+    def _end(self, contacts: tuple[Contact, ...], now: float, *, has_failed: bool) -> Sets:
+        """Return the sets that end all that plays; along endings only under fingers that stay."""
+        if not contacts:
+            return self.slots.silence(RELEASE_RAMP, now)
+        if has_failed or not self.slots.have_settled(now):
+            return self.slots.silence(FADE_RAMP, now)
+        return self.slots.plan((), now)
+
+    def _answered(self, started: Collection[int]) -> dict[ContactKey | None, float]:
+        """Return when [s] the fingers changed that are answered; None: the first that lifted.
+
+        While contents are being chosen, only lifts and pulses that start are answered, and with a
+        content that lasts also the fingers of the choice before.
+        """
+        changed, pending = self._tracker.changed, self._selector.pending
+        before, waiting = self._waiting, dict[ContactKey | None, float]()
+        answered = {**changed, **before}
+        if pending is not None:
+            contents = [self.slots.contents[number].content for number in started]
+            short = [each for each in contents if each.targets[0][1].is_short]
+            keys = {None, *[contact.key for each in short for contact, _ in each.targets]}
+            answered = {key: at for key, at in answered.items() if key in keys}
+            if pending is self._pending:
+                changed.pop(None, None)
+                return answered
+            waiting = {key: at for key, at in changed.items() if key not in keys}
+            if len(short) < len(contents):
+                answered |= before
+            else:
+                waiting |= before
+        changed.clear()
+        self._pending, self._waiting = pending, waiting
+        return answered
+
+    def _pulses(self, numbers: Iterable[int]) -> list[Pulse]:
+        """Return the pulses that play in layers."""
+        return [
+            target.pulse
+            for number in numbers
+            for _, target in self.slots.contents[number].content.targets
+            if target.pulse is not None
+        ]
+
+
+@dataclass(frozen=True)
+class PlayReport:
+    """The contents that amplifiers play since their last confirmed set, or why they are silent."""
+
+    contacts: tuple[Contact, ...]
+    """All contacts, in order of arrival."""
+    targets: tuple[Prediction, ...]
+    """A prediction for each contact that is to feel something; of silence with the reason."""
+    latency: float | None
+    """Time [s] from the touch frame to the last byte of the command; None if none was needed."""
+    time: float
+    """When [s] that byte was sent, or the report made."""
+    is_touch: bool = False
+    """As of the plan."""
+    reason: str = ""
+    """Why all channels are silent."""
+    contents: Mapping[int, Slot] = field(default_factory=dict)
+    """Copies of the slots as they are played, by layer, the newest one last; none in silence."""
+    quiet: tuple[Contact, ...] = ()
+    """Contacts that are to feel nothing of what plays."""
+    quiet_levels: Mapping[ContactKey, Sequence[float]] = field(default_factory=dict)
+    """Foreign levels at quiet contacts (`Selection.foreign_levels`)."""
+    settled_after: float = 0.0
+    """Time [s] until the last fade or envelope has ended."""
+    lasts: bool = True
+    """Whether all contents play until their contacts change."""
+
+    @property
+    def newest(self) -> Slot:
+        """The content that changed last."""
+        return [*self.contents.values()][-1]
+
+    @property
+    def layer(self) -> Layer:
+        """The layer of the newest content as it plays."""
+        return self.newest.layer
+
+    @property
+    def drive(self) -> Drive:
+        """The tones of the newest content, by ERA, without silent ones."""
+        return self.newest.drive
+
+    @property
+    def felt(self) -> Prediction | None:
+        """The prediction for the finger of the newest content; None where none plays."""
+        every = [each for one in self.contents.values() for each in one.content.predictions[:1]]
+        return every[-1] if every else None
+
+
+def play_report(
+    plan: Plan, playing: Mapping[int, Slot], *, sent_at: float | None, now: float
+) -> PlayReport:
+    """Report what plays after a plan, by layer; sent_at [s]: when it starts, None if before."""
+    selection = plan.selection
+    known = partial(
+        PlayReport,
+        plan.contacts,
+        latency=None if sent_at is None else sent_at - plan.since,
+        is_touch=plan.is_touch,
+    )
+    if plan.sets.silence is not None or not selection.contents:
+        reason = plan.sets.reason or selection.reason or ""
+        said = {each.contact.key: each for each in selection.not_served}
+        targets = dict.fromkeys([contact for contact, _ in selection.targets])
+        silent = tuple([said.get(each.key) or not_served(each, reason) for each in targets])
+        return known(silent, time=now, reason=reason)
+    order = sorted(
+        [number for number, one in playing.items() if one.content in selection.contents],
+        key=plan.sets.started.__contains__,
+    )
+    return known(
+        selection.predictions,
+        time=now if sent_at is None else sent_at,
+        contents={number: replace(playing[number]) for number in order},
+        quiet=selection.quiet,
+        quiet_levels={
+            each.key: selection.foreign_levels.get(each.key, ()) for each in selection.quiet
+        },
+        settled_after=plan.sets.settled_after,
+        lasts=all(
+            target.pulse is None for each in selection.contents for _, target in each.targets
+        ),
+    )
+
+
+@dataclass(frozen=True)
+class Observers:
+    """Callbacks of the control loop by event, called within it in order: they must return at once.
+
+    Their exceptions are logged and go no further.
+    """
+
+    contacts_changed: list[Callable[[tuple[Contact, ...], Change], object]] = field(
+        default_factory=list
+    )
+    reported: list[Callable[[PlayReport], object]] = field(default_factory=list)
+    refused: list[Callable[[str], object]] = field(default_factory=list)
+    link_lost: list[Callable[[str], object]] = field(default_factory=list)
+    cycle_completed: list[Callable[[], object]] = field(default_factory=list)
+    """Called after each cycle of the loop, at least once a second."""
+
 
 # s; the loop runs even with nothing to do, for a supervisor that checks whether it is alive.
 IDLE_INTERVAL = 0.5
 
 _P = ParamSpec("_P")
-_logger = logging.getLogger(__name__)
 
 
 class Cycle:
@@ -311,255 +766,3 @@ def _report(callbacks: Iterable[Callable[_P, object]], *args: _P.args, **kwargs:
             callback(*args, **kwargs)
         except Exception:
             _logger.exception("loop: observer failed")
-
-
-CLOSING_RAMP = 0.050  # s; not urgent, so longer than a release
-
-
-class Controller:
-    """Drives the amplifiers of a rig by touch frames: open, arm, run its `cycle`, close.
-
-    It starts disarmed: contacts are followed but nothing is sent. The loop sends the heartbeat
-    itself after it has run, so that the watchdogs of the amplifiers trip when it hangs.
-
-    table: for this rig; lines: makes the lines to its amplifiers, anew for each opening;
-    intent_source: says what contacts shall feel; timing: shapes the patterns of the table; urls,
-    serial_numbers: by amplifier name; drive_mode: None for the best that the amplifiers can play;
-    connected: called with all amplifiers when their lines are open; watchdog [s]: of armed ones.
-    """
-
-    def __init__(
-        self,
-        rig: Rig,
-        table: LocalizationTable,
-        *,
-        lines: Callable[[Lines | None], Lines],
-        intent_source: IntentSource,
-        timing: Timing,
-        urls: Mapping[str, str] | None = None,
-        serial_numbers: Mapping[str, str] | None = None,
-        drive_mode: str | None = None,
-        connected: Callable[[Mapping[str, Amplifier]], None] = lambda amplifiers: None,
-        watchdog: float = WATCHDOG,
-    ) -> None:
-        self.cycle = Cycle(rig.plate, Group({}, watchdog=watchdog))
-        """The control loop."""
-        self._rig, self._intent_source, self._timing = rig, intent_source, timing
-        self.table = table
-        """The table that answers."""
-        self.urls = dict(rig.amplifiers if urls is None else urls)
-        if self.urls.keys() != rig.amplifiers.keys():
-            raise InputError(
-                f"amplifiers must be those of the rig ({', '.join(sorted(rig.amplifiers))}), got "
-                f"{', '.join(sorted(self.urls)) or 'none'}"
-            )
-        self._make_lines = lines
-        self._lines: Lines | None = None  # also after an attempt to open that has failed
-        self._before: Lines | None = None  # the last ones, also once they are closed
-        self._opened: dict[str, Amplifier] = {}  # last, identified or not
-        self._owed: dict[str, asyncio.Future[Awaitable[Mapping[str, StopOutcome]]]] = {}  # stops
-        self._serial_numbers = dict(serial_numbers or {})
-        self._connected = connected
-        self.watchdog = watchdog
-        """Watchdog of armed amplifiers [s]."""
-        self.amplifiers: dict[str, Amplifier] = {}
-        """Amplifiers by name, as identified last; empty before."""
-        self._drive_mode = drive_mode
-
-    @property
-    def group(self) -> Group:
-        """All amplifiers together."""
-        return self.cycle.group
-
-    @property
-    def is_released(self) -> bool:
-        """Whether all lines are closed."""
-        return self._lines is None
-
-    @property
-    def drive_mode(self) -> str:
-        """The drive mode of questions to the table; the best possible one until `open`."""
-        if self.cycle.planner is not None:
-            return self.cycle.planner.capabilities.drive_mode
-        return self._drive_mode or DRIVE_MODES[-1]
-
-    def replace_answers(self, table: LocalizationTable, timing: Timing) -> None:
-        """Answer touches by another table of this plate from now on, in one step.
-
-        What plays is kept until its contacts change or rest. The caller prepares the table: nothing
-        is computed here.
-        """
-        self.table, self._timing = table, timing
-        if self.cycle.planner is not None:
-            self.cycle.planner.replace_answers(table, timing)
-
-    async def open(self) -> None:
-        """Open every amplifier, or none, and prepare what they can play; all stay disarmed.
-
-        A stop reaches each as soon as its line is open, whatever becomes of the others.
-        An amplifier that was open before must have the serial number that it had, and keeps the
-        vibrations that its limits over time count. Raises LinkError, CommandError, and InputError
-        for a wired channel that its amplifier does not have or a drive mode that one cannot play.
-        After a LinkError the lines stay open for the next attempt, until `release`: a board may
-        restart whenever its port is opened.
-        """
-        cycle = self.cycle
-        cycle.is_closed = False
-        if self._lines is None or self._lines.is_closing:
-            self._lines = self._before = self._make_lines(self._before)
-        lines = self._lines
-        try:
-            async with cycle.sending:  # to those of before
-                cycle.group = Group(
-                    self._opened, watchdog=self.watchdog, restored=cycle.feed_at_once
-                )
-            opening = [self._amplifier(lines, name) for name in self.urls]
-            results = await asyncio.gather(*opening, return_exceptions=True)
-            by_name = zip(self.urls, results, strict=True)
-            lost = {name: each for name, each in by_name if isinstance(each, LinkError)}
-            for error in lost.values():
-                error.lost = tuple(lost)
-            opened = self.group.members.checked(results)
-            amplifiers = dict(zip(self.urls, opened, strict=True))
-            self._connected(amplifiers)
-            await self.group.open()
-            for name, amplifier in amplifiers.items():
-                self._serial_numbers[name] = amplifier.identity["serial_number"]
-                if name in self.amplifiers:
-                    amplifier.ledger.go_on_from(self.amplifiers[name].ledger)
-                self.amplifiers[name] = amplifier
-            planner = Planner(
-                self._rig,
-                self.table,
-                tracker=cycle.tracker,
-                capabilities=playback_capabilities(
-                    self._rig, amplifiers, drive_mode=self._drive_mode
-                ),
-                intent_source=self._intent_source,
-                timing=self._timing,
-                check=self.group.sets.refusal_of,
-                arrived=cycle.request_update,
-                too_late=cycle.count_too_late,
-                clock_errors=lambda: self.group.clock_errors,
-            )
-            await asyncio.to_thread(planner.prepare)  # seconds, of a large rig
-        except BaseException as error:
-            if not isinstance(error, LinkError):
-                await self.release()
-            raise
-        cycle.planner = planner
-
-    async def _amplifier(self, lines: Lines, name: str) -> Amplifier:
-        """Open the line of an amplifier, and send the stop that it is owed.
-
-        An amplifier whose line is open since another attempt is kept, with a stop in progress.
-        Raises LinkError, CommandError.
-        """
-        before = amplifier = self._opened.get(name)
-        if amplifier is None or amplifier.line.loss is not None:
-            amplifier = await lines.amplifier(
-                self.urls[name],
-                self._rig.limits,
-                name=name,
-                serial_number=self._serial_numbers.get(name),
-                is_output=name in self._rig.outputs,
-            )
-            if before is not None:
-                amplifier.go_on_from(before)
-        self._opened[name] = self.group.amplifiers[name] = amplifier
-        if name in self._owed:
-            stopping = _identified([amplifier], self.group.stop(waits_for=[name]))
-            self._owed.pop(name).set_result(asyncio.ensure_future(stopping))
-        return amplifier
-
-    async def arm(self) -> None:
-        """Switch the high voltage on, so that touches are felt; `cycle` runs or starts at once."""
-        was_armed = self.group.is_armed
-        await self.group.arm()
-        self.cycle.note_armed(limits_of(self._rig, self.amplifiers), was_armed=was_armed)
-
-    async def disarm(self) -> None:
-        """Ramp to silence, then switch the high voltage off."""
-        await self.group.disarm()
-
-    def stop(self) -> Coroutine[Any, Any, Mapping[str, StopOutcome]]:
-        """Quick-stop every amplifier on an open line; latched until `clear`; see `Group.stop`."""
-        return self.group.stop()
-
-    def stop_all(self) -> Coroutine[Any, Any, Mapping[str, StopOutcome]]:
-        """Quick-stop every amplifier, those whose lines are closed as soon as they are opened.
-
-        The requests on open lines are queued when this returns. Await it for what is known of each,
-        by name: of one whose line is opened within 0.3 s by its reply.
-        """
-        stopping = self.group.stop()
-        if self.group.state is GroupState.CLOSED:  # who replies on open lines is not known for sure
-            opened = [each for each in self.group.amplifiers.values() if each.line.loss is None]
-            stopping = _identified(opened, stopping)
-        self._owe()
-        return self._stopped(asyncio.ensure_future(stopping), {**self._owed})
-
-    def _owe(self) -> None:
-        """Owe a stop to each amplifier whose line is closed."""
-        for name in self.urls:
-            amplifier = self.group.amplifiers.get(name)
-            if amplifier is None or amplifier.line.loss is not None:
-                self._owed.setdefault(name, asyncio.get_running_loop().create_future())
-
-    async def _stopped(
-        self,
-        stopping: Awaitable[Mapping[str, StopOutcome]],
-        owed: Mapping[str, asyncio.Future[Awaitable[Mapping[str, StopOutcome]]]],
-    ) -> Mapping[str, StopOutcome]:
-        if owed:
-            await asyncio.wait(owed.values(), timeout=CONFIRM_TIMEOUT)
-        outcomes = {**await stopping}
-        self._owe()  # what was lost meanwhile
-        for opened in owed.values():
-            if opened.done():
-                outcomes |= await opened.result()
-        return {name: outcomes.get(name, self.what_may_play(name)) for name in self.urls}
-
-    def what_may_play(self, name: str, cause: str = "") -> StopOutcome:
-        """Return what an amplifier may be playing; cause: why no more is known."""
-        opened = self._opened.get(name)
-        return UNREACHED if opened is None else opened.what_may_play(cause)
-
-    async def clear(self) -> None:
-        """Acknowledge stops, and faults whose cause is gone; nothing arms by itself."""
-        await self.group.clear()
-
-    async def close(self) -> None:
-        """Release the amplifiers, and end the cycle."""
-        self.cycle.is_closed = True
-        self.cycle.wake()
-        await self.release()
-
-    async def release(self) -> None:
-        """Ramp to zero in 50 ms, confirm it by reading back, disarm and close all lines."""
-        lines = self._lines  # those of now: others may be opened meanwhile
-        if lines is not None:
-            lines.is_closing = True
-        try:
-            await self.group.close(CLOSING_RAMP)
-        finally:
-            try:
-                if lines is not None:
-                    await lines.close()
-            finally:
-                if self._lines is lines:
-                    self._lines = None
-
-
-async def _identified(
-    amplifiers: Sequence[Amplifier], stopping: Awaitable[Mapping[str, StopOutcome]]
-) -> Mapping[str, StopOutcome]:
-    """Await a stop, and identify amplifiers meanwhile: an unknown one confirms nothing."""
-    for each in amplifiers:
-        each.capabilities = {}
-    requests = [each.identify(timeout=REPLY_TIMEOUT) for each in amplifiers]
-    identifying = asyncio.gather(*requests, return_exceptions=True)
-    try:
-        return await stopping
-    finally:
-        identifying.cancel()

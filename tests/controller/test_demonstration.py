@@ -24,7 +24,7 @@ from controller.demo.recorder import (
     steady_contrast_db,
 )
 from controller.play.intent import Prediction, not_served
-from controller.play.planner import Observers, PlayReport
+from controller.play.loop import Observers, PlayReport
 from controller.sources.touch import Change, Contact, ContactKey
 from daemons import ENABLED, ready_daemon, until, until_state
 from drivers.errors import LinkError

@@ -19,9 +19,9 @@ from controller.api.schema import LatencySummary, LearningState, PlateEvent
 from controller.learning import learning as module
 from controller.learning.learning import Learning, SettledReadings
 from controller.learning.worker import MAX_MEMORY, Worker, make
+from controller.operation.plate_controller import Controller
 from controller.plate_measurement import settling
-from controller.play.loop import Controller
-from controller.play.planner import Observers
+from controller.play.loop import Observers
 from controller.sources.touch import Contact, ContactKey
 from drivers.errors import CommandError, LinkError
 from model.answer.answer_report import Timing

@@ -26,8 +26,8 @@ import hand_written as hand
 from controller.daemon.messages import PlateView
 from controller.effects.layout import SurfaceLayout, default_effects
 from controller.effects.player import EffectPlayer
-from controller.play.loop import Controller
-from controller.play.planner import Observers, PlayReport
+from controller.operation.plate_controller import Controller
+from controller.play.loop import Observers, PlayReport
 from controller.sources.touch import Touch, TouchFrame
 from drivers.host.amplifier import Amplifier as AmplifierAmplifier
 from drivers.opening import Lines

@@ -20,7 +20,7 @@ def wait_long(patch: pytest.MonkeyPatch) -> None:
     """Let amplifiers be waited for, and wait, that long in this process."""
     # Tests that only start this program need not load the daemon.
     from controller.daemon.daemon import Daemon
-    from controller.play.loop import Controller
+    from controller.operation.plate_controller import Controller
     from drivers.host.amplifier import Amplifier
     from drivers.host.group import Group
     from drivers.host.line import Line

@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, Literal, TypeAlias, get_args
 
-from controller.play.loop import Controller
+from controller.operation.plate_controller import Controller
 from controller.sources.touch import TouchFrame
 from drivers.protocol.definition import MESSAGES, QUANTITIES, STATES
 from drivers.protocol.records import Values

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from controller.play import joint_answers, planner
+from controller.play import joint_answers, loop
 from controller.play.intent import NO_CONTACTS, HapticIntent, Target
 from controller.sources.touch import Contact, ContactKey
 from model.answer.answer import NO_LIMITS, Answer, Contents, Layer, Limits, Sensation, Stream, Tones
@@ -207,7 +207,7 @@ def _prepare(table: Any, drive_mode: str | None) -> None:
 
 
 joint_answers.answer = _answer
-planner.prepare_answers, planner.query = _prepare, _query
+loop.prepare_answers, loop.query = _prepare, _query
 
 
 class SetTiming:

@@ -29,7 +29,7 @@ from controller.operation.operation_states import DaemonEvent, DaemonState, Leas
 from controller.operation.supervisor import Supervisor
 from controller.play.intent import Content, Question, Selection, Target
 from controller.play.joint_answers import answered, selection_of
-from controller.play.planner import PlayReport
+from controller.play.loop import PlayReport
 from controller.play.routing import RAMPS_ONLY, PlaybackCapabilities
 from controller.sources.touch import Contact, ContactKey, Touch, TouchFrame
 from controller.sources.tuio import RecordedDatagram

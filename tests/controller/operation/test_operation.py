@@ -28,7 +28,7 @@ from controller.operation.operation_states import (
     fault_remedy,
     step,
 )
-from controller.play.loop import Controller
+from controller.operation.plate_controller import Controller
 from courses import Planted, Step, courses, follow
 from drivers.errors import CommandRefused, DriverError
 from drivers.host.dialogue import StopOutcome

@@ -12,7 +12,7 @@ from controller.daemon.messages import PlateView
 from controller.effects.kinds import Buzz, Click
 from controller.effects.layout import SurfaceLayout
 from controller.play.intent import HapticIntent, Pulse, Target
-from controller.play.planner import ENDED, PlayReport
+from controller.play.loop import ENDED, PlayReport
 from controller.play.selection import Chooser, Selector
 from controller.play.slots import Sets, Slot, Slots
 from controller.sources.touch import Contact, ContactKey

@@ -21,6 +21,7 @@ from controller.daemon.messages import PlateView
 from controller.effects.effect import Region
 from controller.effects.kinds import Buzz, Click
 from controller.effects.layout import SurfaceLayout, default_effects
+from controller.operation.plate_controller import Controller
 from controller.play.intent import (
     BEING_CHOSEN,
     CLICK,
@@ -31,8 +32,7 @@ from controller.play.intent import (
     Target,
     sums_db,
 )
-from controller.play.loop import Controller
-from controller.play.planner import Observers, PlayReport
+from controller.play.loop import Observers, PlayReport
 from controller.play.selection import BLOCKED, GIVEN_UP, Chooser, Selector
 from controller.play.slots import Slot
 from controller.sources.touch import Contact, ContactKey, Touch, TouchFrame

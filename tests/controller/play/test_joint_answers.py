@@ -31,7 +31,7 @@ from controller.play.joint_answers import (
     selection_of,
     with_ways,
 )
-from controller.play.planner import PlayReport
+from controller.play.loop import PlayReport
 from controller.play.slots import CROSSFADE
 from controller.sources.touch import AT_REST, Contact, ContactKey, Motion
 from drivers.errors import CommandRefused

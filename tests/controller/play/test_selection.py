@@ -21,7 +21,7 @@ from controller.effects.kinds import Click
 from controller.effects.layout import SurfaceLayout
 from controller.effects.player import EffectPlayer
 from controller.play.intent import HapticIntent, Pulse, Target
-from controller.play.planner import ENDED
+from controller.play.loop import ENDED
 from controller.play.routing import RAMPS_ONLY, PlaybackCapabilities
 from controller.play.selection import Chooser, Selector
 from controller.sources.touch import Change, Contact, ContactKey, ContactTracker, Touch, TouchFrame

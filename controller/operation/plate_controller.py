@@ -1,0 +1,271 @@
+"""The controller of a plate: opens, arms, stops and releases the amplifiers of its control loop."""
+
+import asyncio
+from collections.abc import Awaitable, Callable, Coroutine, Mapping, Sequence
+from typing import Any
+
+from controller.play.intent import IntentSource
+from controller.play.loop import Cycle, Planner
+from controller.play.routing import limits_of, playback_capabilities
+from drivers.errors import LinkError
+from drivers.host.amplifier import CONFIRM_TIMEOUT, WATCHDOG, Amplifier
+from drivers.host.dialogue import UNREACHED, StopOutcome
+from drivers.host.group import Group, GroupState
+from drivers.opening import Lines
+from drivers.protocol.definition import REPLY_TIMEOUT
+from model.answer.answer_report import Timing
+from model.drive_modes import DRIVE_MODES
+from model.errors import InputError
+from model.rig.rig import Rig
+from model.table.table import LocalizationTable
+
+CLOSING_RAMP = 0.050  # s; not urgent, so longer than a release
+
+
+class Controller:
+    """Drives the amplifiers of a rig by touch frames: open, arm, run its `cycle`, close.
+
+    It starts disarmed: contacts are followed but nothing is sent. The loop sends the heartbeat
+    itself after it has run, so that the watchdogs of the amplifiers trip when it hangs.
+
+    table: for this rig; lines: makes the lines to its amplifiers, anew for each opening;
+    intent_source: says what contacts shall feel; timing: shapes the patterns of the table; urls,
+    serial_numbers: by amplifier name; drive_mode: None for the best that the amplifiers can play;
+    connected: called with all amplifiers when their lines are open; watchdog [s]: of armed ones.
+    """
+
+    def __init__(
+        self,
+        rig: Rig,
+        table: LocalizationTable,
+        *,
+        lines: Callable[[Lines | None], Lines],
+        intent_source: IntentSource,
+        timing: Timing,
+        urls: Mapping[str, str] | None = None,
+        serial_numbers: Mapping[str, str] | None = None,
+        drive_mode: str | None = None,
+        connected: Callable[[Mapping[str, Amplifier]], None] = lambda amplifiers: None,
+        watchdog: float = WATCHDOG,
+    ) -> None:
+        self.cycle = Cycle(rig.plate, Group({}, watchdog=watchdog))
+        """The control loop."""
+        self._rig, self._intent_source, self._timing = rig, intent_source, timing
+        self.table = table
+        """The table that answers."""
+        self.urls = dict(rig.amplifiers if urls is None else urls)
+        if self.urls.keys() != rig.amplifiers.keys():
+            raise InputError(
+                f"amplifiers must be those of the rig ({', '.join(sorted(rig.amplifiers))}), got "
+                f"{', '.join(sorted(self.urls)) or 'none'}"
+            )
+        self._make_lines = lines
+        self._lines: Lines | None = None  # also after an attempt to open that has failed
+        self._before: Lines | None = None  # the last ones, also once they are closed
+        self._opened: dict[str, Amplifier] = {}  # last, identified or not
+        self._owed: dict[str, asyncio.Future[Awaitable[Mapping[str, StopOutcome]]]] = {}  # stops
+        self._serial_numbers = dict(serial_numbers or {})
+        self._connected = connected
+        self.watchdog = watchdog
+        """Watchdog of armed amplifiers [s]."""
+        self.amplifiers: dict[str, Amplifier] = {}
+        """Amplifiers by name, as identified last; empty before."""
+        self._drive_mode = drive_mode
+
+    @property
+    def group(self) -> Group:
+        """All amplifiers together."""
+        return self.cycle.group
+
+    @property
+    def is_released(self) -> bool:
+        """Whether all lines are closed."""
+        return self._lines is None
+
+    @property
+    def drive_mode(self) -> str:
+        """The drive mode of questions to the table; the best possible one until `open`."""
+        if self.cycle.planner is not None:
+            return self.cycle.planner.capabilities.drive_mode
+        return self._drive_mode or DRIVE_MODES[-1]
+
+    def replace_answers(self, table: LocalizationTable, timing: Timing) -> None:
+        """Answer touches by another table of this plate from now on, in one step.
+
+        What plays is kept until its contacts change or rest. The caller prepares the table: nothing
+        is computed here.
+        """
+        self.table, self._timing = table, timing
+        if self.cycle.planner is not None:
+            self.cycle.planner.replace_answers(table, timing)
+
+    async def open(self) -> None:
+        """Open every amplifier, or none, and prepare what they can play; all stay disarmed.
+
+        A stop reaches each as soon as its line is open, whatever becomes of the others.
+        An amplifier that was open before must have the serial number that it had, and keeps the
+        vibrations that its limits over time count. Raises LinkError, CommandError, and InputError
+        for a wired channel that its amplifier does not have or a drive mode that one cannot play.
+        After a LinkError the lines stay open for the next attempt, until `release`: a board may
+        restart whenever its port is opened.
+        """
+        cycle = self.cycle
+        cycle.is_closed = False
+        if self._lines is None or self._lines.is_closing:
+            self._lines = self._before = self._make_lines(self._before)
+        lines = self._lines
+        try:
+            async with cycle.sending:  # to those of before
+                cycle.group = Group(
+                    self._opened, watchdog=self.watchdog, restored=cycle.feed_at_once
+                )
+            opening = [self._amplifier(lines, name) for name in self.urls]
+            results = await asyncio.gather(*opening, return_exceptions=True)
+            by_name = zip(self.urls, results, strict=True)
+            lost = {name: each for name, each in by_name if isinstance(each, LinkError)}
+            for error in lost.values():
+                error.lost = tuple(lost)
+            opened = self.group.members.checked(results)
+            amplifiers = dict(zip(self.urls, opened, strict=True))
+            self._connected(amplifiers)
+            await self.group.open()
+            for name, amplifier in amplifiers.items():
+                self._serial_numbers[name] = amplifier.identity["serial_number"]
+                if name in self.amplifiers:
+                    amplifier.ledger.go_on_from(self.amplifiers[name].ledger)
+                self.amplifiers[name] = amplifier
+            planner = Planner(
+                self._rig,
+                self.table,
+                tracker=cycle.tracker,
+                capabilities=playback_capabilities(
+                    self._rig, amplifiers, drive_mode=self._drive_mode
+                ),
+                intent_source=self._intent_source,
+                timing=self._timing,
+                check=self.group.sets.refusal_of,
+                arrived=cycle.request_update,
+                too_late=cycle.count_too_late,
+                clock_errors=lambda: self.group.clock_errors,
+            )
+            await asyncio.to_thread(planner.prepare)  # seconds, of a large rig
+        except BaseException as error:
+            if not isinstance(error, LinkError):
+                await self.release()
+            raise
+        cycle.planner = planner
+
+    async def _amplifier(self, lines: Lines, name: str) -> Amplifier:
+        """Open the line of an amplifier, and send the stop that it is owed.
+
+        An amplifier whose line is open since another attempt is kept, with a stop in progress.
+        Raises LinkError, CommandError.
+        """
+        before = amplifier = self._opened.get(name)
+        if amplifier is None or amplifier.line.loss is not None:
+            amplifier = await lines.amplifier(
+                self.urls[name],
+                self._rig.limits,
+                name=name,
+                serial_number=self._serial_numbers.get(name),
+                is_output=name in self._rig.outputs,
+            )
+            if before is not None:
+                amplifier.go_on_from(before)
+        self._opened[name] = self.group.amplifiers[name] = amplifier
+        if name in self._owed:
+            stopping = _identified([amplifier], self.group.stop(waits_for=[name]))
+            self._owed.pop(name).set_result(asyncio.ensure_future(stopping))
+        return amplifier
+
+    async def arm(self) -> None:
+        """Switch the high voltage on, so that touches are felt; `cycle` runs or starts at once."""
+        was_armed = self.group.is_armed
+        await self.group.arm()
+        self.cycle.note_armed(limits_of(self._rig, self.amplifiers), was_armed=was_armed)
+
+    async def disarm(self) -> None:
+        """Ramp to silence, then switch the high voltage off."""
+        await self.group.disarm()
+
+    def stop(self) -> Coroutine[Any, Any, Mapping[str, StopOutcome]]:
+        """Quick-stop every amplifier on an open line; latched until `clear`; see `Group.stop`."""
+        return self.group.stop()
+
+    def stop_all(self) -> Coroutine[Any, Any, Mapping[str, StopOutcome]]:
+        """Quick-stop every amplifier, those whose lines are closed as soon as they are opened.
+
+        The requests on open lines are queued when this returns. Await it for what is known of each,
+        by name: of one whose line is opened within 0.3 s by its reply.
+        """
+        stopping = self.group.stop()
+        if self.group.state is GroupState.CLOSED:  # who replies on open lines is not known for sure
+            opened = [each for each in self.group.amplifiers.values() if each.line.loss is None]
+            stopping = _identified(opened, stopping)
+        self._owe()
+        return self._stopped(asyncio.ensure_future(stopping), {**self._owed})
+
+    def _owe(self) -> None:
+        """Owe a stop to each amplifier whose line is closed."""
+        for name in self.urls:
+            amplifier = self.group.amplifiers.get(name)
+            if amplifier is None or amplifier.line.loss is not None:
+                self._owed.setdefault(name, asyncio.get_running_loop().create_future())
+
+    async def _stopped(
+        self,
+        stopping: Awaitable[Mapping[str, StopOutcome]],
+        owed: Mapping[str, asyncio.Future[Awaitable[Mapping[str, StopOutcome]]]],
+    ) -> Mapping[str, StopOutcome]:
+        if owed:
+            await asyncio.wait(owed.values(), timeout=CONFIRM_TIMEOUT)
+        outcomes = {**await stopping}
+        self._owe()  # what was lost meanwhile
+        for opened in owed.values():
+            if opened.done():
+                outcomes |= await opened.result()
+        return {name: outcomes.get(name, self.what_may_play(name)) for name in self.urls}
+
+    def what_may_play(self, name: str, cause: str = "") -> StopOutcome:
+        """Return what an amplifier may be playing; cause: why no more is known."""
+        opened = self._opened.get(name)
+        return UNREACHED if opened is None else opened.what_may_play(cause)
+
+    async def clear(self) -> None:
+        """Acknowledge stops, and faults whose cause is gone; nothing arms by itself."""
+        await self.group.clear()
+
+    async def close(self) -> None:
+        """Release the amplifiers, and end the cycle."""
+        self.cycle.is_closed = True
+        self.cycle.wake()
+        await self.release()
+
+    async def release(self) -> None:
+        """Ramp to zero in 50 ms, confirm it by reading back, disarm and close all lines."""
+        lines = self._lines  # those of now: others may be opened meanwhile
+        if lines is not None:
+            lines.is_closing = True
+        try:
+            await self.group.close(CLOSING_RAMP)
+        finally:
+            try:
+                if lines is not None:
+                    await lines.close()
+            finally:
+                if self._lines is lines:
+                    self._lines = None
+
+
+async def _identified(
+    amplifiers: Sequence[Amplifier], stopping: Awaitable[Mapping[str, StopOutcome]]
+) -> Mapping[str, StopOutcome]:
+    """Await a stop, and identify amplifiers meanwhile: an unknown one confirms nothing."""
+    for each in amplifiers:
+        each.capabilities = {}
+    requests = [each.identify(timeout=REPLY_TIMEOUT) for each in amplifiers]
+    identifying = asyncio.gather(*requests, return_exceptions=True)
+    try:
+        return await stopping
+    finally:
+        identifying.cancel()

@@ -332,6 +332,8 @@ class Selection:
     not exceed them."""
     protected: frozenset[ContactKey] = frozenset()
     """Contacts that must not notice the contents of others."""
+    is_limited: bool = field(default=False, compare=False)
+    """Whether it has only the limits that pulses leave which play beside it."""
 
     @cached_property
     def contacts(self) -> dict[ContactKey, Contact]:
@@ -500,6 +502,11 @@ class Question:
         skipped = tuple(not_served(contact, reason) for contact, _ in targets)
         quiet = self.quiet_beside(targets)
         return Selection(targets, quiet, (), reason, skipped, protected=self.protected)
+
+    def unanswered(self, reason: str) -> tuple[Selection, ...]:
+        """Return selections in place of those not made: silence, unless what plays would do."""
+        each = () if self.is_rested else (self.lasting, *[(one,) for one in self.short])
+        return tuple([self.silent(targets, reason) for targets in each])
 
 
 def foreign_at(key: ContactKey, parts: Sequence[Selection]) -> list[float]:

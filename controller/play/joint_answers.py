@@ -415,7 +415,7 @@ def _in_phase(
     phase of the carrier before. fields (f, eras, fingers): of each ERA at full stroke; number: of
     the finger.
     """
-    fields = fields[:, :, number]
+    fields = fields[:, :, [number]]
     felt = _felt(layer.excitation, fields, table)
     felt_before = {} if before is None else _felt(before.layer.excitation, fields, table)
     (then,) = felt_before.values() if len(felt_before) == 1 else (1.0,)
@@ -431,11 +431,8 @@ def _felt(
     excitation: Excitation, fields: Complex64Array, table: LocalizationTable
 ) -> dict[float, complex]:
     """Return the complex acceleration at a finger, by frequency [Hz]."""
-    frequencies, bases = base_amplitudes(excitation, table.eras)
-    rows = table.rows_of(frequencies)
-    weights = bases / table.highest_drives[rows]
-    felt = (weights * fields[rows]).sum(axis=1)
-    return dict(zip(frequencies.tolist(), felt.tolist(), strict=True))
+    frequencies, felt = table.driven(excitation, fields)
+    return dict(zip(frequencies.tolist(), felt[:, 0].tolist(), strict=True))
 
 
 def with_ways(

@@ -171,7 +171,7 @@ class Planner:
         """Answer by another chooser once all rest, or at once; at once where nothing plays, too."""
         selector = self._selector
         selector.chooser = chooser
-        if at_once or not (self.slots.may_play or selector.is_choosing):
+        if at_once or not (self.slots.may_play or selector.pending):
             selector.choose_anew()
         self.look_again()
 
@@ -204,7 +204,7 @@ class Planner:
     @property
     def is_waiting(self) -> bool:
         """Whether a change of fingers is not answered yet, or contents are being chosen."""
-        return bool(self._tracker.changed) or self._selector.is_choosing
+        return bool(self._tracker.changed) or self._selector.pending is not None
 
     @property
     def is_silence_pending(self) -> bool:

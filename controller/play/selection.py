@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, replace
 from functools import partial
 from operator import itemgetter
-from typing import Self
+from typing import TypeAlias
 
 from controller.play.intent import (
     BEING_CHOSEN,
@@ -60,64 +60,37 @@ _logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
-class Choice:
-    """The selections made for a question."""
-
-    question: Question
-    lasting: Selection | None
-    short: Mapping[ContactKey, Selection]
-    """Selections of short pulses, by finger."""
-    is_limited: bool = False
-    """Whether what lasts has only the limits that pulses leave which play beside it."""
-    steps: tuple[Selection, ...] = ()
-    """Selections on the way to a better answer for what lasts, one after the other."""
-
-    @classmethod
-    def unanswered(cls, question: Question, reason: str) -> Self:
-        """Return a choice in place of one not made: nothing is felt, unless what plays would do."""
-        return cls(
-            question,
-            None if question.is_rested else question.silent(question.lasting, reason),
-            {each[0].key: question.silent((each,), reason) for each in question.short},
-        )
-
-
-@dataclass(frozen=True)
 class Chooser:
     """Chooses contents by a table; shape: adds envelopes to those of a joint answer."""
 
     table: LocalizationTable
     shape: Shape | None = None
 
-    def choose(self, question: Question, capabilities: PlaybackCapabilities) -> Choice:
-        """Choose for the targets of a question, those that last first.
+    def choose(
+        self, question: Question, capabilities: PlaybackCapabilities
+    ) -> tuple[Selection, ...]:
+        """Return the selection of what lasts, then one for each short pulse of a question.
 
-        Where all rest, choose the steps from what plays to what promises more; none on any failure.
+        Where all rest, return the selections on the way from what plays to what promises more, one
+        after the other; none on any failure.
         """
         if question.is_rested:
-            steps: tuple[Selection, ...] = ()
             try:
-                steps = Crossfades(self.table, question, capabilities, self.shape).steps()
+                return Crossfades(self.table, question, capabilities, self.shape).steps()
             except Exception as error:
                 _logger.error("loop: table failed, keeping what plays", exc_info=error)
-            return Choice(question, None, {}, steps=steps)
-        kept, lasting, is_limited = [*question.kept], None, False
-        if question.lasting:
-            lasting, is_limited = self._lasting(question, capabilities)
-            kept.append(lasting)
-        short: dict[ContactKey, Selection] = {}
+                return ()
+        found = [self._lasting(question, capabilities)] if question.lasting else []
+        kept = [*question.kept, *found]
         for each in question.short:
             beside = [*kept, question.fading]
             left = self._left_by(_contents(beside), capabilities)
-            found = self._chosen(question, (each,), left, beside)
-            kept.append(found)
-            short[each[0].key] = found.beside([question.fading], self.table)
-        return Choice(question, lasting, short, is_limited)
+            kept.append(self._chosen(question, (each,), left, beside))
+            found.append(kept[-1].beside([question.fading], self.table))
+        return tuple(found)
 
-    def _lasting(
-        self, question: Question, capabilities: PlaybackCapabilities
-    ) -> tuple[Selection, bool]:
-        """Choose what lasts, and whether it is limited by pulses that play.
+    def _lasting(self, question: Question, capabilities: PlaybackCapabilities) -> Selection:
+        """Choose what lasts; it is limited by pulses that play.
 
         Beside these what it replaces fades, too.
         """
@@ -125,7 +98,7 @@ class Chooser:
         free = self._chosen(question, targets, capabilities)
         pulses = _contents(question.kept) if question.kept else []
         if not pulses:
-            return free, False
+            return free
         fading = [
             one
             for (finger, _), one in question.before.items()
@@ -134,11 +107,11 @@ class Chooser:
         left = self._left_by([*pulses, *fading], capabilities)
         total = [each.layer for each in free.contents]
         if left.limits.factor_within(total, self.table) >= 1 - NEARLY:
-            return free, False
+            return free
         limited = self._chosen(question, targets, left)
         if not limited.contents:
             limited = question.silent(targets, _USED_UP)
-        return limited, True
+        return replace(limited, is_limited=True)
 
     def _left_by(
         self, contents: Sequence[Content], capabilities: PlaybackCapabilities
@@ -318,6 +291,10 @@ def _of_any_course(targets: Targets) -> set[Target]:
     }
 
 
+_Choosing: TypeAlias = "asyncio.Future[tuple[Selection, ...]]"
+"""The selections of a question, made in the thread."""
+
+
 class Selector:
     """Keeps a selection for the contacts on a plate, and chooses anew where it no longer serves.
 
@@ -346,13 +323,12 @@ class Selector:
     ) -> None:
         self.chooser, self._arrived, self._may_lead = chooser, arrived, may_lead
         self._threads = DaemonThreads()
-        self.pending: asyncio.Future[Choice] | None = None
-        """The choice that is made in the thread, or not taken yet: one at a time."""
-        self._late = set[asyncio.Future[Choice]]()  # given up, and still computed
+        self.pending: tuple[Question, _Choosing] | None = None
+        """What is chosen in the thread, or not taken yet: one question at a time."""
+        self._late = set[_Choosing]()  # given up, and still computed
         self._lasting = NOTHING  # as it was chosen, for fingers that have left it, too
         self._short: dict[ContactKey, Selection] = {}
         self._fingers: dict[ContactKey, float] = {}  # of what lasts, down since [s]
-        self._is_limited = False  # what lasts, by pulses that play
         self._situation: object = None
         self._requested: object = None  # the situation in which what lasts was requested last
         self._steps: Sequence[Selection] = ()  # to a better answer
@@ -360,11 +336,6 @@ class Selector:
         self._fading = NOTHING  # what plays until that has been taken
         self.due = math.inf
         """Time [s] to select anew though no contact changes: all rest, or pulses have ended."""
-
-    @property
-    def is_choosing(self) -> bool:
-        """Whether a choice is made in the thread, or not taken yet."""
-        return self.pending is not None
 
     def select(
         self,
@@ -398,13 +369,12 @@ class Selector:
         if situation != self._situation:
             self._situation = situation
             self._rest_again(now)
-        arrived = None
-        if self.pending is not None and self.pending.done():
-            pending, self.pending = self.pending, None
-            if not pending.cancelled():
-                arrived = pending.result()
-                is_late = self._requested is None or not self._is_intended(arrived, intended)
-                self._take(arrived, now, is_late=is_late)
+        has_arrived = self.pending is not None and self.pending[1].done()
+        if self.pending is not None and has_arrived:
+            (question, choosing), self.pending = self.pending, None
+            arrived = choosing.result()
+            is_late = self._requested is None or not self._is_intended(arrived, intended)
+            self._take(question, arrived, now, is_late=is_late)
         pulses, self._short = self._short, {}
         for contact, target in short:
             pulse = pulses.get(contact.key)
@@ -413,7 +383,7 @@ class Selector:
         if not contacts:
             self._lasting = NOTHING
         if self.pending is None:
-            for question in self._questions(intended, pulses, now, has_waited=arrived is not None):
+            for question in self._questions(intended, pulses, now, has_waited=has_arrived):
                 if question.lasting:
                     self._requested = situation
                 self._answer(question, capabilities, now)
@@ -433,28 +403,28 @@ class Selector:
         neither the next choice nor the end of the process, and what it returns is dropped.
         """
         if not question.takes_long:
-            self._take(self.chooser.choose(question, capabilities), now)
+            self._take(question, self.chooser.choose(question, capabilities), now)
         elif len(self._late) >= MAX_LATE:
-            self._take(Choice.unanswered(question, BLOCKED), now)
+            self._take(question, question.unanswered(BLOCKED), now)
         else:
             loop, choose = asyncio.get_running_loop(), self.chooser.choose
-            pending = loop.run_in_executor(self._threads, partial(choose, question, capabilities))
-            self.pending = pending
-            pending.add_done_callback(self._note)
-            loop.call_later(TIME_LIMIT, self._give_up, pending, question)
+            choosing = loop.run_in_executor(self._threads, partial(choose, question, capabilities))
+            self.pending = question, choosing
+            choosing.add_done_callback(self._note)
+            loop.call_later(TIME_LIMIT, self._give_up, question, choosing)
 
-    def _give_up(self, pending: "asyncio.Future[Choice]", question: Question) -> None:
-        if not pending.done():
+    def _give_up(self, question: Question, choosing: _Choosing) -> None:
+        if not choosing.done():
             _logger.warning("loop: answer given up, still computed after %g s", TIME_LIMIT)
-            self._late.add(pending)
-            self.pending = asyncio.get_running_loop().create_future()
-            self.pending.set_result(Choice.unanswered(question, GIVEN_UP))
+            self._late.add(choosing)
+            self.pending = question, asyncio.get_running_loop().create_future()
+            self.pending[1].set_result(question.unanswered(GIVEN_UP))
             self._arrived()
 
-    def _note(self, pending: "asyncio.Future[Choice]") -> None:
-        if pending in self._late:
-            self._late.remove(pending)
-            pending.exception()  # of no interest any more
+    def _note(self, choosing: _Choosing) -> None:
+        if choosing in self._late:
+            self._late.remove(choosing)
+            choosing.exception()  # of no interest any more
             if self._lasting.reason in _UNANSWERED:  # asked again
                 self._lasting = NOTHING
         self._arrived()
@@ -499,7 +469,7 @@ class Selector:
         if self.due < math.inf and self.due <= now:
             self.due = math.inf
             held_back = [each.contact.key in self._fingers for each in self._lasting.not_served]
-            if self._is_limited or (self._requested != self._situation and any(held_back)):
+            if self._lasting.is_limited or (self._requested != self._situation and any(held_back)):
                 is_kept = is_kept and not lasting  # by pulses that have ended, or limits of before
             # No cross-fade follows a course.
             is_rested = is_kept and intended.takes_long and not any(to.course for _, to in lasting)
@@ -533,20 +503,19 @@ class Selector:
         parts = self._short.values()
         return tuple([part for part in parts if any(now < each.end for each in part.pulses)])
 
-    def _is_intended(self, chosen: Choice, intended: Question) -> bool:
+    def _is_intended(self, chosen: Sequence[Selection], intended: Question) -> bool:
         """Whether a late choice of what lasts still serves the contacts on the plate.
 
         All must have been there when it was chosen, and not have lifted since. Places, levels and
         courses may have changed, or such a finger would get nothing; the layout may not. It is
         dropped if what plays will do again, since a finger that came has lifted meanwhile.
         """
-        found = chosen.lasting
-        if found is not None and found.reason in _UNANSWERED:
+        found = next(iter(chosen), NOTHING)
+        if found.reason in _UNANSWERED:
             return True  # in doubt nothing plays
         return (
-            found is not None
-            and (
-                self._is_limited
+            (
+                self._lasting.is_limited
                 or self._requested == self._situation
                 or not _is_met_by(intended, self._lasting)
             )
@@ -556,18 +525,30 @@ class Selector:
             and _of_any_course(intended.lasting) <= _of_any_course(found.targets)
         )
 
-    def _take(self, chosen: Choice, now: float, *, is_late: bool = False) -> None:
-        """Take a choice at a time [s]; is_late: without what lasts."""
-        self._short = {**self._short, **chosen.short}
-        if chosen.steps and self._requested == self._situation:
-            self._steps, self.due = chosen.steps, now
-        if chosen.lasting is not None and not is_late:
-            self._lasting, self._is_limited = chosen.lasting, chosen.is_limited
-            if self._lasting.reason in _UNANSWERED:
-                self.due = math.inf
-            if chosen.is_limited:
-                ends = [pulse.end for part in chosen.question.kept for pulse in part.pulses]
-                self.due = max(ends) + FADED_AFTER
+    def _take(
+        self,
+        question: Question,
+        chosen: Sequence[Selection],
+        now: float,
+        *,
+        is_late: bool = False,
+    ) -> None:
+        """Take what was chosen for a question at a time [s]; is_late: without what lasts."""
+        if question.is_rested:
+            if chosen and self._requested == self._situation:
+                self._steps, self.due = chosen, now
+            return
+        for each in chosen:
+            contact, target = each.targets[0]
+            if target.is_short:
+                self._short[contact.key] = each
+            elif not is_late:
+                self._lasting = each
+                if each.reason in _UNANSWERED:
+                    self.due = math.inf
+                if each.is_limited:
+                    ends = [pulse.end for part in question.kept for pulse in part.pulses]
+                    self.due = max(ends) + FADED_AFTER
 
 
 def _together(

@@ -247,7 +247,7 @@ def _felt(
     for one in short:
         key = one[0].key
         question = Question(contacts, (), (one,), protected or frozenset(), kept=tuple(beside))
-        chosen = simulator.chooser.choose(question, simulator.capabilities).short[key]
+        (chosen,) = simulator.chooser.choose(question, simulator.capabilities)
         (predicted,) = chosen.beside(beside, simulator.table).predictions
         found[key] = predicted.promised_contrast_db or 0.0, predicted.verdict
         worst = min(worst, found[key][0])

@@ -407,7 +407,7 @@ def promised_by_the_loop(contacts: Sequence[Contact], intent: HapticIntent) -> l
         arrived = asyncio.Event()
         selector = Selector(Chooser(paper_table()), arrived=arrived.set)
         selector.select(contacts, intent, playable())
-        if selector.is_choosing:
+        if selector.pending is not None:
             await arrived.wait()
         return selector.select(contacts, intent, playable()).predictions
 

@@ -34,7 +34,7 @@ import numpy as np
 from scipy.linalg import block_diag
 from scipy.optimize import approx_fprime, least_squares
 
-from era_haptics.lab.measuring.loopback import check_levels
+from era_haptics.lab.measuring.measure import check_levels
 from era_haptics.lab.measuring.sound_card import Multisine, SoundCard, play_on_one
 from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError

@@ -1,36 +1,42 @@
-"""Responses of a rig's plate: measured through a sound card by multisines, or simulated.
+"""A plate measured through a sound card, and what is wrong with a measurement.
 
-For identification one run is repeated at half the level and at the whole one. A simulated plate
-deviates from its rig's file.
+A measurement is some runs of a multisine, of which responses are estimated and checked. The
+loop-back shows delay, converters, lost blocks, and whether inputs have the clock of the outputs.
+Two devices, or an aggregate of two, drift by 10 to 100 millionths: runs are then no longer
+orthogonal, and nothing else shows it where the loop-back has the right clock.
+
+One sensor may be moved from place to place, by a person at a terminal. Every place is a measurement
+of its own. Its phases are relative to the loop-back, so that places measured minutes apart agree;
+the sensor's gain is one. What is measured is written after each place, so that the rest can be
+measured another time.
+
+For identification one run is repeated at half the level and at the whole one. A simulated plate, in
+place of a card, deviates from its rig's file.
 """
 
+import math
+import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, closing, contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from controller.plate_measurement import MeasuredPlate
-from era_haptics.lab.measuring.loopback import (
-    check_clocks,
-    check_coherence,
-    check_levels,
-    check_wiring,
-    is_as_late,
-    is_whole,
-    latency,
-    written,
-)
+from drivers.errors import LinkError
 from era_haptics.lab.measuring.sound_card import (
     PERIOD,
     TRIES,
     Desk,
+    DeviceLost,
     Multisine,
+    ResponseEstimate,
     Run,
     SoundCard,
+    WiredSensor,
     are_positions,
     converters,
     default_frequencies,
@@ -42,12 +48,217 @@ from era_haptics.lab.measuring.sound_card import (
 )
 from model.arrays import ComplexArray, FloatArray, best_first
 from model.commands.options import Stopwatch, progress_bar
-from model.estimate.measurement import Measurement, Repeat, write_responses
+from model.errors import InputError
+from model.estimate.measurement import (
+    Measurement,
+    Repeat,
+    measurement_of,
+    read_measured,
+    write_responses,
+)
 from model.processes import Progress, unseen
+from model.quantities import counted
 from model.reduction.free_plate import solve_free_plate
 from model.rig.rig import Rig
 from model.structure.attachments import PointLoad
 from sim.plant.imperfections import draw_imperfections
+
+SILENT = 1e-5
+"""Of full scale, rms: what an input without a signal stays below."""
+
+_MAX_DELAY = 0.1  # s; lines 10 Hz apart repeat then
+_NEARLY = 0.95
+_STRAIGHT = 0.5  # rad
+_AS_LATE = 0.02  # of the gain; one sample more at 500 Hz and 48 kHz makes 0.065
+_SAME = 1e-3  # of periods; a lost block makes them differ by 0.8
+
+
+def is_whole(periods: FloatArray, *, samples: int) -> bool:
+    """Whether all periods of the loop-back (n,) are alike: no block was lost between them.
+
+    Not so where it is silent, which tells nothing.
+    """
+    each = periods.reshape(-1, samples)
+    size = np.linalg.norm(each[0])
+    differ = np.linalg.norm(each - each[0], axis=1).max()
+    return bool(size > SILENT * np.sqrt(samples) and differ <= _SAME * size)
+
+
+def latency(response: ComplexArray, frequencies: FloatArray) -> float:
+    """Delay [s] of a response at frequencies [Hz], from 0 to 0.1 s, by the slope of its phase.
+
+    Lines d apart tell delays below 1 / d apart only.
+
+    Raises LinkError where the phase is no straight line, so that nothing is known of the delay.
+    """
+    unit = response / np.abs(response)
+    tried = np.arange(0, _MAX_DELAY, 0.1 / frequencies.max())
+    alike = np.abs(np.exp(2j * np.pi * np.outer(tried, frequencies)) @ unit)
+    # Lines at equal distances have several such delays: the shortest is meant.
+    near = np.flatnonzero(alike > _NEARLY * alike.max())
+    first_group = near[near - near[0] == np.arange(len(near))]
+    nearest = tried[first_group[alike[first_group].argmax()]]
+    rest = unit * np.exp(2j * np.pi * frequencies * nearest)
+    phase = np.angle(rest / rest.mean())
+    slope, first = np.polyfit(frequencies, phase, 1)
+    if np.abs(phase - slope * frequencies - first).max() > _STRAIGHT:
+        raise LinkError(
+            f"loop-back: its phase must be that of a delay up to {1e3 * _MAX_DELAY:g} ms; check "
+            "the cable, and that nothing else feeds this input"
+        )
+    return float(nearest - slope / (2 * np.pi))
+
+
+TOLERANCE = 2e-6
+"""Of a clock; 13 s of measuring turn 500 Hz by 5 degrees."""
+
+_MAX_DRIFT = 1e-3  # a lost block of 64 samples at 48 kHz looks like more
+_ALIKE = 0.999
+_SURE = 5.0  # standard errors
+
+
+def certain_drift(multisine: Multisine, runs: Sequence[FloatArray]) -> float:
+    """Drift of an input's clock relative to the outputs', from whole periods of each run, (n,).
+
+    Least squares of the phase 2 pi f t drift between the first and the last period, t apart,
+    weighted by the power of each line. 0 where that is within its error, or not all that makes
+    periods differ, as a lost block does.
+    """
+    n = multisine.samples
+    first = np.array([multisine.found(each[:n]) for each in runs])
+    last = np.array([multisine.found(each[-n:]) for each in runs])
+    apart = PERIOD * (len(runs[0]) / n - 1)
+    turned = last * first.conj()
+    weights = np.abs(turned)
+    slopes = np.broadcast_to(2 * np.pi * multisine.frequencies * apart, weights.shape)
+    phases = np.angle(turned)
+    moment = max(float((weights * slopes**2).sum()), 1e-300)
+    relative = float((weights * slopes * phases).sum()) / moment
+    rest = phases - slopes * relative
+    error = np.sqrt(float((weights**2 * slopes**2 * rest**2).sum())) / moment
+    alike = np.abs((turned * np.exp(-1j * slopes * relative)).sum()) / max(weights.sum(), 1e-300)
+    is_large = max(TOLERANCE, _SURE * error) < abs(relative) < _MAX_DRIFT
+    return relative if is_large and alike > _ALIKE else 0.0
+
+
+_FULL = 0.999  # of full scale
+_LOOPED = 0.05  # of a sample that a loop-back brings back at least
+CROSSTALK = 0.02  # of it, that other outputs may
+_COHERENT = 0.9  # in the median over frequencies
+_FAINT = 0.01  # of full scale: what converters themselves add is heard beside it
+_MOVED = 5.0  # times the noise, in the median over frequencies and the maximum over sensors
+
+
+def check_levels(recorded: FloatArray, named: Mapping[int, str]) -> None:
+    """Raise InputError for clipped inputs, LinkError for silent ones, of one run (n, inputs).
+
+    named: what the inputs have that are checked, by their number from 1.
+    """
+    clipped = [name for n, name in named.items() if np.abs(recorded[:, n - 1]).max() >= _FULL]
+    if clipped:
+        raise InputError(
+            f"inputs must stay below full scale, got clipping of {', '.join(clipped)}; turn down "
+            "the gain of the input, and its full_scale_v, or choose a lower --level"
+        )
+    silent = [n for n in named if np.sqrt((recorded[:, n - 1] ** 2).mean()) < SILENT]
+    if len(silent) == len(named) > 1:
+        raise LinkError(
+            "all inputs are silent: check that --device is the one that is wired, its outputs and "
+            "inputs not swapped, amplifier and sensor supply switched on"
+        )
+    if silent:
+        inputs = ", ".join(f"{named[n]} (input {n})" for n in silent)
+        raise LinkError(f"silent: {inputs}; check cables, amplifier and sensor supply (IEPE)")
+
+
+def check_wiring(found: ResponseEstimate, desk: Desk) -> None:
+    """Raise InputError unless the loop-back, and no sensor, has its output by a cable.
+
+    A cable brings back one output alone. Sensors of a single source do so, too, and may.
+    """
+    came = np.median(np.abs(found.values), axis=0)  # (inputs, sources)
+    own, at, output, named = desk.looped, desk.input, desk.output, desk.named_inputs
+    first, others = came.max(axis=1), np.sort(came, axis=1)[:, :-1].max(axis=1, initial=0.0)
+    may_tell = (len(desk.sources) > 1) | (np.arange(1, 1 + len(came)) == at)
+    is_cable = (first > _LOOPED) & (others < CROSSTALK * first) & may_tell
+    by_cable = np.where(is_cable, came.argmax(axis=1), -1)  # source at each input, -1 for none
+    looped, heard = came[at - 1, own], came[at - 1] * (np.arange(came.shape[1]) != own)
+    of_eras = [f"output {to} of ERA {name}" for name, to in desk.eras]
+    other = f"{heard.max():.2g} of {of_eras[heard.argmax()]}"
+    back = np.flatnonzero(by_cable == own) + 1
+    what = f"input {at} must bring back output {output} alone, as the loop-back, got"
+    if by_cable[at - 1] not in (own, -1):
+        raise InputError(f"{what} {other}: outputs are swapped; exchange their cables")
+    if back.size and at not in back:
+        raise InputError(
+            f"the loop-back of output {output} must come back at input {at}, got it at input "
+            f"{back[0]}, {named.get(back[0], 'of no sensor')}: inputs are swapped; exchange "
+            "their cables"
+        )
+    if looped <= _LOOPED:
+        raise InputError(f"{what} {looped:.2g} of it; connect them by a cable")
+    if at not in back:
+        raise InputError(f"{what} {other}, too; check mixers and monitoring of the sound card")
+    for n in (each.input for each in desk.sensors if by_cable[each.input - 1] >= 0):
+        raise InputError(
+            f"input {n} must have {named[n]}, got output {desk.sources[by_cable[n - 1]]} as by a "
+            "cable; check the plug of that sensor, Y cables and monitoring of the sound card"
+        )
+
+
+def check_clocks(multisine: Multisine, recorded: Sequence[FloatArray], desk: Desk) -> None:
+    """Raise InputError for inputs with another clock than the outputs'; runs (n, inputs) each."""
+    found = [
+        f"{1e6 * drift:.0f} millionths at {name} (input {n})"
+        for n, name in desk.named_inputs.items()
+        if (drift := certain_drift(multisine, [each[:, n - 1] for each in recorded]))
+    ]
+    if found:
+        raise InputError(
+            f"inputs must have the clock of the outputs, got a drift of {', '.join(found)}; use "
+            "one sound card, or clock all of them by one (word clock, ADAT)"
+        )
+
+
+def check_coherence(
+    found: ResponseEstimate,
+    recorded: Sequence[FloatArray],
+    desk: Desk,
+    *,
+    is_heard: bool = False,
+) -> None:
+    """Raise LinkError for sensors that hear something else, and for ERAs that move nothing.
+
+    found: of what was recorded, runs (n, inputs) each; is_heard: whether every ERA was heard at
+    another place.
+    """
+    coherence = np.median(found.coherence[:, desk.columns], axis=0)
+    peaks = np.max([np.abs(each[:, desk.columns]).max(axis=0) for each in recorded], axis=0)
+    for are_faint, remedy in (
+        (True, "too low a level: choose a higher --level, or turn up the gain of the input"),
+        (False, "fix these sensors to the plate, check their cables and mains hum"),
+    ):
+        incoherent = [
+            f"{sensor.name} ({each:.2f}, input up to {100 * peak:.2g} % of full scale)"
+            for sensor, each, peak in zip(desk.sensors, coherence, peaks, strict=True)
+            if each < _COHERENT and (peak < _FAINT) == are_faint
+        ]
+        if incoherent:
+            raise LinkError(
+                f"coherence must be at least {_COHERENT:g} in the median, got "
+                f"{', '.join(incoherent)}; {remedy}"
+            )
+    moved = np.abs(found.values[:, desk.columns]) / found.std[:, desk.columns, None]
+    for (name, at), each in zip(desk.eras, np.median(moved, axis=0).max(axis=0), strict=False):
+        if each < _MOVED:
+            raise LinkError(
+                f"output {at} is not heard here, but was at another place: this one is near a "
+                f"nodal line for ERA {name}; s skips it, or move it by a few cm, in its line of "
+                "--sensors too (q, then --resume); if the next place does not hear it either, "
+                "check its cable"
+                if is_heard
+                else f"output {at} moves nothing: check ERA {name}, its amplifier and its cable"
+            )
 
 
 def loopback_gain(
@@ -77,9 +288,11 @@ def play_run(
     def is_same(kept: FloatArray) -> bool:
         """By the cable: drivers report losses that were none, and miss others."""
         check_levels(kept, desk.named_inputs)
-        return is_whole(kept[:, desk.input - 1], samples=multisine.samples) and (
-            before is None or is_as_late(loopback_gain(desk, multisine, number, kept), before)
-        )
+        is_late = False
+        if before is not None:  # a block that was lost between two runs changes the delay
+            changed = np.abs(loopback_gain(desk, multisine, number, kept) - before).max()
+            is_late = bool(changed > _AS_LATE * np.abs(before).max())
+        return not is_late and is_whole(kept[:, desk.input - 1], samples=multisine.samples)
 
     seconds = run_time(periods, settling=desk.settling)
     signal = desk.on_outputs(multisine.signal(number, periods=seconds / PERIOD))
@@ -326,6 +539,249 @@ def _repeats(
     return tuple(
         Repeat(names, float(multisine.frequencies[n]), first[n], again[n]) for n in loudest
     )
+
+
+_MOVED_BY = 0.02  # of the response, or so many times its noise:
+_OF_NOISE = 3.0
+_APART = 5e-3  # m; nearer places may sound alike
+_AT = 5e-4  # m; places of a file are those of the sensors within that
+_NOISY = 0.03  # of the response
+
+
+@dataclass(eq=False)
+class PositionsFile:
+    """What is measured at places of a desk with a multisine, and the file that keeps it.
+
+    values (f, eras) [1/s²] by the name of a place.
+    """
+
+    path: Path
+    desk: Desk
+    multisine: Multisine
+    values: dict[str, ComplexArray] = field(default_factory=dict)
+
+    @property
+    def setting(self) -> str:
+        """What must be the same at all places, in words of the file."""
+        grams = 1e3 * self.desk.sensors[0].mass
+        rig = self.desk.rig.fingerprint[:8]
+        return f"level {self.multisine.level:g}, sensor {grams:.6g} g, rig {rig}"
+
+    @property
+    def missing(self) -> list[WiredSensor]:
+        """Places that are not measured, in the order of their file."""
+        return [place for place in self.desk.sensors if place.name not in self.values]
+
+    def read(self) -> None:
+        """Go on from the file; raises InputError where it is of another measurement."""
+        measured, played = read_measured(self.path), self.multisine.frequencies
+        settings = {each.setting for each in measured} - {self.setting}
+        if settings:
+            raise self._other("setting", self.setting, " and ".join(settings) or "none")
+        found = measurement_of(measured, self.desk.rig)
+        if found.skipped or not np.array_equal(found.frequencies.round(6), played.round(6)):
+            raise self._other("frequencies", _span(played), _span(found.frequencies))
+        for at, values in zip(found.points.tolist(), found.values.swapaxes(0, 1), strict=True):
+            self.values[self._place_at(at).name] = values
+
+    def keep(self, place: WiredSensor, found: MeasuredResponses) -> None:
+        """Write the file with another place; raises OSError."""
+        self.values[place.name] = found.responses.values[:, 0]
+        places = [place for place in self.desk.sensors if place.name in self.values]
+        measured = Measurement(
+            tuple(place.place for place in places),
+            self.multisine.frequencies,
+            np.stack([self.values[place.name] for place in places], axis=1),
+        )
+        write_responses(self.path, measured, self.desk.rig, setting=self.setting)
+
+    def _place_at(self, at: Sequence[float]) -> WiredSensor:
+        for place in self.desk.sensors:
+            if math.dist((place.x, place.y), at) <= _AT:
+                return place
+        raise self._other("places", "one at each line of --sensors", f"({at[0]:g}, {at[1]:g}) m")
+
+    def __str__(self) -> str:
+        """How far it is, in a line."""
+        count, total = len(self.values), len(self.desk.sensors)
+        text = f"{count} of {total} places are measured" + (f", in {self.path}" if count else "")
+        return f"{text}; go on with --resume" if 0 < count < total else text
+
+    def _other(self, what: str, expected: str, got: str) -> InputError:
+        return InputError(
+            f"--resume {self.path}: {what} must be {expected}, got {got} in the file; measure as "
+            "it was begun, or leave out --resume and write another file"
+        )
+
+
+def measure_by_moving(
+    desk: Desk,
+    opened: AbstractContextManager[tuple[SoundCard, Multisine]],
+    output: Path,
+    *,
+    periods: int,
+    is_resumed: bool,
+) -> tuple[list[str], dict[str, Any], bool]:
+    """Guide a person at a terminal through the places of a desk.
+
+    Return the report, and whether all places are measured. Raises InputError, LinkError,
+    KeyboardInterrupt, having said what is kept.
+    """
+    if output.exists() != is_resumed:
+        raise InputError(
+            f"{output}: a file must be there to go on from with --resume, got none; leave it out"
+            if is_resumed
+            else f"{output}: exists; go on with --resume, or choose another name"
+        )
+    with Stopwatch() as timed, opened as (card, multisine):
+        file = PositionsFile(output, desk, multisine)
+        if is_resumed:
+            file.read()
+            _tell(str(file))
+        try:
+            found = measure_positions(file, card, periods=periods)
+        except KeyboardInterrupt:
+            card.close()  # silent before anything is said
+            _tell(f"\nstopped; {file}")
+            raise
+        except DeviceLost as problem:
+            raise LinkError(f"{problem}; check its cable; {file}") from problem
+    missing = [place.name for place in file.missing]
+    answer = {
+        "frequencies_hz": multisine.frequencies.tolist(),
+        "places": {"measured": [*found], "missing": missing},
+        "sensors": {name: each.quality(0) for name, each in found.items()},
+        "measure_time_s": timed.elapsed,
+        "files": [str(output)] if file.values else [],
+    }
+    return [str(file)], answer, not missing
+
+
+def _prompt(text: str) -> str:
+    sys.stderr.write(text)
+    sys.stderr.flush()
+    return sys.stdin.readline() or "q"
+
+
+def _tell(text: str) -> None:
+    sys.stderr.write(f"{text}\n")
+
+
+def measure_positions(
+    file: PositionsFile,
+    card: SoundCard,
+    *,
+    periods: int,
+    prompt: Callable[[str], str] = _prompt,
+    tell: Callable[[str], None] = _tell,
+) -> dict[str, MeasuredResponses]:
+    """Guide a person through the missing places; returns what was measured now, by place.
+
+    prompt: shows what to do and returns what was typed, "q" at the end; tell: shows a line. A place
+    that fails a check is reported with its remedy, and asked for again. Raises DeviceLost, OSError;
+    what was measured before is in the file then.
+    """
+    found: dict[str, MeasuredResponses] = {}
+    todo = file.missing
+    last: WiredSensor | None = None
+    tell(
+        "Enter measures a place, r the one before again, s skips it, q stops; what is measured is "
+        "kept"
+    )
+    while todo:
+        place, places = todo[0], file.desk.sensors
+        reply = prompt(
+            f"Put the sensor at {place.name}, x {1e3 * place.x:g} mm, y {1e3 * place.y:g} mm "
+            f"(place {places.index(place) + 1} of {len(places)}), then Enter: "
+        )
+        match reply.strip().lower():
+            case "q":
+                break
+            case "s":
+                todo.pop(0)
+            case "r" if last is not None:
+                todo.insert(0, last)
+                last = None
+            case "":
+                try:
+                    measured = measure(
+                        replace(file.desk, sensors=(place,)),
+                        card,
+                        file.multisine,
+                        periods=periods,
+                        is_heard=bool(file.values),
+                    )
+                    _check_moved(file, place, measured)
+                except DeviceLost:
+                    raise
+                except (InputError, LinkError) as problem:
+                    tell(f"{place.name} is not kept: {problem}")
+                    continue
+                file.keep(place, measured)
+                found[place.name] = measured
+                last = todo.pop(0)
+                tell(_line(place, measured))
+            case _:
+                tell(f"a reply must be Enter, s, q, or r once, got {reply.strip()[:20]!r}")
+    return found
+
+
+def _check_moved(file: PositionsFile, place: WiredSensor, found: MeasuredResponses) -> None:
+    """Raise InputError for a response that is that of another place."""
+    own = found.responses.values[:, 0]
+    limit = max(_MOVED_BY, _OF_NOISE * float(np.median(found.std)))
+    for other in file.desk.sensors:
+        is_near = math.dist((place.x, place.y), (other.x, other.y)) < _APART
+        before = file.values.get(other.name)
+        if before is None or is_near or other.name == place.name:
+            continue
+        difference = float(np.linalg.norm(own - before) / np.linalg.norm(before))
+        if difference < limit:
+            raise InputError(
+                f"response must differ from that at {other.name} by more than {100 * limit:.1f} %, "
+                f"got {100 * difference:.1f} %: the sensor is still there; move it to {place.name}"
+            )
+
+
+def _line(place: WiredSensor, found: MeasuredResponses) -> str:
+    noise = float(np.median(found.std))
+    text = (
+        f"{place.name}: coherence {np.median(found.coherence):.4f}, noise {100 * noise:.2f} % of "
+        "the response; kept"
+    )
+    if noise > _NOISY:
+        text += "; it is noisy: raise --periods in another measurement"
+    return text
+
+
+def _span(frequencies: FloatArray) -> str:
+    return f"{len(frequencies)} from {frequencies[0]:g} to {frequencies[-1]:g} Hz"
+
+
+def written(
+    found: Measurement, desk: Desk, output: Path, *, source: str
+) -> tuple[list[str | None], dict[str, Any]]:
+    """Write responses that have a source; return the report. Raises InputError."""
+    write_responses(output, found, desk.rig)
+    absent = [each.name for each in desk.sensors if each.name not in found.names]
+    lines = found.frequencies
+    count = found.values.size - found.count
+    rows = [
+        f"{source}: {counted(len(found.sensors), 'sensor')}, "
+        f"{counted(len(lines), 'frequency', plural='frequencies')} from {lines[0]:g} to "
+        f"{lines[-1]:g} Hz, {counted(found.count, 'value')}",
+        f"{counted(count, 'value')} missing, or not settled and left out" if count else None,
+        f"without {', '.join(absent)}" if absent else None,
+        f"wrote {output}",
+    ]
+    return rows, {
+        "frequencies_hz": lines.tolist(),
+        "sensors": [*found.names],
+        "without": absent,
+        "values": found.count,
+        "values_missing": count,
+        "files": [str(output)],
+    }
 
 
 NOISE = 2e-3

@@ -136,7 +136,7 @@ def measure(
     rows: Sequence[str | None]
     is_whole = True
     if source is not None:
-        from era_haptics.lab.measuring.loopback import measured_from
+        from era_haptics.lab.measuring.stepped_sine import measured_from
 
         rows, answer = measured_from(source, desk, output)
     elif is_simulated:
@@ -144,7 +144,7 @@ def measure(
 
         rows, answer = measured_by_simulation(desk, output, frequencies=lines, seed=seed)
     else:
-        from era_haptics.lab.measuring.moved_sensor import measure_by_moving
+        from era_haptics.lab.measuring.measure import measure_by_moving
 
         opened = open_desk(desk, device or "", level=level, frequencies=lines, seed=seed)
         if is_moved:

@@ -9,7 +9,7 @@ import numpy as np
 from drivers.by_hand.actions import BlockingAmplifier
 from drivers.errors import DriverError
 from drivers.playing import AmplifierLayer, AmplifierTone
-from era_haptics.lab.measuring.loopback import check_levels, is_whole
+from era_haptics.lab.measuring.measure import check_levels, is_whole
 from era_haptics.lab.measuring.sound_card import (
     Desk,
     Run,

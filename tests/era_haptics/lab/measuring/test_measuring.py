@@ -18,8 +18,7 @@ from benchmarks.desk_plate.truth import Truth
 from controller.cli.main import run
 from drivers.errors import LinkError
 from era_haptics.lab.measuring import measure
-from era_haptics.lab.measuring.loopback import check_wiring, latency
-from era_haptics.lab.measuring.measure import MeasuredResponses
+from era_haptics.lab.measuring.measure import MeasuredResponses, check_wiring, latency
 from era_haptics.lab.measuring.measure import measure as measure_measure
 from era_haptics.lab.measuring.sound_card import (
     Desk,

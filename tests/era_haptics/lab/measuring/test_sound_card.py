@@ -28,8 +28,7 @@ from benchmarks.direct_plate import direct_responder
 from controller.cli.main import run
 from controller.plate_measurement import MeasuredPlate
 from drivers.errors import LinkError
-from era_haptics.lab.measuring.measure import measure_through
-from era_haptics.lab.measuring.moved_sensor import PositionsFile, measure_positions
+from era_haptics.lab.measuring.measure import PositionsFile, measure_positions, measure_through
 from era_haptics.lab.measuring.sound_card import (
     Desk,
     DeviceLost,

@@ -487,8 +487,9 @@ class Question:
         """Whether what lasts takes longer than the control loop may wait."""
         if self.lasting and not self.is_alone:
             return True
-        courses = [each.course for _, each in self.lasting if each.course is not None]
-        return any(each.duration > _SOON for each in courses)
+        return any(
+            each.course is not None and each.course.duration > _SOON for _, each in self.lasting
+        )
 
     def quiet_beside(self, targets: Targets) -> tuple[Contact, ...]:
         """Return the contacts that are not among some targets."""

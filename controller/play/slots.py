@@ -135,9 +135,8 @@ class Slot:
     confirmed_until: float = math.inf
     """When [s] its first target would have been lifted, as known when it was sent."""
     renewal_due: float = math.inf
-    """When [s] it is renewed, if all targets have been confirmed since it was sent."""
-    renewable_until: float = math.inf
-    """When [s] it is too late for that."""
+    """When [s] it is renewed, if all targets have been confirmed since it was sent, and a margin is
+    left until its end."""
     ends_at: float = math.inf
     """When [s] it has ended by itself unless it was renewed."""
     is_falling: bool = False
@@ -284,7 +283,7 @@ class Slots:
             return endings
         sets = dict[int, PlateLayer]()
         for number, one in self.contents.items():
-            is_due = one.renewal_due <= now < one.renewable_until
+            is_due = one.renewal_due <= now < one.ends_at - _MARGIN / 2
             if is_due and self._confirmed_until(one.content) > one.confirmed_until:
                 lasts = self._lasts(one.content, now)
                 layer = AmplifierLayer(number, ramp=one.layer.ramp, valid_for=lasts, renew=True)
@@ -344,7 +343,6 @@ class Slots:
                 one.ending_due = math.inf
             one.confirmed_until = self._confirmed_until(one.content)
             one.renewal_due = math.inf if lasts < _MIN_VALID_FOR else now + lasts / 2
-            one.renewable_until = now + lasts - _MARGIN / 2
             one.ends_at = since + lasts
 
     def forget(self) -> None:

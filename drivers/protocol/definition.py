@@ -368,7 +368,9 @@ _MESSAGES = (
 )
 MESSAGES: Mapping[str, Message] = {message.name: message for message in _MESSAGES}
 BY_NUMBER: Mapping[int, Message] = {message.number: message for message in _MESSAGES}
-NAMES: Mapping[int, str] = {HELLO: "Hello", **{each.number: each.name for each in _MESSAGES}}
+REQUESTS: Mapping[str, Message] = {"Hello": Message("Hello", HELLO, Record(), IDENTITY), **MESSAGES}
+"""Requests by name: Hello, which every version has, and those of this version."""
+NAMES: Mapping[int, str] = {each.number: name for name, each in REQUESTS.items()}
 """Names of requests by number."""
 
 

@@ -30,14 +30,12 @@ from drivers.protocol.definition import (
     BOOT_TIME,
     BROADCAST,
     BY_NUMBER,
-    HELLO,
-    IDENTITY,
     MAX_WORDS,
-    MESSAGES,
-    NAK,
+    REQUESTS,
     VERSION,
+    Message,
 )
-from drivers.protocol.records import Refusal, Values
+from drivers.protocol.records import Values
 from drivers.urls import ADDRESS, AmplifierUrl
 from drivers.wires.can_frames import (
     BITRATE,
@@ -64,7 +62,6 @@ from drivers.wires.can_frames import (
 )
 from drivers.wires.wire import (
     Arrival,
-    BrokenReply,
     DuplicateAddress,
     OtherHost,
     PortAbove,
@@ -72,7 +69,7 @@ from drivers.wires.wire import (
     Wire,
     WireAddress,
     read_event,
-    read_nak,
+    read_reply,
 )
 from registry import threads
 from registry.threads import in_thread
@@ -102,7 +99,7 @@ class CanWire(Wire):
         self._sequence = sequence
         self._numbers: dict[int, int] = {}  # last ones by node
         self._sent: deque[CanFrame] = deque(maxlen=_KEPT)
-        self._pending: tuple[int, int, int] | None = None  # node, number, type
+        self._pending: tuple[int, int, Message] | None = None  # node, number, request
         self._requested = BROADCAST  # node of the last request
         self._replies = Assembler(self.counters)
         self._events: dict[int, Assembler] = {}
@@ -113,18 +110,18 @@ class CanWire(Wire):
         Hello sets the node operational first, and reads its versions from an object, which one of
         another version has too.
         """
-        number, kind, words = 0, HELLO, list[int]()
+        number, message = 0, REQUESTS[name]
         if address != BROADCAST:
             number = self._numbers.get(address, self._sequence) % NUMBER_MAX + 1
             self._numbers[address] = number
-        if name != "Hello":
-            kind, words = MESSAGES[name].number, MESSAGES[name].request.append([], values)
-        frames = [CanFrame(REQUEST + address, data) for data in segments(number, kind, words)]
+        words = message.request.append([], values)
+        made = segments(number, message.number, words)
+        frames = [CanFrame(REQUEST + address, data) for data in made]
         self._sent.extend(frames)
         if name == "Hello":
             start = CanFrame(cob_id("nmt"), bytes((_START, address)))
             frames[:0] = start, CanFrame(cob_id("sdo_request", address), _READ_VERSIONS)
-        self._pending = (address, number, kind) if has_reply else None
+        self._pending = (address, number, message) if has_reply else None
         self._requested = address
         self._replies = Assembler(self.counters)
         self.counters.frames_out += len(frames)
@@ -190,21 +187,14 @@ class CanWire(Wire):
         message = self._replies.add(data, now)
         if message is None:
             return []
-        kind, self._pending = self._pending[2], None
-        try:
-            if message.type == NAK:
-                return [read_nak(message.words)]
-            if message.type != kind:
-                return [BrokenReply(f"type of the reply must be {kind}, got {message.type}")]
-            record = IDENTITY if kind == HELLO else BY_NUMBER[kind].reply
-            return [Reply(record.read(message.words)[0])]  # what follows is ignored
-        except Refusal as refusal:
-            return [BrokenReply(str(refusal))]
+        (_, _, request), self._pending = self._pending, None
+        return [read_reply(request, message.type, message.words)]
 
     def _other_version(self, node: int, data: bytes) -> list[Arrival]:
         """Take the versions for the reply to Hello, if it is of a node that will not reply."""
         versions = int.from_bytes(data[4:6], "little")
-        if self._pending is None or self._pending[::2] != (node, HELLO) or versions >> VERSION & 1:
+        hello = node, REQUESTS["Hello"]
+        if self._pending is None or self._pending[::2] != hello or versions >> VERSION & 1:
             return []
         self._pending = None
         return [Reply({"versions": versions})]

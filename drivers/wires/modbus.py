@@ -17,13 +17,12 @@ from typing import final
 
 from drivers.errors import LinkError, WireCounters
 from drivers.ports import NETWORK_DELAY, Port, open_port
-from drivers.protocol.definition import BOOT_TIME, BROADCAST, MESSAGES, REACTION
+from drivers.protocol.definition import BOOT_TIME, BROADCAST, REACTION, REQUESTS, Message
 from drivers.protocol.records import Refusal, Values
 from drivers.urls import ADDRESS, ADDRESS_MAX, RTU_BAUD, AmplifierUrl
 from drivers.wires.modbus_frames import (
     BOX,
     ECHO_SIZE,
-    EXCEPTIONS,
     HEAD,
     IDENTITY_COUNT,
     IDENTITY_REGISTER,
@@ -41,8 +40,8 @@ from drivers.wires.modbus_frames import (
     Read,
     Response,
     Write,
+    reply_in,
     response_to,
-    unpack_identity,
 )
 from drivers.wires.wire import (
     WIDEST,
@@ -50,13 +49,12 @@ from drivers.wires.wire import (
     BrokenReply,
     Continuation,
     DuplicateAddress,
-    Nak,
     PortAbove,
     Reply,
     Wire,
     WireAddress,
     WrittenPart,
-    read_nak,
+    read_reply,
     reply_words,
 )
 
@@ -132,10 +130,10 @@ _TCP_CHECKS = "that the server speaks Modbus TCP; of RTU the URL is modbus+rtu:/
 class _Request:
     """A request and its transaction on the wire."""
 
-    name: str
+    message: Message
     tag: int
     """0 for a request that only reads."""
-    message: Pdu
+    pdu: Pdu
     frame: bytes
     has_reply: bool = True
 
@@ -175,15 +173,15 @@ class ModbusWire(Wire):
             if self._is_rtu:
                 return self._written(BROADCAST, name, values).frame
             sent = [self._written(unit, name, values) for unit in self._sizes]
-            self._unawaited.update(each.message.transaction_id for each in sent)
+            self._unawaited.update(each.pdu.transaction_id for each in sent)
             if self._baud and sent:  # a gateway sends each write after the reply to the last one
                 echo = self._time(ECHO_SIZE) + self.silence + REACTION
                 self.takes += (len(sent) - 1) * (self.takes + echo)
             return b"".join(each.frame for each in sent)
         self._sizes.setdefault(address, WIDEST)
         if name == "Hello":
-            message = Read(dev_id=address, address=IDENTITY_REGISTER, count=IDENTITY_COUNT)
-            self._request = self._sent(name, 0, message)
+            pdu = Read(dev_id=address, address=IDENTITY_REGISTER, count=IDENTITY_COUNT)
+            self._request = self._sent(REQUESTS[name], 0, pdu)
         else:
             self._request = self._written(address, name, values)
             self._request.has_reply = has_reply
@@ -197,20 +195,20 @@ class ModbusWire(Wire):
             self._write, self._request = write, self._read_of(write)
             return write.frame + self._request.frame
         self._request = None
-        self._unawaited.add(write.message.transaction_id)
+        self._unawaited.add(write.pdu.transaction_id)
         return write.frame
 
     def _read_of(self, write: _Request) -> _Request:
         """Return the request that reads the reply to a written one."""
-        unit = write.message.dev_id
-        first = MESSAGES[write.name].number * BOX + REPLY_OFFSET
-        count = HEAD + reply_words(write.name, *self._sizes[unit])
-        return self._sent(write.name, write.tag, Read(dev_id=unit, address=first, count=count))
+        unit, message = write.pdu.dev_id, write.message
+        first = message.number * BOX + REPLY_OFFSET
+        count = HEAD + reply_words(message.name, *self._sizes[unit])
+        return self._sent(message, write.tag, Read(dev_id=unit, address=first, count=count))
 
     def received(self, data: bytes) -> list[Arrival]:
         """Return the arrivals that these bytes complete."""
         request = self._request or self._last
-        sent = None if request is None else request.message
+        sent = None if request is None else request.pdu
         arrivals: list[Arrival] = []
         for adu in self._reader.feed(data, sent):
             if not adu.pdu:
@@ -222,7 +220,7 @@ class ModbusWire(Wire):
                 self._unawaited.remove(adu.transaction)
                 continue
             write = self._write
-            if write is not None and (response := response_to(write.message, adu)) is not None:
+            if write is not None and (response := response_to(write.pdu, adu)) is not None:
                 self._write = None
                 if response.exception and (arrival := self._arrival(write, response)):
                     arrivals.append(arrival)
@@ -240,10 +238,10 @@ class ModbusWire(Wire):
                 self.counters.unexpected_frames += 1
                 if self._last is request and self._replied != response:
                     arrivals.append(DuplicateAddress(adu.unit))
-            elif request.message.function_code == WRITE and not response.exception:
+            elif request.pdu.function_code == WRITE and not response.exception:
                 if request.has_reply:
                     self._request = self._read_of(request)
-                    is_present = request.name in PRESENT
+                    is_present = request.message.name in PRESENT
                     arrivals.append(Continuation(self._request.frame, is_present=is_present))
                 else:
                     self._request, self._last, self._replied = None, request, response
@@ -274,29 +272,29 @@ class ModbusWire(Wire):
     def _time(self, characters: int) -> float:
         return _BITS * characters / self._baud if self._baud else 0.0
 
-    def _sent(self, name: str, tag: int, message: Pdu) -> _Request:
+    def _sent(self, message: Message, tag: int, pdu: Pdu) -> _Request:
         """Return a request with its frame, under the next transaction number."""
         self._number = self._number % 0xFFFF + 1
         self._unawaited.discard(self._number)
         self.counters.frames_out += 1
-        is_write = message.function_code == WRITE
+        is_write = pdu.function_code == WRITE
         if self._baud:
-            size = WRITE_SIZE + 2 * message.count if is_write else READ_SIZE
+            size = WRITE_SIZE + 2 * pdu.count if is_write else READ_SIZE
             self.takes = self._time(size) + self.silence
         if self._is_rtu:
-            size = ECHO_SIZE if is_write else RESPONSE_SIZE + 2 * message.count
+            size = ECHO_SIZE if is_write else RESPONSE_SIZE + 2 * pdu.count
             self.busy = self.takes + self._time(size) + self.silence
-            return _Request(name, tag, message, RTU.buildFrame(message))
-        message.transaction_id = self._number
-        return _Request(name, tag, message, TCP.buildFrame(message))
+            return _Request(message, tag, pdu, RTU.buildFrame(pdu))
+        pdu.transaction_id = self._number
+        return _Request(message, tag, pdu, TCP.buildFrame(pdu))
 
     def _written(self, unit: int, name: str, values: Values) -> _Request:
         """Return a request that begins with a write."""
-        message = MESSAGES[name]
+        message = REQUESTS[name]
         tag = self._number % 0xFFFF + 1
         registers = message.request.append([tag], values)
         write = Write(dev_id=unit, address=message.number * BOX, registers=registers)
-        return self._sent(name, tag, write)
+        return self._sent(message, tag, write)
 
     def _count_damaged(self, data: bytes) -> None:
         """Count bytes that are no frame; all that come between two frames count once."""
@@ -311,40 +309,33 @@ class ModbusWire(Wire):
 
     def _arrival(self, request: _Request, response: Response) -> Arrival | None:
         """Return what a response to the transaction on the wire means; None: it does not count."""
+        unit, is_hello = request.pdu.dev_id, request.message.name == "Hello"
         if response.exception in _GATEWAY:  # it counts as no response
             self.counters.remark = (
-                f"the gateway has no {_GATEWAY[response.exception]} unit {request.message.dev_id} "
+                f"the gateway has no {_GATEWAY[response.exception]} unit {unit} "
                 f"(exception {response.exception}): check the unit, its supply and its line"
             )
             return None
         if response.exception:
             self._request = None
-            if request.name == "Hello" and response.exception in _NO_SUCH_REGISTERS:
+            if is_hello and response.exception in _NO_SUCH_REGISTERS:
                 return BrokenReply(
-                    f"unit {request.message.dev_id} is no amplifier of this protocol: its identity "
-                    f"cannot be read (Modbus exception {response.exception}); check address and "
-                    "unit"
+                    f"unit {unit} is no amplifier of this protocol: its identity cannot be read "
+                    f"(Modbus exception {response.exception}); check address and unit"
                 )
-            if (refusal := EXCEPTIONS.get(response.exception)) is not None:
-                return Nak(refusal, None)
-            return BrokenReply(f"Modbus exception {response.exception}")
-        tag, result, *words = response.registers
-        if request.name != "Hello" and tag != request.tag:
+        elif not is_hello and response.registers[0] != request.tag:
             self.counters.unexpected_frames += 1
             self.counters.remark = "a reply to another master came: end that one"
             return None
-        self._request, self._last, self._replied = None, request, response
+        else:
+            self._request, self._last, self._replied = None, request, response
         try:
-            if request.name == "Hello":
-                return Reply(unpack_identity(response.registers))
-            if result:
-                return read_nak((0, *divmod(result, 256)))
-            values = MESSAGES[request.name].reply.unpack(words, is_strict=False)
+            arrival = read_reply(request.message, *reply_in(request.message.number, response))
         except Refusal as error:
             return BrokenReply(str(error))
-        if request.name == "GetCaps":
-            self._sizes[request.message.dev_id] = values["channels"], values["layers"]
-        return Reply(values)
+        if request.message.name == "GetCaps" and isinstance(arrival, Reply):
+            self._sizes[unit] = arrival.values["channels"], arrival.values["layers"]
+        return arrival
 
 
 _TCP_FORM = "modbus+tcp://HOST:PORT/UNIT (behind a gateway: ?baud=38400, that of its line)"

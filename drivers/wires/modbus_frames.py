@@ -24,8 +24,15 @@ from pymodbus.pdu.register_message import (
     WriteMultipleRegistersResponse,
 )
 
-from drivers.protocol.definition import MAX_WORDS, TEXTS
-from drivers.protocol.records import TEXT_MAX, Values
+from drivers.protocol.definition import (
+    HELLO,
+    IDENTITY,
+    MAX_WORDS,
+    NAK,
+    TEXTS,
+    nak_of,
+)
+from drivers.protocol.records import TEXT_MAX, Refusal, Values
 
 # It calls exceptions errors of the program; pymodbus_apply_logging_config still shows its log.
 logging.getLogger("pymodbus").setLevel(logging.CRITICAL + 1)
@@ -162,6 +169,22 @@ def response_to(request: Pdu | None, adu: Adu) -> Response | None:
     if pdu[:2] != bytes((function, 2 * count)) or len(pdu) != 2 + 2 * count:
         return None
     return Response(struct.unpack(f">{count}H", pdu[2:]))
+
+
+def reply_in(number: int, response: Response) -> tuple[int, Sequence[int]]:
+    """Return type and words of the message that replies to one by its number, as on other wires.
+
+    A result or an exception that is a refusal becomes a Nak. Raises Refusal for an identity that
+    cannot be read, and for an exception that stands for no refusal.
+    """
+    if response.exception:
+        if response.exception not in EXCEPTIONS:
+            raise Refusal(f"Modbus exception {response.exception}")
+        return NAK, nak_of(Refusal("", EXCEPTIONS[response.exception]), number)
+    if number == HELLO:
+        return HELLO, IDENTITY.pack(unpack_identity(response.registers))
+    _, result, *words = response.registers
+    return (NAK, (number, *divmod(result, 256))) if result else (number, words)
 
 
 class AduReader:

@@ -17,8 +17,8 @@ from typing import NamedTuple
 
 from cobs import cobs
 
-from drivers.protocol.definition import MAX_WORDS, TEXTS
-from drivers.protocol.records import Refusal, Values
+from drivers.protocol.definition import HELLO, IDENTITY, MAX_WORDS, TEXTS
+from drivers.protocol.records import Refusal
 
 REPLY_BIT = 0x80
 NEUTRAL = 0
@@ -125,22 +125,30 @@ def unpack_words(payload: bytes) -> tuple[int, ...]:
     return struct.unpack(f"<{len(payload) // 2}H", payload)
 
 
-def pack_identity(identity: Values) -> bytes:
-    """Return the payload of the reply; texts are cut at 32 bytes."""
+def words_of(frame: Frame) -> Sequence[int]:
+    """Return the words of a frame; Refusal for half a word.
+
+    A Hello has none. The reply to it has those of its record, as far as its texts go.
+    """
+    if frame.kind == HELLO:
+        return ()
+    if frame.kind != HELLO | REPLY_BIT:
+        return unpack_words(frame.payload)
+    words, rest = [int.from_bytes(frame.payload[:2], "little")], frame.payload[2:]
+    for _ in TEXTS:
+        if rest:
+            length, raw, rest = rest[0], rest[1:][: rest[0]], rest[1 + rest[0] :]
+            padded = raw + b"\0" * (len(raw) % 2)
+            words += [length, *struct.unpack(f">{len(padded) // 2}H", padded)]
+    return words
+
+
+def payload_of(kind: int, words: Sequence[int]) -> bytes:
+    """Return the payload of words; in a reply to Hello each text begins with a byte, its length."""
+    if kind != HELLO | REPLY_BIT:
+        return pack_words(words)
+    identity = IDENTITY.unpack(words, is_strict=True)
     texts = [field.encoded(identity) for field in TEXTS]
     return int(identity["versions"]).to_bytes(2, "little") + b"".join(
         bytes([len(text)]) + text for text in texts
     )
-
-
-def unpack_identity(payload: bytes) -> Values:
-    """Read the payload; what follows is ignored. Raises Refusal."""
-    identity: Values = {"versions": int.from_bytes(payload[:2], "little")}
-    at = 2
-    for field in TEXTS:
-        if at >= len(payload):
-            raise Refusal(f"{field.name} must not be missing", "BAD_LENGTH")
-        end = at + 1 + payload[at]
-        field.read(payload[at + 1 : end], payload[at], identity)
-        at = end
-    return identity

@@ -9,7 +9,7 @@ from collections.abc import Callable
 
 from drivers.errors import WireCounters
 from drivers.ports import NETWORK_DELAY, Port, open_port
-from drivers.protocol.definition import BOOT_TIME, BY_NUMBER, EVENT, HELLO, MESSAGES, NAK, VERSION
+from drivers.protocol.definition import BOOT_TIME, EVENT, HELLO, NAK, REQUESTS, VERSION, Message
 from drivers.protocol.records import Refusal, Values
 from drivers.urls import ADDRESS, ADDRESS_MAX, BAUD, AmplifierUrl
 from drivers.wires.serial_frames import (
@@ -19,18 +19,16 @@ from drivers.wires.serial_frames import (
     FrameReader,
     encode_frame,
     frame_length,
-    unpack_identity,
-    unpack_words,
+    words_of,
 )
 from drivers.wires.wire import (
     Arrival,
     BrokenReply,
     DuplicateAddress,
-    Reply,
     Wire,
     WireAddress,
     read_event,
-    read_nak,
+    read_reply,
 )
 
 _BITS = 10  # of a byte, with start and stop
@@ -47,20 +45,17 @@ class SerialWire(Wire):
         self.delay = delay if baud else NETWORK_DELAY
         self._byte_time = _BITS / baud if baud else 0.0
         self._sequence = sequence
-        self._pending: Frame | None = None
+        self._pending: tuple[Frame, Message] | None = None
         self._replied: Frame | None = None  # the last reply
         self._reader = FrameReader(on_invalid=self._count_invalid)
 
     def request(self, address: int, name: str, values: Values, *, has_reply: bool = True) -> bytes:
         """Return the frame of a request, which counts as sent; address 0: a broadcast."""
         self._sequence = (self._sequence + 1) & 0xFFFF
-        kind, version, words = HELLO, NEUTRAL, list[int]()
-        if name != "Hello":
-            message = MESSAGES[name]
-            kind, version, words = message.number, VERSION, message.request.append([], values)
-        frame = Frame(kind, address, self._sequence, b"", version)
-        data = encode_frame(frame, words)
-        self._pending = frame if has_reply else None
+        message, version = REQUESTS[name], NEUTRAL if name == "Hello" else VERSION
+        frame = Frame(message.number, address, self._sequence, b"", version)
+        data = encode_frame(frame, message.request.append([], values))
+        self._pending = (frame, message) if has_reply else None
         self.counters.frames_out += 1
         self.takes = self._byte_time * len(data)
         return data
@@ -70,28 +65,22 @@ class SerialWire(Wire):
         arrivals: list[Arrival] = []
         for frame in self._reader.feed(data):
             self.counters.frames_in += 1
-            pending, kind = self._pending, frame.kind ^ REPLY_BIT
+            sent, message = self._pending or (None, None)
             if (
-                pending is None
-                or kind & REPLY_BIT
-                or (frame.address, frame.sequence) != (pending.address, pending.sequence)
+                sent is None
+                or message is None
+                or not frame.is_reply
+                or (frame.address, frame.sequence) != (sent.address, sent.sequence)
             ):
                 arrivals += self._unexpected(frame)
                 continue
             self._pending, self._replied = None, frame
             try:
-                if kind == NAK:
-                    arrivals.append(read_nak(unpack_words(frame.payload)))
-                elif (kind, frame.version) != (pending.kind, pending.version):
+                if frame.type != NAK and frame.version != sent.version:
                     raise Refusal(
-                        f"type of the reply must be {pending.kind} in version {pending.version}, "
-                        f"got {kind} in {frame.version}"
+                        f"version of the reply must be {sent.version}, got {frame.version}"
                     )
-                elif kind == HELLO:
-                    arrivals.append(Reply(unpack_identity(frame.payload)))
-                else:  # what follows is ignored
-                    words = unpack_words(frame.payload)
-                    arrivals.append(Reply(BY_NUMBER[kind].reply.read(words)[0]))
+                arrivals.append(read_reply(message, frame.type, words_of(frame)))
             except Refusal as refusal:
                 arrivals.append(BrokenReply(str(refusal)))
         return arrivals
@@ -99,7 +88,7 @@ class SerialWire(Wire):
     def _unexpected(self, frame: Frame) -> list[Arrival]:
         """Read a frame that is no reply to the request on the wire."""
         if frame.kind == EVENT:
-            words = () if len(frame.payload) % 2 else unpack_words(frame.payload)
+            words = () if len(frame.payload) % 2 else words_of(frame)
             return read_event(frame.address, EVENT, words, self.counters)
         self.counters.unexpected_frames += 1
         self.counters.remark = (

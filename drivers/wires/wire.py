@@ -20,13 +20,14 @@ from drivers.ports import Port
 from drivers.protocol.definition import (
     EVENT,
     EVENT_RECORD,
-    IDENTITY,
     MAX_WORDS,
-    MESSAGES,
+    NAK,
     NAK_RECORD,
     NO_CHANNEL,
     QUANTITIES,
     REFUSALS,
+    REQUESTS,
+    Message,
 )
 from drivers.protocol.records import (
     TEXT_MAX,
@@ -135,10 +136,22 @@ def read_nak(words: Sequence[int], *, is_strict: bool = False) -> Nak:
     return Nak(_CODES.get(values["code"], f"code {values['code']}"), channel)
 
 
+def read_reply(request: Message, kind: int, words: Sequence[int]) -> Nak | Reply | BrokenReply:
+    """Read the message, by type and words, that replies to a request; what follows is ignored."""
+    try:
+        if kind == NAK:
+            return read_nak(words)
+        if kind != request.number:
+            raise Refusal(f"type of the reply must be {request.number}, got {kind}")
+        return Reply(request.reply.unpack(words, is_strict=False))
+    except Refusal as refusal:
+        return BrokenReply(str(refusal))
+
+
 @cache
 def request_words(name: str) -> int:
     """Return the largest number of words of a request."""
-    return 0 if name == "Hello" else _words(MESSAGES[name].request, {})
+    return _words(REQUESTS[name].request, {})
 
 
 @cache
@@ -149,7 +162,7 @@ def reply_words(name: str, channels: int = WIDEST[0], layers: int = WIDEST[1]) -
     rows = {"channels": channels, "layers": layers}
     if name in ("GetAchieved", "GetMeasured"):
         rows["count"] = channels
-    return _words(IDENTITY if name == "Hello" else MESSAGES[name].reply, rows)
+    return _words(REQUESTS[name].reply, rows)
 
 
 def _words(record: Record, rows: Mapping[str, int]) -> int:

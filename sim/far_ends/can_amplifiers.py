@@ -27,18 +27,13 @@ from drivers.protocol.definition import (
     EVENT,
     EVENT_RECORD,
     FAULTS,
-    HELLO,
-    IDENTITY,
     MESSAGES,
     NAK,
     QUANTITIES,
     TEXTS,
-    nak_of,
     name_of,
-    read_request,
 )
-from drivers.protocol.records import Refusal, Values
-from drivers.protocol.sets import is_earlier_part
+from drivers.protocol.records import Values
 from drivers.wires.can_frames import (
     BLOCK,
     CANOPEN,
@@ -58,7 +53,7 @@ from drivers.wires.can_frames import (
 from registry import threads
 from sim.amplifier.simulated_amplifier import SILENCING_RAMP
 from sim.bench.amplifier_device import AmplifierDevice
-from sim.transport.far_end import AmplifierPort, FarEnd, Send, TimedFarEnd
+from sim.transport.far_end import AmplifierPort, FarEnd, Send, TimedFarEnd, carry_out
 from sim.transport.simulated_line import TwoWayLine
 
 TOGGLE = 0x0503_0000
@@ -196,6 +191,7 @@ _LEADS_TO = {
 }
 """The state in which a node no longer takes requests, by the command that leads there."""
 _NMT_LENGTH = 2
+_SET_ADDRESS = MESSAGES["SetAddress"].number
 _POLL = 0.05  # s; between looks whether a heartbeat is wanted again
 
 
@@ -325,30 +321,17 @@ class _Node:
     def carry_out(self, message: CanMessage, now: float) -> None:
         """Carry out a message; one without a number has no reply, nor a part of a set."""
         sender = self.number
-        try:
-            kind, words = message.type, self._words(message, now)
-        except Refusal as refusal:
-            has_reply = message.number and not is_earlier_part(message.type, message.words)
-            kind, words = NAK, nak_of(refusal, message.type) if has_reply else []
-        if words:
+        kind, words = carry_out(
+            self._amplifier, message.type, message.words, now, address_max=NODE_MAX
+        )
+        if message.number and words:
             self._put(REPLY + sender, *segments(message.number, kind, words))
+        elif not message.number and kind != NAK:
+            self._amplifier.withdraw_status()
+        if kind == _SET_ADDRESS:
+            self.number = message.words[0]
         if self.number != sender:
             self.boot(now)
-
-    def _words(self, message: CanMessage, now: float) -> list[int]:
-        """Carry out a request; returns the words of its reply, if any. Raises Refusal."""
-        if message.type == HELLO:
-            return IDENTITY.pack(self._amplifier.identity)
-        name, values = read_request(message.type, message.words)
-        if name == "SetAddress" and values["address"] > NODE_MAX:
-            raise Refusal(f"address must be 1 to {NODE_MAX}, got {values['address']}")
-        reply = self._amplifier.handle(name, values, now)
-        if not message.number:
-            self._amplifier.withdraw_status()
-            reply = {}
-        if name == "SetAddress":
-            self.number = values["address"]
-        return BY_NUMBER[message.type].reply.pack(reply) if reply else []
 
     def _leave(self, state: int, now: float) -> None:
         """Stop what plays, then leave the state in which there are requests."""

@@ -8,9 +8,7 @@ result, words). Not modelled: parity and collisions on a serial line.
 import math
 from collections.abc import Mapping, Sequence
 
-from drivers.protocol.definition import BY_NUMBER, MAX_WORDS, Message, nak_of, read_request
-from drivers.protocol.records import Refusal
-from drivers.protocol.sets import is_earlier_part
+from drivers.protocol.definition import BY_NUMBER, MAX_WORDS, NAK, Message
 from drivers.wires.modbus_frames import (
     AREA,
     BOX,
@@ -28,7 +26,7 @@ from drivers.wires.modbus_frames import (
     pack_identity,
     parse_request,
 )
-from sim.transport.far_end import AmplifierPort, FarEnd, Send
+from sim.transport.far_end import AmplifierPort, FarEnd, Send, carry_out
 
 FRAME_TIMEOUT = 0.02
 """Longest pause [s] within an RTU frame: less than the 30 ms after which a host repeats it."""
@@ -147,17 +145,13 @@ class _Unit:
         self, message: Message, words: Sequence[int], now: float
     ) -> tuple[int, Sequence[int]]:
         """Return the result and the words of the reply to a message."""
-        try:
-            name, values = read_request(message.number, words)
-            reply = self.amplifier.handle(name, values, now)
-        except Refusal as refusal:
-            if is_earlier_part(message.number, words):
-                return 0, ()
-            _, code, channel = nak_of(refusal, message.number)
+        kind, reply = carry_out(self.amplifier, message.number, words, now)
+        if kind == NAK:
+            _, code, channel = reply or (0, 0, 0)
             return code << 8 | channel, ()
         if message.name == "SetAddress":
-            self.address = values["address"]
-        return 0, message.reply.pack(reply) if reply else ()
+            self.address = words[0]
+        return 0, reply
 
     def _read(self, address: int, count: int, now: float) -> Sequence[int]:
         """Return registers; none where some of them cannot be read."""

@@ -3,7 +3,7 @@
 On a shared line amplifiers have one address each, and send no events.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 
 from drivers.protocol.definition import (
@@ -12,10 +12,10 @@ from drivers.protocol.definition import (
     EVENT,
     EVENT_RECORD,
     HELLO,
+    MESSAGES,
     NAK,
     VERSION,
     nak_of,
-    read_request,
 )
 from drivers.protocol.records import Refusal, Values
 from drivers.protocol.sets import is_earlier_part
@@ -25,11 +25,14 @@ from drivers.wires.serial_frames import (
     Frame,
     FrameReader,
     encode_frame,
-    pack_identity,
     pack_words,
+    payload_of,
     unpack_words,
+    words_of,
 )
-from sim.transport.far_end import AmplifierPort, FarEnd, Send
+from sim.transport.far_end import AmplifierPort, FarEnd, Send, carry_out
+
+_SET_ADDRESS = MESSAGES["SetAddress"].number
 
 
 class SerialAmplifiers(FarEnd):
@@ -65,36 +68,35 @@ class SerialAmplifiers(FarEnd):
 
     def _answer(self, frame: Frame, amplifier: AmplifierPort, now: float) -> Frame | None:
         """Return the reply to a request, a Nak where it is refused; None where it has none."""
+        version = NEUTRAL if frame.type == HELLO else VERSION
         try:
-            if frame.type == HELLO:
-                payload = pack_identity(amplifier.identity)
-                return frame._replace(kind=HELLO | REPLY_BIT, payload=payload, version=NEUTRAL)
-            payload = self._payload(frame, amplifier, now)
+            kind, words = self._carry_out(frame, amplifier, now)
         except Refusal as refusal:
-            words = unpack_words(frame.payload[: len(frame.payload) & ~1])
-            if frame.version == VERSION and is_earlier_part(frame.type, words):
-                return None
-            payload = pack_words(nak_of(refusal, frame.type))
+            whole = unpack_words(frame.payload[: len(frame.payload) & ~1])
+            is_part = frame.version == VERSION and is_earlier_part(frame.type, whole)
+            kind, words = NAK, [] if is_part else nak_of(refusal, frame.type)
             version = NEUTRAL if refusal.code == "UNSUPPORTED_VERSION" else VERSION
-            return frame._replace(kind=NAK | REPLY_BIT, payload=payload, version=version)
-        return frame._replace(kind=frame.kind | REPLY_BIT, payload=payload) if payload else None
+        kind |= REPLY_BIT
+        reply = frame._replace(kind=kind, payload=payload_of(kind, words), version=version)
+        return reply if words else None
 
-    def _payload(self, frame: Frame, amplifier: AmplifierPort, now: float) -> bytes:
-        """Carry out a request by an amplifier; returns the payload of its reply, if it has one.
+    def _carry_out(
+        self, frame: Frame, amplifier: AmplifierPort, now: float
+    ) -> tuple[int, Sequence[int]]:
+        """Carry out a request by an amplifier; returns type and words of its reply, if it has one.
 
-        Raises Refusal.
+        Raises Refusal for a frame of another version, or with half a word.
         """
-        if frame.version != VERSION:
+        if frame.type != HELLO and frame.version != VERSION:
             raise Refusal(f"version must be {VERSION}, got {frame.version}", "UNSUPPORTED_VERSION")
-        words = unpack_words(frame.payload) if frame.type in BY_NUMBER else ()
-        name, values = read_request(frame.type, words)
-        reply = amplifier.handle(name, values, now)
-        if name == "SetAddress":
+        words = words_of(frame) if frame.type in BY_NUMBER else ()
+        kind, reply = carry_out(amplifier, frame.type, words, now)
+        if kind == _SET_ADDRESS:
             self._amplifiers = {
-                values["address"] if each is amplifier else address: each
+                words[0] if each is amplifier else address: each
                 for address, each in self._amplifiers.items()
             }
-        return pack_words(BY_NUMBER[frame.type].reply.pack(reply)) if reply else b""
+        return kind, reply
 
     def _broadcast(self, frame: Frame, now: float) -> None:
         message = BY_NUMBER.get(frame.type)
@@ -103,8 +105,9 @@ class SerialAmplifiers(FarEnd):
         for amplifier in self._amplifiers.values():
             if amplifier.is_answering:
                 with suppress(Refusal):
-                    self._payload(frame, amplifier, now)
-                    amplifier.withdraw_status()
+                    kind, _ = self._carry_out(frame, amplifier, now)
+                    if kind != NAK:
+                        amplifier.withdraw_status()
 
     def _send_event(self, event: Values, now: float) -> None:
         ((address, amplifier),) = self._amplifiers.items()

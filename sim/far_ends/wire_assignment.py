@@ -1,16 +1,17 @@
 """Assign a wire to each amplifier, and open the far end of each kind of wire.
 
 A far end is an asynchronous context in which devices reply on a real wire; it yields the URL of
-each amplifier by name. A new kind is a function here and its name in `_OPENERS`.
+each amplifier by name. A new kind is a row of `FAR_ENDS`.
 """
 
 from collections.abc import AsyncIterator, Callable, Iterator, Mapping, Sequence
 from contextlib import (
-    AbstractAsyncContextManager,
+    AbstractContextManager,
     AsyncExitStack,
     asynccontextmanager,
     closing,
     contextmanager,
+    nullcontext,
 )
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -26,20 +27,19 @@ from sim.far_ends.can_amplifiers import BUS_NAME, BusNodes, CanBus, SlcanAdapter
 from sim.far_ends.modbus_amplifiers import ModbusAmplifiers
 from sim.far_ends.serial_amplifiers import SerialAmplifiers
 from sim.faults import Faults
-from sim.transport.far_end import HOST, TcpEnd, TerminalEnd
+from sim.transport.far_end import HOST, FarEnd, MakeEnd, Send, TcpEnd, TerminalEnd
 from sim.transport.simulated_line import LINE_NAMES, PROMPT, delays_of
-
-_SERIAL_BITS, _MODBUS_BITS = 10, 11  # of a byte: start, eight data, parity on Modbus, stop
 
 Urls = AsyncIterator[Mapping[str, str]]
 Devices = Sequence[AmplifierDevice]
+Numbered = Mapping[int, AmplifierDevice]
 
 
 @dataclass(frozen=True)
 class SimulatedWire:
     """How simulated amplifiers are reached.
 
-    kind: a key of `_OPENERS`; speed [bit/s]: None for no transmission time, or that of the kind
+    kind: a key of `FAR_ENDS`; speed [bit/s]: None for no transmission time, or that of the kind
     where its line is not prompt; port: on the loopback interface, 0 for any; shared: all amplifiers
     on one serial line, at addresses 1, 2, ...; unpluggable: URLs stay valid when the wire is
     unplugged and plugged in again; line: tells apart wires that are otherwise equal; line_kind: one
@@ -72,7 +72,7 @@ async def open_wire(wire: SimulatedWire, devices: Devices) -> Urls:
     async with AsyncExitStack() as stack:
         urls: dict[str, str] = {}
         for line in [devices] if wire.is_one_line else [[device] for device in devices]:
-            urls |= await stack.enter_async_context(_OPENERS[wire.kind](wire, line))
+            urls |= await stack.enter_async_context(_open_line(wire, line))
         yield urls
 
 
@@ -87,7 +87,7 @@ async def open_wires(wires: Mapping[str, SimulatedWire], devices: Devices) -> Ur
         wire = wires[device.name]
         if len(devices) > 1 and wire.line_kind is None:
             port = Path(wire.line).name.rstrip("0123456789")
-            wire = replace(wire, line_kind=KIND_OF_PORT.get(port, _LINE_OF_WIRE[wire.kind]))
+            wire = replace(wire, line_kind=KIND_OF_PORT.get(port, FAR_ENDS[wire.kind].line_kind))
         lines.setdefault(wire, []).append(device)
     urls: dict[str, str] = {}
     async with AsyncExitStack() as stack:
@@ -96,119 +96,110 @@ async def open_wires(wires: Mapping[str, SimulatedWire], devices: Devices) -> Ur
         yield {device.name: urls[device.name] for device in devices}
 
 
-def _numbered(devices: Devices) -> dict[int, AmplifierDevice]:
-    return {device.address: device for device in devices}
-
-
-def _speed(wire: SimulatedWire, default: int) -> int | None:
-    """Bits per second of a line: as given, the default where it is not prompt, or None."""
-    return wire.speed or (None if wire.line_kind in (None, PROMPT) else default)
-
-
-@asynccontextmanager
-async def _serial(wire: SimulatedWire, devices: Devices) -> Urls:
-    numbered = _numbered(devices) if len(devices) > 1 else {ADDRESS: devices[0]}
-    speed = _speed(wire, BAUD)
-    async with TerminalEnd(
-        devices[0],
-        partial(SerialAmplifiers, numbered),
-        delays=delays_of(wire.line_kind, wire.seed, devices[0].name),
-        byte_time=_SERIAL_BITS / speed if speed else 0.0,
-        unpluggable=wire.unpluggable,
-    ) as end:
-        line = f"serial://{end.port}?baud={wire.speed or BAUD}"
-        yield {
-            device.name: line if address == ADDRESS else f"{line}&address={address}"
-            for address, device in numbered.items()
-        }
-
-
-@asynccontextmanager
-async def _modbus_rtu(wire: SimulatedWire, devices: Devices) -> Urls:
-    speed = _speed(wire, RTU_BAUD)
-    async with TerminalEnd(
-        devices[0],
-        partial(ModbusAmplifiers, _numbered(devices), is_rtu=True),
-        delays=delays_of(wire.line_kind, wire.seed, devices[0].name),
-        byte_time=_MODBUS_BITS / speed if speed else 0.0,
-        unpluggable=wire.unpluggable,
-    ) as end:
-        line = f"modbus+rtu://{end.port}?baud={wire.speed or RTU_BAUD}"
-        yield {device.name: f"{line}#{device.address}" for device in devices}
-
-
-@asynccontextmanager
-async def _modbus_tcp(wire: SimulatedWire, devices: Devices) -> Urls:
-    registers = ModbusAmplifiers(_numbered(devices), lambda data: None, is_rtu=False)
-    delays = delays_of(wire.line_kind, wire.seed, devices[0].name)
-    async with TcpEnd(devices[0], registers.of_connection, delays=delays, port=wire.port) as end:
-        line = f"modbus+tcp://{HOST}:{end.port}"
-        yield {device.name: f"{line}/{device.address}" for device in devices}
-
-
 @contextmanager
-def _bus_with(wire: SimulatedWire, devices: Devices) -> Iterator[CanBus]:
-    with closing(CanBus(_speed(wire, BITRATE))) as bus, closing(BusNodes(bus, devices)):
-        yield bus
+def _on_bus(
+    make_adapter: Callable[[CanBus, Send], FarEnd], speed: int | None, numbered: Numbered
+) -> Iterator[MakeEnd]:
+    with (
+        closing(CanBus(speed)) as bus,
+        closing(BusNodes(bus, [*numbered.values()])),
+    ):
+        yield partial(make_adapter, bus)
 
 
-@asynccontextmanager
-async def _slcan(wire: SimulatedWire, devices: Devices) -> Urls:
-    with _bus_with(wire, devices) as bus:
-        async with TerminalEnd(
-            devices[0],
-            partial(SlcanAdapter, bus),
-            faults=Faults(),
-            delays=delays_of(wire.line_kind, wire.seed, devices[0].name),
-            unpluggable=wire.unpluggable,
-        ) as end:
-            line = f"can+slcan://{end.port}?bitrate={wire.speed or BITRATE}"
-            yield {device.name: f"{line}#{device.address}" for device in devices}
+@dataclass(frozen=True)
+class FarEndKind:
+    """How the far end of a kind of wire is opened, and the form of its URLs.
+
+    url: with {host} where it is a TCP port; speed [bit/s]: usual one; line_kind: of its line where
+    there are several amplifiers; open_end: makes the far end of amplifiers by address, at a speed;
+    bits: of a byte on the line, with start, parity and stop, 0 where bytes take no time.
+    """
+
+    url: str
+    speed: int
+    line_kind: str
+    open_end: Callable[[int | None, Numbered], AbstractContextManager[MakeEnd]]
+    bits: int = 0
+
+    @property
+    def is_ported(self) -> bool:
+        """Whether it is a TCP port."""
+        return "{host}" in self.url
 
 
-@asynccontextmanager
-async def _socketcand(wire: SimulatedWire, devices: Devices) -> Urls:
-    with _bus_with(wire, devices) as bus:
-        async with TcpEnd(
-            devices[0],
-            partial(SocketcandClient, bus),
-            faults=Faults(),
-            delays=delays_of(wire.line_kind, wire.seed, devices[0].name),
-            port=wire.port,
-        ) as end:
-            line = f"can+socketcand://{HOST}:{end.port}/{BUS_NAME}"
-            speed = f"?bitrate={wire.speed}" if wire.speed not in (None, BITRATE) else ""
-            yield {device.name: f"{line}{speed}#{device.address}" for device in devices}
-
-
-_OPENERS: Mapping[
-    str, Callable[[SimulatedWire, Devices], AbstractAsyncContextManager[Mapping[str, str]]]
-] = {
-    "serial": _serial,
-    "modbus-tcp": _modbus_tcp,
-    "modbus-rtu": _modbus_rtu,
-    "socketcand": _socketcand,
-    "slcan": _slcan,
+FAR_ENDS: Mapping[str, FarEndKind] = {
+    "serial": FarEndKind(
+        "serial://{port}?baud={speed}&address={address}",
+        BAUD,
+        "usb-high-speed",
+        lambda speed, numbered: nullcontext(partial(SerialAmplifiers, numbered)),
+        bits=10,
+    ),
+    "modbus-tcp": FarEndKind(
+        "modbus+tcp://{host}:{port}/{address}",
+        RTU_BAUD,
+        "ethernet",
+        lambda speed, numbered: nullcontext(
+            ModbusAmplifiers(numbered, lambda data: None, is_rtu=False).of_connection
+        ),
+    ),
+    "modbus-rtu": FarEndKind(
+        "modbus+rtu://{port}?baud={speed}#{address}",
+        RTU_BAUD,
+        "usb-high-speed",
+        lambda speed, numbered: nullcontext(partial(ModbusAmplifiers, numbered, is_rtu=True)),
+        bits=11,
+    ),
+    "socketcand": FarEndKind(
+        f"can+socketcand://{{host}}:{{port}}/{BUS_NAME}?bitrate={{speed}}#{{address}}",
+        BITRATE,
+        "can",
+        partial(_on_bus, SocketcandClient),
+    ),
+    "slcan": FarEndKind(
+        "can+slcan://{port}?bitrate={speed}#{address}",
+        BITRATE,
+        "can-usb",
+        partial(_on_bus, SlcanAdapter),
+    ),
 }
-
-
-_PORTED = ("modbus-tcp", "socketcand")
-_KINDS = ("serial", "modbus-tcp:PORT", "modbus-rtu", "socketcand:PORT", "slcan")
-_KIND_OF_SCHEME = {
-    "serial": "serial",
-    "modbus+tcp": "modbus-tcp",
-    "modbus+rtu": "modbus-rtu",
-    "can+socketcand": "socketcand",
-    "can+slcan": "slcan",
-}
+"""By the names of `era sim --wire`."""
+_KIND_OF_SCHEME = {kind.url.partition("://")[0]: name for name, kind in FAR_ENDS.items()}
 _EXAMPLE = "; as in --wire main=serial"
-_LINE_OF_WIRE = {
-    "serial": "usb-high-speed",
-    "modbus-tcp": "ethernet",
-    "modbus-rtu": "usb-high-speed",
-    "socketcand": "can",
-    "slcan": "can-usb",
-}
+
+
+@asynccontextmanager
+async def _open_line(wire: SimulatedWire, devices: Devices) -> Urls:
+    kind, first = FAR_ENDS[wire.kind], devices[0]
+    numbered = {device.address: device for device in devices}
+    if wire.kind == "serial" and len(devices) == 1:
+        numbered = {ADDRESS: first}
+    # That of the kind where its line is not prompt, else none.
+    speed = wire.speed or (None if wire.line_kind in (None, PROMPT) else kind.speed)
+    delays = delays_of(wire.line_kind, wire.seed, first.name)
+    faults = Faults() if kind.url.startswith("can") else None  # those of frames are on the bus
+    with kind.open_end(speed, numbered) as make_end:
+        end: TcpEnd | TerminalEnd
+        if kind.is_ported:
+            end = TcpEnd(first, make_end, faults=faults, delays=delays, port=wire.port)
+        else:
+            end = TerminalEnd(
+                first,
+                make_end,
+                faults=faults,
+                delays=delays,
+                byte_time=kind.bits / speed if speed else 0.0,
+                unpluggable=wire.unpluggable,
+            )
+        async with end:
+            url = partial(kind.url.format, host=HOST, port=end.port, speed=wire.speed or kind.speed)
+            yield {
+                device.name: url(address=address)
+                .removesuffix(f"&address={ADDRESS}")
+                .replace(f"{BUS_NAME}?bitrate={BITRATE}#", f"{BUS_NAME}#")
+                for address, device in numbered.items()
+            }
 
 
 def assign_wires(
@@ -281,12 +272,13 @@ def links_of(wires: Mapping[str, SimulatedWire]) -> dict[str, Path]:
 
 def _wire_of_option(text: str, option: str, defaults: SimulatedWire) -> SimulatedWire:
     kind, colon, port = text.partition(":")
-    if kind in _KIND_OF_SCHEME.values() and bool(colon) <= (kind in _PORTED):
+    if kind in FAR_ENDS and bool(colon) <= FAR_ENDS[kind].is_ported:
         if not colon:
             return replace(defaults, kind=kind)
         if port.isascii() and port.isdigit() and int(port) <= 65535:
             return replace(defaults, kind=kind, port=int(port))
-    raise InputError(f"--wire {option}: wire must be one of {', '.join(_KINDS)}, got {text!r}")
+    known = ", ".join(f"{name}:PORT" if kind.is_ported else name for name, kind in FAR_ENDS.items())
+    raise InputError(f"--wire {option}: wire must be one of {known}, got {text!r}")
 
 
 def _wire_of_url(name: str, url: str, defaults: SimulatedWire) -> SimulatedWire:
@@ -298,7 +290,7 @@ def _wire_of_url(name: str, url: str, defaults: SimulatedWire) -> SimulatedWire:
         except CommandError as problem:
             raise InputError(f"amplifier {name}: {problem}") from problem
         place = getattr(address, "place", place)
-    is_ported = kind in _PORTED
+    is_ported = kind is not None and FAR_ENDS[kind].is_ported
     if kind is None or (is_ported and place.name not in url):
         schemes = ", ".join(_KIND_OF_SCHEME)
         raise InputError(

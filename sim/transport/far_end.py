@@ -18,6 +18,10 @@ from typing import Self, TypeAlias, cast
 from urllib.parse import urlsplit
 
 from drivers.errors import LinkError
+from drivers.protocol.definition import HELLO, NAK, REQUESTS, nak_of, read_request
+from drivers.protocol.records import Refusal
+from drivers.protocol.sets import is_earlier_part
+from drivers.urls import ADDRESS_MAX
 from model.errors import InputError
 from registry import files, threads
 from sim.amplifier.simulated_amplifier import SimulatedAmplifier
@@ -243,6 +247,32 @@ class FarEnd(ABC):
 
 AmplifierPort: TypeAlias = SimulatedAmplifier | AmplifierDevice
 """An amplifier as far ends serve it: alone, or on a bench with faults."""
+
+
+def carry_out(
+    amplifier: AmplifierPort,
+    kind: int,
+    words: Sequence[int],
+    now: float,
+    *,
+    address_max: int = ADDRESS_MAX,
+) -> tuple[int, Sequence[int]]:
+    """Carry out a request, by type and words, at a time [s]; returns type and words of its reply.
+
+    A refusal is a Nak; no words: it has no reply, as an earlier part of a set. address_max: of the
+    wire.
+    """
+    if kind == HELLO:
+        return HELLO, REQUESTS["Hello"].reply.pack(amplifier.identity)
+    try:
+        name, values = read_request(kind, words)
+        if name == "SetAddress" and values["address"] > address_max:
+            raise Refusal(f"address must be 1 to {address_max}, got {values['address']}")
+        reply = amplifier.handle(name, values, now)
+    except Refusal as refusal:
+        return NAK, () if is_earlier_part(kind, words) else nak_of(refusal, kind)
+    return kind, REQUESTS[name].reply.pack(reply) if reply else ()
+
 
 Send = Callable[[bytes], None]
 MakeEnd = Callable[[Send], FarEnd]

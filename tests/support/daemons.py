@@ -42,7 +42,8 @@ from drivers.host.amplifier import WATCHDOG as AMPLIFIER_WATCHDOG
 from drivers.host.amplifier import Amplifier as AmplifierAmplifier
 from drivers.opening import Lines
 from drivers.playing import AmplifierLayer, AmplifierTone
-from drivers.protocol.records import Refusal, Values
+from drivers.protocol.definition import READINGS
+from drivers.protocol.records import Number, Refusal, Values
 from drivers.protocol.sets import unpack_layers
 from model.arrays import FloatArray
 from model.rig.rig import Rig
@@ -76,6 +77,16 @@ class DaemonBench:
     async def client(self, name: str = "test") -> AsyncClient:
         """Connect a client."""
         return await AsyncClient.connect(self.socket, name=name, timeout=PATIENCE)
+
+
+def stated_readings(bench: DaemonBench) -> list[tuple[Number, float]]:
+    """The readings of the first amplifier with their values now, by the steps of the table."""
+    bench.far.summary()
+    stated = bench.far.amplifier.status(bench.far.bench.time)
+    return [
+        (each, (stated[each.name] - each.quantity.zero) / each.quantity.per_unit)
+        for each in READINGS
+    ]
 
 
 @cache

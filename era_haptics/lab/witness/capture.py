@@ -41,7 +41,7 @@ from drivers.protocol.definition import (
 from drivers.protocol.definition import HELLO as HELLO_NUMBER
 from drivers.protocol.records import Record, Refusal, Values
 from drivers.protocol.sets import is_last
-from drivers.wires.serial_frames import NEUTRAL, FrameReader, unpack_identity, unpack_words
+from drivers.wires.serial_frames import NEUTRAL, FrameReader, words_of
 from era_haptics.lab.expected_amplifier import FEEDING as FEEDING
 from registry.files import regular_file
 
@@ -389,24 +389,20 @@ def _decode(direction: Direction, piece: bytes) -> Message:
     if frame.is_reply != (direction == "host") and frame.type != EVENT:
         return damaged("a frame of the wrong direction")
     key = (frame.address, frame.sequence, frame.type) if frame.address else None
-    is_hello = frame.type == HELLO_NUMBER
-    version = NEUTRAL if is_hello else VERSION
+    version = NEUTRAL if frame.type == HELLO_NUMBER else VERSION
     is_other = frame.version != version
     try:
-        words = () if is_hello else unpack_words(frame.payload)
-        if direction == "amplifier":
-            request = request_of(frame.type, words, frame.address, key)
-            # One of another version has its reply, too: the identity, or a refusal.
-            wrong = f"version must be {version}, got {frame.version}" if is_other else ""
-            return replace(request, problem=wrong or request.problem)
-        if is_hello:
-            message: Message = WitnessedReply(frame.address, key, unpack_identity(frame.payload))
-        else:
-            message = sent_by_amplifier(frame.type, words, frame.address, frame.sequence)
+        words = words_of(frame)
     except Refusal as refusal:
         if direction == "amplifier":
             return WitnessedRequest(f"type {frame.type}", frame.address, key, problem=str(refusal))
         return WitnessedReply(frame.address, key, problem=str(refusal))
+    if direction == "amplifier":
+        request = request_of(frame.type, words, frame.address, key)
+        # One of another version has its reply, too: the identity, or a refusal.
+        wrong = f"version must be {version}, got {frame.version}" if is_other else ""
+        return replace(request, problem=wrong or request.problem)
+    message = sent_by_amplifier(frame.type, words, frame.address, frame.sequence)
     if is_other and getattr(message, "refusal", 0) != REFUSALS["UNSUPPORTED_VERSION"]:
         return damaged(f"protocol version {frame.version}")
     return message

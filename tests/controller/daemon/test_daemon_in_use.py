@@ -68,6 +68,7 @@ from daemons import (
     ready_daemon,
     running_daemon,
     silent_from,
+    stated_readings,
     until,
     until_state,
     write_daemon,
@@ -657,10 +658,15 @@ def test_help_of_watch_names_every_topic() -> None:
 
 @in_virtual_time
 async def test_readings_are_shown_with_their_unit_to_their_step(tmp_path: Path) -> None:
-    """A temperature in steps of 0.1 °C, by `era status` and by a page."""
-    async with ready_daemon(tmp_path) as (_, era):
-        assert (await era.hello("test")).readings["temperature_c"] == ("Temperature", "°C", 1)
-        assert "temperature 25.0 °C" in show_status(await era.status())
+    """Each as stated; a temperature in steps of 0.1 °C, by `era status` and by a page."""
+    async with ready_daemon(tmp_path) as (bench, era):
+        pages, status = (await era.hello("test")).readings, await era.status()
+        assert pages["temperature_c"] == ("Temperature", "°C", 1)
+        assert "temperature 25.0 °C" in show_status(status)
+        for each, value in stated_readings(bench):
+            assert getattr(status.amplifiers[0], each.key) == pytest.approx(value)
+            shown = each.key in pages, f" {each.label} " in show_status(status)
+            assert shown == ("page" in each.views, "status" in each.views)
 
 
 def test_gateway_keeps_its_token_out_of_a_log(tmp_path: Path) -> None:

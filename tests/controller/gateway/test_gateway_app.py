@@ -31,7 +31,7 @@ from controller.gateway.app import serve
 from controller.gateway.field import DrawnField, FieldSolver
 from controller.gateway.gateway_settings import GatewaySettings
 from controller.gateway.metrics import exposition
-from daemons import PATIENCE, ready_daemon, until
+from daemons import PATIENCE, ready_daemon, stated_readings, until
 from gateway_bench import (
     TOKEN,
     UNCONFIRMED,
@@ -58,9 +58,11 @@ def scraped(status: StatusResult | None) -> dict[tuple[str, str], float]:
 
 async def test_metrics_follow_status(tmp_path: Path) -> None:
     """State, link counters and latency of a daemon, in base units."""
-    async with ready_daemon(tmp_path) as (_, era):
+    async with ready_daemon(tmp_path) as (bench, era):
         status = await era.status()
         read = scraped(status)
+        for each, value in stated_readings(bench):
+            assert read[f"era_amplifier_{each.metric}", "main"] == pytest.approx(value)
     assert read["era_up", ""] == 1
     assert read["era_state", "READY_TO_SWITCH_ON"] == 1
     assert read["era_state", "FAULT"] == 0

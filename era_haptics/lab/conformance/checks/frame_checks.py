@@ -30,8 +30,7 @@ from drivers.protocol.definition import (
     REFUSALS,
     VERSION,
 )
-from drivers.protocol.records import Values
-from drivers.wires import serial_frames
+from drivers.protocol.records import Refusal, Values
 from drivers.wires.can_frames import (
     CANOPEN,
     NODE_MAX,
@@ -73,7 +72,7 @@ from drivers.wires.serial_frames import (
     FrameReader,
     encode_frame,
     pack_words,
-    unpack_words,
+    words_of,
 )
 from era_haptics.lab.conformance.check import driving, reading
 from era_haptics.lab.conformance.judge_client import (
@@ -597,11 +596,11 @@ class SerialClient(JudgeClient):
     def hear(self, data: bytes) -> bytes:
         """Take messages from bytes."""
         for frame in self._reader.feed(data):
-            is_text = frame.kind == HELLO | REPLY_BIT
-            if len(frame.payload) % 2 and not is_text:
+            try:
+                words = (*words_of(frame),)
+            except Refusal:
                 self.invalid.append(frame.payload)
                 continue
-            words = () if is_text else unpack_words(frame.payload)
             heard = HeardMessage(threads.now(), frame.sequence, frame.kind, words, frame)
             self.take(heard, is_event=frame.kind == EVENT)
             self._others |= {frame.address} - {self.address}
@@ -623,10 +622,10 @@ class SerialClient(JudgeClient):
 
     async def hello(self, payload: bytes = b"", version: int = NEUTRAL) -> Values:
         """Read the identity, by a Hello of any length and version."""
-        frame = (await self._replied(HELLO, payload, version)).frame
-        seen = frame.kind, frame.version
+        heard = await self._replied(HELLO, payload, version)
+        seen = heard.type, heard.frame.version
         expect_equal(seen, (HELLO | REPLY_BIT, NEUTRAL), "type, version of the reply to Hello")
-        return read_as("identity", serial_frames.unpack_identity, frame.payload)
+        return read_as("identity", IDENTITY.unpack, heard.words, is_strict=False)
 
     async def exchange(
         self, number: int, words: Sequence[int], *, behind: bytes = b"", version: int = VERSION

@@ -22,7 +22,6 @@ from firmware_machine import play
 from interrupted import full_disk
 from model.errors import InputError
 from model.rig.rig import Rig
-from recordings import read_recording
 from registry import threads
 from sim import firmware
 from sim.bench.bench import Bench
@@ -30,6 +29,7 @@ from sim.plant.fingers import Accelerometer, readings
 from sim.sensors import Recorder, Recording, write_recording
 from sim.transport.far_end import linked_urls, links_by_amplifier
 from sim.transport.simulated_line import LINE_KINDS, Latency, LineKind
+from sound_cards import read_recording
 
 RATE = 5000.0
 

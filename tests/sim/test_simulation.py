@@ -44,13 +44,13 @@ from model.structure.attachments import PointLoad
 from plate_witness import witness_config
 from plates import write_rig
 from real_wires import WIRES, far_side
-from recordings import read_recording
 from registry.limits import GuardLimits
 from sim.bench.bench import Bench
 from sim.control import LINE_MAX, SimulationContext, carry_out, control_socket
 from sim.far_ends.wire_assignment import SimulatedWire
 from sim.plant.imperfections import Imperfections, PlateErrors
 from sim.process.simulation import SimulationView, draw
+from sound_cards import read_recording
 from virtual_lines import in_virtual_time
 
 ROOT = example_rig_path().parent.parent

@@ -22,7 +22,6 @@ from controller.effects.kinds import Buzz, Click, File, Texture
 from controller.effects.layout import SurfaceLayout
 from controller.effects.player import EffectPlayer
 from controller.sources.touch import Contact, ContactKey
-from exciters import Magnets, Outputs
 from long_form import shortly
 from model.answer.answer_report import Timing
 from model.answer.stimulus import STRONGEST
@@ -35,6 +34,7 @@ from model.table.table_file import build_table
 from several_fingers import ABOVE, LEFT, RIGHT, Fingers, fingers_on
 from several_fingers import table as paper_table
 from sim.far_ends.wire_assignment import SimulatedWire
+from sound_cards import Magnets, Outputs
 from virtual_lines import in_virtual_time, run_virtual
 
 SWELL = Pattern(1.5, ((0.0, 0.3), (0.7, 1.0), (1.5, 0.2)), ((0.0, 0.4),))

@@ -41,7 +41,6 @@ from drivers.playing import AmplifierTone as Played
 from drivers.protocol.definition import CLOCK_UNKNOWN
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Command, Envelope, LayerSet
-from exciters import STEP, Magnets
 from model.answer.answer import Answer, Limits
 from model.answer.answer_report import Timing
 from model.answer.plan import answer
@@ -67,6 +66,7 @@ from several_fingers import LAYOUT, LEFT, RIGHT, Fingers
 from sim.amplifier.readings import Crystal, capabilities
 from sim.far_ends.wire_assignment import SimulatedWire as WireAssignmentWire
 from sim.plant.imperfections import draw_imperfections
+from sound_cards import STEP, Magnets
 from virtual_lines import in_virtual_time
 
 RIG = smooth_rig()

@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 from scipy.signal import StateSpace, lsim
 
-from exciters import STEP, Magnets
 from long_form import shortly
 from model.answer.stimulus import Course, swings_of_pulse
 from model.reduction.free_plate import solve_free_plate
@@ -62,6 +61,7 @@ from model.transients.time_response import (
 )
 from model.vibration import Tone
 from plates import exciter_rig, make_paper_rig
+from sound_cards import STEP, Magnets
 
 
 def test_magnets_on_a_board_as_light_as_they_are() -> None:

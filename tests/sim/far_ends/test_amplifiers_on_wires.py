@@ -1,29 +1,67 @@
-"""Simulated amplifiers on real wires: which wire each gets, and what they do there."""
+"""Simulated amplifiers on wires: which wire each gets, what they do there, and faults of links.
+
+Links fail over every wire, with the required reaction times by the amplifier's clock, in virtual
+time. A rig is also simulated in the host's own process: fingers, faults and their files.
+"""
 
 import asyncio
+import contextlib
+import gc
+import json
+import math
+import threading
+from collections.abc import AsyncIterator, Awaitable, Callable
+from contextlib import asynccontextmanager, nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from drivers.errors import CommandRefused, LinkError
-from drivers.protocol.definition import FAULTS, MESSAGES, STATES, STATUS, VERSION
+from drivers.errors import CommandError, CommandRefused, DriverError, LinkDegraded, LinkError
+from drivers.host.amplifier import Amplifier
+from drivers.host.amplifier import Amplifier as Host
+from drivers.host.group import Group
+from drivers.host.line import Line
+from drivers.opening import Lines
+from drivers.playing import AmplifierLayer, AmplifierTone
+from drivers.protocol.definition import (
+    FAULTS,
+    HEARTBEAT,
+    MESSAGES,
+    STATES,
+    STATUS,
+    VERSION,
+    loss_detection_time,
+)
 from drivers.urls import ADDRESS
 from drivers.wires.serial_frames import Frame, encode_frame
+from drivers.wires.serial_line import SerialWire
+from long_form import shortly
 from model.rig.rig import Rig
+from model.rig.rig_file import example_rig_path
+from plates import TWO_AMPLIFIERS, write_rig
 from real_wires import (
+    LIMITS,
     SHARED_WIRES,
     WIRES,
+    HostedRig,
     after_each,
     far_side,
     layer,
+    make_bench,
     on_two_amplifiers,
     rig_on_wire,
 )
 from registry import threads
+from registry import threads as clock
+from registry.threads import no_long_collections
+from sim.bench.amplifier_device import AmplifierDevice
 from sim.far_ends.wire_assignment import SimulatedWire, assign_wires, choose_lines, links_of
-from sim.faults import FaultKind, FaultWindow
+from sim.faults import FaultKind, Faults, FaultWindow, load_faults
+from sim.memory_line import MemoryPort
+from sim.process.simulation import STEP, SteppedLoop
+from sim.transport.simulated_line import SimulatedLine as MemoryLine
 from virtual_lines import VirtualLoop, in_virtual_time
 
 DEFAULTS = SimulatedWire("serial")
@@ -265,3 +303,381 @@ async def test_frames_take_their_time_on_a_slow_line(coarse_rig: Rig, kind: str,
         words = STATUS.words + 4 + 8  # levels, tokens
         least = 2 * words * bits / 9600
         assert least < threads.now() - begin < 2 * least + 0.02
+
+
+def line_to(device: AmplifierDevice) -> Line:
+    """The host's line to a device of this process."""
+    line = Line(SerialWire(0, sequence=0), "main")
+    line.open(MemoryPort([device], line.received, line.lose))
+    return line
+
+
+@in_virtual_time
+async def test_unplugged_line_is_lost_and_opens_again_once_plugged_in(coarse_rig: Rig) -> None:
+    """Requests fail at once, the watchdog silences; no line while it is out, a new one after."""
+    bench, devices = make_bench(coarse_rig)
+    device = devices["main"]
+    group = await opened_group(line_to(device))
+    await group.arm()
+    await group.apply({"main": [layer((0, 110.0, 1.0))]})
+    device.inject_fault(FaultWindow(fault="unplug", lasts=1.0))
+    with pytest.raises(LinkError, match="unplugged"):
+        await group.beat()
+    with pytest.raises(LinkError, match="unplugged"):
+        line_to(device)
+    await asyncio.sleep(1.01)
+    bench.advance(threads.now())
+    assert not any(bench.amplifiers["main"].summary(bench.time).levels)
+    again = await opened_group(line_to(device))
+    assert (await again.amplifiers["main"].read_status())["fault"] == FAULTS["WATCHDOG"]
+
+
+async def opened_group(line: Line) -> Group:
+    """The group of the only amplifier of a line, open."""
+    group = Group({"main": Host(line, 1, LIMITS, name="main")})
+    await group.open()
+    return group
+
+
+ROUND_TRIPS = {"&line=prompt": (0.0, 0.0), "": (28e-6, 1e-3), "&line=ftdi": (10e-3, 12e-3)}
+"""Medians of an exchange without bits, 5 ms after the one before [s].
+
+Two frames of 125 us at most and the operating system; 16 ms after an FTDI chip's last packet.
+"""
+
+
+@pytest.mark.parametrize("option", ROUND_TRIPS)
+@in_virtual_time
+async def test_line_is_that_of_its_url_and_of_usb_where_a_rig_has_several(
+    option: str, tmp_path: Path
+) -> None:
+    """By default as a USB adapter of high speed delays, and not at all as `prompt`."""
+    rig = write_rig(tmp_path / "rig.yaml", *TWO_AMPLIFIERS)
+    lines = Lines()
+    main = await lines.amplifier(f"sim://{rig}?amplifier=main{option}", LIMITS, name="main")
+    await main.open()
+    taken = []
+    for _ in range(51):
+        await asyncio.sleep(0.005)
+        await main.read_status()
+        taken.append(main.counts.last_round_trip)
+    await lines.close()
+    shortest, longest = ROUND_TRIPS[option]
+    assert shortest <= sorted(taken)[25] <= longest
+
+
+@pytest.mark.parametrize("option", ["line=usb", "line="])
+async def test_url_of_an_unknown_line_is_refused(option: str) -> None:
+    """As any other option that is invalid."""
+    with pytest.raises(CommandError, match="line must be one of"):
+        await Lines().amplifier(f"sim://rig.yaml?amplifier=a&{option}", LIMITS, name="a")
+
+
+async def test_amplifiers_of_one_rig_share_its_simulation(tmp_path: Path) -> None:
+    """By URLs with names: the control socket sees both play, and ends with them."""
+    rig, control = write_rig(tmp_path / "rig.yaml", *TWO_AMPLIFIERS), tmp_path / "control"
+    lines = Lines()
+    names = ("main", "side")
+    group = Group(
+        {
+            name: await lines.amplifier(
+                f"sim://{rig}?control={control}&amplifier={name}", LIMITS, name=name
+            )
+            for name in names
+        },
+        watchdog=2.0,
+    )
+    await group.open()
+    await group.arm()
+    played = layer((0, 110.0, 0.5), ramp=0.0)
+    applied = await group.apply({name: [played] for name in names})
+    await asyncio.sleep(applied.starts_at + 0.005 - threads.now())  # by clocks that are just armed
+    reader, writer = await asyncio.open_unix_connection(control)
+    writer.write(b'{"op": "state"}\n{"op": "inject_fault", "fault": "arc", "amplifier": "side"}\n')
+    state = json.loads(await reader.readline())["amplifiers"]
+    assert [state[name]["levels"] for name in names] == [[0.5, 0.0]] * 2
+    assert [state[name]["state"] for name in names] == ["OPERATION_ENABLED"] * 2
+    assert json.loads(await reader.readline())["ok"]
+    with pytest.raises(CommandRefused):
+        await group.beat()
+    writer.close()
+    await writer.wait_closed()
+    await lines.close()
+    assert not control.exists()
+    assert not [task for task in asyncio.all_tasks() if "simulated plate" in task.get_name()]
+
+
+@pytest.mark.parametrize(
+    "url",
+    [
+        "sim://",
+        "sim://?control=x",
+        "sim:///no/such/rig.yaml",
+        *(f"sim://{example_rig_path()}?{rest}" for rest in ("speed=2", "amplifier=aux", "seed=x")),
+    ],
+)
+async def test_invalid_url_is_refused(url: str) -> None:
+    """No rig, an unknown option or amplifier, a seed that is no number."""
+    with pytest.raises(CommandError, match="sim://"):
+        await Lines().amplifier(url, LIMITS, name="a")
+
+
+FRAME = bytes(range(40))
+
+
+def write(tmp_path: Path, text: str) -> Path:
+    """A fault file."""
+    path = tmp_path / "faults.yaml"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def test_load_faults_reads_times_units_and_amplifiers(tmp_path: Path) -> None:
+    """Times are in seconds or with a unit; a named amplifier gets its own faults only."""
+    path = write(
+        tmp_path,
+        "seed: 7\n"
+        "faults:\n"
+        "  - {fault: drop, at: 2, lasts: 1500 ms, share: 20 %, toward: host}\n"
+        "  - {fault: unplug, at: 5, amplifier: west}\n",
+    )
+    file = load_faults(path, amplifiers=["east", "west"])
+    east = file.of("east", begin=100.0)
+    assert east.windows == [FaultWindow(fault="drop", at=2.0, lasts=1.5, share=0.2, toward="host")]
+    assert len(file.of("west", begin=100.0).windows) == 2
+    assert [east.now("drop", time) for time in (101.9, 102.0, 103.4, 103.5)] == [
+        *(False, True, True, False)
+    ]
+
+
+@pytest.mark.parametrize(
+    ("kind", "is_so"),
+    [
+        ("drop", lambda arrived: arrived == []),
+        ("duplicate", lambda arrived: arrived == [(0.0, FRAME)] * 2),
+        (
+            "truncate",
+            lambda arrived: FRAME.startswith(arrived[0][1]) and len(arrived[0][1]) < 40,
+        ),
+        ("incomplete_set", lambda arrived: len(arrived[0][1]) < 40),
+        ("delay", lambda arrived: 0 < arrived[0][0] <= 0.1 and arrived[0][1] == FRAME),
+        ("corrupt", lambda arrived: 1 <= flipped_bits(arrived[0][1]) <= 3),
+    ],
+)
+def test_fault_changes_frames_while_active(kind: str, is_so: "object") -> None:
+    """Each kind of fault has its effect, only within its window."""
+    faults = Faults([FaultWindow(fault=kind, at=1.0, lasts=1.0)], begin=10.0, seed=3)
+    assert is_so(faults.pass_on(FRAME, toward="amplifier", time=11.5))
+    for time in (10.5, 12.0):
+        assert faults.pass_on(FRAME, toward="amplifier", time=time) == [(0.0, FRAME)]
+
+
+def flipped_bits(data: bytes) -> int:
+    """How many bits differ from the frame."""
+    return sum((a ^ b).bit_count() for a, b in zip(data, FRAME, strict=True))
+
+
+def test_fault_hits_a_share_of_one_direction() -> None:
+    """A fifth of the frames to the host; the same seed hits the same ones."""
+    runs = []
+    for _ in range(2):
+        faults = Faults([FaultWindow(fault="drop", share=0.2, toward="host")], seed=5)
+        runs.append([bool(faults.pass_on(FRAME, toward="host", time=1.0)) for _ in range(2000)])
+    assert runs[0] == runs[1]
+    assert 0.17 < runs[0].count(False) / 2000 < 0.23
+    assert faults.pass_on(FRAME, toward="amplifier", time=1.0)
+
+
+@pytest.mark.parametrize("is_closed", [False, True])
+def test_line_delivers_frames_at_its_speed_until_closed(is_closed: bool) -> None:
+    """At 10 kbit/s forty bytes of ten bits take 40 ms; frames in flight are lost on closing.
+
+    They come in pieces of at most 10 ms.
+    """
+
+    async def arrivals() -> list[float]:
+        loop = asyncio.get_running_loop()
+        assert isinstance(loop, SteppedLoop)
+        arrived: list[float] = []
+        line = MemoryLine(
+            lambda data, now: arrived.append(loop.time()),
+            toward="host",
+            faults=Faults(),
+            byte_time=1e-3,
+        )
+        line.send(FRAME)
+        line.send(FRAME)
+        await loop.step(0.06)
+        if is_closed:
+            line.close()
+        await loop.step(0.1)
+        return arrived
+
+    with asyncio.Runner(loop_factory=SteppedLoop) as runner:
+        arrived = runner.run(arrivals())
+    pieces = [0.01 * number for number in range(1, 7 if is_closed else 9)]
+    assert arrived == pytest.approx(pieces, abs=STEP)
+
+
+def test_faults_combine_on_one_frame() -> None:
+    """A frame truncated to nothing does not arrive."""
+    kinds: tuple[FaultKind, ...] = ("truncate", "truncate", "corrupt", "incomplete_set")
+    faults = Faults([FaultWindow(fault=kind) for kind in kinds])
+    arrived = [faults.pass_on(b"ab", toward="amplifier", time=1.0) for _ in range(200)]
+    assert {len(data) for frames in arrived for _, data in frames} <= {1}
+    assert [] in arrived
+
+
+@pytest.mark.parametrize("kind", ["corrupt", "truncate", "incomplete_set"])
+def test_wire_that_finds_damage_loses_the_frame(kind: FaultKind) -> None:
+    """As TCP does; what is only late or double arrives."""
+    for fault, expected in ((kind, []), ("duplicate", [(0.0, FRAME)] * 2)):
+        faults = Faults((FaultWindow(fault=fault),))  # type: ignore[arg-type]
+        arrived = faults.pass_on(FRAME, toward="amplifier", time=1.0, finds_damage=True)
+        assert arrived == expected
+
+
+WATCHDOG = 0.25  # s
+THREE_HEARTBEATS = 0.150  # s
+FOUR = (0.2,) * 4  # levels
+SLOW_WIRES = {
+    "serial, 115 200 baud": SimulatedWire("serial", speed=115_200, unpluggable=True),
+    "modbus+rtu, 115 200 baud": SimulatedWire("modbus-rtu", speed=115_200, unpluggable=True),
+    "modbus+rtu, 19 200 baud": SimulatedWire("modbus-rtu", speed=19_200, unpluggable=True),
+    "can+slcan, 125 kbit/s": SimulatedWire("slcan", speed=125_000, unpluggable=True),
+}
+ALL_WIRES = {**WIRES, **SLOW_WIRES}
+SLOWEST = ("modbus+rtu, 19 200 baud", "can+slcan, 125 kbit/s")
+SHORT_WIRES = ("serial", "modbus+rtu", *SLOWEST)
+"""One of each family, and the slowest; `make test-long` takes the others."""
+
+over_every_wire = pytest.mark.parametrize("wire", shortly(WIRES, SHORT_WIRES))
+at_every_speed = pytest.mark.parametrize("wire", shortly(ALL_WIRES, SHORT_WIRES))
+
+
+@asynccontextmanager
+async def linked(wire: str, rig: Rig, *, watchdog: float = WATCHDOG) -> AsyncIterator[HostedRig]:
+    """The paper's amplifier behind a wire, armed and beaten by nobody."""
+    async with rig_on_wire(rig, ALL_WIRES[wire], watchdog=watchdog) as hosted:
+        await hosted.group.arm()
+        yield hosted
+
+
+def host_of(hosted: HostedRig) -> Amplifier:
+    """The host of the only amplifier."""
+    return hosted.group.amplifiers["main"]
+
+
+def fault(hosted: HostedRig, kind: FaultKind, **options: object) -> None:
+    """Begin a fault."""
+    hosted.devices["main"].inject_fault(FaultWindow(fault=kind, **options))  # type: ignore[arg-type]
+
+
+async def play(hosted: HostedRig, *levels: float) -> None:
+    """Play these levels, from channel 0 on, without a ramp."""
+    tones = tuple(AmplifierTone(channel, 110.0, level) for channel, level in enumerate(levels))
+    await hosted.group.apply({"main": [AmplifierLayer(0, tones, 0.0)]})
+
+
+async def beat_on(hosted: HostedRig) -> None:
+    """Feed the watchdog as the control loop does, until that fails."""
+    while True:
+        await asyncio.sleep(HEARTBEAT)
+        await hosted.group.beat()
+
+
+async def set_after_a_heartbeat(hosted: HostedRig) -> None:
+    """Send a set after a heartbeat's pause."""
+    await asyncio.sleep(HEARTBEAT)
+    await play(hosted, *FOUR)
+
+
+async def lost(hosted: HostedRig) -> None:
+    """Wait for the loss of the line."""
+    async with asyncio.timeout(60):
+        while host_of(hosted).line.loss is None:  # noqa: ASYNC110  it has no event
+            await asyncio.sleep(0.001)
+
+
+async def again(hosted: HostedRig) -> None:
+    """Let it reply, or reopen, clear and arm it, with all faults over."""
+    hosted.devices["main"].recover()
+    async with asyncio.timeout(60):
+        while hosted.group.is_armed and hosted.group.members.degraded:
+            await asyncio.sleep(HEARTBEAT)
+            with contextlib.suppress(DriverError):
+                await hosted.group.beat()
+        while not hosted.group.is_armed:
+            await hosted.reopen(within=30.0)
+            with contextlib.suppress(DriverError):  # not yet silent
+                await hosted.group.clear()
+                await hosted.group.arm()
+
+
+@pytest.mark.parametrize(
+    ("kind", "at_work"),
+    [("unplug", lost), ("hang", beat_on), ("drop", beat_on), ("hang", set_after_a_heartbeat)],
+    ids=["unplugged", "hung", "mute", "hung before a set"],
+)
+@at_every_speed
+@in_virtual_time
+async def test_loss_is_detected_in_time(
+    wire: str,
+    kind: FaultKind,
+    at_work: Callable[[HostedRig], Awaitable[None]],
+    coarse_rig: Rig,
+) -> None:
+    """From the worst moment, right after a reply: 60 ms unplugged, also without a request.
+
+    Three heartbeats otherwise, or as many replies of the slowest wires; of a set the computed time.
+    """
+    async with linked(wire, coarse_rig, watchdog=2.0) as hosted:
+        bound = 0.190 if wire in SLOWEST else THREE_HEARTBEATS  # 3 x 30 to 63 ms, by their bytes
+        if at_work is set_after_a_heartbeat:
+            bound = loss_detection_time([host_of(hosted).exchange_time("Set")])
+        elif kind == "unplug":
+            bound = 0.060
+        for _ in range(3):
+            await again(hosted)
+            fault(hosted, kind)
+            begun = clock.now()
+            noticed = pytest.raises(LinkDegraded) if at_work is not lost else nullcontext()
+            with noticed:
+                await at_work(hosted)
+            assert clock.now() - begun <= bound
+
+
+@at_every_speed
+@in_virtual_time
+async def test_slow_wire_is_not_lost(wire: str, coarse_rig: Rig) -> None:
+    """Sets and heartbeats that occupy the whole wire are not repeated, not one of 240."""
+    async with linked(wire, coarse_rig, watchdog=2.0) as hosted:
+        for number in range(60):
+            await play(hosted, *(0.2 + 0.01 * (number % 2),) * 4)
+            for _ in range(3):
+                await hosted.group.beat()
+        assert host_of(hosted).statistics.retries == 0
+
+
+def in_use() -> tuple[int, int, int]:
+    """Count descriptors, threads and tasks, without asyncio's idle workers."""
+    gc.collect()
+    threads = [one for one in threading.enumerate() if not one.name.startswith("asyncio_")]
+    return len(list(Path("/dev/fd").iterdir())), len(threads), len(asyncio.all_tasks())
+
+
+@over_every_wire
+async def test_replugging_leaks_nothing(wire: str, coarse_rig: Rig) -> None:
+    """Real ports: unplug, plug in, reopen: descriptors, threads and tasks stay constant."""
+    before = (math.inf,) * 3
+    async with linked(wire, coarse_rig, watchdog=2.0) as hosted:
+        with no_long_collections():  # of the suite's own objects
+            for number in range(10):
+                fault(hosted, "unplug")
+                await lost(hosted)
+                hosted.devices["main"].recover()
+                await hosted.reopen(within=60.0)
+                if number == 2:
+                    before = in_use()
+            after = in_use()
+        assert all(now <= then for now, then in zip(after, before, strict=True)), (before, after)

@@ -24,12 +24,11 @@ from era_haptics.lab.measuring.impedance import (
 )
 from era_haptics.lab.measuring.measure_cli import app
 from era_haptics.lab.measuring.sound_card import SoundCard
-from exciters import ExciterCircuit
 from model.arrays import Float32Array, FloatArray
 from model.errors import InputError
 from model.rig.rig_file import parse_rig
 from plates import exciter_rig_text
-from sound_cards import jack_server
+from sound_cards import ExciterCircuit, jack_server
 from typed_page import ERA
 
 F = np.unique(np.geomspace(10, 1000, 100).round())

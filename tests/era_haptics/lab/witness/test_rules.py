@@ -8,13 +8,12 @@ from typing import Any
 import pytest
 
 import hand_written as hand
-import violations
 from era_haptics.lab.witness.capture import read_capture
 from era_haptics.lab.witness.witness import Witness
 from hand_written import HALF, Talk
 from plate_witness import RULES
 
-BROKEN = {**violations.HOST_VIOLATIONS_BROKEN, **violations.BROKEN}
+BROKEN = {**hand.HOST_VIOLATIONS_BROKEN, **hand.BROKEN}
 FADING: dict[str, Any] = {**HALF, "tokens": (0, 0, 0, 0)}
 PAGE = Path(__file__).parents[4] / "docs" / "reference" / "witness.md"
 
@@ -99,8 +98,8 @@ def test_watchdog_of_unknown_time_may_be_sooner_than_what_is_on_its_way(
 def test_loop_that_stalls_between_two_commits_sends_the_second_no_more() -> None:
     """One amplifier plays alone until watchdogs expire, since nothing can be sent."""
     talk = Talk(names=("m", "n")).armed().armed(address=2)
-    talk.staged(5, violations.LOUD)
-    talk.staged(5, violations.LOUD, address=2)
+    talk.staged(5, hand.LOUD)
+    talk.staged(5, hand.LOUD, address=2)
     talk.committed(5, tokens=(5, 0, 0, 0)).told("set_stalled").rest(0.03)
     assert talk.found == []
 

@@ -487,9 +487,8 @@ class Question:
         """Whether what lasts takes longer than the control loop may wait."""
         if self.lasting and not self.is_alone:
             return True
-        return any(
-            each.course is not None and each.course.duration > _SOON for _, each in self.lasting
-        )
+        courses = [each.course for _, each in self.lasting if each.course is not None]
+        return bool(courses) and max([each.duration for each in courses]) > _SOON
 
     def quiet_beside(self, targets: Targets) -> tuple[Contact, ...]:
         """Return the contacts that are not among some targets."""

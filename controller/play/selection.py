@@ -132,9 +132,11 @@ class Chooser:
 
         beside: selections that a pulse is felt beside.
         """
-        raised = tuple([(contact, _over(target, contact, beside)) for contact, target in targets])
-        excitations = [content.layer.excitation.values() for content in _contents(beside)]
-        avoided = [*{tone.frequency for tones in excitations for tone in tones}]
+        raised, avoided = targets, list[float]()
+        if beside:
+            raised = tuple([(contact, _over(to, contact, beside)) for contact, to in targets])
+            excitations = [content.layer.excitation.values() for content in _contents(beside)]
+            avoided = [*{tone.frequency for tones in excitations for tone in tones}]
         is_long = question.takes_long and not targets[0][1].is_short
         try:
             answer = answered(
@@ -356,8 +358,8 @@ class Selector:
         # Lists: a generator would be a call for each.
         targets = tuple([(one, each) for one in contacts for each in by_key.get(one.key, ())])
         served, skipped = _within_layers(targets, capabilities)
-        lasting = tuple([each for each in served if not each[1].is_short])
         short = tuple([each for each in served if each[1].is_short])
+        lasting = tuple([each for each in served if each not in short]) if short else served
         intended = Question(tuple(contacts), lasting, short, intent.protected)
         before, self._fingers = self._fingers, {one.key: one.since for one, _ in lasting}
         back = dict(self._fingers.items() - before.items()).keys() & self._lasting.target_keys

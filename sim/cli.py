@@ -122,9 +122,8 @@ def sim(
         from model.rig.rig_file import load_rig
         from sim.far_ends.wire_assignment import SimulatedWire, assign_wires, choose_lines, links_of
         from sim.faults import FaultFile, load_faults
-        from sim.firmware import find_firmware
         from sim.plant.imperfections import Imperfections, draw_imperfections
-        from sim.process.simulation import Simulation
+        from sim.process.simulation import Simulation, find_firmware
         from sim.transport.far_end import links_by_amplifier
         from sim.transport.simulated_line import PROMPT
 

@@ -14,7 +14,7 @@ from drivers.host.amplifier import Amplifier
 from drivers.protocol.definition import ahead, clock_at
 from drivers.protocol.records import Values
 from registry import threads
-from sim.firmware import find_firmware, running
+from sim.process.simulation import find_firmware, running_firmware
 
 _JUDGED = 10  # exchanges with the shortest times: one in so many
 
@@ -49,7 +49,8 @@ async def firmware_skew(seconds: float) -> tuple[float, float]:
 
     async with AsyncExitStack() as stack:
         urls = {
-            name: await stack.enter_async_context(running(find_firmware(), name)) for name in NAMES
+            name: await stack.enter_async_context(running_firmware(find_firmware(), name))
+            for name in NAMES
         }
         controller = make_controller(make_rig(NAMES), urls, connected=watch)
         await controller.open()

@@ -3,6 +3,10 @@
 Time is that of the event loop: the wall clock, or a virtual clock that is stepped explicitly while
 I/O is served as usual. The live view shows amplifiers, peak accelerations and fingers on the
 terminal.
+
+The project's firmware may be in place of the simulated amplifiers: a process with a serial line for
+each. `make firmware` builds it from the sources of a checkout; it is not part of the wheel. Its
+samples go nowhere, so the plate does not move.
 """
 
 import asyncio
@@ -21,7 +25,9 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
+from drivers.errors import LinkError
 from model.arrays import FloatArray, lattice
+from model.errors import InputError
 from model.rig.rig import Rig
 from model.vibration import G
 from registry import threads
@@ -31,11 +37,58 @@ from sim.bench.bench import Bench, keep_time
 from sim.control import SimulationContext, control_socket
 from sim.far_ends.wire_assignment import SimulatedWire, open_wires
 from sim.faults import FaultFile
-from sim.firmware import running
 from sim.plant.fingers import Accelerometer, Position
 from sim.plant.imperfections import Imperfections
 from sim.plant.plant import SAMPLE_RATE
 from sim.transport.far_end import linked_urls
+
+FIRMWARE_FOLDER = Path(__file__).parents[2] / "out" / "firmware"
+"""Where `make firmware` puts its programs."""
+
+_STARTUP_TIMEOUT = 10.0  # s
+
+
+def find_firmware() -> Path:
+    """The built firmware, a program; InputError where there is none."""
+    program = FIRMWARE_FOLDER / "era-firmware"
+    if program.exists():
+        return program
+    if (FIRMWARE_FOLDER.parents[1] / "firmware").is_dir():
+        raise InputError(f"firmware: {program} does not exist; run `make firmware` first")
+    raise InputError(
+        "firmware: its C sources are not part of this installation; run from a checkout of "
+        "era-haptics, after `make firmware`"
+    )
+
+
+@contextlib.asynccontextmanager
+async def running_firmware(program: Path, name: str) -> AsyncIterator[str]:
+    """Run the firmware for an amplifier, yield its URL. Raises LinkError.
+
+    It ends with this process, also if that is killed: its standard input is at its end then.
+    """
+    process = await asyncio.create_subprocess_exec(
+        program,
+        "--serial",
+        "--until-eof",
+        stdin=asyncio.subprocess.PIPE,
+        stdout=asyncio.subprocess.PIPE,
+        stderr=asyncio.subprocess.DEVNULL,
+    )
+    assert process.stdout is not None  # noqa: S101  a pipe was requested
+    try:
+        async with asyncio.timeout(_STARTUP_TIMEOUT):
+            url = (await process.stdout.readline()).decode().strip()
+        if not url.startswith("serial://"):
+            raise LinkError(f"firmware of {name}: no line was opened, got {url!r}")
+        yield url
+    except TimeoutError:
+        raise LinkError(f"firmware of {name}: not ready in {_STARTUP_TIMEOUT:g} s") from None
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            process.terminate()
+        await process.wait()
+
 
 STEP = 0.005  # s; the largest delay of a timer
 
@@ -112,7 +165,13 @@ async def run_simulation(
     if simulation.until_eof:
         # In a thread, since not every kind of standard input can be polled.
         threading.Thread(target=_await_eof, args=(loop, ended), daemon=True).start()
-    bench = await asyncio.to_thread(_make_bench, simulation, now=threads.now())
+    bench = await asyncio.to_thread(
+        Bench,
+        simulation.rig,
+        now=threads.now(),
+        sample_rate=simulation.sample_rate,
+        imperfections=simulation.imperfections,
+    )
     if ended.is_set():
         return None
     bench.place_fingers(simulation.fingers, now=threads.now())
@@ -125,12 +184,6 @@ async def run_simulation(
     finally:
         message = await context.finish_recording()
     return message
-
-
-def _make_bench(simulation: Simulation, *, now: float) -> Bench:
-    rig, imperfections = simulation.rig, simulation.imperfections
-    rate = simulation.sample_rate
-    return Bench(rig, now=now, sample_rate=rate, imperfections=imperfections)
 
 
 async def _serve(
@@ -146,7 +199,7 @@ async def _serve(
     async with contextlib.AsyncExitStack() as stack:
         if simulation.firmware is not None:
             context.urls = {
-                name: await stack.enter_async_context(running(simulation.firmware, name))
+                name: await stack.enter_async_context(running_firmware(simulation.firmware, name))
                 for name in bench.amplifiers
             }
         else:

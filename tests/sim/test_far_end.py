@@ -23,9 +23,9 @@ from interrupted import full_disk
 from model.errors import InputError
 from model.rig.rig import Rig
 from registry import threads
-from sim import firmware
 from sim.bench.bench import Bench
 from sim.plant.fingers import Accelerometer, readings
+from sim.process import simulation
 from sim.sensors import Recorder, Recording, write_recording
 from sim.transport.far_end import linked_urls, links_by_amplifier
 from sim.transport.simulated_line import LINE_KINDS, Latency, LineKind
@@ -336,19 +336,19 @@ def test_missing_firmware_is_told_with_the_remedy(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """In a checkout the command that builds it, elsewhere that a checkout is needed."""
-    monkeypatch.setattr(firmware, "FOLDER", tmp_path / "out" / "firmware")
+    monkeypatch.setattr(simulation, "FIRMWARE_FOLDER", tmp_path / "out" / "firmware")
     with pytest.raises(InputError, match="checkout"):
-        firmware.find_firmware()
+        simulation.find_firmware()
     (tmp_path / "firmware").mkdir()
     with pytest.raises(InputError, match="make firmware"):
-        firmware.find_firmware()
+        simulation.find_firmware()
 
 
 PARENT = """
 import asyncio, pathlib, sys
-from sim.firmware import running
+from sim.process.simulation import running_firmware
 async def main():
-    async with running(pathlib.Path(sys.argv[1]), "main") as url:
+    async with running_firmware(pathlib.Path(sys.argv[1]), "main") as url:
         print(url, flush=True)
         await asyncio.sleep(60)
 asyncio.run(main())

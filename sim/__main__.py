@@ -8,7 +8,7 @@ def main() -> int:
     """Run the command line; returns the exit status."""
     for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(variable, "1")  # before numpy loads: more are slower
-    from sim.process.early_exit import exit_on_signal
+    from sim.early_exit import exit_on_signal
 
     try:
         with exit_on_signal():

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from sim.control import SimulationContext
     from sim.far_ends.wire_assignment import SimulatedWire
     from sim.plant.fingers import Accelerometer
-    from sim.process.simulation import Simulation, SimulationView
+    from sim.simulation import Simulation, SimulationView
 
 app = typer.Typer(pretty_exceptions_enable=False)
 app.command("soft-amp")(soft_amp)
@@ -115,7 +115,7 @@ def sim(
 
     The plate deviates from the rig within the rig's uncertainty, the same for the same --seed.
     """
-    from sim.process.early_exit import exit_on_signal
+    from sim.early_exit import exit_on_signal
 
     with exit_on_signal():
         from model.config.units import parse_point
@@ -123,7 +123,7 @@ def sim(
         from sim.far_ends.wire_assignment import SimulatedWire, assign_wires, choose_lines, links_of
         from sim.faults import FaultFile, load_faults
         from sim.plant.imperfections import Imperfections, draw_imperfections
-        from sim.process.simulation import Simulation, find_firmware
+        from sim.simulation import Simulation, find_firmware
         from sim.transport.far_end import links_by_amplifier
         from sim.transport.simulated_line import PROMPT
 
@@ -222,7 +222,7 @@ def _sensor(text: str) -> "Accelerometer":
 def _run(simulation: "Simulation", *, virtual_time: bool) -> None:
     import asyncio
 
-    from sim.process.simulation import SteppedLoop, make_fine_loop, run_simulation
+    from sim.simulation import SteppedLoop, make_fine_loop, run_simulation
 
     view = _LiveView() if sys.stdout.isatty() and simulation.firmware is None else None
     factory = SteppedLoop if virtual_time else make_fine_loop
@@ -252,7 +252,7 @@ class _LiveView:
         self._plate: SimulationView | None = None
 
     def __call__(self, context: "SimulationContext") -> None:
-        from sim.process.simulation import SimulationView, draw
+        from sim.simulation import SimulationView, draw
 
         if self._plate is None:
             self._plate = SimulationView(context.bench)

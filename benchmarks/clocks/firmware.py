@@ -14,7 +14,7 @@ from drivers.host.amplifier import Amplifier
 from drivers.protocol.definition import ahead, clock_at
 from drivers.protocol.records import Values
 from registry import threads
-from sim.process.simulation import find_firmware, running_firmware
+from sim.simulation import find_firmware, running_firmware
 
 _JUDGED = 10  # exchanges with the shortest times: one in so many
 

@@ -23,9 +23,9 @@ from interrupted import full_disk
 from model.errors import InputError
 from model.rig.rig import Rig
 from registry import threads
+from sim import simulation
 from sim.bench.bench import Bench
 from sim.plant.fingers import Accelerometer, readings
-from sim.process import simulation
 from sim.sensors import Recorder, Recording, write_recording
 from sim.transport.far_end import linked_urls, links_by_amplifier
 from sim.transport.simulated_line import LINE_KINDS, Latency, LineKind
@@ -346,7 +346,7 @@ def test_missing_firmware_is_told_with_the_remedy(
 
 PARENT = """
 import asyncio, pathlib, sys
-from sim.process.simulation import running_firmware
+from sim.simulation import running_firmware
 async def main():
     async with running_firmware(pathlib.Path(sys.argv[1]), "main") as url:
         print(url, flush=True)

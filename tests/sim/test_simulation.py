@@ -49,7 +49,7 @@ from sim.bench.bench import Bench
 from sim.control import LINE_MAX, SimulationContext, carry_out, control_socket
 from sim.far_ends.wire_assignment import SimulatedWire
 from sim.plant.imperfections import Imperfections, PlateErrors
-from sim.process.simulation import SimulationView, draw
+from sim.simulation import SimulationView, draw
 from sound_cards import read_recording
 from virtual_lines import in_virtual_time
 

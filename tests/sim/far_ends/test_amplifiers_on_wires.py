@@ -60,7 +60,7 @@ from sim.bench.amplifier_device import AmplifierDevice
 from sim.far_ends.wire_assignment import SimulatedWire, assign_wires, choose_lines, links_of
 from sim.faults import FaultKind, Faults, FaultWindow, load_faults
 from sim.memory_line import MemoryPort
-from sim.process.simulation import STEP, SteppedLoop
+from sim.simulation import STEP, SteppedLoop
 from sim.transport.simulated_line import SimulatedLine as MemoryLine
 from virtual_lines import VirtualLoop, in_virtual_time
 

@@ -42,7 +42,7 @@ from sim.plant.imperfections import Imperfections
 from sim.plant.plant import SAMPLE_RATE
 from sim.transport.far_end import linked_urls
 
-FIRMWARE_FOLDER = Path(__file__).parents[2] / "out" / "firmware"
+FIRMWARE_FOLDER = Path(__file__).parents[1] / "out" / "firmware"
 """Where `make firmware` puts its programs."""
 
 _STARTUP_TIMEOUT = 10.0  # s

@@ -1,1 +1,0 @@
-"""The simulation as a process: run loop, live view and shutdown."""

@@ -29,6 +29,9 @@ class GuardLimits:
     rate: float = math.inf
 
 
+MAX_FINGER_LOAD = 10.0
+"""Largest load of a finger, in fingertips; what loads a plate by more is a hand that rests."""
+
 HAND_LOAD = 12.0
 """Load of a hand that rests on a plate, in fingertips.
 

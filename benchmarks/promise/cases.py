@@ -162,6 +162,8 @@ def _clicks(name: str, clicks: tuple[int, ...], *, contents: int = 2, quiet: int
     ]
 
 
+_LANDINGS = (("together", 0.0), (f"{APART:g} s apart", APART))
+
 HELD, RESTING = 3.0, 5.0  # s
 """While clocks are read before any finger comes, and while fingers rest after."""
 
@@ -204,4 +206,5 @@ CASES = (
         for name, known in (("paper_plate", False), ("paper_plate", True), ("car_display", True))
     ],
     *[Case("three contents", None, "eight_eras", 3, is_identified=it) for it in (False, True)],
+    *[Case(f"two contents, landing {when}", None, apart=each) for when, each in _LANDINGS],
 )

@@ -27,7 +27,7 @@ from urllib.parse import parse_qsl
 
 from model.errors import InputError
 from registry import threads
-from registry.limits import HAND_LOAD, MAX_CONTACTS
+from registry.limits import HAND_LOAD, MAX_CONTACTS, MAX_FINGER_LOAD
 from registry.plugins import PluginRegistry
 
 if TYPE_CHECKING:  # numpy is slow to import
@@ -427,7 +427,7 @@ class Contact:
     @property
     def is_hand(self) -> bool:
         """Whether it is a hand that rests: its load is on the plate, and it feels nothing."""
-        return self.load >= HAND_LOAD
+        return self.load > MAX_FINGER_LOAD
 
 
 @dataclass(frozen=True, slots=True)
@@ -571,7 +571,7 @@ class ContactTracker:
         """
         since, load = (time, 1.0) if known is None else (known.since, known.load)
         x, y = touch.x * self._plate.length, (1 - touch.y) * self._plate.width
-        if load >= HAND_LOAD or touch.load == HAND_LOAD:
+        if load > MAX_FINGER_LOAD or touch.load == HAND_LOAD:
             return Contact(key, x, y, since, HAND_LOAD)
         if touch.load is not None and time - since >= LANDING:
             load = followed(load, touch.load)

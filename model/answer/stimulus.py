@@ -21,12 +21,12 @@ from model.arrays import FloatArray, Point
 from model.config.units import in_metres
 from model.errors import InputError, expect_number, shown
 from model.finger import FINGERTIP_RADIUS, STRONG_DB_SL
-from model.structure.attachments import MAX_HAND_LOAD, MAX_LOAD, check_loads
+from model.structure.attachments import MAX_HAND_LOAD, check_loads
 from model.structure.plate import Plate
 from model.transients.base_motion import rise
 from model.transients.excursions import CLICKS_APART, DECAYED, Swing
 from model.transients.knots import RISE
-from registry.limits import MAX_CONTACTS
+from registry.limits import MAX_CONTACTS, MAX_FINGER_LOAD
 
 MIN_LEVEL_DB_SL, MAX_LEVEL_DB_SL = -100.0, 60.0
 """Bounds of a stimulus's level [dB SL].
@@ -197,7 +197,7 @@ class Finger:
     @property
     def is_hand(self) -> bool:
         """Whether it is a hand that rests, rather than a finger."""
-        return self.load > MAX_LOAD
+        return self.load > MAX_FINGER_LOAD
 
     @property
     def name(self) -> str | None:

@@ -335,6 +335,9 @@ def materials(as_json: JsonOption = False) -> None:
             "source": one.source,
             "variation": one.variation,
             "loss_factor": one.loss_factor,
+            "by_kelvin": one.by_kelvin,
+            "by_moisture": one.by_moisture,
+            "weather": one.weather,
         }
         for name, one in known.items()
     ]
@@ -342,7 +345,9 @@ def materials(as_json: JsonOption = False) -> None:
         f"{each['name']}: {_in_gpa(each['moduli_pa'])}, rho {each['rho_kg_m3']:g} kg/m³, "
         f"{'nu' if 'E' in each['moduli_pa'] else 'nu12'} {each['nu']:g}\n"
         f"    source  {each['source']}\n    variation  {each['variation']}\n"
-        f"    loss factor of the bare material, about  {each['loss_factor']}"
+        f"    loss factor of the bare material, about  {each['loss_factor']}\n"
+        f"    weather  moduli by {100 * each['by_kelvin']:+g} % a kelvin, by "
+        f"{each['by_moisture']:+g} % for 1 % of moisture: {each['weather']}"
         for each in entries
     ]
     other = (

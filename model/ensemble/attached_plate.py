@@ -45,7 +45,6 @@ from model.arrays import Complex64Array, ComplexArray, Float32Array, FloatArray
 from model.rig.rig import Uncertainty
 from model.structure.attachments import (
     HAND_STD,
-    MAX_LOAD,
     Fingertip,
     PointLoad,
     Source,
@@ -61,6 +60,7 @@ from model.structure.modal_elasticity import (
     modal_receptance,
 )
 from model.structure.plate import Plate
+from registry.limits import MAX_FINGER_LOAD
 
 LEAST_THICKNESS = 0.1
 """Least thickness of plates that deviate, relative to the modelled one."""
@@ -169,7 +169,7 @@ class AttachedPlate(Mounts):
 
     def load_stds(self, count: int, loads: Sequence[float] = ()) -> Float32Array:
         """Standard deviation of the logarithm of loads as of `finger_stiffness`, (count,)."""
-        is_hand = np.array(loads or (1.0,) * count) > MAX_LOAD
+        is_hand = np.array(loads or (1.0,) * count) > MAX_FINGER_LOAD
         return np.where(is_hand, HAND_STD, self.uncertainty.fingertip).astype(np.float32)
 
     def driven_less(self, shares: FloatArray) -> "AttachedPlate":

@@ -111,6 +111,7 @@ _CHANGED_REMEDY = (
     "identify it (era rig identify), or discard what was learned (era forget)"
 )
 _IDENTIFY = "identify the plate (era rig identify)"
+_MASS_REMEDY = "take away what lies on the plate, or run era rig check"
 
 _VERSION = 3
 _TYPES = {"header": "|u1", "x": "<f8", "covariance": "<f8"}
@@ -426,7 +427,11 @@ class PlateChange:
 
     def __str__(self) -> str:
         if self.name == BY_MASS:
-            return f"{self.name} by {1000 * self.change:+.3g} g"
+            known = self.after.known
+            x, y = (known.model.space.std * known.x)[[*self.widened][1:]]  # from the middle
+            plate = known.model.rig.plate
+            at = f"({x + plate.length / 2:.2f}, {y + plate.width / 2:.2f}) m"
+            return f"{self.name} by {1000 * self.change:+.3g} g at {at}"
         if self.name:
             return f"{self.name} by {100 * np.expm1(self.change):+.2g} %"
         return f"the plate has changed, most as if {self.resembles} had"
@@ -681,7 +686,8 @@ class LearnedTable:
         if known.why_off:
             cause = cause if self._alarms else f"answers stay as built: {known.why_off}"
             return PlateReport("off", cause, _IDENTIFY, is_alarm, table, note)
-        return PlateReport("following", cause, None, is_alarm, table, note)
+        remedy = _MASS_REMEDY if BY_MASS in cause else None
+        return PlateReport("following", cause, remedy, is_alarm, table, note)
 
     def _cautious(self) -> LocalizationTable:
         return self._prepared(table_following(self._table, self.live.known.cautious_rig))

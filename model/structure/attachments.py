@@ -36,6 +36,7 @@ from scipy import sparse
 from model.arrays import ComplexArray, FloatArray, Point
 from model.errors import InputError, expect_values
 from model.structure.plate import Plate
+from registry.limits import MAX_FINGER_LOAD
 
 Gain: TypeAlias = tuple[float, float, float]
 """Frequency [Hz], magnitude, phase [rad]."""
@@ -257,11 +258,11 @@ def damping_from_ratio(
     return 2 * ratio * math.sqrt(stiffness * plate_mass / era_count)
 
 
-MIN_LOAD, MAX_LOAD = 0.1, 10.0
-"""Load of a finger relative to the rig's fingertip."""
+MIN_LOAD = 0.1
+"""Least load of a finger relative to the rig's fingertip; the largest is MAX_FINGER_LOAD."""
 
 MAX_HAND_LOAD = 40.0
-"""Largest load of a hand that rests (`HAND_LOAD`); a load above `MAX_LOAD` is a hand's."""
+"""Largest load of a hand that rests (`HAND_LOAD`)."""
 
 HAND_STD = 1.1
 """Standard deviation of the logarithm of the load of each patch of a hand, a factor of 3."""
@@ -318,7 +319,8 @@ class Fingertip:
 
     def under(self, load: float) -> "Fingertip":
         """A finger of a load, or a patch of a hand of it, whose mass behind is larger, too."""
-        return self.scaled(load) if load <= MAX_LOAD else self.multiplied(load / len(HAND_PATCHES))
+        is_finger = load <= MAX_FINGER_LOAD
+        return self.scaled(load) if is_finger else self.multiplied(load / len(HAND_PATCHES))
 
     def multiplied(self, factor: float) -> "Fingertip":
         """The fingertip with a dynamic stiffness larger by a factor at every frequency."""
@@ -349,7 +351,7 @@ class FingertipLoad:
         return self.fingertip.dynamic_stiffness(omega)
 
 
-def check_loads(loads: Iterable[float], *, highest: float = MAX_LOAD) -> None:
+def check_loads(loads: Iterable[float], *, highest: float = MAX_FINGER_LOAD) -> None:
     """Raise InputError for a load, relative to a fingertip, that no finger has.
 
     highest: MAX_HAND_LOAD where hands may rest.
@@ -371,7 +373,7 @@ def with_patches(
     """
     places, by = [*contacts], [*loads]
     for number, ((x, y), load) in enumerate(zip(contacts, loads, strict=True)):
-        if load > MAX_LOAD:
+        if load > MAX_FINGER_LOAD:
             places[number], *others = [
                 (min(max(x + a, 0.0), size[0]), min(max(y + b, 0.0), size[1]))
                 for a, b in HAND_PATCHES

@@ -127,7 +127,9 @@ WITHOUT_PART = (
 
 
 def check_scales(
-    plate: Plate, *factors: FloatArray | float, remedy: str = "set uncertainty.thickness to 0"
+    plate: Plate,
+    *factors: FloatArray | float,
+    remedy: str = "set uncertainty.thickness and uncertainty.weather to 0",
 ) -> None:
     """Raise InputError for factors on thickness or modulus of a plate with a part that stays.
 

@@ -43,12 +43,12 @@ from model.reduction.reduced_plate import ReducedPlate, reduce_plate
 from model.rig.rig import Rig
 from model.structure.attachments import (
     MAX_HAND_LOAD,
-    MAX_LOAD,
     FingertipLoad,
     PointLoad,
     Source,
     check_loads,
     footprints_of,
+    with_patches,
 )
 from model.structure.plate import Plate
 from model.transients.base_motion import Motion
@@ -584,16 +584,18 @@ class Bench:
                 return
 
     def _contacts_at(self, positions: Mapping[str, Position]) -> Mapping[str, FingertipLoad]:
-        """The fingers that load the plate."""
-        fingertip = self.rig.fingertip
+        """The fingers that load the plate, and the patches of hands."""
+        fingertip, size = self.rig.fingertip, (self.rig.plate.length, self.rig.plate.width)
         if fingertip is None:
             return {}
         found = dict[str, FingertipLoad]()
         for name, at in positions.items():
             if name not in self.observers:
-                load = self.loads.get(name, 1.0)  # a hand acts at a point here
-                tip = (fingertip.scaled if load <= MAX_LOAD else fingertip.multiplied)(load)
-                found[name] = FingertipLoad(*at, self.imperfections.load_of(name, tip))
+                places, loads = with_patches([at], [self.loads.get(name, 1.0)], size)
+                for number, (place, load) in enumerate(zip(places, loads, strict=True)):
+                    patch = f"{name} patch {number}" if number else name
+                    tip = self.imperfections.load_of(name, fingertip.under(load))
+                    found[patch] = FingertipLoad(*place, tip)
         return found
 
     def _sample_plate(self, until: float = math.inf, *, solves: bool = True) -> None:

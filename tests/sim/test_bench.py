@@ -12,6 +12,7 @@ import random
 import threading
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 import pytest
@@ -33,6 +34,7 @@ from model.structure.attachments import Fingertip, FingertipLoad
 from plates import apart, lock_in
 from real_wires import WIRES, layer, on_two_amplifiers, rig_on_wire
 from registry import threads
+from registry.limits import HAND_LOAD
 from sim.amplifier.readings import AmplifierClock, Crystal
 from sim.bench.bench import WRONG, Bench, StraightClocks
 from sim.control import SimulationContext, carry_out
@@ -365,6 +367,7 @@ def test_bench_skips_a_long_pause(coarse_rig: Rig) -> None:
 
 
 A, B = (0.1, 0.07), (0.29, 0.2)
+HAND = (0.2, 0.1)
 FREQUENCY = 210.0
 FULL_STROKE = AmplifierTone(1, FREQUENCY, 1.0)
 
@@ -388,6 +391,20 @@ def test_bench_observers_have_no_weight(coarse_rig: Rig) -> None:
         keep_alive(bench, 4.0)
         (amplitude,) = bench.felt(3.5, 4.0)["a"].amplitude
         assert apart(amplitude, expected(coarse_rig, ())) < 0.01
+
+
+def test_bench_hand_rests_on_four_patches(coarse_rig: Rig) -> None:
+    """Of twelve fingertips: as four loads of three each by the direct solve."""
+    tip = Fingertip(contact_mass=0.002)
+    bench = Bench(replace(coarse_rig, fingertip=tip), now=0.0)
+    hand = {"hand": HAND_LOAD}
+    bench.place_fingers({"a": A, "hand": HAND}, now=0.0, observers={"a"}, loads=hand)
+    play_at_once(bench, FULL_STROKE, now=bench.time, ramp=0.02, watchdog=2.0)
+    keep_alive(bench, 4.0)
+    (amplitude,) = bench.felt(3.5, 4.0)["a"].amplitude
+    corners = product((HAND[0] - 0.0125, HAND[0] + 0.0125), (HAND[1] - 0.0125, HAND[1] + 0.0125))
+    patches = tuple(FingertipLoad(x, y, tip.multiplied(HAND_LOAD / 4)) for x, y in corners)
+    assert apart(amplitude, expected(coarse_rig, patches)) < 0.01
 
 
 def test_bench_sensors_read_through_a_touch(coarse_rig: Rig) -> None:

@@ -9,6 +9,7 @@ Identification of hidden thin plates in Hermite elements, whose theory is not th
 Settled patterns, and the alarm that follows them.
 """
 
+import re
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -221,6 +222,9 @@ def test_sticker_is_named_in_its_place(hidden: Hidden, known: PlateEstimate) -> 
     after = played(live.take, hidden, changed, count=10, start=10)
     (explanation,) = (each.explanation for each in after if each.explanation)
     assert explanation.name == "a mass"
+    stated = re.search(r"g at \((\S+), (\S+)\) m$", str(explanation))
+    assert stated is not None
+    assert [*map(float, stated.groups())] == pytest.approx([0.11, 0.16], abs=0.015)
     added = live.known.rig.masses[-1]
     assert added.mass == pytest.approx(3e-3, abs=0.6e-3)
     assert (added.x, added.y) == pytest.approx((0.11, 0.16), abs=0.015)

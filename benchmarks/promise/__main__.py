@@ -48,7 +48,7 @@ def main() -> None:
     jobs = [
         (number, options.first + plate)
         for number in numbers
-        for plate in range(options.plates // (QUARTER if CASES[number].events else 1))
+        for plate in range(max(1, options.plates // (QUARTER if CASES[number].events else 1)))
     ]
     found: dict[int, list[Outcome]] = {number: [] for number in numbers}
     with ProcessPoolExecutor(options.workers, mp_context=get_context("spawn")) as pool:

@@ -147,7 +147,7 @@ _MAX_NAMES = 4  # of ERAs in a row
 
 def _line(row: "TouchRow") -> str:
     x, y = (100 * value for value in row.targets_m[0])
-    others = max(len(row.quiet_m), len(row.layers) - 1)
+    others = len(row.fingers) - 1 if row.fingers else len(row.quiet)
     start = f"{row.time_s:5.1f}  {x:5.1f},{y:5.1f}  {others:6d}  "
     if row.reason is not None:
         return f"{start}silent: {row.reason}"
@@ -164,8 +164,9 @@ def _line(row: "TouchRow") -> str:
     if row.measured_level_db_sl is None:
         short = "" if row.steady else f": it played for {row.played_s:.2f} s"
         note = f"  not measured{short}"
-    if row.verdict is not None:
-        note += f"  {row.verdict}, of {counted(len(row.layers), 'content')}"
+    for finger in row.fingers:
+        if finger.at_m == row.targets_m[0]:
+            note += f"  {finger.verdict}, of {counted(len(row.contents), 'content')}"
     return f"{start}{eras:22s} {figures} {_number(row.latency_ms):>7s}{note}"
 
 

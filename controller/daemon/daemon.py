@@ -31,6 +31,7 @@ from controller.operation.fault_dumps import FaultDumps
 from controller.operation.operation_states import ENERGISED, DaemonState, Operation
 from controller.operation.plate_controller import Controller
 from controller.operation.supervisor import Supervisor
+from controller.play.loop import Observers
 from controller.process.daemon_process import (
     MIN_DESCRIPTORS,
     ServiceManager,
@@ -61,6 +62,7 @@ class Daemon:
     """A daemon; create it within the event loop that runs it.
 
     dashboard: HOST:PORT at which the gateway serves the page, or None.
+    observe: adds observers of the control loop.
     lines: makes the lines to the amplifiers.
     watchdog [s]: of the amplifiers; longer for simulated ones on a busy machine.
     """
@@ -73,6 +75,7 @@ class Daemon:
         log: LogThread,
         manager: ServiceManager,
         dashboard: str | None,
+        observe: Callable[[Observers], None] = lambda loop: None,
         lines: Callable[[Lines | None], Lines] = Lines,
         watchdog: float = WATCHDOG,
     ) -> None:
@@ -144,6 +147,7 @@ class Daemon:
                 estimated=self._publisher.learning_latencies.add,
             )
             self.learning.readings.observe(cycle.observers)
+        observe(cycle.observers)
         self._inputs = TouchInputs(
             cycle.deliver,
             cycle.lift,

@@ -13,6 +13,7 @@ import socket
 import tempfile
 from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,7 @@ from matplotlib.figure import Figure
 
 from controller.api.client import AsyncClient
 from controller.api.jsonrpc import RpcError
-from controller.api.schema import MAX_LEASE, PlayedTone
+from controller.api.schema import MAX_LEASE
 from controller.daemon.config import DaemonConfig, load_daemon_config
 from controller.daemon.daemon import Daemon, page_address
 from controller.demo.recorder import (
@@ -30,7 +31,6 @@ from controller.demo.recorder import (
     SimulatedPlate,
     TouchRecorder,
     TouchRow,
-    plays_at,
     simulated_plate,
 )
 from controller.effects.layout import BUZZ
@@ -39,7 +39,7 @@ from controller.process.daemon_process import ServiceManager, SocketLock
 from controller.process.log import LogThread, start_log
 from controller.sources.tuio import RESTART_PAUSE, RecordedDatagram, read_capture, replay_capture
 from drivers.errors import LinkError
-from model.answer.answer import Layer, Sensation
+from model.answer.answer import Sensation
 from model.answer.stimulus import Finger
 from model.arrays import ranked_by
 from model.errors import InputError
@@ -54,7 +54,6 @@ from model.rig.rig import Rig
 from model.rig.rig_file import load_rig
 from model.structure.plate import Plate
 from model.table.table import LocalizationTable
-from model.vibration import Excitation, Tone
 from registry import threads
 
 MIN_ERAS_FOR_THREE = 8
@@ -139,8 +138,9 @@ RECOVERY = 30.0
 
 _RIG_FILE = "rig.yaml"
 _HOST = "127.0.0.1"
+_ARMED = DaemonState.OPERATION_ENABLED
 _TIMEOUT = 60.0  # s; of a request to the daemon, on a machine that is busy
-_PAUSE = 0.1  # s; between looks at the state
+_PAUSE = 0.05  # s; between attempts to arm
 
 
 async def run_demo(
@@ -173,18 +173,19 @@ async def run_demo(
                     log=LogThread(None),  # nothing is logged: rows and causes tell it
                     manager=ServiceManager({}),
                     dashboard=None,
+                    observe=recorder.observe,
                     watchdog=WATCHDOG,
                 )
                 serving = tasks.create_task(daemon.run(lock))
-                playing = tasks.create_task(_play(daemon, config.socket, scenes, port, recorder))
+                arming = tasks.create_task(_keep_armed(daemon, config.socket, recorder))
+                playing = tasks.create_task(_play(scenes, port, recorder, config.socket))
                 await asyncio.wait({serving, playing}, return_when=asyncio.FIRST_COMPLETED)
                 if not playing.done():  # a signal has ended the daemon
                     raise KeyboardInterrupt
+                arming.cancel()
                 daemon.shut_down("the demonstration is over")
         except BaseExceptionGroup as failures:
-            while isinstance(failures, BaseExceptionGroup):
-                (failures, *_) = failures.exceptions
-            raise failures from None
+            raise failures.exceptions[0] from None
     return sorted(recorder.rows, key=lambda row: row.time_s)
 
 
@@ -287,58 +288,60 @@ def _free_port() -> int:
         return int(probe.getsockname()[1])
 
 
-async def _play(
-    daemon: Daemon,
-    path: Path,
-    scenes: Sequence[Scene],
-    port: int,
-    recorder: TouchRecorder,
-) -> None:
-    """Play the scenes to a daemon at a socket; wait until all touches are lifted, or count as such.
+async def _keep_armed(daemon: Daemon, path: Path, recorder: TouchRecorder) -> None:
+    """Arm a daemon at a socket, and again after every fault, as of a machine that stalled.
 
-    Raises LinkError after a fault that lasts.
+    Raises LinkError if that takes too long.
     """
     await daemon.started.wait()
-    async with (
-        await AsyncClient.connect(path, name="era demo", timeout=_TIMEOUT) as era,
-        asyncio.TaskGroup() as tasks,
-    ):
-        meanwhile = [tasks.create_task(each) for each in (recorder.follow(era), keep_armed(era))]
-        await recorder.start()
-        for number, scene in enumerate(scenes):
-            await era.layout(_layout_name(number))
-            await replay_capture(scene.touches, _HOST, port)
-            await asyncio.sleep(RESTART_PAUSE)  # or the next scene's sender would be a second one
-            while recorder.touches:  # noqa: ASYNC110  nobody else waits for this
-                await asyncio.sleep(DECAY)
-        await asyncio.sleep(DECAY)
-        for each in meanwhile:
-            each.cancel()
-    recorder.end(threads.now())
-    if recorder.fault is not None:
-        raise LinkError(f"demonstration aborted: {recorder.fault}")
+    async with await AsyncClient.connect(path, name="era demo", timeout=_TIMEOUT) as era:
+        await era.subscribe("state")
+        while True:
+            lease = await _armed(era)
+            recorder.armed()
+            while (status := await era.status()).state == _ARMED:
+                await era.next_event(timeout=MAX_LEASE / 4)
+                with contextlib.suppress(RpcError):  # the lease ends with the state
+                    await era.renew(lease)
+            recorder.failed(status.cause)
 
 
-async def keep_armed(era: AsyncClient) -> None:
-    """Arm, and again after every fault, as of a machine that stalled, but not after a stop.
-
-    Raises LinkError after a stop, and after `RECOVERY` in which it is not armed.
-    """
-    end, lease = threads.now() + RECOVERY, ""
+async def _armed(era: AsyncClient) -> str:
+    """Clear a fault, but no stop, and arm; return the lease. Raises LinkError after `RECOVERY`."""
+    end = threads.now() + RECOVERY
     while True:
         status = await era.status()
         if status.state == DaemonState.QUICK_STOP_ACTIVE or threads.now() > end:
             raise LinkError(f"demonstration aborted: {status.cause}")
         with contextlib.suppress(RpcError):  # the state has changed meanwhile
-            match status.state:
-                case "FAULT":
-                    await era.clear()
-                case "READY_TO_SWITCH_ON":
-                    lease = (await era.arm("the demonstration", lease_s=MAX_LEASE)).lease
-                case "OPERATION_ENABLED":
-                    await era.renew(lease)
-                    end = threads.now() + RECOVERY
+            if status.state == DaemonState.FAULT:
+                await era.clear()
+            if status.state == DaemonState.READY_TO_SWITCH_ON:
+                return (await era.arm("the demonstration", lease_s=MAX_LEASE)).lease
         await asyncio.sleep(_PAUSE)
+
+
+async def _play(
+    scenes: Sequence[Scene],
+    port: int,
+    recorder: TouchRecorder,
+    path: Path,
+) -> None:
+    """Play the scenes to a daemon at a socket; wait until all touches are lifted, or count as such.
+
+    Raises LinkError after a fault that lasts.
+    """
+    await recorder.start()
+    for number, scene in enumerate(scenes):
+        async with await AsyncClient.connect(path, name="era demo", timeout=_TIMEOUT) as era:
+            await era.layout(_layout_name(number))
+        await replay_capture(scene.touches, _HOST, port)
+        await asyncio.sleep(RESTART_PAUSE)  # or the next scene's sender would be a second one
+        while recorder.touches:  # noqa: ASYNC110  nobody else waits for this
+            await asyncio.sleep(DECAY)
+    await asyncio.sleep(DECAY)
+    if recorder.fault is not None:
+        raise LinkError(f"demonstration aborted: {recorder.fault}")
 
 
 def _layout_name(number: int) -> str:
@@ -352,26 +355,23 @@ MAX_PANELS = 6
 def write_pictures(table: LocalizationTable, rows: list[TouchRow], folder: Path) -> list[Path]:
     """Draw some of the touches into a folder, and several contents; return what was written."""
     figures = {}
-    if chosen := choose_rows([row for row in rows if row.verdict is None]):
+    if chosen := choose_rows([row for row in rows if not row.fingers]):
         figures["touches"] = touches_figure(table, chosen)
-    several = [row for row in rows if row.measured_level_db_sl is not None and row.verdict]
+    several = [row for row in rows if row.measured_level_db_sl is not None and row.fingers]
     if several:
-        layers = max(several, key=lambda row: len(row.layers)).layers
+        row = max(several, key=lambda row: len(row.contents))
+        frequencies = [layer.frequency for layer in row.contents]
         fingers = [
             Sensation(
-                Finger(row.targets_m[0]),
-                row.verdict or "",
-                next(
-                    (n for n, each in enumerate(layers) if plays_at(each, row.frequency_hz)), None
-                ),
-                -math.inf if row.measured_level_db_sl is None else row.measured_level_db_sl,
-                contrast_db=row.measured_contrast_db,
+                Finger(each.at_m),
+                each.verdict,
+                frequencies.index(each.frequency_hz) if each.frequency_hz in frequencies else None,
+                -math.inf if each.measured_level_db_sl is None else each.measured_level_db_sl,
+                contrast_db=each.measured_contrast_db,
             )
-            for row in rows
-            if row.layers == layers
+            for each in row.fingers
         ]
-        contents = [Layer(_excitation(table, each)) for each in layers]
-        figures["contents"] = contents_figure(table, contents, fingers)
+        figures["contents"] = contents_figure(table, row.contents, fingers)
     folder.mkdir(parents=True, exist_ok=True)
     paths = [folder / f"{name}.png" for name in figures]
     for path, figure in zip(paths, figures.values(), strict=True):
@@ -380,10 +380,18 @@ def write_pictures(table: LocalizationTable, rows: list[TouchRow], folder: Path)
 
 
 def choose_rows(rows: Sequence[TouchRow]) -> list[TouchRow]:
-    """Choose the measured touch of highest contrast of each number of other fingers."""
-    measured = [row for row in rows if row.measured_level_db_sl is not None]
-    best = {len(row.quiet_m): row for row in reversed(ranked_by(measured, _contrast))}
-    return [best[count] for count in sorted(best)][:MAX_PANELS]
+    """Choose the measured touches of highest contrast, evenly over the number of other fingers.
+
+    One finger alone is shown at most once.
+    """
+    by_count: dict[int, list[TouchRow]] = {}
+    for row in ranked_by(rows, _contrast):
+        if row.measured_level_db_sl is not None:
+            by_count.setdefault(len(row.quiet), []).append(row)
+    by_count[0] = by_count.get(0, [])[:1]
+    in_turn = zip_longest(*(by_count[count] for count in sorted(by_count)))
+    chosen = [row for each in in_turn for row in each if row is not None]
+    return sorted(chosen[:MAX_PANELS], key=lambda row: len(row.quiet))
 
 
 def touches_figure(table: LocalizationTable, rows: Sequence[TouchRow]) -> Figure:
@@ -412,22 +420,14 @@ def _contrast(row: TouchRow) -> float:
 
 
 def _draw_touch(axes: Axes, table: LocalizationTable, row: TouchRow) -> None:
-    for drive in row.layers:
-        draw_levels(axes, table, _excitation(table, drive))
-    places = (row.targets_m[0], *row.quiet_m)
-    for number, (at, level) in enumerate(zip(places, row.levels_db_sl, strict=True)):
-        draw_fingertip(axes, at, felt=number == 0, level_db_sl=level)
+    if row.pattern is not None:
+        draw_levels(axes, table, row.pattern.excitation)
+    level = row.levels_db_sl.get(row.target_id)
+    draw_fingertip(axes, row.targets_m[0], felt=True, level_db_sl=level)
+    for id, position in row.quiet.items():
+        draw_fingertip(axes, position, felt=False, level_db_sl=row.levels_db_sl.get(id))
     contrast, promised = row.measured_contrast_db, row.promised_contrast_db
     title = "one finger alone" if contrast is None else f"felt contrast {contrast:.1f} dB"
     if promised is not None:
         title += f", promised {promised:.1f}"
     axes.set_title(title, fontsize=11, pad=20)
-
-
-def _excitation(table: LocalizationTable, drive: Mapping[str, PlayedTone]) -> Excitation:
-    """What the amplifiers play of one content, as base amplitudes of the table's ERAs."""
-    strokes = {era.name: era.full_level for era in table.eras}
-    return {
-        name: Tone(tone.frequency_hz, tone.level * strokes[name], math.radians(tone.phase_deg))
-        for name, tone in drive.items()
-    }

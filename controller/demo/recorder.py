@@ -2,9 +2,8 @@
 
 `simulated_plate` starts amplifiers in a process of their own behind a real wire. The controller
 reaches them over the wire only; `SimulatedPlate` places the fingers and reads their vibration over
-the control socket. `TouchRecorder` is a client of the daemon: it follows the events of its API, as
-any program can, and makes a `TouchRow` of each touch, with what was promised for it and what was
-measured.
+the control socket. `TouchRecorder` observes the control loop and makes a `TouchRow` of each touch:
+what was predicted for it and what was measured.
 """
 
 import asyncio
@@ -15,33 +14,28 @@ import os
 import sys
 import tempfile
 from collections.abc import AsyncIterator, Callable, Collection, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from itertools import pairwise
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, TypeAlias, TypeVar
+from typing import Any, TypeAlias, cast
 from urllib.parse import quote
 
 import numpy as np
+from pydantic import BaseModel, ValidationError
 
-from controller.api.client import AsyncClient
-from controller.api.link import Notification
-from controller.api.methods import ContactsEvent, PatternEvent, SilenceEvent, StateEvent
-from controller.api.schema import MAX_RATE, ApiMessage, ContactStatus, PlayedTone
-from controller.operation.operation_states import DaemonState
-from controller.play.slots import CROSSFADE
+from controller.play.intent import Prediction
+from controller.play.loop import Observers, PlayReport
 from controller.process.child import ended
+from controller.sources.touch import Change, Contact, ContactKey
 from drivers.errors import LinkError
-from model.answer.answer import HELD_BACK
-from model.answer.stimulus import ONSET_RAMP
+from model.answer.answer import HELD_BACK, Layer
 from model.arrays import FloatArray
 from model.finger import DEFAULT_THRESHOLD, mean_level_db_sl, sensation_level
 from registry import threads
+from registry.wording import first_problem
 
 Position: TypeAlias = tuple[float, float]
-
-_T = TypeVar("_T")
-_MessageT = TypeVar("_MessageT", bound=ApiMessage)
 
 SAME_FREQUENCY = 1.0
 """Difference [Hz] within which a tone is that of a content, as its amplifier has rounded it."""
@@ -81,26 +75,44 @@ class FingerVibration:
 
 
 @dataclass(frozen=True, kw_only=True)
+class FingerRow:
+    """A finger among several contents: its frequency and verdict, what was promised and measured.
+
+    Contrasts are those of its own level above that of the power of all others' contents here.
+    Measured ones are None where nothing of its own, or nothing else, was measured.
+    """
+
+    at_m: Position
+    frequency_hz: float | None
+    verdict: str
+    promised_contrast_db: float | None
+    measured_contrast_db: float | None
+    measured_level_db_sl: float | None
+
+
+@dataclass(frozen=True, kw_only=True)
 class TouchRow:
     """A touch from down to up, with its last steady pattern of most contents.
 
-    Its fields are the keys of `era demo --json`, but for the last two. Predicted figures are of the
-    table's plate; promised ones, in levels, what nine of ten plates within the uncertainty give.
-    Contrasts are None for a finger alone, and measured ones if the pattern was too short.
+    Its fields are the keys of `era demo --json`, but for those that `_OWN` names: quiet: other
+    fingertips by id [m]; pattern; levels_db_sl by id: of the target the mean over its tip, of any
+    other finger its loudest point, whose least difference is the contrast. Contrasts are None for
+    a finger alone, and measured ones if the pattern was too short: predicted ones are of the
+    table's plate, promised ones what nine of ten plates within the uncertainty give, in levels.
+    drive: as the amplifiers achieved it, by ERA; latency_ms: from touch frame to last byte on the
+    wire; reason: why nothing played, if so. fingers: of several contents, each; contrasts are then
+    to the contents of others at this finger; contents: their patterns, in the order of layers.
     """
 
+    target_id: str
     time_s: float
     until_s: float
     targets_m: Sequence[Position]
-    quiet_m: Sequence[Position]
-    """Other fingers, which are to feel nothing of it."""
+    quiet: Mapping[str, Position]
     reason: str | None = None
-    """Why nothing played, if so."""
     drive: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
-    """As the amplifiers achieved it, by ERA."""
     mode: str | None = None
     latency_ms: float | None = None
-    """From the touch frame to the last byte on the wire."""
     played_s: float = 0.0
     steady: bool = False
     predicted_contrast_db: float | None = None
@@ -108,14 +120,10 @@ class TouchRow:
     measured_contrast_db: float | None = None
     predicted_level_db_sl: float | None = None
     measured_level_db_sl: float | None = None
-    frequency_hz: float | None = None
-    """Of what the finger feels; None for several."""
-    verdict: str | None = None
-    """Of a finger among several contents, whose contrasts are to those of others there."""
-    layers: Sequence[Mapping[str, PlayedTone]] = ()
-    """What plays of each content, by ERA, the newest one last."""
-    levels_db_sl: Sequence[float | None] = ()
-    """Of the target the mean over its tip, then of each quiet finger its loudest point."""
+    pattern: Layer | None = None
+    levels_db_sl: Mapping[str, float] = field(default_factory=dict)
+    fingers: Sequence[FingerRow] = ()
+    contents: Sequence[Layer] = ()
 
     @property
     def keeps_promise(self) -> bool | None:
@@ -127,9 +135,15 @@ class TouchRow:
 
     def as_json(self) -> dict[str, Any]:
         """Return the row in the format of `era demo --json`."""
-        row = asdict(replace(self, layers=()))
-        del row["layers"], row["levels_db_sl"]
+        row = {each.name: getattr(self, each.name) for each in fields(self)}
+        row = {key: row[key] for key in row if key not in _OWN}
+        row["quiet_m"] = list(self.quiet.values())
+        if self.fingers:
+            row["fingers"] = [asdict(each) for each in self.fingers]
         return row
+
+
+_OWN = ("target_id", "quiet", "pattern", "levels_db_sl", "fingers", "contents")
 
 
 def steady_contrast_db(target: FingerVibration, quiet: Sequence[FingerVibration]) -> float | None:
@@ -177,47 +191,57 @@ class SimulatedPlate:
     ) -> None:
         """Place fingers at positions [m] by id, loads by id, too; all others are removed."""
         async with self._placing:
-            await self._request(bool, "fingers", fingers=dict(positions), loads=dict(loads))
+            await self._request("fingers", fingers=dict(positions), loads=dict(loads))
 
     async def vibration(self, since: float, until: float) -> dict[str, FingerVibration]:
         """Vibration of each finger by id between two times [s] of time.monotonic()."""
+        reply = await self._request("felt", since_s=since, until_s=until)
+        return {
+            id: FingerVibration(
+                frequencies=np.array(felt.frequencies_hz),
+                amplitudes=np.array(felt.amplitude_m_s2).reshape(
+                    len(felt.frequencies_hz), len(felt.weights)
+                ),
+                weights=np.array(felt.weights),
+                threshold=self._threshold,
+            )
+            for id, felt in reply.fingers.items()
+        }
 
-        def read(reply: Any) -> dict[str, FingerVibration]:
-            return {
-                id: FingerVibration(
-                    frequencies=np.array(felt["frequencies_hz"], float),
-                    amplitudes=np.array(felt["amplitude_m_s2"], float).reshape(
-                        len(felt["frequencies_hz"]), len(felt["weights"])
-                    ),
-                    weights=np.array(felt["weights"], float),
-                    threshold=self._threshold,
-                )
-                for id, felt in reply["fingers"].items()
-            }
-
-        return await self._request(read, "felt", since_s=since, until_s=until)
-
-    async def _request(self, read: Callable[[Any], _T], op: str, **values: object) -> _T:
-        """Read the reply to a request; raises LinkError if there is none or it is an error."""
+    async def _request(self, op: str, **values: object) -> "_Reply":
+        """The reply to a request; raises LinkError if there is none or it is an error."""
         try:
             async with asyncio.timeout(_REPLY_TIMEOUT):
                 path = str(self._control)
                 reader, writer = await asyncio.open_unix_connection(path, limit=_MAX_REPLY)
                 with contextlib.closing(writer):
                     writer.write(json.dumps({"op": op, **values}).encode() + b"\n")
-                    reply = json.loads(await reader.readline())
-            if "error" in reply:
-                raise LinkError(f"simulated plate: {op} refused: {reply['error']}")
-            return read(reply)
-        except LinkError:
-            raise
-        except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+                    reply = _Reply.model_validate_json(await reader.readline())
+        except (OSError, ValueError) as error:  # no line, or half of one, is no JSON
             why = str(error) or "it took too long"
-            if isinstance(error, KeyError):
-                why = f"it has no {error}"
+            if isinstance(error, ValidationError):
+                why = " ".join(first_problem(error))
             raise LinkError(
                 f"simulated plate at {self._control}: no reply to {op} ({why}); {_REMEDY}"
             ) from error
+        if reply.error is not None:
+            raise LinkError(f"simulated plate: {op} refused: {reply.error}")
+        return reply
+
+
+class _FingerRecord(BaseModel):
+    """Vibration of a finger, as the control socket has it."""
+
+    frequencies_hz: list[float]
+    amplitude_m_s2: list[list[float]]
+    weights: list[float]
+
+
+class _Reply(BaseModel):
+    """What is read of a reply of the control socket."""
+
+    error: str | None = None
+    fingers: dict[str, _FingerRecord] = {}
 
 
 @contextlib.asynccontextmanager
@@ -294,61 +318,55 @@ async def _terminate(process: asyncio.subprocess.Process) -> None:
     await ended(process, EXIT_TIMEOUT)
 
 
-STEADY_WINDOW = 0.28
+STEADY_WINDOW = 0.25
 """Time [s] over which a pattern is measured: settled, and it separates tones 10 Hz apart.
 
 It is the end of the longest time in which no finger lands, moves or lifts.
 """
 
-MARGIN = 0.005 + 1 / MAX_RATE
-"""Time [s] left out at both ends of it: from wire to plate, and by which an event may be late."""
+MARGIN = 0.005
+"""Time [s] from the last byte on the wire to the plate, and before the next command."""
 
 STEADY_DURATION = 0.4
 """Shortest pattern [s] that counts as steady; the plate rings for 50 ms to 1 s."""
 
-MIN_MOVEMENT = 0.001
-"""Movement [m] below which a finger's sensor stays in place, so that its window is not broken."""
+Measured: TypeAlias = asyncio.Task[dict[str, FingerVibration]]
 
 _NOT_THE_TARGET = "another finger came down at the same moment and was the target"
-_ARMED = DaemonState.OPERATION_ENABLED
 
-
-@dataclass(eq=False)
-class _Pattern:
-    """What plays from an event to the next one [s]."""
-
-    event: PatternEvent
-    start: float
-    ramp: float
-    end: float = math.inf
-    measured: asyncio.Future[dict[str, FingerVibration]] = field(
-        default_factory=lambda: asyncio.get_running_loop().create_future()
-    )
-    """Vibration of each finger over the longest time in which none moved, known after the end."""
-
-    @property
-    def duration(self) -> float:
-        return self.end - self.start
-
-    @property
-    def targets(self) -> set[str]:
-        """The sensors of the fingers that feel it."""
-        targets = [each for each in self.event.contacts if each.role == "target"]
-        return {_id(each) for each in targets if each.verdict != HELD_BACK}
+MIN_MOVEMENT = 0.001
+"""Movement [m] below which a finger's sensor stays in place, so that its window is not broken."""
 
 
 @dataclass(eq=False)
 class _Touch:
-    """A touch, and why it feels nothing as long as it does not."""
+    """A touch and the patterns that were played for it."""
 
-    contact: ContactStatus
-    start: float
-    quiet: Sequence[Position]
-    reason: str
+    contact: Contact
+    quiet: Mapping[str, Position]
+    until: float = math.inf
+    patterns: list["_PlayedPattern"] = field(default_factory=list)
+    reason: str | None = None
+
+
+@dataclass(eq=False)
+class _PlayedPattern:
+    """What plays from its commit to the next command [s], with its measurements."""
+
+    applied: PlayReport
+    touches: Sequence[_Touch]
+    """Touches that feel a content."""
+    until: float = math.inf
+    steady: Measured | None = None
+    """Vibration by finger over the longest time in which no finger moved."""
+
+    @property
+    def duration(self) -> float:
+        return self.until - self.applied.time
 
 
 class TouchRecorder:
-    """Collects a row per touch from the events of the daemon: see `follow`.
+    """Collects a row per touch: pass `observe` to the daemon.
 
     tasks: group of the tasks that measure and make rows; once it has ended, all rows are made.
     on_row: called with each row once the touch was lifted and its pattern measured.
@@ -363,8 +381,8 @@ class TouchRecorder:
         on_row: Callable[[TouchRow], None],
     ) -> None:
         self.rows: list[TouchRow] = []
-        self.touches: dict[str, _Touch] = {}
-        """Those that are down, by the id of their sensor on the plate."""
+        self.touches: dict[ContactKey, _Touch] = {}
+        """Those that are down."""
         self.fault: str | None = None
         """Why the plate is armed no longer; None while it is, and before."""
         self._is_armed = asyncio.Event()
@@ -372,195 +390,215 @@ class TouchRecorder:
         self._tasks = tasks
         self._on_row = on_row
         self._start = threads.now()
-        self._mode: str | None = None
-        self._playing: _Pattern | None = None
-        self._patterns: list[_Pattern] = []
+        self._playing: _PlayedPattern | None = None
         self._changes: list[float] = []  # when fingers landed, moved or lifted
         self._sensors: dict[str, Position] = {}
         self._loads: dict[str, float] = {}
 
-    async def follow(self, era: AsyncClient) -> None:
-        """Take the events of a daemon until the client is closed."""
-        self._mode = (await era.hello("era demo")).table.mode
-        await era.subscribe("state", "contacts", "pattern", "silence")
-        async for event in era.events():
-            self.take(event)
+    def observe(self, loop: Observers) -> None:
+        """Observe what the control loop reports."""
+        loop.contacts_changed.append(self._contacts_changed)
+        loop.reported.append(self._reported)
 
     async def start(self) -> None:
         """Wait until the plate is armed, and set the start of the recording to then."""
         await self._is_armed.wait()
         self._start = threads.now()
 
-    def take(self, event: Notification) -> None:
-        """Note an event of one of the topics that `follow` subscribes to."""
-        match event.topic:
-            case "state":
-                self._state_changed(_read(StateEvent, event), event.time)
-            case "contacts":
-                self._contacts_changed(_read(ContactsEvent, event).contacts, event.time)
-            case "pattern":
-                self._pattern_changed(_read(PatternEvent, event), event.time)
-            case "silence":
-                self.end(event.time)
-                silence = _read(SilenceEvent, event)
-                for contact in silence.contacts:
-                    self._give_reason(contact, silence.reason or contact.held_back or "")
+    def armed(self) -> None:
+        """Note that the plate is armed, again after a fault."""
+        self.fault = None
+        self._is_armed.set()
 
-    def end(self, now: float, *, is_measured: bool = True) -> None:
-        """End the pattern that plays, and measure the end of it."""
+    def failed(self, cause: str) -> None:
+        """Note that the plate is armed no longer; rows of touches that this spoils say so."""
+        self.fault = cause.partition("; ")[0]  # without its remedy
+        since = -math.inf if self._playing is None else self._playing.applied.time
+        self._end_pattern(threads.now(), is_measured=False)  # silent since a time that is not known
+        for touch in self.touches.values():
+            if touch.contact.since > since:
+                touch.reason = self.fault
+
+    def _contacts_changed(self, contacts: tuple[Contact, ...], change: Change) -> None:
+        self._move_sensors(contacts)
+        if change.down or change.up:
+            self._changes.append(threads.now())
+        for contact in change.down:
+            others = {_id(other): _place(other) for other in contacts if other != contact}
+            self.touches[contact.key] = _Touch(contact, others, reason=self.fault)
+        for contact in change.up:
+            touch = self.touches.pop(contact.key)
+            touch.contact, touch.until = contact, threads.now()
+            self._complete(touch)
+
+    def _reported(self, applied: PlayReport) -> None:
+        self._end_pattern(applied.time)
+        if applied.contents:
+            for each in self.touches.values():
+                each.reason = each.reason or _NOT_THE_TARGET
+        touches = []
+        for felt in applied.targets:
+            touch = self.touches.get(felt.contact.key)
+            if touch is not None and felt.verdict == HELD_BACK:
+                touch.reason = applied.reason or felt.held_back
+            elif touch is not None:  # not lifted meanwhile
+                touches.append(touch)
+        if touches:
+            self._playing = _PlayedPattern(applied, touches)
+        for touch in touches:
+            touch.patterns.append(cast(_PlayedPattern, self._playing))
+
+    def _end_pattern(self, now: float, *, is_measured: bool = True) -> None:
+        """Close the playing pattern and measure its end."""
         ended, self._playing = self._playing, None
         if ended is None:
             return
-        ended.end = now
-        settled = ended.start + ended.ramp
+        ended.until = now
+        # Its end is reported with the reply to what ended it, some time after the fingers changed.
+        settled = ended.applied.time + ended.applied.layer.ramp
         changes = [each for each in self._changes if settled < each < now]
         start, end = max(pairwise([settled, *changes, now]), key=lambda rest: rest[1] - rest[0])
         since, until = max(start, end - STEADY_WINDOW) + MARGIN, end - MARGIN
         self._changes = changes
         if is_measured and since < until:
-            self._tasks.create_task(self._measure(ended, since, until))
-        else:
-            ended.measured.set_result({})
+            ended.steady = self._tasks.create_task(self._plate.vibration(since, until))
+        for touch in ended.touches:
+            self._complete(touch)
 
-    async def _measure(self, pattern: _Pattern, since: float, until: float) -> None:
-        pattern.measured.set_result(await self._plate.vibration(since, until))
+    def _complete(self, touch: _Touch) -> None:
+        """Make the row of a touch once it is lifted and nothing plays for it."""
+        is_playing = self._playing is not None and touch in self._playing.touches
+        if touch.until < math.inf and not is_playing:
+            self._tasks.create_task(self._add_row(touch))
 
-    def _state_changed(self, event: StateEvent, now: float) -> None:
-        """Note whether the plate is armed; rows of touches that a fault spoils say so."""
-        if event.new == _ARMED:
-            self.fault = None
-            self._is_armed.set()
-        elif event.old == _ARMED:
-            self.fault = event.cause.partition("; ")[0]  # without its remedy
-            self.end(now, is_measured=False)  # silent since a time that is not known
-            for touch in self.touches.values():
-                touch.reason = self.fault
-
-    def _contacts_changed(self, contacts: Sequence[ContactStatus], now: float) -> None:
-        """Make the plate's sensors follow the fingers, and note touches that begin or end."""
-        present = {_id(each): each for each in contacts}
-        sensors = dict[str, Position]()
-        for id, contact in present.items():
-            before = self._sensors.get(id, (math.inf, math.inf))
-            is_at_rest = math.dist(before, _place(contact)) < MIN_MOVEMENT
-            sensors[id] = before if is_at_rest else _place(contact)
-            if id not in self.touches:
-                others = [_place(each) for each in contacts if each is not contact]
-                reason = self.fault or "no vibration was confirmed before it lifted"
-                self.touches[id] = _Touch(contact, now, others, reason)
-            self.touches[id].contact = contact
-        for id in self.touches.keys() - present.keys():
-            self._tasks.create_task(self._add_row(self.touches.pop(id), now))
-        loads = {id: contact.load for id, contact in present.items()}
-        if sensors != self._sensors:
-            self._changes.append(now)
-        if (sensors, loads) != (self._sensors, self._loads):
+    def _move_sensors(self, contacts: tuple[Contact, ...]) -> None:
+        """Make the plate's sensors follow the fingers."""
+        sensors = {}
+        for contact in contacts:
+            position = _place(contact)
+            before = self._sensors.get(_id(contact), (math.inf, math.inf))
+            is_at_rest = math.dist(before, position) < MIN_MOVEMENT
+            sensors[_id(contact)] = before if is_at_rest else position
+        if any(sensors.get(id, position) != position for id, position in self._sensors.items()):
+            self._changes.append(threads.now())
+        loads = {_id(contact): contact.load for contact in contacts}
+        if sensors != self._sensors or loads != self._loads:
             self._sensors, self._loads = sensors, loads
             self._tasks.create_task(self._plate.place_fingers(sensors, loads))
 
-    def _pattern_changed(self, event: PatternEvent, now: float) -> None:
-        before = self._playing.event.contacts if self._playing else []
-        is_led = [*map(_id, before)] == [*map(_id, event.contacts)]  # cross-faded for same fingers
-        self.end(now)
-        self._playing = _Pattern(event, now, CROSSFADE if is_led else ONSET_RAMP)
-        self._patterns.append(self._playing)
-        for contact in event.contacts:
-            if contact.role != "target":
-                self._give_reason(contact, _NOT_THE_TARGET)
-            elif contact.verdict == HELD_BACK:
-                self._give_reason(contact, contact.held_back or "")
-
-    def _give_reason(self, contact: ContactStatus, reason: str) -> None:
-        """Note why a touch feels nothing, unless a fault is the reason."""
-        if _id(contact) in self.touches and self.fault is None:
-            self.touches[_id(contact)].reason = reason
-
-    async def _add_row(self, touch: _Touch, until: float) -> None:
-        """Make the row of a touch that has been lifted, once nothing plays for it any more."""
+    async def _add_row(self, touch: _Touch) -> None:
+        """Make the row of a lifted touch."""
+        contact = touch.contact
         row = TouchRow(
-            time_s=touch.start - self._start,
-            until_s=until - self._start,
-            targets_m=[_place(touch.contact)],
-            quiet_m=touch.quiet,
-            reason=touch.reason,
+            target_id=_id(contact),
+            time_s=contact.since - self._start,
+            until_s=touch.until - self._start,
+            targets_m=[_place(contact)],
+            quiet=touch.quiet,
+            reason=touch.reason or "no vibration was confirmed before it lifted",
         )
-        id = _id(touch.contact)
-        # Of a pattern and a contact that come at once the pattern may be reported first.
-        patterns = [
-            each for each in self._patterns if each.end > touch.start and id in each.targets
-        ]
-        if patterns:
-            vibrations = {each: await each.measured for each in patterns}
-            played = max(patterns, key=_significance)
-            row = _played(row, id, played, vibrations[played])
-            row = replace(row, mode=self._mode, latency_ms=patterns[0].event.latency_ms)
+        if touch.patterns:
+            row = await _played(touch, row)
         self.rows.append(row)
         self._on_row(row)
 
 
-def _significance(pattern: _Pattern) -> tuple[int, float, float]:
-    """Order of patterns: by contents, then by steadiness, then by time."""
-    return len(pattern.event.layers), min(pattern.duration, STEADY_DURATION), pattern.start
+async def _played(touch: _Touch, row: TouchRow) -> TouchRow:
+    """The row with the last steady pattern of most contents, or the longest of them.
 
-
-def _played(
-    row: TouchRow, id: str, pattern: _Pattern, vibration: Mapping[str, FingerVibration]
-) -> TouchRow:
-    """The row of a finger with a pattern, which is of one moment for all fingers that it serves."""
-    event = pattern.event
-    felt = next(each for each in event.contacts if _id(each) == id)
-    quiet = [each for each in event.contacts if each.role == "quiet"]
-    drive = next(  # its own content, or the one that it shares
-        (each for each in event.layers.values() if plays_at(each, felt.frequency_hz)), event.drive
+    It is the same pattern for all fingers that it serves, so that their rows are of one moment.
+    Latency is of the touch's first pattern.
+    """
+    first, main_part = touch.patterns[0], max(touch.patterns, key=_significance)
+    key = touch.contact.key
+    applied = main_part.applied
+    predicted = next(felt for felt in applied.targets if felt.contact.key == key)
+    played = next(  # its own content, or the one that it shares
+        each
+        for each in applied.contents.values()
+        if any(contact.key == key for contact, _ in each.content.targets)
     )
-    tips = [vibration[_id(each)] for each in (felt, *quiet) if _id(each) in vibration]
-    levels: list[float | None] = [None] * (1 + len(quiet))
-    level = contrast = None
-    if len(tips) == len(levels) and len(tips[0].frequencies):
-        own, *others = tips
-        levels = [own.level_db_sl, *(each.loudest_db_sl for each in others)]
-        if len(event.layers) > 1:
-            own, *others = own.parted(felt.frequency_hz or math.nan)
-        level, contrast = own.level_db_sl, steady_contrast_db(own, others)
-    return replace(
+    pattern = played.layer
+    vibration = await main_part.steady if main_part.steady else {}
+    row = replace(
         row,
         reason=None,
-        targets_m=[_place(felt)],
-        quiet_m=[_place(each) for each in quiet],
-        drive={era: tone.model_dump() for era, tone in drive.items()},
-        played_s=pattern.duration,
-        steady=pattern.duration >= STEADY_DURATION,
-        predicted_contrast_db=felt.contrast_db,
+        targets_m=[_place(predicted.contact)],
+        quiet={_id(other): _place(other) for other in applied.quiet},
+        drive={
+            era: {"frequency_hz": each.frequency, "level": each.level, "phase_deg": each.phase}
+            for era, each in played.drive.items()
+        },
+        mode=pattern.drive_mode,
+        latency_ms=None if first.applied.latency is None else 1000 * first.applied.latency,
+        played_s=main_part.duration,
+        steady=main_part.duration >= STEADY_DURATION,
+        predicted_contrast_db=predicted.contrast_db,
+        promised_contrast_db=predicted.promised_contrast_db,
+        predicted_level_db_sl=predicted.level_db_sl,
+        pattern=pattern,
+        levels_db_sl={
+            id: finger.level_db_sl if id == row.target_id else finger.loudest_db_sl
+            for id, finger in vibration.items()
+        },
+    )
+    if len(applied.contents) > 1:
+        own = _finger_row(predicted, vibration)
+        return replace(
+            row,
+            measured_contrast_db=own.measured_contrast_db,
+            measured_level_db_sl=own.measured_level_db_sl,
+            fingers=[_finger_row(each, vibration) for each in applied.targets],
+            contents=[each.layer for each in applied.contents.values()],
+        )
+    target, quiet = _fingers(vibration, predicted, applied.quiet)
+    return replace(
+        row,
+        measured_contrast_db=steady_contrast_db(target, quiet) if target else None,
+        measured_level_db_sl=target.level_db_sl if target else None,
+    )
+
+
+def _significance(pattern: _PlayedPattern) -> tuple[int, float, float]:
+    """Order of patterns: by contents, then by steadiness, then by time."""
+    applied = pattern.applied
+    return len(applied.contents), min(pattern.duration, STEADY_DURATION), applied.time
+
+
+def _finger_row(felt: Prediction, vibration: Mapping[str, FingerVibration]) -> FingerRow:
+    """What a finger feels among several contents."""
+    level = contrast = None
+    measured = vibration.get(_id(felt.contact))
+    if measured is not None and felt.frequency is not None:
+        own, others = measured.parted(felt.frequency)
+        if math.isfinite(own.level_db_sl):
+            level = own.level_db_sl
+            contrast = level - others.loudest_db_sl
+    return FingerRow(
+        at_m=_place(felt.contact),
+        frequency_hz=felt.frequency,
+        verdict=felt.verdict,
         promised_contrast_db=felt.promised_contrast_db,
-        predicted_level_db_sl=felt.level_db_sl,
-        measured_contrast_db=_finite(contrast),
-        measured_level_db_sl=_finite(level),
-        frequency_hz=felt.frequency_hz,
-        verdict=felt.verdict if len(event.layers) > 1 else None,
-        layers=[*event.layers.values()],
-        levels_db_sl=levels,
+        measured_contrast_db=contrast if contrast != math.inf else None,
+        measured_level_db_sl=level,
     )
 
 
-def plays_at(drive: Mapping[str, PlayedTone], frequency: float | None) -> bool:
-    """Whether the tones of a content are of a frequency [Hz], which amplifiers may have rounded."""
-    return frequency is not None and all(
-        abs(tone.frequency_hz - frequency) < SAME_FREQUENCY for tone in drive.values()
-    )
+def _fingers(
+    vibration: Mapping[str, FingerVibration], felt: Prediction, others: Sequence[Contact]
+) -> tuple[FingerVibration | None, list[FingerVibration]]:
+    """Vibration of the target and of the quiet fingers; no target unless all were measured."""
+    target = vibration.get(_id(felt.contact))
+    quiet = [vibration[_id(each)] for each in others if _id(each) in vibration]
+    if target is None or not len(target.frequencies) or len(quiet) < len(others):
+        return None, []
+    return target, quiet
 
 
-def _finite(value: float | None) -> float | None:
-    return value if value is not None and math.isfinite(value) else None
+def _place(contact: Contact) -> Position:
+    return contact.x, contact.y
 
 
-def _read(model: type[_MessageT], event: Notification) -> _MessageT:
-    return model.model_validate(event.data, extra="ignore")
-
-
-def _place(contact: ContactStatus) -> Position:
-    return contact.x_m, contact.y_m
-
-
-def _id(contact: ContactStatus) -> str:
+def _id(contact: Contact) -> str:
     """The id of a contact's sensor on the plate."""
-    return f"{contact.source}#{contact.id}"
+    return f"{contact.key.source}#{contact.key.id}"

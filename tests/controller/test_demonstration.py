@@ -6,17 +6,16 @@ from contextlib import asynccontextmanager
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 import pytest
 
-from controller.api.client import AsyncClient
-from controller.api.link import Notification
 from controller.demo import demonstration
 from controller.demo import recorder as far_end
 from controller.demo.demonstration import choose_rows
 from controller.demo.recorder import (
+    FingerRow,
     FingerVibration,
     SimulatedPlate,
     TouchRecorder,
@@ -24,6 +23,9 @@ from controller.demo.recorder import (
     simulated_plate,
     steady_contrast_db,
 )
+from controller.play.intent import Prediction, not_served
+from controller.play.loop import Observers, PlayReport
+from controller.sources.touch import Change, Contact, ContactKey
 from daemons import ENABLED, ready_daemon, until, until_state
 from drivers.errors import LinkError
 from model.finger import detection_threshold
@@ -36,8 +38,20 @@ FIGURES = ("contrast_db", "level_db_sl")
 PROMISED = ("promised_contrast_db",)
 KEYS = (
     *("time_s", "until_s", "targets_m", "quiet_m", "reason", "drive", "mode", "latency_ms"),
-    *("played_s", "steady", "frequency_hz", "verdict"),
+    *("played_s", "steady"),
 )
+FINGER = FingerRow(
+    at_m=(0.1, 0.1),
+    frequency_hz=90.0,
+    verdict="own",
+    promised_contrast_db=12.0,
+    measured_contrast_db=14.0,
+    measured_level_db_sl=20.0,
+)
+FINGER_KEYS = {
+    *("at_m", "frequency_hz", "verdict"),
+    *("promised_contrast_db", "measured_contrast_db", "measured_level_db_sl"),
+}
 
 
 def vibration(amplitudes, frequencies=(100.0, 250.0)):
@@ -51,10 +65,11 @@ def vibration(amplitudes, frequencies=(100.0, 250.0)):
 def row(time, *, contrast, others):
     """A measured touch with other fingers on the plate."""
     return TouchRow(
+        target_id="t",
         time_s=time,
         until_s=time + 1,
         targets_m=[(0.05, 0.05), (0.2, 0.1)],
-        quiet_m=[(0.1, 0.01 * n) for n in range(others)],
+        quiet={f"q{n}": (0.1, 0.01 * n) for n in range(others)},
         measured_level_db_sl=19.0,
         measured_contrast_db=contrast,
     )
@@ -106,32 +121,27 @@ def test_json_has_the_documented_keys_of_every_touch():
     figures = {f"{what}_{of}" for what in ("predicted", "measured") for of in FIGURES}
     assert silent.as_json().keys() == {*figures, *PROMISED, *KEYS}
     assert silent.as_json()["quiet_m"] == [(0.1, 0.0)]
+    shared = replace(silent, fingers=[FINGER])
+    assert shared.as_json().keys() - silent.as_json().keys() == {"fingers"}
+    (finger,) = shared.as_json()["fingers"]
+    assert finger.keys() == FINGER_KEYS
 
 
-def test_picture_shows_highest_contrast_of_each_number_of_fingers():
-    """Fewest fingers first; a touch without measurement is left out."""
+def test_picture_shows_highest_contrasts_of_each_number_of_fingers():
+    """Six panels, fewest fingers first; a touch without measurement is left out."""
     rows = [row(n, contrast=float(n), others=1 + n % 2) for n in range(10)]
     silent = replace(row(99.0, contrast=99.0, others=1), measured_level_db_sl=None)
-    assert [each.time_s for each in choose_rows([*rows, silent])] == [8, 9]
+    chosen = choose_rows([*rows, silent])
+    assert [len(each.quiet) for each in chosen] == [1, 1, 1, 2, 2, 2]
+    assert {each.time_s for each in chosen} == {8, 6, 4, 9, 7, 5}
 
 
 FAULT = "amplifier d: state must be OPERATION_ENABLED, got FAULT with fault WATCHDOG"
 
 
-def finger(number: int, x: float = 0.1, **more: object) -> dict[str, object]:
-    """A contact in an event of the API, as docs/reference/api.md has it."""
-    return {"source": "test", "id": number, "x_m": x, "y_m": 0.1, **more}
-
-
-def said(topic: str, *contacts: dict[str, object], **more: object) -> Notification:
-    """An event that is sent now."""
-    return Notification(topic, threads.now(), 0, {"contacts": [*contacts], **more})
-
-
-def changed(new: str, *, old: str = ENABLED, cause: str = "armed") -> Notification:
-    """The event of a state."""
-    data = {"old": old, "new": new, "cause": cause, "remedy": None, "epoch": 1}
-    return Notification("state", threads.now(), 0, data)
+def contact(number: int) -> Contact:
+    """A contact that is down from now on."""
+    return Contact(ContactKey("test", number), 0.1, 0.1, threads.now())
 
 
 async def nothing(*_: object) -> dict[str, FingerVibration]:
@@ -152,25 +162,25 @@ async def recorder_of(
 async def test_rows_after_a_fault_name_it_until_the_plate_is_armed_again() -> None:
     """The touch that was down at the fault and the one that came later; no other one."""
     rows: list[TouchRow] = []
-    near, down, later, last = (finger(number) for number in range(4))
-    fault = changed("FAULT", cause=f"{FAULT}; once the cause is gone, clear and arm again")
+    near, down, later, last = (contact(number) for number in range(4))
     async with recorder_of(rows) as recorder:
-        for event in (
-            changed(ENABLED),
-            said("contacts", near),
-            said("silence", near, reason="too close to an edge", latency_ms=None),
-            said("contacts"),
-            said("contacts", down),
-            fault,
-            said("silence", down, reason="silent since the fault", latency_ms=None),
-            said("contacts"),
-            said("contacts", later),
-            said("contacts"),
-        ):
-            recorder.take(event)
+        loop = Observers()
+        recorder.observe(loop)
+        (changed,), (reported,) = loop.contacts_changed, loop.reported
+        changed((near,), Change(down=(near,)))
+        reason = "too close to an edge"
+        held_back = (not_served(near, reason),)
+        reported(PlayReport((near,), held_back, None, threads.now(), reason=reason))
+        changed((), Change(up=(near,)))
+        changed((down,), Change(down=(down,)))
+        recorder.failed(f"{FAULT}; once the cause is gone, clear and arm again")
+        changed((), Change(up=(down,)))
+        changed((later,), Change(down=(later,)))
+        changed((), Change(up=(later,)))
         assert recorder.fault == FAULT
-        for event in (changed(ENABLED), said("contacts", last), said("contacts")):
-            recorder.take(event)
+        recorder.armed()
+        changed((last,), Change(down=(last,)))
+        changed((), Change(up=(last,)))
     reasons = [row.reason for row in rows]
     assert reasons[:3] == ["too close to an edge", FAULT, FAULT]
     assert reasons[3] != FAULT
@@ -188,22 +198,28 @@ async def test_pattern_is_measured_while_no_finger_moves(monkeypatch: pytest.Mon
         return {}
 
     async with recorder_of([], vibration) as recorder:
-        start, x = threads.now(), 0.1
-        recorder.take(said("contacts", finger(1, x)))
-        figures = ("promised_contrast_db", "predicted_contrast_db", "predicted_level_db_sl")
-        pattern = {**dict.fromkeys(figures), "drive": {}, "layers": {"0": {}}, "latency_ms": 3.0}
-        for _ in range(3):
-            target = finger(1, x, role="target", verdict="own")
-            recorder.take(said("pattern", target, **pattern))
+        start, loop = threads.now(), Observers()
+        recorder.observe(loop)
+        (changed,), (applied_now,) = loop.contacts_changed, loop.reported
+        finger = contact(1)
+        changed((finger,), Change(down=(finger,)))
+        for quiet in ((), (contact(2),), (contact(2),)):
+            applied = SimpleNamespace(
+                time=threads.now(),
+                targets=(Prediction(finger, 20.0),),
+                layer=SimpleNamespace(ramp=0.04),
+                quiet=quiet,
+                contents=(1,),
+            )
+            applied_now(cast(PlayReport, applied))
             await asyncio.sleep(1.0)
             for _ in range(8):
-                x += 0.004
-                recorder.take(said("contacts", finger(1, x)))
+                finger = replace(finger, x=finger.x + 0.004)
+                changed((finger,), Change(moved=(finger,)))
                 await asyncio.sleep(0.1)
-        recorder.end(threads.now(), is_measured=False)
-    early, late = 1.0 - far_end.STEADY_WINDOW + far_end.MARGIN, 1.0 - far_end.MARGIN
     assert windows == [
-        pytest.approx((start + begun + early, start + begun + late)) for begun in (0.0, 1.8)
+        pytest.approx((start + since, start + until))
+        for since, until in ((0.755, 0.995), (2.555, 2.795))
     ]
 
 
@@ -215,35 +231,32 @@ async def test_plate_is_armed_again_after_a_fault_but_not_after_a_stop(
     monkeypatch.setattr(demonstration, "RECOVERY", 5.0)
     async with asyncio.TaskGroup() as tasks, ready_daemon(tmp_path) as (bench, era):
         recorder = TouchRecorder(cast(SimulatedPlate, None), tasks, on_row=lambda row: None)
-        async with await AsyncClient.connect(bench.socket, name="follower") as following:
-            follow = asyncio.create_task(recorder.follow(following))
-            arming = asyncio.create_task(demonstration.keep_armed(era))
-            await recorder.start()
-            await until_state(era, ENABLED)
-            bench.far.device.inject_fault(FaultWindow(fault="over_voltage", lasts=0.05))
-            await until(lambda: recorder.fault is not None)
-            await until(lambda: recorder.fault is None or arming.done())
-            assert not arming.done()
-            await until_state(era, ENABLED)
-            await era.stop()
-            with pytest.raises(LinkError, match="aborted: stopped"):
-                await arming
-            assert (await era.status()).state == "QUICK_STOP_ACTIVE"
-            follow.cancel()
+        arming = asyncio.create_task(
+            demonstration._keep_armed(bench.daemon, bench.socket, recorder)
+        )
+        await recorder.start()
+        await until_state(era, ENABLED)
+        bench.far.device.inject_fault(FaultWindow(fault="over_voltage", lasts=0.05))
+        await until(lambda: recorder.fault is not None)
+        await until(lambda: recorder.fault is None or arming.done())
+        assert not arming.done()
+        await until_state(era, ENABLED)
+        await era.stop()
+        with pytest.raises(LinkError, match="aborted: stopped"):
+            await arming
+        assert (await era.status()).state == "QUICK_STOP_ACTIVE"
 
 
 @in_virtual_time
-async def test_fault_that_lasts_aborts_the_demonstration(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_fault_that_lasts_aborts_the_demonstration() -> None:
     """At the end, for the cause of the fault, though all scenes have been played."""
-    monkeypatch.setattr(TouchRecorder, "follow", nothing)  # no event says that it is over
-    async with asyncio.TaskGroup() as tasks, ready_daemon(tmp_path) as (bench, _):
+    async with asyncio.TaskGroup() as tasks:
         recorder = TouchRecorder(cast(SimulatedPlate, None), tasks, on_row=lambda row: None)
-        recorder.take(changed(ENABLED))
-        recorder.take(changed("FAULT", cause=f"{FAULT}; once the cause is gone, arm again"))
+        recorder.armed()
+        recorder.failed(f"{FAULT}; once the cause is gone, clear and arm again")
+        nothing = cast(Any, None)
         with pytest.raises(LinkError, match=f"aborted: {FAULT}$"):
-            await demonstration._play(bench.daemon, bench.socket, [], 0, recorder)
+            await demonstration._play([], 0, recorder, nothing)
 
 
 async def test_far_end_terminates_process_when_not_ready_in_time(
@@ -285,10 +298,7 @@ async def test_far_end_reports_exit_status_when_rig_is_invalid(
         (b'{"fingers": ', r"/sock: no reply to felt"),
         (b"x" * (2 << 20), r"/sock: no reply to felt"),
         (b"3\n", r"/sock: no reply to felt"),
-        (
-            b'{"fingers": {"1": {"weights": 3}}}\n',
-            r"/sock: no reply to felt .*has no 'frequencies_hz'",
-        ),
+        (b'{"fingers": {"1": {"weights": 3}}}\n', r"/sock: no reply to felt .*fingers.1"),
         (None, r"/sock: no reply to felt .*too long"),
     ],
     ids=["an error", "half a line", "no line", "a number", "other keys", "nothing"],

@@ -487,10 +487,9 @@ def test_finger_feels_what_many_eras_promise(name: str, capture: Path) -> None:
     assert row.measured_contrast_db is not None
     assert row.promised_contrast_db is not None
     assert row.measured_contrast_db >= row.promised_contrast_db > 6
-    felt, quiet = row.levels_db_sl
-    assert felt is not None
-    assert quiet is not None
-    assert felt - quiet == pytest.approx(row.measured_contrast_db)
+    (quiet,) = row.quiet
+    shown = row.levels_db_sl[row.target_id] - row.levels_db_sl[quiet]
+    assert shown == pytest.approx(row.measured_contrast_db)
     assert row.measured_level_db_sl == pytest.approx(row.predicted_level_db_sl, abs=3)
 
 
@@ -498,27 +497,32 @@ def test_three_people_each_feel_their_own_content_while_one_slides_and_one_leave
     """In its band, and promised as its own; at least that on the first plate that is drawn.
 
     The one that slides by a third of the plate feels it where it rests at last, and the rows of
-    all three are of that moment.
+    all three are of that moment, with one set of figures.
     """
     file = EXAMPLES / "car_display.yaml"
     rig = load_rig(file)
     table = build_table(rig, frequencies=np.arange(70.0, 301.0, 10.0), drive_mode="phased")
     scene = example_scenes(rig)[-1]
     rows = run_virtual(run_demo(file, table, wire="sim", scenes=[scene], on_row=lambda row: None))
-    slid, _, _ = rows
+    slid, stayed, left = rows
+    assert len(slid.fingers) == 3
+    assert slid.fingers == stayed.fingers == left.fingers
+    for row, finger in zip(rows, slid.fingers, strict=True):
+        assert row.measured_contrast_db == finger.measured_contrast_db
+        assert row.targets_m == [finger.at_m]
     assert slid.targets_m == [pytest.approx((0.15 * 0.53, 0.65 * 0.30), abs=0.008)]
     bands = [(70, 110), (180, 220), (250, 300)]
-    for row, (low, high) in zip(rows, bands, strict=True):
-        assert row.layers == slid.layers
-        assert len(row.layers) == 3
+    for finger, (low, high) in zip(slid.fingers, bands, strict=True):
+        assert finger.frequency_hz is not None
+        assert low <= finger.frequency_hz <= high
+        assert finger.verdict == "own"
+        assert finger.measured_contrast_db is not None
+        assert finger.promised_contrast_db is not None
+        assert finger.measured_contrast_db >= finger.promised_contrast_db >= 12
+        assert finger.measured_level_db_sl == pytest.approx(20.0, abs=3)
+    for row in rows:
         assert row.steady
-        assert row.frequency_hz is not None
-        assert low <= row.frequency_hz <= high
-        assert row.verdict == "own"
-        assert row.measured_contrast_db is not None
-        assert row.promised_contrast_db is not None
-        assert row.measured_contrast_db >= row.promised_contrast_db >= 12
-        assert row.measured_level_db_sl == pytest.approx(20.0, abs=3)
+        assert row.as_json()["fingers"]
 
 
 @pytest.mark.parametrize("name", CHANNELS_OF)

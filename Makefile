@@ -10,7 +10,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet --editab
 # Hundreds of processes are started: what is compiled of us is kept, whatever the shell says.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo firmware firmware-test test test-changed test-long test-busy test-kernels test-pymodbus nightly lint pages format docs fuzz faults kill-test fault-test stop-test late-test desk-test qt-test estimate-test soak bench bench-latency \
+.PHONY: demo firmware firmware-test test test-changed test-long test-busy test-kernels test-pymodbus nightly lint pages format docs fuzz faults kill-test fault-test stop-test late-test desk-test qt-test estimate-test surface-test soak bench bench-latency \
 	bench-plant bench-promise dist dist-platform smoke smoke-lowest sbom licences clean
 .NOTPARALLEL:
 
@@ -44,7 +44,7 @@ test-changed: .venv/installed-test
 
 # All that is long, one target after another, each within an hour; the rest goes on after a failure.
 # Two hours on two cores. Others: make nightly NIGHTLY='soak kill-test'
-NIGHTLY := test-long test-kernels test-pymodbus test-busy faults firmware-test fuzz stop-test late-test kill-test soak desk-test qt-test estimate-test smoke-lowest
+NIGHTLY := test-long test-kernels test-pymodbus test-busy faults firmware-test fuzz stop-test late-test kill-test soak desk-test qt-test estimate-test surface-test smoke-lowest
 nightly: .venv/installed-test
 	@failed=; for target in $(NIGHTLY); do start=$$(date +%s); echo "nightly: $$target"; \
 		$(MAKE) $$target || failed="$$failed $$target"; \
@@ -151,6 +151,12 @@ soak: .venv/installed-test
 estimate-test: .venv/installed-test
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python tests/support/error_estimates.py \
 		--write docs/measured/accuracy.md
+
+# A curved glass by the modes that CalculiX computes, against its whole equations; some minutes.
+# Others: make surface-test SURFACE='--sets 200'
+surface-test: .venv/installed-test
+	.ci/install calculix-ccx:ccx
+	$(BIN)/python -m benchmarks.surface --solver calculix --sets 30 $(SURFACE)
 
 format: .venv/installed-test
 	$(BIN)/ruff check --fix .

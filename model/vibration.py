@@ -27,9 +27,8 @@ from model.fem import RIGID_BODY_MODES, Mesh, assemble, simply_supported_modes
 from model.files.csv_file import as_frame
 from model.processes import Progress, unseen
 from model.quantities import counted
-from model.reduction.free_plate import FreePlate, SpectralModes, solve_free_plate
+from model.reduction.free_plate import FreePlate, solve_free_plate
 from model.reduction.reduced_plate import on_springs, reduce_free_plate
-from model.reduction.surface_modes import SurfaceModes
 from model.rig.rig import Rig
 from model.rig.rig_file import mesh_of
 from model.spectral.modes import PlateMesh, SpectralMesh
@@ -498,20 +497,23 @@ def estimate_error(
 
     finer: of `finer_mesh`; frequencies (f,) [Hz]. Each ERA is driven alone.
     """
-    plates = [free]
-    if finer != free.mesh:
-        plates = [solve_free_plate(free.plate, finer, frequency_max=free.frequency_max), free]
-    if isinstance(free.modes, SpectralModes | SurfaceModes):
-        plates.append(replace(free, modes=free.modes.softer()))
-    squares = np.zeros((len(plates), len(frequencies), len(eras)))
+    exactly = (
+        free
+        if finer == free.mesh
+        else solve_free_plate(free.plate, finer, frequency_max=free.frequency_max)
+    )
+    others = [replace(free, modes=each) for each in free.modes.alternatives()]
+    # Of the field, of its error by the mesh, and by what the modes leave open.
+    squares = np.zeros((3, len(frequencies), len(eras)))
     # A few points at a time: whole fields of sixteen ERAs take a gigabyte.
     parts = math.ceil(len(frequencies) * len(eras) * len(points) / _MAX_VALUES)
     for few in np.array_split(points, parts):
-        exact, own, *others = (
-            of.acceleration(eras, frequencies, few, loads=loads) for of in plates
+        own, exact, *possible = (
+            of.acceleration(eras, frequencies, few, loads=loads) for of in (free, exactly, *others)
         )
-        differences = [own - each for each in (exact, *others)]
-        for square, field in zip(squares, (exact, *differences), strict=True):
-            square += np.linalg.norm(field, axis=2) ** 2
-    size, *errors = np.sqrt(squares)
-    return np.asarray(sum(errors) / size)
+        squares[0] += np.linalg.norm(exact, axis=2) ** 2
+        squares[1] += np.linalg.norm(own - exact, axis=2) ** 2
+        for each in possible:
+            squares[2] += np.linalg.norm(own - each, axis=2) ** 2 / len(possible)
+    size, by_mesh, by_modes = np.sqrt(squares)
+    return np.asarray((by_mesh + by_modes) / size)

@@ -120,11 +120,10 @@ def build(
         "takes this error into account and is lower for it; `mesh: auto` chooses one for about 1 %"
     )
     if rig.plate.surface is not None:
-        wanted = WELL_KNOWN * chosen[-1]
         coarse = (
             f"surface: fields by {table.mesh} are wrong by {error:.3g} %; what is promised takes "
             "this error into account and is lower for it; export modes up to "
-            f"{max(wanted, 2 * table.mesh.highest_frequency(rig.plate)):.0f} Hz"
+            f"{max(WELL_KNOWN * chosen[-1], 2 * table.mesh.highest_frequency(rig.plate)):.0f} Hz"
         )
     for warning in (coarse if error >= _COARSE_ERROR else None, why_slow()):
         if warning:

@@ -189,13 +189,15 @@ def _units(path: Path, block: DatasetBlock) -> tuple[float, float]:
     return length, factors[1]
 
 
-def _rows_of(path: Path, block: DatasetBlock, size: int) -> Iterator[list[list[float]]]:
-    """Yield the numbers of records of so many rows each."""
-    rows = block.rows[1:]
+def _rows_of(
+    path: Path, block: DatasetBlock, size: int, head: int = 1
+) -> Iterator[list[list[float]]]:
+    """Yield the numbers of records of so many rows each, behind a head."""
+    rows = block.rows[head:]
     if len(rows) % size:
         raise InputError(
-            f"{path}:{block.line + len(rows) + 1}: dataset {block.kind} must have {size} rows for "
-            f"each entry, got {len(rows)} in all; the file is damaged, export it again"
+            f"{path}:{block.line + head + len(rows)}: dataset {block.kind} must have {size} rows "
+            f"for each entry, got {len(rows)} in all; the file is damaged, export it again"
         )
     for first in range(0, len(rows), size):
         yield [numbers_in(row) for row in rows[first : first + size]]
@@ -299,21 +301,14 @@ def _modal(
 
 def _values(path: Path, block: DatasetBlock, head: int, count: int) -> tuple[list[int], FloatArray]:
     """Numbers of the nodes (n,), and so many values at each (n, count)."""
-    rows = block.rows[head:]
     size = 1 + math.ceil(count / _VALUES_A_ROW)
-    if len(rows) % size:
-        raise InputError(
-            f"{path}:{block.line + head + len(rows)}: a mode must have {size} rows for each node, "
-            f"got {len(rows)} in all; the file is damaged, export it again"
-        )
     numbers, values = [], []
-    for first in range(0, len(rows), size):
-        number = numbers_in(rows[first])
-        own = [each for row in rows[first + 1 : first + size] for each in numbers_in(row)]
+    for entry, (number, *rows) in enumerate(_rows_of(path, block, size, head)):
+        own = [each for row in rows for each in row]
         if len(number) != 1 or len(own) != count:
             raise InputError(
-                f"{path}:{block.line + 1 + head + first}: a node must have its number and then "
-                f"{count} values, got {len(own)}; the file is damaged, export it again"
+                f"{path}:{block.line + 1 + head + size * entry}: a node must have its number and "
+                f"then {count} values, got {len(own)}; the file is damaged, export it again"
             )
         numbers.append(int(number[0]))
         values.append(own)

@@ -1,13 +1,21 @@
 """Modes of a surface that were read, in place of those of a plate that are solved.
 
 Modes above the cut-off are truncated ones that are known. What lies above the last mode is a
-compliance that is estimated from the number and the size of the upper half of the modes:
+compliance that is estimated from the number and the size of the upper half of the modes, as are
+its higher terms, without which no reduced plate (`model.reduction.reduced_plate`) would hold it:
 
-    R(p, q) = n sqrt(m(p) m(q)) c(k |p - q|) / (4 pi² f),   c(r) = 2 int_1^inf J0(r x) / x³ dx
+    T_j(p, q) = n f u^j sqrt(m(p) m(q)) c_j(k |p - q|) / (2j - 1),   u = 1 / (4 pi² f²),
+    c_j(r) = (4j - 2) int_1^inf J0(r x) / x^(4j - 1) dx,   j = 1, 2, ...
 
-with n modes per Hz at the last frequency f, m their mean square at a point and k their wavenumber.
-It is what a homogeneous plate with these modes adds. Residual vectors that a program exports as
-modes are truncated modes like others.
+with n modes per Hz and the frequency f up to which as many are expected, both of the straight line
+through the natural frequencies by their number, m their mean square at a point and k their
+wavenumber. It is what a homogeneous plate with these modes adds. Residual vectors that a program
+exports as modes are truncated modes like others.
+
+The estimate is a mean. That of one surface differs by which modes come next: of Gaussian shapes by
+sqrt(2 / 3N) with N modes known, at each place and in each symmetry by itself, which moves
+resonances on stiff ERAs. So its error is that of surfaces whose next modes are drawn: sums of plane
+waves of the same density, size and wavenumber at evenly spaced frequencies (`alternatives`).
 """
 
 import math
@@ -31,19 +39,20 @@ A field has this many terms, a receptance between points twice as many, from inn
 _MAX_NODES = 2500  # through which splines go; finer meshes are thinned
 _MAX_CACHED = 8
 _TRUNCATED = 0.75  # of the highest frequency: modes above it are not kept but summed
-_UNCERTAIN = 1 / 3  # of the estimated compliance; see docs/how-to/surface.md
+_ALTERNATIVES, _WAVES = 4, 4  # surfaces with other further modes; plane waves in each such mode
 _OF_A_DISC = 0.7  # mean distance of its points from the middle, in radii
 
 
 @cache
-def _correlation() -> tuple[FloatArray, FloatArray]:
-    """Arguments r and c(r)."""
+def _correlations() -> tuple[FloatArray, FloatArray]:
+    """Arguments r (a,) and c_j(r) / (2j - 1) of all terms, (2 RESIDUAL_ORDER, a)."""
     from scipy.special import j0
 
     r = np.linspace(0, 40, 2001)
     t, weights = np.polynomial.legendre.leggauss(800)
     t, weights = (t + 1) / 2, weights / 2
-    return r, 2 * (j0(r[:, None] / t) * t) @ weights
+    orders = np.arange(1, 2 * RESIDUAL_ORDER + 1)
+    return r, 2 * (weights * t ** (4 * orders[:, None] - 3)) @ j0(r / t[:, None])
 
 
 def thinned(points: FloatArray, count: int) -> FloatArray:
@@ -96,20 +105,38 @@ class SurfaceModes:
         shapes = read.shapes[chosen] / math.sqrt(thicker)
         self._spline = RBFInterpolator(read.points[chosen], shapes, kernel="cubic", degree=2)
         self._sides = plate.length, plate.width
-        self._upper = slice(read.rigid + (len(frequencies) - read.rigid) // 2, None)
-        upper = frequencies[self._upper]
-        per_hertz = len(upper) / (highest - upper[0] + 1e-9)
-        self._size = per_hertz / (4 * math.pi**2 * highest)
-        area = math.prod(self._sides)
-        self._wavenumber = math.sqrt(4 * math.pi * highest * per_hertz / area)
-        self._softness = 1.0
+        elastic, half = frequencies[read.rigid :], (len(frequencies) - read.rigid) // 2
+        self._upper = slice(read.rigid + half, len(frequencies))
+        # The straight line through frequencies by number: expected spacing, and where it would end.
+        numbers = np.arange(half, len(elastic)) + 0.5
+        spacing, start = np.polyfit(numbers, elastic[half:], 1)
+        self._spacing = max(float(spacing), 1e-6 * highest)
+        self._above = max(start + self._spacing * len(elastic), highest)
+        self._shift = shift
+        self._waves = np.empty((3, 0, 0))
         self._known: dict[tuple[tuple[int, ...], bytes], FloatArray] = {}
 
-    def softer(self) -> "SurfaceModes":
-        """The surface with as much less of the estimated compliance as that is uncertain."""
-        found = copy(self)
-        found._softness = 1 - _UNCERTAIN
-        return found
+    def alternatives(self) -> list["SurfaceModes"]:
+        """Surfaces that the known modes may be of, with as many further modes drawn for each."""
+        count = self._upper.stop
+        beyond = self._above + self._spacing * (np.arange(count) + 0.5)
+        further = 1 / ((2 * math.pi * beyond) ** 2 + self._shift)
+        exponents, drawn = np.arange(1, len(self._powers) + 1)[:, None], []
+        for seed in range(_ALTERNATIVES):
+            rng, found = np.random.default_rng(seed), copy(self)
+            direction, phase = rng.uniform(0, 2 * math.pi, (2, _WAVES, count))
+            k = self._wavenumber * np.sqrt(beyond / self._above)
+            found._waves = np.array([k * np.cos(direction), k * np.sin(direction), phase])
+            powers = (further / self.largest_truncated) ** exponents
+            found._powers = np.hstack([self._powers, powers])
+            found._above, found._known = self._above + self._spacing * count, {}
+            drawn.append(found)
+        return drawn
+
+    @property
+    def _wavenumber(self) -> float:
+        """Wavenumber [rad/m] of the first mode that is estimated, of a plate with this density."""
+        return math.sqrt(4 * math.pi * self._above / self._spacing / math.prod(self._sides))
 
     def shapes_at(self, points: FloatArray) -> FloatArray:
         """Mode shapes at points [m] (p, 2) or footprints (p, 3), (p, r)."""
@@ -118,15 +145,13 @@ class SurfaceModes:
     def truncated_terms(self, points: FloatArray, others: FloatArray) -> FloatArray:
         """Sums between points (n, 2) and others (m, 2)."""
         own, other = (self._observe(each)[:, self._kept :] for each in (points, others))
-        terms = (own * self._powers[:, None]) @ other.T
-        terms[0] += self._local(points, others)
-        return np.asarray(terms)
+        return np.asarray((own * self._powers[:, None]) @ other.T + self._local(points, others))
 
     def basis(self, points: FloatArray, others: FloatArray) -> FloatArray:
         """Deflection at others of modes and residual vectors, (m, r + RESIDUAL_ORDER n)."""
         at = self._observe(others)
         extra = self._residuals(points) @ at[:, self._kept :].T
-        extra[: len(np.atleast_2d(points))] += self._local(points, others)
+        extra += self._local(points, others)[:RESIDUAL_ORDER].reshape(extra.shape)
         return np.hstack([at[:, : self._kept], extra.T])
 
     def unknowns(self, points: FloatArray) -> tuple[FloatArray, ...]:
@@ -144,28 +169,37 @@ class SurfaceModes:
         return np.concatenate(truncated * self._powers[:RESIDUAL_ORDER, None])
 
     def _local(self, points: FloatArray, others: FloatArray) -> FloatArray:
-        """Estimated compliance in modes that are not known, in units of u_c, (n, m)."""
+        """Estimated terms of modes that are not known, as `truncated_terms`, (TERMS, n, m)."""
         own, other = np.atleast_2d(points), np.atleast_2d(others)
-        sizes = [
-            np.sqrt((self._observe(each)[:, self._upper] ** 2).mean(axis=1))
-            for each in (own, other)
-        ]
+        sizes = [self._sizes(self._observe(each)) for each in (own, other)]
         apart = np.linalg.norm(own[:, None, :2] - other[None, :, :2], axis=2)
         if own.shape[1] == other.shape[1] == 3:  # a disc yields less than a point
             apart = np.hypot(apart, _OF_A_DISC * np.maximum(own[:, None, 2], other[None, :, 2]))
-        correlation = np.interp(self._wavenumber * apart, *_correlation(), right=0.0)
-        found = self._softness * self._size * np.outer(*sizes) * correlation
-        return np.asarray(found / self.largest_truncated)
+        r, by_order = _correlations()
+        correlations = np.array(
+            [np.interp(self._wavenumber * apart, r, each, right=0.0) for each in by_order]
+        )
+        u = 1 / ((2 * math.pi * self._above) ** 2 + self._shift) / self.largest_truncated
+        powers = u ** np.arange(1, len(by_order) + 1) * self._above / self._spacing
+        return np.asarray(powers[:, None, None] * np.outer(*sizes) * correlations)
+
+    def _sizes(self, shapes: FloatArray) -> FloatArray:
+        """Root mean square of the upper half of the modes at points of shapes (p, r), (p,)."""
+        return np.asarray(np.sqrt((shapes[:, self._upper] ** 2).mean(axis=1)))
 
     def _observe(self, points: FloatArray) -> FloatArray:
-        """Shapes of all modes at points or footprints of the surface, cached."""
+        """Shapes of all modes at points or footprints of the surface, drawn ones last, cached."""
         points = np.atleast_2d(np.asarray(points, dtype=float))
         key = points.shape, points.tobytes()
         if key not in self._known:
             length, width = self._sides
             check_on_plate(points, length=length, width=width)
-            found = mean_over(self._spline, points, length=length, width=width)
+            found = np.asarray(mean_over(self._spline, points, length=length, width=width))
+            x, y, phase = self._waves
+            along = np.multiply.outer(points[:, 0], x) + np.multiply.outer(points[:, 1], y)
+            waves = math.sqrt(2 / _WAVES) * np.cos(along + phase).sum(axis=1)
+            found = np.hstack([found, self._sizes(found)[:, None] * waves])
             while len(self._known) >= _MAX_CACHED:
                 self._known.pop(next(iter(self._known)))
-            self._known[key] = np.asarray(found)
+            self._known[key] = found
         return self._known[key]

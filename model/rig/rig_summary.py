@@ -207,9 +207,11 @@ def plate_summary(rig: Rig) -> dict[str, Any]:
 
     Keys carry their units. A laminate comes with both bounds of its rigidity, perfectly bonded and
     freely sliding layers, and, where its layers are bonded, the rigidity in free bending waves at
-    both ends of the rig's frequencies.
+    both ends of the rig's frequencies. Of a surface by its modes the plate is the homogeneous one
+    with as many modes and the same mass.
     """
     plate, limits, gap = rig.plate, rig.limits, rig.plate.air_gap
+    surface = plate.surface
     return {
         "length_m": plate.length,
         "width_m": plate.width,
@@ -245,6 +247,15 @@ def plate_summary(rig: Rig) -> dict[str, Any]:
             if each.stiffness
         ],
         "laminate": None if rig.laminate is None else _laminate(rig.laminate, limits),
+        "surface": surface
+        and {
+            "modes_file": surface.file,
+            "modes": surface.count,
+            "rigid_modes": surface.rigid,
+            "highest_frequency_hz": surface.frequency,
+            "normal": surface.normal,
+            "rings": len(surface.outline),
+        },
         "exciters": [_exciter(one) for one in exciters_of(rig)],
         "exciter_types": _types(rig),
     }
@@ -459,7 +470,7 @@ def _cost_notes(rig: Rig) -> Iterator[str]:
                 "dB; narrow the range, or measure anew when the season has changed"
             )
         return
-    plate: Any = rig.document.data["plate"] if rig.document else {}
+    plate: Any = rig.document.data.get("plate", {}) if rig.document else {}
     if any(key in plate for key in _WEATHER):
         yield (
             f"plate.{' and plate.'.join(_WEATHER)}: nothing is known of how "

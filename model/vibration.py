@@ -27,7 +27,7 @@ from model.fem import RIGID_BODY_MODES, Mesh, assemble, simply_supported_modes
 from model.files.csv_file import as_frame
 from model.processes import Progress, unseen
 from model.quantities import counted
-from model.reduction.free_plate import FreePlate, solve_free_plate
+from model.reduction.free_plate import FiniteElementModes, FreePlate, solve_free_plate
 from model.reduction.reduced_plate import on_springs, reduce_free_plate
 from model.rig.rig import Rig
 from model.rig.rig_file import mesh_of
@@ -502,7 +502,11 @@ def estimate_error(
         if finer == free.mesh
         else solve_free_plate(free.plate, finer, frequency_max=free.frequency_max)
     )
-    others = [replace(free, modes=each) for each in free.modes.alternatives()]
+    others = (
+        []
+        if isinstance(free.modes, FiniteElementModes)
+        else [replace(free, modes=each) for each in free.modes.alternatives()]
+    )
     # Of the field, of its error by the mesh, and by what the modes leave open.
     squares = np.zeros((3, len(frequencies), len(eras)))
     # A few points at a time: whole fields of sixteen ERAs take a gigabyte.

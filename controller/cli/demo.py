@@ -97,7 +97,8 @@ def demo(
         return
     if not as_json:
         print(
-            f"{rig_file.name}: table of {counted(len(rig.eras), 'ERA')} on a mesh of {table.mesh}, "
+            f"{rig_file.name}: table of {counted(len(rig.eras), 'ERA')} "
+            f"{'on a mesh of' if rig.plate.surface is None else 'by'} {table.mesh}, "
             f"ready in {time.perf_counter() - started:.1f} s"
         )
         print(_HEADING, end="")

@@ -233,7 +233,7 @@ def daemon_config_of(document: Document) -> DaemonConfig:
 def is_daemon_document(document: Document) -> bool:
     """Whether a document is a daemon's: it has keys of one and does not describe a plate."""
     keys = document.data.keys()
-    return bool(keys & DaemonSection.model_fields.keys()) and "plate" not in keys
+    return bool(keys & DaemonSection.model_fields.keys()) and keys.isdisjoint({"plate", "surface"})
 
 
 def _check_kind(document: Document) -> None:
@@ -241,7 +241,7 @@ def _check_kind(document: Document) -> None:
     if "rig" in document.data:
         return
     is_layout = is_layout_document(document)
-    if is_layout or "plate" in document.data:
+    if is_layout or not {"plate", "surface"}.isdisjoint(document.data):
         raise InputError(
             f"{document.source}: must be a daemon's file, got a "
             f"{'surface layout' if is_layout else 'rig'}; name it in one with "

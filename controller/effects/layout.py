@@ -171,8 +171,8 @@ def layout_of(
     document: Document, plate: Plate | None, *, level_db_sl: float = STRONG_DB_SL
 ) -> SurfaceLayout:
     """Make the layout of a document; arguments and errors as of `load_layout`."""
-    if not is_layout_document(document) and document.data.keys() & {"plate", "rig"}:
-        kind = "a rig" if "plate" in document.data else "a daemon file"
+    if not is_layout_document(document) and document.data.keys() & {"plate", "surface", "rig"}:
+        kind = "a daemon file" if "rig" in document.data else "a rig"
         raise InputError(
             f"{document.source}: must be a surface layout, got {kind}; "
             "era config init layout.yaml --kind layout  writes one"
@@ -211,7 +211,9 @@ def layout_of(
 def is_layout_document(document: Document) -> bool:
     """Whether a configuration file is a surface layout."""
     own = LayoutSection.model_fields.keys()
-    return bool(document.data.keys() & own) and not document.data.keys() & {"plate", "rig"}
+    return bool(document.data.keys() & own) and document.data.keys().isdisjoint(
+        {"plate", "surface", "rig"}
+    )
 
 
 def _effects(

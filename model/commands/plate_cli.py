@@ -416,10 +416,9 @@ def _made_of_rows(laminate: dict[str, Any] | None, surface: dict[str, Any] | Non
             f"of {surface['modes_file']}, {surface['rigid_modes']} of the rigid body, along "
             f"{surface['normal']}; outline of {surface['rings'] or 'no'} rings"
         )
-        yield "homogeneous plate with as many modes and the same mass, for wavelengths alone"
-        return
     if laminate is None:
-        yield "plate"
+        kind = "homogeneous plate with as many modes and the same mass, for wavelengths alone"
+        yield "plate" if surface is None else kind
         return
     bonded, rows = laminate["rigidity_perfectly_bonded_n_m"], {}
     if len(laminate["layers"]) == 1:

@@ -60,8 +60,11 @@ class ModeShapes:
 
 def read_modes(path: Path, content: bytes) -> ModeShapes:
     """Read the modes of a file with this content; raises InputError with file and line."""
-    found = _from_arrays if content.startswith(_BINARY_ZIP) else _from_universal
-    modes = found(path, content)
+    modes = (
+        _from_arrays(path, content)
+        if content.startswith(_BINARY_ZIP)
+        else _from_universal(path, content)
+    )
     for name in ("nodes", "frequencies", "shapes"):
         if not np.isfinite(getattr(modes, name)).all():
             raise InputError(f"{path}: {name} of modes must be finite; export them again")
@@ -106,7 +109,7 @@ def _from_arrays(path: Path, content: bytes) -> ModeShapes:
 
 
 def _from_universal(path: Path, content: bytes) -> ModeShapes:
-    scale = 1.0, 1.0
+    length = force = 1.0
     nodes: dict[int, tuple[float, ...]] = {}
     turned: set[int] = set()
     modes: list[_Mode] = []
@@ -115,7 +118,7 @@ def _from_universal(path: Path, content: bytes) -> ModeShapes:
     for block in blocks(path, content):
         kinds.add(block.kind)
         if block.kind == 164:
-            scale = _units(path, block)
+            length, force = _units(path, block)
         elif block.kind in (15, 2411):
             _read_nodes(path, block, nodes, turned)
         elif block.kind == 2412:
@@ -152,13 +155,11 @@ def _from_universal(path: Path, content: bytes) -> ModeShapes:
             f"{min(local)}; export shapes in global coordinates"
         )
     rows = {number: row for row, number in enumerate(numbers)}
-    length, force = scale
     # Modal masses are in the file's unit of mass, force s² / length.
-    heavier = math.sqrt(force / length)
     return ModeShapes(
         np.array([nodes[each] for each in numbers]) / length,
         np.array([mode.frequency for mode in modes]),
-        np.array([mode.shape for mode in modes]) * heavier,
+        np.array([mode.shape for mode in modes]) * math.sqrt(force / length),
         np.array([mode.damping_ratio for mode in modes]),
         [[rows[each] for each in face] for face in faces if rows.keys() >= set(face)],
     )

@@ -151,10 +151,6 @@ class FiniteElementModes:
         self.largest_truncated = 1 / (float(eigenvalues[min(kept, len(eigenvalues) - 1)]) + shift)
         self._known: dict[tuple[tuple[int, ...], bytes], FloatArray] = {}
 
-    def alternatives(self) -> list["FiniteElementModes"]:
-        """None: elements resolve what they model."""
-        return []
-
     def shapes_at(self, points: FloatArray) -> FloatArray:
         """Mode shapes at points [m] (p, 2) or footprints (p, 3), (p, r)."""
         return np.asarray(self._matrices.deflection_at(points) @ self._vectors)
@@ -341,7 +337,8 @@ frequency, None where they do not. Between points (n, 2) and others (m, 2), or f
 - shapes_at(points): of the modes, (n, r);
 - truncated_terms(points, others): sums of phi phi' (u / u_c)^j over the truncated modes, j = 1, 2,
   ..., (TERMS, n, m);
-- alternatives(): modes of plates that this one may be as well, by which fields are uncertain;
+- alternatives(), not of elements: modes of plates that this one may be as well, by which fields are
+  uncertain;
 - basis(points, others): deflection at others of modes and of the RESIDUAL_ORDER residual vectors of
   forces at the points, term by term, (m, r + RESIDUAL_ORDER n); unknowns(points): its columns in
   the unknowns of the plate, by symmetry class.

@@ -87,9 +87,7 @@ class SurfaceModes:
         from scipy.interpolate import RBFInterpolator
 
         read = surface_shapes(surface.file, surface.digest, surface.normal)
-        thicker = plate.thickness / THICKNESS
-        faster = surface.frequency_factor(plate.thickness, plate.material.E)
-        frequencies = faster * read.frequencies
+        frequencies = surface.frequency_factor(plate.thickness, plate.material.E) * read.frequencies
         highest = float(frequencies[-1])
         cut = min(cutoff_frequency, max(LEAST_KNOWN * frequency_max, _TRUNCATED * highest))
         # One is left to be truncated, since sums over these need some.
@@ -102,14 +100,13 @@ class SurfaceModes:
         self.largest_truncated = float(u.max())
         self._powers = (u / u.max()) ** np.arange(1, 2 * RESIDUAL_ORDER + 1)[:, None]
         chosen = thinned(read.points, _MAX_NODES)
-        shapes = read.shapes[chosen] / math.sqrt(thicker)
+        shapes = read.shapes[chosen] / math.sqrt(plate.thickness / THICKNESS)
         self._spline = RBFInterpolator(read.points[chosen], shapes, kernel="cubic", degree=2)
         self._sides = plate.length, plate.width
         elastic, half = frequencies[read.rigid :], (len(frequencies) - read.rigid) // 2
         self._upper = slice(read.rigid + half, len(frequencies))
         # The straight line through frequencies by number: expected spacing, and where it would end.
-        numbers = np.arange(half, len(elastic)) + 0.5
-        spacing, start = np.polyfit(numbers, elastic[half:], 1)
+        spacing, start = np.polyfit(np.arange(half, len(elastic)) + 0.5, elastic[half:], 1)
         self._spacing = max(float(spacing), 1e-6 * highest)
         self._above = max(start + self._spacing * len(elastic), highest)
         self._shift = shift
@@ -120,14 +117,13 @@ class SurfaceModes:
         """Surfaces that the known modes may be of, with as many further modes drawn for each."""
         count = self._upper.stop
         beyond = self._above + self._spacing * (np.arange(count) + 0.5)
-        further = 1 / ((2 * math.pi * beyond) ** 2 + self._shift)
-        exponents, drawn = np.arange(1, len(self._powers) + 1)[:, None], []
+        further = 1 / ((2 * math.pi * beyond) ** 2 + self._shift) / self.largest_truncated
+        powers = further ** np.arange(1, len(self._powers) + 1)[:, None]
+        k, drawn = self._wavenumber * np.sqrt(beyond / self._above), []
         for seed in range(_ALTERNATIVES):
             rng, found = np.random.default_rng(seed), copy(self)
             direction, phase = rng.uniform(0, 2 * math.pi, (2, _WAVES, count))
-            k = self._wavenumber * np.sqrt(beyond / self._above)
             found._waves = np.array([k * np.cos(direction), k * np.sin(direction), phase])
-            powers = (further / self.largest_truncated) ** exponents
             found._powers = np.hstack([self._powers, powers])
             found._above, found._known = self._above + self._spacing * count, {}
             drawn.append(found)
@@ -197,9 +193,8 @@ class SurfaceModes:
             found = np.asarray(mean_over(self._spline, points, length=length, width=width))
             x, y, phase = self._waves
             along = np.multiply.outer(points[:, 0], x) + np.multiply.outer(points[:, 1], y)
-            waves = math.sqrt(2 / _WAVES) * np.cos(along + phase).sum(axis=1)
-            found = np.hstack([found, self._sizes(found)[:, None] * waves])
+            size = math.sqrt(2 / _WAVES) * self._sizes(found)[:, None]
             while len(self._known) >= _MAX_CACHED:
                 self._known.pop(next(iter(self._known)))
-            self._known[key] = found
+            self._known[key] = np.hstack([found, size * np.cos(along + phase).sum(axis=1)])
         return self._known[key]

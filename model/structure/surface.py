@@ -154,8 +154,7 @@ def surface_shapes(file: str, digest: str, normal: str) -> SurfaceShapes:
     held = sizes > _HELD * sizes.max(initial=0.0)
     rigid, others = int(held.sum()), [a for a in range(3) if a != axis]
     places = read.nodes[:, others] if read.places is None else read.places
-    corner = places.min(axis=0)
-    points = places - corner
+    points = places - places.min(axis=0)
     return SurfaceShapes(
         points,
         np.concatenate([np.zeros(rigid), frequencies[~is_rigid][seen]]),

@@ -384,7 +384,16 @@ def show(rig_file: RigArgument, as_json: JsonOption = False) -> None:
     bare = in_display_unit(summary["mass_kg"], "kg", digits=4)
     rows = [
         f"{rig_file}: {1e3 * summary['length_m']:g} x {1e3 * summary['width_m']:g} mm",
-        *_made_of_rows(summary["laminate"], summary["surface"]),
+        *(
+            (
+                f"surface by {surface['modes']} modes up to {surface['highest_frequency_hz']:.0f} "
+                f"Hz of {surface['modes_file']}, {surface['rigid_modes']} of the rigid body, along "
+                f"{surface['normal']}; outline of {surface['rings'] or 'no'} rings",
+                "homogeneous plate with as many modes and the same mass, for wavelengths alone",
+            )
+            if (surface := summary["surface"])
+            else _laminate_rows(summary["laminate"])
+        ),
         f"    {1e3 * summary['thickness_m']:.4g} mm of {summary['material']}: "
         f"E {summary['E_pa'] / 1e9:.4g} GPa, rho {summary['rho_kg_m3']:.5g} kg/m³, "
         f"nu {summary['nu']:.3g}, loss factor {summary['loss_factor']:g}",
@@ -396,7 +405,7 @@ def show(rig_file: RigArgument, as_json: JsonOption = False) -> None:
             for name, each in FURTHER.items()
             if (value := summary["further"][each.key(name)])
         ),
-        *(() if summary["surface"] else _air_rows(summary["air_gap"])),
+        *(() if surface else _air_rows(summary["air_gap"])),
         *(
             f"    bending wavelength at {_frequency(key)}  {100 * wavelength:.3g} cm"
             for key, wavelength in summary["bending_wavelength_m"].items()
@@ -408,17 +417,10 @@ def show(rig_file: RigArgument, as_json: JsonOption = False) -> None:
     print_report(rows, summary, as_json=as_json)
 
 
-def _made_of_rows(laminate: dict[str, Any] | None, surface: dict[str, Any] | None) -> Iterator[str]:
-    """Yield layers and rigidities of a laminate, or modes of a surface; None for another plate."""
-    if surface is not None:
-        yield (
-            f"surface by {surface['modes']} modes up to {surface['highest_frequency_hz']:.0f} Hz "
-            f"of {surface['modes_file']}, {surface['rigid_modes']} of the rigid body, along "
-            f"{surface['normal']}; outline of {surface['rings'] or 'no'} rings"
-        )
+def _laminate_rows(laminate: dict[str, Any] | None) -> Iterator[str]:
+    """Yield the layers and rigidities of a laminate; None for a plate of one layer."""
     if laminate is None:
-        kind = "homogeneous plate with as many modes and the same mass, for wavelengths alone"
-        yield "plate" if surface is None else kind
+        yield "plate"
         return
     bonded, rows = laminate["rigidity_perfectly_bonded_n_m"], {}
     if len(laminate["layers"]) == 1:

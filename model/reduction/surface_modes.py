@@ -19,6 +19,7 @@ waves of the same density, size and wavenumber at evenly spaced frequencies (`al
 """
 
 import math
+from collections.abc import Iterator
 from copy import copy
 from functools import cache
 
@@ -100,9 +101,13 @@ class SurfaceModes:
         self.largest_truncated = float(u.max())
         self._powers = (u / u.max()) ** np.arange(1, 2 * RESIDUAL_ORDER + 1)[:, None]
         chosen = thinned(read.points, _MAX_NODES)
-        shapes = read.shapes[chosen] / math.sqrt(plate.thickness / THICKNESS)
-        self._spline = RBFInterpolator(read.points[chosen], shapes, kernel="cubic", degree=2)
-        self._sides = plate.length, plate.width
+        self._spline = RBFInterpolator(
+            read.points[chosen],
+            read.shapes[chosen] / math.sqrt(plate.thickness / THICKNESS),
+            kernel="cubic",
+            degree=2,
+        )
+        self._sides = {"length": plate.length, "width": plate.width}
         elastic, half = frequencies[read.rigid :], (len(frequencies) - read.rigid) // 2
         self._upper = slice(read.rigid + half, len(frequencies))
         # The straight line through frequencies by number: expected spacing, and where it would end.
@@ -113,26 +118,27 @@ class SurfaceModes:
         self._waves = np.empty((3, 0, 0))
         self._known: dict[tuple[tuple[int, ...], bytes], FloatArray] = {}
 
-    def alternatives(self) -> list["SurfaceModes"]:
-        """Surfaces that the known modes may be of, with as many further modes drawn for each."""
+    def alternatives(self) -> Iterator["SurfaceModes"]:
+        """Yield surfaces that the known modes may be of, with as many further modes drawn."""
         count = self._upper.stop
         beyond = self._above + self._spacing * (np.arange(count) + 0.5)
         further = 1 / ((2 * math.pi * beyond) ** 2 + self._shift) / self.largest_truncated
         powers = further ** np.arange(1, len(self._powers) + 1)[:, None]
-        k, drawn = self._wavenumber * np.sqrt(beyond / self._above), []
+        k = self._wavenumber * np.sqrt(beyond / self._above)
         for seed in range(_ALTERNATIVES):
             rng, found = np.random.default_rng(seed), copy(self)
             direction, phase = rng.uniform(0, 2 * math.pi, (2, _WAVES, count))
             found._waves = np.array([k * np.cos(direction), k * np.sin(direction), phase])
             found._powers = np.hstack([self._powers, powers])
             found._above, found._known = self._above + self._spacing * count, {}
-            drawn.append(found)
-        return drawn
+            yield found
 
     @property
     def _wavenumber(self) -> float:
         """Wavenumber [rad/m] of the first mode that is estimated, of a plate with this density."""
-        return math.sqrt(4 * math.pi * self._above / self._spacing / math.prod(self._sides))
+        return math.sqrt(
+            4 * math.pi * self._above / self._spacing / math.prod(self._sides.values())
+        )
 
     def shapes_at(self, points: FloatArray) -> FloatArray:
         """Mode shapes at points [m] (p, 2) or footprints (p, 3), (p, r)."""
@@ -176,8 +182,8 @@ class SurfaceModes:
             [np.interp(self._wavenumber * apart, r, each, right=0.0) for each in by_order]
         )
         u = 1 / ((2 * math.pi * self._above) ** 2 + self._shift) / self.largest_truncated
-        powers = u ** np.arange(1, len(by_order) + 1) * self._above / self._spacing
-        return np.asarray(powers[:, None, None] * np.outer(*sizes) * correlations)
+        powers = u ** np.arange(1, len(by_order) + 1)[:, None, None]
+        return np.asarray(powers * (self._above / self._spacing) * np.outer(*sizes) * correlations)
 
     def _sizes(self, shapes: FloatArray) -> FloatArray:
         """Root mean square of the upper half of the modes at points of shapes (p, r), (p,)."""
@@ -188,13 +194,11 @@ class SurfaceModes:
         points = np.atleast_2d(np.asarray(points, dtype=float))
         key = points.shape, points.tobytes()
         if key not in self._known:
-            length, width = self._sides
-            check_on_plate(points, length=length, width=width)
-            found = np.asarray(mean_over(self._spline, points, length=length, width=width))
-            x, y, phase = self._waves
-            along = np.multiply.outer(points[:, 0], x) + np.multiply.outer(points[:, 1], y)
-            size = math.sqrt(2 / _WAVES) * self._sizes(found)[:, None]
+            check_on_plate(points, **self._sides)
+            found = np.asarray(mean_over(self._spline, points, **self._sides))
+            along = np.tensordot(points[:, :2], self._waves[:2], axes=1) + self._waves[2]
+            drawn = math.sqrt(2 / _WAVES) * np.cos(along).sum(axis=1)
             while len(self._known) >= _MAX_CACHED:
                 self._known.pop(next(iter(self._known)))
-            self._known[key] = np.hstack([found, size * np.cos(along + phase).sum(axis=1)])
+            self._known[key] = np.hstack([found, self._sizes(found)[:, None] * drawn])
         return self._known[key]

@@ -210,8 +210,7 @@ def plate_summary(rig: Rig) -> dict[str, Any]:
     both ends of the rig's frequencies. Of a surface by its modes the plate is the homogeneous one
     with as many modes and the same mass.
     """
-    plate, limits, gap = rig.plate, rig.limits, rig.plate.air_gap
-    surface = plate.surface
+    plate, limits, gap, surface = rig.plate, rig.limits, rig.plate.air_gap, rig.plate.surface
     return {
         "length_m": plate.length,
         "width_m": plate.width,

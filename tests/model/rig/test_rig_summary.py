@@ -389,15 +389,20 @@ def test_programs_make_and_change_exciters(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "levels"),
+    ("name", "levels", "lowest"),
     [
-        ("DAEX25FHE-4", {150: 41, 200: 42, 300: 29}),
-        pytest.param("DAEX25CT-4", {150: 36, 200: 36, 300: 23}, marks=pytest.mark.long),
-        pytest.param("DAEX13-4SM", {150: 35, 200: 36, 300: 22}, marks=pytest.mark.long),
+        ("DAEX25FHE-4", {150: 41, 200: 42, 300: 29}, 40),
+        pytest.param("DAEX25CT-4", {150: 36, 200: 36, 300: 23}, 40, marks=pytest.mark.long),
+        # Below 50 Hz the magnet of one board in ten would leave its excursion.
+        pytest.param("DAEX13-4SM", {150: 35, 200: 36, 300: 22}, 50, marks=pytest.mark.long),
     ],
 )
 def test_show_prints_exciters_and_what_they_reach(
-    name: str, levels: dict[int, float], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    name: str,
+    levels: dict[int, float],
+    lowest: int,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     """Least level over the acrylic board at 1 W as another program found it, to 1.3 dB."""
     path = tmp_path / "board.yaml"
@@ -408,12 +413,12 @@ def test_show_prints_exciters_and_what_they_reach(
         zip(found["reach"]["frequencies_hz"], found["reach"]["least_level_db_sl"], strict=True)
     )
     assert {f: by_frequency[f] for f in levels} == pytest.approx(levels, abs=1.3)
-    assert found["reach"]["from_hz"] == 40
+    assert found["reach"]["from_hz"] == lowest
     assert found["exciters"][0].keys() >= {"magnet_resonance_hz", "q", "force_at_1_w_n"}
     show(str(path), as_json=False)
     text = capsys.readouterr().out
     everywhere = "20 dB SL everywhere but 2 cm at the edges, under a finger"
-    assert f"{everywhere}, by the board of the file: from 40 Hz" in text
+    assert f"{everywhere}, by the board of the file: from {lowest} Hz" in text
 
 
 @pytest.mark.parametrize(

@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 from cobs import cobs
 
-from drivers.protocol.definition import HELLO, IDENTITY, MAX_WORDS, TEXTS
+from drivers.protocol.definition import HELLO, MAX_WORDS, TEXTS
 from drivers.protocol.records import Refusal
 
 REPLY_BIT = 0x80
@@ -147,8 +147,9 @@ def payload_of(kind: int, words: Sequence[int]) -> bytes:
     """Return the payload of words; in a reply to Hello each text begins with a byte, its length."""
     if kind != HELLO | REPLY_BIT:
         return pack_words(words)
-    identity = IDENTITY.unpack(words, is_strict=True)
-    texts = [field.encoded(identity) for field in TEXTS]
-    return int(identity["versions"]).to_bytes(2, "little") + b"".join(
-        bytes([len(text)]) + text for text in texts
-    )
+    payload, rest = pack_words(words[:1]), words[1:]
+    for _ in TEXTS:
+        length, count = rest[0], (rest[0] + 1) // 2
+        payload += bytes([length]) + struct.pack(f">{count}H", *rest[1 : 1 + count])[:length]
+        rest = rest[1 + count :]
+    return payload

@@ -452,22 +452,28 @@ def _plate_notes(rig: Rig) -> Iterator[str]:
 
 def _cost_notes(rig: Rig) -> Iterator[str]:
     """Yield what the weather of use and an object cost, if the rig states any."""
-    if mass := rig.uncertainty.foreign_mass:
-        with contextlib.suppress(InputError):  # no place for two fingers
-            cost = resolve_name(_UNCERTAINTY_COST)(rig, "foreign_mass")
-            yield (
-                f"uncertainty.foreign_mass: with {1e3 * mass:.3g} g anywhere on the plate two "
-                f"contents keep {cost.kept_db:.1f} of {cost.exact_db:.1f} dB; what always lies at "
-                "one place belongs under masses"
-            )
-    if weather := rig.uncertainty.weather:
-        with contextlib.suppress(InputError):  # no place for two fingers
-            cost = resolve_name(_UNCERTAINTY_COST)(rig, "weather")
-            yield (
-                f"plate: temperature and humidity change its modulus by {100 * weather:.2g} %, one "
-                f"standard deviation; two contents keep {cost.kept_db:.1f} of {cost.exact_db:.1f} "
-                "dB; narrow the range, or measure anew when the season has changed"
-            )
+    known = rig.uncertainty
+    notes = {
+        "foreign_mass": (
+            f"uncertainty.foreign_mass: with {1e3 * known.foreign_mass:.3g} g anywhere on the "
+            "plate",
+            "what always lies at one place belongs under masses",
+        ),
+        "weather": (
+            "plate: temperature and humidity change its modulus by "
+            f"{100 * known.weather:.2g} %, one standard deviation;",
+            "narrow the range, or measure anew when the season has changed",
+        ),
+    }
+    for key, (what, remedy) in notes.items():
+        if getattr(known, key):
+            with contextlib.suppress(InputError):  # no place for two fingers
+                cost = resolve_name(_UNCERTAINTY_COST)(rig, key)
+                yield (
+                    f"{what} two contents keep {cost.kept_db:.1f} of {cost.exact_db:.1f} dB; "
+                    f"{remedy}"
+                )
+    if known.weather:
         return
     plate: Any = rig.document.data.get("plate", {}) if rig.document else {}
     if any(key in plate for key in _WEATHER):

@@ -181,11 +181,8 @@ def _mass(rigid: FloatArray) -> float:
     """Mass [kg] by rigid modes (n, r) of unit modal mass, NaN where they make no even motion."""
     # Six digits of a file leave directions that are rounding, and would be light.
     shares, *_ = np.linalg.lstsq(rigid, np.ones(len(rigid)), rcond=1e-4)
-    return (
-        float(shares @ shares)
-        if rigid.size > 0 and np.abs(rigid @ shares - 1).max() < 0.05
-        else math.nan
-    )
+    is_even = rigid.size > 0 and np.abs(rigid @ shares - 1).max() < 0.05
+    return float(shares @ shares) if is_even else math.nan
 
 
 def rings_of(faces: Iterable[Sequence[int]], points: FloatArray) -> Rings:

@@ -383,7 +383,7 @@ class Served(Taken):
             self.held.pop().cancel()
 
     async def touches(self, *places: str) -> None:
-        """Report fingers several times, or that there is none."""
+        """Report fingers several times, or an empty plate."""
         for _ in range(4):
             await self.era.touch([PLACES[each] for each in places])
             await asyncio.sleep(0.05)

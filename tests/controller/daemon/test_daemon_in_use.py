@@ -517,7 +517,7 @@ def test_lease_is_renewed_by_its_token_only(token: str) -> None:
 @pytest.mark.parametrize("state", DaemonState)
 @pytest.mark.parametrize("trigger", Trigger)
 def test_lease_exists_while_energised_alone(state: DaemonState, trigger: Trigger) -> None:
-    """Whatever happens; and what may not go on afterwards is told by the epoch."""
+    """However it ends; the epoch says what may not go on afterwards."""
     lease = Lease("me", 5, expires_at=10.0) if state in ENERGISED else None
     before = Operation(state, lease=lease, epoch=7)
     after, _ = step(before, DaemonEvent(trigger, "a test", lease=Lease("you", 3)), 6.0)

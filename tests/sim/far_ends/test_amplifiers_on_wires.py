@@ -557,7 +557,7 @@ at_every_speed = pytest.mark.parametrize("wire", shortly(ALL_WIRES, SHORT_WIRES)
 
 @asynccontextmanager
 async def linked(wire: str, rig: Rig, *, watchdog: float = WATCHDOG) -> AsyncIterator[HostedRig]:
-    """The paper's amplifier behind a wire, armed and beaten by nobody."""
+    """The paper's amplifier behind a wire, armed, without a host that feeds it."""
     async with rig_on_wire(rig, ALL_WIRES[wire], watchdog=watchdog) as hosted:
         await hosted.group.arm()
         yield hosted

@@ -78,8 +78,7 @@ def _line(row: Row, sets: int) -> str:
     """A line of the table: medians over sets, and over all draws."""
     import numpy as np
 
-    from benchmarks.identification.answers import DRIVES
-    from benchmarks.identification.plates import FREQUENCIES
+    from benchmarks.identification.plates import DRIVES, FREQUENCIES
     from model.answer.plan import query
     from model.answer.stimulus import Placement
     from model.rig.rig_file import load_rig

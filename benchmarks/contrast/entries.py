@@ -3,7 +3,7 @@
     OPENBLAS_NUM_THREADS=1 python -m benchmarks.contrast.entries -o DIR [--methods random,paper]
 
 Writes a file for each method, for `python -m benchmarks.contrast score`. All but the paper's drive
-every ERA at one frequency of the table's 47, the one where the method itself does best on the plate
+every ERA at one frequency of the table's 47, the one where the method itself does best on the
 nominal plate:
 
 - random: any frequency, levels and phases
@@ -26,8 +26,7 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.contrast.data_set import VERSION, ContactSet, DataSet, data_set
-from benchmarks.contrast.optimum import optimum
+from benchmarks.contrast.__main__ import VERSION, ContactSet, DataSet, data_set, optimum
 from model.answer.plan import query
 from model.answer.stimulus import Placement
 from model.arrays import ComplexArray, FloatArray, IntArray

@@ -20,10 +20,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.desk.chain import Outcome, chain
-from benchmarks.desk.errors import errors_table
-from benchmarks.desk.identified import Identified, identify
-from benchmarks.desk.session import desk
+from benchmarks.desk.session import Identified, Outcome, chain, desk, errors_table, identify
 from benchmarks.page import write_parts
 from benchmarks.setting import use_one_thread
 

@@ -17,8 +17,7 @@ from model.commands.options import RigArgument
 from model.errors import InputError
 
 if TYPE_CHECKING:
-    from benchmarks.desk_plate.desk_plate import DeskPlate
-    from benchmarks.desk_plate.jack_plate import JackPlate
+    from benchmarks.desk_plate.desk_plate import DeskPlate, JackPlate
 
 _POLL = 0.05  # s
 
@@ -74,10 +73,14 @@ def desk_plate(
     """
     import gc
 
-    from benchmarks.desk_plate.desk_plate import DeskPlate
-    from benchmarks.desk_plate.jack_plate import JackPlate
-    from benchmarks.desk_plate.sensing import Converters
-    from benchmarks.desk_plate.truth import MESH, as_built, draw_truth
+    from benchmarks.desk_plate.desk_plate import (
+        MESH,
+        Converters,
+        DeskPlate,
+        JackPlate,
+        as_built,
+        draw_truth,
+    )
     from era_haptics.lab.measuring.sound_card import read_sensors
     from model.rig.rig_file import load_rig
     from sim.soft_amp.jack import JackClient

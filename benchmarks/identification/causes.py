@@ -2,7 +2,7 @@
 
     python -m benchmarks.identification.causes [--plates 5] [--sound 20] [--first 1] [--report]
 
-Hidden plates are those of `benchmarks.identification.hidden`, read by eight accelerometers at 16
+Hidden plates are those of `benchmarks.identification.plates`, read by eight accelerometers at 16
 tones with 1 % of noise, scales off by 1 % and places by 0.5 mm. It counts the plates of which the
 check says what is wrong, and of which it says that anything is; --sound: of those without a fault.
 With --report, the page docs/measured/identification.md is written as well.
@@ -14,9 +14,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from benchmarks.identification.hidden import LENGTH, NOISE, WIDTH, draw, finger_stiffness
-from benchmarks.identification.tables import PAGE
-from benchmarks.identification.thin_plate import Complexes
+from benchmarks.identification.__main__ import PAGE
+from benchmarks.identification.plates import LENGTH, NOISE, WIDTH, Complexes, draw, finger_stiffness
 from benchmarks.page import write_parts
 from benchmarks.setting import RIG, use_one_thread
 from model.estimate.findings import Verdict

@@ -19,11 +19,18 @@ from multiprocessing import get_context
 
 import numpy as np
 
-from benchmarks.identification.answers import answer, known_table, table_of
-from benchmarks.identification.hidden import LENGTH, WIDTH, draw, finger_stiffness
-from benchmarks.identification.plates import FREQUENCIES
-from benchmarks.identification.tables import PAGE
-from benchmarks.identification.thin_plate import Mounted
+from benchmarks.identification.__main__ import PAGE
+from benchmarks.identification.plates import (
+    FREQUENCIES,
+    LENGTH,
+    WIDTH,
+    Mounted,
+    answer,
+    draw,
+    finger_stiffness,
+    known_table,
+    table_of,
+)
 from benchmarks.page import write_parts
 from benchmarks.setting import RIG, random_contacts, use_one_thread
 from model.estimate.following import LivePlate, PatternReport, PlateEstimate, SettledPattern

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.identification.tables import PAGE
+from benchmarks.identification.__main__ import PAGE
 from benchmarks.page import write_parts
 from benchmarks.setting import use_one_thread
 from benchmarks.weekend.chain import FOLDER, BuiltBoard

@@ -10,6 +10,12 @@ minutes. Beside each figure is how busy other programs kept the processors: on a
 left alone figures are upper bounds. --report: write docs/measured/latency.md. --fingers: instead,
 when ten fingers that land at once in one region are felt, on every rig of the examples, with the
 kernels and without a compiler, and the peak memory of the daemon.
+
+Own calls and files on the way are counted with amplifiers in this process, on a line of memory
+each, which are left out; time is virtual, so that the counts do not depend on the machine. A touch
+goes from its frame to the last byte of its set, answer included, after the first such touch; a
+finger rests for two seconds, its frames coming 20 times a second. The floods of clients are those
+of the tests (tests/support/floods.py), each a process.
 """
 
 import argparse
@@ -19,32 +25,260 @@ import os
 import platform
 import sys
 import time
-from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
-from contextlib import AsyncExitStack, asynccontextmanager
+from collections.abc import AsyncIterator, Awaitable, Callable, Mapping, Sequence
+from contextlib import AsyncExitStack, asynccontextmanager, suppress
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 
+from benchmarks.latency.session import (
+    DAEMON,
+    RESTING,
+    TIMEOUT,
+    UNANSWERED,
+    OtherLoad,
+    Session,
+    become_device,
+    computed,
+    daemon_session,
+    move_ten,
+    peak_memory,
+    plain_session,
+    rest_one,
+    running,
+    taps,
+)
 from benchmarks.page import write_parts
-from benchmarks.setting import use_one_thread
+from benchmarks.setting import support, use_one_thread
+from controller.api.client import AsyncClient
+from controller.api.jsonrpc import RpcError
+from controller.api.link import Unreachable
+from controller.effects.layout import SurfaceLayout, default_effects
+from controller.effects.player import EffectPlayer
+from controller.operation.plate_controller import Controller
+from controller.play.loop import PlayReport
+from controller.sources.touch import (
+    Touch,
+    TouchFrame,
+)
+from drivers.host.amplifier import Amplifier
+from drivers.host.line import Line
+from drivers.opening import Lines
+from drivers.wires.serial_line import SerialWire
+from model.answer.answer_report import Timing
+from model.rig.rig import Rig
+from model.rig.rig_file import load_rig
+from model.table.table_file import cached_table
+from registry.limits import GuardLimits
+from sim.amplifier.simulated_amplifier import SimulatedAmplifier as SimulatedAmplifier
+from sim.far_ends.serial_amplifiers import SerialAmplifiers
+
+_ROOT = Path(__file__).parents[2]
+_run_virtual: Any = support("virtual_lines").run_virtual
+_Recorder: Any = support("courses").Recorder
+_FRAME_INTERVAL, _RESTING = 0.05, 2.0  # s
+_LEVEL = 15.0  # dB SL
+
+
+class FarEnd:
+    """An amplifier behind a line of memory."""
+
+    is_blocked = False
+
+    def __init__(self, channels: int, written: Callable[[], None]) -> None:
+        self._written = written
+        self._end = SerialAmplifiers({1: SimulatedAmplifier("any", channels=channels)}, self._reply)
+        self.line = Line(SerialWire(0, sequence=0), "line")
+        self.line.open(self)
+
+    def write(self, data: bytes) -> None:
+        """Take bytes of the host."""
+        self._written()
+        asyncio.get_running_loop().call_soon(self._receive, data)
+
+    def poll(self) -> None:
+        """Do nothing: all that has come was handed over."""
+
+    def _receive(self, data: bytes) -> None:
+        self._end.receive(data, asyncio.get_running_loop().time())
+
+    def _reply(self, data: bytes) -> None:
+        asyncio.get_running_loop().call_soon(self.line.received, data)
+
+
+class MemoryLines(Lines):
+    """A new line of memory for each amplifier; written: called at each write."""
+
+    def __init__(self, rig: Rig, written: Callable[[], None]) -> None:
+        super().__init__()
+        self._rig = rig
+        self._written = written
+
+    async def amplifier(
+        self,
+        url: str,
+        limits: GuardLimits,
+        *,
+        name: str,
+        serial_number: str | None = None,
+        is_output: bool | None = False,
+    ) -> Amplifier:
+        """Return a host's amplifier."""
+        wired = [each.number for each in self._rig.wiring.values() if each.amplifier == name]
+        far_end = FarEnd(max(wired) + 1, self._written)
+        return Amplifier(far_end.line, 1, limits, name=name, is_output=is_output)
+
+
+async def measure(rig: Rig) -> list[str]:
+    """Return the cells of a rig."""
+    recorder, played = _Recorder(), asyncio.Event()
+    table, _ = cached_table(rig)
+    controller = Controller(
+        rig,
+        table,
+        lines=lambda before: MemoryLines(rig, recorder.written),
+        intent_source=EffectPlayer(SurfaceLayout(effects=default_effects(_LEVEL))),
+        timing=Timing(table),
+        watchdog=2.0,
+    )
+
+    def reported(report: PlayReport) -> None:
+        if report.contents:
+            played.set()
+
+    controller.cycle.observers.reported.append(reported)
+    await controller.open()
+    await controller.arm()
+    running = asyncio.create_task(controller.cycle.run())
+    x, y = rig.plate.length / 3, rig.plate.width / 3
+
+    def deliver(*touches: Touch) -> None:
+        controller.cycle.deliver(TouchFrame("panel", asyncio.get_running_loop().time(), touches))
+
+    async def rest() -> None:
+        for _ in range(round(_RESTING / _FRAME_INTERVAL)):
+            deliver(Touch(3, x, y))
+            await asyncio.sleep(_FRAME_INTERVAL)
+
+    deliver(Touch(1, x, y))
+    await asyncio.sleep(_FRAME_INTERVAL)
+    deliver()
+    await asyncio.sleep(1.0)
+    with recorder:
+        played.clear()
+        deliver(Touch(2, x + 0.02, y))
+        await played.wait()
+    touched = recorder.way(is_until_written=True)
+    in_drivers = sum(n for file, n in touched.calls.items() if file.startswith("drivers/"))
+    await rest()
+    with recorder:
+        await rest()
+    resting = recorder.way(is_until_written=True).calls.total() / _RESTING
+    await controller.close()
+    await running
+    return [f"{touched.calls.total()}", f"{in_drivers}", f"{len(touched.files)}", f"{resting:.0f}"]
+
+
+def table(rigs: Mapping[str, str]) -> str:
+    """Measure the rigs of examples, whose names are the values; returns a table."""
+    rows = [
+        "| rig | touch: calls (goal 300) | of these in drivers | files (goal 22) "
+        "| resting: calls a second (goal 3000) |",
+        "|---|---|---|---|---|",
+    ]
+    for name, file in rigs.items():
+        cells = _run_virtual(measure(load_rig(_ROOT / "examples" / f"{file}.yaml")))
+        rows.append(f"| {' | '.join([name, *cells])} |")
+    return "\n".join(rows)
+
+
+_FLOODS = Path(__file__).parents[2] / "tests" / "support" / "floods.py"
+RECONNECTING = ("again", 200)
+SLOW, MALFORMED, ASKING = ("unreading", 10), ("garbage", 1), ("asking", 5)
+ALL = (SLOW, MALFORMED, ASKING, RECONNECTING)  # these last: they leave no place to others
+_SETTLING = 1.0  # s
+
+
+@asynccontextmanager
+async def floods(path: Path, *kinds: tuple[str, int]) -> AsyncIterator[None]:
+    """Flood the daemon at a socket while this lasts."""
+    async with AsyncExitStack() as stack:
+        for kind, count in kinds:
+            command = (sys.executable, "-P", _FLOODS, kind, path, count)
+            await stack.enter_async_context(running(*command))
+        await asyncio.sleep(_SETTLING)
+        yield
+
+
+@asynccontextmanager
+async def computing(count: int) -> AsyncIterator[None]:
+    """Keep so many processors busy while this lasts."""
+    async with AsyncExitStack() as stack:
+        for _ in range(count):
+            command = (sys.executable, "-c", "while True: sum(range(10_000))")
+            await stack.enter_async_context(running(*command, has_line=False))
+        yield
+
+
+async def fresh_stops(session: Session, count: int) -> int:
+    """Return how many of so many new clients were served a stop."""
+    served = 0
+    for _ in range(count):
+        with suppress(RpcError, Unreachable):
+            async with await AsyncClient.connect(session.socket, name="fresh") as era:
+                await era.stop()
+                served += 1
+    return served
+
+
+async def round_trips(session: Session, count: int) -> np.ndarray:
+    """Return the times [s] of so many touches of the lease's holder, each until its response."""
+    assert session.era is not None
+    times = []
+    for number in range(count):
+        at = session.rig.plate.length * (0.3 + 0.4 * number / count), session.rig.plate.width / 2
+        begun = time.monotonic()
+        await session.era.touch([at])
+        times.append(time.monotonic() - begun)
+        await asyncio.sleep(0.01)
+    return np.array(times)
+
+
+async def stops(session: Session, count: int) -> np.ndarray:
+    """Return the times [s] of so many stops beside a finger, from the request of the lease's holder
+    to the last byte of the stop at the last amplifier; infinite for one that was not seen."""
+    era, far, times = session.era, session.far, []
+    assert era is not None
+    async with AsyncExitStack() as armed:
+        for _ in range(count):
+            far.begin()
+            session.touch(RESTING)
+            await far.until(lambda: far.playing_since(1), UNANSWERED)
+            begun = time.monotonic()
+            stopping = asyncio.create_task(era.stop())
+            stopped_at = await far.until(far.stopped_at, UNANSWERED)
+            times.append(np.inf if stopped_at is None else stopped_at - begun)
+            session.touch()
+            await stopping
+            await _clear(era)
+            await armed.enter_async_context(era.armed("latency"))
+    return np.array(times)
+
+
+async def _clear(era: AsyncClient) -> None:
+    """Clear a stop, once the daemon has done with it; raises TimeoutError."""
+    async with asyncio.timeout(TIMEOUT):
+        while True:
+            with suppress(RpcError):
+                return await era.clear()
+            await asyncio.sleep(0.02)
+
 
 use_one_thread()  # with two the daemon would compete
 
-from benchmarks.latency import calls, crowd  # noqa: E402
-from benchmarks.latency.machine import OtherLoad, become_device, computed, peak_memory  # noqa: E402
-from benchmarks.latency.session import (  # noqa: E402
-    DAEMON,
-    Session,
-    daemon_session,
-    move_ten,
-    plain_session,
-    rest_one,
-    taps,
-)
-from controller.sources.touch import Touch  # noqa: E402
 
 PAGE = Path(__file__).parents[2] / "docs" / "measured" / "latency.md"
 TOUCHES = 300
@@ -114,8 +348,8 @@ async def opened(case: Case) -> AsyncIterator[Session]:
             daemon = daemon_session(rig, program=program, is_two=case.is_two)
             session = await stack.enter_async_context(daemon)
         if case.is_loaded:
-            await stack.enter_async_context(crowd.floods(session.socket, *crowd.ALL))
-            await stack.enter_async_context(crowd.computing(2))
+            await stack.enter_async_context(floods(session.socket, *ALL))
+            await stack.enter_async_context(computing(2))
         yield session
 
 
@@ -156,17 +390,17 @@ async def resting(session: Session, touches: int) -> str:
 
 async def fresh(session: Session, touches: int) -> str:
     """How many stops of new clients are served."""
-    return f"{await crowd.fresh_stops(session, touches // 3)} of {touches // 3}"
+    return f"{await fresh_stops(session, touches // 3)} of {touches // 3}"
 
 
 async def trips(session: Session, touches: int) -> str:
     """Round trips of the lease's holder."""
-    return _late(await crowd.round_trips(session, touches))
+    return _late(await round_trips(session, touches))
 
 
-async def stops(session: Session, touches: int) -> str:
+async def stop_times(session: Session, touches: int) -> str:
     """Times of stops."""
-    return _late(await crowd.stops(session, touches))
+    return _late(await stops(session, touches))
 
 
 _Act: TypeAlias = Callable[[Session, int], Awaitable[str]]
@@ -175,14 +409,14 @@ FURTHER: Sequence[tuple[str, str, str, _Act, tuple[tuple[str, int], ...]]] = (
     ("processor, one finger that rests", "16 on 4", "2 %", resting, ()),
     (
         *("stops of new clients beside 200 that reconnect", "4 ERAs on 1", "all"),
-        *(fresh, (crowd.RECONNECTING,)),
+        *(fresh, (RECONNECTING,)),
     ),
     (
         "touch of the lease's holder beside these, slow readers and bad JSON, round trip",
         *("4 ERAs on 1", "99th 20 ms", trips),
-        (crowd.SLOW, crowd.MALFORMED, crowd.RECONNECTING),
+        (SLOW, MALFORMED, RECONNECTING),
     ),
-    ("stop until the wire, beside all floods", "4 ERAs on 1", "99th 5 ms", stops, crowd.ALL),
+    ("stop until the wire, beside all floods", "4 ERAs on 1", "99th 5 ms", stop_times, ALL),
 )
 
 
@@ -190,7 +424,7 @@ async def further_row(
     name: str, rig: str, goal: str, act: _Act, kinds: Sequence[tuple[str, int]], touches: int
 ) -> str:
     """Measure something else than taps; returns its row."""
-    async with daemon_session(_RIGS[rig]) as session, crowd.floods(session.socket, *kinds):
+    async with daemon_session(_RIGS[rig]) as session, floods(session.socket, *kinds):
         load = OtherLoad()
         text, others = await act(session, touches), load.processors()
     return _joined([name, rig, text, goal, f"{others:.2f}"])
@@ -241,7 +475,7 @@ def _joined(cells: Sequence[str]) -> str:
     return f"| {' | '.join(cells)} |"
 
 
-async def measure(touches: int) -> tuple[str, str]:
+async def measured(touches: int) -> tuple[str, str]:
     """Measure everything with real daemons, printing each row; returns two tables."""
     tables: list[list[str]] = []
 
@@ -274,11 +508,11 @@ def main() -> None:
             found = asyncio.run(fingers_row(rig, options.touches, has_kernels=has_kernels))
             print(found, flush=True)
         return
-    own = calls.table(_RIGS)
+    own = table(_RIGS)
     print(own, flush=True)
     note = "" if become_device() else " Real-time priority was not permitted."
     begun = time.monotonic()
-    figures, further = asyncio.run(measure(options.touches))
+    figures, further = asyncio.run(measured(options.touches))
     minutes = (time.monotonic() - begun) / 60
     if options.report:
         note = (

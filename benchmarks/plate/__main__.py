@@ -20,9 +20,13 @@ from benchmarks.setting import ONE_THREAD, RIG, use_one_thread
 
 use_one_thread()
 
-from benchmarks.plate.measure import SLOW, SLOW_ROUNDS, measure  # noqa: E402
+from benchmarks.plate.measure import (  # noqa: E402
+    SLOW,
+    SLOW_ROUNDS,
+    measure,
+    write_report,
+)
 from benchmarks.plate.programs import CASES  # noqa: E402
-from benchmarks.plate.report import write_report  # noqa: E402
 
 LAYOUTS, WORKERS, STUDIES = 10_000, 2, 3
 

@@ -18,8 +18,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from benchmarks.clocks.__main__ import ARRANGEMENTS
-from benchmarks.clocks.session import NAMES, Arrangement, armed, run_virtual
+from benchmarks.clocks import ARRANGEMENTS, NAMES, Arrangement, armed, run_virtual
 from benchmarks.promise.cases import LEVEL_DB_SL, Case
 from benchmarks.setting import random_contacts
 from controller.play.routing import MARGIN

@@ -22,10 +22,8 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.desk.session import Desk, desk
-from benchmarks.desk.touches import REPEAT, hold, playing, sizes, until_ready
-from benchmarks.desk_plate.lifted_blocks import SAMPLES
-from benchmarks.desk_plate.truth import as_built
+from benchmarks.desk.session import REPEAT, Desk, desk, hold, playing, sizes, until_ready
+from benchmarks.desk_plate.desk_plate import SAMPLES, as_built
 from benchmarks.page import write_parts
 from benchmarks.setting import use_one_thread
 from benchmarks.weekend.boards import LEVEL_DB_SL, PAGE, ROOT, felt_contrast

@@ -18,10 +18,17 @@ import pytest
 from typer.testing import CliRunner
 
 from benchmarks import realised, versions
-from benchmarks.contrast.__main__ import app
-from benchmarks.contrast.data_set import CHECKSUM, FILE, VERSION, data_set
-from benchmarks.contrast.entry import read_entry
-from benchmarks.contrast.score import SetScore, score, summary
+from benchmarks.contrast.__main__ import (
+    CHECKSUM,
+    FILE,
+    VERSION,
+    SetScore,
+    app,
+    data_set,
+    read_entry,
+    score,
+    summary,
+)
 from model.errors import InputError
 from model.table.table_file import build_table
 from plates import smooth_rig

@@ -29,12 +29,9 @@ import pytest
 from typer.testing import CliRunner
 
 import model
-from benchmarks.desk.chain import chain
-from benchmarks.desk.identified import identified_errors
-from benchmarks.desk.session import BLOCK, PLATE, Desk, desk
+from benchmarks.desk.session import BLOCK, PLATE, Desk, chain, desk, identified_errors
 from benchmarks.desk.session import EXAMPLES as DESK_EXAMPLES
-from benchmarks.desk_plate.model_in_time import DeskModel
-from benchmarks.desk_plate.truth import draw_truth
+from benchmarks.desk_plate.desk_plate import DeskModel, draw_truth
 from benchmarks.latency.session import Taps, daemon_session, plain_session, taps
 from controller.api.client import AsyncClient, Client
 from controller.api.jsonrpc import RpcError

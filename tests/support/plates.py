@@ -22,10 +22,9 @@ from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
 from benchmarks.direct_plate import direct_acceleration
-from benchmarks.identification.hidden import LENGTH as HIDDEN_LENGTH
-from benchmarks.identification.hidden import WIDTH as HIDDEN_WIDTH
-from benchmarks.identification.hidden import Hidden, finger_stiffness
-from benchmarks.identification.thin_plate import Mounted
+from benchmarks.identification.plates import LENGTH as HIDDEN_LENGTH
+from benchmarks.identification.plates import WIDTH as HIDDEN_WIDTH
+from benchmarks.identification.plates import Hidden, Mounted, finger_stiffness
 from benchmarks.setting import random_contacts
 from model.answer.promise import FingersOnPlate
 from model.answer.stimulus import Placement

@@ -32,7 +32,7 @@ import pyuff
 from scipy.io import wavfile
 from scipy.signal import bilinear_zpk, cont2discrete, sosfilt, zpk2sos
 
-from benchmarks.desk.capture import Capture
+from benchmarks.desk.session import Capture
 from benchmarks.desk_plate.desk_plate import DeskPlate
 from era_haptics.lab.measuring.sound_card import SoundCard
 from model.arrays import ComplexArray, Float32Array, FloatArray

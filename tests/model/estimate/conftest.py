@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from benchmarks.identification.hidden import Hidden, draw
+from benchmarks.identification.plates import Hidden, draw
 from model.estimate.following import PlateEstimate
 from model.estimate.forward import Sensor
 from model.estimate.identify import Identification, identify

@@ -19,11 +19,17 @@ from typing import cast
 import numpy as np
 import pytest
 
-from benchmarks.identification.answers import table_of
-from benchmarks.identification.hidden import Hidden, draw, finger_stiffness
 from benchmarks.identification.plates import FREQUENCIES as PLATES_FREQUENCIES
-from benchmarks.identification.plates import outcome
-from benchmarks.identification.thin_plate import Complexes, Mounted, Reals
+from benchmarks.identification.plates import (
+    Complexes,
+    Hidden,
+    Mounted,
+    Reals,
+    draw,
+    finger_stiffness,
+    outcome,
+    table_of,
+)
 from long_form import shortly
 from model.arrays import FloatArray
 from model.errors import InputError

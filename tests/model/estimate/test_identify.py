@@ -14,8 +14,7 @@ import numpy as np
 import pytest
 
 from benchmarks.direct_plate import direct_acceleration
-from benchmarks.identification.coverage import parameters_held
-from benchmarks.identification.hidden import Hidden, draw
+from benchmarks.identification.plates import Hidden, draw, parameters_held
 from model.arrays import ComplexArray, FloatArray
 from model.config.document import parse_document
 from model.errors import InputError

@@ -12,8 +12,7 @@ import numpy as np
 import pytest
 import pyuff
 
-from benchmarks.desk_plate.model_in_time import DeskModel
-from benchmarks.desk_plate.truth import draw_truth
+from benchmarks.desk_plate.desk_plate import DeskModel, draw_truth
 from benchmarks.direct_plate import direct_acceleration
 from model.arrays import FloatArray
 from model.errors import InputError

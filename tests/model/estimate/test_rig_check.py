@@ -19,8 +19,8 @@ import pytest
 
 import controller.cli.rig_cli
 from benchmarks.identification import causes
-from benchmarks.identification.hidden import draw
 from benchmarks.identification.mistakes import on_glue
+from benchmarks.identification.plates import draw
 from benchmarks.weekend.chain import FOLDER, BuiltBoard
 from controller.cli.main import run
 from controller.plate_measurement import MeasuredPlate

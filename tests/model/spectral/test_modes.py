@@ -15,8 +15,7 @@ from scipy import linalg, special
 from scipy.integrate import trapezoid
 
 from benchmarks.direct_plate import direct_responder
-from benchmarks.layers.elasticity import strip_frequencies
-from benchmarks.layers.gap import air_pressure, cell_middles
+from benchmarks.layers import air_pressure, cell_middles, strip_frequencies
 from long_form import in_turn
 from model.errors import InputError
 from model.fem import ELEMENTS, Q5, Mesh, assemble, element_slopes

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from benchmarks.direct_plate import direct_acceleration, direct_responder
-from benchmarks.layers.elasticity import wave_number
+from benchmarks.layers import wave_number
 from long_form import in_turn, shortly
 from model.arrays import ComplexArray, FloatArray, lattice
 from model.errors import InputError

@@ -25,7 +25,7 @@ import pytest
 from cobs import cobs
 
 import hand_written as hand
-from benchmarks.desk.capture import Capture
+from benchmarks.desk.session import Capture
 from drivers.host.amplifier import Amplifier
 from drivers.opening import Lines
 from drivers.protocol.definition import FAULTS, STATES

@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from benchmarks.desk.capture import open_client
-from benchmarks.desk_plate.jack_plate import JackPlate
+from benchmarks.desk.session import open_client
+from benchmarks.desk_plate.desk_plate import JackPlate
 from era_haptics.lab.measuring.impedance import (
     ImpedanceSetup,
     exciter_values,

@@ -11,10 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.desk_plate.desk_plate import DeskPlate
-from benchmarks.desk_plate.model_in_time import DeskModel
-from benchmarks.desk_plate.sensing import Converters
-from benchmarks.desk_plate.truth import Truth
+from benchmarks.desk_plate.desk_plate import Converters, DeskModel, DeskPlate, Truth
 from controller.cli.main import run
 from drivers.errors import LinkError
 from era_haptics.lab.measuring import measure

@@ -19,11 +19,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.desk_plate.desk_plate import DeskPlate
-from benchmarks.desk_plate.lifted_blocks import sampled
-from benchmarks.desk_plate.model_in_time import DeskModel
-from benchmarks.desk_plate.sensing import Converters
-from benchmarks.desk_plate.truth import Truth, as_built, draw_truth
+from benchmarks.desk_plate.desk_plate import (
+    Converters,
+    DeskModel,
+    DeskPlate,
+    Truth,
+    as_built,
+    draw_truth,
+    sampled,
+)
 from benchmarks.direct_plate import direct_responder
 from controller.cli.main import run
 from controller.plate_measurement import MeasuredPlate

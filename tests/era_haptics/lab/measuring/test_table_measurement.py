@@ -16,9 +16,7 @@ import pytest
 from scipy.io import wavfile
 from typer.testing import CliRunner
 
-from benchmarks.desk_plate.desk_plate import DeskPlate
-from benchmarks.desk_plate.sensing import Converters
-from benchmarks.desk_plate.truth import Actuator, Truth, draw_truth
+from benchmarks.desk_plate.desk_plate import Actuator, Converters, DeskPlate, Truth, draw_truth
 from benchmarks.direct_plate import direct_responder
 from drivers.by_hand.actions import BlockingAmplifier
 from drivers.errors import CommandRefused, LinkError

@@ -1,1 +1,0 @@
-"""`python -m benchmarks.clocks`: how far apart the clocks of three amplifiers are, by lines."""

@@ -1,1 +1,0 @@
-"""Accuracy of plates of layers and of the air behind them: `python -m benchmarks.layers`."""

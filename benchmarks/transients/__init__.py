@@ -1,1 +1,0 @@
-"""Shaped onsets and endings beside plain ramps."""

@@ -1,6 +1,8 @@
 """Rows, measures and choice of touches of the demonstration, and what fails in it."""
 
 import asyncio
+import re
+import shutil
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
 from dataclasses import replace
@@ -11,6 +13,7 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
+from controller.cli.main import run
 from controller.demo import demonstration
 from controller.demo import recorder as far_end
 from controller.demo.demonstration import choose_rows
@@ -30,6 +33,8 @@ from daemons import ENABLED, ready_daemon, until, until_state
 from drivers.errors import LinkError
 from model.finger import detection_threshold
 from model.rig.rig_file import example_rig_path
+from model.table import table_file
+from plates import small_table
 from registry import threads
 from sim.faults import FaultWindow
 from virtual_lines import in_virtual_time
@@ -125,6 +130,76 @@ def test_json_has_the_documented_keys_of_every_touch():
     assert shared.as_json().keys() - silent.as_json().keys() == {"fingers"}
     (finger,) = shared.as_json()["fingers"]
     assert finger.keys() == FINGER_KEYS
+
+
+ROWS = (
+    replace(row(0.26, contrast=None, others=0), targets_m=[(0.198, 0.0594)], steady=True),
+    replace(row(1.0, contrast=14.0, others=2), promised_contrast_db=12.25, steady=True),
+    replace(row(1.5, contrast=11.0, others=1), promised_contrast_db=12.0, steady=True),
+    replace(row(2.0, contrast=None, others=1), reason="too close"),
+    replace(row(3.0, contrast=None, others=1), measured_level_db_sl=None, played_s=0.214),
+    replace(row(4.0, contrast=9.0, others=1), promised_contrast_db=8.0),
+    replace(
+        row(12.0, contrast=14.0, others=0),
+        targets_m=[(0.1, 0.1)],
+        fingers=[FINGER, replace(FINGER, at_m=(0.2, 0.1), verdict="mixed")],
+        contents=(None, None),
+        promised_contrast_db=12.0,
+        steady=True,
+    ),
+)
+DRIVEN = {"SW": {"frequency_hz": 50.0}, "SE": {"frequency_hz": 50.0}, "NE": {"frequency_hz": 120.0}}
+LINES = """\
+  0.3   19.8,  5.9       0  SW SE 50 Hz, NE 120 Hz      -      -    20.0   19.0     9.6
+  1.0    5.0,  5.0       2  SW SE 50 Hz, NE 120 Hz   12.2   14.0    20.0   19.0     9.6
+  1.5    5.0,  5.0       1  SW SE 50 Hz, NE 120 Hz   12.0   11.0    20.0   19.0     9.6
+  2.0    5.0,  5.0       1  silent: too close
+  3.0    5.0,  5.0       1  SW SE 50 Hz, NE 120 Hz      -      -    20.0      -     9.6\
+  not measured: it played for 0.21 s
+  4.0    5.0,  5.0       1  SW SE 50 Hz, NE 120 Hz    8.0    9.0    20.0   19.0     9.6\
+  still ringing
+ 12.0   10.0, 10.0       1  SW SE 50 Hz, NE 120 Hz   12.0   14.0    20.0   19.0     9.6\
+  own, of 2 contents
+7 touches; of 3 with other fingers on the plate 2 (67%) felt at least the contrast promised
+"""
+
+
+@pytest.mark.parametrize(
+    ("given", "then"),
+    [((), "era config init my_rig.yaml"), (("mine.yaml",), "era table build mine.yaml")],
+)
+def test_lines_say_of_each_touch_what_was_promised_and_felt(
+    given: tuple[str, ...],
+    then: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """By hand, of touches alone, kept, missed, silent, too short, still ringing, and of two people.
+
+    With a rig of one's own its table comes next. Without a capture the scenes are the examples'.
+    """
+    played = [
+        replace(each, drive=DRIVEN, latency_ms=9.62, predicted_level_db_sl=20.0) for each in ROWS
+    ]
+
+    async def run_demo(file: Path, table: object, *, on_row: Any, **more: Any) -> list[TouchRow]:
+        assert file.name == (given[0] if given else "paper_plate.yaml")
+        assert len(more["scenes"]) == 2
+        for each in played:
+            on_row(each)
+        return played
+
+    monkeypatch.setattr(demonstration, "run_demo", run_demo)
+    monkeypatch.setattr(demonstration, "write_pictures", lambda table, rows, out: [out / "t.png"])
+    monkeypatch.setattr(table_file, "cached_table", lambda rig: (small_table(), None))
+    monkeypatch.chdir(tmp_path)
+    shutil.copy(example_rig_path(), "mine.yaml")
+    assert run(["demo", *given, "--out", "drawn"]) == 0
+    head, _, _, _, *lines = capsys.readouterr().out.splitlines(keepends=True)
+    assert re.search(r"\.yaml: table of 4 ERAs on a mesh of 12x9, ready in [0-9]\.\d s$", head)
+    assert "".join(lines).startswith(LINES)
+    assert lines[-2:] == ["wrote drawn/t.png\n", f"Next: {then}{lines[-1].partition(then)[2]}"]
 
 
 def test_picture_shows_highest_contrasts_of_each_number_of_fingers():

@@ -170,11 +170,12 @@ class PseudoTerminal:
         if self._master < 0:
             return
         asyncio.get_running_loop().remove_reader(self._master)
+        if self._folder is not None:
+            # First: once it is closed its number may be another's, whom the host would find here.
+            Path(self.port).unlink(missing_ok=True)
         os.close(self._master)
         os.close(self._slave)
         self._master = self._slave = -1
-        if self._folder is not None:
-            Path(self.port).unlink(missing_ok=True)
 
     def plug(self, is_plugged: bool) -> None:
         """Unplug the line, or plug it in and read again."""

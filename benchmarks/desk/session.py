@@ -29,7 +29,7 @@ from controller.api.jsonrpc import RpcError
 from controller.api.link import Unreachable
 from controller.api.methods import StatusResult
 from drivers.errors import LinkError
-from era_haptics.lab.measuring.sound_card import SoundCard, activate, open_card
+from era_haptics.lab.measuring.sound_card import SoundCard, open_card
 from model.arrays import Float32Array, FloatArray
 from model.finger import detection_threshold
 from model.rig.rig import Rig
@@ -269,8 +269,9 @@ class Capture(SoundCard):
     def __init__(self, name: str, channels: int, *, longest: float = 600.0) -> None:
         super().__init__(outputs=0, inputs=channels, limit=0)
         self._client = open_client(name)
-        self.rate, self.block = float(self._client.rate), self._client.block
-        activate(self, self._client, outputs=0, inputs=channels)
+        self.block = self._client.block
+        self._client.wire(None, inputs=channels)
+        self.play_through(self._client)
         frames = round(longest * self.rate)
         self._times = np.zeros(frames // self.block + 1, dtype=np.int64)  # us
         self._transfer.arrivals = self._times.ctypes.data
@@ -300,10 +301,6 @@ class Capture(SoundCard):
     def is_played_to(self, port: str) -> bool:
         """Whether a program plays to a port of the server."""
         return bool(self._client.connected_to(port))
-
-    def close(self) -> None:
-        """Leave the server."""
-        self._client.close()
 
     def _loud(self, since: int) -> "np.ndarray[tuple[int], np.dtype[np.intp]]":
         loud = np.abs(self._samples[since : self.position]).max(axis=1) > AUDIBLE

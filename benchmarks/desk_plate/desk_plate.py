@@ -42,7 +42,7 @@ from model.rig.rig import Rig
 from model.rig.rig_file import parse_mesh
 from model.structure.attachments import Era, FingertipLoad, fingertip_loads, footprints_of
 from model.structure.plate import Plate
-from sim.soft_amp.jack import IS_INPUT, IS_OUTPUT, JackClient, libjack
+from sim.soft_amp.jack import JackClient, libjack
 
 _ORDER = 4
 _CORNER = 0.42  # of the sample rate; anti-aliasing filters of converters pass all of the audio band
@@ -636,16 +636,13 @@ class JackPlate:
         self._client, self._plate = client, plate
         self._problem: Exception | None = None
         self._ended = threading.Event()
-        self._in = client.register((f"in_{n + 1}" for n in range(plate.outputs)), IS_INPUT)
-        self._out = client.register((f"out_{n + 1}" for n in range(plate.inputs)), IS_OUTPUT)
+        client.wire(None, outputs=plate.inputs, inputs=plate.outputs)
         self._callbacks = _PROCESS(self._advance), _SHUTDOWN(self._lose)  # kept: libjack calls them
-        called, lost = (ctypes.cast(each, ctypes.c_void_p) for each in self._callbacks)
-        libjack().jack_set_process_callback(client.pointer, called, None)
-        libjack().jack_on_shutdown(client.pointer, lost, None)
 
     def start(self) -> None:
         """Begin to vibrate; raises LinkError."""
-        self._client.activate()
+        called, lost = (ctypes.cast(each, ctypes.c_void_p) for each in self._callbacks)
+        self._client.start({"jack_set_process_callback": called, "jack_on_shutdown": lost})
 
     def wait(self, timeout: float) -> None:
         """Wait for a time [s]; raises what ended the plate."""
@@ -660,9 +657,9 @@ class JackPlate:
         if self._problem is not None:
             return 0
         try:
-            played = np.stack([_samples(port, frames) for port in self._in], axis=1)
+            played = np.stack([_samples(port, frames) for port in self._client.inputs], axis=1)
             heard = self._plate.advance(played.astype(float))
-            for port, samples in zip(self._out, heard.T, strict=True):
+            for port, samples in zip(self._client.outputs, heard.T, strict=True):
                 _samples(port, frames)[:] = samples
         except Exception as problem:  # the server's thread has nobody to raise it to
             self._problem = problem

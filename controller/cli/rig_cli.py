@@ -6,12 +6,11 @@ and the sensors of its amplifiers, or read a file of responses.
 """
 
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from itertools import compress
 from pathlib import Path
-from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
@@ -26,8 +25,8 @@ if TYPE_CHECKING:
     from model.estimate.measurement import Measurement
     from model.rig.rig import Rig
 
-_BY_CARD = "era_haptics.lab.measuring.measure:measure_plate"
-"""Named, not imported: the controller does not depend on the lab."""
+measure_by_card: "Callable[..., MeasuredPlate] | None" = None
+"""Measures a plate through a sound card; set by the lab, which knows such cards."""
 
 _NOT_EXPLAINED = (
     "chi² must be at most 2 for a plate that the model explains; no rig is written. Check that "
@@ -166,8 +165,9 @@ def identify(
         if measured_file is not None:
             measured = _measured_before(measured_file, rig)
         elif device is not None:
+            assert measure_by_card is not None  # noqa: S101  the lab is loaded
             with progress_bar("runs") as progress:
-                measured = resolve_name(_BY_CARD)(
+                measured = measure_by_card(
                     rig,
                     device,
                     sensors_file,

@@ -7,10 +7,9 @@ tips. The lab measures (`era_haptics.lab.measuring`), since it knows sound cards
 """
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from pkgutil import resolve_name
 from typing import Any
 
 import numpy as np
@@ -22,7 +21,6 @@ from model.arrays import FloatArray, Point
 from model.ensemble.draws import percentile
 from model.errors import InputError
 from model.finger import decibels, sensation_level
-from model.processes import Progress
 from model.rig.rig import Channel, Rig
 from model.study.contrast_maps import are_apart
 from model.study.verification import MIN_KEPT_SHARE, PLATES, amplitudes_on, draw_plates
@@ -187,22 +185,6 @@ class CheckSettings:
     seed: int
     level: float | None
     """Level of the loudest ERA, None for half of what the rig's limits allow."""
-
-
-_CHECK = "era_haptics.lab.measuring.table_measurement:check_table"
-"""The check by measuring, by name: the model does not import the packages above it."""
-
-
-def check_by_measuring(
-    table: LocalizationTable,
-    rig: Rig,
-    settings: CheckSettings,
-    *,
-    progress: Progress,
-) -> MeasuredVerification:
-    """Play promises of a table and measure them; raises InputError, LinkError."""
-    check: Callable[..., MeasuredVerification] = resolve_name(_CHECK)
-    return check(table, rig, settings, progress=progress)
 
 
 def plain_rig(table: LocalizationTable, *, level: float) -> Rig:

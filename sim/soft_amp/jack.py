@@ -3,7 +3,7 @@
 import ctypes
 import ctypes.util
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from functools import cache
 
 from drivers.errors import LinkError
@@ -92,6 +92,12 @@ class JackClient:
                 "-r 48000 -p 128, by the same user; JACK_DEFAULT_SERVER names another than default"
             )
         self.pointer = int(client)
+        self.outputs: list[int] = []
+        """Its own ports that give samples."""
+        self.inputs: list[int] = []
+        """Its own ports that take samples."""
+        self._takers: list[str] = []
+        self._givers: list[str] = []
         self.rate = int(libjack().jack_get_sample_rate(client))
         self.block = int(libjack().jack_get_buffer_size(client))
 
@@ -147,32 +153,48 @@ class JackClient:
                     f"--device {device}: busy, {users[0]} plays to {port}; end or disconnect it"
                 )
 
-    def register(self, names: Iterable[str], flag: int) -> list[int]:
-        """Register ports of its own, with IS_INPUT or IS_OUTPUT; raises LinkError."""
+    def wire(self, other: str | None, *, outputs: int = 0, inputs: int = 0) -> None:
+        """Register ports out_1, ... and in_1, ..., each for the next free port of another client.
+
+        other: its name, "" for the hardware, None to connect them to nothing. Raises InputError,
+        LinkError as `first_ports`.
+        """
+        if other is not None:
+            self._takers = self.first_ports(other, IS_INPUT, outputs)
+            self._givers = self.first_ports(other, IS_OUTPUT, inputs)
+        self.outputs = self._registered("out", outputs, IS_OUTPUT)
+        self.inputs = self._registered("in", inputs, IS_INPUT)
+
+    def _registered(self, name: str, count: int, flag: int) -> list[int]:
+        """New ports of its own, numbered from 1; raises LinkError."""
         ports = [
             libjack().jack_port_register(
-                self.pointer, name.encode(), _AUDIO, flag | _IS_TERMINAL, 0
+                self.pointer, f"{name}_{n + 1}".encode(), _AUDIO, flag | _IS_TERMINAL, 0
             )
-            for name in names
+            for n in range(count)
         ]
         if None in ports:
             raise LinkError("jack: the server has no more ports; start it with a larger -p (ports)")
         return ports
 
-    def activate(self) -> None:
-        """Begin to be called; raises LinkError."""
+    def start(
+        self, callbacks: Mapping[str, int | ctypes.c_void_p], given: int | None = None
+    ) -> None:
+        """Begin to be called, and connect the ports; raises LinkError.
+
+        callbacks: addresses by the function of libjack that sets them; given: the address of what
+        they are given.
+        """
+        for function, callback in callbacks.items():
+            getattr(libjack(), function)(self.pointer, callback, given)
         if libjack().jack_activate(self.pointer):
             raise LinkError("jack: the server did not activate the client")
-
-    def connect(self, source: str | int, destination: str | int) -> None:
-        """Connect two ports, by name or of its own; raises LinkError."""
-        one, other = (
-            port.encode() if isinstance(port, str) else libjack().jack_port_name(port)
-            for port in (source, destination)
-        )
-        if libjack().jack_connect(self.pointer, one, other):
-            theirs = source if isinstance(source, str) else destination
-            raise LinkError(f"jack: {theirs} could not be connected; it may have gone")
+        own = [libjack().jack_port_name(port).decode() for port in (*self.outputs, *self.inputs)]
+        theirs = [*self._takers, *self._givers]
+        for number, (one, other) in enumerate(zip(own, theirs, strict=False)):
+            way = (one, other) if number < len(self.outputs) else (other, one)
+            if libjack().jack_connect(self.pointer, *(port.encode() for port in way)):
+                raise LinkError(f"jack: {other} could not be connected; it may have gone")
 
     def close(self) -> None:
         """Leave the server, once."""

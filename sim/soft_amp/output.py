@@ -13,7 +13,7 @@ from model.errors import InputError
 from registry.plugins import did_you_mean
 from sim.soft_amp.engine import JackCalls, address_of
 from sim.soft_amp.engine import library as engine
-from sim.soft_amp.jack import IS_INPUT, IS_OUTPUT, JackClient, NoSound, jack_name, libjack
+from sim.soft_amp.jack import IS_INPUT, JackClient, NoSound, jack_name, libjack
 from sim.soft_amp.settings import SoftAmplifierSettings, check_rate
 
 CLIENT = "era-soft-amp"
@@ -48,10 +48,7 @@ class JackOutput:
                     f"{settings.block}; start the server with -p {settings.block}, or omit --block"
                 )
             self.name = jack_name(destination)
-            self._inputs = self._client.first_ports(destination, IS_INPUT, settings.channels)
-            self._ports = self._client.register(
-                (f"out_{n + 1}" for n in range(settings.channels)), IS_OUTPUT
-            )
+            self._client.wire(destination, outputs=settings.channels)
         except BaseException:
             self.close()
             raise
@@ -60,21 +57,18 @@ class JackOutput:
         """Connect, and let JACK call the engine; raises LinkError."""
         library = libjack()
         calls = JackCalls(client=self._client.pointer)
-        calls.ports[: len(self._ports)] = self._ports
+        calls.ports[: len(self._client.outputs)] = self._client.outputs
         for field, name in _CALLED_BY_ENGINE.items():
             setattr(calls, field, ctypes.cast(getattr(library, name), ctypes.c_void_p))
         engine().sound_use_jack(ctypes.byref(calls))
-        set_ = {
-            "sound_jack_process": library.jack_set_process_callback,
-            "sound_jack_xrun": library.jack_set_xrun_callback,
-            "sound_jack_shutdown": library.jack_on_shutdown,
-            "sound_jack_connect": library.jack_set_port_connect_callback,
-        }
-        for callback, set_callback in set_.items():
-            set_callback(self._client.pointer, address_of(callback), None)
-        self._client.activate()
-        for port, name in zip(self._ports, self._inputs, strict=True):
-            self._client.connect(port, name)
+        self._client.start(
+            {
+                "jack_set_process_callback": address_of("sound_jack_process"),
+                "jack_set_xrun_callback": address_of("sound_jack_xrun"),
+                "jack_on_shutdown": address_of("sound_jack_shutdown"),
+                "jack_set_port_connect_callback": address_of("sound_jack_connect"),
+            }
+        )
 
     def is_playing(self) -> bool:
         """Always, since JACK tells of a loss by its callbacks."""

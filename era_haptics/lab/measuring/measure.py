@@ -96,8 +96,7 @@ def latency(response: ComplexArray, frequencies: FloatArray) -> float:
     alike = np.abs(np.exp(2j * np.pi * np.outer(tried, frequencies)) @ unit)
     # Lines at equal distances have several such delays: the shortest is meant.
     near = np.flatnonzero(alike > _NEARLY * alike.max())
-    first_group = near[near - near[0] == np.arange(len(near))]
-    nearest = tried[first_group[alike[first_group].argmax()]]
+    nearest = tried[near[0]]
     rest = unit * np.exp(2j * np.pi * frequencies * nearest)
     phase = np.angle(rest / rest.mean())
     slope, first = np.polyfit(frequencies, phase, 1)

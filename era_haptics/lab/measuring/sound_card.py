@@ -13,10 +13,9 @@ empty even ones. Amplitudes fall with frequency, since accelerations grow.
 import ctypes
 import math
 import time
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 
 import numpy as np
@@ -39,7 +38,7 @@ from model.structure.attachments import footprints_of
 from model.structure.plate import Plate
 from model.transients.time_response import plate_in_time
 from sim.soft_amp.engine import address_of
-from sim.soft_amp.jack import IS_INPUT, IS_OUTPUT, JackClient, jack_name, libjack
+from sim.soft_amp.jack import JackClient, jack_name, libjack
 from sim.soft_amp.output import portaudio_device, portaudio_stream, sounddevice
 
 PERIOD = 1.0
@@ -248,15 +247,21 @@ class DeviceLost(LinkError):
     """A device that is gone, or takes no samples, in the middle of a run."""
 
 
-class SoundCard(ABC):
+CLIENT = "era-measure"
+_BLOCK = 512  # frames; late samples are worse than a delay, which is measured
+
+
+class SoundCard:
     """An open device with some outputs and inputs, the first ones that it has.
 
-    name: of the device; rate [Hz]; limit: no sample played is larger, since nothing behind this
-    checks it. Its stream runs until `close`, so that the delay through it stays the same.
+    limit: no sample played is larger, since nothing behind this checks it. Its stream runs until
+    `close`, so that the delay through it stays the same.
     """
 
     name: str
+    """Of the device."""
     rate: float
+    """Samples per second [Hz]."""
 
     def __init__(self, *, outputs: int, inputs: int, limit: float) -> None:
         for what, count in (("outputs", outputs), ("inputs", inputs)):
@@ -264,13 +269,29 @@ class SoundCard(ABC):
                 raise InputError(f"{what} must be at most {MAX_PORTS}, got {count}")
         self._transfer = _Transfer(outputs=outputs, inputs=inputs)
         self._limit = limit * (1 + 1e-6)  # of rounding
+        self._close: Callable[[], object] = lambda: None
         self.gaps = 0
+        """Holes in the sound of the last run."""
 
-    def given(self, ports: Ports | None = None) -> int:
-        """The address of what the callbacks are to be given; ports: those of JACK."""
-        self._ports = ports  # kept, since the callbacks use it
-        self._transfer.ports = None if ports is None else ctypes.addressof(ports)
+    @property
+    def given(self) -> int:
+        """The address of what the callbacks are to be given."""
         return ctypes.addressof(self._transfer)
+
+    def play_through(self, client: JackClient) -> None:
+        """Be the ports of a JACK client, which are connected; raises LinkError."""
+        library, self.rate, self._close = libjack(), float(client.rate), client.close
+        self._ports = ports = Ports(client=client.pointer)  # kept, since the callbacks use it
+        ports.outputs[: len(client.outputs)] = client.outputs
+        ports.inputs[: len(client.inputs)] = client.inputs
+        ports.buffer = ctypes.cast(library.jack_port_get_buffer, ctypes.c_void_p)
+        ports.frame_time = ctypes.cast(library.jack_last_frame_time, ctypes.c_void_p)
+        self._transfer.ports = ctypes.addressof(ports)
+        callbacks = {
+            "jack_set_process_callback": address_of("transfer_jack_process"),
+            "jack_on_shutdown": address_of("transfer_jack_shutdown"),
+        }
+        client.start(callbacks, self.given)
 
     def run(self, played: FloatArray) -> Float32Array:
         """Play samples (n, outputs), and return those recorded meanwhile (n, inputs).
@@ -316,102 +337,49 @@ class SoundCard(ABC):
         """Frames that were played and recorded since `start`."""
         return int(self._transfer.position)
 
-    @abstractmethod
     def close(self) -> None:
-        """Stop, and leave the device."""
-
-
-CLIENT = "era-measure"
-
-
-def activate(
-    card: SoundCard, client: JackClient, *, outputs: int, inputs: int
-) -> tuple[list[int], list[int]]:
-    """Let a client's new ports out_1, ... and in_1, ... be those of a card; returns them."""
-    out = client.register((f"out_{n + 1}" for n in range(outputs)), IS_OUTPUT)
-    into = client.register((f"in_{n + 1}" for n in range(inputs)), IS_INPUT)
-    library = libjack()
-    ports = Ports(client=client.pointer)
-    ports.outputs[: len(out)], ports.inputs[: len(into)] = out, into
-    ports.buffer = ctypes.cast(library.jack_port_get_buffer, ctypes.c_void_p)
-    ports.frame_time = ctypes.cast(library.jack_last_frame_time, ctypes.c_void_p)
-    given = card.given(ports)
-    for name, set_callback in (
-        ("transfer_jack_process", library.jack_set_process_callback),
-        ("transfer_jack_shutdown", library.jack_on_shutdown),
-    ):
-        set_callback(client.pointer, address_of(name), given)
-    client.activate()
-    return out, into
-
-
-class JackCard(SoundCard):
-    """Ports of its own, each connected to the next one of a client; "": of the hardware."""
-
-    def __init__(self, other: str, *, outputs: int, inputs: int, limit: float) -> None:
-        super().__init__(outputs=outputs, inputs=inputs, limit=limit)
-        self.name = jack_name(other)
-        self._client = JackClient(CLIENT)
-        try:
-            self.rate = float(self._client.rate)
-            takers = self._client.first_ports(other, IS_INPUT, outputs)
-            givers = self._client.first_ports(other, IS_OUTPUT, inputs)
-            out, into = activate(self, self._client, outputs=outputs, inputs=inputs)
-            for port, taker in zip(out, takers, strict=True):
-                self._client.connect(port, taker)
-            for giver, port in zip(givers, into, strict=True):
-                self._client.connect(giver, port)
-        except BaseException:
-            self.close()
-            raise
-
-    def close(self) -> None:
-        """Leave the server."""
-        self._client.close()
-
-
-_BLOCK = 512  # frames; late samples are worse than a delay, which is measured
-
-
-class PortAudioCard(SoundCard):
-    """One stream in both directions, of one device: two devices would have two clocks."""
-
-    def __init__(self, device: str, *, outputs: int, inputs: int, limit: float) -> None:
-        super().__init__(outputs=outputs, inputs=inputs, limit=limit)
-        found = portaudio_device(device, outputs=outputs, inputs=inputs)
-        self.name, self.rate = found["name"], float(found["default_samplerate"])
-        try:
-            self._stream = portaudio_stream(
-                found["index"],
-                address_of("transfer_portaudio"),
-                self.given(),
-                outputs=outputs,
-                inputs=inputs,
-                samplerate=self.rate,
-                blocksize=_BLOCK,
-                latency="high",
-            )
-        except sounddevice().PortAudioError as problem:
-            raise LinkError(
-                f"--device {self.name}: cannot be opened: {problem.args[0]}; end the program that "
-                "uses it"
-            ) from None
-
-    def close(self) -> None:
-        """Stop at once, and close the device."""
-        self._stream.close(ignore_errors=True)
+        """Stop at once, and leave the device."""
+        self._close()
 
 
 def open_card(device: str, *, outputs: int, inputs: int, limit: float) -> SoundCard:
     """Open `jack`, `jack:CLIENT`, or a device of PortAudio by its name or number.
 
+    PortAudio has one stream in both directions, of one device: two devices would have two clocks.
     limit: of the samples played, in full scale. Raises InputError for a device that does not suit;
     LinkError where it is busy or gone.
     """
-    kind, _, name = device.partition(":")
+    card = SoundCard(outputs=outputs, inputs=inputs, limit=limit)
+    kind, _, other = device.partition(":")
     if kind == "jack":
-        return JackCard(name, outputs=outputs, inputs=inputs, limit=limit)
-    return PortAudioCard(device, outputs=outputs, inputs=inputs, limit=limit)
+        card.name, client = jack_name(other), JackClient(CLIENT)
+        try:
+            client.wire(other, outputs=outputs, inputs=inputs)
+            card.play_through(client)
+        except BaseException:
+            client.close()
+            raise
+        return card
+    found = portaudio_device(device, outputs=outputs, inputs=inputs)
+    card.name, card.rate = found["name"], float(found["default_samplerate"])
+    try:
+        stream = portaudio_stream(
+            found["index"],
+            address_of("transfer_portaudio"),
+            card.given,
+            outputs=outputs,
+            inputs=inputs,
+            samplerate=card.rate,
+            blocksize=_BLOCK,
+            latency="high",
+        )
+    except sounddevice().PortAudioError as problem:
+        raise LinkError(
+            f"--device {card.name}: cannot be opened: {problem.args[0]}; end the program that "
+            "uses it"
+        ) from None
+    card._close = partial(stream.close, ignore_errors=True)
+    return card
 
 
 MIN_SETTLING = 1.0

@@ -343,13 +343,10 @@ class CallbackCard(SoundCard):
         callback = kind(address_of("transfer_portaudio"))
         block = np.ones(FRAMES, dtype=np.float32)
         out = np.zeros(FRAMES, dtype=np.float32)
-        recorded, played, given = block.ctypes.data, out.ctypes.data, self.given()
+        recorded, played, given = block.ctypes.data, out.ctypes.data, self.given
         for flags in self._flags:
             assert callback(recorded, played, FRAMES, None, flags, given) == 0
         return self._transfer.gaps, bool(heard.all())
-
-    def close(self) -> None:
-        """Nothing is open."""
 
 
 @pytest.mark.parametrize(

@@ -517,6 +517,21 @@ async def carry_out(context: SimulationContext, line: bytes, *, now: float) -> R
         return {"error": problem if error.strerror else str(error)}
 
 
+@asynccontextmanager
+async def in_background(
+    work: Coroutine[None, None, None], on_end: Callable[[], object] = lambda: None
+) -> AsyncIterator[None]:
+    """Run a task in the background; on_end: called when it ends, even by a failure."""
+    task = asyncio.create_task(work)
+    task.add_done_callback(lambda _: on_end())
+    try:
+        yield
+    finally:
+        task.cancel()
+        with contextlib.suppress(asyncio.CancelledError):
+            await task
+
+
 LINE_MAX = 64 * 1024  # bytes; thirty fingers take a tenth of it
 
 

@@ -25,7 +25,7 @@ from model.rig.rig_file import load_rig
 from registry import threads
 from sim.bench.amplifier_device import AmplifierDevice
 from sim.bench.bench import Bench, keep_time
-from sim.control import SimulationContext, control_socket
+from sim.control import SimulationContext, control_socket, in_background
 from sim.far_ends.serial_amplifiers import SerialAmplifiers
 from sim.plant.imperfections import Imperfections, draw_imperfections
 from sim.transport.simulated_line import LineDelays, TwoWayLine, delays_of
@@ -123,8 +123,7 @@ class _SharedRig:
                 async with contextlib.AsyncExitStack() as stack:
                     if self._control is not None:
                         await stack.enter_async_context(control_socket(context, self._control))
-                    task = asyncio.create_task(keep_time(context.bench), name="simulated plate")
-                    stack.push_async_callback(_cancel, task)
+                    await stack.enter_async_context(in_background(keep_time(context.bench)))
                     self._running = stack.pop_all()
                 self._context = context
             self._users += 1
@@ -145,12 +144,6 @@ class _SharedRig:
 
 _rigs: WeakValueDictionary[object, _SharedRig] = WeakValueDictionary()
 """Rigs that amplifiers of this process share."""
-
-
-async def _cancel(task: "asyncio.Task[None]") -> None:
-    task.cancel()
-    with contextlib.suppress(asyncio.CancelledError):
-        await task
 
 
 class MemoryPort:

@@ -15,8 +15,7 @@ import os
 import selectors
 import signal
 import threading
-from collections.abc import AsyncIterator, Callable, Coroutine, Mapping, Sequence
-from contextlib import asynccontextmanager
+from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -34,7 +33,7 @@ from registry import threads
 from registry.threads import no_long_collections
 from sim.bench.amplifier_device import AmplifierDevice
 from sim.bench.bench import Bench, keep_time
-from sim.control import SimulationContext, control_socket
+from sim.control import SimulationContext, control_socket, in_background
 from sim.far_ends.wire_assignment import SimulatedWire, open_wires
 from sim.faults import FaultFile
 from sim.plant.fingers import Accelerometer, Position
@@ -210,9 +209,10 @@ async def _serve(
         for device in context.devices.values():
             stack.callback(device.close)
             device.start()
-        await stack.enter_async_context(_in_background(keep_time(bench), ended))
+        await stack.enter_async_context(in_background(keep_time(bench), ended.set))
         if view is not None:
-            await stack.enter_async_context(_in_background(_keep_viewing(context, view), ended))
+            viewing = _keep_viewing(context, view)
+            await stack.enter_async_context(in_background(viewing, ended.set))
         stack.enter_context(no_long_collections())
         ready(context.urls)
         await ended.wait()
@@ -250,21 +250,6 @@ async def _keep_viewing(
     while True:
         view(context)
         await asyncio.sleep(_VIEW_INTERVAL)
-
-
-@asynccontextmanager
-async def _in_background(
-    work: Coroutine[None, None, None], ended: asyncio.Event
-) -> AsyncIterator[None]:
-    """Run a task in the background; its failure ends the simulation."""
-    task = asyncio.create_task(work)
-    task.add_done_callback(lambda _: ended.set())
-    try:
-        yield
-    finally:
-        task.cancel()
-        with contextlib.suppress(asyncio.CancelledError):
-            await task
 
 
 WINDOW = 0.2  # s; of the peaks shown for fingers

@@ -96,8 +96,7 @@ class JackClient:
         """Its own ports that give samples."""
         self.inputs: list[int] = []
         """Its own ports that take samples."""
-        self._takers: list[str] = []
-        self._givers: list[str] = []
+        self._theirs: list[str] = []  # ports for these, in their order
         self.rate = int(libjack().jack_get_sample_rate(client))
         self.block = int(libjack().jack_get_buffer_size(client))
 
@@ -160,8 +159,8 @@ class JackClient:
         LinkError as `first_ports`.
         """
         if other is not None:
-            self._takers = self.first_ports(other, IS_INPUT, outputs)
-            self._givers = self.first_ports(other, IS_OUTPUT, inputs)
+            takers = self.first_ports(other, IS_INPUT, outputs)
+            self._theirs = [*takers, *self.first_ports(other, IS_OUTPUT, inputs)]
         self.outputs = self._registered("out", outputs, IS_OUTPUT)
         self.inputs = self._registered("in", inputs, IS_INPUT)
 
@@ -190,8 +189,7 @@ class JackClient:
         if libjack().jack_activate(self.pointer):
             raise LinkError("jack: the server did not activate the client")
         own = [libjack().jack_port_name(port).decode() for port in (*self.outputs, *self.inputs)]
-        theirs = [*self._takers, *self._givers]
-        for number, (one, other) in enumerate(zip(own, theirs, strict=False)):
+        for number, (one, other) in enumerate(zip(own, self._theirs, strict=False)):
             way = (one, other) if number < len(self.outputs) else (other, one)
             if libjack().jack_connect(self.pointer, *(port.encode() for port in way)):
                 raise LinkError(f"jack: {other} could not be connected; it may have gone")

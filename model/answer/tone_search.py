@@ -182,7 +182,7 @@ def _kept_of(table: LocalizationTable) -> _Kept:
         pruning_step=PRUNING_STEP,
         rim_count=len(CENTRE_AND_RIM),
         is_deep=variance < MAX_VARIANCE_FINE,
-        others=uncertainty.frequency > 0,
+        others=uncertainty.changes_modes,
         gain_variance=variance,
         ridge=RIDGE,
         margin=LEVEL_MARGIN,

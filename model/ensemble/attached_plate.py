@@ -10,7 +10,11 @@ changes the frequencies alone. With h times the thickness, and frequencies q tim
 
     g = 1 / (h (q² s lambda - w²)),    dg / d ln loss = -i h q² Im(s lambda) g².
 
-Plates are drawn along one axis, that of q; h is the expected value for a plate with that q.
+Plates are drawn along one axis, that of q; h is the expected value for a plate with that q. Modes
+whose frequencies and sizes are uncertain, each by itself, are drawn anew at each place on it: with
+a mode's own frequency v times as high, and its shape a times as large,
+
+    g = a² / (h (v² q² s lambda - w²)).
 
 With dynamic stiffness Z of the attachments b, ERAs first, elimination gives
 
@@ -42,6 +46,7 @@ from statistics import NormalDist
 import numpy as np
 
 from model.arrays import Complex64Array, ComplexArray, Float32Array, FloatArray
+from model.ensemble.draws import standard_normal
 from model.rig.rig import Uncertainty
 from model.structure.attachments import (
     HAND_STD,
@@ -137,22 +142,26 @@ class AttachedPlate(Mounts):
         return int(self.forces.shape[1])
 
     def of_thicknesses(
-        self, deviations: FloatArray, row: int
+        self, deviations: FloatArray, of_modes: FloatArray, row: int
     ) -> tuple[Complex64Array, Complex64Array]:
         """Return g of plates of several thicknesses at a row of the frequencies, (d, r) [s²/kg].
 
         Also its change by one standard deviation of the loss factor. deviations (d,): of the
-        plates' frequencies, in standard deviations.
+        plates' frequencies, of_modes (2, r, d): of each mode's own frequency and size, both in
+        standard deviations.
         """
         known = self.uncertainty
+        own = np.maximum(1 + known.mode_frequency * of_modes[0].T, LEAST_THICKNESS) ** 2
+        # Those of the rigid body have the weight of a plate, which is known.
+        size = (1 + known.mode_amplitude * (self.modal[row].real > 0) * of_modes[1].T) ** 2
         share = (known.thickness / known.frequency) ** 2 if known.frequency > 0 else 1.0
         off = known.frequency * deviations
         higher = np.maximum(1 + off, LEAST_THICKNESS)
         factor = np.maximum(1 + share * off, LEAST_THICKNESS)
-        stiffness = (higher / factor)[:, None, None] ** 2 * self.modal[[row]]
-        receptance = modal_receptance(stiffness, self.omega[[row]], factor)[:, 0]
+        stiffness = ((higher / factor)[:, None] ** 2 * own * self.modal[row])[:, None]
+        receptance = size * modal_receptance(stiffness, self.omega[[row]], factor)[:, 0]
         lost = -1j * math.log(known.damping) * self.modal[row].imag
-        by_loss = lost * (factor * higher**2)[:, None] * receptance**2
+        by_loss = lost * (factor * higher**2)[:, None] * own / size * receptance**2
         return receptance.astype(np.complex64), by_loss.astype(np.complex64)
 
     def finger_stiffness(self, count: int, loads: Sequence[float] = ()) -> Complex64Array:
@@ -253,6 +262,17 @@ def thickness_nodes(count: int) -> FloatArray:
     return found
 
 
+def mode_numbers(modes: int, count: int) -> FloatArray:
+    """Return deviations (2, modes, count) of each mode's frequency and size, 0 of one plate alone.
+
+    In standard deviations, beside the `thickness_nodes` of as many plates.
+    """
+    if count < 2:
+        return np.zeros((2, modes, count))
+    drawn = standard_normal(np.random.default_rng([modes, count]), 2 * modes, count)
+    return drawn.reshape(2, modes, count)
+
+
 @dataclass(frozen=True, eq=False)
 class PlateOnEras:
     """The plate on its b attachments, without fingers, at f frequencies and t thicknesses."""
@@ -278,18 +298,19 @@ class PlateOnEras:
         If its thickness is certain, there is only the nominal one.
         """
         deviations, first = [np.zeros(1)], {}
-        if plate.uncertainty.frequency > 0:
+        if plate.uncertainty.changes_modes:
             deviations.append(np.array([1.0, -1.0]))
             for count in node_counts:
                 first[count] = sum(map(len, deviations))
                 deviations.append(thickness_nodes(count))
         every = np.concatenate(deviations)
         (f, b), t, r = plate.stiffness.shape, len(every), plate.shapes.shape[1]
+        of_modes = np.concatenate([mode_numbers(r, len(each)) for each in deviations], axis=2)
         n, single = plate.era_count, np.complex64
         sizes = ((f, t, r), (f, t, r), (f, t, b, r), (f, t, b, b), (f, t, b, n))
         found = [np.empty(size, dtype=single) for size in sizes]
         for row in range(f):
-            receptance, by_loss = plate.of_thicknesses(every, row)
+            receptance, by_loss = plate.of_thicknesses(every, of_modes, row)
             parts = receptance, by_loss, *_eliminated(plate, row, receptance)
             for to, part in zip(found, parts, strict=True):
                 to[row] = part

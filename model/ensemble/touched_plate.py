@@ -175,7 +175,7 @@ class TouchedPlate:
         stretched = -moved
         stretched.reshape(f, -1)[:, : n * n : n + 1] += plate.strokes[rows]
         changes = [h, by_force[:, :, :n] @ (plate.by_damping[rows, :, None] * stretched[:, :n])]
-        if plate.uncertainty.frequency > 0:
+        if plate.uncertainty.changes_modes:
             for node in (THICKER, THINNER):
                 other, _ = self.sources(rows, np.full(f, node), every)
                 changes.append((other[:, :, :n] * forces - h) * np.float32(math.sqrt(0.5)))
@@ -368,7 +368,7 @@ class TouchedByKernel(TouchedPlate):
             groups=g,
             p=p,
             fine=g * fine_count,
-            others=plate.uncertainty.frequency > 0,
+            others=plate.uncertainty.changes_modes,
             gain_variance=plate.uncertainty.gain_variance,
             ridge=RIDGE,
         )

@@ -150,7 +150,15 @@ def calibration_json(calibration: Calibration, before: Rig) -> dict[str, Any]:
             }
             for fitted in calibration.parameters
         ],
-        "gains": _gains_json(calibration),
+        "gains": {
+            era.name: {
+                "frequency_hz": [row[0] for row in era.gains],
+                "magnitude": [row[1] for row in era.gains],
+                "phase_deg": np.degrees([row[2] for row in era.gains]).tolist(),
+                "standard_error": errors[np.isfinite(errors)].tolist(),
+            }
+            for era, errors in zip(calibration.rig.eras, calibration.gains_error.T, strict=True)
+        },
         "moved_eras": [
             {
                 "era": name,
@@ -185,19 +193,6 @@ def calibration_json(calibration: Calibration, before: Rig) -> dict[str, Any]:
         "good": calibration.is_good,
         "fingerprint_before": before.fingerprint,
         "fingerprint_after": calibration.rig.fingerprint,
-    }
-
-
-def _gains_json(calibration: Calibration) -> dict[str, Any]:
-    """Gains of each ERA of the rig by its name."""
-    return {
-        era.name: {
-            "frequency_hz": [row[0] for row in era.gains],
-            "magnitude": [row[1] for row in era.gains],
-            "phase_deg": np.degrees([row[2] for row in era.gains]).tolist(),
-            "standard_error": errors[np.isfinite(errors)].tolist(),
-        }
-        for era, errors in zip(calibration.rig.eras, calibration.gains_error.T, strict=True)
     }
 
 

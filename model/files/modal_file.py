@@ -19,7 +19,7 @@ import numpy as np
 
 from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError
-from model.files.uff import DatasetBlock, blocks, lengths_in_si, numbers_in
+from model.files.uff import DatasetBlock, blocks, numbers_in, read_nodes, rows_of, units_of
 
 _SHELLS = frozenset(range(40, 100)) | {171, 172}  # plane stress, plates, membranes, thin shells
 _BEAMS = frozenset(range(11, 38))  # whose elements have a further row
@@ -118,9 +118,9 @@ def _from_universal(path: Path, content: bytes) -> ModeShapes:
     for block in blocks(path, content):
         kinds.add(block.kind)
         if block.kind == 164:
-            length, force = _units(path, block)
+            length, force = units_of(path, block)
         elif block.kind in (15, 2411):
-            _read_nodes(path, block, nodes, turned)
+            read_nodes(path, block, nodes, turned)
         elif block.kind == 2412:
             faces += _read_faces(path, block)
         elif block.kind in _HEAD and (mode := _read_mode(path, block)) is not None:
@@ -174,54 +174,6 @@ class _Mode:
     damping_ratio: float
     nodes: list[int]
     shape: FloatArray
-
-
-def _units(path: Path, block: DatasetBlock) -> tuple[float, float]:
-    """By what lengths and forces of the file are divided to have metres and newtons."""
-    place, rows = f"{path}:{block.line}", block.rows[1:]
-    factors = [each for row in rows[1:] for each in numbers_in(row)]
-    code = numbers_in(rows[0][:10]) if rows else []
-    if not code or len(factors) < 2:
-        raise InputError(f"{place}: units (dataset 164) must have a code and factors; export again")
-    label = rows[0][10:30].decode("ascii", "replace").strip()
-    length = lengths_in_si(place, factors[0], int(code[0]), label)
-    if not 0 < factors[1] < math.inf:
-        raise InputError(f"{place}: factor of forces must be positive, got {factors[1]:g}")
-    return length, factors[1]
-
-
-def _rows_of(
-    path: Path, block: DatasetBlock, size: int, head: int = 1
-) -> Iterator[list[list[float]]]:
-    """Yield the numbers of records of so many rows each, behind a head."""
-    rows = block.rows[head:]
-    if len(rows) % size:
-        raise InputError(
-            f"{path}:{block.line + head + len(rows)}: dataset {block.kind} must have {size} rows "
-            f"for each entry, got {len(rows)} in all; the file is damaged, export it again"
-        )
-    for first in range(0, len(rows), size):
-        yield [numbers_in(row) for row in rows[first : first + size]]
-
-
-def _read_nodes(
-    path: Path,
-    block: DatasetBlock,
-    nodes: dict[int, tuple[float, ...]],
-    turned: set[int],
-) -> None:
-    """Add the nodes of a dataset, and the numbers of those with local displacements."""
-    size = 1 if block.kind == 15 else 2
-    for count, record in enumerate(_rows_of(path, block, size)):
-        numbers = [each for row in record for each in row]
-        if len(numbers) != 7 or not np.isfinite(numbers).all():
-            raise InputError(
-                f"{path}:{block.line + 2 + size * count}: node must have a number, three codes and "
-                f"three finite coordinates, got {len(numbers)} numbers; export it again"
-            )
-        nodes[int(numbers[0])] = tuple(numbers[4:])
-        if numbers[2]:
-            turned.add(int(numbers[0]))
 
 
 def _read_faces(path: Path, block: DatasetBlock) -> Iterator[list[int]]:
@@ -304,7 +256,7 @@ def _values(path: Path, block: DatasetBlock, head: int, count: int) -> tuple[lis
     """Numbers of the nodes (n,), and so many values at each (n, count)."""
     size = 1 + math.ceil(count / _VALUES_A_ROW)
     numbers, values = [], []
-    for entry, (number, *rows) in enumerate(_rows_of(path, block, size, head)):
+    for entry, (number, *rows) in enumerate(rows_of(path, block, size, head)):
         own = [each for row in rows for each in row]
         if len(number) != 1 or len(own) != count:
             raise InputError(

@@ -1,12 +1,11 @@
 """Universal files (UFF): functions at nodes (dataset 58), nodes (15, 2411) and units (164).
 
-The format of modal analysis since the 1970s, ASCII or binary, with fields as in pyuff. pyuff skips
-over damage and knows one spelling of numbers, so datasets are cut and numbers read here.
+The format of modal analysis since the 1970s, ASCII or binary, with fields named as in pyuff, which
+writes files. It skips over damage and knows one spelling of numbers, so files are read here.
 """
 
 import math
 import re
-import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,18 +26,36 @@ _UTF_16 = (b"\xff\xfe", b"\xfe\xff")
 BYTE_ORDER_MARKS = (b"\xef\xbb\xbf", *_UTF_16)
 
 _MAX_BYTES = 512 << 20
-_READ = (15, 58, 164, 2411)
 _HEADER_LINES = 12  # of dataset 58, its number first
-_ID_LINES = 5  # of these, free text
 _NOTE = 2  # of these, see `Function`
-_FORM = 7  # of these, that of the data: kind, count, abscissa
+# Of these, by name: line, first and last column, and how its text is read.
+_FIELDS = {
+    "func_type": (6, 0, 5, int),
+    "rsp_ent_name": (6, 31, 41, str),
+    "rsp_node": (6, 41, 51, int),
+    "rsp_dir": (6, 51, 55, int),
+    "ref_ent_name": (6, 56, 66, str),
+    "ref_node": (6, 66, 76, int),
+    "ref_dir": (6, 76, 80, int),
+    "ord_data_type": (7, 0, 10, int),
+    "num_pts": (7, 10, 20, int),
+    "abscissa_spacing": (7, 20, 30, int),
+    "abscissa_min": (7, 30, 43, float),
+    "abscissa_inc": (7, 43, 56, float),
+    "abscissa_spec_data_type": (8, 0, 10, int),
+    "abscissa_axis_units_lab": (8, 47, 67, str),
+    "ordinate_spec_data_type": (9, 0, 10, int),
+    "ordinate_axis_units_lab": (9, 47, 67, str),
+    "orddenom_spec_data_type": (10, 0, 10, int),
+    "orddenom_axis_units_lab": (10, 47, 67, str),
+}
 _SI = 1  # units code of dataset 164
 _NOT_METRES = (2, 4, 5, 6, 7, 8, 10)  # such codes: feet, millimetres, centimetres, inches
 _MARK = re.compile(rb"^ {4}-1[ \t]*(?:\r?\n|\r|\Z)", re.MULTILINE)
 _BINARY_END = re.compile(rb" {4}-1[ \t]*(?:\r?\n|\r|\Z)")  # no line end before it
 _HEADER = re.compile(
     rb"[ \t]*(?P<kind>\d{1,9})(?!\d)"
-    rb"(?:(?P<binary>[bB])(?:\s*\d+){3}[ \t]+(?P<bytes>\d{1,18})(?!\d))?[^\r\n]*"
+    rb"(?:[bB]\s*(?P<order>\d)(?:\s*\d+){2}[ \t]+(?P<bytes>\d{1,18})(?!\d))?[^\r\n]*"
 )
 # As Fortran writes them: they may touch, with D for E, or without a letter.
 _NUMBER = re.compile(
@@ -123,39 +140,16 @@ def write_universal(path: Path, content: Universal) -> None:
 
 
 def read_universal(path: Path) -> Universal:
-    """Read a file; raises InputError with file and line if it is damaged or of another format.
-
-    Of each record the numbers that its header counts. pyuff reads the headers, nodes and units, of
-    a copy in which nothing else can be taken for them.
-    """
-    import pyuff
-
-    wanted = [each for each in blocks(path, read_bytes(path)) if each.kind in _READ]
-    nodes: dict[int, tuple[float, float, float]] = {}
+    """Read a file; raises InputError with file and line if it is damaged or of another format."""
+    nodes: dict[int, tuple[float, ...]] = {}
     functions, length = [], 1.0
-    with tempfile.TemporaryDirectory(prefix="era-") as folder:
-        copy = Path(folder) / "copy.uff"
-        copy.write_bytes(b"".join(each.plain for each in wanted))
-        file = pyuff.UFF(str(copy))
-        for number, block in enumerate(wanted):
-            place = f"{path}:{block.line}"
-            try:
-                found = file.read_sets(number, header_only=True)
-                if block.kind == 58:
-                    functions.append(_function(path, block, found))
-                elif block.kind == 164:
-                    label = found["units_description"]
-                    code = int(found["units_code"])
-                    length = lengths_in_si(place, float(found["length"]), code, label)
-                else:
-                    xyz = zip(found["x"], found["y"], found["z"], strict=True)
-                    nodes.update(zip(map(int, found["node_nums"]), xyz, strict=True))
-            except InputError:
-                raise
-            except Exception as error:  # pyuff raises nothing narrower
-                raise InputError(
-                    f"{place}: dataset {block.kind} cannot be read; export it again"
-                ) from error
+    for block in blocks(path, read_bytes(path)):
+        if block.kind == 58:
+            functions.append(_function(path, block))
+        elif block.kind == 164:
+            length, _ = units_of(path, block)
+        elif block.kind in (15, 2411):
+            read_nodes(path, block, nodes, set())
     return Universal(
         {n: (x / length, y / length, z / length) for n, (x, y, z) in nodes.items()}, functions
     )
@@ -185,34 +179,20 @@ def read_bytes(path: Path) -> bytes:
 
 @dataclass(frozen=True)
 class DatasetBlock:
-    """One dataset: the line of its opening mark, its number, the content between its marks."""
+    """One dataset: the line of its opening mark, its number, the content between its marks.
+
+    byte_order: of a binary one, as NumPy has it; empty of text.
+    """
 
     line: int
     kind: int
-    is_binary: bool
+    byte_order: str
     content: bytes
 
     @property
     def rows(self) -> list[bytes]:
         """Lines of text, with the number of the dataset first."""
         return self.content.splitlines()
-
-    @property
-    def plain(self) -> bytes:
-        """The dataset as pyuff reads it, without free text and the numbers of a record."""
-        rows = self.rows
-        if self.kind == 58:
-            rows += [b""] * (_HEADER_LINES - len(rows))
-            rows[_FORM] = rows[_FORM].upper().replace(b"D", b"E")
-            rows = [rows[0], *[b"NONE"] * _ID_LINES, *rows[1 + _ID_LINES : _HEADER_LINES]]
-        elif self.kind != 164:  # a node's number must not be taken for a mark
-            rows = [rows[0], *(b" " + b" ".join(row.split()) for row in rows[1:])]
-        text = b"\n".join(rows)
-        try:
-            text.decode()
-        except UnicodeDecodeError:
-            text = text.decode("latin-1").encode()
-        return b"    -1\n" + text + b"\n    -1\n"
 
 
 def blocks(path: Path, content: bytes) -> Iterator[DatasetBlock]:
@@ -236,17 +216,19 @@ def blocks(path: Path, content: bytes) -> Iterator[DatasetBlock]:
                 f"{path}:{line}: dataset must begin with its number, got none; export it again"
             )
         data = begin
-        if head["binary"]:  # its numbers are any bytes
+        if head["order"]:  # its numbers are any bytes
             for _ in range(_HEADER_LINES):
                 data = content.find(b"\n", data) + 1 or len(content)
             data += int(head["bytes"] or 0)
-        end = (_BINARY_END if head["binary"] else _MARK).search(content, data)
+        end = (_BINARY_END if head["order"] else _MARK).search(content, data)
         if end is None:
             raise InputError(
                 f"{path}:{line}: dataset has no end; the file was cut off, export it again"
             )
         kind = int(head["kind"])
-        yield DatasetBlock(line, kind, bool(head["binary"]), content[begin : end.start()])
+        yield DatasetBlock(
+            line, kind, {b"1": "<", None: ""}.get(head["order"], ">"), content[begin : end.start()]
+        )
         start = _MARK.search(content, end.end())
 
 
@@ -276,11 +258,29 @@ def _as_58(function: Function) -> dict[str, Any]:
     }
 
 
-def _function(path: Path, block: DatasetBlock, found: Mapping[str, Any]) -> Function:
-    place, count = f"{path}:{block.line}", int(found["num_pts"])
+def _header(place: str, block: DatasetBlock) -> dict[str, Any]:
+    """The fields of a dataset 58 by name; 0 for numbers that are left out."""
+    head, found = b"\n".join(block.rows[:_HEADER_LINES]), dict[str, Any]()
+    try:
+        lines = head.decode().split("\n")
+    except UnicodeDecodeError:
+        lines = head.decode("latin-1").split("\n")
+    try:
+        for name, (line, first, last, read) in _FIELDS.items():
+            text = lines[line][first:last].strip()
+            found[name] = text if read is str else read(text.upper().replace("D", "E") or "0")
+    except (IndexError, ValueError) as error:
+        raise InputError(f"{place}: dataset 58 cannot be read; export it again") from error
+    return found
+
+
+def _function(path: Path, block: DatasetBlock) -> Function:
+    place = f"{path}:{block.line}"
+    found = _header(place, block)
+    count = found["num_pts"]
     is_complex, is_even = found["ord_data_type"] in (5, 6), found["abscissa_spacing"] == 1
     shape = (count, 1 + is_complex + (not is_even))
-    read = _bytes_of if block.is_binary else _numbers_of
+    read = _bytes_of if block.byte_order else _numbers_of
     values = read(path, block, found, math.prod(shape))
     if len(values) < math.prod(shape):
         raise InputError(
@@ -320,7 +320,6 @@ def _function(path: Path, block: DatasetBlock, found: Mapping[str, Any]) -> Func
 def _bytes_of(path: Path, block: DatasetBlock, found: Mapping[str, Any], count: int) -> FloatArray:
     """So many numbers of a binary record, or all that it has."""
     data = block.content.split(b"\n", _HEADER_LINES)[-1]
-    order = "<" if found["byte_ordering"] == 1 else ">"
     size = 8 if found["ord_data_type"] in (4, 6) else 4
     if data[count * size :].strip(b"\0 \t\r\n"):
         raise InputError(
@@ -328,7 +327,7 @@ def _bytes_of(path: Path, block: DatasetBlock, found: Mapping[str, Any], count: 
             f"{len(data) - count * size} bytes more; export it again, and copy it as a binary file"
         )
     whole = min(count, len(data) // size) * size
-    return np.frombuffer(data[:whole], dtype=f"{order}f{size}").astype(float)
+    return np.frombuffer(data[:whole], dtype=f"{block.byte_order}f{size}").astype(float)
 
 
 def _numbers_of(
@@ -353,16 +352,58 @@ def numbers_in(row: bytes) -> list[float]:
     return [float(_NO_LETTER.sub(b"E", word)) for word in words]
 
 
-def lengths_in_si(place: str, length: float, code: int, label: str) -> float:
-    """By what lengths of the file are divided to have metres; raises InputError."""
-    if not 0 < length < math.inf or (length == 1 and code in _NOT_METRES):
+def units_of(path: Path, block: DatasetBlock) -> tuple[float, float]:
+    """By what lengths and forces of the file are divided to have metres and newtons."""
+    place, rows = f"{path}:{block.line}", block.rows[1:]
+    factors = [each for row in rows[1:] for each in numbers_in(row)]
+    code = numbers_in(rows[0][:10]) if rows else []
+    if not code or len(factors) < 2:
+        raise InputError(f"{place}: units (dataset 164) must have a code and factors; export again")
+    label = rows[0][10:30].decode("ascii", "replace").strip()
+    length, force = factors[:2]
+    if not 0 < length < math.inf or (length == 1 and int(code[0]) in _NOT_METRES):
         raise InputError(
             f"{place}: factor of lengths (dataset 164) must be positive and that of units code "
-            f"{code} {label!r}, got {length:g}; export it in SI"
+            f"{int(code[0])} {label!r}, got {length:g}; export it in SI"
         )
-    return length
+    if not 0 < force < math.inf:
+        raise InputError(f"{place}: factor of forces must be positive, got {force:g}")
+    return length, force
+
+
+def rows_of(
+    path: Path, block: DatasetBlock, size: int, head: int = 1
+) -> Iterator[list[list[float]]]:
+    """Yield the numbers of records of so many rows each, behind a head."""
+    rows = block.rows[head:]
+    if len(rows) % size:
+        raise InputError(
+            f"{path}:{block.line + head + len(rows)}: dataset {block.kind} must have {size} rows "
+            f"for each entry, got {len(rows)} in all; the file is damaged, export it again"
+        )
+    for first in range(0, len(rows), size):
+        yield [numbers_in(row) for row in rows[first : first + size]]
+
+
+def read_nodes(
+    path: Path,
+    block: DatasetBlock,
+    nodes: dict[int, tuple[float, ...]],
+    turned: set[int],
+) -> None:
+    """Add the nodes of a dataset, and the numbers of those with local displacements."""
+    size = 1 if block.kind == 15 else 2
+    for count, record in enumerate(rows_of(path, block, size)):
+        numbers = [each for row in record for each in row]
+        if len(numbers) != 7 or not np.isfinite(numbers).all():
+            raise InputError(
+                f"{path}:{block.line + 2 + size * count}: node must have a number, three codes and "
+                f"three finite coordinates, got {len(numbers)} numbers; export it again"
+            )
+        nodes[int(numbers[0])] = tuple(numbers[4:])
+        if numbers[2]:
+            turned.add(int(numbers[0]))
 
 
 def _name(text: str) -> str:
-    plain = text.strip()
-    return "" if plain.upper() == "NONE" else plain
+    return "" if text.strip().upper() == "NONE" else text.strip()

@@ -101,9 +101,12 @@ class SurfaceModes:
         self.largest_truncated = float(u.max())
         self._powers = (u / u.max()) ** np.arange(1, 2 * RESIDUAL_ORDER + 1)[:, None]
         chosen = thinned(read.points, _MAX_NODES)
+        sizes = np.full(len(frequencies), math.sqrt(THICKNESS / plate.thickness))
+        differing = sizes[read.rigid :][: len(surface.sizes)]
+        differing *= surface.sizes[: len(differing)]
         self._spline = RBFInterpolator(
             read.points[chosen],
-            read.shapes[chosen] / math.sqrt(plate.thickness / THICKNESS),
+            read.shapes[chosen] * sizes,
             kernel="cubic",
             degree=2,
         )

@@ -46,6 +46,8 @@ BOUNDS = {
     "supports": (0.0, 0.5),
     "weather": (0.0, 0.5),
     "foreign_mass": (0.0, 2.0),
+    "mode_frequency": (0.0, 0.1),
+    "mode_amplitude": (0.0, 0.3),
 }
 """What a rig may state of each parameter: exactly known, and the most."""
 
@@ -59,6 +61,8 @@ _RELATIVE = (
     "common_gain",
     "field",
     "harmonic",
+    "mode_frequency",
+    "mode_amplitude",
 )
 
 MAX_UNCERTAINTY = 1000.0
@@ -105,6 +109,10 @@ class Uncertainty:
     """
     foreign_mass: float = 0.0
     """Mass [kg] of an object that may lie anywhere on the plate, 0 where none is expected."""
+    mode_frequency: float = 0.0
+    """Natural frequency of each mode by itself, relative, beside what moves all together."""
+    mode_amplitude: float = 0.0
+    """Size of the shape of each elastic mode by itself, relative."""
 
     def __post_init__(self) -> None:
         """Refuse values that are not finite, negative ones, and a factor below 1."""
@@ -159,6 +167,11 @@ class Uncertainty:
     def frequency(self) -> float:
         """Relative standard deviation of natural frequencies, by thickness and modulus."""
         return math.hypot(self.thickness, self.elasticity / 2)
+
+    @property
+    def changes_modes(self) -> bool:
+        """Whether modes are uncertain, all together or each by itself."""
+        return max(self.frequency, self.mode_frequency, self.mode_amplitude) > 0
 
     @staticmethod
     def of_frequency(std: float) -> dict[str, float]:

@@ -41,6 +41,7 @@ from model.rig.sections import (
     RigSection,
     SupportSection,
     SurfaceSection,
+    UncertaintySection,
 )
 from model.spectral.modes import (
     MAX_DEGREE,
@@ -154,6 +155,9 @@ def check_across(validation: Validation[RigSection], *, mesh_given: bool) -> Non
     plate = _check_plate(validation, frequency_max=high)
     if plate is not None and plate.surface is None and not mesh_given:
         _check_mesh(validation, plate, frequency_max=high)
+    path = "uncertainty", "mode_amplitude"
+    if plate is not None and plate.surface is None and validation.field(path, UncertaintySection):
+        validation.add(path, "must be of a surface by its modes; remove it, or give surface")
     eras = {}
     for name, keys in validation.mapping(("eras",)).items():
         section = section_by_kind([*KINDS.values()], keys)

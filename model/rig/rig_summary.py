@@ -43,7 +43,6 @@ from model.structure.attachments import (
 from model.structure.exciter import Exciter
 from model.structure.material import EXCITER_TYPES
 from model.structure.plate import (
-    AirGap,
     Bond,
     Laminate,
     Plate,
@@ -231,7 +230,19 @@ def plate_summary(rig: Rig) -> dict[str, Any]:
             else plate.bending_wavelength(frequency)
             for frequency in (limits.frequency_min, limits.frequency_max)
         },
-        "air_gap": None if gap is None else _air_gap(gap, limits),
+        "air_gap": None
+        if gap is None
+        else {
+            "depth_m": gap.depth,
+            "closed": gap.closed,
+            "inertia_kg_m3": {
+                f"{frequency:g}_hz": gap.inertia(frequency).real
+                for frequency in (limits.frequency_min, limits.frequency_max)
+            },
+            "stiffness_n_m3": gap.bulk_modulus(limits.frequency_max).real / gap.depth
+            if gap.closed
+            else 0.0,
+        },
         "point_masses": [
             {"at_m": [mass.x, mass.y], "mass_kg": mass.mass} for mass in rig.masses if mass.mass
         ],
@@ -255,7 +266,19 @@ def plate_summary(rig: Rig) -> dict[str, Any]:
             "normal": surface.normal,
             "rings": len(surface.outline),
         },
-        "exciters": [_exciter(one) for one in exciters_of(rig)],
+        "exciters": [
+            {
+                "name": one.name,
+                "magnet": "held" if one.held else "free",
+                "magnet_resonance_hz": one.magnet_frequency,
+                "q": one.quality,
+                "force_at_1_w_n": one.force_factor * math.sqrt(2 / one.resistance),
+                "full_level_v": one.voltage * one.largest_gain,
+                "full_level_force_n": one.largest_force,
+                "excursion_max_m": one.excursion if math.isfinite(one.excursion) else None,
+            }
+            for one in exciters_of(rig)
+        ],
         "exciter_types": _types(rig),
     }
 
@@ -271,20 +294,6 @@ def _grain(plate: Plate) -> dict[str, float] | None:
         "nu12": material.nu,
         "flexural_rigidity_along_n_m": float(along),
         "flexural_rigidity_across_n_m": float(across),
-    }
-
-
-def _air_gap(gap: AirGap, limits: GuardLimits) -> dict[str, Any]:
-    return {
-        "depth_m": gap.depth,
-        "closed": gap.closed,
-        "inertia_kg_m3": {
-            f"{frequency:g}_hz": gap.inertia(frequency).real
-            for frequency in (limits.frequency_min, limits.frequency_max)
-        },
-        "stiffness_n_m3": gap.bulk_modulus(limits.frequency_max).real / gap.depth
-        if gap.closed
-        else 0.0,
     }
 
 
@@ -309,20 +318,6 @@ def _laminate(laminate: Laminate, limits: GuardLimits) -> dict[str, Any]:
         "rigidity_perfectly_bonded_n_m": perfectly_bonded(laminate.layers).rigidity,
         "rigidity_freely_sliding_n_m": freely_sliding(laminate.layers).rigidity,
         **({"rigidity_by_frequency_n_m": by_frequency} if laminate.bond is Bond.FULL else {}),
-    }
-
-
-def _exciter(one: Exciter) -> dict[str, Any]:
-    """An exciter by itself."""
-    return {
-        "name": one.name,
-        "magnet": "held" if one.held else "free",
-        "magnet_resonance_hz": one.magnet_frequency,
-        "q": one.quality,
-        "force_at_1_w_n": one.force_factor * math.sqrt(2 / one.resistance),
-        "full_level_v": one.voltage * one.largest_gain,
-        "full_level_force_n": one.largest_force,
-        "excursion_max_m": one.excursion if math.isfinite(one.excursion) else None,
     }
 
 

@@ -528,11 +528,6 @@ class SurfaceSection(Section):
         )
 
 
-def _named_modes(value: object) -> object:
-    """The keys of a surface of which only the file is given."""
-    return {"modes": value} if isinstance(value, str) else value
-
-
 Edges = Literal["edges"]
 Points = Annotated[int, Field(ge=3, le=40)]
 
@@ -740,6 +735,14 @@ class UncertaintySection(Section):
     [what lies on the plate](../concepts/people.md#what-lies-on-the-plate).
     """
 
+    mode_frequency: Annotated[float, _within("mode_frequency")] = Uncertainty.mode_frequency
+    """Natural frequency of each mode by itself, relative, as modes of a computed
+    [surface](#surface) differ from those of the one that was made.
+    """
+
+    mode_amplitude: Annotated[float, _within("mode_amplitude")] = Uncertainty.mode_amplitude
+    """Size of the shape of each mode of a surface by itself, relative."""
+
     def made(self, *, has_feet: bool, weather: float) -> Uncertainty:
         """Make the uncertainty of a rig; that of its feet, if none is stated, as `FEET_DEVIATE`.
 
@@ -833,7 +836,10 @@ class RigSection(Section):
 
     surface: Annotated[
         SurfaceSection | None,
-        BeforeValidator(_named_modes, json_schema_input_type=SurfaceSection | str | None),
+        BeforeValidator(
+            lambda value: {"modes": value} if isinstance(value, str) else value,
+            json_schema_input_type=SurfaceSection | str | None,
+        ),
     ] = None
     """Modes of another program in place of a plate, see [surface](#surface).
 

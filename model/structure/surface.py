@@ -39,6 +39,9 @@ LEAST_KNOWN, WELL_KNOWN = 1.15, 3.0
 """Multiples of the highest frequency up to which modes must be known, and should be: with fewer,
 fields were wrong by a fifth; with those up to three times by 3 %."""
 
+MAX_DEVIATING = 64
+"""Number of the lowest elastic modes that may differ from those of a file."""
+
 _RIGID_FREQUENCY = 1.0  # Hz; below it a mode is of the rigid body
 _HELD = 0.2  # motion along the normal of a rigid mode, to that of the one with most
 _SEEN = 1e-3  # the same of elastic modes, to their median; others move within the surface
@@ -47,7 +50,6 @@ _BESIDE = 9  # nodes beside each other, whose plane has the normal
 _ON_OUTLINE = 1e-3  # m; a place so near to it is on the surface
 _SAME_MASS = 0.1
 _SAME_LOSS = 0.01
-_MAX_DEVIATING = 64  # modes
 
 
 @dataclass(frozen=True)
@@ -75,6 +77,9 @@ class Surface:
 
     outline: Rings = ()
     """Edges and cut-outs as rings of points [m]; none for the whole rectangle."""
+
+    sizes: tuple[float, ...] = ()
+    """Factors of the shapes of the lowest elastic modes, on one that differs from the file's."""
 
     def frequency_factor(self, thickness: float, modulus: float) -> float:
         """Return the factor of its natural frequencies for a homogeneous plate that deviates.
@@ -255,7 +260,7 @@ def homogeneous(shapes: SurfaceShapes, mass: float | None) -> tuple[float, float
 
 def deviating_losses(shapes: SurfaceShapes, loss_factor: float) -> tuple[tuple[float, float], ...]:
     """Deviations of the lowest elastic modes whose damping is not a plate's (`mode_deviations`)."""
-    ratios = shapes.damping_ratios[shapes.rigid :][:_MAX_DEVIATING]
+    ratios = shapes.damping_ratios[shapes.rigid :][:MAX_DEVIATING]
     known = np.where(ratios > 0, 2 * ratios, loss_factor) / max(loss_factor, 1e-12)
     if np.abs(known - 1).max() < _SAME_LOSS:
         return ()

@@ -21,7 +21,7 @@ Verification of a table: a sample of it recomputed by other methods.
 import contextlib
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
@@ -57,7 +57,8 @@ from model.structure.attachments import (
     fingertip_loads,
     footprints_of,
 )
-from model.structure.modal_elasticity import check_scales, modal_receptance
+from model.structure.modal_elasticity import check_scales, lowest_elastic, modal_receptance
+from model.structure.surface import MAX_DEVIATING
 from model.study.contrast_maps import MIN_DISTANCE, random_contacts
 from model.table.table import LocalizationTable, read_fingertips
 from model.table.table_file import build_table
@@ -93,6 +94,8 @@ class Plates:
     """Second harmonic (d, eras) of each ERA's motion, relative to it."""
     feet: FloatArray
     """Stiffness (d, feet) of each foot."""
+    modes: FloatArray = field(default_factory=lambda: np.ones((1, 2, 0)))
+    """Eigenvalue and squared size (d, 2, m) of each of the lowest elastic modes by itself."""
 
 
 def draw_plates(
@@ -115,6 +118,9 @@ def draw_plates(
         real, imaginary = normal(size), normal(size)
         return np.asarray(math.sqrt(0.5) * (real + 1j * imaginary))
 
+    of_modes = np.array([[uncertainty.mode_frequency], [uncertainty.mode_amplitude]])
+    modes = MAX_DEVIATING if of_modes.any() else 0
+    (apart,) = rng.spawn(1)  # so that all else of a seed stays
     deviation = complex_normal(contact_count)
     common = np.exp(uncertainty.common_gain * normal(1))
     return Plates(
@@ -131,6 +137,7 @@ def draw_plates(
         places=uncertainty.place * normal(era_count, 2),
         harmonic=uncertainty.harmonic * complex_normal(era_count),
         feet=np.exp(uncertainty.supports * normal(foot_count)),
+        modes=(1 + of_modes * apart.standard_normal((count, 2, modes))) ** 2,
     )
 
 
@@ -247,8 +254,11 @@ def accelerations_on(
     stiffness = np.concatenate([at_eras, resting], axis=-1)
     nominal = attached.modal[rows]
     lossy = nominal.real + 1j * plates.loss[:, None, None] * nominal.imag
-    stiffer = np.asarray(plates.modulus[:, None, None] * lossy, dtype=complex)
-    modal = modal_receptance(stiffer, w, plates.thickness)[:, :, None]
+    lowest = lowest_elastic(nominal[0].real, plates.modes.shape[2])
+    of_modes = np.ones((len(plates.modes), 2, nominal.shape[1]))
+    of_modes[:, :, lowest] = plates.modes[:, :, : len(lowest)]
+    stiffer = np.asarray(plates.modulus[:, None, None] * of_modes[:, :1] * lossy, dtype=complex)
+    modal = modal_receptance(stiffer, w, plates.thickness)[:, :, None] * of_modes[:, None, 1:]
     shapes = np.vstack([table.attachment_shapes, discs[: len(fingers), 0]])
     shapes = np.repeat(shapes[None], len(plates.places), axis=0)
     shapes[:, : len(eras)] += _shifts(table, plates.places)

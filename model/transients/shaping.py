@@ -231,7 +231,9 @@ class Shaper:
         self._names = [era.name for era in plate.eras]
         self._strokes = np.array([era.full_level for era in plate.eras])
         self._magnets = magnets or MagnetMotions.of(plate)
-        self._full = lru_cache(_KEPT)(self._full_share)
+        self._full = lru_cache(_KEPT)(
+            lambda hertz: float(self._magnets.shares(np.array([hertz]))[0])
+        )
         self._residual_form = mean_square(plate, ENDING_WINDOW)
         self._carriers: dict[float, Carrier] = {}
         self._centres = _SURROUNDINGS.centres(plate.reduced.plate)
@@ -303,9 +305,6 @@ class Shaper:
             self._names[era]: BaseEnvelope(frequency, start, tuple(rest))
             for era, (start, *rest) in by_era
         }
-
-    def _full_share(self, frequency: float) -> float:
-        return float(self._magnets.shares(np.array([frequency]))[0])
 
     def _groups(
         self, excitation: Excitation, *, helped: bool

@@ -66,7 +66,8 @@ class PlateErrors:
 
     stiffness: by ERA; places [m]: by ERA, by how far it is off; era_damping: of all ERAs; feet: of
     the stiffness of each foot, by its number among the rig's masses; masses: on the plate beside
-    the rig's; mesh: on which it is solved, None for the rig's.
+    the rig's; mesh: on which it is solved, None for the rig's; modes: eigenvalue and squared size
+    (2, m) of each of the lowest elastic modes.
     """
 
     thickness: float = 1.0
@@ -78,6 +79,7 @@ class PlateErrors:
     feet: Mapping[int, float] = field(default_factory=dict)
     masses: tuple[PointLoad, ...] = ()
     mesh: PlateMesh | None = None
+    modes: FloatArray = field(default_factory=lambda: np.ones((2, 0)))
 
     def realised(self, rig: Rig) -> Rig:
         """The rig whose plate and ERAs have these errors."""
@@ -93,9 +95,19 @@ class PlateErrors:
                 y=float(np.clip(y, 0.0, rig.plate.width)),
             )
 
+        stated, surface, (squares, sizes) = rig.plate.mode_deviations, rig.plate.surface, self.modes
         plate = replace(
             rig.plate.scaled(thickness=self.thickness, modulus=self.modulus),
             loss_factor=min(self.loss_factor * rig.plate.loss_factor, _MAX_LOSS_FACTOR),
+            mode_deviations=tuple(
+                (a + math.log(square), b)
+                for (a, b), square in zip(
+                    [*stated, *[(0.0, 0.0)] * len(squares)],
+                    [*squares, *[1.0] * len(stated)],
+                    strict=True,
+                )
+            ),
+            surface=surface and replace(surface, sizes=tuple(np.sqrt(sizes).tolist())),
         )
         masses = list(rig.masses)
         for number, factor in self.feet.items():
@@ -210,6 +222,7 @@ def draw_imperfections(rig: Rig, *, seed: int = 0) -> Imperfections:
         modulus=relative(std.elasticity),
         places=_places(rig, std.place * rng.standard_normal((len(rig.eras), 2))),
         feet=_feet(rig, np.exp(std.supports * of_feet.standard_normal(len(rig.feet)))),
+        modes=draw_plates(of_feet, std, of=rig, count=1, contact_count=0).modes[0],
     )
     real, imaginary = rng.standard_normal((2, len(channels))) * (std.harmonic * math.sqrt(0.5))
     channels = {
@@ -253,6 +266,7 @@ def draw_of_ensemble(rig: Rig, *, seed: int) -> Imperfections:
         },
         feet=_feet(rig, drawn.feet[0]),
         mesh=_other_mesh(rig),
+        modes=drawn.modes[0],
     )
     channels = {
         rig.wiring[era.name]: ChannelErrors(*cmath.polar(gain), harmonic)
@@ -294,8 +308,9 @@ def _other_mesh(rig: Rig) -> PlateMesh:
 
 def realised(motion: Motion, errors: ChannelErrors) -> list[Term]:
     """Base motion with the gain and phase errors of its channel."""
-    factor = errors.factor
-    return [term._replace(c0=factor * term.c0, c1=factor * term.c1) for term in motion]
+    return [
+        term._replace(c0=errors.factor * term.c0, c1=errors.factor * term.c1) for term in motion
+    ]
 
 
 def of_voices(voices: Sequence[Voice], share: complex) -> list[Voice]:

@@ -96,7 +96,8 @@ class SoftAmplifierSupervisor:
                 self._kill()
                 self._restart(f"no sound was made for {1e3 * (now - since):.0f} ms")
             self._report_underruns(now)
-            if until is not None and _has_ended(until):
+            said = [] if until is None else select.select([until], [], [], 0)[0]
+            if said and not os.read(said[0], 4096):
                 return
 
     def _take(self, event: dict[str, Any]) -> None:
@@ -185,10 +186,6 @@ class SoftAmplifierSupervisor:
             f"{self.counters.gaps} gaps in the sound, {self.counters.xruns} underruns reported by "
             f"the driver, in {self.counters.frames / (self._rate or 48_000):.0f} s"
         )
-
-
-def _has_ended(descriptor: int) -> bool:
-    return bool(select.select([descriptor], [], [], 0)[0]) and not os.read(descriptor, 4096)
 
 
 def _raise_priority() -> None:

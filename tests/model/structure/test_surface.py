@@ -2,24 +2,29 @@
 
 import re
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from benchmarks.contents import share_kept
+from benchmarks.setting import random_contacts
 from benchmarks.surface import exported_modes
 from controller.cli.main import run
-from model.answer.stimulus import check_on_plate
+from model.answer.plan import answer, query
+from model.answer.stimulus import Finger, Stimulus, check_on_plate
 from model.arrays import FloatArray
 from model.errors import InputError
-from model.rig.rig import Rig
+from model.rig.rig import Rig, Uncertainty
 from model.rig.rig_file import load_rig, parse_rig
 from model.rig.rig_writing import save_rig
 from model.structure.surface import is_within, rings_of
-from model.study.verification import verify_table
+from model.study.verification import amplitudes_on, draw_plates, verify_table
 from model.table.table import LocalizationTable
 from model.table.table_file import build_table, load_table, save_table
+from sim.plant.imperfections import draw_of_ensemble
 from yaml_files import read_yaml
 
 ERAS = """
@@ -175,6 +180,65 @@ def test_curved_surface_counts_along_its_arc(
     path = _write(tmp_path, modes, nodes=nodes, shapes=shapes, places=places)
     path.write_text("surface: {modes: modes.npz, normal: local z, mass: 282 g}" + ERAS)
     assert _difference(own, build_table(load_rig(path))) < 0.05
+
+
+def _of_modes(rig: Rig, **known: float) -> Rig:
+    """A rig of which each mode is uncertain by itself, and nothing else but fingers."""
+    own = {"mode_frequency": 0.02, "mode_amplitude": 0.05, "fingertip": 0.5}
+    return replace(rig, uncertainty=replace(Uncertainty.none(), **(own | known)))
+
+
+def test_modes_that_differ_are_those_of_the_bench_and_of_drawn_plates(
+    modes: Mapping[str, FloatArray], tmp_path: Path
+) -> None:
+    """As of a file whose modes have these frequencies and sizes.
+
+    Within what those modes add that are truncated, whose frequencies stay.
+    """
+    rig = _of_modes(load_rig(_write(tmp_path, modes)), fingertip=0.0)
+    known, size = build_table(rig), (0.3048, 0.2286)
+    plates = draw_plates(
+        np.random.default_rng(3), rig.uncertainty, of=rig, count=1, contact_count=3
+    )
+    squares, sizes = plates.modes[0][:, : (modes["frequencies"] > 1).sum()]
+    changed = {name: each.copy() for name, each in modes.items()}
+    changed["frequencies"][-len(squares) :] *= np.sqrt(squares)
+    changed["shapes"][-len(sizes) :] *= np.sqrt(sizes)[:, None]
+    (tmp_path / "other").mkdir()
+    other = build_table(load_rig(_write(tmp_path / "other", changed)))
+    bench = draw_of_ensemble(rig, seed=3).plate.realised(rig)
+    assert _difference(other, known) > 0.1
+    assert _difference(other, build_table(replace(bench, mesh=rig.mesh))) < 0.04
+    points = random_contacts(np.random.default_rng(1), 3, size)
+    places = [(float(x), float(y)) for x, y in points]
+    drive = query(known, places[0]).layers[0].excitation
+    exact = draw_plates(
+        np.random.default_rng(0), Uncertainty.none(), of=rig, count=1, contact_count=3
+    )
+    still = {"deviation": np.zeros((1, 3))}
+    _, drawn = amplitudes_on(known, places, drive, replace(plates, **still))
+    _, expected = amplitudes_on(other, places, drive, replace(exact, **still))
+    np.testing.assert_allclose(drawn, expected, rtol=0.05)
+
+
+def test_promises_are_kept_where_each_mode_differs(
+    modes: Mapping[str, FloatArray], tmp_path: Path
+) -> None:
+    """On nine of ten plates, which promises that know of no such modes are not."""
+    rig, size = load_rig(_write(tmp_path, modes)), (0.3048, 0.2286)
+    uncertain = build_table(_of_modes(rig))
+    blind = build_table(_of_modes(rig, mode_frequency=0.0, mode_amplitude=0.0))
+    kept, rng = list[list[float]](), np.random.default_rng(1)
+    for seed in range(12):
+        target, *quiet = [(float(x), float(y)) for x, y in random_contacts(rng, 2, size)]
+        found = [
+            answer(each, [Finger(target, Stimulus())], quiet=quiet, min_contrast_db=-np.inf)
+            for each in (uncertain, blind)
+        ]
+        kept.append([share_kept(uncertain, each, quiet, seed=seed) for each in found])
+    knowing, not_knowing = np.mean(kept, axis=0)
+    assert 0.8 < knowing < 0.98
+    assert not_knowing < knowing - 0.15
 
 
 def test_cut_out_has_no_fingers(modes: Mapping[str, FloatArray], tmp_path: Path) -> None:

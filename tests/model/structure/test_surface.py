@@ -13,7 +13,7 @@ from benchmarks.contents import share_kept
 from benchmarks.setting import random_contacts
 from benchmarks.surface import exported_modes
 from controller.cli.main import run
-from model.answer.plan import answer, query
+from model.answer.plan import answer
 from model.answer.stimulus import Finger, Stimulus, check_on_plate
 from model.arrays import FloatArray
 from model.errors import InputError
@@ -211,7 +211,7 @@ def test_modes_that_differ_are_those_of_the_bench_and_of_drawn_plates(
     assert _difference(other, build_table(replace(bench, mesh=rig.mesh))) < 0.04
     points = random_contacts(np.random.default_rng(1), 3, size)
     places = [(float(x), float(y)) for x, y in points]
-    drive = query(known, places[0]).layers[0].excitation
+    drive = answer(known, [Finger(places[0], Stimulus())]).layers[0].excitation
     exact = draw_plates(
         np.random.default_rng(0), Uncertainty.none(), of=rig, count=1, contact_count=3
     )

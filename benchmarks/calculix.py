@@ -222,9 +222,9 @@ class GlassOnEras:
         rest = self._by_frequency[row][np.ix_(observed, forced)]
         rest = rest - (left / ((1 + 1j * eta) * own - w2)) @ right.T
         h, e = plates.thickness[:, None], plates.modulus[:, None]
-        lowest = np.flatnonzero(own > (2 * np.pi) ** 2)[: plates.modes.shape[2]]
-        of_modes = np.ones((len(plates.modes), 2, len(own)))
-        of_modes[:, :, lowest] = plates.modes[:, :, : len(lowest)]
+        rigid, drawn = int((own < (2 * np.pi) ** 2).sum()), plates.modes[:, :, : len(own)]
+        around = (0, 0), (0, 0), (rigid, len(own) - rigid - drawn.shape[2])
+        of_modes = np.pad(drawn, around, constant_values=1.0)
         lossy = own * of_modes[:, 0] * (1 + 1j * eta * plates.loss[:, None])
         modal = of_modes[:, 1] / (h * (h**2 * e * lossy - w2))
         whole = (left * modal[:, None]) @ right.T

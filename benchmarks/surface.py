@@ -135,13 +135,13 @@ def _of_the_glass(sets: int) -> tuple[list[str], bool]:
     with tempfile.TemporaryDirectory() as folder:
         glass = CurvedGlass(Path(folder))
         modes = dict(np.load(glass.modes_file))
-        (file := Path(folder) / GLASS.name).write_text(GLASS.read_text("utf-8"), "utf-8")
+        file, text = Path(folder) / GLASS.name, GLASS.read_text("utf-8")
         for multiple, own in (*((each, {}) for each in OF_THE_GLASS), (2.5, OF_MODES)):
             known = modes["frequencies"] <= multiple * 400.0
             few = {name: modes[name][known] for name in ("frequencies", "shapes")}
+            file.write_text(f"{text}uncertainty: {own}\n", "utf-8")
             np.savez(glass.modes_file, **(modes | few))
             rig = load_rig(file)
-            rig = replace(rig, uncertainty=replace(rig.uncertainty, **own))
             frequencies = np.linspace(60.0, 400.0, FREQUENCIES)
             table = build_table(rig, frequencies=frequencies, drive_mode="phased")
             on = on or GlassOnEras(glass, rig, frequencies, _places_on(rig), table.cell_centres)

@@ -25,7 +25,8 @@ from controller.play.routing import (
     tones_by_era,
 )
 from drivers.errors import CommandError, CommandRefused
-from drivers.host.amplifier import Amplifier, AmplifierSensor, Reading, measure_tones, read_sensors
+from drivers.host.amplifier import Amplifier
+from drivers.host.amplifier_sensors import AmplifierSensor, Reading, measure_tones, read_sensors
 from drivers.host.clock import CLOCK_SETTLING
 from drivers.host.group import Group
 from drivers.opening import Lines

@@ -65,8 +65,8 @@ from controller.play.routing import Drive
 from controller.sources.touch import Change, Contact, ContactKey
 from drivers.host.amplifier import Amplifier
 from drivers.host.clock import REPORT_LIFE, REPORTS, ReportKind
-from drivers.host.dialogue import StopOutcome
 from drivers.host.joint_sets import is_lost
+from drivers.host.ledger import StopOutcome
 from drivers.host.line import LinkStatistics
 from drivers.protocol.definition import FAULTS, QUANTITIES, READINGS, STATES, has_flag, name_of
 from model.answer.answer import is_felt

@@ -40,7 +40,7 @@ from controller.plate_measurement import PlateSensor, check_clocks, plate_sensor
 from controller.play.loop import Observers, PlayReport
 from controller.sources.touch import Contact
 from drivers.errors import CommandError, DriverError, Preempted
-from drivers.host.amplifier import Reading, finish_reading, start_reading
+from drivers.host.amplifier_sensors import Reading, finish_reading, start_reading
 from model.answer.answer_report import Timing
 from model.errors import InputError
 from model.estimate.following import LearnedTable, PlateReport, SettledPattern

@@ -9,8 +9,8 @@ from controller.play.loop import Cycle, Planner
 from controller.play.routing import limits_of, playback_capabilities
 from drivers.errors import LinkError
 from drivers.host.amplifier import CONFIRM_TIMEOUT, WATCHDOG, Amplifier
-from drivers.host.dialogue import UNREACHED, StopOutcome
 from drivers.host.group import Group, GroupState
+from drivers.host.ledger import UNREACHED, StopOutcome
 from drivers.opening import Lines
 from drivers.protocol.definition import REPLY_TIMEOUT
 from model.answer.answer_report import Timing

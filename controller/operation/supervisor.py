@@ -46,8 +46,8 @@ from drivers.errors import (
     WrongAmplifier,
 )
 from drivers.host.amplifier import Amplifier
-from drivers.host.dialogue import StopOutcome
 from drivers.host.group import GroupState
+from drivers.host.ledger import StopOutcome
 from drivers.protocol.definition import FAULTS, NO_CHANNEL, name_of
 from drivers.protocol.records import Values
 from model.errors import InputError

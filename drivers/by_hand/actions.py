@@ -32,9 +32,8 @@ from drivers.by_hand.reaching import (
     wire_rows,
 )
 from drivers.errors import CommandError, CommandRefused, DriverError, LinkError
-from drivers.host.amplifier import (
-    WATCHDOG,
-    Amplifier,
+from drivers.host.amplifier import WATCHDOG, Amplifier
+from drivers.host.amplifier_sensors import (
     AmplifierSensor,
     Reading,
     check_tones,
@@ -42,7 +41,7 @@ from drivers.host.amplifier import (
     read_measured,
     read_sensors,
 )
-from drivers.host.dialogue import StagedSet, StopOutcome
+from drivers.host.ledger import StagedSet, StopOutcome
 from drivers.host.line import Priority
 from drivers.playing import AmplifierLayer, AmplifierTone
 from drivers.protocol.definition import (

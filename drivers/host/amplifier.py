@@ -1,28 +1,47 @@
-"""One amplifier of protocol 4 on any wire: its identity, its requests and its measurements.
+"""One amplifier of protocol 4 on any wire: what it was sent, what it replied, and its stops.
 
-`Amplifier` identifies, arms, silences, disarms and stops one amplifier. The functions below it
-measure its channels, and tones at its sensors; these requests need no session, do not feed the
-watchdog and do not change what plays.
+`Amplifier` identifies, arms, plays, silences, disarms and stops one amplifier. It keeps session,
+latch, status and ledger, and raises CommandRefused once replies contradict the requests.
 """
 
 import asyncio
 import contextlib
-import random
-from collections.abc import Coroutine, Sequence
-from dataclasses import dataclass, field, replace
-from itertools import pairwise
-from typing import Any
+import logging
+import math
+from collections.abc import Callable, Coroutine, Sequence
+from dataclasses import replace
+from functools import cache
+from typing import Any, TypeAlias
 
 from drivers.errors import (
     CommandError,
     CommandRefused,
     FrameError,
+    LinkDegraded,
     LinkTimeout,
+    Overtaken,
     Preempted,
     WrongAmplifier,
 )
-from drivers.host.dialogue import MAX_CONTRADICTIONS, Dialogue, StopOutcome
-from drivers.host.ledger import Ledger
+from drivers.host.bounds import COMMIT_DELAY
+from drivers.host.clock import (
+    REPORT_LIFE,
+    REPORTS,
+    HeldClock,
+    ReportKind,
+    armed_problem,
+    reports_of,
+)
+from drivers.host.ledger import (
+    UNREACHED,
+    Feeding,
+    Ledger,
+    PendingStop,
+    StagedSet,
+    StopOutcome,
+    check_capabilities,
+    check_identity,
+)
 from drivers.host.line import (
     Line,
     LinkStatistics,
@@ -31,27 +50,47 @@ from drivers.host.line import (
     disarmed,
     driven_by_another,
 )
+from drivers.playing import AmplifierLayer
 from drivers.protocol.definition import (
     ATTEMPTS,
+    COMMAND,
     ENABLED,
+    ENVELOPE,
+    EVENT_RECORD,
+    FAST,
+    HIGH_TIME,
+    KNOT,
     LATCHED,
-    NO_CHANNEL,
+    LAYER,
+    MAX_AHEAD,
+    MESSAGES,
     QUANTITIES,
-    READING_STATES,
     REPLY_TIMEOUT,
-    SENSOR_UNITS,
+    SET_WORDS,
     STATES,
+    STATUS,
     STOP_RAMP,
-    UNKNOWN_PLACE,
-    VERSION,
-    capability_ranges,
-    has_feature,
-    name_of,
-    sensor_reading,
 )
-from drivers.protocol.records import Record, Refusal, Rows, Values, bits_of
-from drivers.protocol.sets import LayerSet, achieved_layer, achieved_problem, is_newer_token
-from drivers.wires.wire import reply_words
+from drivers.protocol.records import Values
+from drivers.protocol.sets import (
+    PART_WORDS,
+    LayerSet,
+    achieved_layer,
+    achieved_problem,
+    is_last,
+    is_newer_token,
+    is_vibrating,
+    pack_layers,
+    parts,
+)
+from drivers.wires.wire import (
+    WIDEST,
+    DuplicateAddress,
+    Event,
+    OtherHost,
+    reply_words,
+    request_words,
+)
 from registry import threads
 from registry.limits import GuardLimits
 
@@ -65,41 +104,34 @@ SECOND_REPLY = 0.02  # s; how long it waits for a second amplifier at the same a
 _INTERVAL = 0.005  # s; between two attempts to stop, in addition to the ramp
 _RAMP, _WATCHDOG = QUANTITIES["ramp"], QUANTITIES["watchdog"]
 _ENERGISED = (STATES["SWITCHED_ON"], ENABLED)
-_FULL_LEVEL = ("motion of a stiff source", "output of a linear amplifier")
 _WIRE_ROUNDING = 0.5  # steps of the wire, beside half a step of the amplifier
+MAX_CONTRADICTIONS = 2
+"""So many contradictions in a row are a fault; a single one may be a moment between two sets."""
+_SAME_MOMENT = 0.01  # s; contradictions of statuses closer to each other than this count once
+_LEFT = QUANTITIES["watchdog_left"]
+_SILENCING = ("Stop", "Disarm", "Silence")
+_CHANGING = ("Arm", "Disarm", "Stop", "Clear")
+# A request that changes the state may be preceded by an event, in a frame of its own of 7 words.
+_EVENT_WORDS = EVENT_RECORD.words + 7
+_SURELY = 3.0  # standard errors of a clock
+_MAX_START_ERROR = 0.003  # s; if a start is known worse than this, statuses are not compared
+COMMITTING = 0.1
+"""Time [s] within which a commit arrives and is carried out."""
+_CHECKED_FOR = 0.005  # s; a check holds for so long unless anything is sent or received
+IsPreempted: TypeAlias = Callable[[], bool]
+"""Tells whether something more urgent waits, so that a set that does not play yet is dropped."""
+_Checked: TypeAlias = tuple[tuple[LayerSet, ...], list[int]]
+_UNCHECKED: tuple[Sequence[AmplifierLayer] | None, float, float, _Checked] = (
+    None,
+    -math.inf,
+    0.0,
+    ((), []),
+)
+_logger = logging.getLogger(__name__)
 
 
-@dataclass(eq=False, slots=True)
-class _Stop:
-    """A stop, which is repeated until the amplifier has confirmed it or a timeout has passed."""
-
-    ramp: int
-    """In units of the wire."""
-    timeout: float
-    """How long it is repeated after the first request has gone out [s]."""
-    ends: float
-    """When the timeout passes [s]."""
-    is_sent: bool = False
-    """Whether the first request has gone out; what is played later needs a stop of its own."""
-    limit: asyncio.Timeout | None = None
-    requested: "asyncio.Future[Values] | None" = None
-    """The first request, which is queued as soon as the stop is asked for."""
-    latch: int | None = None
-    """The newest latch that was known when the last request was made."""
-    result: "asyncio.Future[StopOutcome]" = field(init=False)
-
-    def sent(self) -> list[Values]:
-        """Return the values of the request, and note that it goes out now."""
-        if not self.is_sent:
-            self.is_sent = True
-            self.ends = threads.now() + self.timeout
-            if self.limit is not None:
-                self.limit.reschedule(self.ends)
-        return [{"ramp": self.ramp}]
-
-
-class Amplifier(Dialogue):
-    """An amplifier on an open line.
+class Amplifier:
+    """An amplifier on an open line, and the exchanges with it.
 
     limits: the configured ones. serial_number: the expected one; None for any. is_output: what full
     level means by the rig: True for the output of a linear amplifier, False for the motion of a
@@ -116,11 +148,389 @@ class Amplifier(Dialogue):
         serial_number: str | None = None,
         is_output: bool | None = False,
     ) -> None:
-        super().__init__(line, address, name)
+        self.line, self.address, self.name = line, address, name
+        self.capabilities: Values = {}
+        """Values of its capabilities record; empty until it is identified, or if several reply."""
+        self.session = 0
+        self.may_be_armed = False
+        """Whether it may have carried out an Arm of this host since it was last disarmed."""
+        self.latch: int | None = None
+        """Newest latch that a status has shown since it was identified."""
+        self.status: Values | None = None
+        """The last status."""
+        self.status_at: float | None = None
+        """When the last status came [s]."""
+        self.arming = (0, -math.inf)
+        """`silences` when Arm was requested, and the time [s] until which the Arm may go out."""
+        self.armed_latch: int | None = None
+        """Latch in the reply to the last Arm."""
+        self.reported_at: dict[ReportKind, float] = {}
+        """When a status last had a report of each kind [s]."""
+        self.played_at = -math.inf
+        """When the set that was sent last starts at the soonest, or when silence was sent [s]."""
+        self.starts = -math.inf
+        """When the staged set starts if it is committed next [s]; a time in the past: at once."""
+        self._may_wait_until = -math.inf  # s; the last set may start so late by a poor clock
+        self._is_start_known = True  # well enough that statuses can be compared with what was sent
+        self.committed = 0
+        """Token of the set that it committed last; 0 if it committed none since it was armed."""
+        self.feeding = Feeding(line.wire.delay, line.wire.is_kept)
+        self.known = UNREACHED
+        """What it may play, apart from what its statuses and its watchdog tell."""
+        self.clock = HeldClock()
+        """Its clock, which is held to that of the line."""
+        self.counts = LinkStatistics()
+        self.exchange_time = cache(self._exchange_time)  # cleared when it is identified
+        self.silence_cause: str | None = None
+        """Why it is degraded: it did not reply to a request, and may still play."""
+        self.listeners: list[Callable[[Values], None]] = []
+        """They are called with the values of each event."""
+        self.silences = 0
+        """Number of stops and disarms that were sent to it."""
+        self._time = line.time
+        self._ledger: Ledger | None = None
+        self._admitted: StagedSet | None = None
+        self._checked = _UNCHECKED  # the layers checked last, until when [s] that holds, the result
+        self._contradictions = 0  # of statuses, in a row
+        self._misachieved = 0  # contradictions of achieved layers, in a row
+        self._contradicted_at = -math.inf
+        self._was_unfed = False  # whether the last contradiction was in a status that does not feed
+        self._other_host_at = -math.inf  # when another host was heard last
+        self._are_several = False  # whether two amplifiers have replied since this was reset
+        line.members[address] = self
         self.limits, self._serial_number = limits, serial_number
         self._is_output = is_output
         self.identity: Values = {}
-        self._stop: _Stop | None = None
+        self._stop: PendingStop | None = None
+
+    @property
+    def ledger(self) -> Ledger:
+        """The ledger; raises CommandError before the amplifier is identified."""
+        if self._ledger is None:
+            raise CommandError(f"amplifier {self.name} must be opened first")
+        return self._ledger
+
+    @property
+    def is_in_doubt(self) -> bool:
+        """Whether it has not confirmed the last set, which it may or may not play."""
+        return self._ledger is not None and self._ledger.doubt is not None
+
+    def _exchange_time(self, name: str) -> float:
+        """Return how long the longest request with this name and its reply take on the wire [s]."""
+        can = self.capabilities
+        size = (can["channels"], can["layers"]) if can else WIDEST
+        event = _EVENT_WORDS if name in _CHANGING else 0
+        return self.line.wire.exchange_time(request_words(name), reply_words(name, *size) + event)
+
+    async def stage(
+        self,
+        token: int,
+        layers: Sequence[AmplifierLayer],
+        *,
+        now: bool = False,
+        priority: Priority = Priority.SET,
+        is_preempted: IsPreempted | None = None,
+    ) -> StagedSet:
+        """Stage a set under a token, or play it at once if `now`.
+
+        The ledger admits it when its turn on the line comes, unless it is preempted then. Raises
+        CommandRefused with the reason; Preempted if a stop came first; FrameError if two replies in
+        a row have another token.
+        """
+        staged: StagedSet
+
+        def make() -> list[Values]:
+            nonlocal staged
+            if is_preempted is not None and is_preempted():
+                raise Overtaken(f"amplifier {self.name}: set {token} is preempted")
+            moment, (known, until, delay, checked) = self._time(), self._checked
+            if known is not layers or moment > until:
+                delay, checked = self._check(layers, moment)
+            (admitted, stream), self._checked = checked, _UNCHECKED
+            messages = parts(stream, session=self.session, token=token, now=now)
+            self._admitted = staged = StagedSet(token, admitted, True, until=moment + delay)
+            return messages
+
+        for _ in range(MAX_CONTRADICTIONS):
+            taken = await self.line.submit(self, priority, "Set", make)
+            if taken["token"] == token:
+                break
+        else:
+            problem = f"a set with token {token} must be taken, got token {taken['token']}"
+            # This is no refusal: the group stops all amplifiers for it.
+            raise FrameError(str(contradicted(self.name, problem)))
+        if not (taken["played"] or (taken["staged"] and not now and self._admitted is staged)):
+            raise Preempted(f"amplifier {self.name}: set {token} was not staged")
+        return staged if taken["exact"] else replace(staged, is_exact=False)
+
+    def refusal_of(self, layers: Sequence[AmplifierLayer]) -> CommandRefused | None:
+        """Return why the ledger would not admit layers now; None if it would.
+
+        The result is used again if the layers are staged within 5 ms and nothing is sent or
+        received meanwhile.
+        """
+        moment = self._time()
+        try:
+            delay, checked = self._check(layers, moment, longer=_CHECKED_FOR)
+        except CommandRefused as error:
+            return error
+        self._checked = layers, moment + _CHECKED_FOR, delay, checked
+        return None
+
+    def _check(
+        self, layers: Sequence[AmplifierLayer], moment: float, *, longer: float = 0.0
+    ) -> tuple[float, _Checked]:
+        """Return the longest time until layers are committed [s], and the layers as admitted.
+
+        longer: time until they are staged [s]. Raises CommandRefused.
+        """
+        takes = len(self.line.members) * self.exchange_time("Set")
+        delay = max(COMMIT_DELAY, ATTEMPTS * takes)
+        words = LAYER.words * len(layers)
+        for layer in layers:
+            words += COMMAND.words * len(layer.tones)
+            for tone in layer.tones:
+                for shape in (tone.onset, tone.ending):
+                    if shape is not None:
+                        words += ENVELOPE.words + KNOT.words * len(shape.knots)
+        if words > PART_WORDS:  # parts for all amplifiers of the line, each perhaps repeated
+            delay += 2 * words / PART_WORDS * takes
+        admitted = self.ledger.admit(layers, moment, delay=delay + longer)
+        stream = pack_layers(admitted)
+        if not self.capabilities and is_vibrating(*admitted):
+            raise CommandRefused(f"amplifier {self.name} must be identified first; open it again")
+        if len(stream) > (limit := self.ledger.capabilities["set_words"]):
+            raise CommandRefused(f"a set must have at most {limit} words, got {len(stream)}")
+        return delay, (admitted, stream)
+
+    def commit(self, token: int, at: int) -> asyncio.Future[Values]:
+        """Play the staged set; returns a future of the status, which shows the tokens.
+
+        at: high word of the amplifier's clock at which it starts. The future raises Preempted if a
+        stop or disarm came first, CommandRefused if it is too late for what the ledger admitted.
+        """
+        values = {"session": self.session, "token": token, "at": at}
+        return self.line.submit(self, Priority.SET, "Commit", values)
+
+    def next_request(self, name: str, values: Values, priority: Priority) -> float:
+        """Return how long a request and its reply take on the wire [s].
+
+        Raises if the request would play or feed and must not be sent: LinkError while the amplifier
+        is degraded or driven by another host, CommandRefused once a status has shown that it is not
+        armed. For a set and its commit it raises Preempted if the set is no longer admitted, and
+        CommandRefused if it is too late.
+        """
+        takes = self.exchange_time(name)
+        if name == "Set" and takes > FAST:  # most sets are much shorter than the longest one
+            words = SET_WORDS + len(values["stream"])
+            takes = self.line.wire.exchange_time(words, reply_words("Set"))
+        if name in ("Hello", "Silence") or not MESSAGES[name].feeds:
+            return takes
+        if name == "Set" or (name == "Commit" and values["token"] != self.committed):
+            admitted, token, now = self._admitted, values["token"], self._time()
+            if admitted is None or admitted.token != token:
+                raise Preempted(f"amplifier {self.name}: a stop, disarm or newer set came first")
+            if now > admitted.until and priority is Priority.SET:  # silence is never too late
+                raise CommandRefused(
+                    f"amplifier {self.name}: set {token} must be committed "
+                    f"{now - admitted.until:.3g} s earlier; the wire is too slow or too busy",
+                    until=now,
+                )
+        if name == "Arm":
+            silences, until = self.arming
+            if self.silences != silences:
+                raise Preempted(f"amplifier {self.name}: a stop or disarm came first")
+            if self._time() > until:  # this machine slept, and the caller does not expect it now
+                raise LinkTimeout(f"amplifier {self.name}: identified too late; arm again")
+        if self._other_host_at > -math.inf:
+            self.check_other_host()
+        if self.silence_cause is not None:
+            raise LinkDegraded(
+                f"{self.silence_cause}. The amplifier may play its last set until its watchdog has "
+                "passed; nothing new is played until it replies"
+            )
+        if name != "Arm" and self.status is not None and self.status["state"] != ENABLED:
+            raise disarmed(self.name, self.status)
+        return takes
+
+    def note_sent(self, name: str, values: Values, now: float, arrives: float) -> None:
+        """Note a request that is sent now; `arrives`: when it arrives [s] unless it is delayed."""
+        self._checked = _UNCHECKED
+        if name != "Set":  # the reply to a Set shows no clock
+            # What was sent before may be lost, so this may arrive as soon as its bits have passed.
+            self.clock.sent(name, values, now, now + self.line.wire.takes)
+        if name == "Hello":
+            return
+        feeding = self.feeding
+        if MESSAGES[name].feeds and (name == "Arm" or values["session"] == self.session):
+            if name == "Silence" and self.silence_cause is not None:
+                # If it arrives, it does so within the time of the watchdog, and its ramp follows.
+                # Repeating it without reply does not put off when the amplifier must be silent.
+                feeding.may = now
+                feeding.fade = max(feeding.fade, _RAMP.from_wire(values["ramp"]))
+            else:
+                feeding.may = feeding.plays = now
+                feeding.arrives, feeding.fade = arrives, 0.0
+        elif name in ("Stop", "Disarm"):
+            feeding.fade = max(feeding.fade, _RAMP.from_wire(values["ramp"]))
+            self.silences += 1
+        admitted = self._admitted
+        if name == "Arm":
+            self._admitted, self.may_be_armed = None, True
+            self.known = replace(self.known, is_confirmed=False, may_play_until=-math.inf)
+        elif name in _SILENCING:
+            self._admitted = None
+            if name == "Silence" and self._ledger is not None:
+                self.played_at = now
+                self._ledger.may_be_silent.update(range(self._ledger.capabilities["layers"]))
+        elif admitted is not None and values.get("token") == admitted.token and self._ledger:
+            is_now = name == "Set" and values["now"] and is_last(values)
+            if name == "Commit" or is_now:
+                starts = None if is_now or self.starts <= now else self.starts
+                self._may_wait_until, error = -math.inf, 0.0
+                if not is_now:
+                    self._may_wait_until = now + MAX_AHEAD
+                    error = abs(self.clock.lead(now)) + _SURELY * self.clock.scatter(now)
+                    self._is_start_known = error <= _MAX_START_ERROR
+                error = 0.0 if starts is None else min(max(error, HIGH_TIME), _MAX_START_ERROR)
+                self.played_at = arrives if starts is None else starts
+                self._ledger.sent(admitted.token, admitted.layers, now, starts=starts, error=error)
+
+    def note_reply(self, name: str, values: Values, reply: Values, sent_at: float) -> None:
+        """Note the reply to a request that was sent at a time [s].
+
+        Raises CommandRefused if two statuses in a row contradict what was sent.
+        """
+        now, self._checked = self._time(), _UNCHECKED
+        self.counts.last_round_trip = now - sent_at
+        message = MESSAGES.get(name)
+        if message is None:
+            return
+        if message.feeds:
+            feeding = self.feeding
+            feeding.since, feeding.confirmed_at = sent_at, now
+            if sent_at > feeding.plays:
+                feeding.plays, feeding.fade = sent_at, 0.0
+        if message.reply is not STATUS:
+            if name == "Set" and reply["played"]:
+                self._confirm(values["token"], now)
+            return
+        if (latch := reply["latch"]) != self.latch and (
+            self.latch is None or is_newer_token(latch, self.latch)
+        ):
+            self.latch = latch
+        self.status, self.status_at = reply, now
+        # The status of a Commit tells no more than those of heartbeats, except where it may show a
+        # Mark, or that the amplifier is not armed any more.
+        if name != "Commit" or len(self.line.members) > 1 or reply["state"] != ENABLED:
+            self.clock.replied(name, values, reply, now)
+        for kind in reports_of(reply, self.clock.problem(now)):
+            self._note_report(kind, now)
+        ledger, is_enabled, fed = self._ledger, reply["state"] == ENABLED, message.feeds
+        if ledger is not None and name in _SILENCING:
+            ledger.silenced(_RAMP.from_wire(values["ramp"]), sent_at, now)
+            self.committed = reply["token"]
+            return
+        # A set plays some time after its commit. An earlier status may show that it plays, but not
+        # that it does not.
+        is_sure = reply["token"] != self.committed or sent_at >= self.played_at + COMMITTING
+        if ledger is not None and is_sure:
+            self._confirm(reply["token"], now)
+        if name == "Ping" and not is_enabled:
+            raise disarmed(self.name, reply)
+        if ledger is None or not self.session or name in ("Arm", "Clear") or not is_enabled:
+            return
+        # The reply to a request that feeds does not show how the watchdog runs down.
+        tells = not fed and self.feeding.tells(sent_at)
+        problem = armed_problem(reply, self.armed_latch)
+        if problem is None and not fed:
+            left = reply["watchdog_left"] / _LEFT.per_unit
+            problem = self.feeding.problem(left, sent_at, now)
+        plays_wrong = None if problem else ledger.problem_of(reply, sent_at, now)
+        # If its clock is not held, a set may wait even though it was committed.
+        if plays_wrong and (
+            sent_at >= self._may_wait_until
+            or (self._is_start_known and self.clock.error(now) < math.inf)
+        ):
+            problem = plays_wrong
+        if problem is None:
+            if tells or not self._was_unfed:
+                self._contradictions, self._contradicted_at = 0, -math.inf
+            return
+        self._was_unfed = not fed
+        if now - self._contradicted_at >= _SAME_MOMENT:
+            self._contradictions, self._contradicted_at = self._contradictions + 1, now
+            if self._contradictions >= MAX_CONTRADICTIONS:
+                raise contradicted(self.name, problem)
+
+    def note_unasked(self, arrival: Event | OtherHost | DuplicateAddress) -> None:
+        """Note a message that came without a request; an event is passed to the listeners."""
+        if isinstance(arrival, OtherHost):
+            self._other_host_at = self._time()
+        elif isinstance(arrival, DuplicateAddress):
+            self._are_several = True
+        else:
+            for listener in self.listeners:
+                try:
+                    listener(arrival.values)
+                except Exception:
+                    _logger.exception("amplifier %s: a listener failed", self.name)
+
+    def _note_report(self, kind: ReportKind, now: float) -> None:
+        """Note a report of a status, and log it unless there was one a short time ago."""
+        if now - self.reported_at.get(kind, -math.inf) > REPORT_LIFE:
+            cause, remedy = REPORTS[kind]
+            _logger.warning("amplifier %s: %s", self.name, cause, extra={"remedy": remedy})
+        self.reported_at[kind] = now
+
+    def wire_ramp(self, ramp: float) -> int:
+        """Return the nearest ramp [s] that the amplifier can play, in units of the wire.
+
+        Any number is accepted, since silence must never be refused for its ramp.
+        """
+        highest = self.capabilities.get("ramp_max", _RAMP.maximum)
+        if math.isnan(ramp):
+            return _RAMP.to_wire(STOP_RAMP)
+        return min(_RAMP.to_wire(min(max(ramp, 0.0), _RAMP.high)), int(highest))
+
+    def is_silent(self, status: Values) -> bool:
+        """Whether a status shows the levels of all channels, and all of them are zero."""
+        known = self.capabilities.get("channels")
+        return known == len(status["levels"]) and not any(status["levels"])
+
+    def what_may_play(self, cause: str = "") -> StopOutcome:
+        """Return until when it may play, by all that is known of it.
+
+        cause: why no more is known; by default the reason why it is mute, or its line lost. An
+        amplifier that confirmed a stop, and was sent neither Clear nor Arm since, is silent. Else
+        the watchdog ends what plays; one that was never fed is silent once a status has shown it.
+        If it plays although it has confirmed silence, or although its watchdog must have silenced
+        it, another host feeds it or it is broken: then nothing is known to silence it.
+        """
+        status, at, until = self.status, self.status_at, self.known.may_play_until
+        if not self.known.is_confirmed:
+            until = max(until, self.feeding.may_play_until)
+        if status is not None and at is not None:
+            is_armed = status["state"] == ENABLED
+            if self.is_silent(status) and not is_armed:
+                until = at if until == math.inf else max(until, at)
+            elif (is_armed or any(status["levels"])) and at >= until:
+                until = math.inf
+        cause = cause or self.line.loss or self.silence_cause or ""
+        return StopOutcome(False, math.inf if until == -math.inf else until, cause)
+
+    def check_other_host(self) -> None:
+        """Raise LinkError if another host was heard within the longest time of a watchdog."""
+        if self._time() - self._other_host_at <= _WATCHDOG.high:
+            raise driven_by_another(self.name)
+
+    def _confirm(self, token: int, now: float) -> None:
+        """Note that the amplifier has reported the set with this token as the one it plays."""
+        self.committed = token
+        if self._ledger is not None:
+            self._ledger.resolve(token, now)
+        if self._admitted is not None and self._admitted.token == token:
+            self._admitted = None
 
     def go_on_from(self, before: "Amplifier") -> None:
         """Adopt what was known of the same amplifier before its line was opened again."""
@@ -308,17 +718,17 @@ class Amplifier(Dialogue):
             timeout += ATTEMPTS * members * self.exchange_time("GetStatus")
             timeout += _RAMP.from_wire(wire_ramp)
             ends = threads.now() + timeout * (members + 1)  # others may keep the line busy
-            self._stop = stop = _Stop(wire_ramp, timeout, ends)
+            self._stop = stop = PendingStop(wire_ramp, timeout, ends)
             stop.result = asyncio.ensure_future(self._confirm_stop(stop))
             with contextlib.suppress(Exception):  # then `_confirm_stop` makes the request
                 stop.requested = self._request_stop(stop)
         return asyncio.shield(stop.result)
 
-    def _request_stop(self, stop: _Stop) -> "asyncio.Future[Values]":
+    def _request_stop(self, stop: PendingStop) -> "asyncio.Future[Values]":
         stop.latch = self.latch
         return self.line.submit(self, Priority.STOP, "Stop", stop.sent)
 
-    async def _confirm_stop(self, stop: _Stop) -> StopOutcome:
+    async def _confirm_stop(self, stop: PendingStop) -> StopOutcome:
         """Repeat a stop until its silence is confirmed, or its timeout has passed.
 
         A status confirms it if its state is latched, its latch is newer than each one seen before,
@@ -378,252 +788,3 @@ def _is_stopping(status: Values, before: int | None) -> bool:
     if before is None or status["state"] not in LATCHED:
         return False
     return status["latch"] > 0 and is_newer_token(status["latch"], before)
-
-
-def check_identity(identity: Values, name: str, serial_number: str | None) -> None:
-    """Raise LinkError unless an amplifier speaks this version and has the expected serial number.
-
-    name: of the amplifier, for the message. serial_number: None for any.
-    """
-    if not identity["versions"] >> VERSION & 1:  # bit n: version n
-        spoken = map(str, bits_of(identity["versions"]))
-        raise WrongAmplifier(
-            f"amplifier {name} speaks protocol {', '.join(spoken) or 'none'}, needs {VERSION}; "
-            "update it"
-        )
-    serial = identity["serial_number"]
-    if serial_number not in (None, serial):
-        raise WrongAmplifier(
-            f"amplifier {name}: serial number must be {serial_number}, got {serial}; connect the "
-            "expected amplifier, or restart with this one"
-        )
-
-
-def check_capabilities(can: Values, name: str, *, is_output: bool | None) -> None:
-    """Raise LinkError for capabilities that no amplifier can have, or that contradict the rig.
-
-    is_output: as of `Amplifier`; None also where there is no rig.
-    """
-    for each, low, stated, high in capability_ranges(can):
-        if not low <= stated <= high:
-            raise WrongAmplifier(f"amplifier {name}: {each} must be {low} to {high}, got {stated}")
-    has_output = has_feature(can, "output")
-    if is_output is not None and has_output is not is_output:
-        raise WrongAmplifier(
-            f"amplifier {name}: full level must be {_FULL_LEVEL[is_output]} as in the rig file, "
-            f"got {_FULL_LEVEL[has_output]}; correct the rig file, or connect another amplifier"
-        )
-
-
-_MARGIN = 0.002  # s; by which the amplifier's clock may be late at the end of a window
-_MAX_OVERDUE = 2.0  # s; after the end of the window; an emulator may stand still for a while
-_ROUNDING = 1e-6  # periods
-_Q = QUANTITIES
-_VIOLATION = "the amplifier does not keep the protocol"
-
-
-@dataclass(frozen=True, slots=True)
-class AmplifierSensor:
-    """A sensor of an amplifier, as it describes it."""
-
-    unit: str
-    """A name of `SENSOR_UNITS`."""
-    channel: int | None
-    """The channel whose actuator it sits at; None if it sits at none."""
-    x: float | None
-    """Place on the plate [m]; None if the amplifier does not know it."""
-    y: float | None
-    """As x."""
-    range: float
-    """Largest amplitude that it measures, in its unit."""
-    frequency_max: float
-    """Highest frequency that it measures [Hz]."""
-
-
-@dataclass(frozen=True, slots=True)
-class SensorReading:
-    """What a sensor measured."""
-
-    is_overloaded: bool
-    tones: tuple[tuple[float, float], ...]
-    """Amplitude in the sensor's unit and phase [degrees] of each tone."""
-
-
-@dataclass(frozen=True, slots=True)
-class Reading:
-    """A measurement of tones at all sensors of an amplifier over a window."""
-
-    number: int
-    state: str
-    """A name of `READING_STATES`."""
-    left: float
-    """Time until its window ends [s]."""
-    start: int
-    """The amplifier's clock at the start of the window, from which phases count."""
-    token: int
-    """Token of the set that played then."""
-    tones: int
-    """Number of tones."""
-    sensors: tuple[SensorReading, ...]
-    """Empty until the reading is complete."""
-
-
-async def read_sensors(amplifier: Amplifier) -> tuple[AmplifierSensor, ...]:
-    """Read the descriptions of an amplifier's sensors; empty if it has none."""
-    if not has_feature(amplifier.ledger.capabilities, "sensors"):
-        return ()
-    found: list[AmplifierSensor] = []
-    while True:
-        listed = await amplifier.request("GetSensors", {"first": len(found)}, Priority.READING)
-        found += [_sensor(each) for each in listed["sensors"]]
-        if len(found) > listed["all"]:
-            raise FrameError(f"sensors must be {listed['all']}, got {len(found)}; {_VIOLATION}")
-        is_last = len(found) > _Q["sensor"].maximum or not listed["sensors"]
-        if is_last or len(found) == listed["all"]:
-            return tuple(found)
-
-
-async def read_measured(amplifier: Amplifier) -> list[tuple[float, float]]:
-    """Read voltage [V] and current [A] of each channel; empty if it does not measure them."""
-    if not has_feature(amplifier.ledger.capabilities, "electrical"):
-        return []
-    measured = await amplifier.request("GetMeasured", {}, Priority.READING)
-    voltage, current = _Q["channel_voltage"].from_wire, _Q["channel_current"].from_wire
-    return [
-        (voltage(row["channel_voltage"]), current(row["channel_current"]))
-        for row in measured["channels"]
-    ]
-
-
-async def start_reading(
-    amplifier: Amplifier, frequencies: Sequence[float], window: float
-) -> Reading:
-    """Begin to measure tones [Hz] at all sensors over a window [s] that starts now.
-
-    Raises CommandError for tones that the window cannot tell apart, and CommandRefused for tones
-    that the sensors cannot measure.
-    """
-    check_tones(frequencies, window)
-    number = random.randint(_Q["reading"].minimum, _Q["reading"].maximum)  # noqa: S311  no secret
-    values: Values = {
-        "reading": number,
-        "window": _Q["window"].to_wire(window),
-        "tones": len(frequencies),
-        "frequencies": [_Q["frequency"].to_wire(each) for each in frequencies],
-    }
-    found = await amplifier.request("Measure", values, Priority.READING)
-    return _reading(found, number=number, tones=len(frequencies))
-
-
-async def measure_tones(
-    amplifier: Amplifier, frequencies: Sequence[float], window: float
-) -> Reading:
-    """Measure tones [Hz] at all sensors over a window [s] that starts now, and wait for its end.
-
-    The tones of the result are in the order of the frequencies. The caller must wait until the
-    plate has settled before, and feed the watchdog during the reading. Raises what `start_reading`
-    and `finish_reading` raise.
-    """
-    return await finish_reading(amplifier, await start_reading(amplifier, frequencies, window))
-
-
-async def finish_reading(amplifier: Amplifier, started: Reading) -> Reading:
-    """Wait for the end of a reading, and return it with all its sensors.
-
-    Raises CommandRefused if another host has started a reading meanwhile, and FrameError if this
-    one does not end in time or lacks sensors.
-    """
-    found = started
-    end = threads.now() + started.left + _MAX_OVERDUE
-    while found.state == "RUNNING":
-        if threads.now() > end:
-            raise FrameError(
-                f"reading {started.number} must be complete after its window, got {found.state} "
-                f"{_MAX_OVERDUE:g} s later; {_VIOLATION}"
-            )
-        await asyncio.sleep(found.left + _MARGIN)
-        found = await _same_reading(amplifier, started, 0)
-    count = (await amplifier.request("GetSensors", {"first": 0}, Priority.READING))["all"]
-    sensors = found.sensors
-    more = sensors
-    while more and len(sensors) < count:
-        more = (await _same_reading(amplifier, started, len(sensors))).sensors
-        sensors += more
-    if len(sensors) != count:
-        raise FrameError(f"reading must have all {count} sensors, got {len(sensors)}; {_VIOLATION}")
-    return replace(found, sensors=sensors)
-
-
-def check_tones(frequencies: Sequence[float], window: float) -> None:
-    """Raise CommandError for tones [Hz] that a window [s] cannot tell apart."""
-    limit = _Q["tone_count"].maximum
-    if not 1 <= len(frequencies) <= limit:
-        raise CommandError(f"a reading must have 1 to {limit} tones, got {len(frequencies)}")
-    apart = min(after - before for before, after in pairwise([0.0, *sorted(frequencies)]))
-    if not apart * window >= 1 - _ROUNDING:
-        raise CommandError(
-            f"window must be at least a period of each frequency and of the differences between "
-            f"them, 1/({apart:g} Hz), got {window:g} s"
-        )
-
-
-async def _same_reading(amplifier: Amplifier, started: Reading, first: int) -> Reading:
-    """Read a reading that was started, with its sensors from this index on."""
-    found = await amplifier.request("GetReading", {"first": first}, Priority.READING)
-    return _reading(found, number=started.number, tones=started.tones)
-
-
-def _sensor(values: Values) -> AmplifierSensor:
-    channel = values["channel"]
-    return AmplifierSensor(
-        name_of(SENSOR_UNITS, values["unit"]),
-        None if channel == NO_CHANNEL else channel,
-        _place(values["x"]),
-        _place(values["y"]),
-        values["range"],
-        _Q["frequency"].from_wire(values["frequency_max"]),
-    )
-
-
-def _place(at: int) -> float | None:
-    return None if at == UNKNOWN_PLACE else _Q["place"].from_wire(at)
-
-
-def _reading(values: Values, *, number: int, tones: int) -> Reading:
-    """Return the reading that a reply describes.
-
-    Raises CommandRefused if its number is another one, FrameError for another count of tones.
-    """
-    if values["reading"] != number:
-        raise CommandRefused(
-            f"reading {number} was replaced by {values['reading'] or 'none'}: another host "
-            "measures, or the amplifier has restarted; measure again"
-        )
-    if values["tones"] != tones:
-        raise FrameError(
-            f"reading {number} must have {tones} tones, got {values['tones']}; {_VIOLATION}"
-        )
-    count = values["count"]
-    record = Record(Rows("sensors", count, sensor_reading(tones)))
-    try:
-        rows = record.unpack(values["sensors"], is_strict=False)["sensors"] if count else []
-    except Refusal as refusal:
-        raise FrameError(f"reading: {refusal}; {_VIOLATION}") from None
-    return Reading(
-        values["reading"],
-        name_of(READING_STATES, values["state"]),
-        _Q["window_left"].from_wire(values["window_left"]),
-        values["window_start"],
-        values["token"],
-        tones,
-        tuple(
-            SensorReading(
-                bool(row["flags"] & 1),
-                tuple(
-                    (tone["amplitude"], _Q["phase"].from_wire(tone["phase"]))
-                    for tone in row["tones"]
-                ),
-            )
-            for row in rows
-        ),
-    )

@@ -27,9 +27,17 @@ from drivers.errors import (
     LinkTimeout,
     Preempted,
 )
-from drivers.host.amplifier import CONFIRM_TIMEOUT, DISARM_RAMP, WATCHDOG, Amplifier
-from drivers.host.dialogue import IsPreempted, StopOutcome, word_passed_by_all
-from drivers.host.joint_sets import Clocks, JointSets, Members, PlayedSet, is_lost, outcomes
+from drivers.host.amplifier import CONFIRM_TIMEOUT, DISARM_RAMP, WATCHDOG, Amplifier, IsPreempted
+from drivers.host.joint_sets import (
+    Clocks,
+    JointSets,
+    Members,
+    PlayedSet,
+    is_lost,
+    outcomes,
+    word_passed_by_all,
+)
+from drivers.host.ledger import StopOutcome
 from drivers.host.line import GRACE, Line, Make, Priority
 from drivers.playing import AmplifierLayer
 from drivers.protocol.definition import ENABLED, HEARTBEAT, QUANTITIES, STOP_RAMP, check_watchdog

@@ -27,20 +27,26 @@ from statistics import median
 from typing import Any, ParamSpec, TypeVar, cast
 
 from drivers.errors import CommandRefused, DriverError, LinkError, LinkTimeout, Overtaken, Preempted
-from drivers.host.amplifier import Amplifier
+from drivers.host.amplifier import COMMITTING, Amplifier, IsPreempted
 from drivers.host.clock import HeldClock
-from drivers.host.dialogue import IsPreempted, StagedSet, StopOutcome, word_passed_by_all, words_of
-from drivers.host.ledger import is_silence
+from drivers.host.ledger import StagedSet, StopOutcome, is_silence
 from drivers.host.line import GRACE, Line, Priority
 from drivers.playing import AmplifierLayer
 from drivers.protocol.definition import (
+    AHEAD_MAX,
     HEARTBEAT,
+    HIGH_TIME,
+    HIGH_WORDS,
     LATCHED,
     STATES,
     STOP_RAMP,
+    clock_at,
     has_feature,
+    high_word,
     moment_behind,
+    moment_of,
     name_of,
+    word_passed,
 )
 from drivers.protocol.records import Values
 from drivers.protocol.sets import LayerSet, token_after
@@ -210,6 +216,38 @@ def is_lost(amplifier: Amplifier) -> bool:
     if amplifier.silence_cause is None or amplifier.line.loss is not None:
         return amplifier.line.loss is not None
     return threads.now() >= amplifier.feeding.lost_from
+
+
+_STEP = AHEAD_MAX // 2  # between two high words that are tried
+
+
+def words_of(moment: float, amplifiers: Sequence[Amplifier]) -> dict[Amplifier, int]:
+    """Return the nearest high word of the clock of each amplifier at a moment [s]."""
+    word = high_word(clock_at(moment + HIGH_TIME / 2))
+    return {
+        each: word if each.clock.can_be_steered else high_word(clock_at(_shown(each, moment)))
+        for each in amplifiers
+    }
+
+
+def word_passed_by_all(now: float, amplifiers: Sequence[Amplifier]) -> int:
+    """Return a high word that is no moment ahead by the clocks of amplifiers, now [s] and soon.
+
+    A commit with it starts at once.
+    """
+    at = word_passed(now)
+    others = [each for each in amplifiers if not each.clock.can_be_steered]
+    times = [_shown(each, now + later) for each in others for later in (0.0, COMMITTING)]
+    for _ in range(HIGH_WORDS // _STEP):
+        if all(moment_of(at, time) is None for time in times):
+            break
+        at = (at - _STEP) % HIGH_WORDS
+    return at
+
+
+def _shown(amplifier: Amplifier, time: float) -> float:
+    """Return what the clock of an amplifier shows at a time [s], to the nearest high word."""
+    return time + amplifier.clock.lead(time) + HIGH_TIME / 2
 
 
 INTERVAL = 1 << 12

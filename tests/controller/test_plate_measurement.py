@@ -19,7 +19,7 @@ from controller.plate_measurement import (
     interleaved,
 )
 from drivers.errors import CommandRefused
-from drivers.host.amplifier import Reading, SensorReading, measure_tones
+from drivers.host.amplifier_sensors import Reading, SensorReading, measure_tones
 from drivers.opening import Lines
 from model.answer.plan import query
 from model.answer.stimulus import Placement

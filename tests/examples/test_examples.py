@@ -343,7 +343,7 @@ def address(monkeypatch: pytest.MonkeyPatch) -> Any:
     module = util.module_from_spec(spec)
     spec.loader.exec_module(module)
     monkeypatch.setattr(opening, "address_of", module.UnixAddress)
-    monkeypatch.setattr("drivers.host.dialogue.COMMIT_DELAY", 10.0)  # on a busy machine
+    monkeypatch.setattr("drivers.host.amplifier.COMMIT_DELAY", 10.0)  # on a busy machine
     return module.UnixAddress
 
 

@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 
 from benchmarks.direct_plate import direct_acceleration
-from drivers.host.amplifier import measure_tones, read_sensors
+from drivers.host.amplifier_sensors import measure_tones, read_sensors
 from drivers.playing import AmplifierTone, Voice, VoiceTransition
 from drivers.protocol.definition import READING_STATES
 from drivers.protocol.records import Refusal, Values

@@ -28,8 +28,8 @@ import sim
 from chain import Chain
 from drivers.by_hand import actions
 from drivers.errors import CommandRefused, DriverError, LinkError, Preempted
-from drivers.host.dialogue import SILENCING, StopOutcome
 from drivers.host.group import Group
+from drivers.host.ledger import SILENCING, StopOutcome
 from drivers.host.line import Priority
 from drivers.playing import AmplifierLayer, AmplifierTone
 from drivers.protocol.definition import BOOT_TIME, STATES

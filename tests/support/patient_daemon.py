@@ -27,7 +27,7 @@ def wait_long(patch: pytest.MonkeyPatch) -> None:
 
     for method in (Line.submit, Amplifier.request):
         patch.setitem(method.__kwdefaults__, "timeout", REPLY_TIMEOUT)  # type: ignore[arg-type]
-    patch.setattr("drivers.host.dialogue.COMMIT_DELAY", REPLY_TIMEOUT)
+    patch.setattr("drivers.host.amplifier.COMMIT_DELAY", REPLY_TIMEOUT)
     for made in (Daemon, Controller, Group):
         patch.setitem(made.__init__.__kwdefaults__, "watchdog", WATCHDOG)  # type: ignore[arg-type]
 

@@ -20,8 +20,8 @@ from drivers.errors import (
     LinkError,
     LinkTimeout,
 )
-from drivers.host.amplifier import (
-    Amplifier,
+from drivers.host.amplifier import Amplifier
+from drivers.host.amplifier_sensors import (
     AmplifierSensor,
     measure_tones,
     read_measured,
@@ -524,7 +524,7 @@ async def test_group_plays_over_a_wire_and_stops(
 
     A busy machine may keep the commit waiting for longer than a host allows.
     """
-    monkeypatch.setattr("drivers.host.dialogue.COMMIT_DELAY", 10.0)
+    monkeypatch.setattr("drivers.host.amplifier.COMMIT_DELAY", 10.0)
     async with WORD_WIRES[wire](2) as far, opened_lines() as lines:
         amplifiers = {
             str(number): await lines.amplifier(far.url(number), LIMITS, name=str(number))

@@ -12,8 +12,8 @@ import pytest
 
 from drivers.errors import DriverError, LinkDegraded, LinkError, LinkTimeout
 from drivers.host.amplifier import Amplifier
-from drivers.host.dialogue import SILENCING
 from drivers.host.group import Group
+from drivers.host.ledger import SILENCING
 from drivers.host.line import Priority
 from drivers.playing import AmplifierTone
 from drivers.protocol.definition import ATTEMPTS, STATES

@@ -21,9 +21,9 @@ import pytest
 
 from courses import Taken, courses, follow
 from drivers.errors import CommandRefused, DriverError, LinkTimeout
-from drivers.host.amplifier import read_measured
-from drivers.host.dialogue import StopOutcome
+from drivers.host.amplifier_sensors import read_measured
 from drivers.host.group import Group
+from drivers.host.ledger import StopOutcome
 from drivers.playing import AmplifierLayer, AmplifierTone
 from drivers.protocol.definition import MESSAGES, STATES
 from drivers.protocol.records import Refusal, Values

@@ -20,7 +20,7 @@ from benchmarks.desk_plate.desk_plate import Actuator, Converters, DeskPlate, Tr
 from benchmarks.direct_plate import direct_responder
 from drivers.by_hand.actions import BlockingAmplifier
 from drivers.errors import CommandRefused, LinkError
-from drivers.host.dialogue import StagedSet
+from drivers.host.ledger import StagedSet
 from drivers.playing import AmplifierLayer
 from era_haptics.lab.cli import app as cli_app
 from era_haptics.lab.measuring import table_measurement

@@ -28,9 +28,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from benchmarks.promise.cases import Case
-from benchmarks.promise.clicked import owner_of
-from benchmarks.promise.heard import Heard, Log
-from benchmarks.promise.session import EARLY
+from benchmarks.promise.session import EARLY, Heard, Log, owner_of
 from benchmarks.setting import random_contacts, support, use_one_thread
 from controller.content.pattern import Pattern
 from controller.effects.effect import Region

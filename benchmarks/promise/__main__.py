@@ -41,8 +41,7 @@ def main() -> None:
     use_one_thread()
 
     from benchmarks.promise.cases import CASES
-    from benchmarks.promise.session import Outcome, outcome
-    from benchmarks.promise.tables import as_markdown, kept
+    from benchmarks.promise.session import Outcome, as_markdown, kept, outcome
 
     numbers = [int(n) for n in options.cases.split(",")] if options.cases else [*range(len(CASES))]
     jobs = [

@@ -108,7 +108,7 @@ class Case:
 @cache
 def _table(rig_name: str, is_identified: bool, without: tuple[str, ...]) -> LocalizationTable:
     rig = Case("", None, rig_name, is_identified=is_identified, without=without).rig
-    grid = np.arange(40.0, 321.0, 10.0)
+    grid = np.arange(max(40.0, rig.limits.frequency_min), 321.0, 10.0)
     return build_table(rig, drive_mode="phased", frequencies=grid)
 
 

@@ -1,13 +1,21 @@
 """One session of a case on a plate of its own: what its fingers were promised, and what they felt.
 
 Control loop, serial lines and amplifiers run in virtual time, the plate in time under the fingers;
-a witness reads every byte.
+a witness reads every byte. What fingers feel is noted over time, and parted by contents: all that
+moved the bases is played once more on the same plate under the same fingers, only the voices of a
+finger's own layers, or only those of all others. Voices are divided by the threshold at their
+frequency, by each set of thresholds by which the rig's promises hold, so that accelerations are
+levels of sensation.
+
+A click has a content of its own at its finger, whether that feels what lasts besides or not. All
+levels are of 40 ms: the click's of its duration, others' the strongest while it plays and rings.
 """
 
 import asyncio
 import math
+import operator
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, partial
 from itertools import pairwise
@@ -26,18 +34,255 @@ from benchmarks.promise.cases import (
     Case,
     Point,
 )
-from benchmarks.promise.clicked import Clicked, clicks, measured, owner_of
-from benchmarks.promise.heard import STRONGEST, Heard, Log, Span
 from benchmarks.setting import random_contacts, support
-from controller.play.intent import HapticIntent, Prediction, Target
+from controller.effects.player import CLICK_ABOVE_DB
+from controller.play.intent import CLICK, HapticIntent, Prediction, Pulse, Target
 from controller.play.loop import PlayReport
 from controller.play.slots import CROSSFADE, FALL_AFTER
+from controller.sources.touch import ContactKey
+from drivers.playing import Voice
 from model.answer.answer_report import Timing
-from model.finger import FINGERTIP_RADIUS
+from model.arrays import FloatArray
+from model.finger import FINGERTIP_RADIUS, detection_threshold
+from model.rig.rig import Rig
 from registry import threads
+from sim.amplifier.readings import StraightClock
+from sim.bench.bench import Bench
 from sim.far_ends.wire_assignment import SimulatedWire
-from sim.plant.imperfections import draw_imperfections
+from sim.plant import imperfections
+from sim.plant.imperfections import Imperfections, draw_imperfections, motion_of, realised
+from sim.plant.plant import FingerPlacement
 from sim.transport.simulated_line import PROMPT
+
+STRONGEST = 0.040  # s
+
+Span = tuple[float, float]
+
+
+class _Part(Bench):
+    """A bench whose ERAs play only some voices; owners: fingers by layer.
+
+    threshold: name of the set by which voices are divided.
+    """
+
+    def __init__(
+        self,
+        rig: Rig,
+        drawn: Imperfections,
+        now: float,
+        is_heard: Callable[[int | None], bool],
+        threshold: str,
+    ) -> None:
+        super().__init__(rig, now=now, imperfections=drawn)
+        self.is_heard, self.threshold = is_heard, threshold
+        self.owners: Mapping[int, int] = {}
+
+    def _motion(self, index: int, playing: Sequence[Voice], clock: StraightClock) -> Any:
+        errors, terms = self._errors[index], []
+        for voice in (*playing, *imperfections.of_voices(playing, errors.harmonic)):
+            if self.is_heard(self.owners.get(voice.layer)):
+                at = np.array([voice.frequency])
+                threshold = float(detection_threshold(at, self.threshold)[0])
+                motion = motion_of(
+                    [voice],
+                    clock,
+                    stroke=self.rig.eras[index].full_level,
+                    delay=self._delays[index],
+                )
+                terms += realised(motion, replace(errors, gain=errors.gain / threshold))
+        return tuple(terms)
+
+
+@dataclass
+class Log:
+    """What happened on a bench, by time [s]: fingers, voices, and whose layers are whose."""
+
+    rig: Rig
+    drawn: Imperfections
+    start: float
+    steps: list[tuple[float, Callable[[_Part], None]]] = field(default_factory=list)
+
+    def watch(self, bench: Any) -> None:
+        """Note the voices of a bench from now on, and its fingers, with the plate under them."""
+        apply, place = bench._apply, bench._place
+
+        def applied(index: int, playing: tuple[Voice, ...], clock: StraightClock) -> None:
+            self.steps.append((bench.time, lambda part: part._apply(index, playing, clock)))
+            apply(index, playing, clock)
+
+        def placed(placement: FingerPlacement) -> None:
+            self.steps.append((placement.time, lambda part: part._place(placement)))
+            place(placement)
+
+        bench._apply, bench._place = applied, placed
+
+    def own(self, owners: Mapping[int, int], time: float) -> None:
+        """Note whose content each layer has from a time [s] on."""
+        self.steps.append((time, lambda part: setattr(part, "owners", {**part.owners, **owners})))
+
+    def replayed(self, is_heard: Callable[[int | None], bool], until: float) -> list[Bench]:
+        """Benches on which some voices have been played up to a time [s], by set of thresholds."""
+        found: list[Bench] = []
+        for name in dict.fromkeys((self.rig.threshold, *self.rig.promised_thresholds)):
+            part = _Part(self.rig, self.drawn, self.start, is_heard, name)
+            for time, change in sorted(self.steps, key=lambda each: each[0]):
+                part.advance(time)
+                change(part)
+            part.advance(until)
+            found.append(part)
+        return found
+
+
+@dataclass(frozen=True)
+class Heard:
+    """What a finger felt in a session, of its own and of others', by set of thresholds."""
+
+    finger: int
+    own: list[Bench]
+    foreign: list[Bench]
+
+    @classmethod
+    def by(cls, finger: int, log: Log, until: float) -> "Heard":
+        """By a finger up to a time [s]; its clicks, of the complement, are neither."""
+        own = log.replayed(lambda owner: owner == finger, until)
+        return cls(finger, own, log.replayed(lambda o: o not in (finger, ~finger), until))
+
+    def own_db_sl(self, *spans: Span, strongest: bool = False) -> FloatArray:
+        """Levels of its own content, mean over the fingertip, in spans of time [s] together."""
+        return np.array([self._level(each, spans, strongest, is_mean=True) for each in self.own])
+
+    def foreign_db_sl(self, *spans: Span, strongest: bool = False) -> FloatArray:
+        """Levels of all others' at the loudest point; strongest: of 40 ms."""
+        levels = [self._level(each, spans, strongest, is_mean=False) for each in self.foreign]
+        return np.array(levels)
+
+    def contrast_db(self, *spans: Span, strongest: bool = False) -> float:
+        """Own above foreign level in spans of time [s], the least over the sets."""
+        own, foreign = (
+            each(*spans, strongest=strongest) for each in (self.own_db_sl, self.foreign_db_sl)
+        )
+        return float((own - foreign).min())
+
+    def short_until(self, least_db: float, time: float) -> float:
+        """How long [ms] after a time [s] it first feels a contrast over 40 ms; a second at most.
+
+        In steps of 5 ms.
+        """
+        for after in range(0, 1000, 5):
+            start = time + after / 1000
+            if self.contrast_db((start, start + STRONGEST)) >= least_db:
+                return float(after)
+        return 1000.0
+
+    def _level(self, bench: Bench, spans: Sequence[Span], strongest: bool, is_mean: bool) -> float:
+        records = [bench.fingers.felt(*span)[str(self.finger)] for span in spans]
+        squares = np.cumsum(np.concatenate([each.accelerations for each in records]) ** 2, axis=0)
+        count = round(STRONGEST * bench.sample_rate) if strongest else len(squares) - 1
+        powers: FloatArray = 2 * (squares[count:] - squares[:-count]) / count
+        if not is_mean:
+            return float(10 * np.log10(powers.max() + 1e-12))
+        return float(20 * np.log10((np.sqrt(powers) @ records[0].weights).max() + 1e-6))
+
+
+DURATION, CLICK_LEVEL_DB_SL, RINGING, PAUSE = 0.040, 20.0, 0.060, 0.6  # s, dB SL
+
+
+@dataclass
+class Clicked:
+    """Of the clicks of a session, each promised and felt [dB].
+
+    contrasts: of the click, above its own at other fingers and above others' at its own; foreign:
+    levels at the others meanwhile, negative, so that more is better; restated: contrasts of their
+    own contents meanwhile; over_own: level of the click above what lasts at its finger, felt alone.
+    """
+
+    contrasts: list[tuple[float, float]] = field(default_factory=list)
+    foreign: list[tuple[float, float]] = field(default_factory=list)
+    restated: list[tuple[float, float]] = field(default_factory=list)
+    over_own: list[float] = field(default_factory=list)
+
+
+def owner_of(one: Any) -> int:
+    """The finger that a layer plays for, its complement for a click."""
+    id = int(one.content.targets[0][0].key.id)
+    return ~id if one.content.key[1] == CLICK else id
+
+
+def click_at(key: ContactKey, now: float) -> Target:
+    """The target of a click from a time [s] on."""
+    pulse = Pulse(DURATION, now)
+    return Target(key, CLICK_LEVEL_DB_SL, pulse, content="click", above_db=CLICK_ABOVE_DB)
+
+
+async def clicks(on: Any, wanted: Any, fingers: Sequence[int]) -> list[tuple[int, PlayReport]]:
+    """Let fingers click, one after the other; returns the report of each click that was played."""
+    found = list[tuple[int, PlayReport]]()
+    for id in fingers:
+        count = len(on.applied)
+        wanted.click = click_at(ContactKey("panel", id), threads.now())
+        on.controller.cycle.request_update()
+        await asyncio.sleep(0)
+        await on.hold(PAUSE)
+        reports = [each for each in on.applied[count:] if _layers_of(each, ~id)]
+        found += [(id, each) for each in reports[:1]]
+    return found
+
+
+def measured(
+    log: Log, reports: Sequence[tuple[int, PlayReport]], fingers: int, until: float
+) -> Clicked:
+    """What was felt of clicks up to a time [s] by so many fingers, beside what was promised."""
+    found = Clicked()
+    every = {id: Heard.by(id, log, until) for id in range(fingers)} if reports else {}
+    alone = {id: log.replayed(partial(operator.eq, ~id), until) for id, _ in reports}
+    for id, report in reports:
+        promised = {each.contact.key.id: each for each in report.targets}
+        during, after = _spans(report.time)
+        others, click = [other for other in range(fingers) if other != id], alone[id]
+        own = Heard(id, click, click).own_db_sl(during)
+        leaks = [
+            Heard(other, click, click).foreign_db_sl(after, strongest=True) for other in others
+        ]
+        foreign = every[id].foreign_db_sl(during)
+        contrast = promised[id].promised_contrast_db
+        if contrast is not None:
+            loudest = np.max([*leaks, foreign], axis=0)
+            found.contrasts.append((contrast, float((own - loudest).min())))
+        if _layers_of(report, id):
+            found.over_own.append(float((own - every[id].own_db_sl(during))[0]))
+        for other in others:
+            _note(found, other, report, promised.get(other), every[other])
+    return found
+
+
+def _note(
+    found: Clicked,
+    id: int,
+    report: PlayReport,
+    promised: Prediction | None,
+    heard: Heard,
+) -> None:
+    """Note what another finger felt of a click."""
+    during, after = _spans(report.time)
+    foreign = heard.foreign_db_sl(after, strongest=True)
+    if promised is None:
+        (levels,) = [each for key, each in report.quiet_levels.items() if key.id == id]
+        found.foreign.append((-max(levels), -float(foreign.max())))
+        return
+    if promised.foreign_level_db_sl is not None:
+        found.foreign.append((-promised.foreign_level_db_sl, -float(foreign.max())))
+    if promised.promised_contrast_db is not None:
+        contrast = float((heard.own_db_sl(during) - foreign).min())
+        found.restated.append((promised.promised_contrast_db, contrast))
+
+
+def _spans(since: float) -> tuple[Span, Span]:
+    return (since, since + DURATION), (since, since + DURATION + RINGING)
+
+
+def _layers_of(report: PlayReport, owner: int) -> list[int]:
+    return [n for n, one in report.contents.items() if owner_of(one) == owner]
+
 
 _chain: Any = support("chain").Chain
 _run_virtual: Any = support("virtual_lines").run_virtual
@@ -136,8 +381,12 @@ def _timing(number: int) -> Timing:
 
 def outcome(number: int, seed: int) -> Outcome:
     """Run a case by its number on the plate of a seed."""
-    case = CASES[number]
-    return _run_virtual(_Session(case, _timing(number), seed).run())  # type: ignore[no-any-return]
+    return on_plate(CASES[number], _timing(number), seed)
+
+
+def on_plate(case: Case, timing: Timing, seed: int) -> Outcome:
+    """Run a case on the plate of a seed."""
+    return _run_virtual(_Session(case, timing, seed).run())  # type: ignore[no-any-return]
 
 
 class _Session:
@@ -151,7 +400,10 @@ class _Session:
             margin=FINGERTIP_RADIUS + 0.001,
         )
         count = case.contents + case.quiet
-        self._places: list[Point] = [(float(x), float(y)) for x, y in draw(count)]
+        places, tip = draw(count), FINGERTIP_RADIUS * np.array([[1, 0], [-1, 0], [0, 1], [0, -1]])
+        while not plate.covers((places[:, None] + tip).reshape(-1, 2)).all():  # beside a cut-out
+            places = draw(count)
+        self._places: list[Point] = [(float(x), float(y)) for x, y in places]
         if JOINS in case.events:  # elsewhere: where it left, others may be quiet yet
             ((x, y),) = draw(1, beside=self._places)
             self._landing = float(x), float(y)
@@ -337,7 +589,7 @@ def _measured(
                     above = mover.contrast_db(*spans) - promised.promised_contrast_db
                     found.events[ANSWERS].append(above)
         else:
-            _note(event, found, heard, timing, case)
+            _noted(event, found, heard, timing, case)
     return found
 
 
@@ -378,7 +630,7 @@ def _most(id: int, *promises: Mapping[int, Prediction]) -> float:
     return max([each for each in levels if each is not None], default=-math.inf)
 
 
-def _note(
+def _noted(
     event: _Event, found: Outcome, heard: Mapping[int, Heard], timing: Timing, case: Case
 ) -> None:
     """Note the first 100 ms of an event at every finger, beside what was promised."""
@@ -410,3 +662,97 @@ def _note(
             found.events[f"{event.name}, above promise"].append(foreign - levels[1])
             expected = 10 * math.log10(sum(10 ** (each / 10) for each in levels) + 1e-12)
             found.events[event.name].append(foreign - expected)
+
+
+Found = Mapping[Case, Sequence[Outcome]]
+
+
+def as_markdown(found: Found) -> str:
+    """A table of steady contrasts, with a row of all cases, and one of what happens in events."""
+    clicked = {case: each for case, each in found.items() if case.clicks}
+    found = {case: each for case, each in found.items() if not case.clicks}
+    lines = _of_clicks(clicked) if clicked else []
+    if not found:
+        return "\n".join(lines)
+    lines += [
+        "| | plates | goal | promised [dB] (10 %) | felt [dB] (10 %) | served | promise kept |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for case, each in found.items():
+        promised, felt = np.array([one.worst for one in each]).T
+        lines.append(
+            f"| {case.title} | {len(each)} | {'-' if case.goal_db is None else case.goal_db} | "
+            f"{_shown(promised)} | {_shown(felt)} | "
+            f"{100 * np.mean([one.served for one in each]):.0f} % | "
+            f"{_shown_kept(each)} |"
+        )
+    every = [one for each in found.values() for one in each]
+    lines.append(f"| all | {len(every)} | - | - | - | - | {_shown_kept(every)} |")
+    names = list(dict.fromkeys(n for each in found.values() for one in each for n in one.events))
+    lines += ["", f"| | {' | '.join(names)} |", "|---|" + "---|" * len(names)]
+    for case, each in found.items():
+        columns = [[value for one in each for value in one.events.get(name, [])] for name in names]
+        if any(columns):
+            cells = [
+                _shown(values, worst=_WORST.get(name, 90)) + _share(name, values)
+                for name, values in zip(names, columns, strict=True)
+            ]
+            lines.append(f"| {case.title} | {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def _of_clicks(found: Found) -> list[str]:
+    """A table of clicks, with what the others are said to feel meanwhile."""
+    lines = [
+        "| | plates | promised [dB] (10 %) | felt [dB] (10 %) | kept | others' foreign kept | "
+        "others' contrast meanwhile [dB] (10 %) | kept | above own [dB] (10 %) |",
+        "|---|---|---|---|---|---|---|---|---|",
+    ]
+    for case, each in found.items():
+        clicked = [one.clicked for one in each if one.clicked is not None]
+        contrasts, foreign, restated = (
+            [pair for one in clicked for pair in getattr(one, name)]
+            for name in ("contrasts", "foreign", "restated")
+        )
+        lines.append(
+            f"| {case.title} | {len(each)} | {_shown([a for a, _ in contrasts])} | "
+            f"{_shown([b for _, b in contrasts])} | {_kept(contrasts)} | {_kept(foreign)} | "
+            f"{_shown([a for a, _ in restated])} | {_kept(restated)} | "
+            f"{_shown([a for one in clicked for a in one.over_own])} |"
+        )
+    return [*lines, ""]
+
+
+def _kept(pairs: Sequence[tuple[float, float]]) -> str:
+    """Share of the promises that are kept, of pairs of promised and felt."""
+    if not pairs:
+        return "-"
+    kept = np.mean([felt >= promised for promised, felt in pairs])
+    return f"{100 * kept:.0f} % of {len(pairs)}"
+
+
+_WORST = {ANSWERS: 10, "moves": 10, "first 100 ms, joining": 10, "first 100 ms, beside": 10}
+"""Percentile that is the worst tenth, where that is not the 90th."""
+
+
+def _share(name: str, values: Sequence[float]) -> str:
+    """The share of answers that keep their promise."""
+    if name != ANSWERS or not values:
+        return ""
+    return f", {100 * np.mean(np.array(values) >= 0):.0f} % of {len(values)} kept"
+
+
+def kept(found: Sequence[Outcome]) -> float:
+    """Share of the promises that are kept."""
+    return float(np.mean([felt >= promised for one in found for promised, felt in one.fingers]))
+
+
+def _shown_kept(found: Sequence[Outcome]) -> str:
+    return _kept([pair for one in found for pair in one.fingers])
+
+
+def _shown(values: Sequence[float] | np.ndarray, *, worst: float = 10) -> str:
+    """Median, and the worst tenth in brackets."""
+    if not len(values):
+        return "-"
+    return f"{np.median(values):.1f} ({np.percentile(values, worst):.1f})"

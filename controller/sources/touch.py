@@ -636,12 +636,10 @@ def _valid_touches(
     for touch in last.values():
         if not (math.isfinite(touch.x) and math.isfinite(touch.y)):
             rejected.append("not_finite")
-        elif 0 <= touch.x <= 1 and 0 <= touch.y <= 1:
-            valid[ContactKey(frame.source, touch.id)] = touch
         else:
             x, y = min(max(touch.x, 0.0), 1.0), min(max(touch.y, 0.0), 1.0)
             beyond = math.hypot((touch.x - x) * plate.length, (touch.y - y) * plate.width)
-            if beyond > RIM:
+            if beyond > RIM or not plate.contains(x * plate.length, (1 - y) * plate.width):
                 rejected.append("off_plate")
             else:
                 valid[ContactKey(frame.source, touch.id)] = replace(touch, x=x, y=y)

@@ -13,6 +13,7 @@ from benchmarks.contents import share_kept
 from benchmarks.setting import random_contacts
 from benchmarks.surface import exported_modes
 from controller.cli.main import run
+from controller.sources.touch import ContactTracker, Touch, TouchFrame
 from model.answer.plan import answer
 from model.answer.stimulus import Finger, Stimulus, check_on_plate
 from model.arrays import FloatArray
@@ -242,7 +243,10 @@ def test_promises_are_kept_where_each_mode_differs(
 
 
 def test_cut_out_has_no_fingers(modes: Mapping[str, FloatArray], tmp_path: Path) -> None:
-    """Faces around a hole give two rings; a finger in the hole is refused, no cell is there."""
+    """Faces around a hole give two rings; a finger in the hole is refused, no cell is there.
+
+    A panel that reports one there has it rejected, so that all others are served.
+    """
     first = (21 * np.arange(15)[:, None] + np.arange(20)).ravel()
     hole = (21 * np.arange(5, 9)[:, None] + np.arange(7, 13)).ravel()
     faces = np.setdiff1d(first, hole)[:, None] + [0, 1, 22, 21]
@@ -251,6 +255,10 @@ def test_cut_out_has_no_fingers(modes: Mapping[str, FloatArray], tmp_path: Path)
     assert len(rig.plate.surface.outline) == 2
     with pytest.raises(InputError, match=r"finger must be within the outline"):
         check_on_plate("finger", [(0.152, 0.1)], rig.plate)
+    touches = (Touch(1, 0.5, 0.56), Touch(2, 0.2, 0.2))  # shares of the size, y downwards
+    change = ContactTracker(rig.plate).update(TouchFrame("panel", 0.0, touches))
+    assert [each.key.id for each in change.down] == [2]
+    assert change.rejected == ("off_plate",)
     table = build_table(rig)
     assert len(table.cell_centres) < table.grid.cell_count
     assert rig.plate.covers(table.cell_centres).all()

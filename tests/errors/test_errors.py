@@ -38,8 +38,8 @@ from era_haptics.lab.design.problem import (
     layouts_of,
 )
 from era_haptics.lab.measuring.impedance import read_impedance
+from era_haptics.lab.measuring.other_sources import read_stepped
 from era_haptics.lab.measuring.sound_card import Desk, WiredSensor, read_sensors
-from era_haptics.lab.measuring.stepped_sine import read_stepped
 from era_haptics.lab.paper_figures import paper_figures
 from era_haptics.lab.witness import capture
 from era_haptics.lab.witness.relay import parse_endpoint

@@ -10,8 +10,7 @@ of its own. Its phases are relative to the loop-back, so that places measured mi
 the sensor's gain is one. What is measured is written after each place, so that the rest can be
 measured another time.
 
-For identification one run is repeated at half the level and at the whole one. A simulated plate, in
-place of a card, deviates from its rig's file.
+For identification one run is repeated at half the level and at the whole one.
 """
 
 import math
@@ -37,7 +36,6 @@ from era_haptics.lab.measuring.sound_card import (
     Run,
     SoundCard,
     WiredSensor,
-    are_positions,
     converters,
     default_frequencies,
     estimate,
@@ -57,11 +55,7 @@ from model.estimate.measurement import (
     write_responses,
 )
 from model.processes import Progress, unseen
-from model.quantities import counted
-from model.reduction.free_plate import solve_free_plate
 from model.rig.rig import Rig
-from model.structure.attachments import PointLoad
-from sim.plant.imperfections import draw_imperfections
 
 SILENT = 1e-5
 """Of full scale, rms: what an input without a signal stays below."""
@@ -755,72 +749,3 @@ def _line(place: WiredSensor, found: MeasuredResponses) -> str:
 
 def _span(frequencies: FloatArray) -> str:
     return f"{len(frequencies)} from {frequencies[0]:g} to {frequencies[-1]:g} Hz"
-
-
-def written(
-    found: Measurement, desk: Desk, output: Path, *, source: str
-) -> tuple[list[str | None], dict[str, Any]]:
-    """Write responses that have a source; return the report. Raises InputError."""
-    write_responses(output, found, desk.rig)
-    absent = [each.name for each in desk.sensors if each.name not in found.names]
-    lines = found.frequencies
-    count = found.values.size - found.count
-    rows = [
-        f"{source}: {counted(len(found.sensors), 'sensor')}, "
-        f"{counted(len(lines), 'frequency', plural='frequencies')} from {lines[0]:g} to "
-        f"{lines[-1]:g} Hz, {counted(found.count, 'value')}",
-        f"{counted(count, 'value')} missing, or not settled and left out" if count else None,
-        f"without {', '.join(absent)}" if absent else None,
-        f"wrote {output}",
-    ]
-    return rows, {
-        "frequencies_hz": lines.tolist(),
-        "sensors": [*found.names],
-        "without": absent,
-        "values": found.count,
-        "values_missing": count,
-        "files": [str(output)],
-    }
-
-
-NOISE = 2e-3
-"""Of a sensor's root mean square over all that it reads, of each part."""
-
-
-def measured_by_simulation(
-    desk: Desk, output: Path, *, frequencies: FloatArray | None, seed: int
-) -> tuple[list[str | None], dict[str, Any]]:
-    """Write responses of a plate drawn within a rig's uncertainty; return the report.
-
-    frequencies (f,) [Hz]: None for those of `era measure`; seed: of the plate and of the noise.
-    Sensors weigh what their file says, one that is moved at one place at a time. Raises InputError
-    for frequencies beyond the rig's limits.
-    """
-    rig, sensors = desk.rig, desk.sensors
-    limits, drawn = rig.limits, draw_imperfections(rig, seed=seed)
-    if frequencies is None:
-        frequencies = default_frequencies(limits.frequency_min, limits.frequency_max)
-    desk.check_frequencies(frequencies, what="--frequencies")
-    real = drawn.plate.realised(rig)
-    plate = solve_free_plate(real.plate, real.mesh, frequency_max=limits.frequency_max)
-    points = np.array([[each.x, each.y] for each in sensors])
-    weights = [PointLoad(each.x, each.y, mass=each.mass) for each in sensors]
-    found = [
-        plate.acceleration(
-            real.eras,
-            frequencies,
-            point[None],
-            loads=[*real.masses, *([weight] if are_positions(sensors) else weights)],
-        )
-        for point, weight in zip(points, weights, strict=True)
-    ]
-    drives = drawn.factors(rig) / np.array([*rig.full_levels.values()])
-    values = np.concatenate(found, axis=2) * drives[:, None]  # (f, eras, sensors)
-    parts = np.random.default_rng(seed).standard_normal((2, *values.shape))
-    rms = np.sqrt((np.abs(values) ** 2).mean(axis=(0, 1)))
-    values += NOISE * rms * (parts[0] + 1j * parts[1])
-    places = [each.place for each in sensors]
-    if not are_positions(sensors):
-        places = [replace(each, mass=0.0) for each in places]
-    measured = Measurement(places, frequencies, values.swapaxes(1, 2))
-    return written(measured, desk, output, source="simulated plate")

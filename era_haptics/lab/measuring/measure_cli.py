@@ -156,11 +156,11 @@ def measure(
     rows: Sequence[str | None]
     is_whole = True
     if source is not None:
-        from era_haptics.lab.measuring.stepped_sine import measured_from
+        from era_haptics.lab.measuring.other_sources import measured_from
 
         rows, answer = measured_from(source, desk, output)
     elif is_simulated:
-        from era_haptics.lab.measuring.measure import measured_by_simulation
+        from era_haptics.lab.measuring.other_sources import measured_by_simulation
 
         rows, answer = measured_by_simulation(desk, output, frequencies=lines, seed=seed)
     else:

@@ -14,7 +14,7 @@ import pytest
 from benchmarks.desk_plate.desk_plate import Converters, DeskModel, DeskPlate, Truth
 from controller.cli.main import run
 from drivers.errors import LinkError
-from era_haptics.lab.measuring import measure
+from era_haptics.lab.measuring import other_sources
 from era_haptics.lab.measuring.measure import MeasuredResponses, check_wiring, latency
 from era_haptics.lab.measuring.measure import measure as measure_measure
 from era_haptics.lab.measuring.sound_card import (
@@ -44,10 +44,12 @@ FREQUENCIES = np.array([61.0, 151.0, 311.0])
 @pytest.mark.parametrize("sensors", [FIXED, MOVED], ids=["fixed", "moved"])
 def test_responses_are_those_of_the_plate_in_time(sensors, monkeypatch, tmp_path) -> None:
     """Of a plate that is the rig's, without noise; a sensor of 20 g weighs where it is moved to."""
-    monkeypatch.setattr(measure, "NOISE", 0.0)
+    monkeypatch.setattr(other_sources, "NOISE", 0.0)
     rig = replace(load_rig(example_rig_path()), uncertainty=Uncertainty.none())
     output = tmp_path / "measured.csv"
-    measure.measured_by_simulation(Desk(rig, sensors), output, frequencies=FREQUENCIES, seed=0)
+    other_sources.measured_by_simulation(
+        Desk(rig, sensors), output, frequencies=FREQUENCIES, seed=0
+    )
     found = measurement_of(read_measured(output), rig)
     for number, each in enumerate(sensors):
         load = PointLoad(each.x, each.y, mass=each.mass)

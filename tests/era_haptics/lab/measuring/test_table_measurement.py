@@ -24,9 +24,9 @@ from drivers.host.ledger import StagedSet
 from drivers.playing import AmplifierLayer
 from era_haptics.lab.cli import app as cli_app
 from era_haptics.lab.measuring import table_measurement
+from era_haptics.lab.measuring.other_sources import read_stepped
 from era_haptics.lab.measuring.outputs import OutputFinding, listen, matched, tone
 from era_haptics.lab.measuring.sound_card import Desk, SoundCard, WiredSensor, read_sensors
-from era_haptics.lab.measuring.stepped_sine import read_stepped
 from long_form import shortly
 from model.arrays import ComplexArray, Float32Array, FloatArray
 from model.cli import app

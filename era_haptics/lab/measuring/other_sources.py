@@ -1,4 +1,6 @@
-"""Responses from recordings of a stepped sine, measured with any converter: WAV or CSV files.
+"""Responses from other sources than a sound card: files of a stepped sine, a simulated plate.
+
+A stepped sine was recorded or measured with any converter: WAV or CSV files.
 
 - WAV: channels are the inputs of the sensors and, behind the last one, the references: a cable for
   each ERA in the order of the rig, or one for all. With one cable each ERA plays ascending
@@ -10,6 +12,8 @@
   `phase_deg`, or `real` with `imag`. An output is an ERA's name, or its number from 1.
 
 What a file does not say is in its name: SENSOR-OUTPUT.csv, or SENSOR.wav.
+
+The simulated plate deviates from its rig's file.
 """
 
 import cmath
@@ -22,21 +26,28 @@ import numpy as np
 from scipy import signal
 
 from drivers.errors import LinkError
-from era_haptics.lab.measuring.measure import CROSSTALK, SILENT, check_levels, written
+from era_haptics.lab.measuring.measure import CROSSTALK, SILENT, check_levels
 from era_haptics.lab.measuring.sound_card import (
     Desk,
     WiredSensor,
     are_positions,
+    default_frequencies,
 )
 from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError
 from model.estimate.measurement import (
     MeasuredValue,
+    Measurement,
     measurement_of,
+    write_responses,
 )
 from model.files.csv_file import read_lines
 from model.files.uff import read_bytes
 from model.files.wav_file import samples_of
+from model.quantities import counted
+from model.reduction.free_plate import solve_free_plate
+from model.structure.attachments import PointLoad
+from sim.plant.imperfections import draw_imperfections
 
 CLOSE = 2e-4
 """Of a frequency: nearer ones are the same, played for several ERAs."""
@@ -279,3 +290,72 @@ def _value(
         sensor.mass,
         is_per_volt=actuator.UNIT == "V",
     )
+
+
+def written(
+    found: Measurement, desk: Desk, output: Path, *, source: str
+) -> tuple[list[str | None], dict[str, Any]]:
+    """Write responses that have a source; return the report. Raises InputError."""
+    write_responses(output, found, desk.rig)
+    absent = [each.name for each in desk.sensors if each.name not in found.names]
+    lines = found.frequencies
+    count = found.values.size - found.count
+    rows = [
+        f"{source}: {counted(len(found.sensors), 'sensor')}, "
+        f"{counted(len(lines), 'frequency', plural='frequencies')} from {lines[0]:g} to "
+        f"{lines[-1]:g} Hz, {counted(found.count, 'value')}",
+        f"{counted(count, 'value')} missing, or not settled and left out" if count else None,
+        f"without {', '.join(absent)}" if absent else None,
+        f"wrote {output}",
+    ]
+    return rows, {
+        "frequencies_hz": lines.tolist(),
+        "sensors": [*found.names],
+        "without": absent,
+        "values": found.count,
+        "values_missing": count,
+        "files": [str(output)],
+    }
+
+
+NOISE = 2e-3
+"""Of a sensor's root mean square over all that it reads, of each part."""
+
+
+def measured_by_simulation(
+    desk: Desk, output: Path, *, frequencies: FloatArray | None, seed: int
+) -> tuple[list[str | None], dict[str, Any]]:
+    """Write responses of a plate drawn within a rig's uncertainty; return the report.
+
+    frequencies (f,) [Hz]: None for those of `era measure`; seed: of the plate and of the noise.
+    Sensors weigh what their file says, one that is moved at one place at a time. Raises InputError
+    for frequencies beyond the rig's limits.
+    """
+    rig, sensors = desk.rig, desk.sensors
+    limits, drawn = rig.limits, draw_imperfections(rig, seed=seed)
+    if frequencies is None:
+        frequencies = default_frequencies(limits.frequency_min, limits.frequency_max)
+    desk.check_frequencies(frequencies, what="--frequencies")
+    real = drawn.plate.realised(rig)
+    plate = solve_free_plate(real.plate, real.mesh, frequency_max=limits.frequency_max)
+    points = np.array([[each.x, each.y] for each in sensors])
+    weights = [PointLoad(each.x, each.y, mass=each.mass) for each in sensors]
+    found = [
+        plate.acceleration(
+            real.eras,
+            frequencies,
+            point[None],
+            loads=[*real.masses, *([weight] if are_positions(sensors) else weights)],
+        )
+        for point, weight in zip(points, weights, strict=True)
+    ]
+    drives = drawn.factors(rig) / np.array([*rig.full_levels.values()])
+    values = np.concatenate(found, axis=2) * drives[:, None]  # (f, eras, sensors)
+    parts = np.random.default_rng(seed).standard_normal((2, *values.shape))
+    rms = np.sqrt((np.abs(values) ** 2).mean(axis=(0, 1)))
+    values += NOISE * rms * (parts[0] + 1j * parts[1])
+    places = [each.place for each in sensors]
+    if not are_positions(sensors):
+        places = [replace(each, mass=0.0) for each in places]
+    measured = Measurement(places, frequencies, values.swapaxes(1, 2))
+    return written(measured, desk, output, source="simulated plate")

@@ -1,12 +1,18 @@
 """Hours of plates in service: each thins, a mount loosens and a sticker comes.
 
     python -m benchmarks.identification.hour [--hours 10] [--quiet] [--jobs 2] [--report]
+    python -m benchmarks.identification.hour --objects [--hours 10]
 
 Each hour is that of another hidden thin plate with form errors, identified at first; 300 patterns,
 the table's own answers at random touches of two to four fingers of unknown loads. Thickness falls
 by 1 % an hour, a mount loses 20 % after 20 minutes, a sticker of 3 g comes after 40. Printed are
 alarms, explanations and the contrast [dB] for one quiet finger: as identified and never updated,
 followed in service, and for the plate known. --quiet: without mount and sticker, for false alarms.
+With --objects, on each plate a phone of 50 g and a cup of 200 g lie for a while, one after the
+other, amid touches every two seconds; then comes a quiet hour of such touches, one every 12 s.
+Tones are of one to three contents at once. Printed are the seconds until each was noticed and until
+its going was, how far from its place and how many times as heavy it was said to be, and alarms.
+
 With --report, docs/measured/identification.md is written as well.
 """
 
@@ -27,19 +33,19 @@ from benchmarks.identification.plates import (
     Mounted,
     answer,
     draw,
-    finger_stiffness,
     known_table,
+    pattern_of_touches,
+    settled_pattern,
     table_of,
 )
 from benchmarks.page import write_parts
 from benchmarks.setting import RIG, random_contacts, use_one_thread
-from model.estimate.following import LivePlate, PatternReport, PlateEstimate, SettledPattern
-from model.estimate.forward import RestingFinger, Sensor
+from model.estimate.following import LivePlate, PatternReport, PlateEstimate
+from model.estimate.forward import Sensor
 from model.estimate.identify import identify
 from model.estimate.measurement import Measurement
 from model.finger import fingertip_points, fingertip_weights
 from model.rig.rig_file import load_rig
-from model.structure.attachments import Fingertip
 from model.table.table import LocalizationTable
 from model.table.table_file import table_following
 
@@ -48,6 +54,7 @@ MOUNT_AT, STICKER_AT = 20.0, 40.0
 JUDGED_AT = (19.8, 23.0, 39.8, 43.0, 59.8)
 SETS = 12
 _FOLLOWED_EVERY = 5  # patterns
+_UNNOTICED = 60.0  # s; after which an object is given up
 
 
 def main() -> None:
@@ -57,9 +64,14 @@ def main() -> None:
     parser.add_argument("--quiet", action="store_true")
     parser.add_argument("--jobs", type=int, default=2, help="hours at the same time")
     parser.add_argument("--report", action="store_true")
+    parser.add_argument("--objects", action="store_true", help="what lies there for a while")
     options = parser.parse_args()
     use_one_thread()
     found = []
+    if options.objects:
+        for seed in range(options.first, options.first + options.hours):
+            print(f"plate {seed}: {visits(seed)}", flush=True)
+        return
     seeds = range(options.first, options.first + options.hours)
     with ProcessPoolExecutor(options.jobs, mp_context=get_context("spawn")) as pool:
         for one in pool.map(partial(hour, is_quiet=options.quiet), seeds):
@@ -147,16 +159,11 @@ def hour(seed: int, *, is_quiet: bool) -> Hour:
         tone = answer(table, places)
         frequency, bases = tone.frequency, 0.2 * tone.bases
         factors = np.exp(0.5 * rng.standard_normal(len(places)))
-        loads = np.array([finger_stiffness(frequency, np.full(4, each)) for each in factors])
-        felt = mounted.accelerations(frequency, mounted.at, fingers=places, loads=loads) @ bases
-        measured = hidden.sensor_gain * felt
-        noise = rng.standard_normal((2, len(measured)))
-        measured = measured + 0.01 * np.abs(measured) * (noise[0] + 1j * noise[1])
-        fingers = tuple(RestingFinger(x, y, Fingertip()) for x, y in places.tolist())
-        report = live.take(
-            SettledPattern(60 * minute, frequency, bases, measured, fingers, has_phase=False)
+        tones, at = (np.array([frequency]), bases[None]), 60 * minute
+        pattern = settled_pattern(
+            hidden, mounted, tones, places, factors, rng, time=at, has_phase=False
         )
-        found.take(seed, minute, report)
+        found.take(seed, minute, live.take(pattern))
         if number % _FOLLOWED_EVERY == 0:
             table = table_following(loaded, live.known.rig)
         if judged and minute >= judged[0] - 1e-6:
@@ -168,6 +175,41 @@ def hour(seed: int, *, is_quiet: bool) -> Hour:
             for way, contrasts in _judged(tables, mounted, seed).items():
                 found.contrasts[at, way] = contrasts
     return found
+
+
+def visits(seed: int) -> str:
+    """What is noticed of a phone and a cup on a plate, and of nothing in a quiet hour."""
+    rig, hidden, rng = load_rig(RIG), draw("form", seed), np.random.default_rng([seed, 4])
+    sensors = [Sensor(era.name, era.name) for era in rig.eras]
+    values = hidden.measured(FREQUENCIES, np.random.default_rng([seed, 1]))
+    identified = identify(rig, Measurement(sensors, FREQUENCIES, values))
+    live, time, said = LivePlate(PlateEstimate.of_rig(identified.rig, sensors)), 0.0, list[str]()
+
+    def touched(lying: tuple[float, float, float] | None, *, pause: float = 2.0) -> bool:
+        nonlocal time
+        time += pause
+        return live.take(pattern_of_touches(hidden, rng, time=time, lying=lying)).alarm
+
+    for mass in (0.05, 0.2):
+        false = sum(touched(None) for _ in range(10))
+        x, y = (rng.uniform(0.1, 0.9, 2) * (LENGTH, WIDTH)).tolist()
+        began, change = time, ""
+        while not change and time - began < _UNNOTICED:
+            touched((x, y, mass))
+            change = live.known.change
+        noticed, lying = time - began, live.known.lying
+        while live.known.change and time - began < 2 * _UNNOTICED:
+            touched(None)
+        gone = time - began - noticed
+        where = ""
+        if lying is not None:
+            off = np.hypot(lying[0] - x, lying[1] - y)
+            where = f", {1000 * off:.0f} mm off, {lying[2] / mass:.1f} times as heavy"
+        said.append(
+            f"{1000 * mass:g} g: {false} alarms before; {noticed:g} s{where}, {gone:g} s until gone"
+        )
+    alarms = sum(touched(None, pause=12.0) for _ in range(300))
+    return f"{'; '.join(said)}; {alarms} alarms in a quiet hour"
 
 
 def _judged(

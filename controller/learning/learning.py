@@ -42,6 +42,7 @@ from controller.sources.touch import Contact
 from drivers.errors import CommandError, DriverError, Preempted
 from drivers.host.amplifier_sensors import Reading, finish_reading, start_reading
 from model.answer.answer_report import Timing
+from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError
 from model.estimate.following import LearnedTable, PlateReport, SettledPattern
 from model.estimate.forward import RestingFinger
@@ -123,9 +124,10 @@ class SettledReadings:
             self.ended()
             return
         highest = min((each.frequency_max for each in self.sensors), default=0.0)
-        frequencies = {command.frequency for command in applied.drive.values()}
-        is_one = applied.lasts and len(applied.contents) == len(frequencies) == 1
-        self._playing = applied if is_one and max(frequencies) <= highest else None
+        frequencies, _ = self._tones(applied)
+        is_apart = np.diff(frequencies, prepend=0.0).min() * WINDOW >= 1
+        is_read = applied.lasts and len(applied.contents) == len(frequencies) and is_apart
+        self._playing = applied if is_read and frequencies[-1] <= highest else None
         self._contacts = applied.contacts
         self._wait_for(applied.time + applied.settled_after)
 
@@ -175,53 +177,66 @@ class SettledReadings:
 
         Without the phase of its drives: outputs follow their clocks by a delay that is not known.
         """
-        (frequency,) = {command.frequency for command in applied.drive.values()}
+        frequencies, bases = self._tones(applied)
         for _ in range(READINGS):
-            readings, ended_at = await self._measure(frequency)
+            readings, ended_at = await self._measure(frequencies)
             if self._change.is_set():
                 return None
             if all(each.state == "COMPLETE" for each in readings.values()):
                 break
         else:
             return None
-        values = []
-        for sensor in self.sensors:
-            reading = readings[sensor.amplifier]
-            if reading.sensors[sensor.number].is_overloaded:
-                return None
-            values.append(sensor.accelerations(reading, np.array([frequency]))[0])
-        if not np.isfinite(values).all() or not np.any(values):  # no phase to turn others to
-            _logger.info("reading given up: all sensors read nothing")
+        overloaded = [readings[each.amplifier].sensors[each.number] for each in self.sensors]
+        if any(each.is_overloaded for each in overloaded):
             return None
-        bases = {
-            name: cmath.rect(tone.level * self._rig.era(name).full_level, math.radians(tone.phase))
-            for name, tone in applied.drive.items()
-        }
+        values = np.array(
+            [each.accelerations(readings[each.amplifier], frequencies) for each in self.sensors]
+        ).T
+        if not np.isfinite(values).all() or not np.abs(values).any(axis=1).all():
+            _logger.info("reading given up: all sensors read nothing")  # no phase to turn others to
+            return None
         tip = self._rig.fingertip
         fingers = (
             ()
             if tip is None
             else (RestingFinger(each.x, each.y, tip.scaled(each.load)) for each in contacts)
         )
+        # Not where the second harmonic of another tone is heard as well.
+        is_own = np.abs(frequencies[:, None] - 2 * frequencies).min(axis=1) * WINDOW >= 1
         return SettledPattern(
             ended_at,
-            frequency,
-            np.array([bases.get(era.name, 0j) for era in self._rig.eras]),
-            np.array(values),
+            frequencies[is_own],
+            bases[is_own],
+            values[is_own],
             tuple(fingers),
             has_phase=False,
         )
 
-    async def _measure(self, frequency: float) -> tuple[Mapping[str, Reading], float]:
-        """Read a tone [Hz] at all amplifiers; the readings, and when [s] their window ended.
+    def _tones(self, applied: PlayReport) -> tuple[FloatArray, ComplexArray]:
+        """Frequencies (k,) [Hz] of what plays, ascending, and bases (k, n) [m] as commanded."""
+        tones = [
+            (number, tone)
+            for each in applied.contents.values()
+            for number, era in enumerate(self._rig.eras)
+            if (tone := each.drive.get(era.name))
+        ]
+        frequencies, rows = np.unique([t.frequency for _, t in tones], return_inverse=True)
+        bases = np.zeros((len(frequencies), len(self._rig.eras)), dtype=complex)
+        for row, (number, tone) in zip(rows, tones, strict=True):
+            level = tone.level * self._rig.eras[number].full_level
+            bases[row, number] += cmath.rect(level, math.radians(tone.phase))
+        return frequencies, bases
+
+    async def _measure(self, frequencies: FloatArray) -> tuple[Mapping[str, Reading], float]:
+        """Read tones (k,) [Hz] at all amplifiers; the readings, and when [s] their window ended.
 
         Nothing is requested after a change meanwhile.
         """
         names = sorted({sensor.amplifier for sensor in self.sensors})
         amplifiers = {name: self._controller.amplifiers[name] for name in names}
-        window = max(WINDOW, _PERIODS / frequency)
+        window = max(WINDOW, _PERIODS / float(np.diff(frequencies, prepend=0.0).min()))
         started = {
-            name: await start_reading(each, [frequency], window)
+            name: await start_reading(each, frequencies.tolist(), window)
             for name, each in amplifiers.items()
         }
         end = threads.now() + max(each.left for each in started.values())

@@ -37,7 +37,7 @@ from scipy import linalg
 from scipy.special import chdtrc
 
 from model.answer.plan import prepare_answers
-from model.arrays import ComplexArray, FloatArray, best_of, ranked_by
+from model.arrays import ComplexArray, FloatArray, best_by, best_of, ranked_by
 from model.errors import InputError
 from model.estimate.fit import Fit, best_gains, fit
 from model.estimate.forward import (
@@ -55,7 +55,8 @@ from model.estimate.space import rig_with, space_of
 from model.files.array_file import UNREADABLE, read_arrays, remove_partial, write_arrays
 from model.files.output_paths import begins_with
 from model.finger import Grid
-from model.rig.rig import Rig, Uncertainty
+from model.rig.rig import BOUNDS, Rig, Uncertainty
+from model.structure.attachments import object_load
 from model.structure.modal_elasticity import lowest_elastic
 from model.table.table import LocalizationTable
 from model.table.table_file import table_following
@@ -87,6 +88,7 @@ _STARTS = 3
 _EVALUATIONS, _FIRST_EVALUATIONS, _LAST_EVALUATIONS = 20, 10, 40  # of an update, of hypotheses
 BY_MASS = "a mass"
 _WITHIN_REACH = 300.0  # of the least cost
+_OF_MASS = -2  # of the last load
 _FOLLOWED = 3  # of the least cost after the first evaluations
 
 _MIN_EXPLAINED, _MAX_EXPLAINED = 4, 6  # patterns that are explained together
@@ -105,6 +107,15 @@ _NOT_STATED = (
 """Kinds whose uncertainty a rig does not state."""
 
 _IDENTIFIED = 0.5  # of the thickness error of a plate that was not measured
+OBJECT = "an object"
+_LEAST_OBJECT = 0.01  # kg; what is lighter is followed as a mass where it explains all
+_OBJECT_MASSES = (0.02, 0.06, 0.2)  # kg, from which to search
+_PLACE_STEPS = (0.01, 0.005)  # m; by which the place of an object is refined
+_OBJECT_STD = (0.0, 0.5, 1.0, 0.0)  # of the logarithms of contact stiffness and mass
+_OBJECT_COST = 3 * _COST_OF_CHANGE  # of its mass and of its place
+OBJECT_PLACES: Final = Grid(18, 14)
+"""Cells in whose middles objects are looked for."""
+
 _HELD = "the plate is not as known; the next patterns tell what has changed"
 _CHANGED_REMEDY = (
     "run era rig check, and look for a loose mount, a crack or something on the plate; then "
@@ -120,29 +131,30 @@ _MAX_BYTES = 1 << 24
 
 @dataclass(frozen=True, eq=False)
 class SettledPattern:
-    """A tone that has settled, as it was played and measured."""
+    """Tones that have settled under the same fingers, as they were played and measured."""
 
     time: float
     """Time of the measurement [s]."""
-    frequency: float
-    """Frequency of the tone [Hz]."""
+    frequencies: FloatArray
+    """Frequency of each tone (k,) [Hz]."""
     bases: ComplexArray
-    """Amplitude of each ERA's base as commanded (n,) [m]."""
+    """Amplitude of each ERA's base as commanded (k, n) [m]."""
     values: ComplexArray
-    """Acceleration at each sensor (s,) [m/s²], phases as exp(+i omega t)."""
+    """Acceleration at each sensor (k, s) [m/s²], phases as exp(+i omega t)."""
     fingers: tuple[RestingFinger, ...] = ()
     """Fingers on the plate, as far as they are known."""
     has_phase: bool = True
-    """Whether phases of values count from those of bases; otherwise one phase, common to all
-    sensors, is unknown, and no update depends on it."""
+    """Whether phases of values count from those of bases; otherwise one phase of each tone, common
+    to all sensors, is unknown, and no update depends on it."""
     noise: float = 1.0
     """Noise of the reading, relative to the largest."""
 
     @property
     def std(self) -> FloatArray:
-        """Error of the real and of the imaginary part of each value (s,)."""
+        """Error of the real and of the imaginary part of each value (k, s)."""
         squares = np.abs(self.values) ** 2
-        return np.asarray(self.noise * _NOISE * np.sqrt(squares + _FLOOR**2 * squares.mean()))
+        mean = squares.mean(axis=-1, keepdims=True)
+        return np.asarray(self.noise * _NOISE * np.sqrt(squares + _FLOOR**2 * mean))
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,6 +173,8 @@ class PlateEstimate:
     """Why patterns only raise alarms, "" where they update what is known."""
     change: str = ""
     """How it has changed in a way that its parameters do not follow, "" where it has not."""
+    lying: tuple[float, float, float] | None = None
+    """Place x, y [m] and mass [kg] of an object that lies on it, where that is the change."""
 
     @property
     def rig(self) -> Rig:
@@ -170,8 +184,12 @@ class PlateEstimate:
 
     @property
     def cautious_rig(self) -> Rig:
-        """The rig as last known, with the errors of a plate that was not measured."""
-        return replace(self.rig, uncertainty=widest(self.model.rig.uncertainty))
+        """The rig as last known, with an object on it or the errors of one never measured."""
+        uncertainty = self.model.rig.uncertainty
+        if self.lying is None:
+            return replace(self.rig, uncertainty=widest(uncertainty))
+        mass = min(max(uncertainty.foreign_mass, self.lying[2]), BOUNDS["foreign_mass"][1])
+        return replace(self.rig, uncertainty=replace(uncertainty, foreign_mass=mass))
 
     @classmethod
     def of_rig(cls, rig: Rig, sensors: Sequence[Sensor]) -> Self:
@@ -257,6 +275,30 @@ class PlateUpdate:
         weighted = self.precision @ columns
         return weighted.T @ self.innovation, (columns * weighted).sum(axis=0), len(points)
 
+    def explained_at(self, points: FloatArray) -> FloatArray:
+        """Squared deviations that a force at each point (p, 2) explains (p,).
+
+        It may have any size and phase at each tone, as that of a load of any kind.
+        """
+        best, tones = self.fit, len(self.fit.model.frequencies)
+        driven = best.measurement.driven
+        forces = driven(by_mass_at(best.plate, points))
+        forces = np.concatenate([forces, 1j * forces], axis=-1)
+        _, _, _, slopes = best_gains(driven(best.plate.responses), forces, best.measurement)
+        of_tone = np.repeat(np.eye(tones), len(slopes) // tones, axis=0)
+        columns = np.vstack([slopes.real, slopes.imag]).reshape(2 * len(slopes), 2, -1)
+        columns = np.einsum("mt,map->pmta", np.vstack([of_tone, of_tone]), columns)
+        columns = columns.reshape(*columns.shape[:2], -1)
+        weighted = self.precision @ columns
+        along, curvature = (
+            weighted.swapaxes(1, 2) @ self.innovation,
+            columns.swapaxes(1, 2) @ weighted,
+        )
+        curvature += 1e-9 * np.trace(curvature, axis1=1, axis2=2)[:, None, None] * np.eye(2 * tones)
+        return np.asarray(
+            (along * np.linalg.solve(curvature, along[..., None])[..., 0]).sum(axis=1)
+        )
+
 
 def update(
     before: PlateEstimate,
@@ -265,36 +307,45 @@ def update(
     evaluations: int = _EVALUATIONS,
     start: FloatArray | None = None,
     theory: FloatArray | None = None,
+    lying: Sequence[RestingFinger] = (),
 ) -> PlateUpdate:
     """Find the most likely plate after patterns, within its bounds.
 
     evaluations: of the model, at most; start: of the plate (p,), or of plate and fingers, by
     default what was known before; theory (p,): variances of the theory's errors, which count only
-    in the likelihood of the innovation.
+    in the likelihood of the innovation; lying: objects that lie there during all patterns.
     """
     model = before.model
-    fingers = [replace(f, tone=n) for n, each in enumerate(patterns) for f in each.fingers]
+    of_tone = np.repeat(np.arange(len(patterns)), [len(each.frequencies) for each in patterns])
+    fingers = [
+        replace(finger, tones=tuple(np.flatnonzero(of_tone == number).tolist()))
+        for number, each in enumerate(patterns)
+        for finger in each.fingers
+    ]
+    count, fingers = len(fingers), [*fingers, *lying]
     parts, p = len(FINGER_PARTS), len(before.x)
     names = [f"finger part {number}" for number in range(parts * len(fingers))]
     whole = replace(
         model,
-        frequencies=np.array([each.frequency for each in patterns]),
+        frequencies=np.concatenate([each.frequencies for each in patterns]),
         fingers=fingers,
         space=model.space.and_further("fingers", names),
         last_places={},
     )
     measurement = Measurement(
         model.sensors,
-        np.arange(len(patterns), dtype=float),
-        np.array([each.values for each in patterns])[..., None],
-        np.array([each.std for each in patterns])[..., None],
+        np.arange(len(of_tone), dtype=float),
+        np.concatenate([each.values for each in patterns])[..., None],
+        np.concatenate([each.std for each in patterns])[..., None],
         gain_std=0.0 if patterns[0].has_phase else _ONLY_PHASE,
-        bases=np.array([each.bases for each in patterns]),
+        bases=np.concatenate([each.bases for each in patterns]),
     )
     # A finger loads a plate more or less as a whole, and each of its parts differs half as much
     # beside that: with parts that varied on their own a heavy finger would be as unlikely as four.
     of_finger = _PART_SHARE**2 * np.eye(parts) + np.ones((parts, parts))
-    P = linalg.block_diag(before.covariance, *[of_finger] * len(fingers))
+    of_object = np.diag(_OBJECT_STD) ** 2
+    blocks = [of_finger] * count + [of_object] * len(lying)
+    P = linalg.block_diag(before.covariance, *blocks)
     mean = np.zeros(len(P))
     mean[:p] = before.x
     first = mean.copy()
@@ -363,8 +414,8 @@ class Alarm:
 
     @property
     def is_full(self) -> bool:
-        """Whether a whole window of patterns has come without an alarm."""
-        return len(self._recent) == WINDOW
+        """Whether as many tones as a window has patterns have come without an alarm."""
+        return _tones([each.patterns[0] for each in self._recent]) >= WINDOW
 
     @property
     def is_odd(self) -> bool:
@@ -395,6 +446,11 @@ class Alarm:
         return None
 
 
+def _tones(patterns: Sequence[SettledPattern]) -> int:
+    """Number of tones of patterns."""
+    return sum(len(each.frequencies) for each in patterns)
+
+
 def _squares(slopes: FloatArray, curvatures: FloatArray, masses: int) -> FloatArray:
     """Squared deviations along directions (..., d), of which the last can only be upwards."""
     up = slopes.copy()
@@ -419,13 +475,27 @@ class PlateChange:
     """Further cost of the next best explanation."""
     resembles: str = ""
     """Name of the change that explains most, though not enough."""
+    lying: tuple[RestingFinger, ...] = ()
+    """The object that has come, where that is the change."""
 
     @property
     def likelihood(self) -> float:
         """Less the cost of residuals and changes, and of supposing a change."""
-        return -(2 * self.after.fit.cost + _COST_OF_CHANGE * len(self.widened))
+        cost = _COST_OF_CHANGE * len(self.widened) + _OBJECT_COST * len(self.lying)
+        return -(2 * self.after.fit.cost + cost)
+
+    @property
+    def of_object(self) -> tuple[float, float, float] | None:
+        """Place x, y [m] and mass [kg] of the object, None where the change is another."""
+        if self.name != OBJECT:
+            return None
+        (one,) = self.lying
+        return one.x, one.y, self.change
 
     def __str__(self) -> str:
+        if self.of_object is not None:
+            x, y, mass = self.of_object
+            return f"something of about {mass:.1g} kg lies near ({x:.2f}, {y:.2f}) m"
         if self.name == BY_MASS:
             known = self.after.known
             x, y = (known.model.space.std * known.x)[[*self.widened][1:]]  # from the middle
@@ -441,16 +511,20 @@ def explain(known: PlateEstimate, patterns: Sequence[SettledPattern]) -> PlateCh
     """Find the one change that explains patterns, from the plate as known before it."""
 
     def supposed(
-        name: str, widened: Mapping[int, float], start: FloatArray | None, evaluations: int
+        name: str,
+        widened: Mapping[int, float],
+        start: FloatArray | None,
+        lying: tuple[RestingFinger, ...],
+        evaluations: int,
     ) -> PlateChange:
         std, covariance = known.model.space.std, known.covariance.copy()
         for number, deviation in widened.items():
             covariance[number, number] += (deviation / std[number]) ** 2
         prior = replace(known, covariance=covariance)
-        after = update(prior, patterns, evaluations=evaluations, start=start)
-        first = next(iter(widened))
-        change = float(std[first] * (after.known.x[first] - known.x[first]))
-        return PlateChange(name, widened, after, change)
+        after = update(prior, patterns, evaluations=evaluations, start=start, lying=lying)
+        change = [std[n] * (after.known.x[n] - known.x[n]) for n in widened]
+        change += [one.fingertip.phalanx_mass * np.exp(after.fit.x[_OF_MASS]) for one in lying]
+        return PlateChange(name, widened, after, float(change[0]), lying=lying)
 
     tried = [supposed(*each, _FIRST_EVALUATIONS) for each in _hypotheses(known, patterns)]
     tried = ranked_by(tried, lambda each: each.likelihood)
@@ -459,20 +533,30 @@ def explain(known: PlateEstimate, patterns: Sequence[SettledPattern]) -> PlateCh
     for number in sorted(best_of_name.values())[:_FOLLOWED]:
         if (each := tried[number]).likelihood >= least:
             start = each.after.fit.x
-            tried[number] = supposed(each.name, each.widened, start, _LAST_EVALUATIONS)
+            tried[number] = supposed(each.name, each.widened, start, each.lying, _LAST_EVALUATIONS)
     best, *others = ranked_by(tried, lambda each: each.likelihood)
-    if chdtrc(len(best.after.innovation), -best.likelihood) < _UNLIKELY:
-        return replace(best, name="", resembles=best.name)
+    for step in _PLACE_STEPS if best.lying else ():
+        (one,) = best.lying
+        start, moves = best.after.fit.x, ((step, 0.0), (-step, 0.0), (0.0, step), (0.0, -step))
+        near = [replace(one, x=one.x + x, y=one.y + y) for x, y in moves]
+        tried = [supposed(OBJECT, {}, start, (each,), _FIRST_EVALUATIONS) for each in near]
+        best = best_by([best, *tried], lambda each: each.likelihood)
     rival = max(each.likelihood for each in others if each.name != best.name)
-    return replace(best, lead=best.likelihood - rival)
+    best = replace(best, lead=best.likelihood - rival)
+    is_whole = chdtrc(len(best.after.innovation), -best.likelihood) >= _UNLIKELY
+    # An object's shape is not known, so that it may leave residuals.
+    is_object = best.lying and best.change >= _LEAST_OBJECT and best.lead > _CERTAIN
+    is_named = is_object if best.lying else is_whole
+    return best if is_named else replace(best, name="", resembles=best.name)
 
 
 def _hypotheses(
     known: PlateEstimate, patterns: Sequence[SettledPattern]
-) -> Iterator[tuple[str, Mapping[int, float], FloatArray | None]]:
+) -> Iterator[tuple[str, Mapping[int, float], FloatArray | None, tuple[RestingFinger, ...]]]:
     """All that may have changed, by name: with what, how far, and where a fit starts.
 
-    A mass starts where it would explain most. A new kind of change is one more of them.
+    A mass starts where it would explain most, and so does an object, which is a load on a contact
+    spring and held by nothing. A new kind of change is one more of them.
     """
     space, plate = known.model.space, known.model.rig.plate
     kinds = [(space.names[n], {n: _SPRING}) for n in space.indices("stiffness")]
@@ -481,14 +565,18 @@ def _hypotheses(
     kinds.append(("thickness", {space.groups["thickness"].start: _THICKNESS}))
     for name, changed in kinds:
         if all(space.std[n] > 0 for n in changed):
-            yield name, changed, None
+            yield name, changed, None, ()
     points, mass = PLACES.centres(plate), space.groups["masses"].stop - 3
     own, sides = slice(mass, mass + 3), np.array([plate.length, plate.width])
-    unchanged = update(known, patterns, evaluations=1).fit
-    for number, size in unchanged.loads(points, std=_MASS)[:_STARTS]:
+    unchanged = update(known, patterns, evaluations=1)
+    for number, size in unchanged.fit.loads(points, std=_MASS)[:_STARTS]:
         start = known.x.copy()
         start[own] = [size, *(points[number] - sides / 2)] / space.std[own]
-        yield BY_MASS, dict(zip(range(mass, mass + 3), [_MASS, *sides / 3], strict=True)), start
+        yield BY_MASS, dict(zip(range(mass, mass + 3), [_MASS, *sides / 3], strict=True)), start, ()
+    points = OBJECT_PLACES.centres(plate)
+    x, y = points[best_of(unchanged.explained_at(points))].tolist()
+    for each in _OBJECT_MASSES:
+        yield OBJECT, {}, None, (RestingFinger(x, y, object_load(each)),)
 
 
 @dataclass(frozen=True, eq=False)
@@ -539,7 +627,7 @@ class LivePlate:
                 report = self._explained(pattern.time)
             return replace(report, alarm=not known.change)
         if known.change and self._alarm.is_full:
-            known = self.known = replace(known, change="")
+            known = self.known = replace(known, change="", lying=None)
         if not known.why_off and not known.change and not self._alarm.is_odd:
             self.known = replace(after.known, change="")
             self._noise.take(after.misfit, after.freedom)
@@ -547,8 +635,8 @@ class LivePlate:
 
     def _explained(self, time: float) -> PatternReport:
         """Explain the held patterns, early if the explanation is certain."""
-        count, before = len(self._held), self.known.at(time)
-        is_full = count >= max(_MAX_EXPLAINED, self._suspects + _AFTER_ALARM)
+        count, before = _tones(self._held), self.known.at(time)
+        is_full = count >= _MAX_EXPLAINED and len(self._held) >= self._suspects + _AFTER_ALARM
         found = explain(before, self._held) if count >= _MIN_EXPLAINED else None
         if is_full and found and not found.name:
             # The first of them may be from before the change.
@@ -557,7 +645,9 @@ class LivePlate:
         if found is None or not (is_full or (found.name and found.lead > _CERTAIN)):
             return PatternReport(is_held=True)
         self._held = []
-        self.known = found.after.known if found.name else replace(self.known, change=str(found))
+        is_followed = found.name and not found.lying
+        changed = replace(self.known, change=str(found), lying=found.of_object)
+        self.known = found.after.known if is_followed else changed
         return PatternReport(explanation=found)
 
 
@@ -574,6 +664,8 @@ class PlateReport:
     """Corrected table, prepared for its first touch; None: answers stay as they are."""
     note: str = ""
     """A line for the log; else ""."""
+    lying: tuple[float, float, float] | None = None
+    """As of the plate."""
 
 
 class LearnedTable:
@@ -616,6 +708,7 @@ class LearnedTable:
             )
         then = clock.monotonic() - max(clock.time() - self._file.stat().st_mtime, 0.0)
         known = replace(known, x=x, covariance=covariance, time=then, change=header["change"])
+        known = replace(known, lying=header.get("lying"))
         self.current, self.live = self._followed(known), LivePlate(known)
         self._cause = "the plate is followed from what was learned before on"
 
@@ -682,12 +775,14 @@ class LearnedTable:
         known, cause = self.live.known, self._cause
         table = None if table is None else self._prepared(table)
         if known.change:
-            return PlateReport("changed", known.change, _CHANGED_REMEDY, is_alarm, table, note)
+            remedy = _MASS_REMEDY if known.lying else _CHANGED_REMEDY
+            changed = PlateReport("changed", known.change, remedy, is_alarm, table, note)
+            return replace(changed, lying=known.lying)
         if known.why_off:
             cause = cause if self._alarms else f"answers stay as built: {known.why_off}"
             return PlateReport("off", cause, _IDENTIFY, is_alarm, table, note)
-        remedy = _MASS_REMEDY if BY_MASS in cause else None
-        return PlateReport("following", cause, remedy, is_alarm, table, note)
+        by_mass = _MASS_REMEDY if BY_MASS in cause else None
+        return PlateReport("following", cause, by_mass, is_alarm, table, note)
 
     def _cautious(self) -> LocalizationTable:
         return self._prepared(table_following(self._table, self.live.known.cautious_rig))
@@ -734,7 +829,7 @@ def save_learned(file: Path, known: PlateEstimate, *, table: str) -> None:
     """Write what was learned for a table by its fingerprint, atomically; raises OSError."""
     names, base = _identity(known)
     header = {"version": _VERSION, "table": table, "base": base, "names": names}
-    text = json.dumps({**header, "change": known.change})
+    text = json.dumps({**header, "change": known.change, "lying": known.lying})
     encoded = np.frombuffer(text.encode(), dtype=np.uint8)
     write_arrays(file, {"header": encoded, "x": known.x, "covariance": known.covariance})
 

@@ -110,8 +110,8 @@ class RestingFinger:
     x: float
     y: float
     fingertip: Fingertip
-    tone: int | None = None
-    """Number of the only tone during which it rests, None for all."""
+    tones: tuple[int, ...] | None = None
+    """Numbers of the tones during which it rests, None for all."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -796,8 +796,8 @@ def _finger(
     logs (4,): logarithms of the factors on contact mass, pulp, phalanx and joint.
     """
     tip, rests = finger.fingertip, np.ones(len(omega))
-    if finger.tone is not None:
-        rests = (np.arange(len(omega)) == finger.tone).astype(float)
+    if finger.tones is not None:
+        rests = np.isin(np.arange(len(omega)), finger.tones).astype(float)
     mass, pulp, phalanx, joint = np.exp(logs)
     w = omega
     Zm = -(w**2) * tip.contact_mass * mass

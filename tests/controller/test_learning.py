@@ -128,7 +128,8 @@ CORRECTED = replace(small_table())
 FOLLOWED = PlateReport("following", "the plate is followed", None)
 CHANGED = PlateReport("changed", "a crack", "look for it")
 WATCHED = PlateReport("off", "never measured", "measure it")
-PATTERN = SettledPattern(0.0, 110.0, np.zeros(4, dtype=complex), np.ones(4, dtype=complex))
+TONE = np.array([110.0])  # Hz
+PATTERN = SettledPattern(0.0, TONE, np.zeros((1, 4), complex), np.ones((1, 4), complex))
 
 
 @asynccontextmanager
@@ -441,8 +442,9 @@ async def test_nothing_is_read_while_a_hand_rests(load: float, count: int) -> No
     readings.sensors = [cast(Any, SimpleNamespace(frequency_max=500.0))]
     playing = SimpleNamespace(
         lasts=True,
-        contents={0: None},
-        drive={"SW": SimpleNamespace(frequency=100.0)},
+        contents={
+            0: SimpleNamespace(drive={"SW": SimpleNamespace(frequency=100.0, level=0.1, phase=0.0)})
+        },
         contacts=(Contact(ContactKey("a", 1), 0.1, 0.1, 0.0, load),),
         time=0.0,
         settled_after=0.1,
@@ -473,7 +475,8 @@ def test_pattern_of_nothing_is_noted_and_leaves_no_file(tmp_path: Path) -> None:
     file = tmp_path / "learned.npz"
     found = learned_table(file)
     count = len(small_table().eras)
-    nothing = SettledPattern(1.0, 110.0, np.full(count, 1e-5 + 0j), np.zeros(count, dtype=complex))
+    none = np.zeros((1, count), complex)
+    nothing = SettledPattern(1.0, TONE, none + 1e-5, none)
     report = found.take(nothing)
     assert "not used" in report.note
     assert (report.is_alarm, report.table) == (False, None)

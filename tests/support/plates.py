@@ -24,14 +24,13 @@ from scipy.integrate import solve_ivp
 from benchmarks.direct_plate import direct_acceleration
 from benchmarks.identification.plates import LENGTH as HIDDEN_LENGTH
 from benchmarks.identification.plates import WIDTH as HIDDEN_WIDTH
-from benchmarks.identification.plates import Hidden, Mounted, finger_stiffness
+from benchmarks.identification.plates import Hidden, Mounted, settled_pattern
 from benchmarks.setting import random_contacts
 from model.answer.promise import FingersOnPlate
 from model.answer.stimulus import Placement
 from model.arrays import ComplexArray, FloatArray
 from model.drive_modes import Drive, Forms
 from model.estimate.following import SettledPattern
-from model.estimate.forward import RestingFinger
 from model.estimate.measurement import Measurement, sensors_at
 from model.fem import ELEMENTS, Mesh, assemble
 from model.finger import Grid
@@ -548,13 +547,8 @@ def settled_patterns(
         factors = np.exp(0.5 * rng.standard_normal(len(places)))
         if heaviest is not None:
             factors[0] = heaviest
-        loads = np.array([finger_stiffness(frequency, np.full(4, each)) for each in factors])
-        felt = plate.accelerations(frequency, plate.at, fingers=places, loads=loads)
-        values = hidden.sensor_gain * (felt @ bases)
-        parts = rng.standard_normal((2, 4))
-        values = values + noise * np.abs(values) * (parts[0] + 1j * parts[1])
-        fingers = tuple(RestingFinger(x, y, Fingertip()) for x, y in places.tolist())
-        yield SettledPattern(number * SECONDS, frequency, bases, values, fingers)
+        tone, time = (np.array([frequency]), bases[None]), number * SECONDS
+        yield settled_pattern(hidden, plate, tone, places, factors, rng, time=time, noise=noise)
 
 
 def played(

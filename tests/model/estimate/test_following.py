@@ -427,7 +427,7 @@ def test_update_within_bounds_explains_a_pattern(
     """
     found = update(drawn, [pattern])
     count = len(found.innovation)
-    assert count == 2 * len(pattern.values)
+    assert count == 2 * pattern.values.size
     assert found.misfit < count
     assert 2 * found.fit.cost < 3 * count
     space = found.fit.space
@@ -436,7 +436,7 @@ def test_update_within_bounds_explains_a_pattern(
     # What the fit predicts is what the plate does under the fingers that it found.
     rows, own = found.fit.plate.responses[0], found.fit.x[: drawn.model.space.size]
     np.testing.assert_array_equal(found.known.x, own)
-    np.testing.assert_allclose(found.fit.predicted[0, :, 0], rows @ pattern.bases)
+    np.testing.assert_allclose(found.fit.predicted[0, :, 0], rows @ pattern.bases[0])
 
 
 def test_patterns_together_are_those_alone(drawn: PlateEstimate) -> None:
@@ -476,7 +476,7 @@ def test_numbers_change_as_their_derivatives_say(
         np.testing.assert_allclose(
             (ahead - behind) / (2 * step), J[:, number], rtol=1e-3, atol=1e-6
         )
-    turn = 1j * without.values / without.std
+    turn = (1j * without.values / without.std).ravel()
     turn = np.concatenate([turn.real, turn.imag])
     assert np.abs(turn @ J).max() < 1e-6 * np.linalg.norm(turn) * np.linalg.norm(J)
 

@@ -371,15 +371,26 @@ LEARNING_WORDS: dict[LearningState, str] = {
 """What people read of it."""
 
 
+class PlateObject(ApiMessage):
+    """An object that was found on the plate; its place is from the south-west corner."""
+
+    x_m: float
+    y_m: float
+    mass_kg: float
+
+
 class PlateEvent(CauseAndRemedy):
     """What is known of the plate has changed, or whether it is followed."""
 
     state: LearningState
     cautious: bool = Field(
         description="whether answers are those of a plate that is not known: it has changed in an "
-        "unknown way, or there was no estimator for a minute"
+        "unknown way, an object lies on it, or there was no estimator for a minute"
     )
     alarms: Count = Field(description="patterns so far that show another plate than the known one")
+    object: PlateObject | None = Field(
+        default=None, description="what lies on it, where that is the change; optional"
+    )
 
 
 class LearningSummary(PlateEvent):

@@ -21,6 +21,7 @@ from controller.effects.layout import (
     load_layout,
 )
 from controller.effects.strengths import read_strengths
+from controller.learning.learned_table import was_learned
 from controller.process.daemon_process import check_socket_path
 from controller.sources.touch import TouchCalibration, TouchSource, fitted, open_source, turned
 from drivers.by_hand.reaching import check_links
@@ -31,7 +32,6 @@ from model.config.file_kinds import CheckedFile, ConfigKind
 from model.config.units import LENGTH, LEVEL
 from model.drive_modes import DRIVE_MODES
 from model.errors import InputError
-from model.estimate.following import was_learned
 from model.finger import STRONG_DB_SL
 from model.rig.actuator_keys import Identifier
 from model.rig.rig import Rig

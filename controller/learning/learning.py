@@ -33,7 +33,9 @@ from controller.api.schema import (
     LearningState,
     LearningSummary,
     PlateEvent,
+    PlateObject,
 )
+from controller.learning.learned_table import LearnedTable, PlateReport
 from controller.learning.worker import Worker, make, of_made
 from controller.operation.plate_controller import Controller
 from controller.plate_measurement import PlateSensor, check_clocks, plate_sensors, settling
@@ -44,7 +46,7 @@ from drivers.host.amplifier_sensors import Reading, finish_reading, start_readin
 from model.answer.answer_report import Timing
 from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError
-from model.estimate.following import LearnedTable, PlateReport, SettledPattern
+from model.estimate.following import SettledPattern
 from model.estimate.forward import RestingFinger
 from model.rig.rig import Rig
 from model.table.table import LocalizationTable
@@ -480,7 +482,7 @@ class Learning:
         self.event = self.event.model_copy(update={"alarms": self.event.alarms + report.is_alarm})
         if report.is_alarm or (report.state, report.cause) != (self.event.state, self.event.cause):
             is_bad = report.is_alarm or report.state == "changed"
-            self._say(report.state, report.cause, report.remedy, is_bad=is_bad)
+            self._say(report.state, report.cause, report.remedy, is_bad=is_bad, lying=report.lying)
 
     def _note(self, note: str) -> None:
         if note:
@@ -521,10 +523,19 @@ class Learning:
             self._changed(self.event)
 
     def _say(
-        self, state: LearningState, cause: str, remedy: str | None = None, *, is_bad: bool = False
+        self,
+        state: LearningState,
+        cause: str,
+        remedy: str | None = None,
+        *,
+        is_bad: bool = False,
+        lying: tuple[float, float, float] | None = None,
     ) -> None:
-        """Set state, cause and remedy, log them and report the change."""
-        said = {"state": state, "cause": cause, "remedy": remedy}
+        """Set state, cause, remedy and what lies there, log them and report the change."""
+        found = None
+        if lying is not None:
+            found = PlateObject(x_m=lying[0], y_m=lying[1], mass_kg=lying[2])
+        said = {"state": state, "cause": cause, "remedy": remedy, "object": found}
         self.event = self.event.model_copy(update=said)
         level = logging.WARNING if is_bad else logging.INFO
         words = LEARNING_WORDS[state]

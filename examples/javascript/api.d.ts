@@ -373,10 +373,12 @@ export interface PlateEvent {
   /** what to do about it; null if nothing */
   remedy: string | null;
   state: "following" | "changed" | "off";
-  /** whether answers are those of a plate that is not known: it has changed in an unknown way, or there was no estimator for a minute */
+  /** whether answers are those of a plate that is not known: it has changed in an unknown way, an object lies on it, or there was no estimator for a minute */
   cautious: boolean;
   /** patterns so far that show another plate than the known one */
   alarms: number;
+  /** what lies on it, where that is the change; optional */
+  object?: PlateObject | null;
 }
 
 /** A touch input was opened, fell silent or was lost, or touches were rejected. */
@@ -512,10 +514,12 @@ export interface LearningSummary {
   /** what to do about it; null if nothing */
   remedy: string | null;
   state: "following" | "changed" | "off";
-  /** whether answers are those of a plate that is not known: it has changed in an unknown way, or there was no estimator for a minute */
+  /** whether answers are those of a plate that is not known: it has changed in an unknown way, an object lies on it, or there was no estimator for a minute */
   cautious: boolean;
   /** patterns so far that show another plate than the known one */
   alarms: number;
+  /** what lies on it, where that is the change; optional */
+  object?: PlateObject | null;
   /** settled patterns that were measured */
   readings: number;
   /** of these, by the estimator */
@@ -562,6 +566,13 @@ export interface EffectDescription {
   description: string;
   /** by their names in a layout, in SI units */
   parameters: Record<string, unknown>;
+}
+
+/** An object that was found on the plate; its place is from the south-west corner. */
+export interface PlateObject {
+  x_m: number;
+  y_m: number;
+  mass_kg: number;
 }
 
 /** Position of an ERA under the plate, from the south-west corner, and its wiring. */

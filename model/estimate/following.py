@@ -1,4 +1,4 @@
-"""A plate that settled patterns follow while it is driven, and a table that follows it.
+"""A plate that settled patterns follow while it is driven.
 
 The parameters of an identification drift. Each settled pattern updates them, together with the
 loads of its fingers, which are dropped afterwards: the one fit, with what was known before as its
@@ -18,27 +18,23 @@ it still leaves residuals beyond chance, as for a crack or a hand that rests on 
 counts as changed until patterns fit it again as it was: its table is that of the plate as last
 known, with the errors of one that was not measured.
 
-A `LearnedTable` is a table in service that follows a `LivePlate`, says in words how the plate is
-known, and keeps in a file what was learned.
+An object of 10 g or more, such as a cup, is such a change as well, whose place and mass are found.
+It is sought where forces of any size and phase at each tone explain most, which holds for a load of
+any kind, and fitted as a mass on a contact spring. Its residuals are not held against it, since a
+cup is no point. The plate is as known before, so that its table has that mass in its uncertainty.
 """
 
-import json
-import time as clock
-import zipfile
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
-from pathlib import Path
-from typing import Any, Final, Literal, Self
+from typing import Final, Self
 
 import numpy as np
 from scipy import linalg
 from scipy.special import chdtrc
 
-from model.answer.plan import prepare_answers
 from model.arrays import ComplexArray, FloatArray, best_by, best_of, ranked_by
-from model.errors import InputError
 from model.estimate.fit import Fit, best_gains, fit
 from model.estimate.forward import (
     FINGER_PARTS,
@@ -52,14 +48,10 @@ from model.estimate.forward import (
 from model.estimate.identify import solved_for
 from model.estimate.measurement import Measurement
 from model.estimate.space import rig_with, space_of
-from model.files.array_file import UNREADABLE, read_arrays, remove_partial, write_arrays
-from model.files.output_paths import begins_with
 from model.finger import Grid
 from model.rig.rig import BOUNDS, Rig, Uncertainty
 from model.structure.attachments import object_load
 from model.structure.modal_elasticity import lowest_elastic
-from model.table.table import LocalizationTable
-from model.table.table_file import table_following
 
 _NOISE, _FLOOR = 0.01, 0.1
 """Largest noise of a reading relative to its size, and its floor relative to the sensors' rms."""
@@ -106,27 +98,15 @@ _NOT_STATED = (
 )
 """Kinds whose uncertainty a rig does not state."""
 
-_IDENTIFIED = 0.5  # of the thickness error of a plate that was not measured
 OBJECT = "an object"
 _LEAST_OBJECT = 0.01  # kg; what is lighter is followed as a mass where it explains all
-_OBJECT_MASSES = (0.02, 0.06, 0.2)  # kg, from which to search
+_OBJECT_STARTS = ((0.02, 0.005), (0.02, 0.05), (0.1, 0.005), (0.1, 0.05))
+"""Masses [kg] from which to search, each with one by whose contact's damping."""
 _PLACE_STEPS = (0.01, 0.005)  # m; by which the place of an object is refined
 _OBJECT_STD = (0.0, 0.5, 1.0, 0.0)  # of the logarithms of contact stiffness and mass
 _OBJECT_COST = 3 * _COST_OF_CHANGE  # of its mass and of its place
 OBJECT_PLACES: Final = Grid(18, 14)
 """Cells in whose middles objects are looked for."""
-
-_HELD = "the plate is not as known; the next patterns tell what has changed"
-_CHANGED_REMEDY = (
-    "run era rig check, and look for a loose mount, a crack or something on the plate; then "
-    "identify it (era rig identify), or discard what was learned (era forget)"
-)
-_IDENTIFY = "identify the plate (era rig identify)"
-_MASS_REMEDY = "take away what lies on the plate, or run era rig check"
-
-_VERSION = 3
-_TYPES = {"header": "|u1", "x": "<f8", "covariance": "<f8"}
-_MAX_BYTES = 1 << 24
 
 
 @dataclass(frozen=True, eq=False)
@@ -209,6 +189,11 @@ class PlateEstimate:
         std[space.of(*_NOT_STATED)] = std[space.index("thickness")]
         std[space.groups["masses"]] = 0.0
         return cls(model, np.zeros(space.size), np.diag(std**2))
+
+    @property
+    def unchanged(self) -> Self:
+        """The same plate, once it is again as it was."""
+        return replace(self, change="", lying=None)
 
     def at(self, time: float) -> Self:
         """Return it for a later time [s], less certain by the drift since its last update."""
@@ -575,8 +560,9 @@ def _hypotheses(
         yield BY_MASS, dict(zip(range(mass, mass + 3), [_MASS, *sides / 3], strict=True)), start, ()
     points = OBJECT_PLACES.centres(plate)
     x, y = points[best_of(unchanged.explained_at(points))].tolist()
-    for each in _OBJECT_MASSES:
-        yield OBJECT, {}, None, (RestingFinger(x, y, object_load(each)),)
+    for size, damped in _OBJECT_STARTS:
+        load = replace(object_load(damped), phalanx_mass=size)
+        yield OBJECT, {}, None, (RestingFinger(x, y, load),)
 
 
 @dataclass(frozen=True, eq=False)
@@ -622,14 +608,14 @@ class LivePlate:
         if suspect is not None:
             self._alarm = Alarm()
             if not known.why_off and not known.change:
-                self.known = replace(suspect[0].before, change="")
+                self.known = suspect[0].before.unchanged
                 self._held, self._suspects = [e.patterns[0] for e in suspect], len(suspect)
                 report = self._explained(pattern.time)
             return replace(report, alarm=not known.change)
         if known.change and self._alarm.is_full:
-            known = self.known = replace(known, change="", lying=None)
+            known = self.known = known.unchanged
         if not known.why_off and not known.change and not self._alarm.is_odd:
-            self.known = replace(after.known, change="")
+            self.known = after.known.unchanged
             self._noise.take(after.misfit, after.freedom)
         return report
 
@@ -649,223 +635,3 @@ class LivePlate:
         changed = replace(self.known, change=str(found), lying=found.of_object)
         self.known = found.after.known if is_followed else changed
         return PatternReport(explanation=found)
-
-
-@dataclass(frozen=True, eq=False)
-class PlateReport:
-    """The plate as a learned table knows it, after its start or a pattern."""
-
-    state: Literal["following", "changed", "off"]
-    cause: str
-    remedy: str | None
-    is_alarm: bool = False
-    """Whether the pattern is not of the plate as known."""
-    table: LocalizationTable | None = None
-    """Corrected table, prepared for its first touch; None: answers stay as they are."""
-    note: str = ""
-    """A line for the log; else ""."""
-    lying: tuple[float, float, float] | None = None
-    """As of the plate."""
-
-
-class LearnedTable:
-    """A table in service, corrected by the settled patterns of its plate; raises InputError.
-
-    table: of the rig as built, never changed; sensors: those that readings come from; drive_mode:
-    of the questions that answers are prepared for; file: keeps what is learned. One that is
-    damaged, of another plate, or of one that no table can follow is renamed.
-    """
-
-    def __init__(
-        self,
-        rig: Rig,
-        table: LocalizationTable,
-        sensors: Sequence[Sensor],
-        drive_mode: str,
-        file: Path,
-    ) -> None:
-        self._table, self._drive_mode, self._file = table, drive_mode, file
-        known = replace(PlateEstimate.of_rig(rig, sensors), why_off=why_only_alarms(rig))
-        self.live = LivePlate(known)
-        self.current = table
-        """The table as corrected so far."""
-        self._cause, self._alarms = "the plate is followed from the rig as built on", 0
-        self._note, self._is_kept = "", True
-        remove_partial(file)
-        try:
-            if file.exists():
-                self._resume(known)
-        except ValueError as error:  # InputError and LinAlgError are such
-            self._note = f"learning anew: {error}; {_set_aside(file)}"
-
-    def _resume(self, known: PlateEstimate) -> None:
-        """Resume with what the file holds; the plate has drifted since it was written."""
-        header, x, covariance = load_learned(self._file, table=self._table.fingerprint)
-        if (header["names"], header["base"]) != _identity(known):
-            raise InputError(
-                f"{self._file}: parameters must be those of this rig and its sensors; remove the "
-                "file to learn anew"
-            )
-        then = clock.monotonic() - max(clock.time() - self._file.stat().st_mtime, 0.0)
-        known = replace(known, x=x, covariance=covariance, time=then, change=header["change"])
-        known = replace(known, lying=header.get("lying"))
-        self.current, self.live = self._followed(known), LivePlate(known)
-        self._cause = "the plate is followed from what was learned before on"
-
-    def start(self) -> tuple[PlateReport, LocalizationTable]:
-        """Report what was learned before, with the cautious table."""
-        found = None if self.current is self._table else self.current
-        return self._report(found, note=self._note), self._cautious()
-
-    def take(self, pattern: SettledPattern) -> PlateReport:
-        """Take a settled pattern, and correct the table by it.
-
-        One without readings, or one that leads to a plate that no table can follow, is not used,
-        and a note says so: what was known before is restored, suspect patterns are discarded.
-        """
-        before = self.live.known
-        try:
-            if not np.isfinite(pattern.values).all() or not np.any(pattern.values):
-                raise InputError("readings must be finite and not all 0, got others")
-            found, known = self.live.take(pattern), self.live.known
-            is_new = known.x is not before.x or bool(known.change) != bool(before.change)
-            table = self._followed(known) if is_new else None
-        except Exception as error:
-            self.live = LivePlate(before)
-            if not isinstance(error, ValueError):  # InputError and LinAlgError are such
-                raise
-            return self._report(None, note=f"a pattern is not used: {error}")
-        if table is not None:
-            self.current, self._is_kept = table, False
-        self._alarms += found.alarm
-        if found.explanation is not None:
-            self._cause = f"the plate has changed: {found.explanation}"
-        elif found.is_held:
-            self._cause = _HELD
-        elif found.alarm:
-            self._cause = f"the plate is not as the rig says (alarm {self._alarms})"
-        elif before.change or self._cause == _HELD:
-            self._cause = "the plate is again as it was"
-        return self._report(table, is_alarm=found.alarm)
-
-    def keep(self) -> tuple[str, LocalizationTable | None]:
-        """Write what was learned since; return why it could not be, and the cautious table of it.
-
-        The next call tries again, with the same reason once only. None: the table is as before.
-        """
-        if self._is_kept:
-            return "", None
-        before, self._note = self._note, ""
-        try:
-            save_learned(self._file, self.live.known, table=self._table.fingerprint)
-        except OSError as error:
-            self._note = f"{self._file}: not written: {error}"
-        self._is_kept = not self._note
-        return "" if self._note == before else self._note, self._cautious()
-
-    def _followed(self, known: PlateEstimate) -> LocalizationTable:
-        """Return the table for a plate as it is known; raises InputError if none can follow it."""
-        if not np.isfinite(known.x).all() or not np.isfinite(known.covariance).all():
-            raise InputError("parameters must be finite, got others")
-        return table_following(self._table, known.cautious_rig if known.change else known.rig)
-
-    def _report(
-        self, table: LocalizationTable | None, *, is_alarm: bool = False, note: str = ""
-    ) -> PlateReport:
-        known, cause = self.live.known, self._cause
-        table = None if table is None else self._prepared(table)
-        if known.change:
-            remedy = _MASS_REMEDY if known.lying else _CHANGED_REMEDY
-            changed = PlateReport("changed", known.change, remedy, is_alarm, table, note)
-            return replace(changed, lying=known.lying)
-        if known.why_off:
-            cause = cause if self._alarms else f"answers stay as built: {known.why_off}"
-            return PlateReport("off", cause, _IDENTIFY, is_alarm, table, note)
-        by_mass = _MASS_REMEDY if BY_MASS in cause else None
-        return PlateReport("following", cause, by_mass, is_alarm, table, note)
-
-    def _cautious(self) -> LocalizationTable:
-        return self._prepared(table_following(self._table, self.live.known.cautious_rig))
-
-    def _prepared(self, table: LocalizationTable) -> LocalizationTable:
-        table = replace(table)  # not the one that the next correction starts from
-        prepare_answers(table, self._drive_mode)
-        _ = table.in_time
-        return table
-
-
-def why_only_alarms(rig: Rig) -> str:
-    """Return why patterns may not correct answers of a rig, or nothing.
-
-    Corrections of a plate that was never measured would put its form errors into other parameters.
-    """
-    stated, built = rig.uncertainty.thickness, Uncertainty().thickness
-    if not stated:
-        return "the rig's uncertainty takes its thickness as known exactly"
-    if stated > _IDENTIFIED * built:
-        return (
-            f"the rig's uncertainty of thickness must be at most {100 * _IDENTIFIED * built:g} %, "
-            f"that of a plate that was measured, got {100 * stated:g} %"
-        )
-    return ""
-
-
-def _set_aside(file: Path) -> str:
-    """Rename a file that is not resumed; return what was done, or why not."""
-    old = file.with_name(f"{file.name}.old")
-    try:
-        file.replace(old)
-    except OSError as error:
-        return f"it could not be renamed and will be replaced: {error}"
-    return f"it is {old} now"
-
-
-def _identity(known: PlateEstimate) -> tuple[list[str], str]:
-    """Names of the parameters of a plate, and fingerprint of the rig that they count from."""
-    return [*known.model.space.names], known.model.rig.fingerprint
-
-
-def save_learned(file: Path, known: PlateEstimate, *, table: str) -> None:
-    """Write what was learned for a table by its fingerprint, atomically; raises OSError."""
-    names, base = _identity(known)
-    header = {"version": _VERSION, "table": table, "base": base, "names": names}
-    text = json.dumps({**header, "change": known.change, "lying": known.lying})
-    encoded = np.frombuffer(text.encode(), dtype=np.uint8)
-    write_arrays(file, {"header": encoded, "x": known.x, "covariance": known.covariance})
-
-
-def load_learned(file: Path, *, table: str) -> tuple[dict[str, Any], FloatArray, FloatArray]:
-    """Read what was learned for a table by its fingerprint: header, parameters, covariance.
-
-    Raises InputError for a damaged file, another version, or another table.
-    """
-    try:
-        arrays = read_arrays(file, _TYPES, max_bytes=_MAX_BYTES)
-        header = json.loads(arrays["header"].tobytes())
-        x, covariance = arrays["x"], arrays["covariance"]
-        version, p = header["version"], len(header["names"])
-        of, _, _ = header["table"], header["base"], header["change"]
-    except (*UNREADABLE, KeyError, TypeError) as error:
-        why = (isinstance(error, OSError) and error.strerror) or error
-        raise InputError(
-            f"{file}: must be a learned plate: {why}; remove the file to learn anew"
-        ) from error
-    if version != _VERSION or x.shape != (p,) or covariance.shape != (p, p):
-        raise InputError(f"{file}: version must be {_VERSION}; remove the file to learn anew")
-    if of != table:
-        raise InputError(
-            f"{file}: must be learned for this table, got one of another rig; remove the file to "
-            "learn anew"
-        )
-    return header, x, covariance
-
-
-def was_learned(file: Path) -> bool:
-    """Whether a file is a learned plate of any version, or may have been before it was damaged."""
-    if not begins_with(file, b"PK"):
-        return False
-    try:
-        with zipfile.ZipFile(file) as members:
-            return "covariance.npy" in members.namelist()
-    except zipfile.BadZipFile:
-        return True

@@ -16,18 +16,22 @@ import numpy as np
 import pytest
 
 from controller.api.schema import LatencySummary, LearningState, PlateEvent
+from controller.learning import learned_table as learned_table_module
 from controller.learning import learning as module
+from controller.learning.learned_table import LearnedTable, PlateReport
 from controller.learning.learning import Learning, SettledReadings
 from controller.learning.worker import MAX_MEMORY, Worker, make
 from controller.operation.plate_controller import Controller
-from controller.plate_measurement import settling
+from controller.plate_measurement import PlateSensor, settling
 from controller.play.loop import Observers
+from controller.play.routing import Drive
 from controller.sources.touch import Contact, ContactKey
 from drivers.errors import CommandError, LinkError
+from drivers.host.amplifier import Reading, SensorReading
+from drivers.playing import AmplifierTone
 from model.answer.answer_report import Timing
 from model.errors import InputError
-from model.estimate import following
-from model.estimate.following import LearnedTable, PatternReport, PlateReport, SettledPattern
+from model.estimate.following import PatternReport, SettledPattern
 from model.estimate.forward import Sensor
 from model.rig.rig_file import example_rig_path
 from model.table.table import LocalizationTable
@@ -127,6 +131,7 @@ CAUTIOUS = replace(small_table())
 CORRECTED = replace(small_table())
 FOLLOWED = PlateReport("following", "the plate is followed", None)
 CHANGED = PlateReport("changed", "a crack", "look for it")
+CUP = replace(CHANGED, cause="a cup lies there", lying=(0.1, 0.2, 0.3))
 WATCHED = PlateReport("off", "never measured", "measure it")
 TONE = np.array([110.0])  # Hz
 PATTERN = SettledPattern(0.0, TONE, np.zeros((1, 4), complex), np.ones((1, 4), complex))
@@ -176,6 +181,7 @@ class Course:
     state: LearningState
     is_cautious: bool | None = None
     taken: int | None = None
+    lying: tuple[float, float, float] | None = None
     levels: Sequence[str] | None = None
 
 
@@ -214,6 +220,13 @@ COURSES = {
             Course(replace(WATCHED, is_alarm=True), "off", taken=0, levels=["WARNING"]),
         ],
     ),
+    "an object is said until it is gone": (
+        FOLLOWED,
+        [
+            Course(replace(CUP, table=CORRECTED), "changed", is_cautious=True, lying=CUP.lying),
+            Course(AGAIN, "following"),
+        ],
+    ),
     "a note is logged": (
         FOLLOWED,
         [Course(replace(FOLLOWED, note="not used"), "following", levels=["WARNING"])],
@@ -238,6 +251,8 @@ async def test_status_follows_the_estimator(
             logged = [found.levelname for found in caplog.records]
             assert learning.event.state == each.state, each
             assert each.is_cautious in (None, learning.event.cautious), each
+            found = learning.event.object
+            assert each.lying == (found and (found.x_m, found.y_m, found.mass_kg)), each
             assert each.taken in (None, len(taking.taken)), each
             assert each.levels in (None, logged), each
             assert events[-1] == learning.event or not logged
@@ -433,34 +448,100 @@ async def test_patterns_wait_for_a_slow_estimator_up_to_a_number(
         assert counted(learning, "estimates", "discarded") == (17, 2)
 
 
-@pytest.mark.parametrize(("load", "count"), [(1.0, 1), (HAND_LOAD, 0)])
-@in_virtual_time
-async def test_nothing_is_read_while_a_hand_rests(load: float, count: int) -> None:
-    """Its load is hardly known, so that it would be taken for a change of the plate."""
-    read, observers = list[Any](), Observers()
-    readings = SettledReadings(make_paper_rig(12, 9), cast(Any, None), take=read.append)
-    readings.sensors = [cast(Any, SimpleNamespace(frequency_max=500.0))]
+def tone(frequency: float, level: float, phase: float) -> AmplifierTone:
+    """One in Hz, as a share of full level, in degrees."""
+    return AmplifierTone(0, frequency, level, phase)
+
+
+def settled_readings(take: Callable[[SettledPattern], None]) -> SettledReadings:
+    """Of the paper's rig, whose amplifier has a sensor at each ERA."""
+    rig = make_paper_rig(12, 9)
+    controller = SimpleNamespace(amplifiers={"main": None})
+    found = SettledReadings(rig, cast(Any, controller), take=take)
+    places = [Sensor(era.name, era.name) for era in rig.eras]
+    found.sensors = [PlateSensor("main", n, place, 0, 500.0) for n, place in enumerate(places)]
+    return found
+
+
+async def read_of(readings: SettledReadings, drives: Sequence[Drive], *, load: float = 1.0) -> None:
+    """Have a second pass in which contents of some drives play under a finger of a load."""
+    observers = Observers()
     playing = SimpleNamespace(
         lasts=True,
-        contents={
-            0: SimpleNamespace(drive={"SW": SimpleNamespace(frequency=100.0, level=0.1, phase=0.0)})
-        },
+        contents={n: SimpleNamespace(drive=drive) for n, drive in enumerate(drives)},
         contacts=(Contact(ContactKey("a", 1), 0.1, 0.1, 0.0, load),),
         time=0.0,
         settled_after=0.1,
     )
-
-    async def settled(applied: Any, contacts: object) -> Any:
-        return applied
-
-    cast(Any, readings)._read = settled
     readings.observe(observers)
     running = asyncio.create_task(readings.run())
     for callback in observers.reported:
         callback(cast(Any, playing))
     await asyncio.sleep(1.0)
     running.cancel()
+
+
+@pytest.fixture
+def heard(monkeypatch: pytest.MonkeyPatch) -> list[Sequence[float]]:
+    """Tones that were read; each sensor hears each tone by its frequency and its own number."""
+    asked = list[Sequence[float]]()
+
+    async def start(amplifier: object, frequencies: Sequence[float], window: float) -> Reading:
+        asked.append(frequencies)
+        return Reading(1, "RUNNING", window, 0, 0, len(frequencies), ())
+
+    async def finish(amplifier: object, started: Reading) -> Reading:
+        tones = [[(frequency + n, 0.0) for frequency in asked[-1]] for n in range(4)]
+        sensors = tuple(SensorReading(is_overloaded=False, tones=tuple(each)) for each in tones)
+        return replace(started, state="COMPLETE", sensors=sensors)
+
+    monkeypatch.setattr(module, "start_reading", start)
+    monkeypatch.setattr(module, "finish_reading", finish)
+    return asked
+
+
+@pytest.mark.parametrize(("load", "count"), [(1.0, 1), (HAND_LOAD, 0)])
+@in_virtual_time
+async def test_nothing_is_read_while_a_hand_rests(
+    heard: list[Sequence[float]], load: float, count: int
+) -> None:
+    """Its load is hardly known, so that it would be taken for a change of the plate."""
+    read = list[SettledPattern]()
+    await read_of(settled_readings(read.append), [{"SW": tone(100.0, 0.1, 0.0)}], load=load)
     assert len(read) == count
+
+
+@in_virtual_time
+async def test_contents_that_play_at_once_are_read_together(heard: list[Sequence[float]]) -> None:
+    """Each tone with the bases that play it; not one where the harmonic of another is heard."""
+    read = list[SettledPattern]()
+    drives = [
+        {"NE": tone(200.0, 0.5, 0.0)},
+        {"SW": tone(100.0, 0.1, 90.0), "SE": tone(100.0, 0.2, 180.0)},
+        {"NW": tone(150.0, 0.3, 0.0)},
+    ]
+    await read_of(settled_readings(read.append), drives)
+    (found,) = read
+    assert heard == [[100.0, 150.0, 200.0]]
+    assert found.frequencies.tolist() == [100.0, 150.0]
+    np.testing.assert_allclose(found.values, [100 + np.arange(4), 150 + np.arange(4)])
+    stroke = 100e-6  # m; of the rig
+    bases = [[0.1j * stroke, -0.2 * stroke, 0, 0], [0, 0, 0, 0.3 * stroke]]
+    np.testing.assert_allclose(found.bases, bases, atol=1e-12)
+
+
+@in_virtual_time
+async def test_contents_that_no_reading_tells_apart_are_not_read(
+    heard: list[Sequence[float]],
+) -> None:
+    """Two of one frequency, or 3 Hz apart where a window is 0.2 s."""
+    for frequency in (100.0, 103.0):
+        drives = [
+            {"SW": tone(100.0, 0.1, 0.0)},
+            {"SE": tone(frequency, 0.1, 0.0)},
+        ]
+        await read_of(settled_readings(lambda pattern: None), drives)
+    assert not heard
 
 
 def learned_table(file: Path) -> LearnedTable:
@@ -522,7 +603,7 @@ def test_folder_without_room_is_noted_once(tmp_path: Path, monkeypatch: pytest.M
         found.live.known = replace(found.live.known, x=found.live.known.x.copy())
         return PatternReport()
 
-    monkeypatch.setattr(following, "save_learned", save)
+    monkeypatch.setattr(learned_table_module, "save_learned", save)
     monkeypatch.setattr(found.live, "take", take)
     found.take(PATTERN)
     notes = []

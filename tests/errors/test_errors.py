@@ -26,6 +26,7 @@ from controller.content.formats import read_content
 from controller.effects.layout import load_layout
 from controller.effects.strengths import read_strengths
 from controller.gateway.gateway_settings import read_token
+from controller.learning.learned_table import load_learned
 from controller.sources.touch import open_source
 from controller.sources.tuio import read_capture
 from drivers.errors import CommandError
@@ -51,7 +52,6 @@ from model.config.document import read_document
 from model.config.units import parse_frequencies
 from model.errors import InputError
 from model.estimate import calibrate
-from model.estimate.following import load_learned
 from model.estimate.measurement import read_measured, read_places
 from model.files.array_file import UNREADABLE, read_arrays
 from model.processes import on_cluster

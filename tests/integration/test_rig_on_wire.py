@@ -33,6 +33,7 @@ from controller.cli.commands import app
 from controller.daemon.daemon import Daemon
 from controller.demo.recorder import FingerVibration, steady_contrast_db
 from controller.learning import learning as learning_module
+from controller.learning.learned_table import load_learned
 from controller.learning.worker import Worker
 from controller.process.daemon_process import SocketLock
 from daemons import PATIENCE, daemon_at, far_end, ready
@@ -50,7 +51,6 @@ from gateway_bench import (
 )
 from long_form import shortly
 from model.errors import InputError
-from model.estimate.following import load_learned
 from model.estimate.measurement import write_responses_csv, write_responses_uff
 from model.rig.rig import Rig
 from model.rig.rig_file import example_rig_path, load_rig

@@ -268,7 +268,8 @@ const HANDLERS = {
   latency({ latency_ms }) {
     showLatency(at("latency-numbers"), at("latency"), latency_ms);
   },
-  plate({ state, cause, remedy, cautious, alarms }) {
+  plate({ state, cause, remedy, cautious, alarms, object }) {
+    overlay.show({ object: object ?? null });
     const words = state === "changed" ? "changed, promises lowered until you run era rig check" : state;
     const isAlarm = alarms > knownAlarms;
     knownAlarms = alarms;

@@ -28,23 +28,24 @@ from benchmarks.identification.plates import (
     draw,
     finger_stiffness,
     outcome,
+    pattern_of_touches,
     table_of,
 )
+from controller.learning import learned_table as learned_table_module
+from controller.learning.learned_table import LearnedTable, save_learned
 from long_form import shortly
 from model.arrays import FloatArray
 from model.errors import InputError
-from model.estimate import following
 from model.estimate.fit import Fit
 from model.estimate.following import (
     WINDOW,
     Alarm,
-    LearnedTable,
     LivePlate,
     NoiseLevel,
+    PatternReport,
     PlateEstimate,
     PlateUpdate,
     SettledPattern,
-    save_learned,
     update,
 )
 from model.estimate.forward import Sensor
@@ -128,7 +129,7 @@ def test_pattern_that_no_table_follows_leaves_the_state(
         raise InputError("thickness must be within 10 %, got 20 %")
 
     with monkeypatch.context() as patch:
-        patch.setattr(following, "table_following", refused)
+        patch.setattr(learned_table_module, "table_following", refused)
         report = learned.take(second)
     assert "not used: thickness" in report.note
     assert report.table is None
@@ -145,6 +146,14 @@ def test_what_was_learned_is_resumed_for_its_table_only(
     learned = learned_table(table, known, file)
     played(learned.take, hidden, hidden.mounted, count=3)
     after = learned.live.known
+    lying = (0.1, 0.2, 0.05)
+    cup = replace(after, change="a cup", lying=lying)
+    save_learned(file, cup, table=table.fingerprint)
+    beside = learned_table(table, known, file)
+    report, _ = beside.start()
+    assert (report.cause, tuple(report.lying or ())) == ("a cup", lying)
+    assert "take away" in str(report.remedy)
+    assert beside.current.uncertainty == replace(table.uncertainty, foreign_mass=0.05)
     save_learned(file, replace(after, change="a crack"), table=table.fingerprint)
     cautious = learned_table(table, known, file)
     assert cautious.start()[0].cause == "a crack"
@@ -234,6 +243,47 @@ def test_sticker_is_named_in_its_place(hidden: Hidden, known: PlateEstimate) -> 
     added = live.known.rig.masses[-1]
     assert added.mass == pytest.approx(3e-3, abs=0.6e-3)
     assert (added.x, added.y) == pytest.approx((0.11, 0.16), abs=0.015)
+
+
+@pytest.mark.parametrize("mass", shortly([0.05, 0.2], [0.2]))
+def test_object_is_noticed_where_it_lies_until_it_is_gone(
+    hidden: Hidden, known: PlateEstimate, mass: float
+) -> None:
+    """A phone and a cup within 10 s of touches, to 2 cm; promises count it, for 10 s after.
+
+    A touch every two seconds. What is known of the plate itself stays as it was.
+    """
+    live, rng = LivePlate(known), np.random.default_rng(3)
+
+    def touched(start: int, lying: tuple[float, float, float] | None) -> list[PatternReport]:
+        times = 2.0 * np.arange(start, start + 5)
+        return [live.take(pattern_of_touches(hidden, rng, time=t, lying=lying)) for t in times]
+
+    assert not any(each.alarm for each in touched(0, None))
+    before = live.known
+    reports = touched(5, (0.2, 0.09, mass))
+    assert [str(each.explanation) for each in reports if each.explanation] == [live.known.change]
+    assert live.known.lying is not None
+    x, y, found = live.known.lying
+    assert np.hypot(x - 0.2, y - 0.09) < 0.02
+    assert mass / 5 < found < 5 * mass
+    assert f"near ({x:.2f}, {y:.2f}) m" in live.known.change
+    promised = replace(before.rig.uncertainty, foreign_mass=found)
+    assert live.known.cautious_rig.uncertainty == promised
+    assert live.known.x is before.x
+    touched(10, None)
+    assert (live.known.change, live.known.lying) == ("", None)
+
+
+@pytest.mark.parametrize("hours", shortly([0.2, 1.0], [0.2]))
+def test_nothing_is_accused_of_lying_there(
+    hidden: Hidden, known: PlateEstimate, hours: float
+) -> None:
+    """Not in hours of a touch each 12 s under one to three contents at once."""
+    live, rng = LivePlate(known), np.random.default_rng(4)
+    times = np.arange(0.0, 3600 * hours, 12.0)
+    quiet = [live.take(pattern_of_touches(hidden, rng, time=t)) for t in times]
+    assert not any(each.alarm for each in quiet)
 
 
 def test_heavy_finger_is_no_change(hidden: Hidden, known: PlateEstimate) -> None:

@@ -27,7 +27,7 @@ from controller.play.loop import Observers
 from controller.play.routing import Drive
 from controller.sources.touch import Contact, ContactKey
 from drivers.errors import CommandError, LinkError
-from drivers.host.amplifier import Reading, SensorReading
+from drivers.host.amplifier_sensors import Reading, SensorReading
 from drivers.playing import AmplifierTone
 from model.answer.answer_report import Timing
 from model.errors import InputError
@@ -456,10 +456,11 @@ def tone(frequency: float, level: float, phase: float) -> AmplifierTone:
 def settled_readings(take: Callable[[SettledPattern], None]) -> SettledReadings:
     """Of the paper's rig, whose amplifier has a sensor at each ERA."""
     rig = make_paper_rig(12, 9)
-    controller = SimpleNamespace(amplifiers={"main": None})
-    found = SettledReadings(rig, cast(Any, controller), take=take)
-    places = [Sensor(era.name, era.name) for era in rig.eras]
-    found.sensors = [PlateSensor("main", n, place, 0, 500.0) for n, place in enumerate(places)]
+    found = SettledReadings(rig, cast(Any, SimpleNamespace(amplifiers={"main": None})), take=take)
+    found.sensors = [
+        PlateSensor("main", number, Sensor(era.name, era.name), 0, 500.0)
+        for number, era in enumerate(rig.eras)
+    ]
     return found
 
 
@@ -491,9 +492,11 @@ def heard(monkeypatch: pytest.MonkeyPatch) -> list[Sequence[float]]:
         return Reading(1, "RUNNING", window, 0, 0, len(frequencies), ())
 
     async def finish(amplifier: object, started: Reading) -> Reading:
-        tones = [[(frequency + n, 0.0) for frequency in asked[-1]] for n in range(4)]
-        sensors = tuple(SensorReading(is_overloaded=False, tones=tuple(each)) for each in tones)
-        return replace(started, state="COMPLETE", sensors=sensors)
+        heard = [
+            SensorReading(False, tuple([(frequency + n, 0.0) for frequency in asked[-1]]))
+            for n in range(4)
+        ]
+        return replace(started, state="COMPLETE", sensors=tuple(heard))
 
     monkeypatch.setattr(module, "start_reading", start)
     monkeypatch.setattr(module, "finish_reading", finish)

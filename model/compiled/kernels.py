@@ -246,7 +246,9 @@ def kept_library(
     its name in messages. Raises InputError.
     """
     sources = list(sources)
-    file = f"{name}-{_libc()}-{_digest([*sources, *headers], flags)}.so"
+    # The C library and its version, if known: glibc2.36.
+    libc = "".join(platform.libc_ver()) or str(sysconfig.get_config_var("HOST_GNU_TYPE"))
+    file = f"{name}-{libc}-{_digest([*sources, *headers], flags)}.so"
     try:
         folder = _own_folder(cache_folder())
     except OSError as error:
@@ -336,11 +338,6 @@ def _clean_up(folder: Path) -> None:
 
 def _checksum_file(path: Path) -> Path:
     return path.with_name(f"{path.name}.sha256")
-
-
-def _libc() -> str:
-    """Return the C library and its version, if known: `glibc2.36`."""
-    return "".join(platform.libc_ver()) or str(sysconfig.get_config_var("HOST_GNU_TYPE"))
 
 
 def _digest(files: Iterable[Path], flags: Sequence[str]) -> str:

@@ -560,7 +560,17 @@ def as_json(verdict: Verdict) -> dict[str, Any]:
         "plate": {
             "matches": verdict.plate_matches,
             **corrections,
-            "beyond": _beyond_json(beyond) if beyond else None,
+            "beyond": {
+                "kind": beyond[0].kind,
+                "thicker_at_end_of_x": None,
+                "thicker_at_end_of_y": None,
+                "farthest": None,
+                "standard_deviations": None,
+                **beyond[0].json,
+                "loads": [load for each in beyond for load in each.json.get("loads", ())],
+            }
+            if beyond
+            else None,
             "changes": verdict.changes or {},
             "kept_share": verdict.kept_share,
             "promise_margins_db": [*verdict.promise_margins],
@@ -603,16 +613,4 @@ def as_json(verdict: Verdict) -> dict[str, Any]:
         "sensor_count": len(verdict.sensors),
         "drive_frequencies_hz": verdict.frequencies.tolist(),
         "findings": verdict_rows(verdict),
-    }
-
-
-def _beyond_json(found: Sequence[Finding]) -> dict[str, Any]:
-    return {
-        "kind": found[0].kind,
-        "thicker_at_end_of_x": None,
-        "thicker_at_end_of_y": None,
-        "farthest": None,
-        "standard_deviations": None,
-        **found[0].json,
-        "loads": [load for each in found for load in each.json.get("loads", ())],
     }

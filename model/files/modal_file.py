@@ -1,11 +1,12 @@
-"""Modes of a surface from another program: universal files (UFF) and NumPy files (.npz).
+"""Modes of a surface from another program: universal files (UFF), NumPy files (.npz) and CSV.
 
 Of a universal file nodes (datasets 15 and 2411), shell elements (2412), modes (55 and 2414) and
 units (164) are read by position, as the definitions of the format state them (Structural Dynamics
 Research Laboratory, University of Cincinnati); other datasets are passed over. Values may be in any
 spelling of Fortran. A .npz has the arrays nodes (n, 3) [m], frequencies (r,) [Hz] and shapes
 (r, n, 3), or (r, n) along the normal, [1/sqrt(kg)]; further damping_ratios (r,), places (n, 2) [m]
-of the nodes in coordinates of touches, and faces (k, 3 or more), rows of node numbers from 0.
+of the nodes in coordinates of touches, and faces (k, 3 or more), rows of node numbers from 0. A
+.csv has a line for each node of each mode, with the columns of `_COLUMNS` and damping_ratio.
 """
 
 import math
@@ -19,6 +20,7 @@ import numpy as np
 
 from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError
+from model.files.csv_file import read_lines
 from model.files.uff import DatasetBlock, blocks, numbers_in, read_nodes, rows_of, units_of
 
 _SHELLS = frozenset(range(40, 100)) | {171, 172}  # plane stress, plates, membranes, thin shells
@@ -32,6 +34,7 @@ _HEAD = {55: (9, 6), 2414: (14, 9)}
 
 _ARRAYS = {"nodes", "frequencies", "shapes"}
 _FURTHER = {"damping_ratios", "places", "faces"}
+_COLUMNS = ("mode", "frequency_hz", "x_m", "y_m", "z_m", "shape_x", "shape_y", "shape_z")
 _BINARY_ZIP = b"PK\x03\x04"
 
 
@@ -63,6 +66,8 @@ def read_modes(path: Path, content: bytes) -> ModeShapes:
     modes = (
         _from_arrays(path, content)
         if content.startswith(_BINARY_ZIP)
+        else _from_lines(path)
+        if path.suffix.lower() == ".csv"
         else _from_universal(path, content)
     )
     for name in ("nodes", "frequencies", "shapes"):
@@ -105,6 +110,26 @@ def _from_arrays(path: Path, content: bytes) -> ModeShapes:
         held.get("damping_ratios", np.full(r, math.nan)).astype(float),
         faces.tolist(),
         None if places is None else places.astype(float),
+    )
+
+
+def _from_lines(path: Path) -> ModeShapes:
+    """Read a CSV file: one mode after another, each at the same nodes in the same order."""
+    lines = read_lines(path, _COLUMNS, optional=["damping_ratio"])
+    values = np.array([[line.number(each) for each in _COLUMNS] for line in lines])
+    count, rows = int((values[:, 0] == values[0, 0]).sum()), np.arange(len(lines))
+    first = np.hstack([values[rows - rows % count, :2], values[rows % count, 2:5]])
+    if len(lines) % count or (other := (values[:, :5] != first).any(axis=1)).any():
+        place = lines[-1 if len(lines) % count else int(other.argmax())].place
+        raise InputError(
+            f"{place}: modes must follow each other, each with one number and frequency and the "
+            f"{count} nodes of the first one in its order, got another line; export them again"
+        )
+    return ModeShapes(
+        values[:count, 2:5],
+        values[::count, 1],
+        values[:, 5:].reshape(-1, count, 3),
+        np.array([line.number("damping_ratio", math.nan) for line in lines[::count]]),
     )
 
 

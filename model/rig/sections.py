@@ -120,11 +120,6 @@ class _MaterialByName:
         return {"anyOf": [{"enum": list(material_names())}, handler(schema)]}
 
 
-def _or_none(value: object, section: ValidatorFunctionWrapHandler) -> object:
-    """A section, or `none` in its place: of a union pydantic would name both in errors."""
-    return value if value == "none" else section(value)
-
-
 Modulus = Annotated[float, Quantity(MODULUS, at_least=1e3, at_most=1e13)]
 ModulusRows = Annotated[list[GainRow], Field(min_length=2, max_length=200), MODULI]
 
@@ -472,7 +467,7 @@ class SurfaceSection(Section):
     """A surface by the modes of another program, in place of a plate."""
 
     modes: Annotated[str, Field(min_length=1, max_length=1000)]
-    """File of its modes beside the rig file: a universal file, or .npz; see [surfaces](#surface).
+    """File of its modes beside the rig file: a universal file, .npz or .csv; see [surfaces](#surface).
 
     Limits: a file
     """
@@ -880,7 +875,11 @@ class RigSection(Section):
 
     fingertip: Annotated[
         FingertipSection,
-        WrapValidator(_or_none, json_schema_input_type=FingertipSection | Literal["none"]),
+        # Not a union, of which pydantic would name both in errors.
+        WrapValidator(
+            lambda value, section: value if value == "none" else section(value),
+            json_schema_input_type=FingertipSection | Literal["none"],
+        ),
     ] = FingertipSection()
     """Load of each finger on the plate, see [fingertip](#fingertip); `none` for weightless ones.
 

@@ -70,7 +70,7 @@ from model.structure.attachments import (
 from model.structure.exciter import Actuator, Exciter
 from model.structure.modal_elasticity import Dispersion
 from model.structure.plate import Plate
-from model.transients.excursions import MagnetMotions, Swing
+from model.transients.excursions import MagnetMotions, Swing, share_along
 from model.transients.time_response import PlateInTime, plate_in_time
 from model.vibration import Excitation, base_amplitudes
 from registry.limits import GuardLimits
@@ -527,7 +527,7 @@ class LocalizationTable:
             for name, tone in each.items():
                 share = float(np.interp(tone.frequency, self.frequencies, self.allowed_shares))
                 for swing in swings:
-                    share = min(share, self.magnets.share_along(tone.frequency, swing))
+                    share = min(share, share_along(self.magnets, tone.frequency, swing))
                 part = tone.amplitude / self.full_levels[name] / share
                 parts[number, tone.frequency] = max(part, parts.get((number, tone.frequency), 0.0))
         return sum(parts.values())

@@ -149,10 +149,6 @@ class MagnetMotions:
         least: FloatArray = (allowed / self.by_jumps(frequencies)).min(axis=1)
         return np.asarray(np.minimum(least, 1.0))
 
-    def share_along(self, frequency: float, swing: Swing) -> float:
-        """Share of full level, 1 at most, at which a level may swing at a frequency [Hz]."""
-        return _share_along(self, frequency, swing)
-
     def by_jumps(self, frequencies: FloatArray) -> FloatArray:
         """Largest motions (f, m) [m] by drives that jump to full level at frequencies [Hz].
 
@@ -209,7 +205,8 @@ class MagnetMotions:
 
 
 @lru_cache(_SWINGS_KEPT)  # the same answer is computed several times
-def _share_along(magnets: MagnetMotions, frequency: float, swing: Swing) -> float:
+def share_along(magnets: MagnetMotions, frequency: float, swing: Swing) -> float:
+    """Share of full level, 1 at most, at which a level may swing at a frequency [Hz]."""
     moved = motions_along(magnets.plate, magnets.rows, frequency, swing)
     return min(1.0, float((magnets.allowed(frequency) / moved).min()))
 

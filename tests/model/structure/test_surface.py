@@ -99,6 +99,35 @@ def _difference(own: LocalizationTable, other: LocalizationTable) -> float:
     return float((np.linalg.norm(first - second, axis=-1) / size).max(axis=1).mean())
 
 
+def _lines(modes: Mapping[str, FloatArray]) -> str:
+    """The same as CSV, a line for each node of each mode."""
+    rows = ["mode,frequency_hz,x_m,y_m,z_m,shape_x,shape_y,shape_z"]
+    for number, (frequency, shape) in enumerate(
+        zip(modes["frequencies"], modes["shapes"], strict=True)
+    ):
+        for (x, y, z), w in zip(modes["nodes"], shape, strict=True):
+            rows.append(f"{number},{frequency:.9g},{x:.9g},{y:.9g},{z:.9g},0,0,{w:.9g}")
+    return "\n".join([*rows, ""])
+
+
+def test_modes_in_csv_are_those_of_the_plate(
+    modes: Mapping[str, FloatArray], own: LocalizationTable, tmp_path: Path
+) -> None:
+    """A line for each node of each mode; another node in one of them is refused with its line."""
+    text = _lines(modes)
+    (tmp_path / "modes.csv").write_text(text)
+    (tmp_path / "rig.yaml").write_text("surface: modes.csv" + ERAS)
+    rig = load_rig(tmp_path / "rig.yaml")
+    assert rig.plate.mass == pytest.approx(own.plate.mass, rel=1e-3)
+    assert _difference(own, build_table(rig)) < 0.04
+    head, *rows = text.splitlines()
+    rows[400] = rows[401]
+    for wrong, line in (([head, *rows], 402), ([head, *rows[:-1]], len(rows))):
+        (tmp_path / "modes.csv").write_text("\n".join(wrong))
+        with pytest.raises(InputError, match=rf"modes.csv:{line}: modes must follow each other"):
+            load_rig(tmp_path / "rig.yaml")
+
+
 @pytest.mark.parametrize(("kind", "length"), [(55, 1.0), (2414, 1.0), (55, 1000.0)])
 def test_plate_by_its_own_modes_has_the_fields_of_its_table(
     modes: Mapping[str, FloatArray],

@@ -467,7 +467,7 @@ class SurfaceSection(Section):
     """A surface by the modes of another program, in place of a plate."""
 
     modes: Annotated[str, Field(min_length=1, max_length=1000)]
-    """File of its modes beside the rig file: a universal file, .npz or .csv; see [surfaces](#surface).
+    """File of its modes beside the rig file: universal, .npz or .csv; see [surfaces](#surface).
 
     Limits: a file
     """

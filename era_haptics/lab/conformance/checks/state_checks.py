@@ -184,6 +184,7 @@ def stop_ramps(subject: Subject) -> Rows:
         (whole, disarm),
         (whole, slowest_stop, amid, disarm),
         (whole, slowest_disarm, *fading, subject.clear, amid, stop),
+        (whole, send("Stop", ramp=min(2 * subject.can["ramp_max"], 0xFFFF))),
     ]
 
 
@@ -234,8 +235,8 @@ def clear_too_early(subject: Subject) -> Rows:
     """It stays stopped by a Clear amid its fade."""
     subject.require_ramp()
     ramp = subject.ramp
-    slow = send("Stop", ramp=ramp)
-    return [subject.arm, subject.one(), slow, subject.clear, ramp / 1000 + 0.02, subject.clear]
+    slow, last = send("Stop", ramp=ramp), layer(0, subject.tone(subject.channels[-1]))
+    return [subject.arm, last, slow, subject.clear, ramp / 1000 + 0.02, subject.clear]
 
 
 @driving("protocol.md#sets")

@@ -143,12 +143,12 @@ def area_of(where: str, plate: Plate) -> Area:
     length, width = plate.length, plate.width
     if where in (EDGE, ANYWHERE):
         contains = everywhere if where == ANYWHERE else partial(_on_edge, length, width)
-        return Area(where, length, width, contains)
+        return Area(where, length, width, partial(_both, plate.covers, contains))
     path = Path(where)
     if path.suffix.lower() in PICTURES:
         content = read_bytes(path, _MAX_BYTES, is_for="draw it smaller", give="a picture")
         contains = partial(_is_white, _white(path, content, plate), length, width)
-        return Area(content.hex(), length, width, contains)
+        return Area(content.hex(), length, width, partial(_both, plate.covers, contains))
     if path.suffix.lower() not in (".yaml", ".yml"):
         raise InputError(
             f"where must be {EDGE}, {ANYWHERE}, a picture ({', '.join(PICTURES)}) or a .yaml "
@@ -157,7 +157,8 @@ def area_of(where: str, plate: Plate) -> Area:
     document = read_document(path, if_empty="it must have polygons, each a name with its corners")
     polygons = Validation(document, _PolygonsSection).finish().polygons
     shapes = [Polygon(tuple(each)) for each in polygons.values()]
-    return Area(document.text, length, width, partial(_in_any, shapes))
+    contains = partial(_in_any, shapes)
+    return Area(document.text, length, width, partial(_both, plate.covers, contains))
 
 
 def everywhere(points: FloatArray) -> NDArray[np.bool_]:
@@ -187,6 +188,15 @@ def candidates_of(area: Area, *, count: int) -> tuple[FloatArray, float]:
             "from the plate's corner, and white where ERAs may stand"
         )
     return places, spacing
+
+
+def _both(
+    covers: Callable[[FloatArray], NDArray[np.bool_]],
+    contains: Callable[[FloatArray], NDArray[np.bool_]],
+    points: FloatArray,
+) -> NDArray[np.bool_]:
+    """Whether points (n, 2) are on a plate, not in a cut-out of a surface, and in an area of it."""
+    return np.asarray(covers(points) & contains(points))
 
 
 def _on_edge(length: float, width: float, points: FloatArray) -> NDArray[np.bool_]:

@@ -79,7 +79,7 @@ class PlateErrors:
     feet: Mapping[int, float] = field(default_factory=dict)
     masses: tuple[PointLoad, ...] = ()
     mesh: PlateMesh | None = None
-    modes: FloatArray = field(default_factory=lambda: np.ones((2, 0)))
+    modes: Sequence[Sequence[float]] = field(default_factory=lambda: [[], []])
 
     def realised(self, rig: Rig) -> Rig:
         """The rig whose plate and ERAs have these errors."""
@@ -107,7 +107,7 @@ class PlateErrors:
                     strict=True,
                 )
             ),
-            surface=surface and replace(surface, sizes=tuple(np.sqrt(sizes).tolist())),
+            surface=surface and replace(surface, sizes=tuple(map(math.sqrt, sizes))),
         )
         masses = list(rig.masses)
         for number, factor in self.feet.items():
@@ -222,7 +222,7 @@ def draw_imperfections(rig: Rig, *, seed: int = 0) -> Imperfections:
         modulus=relative(std.elasticity),
         places=_places(rig, std.place * rng.standard_normal((len(rig.eras), 2))),
         feet=_feet(rig, np.exp(std.supports * of_feet.standard_normal(len(rig.feet)))),
-        modes=draw_plates(of_feet, std, of=rig, count=1, contact_count=0).modes[0],
+        modes=draw_plates(of_feet, std, of=rig, count=1, contact_count=0).modes[0].tolist(),
     )
     real, imaginary = rng.standard_normal((2, len(channels))) * (std.harmonic * math.sqrt(0.5))
     channels = {
@@ -266,7 +266,7 @@ def draw_of_ensemble(rig: Rig, *, seed: int) -> Imperfections:
         },
         feet=_feet(rig, drawn.feet[0]),
         mesh=_other_mesh(rig),
-        modes=drawn.modes[0],
+        modes=drawn.modes[0].tolist(),
     )
     channels = {
         rig.wiring[era.name]: ChannelErrors(*cmath.polar(gain), harmonic)

@@ -590,7 +590,8 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
         for each in rig_page.SECTIONS.values()
         for key in each.model_fields
         # A kind has other keys, `along` has one value, surfaces are in tests/model/structure.
-        if key not in ("kind", "along", "surface") and each is not sections.SurfaceSection
+        if key not in ("kind", "along", "surface", "mode_amplitude")
+        and each is not sections.SurfaceSection
     ],
 )
 def test_a_rig_that_differs_in_a_key_is_refused(

@@ -160,6 +160,11 @@ def surface_shapes(file: str, digest: str, normal: str) -> SurfaceShapes:
     rigid, others = int(held.sum()), [a for a in range(3) if a != axis]
     places = read.nodes[:, others] if read.places is None else read.places
     points = places - places.min(axis=0)
+    if not np.ptp(points, axis=0).all():
+        raise InputError(
+            f"{file}: nodes must extend along both axes across {normal}, got a line; set "
+            "surface.normal to the axis out of the surface"
+        )
     return SurfaceShapes(
         points,
         np.concatenate([np.zeros(rigid), frequencies[~is_rigid][seen]]),

@@ -259,20 +259,21 @@ def test_promises_are_kept_where_each_mode_differs(
 def test_cut_out_has_no_fingers(modes: Mapping[str, FloatArray], tmp_path: Path) -> None:
     """Faces around a hole give two rings; a finger in the hole is refused, no cell is there.
 
-    A panel that reports one there has it rejected, so that all others are served.
+    A panel that reports one there has it rejected, so that all others are served. Along the wrong
+    normal the surface would be a line.
     """
     first = (21 * np.arange(15)[:, None] + np.arange(20)).ravel()
-    hole = (21 * np.arange(5, 9)[:, None] + np.arange(7, 13)).ravel()
-    faces = np.setdiff1d(first, hole)[:, None] + [0, 1, 22, 21]
-    rig = load_rig(_write(tmp_path, modes, faces=faces))
+    faces = np.setdiff1d(first, 21 * np.arange(5, 9)[:, None] + np.arange(7, 13))[:, None]
+    rig = load_rig(_write(tmp_path, modes, faces=[*faces, 0, 1, 22, 21]))
     assert len(getattr(rig.plate.surface, "outline", ())) == 2
     with pytest.raises(InputError, match=r"finger must be within the outline"):
         check_on_plate("finger", [(0.152, 0.1)], rig.plate)
+    with pytest.raises(InputError, match=r"nodes must extend along both axes across x, got a line"):
+        parse_rig(str(tmp_path / "rig.yaml"), "surface: {modes: modes.npz, normal: x}" + ERAS)
     change = ContactTracker(rig.plate).update(
         TouchFrame("panel", 0.0, (Touch(1, 0.5, 0.56), Touch(2, 0.2, 0.2)))  # shares, y downwards
     )
-    assert [each.key.id for each in change.down] == [2]
-    assert change.rejected == ("off_plate",)
+    assert ([each.key.id for each in change.down], change.rejected) == ([2], ("off_plate",))
     table = build_table(rig)
     assert len(table.cell_centres) < table.grid.cell_count
     candidates = area_of("anywhere", rig.plate).candidates(0.02)  # for ERAs

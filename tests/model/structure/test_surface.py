@@ -264,7 +264,7 @@ def test_cut_out_has_no_fingers(modes: Mapping[str, FloatArray], tmp_path: Path)
     """
     first = (21 * np.arange(15)[:, None] + np.arange(20)).ravel()
     faces = np.setdiff1d(first, 21 * np.arange(5, 9)[:, None] + np.arange(7, 13))[:, None]
-    rig = load_rig(_write(tmp_path, modes, faces=[*faces, 0, 1, 22, 21]))
+    rig = load_rig(_write(tmp_path, modes, faces=np.add(faces, [0, 1, 22, 21])))
     assert len(getattr(rig.plate.surface, "outline", ())) == 2
     with pytest.raises(InputError, match=r"finger must be within the outline"):
         check_on_plate("finger", [(0.152, 0.1)], rig.plate)

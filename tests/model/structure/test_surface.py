@@ -214,7 +214,7 @@ def test_modes_that_differ_are_those_of_the_bench_and_of_drawn_plates(
 
     Within what those modes add that are truncated, whose frequencies stay.
     """
-    rig = _of_modes(load_rig(_write(tmp_path, modes)), fingertip=0.0)
+    rig = _of_modes(load_rig(_write(tmp_path, modes)), fingertip=0.0, mode_amplitude=0.2)
     realised = draw_of_ensemble(rig, seed=3).plate.realised(rig)
     known, bench = build_table(rig), build_table(replace(realised, mesh=rig.mesh))
     plates = draw_plates(

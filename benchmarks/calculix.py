@@ -7,26 +7,22 @@ and what all others add is scaled.
 """
 
 import subprocess
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from scipy import sparse
 from scipy.sparse.linalg import splu
 
 from examples.calculix import curved_glass, from_calculix
+from model.answer.stimulus import Placement
+from model.arrays import ComplexArray, FloatArray
 from model.finger import detection_threshold, fingertip_points, fingertip_weights
+from model.rig.rig import Rig
 from model.structure.attachments import attached_stiffness, fingertip_loads
-from model.vibration import base_amplitudes
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from model.answer.stimulus import Placement
-    from model.arrays import ComplexArray, FloatArray
-    from model.rig.rig import Rig
-    from model.study.verification import Plates
-    from model.vibration import Excitation
+from model.study.verification import Plates
+from model.vibration import Excitation, base_amplitudes
 
 RIG = Path(__file__).parents[1] / "examples" / "calculix" / "curved_glass.yaml"
 _STEP = 1e-4  # m, of differences by an ERA's place
@@ -50,7 +46,7 @@ class CurvedGlass:
             [[shape[int(node)][int(axis) - 1] for node, axis in dof] for _, shape in modes]
         ).T
 
-    def rows(self, places: "FloatArray", layer: int) -> sparse.csr_array:
+    def rows(self, places: FloatArray, layer: int) -> sparse.csr_array:
         """Displacement along the normals at places (p, 2) [m] on the face of a layer, (p, dof)."""
         mesh, found = curved_glass, sparse.lil_array((len(places), len(self._column)))
         for row, (u, v) in enumerate(places):
@@ -74,7 +70,7 @@ class CurvedGlass:
         observed: sparse.csr_array,
         frequency: float,
         loss_factor: float,
-    ) -> "ComplexArray":
+    ) -> ComplexArray:
         """Displacement [m/N] of rows (o, dof) by forces along others (n, dof), (o, n)."""
         omega = 2 * np.pi * frequency
         system = (1 + 1j * loss_factor) * self._stiffness - omega**2 * self._mass
@@ -86,7 +82,7 @@ class CurvedGlass:
         )
         return np.asarray(observed @ factors.solve(forced.toarray().T.astype(complex)))
 
-    def at(self, rows: sparse.csr_array) -> "FloatArray":
+    def at(self, rows: sparse.csr_array) -> FloatArray:
         """Mode shapes (p, r) of unit modal mass at rows."""
         return np.asarray(rows @ self._shapes)
 
@@ -99,7 +95,7 @@ def _matrix(path: Path) -> sparse.csr_array:
     return whole
 
 
-def _quadratic(x: float, y: float) -> "dict[tuple[int, int], float]":
+def _quadratic(x: float, y: float) -> dict[tuple[int, int], float]:
     """Shape functions of a quadrilateral of eight nodes at x, y within -1 to 1, by node."""
     found = {}
     for a in (-1, 0, 1):
@@ -119,10 +115,10 @@ class GlassOnEras:
     def __init__(
         self,
         glass: CurvedGlass,
-        rig: "Rig",
-        frequencies: "FloatArray",
-        places: "FloatArray",
-        cells: "FloatArray",
+        rig: Rig,
+        frequencies: FloatArray,
+        places: FloatArray,
+        cells: FloatArray,
     ) -> None:
         self.rig, self._frequencies, self._glass = rig, frequencies, glass
         self._eras: Sequence[Any] = rig.eras
@@ -143,7 +139,7 @@ class GlassOnEras:
         self._cells = slice(observed.shape[0] - len(cells), None)
 
     @property
-    def fields(self) -> "ComplexArray":
+    def fields(self) -> ComplexArray:
         """Acceleration (f, n, p) [m/s²] at the cells by each ERA at full level, without fingers."""
         n, found = len(self._eras), []
         for frequency, whole in zip(self._frequencies, self._by_frequency, strict=True):
@@ -157,17 +153,15 @@ class GlassOnEras:
     def _springs(
         self,
         frequency: float,
-        stiffer: "FloatArray | float" = 1.0,
-        damped: "FloatArray | float" = 1,
-    ) -> "tuple[ComplexArray, FloatArray]":
+        stiffer: FloatArray | float = 1.0,
+        damped: FloatArray | float = 1,
+    ) -> tuple[ComplexArray, FloatArray]:
         """Stiffness of each ERA's spring with its damper, and omega² times its mass [N/m]."""
         w = 2 * np.pi * frequency
         k, c, m = np.array([[e.stiffness, e.damping, e.bolt_mass] for e in self._eras]).T
         return stiffer * k + 1j * w * c * damped, w**2 * m
 
-    def contrast_db(
-        self, placed: "Placement", excitation: "Excitation", plates: "Plates"
-    ) -> "FloatArray":
+    def contrast_db(self, placed: Placement, excitation: Excitation, plates: Plates) -> FloatArray:
         """Felt contrast [dB] of a target beside quiet fingers on glasses, (d,)."""
         fingers = [
             int(np.argmin(np.linalg.norm(self.places - each, axis=1))) for each in placed.contacts
@@ -211,10 +205,10 @@ class GlassOnEras:
     def _deviating(
         self,
         row: int,
-        forced: "Sequence[int]",
-        observed: "Sequence[int]",
-        plates: "Plates",
-    ) -> "ComplexArray":
+        forced: Sequence[int],
+        observed: Sequence[int],
+        plates: Plates,
+    ) -> ComplexArray:
         """Receptances (d, o, n) of plates at a frequency, of rows by forces along others."""
         w2 = (2 * np.pi * self._frequencies[row]) ** 2
         eta, own = self.rig.plate.loss_factor, self._glass.eigenvalues

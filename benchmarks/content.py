@@ -18,34 +18,36 @@ in order of name, that can be read and ask for anything; of equal ones the first
 import argparse
 import operator
 import sys
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from functools import cache, partial
 from multiprocessing import get_context
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from benchmarks.promise.cases import Case
 from benchmarks.promise.session import EARLY, Heard, Log, owner_of
-from benchmarks.setting import random_contacts, support, use_one_thread
+from benchmarks.setting import random_contacts, support
+from controller.content.formats import named_content, named_contents, read_content
 from controller.content.pattern import Pattern
+from controller.content.rendition import rendered
 from controller.effects.effect import Region
 from controller.effects.kinds import File
 from controller.effects.layout import SurfaceLayout
 from controller.effects.player import EffectPlayer
 from controller.play.intent import CLICK
+from era_haptics.lab.checks.content_check import MAX_DELAY, check_content
 from model.answer.answer_report import Timing
 from model.config.fields import Circle
+from model.errors import InputError
 from model.finger import FINGERTIP_RADIUS
 from registry import threads
 from sim.far_ends.wire_assignment import SimulatedWire
 from sim.plant.imperfections import draw_imperfections
 from sim.transport.simulated_line import PROMPT
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
 
 AT = (0.11, 0.13)
 LEVEL_DB_SL = 20.0
@@ -63,7 +65,6 @@ def main() -> None:
     parser.add_argument("--pairs", type=int, default=0, help="fingers beside each file")
     parser.add_argument("--workers", type=int, default=2)
     options = parser.parse_args()
-    use_one_thread()
     patterns = [*dict.fromkeys(_patterns(options.files))][: options.count]
     is_kept = _print_alone(patterns)
     if options.pairs:
@@ -71,12 +72,8 @@ def main() -> None:
     sys.exit(not is_kept)
 
 
-def _print_alone(patterns: "Sequence[Pattern]") -> bool:
+def _print_alone(patterns: Sequence[Pattern]) -> bool:
     """Print what is kept; returns whether that is enough."""
-    import numpy as np
-
-    from controller.content.rendition import rendered
-    from era_haptics.lab.checks.content_check import MAX_DELAY, check_content
 
     table, delays = CASE.table, np.linspace(0, MAX_DELAY, 11)
     shares, lost = [], 0
@@ -111,9 +108,8 @@ def _print_alone(patterns: "Sequence[Pattern]") -> bool:
     return bool((kept[0] >= (MEDIAN, WORST_TENTH)).all())
 
 
-def _print_beside(patterns: "Sequence[Pattern]", pairs: int, workers: int) -> bool:
+def _print_beside(patterns: Sequence[Pattern], pairs: int, workers: int) -> bool:
     """Print what is promised and felt beside other fingers; returns whether enough is kept."""
-    import numpy as np
 
     with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
         running = [
@@ -136,10 +132,8 @@ def _print_beside(patterns: "Sequence[Pattern]", pairs: int, workers: int) -> bo
     return 0.86 <= kept <= 0.94
 
 
-def _patterns(folder: Path | None) -> "Iterator[Pattern]":
+def _patterns(folder: Path | None) -> Iterator[Pattern]:
     """What can be read of a folder in order of name, or the named contents."""
-    from controller.content.formats import named_content, named_contents, read_content
-    from model.errors import InputError
 
     paths = [named_content(each) for each in named_contents()]
     for path in paths if folder is None else sorted(folder.iterdir()):
@@ -150,10 +144,6 @@ def _patterns(folder: Path | None) -> "Iterator[Pattern]":
             continue
         if pattern.transients or any(value > 0 for _, value in pattern.intensity):
             yield pattern
-
-
-if __name__ == "__main__":
-    main()
 
 
 _chain: Any = support("chain").Chain
@@ -218,3 +208,7 @@ async def _run(pattern: Pattern, level_db_sl: float, pair: int, seed: int) -> tu
         own = Heard(0, played, played).own_db_sl(span, strongest=True)
         leaked = Heard(1, played, played).foreign_db_sl(span, strongest=True)
         return promises[voice], float((own - leaked).min())
+
+
+if __name__ == "__main__":
+    main()

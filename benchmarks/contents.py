@@ -24,21 +24,26 @@ an answer takes without kernels in C.
 import argparse
 import time
 from collections import defaultdict
+from collections.abc import Iterator
 from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from benchmarks.setting import random_contacts, use_one_thread
-from model.answer.plan import prepare_answers
-from model.table.table import read_fingertips
+import numpy as np
 
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from model.answer.answer import Answer
-    from model.arrays import FloatArray
-    from model.table.table import LocalizationTable
+from benchmarks.promise.cases import IDENTIFIED
+from benchmarks.setting import random_contacts
+from model import drive_modes as coherent
+from model.answer.answer import APART_HZ, Answer, Contents, Stream
+from model.answer.plan import answer, prepare_answers
+from model.answer.stimulus import ANY_BAND, Finger, Placement, Stimulus
+from model.answer.tone_search import choose_by_numpy, choose_tones
+from model.arrays import FloatArray
+from model.rig.rig_file import load_rig
+from model.study.verification import draw_plates, powers_on
+from model.table.table import LocalizationTable, read_fingertips
+from model.table.table_file import build_table
+from model.vibration import base_amplitudes
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 PLATES = ("paper_plate", "eight_eras", "car_display", "table")
@@ -61,12 +66,6 @@ def main() -> None:
     parser.add_argument("--bands", action="store_true", help="a band for each content")
     parser.add_argument("--sharing", action="store_true", help="2 to 20 fingers of one content")
     options = parser.parse_args()
-    use_one_thread()
-    import numpy as np
-
-    from benchmarks.promise.cases import IDENTIFIED
-    from model.rig.rig_file import load_rig
-    from model.table.table_file import build_table
 
     sets = [(k, options.fingers - k) for k in range(1, 5)] if options.fingers else SETS
     if options.bands:
@@ -98,10 +97,9 @@ def main() -> None:
 
 
 def _sets(
-    table: "LocalizationTable", contents: int, quiet: int, *, count: int, apart: float
-) -> "Iterator[list[tuple[float, float]]]":
+    table: LocalizationTable, contents: int, quiet: int, *, count: int, apart: float
+) -> Iterator[list[tuple[float, float]]]:
     """Places [m] of fingers, those with contents first."""
-    import numpy as np
 
     rng = np.random.default_rng([contents, quiet])
     size = (table.plate.length, table.plate.width)
@@ -112,7 +110,7 @@ def _sets(
 
 def _print_row(
     names: tuple[str, str],
-    table: "LocalizationTable",
+    table: LocalizationTable,
     contents: int,
     quiet: int,
     has_bands: bool,
@@ -120,10 +118,6 @@ def _print_row(
     count: int,
     apart: float,
 ) -> None:
-    import numpy as np
-
-    from model.answer.plan import answer
-    from model.answer.stimulus import ANY_BAND, Finger, Stimulus
 
     choices = list(combinations(BANDS, contents)) if has_bands else [(ANY_BAND,) * contents]
 
@@ -157,19 +151,14 @@ def _print_row(
     )
 
 
-def promised_worst(found: "Answer") -> float:
+def promised_worst(found: Answer) -> float:
     if found.promised_worst_db is None:
         raise ValueError("a set must have two fingers")
     return found.promised_worst_db
 
 
-def _print_sharing(names: tuple[str, str], table: "LocalizationTable", *, count: int) -> None:
+def _print_sharing(names: tuple[str, str], table: LocalizationTable, *, count: int) -> None:
     """Print what a search that takes its time finds beyond the answers."""
-    import numpy as np
-
-    from model import drive_modes as coherent
-    from model.answer.answer import Contents, Stream
-    from model.answer.tone_search import choose_by_numpy, choose_tones
 
     chosen = coherent.TARGET_STARTS, coherent.ALIGNMENTS, coherent.REALIGNMENTS
     coherent.TARGET_STARTS, coherent.ALIGNMENTS, coherent.REALIGNMENTS = 20, 400, 100
@@ -216,7 +205,7 @@ def _print_sharing(names: tuple[str, str], table: "LocalizationTable", *, count:
 
 def _print_modulated(
     names: tuple[str, str],
-    table: "LocalizationTable",
+    table: LocalizationTable,
     contents: int,
     quiet: int,
     modulation: float,
@@ -225,10 +214,6 @@ def _print_modulated(
     apart: float,
 ) -> None:
     """Print what side bands cost the worst finger."""
-    import numpy as np
-
-    from model.answer.plan import answer
-    from model.answer.stimulus import Finger, Stimulus
 
     steady, cost = [], []
     for places in _sets(table, contents, quiet, count=count, apart=apart):
@@ -250,7 +235,7 @@ def _print_modulated(
 
 def _print_distorted(
     names: tuple[str, str],
-    table: "LocalizationTable",
+    table: LocalizationTable,
     contents: int,
     quiet: int,
     percent: float,
@@ -259,12 +244,6 @@ def _print_distorted(
     apart: float,
 ) -> None:
     """Print how far each content is above the second harmonics, sums and differences there."""
-    import numpy as np
-
-    from model.answer.answer import APART_HZ
-    from model.answer.plan import answer
-    from model.answer.stimulus import Finger, Stimulus
-    from model.vibration import base_amplitudes
 
     above, near = [], []
     strokes = np.array([era.full_level for era in table.eras])
@@ -308,13 +287,9 @@ def _print_distorted(
 
 
 def share_kept(
-    table: "LocalizationTable", found: "Answer", quiet: list[tuple[float, float]], *, seed: int
+    table: LocalizationTable, found: Answer, quiet: list[tuple[float, float]], *, seed: int
 ) -> float:
     """Share of held-out plates on which the worst finger has what is promised."""
-    import numpy as np
-
-    from model.answer.stimulus import Placement
-    from model.study.verification import draw_plates, powers_on
 
     count = len(found.layers) + len(quiet)
     plates = draw_plates(

@@ -267,10 +267,6 @@ def _modes(rig: Rig) -> str:
     return ", ".join(f"{each:.1f}" for each in found) + " Hz"
 
 
-if __name__ == "__main__":
-    main()
-
-
 def cell_middles(length: float, width: float, cells: tuple[int, int]) -> tuple[FloatArray, ...]:
     """Coordinates x and y [m] of the middles of cells, each (nx, ny)."""
     x, y = (
@@ -303,3 +299,7 @@ def _second(count: int, step: float, closed: bool) -> sparse.csr_array:
     off = np.ones(count - 1)
     whole = np.diag(off, -1) + np.diag(diagonal) + np.diag(off, 1)
     return sparse.csr_array(whole / step**2)
+
+
+if __name__ == "__main__":
+    main()

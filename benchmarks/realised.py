@@ -12,16 +12,23 @@ median counts, at the loudest of 17 points under each quiet finger; of the sets 
 import argparse
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from benchmarks.page import write_parts
-from benchmarks.setting import RIG, random_contacts, use_one_thread
+import numpy as np
 
-if TYPE_CHECKING:
-    from model.answer.stimulus import Placement
-    from model.arrays import FloatArray
-    from model.rig.rig import Rig
-    from model.vibration import Excitation
+from benchmarks.identification.plates import DRIVES, FREQUENCIES
+from benchmarks.setting import RIG, random_contacts, write_parts
+from model.answer.plan import query
+from model.answer.stimulus import Placement
+from model.arrays import FloatArray
+from model.finger import DiscRule, decibels, detection_threshold, fingertips_on
+from model.rig.rig import Rig
+from model.rig.rig_file import load_rig
+from model.spectral.direct_solution import direct_spectral_acceleration
+from model.spectral.modes import SpectralMesh
+from model.structure.attachments import fingertip_loads
+from model.study.verification import draw_plates
+from model.table.table_file import build_table
+from model.vibration import Excitation, base_amplitudes
 
 PAGE = Path(__file__).parents[1] / "docs" / "measured" / "contrast-benchmark.md"
 QUIET = (1, 2, 3)
@@ -60,7 +67,6 @@ def main() -> None:
     parser.add_argument("--sets", type=int, default=30, help="for each number of quiet fingers")
     parser.add_argument("--report", action="store_true")
     options = parser.parse_args()
-    use_one_thread()
     lines = [
         "| drives known to | realised | goal | nine of ten | promise kept | least level |",
         "|---|---|---|---|---|---|",
@@ -76,13 +82,6 @@ def main() -> None:
 
 def _line(row: Row, sets: int) -> str:
     """A line of the table: medians over sets, and over all draws."""
-    import numpy as np
-
-    from benchmarks.identification.plates import DRIVES, FREQUENCIES
-    from model.answer.plan import query
-    from model.answer.stimulus import Placement
-    from model.rig.rig_file import load_rig
-    from model.table.table_file import build_table
 
     rig = load_rig(RIG.parent / f"{row.rig}.yaml")
     known = replace(DRIVES, gain=row.error, phase_deg=100 * row.error)
@@ -114,17 +113,9 @@ def _line(row: Row, sets: int) -> str:
 
 
 def realised(
-    rig: "Rig", asked: "Placement", excitation: "Excitation", number: int
-) -> "tuple[FloatArray, FloatArray]":
+    rig: Rig, asked: Placement, excitation: Excitation, number: int
+) -> tuple[FloatArray, FloatArray]:
     """Felt contrast [dB] and level [dB SL] on plates (d,), drawn by the number of the set."""
-    import numpy as np
-
-    from model.finger import DiscRule, decibels, detection_threshold, fingertips_on
-    from model.spectral.direct_solution import direct_spectral_acceleration
-    from model.spectral.modes import SpectralMesh
-    from model.structure.attachments import fingertip_loads
-    from model.study.verification import draw_plates
-    from model.vibration import base_amplitudes
 
     plate, eras = rig.plate, rig.eras
     around = np.exp(0.25j * np.pi * np.arange(8))

@@ -1,27 +1,19 @@
-"""What benchmarks on the paper's plate have in common; numpy is loaded only when it is used."""
+"""What benchmarks have in common: the paper's rig, contact sets, and parts of pages they write."""
 
-import os
+import re
 import sys
+from collections.abc import Sequence
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-if TYPE_CHECKING:
-    from collections.abc import Sequence
+import numpy as np
 
-    import numpy as np
-
-    from model.arrays import FloatArray
+from model.arrays import FloatArray
 
 _ROOT = Path(__file__).parents[1]
 RIG = _ROOT / "examples" / "paper_plate.yaml"
 APART = 0.05  # m; between the fingers of a contact set
-ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
-
-
-def use_one_thread() -> None:
-    """Let linear algebra use one thread; call before numpy is loaded."""
-    os.environ.update(ONE_THREAD)
 
 
 def support(module: str) -> Any:
@@ -33,19 +25,18 @@ def support(module: str) -> Any:
 
 
 def random_contacts(
-    rng: "np.random.Generator",
+    rng: np.random.Generator,
     count: int,
-    size: "tuple[float, float]",
+    size: tuple[float, float],
     *,
     margin: float = 0.0,
     apart: float = APART,
-    beside: "Sequence[tuple[float, float]]" = (),
-) -> "FloatArray":
+    beside: Sequence[tuple[float, float]] = (),
+) -> FloatArray:
     """Contacts (count, 2) [m] on a plate of a size, so far apart and so far from its edges.
 
     beside: places [m] on the plate that they are as far from.
     """
-    import numpy as np
 
     while True:
         places = rng.uniform(margin, np.array(size) - margin, (count, 2))
@@ -53,3 +44,19 @@ def random_contacts(
         gaps = np.linalg.norm(every[:, None] - every, axis=-1)
         if gaps[np.triu_indices(len(every), 1)].min(initial=np.inf) > apart:
             return places
+
+
+def write_parts(page: Path, parts: dict[str, str]) -> None:
+    """Replace the text between `<!-- begin NAME -->` and `<!-- end NAME -->` for each name.
+
+    Raises ValueError for a page without the marks of a part.
+    """
+    text = page.read_text(encoding="utf-8")
+    for name, part in parts.items():
+        marks = f"<!-- begin {name} -->\n", f"<!-- end {name} -->"
+        found = re.fullmatch(f"(.*{marks[0]}).*({marks[1]}.*)", text, re.DOTALL)
+        if found is None:
+            raise ValueError(f"{page}: no marks of the part {name}")
+        text = f"{found[1]}{part.strip()}\n{found[2]}"
+    page.write_text(text, encoding="utf-8")
+    print(f"wrote {page}")

@@ -25,16 +25,26 @@ import sys
 import tempfile
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import numpy as np
+import yaml
+
+from benchmarks.calculix import RIG as GLASS
+from benchmarks.calculix import CurvedGlass, GlassOnEras
 from benchmarks.contents import promised_worst, share_kept
-from benchmarks.page import write_parts
-from benchmarks.setting import APART, RIG, random_contacts, use_one_thread
-
-if TYPE_CHECKING:
-    from model.answer.stimulus import Placement
-    from model.arrays import FloatArray
-    from model.rig.rig import Rig
+from benchmarks.promise.cases import Case
+from benchmarks.promise.session import as_markdown, kept, on_plate
+from benchmarks.setting import APART, RIG, random_contacts, write_parts
+from model.answer.answer_report import Timing
+from model.answer.plan import answer
+from model.answer.stimulus import Finger, Placement, Stimulus
+from model.arrays import FloatArray, lattice
+from model.reduction.free_plate import FREQUENCY_MARGIN, solve_free_plate
+from model.rig.rig import Rig
+from model.rig.rig_file import load_rig
+from model.study.verification import draw_plates
+from model.table.table_file import build_table
 
 PAGE = Path(__file__).parents[1] / "docs" / "how-to" / "surface.md"
 MULTIPLES = (1.5, 3.0, 5.0)
@@ -56,7 +66,6 @@ def main() -> None:
     parser.add_argument("--sets", type=int, default=67, help="sets of fingers for each row")
     parser.add_argument("--page", action="store_true", help="write the table to its page")
     options = parser.parse_args()
-    use_one_thread()
     measure = _of_the_glass if options.solver == "calculix" else _of_the_plate
     rows, is_good = (_through_the_wire if options.wire else measure)(options.sets)
     if options.page:
@@ -66,12 +75,6 @@ def main() -> None:
 
 def _of_the_plate(sets: int) -> tuple[list[str], bool]:
     """Rows of the paper's plate."""
-    import numpy as np
-
-    from model.answer.plan import answer
-    from model.answer.stimulus import Finger, Stimulus
-    from model.rig.rig_file import load_rig
-    from model.table.table_file import build_table
 
     rig = load_rig(RIG)
     own = build_table(rig, drive_mode="phased")
@@ -118,15 +121,6 @@ def _of_the_plate(sets: int) -> tuple[list[str], bool]:
 
 def _of_the_glass(sets: int) -> tuple[list[str], bool]:
     """Rows of the curved glass, and whether they are good."""
-    import numpy as np
-
-    from benchmarks.calculix import RIG as GLASS
-    from benchmarks.calculix import CurvedGlass, GlassOnEras
-    from model.answer.plan import answer
-    from model.answer.stimulus import Finger, Stimulus
-    from model.rig.rig_file import load_rig
-    from model.study.verification import draw_plates
-    from model.table.table_file import build_table
 
     rows = [
         "| modes up to | drive | field differs, most | mean | stated, mean | nominal / dB "
@@ -191,11 +185,6 @@ def _of_the_glass(sets: int) -> tuple[list[str], bool]:
 
 def _through_the_wire(sets: int) -> tuple[list[str], bool]:
     """Rows of three contents on glasses that deviate, and whether they are good."""
-    from benchmarks.calculix import RIG as GLASS
-    from benchmarks.calculix import CurvedGlass
-    from benchmarks.promise.cases import Case
-    from benchmarks.promise.session import as_markdown, kept, on_plate
-    from model.answer.answer_report import Timing
 
     found = {}
     with tempfile.TemporaryDirectory() as folder:
@@ -211,9 +200,8 @@ def _through_the_wire(sets: int) -> tuple[list[str], bool]:
     return [rows], all(0.8 <= kept(each) <= 0.98 for each in found.values())
 
 
-def _places_on(rig: "Rig") -> "FloatArray":
+def _places_on(rig: Rig) -> FloatArray:
     """Places (n, 2) [m] for fingers, whole fingertips away from the edges of a surface."""
-    import numpy as np
 
     around = MARGIN * np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]])
     found = list[Any]()
@@ -223,11 +211,8 @@ def _places_on(rig: "Rig") -> "FloatArray":
     return np.array(found)
 
 
-def _some_of(places: "FloatArray", number: int) -> "Placement":
+def _some_of(places: FloatArray, number: int) -> Placement:
     """A target and one to three quiet fingers, 5 cm apart, of these places [m]."""
-    import numpy as np
-
-    from model.answer.stimulus import Placement
 
     rng = np.random.default_rng([5, number])
     while True:
@@ -238,12 +223,8 @@ def _some_of(places: "FloatArray", number: int) -> "Placement":
             return Placement((first,), tuple(others))
 
 
-def _as_surface(rig: "Rig", highest: float, folder: Path) -> "Rig":
+def _as_surface(rig: Rig, highest: float, folder: Path) -> Rig:
     """Return a rig with a surface in place of its plate, by the plate's modes up to a frequency."""
-    import numpy as np
-    import yaml
-
-    from model.rig.rig_file import load_rig
 
     arrays: dict[str, Any] = {**exported_modes(rig, highest, NODES)}
     arrays["damping_ratios"] = np.full(len(arrays["frequencies"]), rig.plate.loss_factor / 2)
@@ -256,15 +237,11 @@ def _as_surface(rig: "Rig", highest: float, folder: Path) -> "Rig":
     return replace(load_rig(file), uncertainty=rig.uncertainty)
 
 
-def exported_modes(rig: "Rig", highest: float, nodes: tuple[int, int]) -> "dict[str, FloatArray]":
+def exported_modes(rig: Rig, highest: float, nodes: tuple[int, int]) -> dict[str, FloatArray]:
     """Return the modes of a rig's free plate up to a frequency [Hz], as another program has them.
 
     nodes: numbers of nodes along x and y, at which shapes along z are given.
     """
-    import numpy as np
-
-    from model.arrays import lattice
-    from model.reduction.free_plate import FREQUENCY_MARGIN, solve_free_plate
 
     plate = rig.plate
     free = solve_free_plate(plate, rig.mesh, frequency_max=highest / FREQUENCY_MARGIN)

@@ -22,7 +22,7 @@ from typing import TypeVar
 import numpy as np
 from matplotlib.figure import Figure
 
-from benchmarks.setting import RIG, random_contacts, use_one_thread
+from benchmarks.setting import RIG, random_contacts
 from model.answer.plan import query
 from model.answer.stimulus import ONSET_RAMP, Placement
 from model.arrays import ComplexArray, FloatArray
@@ -37,6 +37,7 @@ from model.finger import (
 from model.reduction.free_plate import solve_free_plate
 from model.reduction.reduced_plate import reduce_plate
 from model.rig.rig import Rig, Uncertainty
+from model.rig.rig_file import load_rig
 from model.structure.attachments import footprints_of
 from model.table.table_file import build_table
 from model.transients.base_motion import Bases, Envelopes, ramped_ending, ramped_onset, shaped
@@ -55,10 +56,6 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--picture", type=Path)
     options = parser.parse_args()
-    use_one_thread()
-    import numpy as np
-
-    from model.rig.rig_file import load_rig
 
     rng = np.random.default_rng(options.seed)
     rig = load_rig(RIG)
@@ -84,10 +81,6 @@ def main() -> None:
             if not full:
                 print_columns(f"contrast from the end on, {title}, {how}", contrast, worse=10)
     bench.clock.show()
-
-
-if __name__ == "__main__":
-    main()
 
 
 FREQUENCIES = np.linspace(40, 500, 27)
@@ -485,3 +478,7 @@ def _remark(felt: FloatArray, weights: FloatArray, *, start: bool) -> str:
         return f"contrast {contrast:.0f} dB in the first 100 ms"
     late = np.abs(felt[round(0.04 * SAMPLE_RATE) :, : len(weights)]).max()
     return f"target moves up to {late:.2g} m/s² after 40 ms"
+
+
+if __name__ == "__main__":
+    main()

@@ -15,19 +15,24 @@ docs/measured/contrast-benchmark.md is written as well.
 
 import argparse
 import json
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from benchmarks.setting import RIG, random_contacts, use_one_thread
+import numpy as np
+
+from benchmarks.realised import PAGE, realised
+from benchmarks.setting import RIG, random_contacts, write_parts
 from model.answer.plan import query
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from model.answer.stimulus import Placement
-    from model.rig.rig import Rig
-    from model.table.table import LocalizationTable
+from model.answer.stimulus import Placement
+from model.finger import decibels
+from model.rig.rig import Rig, Uncertainty
+from model.rig.rig_file import load_rig
+from model.study.verification import draw_plates, felt_on
+from model.table.table import LocalizationTable
+from model.table.table_file import build_table
+from model.vibration import Tone
 
 PLATES = ("paper_plate", "eight_eras", "car_display", "table")
 UNCERTAINTIES = ("as in the file", "drives known to 1 %")
@@ -47,12 +52,9 @@ def main() -> None:
     two.add_argument("after", type=Path)
     two.add_argument("--report", action="store_true")
     options = parser.parse_args()
-    use_one_thread()
     if options.command == "answer":
         options.file.write_text(json.dumps(_answers(options.sets), indent=1) + "\n")
         return
-    from benchmarks.page import write_parts
-    from benchmarks.realised import PAGE
 
     text = _compared(json.loads(options.before.read_text()), json.loads(options.after.read_text()))
     if options.report:
@@ -60,13 +62,8 @@ def main() -> None:
         write_parts(PAGE, {"versions": f"Printed by {run}.\n\n{text}"})
 
 
-def _tables() -> "Iterator[tuple[str, str, Rig, LocalizationTable]]":
+def _tables() -> Iterator[tuple[str, str, Rig, LocalizationTable]]:
     """Names of plates, their uncertainty in words, rigs with it, and their tables."""
-    import numpy as np
-
-    from model.rig.rig import Uncertainty
-    from model.rig.rig_file import load_rig
-    from model.table.table_file import build_table
 
     known = replace(Uncertainty.none(), gain=0.01, phase_deg=1.0)
     for name in PLATES:
@@ -77,11 +74,8 @@ def _tables() -> "Iterator[tuple[str, str, Rig, LocalizationTable]]":
             yield name, words, rig, build_table(rig, frequencies=frequencies, drive_mode="phased")
 
 
-def _placement(rig: "Rig", quiet: int, number: int) -> "Placement":
+def _placement(rig: Rig, quiet: int, number: int) -> Placement:
     """The fingers of a set."""
-    import numpy as np
-
-    from model.answer.stimulus import Placement
 
     rng = np.random.default_rng([SEED, quiet, number])
     size = (rig.plate.length, rig.plate.width)
@@ -110,7 +104,6 @@ def _answers(sets: int) -> dict[str, list[dict[str, list[float]]]]:
 
 def _compared(before: dict[str, Any], after: dict[str, Any]) -> str:
     """A table of differences; its lines are printed as they come."""
-    import numpy as np
 
     quiet_fingers = " / ".join(map(str, QUIET))
     lines = [
@@ -147,15 +140,9 @@ def _compared(before: dict[str, Any], after: dict[str, Any]) -> str:
 
 
 def _score(
-    table: "LocalizationTable", rig: "Rig", quiet: int, number: int, tones: dict[str, list[float]]
+    table: LocalizationTable, rig: Rig, quiet: int, number: int, tones: dict[str, list[float]]
 ) -> tuple[float, float]:
     """Felt contrast [dB] and level [dB SL] that nine of ten plates give."""
-    import numpy as np
-
-    from benchmarks.realised import realised
-    from model.finger import decibels
-    from model.study.verification import draw_plates, felt_on
-    from model.vibration import Tone
 
     question = _placement(rig, quiet, number)
     excitation = {era: Tone(*tone) for era, tone in tones.items()}

@@ -36,7 +36,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from model.answer.answer import Layer
 from model.answer.stimulus import Placement, Stimulus, together
 from model.arrays import ComplexArray, FloatArray, Point
-from model.commands.options import JsonOption
+from model.commands.options import JsonOption, progress_bar
 from model.config.document import parse_document
 from model.errors import InputError
 from model.finger import decibels
@@ -69,7 +69,6 @@ def score_entry(
 
     The score is the felt contrast that nine of ten of them give.
     """
-    from model.commands.options import progress_bar
 
     name, excitations = read_entry(file)
     with progress_bar("contact sets") as progress:
@@ -120,13 +119,6 @@ def export_data_set(
     ):
         (folder / name).write_text(content, encoding="utf-8")
         print(f"wrote {folder / name}")
-
-
-if __name__ == "__main__":
-    try:
-        app()
-    except InputError as error:
-        raise SystemExit(f"error: {error}") from None
 
 
 VERSION = 1
@@ -571,3 +563,10 @@ class _InTime:
             duration=DURATION,
             imperfections=self._drawn,
         ).contrast_db
+
+
+if __name__ == "__main__":
+    try:
+        app()
+    except InputError as error:
+        raise SystemExit(f"error: {error}") from None

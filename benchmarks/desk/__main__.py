@@ -21,8 +21,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.desk.session import Identified, Outcome, chain, desk, errors_table, identify
-from benchmarks.page import write_parts
-from benchmarks.setting import use_one_thread
+from benchmarks.setting import write_parts
 
 ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "docs" / "measured" / "desk.md"
@@ -39,7 +38,6 @@ def main() -> None:
     parser.add_argument("--report", action="store_true", help=f"write {PAGE.relative_to(ROOT)}")
     parser.add_argument("--identify-only", action="store_true", help="nothing but identify")
     options = parser.parse_args()
-    use_one_thread()
     if options.identify_only:
         identify_only(range(options.seed, options.seed + options.plates), options.report)
         return

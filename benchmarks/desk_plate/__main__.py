@@ -8,16 +8,15 @@ import select
 import sys
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
+import numpy as np
 import typer
 
+from benchmarks.desk_plate.desk_plate import DeskPlate, JackPlate
 from drivers.errors import LinkError
 from model.commands.options import RigArgument
 from model.errors import InputError
-
-if TYPE_CHECKING:
-    from benchmarks.desk_plate.desk_plate import DeskPlate, JackPlate
 
 _POLL = 0.05  # s
 
@@ -116,7 +115,7 @@ def desk_plate(
         client.close()
 
 
-def _run(running: "JackPlate", plate: "DeskPlate", *, until_eof: bool) -> None:
+def _run(running: JackPlate, plate: DeskPlate, *, until_eof: bool) -> None:
     """Take lines from standard input until it ends, or for ever."""
     while True:
         running.wait(0 if until_eof else _POLL)
@@ -127,9 +126,8 @@ def _run(running: "JackPlate", plate: "DeskPlate", *, until_eof: bool) -> None:
             print(json.dumps(_changed(running, plate, line)), flush=True)
 
 
-def _changed(running: "JackPlate", plate: "DeskPlate", line: str) -> dict[str, object]:
+def _changed(running: JackPlate, plate: DeskPlate, line: str) -> dict[str, object]:
     """Change what a line says; return what is there now."""
-    import numpy as np
 
     try:
         wanted = json.loads(line)

@@ -21,15 +21,20 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.identification.plates import (
+    FAMILY,
+    FREQUENCIES,
     QUIET,
     SETS,
     WAYS,
     Outcome,
+    draw,
+    outcome,
     share_in_region,
     share_within,
+    table_of,
 )
-from benchmarks.page import write_parts
-from benchmarks.setting import RIG, use_one_thread
+from benchmarks.setting import RIG, write_parts
+from model.rig.rig_file import load_rig
 
 
 def main() -> None:
@@ -44,10 +49,6 @@ def main() -> None:
     parser.add_argument("--sensors", default="4", help="numbers of sensors")
     parser.add_argument("--report", action="store_true")
     options = parser.parse_args()
-    use_one_thread()
-
-    from benchmarks.identification.plates import FAMILY, FREQUENCIES, draw, outcome, table_of
-    from model.rig.rig_file import load_rig
 
     rig = load_rig(RIG)
     written = {loaded: table_of(rig, FREQUENCIES, loaded=loaded) for loaded in (False, True)}
@@ -83,10 +84,6 @@ def main() -> None:
         which = f" --kinds {options.kinds} --sensors {options.sensors}" if is_outside else ""
         printed = f"Printed by `{run}{first}{which}{rounds} --report`."
         write_parts(PAGE, {part: f"{printed}\n\n{text}" for part, text in texts.items()})
-
-
-if __name__ == "__main__":
-    main()
 
 
 PAGE = Path(__file__).parents[2] / "docs" / "measured" / "identification.md"
@@ -234,3 +231,7 @@ def _cell(outcomes: Sequence[Outcome], way: str, loaded: bool, quiet: int) -> st
 def _share(outcomes: Sequence[Outcome], *kinds: str) -> str:
     errors = [each.errors[kind] for each in outcomes for kind in kinds if kind in each.errors]
     return f"{100 * share_within(np.concatenate(errors)):.0f} %" if errors else "–"
+
+
+if __name__ == "__main__":
+    main()

@@ -16,8 +16,7 @@ import numpy as np
 
 from benchmarks.identification.__main__ import PAGE
 from benchmarks.identification.plates import LENGTH, NOISE, WIDTH, Complexes, draw, finger_stiffness
-from benchmarks.page import write_parts
-from benchmarks.setting import RIG, use_one_thread
+from benchmarks.setting import RIG, write_parts
 from model.estimate.findings import Verdict
 from model.estimate.measurement import Measurement, sensors_at
 from model.estimate.rig_check import diagnose, judged_by_promises
@@ -131,7 +130,6 @@ def main() -> None:
     parser.add_argument("--first", type=int, default=1, help="seed of the first plate")
     parser.add_argument("--report", action="store_true")
     options = parser.parse_args()
-    use_one_thread()
     rig = load_rig(RIG)
     lines = ["| fault | named | exit status 1 |", "|---|---|---|"]
     for name, fault in FAULTS.items():

@@ -38,8 +38,7 @@ from benchmarks.identification.plates import (
     settled_pattern,
     table_of,
 )
-from benchmarks.page import write_parts
-from benchmarks.setting import RIG, random_contacts, use_one_thread
+from benchmarks.setting import RIG, random_contacts, write_parts
 from model.estimate.following import LivePlate, PatternReport, PlateEstimate
 from model.estimate.forward import Sensor
 from model.estimate.identify import identify
@@ -66,7 +65,6 @@ def main() -> None:
     parser.add_argument("--report", action="store_true")
     parser.add_argument("--objects", action="store_true", help="what lies there for a while")
     options = parser.parse_args()
-    use_one_thread()
     found = []
     if options.objects:
         for seed in range(options.first, options.first + options.hours):

@@ -19,8 +19,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.identification.__main__ import PAGE
-from benchmarks.page import write_parts
-from benchmarks.setting import use_one_thread
+from benchmarks.setting import write_parts
 from benchmarks.weekend.chain import FOLDER, BuiltBoard
 from model.arrays import ComplexArray, FloatArray
 from model.estimate.findings import Verdict
@@ -156,7 +155,6 @@ def measured(rig: Rig, mistake: Mistake, seed: int) -> Measurement:
 
 def verdict_on(name: str, seed: int) -> tuple[bool, bool]:
     """Whether the check names a mistake on a board, and whether it fails."""
-    use_one_thread()
     rig, mistake = load_rig(FOLDER / "rig.yaml"), MISTAKES[name]
     verdict = diagnose(rig, measured(rig, mistake, seed), has_form=True)
     if verdict.is_well:  # what fails already need not miss its promises

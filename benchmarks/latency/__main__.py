@@ -51,8 +51,7 @@ from benchmarks.latency.session import (
     running,
     taps,
 )
-from benchmarks.page import write_parts
-from benchmarks.setting import support, use_one_thread
+from benchmarks.setting import support, write_parts
 from controller.api.client import AsyncClient
 from controller.api.jsonrpc import RpcError
 from controller.api.link import Unreachable
@@ -275,9 +274,6 @@ async def _clear(era: AsyncClient) -> None:
             with suppress(RpcError):
                 return await era.clear()
             await asyncio.sleep(0.02)
-
-
-use_one_thread()  # with two the daemon would compete
 
 
 PAGE = Path(__file__).parents[2] / "docs" / "measured" / "latency.md"

@@ -18,7 +18,7 @@ from functools import cache
 
 import numpy as np
 
-from benchmarks.setting import RIG, use_one_thread
+from benchmarks.setting import RIG
 from drivers.protocol.definition import QUANTITIES
 from drivers.protocol.sets import Command, LayerSet, pack_layers, parts
 from model.finger import fingertip_points
@@ -58,7 +58,6 @@ def main() -> int:
     parser.add_argument("--seconds", type=float, default=2.0)
     parser.add_argument("--repeats", type=int, default=3)
     options = parser.parse_args()
-    use_one_thread()
 
     rigs = Rigs()
 
@@ -119,10 +118,6 @@ def _factor(run: Callable[[float], None], seconds: float) -> float:
     used = time.thread_time()
     run(seconds)
     return seconds / (time.thread_time() - used)
-
-
-if __name__ == "__main__":
-    sys.exit(main())
 
 
 FREQUENCIES = (110.0, 110.0, 250.0, 320.0)
@@ -263,3 +258,7 @@ def contact_times(rigs: Rigs) -> Iterator[tuple[str, float]]:
                 plant.skip(plant.time + 0.1)
                 plant.set_contacts({})
             yield f"{count} at once, {what}", float(np.median(times))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -16,17 +16,14 @@ import tempfile
 import time
 from pathlib import Path
 
-from benchmarks.setting import ONE_THREAD, RIG, use_one_thread
-
-use_one_thread()
-
-from benchmarks.plate.measure import (  # noqa: E402
+from benchmarks.plate.measure import (
     SLOW,
     SLOW_ROUNDS,
     measure,
     write_report,
 )
-from benchmarks.plate.programs import CASES  # noqa: E402
+from benchmarks.plate.programs import CASES
+from benchmarks.setting import RIG
 
 LAYOUTS, WORKERS, STUDIES = 10_000, 2, 3
 
@@ -62,7 +59,7 @@ def study() -> tuple[float, float]:
             "--workers", str(WORKERS), "-o", folder, "--json",
         ]  # fmt: skip
         started, used = time.perf_counter(), _used()
-        environment = os.environ | ONE_THREAD | {"XDG_CACHE_HOME": folder}
+        environment = os.environ | {"XDG_CACHE_HOME": folder}
         # Users' modules are compiled once; without this each start would compile them all.
         environment.pop("PYTHONDONTWRITEBYTECODE", None)
         subprocess.run(command, env=environment, check=True, capture_output=True)

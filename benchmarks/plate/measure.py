@@ -17,7 +17,6 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from benchmarks.page import write_parts
 from benchmarks.plate import programs
 from benchmarks.plate.peers.ways import Direct
 from benchmarks.plate.problem import (
@@ -31,6 +30,7 @@ from benchmarks.plate.problem import (
     difference,
 )
 from benchmarks.plate.programs import ACCURACIES, CASES, Setting, Solved, reference, settings
+from benchmarks.setting import write_parts
 from model.arrays import FloatArray
 
 SLOW = 0.3  # s; a setting that takes longer is measured in the first rounds alone

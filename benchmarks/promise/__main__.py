@@ -17,8 +17,9 @@ from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
 
-from benchmarks.page import write_parts
-from benchmarks.setting import use_one_thread
+from benchmarks.promise.cases import CASES
+from benchmarks.promise.session import Outcome, as_markdown, kept, outcome
+from benchmarks.setting import write_parts
 
 QUARTER = 4
 """Part of the plates for cases with events, which take ten times as long."""
@@ -38,10 +39,6 @@ def main() -> None:
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--report", action="store_true")
     options = parser.parse_args()
-    use_one_thread()
-
-    from benchmarks.promise.cases import CASES
-    from benchmarks.promise.session import Outcome, as_markdown, kept, outcome
 
     numbers = [int(n) for n in options.cases.split(",")] if options.cases else [*range(len(CASES))]
     jobs = [

@@ -14,15 +14,23 @@ import argparse
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
-from benchmarks.setting import use_one_thread
+import numpy as np
 
-if TYPE_CHECKING:
-    from model.answer.answer import Answer
-    from model.arrays import ComplexArray, FloatArray
-    from model.rig.rig import Rig
-    from model.table.table import LocalizationTable
+from benchmarks.promise.cases import EXAMPLES, IDENTIFIED
+from model.answer.answer import Answer
+from model.answer.plan import query
+from model.answer.promise import RingingUnderFingers
+from model.answer.stimulus import DriveEnvelope, Placement
+from model.arrays import ComplexArray, FloatArray
+from model.finger import fingertip_points, fingertip_weights
+from model.rig.rig import Rig
+from model.rig.rig_file import load_rig
+from model.study.contrast_maps import random_contacts
+from model.study.verification import draw_plates
+from model.table.table import LocalizationTable
+from model.table.table_file import build_table, table_following
+from model.vibration import Tone, base_amplitudes
 
 RIGS = ("paper_plate", "eight_eras", "car_display", "table")
 DURATION, LEVEL_DB_SL = 0.04, 20.0
@@ -41,12 +49,6 @@ def main() -> None:
     parser.add_argument("--plates", type=int, default=4)
     parser.add_argument("--seed", type=int, default=20)
     options = parser.parse_args()
-    use_one_thread()
-    import numpy as np
-
-    from benchmarks.promise.cases import EXAMPLES, IDENTIFIED
-    from model.rig.rig_file import load_rig
-    from model.table.table_file import build_table
 
     print("| rig | uncertainty | promised [dB] | kept | beyond nine of ten [dB] |")
     print("|---|---|---|---|---|")
@@ -72,13 +74,8 @@ def main() -> None:
             )
 
 
-def clicks_on(table: "LocalizationTable", sets: int, seed: int) -> Clicks:
+def clicks_on(table: LocalizationTable, sets: int, seed: int) -> Clicks:
     """What is played for a click with one to three quiet fingers in turn."""
-    import numpy as np
-
-    from model.answer.plan import query
-    from model.answer.stimulus import Placement
-    from model.study.contrast_maps import random_contacts
 
     rng, found = np.random.default_rng(seed), []
     for number in range(sets):
@@ -89,14 +86,13 @@ def clicks_on(table: "LocalizationTable", sets: int, seed: int) -> Clicks:
 
 
 def given(
-    table: "LocalizationTable", rig: "Rig", answers: Sequence["Answer"], plates: int, seed: int
-) -> "FloatArray":
+    table: LocalizationTable, rig: Rig, answers: Sequence[Answer], plates: int, seed: int
+) -> FloatArray:
     """Contrast [dB] of the first finger on plates that differ from a rig's within its uncertainty.
 
     Of each answer (a, plates): its level above the others' content at it, or of an only content
     above what is felt of it at the loudest other finger.
     """
-    import numpy as np
 
     found = np.empty((len(answers), plates))
     for number, drawn in enumerate(_drawn_plates(table, rig, plates, seed)):
@@ -108,13 +104,9 @@ def given(
 
 
 def _drawn_plates(
-    table: "LocalizationTable", rig: "Rig", plates: int, seed: int
-) -> Iterator[tuple["LocalizationTable", "ComplexArray", "ComplexArray"]]:
+    table: LocalizationTable, rig: Rig, plates: int, seed: int
+) -> Iterator[tuple[LocalizationTable, ComplexArray, ComplexArray]]:
     """The table of each plate, and gains and second harmonics of its drives (eras,)."""
-    import numpy as np
-
-    from model.study.verification import draw_plates
-    from model.table.table_file import table_following
 
     drawn = draw_plates(
         np.random.default_rng(seed),
@@ -151,22 +143,16 @@ def _drawn_plates(
 
 
 def _felt_on(
-    table: "LocalizationTable",
-    gains: "ComplexArray",
-    harmonic: "ComplexArray",
-    answer: "Answer",
+    table: LocalizationTable,
+    gains: ComplexArray,
+    harmonic: ComplexArray,
+    answer: Answer,
     number: int,
-) -> tuple[float, "FloatArray"]:
+) -> tuple[float, FloatArray]:
     """Power to threshold of a layer at its first finger, and at the loudest points of all (k,).
 
     In time: over a duration, or at the strongest moments of a course; of what lasts the steady one.
     """
-    import numpy as np
-
-    from model.answer.promise import RingingUnderFingers
-    from model.answer.stimulus import DriveEnvelope
-    from model.finger import fingertip_points, fingertip_weights
-    from model.vibration import Tone, base_amplitudes
 
     contents, power = answer.contents, 0.0
     steady = RingingUnderFingers(

@@ -17,16 +17,20 @@ density higher by 1.8 %; fingers 2 cm from the edge.
 import argparse
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
-from benchmarks.setting import use_one_thread
+import numpy as np
 
-if TYPE_CHECKING:
-    from model.answer.answer import Answer
-    from model.arrays import FloatArray
-    from model.rig.rig import Uncertainty
-    from model.study.verification import Plates
-    from model.table.table import LocalizationTable
+from benchmarks.promise.cases import CASES, EXAMPLES, IDENTIFIED
+from model.answer.answer import Answer
+from model.answer.plan import answer
+from model.answer.stimulus import Finger, Placement, Stimulus
+from model.arrays import FloatArray
+from model.rig.rig import Uncertainty
+from model.rig.rig_file import load_rig
+from model.study.contrast_maps import random_contacts
+from model.study.verification import Plates, draw_plates, harmonics_on, powers_on
+from model.table.table import LocalizationTable, read_fingertips
+from model.table.table_file import build_table
 
 
 def main() -> None:
@@ -40,7 +44,6 @@ def main() -> None:
     parser.add_argument("--place", type=float)
     parser.add_argument("--weather", action="store_true")
     options = parser.parse_args()
-    use_one_thread()
     size = options.sets, options.plates
     print("| | not counted: promised | kept | counted: promised | kept |")
     print("|---|---|---|---|---|")
@@ -51,7 +54,6 @@ def main() -> None:
 
 def with_errors(sets: int, count: int, place: float | None) -> Iterator[tuple[str, list[str]]]:
     """Yield rows of plates with harmonics and further errors; place [m]: of ERAs, if given."""
-    from benchmarks.promise.cases import CASES
 
     for case in [each for each in CASES if each.with_errors]:
         known = case.rig.uncertainty
@@ -66,12 +68,6 @@ def with_errors(sets: int, count: int, place: float | None) -> Iterator[tuple[st
 
 def after_weather(sets: int, count: int) -> Iterator[tuple[str, list[str]]]:
     """Yield rows of plates that were measured, after the weather has changed."""
-    import numpy as np
-
-    from benchmarks.promise.cases import EXAMPLES, IDENTIFIED
-    from model.rig.rig import Uncertainty
-    from model.rig.rig_file import load_rig
-    from model.table.table_file import build_table
 
     acrylic = load_rig(EXAMPLES / "paper_plate.yaml").replaced(
         plate={
@@ -95,7 +91,7 @@ def after_weather(sets: int, count: int) -> Iterator[tuple[str, list[str]]]:
         whole = replace(rig, uncertainty=stated)
         table = build_table(whole, drive_mode="phased", frequencies=grid)
 
-        def changed(plates: "Plates", modulus: float = modulus, loss: float = loss) -> "Plates":
+        def changed(plates: Plates, modulus: float = modulus, loss: float = loss) -> Plates:
             return replace(plates, modulus=modulus * plates.modulus, loss=loss * plates.loss)
 
         tables = [replace(table, uncertainty=each) for each in (known, stated)]
@@ -103,20 +99,14 @@ def after_weather(sets: int, count: int) -> Iterator[tuple[str, list[str]]]:
 
 
 def kept_by(
-    table: "LocalizationTable",
-    known: "Uncertainty",
+    table: LocalizationTable,
+    known: Uncertainty,
     sets: int,
     count: int,
     margin: float = 0.013,
-    changed: "Callable[[Plates], Plates]" = lambda plates: plates,
+    changed: Callable[[Plates], Plates] = lambda plates: plates,
 ) -> str:
     """Return cells of what is promised and kept on plates of an uncertainty, changed after."""
-    import numpy as np
-
-    from model.answer.plan import answer
-    from model.answer.stimulus import Finger, Stimulus
-    from model.study.contrast_maps import random_contacts
-    from model.study.verification import draw_plates
 
     kept, promised = [], []
     for number in range(sets):
@@ -131,13 +121,8 @@ def kept_by(
     return f"{np.median(promised):.1f} dB | {100 * np.mean(kept):.0f} %"
 
 
-def contrasts_on(table: "LocalizationTable", found: "Answer", plates: "Plates") -> "FloatArray":
+def contrasts_on(table: LocalizationTable, found: Answer, plates: Plates) -> FloatArray:
     """Contrast of each finger to the other's content on plates [dB], (2, d)."""
-    import numpy as np
-
-    from model.answer.stimulus import Placement
-    from model.study.verification import harmonics_on, powers_on
-    from model.table.table import read_fingertips
 
     places = [each.at for each in found.asked]
     placed, tips = Placement((places[0],), (places[1],)), read_fingertips(table, places)

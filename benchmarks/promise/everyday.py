@@ -11,21 +11,25 @@ and what nine of ten plates lack to it [dB].
 """
 
 import argparse
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
-from benchmarks.setting import use_one_thread
+import numpy as np
+
+from benchmarks.promise.cases import Case
+from benchmarks.setting import random_contacts
 from controller.sources.touch import LIGHT_FORCE
-
-if TYPE_CHECKING:
-    import numpy as np
-
-    from model.answer.answer import Answer
-    from model.arrays import FloatArray, Point
-    from model.structure.attachments import FingertipLoad
-    from model.study.verification import Plates
-    from model.table.table import LocalizationTable
+from model.answer.answer import Answer
+from model.answer.plan import answer
+from model.answer.stimulus import Finger, Stimulus
+from model.arrays import FloatArray, Point
+from model.finger import FINGERTIP_RADIUS, decibels
+from model.structure.attachments import Fingertip, FingertipLoad, object_load
+from model.study.verification import Plates, accelerations_on, draw_plates
+from model.table.table import LocalizationTable, read_fingertips
+from model.vibration import base_amplitudes
+from registry.limits import HAND_LOAD
 
 RIGS = (("paper_plate", False), ("paper_plate", True), ("car_display", True))
 OBJECT_AWAY = 0.03  # m
@@ -96,10 +100,6 @@ def main() -> None:
     parser.add_argument("--only", nargs="+", default=[""], help="words in the names of rows")
     parser.add_argument("--rigs", nargs="+", type=int, default=[*range(len(RIGS))])
     options = parser.parse_args()
-    use_one_thread()
-    import numpy as np
-
-    from benchmarks.promise.cases import Case
 
     print("| rig | | promised (10 %) | kept | nine of ten lack |\n|---|---|---|---|---|")
     for name, known in [RIGS[number] for number in options.rigs]:
@@ -125,17 +125,9 @@ def main() -> None:
 
 
 def _row(
-    table: "LocalizationTable", of: Situation, rng: "np.random.Generator", count: int
-) -> "tuple[Answer, FloatArray]":
+    table: LocalizationTable, of: Situation, rng: np.random.Generator, count: int
+) -> tuple[Answer, FloatArray]:
     """An answer, and by how much plates are above its promises (2, d) [dB]."""
-    import numpy as np
-
-    from benchmarks.setting import random_contacts
-    from model.answer.plan import answer
-    from model.answer.stimulus import Finger, Stimulus
-    from model.finger import FINGERTIP_RADIUS
-    from model.study.verification import draw_plates
-    from registry.limits import HAND_LOAD
 
     size = table.plate.length, table.plate.width
     margin = FINGERTIP_RADIUS + 0.001
@@ -172,13 +164,12 @@ def _row(
 
 
 def _hand_at(
-    rng: "np.random.Generator",
-    places: "Sequence[Point]",
+    rng: np.random.Generator,
+    places: Sequence[Point],
     size: tuple[float, float],
     distance: float,
-) -> "Point | None":
+) -> Point | None:
     """Where a hand rests: so far from the nearer finger, or in the corner farthest from both."""
-    import numpy as np
 
     margin = 2 * PATCH
     if not distance:
@@ -194,16 +185,13 @@ def _hand_at(
 
 
 def _patches(
-    table: "LocalizationTable",
-    places: "Sequence[Point]",
-    hand: "Point | None",
+    table: LocalizationTable,
+    places: Sequence[Point],
+    hand: Point | None,
     of: Situation,
-    rng: "np.random.Generator",
-) -> "list[FingertipLoad]":
+    rng: np.random.Generator,
+) -> list[FingertipLoad]:
     """Loads of a hand's patches, or of an object at least 3 cm from fingers."""
-    import math
-
-    from model.structure.attachments import Fingertip, FingertipLoad, object_load
 
     if of.mass:
         sides, at = (table.plate.length, table.plate.width), places[0]
@@ -220,24 +208,17 @@ def _patches(
 
 
 def contrasts_on(
-    table: "LocalizationTable",
-    found: "Answer",
-    plates: "Plates",
+    table: LocalizationTable,
+    found: Answer,
+    plates: Plates,
     of: Situation,
-    patches: "list[FingertipLoad]",
-    rng: "np.random.Generator",
-) -> "FloatArray":
+    patches: list[FingertipLoad],
+    rng: np.random.Generator,
+) -> FloatArray:
     """Contrast [dB] of both fingers to the other's content on plates solved exactly, (2, d).
 
     The least over all sets of thresholds; by those of a person if there is one.
     """
-    import numpy as np
-
-    from model.finger import decibels
-    from model.structure.attachments import Fingertip, FingertipLoad
-    from model.study.verification import accelerations_on
-    from model.table.table import read_fingertips
-    from model.vibration import base_amplitudes
 
     tip, places = table.fingertip or Fingertip(), [each.at for each in found.asked[:2]]
     pressed = tip.scaled((of.force / LIGHT_FORCE) ** (2 / 3))

@@ -19,16 +19,20 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from multiprocessing import get_context
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from benchmarks.page import write_parts
-from benchmarks.setting import random_contacts, use_one_thread
+import numpy as np
 
-if TYPE_CHECKING:
-    from era_haptics import SolvedPlate
-    from model.arrays import ComplexArray, FloatArray
-    from model.rig.rig import Rig
-    from model.table.table import LocalizationTable
+import era_haptics as era
+from benchmarks.setting import random_contacts, write_parts
+from era_haptics import SolvedPlate
+from model.arrays import ComplexArray, FloatArray
+from model.finger import decibels, detection_threshold, fingertips_on
+from model.rig.rig import Rig
+from model.rig.rig_file import load_rig
+from model.table.table import LocalizationTable
+from model.table.table_file import build_table
+from model.transients.excursions import excursions_of
 
 ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "docs" / "how-to" / "a-plate-for-a-weekend.md"
@@ -63,10 +67,8 @@ class Board:
     exciter: str
 
     @property
-    def rig(self) -> "Rig":
+    def rig(self) -> Rig:
         """Its rig, from where magnets stay within their excursion; raises ConfigError."""
-        from model.rig.rig_file import load_rig
-        from model.transients.excursions import excursions_of
 
         rig = load_rig(ROOT / "examples" / "weekend" / "rig.yaml")
         data: Any = rig.document.data if rig.document else {}
@@ -119,7 +121,6 @@ def main() -> None:
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--report", action="store_true")
     options = parser.parse_args()
-    use_one_thread()
     numbers = [int(n) for n in options.cases.split(",")] if options.cases else range(len(BOARDS))
     chosen = [BOARDS[number] for number in numbers]
     with ProcessPoolExecutor(options.workers, mp_context=get_context("spawn")) as pool:
@@ -142,7 +143,6 @@ _HEAD = (
 
 
 def _line(board: Board, found: Expected) -> str:
-    import numpy as np
 
     def medians(known: str) -> str:
         return " / ".join(
@@ -164,10 +164,6 @@ def _line(board: Board, found: Expected) -> str:
 
 def expected(board: Board, touches: int, plates: int) -> Expected:
     """Answers and levels of a board."""
-    import numpy as np
-
-    import era_haptics as era
-    from model.table.table_file import build_table
 
     rig = board.rig
     frequencies = np.arange(rig.limits.frequency_min, rig.limits.frequency_max + 1, STEP)
@@ -185,12 +181,9 @@ def expected(board: Board, touches: int, plates: int) -> Expected:
 
 
 def _touches(
-    table: "LocalizationTable", drawn: "Sequence[SolvedPlate]", quiet: int, count: int
+    table: LocalizationTable, drawn: Sequence[SolvedPlate], quiet: int, count: int
 ) -> Iterator[tuple[float, bool]]:
     """Yield what is promised to random touches, and whether a drawn board keeps it."""
-    import numpy as np
-
-    import era_haptics as era
 
     plate = table.plate
     rng = np.random.default_rng([SEED, quiet])
@@ -203,16 +196,13 @@ def _touches(
         yield promised, contrast(drawn[number % len(drawn)], answer) >= promised
 
 
-def contrast(plate: "SolvedPlate", answer: Any) -> float:
+def contrast(plate: SolvedPlate, answer: Any) -> float:
     """Felt contrast [dB] of an answer in the steady state of a plate under its fingers."""
-    import numpy as np
-
-    from model.finger import fingertips_on
 
     fingers, size = [each.finger.at for each in answer.fingers], plate.rig.plate
     points, weights = fingertips_on(np.array(fingers), length=size.length, width=size.width)
 
-    def response(frequency: float) -> "ComplexArray":
+    def response(frequency: float) -> ComplexArray:
         places = points.reshape(-1, 2).tolist()
         return np.asarray(plate.responses(places, [frequency], fingers=fingers)[0])
 
@@ -220,12 +210,9 @@ def contrast(plate: "SolvedPlate", answer: Any) -> float:
 
 
 def sensed(
-    answer: Any, rig: "Rig", response: "Callable[[float], ComplexArray]", weights: "FloatArray"
+    answer: Any, rig: Rig, response: Callable[[float], ComplexArray], weights: FloatArray
 ) -> float:
     """Felt contrast [dB]; response: of a frequency, (e, k p) [m/s²] under k fingertips."""
-    import numpy as np
-
-    from model.finger import detection_threshold
 
     names = [each.name for each in rig.eras]
     squares: FloatArray = np.zeros(weights.size)
@@ -238,20 +225,14 @@ def sensed(
     return felt_contrast(np.sqrt(squares).reshape(len(answer.fingers), -1), weights)
 
 
-def felt_contrast(felt: "FloatArray", weights: "FloatArray") -> float:
+def felt_contrast(felt: FloatArray, weights: FloatArray) -> float:
     """Contrast [dB] of what is felt (k, p), relative to the threshold, the target first."""
-    import numpy as np
-
-    from model.finger import decibels
 
     return float(decibels(felt[0] @ np.reshape(weights, felt.shape)[0] / felt[1:].max()))
 
 
-def levels(plate: "SolvedPlate", frequencies: Sequence[float]) -> dict[float, float]:
+def levels(plate: SolvedPlate, frequencies: Sequence[float]) -> dict[float, float]:
     """Least level [dB SL] over the board but its edges, under a finger, all exciters in phase."""
-    import numpy as np
-
-    from model.finger import decibels, detection_threshold
 
     rig = plate.rig
     x, y = (

@@ -25,8 +25,7 @@ import numpy as np
 
 import era_haptics as era
 from benchmarks.calibration.hidden_plates import FORM
-from benchmarks.page import write_parts
-from benchmarks.setting import random_contacts, use_one_thread
+from benchmarks.setting import random_contacts, write_parts
 from benchmarks.weekend.boards import EDGE, LEVEL_DB_SL, PAGE, ROOT, SEED, sensed
 from era_haptics.lab.measuring.sound_card import WiredSensor, read_sensors
 from model.answer.answer import Answer
@@ -229,7 +228,6 @@ def rig_as_bought() -> Rig:
 
 def outcome(board: int, touched: int) -> "Outcome":
     """Touches on a board by its number."""
-    use_one_thread()
     try:
         return Outcome(board, tuple(touches(rig_as_bought(), board, touched)))
     except InputError as refused:

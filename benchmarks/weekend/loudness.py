@@ -13,7 +13,7 @@ import math
 
 import numpy as np
 
-from benchmarks.page import write_parts
+from benchmarks.setting import write_parts
 from benchmarks.weekend.boards import BOARDS, PAGE
 from model.finger import detection_threshold
 

@@ -16,8 +16,7 @@ from multiprocessing import get_context
 
 import numpy as np
 
-from benchmarks.page import write_parts
-from benchmarks.setting import use_one_thread
+from benchmarks.setting import write_parts
 from benchmarks.weekend.boards import ROOT
 from benchmarks.weekend.chain import FOLDER, measured
 from model.errors import InputError
@@ -46,7 +45,6 @@ class Known:
 
 def known_by(board: int, count: int) -> Known:
     """How well a board is known by a number of places."""
-    use_one_thread()
     rig = load_rig(FOLDER / "rig.yaml")
     built, responses = measured(rig, board)
     order = np.random.default_rng([7, board]).permutation(len(responses.sensors))

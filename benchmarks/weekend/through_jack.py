@@ -24,8 +24,7 @@ import numpy as np
 
 from benchmarks.desk.session import REPEAT, Desk, desk, hold, playing, sizes, until_ready
 from benchmarks.desk_plate.desk_plate import SAMPLES, as_built
-from benchmarks.page import write_parts
-from benchmarks.setting import use_one_thread
+from benchmarks.setting import write_parts
 from benchmarks.weekend.boards import LEVEL_DB_SL, PAGE, ROOT, felt_contrast
 from benchmarks.weekend.chain import (
     FOLDER,
@@ -214,7 +213,6 @@ def main() -> None:
     parser.add_argument("--first", type=int, default=0, help="number of the first board")
     parser.add_argument("--report", action="store_true")
     options = parser.parse_args()
-    use_one_thread()
     found: list[Played] = []
     for number in range(options.first, options.first + options.boards):
         try:

@@ -262,7 +262,7 @@ class Sampler:
     def _rows(self, amplitudes: ComplexArray) -> FloatArray:
         """Real and imaginary parts (2 n, q) of amplitudes (n, q), one after the other."""
         parts = np.stack([amplitudes.real, amplitudes.imag], axis=1, dtype=self.precision)
-        return parts.reshape(-1, len(self.points))
+        return parts.reshape(2 * len(amplitudes), len(self.points))
 
     def _columns(self, table: ComplexArray) -> FloatArray:
         """Real and imaginary parts (n, 2 k) of a table (n, k)."""

@@ -198,7 +198,6 @@ ARRANGEMENTS = {
 _WINDOW, _STEP = 1.0, 0.05  # s
 _TAPS, _HELD, _APART = 40, 0.05, 0.25  # s
 
-
 Skews: TypeAlias = tuple[list[float], list[float]]
 """Differences of clocks, and errors that are stated of them [s]."""
 

@@ -67,7 +67,6 @@ It raises LinkError.
 PORT_OPENER: ContextVar[PortOpener | None] = ContextVar("PORT_OPENER", default=None)
 """Opens serial ports in this context; None: the machine itself does."""
 
-
 FAILURES: tuple[type[Exception], ...] = (OSError, ValueError, TypeError)
 """What a device raises once it is gone; pyserial raises TypeError if it is closed during a read."""
 

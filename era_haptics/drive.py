@@ -167,10 +167,8 @@ class Drive:
 Driven: TypeAlias = float | Drive | Tone
 """A frequency [Hz] at full level, a `Drive`, or a `Tone` [Hz; m, or V of an exciter; rad]."""
 
-
 Drives: TypeAlias = Mapping[str, Driven | Sequence[Driven]]
 """By ERA name: what it plays, or a list of what it plays at once."""
-
 
 Played: TypeAlias = Answer | Layer | Drives
 """What ERAs are to play: an answer with all its layers, one layer, or drives."""

@@ -49,7 +49,6 @@ FIELD_POINTS = FIELD_POINTS.reshape(-1, 2)
 CHOSEN = {3: [0, 6, 9], 4: [0, 3, 5, 10], 6: [0, 2, 4, 7, 9, 10], 12: list(range(12))}
 """Sensors of those above, by their number."""
 
-
 FORM = {
     "place": 1.5e-3,
     "side": 0.5e-3,

@@ -616,7 +616,6 @@ class DeskPlate:
 BLOCK_MULTIPLE = SAMPLES
 """Frames of a block must be a multiple of this."""
 
-
 _PROCESS = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_uint32, ctypes.c_void_p)
 _SHUTDOWN = ctypes.CFUNCTYPE(None, ctypes.c_void_p)
 
@@ -661,7 +660,7 @@ class JackPlate:
             heard = self._plate.advance(played.astype(float))
             for port, samples in zip(self._client.outputs, heard.T, strict=True):
                 _samples(port, frames)[:] = samples
-        except Exception as problem:  # the server's thread has nobody to raise it to
+        except Exception as problem:  # nothing above catches it in the server's thread
             self._problem = problem
             self._ended.set()
         return 0

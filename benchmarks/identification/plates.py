@@ -406,7 +406,6 @@ def pattern_of_touches(
 
 CONTACT_SPRING = 1e5 * (1 + 0.1j)  # N/m; of an object that lies on a plate
 
-
 DRIVES = Uncertainty(gain=0.01, phase_deg=1, thickness=0, stiffness=0, damping=1, fingertip=0)
 
 

@@ -142,7 +142,6 @@ _HEADING = (
     f"{'prom.':>6} {'meas.':>6}  {'prom.':>6} {'meas.':>6}\n"
 )
 
-
 _MAX_NAMES = 4  # of ERAs in a row
 
 

@@ -71,12 +71,10 @@ MIN_DB_SL, DEFAULT_MAX_DB_SL = -20.0, 40.0
 DB_SL = Quantity(LEVEL, at_least=MIN_DB_SL, at_most=MAX_LEVEL_DB_SL)
 """A level of an effect."""
 
-
 MIN_DURATION = 0.020
 """The plate needs about 20 ms to respond (docs/concepts/transients.md); less is not felt [s]."""
 
 MAX_DURATION = 10.0
-
 
 Modulation: TypeAlias = (
     Annotated[float, Quantity(FREQUENCY, at_least=MIN_MODULATION, at_most=MAX_MODULATION)] | None

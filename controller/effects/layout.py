@@ -125,7 +125,6 @@ class SurfaceLayout:
 
 _MAX_REGIONS, _MAX_EFFECTS = 256, 64  # those beyond are one problem, and not checked
 
-
 _HighestLevel = Annotated[
     float, Quantity(LEVEL, at_least=DEFAULT_MAX_DB_SL, at_most=MAX_LEVEL_DB_SL)
 ]

@@ -28,22 +28,15 @@ from model.table.table_file import table_following
 _IDENTIFIED = 0.5  # of the thickness error of a plate that was not measured
 
 _HELD = "the plate is not as known; the next patterns tell what has changed"
-
-
 _CHANGED_REMEDY = (
     "run era rig check, and look for a loose mount, a crack or something on the plate; then "
     "identify it (era rig identify), or discard what was learned (era forget)"
 )
-
 _IDENTIFY = "identify the plate (era rig identify)"
-
-
 _MASS_REMEDY = "take away what lies on the plate, or run era rig check"
 
 _VERSION = 3
 _TYPES = {"header": "|u1", "x": "<f8", "covariance": "<f8"}
-
-
 _MAX_BYTES = 1 << 24
 
 

@@ -43,7 +43,6 @@ from model.vibration import Tone
 MIN_LEFT = 0.001
 """Shortest remaining time [s] of a pulse."""
 
-
 # With no finger left on the plate the end may be short: zero within 20 ms of the lift.
 RELEASE_RAMP = 0.010
 

@@ -176,7 +176,6 @@ _VERSION = re.compile(rb"V([0-9A-Fa-f]{4})\r")
 _END = re.compile(rb"[\r\x07]")  # done, or refused
 _DONE = b"\r"
 
-
 _NETWORK = Path("/sys/class/net")
 _CAN_TYPE = "280"  # ARPHRD_CAN of Linux
 _UNDESCRIBED = "n/a"  # by pyserial

@@ -47,7 +47,6 @@ _MEASURING_ERROR = 0.002  # of full level, if the amplifier measures its levels
 _WEAK = 0.25  # largest measuring error, as a share of a weak level
 _logger = logging.getLogger(__name__)
 
-
 SILENCING = 0.005 + REACTION
 """Longest time from the expiry of a watchdog until the outputs are silent [s]."""
 _FULL_LEVEL = ("motion of a stiff source", "output of a linear amplifier")

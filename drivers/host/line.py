@@ -144,7 +144,6 @@ _SUPERSEDED = {
     Priority.SILENCE: (Priority.SET, Priority.ARM),
 }
 
-
 Make: TypeAlias = Callable[[], list[Values]]
 """A function that makes a request when its turn comes.
 

@@ -150,7 +150,6 @@ _FALLING = {SWITCHED_ON: OFF, REACTING: FAULT}
 """States until all is silent, and then."""
 _NEVER: Interval = (-math.inf, math.inf)
 
-
 _WARM = QUANTITIES["temperature"].to_wire(60.0)  # from here on an amplifier may derate
 FEEDING = frozenset(name for name, message in MESSAGES.items() if message.feeds)
 """Requests that feed the watchdog unless they are refused."""

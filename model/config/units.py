@@ -53,85 +53,59 @@ LENGTH = Dimension(
     {"m": "1", "cm": "0.01", "mm": "0.001", "um": "0.000001", "in": "0.0254"},
 )
 
-
 MODULUS = Dimension("a modulus", "Pa", "70 GPa", {"Pa": "1", "MPa": "1000000", "GPa": "1000000000"})
-
 
 DENSITY = Dimension("a density", "kg/m^3", "2700 kg/m^3", {"kg/m^3": "1"})
 
-
 STIFFNESS = Dimension("a stiffness", "N/m", "17 kN/m", {"N/m": "1", "kN/m": "1000", "N/mm": "1000"})
-
 
 LINE_STIFFNESS = Dimension("a stiffness per length", "N/m^2", "5 kN/m^2")
 
-
 DAMPING = Dimension("a damping", "N s/m", "2 N s/m", {"N s/m": "1"})
-
 
 MASS = Dimension("a mass", "kg", "5 g", {"kg": "1", "g": "0.001"})
 
-
 FORCE_FACTOR = Dimension("a force factor", "N/A", "3.6 N/A", {"N/A": "1", "T m": "1"})
-
 
 RESISTANCE = Dimension("a resistance", "ohm", "4 ohm", {"ohm": "1"})
 
-
 INDUCTANCE = Dimension("an inductance", "H", "0.1 mH", {"H": "1", "mH": "0.001"})
-
 
 POWER = Dimension("a power", "W", "3 W", {"W": "1", "mW": "0.001"})
 
-
 VOLTAGE = Dimension("a voltage", "V", "5 V", {"V": "1", "mV": "0.001"})
-
 
 LINE_MASS = Dimension("a mass per length", "kg/m", "0.05 kg/m", {"kg/m": "1", "g/m": "0.001"})
 
-
 FREQUENCY = Dimension("a frequency", "Hz", "250 Hz", {"Hz": "1", "kHz": "1000"})
-
 
 TIME = Dimension("a time", "s", "50 ms", {"s": "1", "ms": "0.001"})
 
-
 SPEED = Dimension("a speed", "m/s", "5 cm/s", {"m/s": "1", "cm/s": "0.01", "mm/s": "0.001"})
-
 
 ANGLE = Dimension(
     "an angle", "rad", "15 deg", {"rad": "1", "deg": "0.01745329251994329576923690768"}
 )
 
-
 RATE = Dimension("a rate", "1/s", "50 Hz", {"Hz": "1", "%/ms": "10"})
-
 
 SLEW = Dimension("a rise of the level", "1/s", "2 %/ms", RATE.factors)
 
-
 TEMPERATURE = Dimension("a temperature", "degC", "23 °C or 296 K", {"degC": "1", "°C": "1"})
-
 
 LEVEL = Dimension("a level", "dB", "14 dB", {"dB": "1"})
 
-
 RATIO = Dimension("a plain number", "", "0.05 or 5 %", {"%": "0.01"})
-
 
 # The number is split from its unit here and texts are short, so that nothing is evaluated: pint
 # by itself would compute `9**9**9 m`.
 _MAX_LENGTH = 40
 
-
 _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d{1,2})?"
-
 
 _FACTOR = r"[A-Za-zµμΩ%°]+(?:(?:\^|\*\*)-?\d|[²³])?"
 
-
 _UNIT = rf"{_FACTOR}(?:(?:\s*[*/·]\s*|\s+){_FACTOR}){{0,4}}"
-
 
 _QUANTITY = re.compile(rf"\s*({_NUMBER})\s*({_UNIT})?\s*", re.ASCII)
 

@@ -75,7 +75,6 @@ _GAIN_ALLOWED, _PHASE_ALLOWED = 0.3, math.radians(20)  # whatever the rig's unce
 
 _CLOCK_STDS = 4.0  # beyond which a clock is not as stated
 
-
 _EXTRA_NOISE = 0.05  # of the rms at each frequency, in the first stages
 _THICKNESSES = (0.0, 1.5, -1.5)  # standard deviations from which the first stage starts
 _FREQUENCY_MARGIN = 1.02  # since layers do not stiffen all modes alike

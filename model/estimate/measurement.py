@@ -88,7 +88,6 @@ _SPELLED = {ord("²"): "2", ord("µ"): "u", ord("μ"): "u", **dict.fromkeys(map(
 PLACE_COLUMNS = ("sensor", "x_m", "y_m")
 INPUT_COLUMNS = ("input", "mv_per_m_s2", "gain", "full_scale_v", "mass_g")
 
-
 NONLINEAR = 0.02
 """Relative difference of responses at two levels beyond which a plate is not linear."""
 

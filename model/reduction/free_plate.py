@@ -344,7 +344,6 @@ frequency, None where they do not. Between points (n, 2) and others (m, 2), or f
   the unknowns of the plate, by symmetry class.
 """
 
-
 TERMS = 2 * RESIDUAL_ORDER
 """Truncated sums of a receptance between points."""
 

@@ -354,7 +354,6 @@ MAY_DIFFER = {
 Everything else, and so every new field, must be the same.
 """
 
-
 PHYSICS = tuple(each.name for each in fields(Rig) if f"Rig.{each.name}" not in MAY_DIFFER)
 """Fields of a rig that a table has, too."""
 

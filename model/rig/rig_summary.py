@@ -412,7 +412,6 @@ RIG = ConfigKind(
     keys=_keys,
 )
 
-
 _THICK = 0.02  # m; of one material
 _NEARLY_ALL = 0.9  # of the modes up to a frequency the highest may be so far below it
 

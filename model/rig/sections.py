@@ -452,7 +452,6 @@ PLAIN_KEYS: Mapping[str, Dimension] = {
 }
 """Dimensions of the keys of a plate that are quantities with the value of a field of `Plate`."""
 
-
 Corner = Annotated[
     tuple[
         Annotated[float, Quantity(LENGTH, at_least=-10, at_most=10)],

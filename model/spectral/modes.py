@@ -78,7 +78,6 @@ _SPAN = 1.5  # of the moduli of the three plates where only losses matter
 _DEPENDENT = 1e-10  # share of the largest below which directions of the space are left out
 _STEPS = 12  # of the iteration for a complex mode, which takes three or four
 
-
 _functions = lru_cache(maxsize=16)(EdgedFunctions)
 
 

@@ -414,7 +414,6 @@ FOLLOWED_FIELDS = tuple(
 )
 """Fields of a plate that a table follows, and that leave the modes of the plate's theory alone."""
 
-
 _MAX_STEPS = 200  # of the iteration for a wavenumber, which takes some twenty
 
 

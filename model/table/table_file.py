@@ -73,7 +73,6 @@ _DTYPES = {
     "shapes": "<f4",
 }
 
-
 # Bound of accelerations [m/s²], frequencies [rad/s] and shapes [1/sqrt(kg)], whose squares fit into
 # single precision.
 MAX_VALUE = 1e9
@@ -494,7 +493,6 @@ _Part = TypeVar("_Part", bound=Plate | Actuator)
 
 _SAME_PLACE = 1e-9  # m
 _MAX_SCALE, _MAX_SCALE_ON_AIR = 0.1, 0.01  # mass and stiffness of air do not follow the plate's
-
 
 _FOLLOWED_OF_RIG = ("masses", "uncertainty", "fingertip", "threshold")
 """Fields of a rig that may differ, beside those of its plate and `LEARNED` of its ERAs.

@@ -86,7 +86,6 @@ TRANSITIONS: Mapping[tuple[str, str], str] = {
 }
 """The state after a request, by state and name of the request."""
 
-
 Layers: TypeAlias = tuple[LayerSet, ...]
 
 

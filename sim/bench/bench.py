@@ -356,7 +356,6 @@ _MAX_BEHIND = 0.1  # s; of the plate behind the amplifiers, once time goes on
 _MAX_STEP = 1.0  # s; sampled at once
 _MAX_SHAPES = 16  # sets of points
 
-
 Voices: TypeAlias = tuple[Voice, ...]
 """What a channel plays."""
 

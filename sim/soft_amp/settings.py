@@ -14,7 +14,6 @@ from model.errors import InputError
 MAX_CHANNELS = 32
 """Of two amplifiers; one has at most 16 by the protocol."""
 
-
 CHANNELS_OF_AMPLIFIER = 16
 
 

@@ -627,6 +627,9 @@ def test_files_of_writers_that_were_killed_are_removed(tmp_path: Path) -> None:
     assert other.exists()
 
 
+PATIENCE = 300.0  # s; a worker gives way to all else that runs
+
+
 def nap(seconds: float) -> int:
     """Sleep, and return the process number."""
     time.sleep(seconds)
@@ -643,7 +646,7 @@ async def working() -> AsyncIterator[Worker]:
     """A worker that has started."""
     worker = Worker()
     try:
-        await worker.call(60.0, nap, 0.0)
+        await worker.call(PATIENCE, nap, 0.0)
         yield worker
     finally:
         worker.end()
@@ -672,7 +675,7 @@ async def gone(*pids: int) -> bool:
 async def test_worker_that_hangs_holds_nothing() -> None:
     """Its call ends in time, the loop goes on meanwhile, and `end` returns at once and kills it."""
     async with working() as worker:
-        assert await worker.call(60.0, nap, 0.0) == worker.pid
+        assert await worker.call(PATIENCE, nap, 0.0) == worker.pid
         ticks = asyncio.create_task(asyncio.sleep(0.1))
         with pytest.raises(TimeoutError, match=r"no reply within 0\.3 s"):
             await worker.call(0.3, nap, 1e3)
@@ -680,8 +683,7 @@ async def test_worker_that_hangs_holds_nothing() -> None:
         began = time.monotonic()
         worker.end()
         assert time.monotonic() - began < 0.2
-        assert worker.pid is not None
-        assert await gone(worker.pid)
+        assert await gone(worker.pid or 0)
 
 
 @pytest.mark.real_time
@@ -689,10 +691,10 @@ async def test_worker_that_dies_is_reported() -> None:
     """At the call that it was killed in, and at the next one."""
     async with working() as worker:
         assert worker.pid is not None
-        napping = asyncio.create_task(worker.call(60.0, nap, 1e3))
+        napping = asyncio.create_task(worker.call(PATIENCE, nap, 1e3))
         await asyncio.sleep(0.1)
         os.kill(worker.pid, signal.SIGKILL)
-        for call in (napping, worker.call(60.0, nap, 0.0)):
+        for call in (napping, worker.call(PATIENCE, nap, 0.0)):
             with pytest.raises(ChildProcessError):
                 await call
 
@@ -705,8 +707,8 @@ async def test_worker_may_not_take_all_memory() -> None:
     assert MAX_MEMORY <= 2**30 - 0.6e9
     async with working() as worker:
         with pytest.raises(MemoryError):
-            await worker.call(60.0, grow, 2 * MAX_MEMORY)
-        assert await worker.call(60.0, grow, 1000) == 1000
+            await worker.call(PATIENCE, grow, 2 * MAX_MEMORY)
+        assert await worker.call(PATIENCE, grow, 1000) == 1000
 
 
 @pytest.mark.real_time
@@ -716,7 +718,7 @@ async def test_signals_to_all_processes_of_a_daemon_do_not_end_a_worker() -> Non
         assert worker.pid is not None
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1):
             os.kill(worker.pid, number)
-        assert await worker.call(60.0, nap, 0.0) == worker.pid
+        assert await worker.call(PATIENCE, nap, 0.0) == worker.pid
 
 
 PARENT = """
@@ -725,7 +727,7 @@ from controller.learning.worker import Worker
 
 async def main():
     worker = Worker()
-    await worker.call(60.0, dict)
+    await worker.call(300.0, dict)
     children = open(f"/proc/self/task/{os.getpid()}/children").read()
     print(worker.pid, children, flush=True)
     time.sleep(1000)

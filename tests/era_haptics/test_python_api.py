@@ -593,7 +593,6 @@ TAKES_ANYTHING = {
     "all_scales",
 }
 
-
 STRAYS = (object(), "here", 3.5, [object()])
 
 

@@ -537,7 +537,6 @@ TARGET, QUIET = "0.08,0.06", "0.22,0.16"
 CLIENT_ROOT = BUTTON.parents[2]
 PAGE = "controller/gateway/page/connection.js"
 
-
 MEMBERS = """
     const [name] = process.argv.slice(1);
     const found = await import(name);

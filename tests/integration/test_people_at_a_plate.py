@@ -376,7 +376,6 @@ regions:
   pad: {rectangle: {start: [1 cm, 1 cm], end: [20 cm, 18 cm]}, on_press: hum}
 """
 
-
 INVALID = [
     pytest.param(b"", "", id="empty"),
     pytest.param(pickle.dumps({"rig": Opened()}), "", id="pickle"),

@@ -526,7 +526,6 @@ UNCONFIRMED = {
 }
 """What a stop may leave: one amplifier of three is confirmed silent."""
 
-
 BINARIES = ("chromium", "chromium-browser", "google-chrome")
 FLAGS = (
     "--headless=new",

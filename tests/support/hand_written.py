@@ -281,7 +281,6 @@ class Talk:
 Broken: TypeAlias = dict[str, tuple[str, Callable[[], Talk]]]
 """Conversations by name, each with the one rule that it breaks."""
 
-
 LOUD = layer(0, tone(0, 100, 0.5))
 ABOVE: dict[str, Any] = {"token": 6, "tokens": (5, 6, 0, 0)}
 """Layers of 0.7 each at one channel."""
@@ -597,7 +596,6 @@ BROKEN: Broken = {
     ),
 }
 """Conversations by what is wrong, each with the rule that it breaks."""
-
 
 HOST_VIOLATIONS_BROKEN: Broken = {
     "set_of_520_hz": (

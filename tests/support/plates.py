@@ -149,7 +149,6 @@ TWO_AMPLIFIERS = (
 )
 """The ERAs NE and NW on an amplifier of their own."""
 
-
 ACRYLIC = "{name: acrylic, E: 4.5 GPa, rho: 1190, nu: 0.37}"
 
 _PLACES = {"SW": (0.18, 0.24), "SE": (0.79, 0.17), "NE": (0.84, 0.78), "NW": (0.27, 0.81)}
@@ -466,7 +465,6 @@ BASES = (
     shaped_base(STROKE, 110.0, start=0.0, step=0.005, knots=(0, 0.3, 0.5j, -0.8, 0.4 - 0.2j, 0)),
 )
 """Ramps on two bases, an envelope on another, and one at rest."""
-
 
 FINGERTIP = Fingertip(
     stiffness=1000.0,

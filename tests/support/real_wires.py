@@ -410,7 +410,6 @@ WORD_WIRES: Mapping[str, Callable[[int], Any]] = {
 }
 """Wires by their names: called with the number of amplifiers, at numbers from 1 on."""
 
-
 TIMEOUT = 5.0  # s; far ends may be processes, on a busy machine
 STATUS = 256 * 9 + 128
 

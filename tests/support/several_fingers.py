@@ -54,7 +54,6 @@ from virtual_lines import run_virtual
 LEFT, RIGHT, ABOVE = (0.126, 0.081), (0.234, 0.049), (0.069, 0.208)
 """Places on the paper's plate, 11 to 23 cm apart."""
 
-
 LAYOUT = SurfaceLayout(
     (
         Region("left", Rectangle(0.0, 0.0, 0.15, 0.12), on_press="low"),

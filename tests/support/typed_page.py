@@ -322,7 +322,6 @@ def expect(holds: bool, what: str) -> None:
 
 ERA = str(Path(sys.executable).with_name("era"))
 
-
 PACKAGES = {"cc": "gcc", "jackd": "jackd2", "portaudio": "libportaudio2"}
 """What to install on Debian where the package has another name."""
 

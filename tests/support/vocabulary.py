@@ -102,7 +102,6 @@ ALLOWED = {
 }
 """Identifiers in which the word has its ordinary meaning, and which."""
 
-
 _IDENTIFIER = re.compile(r"[^\W\d]\w*")  # also in comments: for which files need be parsed
 _PROGRAM = re.compile(r"^```python\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 

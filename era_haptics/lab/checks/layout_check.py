@@ -161,7 +161,6 @@ _WAY = 0.12  # m
 _SPEEDS = (0.05, 0.2, 1.0, 5.0)  # m/s
 _TURNING_RADIUS = 0.02  # m
 
-
 _KEY = ContactKey("check", 1)
 
 

@@ -569,7 +569,6 @@ def play(*layers: LayerSet, now: int = 1, **values: Any) -> Send:
 stage = partial(play, now=0)
 """Makes a set that is staged."""
 
-
 _WORD = 0xFFFF
 
 

@@ -260,7 +260,6 @@ _COLUMNS = ("frequency_hz", "real_ohm", "imag_ohm")
 _READ = ("frequency_hz", "real", "imag", "magnitude", "phase_deg")
 _UNNAMED = ("frequency_hz", "magnitude", "phase_deg")
 
-
 LINES: FloatArray = np.unique(np.geomspace(LOW, HIGH, 120).round())
 """Whole frequencies [Hz] from 10 to 1000, nearly at equal ratios."""
 

@@ -272,7 +272,6 @@ class AmplifierSession:
 _DELAYS_KEPT = 64
 _MAX_DEFER = 0.1  # s; before a deadline, within which delays defer it
 
-
 Expected = tuple[str, AmplifierSession, Callable[[], bool]]
 """A rule, of which amplifier, and whether it is kept at a time."""
 

@@ -63,9 +63,7 @@ def parse_endpoint(url: str) -> WireEndpoint:
 
 _READ_MAX = 4096
 
-
 _WAKE_INTERVAL = 0.005  # s; a longer delay of this program is told to the witness
-
 
 _logger = logging.getLogger(__name__)
 

@@ -44,7 +44,6 @@ _PRESENT = ("GetStatus", "GetFaults")
 """Requests that are carried out when their reply is read, on Modbus."""
 _CONSTANT = (HELLO, "GetCaps")
 
-
 DECODERS: Mapping[str, Callable[[], Decoder]] = {
     "serial": SerialDecoder,
     "modbus-tcp": partial(ModbusDecoder, over_tcp=True),

@@ -266,7 +266,6 @@ FREQUENCIES = np.arange(60.0, 301.0, 20.0)  # Hz; of a table
 MOST_EVENTS = 4000
 """Of a callback that handles input of clients or files: 2000 calls and returns, about 1 ms."""
 
-
 DEFAULTS = {
     "rig": "rig.yaml",
     "level_db_sl": "20",

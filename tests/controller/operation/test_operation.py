@@ -479,7 +479,6 @@ def test_stop_takes_one_turn_and_few_functions() -> None:
 ARMED, STOPPED = "OPERATION_ENABLED", "QUICK_STOP_ACTIVE"
 ARM, STOP, CLEAR = (DaemonEvent(each) for each in (Trigger.ARM, Trigger.STOP, Trigger.CLEAR))
 
-
 COURSES = courses(Path(__file__).with_name("courses.yaml"))
 
 

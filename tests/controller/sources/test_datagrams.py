@@ -76,7 +76,6 @@ class ReferenceSender:
 
 PAUSE = 0.02  # s
 
-
 Send: TypeAlias = Callable[..., Awaitable[list[tuple[bytes, float]]]]
 
 

@@ -311,7 +311,6 @@ _ROWS = [(wire, amplifiers, 1) for wire in LATE_WIRES for amplifiers in AMPLIFIE
 _FOUND = [("modbus", 3, 12), ("modbus", 3, 64)]
 """Three on a line that were not fed in time; one that replied again and was not heard."""
 
-
 _SHORT = [("modbus", 1, 1), ("serial", 3, 1), ("can", 1, 1), _FOUND[0]]
 
 

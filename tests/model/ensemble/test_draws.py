@@ -130,7 +130,6 @@ WEIGHTS = np.array(
     dtype=np.complex64,
 )
 
-
 MANY = Drawing(count=4000, seed=3, thicknesses=1)
 
 

@@ -633,7 +633,6 @@ def test_corners_and_pairs_are_those_of_the_paper():
 
 RIG = Path(__file__).parents[3] / "examples" / "desk" / "rig.yaml"
 
-
 FLOW = """\
 # my panel
 plate: {length: 0.3, width: 0.2, thickness: 2 mm, material: steel}  # from stock

@@ -642,7 +642,6 @@ def test_terms_that_have_ended_are_left_out() -> None:
 ERA = Era("", 0, 0, stiffness=100.0**2, damping=2 * 100.0, bolt_mass=0.0, stroke=1e-4)
 """Under one kilogram it is damped critically, in numbers that are exact."""
 
-
 PLATE = Plate(0.3, 0.2, 0.001, material("steel"), loss_factor=0.0)
 THREE_MASSES = ReducedPlate(
     PLATE, np.zeros(3), np.zeros(3), lambda points: np.eye(3)[: len(points)]

@@ -149,7 +149,6 @@ OWN_STEPS = [
     {"frequency_step": 65_535, "phase_step": 77},
 ]
 
-
 ROUNDED = ["steps_as_stated", "achieved", "phases"]
 """Checks of which what is rounded is the subject."""
 
@@ -605,7 +604,6 @@ def test_page_counts_all_checks_of_a_serial_line() -> None:
 
 RISE = LayerSet(0, 100, 0, (Command(0, 2200, 5000, 0),))
 """To half of full level along 100 ms."""
-
 
 OFF = {
     "state": 1,

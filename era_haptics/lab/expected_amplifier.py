@@ -49,11 +49,11 @@ from era_haptics.lab.expected_output import (
 class ExpectedSet:
     """The newest set to one amplifier; times [s]. is_exact: it plays to the word, as is said.
 
-    staged: token of the set that is staged, 0 for none.
+    staged: token of the set that is staged, 0 for none. has_expired: one may have, by now.
     """
 
     def __init__(self) -> None:
-        self.is_exact = True
+        self.is_exact, self.has_expired = True, False
         self._whole: tuple[int, tuple[LayerSet, ...]] = (0, ())  # token, and layers
         self._replaced = 0  # token of a set of which it is known what really plays
         self.drop()
@@ -68,7 +68,7 @@ class ExpectedSet:
     def keep(self, part: Values, when: Interval) -> bool:
         """Note a part but the last that comes between two times; returns whether it is kept."""
         token = part["token"]
-        self._expire(when)
+        self.expire(when)
         if token != self._parts.token:
             if not is_newer_token(token, self._parts.token):
                 return False
@@ -106,7 +106,7 @@ class ExpectedSet:
         Returns what it must say: missing, staged and played; None where its set expired just then.
         """
         token = last["token"]
-        self._expire(when)
+        self.expire(when)
         is_unclear, is_under_way = self._is_unclear, token == self._parts.token
         stream = [] if is_under_way and self.staged else self._parts.whole(last)
         if reply["staged"] or reply["played"]:
@@ -132,9 +132,10 @@ class ExpectedSet:
         if is_own and is_one and not isinstance(self._parts.whole(last), int):
             self.drop()
 
-    def _expire(self, when: Interval) -> None:
+    def expire(self, when: Interval) -> None:
         """Drop what has expired by an interval."""
         lived = when[0] - self._began[1], when[1] - self._began[0]
+        self.has_expired |= STAGED_LIFE < lived[1] < math.inf
         if lived[0] > STAGED_LIFE:
             self.drop()
         self._is_unclear |= lived[0] <= STAGED_LIFE < lived[1]

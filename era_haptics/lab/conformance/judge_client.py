@@ -137,11 +137,12 @@ def expect_one_of(seen: object, known: Collection[object], what: str) -> None:
 
 
 _MAX_ATTEMPTS = 20  # of a check with all its cases, for which this machine was late
-_FEW = 3  # replies, which this machine does not make late by chance
+FEW = 3
+"""Times that this machine does not make wrong by chance."""
 _MAX_WASTED = 20.0  # s; of a run, for attempts that came too late
 _LOOK = 0.005  # s; between looks whether this machine is late
-# s; by which it is late where an amplifier on it is not judged by its silence, a few times, or ever
-_BUSY, _STALLED = 0.02, 0.1
+BUSY, _STALLED = 0.02, 0.1
+"""Lateness [s] at which an amplifier is not judged by its silence, a few times, or ever."""
 REPLY_TIMEOUT = 0.5  # s; far above the reaction, so that a busy machine is no mute amplifier
 # s; beyond that, for a reply which the machine or line delivers late; in a check, so many at most
 _DELIVERED, _MAX_DELIVERED = 1.5, 8
@@ -327,7 +328,7 @@ class JudgeClient(ABC):
     def slow_reply(self) -> str:
         """Which message it always replies to later than it may, and by when; empty if none."""
         for name, times in self.reactions.items():
-            if len(times) >= _FEW and (least := min(times)) > REACTION:
+            if len(times) >= FEW and (least := min(times)) > REACTION:
                 return f"its replies to {name} begin after {1e3 * least:.3g} ms at least"
         return ""
 
@@ -371,16 +372,20 @@ class JudgeClient(ABC):
         heard = await self.send(data, *before)
         expect(not heard, f"replies to {what}", expected="none", seen=heard)
 
-    async def send(self, data: bytes, *before: bytes) -> list[HeardMessage]:
-        """Send frames, data the last; return what is heard until a reply must have come."""
+    async def send(self, data: bytes, *before: bytes, count: int = 0) -> list[HeardMessage]:
+        """Send frames, data the last; return what is heard until a reply must have come.
+
+        count: of replies that must come, which are awaited longer.
+        """
         self.heard.clear()
         self.came = b""
         for each in before:
             self.write(each)
             await asyncio.sleep(self.quiet / 4)  # also what ends a frame of Modbus RTU
         self.write(data)
+        replies = [await self.next(lambda each: True, self.timeout) for _ in range(count)]
         await asyncio.sleep(self.quiet)
-        heard, self.heard = self.heard, []
+        heard, self.heard = [*filter(None, replies), *self.heard], []
         return heard
 
     async def reply_to(self, data: bytes) -> HeardMessage | None:
@@ -425,16 +430,17 @@ class JudgeClient(ABC):
         """
         before, self.lag, began = self.lag, 0.0, threads.now()
         found = await self.next(is_meant, self.timeout)
-        is_in_time = self.lag <= (_BUSY if self.mute < _FEW else _STALLED)
+        is_in_time = self.lag <= (BUSY if self.mute < FEW else _STALLED)
         self.lag = max(self.lag, before)
         if found is None:
             self.mute += 1
-            require_in_time(is_in_time, f"no reply came to {what}")
             others = f", but {len(self.came)} other bytes{self.remark()}" if self.came else ""
             is_sound = not others or any(each.at > began for each in self.order[-1:])
-            if is_sound and await self.next(is_meant, _DELIVERED):
+            is_delivered = is_sound and await self.next(is_meant, _DELIVERED)
+            require_in_time(is_in_time, f"no reply came to {what}")
+            if is_delivered:
                 self.delivered += 1
-                is_slow = self.delivered >= _FEW or self.mute > _MAX_DELIVERED
+                is_slow = self.delivered >= FEW or self.mute > _MAX_DELIVERED
                 require_in_time(is_slow, f"the reply to {what} came later than {self.timeout:g} s")
                 others = ", but later"
             raise NoReply(what, f"no reply within {self.timeout:g} s{others}")

@@ -137,23 +137,26 @@ class Subject(PlayableMaterial):
 
     async def send(self, row: Send) -> RequestOutcome:
         """Send a request, whose answer must be one of its codes."""
-        several = [row.values]
+        name, several = row.name, [row.values]
         if row.layers:
             token, now = row.values.get("token", 0), row.values["now"]
             parts = self.parts(*row.layers, token=token, now=now)
             several = [{**each, **row.values} for each in parts]
         codes = [each or _DONE for each in row.codes]
         for values in several:
-            answer = await self.answer(row.name, row.raw, **values)
-            if not _has_reply(row.name, row.raw, values):
+            answer = await self.answer(name, row.raw, **values)
+            if not _has_reply(name, row.raw, values):
                 continue
-            brief = {name: value for name, value in values.items() if name != "stream"}
-            what = f"{row.name} {row.raw or brief}"
+            brief = {each: value for each, value in values.items() if each != "stream"}
+            what = f"{name} {row.raw or brief}"
+            is_of_set = name == "Set" or (name == "Commit" and answer.code != "")
+            if is_of_set and self.expected is not None and self.shown.sets.has_expired:
+                require_in_time((answer.code or _DONE) in codes, f"a set expired before {name}")
             # First, since what has words too few has not all of its values.
             expect_one_of(answer.code or _DONE, codes, f"answer to {what}")
             if answer.code:
                 break
-            answer = await self._carried_out(row.name, self.filled(values), answer)
+            answer = await self._carried_out(name, self.filled(values), answer)
         is_named = self.client.kind not in ("rtu", "tcp") or answer.code not in _BY_EXCEPTION
         if answer.code and is_named:
             expect_one_of(answer.channel, row.channels, f"channel of the refusal of {what}")
@@ -189,8 +192,10 @@ class Subject(PlayableMaterial):
         took = threads.now() - sent
         client.quiet = min(client.quiet, QUIET + took)
         before = self._parts_came(answer.when.latest)
-        if "index" in values and answer.code and self.expected is not None:
-            self.expected.part_refused(values, answer.code)
+        if self.expected is not None:
+            self.expected.sets.expire(self.dating.interval(answer.when))
+            if "index" in values and answer.code:
+                self.expected.part_refused(values, answer.code)
         bits = client.wire_time(len(raw), len(answer.words))
         if not answer.code:  # a refusal may come sooner
             client.pace = min(client.pace, took / bits if bits else 0.0)

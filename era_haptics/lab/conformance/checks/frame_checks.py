@@ -237,7 +237,7 @@ async def numbers(subject: Subject) -> None:
     client.quiet = _FAST
 
     async def expect_replies(count: int, what: str, *data: bytes, since: float = math.inf) -> None:
-        heard = await client.send(client.packed(data))
+        heard = await client.send(client.packed(data), count=count)
         require_in_time(threads.now() - since <= _LIFE, "frames were too far apart")
         expect_equal(len(heard), count, f"replies to {what}")
 
@@ -404,10 +404,10 @@ class ModbusClient(JudgeClient):
             for at in (-2, -1, -4):
                 yield f"a wrong byte {at}", altered(frame, at)
 
-    async def send(self, data: bytes, *before: bytes) -> list[HeardMessage]:
+    async def send(self, data: bytes, *before: bytes, count: int = 0) -> list[HeardMessage]:
         """Send frames, data the last; return what is heard until a reply must have come."""
         self._reader.end()
-        heard = await super().send(data, *before)
+        heard = await super().send(data, *before, count=count)
         if self.is_rtu:
             await asyncio.sleep(QUIET)  # ends a frame that is not whole
         return heard
@@ -572,7 +572,7 @@ async def pieces(subject: Subject) -> None:
         require_in_time(
             not wait < limit < threads.now() - began, "the rest of a frame came too late"
         )
-        heard = await client.send(second)
+        heard = await client.send(second, count=len(frames))
         what = f"responses after {len(first)} bytes and a pause of {1e3 * wait:g} ms"
         numbers = [0 if client.is_rtu else int.from_bytes(each[:2]) for each in frames]
         expect_equal([each.number for each in heard], numbers, f"transactions of the {what}")
@@ -787,7 +787,7 @@ async def tolerated_frames(subject: Subject) -> None:
         for piece in pieces[:-1]:
             client.write(piece)
             await asyncio.sleep(0.05)
-        heard = [each for each in await client.send(pieces[-1]) if each.type & 0x80]
+        heard = [each for each in await client.send(pieces[-1], count=count) if each.type & 0x80]
         expect_equal(len(heard), count, f"replies to a frame with {what}")
     for sequence in (0, 0xFFFF):
         client.sequence = (sequence - 1) % 0x10000

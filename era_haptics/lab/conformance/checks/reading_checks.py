@@ -337,7 +337,10 @@ async def broadcasts(subject: Subject) -> None:
         words = message.request.pack(values)
         data = client.request(message.number, words, to=0)
         await client.expect_silence(data, f"{name} for all", *before)
-        subject.shown.granted(name, values, {}, subject.since(sent))
+        when = subject.since(sent)
+        subject.shown.sets.expire(when)
+        require_in_time(not subject.shown.sets.has_expired, "a set expired before its Commit")
+        subject.shown.granted(name, values, {}, when)
         await subject.request("GetStatus")
 
     await ignore_all(session=subject.next_session, serial_number=serial[:-1])
@@ -365,8 +368,9 @@ async def mark(subject: Subject) -> None:
     if client.has_broadcasts and not client.neighbours:
         sent = threads.now()
         client.write(client.request(MESSAGES["Mark"].number, (), to=0))
+        written = threads.now()
         await asyncio.sleep(_MARKED)
-        when = subject.dating.interval(When(sent, sent + REACTION + client.transit))
+        when = subject.dating.interval(When(sent, written + REACTION + client.transit))
         subject.shown.carry_out("Mark", {}, {}, when)
         await subject.run([subject.ping, subject.status])
         expect_equal(len(client.heard), 0, "replies to a Mark for all")

@@ -373,6 +373,7 @@ def parts_that_are_dropped(subject: Subject) -> Rows:
         *({"token": token} for token in (5, 4, 8, 5 + 0x8000)),
         {"parts": count + 1},
     ]
+    drop_all = partial(subject.send_all, [_with(second, **each) for each in dropped])
     head = MESSAGES["Set"].request.pack({"session": subject.next_session, **second.values})
     nameless = [0, *head[1:]], [head[0], 0, *head[2:]]
     refused: list[tuple[Values, str]] = [
@@ -391,15 +392,15 @@ def parts_that_are_dropped(subject: Subject) -> Rows:
         play(subject.one(), token=5),
         last,
         first,
-        *(_with(second, **each) for each in dropped),
+        drop_all,
         *(partial(subject.client.part, MESSAGES["Set"].number, each) for each in nameless),
-        *(_with(last, code=code, **each) for each, code in refused),
+        partial(subject.send_all, [_with(last, code=code, **each) for each, code in refused]),
         _with(last, token=5),
         last,
         *others,
         second,
         last,
-        *(_with(second, **each) for each in dropped),
+        drop_all,
         send("Commit", token=9),
         send("Disarm", ramp=0),
         subject.settle,
@@ -516,6 +517,8 @@ def sets_expire(subject: Subject) -> Rows:
     async def outlive() -> None:
         lived = (await subject.status()).when.latest - began
         await subject.pause(max(1.03 * STAGED_LIFE - lived, 0.0))
+        await subject.status()
+        subject.shown.sets.has_expired = False  # as it must have
 
     return [
         subject.arm,

@@ -119,10 +119,12 @@ def smooth_table() -> LocalizationTable:
     return build_table(smooth_rig(), frequencies=SMALL_TABLE_HZ)
 
 
-def contact_sets(count: int, *, fingers: int, seed: int) -> list[list[tuple[float, float]]]:
-    """Fingertips anywhere on the paper's plate, at least 5 cm apart."""
+def contact_sets(
+    count: int, *, fingers: int, seed: int, plate: Plate | None = None
+) -> list[list[tuple[float, float]]]:
+    """Fingertips anywhere on a plate, by default the paper's, at least 5 cm apart."""
     rng = np.random.default_rng(seed)
-    plate = smooth_rig().plate
+    plate = plate or smooth_rig().plate
     found: list[list[tuple[float, float]]] = []
     while len(found) < count:
         places = rng.uniform(0, [plate.length, plate.width], (fingers, 2))

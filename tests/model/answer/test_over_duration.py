@@ -29,8 +29,7 @@ from model.ensemble.draws import JUDGING_DRAWS
 from model.finger import THRESHOLDS, detection_threshold, fingertip_points, fingertip_weights
 from model.rig.rig import Uncertainty
 from model.rig.rig_file import load_rig
-from model.study.verification import draw_plates, powers_on
-from model.table.table import LocalizationTable, read_fingertips
+from model.table.table import LocalizationTable
 from model.table.table_file import build_table
 from model.transients.base_motion import ramped_onset, ramped_pulse
 from model.transients.shaping import SAMPLE_RATE, Transients
@@ -359,62 +358,6 @@ def known_table() -> LocalizationTable:
     well = Uncertainty(0.015, 1.5, 0.002, 0.01, 1.1, 0.5)
     rig = replace(smooth_rig(), promised_thresholds=THRESHOLDS, uncertainty=well)
     return build_table(rig, frequencies=np.linspace(40.0, 320.0, 29))
-
-
-def felt(of, found, plates, threshold):
-    """Contrast of each finger with a content, and foreign level of each, (k, d), by one set."""
-    placed = Placement(tuple(each.at for each in found.asked))
-    tips = read_fingertips(of, placed.contacts)
-    power = []
-    for layer in found.layers:
-        rows, squares = powers_on(of, placed, layer.excitation, plates)
-        sensed = squares[0] / detection_threshold(of.frequencies[rows], threshold) ** 2
-        power.append(sensed.reshape(len(placed.contacts), -1, sensed.shape[-1]))
-    power = np.array(power)
-    foreign = [
-        np.delete(power[:, k], k, axis=0).sum(axis=0).max(axis=0)
-        if k < len(power)
-        else power[:, k].sum(axis=0).max(axis=0)
-        for k in range(power.shape[1])
-    ]
-    own = [tips.fine_weights[k] @ np.sqrt(power[k, k]) for k in range(len(power))]
-    contrast = [20 * np.log10(a) - 10 * np.log10(b) for a, b in zip(own, foreign, strict=False)]
-    return np.array(contrast), 10 * np.log10(foreign)
-
-
-@pytest.mark.usefixtures("kernels_or_numpy")
-def test_nine_of_ten_plates_keep_the_promise_by_every_set():
-    """Exactly solved plates: by the set that is worst at a finger nine of ten, by others more.
-
-    Contrast and foreign level; what one set promises alone is kept by fewer by the other.
-    """
-    kept, heard, by_one = [], [], []
-    for number, places in enumerate(contact_sets(8, fingers=3, seed=3)):
-        requests = [wants(at, level_db_sl=12) for at in places[:2]]
-        plates = draw_plates(
-            np.random.default_rng(number),
-            smooth_rig().uncertainty,
-            of=smooth_rig(),
-            count=150,
-            contact_count=3,
-        )
-
-        def shares(of, requests=requests, quiet=places[2], plates=plates):
-            found = set_answer(of, requests, [Finger(quiet)], min_contrast_db=-99)
-            promised = [[each.promised_contrast_db] for each in found.fingers[:2]]
-            level = [[each.foreign_level_db_sl] for each in found.fingers]
-            each = [felt(of, found, plates, name) for name in THRESHOLDS]
-            contrasts = np.array([(one >= promised).mean(axis=1) for one, _ in each])
-            levels = np.array([(one <= level).mean(axis=1) for _, one in each])
-            return contrasts.min(axis=0), levels.min(axis=0)
-
-        of_all = shares(faint_table(*THRESHOLDS))
-        kept.append(of_all[0])
-        heard.append(of_all[1])
-        by_one.append(shares(faint_table(PROBE))[0])
-    assert 0.86 <= np.mean(kept) <= 0.95
-    assert 0.86 <= np.mean(heard) <= 0.96
-    assert np.mean(by_one) < 0.8
 
 
 def test_searching_for_the_least_costs_less_than_promising_it():

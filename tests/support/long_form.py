@@ -56,6 +56,8 @@ SLOWEST = (
     "test_courses_at_fingers.py",
     "test_layout_check.py",
     "test_joint_sets.py",
+    "test_promises.py",
+    "test_printed.py",
     "test_stimulus.py",
     "test_draws.py",
     "test_operation.py",

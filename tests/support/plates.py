@@ -1,5 +1,7 @@
 """Plates for tests: rigs and their files, tables, measured responses, and second solutions.
 
+Also what fingers feel of answers on plates that deviate, each solved exactly at the tones played.
+
 The founding paper's plate, also on a mesh that is quick to solve, with a table that is built in a
 moment or in time on its ERAs; boards on exciters; a plate that is not quite the paper's, with
 responses measured on it, sound ones and others that are not what they claim; settled patterns of a
@@ -10,7 +12,7 @@ extrapolation of central differences.
 
 import cmath
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from itertools import pairwise
@@ -26,14 +28,15 @@ from benchmarks.identification.plates import LENGTH as HIDDEN_LENGTH
 from benchmarks.identification.plates import WIDTH as HIDDEN_WIDTH
 from benchmarks.identification.plates import Hidden, Mounted, settled_pattern
 from benchmarks.setting import random_contacts
+from model.answer.answer import Answer
 from model.answer.promise import FingersOnPlate
 from model.answer.stimulus import Placement
-from model.arrays import ComplexArray, FloatArray
+from model.arrays import ComplexArray, FloatArray, Point
 from model.drive_modes import Drive, Forms
 from model.estimate.following import SettledPattern
 from model.estimate.measurement import Measurement, sensors_at
 from model.fem import ELEMENTS, Mesh, assemble
-from model.finger import Grid
+from model.finger import Grid, detection_threshold
 from model.reduction.reduced_plate import modal_matrices, reduce_plate
 from model.rig.rig import Channel, Rig
 from model.rig.rig_file import example_rig_path, parse_rig
@@ -47,11 +50,13 @@ from model.structure.attachments import (
 )
 from model.structure.material import Material
 from model.structure.plate import Plate
-from model.table.table import LocalizationTable
+from model.study.verification import Plates, harmonics_on, powers_on
+from model.table.table import LocalizationTable, read_fingertips
 from model.table.table_file import TableProblem, build_table, solve_table
 from model.transients.base_motion import Motion as BaseMotionMotion
 from model.transients.base_motion import Term, along_lines, raised_cosine
 from model.transients.time_response import PlateInTime, plate_in_time
+from model.vibration import Excitation
 from registry.limits import GuardLimits
 
 # Section 3 of the founding paper; stiffness recovered from its Table 2, damping and stroke assumed.
@@ -561,3 +566,67 @@ def played(
 ) -> list[_Found]:
     """What is found of each of some patterns."""
     return [take(each) for each in settled_patterns(hidden, plate, count=count, start=start)]
+
+
+@dataclass(frozen=True)
+class Realised:
+    """Levels [dB SL] of fingers as asked, on d plates: of their own content and of all else.
+
+    own (fingers, d): means over fingertips, NaN without a content; foreign (fingers, d): at the
+    loudest points.
+    """
+
+    own: FloatArray
+    foreign: FloatArray
+
+    @property
+    def contrast(self) -> FloatArray:
+        """Contrast (fingers, d) [dB]: at quiet fingers that of the weakest content."""
+        weakest = np.nanmin(self.own, axis=0)
+        return np.where(np.isnan(self.own), weakest, self.own) - self.foreign
+
+
+def realised(
+    table: LocalizationTable,
+    found: Answer,
+    plates: Plates,
+    *,
+    threshold: str | None = None,
+    resting: Sequence[Point] = (),
+    loads: Sequence[float] = (),
+    late: FloatArray | None = None,
+) -> Realised:
+    """Solve an answer on plates, drawn for as many contacts as it has.
+
+    threshold: another set than the table's; resting: places of what lies in the stead of quiet
+    fingers, with a load for each contact; late (d, eras): delays of the drives [s].
+    """
+    layers = [each.layer for each in found.fingers]
+    places = [each.at for each in found.asked]
+    if resting:
+        places = [at for at, layer in zip(places, layers, strict=True) if layer is not None]
+        layers = [*range(len(places)), *[None] * len(resting)]
+    placed = Placement((*places, *resting), (), tuple(loads))
+    weights = read_fingertips(table, placed.contacts).fine_weights
+
+    def sensed(tones: Excitation) -> FloatArray:
+        """Power to threshold at all fine points of the fingers, (fingers, points, d)."""
+        frequency = next(iter(tones.values())).frequency
+        drives = plates
+        if late is not None:
+            drives = replace(plates, gain=plates.gain * np.exp(-2j * np.pi * frequency * late))
+        rows, power = powers_on(table, placed, tones, drives)
+        hertz, name = table.frequencies[rows], threshold or table.threshold
+        felt = (power / detection_threshold(hertz, name)[:, None, None] ** 2).sum(axis=0)
+        own, other = (detection_threshold(2 * hertz[0], each) for each in (table.threshold, name))
+        felt += (own / other) ** 2 * harmonics_on(table, placed, tones, drives)
+        return felt.reshape(*weights.shape, -1)
+
+    power = np.array([sum(map(sensed, (one.excitation, *one.side_bands))) for one in found.layers])
+    levels, foreign = [], []
+    for finger, layer in enumerate(layers):
+        mine = np.arange(len(power)) == layer
+        levels.append(weights[finger] @ np.sqrt(power[mine, finger].sum(axis=0)))
+        foreign.append(power[~mine, finger].sum(axis=0).max(axis=0))
+    own = np.where(np.equal(layers, None)[:, None], np.nan, levels)
+    return Realised(20 * np.log10(own), 10 * np.log10(np.maximum(foreign, 1e-12)))

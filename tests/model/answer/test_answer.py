@@ -9,8 +9,6 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-import era_haptics
-from exact_plates import realised
 from model.answer.answer import Limits
 from model.answer.answer_report import query_one
 from model.answer.plan import answer as answer_by_table
@@ -24,7 +22,7 @@ from model.finger import detection_threshold
 from model.structure.attachments import HAND_PATCHES, HAND_STD
 from model.study.verification import Plates, draw_plates
 from model.table.table_file import build_table, save_table
-from plates import SMALL_TABLE_HZ, contact_sets, smooth_rig, smooth_table
+from plates import SMALL_TABLE_HZ, contact_sets, realised, smooth_rig, smooth_table
 from registry.limits import HAND_LOAD
 from set_table import drives, only, wants
 from set_table import phased as answer
@@ -437,41 +435,6 @@ def run(*words):
     return CliRunner().invoke(app, ["table", "query", *words])
 
 
-@pytest.mark.parametrize("way", ["era.answer", "--own", "--batch"])
-def test_a_table_of_on_and_off_plays_one_content_only(way, tmp_path):
-    """Built `switched`: a finger of its own gets ERAs that are on or off, several are refused.
-
-    Unless the question says `phased`.
-    """
-    table, path, lines = smooth_table(), tmp_path / "t.npz", tmp_path / "lines"
-    save_table(table, path)
-
-    def modes(places, *, drive_mode=None):
-        """Drive modes of the layers; raises InputError."""
-        if way == "era.answer":
-            found = era_haptics.answer(table, [wants(at) for at in places], drive_mode=drive_mode)
-            return [each.drive_mode for each in found.layers]
-        options = [] if drive_mode is None else ["--mode", drive_mode]
-        if way == "--batch":
-            lines.write_text(json.dumps({"own": [{"at": at} for at in places]}))
-            result = run(str(path), "--batch", str(lines), *options)
-            found = json.loads(result.stdout)
-            if "error" in found:
-                raise InputError(found["error"])
-        else:
-            own = [word for x, y in places for word in ("--own", f"{x},{y}")]
-            result = run(str(path), *own, *options, "--json")
-            if isinstance(result.exception, InputError):
-                raise result.exception
-            found = json.loads(result.stdout)
-        return [each["mode"] for each in found["layers"]]
-
-    assert modes([NEAR]) == ["switched"]
-    with pytest.raises(InputError, match="phased"):
-        modes([NEAR, FAR])
-    assert modes([NEAR, FAR], drive_mode="phased") == ["phased"] * 2
-
-
 def test_the_command_answers_as_python_does(table_file):
     """`--own` with a band and a quiet finger: the keys that scripts rely on."""
     options = ["--own", "0.09,0.07@100-200", "--own", "0.25,0.18"]
@@ -498,52 +461,6 @@ def test_the_command_answers_as_python_does(table_file):
     assert found["solve_time_s"] > 0
     printed = run(table_file, *options).stdout
     assert f"worst finger: {found['promised_worst_db']:.1f} dB promised" in printed
-
-
-def test_a_batch_holds_lines_with_contents(table_file, tmp_path):
-    """Every key of a line, beside a line with a target; what contradicts itself has its number."""
-    own = {"at": [0.09, 0.07], "band_hz": [100, 200], "priority": 1, "sharing": "any"}
-    lines = [
-        {"own": [own, {"at": [0.25, 0.18], "level_db_sl": 13}], "quiet": [[0.16, 0.2]]},
-        {"target": [0.09, 0.07], "mode": "phased"},
-        {"own": [{"at": [0.126, 0.081], "modulation_hz": 20}, {"at": [0.234, 0.049]}]},
-        {"own": [own], "target": [0.09, 0.07]},
-        {"own": [own], "quiet": [[0.05, 0.19]], "loads": [1, 1]},
-        {"own": [own | {"loud": 1}]},
-        {"own": [own], "duration": 0.04},
-        {"target": [0.09, 0.07], "apart_hz": 10},
-        {"own": [own], "apart_hz": -1},
-        {"own": [own | {"modulation_hz": 9}]},
-    ]
-    batch = tmp_path / "b.jsonl"
-    batch.write_text("\n".join(map(json.dumps, lines)))
-    result = run(table_file, "--batch", str(batch), "--level", "14")
-    assert result.exit_code == 1
-    first, second, modulated, *errors = map(json.loads, result.stdout.splitlines())
-    levels = [each["promised_level_db_sl"] for each in first["fingers"][:2]]
-    assert levels == pytest.approx([14, 13], abs=1e-3)
-    assert second["layers"][0]["mode"] == "phased"
-    carrier, sides = modulated["layers"][0]["frequency_hz"], modulated["layers"][0]["side_bands"]
-    around = sorted({tone["frequency_hz"] for side in sides for tone in side.values()})
-    assert around == pytest.approx([carrier - 20, carrier + 20], abs=5.0)  # half a step
-    assert sum(around) == pytest.approx(2 * carrier)
-    assert modulated["layers"][1]["side_bands"] == []
-    assert [each["line"] for each in errors] == [4, 5, 6, 7, 8, 9, 10]
-
-
-@pytest.mark.parametrize(
-    "options",
-    [
-        "--own 0.1,0.1@x",
-        "--own 0.1,0.1@145",
-        "--own 0.1,0.1 --target 0.2,0.1",
-        "--own 0.1,0.1 --own 0.2,0.1 --mode switched",
-        "--target 0.1,0.1 --swap-bands",
-    ],
-)
-def test_the_command_refuses_what_it_cannot_answer(table_file, options):
-    """A band that is none, and options of the other form."""
-    assert isinstance(run(table_file, *options.split()).exception, InputError)
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,6 @@ from unittest.mock import Mock
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from model.answer.answer_report import (
     Timing,
@@ -23,9 +22,7 @@ from model.answer.answer_report import (
 from model.answer.plan import query
 from model.answer.stimulus import Finger, Placement
 from model.arrays import lattice
-from model.cli import app
 from model.commands.table_cli import query as query_command
-from model.errors import InputError
 from model.finger import detection_threshold, fingertip_points, is_beyond
 from model.reduction.reduced_plate import reduce_plate
 from model.rig.rig import Uncertainty
@@ -235,9 +232,6 @@ def test_query_batch_has_knots_only_with_envelopes(table):
     assert after > before
 
 
-RUNNER = CliRunner()
-
-
 @pytest.fixture(scope="module")
 def table_file(tmp_path_factory):
     """The table on disk."""
@@ -279,29 +273,6 @@ def test_a_bad_line_of_a_batch_is_refused():
         assert re.search(named, row["error"])
 
 
-@pytest.mark.parametrize("has_errors", [True, False])
-def test_batch_answers_line_by_line(table_file, tmp_path, has_errors):
-    """An error has its line's number and makes status 1; empty lines are skipped."""
-    batch = tmp_path / "b.jsonl"
-    good = '{"target": [0.1, 0.1], "quiet": [[0.2, 0.15]], "mode": "phased"}\n\n'
-    batch.write_text(good * 2 + 'oops\n{"target": [9, 9]}\n' * has_errors)
-    result = RUNNER.invoke(app, ["table", "query", str(table_file), "--batch", str(batch)])
-    assert result.exit_code == has_errors
-    first, second, *errors = map(json.loads, result.stdout.splitlines())
-    assert first["layers"][0]["mode"] == second["layers"][0]["mode"] == "phased"
-    assert [each["line"] for each in errors] == [5, 6][: len(errors)]
-    assert all("error" in each for each in errors)
-    assert len(errors) == 2 * has_errors
-
-
-def test_batch_reads_standard_input(table_file):
-    """`-` is no file of that name: what another program writes is answered."""
-    line = '{"target": [0.1, 0.1], "mode": "phased"}\n'
-    result = RUNNER.invoke(app, ["table", "query", str(table_file), "--batch", "-"], input=line)
-    assert result.exit_code == 0
-    assert json.loads(result.stdout)["layers"][0]["mode"] == "phased"
-
-
 def test_batch_is_not_blamed_where_its_reader_closes(table_file, tmp_path, monkeypatch):
     """As in `era table query TABLE --batch FILE | head`: the error is of the answers' pipe."""
     batch = tmp_path / "b.jsonl"
@@ -310,30 +281,3 @@ def test_batch_is_not_blamed_where_its_reader_closes(table_file, tmp_path, monke
     monkeypatch.setattr("builtins.print", broken)
     with pytest.raises(BrokenPipeError):
         query_command(table_file, batch=batch)
-
-
-def test_batch_takes_options_as_defaults_of_its_lines(table_file, tmp_path):
-    """Level, mode and envelopes of the command hold where a line leaves them out."""
-    batch = tmp_path / "b.jsonl"
-    place = '"target": [0.1, 0.1], "quiet": [[0.2, 0.15]]'
-    own = '"mode": "switched", "level_db_sl": 9, "envelopes": false'
-    batch.write_text("{" + place + "}\n{" + place + ", " + own + "}\n")
-    options = "--level 14 --mode phased --envelopes"
-    command = ["table", "query", str(table_file), "--batch", str(batch), *options.split()]
-    result = RUNNER.invoke(app, command)
-    default, given = map(json.loads, result.stdout.splitlines())
-    for found, level in ((default, 14.0), (given, 9.0)):
-        assert found["fingers"][0]["promised_level_db_sl"] == pytest.approx(level)
-    (shaped,), (plain,) = default["layers"], given["layers"]
-    assert (shaped["mode"], plain["mode"]) == ("phased", "switched")
-    assert shaped["onset"] is not None
-    assert plain["onset"] is None
-
-
-def test_batch_refuses_a_file_that_is_not_utf_8(table_file, tmp_path):
-    """The error names the option."""
-    (tmp_path / "b.jsonl").write_bytes(b"\xff\xfe")
-    command = ["table", "query", str(table_file), "--batch", str(tmp_path / "b.jsonl")]
-    result = RUNNER.invoke(app, command)
-    assert isinstance(result.exception, InputError)
-    assert "--batch" in str(result.exception)

@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from exact_plates import Realised, realised
 from model.answer.answer import Answer
 from model.answer.plan import answer
 from model.answer.stimulus import Finger, Stimulus
@@ -23,7 +22,7 @@ from model.rig.rig_file import load_rig
 from model.study.verification import draw_plates
 from model.table.table import LocalizationTable
 from model.table.table_file import build_table
-from plates import SMALL_TABLE_HZ, contact_sets, smooth_rig
+from plates import SMALL_TABLE_HZ, Realised, contact_sets, realised, smooth_rig
 from yaml_files import read_yaml
 
 WEEKEND = Path(__file__).parents[3] / "examples" / "weekend" / "rig.yaml"

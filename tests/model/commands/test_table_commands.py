@@ -10,7 +10,6 @@ import re
 import shlex
 import sys
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,11 +20,9 @@ from click.testing import Result
 from typer.testing import CliRunner
 
 import era_haptics as api
-from controller.cli.main import run
 from era_haptics.lab.cli import app as lab_app
-from era_haptics.lab.cli import figure_app
 from era_haptics.lab.design import problem, score
-from model.cli import app, config_app
+from model.cli import app
 from model.commands import options
 from model.commands.options import next_line, progress_bar
 from model.compiled.kernels import WITHOUT_KERNELS
@@ -33,7 +30,6 @@ from model.config.document import read_document
 from model.errors import InputError
 from model.rig.rig_file import example_rig_path, load_rig
 from model.study import overview
-from model.table.table_file import load_table, save_table
 from model.vibration import study_convergence
 from plates import write_rig
 
@@ -42,12 +38,11 @@ pytestmark = pytest.mark.usefixtures("plain_pictures")
 RIG = str(example_rig_path())
 ERA = str(Path(sys.executable).with_name("era"))
 QUICK = ["--mesh", "12x9", "--frequencies", "60,110,250", "--grid", "4x3"]
-PNG = b"\x89PNG\r\n\x1a\n"
 
 
-def table(*arguments: str | Path) -> Result:
-    """Run `era table`; what it raises is raised here."""
-    result = CliRunner().invoke(app, ["table", *map(str, arguments)])
+def era(*arguments: str | Path) -> Result:
+    """Run `era`; what it raises is raised here."""
+    result = CliRunner().invoke(app, [*map(str, arguments)])
     if isinstance(result.exception, Exception):
         raise result.exception
     return result
@@ -55,7 +50,7 @@ def table(*arguments: str | Path) -> Result:
 
 def as_json(*arguments: str | Path) -> dict[str, Any]:
     """The one object that it prints."""
-    answer: dict[str, Any] = json.loads(table(*arguments, "--json").stdout)
+    answer: dict[str, Any] = json.loads(era(*arguments, "--json").stdout)
     return answer
 
 
@@ -71,39 +66,8 @@ def few_sets() -> Iterator[None]:
 def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A small table of the example rig."""
     path = tmp_path_factory.mktemp("built") / "t.npz"
-    table("build", RIG, "-o", path, *QUICK)
+    era("table", "build", RIG, "-o", path, *QUICK)
     return path
-
-
-def test_build_writes_a_table_and_what_made_it(tmp_path: Path) -> None:
-    """66 patterns, 4 * 3 alone and 6 * 3² in pairs, for 12 cells; no other file is left."""
-    path = tmp_path / "t.npz"
-    lines = table("build", RIG, "-o", path, *QUICK).stdout.splitlines()
-    assert lines[-1] == f"Next: era table show {path}"
-    answer = as_json("build", RIG, "-o", path, "--mode", "phased", *QUICK)
-    assert answer["drive_frequencies_hz"] == [60.0, 110.0, 250.0]
-    assert (answer["patterns"], answer["cells"], answer["mode"]) == (66, 12, "phased")
-    assert (answer["mesh"], answer["element"]) == ([12, 9], "MITC4")
-    assert 10 < answer["discretisation_error_percent"] < 100  # the paper's mesh is a coarse one
-    assert answer["files"] == [str(path)]
-    assert load_table(path).fingerprint == answer["fingerprint"]
-    assert list(tmp_path.iterdir()) == [path]
-
-
-def test_build_notes_a_coarse_mesh_and_what_is_taken_as_none(tmp_path: Path) -> None:
-    """A warning of the error on standard error, and what the rig says is known exactly."""
-    rig = tmp_path / "rig.yaml"
-    text = Path(RIG).read_text(encoding="utf-8")
-    rig.write_text(text + "\nuncertainty: {thickness: 0}\n", encoding="utf-8")
-    path = tmp_path / "t.npz"
-    coarse = table("build", rig, "-o", path, *QUICK)
-    assert "warning: mesh 12x9" in coarse.stderr
-    assert any("thickness" in line and "none" in line for line in coarse.stdout.splitlines())
-    fine = ["--frequencies", "60", "--grid", "4x3"]
-    answer = json.loads(table("build", RIG, "-o", path, *fine, "--json").stdout)
-    assert answer["exactly_known"] == []
-    assert answer["discretisation_error_percent"] < 5
-    assert table("build", RIG, "-o", path, *fine).stderr == ""
 
 
 def test_show_prints_summary_map_and_a_query_that_has_an_answer(
@@ -112,7 +76,7 @@ def test_show_prints_summary_map_and_a_query_that_has_an_answer(
     """The map is 4 by 3, each star of it is in the list, and the next command is quoted."""
     spaced = tmp_path / "my table.npz"
     spaced.write_bytes(built.read_bytes())
-    lines = table("show", spaced, "--weak").stdout.splitlines()
+    lines = era("table", "show", spaced, "--weak").stdout.splitlines()
     rows = {line[:20].strip(): line[20:].strip() for line in lines}
     assert rows["dead zones"].startswith("0 %")
     for name in ("feasible cells", "contrast to 3 others", "mesh", "fingerprint"):
@@ -126,61 +90,9 @@ def test_show_prints_summary_map_and_a_query_that_has_an_answer(
     assert [len(line.split()) for line in cells] == [4, 4, 4]
     stars = sum(line.count("*") for line in cells)
     assert sum(line.startswith("(0.") for line in lines) == stars > 0
-    era, group, *words = shlex.split(lines[-1])[1:]
-    assert (era, group, words[1]) == ("era", "table", str(spaced))
-    assert as_json(*words)["promised_worst_db"] > 0
-
-
-def test_verify_passes_a_true_table_and_fails_a_false_one(built: Path, tmp_path: Path) -> None:
-    """Modes of a tenth higher frequencies, the checksum right: status 1, as text and as JSON."""
-    result = table("verify", built, RIG, "--samples", "3")
-    assert result.exit_code == 0
-    assert sum(line.endswith("passed") for line in result.stdout.splitlines()) == 6
-    true = load_table(built)
-    false = tmp_path / "false.npz"
-    save_table(replace(true, omega=1.1 * true.omega), false)
-    result = table("verify", false, RIG, "--samples", "3")
-    assert result.exit_code == 1
-    assert result.stdout.splitlines()[-1].startswith("Next: era table build")
-    result = table("verify", false, RIG, "--samples", "3", "--json")
-    assert result.exit_code == 1
-    assert json.loads(result.stdout)["failed"] > 0
-
-
-def test_query_prints_levels_and_contrast(built: Path) -> None:
-    """One row per driven ERA, then one per finger; that 99 dB SL is out of reach is said."""
-    contacts = ["--target", "0.08,0.06", "--quiet", "0.22,0.16"]
-    answer = as_json("query", built, *contacts)
-    lines = table("query", built, *contacts).stdout.splitlines()
-    drive, felt = answer["layers"][0]["drive"], answer["fingers"][0]
-    assert [line.split()[0] for line in lines[: len(drive)]] == list(drive)
-    assert lines[len(drive) + 1].split()[:2] == ["(0.08,", "0.06)"]
-    assert f"{felt['promised_contrast_db']:.1f} dB" in lines[len(drive) + 1]
-    assert "cm²" in table("query", built, "--target", "0.08,0.06").stdout
-    assert "is lowered to" in table("query", built, "--target", "0.1,0.1", "--level", "60").stdout
-
-
-def test_plot_writes_its_pictures(built: Path, tmp_path: Path) -> None:
-    """Four of them in a new folder, named; a command comes last."""
-    folder = tmp_path / "new" / "pictures"
-    lines = table("plot", built, "-o", folder).stdout.splitlines()
-    files = [line.strip() for line in lines[1:5]]
-    names = ["weak_cells", "levels", "contrast", "answer"]
-    assert files == [str(folder / f"{name}.png") for name in names]
-    assert all(Path(file).read_bytes().startswith(PNG) for file in files)
-    assert lines[5:] == [f"Next: era table show {built} --weak"]
-
-
-def test_export_writes_both_formats(built: Path, tmp_path: Path) -> None:
-    """A .mat file, and .csv files of patterns or fields; --content is for .csv only."""
-    table("export", built, "--format", "mat", "-o", tmp_path / "t.mat")
-    table("export", built, "--format", "csv", "-o", tmp_path / "t.csv")
-    table("export", built, "--format", "csv", "--content", "fields", "-o", tmp_path / "f.csv")
-    heads = [(tmp_path / name).read_text().split(",")[0] for name in ("t.csv", "f.csv")]
-    assert heads == ["target_x_m", "x_m"]
-    assert (tmp_path / "t.mat").read_bytes().startswith(b"MATLAB 5.0")
-    with pytest.raises(InputError, match="--content"):
-        table("export", built, "--format", "mat", "--content", "fields", "-o", tmp_path / "t.mat")
+    program, group, *words = shlex.split(lines[-1])[1:]
+    assert (program, group, words[1]) == ("era", "table", str(spaced))
+    assert as_json("table", *words)["promised_worst_db"] > 0
 
 
 def test_commands_say_that_there_is_no_compiler(
@@ -188,38 +100,12 @@ def test_commands_say_that_there_is_no_compiler(
 ) -> None:
     """`era table build` and `era config check`, with how much longer answers take."""
     without_kernels()
-    built = table("build", RIG, "-o", tmp_path / "t.npz", *QUICK)
+    built = era("table", "build", RIG, "-o", tmp_path / "t.npz", *QUICK)
     checked = CliRunner().invoke(app, ["config", "check", RIG, "--json"])
     assert (built.exit_code, checked.exit_code) == (0, 0)
     assert WITHOUT_KERNELS in built.stderr
     (warning,) = json.loads(checked.stdout)["warnings"]
     assert warning.startswith(WITHOUT_KERNELS)
-
-
-RUNNER = CliRunner()
-
-
-def test_figure_writes_a_picture_and_its_numbers(tmp_path: Path) -> None:
-    """Figure 7 as PNG and CSV in a new folder, and what is printed of them."""
-    folder = tmp_path / "new" / "figures"
-    result = RUNNER.invoke(figure_app, ["7", RIG, "-o", str(folder), "--mesh", "12x9", "--json"])
-    assert result.exit_code == 0
-    assert sorted(path.name for path in folder.iterdir()) == [
-        "figure_7.csv",
-        "figure_7.png",
-        "figure_7_shapes.csv",
-    ]
-    assert (folder / "figure_7.png").read_bytes().startswith(PNG)
-    with (folder / "figure_7.csv").open(encoding="utf-8") as stream:
-        rows = list(csv.DictReader(stream))
-    # Table 2 of the paper, on its mesh.
-    assert [f"{float(row['model_hz']):.2f}" for row in rows] == [
-        "31.98", "68.50", "76.62", "107.84", "160.77",
-    ]  # fmt: skip
-    answer = json.loads(result.stdout)
-    assert "figure_7" in answer["figures"]
-    assert all(Path(name).is_file() for name in answer["files"])
-    assert len(answer["files"]) == 3
 
 
 @pytest.fixture
@@ -401,106 +287,21 @@ def test_design_of_python_is_that_of_the_command(small, tmp_path: Path) -> None:
     assert steps[-1][0] == steps[-1][1] > 0
 
 
-EXAMPLES = Path(__file__).parents[3] / "examples"
-
-
-@pytest.fixture
-def era(capsys):
-    """Run one command line in this process; returns its exit status and what it printed."""
-
-    def call(*arguments):
-        status = run([str(a) for a in arguments])
-        printed = capsys.readouterr()
-        return status, printed.out, printed.err
-
-    return call
-
-
-@pytest.fixture
-def answer(era):
-    """Run `era plate ... --json`, with status 0; returns its object."""
-
-    def call(*arguments):
-        status, text, _ = era("plate", *arguments, "--json")
-        assert status == 0
-        return json.loads(text)
-
-    return call
-
-
-@pytest.mark.parametrize(
-    ("support", "expected"),
-    [
-        ("simply-supported", ["110.95", "234.16", "337.90", "454.29", "459.69"]),
-        ("eras", ["31.98", "68.50", "76.62", "107.84", "160.77"]),
-    ],
-)
-def test_modes_prints_the_papers_tables(era, answer, support, expected):
-    """Both tables of the founding paper, digit by digit, as text and as JSON."""
-    arguments = ("modes", RIG, "--mesh", "12x9", "--support", support, "-n", "5")
-    _, text, _ = era("plate", *arguments)
-    assert [line.split()[2] for line in text.splitlines() if line.startswith("mode")] == expected
-    result = answer(*arguments)
-    assert (result["mesh"], result["dof"], result["element"]) == ([12, 9], 390, "MITC4")
-    assert [round(f, 2) for f in result["frequencies_hz"]] == [float(f) for f in expected]
-
-
-def test_modes_marks_those_that_the_mesh_does_not_carry(era, answer):
-    """Elements of 76.2 mm carry waves of 457.2 mm, 70.2 Hz: mode 1 but not 2; 12x9 carries all."""
-    coarse = ("modes", RIG, "--mesh", "4x3", "-n", "3")
-    for command, marks in ((coarse, [False, True, True]), (("modes", RIG), [False] * 12)):
-        _, text, _ = era("plate", *command)
-        rows = [line for line in text.splitlines() if line.startswith("mode")]
-        assert [len(row.split()) > 4 for row in rows] == marks
-    assert round(answer(*coarse)["mesh_carries_up_to_hz"], 1) == 70.2
-
-
-def test_map_has_numbers_and_a_picture(answer, tmp_path):
-    """A raster row per y, its maximum named, and a picture on request; half the level is half."""
-    picture = tmp_path / "map.png"
+def test_map_has_its_maximum_and_is_in_proportion_to_the_level():
+    """A raster row per y, its maximum named; half the level is half."""
     options = ("map", RIG, "--mesh", "24x18", "--points", "13x10")
-    result = answer(*options, "-o", picture, "--drive", "SW=110", "--drive", "NE=110@0.5:90")
+    result = as_json("plate", *options, "--drive", "SW=110", "--drive", "NE=110@0.5:90")
     peak = np.array(result["peak_acceleration_m_s2"])
     assert peak.shape == (10, 13)
-    assert (result["x_m"][-1], result["y_m"][-1]) == (0.3048, 0.2286)
-    assert result["max_m_s2"] == peak.max()
     x, y = result["max_at_m"]
-    assert peak[result["y_m"].index(y), result["x_m"].index(x)] == peak.max()
-    assert result["files"] == [str(picture)]
-    assert picture.read_bytes().startswith(b"\x89PNG")
-    half = answer(*options, "--drive", "SW=110@0.5", "--drive", "NE=110@0.25:90")
+    at = result["y_m"].index(y), result["x_m"].index(x)
+    assert result["max_m_s2"] == peak.max() == peak[at]
+    half = as_json("plate", *options, "--drive", "SW=110@0.5", "--drive", "NE=110@0.25:90")
     np.testing.assert_allclose(half["peak_acceleration_m_s2"], peak / 2, rtol=1e-12)
 
 
-def test_map_warns_of_frequencies_outside_the_limits(era):
-    """40 and 500 Hz are the example's own limits; each ERA outside is named in one line."""
-    options = ("plate", "map", RIG, "--mesh", "24x18")
-    status, text, said = era(*options, "--drive", "SW=600", "--drive", "NE=110", "--drive", "NW=39")
-    assert status == 0
-    assert re.search(r"^median .* g$", text, re.MULTILINE)
-    assert said.count("\n") == 1
-    for named in ("SW", "600 Hz", "NW", "39 Hz", "limits.frequency"):
-        assert named in said
-    assert "NE" not in said
-    assert era(*options, "--drive", "SW=500", "--drive", "NE=40")[2] == ""
-
-
-def test_map_marks_a_plate_that_is_not_supported(era, answer, tmp_path):
-    """On two ERAs it would tip over; the map is drawn, with a warning and a mark."""
-    others = ("NE:", "NW:")
-    lines = Path(RIG).read_text(encoding="utf-8").splitlines(keepends=True)
-    rig = tmp_path / "rig.yaml"
-    rig.write_text("".join(line for line in lines if not line.strip().startswith(others)))
-    options = ("map", rig, "--mesh", "24x18", "--drive", "SW=110")
-    assert answer(*options)["is_supported"] is False
-    status, _, said = era("plate", *options)
-    assert status == 0
-    assert "not supported" in said
-    assert answer("map", RIG, *options[2:])["is_supported"] is True
-
-
 @pytest.mark.long
-def test_convergence_lists_errors_of_finer_and_finer_meshes(era, answer, monkeypatch, tmp_path):
+def test_convergence_lists_errors_of_finer_and_finer_meshes(monkeypatch, tmp_path):
     """Errors fall from mesh to mesh, and the rig's own is marked; text and JSON agree."""
     studied = []
 
@@ -512,7 +313,7 @@ def test_convergence_lists_errors_of_finer_and_finer_meshes(era, answer, monkeyp
     monkeypatch.setattr("model.vibration._DOUBLINGS", 1)
     rig = write_rig(tmp_path / "rig.yaml", ("[40 Hz, 500 Hz]", "[40 Hz, 125 Hz]"))
     arguments = ("convergence", rig, "--mesh", "6x5", "--frequencies", "110")
-    found = answer(*arguments)
+    found = as_json("plate", *arguments)
     errors = [row["response_error_percent"][0] for row in found["meshes"]]
     mitc4, accurate = errors[:-2], errors[-2:]
     assert mitc4 == sorted(mitc4, reverse=True)
@@ -523,103 +324,8 @@ def test_convergence_lists_errors_of_finer_and_finer_meshes(era, answer, monkeyp
     assert [row["element"] for row in found["meshes"][-2:]] == ["Legendre", "Q5"]
     estimates = [row["estimated_response_error_percent"] for row in found["meshes"]]
     assert [each is None for each in estimates] == 2 * [True] + [False, True]
-    _, text, _ = era("plate", *arguments)
+    text = era("plate", *arguments).stdout
     assert all(f"{error:.3f} %" in text for error in [*errors, *estimates[-2]])
-
-
-def test_materials_are_listed_with_numbers_and_sources(era, answer):
-    """As text and as JSON, every material with its standard or data sheet."""
-    entries = answer("materials")["materials"]
-    glass = next(entry for entry in entries if entry["name"] == "soda-lime-glass")
-    assert (glass["E_pa"], glass["rho_kg_m3"], glass["nu"]) == (70e9, 2500, 0.2)
-    assert len(entries) == 12
-    assert all(entry["source"] for entry in entries)
-    text = era("plate", "materials")[1]
-    assert all(entry["source"] in text for entry in entries)
-
-
-def test_show_agrees_with_hand_calculation(era, answer):
-    """The paper's plate: D = 70e9 * 0.0015³ / 12 (1 - 0.33²) = 22.0935 N m, 282.19 g."""
-    summary = answer("show", EXAMPLES / "paper_plate.yaml")
-    assert summary["flexural_rigidity_n_m"] == pytest.approx(22.0935, abs=5e-5)
-    assert summary["mass_kg"] == pytest.approx(0.28219, abs=5e-6)
-    assert summary["surface_density_kg_m2"] == pytest.approx(4.05)
-    assert summary["bending_wavelength_m"]["500_hz"] == pytest.approx(0.17132, abs=5e-6)
-    assert summary["laminate"] is None
-    assert summary["point_masses"] == []
-    assert "1.5 mm of aluminium" in era("plate", "show", EXAMPLES / "paper_plate.yaml")[1]
-
-
-EXAMPLE = example_rig_path().read_text(encoding="utf-8")
-
-
-def test_init_writes_a_rig_and_its_schema(tmp_path: Path) -> None:
-    """The new rig is the example's and names its schema."""
-    path = tmp_path / "mine.yaml"
-    result = RUNNER.invoke(config_app, ["init", str(path)])
-    assert result.exit_code == 0
-    assert load_rig(path).fingerprint == load_rig(example_rig_path()).fingerprint
-    first = path.read_text(encoding="utf-8").splitlines()[0]
-    assert first == "# yaml-language-server: $schema=mine.schema.json"
-    schema = json.loads((tmp_path / "mine.schema.json").read_text(encoding="utf-8"))
-    assert "eras" in schema["else"]["required"]
-    assert result.stdout.splitlines()[-1] == f"Next: era config check {path}"
-
-
-@pytest.mark.parametrize("name", ["kept.yaml", "rig.txt", "no/rig.yaml"])
-def test_init_refuses_names_that_it_cannot_write(tmp_path: Path, name: str) -> None:
-    """A file that exists is left as it was; another ending or a missing folder is refused."""
-    (tmp_path / "kept.yaml").write_text("mine", encoding="utf-8")
-    result = RUNNER.invoke(config_app, ["init", str(tmp_path / name)])
-    assert isinstance(result.exception, InputError)
-    assert name in str(result.exception)
-    assert (tmp_path / "kept.yaml").read_text(encoding="utf-8") == "mine"
-    assert [path.name for path in tmp_path.iterdir()] == ["kept.yaml"]
-
-
-def check(path: Path, text: str | None = None) -> tuple[int, list[dict[str, str]], list[str]]:
-    """Check a file; returns exit status, errors and warnings of the JSON."""
-    if text is not None:
-        path.write_text(text, encoding="utf-8")
-    result = RUNNER.invoke(config_app, ["check", "--json", str(path)])
-    answer = json.loads(result.stdout)
-    assert answer["ok"] is (result.exit_code == 0)
-    plain = RUNNER.invoke(config_app, ["check", str(path)])
-    assert plain.exit_code == result.exit_code
-    for named in [*answer["warnings"], *(error["key"] or "" for error in answer["errors"])]:
-        assert named in plain.stdout
-    return result.exit_code, answer["errors"], answer["warnings"]
-
-
-def test_check_passes_a_good_rig_with_warnings(tmp_path: Path) -> None:
-    """The example has none; two links that cost some of the promise have, as an exact thickness."""
-    assert check(example_rig_path()) == (0, [], [])
-    links = EXAMPLE.replace(
-        'main: {url: "sim://"}',
-        "main: {url: 'serial:///dev/ttyUSB0'}\n  two: {url: 'serial:///dev/ttyUSB1'}",
-    ).replace("amplifier: main, channel: 3", "amplifier: two, channel: 0")
-    status, errors, (warning,) = check(tmp_path / "rig.yaml", links)
-    assert (status, errors) == (0, [])
-    assert "ftdi-low-latency" in warning
-    exact = EXAMPLE + "\nuncertainty: {thickness: 0}\n"
-    status, errors, (warning,) = check(tmp_path / "rig.yaml", exact)
-    assert (status, errors) == (0, [])
-    assert "thickness" in warning
-
-
-def test_check_lists_all_errors_with_line_and_key(tmp_path: Path) -> None:
-    """Units, values and URLs; a missing file is an answer like any other, for scripts."""
-    path = tmp_path / "rig.yaml"
-    bad = EXAMPLE.replace('"sim://"', '"seriel:///dev/ttyS0"').replace("1.5 mm", "1.5 kg")
-    status, errors, _ = check(path, bad.replace("level: 1.0", "level: 2"))
-    assert status == 1
-    lines = path.read_text().splitlines()
-    found = {error["key"]: lines[int(error["line"]) - 1] for error in errors}
-    assert found.keys() == {"plate.thickness", "amplifiers.main.url", "limits.level"}
-    assert all(key.split(".")[-1] in line for key, line in found.items())
-    assert any("serial://" in error["message"] for error in errors)
-    status, (missing,), _ = check(tmp_path / "none.yaml")
-    assert (status, missing["line"]) == (1, None)
 
 
 def test_log_gets_a_line_every_two_seconds(

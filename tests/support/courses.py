@@ -1,12 +1,14 @@
 """Courses in virtual time: lists of steps in a YAML file, by the sentence that they prove.
 
-A step is a method of what is played or, with dots, of its parts; or `is`: values of properties.
+A step is a method of what is played or, with dots, of its parts; or `is`: values of properties as
+`fits` compares them. What is given by number, as of fingers, is given as it is.
 `calls` lists calls of the project's own functions, without those of far ends and judges.
 """
 
 import asyncio
 import inspect
 import math
+import operator
 import sys
 import types
 from collections import Counter
@@ -95,11 +97,12 @@ class Taken:
         """Take a step."""
         ((name, given),) = step.items() if isinstance(step, Mapping) else [(step, [])]
         if name == "is":
-            found = {what: attrgetter(what)(self) for what in given}
-            assert found == {**given}, found
+            found = {what: _value(attrgetter(what)(self)) for what in given}
+            assert fits(found, given), {what: found[what] for what in given}
             return
         method = attrgetter(name.replace(" ", "_"))(self)
-        if name in _OF_A_STEP or not isinstance(given, list | Mapping):
+        is_by_number = isinstance(given, Mapping) and all(isinstance(key, int) for key in given)
+        if name in _OF_A_STEP or is_by_number or not isinstance(given, list | Mapping):
             done = method(given)
         else:
             done = method(**given) if isinstance(given, Mapping) else method(*given)
@@ -313,6 +316,42 @@ class Acted(Taken, Chain):
         kinds = self.far_end.names()
         found = [kinds.index(name) for name in names]
         assert found == sorted(found), kinds
+
+
+def _value(found: Any) -> Any:
+    """What a property is, or a method returns."""
+    return found() if callable(found) else found
+
+
+_COMPARED = {"<": operator.lt, "<=": operator.le, ">": operator.gt, ">=": operator.ge}
+
+
+def fits(found: Any, wanted: Any) -> bool:
+    """Whether a value is as it is wanted: the same, or as one of the texts below.
+
+    By key in mappings, one by one in lists; what is neither is wanted of each that is in one.
+    """
+    if isinstance(wanted, Mapping):
+        return found.keys() == wanted.keys() and all(
+            fits(found[key], wanted[key]) for key in wanted
+        )
+    if isinstance(wanted, list):
+        return len(found) == len(wanted) and all(map(fits, found, wanted))
+    if isinstance(found, Mapping | list | tuple | set):
+        values = [*found.values()] if isinstance(found, Mapping) else [*found]
+        return bool(values) and all(fits(each, wanted) for each in values)
+    match wanted.split() if isinstance(wanted, str) else ():
+        case ["<" | "<=" | ">" | ">=" as sign, limit]:
+            return bool(_COMPARED[sign](found, float(limit)))
+        case [least, "to", most]:
+            return bool(float(least) <= found <= float(most))
+        case [middle, "+-", width]:
+            return bool(abs(found - float(middle)) <= float(width))
+        case ["has", *words]:
+            return " ".join(words) in str(found)
+        case ["any"]:
+            return True
+    return bool(found == wanted)
 
 
 def _name(step: Step) -> str:

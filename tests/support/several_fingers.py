@@ -13,14 +13,16 @@ from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import pytest
 from pythonosc.osc_bundle_builder import IMMEDIATELY, OscBundleBuilder
 from pythonosc.osc_message_builder import OscMessageBuilder
+from scipy.signal import hilbert
 
 from chain import Chain, Position, set_chain
+from controller.daemon.messages import PlateView
 from controller.effects.effect import Region
 from controller.effects.kinds import Buzz
 from controller.effects.layout import SurfaceLayout
@@ -33,14 +35,16 @@ from controller.play.loop import PlayReport
 from controller.play.routing import RAMPS_ONLY, PlaybackCapabilities
 from controller.sources.touch import Contact, ContactKey, Touch, TouchFrame
 from controller.sources.tuio import RecordedDatagram
-from courses import Acted, Planted, Step
+from courses import Acted, Planted, Step, fits
 from drivers.errors import CommandRefused, LinkError
 from drivers.playing import AmplifierLayer
+from drivers.protocol.sets import LayerSet
 from examples.make_touches import tuio_datagram, write_capture
 from model.answer.answer import Limits
 from model.answer.answer_report import Timing
 from model.arrays import FloatArray
 from model.config.fields import Rectangle
+from model.errors import InputError
 from model.finger import detection_threshold
 from model.rig.rig import Rig
 from model.table.table import LocalizationTable
@@ -147,22 +151,6 @@ class Fingers(Chain):
         self.player.play(effect, contact, threads.now(), level_db_sl=None)
         self.controller.cycle.request_update()
 
-    def refuse(
-        self, why: str, is_refused: Callable[[Sequence[AmplifierLayer]], bool]
-    ) -> list[float]:
-        """Let the ledger refuse some layers for a reason; returns when [s] it does."""
-        layers, refused = self.controller.cycle.planner.slots, list[float]()
-        check = layers.check
-
-        def refuse(asked: Mapping[str, Sequence[AmplifierLayer]]) -> CommandRefused | None:
-            if not is_refused(asked["main"]):
-                return check(asked)
-            refused.append(threads.now())
-            return CommandRefused(why)
-
-        layers.check = refuse
-        return refused
-
     def reached(
         self, *, over: float = 0.25
     ) -> Iterator[tuple[int, FloatArray, FloatArray, FloatArray]]:
@@ -209,22 +197,26 @@ def _db(power: float) -> float:
     return float(10 * np.log10(power))
 
 
+Placed = TypeVar("Placed", bound=Fingers)
+
+
 @asynccontextmanager
 async def fingers_on(
     table: LocalizationTable,
     layout: SurfaceLayout,
     *,
+    of: type[Placed] = Fingers,  # type: ignore[assignment]
     at: Mapping[int, Position] = MappingProxyType({}),
     held: float = 0.0,
     layers: int = 8,
     breaks: str | None = None,
-) -> AsyncIterator[Fingers]:
+) -> AsyncIterator[Placed]:
     """Fingers on a layout, armed, with an amplifier of four channels.
 
-    at: those that are held for a time [s] first; breaks: the only rule of the witness that what is
-    planted breaks.
+    of: their class; at: those that are held for a time [s] first; breaks: the only rule of the
+    witness that what is planted breaks.
     """
-    async with Fingers.armed(
+    async with of.armed(
         SimulatedWire("serial", speed=921_600, unpluggable=True),
         smooth_rig(),
         table,
@@ -236,6 +228,321 @@ async def fingers_on(
         fingers.at = {**at}
         await fingers.hold(held)
         yield fingers
+
+
+@dataclass
+class Hands(Acted, Fingers):
+    """Fingers that take the steps of courses; what is new has come since the last mark.
+
+    layouts: those that may be chosen, by name; patch: undone at the end; questions [s]: when
+    answers of the thread were asked for, since it is set how long they take; failures: of answers.
+    """
+
+    layouts: Mapping[str, SurfaceLayout] = field(default_factory=dict)
+    patch: pytest.MonkeyPatch = field(default_factory=pytest.MonkeyPatch)
+    questions: list[float] = field(default_factory=list)
+    failures: list[str] = field(default_factory=list)
+    refusals: list[float] = field(default_factory=list)
+    marked_at: float = 0.0
+    marked: tuple[int, int] = (0, 0)
+    before: PlayReport | None = None
+
+    def marks(self) -> None:
+        """Let what comes from now on be new."""
+        self.marked_at, self.before = threads.now(), self.applied[-1] if self.applied else None
+        self.marked = len(self.applied), len(self.committed)
+
+    def down(self, fingers: Mapping[int, str | Position]) -> None:
+        """Have fingers at places, beside others that are down."""
+        self.at |= places_of(fingers)
+
+    def up(self, *ids: int) -> None:
+        """Lift fingers."""
+        for id in ids:
+            del self.at[id]
+
+    async def moves(self, seconds: float, dx: float, dy: float, *ids: int) -> None:
+        """Hold all fingers for a time; these, or all, move so far [m] meanwhile."""
+        began = {id: self.at[id] for id in ids or self.at}
+
+        def move(since: float) -> None:
+            way = since / seconds
+            self.at |= {id: (x + way * dx, y + way * dy) for id, (x, y) in began.items()}
+
+        await self.hold(seconds, move)
+
+    def spreads(self, count: int) -> None:
+        """Have so many fingers 5 cm apart or more, numbered from one on."""
+        places = [(0.04 + 0.055 * (n % 5), 0.035 + 0.05 * (n // 5)) for n in range(count)]
+        self.at = dict(enumerate(places, start=1))
+
+    def has_layout(self, name: str) -> None:
+        """Choose another layout."""
+        self.player.replace(self.layouts[name])
+        self.controller.cycle.request_update()
+
+    def answers_take(self, *seconds: float) -> None:
+        """Let answers of the thread take these times, the last one as often as it is asked."""
+        self.questions = answers_take(self.patch, *seconds)
+
+    def answers_fail(self, text: str, *, is_refused: bool = False) -> None:
+        """Let answers fail by a bug, or be refused by the table, until all works again."""
+
+        def fail(*_: Any, **__: Any) -> None:
+            self.failures.append(text)
+            raise InputError(text) if is_refused else Planted(text)
+
+        self.patch.setattr("controller.play.selection.answered", fail)
+
+    def answers_are_refused(self, text: str) -> None:
+        """Let the table refuse to answer."""
+        self.answers_fail(text, is_refused=True)
+
+    def threads_fail(self) -> None:
+        """Let the system have no thread left until all works again."""
+
+        def exhausted(*_: object) -> None:
+            raise RuntimeError("can't start new thread")
+
+        self.patch.setattr(type(asyncio.get_running_loop()), "run_in_executor", exhausted)
+
+    def all_works(self) -> None:
+        """Undo what has been set of answers and threads."""
+        self.patch.undo()
+
+    def refuses_layers(self, why: str, least: int) -> None:
+        """Let the ledger refuse so many layers that vibrate, or more."""
+        slots = self.controller.cycle.planner.slots
+        check = slots.check
+
+        def refuse(asked: Mapping[str, Sequence[AmplifierLayer]]) -> CommandRefused | None:
+            begun = [each for each in asked["main"] if not each.renew]
+            if sum(any(tone.level for tone in each.tones) for each in begun) < least:
+                return check(asked)
+            self.refusals.append(threads.now() - self.marked_at)
+            return CommandRefused(why)
+
+        slots.check = refuse
+
+    def has(self, **least: int) -> None:
+        """Require that there is at least so much of something."""
+        for what, count in least.items():
+            assert len(getattr(self, what)) >= count, getattr(self, what)
+
+    def is_full(self) -> None:
+        """Let the next fingers be some that feel nothing: there are as many as there may be."""
+        self.must_be_felt = False
+
+    async def repeats(self, count: int, steps: Sequence[Step]) -> None:
+        """Take steps so often."""
+        for step in [*steps] * count:
+            await self.take(step)
+
+    def comes(self, layer: int, *times: str) -> None:
+        """Require that the first new sets of a layer come so long after the mark."""
+        found = [time for time, one in self.new_layers if one.layer == layer]
+        assert fits(found[: len(times)], [*times]), found
+
+    def status(self, **wanted: Any) -> None:
+        """Require what the status says of each finger."""
+        reports = [*self.applied[-1:], *self.silenced[-1:]]
+        report = max(reports, key=lambda each: each.time, default=None)
+        view = PlateView(self.player.effect_of, self.controller.cycle.tracker.contacts, report)
+        for key, each in wanted.items():
+            found = {one.id: getattr(one, key) for one in view.statuses_now(table())}
+            assert fits(found, each), (key, found)
+
+    @property
+    def new(self) -> list[PlayReport]:
+        """New reports of what plays."""
+        return self.applied[self.marked[0] :]
+
+    @property
+    def new_commits(self) -> list[tuple[float, Sequence[LayerSet]]]:
+        """New sets, and how long after the mark [s] they were committed; of a silence no layers."""
+        commits = self.committed[self.marked[1] :]
+        return [(time - self.marked_at, layers) for time, _, layers in commits]
+
+    @property
+    def new_layers(self) -> list[tuple[float, LayerSet]]:
+        """Each layer of them."""
+        return [(time, one) for time, layers in self.new_commits for one in layers]
+
+    @property
+    def sets(self) -> list[list[int]]:
+        """Layers of each new set that changes what plays: of no renewal, and of no ending."""
+        return [
+            sorted(one.layer for one in layers)
+            for _, layers in self.new_commits
+            if not any(one.renew or any(each.ending for each in one.commands) for one in layers)
+        ]
+
+    @property
+    def first_set_after(self) -> float:
+        """How long after the mark the first new set was committed."""
+        return self.new_commits[0][0]
+
+    @property
+    def renewed(self) -> list[int]:
+        """Layers of new sets that are renewed."""
+        return sorted({one.layer for _, one in self.new_layers if one.renew})
+
+    @property
+    def driven(self) -> dict[int, bool]:
+        """Of layers of new sets, whether they are to vibrate after the last one."""
+        layers = [one for _, one in self.new_layers if not one.renew]
+        return {one.layer: any(each.level for each in one.commands) for one in layers}
+
+    @property
+    def ramps(self) -> dict[int, int]:
+        """Of layers of new sets, the last ramp [ms]."""
+        return {one.layer: one.ramp for _, one in self.new_layers if not one.renew}
+
+    @property
+    def keeps_phase(self) -> dict[int, list[bool]]:
+        """Of layers of the first new set, which tones continue."""
+        layers = self.new_commits[0][1]
+        return {one.layer: [each.keep_phase for each in one.commands] for one in layers}
+
+    @property
+    def reported_after(self) -> float:
+        """How long after the mark the first new report was made."""
+        return self.new[0].time - self.marked_at
+
+    @property
+    def latencies(self) -> list[float]:
+        """Of new reports."""
+        return [each.latency or 0.0 for each in self.new]
+
+    @property
+    def silent_after(self) -> float:
+        """How long after the mark it fell silent."""
+        return self.silenced[-1].time - self.marked_at
+
+    @property
+    def longest_unfed(self) -> float:
+        """The longest time without anything that feeds the watchdog."""
+        times = self.far_end.times("Ping", "Set", "Commit")
+        return max(later - sooner for sooner, later in itertools.pairwise(times))
+
+    @property
+    def asked_after(self) -> list[float]:
+        """How long after the mark answers were asked for."""
+        return [each - self.marked_at for each in self.questions]
+
+    @property
+    def layers(self) -> dict[int, list[int]]:
+        """Layers that play, by finger."""
+        playing = [(each.content.key[0].id, n) for n, each in self.applied[-1].contents.items()]
+        return {id: [n for other, n in playing if other == id] for id, _ in playing}
+
+    @property
+    def voices(self) -> list[float | None]:
+        """Frequencies that play [Hz]."""
+        return [one.content.frequency for one in self.applied[-1].contents.values()]
+
+    @property
+    def least_apart(self) -> float:
+        """The least distance of frequencies that play [Hz]."""
+        pairs = itertools.pairwise(sorted(each or 0.0 for each in self.voices))
+        return min(more - less for less, more in pairs)
+
+    @property
+    def is_as_before(self) -> bool:
+        """Whether what lasts is, of each finger that feels something, what it was at the mark."""
+        return _lasting(self.applied[-1]).items() <= _lasting(self.before).items()
+
+    @property
+    def keeps_frequencies(self) -> bool:
+        """Whether fingers keep, in new reports, the frequencies that they had at the mark."""
+        had = felt(self.before, "frequency")
+        found = [felt(each, "frequency") for each in self.new]
+        return all(had[id] == each[id] for each in found for id in had.keys() & each.keys())
+
+    @property
+    def worst_promise(self) -> float:
+        """The least contrast that a finger is promised [dB]."""
+        return _worst(self.applied[-1])
+
+    @property
+    def gained_db(self) -> float:
+        """How much more that is than at the mark [dB]."""
+        return _worst(self.applied[-1]) - _worst(self.before)
+
+    @property
+    def held_back(self) -> dict[int, str | None]:
+        """Why fingers feel nothing of their own, as is reported."""
+        return felt(self.applied[-1], "held_back")
+
+    @property
+    def told(self) -> list[list[tuple[int, str]]]:
+        """Verdicts of each new report, by finger."""
+        return [sorted(felt(each, "verdict").items()) for each in self.new]
+
+    @property
+    def verdicts(self) -> list[str]:
+        """All verdicts."""
+        return sorted({*felt(self.applied[-1], "verdict").values()})
+
+    @property
+    def beyond_nominal_db(self) -> dict[int, float]:
+        """By how much contrasts at fingertips are beyond those of contents, as modelled [dB]."""
+        contents = [one.content for one in self.applied[-1].contents.values()]
+        said = {each.key[0].id: each.predictions[0].contrast_db or 0.0 for each in contents}
+        return {id: contrast - said[id] for id, contrast in self.contrasts().items()}
+
+    @property
+    def beyond_quiet_db(self) -> dict[int, float]:
+        """By how much levels at fingers that are to feel nothing are beyond what is said [dB]."""
+        levels, said = self.levels_db_sl(), self.applied[-1].quiet_levels
+        return {key.id: levels[key.id] - level for key, (level,) in said.items()}
+
+    @property
+    def places(self) -> dict[int, list[Position]]:
+        """Where fingers were for which new reports play something [m]."""
+        contents = [one.content for each in self.new for one in each.contents.values()]
+        places = [(each.key.id, (each.x, each.y)) for one in contents for each, _ in one.targets]
+        return {id: sorted({at for other, at in places if other == id}) for id, _ in places}
+
+    @property
+    def effects_played(self) -> list[str | None]:
+        """Names of what new reports play."""
+        contents = [one.content for each in self.new for one in each.contents.values()]
+        return [each.targets[0][1].content for each in contents]
+
+    @property
+    def depths(self) -> dict[int, float]:
+        """How deep the envelope at each finger comes and goes 20 times a second, 1 for to zero."""
+        now, bench = threads.now(), self.far.bench
+        bench.advance(now)
+        found = dict[int, float]()
+        for id, record in bench.fingers.felt(now - 0.5, now).items():
+            envelope = np.abs(hilbert(record.accelerations @ record.weights))[200:-200]
+            times = np.arange(len(envelope)) / bench.sample_rate
+            part = envelope * np.hanning(len(envelope))
+            swing = (part * np.exp(-2j * np.pi * 20.0 * times)).sum()
+            found[int(id)] = float(2 * abs(swing) / part.sum())
+        return found
+
+
+def places_of(fingers: Mapping[int, str | Position]) -> dict[int, Position]:
+    """Places [m] of fingers, some by name."""
+    named = {"left": LEFT, "right": RIGHT, "above": ABOVE}
+    return {id: named[at] if isinstance(at, str) else (at[0], at[1]) for id, at in fingers.items()}
+
+
+def felt(report: PlayReport | None, what: str) -> dict[int, Any]:
+    """What is predicted of each finger that is to feel something."""
+    return {each.contact.key.id: getattr(each, what) for each in (report.targets if report else ())}
+
+
+def _lasting(report: PlayReport | None) -> dict[int, Content]:
+    contents = [one.content for one in report.contents.values()] if report else []
+    return {each.key[0].id: each for each in contents if each.key[1] == 0}
+
+
+def _worst(report: PlayReport | None) -> float:
+    return min(each or 0.0 for each in felt(report, "promised_contrast_db").values())
 
 
 WIRES = {

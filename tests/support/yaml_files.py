@@ -9,9 +9,11 @@ from model.config.document import plain_value
 
 
 class _Loader(yaml.CSafeLoader):
-    """Leaves it to `plain_value` which unquoted texts are words and numbers."""
+    """Leaves it to `plain_value` which unquoted texts are words and numbers; `<<` merges."""
 
-    yaml_implicit_resolvers: ClassVar[dict[str, Any]] = {}
+    yaml_implicit_resolvers: ClassVar[dict[str, Any]] = {
+        "<": yaml.CSafeLoader.yaml_implicit_resolvers["<"]
+    }
 
     def scalar(self, node: yaml.ScalarNode) -> Any:
         """The value of a text."""

@@ -358,22 +358,6 @@ def test_a_finger_that_rests_is_answered_where_it_is() -> None:
     )
 
 
-@pytest.mark.parametrize(("way", "count"), [(0.2, 1), (0.04, 0)])
-@in_virtual_time
-async def test_a_finger_that_sets_out_is_answered_before_it_has_gone_8_mm(
-    way: float, count: int
-) -> None:
-    """At 0.2 m/s its slope over 60 ms is 3 mm after 20 ms; at 40 mm/s it rests."""
-    async with fingers_on(paper_table(), LAYOUT, at={1: LEFT, 2: RIGHT}, held=1.5) as fingers:
-        before = len(fingers.applied)
-
-        def move(since: float) -> None:
-            fingers.at[1] = (LEFT[0] - way * since, LEFT[1])
-
-        await fingers.hold(0.035, move)
-        assert len(fingers.applied) - before == count
-
-
 FIRST, SECOND = (0.2133, 0.0366), (0.1206, 0.1132)
 
 

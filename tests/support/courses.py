@@ -71,6 +71,11 @@ class Taken:
         """Wait until a step was taken, or refused."""
         await asyncio.gather(self.under_way.pop(_name(step)), return_exceptions=True)
 
+    async def repeats(self, count: int, steps: Sequence[Step]) -> None:
+        """Take steps so often."""
+        for step in [*steps] * count:
+            await self.take(step)
+
     def cancels(self, step: Step) -> None:
         """Cancel a step that has begun."""
         self.under_way[_name(step)].cancel()

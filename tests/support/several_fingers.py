@@ -29,10 +29,11 @@ from controller.effects.layout import SurfaceLayout
 from controller.effects.player import EffectPlayer
 from controller.operation.operation_states import DaemonEvent, DaemonState, Lease, Trigger
 from controller.operation.supervisor import Supervisor
-from controller.play.intent import Content, Question, Selection, Target
+from controller.play.intent import CLICK, Content, Question, Selection, Target
 from controller.play.joint_answers import answered, selection_of
 from controller.play.loop import PlayReport
 from controller.play.routing import RAMPS_ONLY, PlaybackCapabilities
+from controller.play.slots import Sets, Slots
 from controller.sources.touch import Contact, ContactKey, Touch, TouchFrame
 from controller.sources.tuio import RecordedDatagram
 from courses import Acted, Planted, Step, fits
@@ -333,10 +334,41 @@ class Hands(Acted, Fingers):
         """Let the next fingers be some that feel nothing: there are as many as there may be."""
         self.must_be_felt = False
 
-    async def repeats(self, count: int, steps: Sequence[Step]) -> None:
-        """Take steps so often."""
-        for step in [*steps] * count:
-            await self.take(step)
+    def is_degraded(self) -> None:
+        """Let the amplifier be one that does not reply but may play, until all works again."""
+        members = self.controller.group.members
+        self.patch.setattr(type(members), "degraded", ("main",))
+
+    def refuses_once(self) -> None:
+        """Let the amplifier refuse the next set."""
+        group = self.controller.group
+
+        async def refuse(*_: Any, **__: Any) -> None:
+            self.patch.undo()
+            raise CommandRefused("not now")
+
+        self.patch.setattr(group, "apply", refuse)
+
+    def has_layers(self, count: int) -> None:
+        """Let so many layers be all that may play."""
+        self.controller.cycle.planner.slots._count = count
+
+    def renews_not(self, layer: int) -> None:
+        """Let a layer not be renewed any more."""
+        renewal = Slots.renewal
+
+        def others(slots: Slots, now: float) -> Sets:
+            due = renewal(slots, now).layers
+            return Sets({number: each for number, each in due.items() if number != layer})
+
+        self.patch.setattr(Slots, "renewal", others)
+
+    def falls_silent_within(self, seconds: float, *layers: int) -> None:
+        """Require that layers are silent so long after the mark, by what the amplifier plays."""
+        voices = [each for every in self.far_end.amplifier.outputs for each in every]
+        ends = [each.silent_from - self.marked_at for each in voices if each.layer in layers]
+        assert ends
+        assert max(ends) <= seconds, ends
 
     def comes(self, layer: int, *times: str) -> None:
         """Require that the first new sets of a layer come so long after the mark."""
@@ -442,6 +474,12 @@ class Hands(Acted, Fingers):
         return [one.content.frequency for one in self.applied[-1].contents.values()]
 
     @property
+    def frequency_of_clicks(self) -> list[float | None]:
+        """Frequencies of clicks that play [Hz]."""
+        contents = [one.content for one in self.applied[-1].contents.values()]
+        return [each.frequency for each in contents if each.key[1] == CLICK]
+
+    @property
     def least_apart(self) -> float:
         """The least distance of frequencies that play [Hz]."""
         pairs = itertools.pairwise(sorted(each or 0.0 for each in self.voices))
@@ -458,11 +496,6 @@ class Hands(Acted, Fingers):
         had = felt(self.before, "frequency")
         found = [felt(each, "frequency") for each in self.new]
         return all(had[id] == each[id] for each in found for id in had.keys() & each.keys())
-
-    @property
-    def worst_promise(self) -> float:
-        """The least contrast that a finger is promised [dB]."""
-        return _worst(self.applied[-1])
 
     @property
     def gained_db(self) -> float:

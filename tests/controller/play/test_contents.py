@@ -6,39 +6,33 @@ contents are lowered so that their sum is within the limits of the amplifiers.
 
 import asyncio
 import math
-from collections.abc import Sequence
+from collections.abc import AsyncIterator, Mapping, Sequence
+from contextlib import asynccontextmanager
 from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
-from chain import FINGER, OTHER, Chain, set_running
+from chain import FINGER, set_running
 from controller.content.pattern import Pattern, Transient
-from controller.effects.effect import Region
-from controller.effects.kinds import Buzz, File
+from controller.effects.kinds import File
 from controller.effects.layout import SurfaceLayout
 from controller.play.intent import CLICK, Content, HapticIntent, Pulse, Selection, Target
 from controller.play.routing import PlaybackCapabilities
 from controller.play.selection import Chooser, Selector
 from controller.play.slots import Slot, Slots
 from controller.sources.touch import Contact, ContactKey
+from courses import Acted, courses, fits, follow
 from model.answer.answer import Layer
 from model.answer.answer_report import Timing
 from model.answer.stimulus import Course, Placement
-from model.config.fields import Rectangle
 from model.vibration import Tone
 from plates import smooth_rig
+from registry import threads
 from several_fingers import LEFT, RIGHT, chosen_for, fingers_on, playable, table
 from virtual_lines import in_virtual_time
-
-LAYOUT = SurfaceLayout(
-    (
-        Region("left", Rectangle(0.0, 0.0, 0.15, 0.12), on_press="rough"),
-        Region("right", Rectangle(0.16, 0.0, 0.14, 0.12), on_press="smooth"),
-    ),
-    {"rough": Buzz(level=14.0, modulation=20.0), "smooth": Buzz(level=14.0)},
-    elsewhere=None,
-)
 
 
 def test_a_shared_content_that_changes_beside_a_click_of_its_finger_keeps_its_layer() -> None:
@@ -265,177 +259,108 @@ class FeelsCourse:
 WAVE = Course((0.0, 0.1, 0.5, 0.8, 1.2), (0.0, 1.0, 0.25, 1.0, 0.0))
 
 
-async def looked_at(chain: Chain, seconds: float, *down: tuple[int, float, float]) -> np.ndarray:
-    """Times [s] and levels of the first channel, a millisecond apart, while fingers are down."""
-    looks = []
-    for number in range(round(seconds * 1000)):
-        if number % 10 == 0:
-            chain.put(*down)
-        looks.append((asyncio.get_running_loop().time(), chain.far_end.levels[0]))
-        await asyncio.sleep(0.001)
-    return np.array(looks).T
+@dataclass
+class Looked(Acted):
+    """A chain whose first finger feels a course; seen: times [s] and levels of a channel."""
 
+    feels: FeelsCourse = field(init=False)
+    seen: list[tuple[float, float]] = field(default_factory=list)
 
-def expected(times: np.ndarray, course: Course = WAVE, full: float = FULL) -> np.ndarray:
-    """Levels by the points of a course alone, at times [s] from its start."""
-    return full * np.interp(times, course.times, course.shares, left=0.0, right=0.0)
-
-
-def furthest(
-    times: np.ndarray,
-    levels: np.ndarray,
-    early: float = WAY,
-    late: float = WAY,
-    course: Course = WAVE,
-) -> float:
-    """How far levels are from all that is due from so early [s] on until so late."""
-    shifts = np.arange(-early, late + 1e-9, 0.0005)
-    due = np.array([expected(times - each, course) for each in shifts])
-    return float(np.maximum(due.min(axis=0) - levels, levels - due.max(axis=0)).max())
-
-
-@in_virtual_time
-async def test_a_course_is_played_as_it_is() -> None:
-    """Within the 2 ms of the wire and a step of it: the points lie on knots, which are 10 ms apart.
-
-    It ends by itself, and nothing is left of it.
-    """
-    felt = FeelsCourse(WAVE)
-    async with set_running(knots=32, intent_source=felt) as chain:
-        times, levels = await looked_at(chain, 1.4, FINGER)
-        assert furthest(times - felt.started_at, levels) < ROUNDING
-        pieces = [one.layer for one in chain.far_end.sent()[1:] if not one.is_silent]
-        assert [each.after for each in pieces] == [False, True, True, True, True]
-        assert not chain.refused
-
-
-@in_virtual_time
-async def test_a_course_has_no_gap_while_the_host_is_late() -> None:
-    """By 0.1 s, whenever it has turned: what was sent before goes on on the amplifier."""
-    felt = FeelsCourse(WAVE)
-    async with set_running(knots=32, intent_source=felt) as chain:
-        chain.put(FINGER)
-        await asyncio.sleep(0.02)
-        looks = []
-        for number in range(1300):
-            if number % 105 == 0:
-                chain.turning.clear()
-            if number % 105 == 100:
-                chain.put(FINGER)
-                chain.turning.set()
-            looks.append((asyncio.get_running_loop().time(), chain.far_end.levels[0]))
+    async def looks_on(self, seconds: float, *fingers: str) -> None:
+        """Look every millisecond; fingers that are named are reported every ten."""
+        for number in range(round(seconds * 1000)):
+            if fingers and number % 10 == 0:
+                self.touch(*fingers)
+            self.seen.append((threads.now(), self.far_end.levels[0]))
             await asyncio.sleep(0.001)
-        chain.turning.set()
-        times, levels = np.array(looks).T
-        assert furthest(times - felt.started_at, levels) < ROUNDING
+
+    async def looks(self, seconds: float, *fingers: str) -> None:
+        """Do the same, and forget what was seen before."""
+        self.seen.clear()
+        await self.looks_on(seconds, *fingers)
+
+    def follows(
+        self,
+        *,
+        within: float = ROUNDING,
+        early: float = WAY,
+        late: float = WAY,
+        first: int = 0,
+        gain: float = 1.0,
+    ) -> None:
+        """Require that levels are within all that is due from so early [s] on until so late.
+
+        first: of the looks; gain: of levels.
+        """
+        times, levels = np.array(self.seen[first:]).T
+        since = times - self.feels.started_at
+        if self.feels.loops:
+            since = np.mod(since, self.feels.course.duration)
+        course, shifts = self.feels.course, np.arange(-early, late + 1e-9, 0.0005)
+        due = [
+            FULL * np.interp(since - each, course.times, course.shares, left=0.0, right=0.0)
+            for each in shifts
+        ]
+        off = np.maximum(np.min(due, axis=0) - gain * levels, gain * levels - np.max(due, axis=0))
+        assert off.max() < within, off.max()
+
+    def plays(self, start: float, end: float, level: str | float) -> None:
+        """Require the level between two times [s] since the course has started."""
+        began = self.feels.started_at
+        assert fits([level for time, level in self.seen if start <= time - began <= end], level)
+
+    def stalls(self) -> None:
+        """Let the control loop not turn."""
+        self.turning.clear()
+
+    def turns(self) -> None:
+        """Let it turn again."""
+        self.turning.set()
+
+    def taps(self) -> None:
+        """Let the finger feel a tap of 40 ms beside the course."""
+        self.feels.tap = Pulse(0.04, threads.now())
+        self.controller.cycle.request_update()
+
+    def beside_others(self, **tones: Sequence[float]) -> None:
+        """Have the table answer by these tones where another finger rests."""
+        self.table.shared = {era: Tone(*tone) for era, tone in tones.items()}
+
+    @property
+    def is_appended(self) -> list[bool]:
+        """Of each set that vibrates, whether it begins as the one before ends."""
+        return [one.layer.after for one in self.far_end.sent()[1:] if not one.is_silent]
+
+    @property
+    def set_count(self) -> int:
+        """How many sets that vibrate there were."""
+        return len(self.is_appended)
+
+    @property
+    def highest(self) -> float:
+        """The highest level that was seen."""
+        return max(level for _, level in self.seen)
 
 
-@in_virtual_time
-async def test_a_course_goes_on_where_its_host_was_late_for_longer() -> None:
-    """By 0.6 s, beyond its end by itself: where it would be, also after a tap beside it."""
-    felt = FeelsCourse(Course((0.0, 0.1, 3.0), (0.0, 1.0, 0.5)))
-    async with set_running(knots=32, intent_source=felt, watchdog=2.0) as chain:
-        await looked_at(chain, 0.7, FINGER)
-        chain.turning.clear()
-        _, levels = await looked_at(chain, 0.6, FINGER)
-        assert levels[-1] == 0
-        chain.turning.set()
-        await looked_at(chain, 0.1, FINGER)
-        for _ in range(2):
-            times, levels = await looked_at(chain, 0.4, FINGER)
-            assert furthest(times - felt.started_at, levels, course=felt.course) < ROUNDING
-            felt.tap = Pulse(0.04, times[-1])
-            chain.controller.cycle.request_update()
-            await looked_at(chain, 0.1, FINGER)
+@asynccontextmanager
+async def feeling(
+    *, course: Mapping[str, Sequence[float]], loops: bool = False, **options: Any
+) -> AsyncIterator[Looked]:
+    """A chain, armed, whose first finger feels a course; options: as of `set_running`."""
+    feels = FeelsCourse(Course(tuple(course["times"]), tuple(course["shares"])), loops)
+    given = {"knots": 32, "intent_source": feels, **options}
+    async with set_running(of=Looked, **given) as chain:
+        chain.feels = feels
+        yield chain
 
 
-@in_virtual_time
-async def test_a_course_ends_by_itself_if_its_host_is_gone() -> None:
-    """0.1 s after the last piece that it has sent, along 20 ms: at 0.48 s, half way to the next."""
-    felt = FeelsCourse(Course((0.0, 0.1, 9.0), (0.0, 1.0, 1.0)))
-    async with set_running(knots=32, intent_source=felt, watchdog=2.0) as chain:
-        await looked_at(chain, 0.3, FINGER)
-        chain.turning.clear()
-        times, levels = await looked_at(chain, 0.5, FINGER)
-        times -= felt.started_at
-        assert levels[times < 0.58 - WAY].min() > FULL - 2e-4
-        assert not levels[times > 0.58 + 0.020 + WAY].any()
-        chain.turning.set()
+COURSES = courses(Path(__file__).with_name("contents.yaml"))
 
 
-@in_virtual_time
-async def test_a_stop_amid_a_course_is_silence() -> None:
-    """What waits on the amplifier does not start."""
-    felt = FeelsCourse(WAVE)
-    async with set_running(knots=32, intent_source=felt) as chain:
-        await looked_at(chain, 0.41, FINGER)  # the third piece waits for the second
-        await chain.operate("stop")
-        _, levels = await looked_at(chain, 0.6, FINGER)
-        assert levels[0] < 1e-4
-        assert not levels.any()
-
-
-@in_virtual_time
-async def test_a_restart_amid_a_course_is_silence_until_it_is_armed_again() -> None:
-    """Then the resting finger feels what is left, where it would be; no old piece is waited for."""
-    felt = FeelsCourse(Course((0.0, 0.1, 5.0), (0.0, 1.0, 0.5)))
-    async with set_running(knots=32, intent_source=felt) as chain:
-        await looked_at(chain, 0.5, FINGER)
-        chain.far_end.fault("reboot", lasts=0.1)
-        _, levels = await looked_at(chain, 0.6, FINGER)
-        assert not levels.any()
-        (refused,) = chain.refused
-        assert "once the cause is gone, clear and arm again" in refused
-        await chain.operate("clear")
-        await chain.operate("arm")
-        times, levels = await looked_at(chain, 0.8, FINGER)
-        assert furthest(times[50:] - felt.started_at, levels[50:], course=felt.course) < ROUNDING
-
-
-@in_virtual_time
-async def test_a_course_begins_anew_without_a_gap() -> None:
-    """Each of its turns is as the first, the seam included, until the finger lifts."""
-    felt = FeelsCourse(Course((0.0, 0.2, 0.37), (0.5, 1.0, 0.5)), loops=True)
-    async with set_running(knots=32, intent_source=felt) as chain:
-        times, levels = await looked_at(chain, 2.0, FINGER)
-        since = (times - felt.started_at)[20:]
-        due = expected(np.mod(since - WAY / 2, 0.37), felt.course)
-        # By hand: 10 ms change it by 0.6 % of full level, and cut that off at its corners.
-        assert np.abs(levels[20:] - due).max() < 0.006
-        await chain.leave(0.025)
-        assert chain.far_end.levels[0] == 0
-
-
-@in_virtual_time
-async def test_what_is_left_of_a_course_goes_on_where_another_finger_joins() -> None:
-    """At the new weights, half of those before, 20 ms later."""
-    felt = FeelsCourse(WAVE)
-    async with set_running(knots=32, intent_source=felt) as chain:
-        chain.table.shared = {"SW": Tone(110.0, 10e-6, math.pi / 2)}
-        times, levels = await looked_at(chain, 0.43, FINGER)
-        joined = times[-1] - felt.started_at
-        times, levels = await looked_at(chain, 1.0, FINGER, OTHER)
-        times -= felt.started_at
-        is_late = times > joined + 0.03
-        # By hand: straight lines of 20 ms, for a while, cut off 0.0044 of its corner at 0.5 s.
-        assert furthest(times[is_late], 2 * levels[is_late]) < 0.0044 + ROUNDING
-        # In between it is led there without falling silent.
-        assert levels[~is_late].min() > 0.9 * expected(np.array([0.5]))[0] / 2
-
-
-@in_virtual_time
-async def test_an_amplifier_without_knots_follows_along_ramps() -> None:
-    """50 ms each: it is never further off than what the course has within one of them.
-
-    That it is coarse is said once.
-    """
-    felt = FeelsCourse(WAVE)
-    async with set_running(intent_source=felt) as chain:
-        times, levels = await looked_at(chain, 1.4, FINGER)
-        assert furthest(times - felt.started_at, levels, 0.05, 0.06) < ROUNDING
-        assert max(levels) > 0.8 * FULL
-        ramps = [each for each in chain.far_end.sent()[1:] if not each.is_silent]
-        assert len(ramps) == pytest.approx(1.2 / 0.05, abs=2)
+@pytest.mark.parametrize("name", COURSES)
+def test_content_keeps_to_its_course(name: str) -> None:
+    """Every step is as it is in the file."""
+    follow(COURSES[name], feeling)
 
 
 @in_virtual_time

@@ -15,12 +15,9 @@ from controller.daemon.messages import PlateView
 from controller.effects.kinds import Buzz, Click
 from controller.effects.layout import SurfaceLayout, layout_of
 from controller.play.intent import HapticIntent, Pulse, Target
-from controller.play.loop import ENDED
 from controller.play.selection import Chooser, Selector
-from controller.play.slots import Sets, Slot, Slots
 from controller.sources.touch import Contact, ContactKey
 from courses import follow
-from drivers.errors import CommandRefused
 from drivers.protocol.sets import LayerSet
 from model.answer import answer
 from model.arrays import Complex64Array
@@ -85,30 +82,6 @@ def begun(committed: Sequence[tuple[float, int, tuple[LayerSet, ...]]]) -> list[
 
 
 @in_virtual_time
-async def test_a_lifted_finger_falls_silent_while_an_amplifier_is_degraded(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """Its layer alone, within 20 ms, though the other moves, which begins anew in its layer."""
-    async with fingers_on(table(), LAYOUT, at={1: LEFT, 2: RIGHT}, held=0.6) as fingers:
-        layers = {_id(one): number for number, one in fingers.applied[-1].contents.items()}
-        group, count = fingers.controller.group, len(fingers.committed)
-        with monkeypatch.context() as patched:
-            patched.setattr(type(group.members), "degraded", ("main",))
-            fingers.at[2] = (RIGHT[0] + 0.01, RIGHT[1])
-            await fingers.hold(0.03)  # what plays is unknown by now
-            del fingers.at[1]
-            lifted = asyncio.get_running_loop().time()
-            await fingers.hold(0.1)
-            ((ended, _, sent),) = fingers.committed[count:]
-            assert [(one.layer, one.renew) for one in sent] == [(layers[1], False)]
-            assert not any(command.level for one in sent for command in one.commands)
-            assert ended - lifted <= 0.020
-        await fingers.hold(0.1)
-        _, _, sent = fingers.committed[count + 1]
-        assert [one.layer for one in sent] == [layers[2]]
-
-
-@in_virtual_time
 async def test_what_lasts_has_what_a_loud_click_leaves_and_all_of_it_after_that() -> None:
     """A finger's vibration is raised amid the 40 ms of another's click: both need 1.2 strokes.
 
@@ -131,62 +104,6 @@ async def test_what_lasts_has_what_a_loud_click_leaves_and_all_of_it_after_that(
         assert raised[-1].time - begin <= 0.15
         await fingers.hold(0.3)
         assert fingers.levels_db_sl()[1] >= 43
-
-
-@in_virtual_time
-async def test_a_finger_that_rests_feels_again_what_an_amplifier_refused_once(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """All is silent meanwhile, for a second; the latency is that of the touch."""
-    async with fingers_on(table(), LAYOUT, at={}, held=0.1) as fingers:
-        fingers.must_be_felt, group = False, fingers.controller.group
-        apply, refused = group.apply, list[float]()
-
-        async def refuse_once(*given: Any, **more: Any) -> Any:
-            if not refused:
-                refused.append(asyncio.get_running_loop().time())
-                raise CommandRefused("not now")
-            return await apply(*given, **more)
-
-        monkeypatch.setattr(group, "apply", refuse_once)
-        fingers.at[1] = LEFT
-        await fingers.hold(0.9)
-        assert (len(fingers.refused), fingers.applied) == (1, [])
-        await fingers.hold(0.5)
-        (applied,) = fingers.applied
-        assert applied.is_touch
-        assert applied.latency == pytest.approx(1.0, abs=0.1)
-
-
-@in_virtual_time
-async def test_the_end_of_one_layer_by_itself_is_said_while_the_other_plays(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """One is not renewed, and ends after 2 s; the others go on, and nothing was sent for that.
-
-    Nor does it count as felt once one of the others lifts.
-    """
-    renewal = Slots.renewal
-    async with fingers_on(table(), LAYOUT, at={1: LEFT, 2: RIGHT, 3: ABOVE}, held=1.8) as fingers:
-        layers = {_id(one): n for n, one in fingers.applied[-1].contents.items()}
-
-        def not_one(all_slots: Slots, now: float) -> Sets:
-            due = renewal(all_slots, now).layers
-            return Sets({n: each for n, each in due.items() if n != layers[1]})
-
-        monkeypatch.setattr(Slots, "renewal", not_one)
-        count = len(fingers.applied)
-        await fingers.hold(2.5)
-        (applied,) = fingers.applied[count:]
-        assert {*applied.contents} == {layers[2], layers[3]}
-        assert applied.latency is None
-        felt = {each.contact.key.id: each.held_back for each in applied.targets}
-        assert felt == {1: ENDED, 2: None, 3: None}
-        del fingers.at[3]
-        await fingers.hold(0.2)
-        assert [*fingers.applied[-1].contents] == [layers[2]]
-        felt = {each.contact.key.id: each.held_back for each in fingers.applied[-1].targets}
-        assert felt == {1: ENDED, 2: None}
 
 
 @in_virtual_time
@@ -311,7 +228,3 @@ def _felt(pattern: answer.Layer, fields: Complex64Array) -> complex:
             for name, tone in pattern.excitation.items()
         )
     )
-
-
-def _id(one: Slot) -> int:
-    return one.content.targets[0][0].key.id

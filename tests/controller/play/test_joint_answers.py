@@ -6,7 +6,6 @@ one of them back has passed; and the way from what plays to a better answer. Two
 19.5 where they land together; on the way both frequencies change.
 """
 
-import asyncio
 import math
 from collections.abc import AsyncIterator, Mapping, Sequence
 from contextlib import asynccontextmanager
@@ -20,7 +19,6 @@ import numpy as np
 import pytest
 
 from chain import Chain, Position
-from controller.effects.kinds import Click
 from controller.play.intent import HapticIntent, Target
 from controller.play.joint_answers import (
     MARGIN_DB,
@@ -429,74 +427,6 @@ async def test_one_content_rises_in_a_layer_of_its_own_and_the_other_falls_later
         assert old.layer not in fingers.applied[-1].contents
 
 
-@pytest.mark.parametrize(("amid", "within"), [(0.15, 0.042), (0.25, 0.022)])
-@in_virtual_time
-async def test_a_finger_that_lifts_amid_a_crossfade_is_silent_at_once(
-    amid: float, within: float
-) -> None:
-    """Along the ending of 40 ms of what plays in full yet, and a ramp of 20 of what falls."""
-    async with fingers_on(paper_table(), WHOLE) as fingers:
-        await apart(fingers, then=amid)
-        assert frequencies(fingers.applied[-1]) == {1: 140.0, 2: 190.0}
-        del fingers.at[1]
-        lifted, count = asyncio.get_running_loop().time(), len(fingers.committed)
-        await fingers.hold(0.012)
-        _, _, layers = fingers.committed[count]
-        assert sorted(one.layer for one in layers) == [0, 2]
-        assert not any(command.level for one in layers for command in one.commands)
-        voices = [each for every in fingers.far_end.amplifier.outputs for each in every]
-        assert all(each.silent_from <= lifted + within for each in voices if each.layer != 1)
-
-
-@in_virtual_time
-async def test_a_touch_amid_a_crossfade_is_answered_at_once() -> None:
-    """The next set has all three; the tone that fell ends with it, and nothing is led meanwhile."""
-    async with fingers_on(paper_table(), WHOLE) as fingers:
-        await apart(fingers, then=0.25)
-        count, touched = len(fingers.committed), asyncio.get_running_loop().time()
-        fingers.at[3] = (0.05, 0.19)
-        await fingers.hold(0.06)
-        at, _, layers = fingers.committed[count]
-        assert at - touched <= 0.02
-        driven = {one.layer for one in layers if any(command.level for command in one.commands)}
-        assert {1, 2} < driven
-        assert {one.layer for one in layers} - driven == {0} - driven
-        assert len(fingers.applied[-1].contents) == 3
-
-
-@in_virtual_time
-async def test_a_click_amid_a_crossfade_keeps_from_all_that_sounds() -> None:
-    """Answered at once, 30 Hz from the tone that falls, too, and that goes on in its layer.
-
-    Of its band that leaves 100 and 110 Hz, without what falls 220 to 240 as well.
-    """
-    layout = replace(WHOLE, effects={**WHOLE.effects, "click": Click(band=(100.0, 240.0))})
-    async with fingers_on(paper_table(), layout) as fingers:
-        await apart(fingers, then=0.25)
-        before, count = fingers.applied[-1], len(fingers.committed)
-        assert frequencies(before) == {1: 140.0, 2: 190.0}  # after 230
-        began = asyncio.get_running_loop().time()
-        fingers.play("click", 2)
-        await fingers.hold(0.03)
-        at, _, layers = fingers.committed[count]
-        (click,) = [one for one in fingers.applied[-1].contents.values() if one.content.key[1] < 0]
-        assert at - began <= 0.02
-        assert [one.layer for one in layers] == [3]
-        assert click.content.frequency in (100, 110)
-
-
-@in_virtual_time
-async def test_where_no_layer_is_free_nothing_is_led_over() -> None:
-    """Of two layers both play, and stay as they are."""
-    async with fingers_on(paper_table(), WHOLE) as fingers:
-        fingers.controller.cycle.planner.slots._count = 2
-        count = await apart(fingers, then=1.5)
-        sent = [one for _, _, layers in fingers.committed[count:] for one in layers]
-        assert all(one.renew or one.ramp < 300 for one in sent)
-        assert frequencies(fingers.applied[-1]) == {1: 230.0, 2: 190.0}
-        assert fingers.contrasts().keys() == {1, 2}
-
-
 @in_virtual_time
 async def test_a_finger_that_moves_again_within_a_second_is_not_led_again() -> None:
     """The last step, and the first of the next way, are a second apart or more."""
@@ -508,26 +438,6 @@ async def test_a_finger_that_moves_again_within_a_second_is_not_led_again() -> N
         await fingers.hold(1.5)
         led = [each.time for each in fingers.applied if each.settled_after == CROSSFADE]
         assert all(time - steps[-1] >= 1.0 for time in led[2:])
-
-
-@in_virtual_time
-async def test_after_a_leave_weights_are_led_within_their_layers() -> None:
-    """Of three fingers one leaves: the others keep frequency, phase and layer, along 300 ms."""
-    places = {1: (0.206, 0.015), 2: (0.151, 0.098), 3: (0.07, 0.077)}
-    async with fingers_on(paper_table(), WHOLE, at=places, held=1.5) as fingers:
-        before = fingers.applied[-1]
-        del fingers.at[3]
-        await fingers.hold(0.09)
-        left, count = fingers.applied[-1], len(fingers.committed)
-        await fingers.hold(1.1)
-        sent = [one for _, _, layers in fingers.committed[count:] for one in layers]
-        led = [one for one in sent if one.ramp == 300 and not any(c.ending for c in one.commands)]
-        after = fingers.applied[-1]
-        assert {one.layer for one in led} <= {*after.contents}
-        assert all(command.keep_phase for one in led for command in one.commands)
-        assert frequencies(after) == frequencies(left)
-        assert {*frequencies(after).items()} < {*frequencies(before).items()}
-        assert worst(after) >= worst(left) + 0.5
 
 
 def test_every_step_keeps_30_hz_between_all_that_sounds() -> None:

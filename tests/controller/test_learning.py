@@ -1,32 +1,34 @@
 """Learning of the plate: what the daemon says and answers by, the estimator, and its process."""
 
 import asyncio
+import logging
 import os
 import signal
 import sys
 import time
 from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import asynccontextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any, ClassVar, cast
+from tempfile import TemporaryDirectory
+from types import MappingProxyType, SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
 
-from controller.api.schema import LatencySummary, LearningState, PlateEvent
+from controller.api.schema import LatencySummary, LearningSummary, PlateEvent
 from controller.learning import learned_table as learned_table_module
 from controller.learning import learning as module
 from controller.learning.learned_table import LearnedTable, PlateReport
 from controller.learning.learning import Learning, SettledReadings
 from controller.learning.worker import MAX_MEMORY, Worker, make
-from controller.operation.plate_controller import Controller
 from controller.plate_measurement import PlateSensor, settling
 from controller.play.loop import Observers
 from controller.play.routing import Drive
 from controller.sources.touch import Contact, ContactKey
-from drivers.errors import CommandError, LinkError
+from courses import Taken, courses, follow
+from drivers.errors import LinkError
 from drivers.host.amplifier_sensors import Reading, SensorReading
 from drivers.playing import AmplifierTone
 from model.answer.answer_report import Timing
@@ -38,21 +40,6 @@ from model.table.table import LocalizationTable
 from plates import make_paper_rig, small_table
 from registry.limits import HAND_LOAD
 from virtual_lines import in_virtual_time
-
-
-class Taking:
-    """A controller that keeps what it answers by."""
-
-    drive_mode = "switched"
-    amplifiers: ClassVar[dict[str, object]] = {}
-    cycle = SimpleNamespace(is_preparing=False)
-
-    def __init__(self) -> None:
-        self.taken: list[LocalizationTable] = []
-
-    def replace_answers(self, table: LocalizationTable, timing: Timing) -> None:
-        """Note a table."""
-        self.taken.append(table)
 
 
 class Readings:
@@ -79,7 +66,7 @@ class Workers:
 
     def __init__(self) -> None:
         self.count, self.ended, self.pid = 0, 0, 1
-        self.started: PlateReport | Exception = FOLLOWED
+        self.started: PlateReport | Exception = report_of()
         self.reports = asyncio.Queue[PlateReport | Exception | None]()
 
     def __call__(self) -> "Workers":
@@ -112,340 +99,165 @@ class Workers:
         self.ended += 1
 
 
-@pytest.fixture
-def workers(monkeypatch: pytest.MonkeyPatch) -> Workers:
-    """Of a learning whose amplifiers have a sensor."""
-    found = Workers()
-
-    async def sensors(*args: object) -> Any:
-        return (SimpleNamespace(place=None),), ()
-
-    monkeypatch.setattr(module, "Worker", found)
-    monkeypatch.setattr(module, "SettledReadings", Readings)
-    monkeypatch.setattr(module, "plate_sensors", sensors)
-    monkeypatch.setattr(module, "check_clocks", lambda amplifiers: None)
-    return found
-
-
 CAUTIOUS = replace(small_table())
 CORRECTED = replace(small_table())
-FOLLOWED = PlateReport("following", "the plate is followed", None)
-CHANGED = PlateReport("changed", "a crack", "look for it")
-CUP = replace(CHANGED, cause="a cup lies there", lying=(0.1, 0.2, 0.3))
-WATCHED = PlateReport("off", "never measured", "measure it")
 TONE = np.array([110.0])  # Hz
 PATTERN = SettledPattern(0.0, TONE, np.zeros((1, 4), complex), np.ones((1, 4), complex))
+ERRORS = {"ChildProcessError": ChildProcessError("it died"), "InputError": InputError("InputError")}
+
+
+def report_of(
+    *, state: Any = "following", cause: str = "", remedy: str | None = None, **more: Any
+) -> PlateReport:
+    """What an estimator reports; table: whether it has corrected it, by any word."""
+    table = CORRECTED if more.pop("table", None) else None
+    lying = tuple(more.pop("lying", ())) or None
+    return PlateReport(state, cause, remedy, table=table, lying=cast(Any, lying), **more)
+
+
+@dataclass
+class Learned(Taken):
+    """A plate that is learned; taken: the tables that the controller has answered by.
+
+    asked: how often sensors were to be read; sensors: why they are not, "" if they reply.
+    """
+
+    learning: Learning = field(init=False)
+    workers: Workers = field(default_factory=lambda: Workers())
+    events: list[PlateEvent] = field(default_factory=list)
+    taken: list[LocalizationTable] = field(default_factory=list)
+    log: list[logging.LogRecord] = field(default_factory=list)
+    asked: int = 0
+    sensors: str = ""
+
+    @property
+    def event(self) -> PlateEvent:
+        """What clients are told; a change that is logged has been told to them."""
+        assert self.learning.event in (self.events or [self.learning.event])[-1:] or not self.log
+        return self.learning.event
+
+    @property
+    def status(self) -> LearningSummary:
+        """What the status says."""
+        empty = LatencySummary(count=0, median=None, p99=None, p999=None, histogram=[])
+        return self.learning.summary(empty)
+
+    @property
+    def logged(self) -> list[str]:
+        """Levels of what was logged since the last report."""
+        return [each.levelname for each in self.log]
+
+    @property
+    def is_corrected(self) -> bool:
+        """Whether answers are by the corrected table."""
+        return self.taken[-1] is CORRECTED
+
+    @property
+    def is_cautious(self) -> bool:
+        """Whether they are by that of a plate that is not known."""
+        return self.taken[-1] is CAUTIOUS
+
+    def will_report(self, **report: Any) -> None:
+        """Let the estimator report this of the next pattern that has no report."""
+        self.workers.reports.put_nowait(report_of(**report))
+
+    def will_fail(self, cause: str) -> None:
+        """Let its process die at the next pattern."""
+        self.workers.reports.put_nowait(ChildProcessError(cause))
+
+    def will_hang(self) -> None:
+        """Let it never reply to the next pattern."""
+        self.workers.reports.put_nowait(None)
+
+    async def hands(self, count: int) -> None:
+        """Hand patterns over, and wait for what is reported of them."""
+        self.log.clear()
+        for _ in range(count):
+            cast(Any, self.learning.readings).take(PATTERN)
+        await asyncio.sleep(0.1)
+
+    async def reports(self, **report: Any) -> None:
+        """Hand a pattern over of which this is reported."""
+        self.will_report(**report)
+        await self.hands(1)
+
+    async def readings_fail(self) -> None:
+        """Let what reads patterns end by a bug."""
+        cast(Readings, self.learning.readings).ending.set()
+        await asyncio.sleep(0.1)
+
+    def sensors_reply(self) -> None:
+        """Let sensors be read from now on."""
+        self.sensors = ""
+
+    def starts(self) -> None:
+        """Let estimators start from now on."""
+        self.workers.started = report_of()
+
+    def file_is_a_folder(self) -> None:
+        """Have a folder where the file is, which cannot be removed."""
+        self.learning._file.mkdir()
+
+    async def plate_sensors(self, *_: object) -> Any:
+        """One sensor, or the error of reading it."""
+        self.asked += 1
+        if self.sensors:
+            raise RuntimeError(self.sensors) if "bug" in self.sensors else LinkError(self.sensors)
+        return (SimpleNamespace(place=None),), ()
+
+    def replace_answers(self, table: LocalizationTable, timing: Timing) -> None:
+        """Note a table that the controller answers by."""
+        self.taken.append(table)
 
 
 @asynccontextmanager
-async def opened(folder: Path) -> AsyncIterator[tuple[Learning, Taking, list[PlateEvent]]]:
-    """A learning whose estimator is started, its controller and events, closed at the end."""
-    taking, events = Taking(), list[PlateEvent]()
-    learning = Learning(
-        make_paper_rig(12, 9),
-        small_table(),
-        Timing(small_table()),
-        folder / "learned.npz",
-        controller=cast(Controller, taking),
-        changed=events.append,
-        estimated=lambda latency: None,
-    )
-    learning.open()
-    await asyncio.sleep(0.1)
-    yield learning, taking, events
-    await learning.close()
+async def learned(
+    *, started: Any = MappingProxyType({}), sensors: str = ""
+) -> AsyncIterator[Learned]:
+    """A plate whose estimator is started; started: what it reports then, or the error that ends it.
 
-
-async def hand(learning: Learning, *, count: int = 1) -> None:
-    """Hand patterns over, and wait until they are estimated."""
-    for _ in range(count):
-        cast(Any, learning.readings).take(PATTERN)
-    await asyncio.sleep(0.1)
-
-
-def counted(learning: Learning, *names: str) -> tuple[int, ...]:
-    """Counts of the status by their names."""
-    empty = LatencySummary(count=0, median=None, p99=None, p999=None, histogram=[])
-    status = learning.summary(empty)
-    return tuple(getattr(status, name) for name in names)
-
-
-@dataclass(frozen=True)
-class Course:
-    """What the estimator reports of a pattern, and what is so thereafter.
-
-    taken: how many tables the controller has taken in all; levels: of what was logged for it.
+    sensors: why they cannot be read.
     """
+    found = Learned(sensors=sensors)
+    error = ERRORS[started] if isinstance(started, str) else None
+    found.workers.started = error or report_of(**started)
+    handler, logger = logging.Handler(), logging.Logger("plate")
+    handler.emit = found.log.append  # type: ignore[method-assign]
+    logger.addHandler(handler)
+    controller: Any = SimpleNamespace(
+        drive_mode="switched",
+        amplifiers={},
+        cycle=SimpleNamespace(is_preparing=False),
+        replace_answers=found.replace_answers,
+    )
+    with TemporaryDirectory() as folder, pytest.MonkeyPatch.context() as patch:
+        patch.setattr(module, "Worker", found.workers)
+        patch.setattr(module, "SettledReadings", Readings)
+        patch.setattr(module, "plate_sensors", found.plate_sensors)
+        patch.setattr(module, "check_clocks", lambda amplifiers: None)
+        patch.setattr(module, "_logger", logger)
+        found.learning = Learning(
+            make_paper_rig(12, 9),
+            small_table(),
+            Timing(small_table()),
+            Path(folder) / "learned.npz",
+            controller=controller,
+            changed=found.events.append,
+            estimated=lambda latency: None,
+        )
+        found.learning.open()
+        await asyncio.sleep(0.1)
+        yield found
+        await found.learning.close()
 
-    report: PlateReport
-    state: LearningState
-    is_cautious: bool | None = None
-    taken: int | None = None
-    lying: tuple[float, float, float] | None = None
-    levels: Sequence[str] | None = None
 
-
-AGAIN = replace(FOLLOWED, cause="the plate is again as it was")
-HELD = replace(FOLLOWED, cause="the plate is not as known", is_alarm=True)
-COURSES = {
-    # Changed and cautious, until an estimate says that it is as it was.
-    "a plate that had changed stays so over a restart": (
-        replace(CHANGED, table=CORRECTED),
-        [
-            Course(CHANGED, "changed", is_cautious=True, levels=[]),
-            Course(replace(AGAIN, table=CORRECTED), "following", is_cautious=False),
-        ],
-    ),
-    # Each change is a warning once; answers of a plate that is followed stay while it is not known.
-    "answers follow the plate again after a change": (
-        FOLLOWED,
-        [
-            Course(replace(FOLLOWED, table=CORRECTED), "following", taken=2, levels=[]),
-            Course(HELD, "following", is_cautious=False, taken=2, levels=["WARNING"]),
-            Course(
-                replace(CHANGED, table=CORRECTED),
-                "changed",
-                is_cautious=True,
-                taken=3,
-                levels=["WARNING"],
-            ),
-            Course(replace(AGAIN, table=CORRECTED), "following", is_cautious=False, taken=4),
-        ],
-    ),
-    # It is all that such a plate can tell.
-    "an alarm of a watched plate is a warning": (
-        WATCHED,
-        [
-            Course(WATCHED, "off", levels=[]),
-            Course(replace(WATCHED, is_alarm=True), "off", taken=0, levels=["WARNING"]),
-        ],
-    ),
-    "an object is said until it is gone": (
-        FOLLOWED,
-        [
-            Course(replace(CUP, table=CORRECTED), "changed", is_cautious=True, lying=CUP.lying),
-            Course(AGAIN, "following"),
-        ],
-    ),
-    "a note is logged": (
-        FOLLOWED,
-        [Course(replace(FOLLOWED, note="not used"), "following", levels=["WARNING"])],
-    ),
-}
+COURSES = courses(Path(__file__).with_name("learning.yaml"))
 
 
 @pytest.mark.parametrize("name", COURSES)
-@in_virtual_time
-async def test_status_follows_the_estimator(
-    workers: Workers, tmp_path: Path, caplog: pytest.LogCaptureFixture, name: str
-) -> None:
-    """State, answers and log are those of each report of a course, and each is an event."""
-    caplog.set_level("INFO")
-    workers.started, course = COURSES[name]
-    async with opened(tmp_path) as (learning, taking, events):
-        assert learning.event.state == workers.started.state
-        for each in course:
-            caplog.clear()
-            workers.reports.put_nowait(each.report)
-            await hand(learning)
-            logged = [found.levelname for found in caplog.records]
-            assert learning.event.state == each.state, each
-            assert each.is_cautious in (None, learning.event.cautious), each
-            found = learning.event.object
-            assert each.lying == (found and (found.x_m, found.y_m, found.mass_kg)), each
-            assert each.taken in (None, len(taking.taken)), each
-            assert each.levels in (None, logged), each
-            assert events[-1] == learning.event or not logged
-        alarms = sum(each.report.is_alarm for each in course)
-        assert learning.event.alarms == alarms
-        assert counted(learning, "readings", "estimates") == (len(course),) * 2
-
-
-@in_virtual_time
-async def test_onsets_are_shaped_anew_a_minute_after_a_correction(
-    workers: Workers, tmp_path: Path
-) -> None:
-    """Of several corrections in a minute, the first and the last are shaped, in one step each."""
-    async with opened(tmp_path) as (learning, taking, _):
-        for _ in range(2):
-            workers.reports.put_nowait(replace(FOLLOWED, table=CORRECTED))
-            await hand(learning)
-            await asyncio.sleep(15.0)
-        assert len(taking.taken) == 3
-        await asyncio.sleep(60.0)
-        assert len(taking.taken) == 4
-        assert counted(learning, "corrections") == (2,)
-
-
-@in_virtual_time
-async def test_file_that_cannot_be_removed_is_still_followed(
-    workers: Workers, tmp_path: Path
-) -> None:
-    """`forget` names the file, and another estimator starts from it; then answers are as built."""
-    workers.started = replace(FOLLOWED, table=CORRECTED)
-    async with opened(tmp_path) as (learning, taking, _):
-        (tmp_path / "learned.npz").mkdir()
-        with pytest.raises(CommandError, match=r"learned\.npz"):
-            await learning.forget()
-        assert taking.taken[-1] is not CORRECTED
-        await asyncio.sleep(0.1)
-        assert (workers.count, workers.ended) == (2, 1)
-        assert learning.event.state == "following"
-        assert taking.taken[-1] is CORRECTED
-
-
-@in_virtual_time
-async def test_what_waits_is_forgotten_with_the_plate(workers: Workers, tmp_path: Path) -> None:
-    """The next estimator gets no pattern from before, and those are counted."""
-    async with opened(tmp_path) as (learning, _, _):
-        await hand(learning, count=3)
-        await learning.forget()
-        await asyncio.sleep(0.1)
-        workers.reports.put_nowait(FOLLOWED)
-        await asyncio.sleep(0.1)
-        assert counted(learning, "readings", "estimates", "discarded") == (3, 0, 3)
-
-
-@in_virtual_time
-async def test_readings_that_fail_are_started_anew(workers: Workers, tmp_path: Path) -> None:
-    """Off with the cause at once; read again after a pause, and followed after an estimate."""
-    async with opened(tmp_path) as (learning, _, _):
-        readings = cast(Readings, learning.readings)
-        readings.ending.set()
-        await asyncio.sleep(0.1)
-        assert learning.event.state == "off"
-        assert "a sensor of no kind" in learning.event.cause
-        assert learning.event.remedy is not None
-        await asyncio.sleep(11.0)
-        assert readings.count == 2
-        workers.reports.put_nowait(FOLLOWED)
-        await hand(learning)
-        assert learning.event.state == "following"
-        await asyncio.sleep(61.0)
-        assert not learning.event.cautious
-
-
-@in_virtual_time
-async def test_plate_that_is_not_watched_makes_answers_cautious(
-    workers: Workers, tmp_path: Path
-) -> None:
-    """After a minute without readings what was learned is not trusted, and not before."""
-    async with opened(tmp_path) as (learning, taking, events):
-        cast(Readings, learning.readings).ending.set()
-        await asyncio.sleep(59.0)
-        assert not learning.event.cautious
-        await asyncio.sleep(2.0)
-        assert learning.event.cautious
-        assert events[-1].cautious
-        assert taking.taken == [CAUTIOUS]
-
-
-@in_virtual_time
-async def test_sensors_that_were_not_read_are_asked_for_again(
-    workers: Workers, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Off with the link's error and a remedy; the estimator starts once they reply."""
-    replying = module.plate_sensors
-
-    async def silent(*args: object) -> Any:
-        raise LinkError("no reply of A")
-
-    monkeypatch.setattr(module, "plate_sensors", silent)
-    async with opened(tmp_path) as (learning, _, _):
-        assert learning.event.state == "off"
-        assert "no reply of A" in learning.event.cause
-        assert learning.event.remedy is not None
-        with pytest.raises(CommandError, match="no reply of A"):
-            await learning.forget()
-        monkeypatch.setattr(module, "plate_sensors", replying)
-        await asyncio.sleep(11.0)
-        assert learning.event.state == "following"
-
-
-@in_virtual_time
-async def test_failure_to_read_sensors_is_said_again(
-    workers: Workers, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Without them no estimator is started; `forget` tries again, as an opened amplifier does."""
-    asked = 0
-
-    async def failing(*args: object) -> None:
-        nonlocal asked
-        asked += 1
-        raise RuntimeError("no such words")
-
-    monkeypatch.setattr(module, "plate_sensors", failing)
-    async with opened(tmp_path) as (learning, _, _):
-        assert "no such words" in learning.event.cause
-        await learning.forget()
-        await asyncio.sleep(0.1)
-        learning.open()
-        await asyncio.sleep(0.1)
-        assert (learning.event.state, workers.count, asked) == ("off", 0, 3)
-
-
-@in_virtual_time
-async def test_estimator_that_fails_is_replaced(workers: Workers, tmp_path: Path) -> None:
-    """One that hangs or dies is ended and replaced after a second; its pattern alone is lost."""
-    async with opened(tmp_path) as (learning, _, _):
-        for failure, reason in ((None, "no reply"), (ChildProcessError("it died"), "it died")):
-            workers.reports.put_nowait(failure)
-            workers.reports.put_nowait(FOLLOWED)
-            began = workers.count
-            await hand(learning, count=2)
-            await asyncio.sleep(30.1 if failure is None else 0.0)
-            assert learning.event.state == "off"
-            assert reason in learning.event.cause or failure is None
-            assert (workers.count, workers.ended) == (began, began)
-            await asyncio.sleep(1.5 * began)
-            assert learning.event.state == "following"
-        assert counted(learning, "restarts", "estimates", "discarded") == (2, 2, 2)
-
-
-@in_virtual_time
-async def test_estimator_that_always_fails_is_given_up(workers: Workers, tmp_path: Path) -> None:
-    """After eight in a row, with the remedy; readings end, and `forget` starts anew."""
-    workers.started = ChildProcessError("its process has died")
-    async with opened(tmp_path) as (learning, taking, _):
-        await asyncio.sleep(600.0)
-        assert (workers.count, workers.ended) == (8, 8)
-        assert "era forget" in str(learning.event.remedy)
-        assert not taking.taken
-        assert counted(learning, "restarts") == (7,)
-        learning.open()
-        await asyncio.sleep(1.0)
-        assert workers.count == 8
-        workers.started = FOLLOWED
-        await learning.forget()
-        await asyncio.sleep(1.0)
-        assert learning.event.state == "following"
-
-
-@in_virtual_time
-async def test_rig_of_which_nothing_is_learned_is_not_tried_again(
-    workers: Workers, tmp_path: Path
-) -> None:
-    """Its InputError is the cause."""
-    workers.started = InputError("a plate that does not scale")
-    async with opened(tmp_path) as (learning, _, _):
-        await asyncio.sleep(600.0)
-        assert workers.count == 1
-        assert "does not scale" in learning.event.cause
-
-
-@in_virtual_time
-async def test_patterns_wait_for_a_slow_estimator_up_to_a_number(
-    workers: Workers, tmp_path: Path
-) -> None:
-    """One is estimated, 16 wait, and two more are discarded."""
-    async with opened(tmp_path) as (learning, _, _):
-        await hand(learning)
-        await hand(learning, count=18)
-        assert counted(learning, "readings", "discarded") == (19, 2)
-        for _ in range(17):
-            workers.reports.put_nowait(FOLLOWED)
-        await asyncio.sleep(1.0)
-        assert counted(learning, "estimates", "discarded") == (17, 2)
+def test_plate_keeps_to_its_course(name: str) -> None:
+    """Every step is as it is in the file."""
+    follow(COURSES[name], learned)
 
 
 def tone(frequency: float, level: float, phase: float) -> AmplifierTone:

@@ -106,7 +106,7 @@ class Taken:
             assert fits(found, given), {what: found[what] for what in given}
             return
         method = attrgetter(name.replace(" ", "_"))(self)
-        is_by_number = isinstance(given, Mapping) and all(isinstance(key, int) for key in given)
+        is_by_number = isinstance(given, Mapping) and any(isinstance(key, int) for key in given)
         if name in _OF_A_STEP or is_by_number or not isinstance(given, list | Mapping):
             done = method(given)
         else:

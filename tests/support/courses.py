@@ -18,6 +18,7 @@ from dataclasses import dataclass, field
 from operator import attrgetter
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 
@@ -47,7 +48,7 @@ class Planted(Exception):
     """A bug."""
 
 
-@dataclass
+@dataclass(kw_only=True)
 class Taken:
     """What takes the steps of courses; under_way: those that have begun; error: the last of one."""
 
@@ -80,6 +81,22 @@ class Taken:
         """Cancel a step that has begun."""
         self.under_way[_name(step)].cancel()
 
+    async def repeats(self, times: int, *steps: Step) -> None:
+        """Take steps one after the other, so often."""
+        for step in steps * times:
+            await self.take(step)
+
+    def breaks(self, what: str) -> None:
+        """Let a method, by its name, fail by a bug from now on."""
+        owner, _, name = what.rpartition(".")
+        setattr(attrgetter(owner)(self), name, Mock(side_effect=Planted(what)))
+
+    def sets(self, **values: Any) -> None:
+        """Give attributes, by their names, values."""
+        for what, value in values.items():
+            owner, _, name = what.rpartition(".")
+            setattr(attrgetter(owner)(self) if owner else self, name, value)
+
     def says(self, what: str, text: str) -> None:
         """Require a part of a text."""
         assert text in attrgetter(what)(self), attrgetter(what)(self)
@@ -88,6 +105,11 @@ class Taken:
         """Require the numbers of what was reported."""
         found = {what: len(attrgetter(what)(self)) for what in numbers}
         assert found == numbers
+
+    def is_between(self, **bounds: Sequence[float]) -> None:
+        """Require values between two."""
+        found = {what: attrgetter(what)(self) for what in bounds}
+        assert all(low <= found[each] <= high for each, (low, high) in bounds.items()), found
 
     async def refuses(self, step: Step) -> None:
         """Require that a step is refused."""
@@ -115,15 +137,17 @@ class Taken:
             await done
 
     async def raises(self, error: str, step: Step, text: str = ".") -> None:
-        """Require that a step raises an error of the drivers, by its name, with this text."""
-        with pytest.raises(getattr(errors, error), match=text) as caught:
+        """Require that a step raises an error of the drivers, or Planted, by name, with a text."""
+        kind = Planted if error == "Planted" else getattr(errors, error)
+        with pytest.raises(kind, match=text) as caught:
             await self.take(step)
         self.error = caught.value
 
     async def takes(self, least: float, most: float, step: Step) -> None:
         """Require that a step takes so many seconds."""
         began = threads.now()
-        await self.take(step)
+        async with asyncio.timeout(most + 1.0):
+            await self.take(step)
         assert least <= threads.now() - began <= most
 
 

@@ -34,7 +34,7 @@ from drivers.playing import AmplifierLayer, AmplifierTone
 from drivers.ports import PORT_OPENER, Port
 from drivers.protocol.definition import MESSAGES, READING_STATES, UNKNOWN_PLACE, sensor_reading
 from drivers.protocol.records import Values
-from drivers.protocol.sets import Command, Envelope, LayerSet, achieved_problem
+from drivers.protocol.sets import Command, LayerSet, achieved_problem
 from drivers.wires.can_frames import unpack_frames
 from drivers.wires.serial_frames import REPLY_BIT, FrameReader, encode_frame
 from drivers.wires.serial_line import SerialWire
@@ -44,7 +44,7 @@ from real_wires import WORD_WIRES
 from registry.limits import GuardLimits
 from sim.amplifier.readings import capabilities
 from sim.amplifier.simulated_amplifier import SimulatedAmplifier
-from virtual_lines import KINDS, MemoryLine, group_of, in_virtual_time
+from virtual_lines import KINDS, MemoryLine, in_virtual_time
 from virtual_lines import LIMITS as WIRE_LIMITS
 
 FREQUENCIES = [110.0, 173.5]
@@ -268,126 +268,6 @@ def test_more_than_that_is_one(name: str) -> None:
     problem = achieved_problem(SENT, shown(*OTHER[name]), CAN, is_exact=False, slack=0.5)
     assert problem is not None
     assert name in problem[1]
-
-
-@pytest.mark.parametrize("kind", KINDS)
-@in_virtual_time
-async def test_ledger_goes_on_with_what_was_achieved(kind: str) -> None:
-    """An amplifier of steps of 10 % plays 0.6 for 0.58: 0.41 beside it is refused, 0.4 plays."""
-    end = MemoryLine(kind, "a")
-    far, (host,) = end.far["a"], end.hosts.values()
-    far.capabilities = {**far.capabilities, "level_step": 1000}
-    group = await group_of(end)
-    commit = far.playback.commit
-
-    def rounded(layers: tuple[LayerSet, ...], token: int, time: float) -> None:
-        commands = [
-            tuple(replace(each, level=round(each.level, -3)) for each in layer.commands)
-            for layer in layers
-        ]
-        made = [replace(one, commands=each) for one, each in zip(layers, commands, strict=True)]
-        commit(made, token, time)
-
-    far.playback.commit = rounded  # type: ignore[method-assign]
-    played = await group.apply({"a": [AmplifierLayer(0, (AmplifierTone(0, 100.0, 0.58),), 0.001)]})
-    achieved = await host.read_achieved(played.layers["a"][0], played.token)
-    assert achieved.commands[0].level == 6000
-    with pytest.raises(CommandRefused):
-        await group.apply({"a": [AmplifierLayer(1, (AmplifierTone(0, 150.0, 0.41),), 0.001)]})
-    await group.apply({"a": [AmplifierLayer(1, (AmplifierTone(0, 150.0, 0.4),), 0.001)]})
-
-
-@in_virtual_time
-async def test_phase_is_kept_of_a_frequency_that_the_amplifier_rounds() -> None:
-    """101.3 Hz in steps of 1.5 Hz from 0 on are 102: sent so from then on, the tone goes on."""
-    end = MemoryLine("serial", "a")
-    far, (host,) = end.far["a"], end.hosts.values()
-    far.capabilities = {**far.capabilities, "frequency_step": 30}
-    group = await group_of(end)
-    commit, take = far.playback.commit, far._take
-
-    def rounded(layers: tuple[LayerSet, ...], token: int, time: float) -> None:
-        (one,) = layers
-        (only,) = one.commands
-        exact = replace(only, frequency=30 * round(only.frequency / 30))
-        commit([replace(one, commands=(exact,))], token, time)
-
-    far.playback.commit = rounded  # type: ignore[method-assign]
-    far._take = lambda part, now: {**take(part, now), "exact": 0}  # type: ignore[method-assign]
-    for level in (0.5, 0.4):
-        again = AmplifierTone(0, 101.3, level, keep_phase=True)
-        played = await group.apply({"a": [AmplifierLayer(0, (again,), 0.02)]})
-        assert played.layers["a"][0].commands[0].frequency == 2040
-        for playback in (far.playback, host.ledger.playback):
-            assert [voice.frequency for voice in playback.all_voices[0]] == [102.0]
-
-
-@pytest.mark.parametrize("said", [0, 1200])
-@in_virtual_time
-async def test_any_frequency_may_be_said_of_a_tone_at_level_0(said: int) -> None:
-    """A pulse of 170 Hz leads to level 0, which does not drive: none of its kind plays at 60 Hz."""
-    end = MemoryLine("serial", "a")
-    far = end.far["a"]
-    group = await group_of(end)
-    take, handle = far._take, far.handle
-
-    def handled(name: str, values: Values, now: float) -> Values:
-        reply = handle(name, values, now)
-        if name == "GetAchieved":
-            reply["commands"] = [{**each, "frequency": said} for each in reply["commands"]]
-        return reply
-
-    far._take = lambda part, now: {**take(part, now), "exact": 0}  # type: ignore[method-assign]
-    far.handle = handled  # type: ignore[method-assign]
-    pulse = AmplifierTone(0, 170.0, 0.0, onset=Envelope(100, ((300, 0),)))
-    for _ in range(2):
-        played = await group.apply({"a": [AmplifierLayer(0, (pulse,), 0.001)]})
-        assert played.layers["a"][0].commands[0].frequency == 3400
-        assert {voice.frequency for voice in far.playback.all_voices[0]} == {170.0}
-
-
-@in_virtual_time
-async def test_layers_that_play_on_are_no_contradiction_where_sets_are_inexact() -> None:
-    """Renewed, or still waiting for an onset: they show an earlier set, however often."""
-    end = MemoryLine("serial", "a")
-    far = end.far["a"]
-    group = await group_of(end)
-    onset = Envelope(1000, ((1000, 0),) * 9)
-    await group.apply({"a": [AmplifierLayer(0, (AmplifierTone(0, 100.0, 0.5),), 0.001)]})
-    await group.apply(
-        {"a": [AmplifierLayer(1, (AmplifierTone(0, 150.0, 0.1, onset=onset),), 0.001)]}
-    )
-    take = far._take
-    far._take = lambda part, now: {**take(part, now), "exact": 0}  # type: ignore[method-assign]
-    for _ in range(3):
-        await group.apply({"a": [AmplifierLayer(0, renew=True)]})
-        await group.apply(
-            {"a": [AmplifierLayer(1, (AmplifierTone(0, 200.0, 0.1),), 0.001, after=True)]}
-        )
-    assert group.is_armed
-
-
-@in_virtual_time
-async def test_levels_that_are_measured_have_an_error() -> None:
-    """0.002 of full level, a quarter at most: 0.5 measured as 0.498 agrees, as 0.497 does not.
-
-    The tolerance of two steps of 1e-4 comes on top.
-    """
-    end = MemoryLine("serial", "a")
-    far, (host,) = end.far["a"], end.hosts.values()
-    far.capabilities = {**far.capabilities, "features": far.capabilities["features"] | 1 << 2}
-    group = await group_of(end)
-    await group.apply({"a": [AmplifierLayer(0, (AmplifierTone(0, 100.0, 0.5),), 0.001)]})
-    status = far.status
-
-    def measured(level: int) -> None:
-        far.status = lambda now: {**status(now), "levels": [level, 0]}  # type: ignore[method-assign]
-
-    for level, count in ((4978, 0), (4977, 1)):
-        measured(level)
-        end.loop.now += 0.02  # type: ignore[attr-defined]
-        await host.ping()
-        assert host._contradictions == count
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -1,13 +1,20 @@
-"""One clock as its host sees it: readings of a counter made by hand, in a time of its own."""
+"""One clock as its host sees it: readings of a counter made by hand, in a time of its own.
+
+Courses of single clocks in YAML, each by the sentence that it proves.
+"""
 
 import math
 import random
-from collections.abc import Callable
+from collections.abc import AsyncIterator, Callable, Mapping
+from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
 from functools import partial
+from pathlib import Path
+from typing import Any
 
 import pytest
 
+from courses import Taken, courses, follow
 from drivers.host.clock import HeldClock
 
 ARMED, OFF = 4, 1
@@ -42,13 +49,25 @@ class Counter:
 
 
 @dataclass
-class Exchanges:
+class Chance(Counter):
+    """A clock that shows any number once its crystal is not what it was."""
+
+    rng: random.Random = field(default_factory=lambda: random.Random(8))
+
+    @property
+    def word(self) -> int:
+        """What a Status shows."""
+        return self.rng.randrange(1 << 32) if self.crystal else super().word
+
+
+@dataclass
+class Exchanges(Taken):
     """Exchanges of a host with a counter; delay: draws how long a request takes beside its bits.
 
     takes: s that bits of a request really take, None for all of them; back: draws those of a reply.
     """
 
-    counter: Counter
+    counter: Counter = field(default_factory=Counter)
     delay: Callable[[], float] = lambda: 0.0
     bits: float = 0.0  # s; of a request
     takes: float | None = None
@@ -58,6 +77,7 @@ class Exchanges:
     state: int = OFF
     lost: Callable[[], bool] = lambda: False
     is_playing: bool = True
+    shift: int = 0
     held: HeldClock = field(default_factory=HeldClock)
     leads: list[float] = field(default_factory=list)
 
@@ -83,11 +103,11 @@ class Exchanges:
         status = {"state": self.state, "clock": counter.word}
         self.held.replied(name, values, status, counter.at + self.back())
 
-    def arm(self) -> int:
-        """Read it for a second, then arm; returns the shift."""
-        self.run(1.0)
-        self.send("Arm", shift=(shift := self.held.shift(self.now)))
-        return shift
+    def arm(self, duration: float = 1.0) -> None:
+        """Read it for some time, then arm, with the shift that it needs."""
+        self.run(duration)
+        self.shift = self.held.shift(self.now)
+        self.send("Arm", shift=self.shift)
 
     def run(self, duration: float) -> None:
         """Exchange for some time: Pings each 50 ms while armed, else statuses."""
@@ -100,27 +120,86 @@ class Exchanges:
             else:
                 self.send("GetStatus")
 
+    @property
+    def known_error(self) -> float:
+        """The error that the host knows of [s]."""
+        return self.held.error(self.now)
 
-def frames(seed: int, frame: float) -> Callable[[], float]:
-    """Delays until the next frame of USB [s]."""
-    rng = random.Random(seed)
-    return lambda: rng.uniform(0.0, frame)
+    @property
+    def said_share(self) -> float:
+        """That error as a share of the lead."""
+        return self.known_error / abs(self.counter.lead)
+
+    @property
+    def scatter(self) -> float:
+        """How exactly the host knows the lead [s]."""
+        return self.held.scatter(self.now)
+
+    @property
+    def misread(self) -> float:
+        """By how much the host takes the lead for more than it is [s]."""
+        return math.remainder(self.held.lead(self.now) - self.counter.lead, 20)
+
+    @property
+    def problem(self) -> str | None:
+        """What the host says of the clock."""
+        return self.held.problem(self.now)
+
+    def is_late(self, least: float, most: float) -> None:
+        """Let requests take a random time beside their bits [s]."""
+        self.delay = uniform(1, least, most)
+
+    def replies_in(self, least: float, most: float) -> None:
+        """Let replies take a random time [s]."""
+        self.back = uniform(1, least, most)
+
+    def is_busy(self) -> None:
+        """Let requests and replies take the times of a busy machine."""
+        self.delay, self.back = busy(3), busy(4)
+
+    def loses_replies(self, is_lost: bool) -> None:
+        """Let no reply come, or all."""
+        self.lost = lambda: is_lost
+
+    def pauses(self, seconds: float) -> None:
+        """Let time pass without an exchange."""
+        self.now += seconds
+
+    def jumps(self, seconds: float) -> None:
+        """Move the clock on."""
+        self.counter.shown += seconds
+
+    def is_shifted(self) -> None:
+        """Move the clock by the shift that was sent."""
+        self.jumps(self.shift * STEP)
+
+
+def uniform(seed: int, least: float, most: float) -> Callable[[], float]:
+    """Random delays [s]; from 0 on they are those until the next frame of USB."""
+    return partial(random.Random(seed).uniform, least, most)
+
+
+@asynccontextmanager
+async def exchanging(
+    *, clock: str = "Counter", counter: Mapping[str, float], **options: Any
+) -> AsyncIterator[Exchanges]:
+    """Exchanges with a kind of counter."""
+    made = {"Counter": Counter, "Chance": Chance}[clock](**{"shown": START, **counter})
+    yield Exchanges(made, **options)
+
+
+COURSES = courses(Path(__file__).with_name("clocks.yaml"))
+
+
+@pytest.mark.parametrize("name", COURSES)
+def test_clock_keeps_to_its_course(name: str) -> None:
+    """Every step is as it is in the file."""
+    follow({"counter": {}, **COURSES[name]}, exchanging)
 
 
 def rms(values: list[float]) -> float:
     """Root of the mean square."""
     return math.sqrt(sum(each * each for each in values) / len(values))
-
-
-def test_shift_is_the_nearest_step_and_the_rate_undoes_the_crystal() -> None:
-    """3.2001 s ahead at 40 ppm: 10486 steps of 305.2 us back, then -400 in tenths of a ppm."""
-    talk = Exchanges(Counter(40e-6, shown=START + 3.2001 - 40e-6))
-    assert talk.arm() == 65536 - 10486
-    assert abs(talk.counter.lead) <= STEP / 2 + 1e-6
-    assert talk.held.scatter(talk.now) < 20e-6  # what was read before goes on to count
-    talk.run(10.0)
-    assert talk.counter.rate == pytest.approx(-40e-6, abs=0.5e-6)
-    assert abs(talk.counter.lead) < 2e-6
 
 
 @pytest.mark.parametrize(
@@ -130,7 +209,9 @@ def test_frames_of_usb_only_add(frame: float, bound: float) -> None:
     """Uniform delays: the lowest tell, not their mean of half a frame, and their error is said."""
     leads, said = list[float](), list[float]()
     for seed in range(8):
-        talk = Exchanges(Counter(-50e-6 + 14e-6 * seed, shown=START + seed), frames(seed, frame))
+        talk = Exchanges(
+            Counter(-50e-6 + 14e-6 * seed, shown=START + seed), uniform(seed, 0.0, frame)
+        )
         talk.arm()
         talk.run(15.0)
         leads += talk.leads[-100::10]
@@ -155,7 +236,7 @@ def test_lost_pings_make_it_swing_no_further(is_playing: bool) -> None:
         return in_a_row > 0
 
     for seed in range(8):
-        talk = Exchanges(Counter(50e-6), frames(seed, 125e-6), is_playing=is_playing)
+        talk = Exchanges(Counter(50e-6), uniform(seed, 0.0, 125e-6), is_playing=is_playing)
         talk.arm()
         talk.lost = is_lost
         talk.run(15.0)
@@ -181,7 +262,9 @@ def test_busy_machine_accuses_no_clock() -> None:
     """
     within = list[bool]()
     for seed in range(8):
-        talk = Exchanges(Counter(-50e-6 + 14e-6 * seed, shown=START + seed), frames(seed, 125e-6))
+        talk = Exchanges(
+            Counter(-50e-6 + 14e-6 * seed, shown=START + seed), uniform(seed, 0.0, 125e-6)
+        )
         talk.arm()
         for duration, delay in ((5.0, talk.delay), (30.0, busy(seed)), (10.0, talk.delay)):
             talk.delay = delay
@@ -191,21 +274,6 @@ def test_busy_machine_accuses_no_clock() -> None:
                 within.append(abs(talk.counter.lead) < 3 * talk.held.error(talk.now) + 40e-6)
         assert abs(talk.counter.lead) < 40e-6
     assert sum(within) >= 0.9 * len(within)
-
-
-def test_one_early_reading_is_no_jump() -> None:
-    """Requests take 0.7 ms and up to 0.1 more, one of 300 none: it is led between both, gently."""
-    rng = random.Random(4)
-    talk = Exchanges(Counter(40e-6), lambda: 0.7e-3 + rng.uniform(0.0, 0.1e-3))
-    talk.arm()
-    talk.run(10.0)
-    delay, talk.delay = talk.delay, lambda: 0.0
-    talk.run(0.05)
-    talk.delay = delay
-    for _ in range(100):
-        talk.run(0.05)
-        assert talk.held.problem(talk.now) is None
-        assert -0.85e-3 < talk.counter.lead < 0.05e-3
 
 
 @dataclass
@@ -227,7 +295,7 @@ def test_clock_that_is_rarely_read_wrong_is_off_by_no_more_than_is_said() -> Non
     """
     leads, said = list[float](), list[float]()
     for seed in range(8):
-        talk = Exchanges(TornCounter(-50e-6 + 14e-6 * seed), frames(seed, 125e-6))
+        talk = Exchanges(TornCounter(-50e-6 + 14e-6 * seed), uniform(seed, 0.0, 125e-6))
         talk.arm()
         talk.run(10.0)
         for _ in range(100):
@@ -253,14 +321,6 @@ def test_requests_that_are_late_for_a_second_leave_a_clock_known() -> None:
                 talk.send("GetStatus")
             said.append(talk.held.error(talk.now))
         assert max(said) < 50e-6
-
-
-def test_bits_of_a_request_are_no_lead() -> None:
-    """A request of 5 ms: the clock of its last bit is compared with that moment."""
-    talk = Exchanges(Counter(), bits=5e-3)
-    talk.arm()
-    talk.run(3.0)
-    assert abs(talk.counter.lead) < 2e-6
 
 
 def _prompt(rng: random.Random) -> float:
@@ -296,185 +356,6 @@ def test_bits_that_take_no_time_do_not_count(bits: float, takes: float) -> None:
         assert talk.counter.rate == pytest.approx(-crystal, abs=3e-6)
         leads.append(talk.leads[-400:])
     assert rms([one - other for one, other in zip(*leads, strict=True)]) < 9e-6
-
-
-def test_bits_that_take_a_little_less_than_stated_count() -> None:
-    """Frames of CAN are stated stuffed at worst, up to a fifth longer: no reading is thrown away.
-
-    0.5 ms out and 2 ms back are stated, 0.4 and 1.6 ms are true.
-    """
-    rng = random.Random(1)
-    back = partial(rng.uniform, 1.6e-3, 1.65e-3)
-    late = partial(rng.uniform, 0.0, 40e-6)
-    talk = Exchanges(Counter(40e-6), late, bits=0.5e-3, takes=0.4e-3, back=back)
-    talk.held.identified(10, bits=2e-3)
-    talk.arm()
-    talk.run(10.0)
-    assert talk.counter.rate == pytest.approx(-40e-6, abs=3e-6)
-    assert talk.held.lead(talk.now) == pytest.approx(talk.counter.lead - 0.1e-3, abs=20e-6)
-
-
-def test_clock_goes_round_unnoticed() -> None:
-    """30 s at 30 ppm without an Arm, over the end of its 20 s: 900 us more, nothing is said."""
-    talk = Exchanges(Counter(30e-6, shown=START + 9.9995))
-    talk.run(1.0)
-    before = talk.held.lead(talk.now)
-    for _ in range(600):
-        talk.run(0.05)
-        assert talk.held.scatter(talk.now) < 10e-6
-    gained = math.remainder(talk.held.lead(talk.now) - before, 20)
-    assert gained == pytest.approx(900e-6, abs=5e-6)
-    assert talk.held.problem(talk.now) is None
-
-
-def test_readings_begin_anew_after_a_pause() -> None:
-    """10 s without a reply, longer than readings count: its crystal has not changed meanwhile."""
-    talk = Exchanges(Counter(30e-6))
-    talk.run(2.0)
-    talk.now += 10.0
-    talk.run(1.0)
-    assert talk.held.problem(talk.now) is None
-    assert talk.held.lead(talk.now) == pytest.approx(talk.counter.lead, abs=2e-6)
-
-
-def jumps(counter: Counter) -> None:
-    """Move it on by 10 ms."""
-    counter.shown += 0.01
-
-
-def jumps_back(counter: Counter) -> None:
-    """Move it back by as much."""
-    counter.shown -= 0.01
-
-
-def stands_still(counter: Counter) -> None:
-    """Stop it."""
-    counter.crystal = -1.0
-
-
-@pytest.mark.parametrize("fault", [jumps, jumps_back, stands_still])
-def test_clock_that_jumps_is_not_trusted(fault: Callable[[Counter], None]) -> None:
-    """Its error is infinite at once; after a single jump it is led back and trusted again."""
-    talk = Exchanges(Counter(20e-6), frames(1, 125e-6))
-    talk.arm()
-    talk.run(10.0)  # until what was read singly, before it was armed, does not count any more
-    assert talk.held.error(talk.now) < 10e-6
-    fault(talk.counter)
-    talk.run(0.1)
-    assert talk.held.problem(talk.now) == "clock_jumped"
-    assert talk.held.error(talk.now) == math.inf
-    talk.is_playing = False
-    talk.run(15.0)
-    is_still = fault is stands_still
-    assert (talk.held.problem(talk.now) == "clock_jumped") is is_still
-    assert (abs(talk.counter.lead) < 10e-6) is not is_still
-
-
-def runs_on(counter: Counter) -> None:
-    """Let it run 1.5 times as fast."""
-    counter.crystal = 0.5
-
-
-def runs_back(counter: Counter) -> None:
-    """Let it run backwards."""
-    counter.crystal = -2.0
-
-
-@dataclass
-class Chance(Counter):
-    """A clock that shows any number once its crystal is not what it was."""
-
-    rng: random.Random = field(default_factory=lambda: random.Random(8))
-
-    @property
-    def word(self) -> int:
-        """What a Status shows."""
-        return self.rng.randrange(1 << 32) if self.crystal else super().word
-
-
-@pytest.mark.parametrize("fault", [jumps, jumps_back, stands_still, runs_on, runs_back])
-@pytest.mark.parametrize("kind", [Counter, Chance])
-def test_clock_of_one_alone_that_lies_is_said(
-    kind: type[Counter], fault: Callable[[Counter], None]
-) -> None:
-    """Within 3 s: all frequencies are wrong by it; a sound one that goes round is not accused.
-
-    Nor is one whose replies take up to 60 ms, that restarts, or that is not steered.
-    """
-    talk = Exchanges(kind(), busy(3), back=busy(4), stated=65535)
-    talk.held.is_alone = True
-    talk.send("Arm", shift=0)
-    for _ in range(60):
-        talk.run(0.5)
-        assert talk.held.problem(talk.now) is None
-    fault(talk.counter)
-    talk.run(3.0)
-    assert talk.held.problem(talk.now) == "clock_jumped"
-    assert talk.counter.rate == 0
-    talk.counter.crystal = 0.0
-    talk.run(4.0)
-    assert talk.held.problem(talk.now) is None
-    talk.state, talk.counter.shown = OFF, 0.0
-    talk.run(0.1)
-    talk.send("Arm", shift=0)
-    talk.run(0.5)
-    talk.counter.shown = 0.0  # restarts, and is armed before its status is read
-    talk.send("Arm", shift=0)
-    talk.run(0.5)
-    assert talk.held.problem(talk.now) is None
-
-
-def test_restart_is_no_jump() -> None:
-    """Disarmed with another clock, as after its supply was away: read anew, nothing is said."""
-    talk = Exchanges(Counter(20e-6))
-    talk.arm()
-    talk.run(5.0)
-    talk.state, talk.counter.shown, talk.counter.rate = OFF, 0.0, 0.0
-    talk.run(1.0)
-    assert talk.held.problem(talk.now) is None
-    assert talk.held.lead(talk.now) == pytest.approx(talk.counter.lead, abs=60e-6)
-
-
-@pytest.mark.parametrize(("crystal", "is_deaf"), [(400e-6, False), (-400e-6, False), (60e-6, True)])
-def test_clock_that_does_not_follow_has_the_error_that_it_has(
-    crystal: float, is_deaf: bool
-) -> None:
-    """A broken crystal, and one that ignores shift and rate: said within 6 s, its lead counts."""
-    talk = Exchanges(Counter(crystal, is_deaf=is_deaf), frames(1, 125e-6))
-    talk.arm()
-    talk.run(6.0)
-    for _ in range(20):
-        talk.run(0.5)
-        assert talk.held.problem(talk.now) is not None
-        assert talk.held.error(talk.now) >= 0.8 * abs(talk.counter.lead)
-
-
-def test_what_it_states_is_in_its_error() -> None:
-    """30 us at the most are 17.3 us rms; one of which nothing is known is not steered at all."""
-    stating = Exchanges(Counter(), stated=300)
-    stating.arm()
-    stating.run(5.0)
-    assert 30e-6 / math.sqrt(3) <= stating.held.error(stating.now) < 19e-6
-    unknown = Exchanges(Counter(40e-6, shown=3.0), stated=65535)
-    assert unknown.arm() == 0
-    unknown.run(5.0)
-    assert unknown.counter.rate == 0
-    assert unknown.held.error(unknown.now) == math.inf
-    assert unknown.held.problem(unknown.now) == "clock_not_steered"
-
-
-def test_shift_of_an_arm_without_reply_is_not_assumed() -> None:
-    """The reply to Arm is lost: its clock is read anew, whether it was shifted by a step or not."""
-    for is_obeyed in (True, False):
-        talk = Exchanges(Counter(shown=START - STEP))
-        talk.run(1.0)
-        shift = talk.held.shift(talk.now)
-        talk.lost = lambda: True
-        talk.send("Arm", shift=shift)
-        talk.lost = lambda: False
-        talk.counter.shown += is_obeyed * shift * STEP
-        talk.run(0.2)
-        assert talk.held.lead(talk.now) == pytest.approx(talk.counter.lead, abs=2e-6)
 
 
 def show(talk: Exchanges, clock: int) -> None:
@@ -535,7 +416,7 @@ def test_mark_that_comes_twice_moves_no_clock(is_armed: bool) -> None:
 
     It is known by the next reading that the clock has not moved; before that it is to be read.
     """
-    talk = Exchanges(Counter(20e-6, shown=START - 3.0), frames(1, 125e-6))
+    talk = Exchanges(Counter(20e-6, shown=START - 3.0), uniform(1, 0.0, 125e-6))
     if is_armed:
         talk.arm()
     talk.run(10.0)
@@ -552,7 +433,7 @@ def test_mark_that_comes_twice_moves_no_clock(is_armed: bool) -> None:
 
 def test_a_status_that_may_show_either_of_two_marks_is_no_reading() -> None:
     """The second Mark is lost, twice in a row: the status shows the clock of 50 ms before."""
-    talk = Exchanges(Counter(20e-6), frames(1, 125e-6))
+    talk = Exchanges(Counter(20e-6), uniform(1, 0.0, 125e-6))
     talk.arm()
     talk.run(5.0)
     for _ in range(2):

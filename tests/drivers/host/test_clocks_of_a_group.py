@@ -425,18 +425,6 @@ async def test_clock_that_lies_alone_is_said(lie: str) -> None:
     await stops_truthfully(group, end)
 
 
-@in_virtual_time
-async def test_set_starts_at_once_where_a_clock_cannot_be_steered() -> None:
-    """One that is 0.4 s behind would wait 0.1 s for a moment that has passed on the host's."""
-    ends = [MemoryLine("serial", name) for name in "ab"]
-    far = ends[0].far["a"]
-    far.capabilities["clock_error"], far.clock = CLOCK_UNKNOWN, AmplifierClock(Crystal(ahead=-0.4))
-    group = await group_of(*ends)
-    await group.apply({name: [LOUD] for name in group.amplifiers})
-    await asyncio.sleep(0.01)
-    assert ends[0].levels("a") == ends[1].levels("b") == [0.5, 0.0]
-
-
 MARK = 1 << FEATURES["mark"]
 
 

@@ -6,62 +6,27 @@ long its bits take, what is late, and what a delay of this process costs.
 
 import asyncio
 from collections.abc import Callable
-from random import Random
 
 import pytest
 
-from drivers.errors import DriverError, LinkDegraded, LinkError, LinkTimeout
+from drivers.errors import DriverError, LinkError, LinkTimeout
 from drivers.host.amplifier import Amplifier
 from drivers.host.group import Group
 from drivers.host.ledger import SILENCING
 from drivers.host.line import Priority
-from drivers.playing import AmplifierTone
-from drivers.protocol.definition import ATTEMPTS, STATES
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Envelope
 from drivers.wires.modbus import ModbusWire
 from drivers.wires.serial_line import SerialWire
-from drivers.wires.wire import BrokenReply, Wire
+from drivers.wires.wire import Wire
 from virtual_lines import (
     MemoryLine,
     group_of,
     grouped,
     in_virtual_time,
     layer,
-    losing,
     tone,
-    unaltered,
-    with_group,
 )
-
-LINES = {"alone": (("a",),), "each its own": (("a",), ("b",)), "shared": (("a", "b"),)}
-
-
-@pytest.mark.parametrize("lines", LINES)
-def test_layers_play_together_and_leave_each_other_alone(wire: str, lines: str) -> None:
-    """A second layer adds 0.2; the first falls silent while the second plays on, on all at once."""
-
-    async def test(group: Group, ends: list[MemoryLine]) -> None:
-        names = [*group.amplifiers]
-        await group.apply({name: [layer(0, tone())] for name in names})
-        second = layer(1, AmplifierTone(0, 150.0, 0.2), AmplifierTone(1, 150.0, 0.1))
-        await group.apply({name: [second] for name in names})
-        await asyncio.sleep(0.01)
-        for end in ends:
-            assert all(end.levels(name) == [0.7, 0.1] for name in end.hosts)
-        origins = [
-            {round(voice.began, 4) for voice in far.playback.all_voices[1]}
-            for end in ends
-            for far in end.far.values()
-        ]
-        assert all(each == origins[0] and len(each) == 1 for each in origins)
-        await group.apply({name: [layer(0)] for name in names})
-        await asyncio.sleep(0.01)
-        assert all(end.levels(name) == [0.2, 0.1] for end in ends for name in end.hosts)
-        assert all(end.retries == 0 for end in ends)
-        assert all(end.line.wire.counters.unexpected_frames == 0 for end in ends)
-
-    with_group(test, wire, *LINES[lines])
 
 
 @grouped(*map(tuple, "abcdefgh"), wire="serial")
@@ -70,18 +35,6 @@ async def test_lines_come_in_the_order_of_the_amplifiers(
 ) -> None:
     """Not by where they are in memory: runs of one random seed send the same bytes."""
     assert [*group.members.lines] == [end.line for end in ends]
-
-
-@grouped(("a",))
-async def test_stop_is_repeated_after_a_reply_that_is_none(
-    group: Group, ends: list[MemoryLine], wire: str
-) -> None:
-    """The first reply to it cannot be read; the second confirms it."""
-    host_side = ends[0].line.wire
-    received, broken = host_side.received, iter([[BrokenReply("cut")]])
-    host_side.received = lambda data: next(broken, None) or received(data)
-    assert (await group.stop())["a"].is_confirmed
-    assert [each for _, each in ends[0].sent][-2:] == ["1:8", "1:8"]
 
 
 @in_virtual_time
@@ -129,26 +82,6 @@ async def test_broadcast_may_have_fed_every_amplifier(
     await group.apply({name: [layer(0, tone())] for name in "ab"})
     commit = max(at for at, each in ends[0].sent if each == "0:6") if wire != "tcp" else before
     assert all(each.feeding.may >= commit for each in group.amplifiers.values())
-
-
-@in_virtual_time
-async def test_copy_of_an_old_status_is_no_reply(wire: str) -> None:
-    """All replies from before it was armed come once more, amid readings and heartbeats."""
-    end, kept = MemoryLine(wire, "a"), list[bytes]()
-    group, (host,) = await group_of(end, is_armed=False), end.hosts.values()
-    end.outward = lambda name, data: kept.append(data) or unaltered(name, data)
-    await host.read_status()
-    await group.arm()
-    end.outward = lambda name, data: [(0.004, data)]
-    for request in (host.read_status, host.ping, host.read_status, group.beat):
-        replying = asyncio.ensure_future(request())
-        await asyncio.sleep(0.001)
-        for data in kept:
-            end.line.received(data)
-        await replying
-        assert host.status is not None
-        assert host.status["state"] == STATES["OPERATION_ENABLED"]
-    assert group.is_armed
 
 
 @grouped(("a", "b"), wire="serial")
@@ -347,18 +280,3 @@ async def test_reply_that_never_comes_to_a_process_that_is_often_delayed_is_give
             await group.amplifiers["a"].read_status()
     assert end.loop.time() - began < 3 * 8 * 0.031
     stalling.cancel()
-
-
-@in_virtual_time
-async def test_amplifier_that_misses_only_its_arming_can_be_armed_next() -> None:
-    """Stopped long ago, it counts as lost, but replies to the disarm that follows at once."""
-    ends = [MemoryLine("serial", "a"), MemoryLine("serial", "b")]
-    group = await group_of(*ends, draw=Random(1).randint)
-    await group.stop()
-    await group.clear()
-    await asyncio.sleep(1.0)
-    ends[0].inward = losing("Hello", count=ATTEMPTS)
-    with pytest.raises(LinkDegraded):
-        await group.arm()
-    await group.arm()
-    assert group.is_armed

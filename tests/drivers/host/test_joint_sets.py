@@ -11,7 +11,7 @@ import logging
 import math
 import os
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from functools import cache
 from itertools import combinations
 from pathlib import Path
@@ -23,11 +23,9 @@ from chain import set_running
 from courses import Acted
 from drivers.errors import (
     DriverError,
-    Overtaken,
 )
 from drivers.playing import AmplifierLayer, AmplifierTone
-from drivers.protocol.definition import CLOCK_UNKNOWN, MESSAGES
-from drivers.protocol.sets import LayerSet
+from drivers.protocol.definition import MESSAGES
 from drivers.wires.can_bus import CanWire
 from drivers.wires.can_frames import unpack_frames
 from drivers.wires.modbus import ModbusWire
@@ -39,7 +37,7 @@ from group_stops import play as play_stops
 from late_taps import AMPLIFIERS, play
 from late_taps import WIRES as LATE_WIRES
 from sim.amplifier.readings import AmplifierClock, Crystal
-from virtual_lines import KINDS, MemoryLine, group_of, in_virtual_time, unaltered
+from virtual_lines import KINDS, MemoryLine, group_of, in_virtual_time
 
 LAYER = AmplifierLayer(0, (AmplifierTone(0, 100.0, 0.5),), 0.001)
 # By hand, of what is written: bytes of ten bits; of eleven after 3.5 characters; CAN frames of at
@@ -129,82 +127,6 @@ async def test_sets_start_together_on_lines_of_any_speed_that_are_busy(
     assert await apart() < 1e-6
 
 
-@pytest.mark.parametrize("lines", [("a", "b"), ("ab",)], ids=len)
-@in_virtual_time
-async def test_sets_start_together_by_clocks_that_cannot_be_steered(lines: tuple[str, ...]) -> None:
-    """Each its own way around: b's is 0.35 s behind, where the word of 0.25 s ago is ahead.
-
-    On two lines within a step of the word that names the moment; on one all play at once.
-    """
-    ends = [MemoryLine("serial", *names) for names in lines]
-    for end in ends:
-        for name, far in end.far.items():
-            far.capabilities["clock_error"] = CLOCK_UNKNOWN
-            crystal = Crystal(ahead={"a": 7.3, "b": -0.35}[name])
-            far.clock = AmplifierClock(crystal, since=end.loop.time())
-    group = await group_of(*ends)
-    applied = await group.apply({"a": [LAYER], "b": [LAYER]})
-    began = [each for starts in await started(*ends) for each in starts]
-    assert len(began) == 2
-    if len(lines) == 2:
-        assert max(abs(each - applied.starts_at) for each in began) < 305e-6
-
-
-@in_virtual_time
-async def test_set_that_starts_as_late_as_its_clock_is_behind_is_no_fault() -> None:
-    """Requests took 6 ms until it was armed: it is behind by as much, and known to be.
-
-    Of each of two sets a status 3 ms after its moment shows the set before.
-    """
-    ends = [MemoryLine("serial", "a"), MemoryLine("serial", "b")]
-    group = await group_of(*ends, is_armed=False)
-    ends[1].inward = lambda name, data: [(0.0062, data)]
-    for _ in range(10):
-        await asyncio.sleep(0.05)
-        await group.statuses()
-    ends[1].inward = lambda name, data: [(0.0002 if name == "Arm" else 0.0062, data)]
-    await group.arm()
-    ends[1].inward = unaltered
-    host, levels = group.amplifiers["b"], []
-    for level in (0.3, 0.6):
-        applied = await group.apply({name: [loud(0, level)] for name in group.amplifiers})
-        await asyncio.sleep(applied.starts_at + 0.003 - ends[0].loop.time())
-        levels.append((await host.read_status())["levels"][0])
-        await asyncio.sleep(0.01)
-    assert levels == [0, 3000]
-    assert group.is_armed
-
-
-@pytest.mark.parametrize(("meanwhile", "checks"), [("nothing", 1), ("6 ms", 2), ("a reply", 2)])
-@in_virtual_time
-async def test_a_set_is_checked_once_unless_what_plays_may_be_another(
-    meanwhile: str, checks: int
-) -> None:
-    """What a ledger would admit is admitted within 5 ms, if nothing was sent or received since."""
-    group = await group_of(MemoryLine("serial", "a"), watchdog=1.0)
-    amplifier, checked = group.amplifiers["a"], list[float]()
-    admit = amplifier.ledger.admit
-
-    def noted(
-        layers: Sequence[AmplifierLayer], now: float, *, delay: float
-    ) -> tuple[LayerSet, ...]:
-        checked.append(now)
-        return admit(layers, now, delay=delay)
-
-    amplifier.ledger.admit = noted  # type: ignore[method-assign]
-    layers = {"a": [LAYER]}
-    assert group.sets.refusal_of(layers) is None
-    if meanwhile == "6 ms":
-        await asyncio.sleep(0.006)
-    elif meanwhile == "a reply":
-        await amplifier.read_status()
-    await group.apply(layers)
-    assert len(checked) == checks
-    refusal = group.sets.refusal_of({"a": [AmplifierLayer(0, (AmplifierTone(0, 100.0, 2.0),))]})
-    assert refusal is not None
-    assert refusal.channel == 0
-
-
 @in_virtual_time
 async def test_stop_while_a_line_is_kept_for_its_commit_commits_nothing() -> None:
     """One line is free, the other busy for 90 ms: the stop goes out at once on the first."""
@@ -233,43 +155,6 @@ async def test_stop_while_a_line_is_kept_for_its_commit_commits_nothing() -> Non
         await applying
     await reading
     assert await started(*ends) == [[], []]
-
-
-@pytest.mark.parametrize(
-    ("names", "is_busy", "staged"), [("a", True, [0]), ("ab", True, [0, 1]), ("ab", False, [1, 1])]
-)
-@in_virtual_time
-async def test_set_gives_way_until_an_amplifier_is_to_play_it(
-    names: str, is_busy: bool, staged: list[int]
-) -> None:
-    """The line of one is busy for 3 ms, or its reply takes that; another one has staged it.
-
-    What plays goes on, and the next set plays at once.
-    """
-    ends = [MemoryLine("serial", each) for each in names]
-    group = await group_of(*ends)
-    await group.apply({each: [LAYER] for each in names})
-    await started(*ends)
-    for end in ends:
-        end.sent.clear()
-    ends[0].outward = lambda _, data: [(0.003, data)]
-    readings = [group.amplifiers["a"].read_status()] if is_busy else []
-    has_come = False
-    ending = group.apply({each: [loud(0, 0.4)] for each in names}, lambda: has_come)
-    giving_way = asyncio.ensure_future(ending)
-    await asyncio.sleep(0.001)
-    has_come = True
-    with pytest.raises(Overtaken):
-        await giving_way
-    await asyncio.gather(*readings)
-    sent = [[each for _, each in end.sent] for end in ends]
-    assert [each.count(f"1:{MESSAGES['Set'].number}") for each in sent] == staged
-    assert not any(f"1:{MESSAGES['Commit'].number}" in each for each in sent)
-    assert [end.levels()[0] for end in ends] == [0.5] * len(ends)
-    assert group.is_armed
-    await group.apply({each: [loud(0, 0.2)] for each in names})
-    await started(*ends)
-    assert [end.levels()[0] for end in ends] == [0.2] * len(ends)
 
 
 def loud(number: int, level: float) -> AmplifierLayer:

@@ -17,19 +17,16 @@ from types import EllipsisType
 import pytest
 
 from drivers.errors import CommandError, CommandRefused, LinkTimeout
-from drivers.host.group import Group
 from drivers.host.ledger import Ledger
 from drivers.host.line import Job, Priority
 from drivers.playing import AmplifierLayer, AmplifierTone, Playback
-from drivers.protocol.definition import word_passed
-from drivers.protocol.records import Refusal, Values
 from drivers.protocol.sets import Envelope
 from drivers.wires.can_frames import CanFrame, pack_frames
 from drivers.wires.serial_frames import Frame, encode_frame
 from drivers.wires.serial_line import SerialWire
 from registry.limits import GuardLimits
 from sim.amplifier.readings import capabilities
-from virtual_lines import KINDS, MemoryLine, grouped, in_virtual_time, unaltered
+from virtual_lines import MemoryLine, in_virtual_time, unaltered
 
 WIDE = GuardLimits(20.0, 1000.0, 1.0)
 CAN = capabilities(3)
@@ -507,30 +504,6 @@ def test_what_waits_for_an_onset_ends_within_the_longest_vibration() -> None:
     assert one.valid_for == pytest.approx(800, abs=2)
 
 
-@pytest.mark.parametrize("wire", KINDS)
-@grouped(("a", "b"))
-async def test_request_that_has_waited_for_50_ms_goes_before_newer_heartbeats(
-    group: Group, ends: list[MemoryLine]
-) -> None:
-    """With a heartbeat queued whenever one is answered; without that rule it waits for ever."""
-    (end,), (first, second) = ends, group.amplifiers.values()
-    end.outward = lambda name, data: [(0.004, data)]
-
-    async def beat() -> None:
-        while True:
-            await first.ping()
-
-    beating = [asyncio.ensure_future(beat()) for _ in range(3)]
-    await asyncio.sleep(0.01)
-    began = end.loop.time()
-    async with asyncio.timeout(0.3):
-        await second.read_status()
-    assert 0.05 < end.loop.time() - began < 0.1
-    for each in beating:
-        each.cancel()
-    await asyncio.wait(beating)
-
-
 @pytest.mark.parametrize(("baud", "attempts"), [(921_600, 3), (9600, 2)])
 @in_virtual_time
 async def test_request_is_repeated_twice_and_once_on_a_slow_line(baud: int, attempts: int) -> None:
@@ -563,34 +536,6 @@ async def test_read_behind_a_write_whose_response_was_found_late_is_awaited() ->
     end.outward = lambda name, data: unread.append(data) or []  # type: ignore[func-returns-value]
     await host.read_status()
     assert host.counts.retries == 0
-
-
-@pytest.mark.parametrize("wire", KINDS)
-@grouped(("a",))
-async def test_refusal_after_no_reply_says_that_it_may_have_played(
-    group: Group, ends: list[MemoryLine]
-) -> None:
-    """The reply to a commit is lost, and the commit that is repeated is refused; then one alone."""
-    (end,), (host,) = ends, group.amplifiers.values()
-    await host.stage(5, [AmplifierLayer(0, (AmplifierTone(0, 100.0, 0.5),), 0.001)])
-    far = end.far["a"]
-    handle, commits = far.handle, iter([True])
-
-    def once(name: str, values: Values, now: float, **options: bool) -> Values:
-        if name == "Commit" and not next(commits, False):
-            raise Refusal("not now", "WRONG_STATE")
-        return handle(name, values, now, **options)
-
-    far.handle = once  # type: ignore[method-assign]
-    lost = iter([True])
-    end.outward = lambda name, data: [] if next(lost, False) else unaltered(name, data)
-    with pytest.raises(CommandRefused) as raised:
-        await host.commit(5, word_passed(end.loop.time()))
-    assert raised.value.may_play
-    await host.stage(6, [AmplifierLayer(0, ())])
-    with pytest.raises(CommandRefused) as raised:
-        await host.commit(6, word_passed(end.loop.time()))
-    assert not raised.value.may_play
 
 
 @in_virtual_time

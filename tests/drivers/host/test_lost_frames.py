@@ -9,9 +9,9 @@ import asyncio
 import contextlib
 import itertools
 import random
-from collections.abc import AsyncIterator, Callable, Sequence
+from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from contextlib import asynccontextmanager, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
@@ -23,12 +23,15 @@ from courses import Taken, courses, follow
 from drivers.errors import CommandRefused, DriverError, LinkTimeout
 from drivers.host.amplifier_sensors import read_measured
 from drivers.host.group import Group
-from drivers.host.ledger import StopOutcome
+from drivers.host.joint_sets import PlayedSet
+from drivers.host.ledger import Ledger, StopOutcome
 from drivers.playing import AmplifierLayer, AmplifierTone
-from drivers.protocol.definition import MESSAGES, STATES
+from drivers.protocol.definition import CLOCK_UNKNOWN, FEATURES, MESSAGES, STATES
 from drivers.protocol.records import Refusal, Values
 from drivers.protocol.sets import Envelope, LayerSet
 from drivers.wires.serial_frames import REPLY_BIT, FrameReader, encode_frame, pack_words
+from drivers.wires.wire import BrokenReply
+from sim.amplifier.readings import AmplifierClock, Crystal
 from sim.amplifier.simulated_amplifier import SimulatedAmplifier as FarEnd
 from virtual_lines import (
     KINDS,
@@ -202,50 +205,40 @@ async def read(group: Group) -> None:
         await group.amplifiers["a"].read_status()
 
 
-@pytest.mark.parametrize("ends_by", ["a pulse", "its time", "what waited"])
+ENDING: dict[str, tuple[Sequence[AmplifierLayer], AmplifierLayer | None]] = {
+    "a pulse": ([layer(0, PULSE)], None),
+    "its time": ([layer(0, tone(ending=Envelope(50, ((8000, 0),))), valid_for=0.04)], None),
+    "what waited": (
+        [layer(0, PULSE), layer(1, tone(1, 0.1))],
+        layer(0, tone(level=0.4), after=True, valid_for=0.02),
+    ),
+    "a renewal": ([layer(0, tone(), valid_for=0.04)], layer(0, renew=True, valid_for=1.0)),
+}
+"""Layers that end within 40 ms, and one that follows; a renewal that comes about then."""
+
+
+@pytest.mark.parametrize("ends_by", ENDING)
 @in_virtual_time
 async def test_what_ends_amid_an_exchange_may_be_shown_or_not(ends_by: str) -> None:
     """Up to 14 ms out, and back: a status may show the layer and its level, whenever it is read."""
-    rng, end = random.Random(5), MemoryLine("serial", "a")
+    rng, end, shown = random.Random(5), MemoryLine("serial", "a"), set[bool]()
     group = await group_of(end, watchdog=2.0)
-    host = group.amplifiers["a"]
-    layers = {
-        "a pulse": [layer(0, PULSE)],
-        "its time": [layer(0, tone(ending=Envelope(50, ((8000, 0),))), valid_for=0.04)],
-        "what waited": [layer(0, PULSE), layer(1, tone(1, 0.1))],
-    }[ends_by]
-    shown = set[int]()
+    host, (layers, following) = group.amplifiers["a"], ENDING[ends_by]
     for _ in range(60):
         await group.apply({"a": layers})
-        if ends_by == "what waited":
-            await group.apply({"a": [layer(0, tone(level=0.4), after=True, valid_for=0.02)]})
+        if ends_by == "a renewal":
+            delayed(end, rng)
+            await asyncio.sleep(rng.uniform(0.02, 0.045))
+        if following:
+            await group.apply({"a": [following]})
         delayed(end, rng)
         for _ in range(4):
             await asyncio.sleep(rng.uniform(0.0, 0.02))
             shown.add((await host.read_status())["tokens"][0] > 0)
             assert host._contradictions == 0
         end.inward = end.outward = unaltered
-        await asyncio.sleep(0.1)
-    assert shown == {False, True}
-
-
-@in_virtual_time
-async def test_renewal_that_comes_as_its_layer_ends_may_be_too_late() -> None:
-    """A layer of 40 ms is renewed about then, up to 14 ms late: it plays on, or it does not."""
-    rng, end = random.Random(7), MemoryLine("serial", "a")
-    group = await group_of(end, watchdog=2.0)
-    host, shown = group.amplifiers["a"], set[int]()
-    for _ in range(40):
-        await group.apply({"a": [layer(0, tone(), valid_for=0.04)]})
-        delayed(end, rng)
-        await asyncio.sleep(rng.uniform(0.02, 0.045))
-        await group.apply({"a": [layer(0, renew=True, valid_for=1.0)]})
-        for _ in range(3):
-            await asyncio.sleep(0.015)
-            shown.add((await host.read_status())["tokens"][0] > 0)
-            assert host._contradictions == 0
-        end.inward = end.outward = unaltered
         await group.silence(0.0)
+        await asyncio.sleep(0.1)
     assert shown == {False, True}
 
 
@@ -275,50 +268,6 @@ def altered(
     far.handle = lambda name, values, now, **options: change(  # type: ignore[method-assign]
         name, values, now, partial(handle, **options)
     )
-
-
-@grouped(("a",), ("b",), wire="serial")
-async def test_reply_that_cannot_be_noted_keeps_nobody_waiting(
-    group: Group, ends: list[MemoryLine], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The exchange fails, all are stopped; a stop whose reply cannot be noted ends in time."""
-
-    def fail(*_: object) -> None:
-        raise ZeroDivisionError("planted")
-
-    await group.apply({name: [layer(0, tone())] for name in "ab"})
-    monkeypatch.setattr(group.amplifiers["b"].ledger, "resolve", fail)
-    with pytest.raises(ZeroDivisionError):
-        async with asyncio.timeout(1.0):
-            await group.apply({name: [layer(0, tone(level=0.4))] for name in "ab"})
-    assert not group.is_armed
-    await asyncio.sleep(0.01)
-    assert (ends[0].levels("a"), ends[1].levels("b")) == ([0.0, 0.0], [0.0, 0.0])
-    monkeypatch.setattr(group.amplifiers["b"].ledger, "silenced", fail)
-    async with asyncio.timeout(1.0):
-        await group.stop()
-
-
-@grouped(("a",), wire="serial")
-async def test_request_to_a_busy_amplifier_goes_again_whenever_its_timer_comes(
-    group: Group, ends: list[MemoryLine], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """By the clock of some systems a timer comes up to 16 ms early: here 4 ms."""
-    (end,) = ends
-    call_at, refusals = end.loop.call_at, [Refusal("busy", "BUSY")]
-
-    def early(when: float, *args: Any, **more: Any) -> asyncio.TimerHandle:
-        return call_at(when - 0.004 if when - end.loop.time() > 0.0045 else when, *args, **more)
-
-    def busy(name: str, values: Values, now: float, handle: Callable[..., Values]) -> Values:
-        if name == "Ping" and refusals:
-            raise refusals.pop()
-        return handle(name, values, now)
-
-    monkeypatch.setattr(end.loop, "call_at", early)
-    altered(end.far["a"], busy)
-    await asyncio.wait_for(group.beat(), 0.1)
-    assert not refusals
 
 
 @pytest.mark.parametrize("what", ["cables", "replies"])
@@ -351,12 +300,23 @@ async def test_lines_that_are_exchanged_while_armed_are_silenced(
             assert far.state != "OPERATION_ENABLED"
 
 
-def _layer(
-    number: float, channel: float = 0, level: float = 0, frequency: float = 0
-) -> AmplifierLayer:
-    """A layer with a ramp of 1 ms and a tone, or none without a frequency."""
-    tones = (AmplifierTone(int(channel), frequency, level),) if frequency else ()
-    return AmplifierLayer(int(number), tones, 0.001)
+def _layer(row: Sequence[float] | Mapping[str, Any]) -> AmplifierLayer:
+    """A layer of a row: layer, channel, level, frequency [Hz]; the layer alone ends it.
+
+    Or by name: layer, tones as rows of channel, level, frequency, the arguments of a layer, and
+    keep_phase and onset (its step [us], and knots) of all tones. Its ramp is 1 ms unless given.
+    """
+    if not isinstance(row, Mapping):
+        row = {"layer": row[0], "tones": [row[1:]] if len(row) > 1 else []}
+    given = {"ramp": 0.001, "tones": [], "onset": [0], **row}
+    number, tones, (step, *knots) = (given.pop(each) for each in ("layer", "tones", "onset"))
+    keep_phase = given.pop("keep_phase", False)
+    onset = Envelope(step, tuple(map(tuple, knots))) if knots else None
+    made = [
+        AmplifierTone(channel, frequency, level, keep_phase=keep_phase, onset=onset)
+        for channel, level, frequency in tones
+    ]
+    return AmplifierLayer(number, tuple(made), **given)
 
 
 @dataclass
@@ -365,7 +325,11 @@ class OnLines(Taken):
 
     lines: Sequence[MemoryLine] = ()
     group: Group = field(init=False)
+    applied: PlayedSet = field(init=False)
     stopped: dict[str, StopOutcome] = field(default_factory=dict)
+    kept: list[bytes] = field(default_factory=list)
+    checks: int = 0
+    has_come: bool = False
     since: float = 0.0
 
     @property
@@ -391,9 +355,9 @@ class OnLines(Taken):
         return [[each for _, each in line.sent] for line in self.lines]
 
     @property
-    def unexpected(self) -> list[int]:
-        """Frames on each line that belonged to nothing."""
-        return [line.line.wire.counters.unexpected_frames for line in self.lines]
+    def unexpected(self) -> int:
+        """Frames that belonged to nothing."""
+        return sum(line.line.wire.counters.unexpected_frames for line in self.lines)
 
     @property
     def tokens(self) -> dict[str, Any]:
@@ -411,6 +375,16 @@ class OnLines(Taken):
         return int((self.hosts.a.status or {})["tokens"][0])
 
     @property
+    def shown_level(self) -> int:
+        """The level of the first channel in it."""
+        return int((self.hosts.a.status or {})["levels"][0])
+
+    @property
+    def is_shown_armed(self) -> bool:
+        """Whether it shows the first amplifier armed."""
+        return (self.hosts.a.status or {})["state"] == STATES["OPERATION_ENABLED"]
+
+    @property
     def contradictions(self) -> int:
         """How many statuses of the first amplifier have contradicted its requests, in a row."""
         return int(self.hosts.a._contradictions)
@@ -424,6 +398,11 @@ class OnLines(Taken):
     def degraded(self) -> list[str]:
         """Amplifiers that do not reply but may play."""
         return [*self.group.members.degraded]
+
+    @property
+    def applied_frequency(self) -> int:
+        """Of the first tone that was applied last [0.05 Hz]."""
+        return self.applied.layers["a"][0].commands[0].frequency
 
     @property
     def plays_for(self) -> float:
@@ -466,11 +445,6 @@ class OnLines(Taken):
         found = {request: self.sent[0].count(request) for request in bounds}
         assert all(low <= found[each] <= high for each, (low, high) in bounds.items()), found
 
-    def is_between(self, **bounds: Sequence[float]) -> None:
-        """Require values of properties: more than the one, less than the other."""
-        found = {what: getattr(self, what) for what in bounds}
-        assert all(low < found[each] < high for each, (low, high) in bounds.items()), found
-
     async def waits_until_sent(self, request: str) -> None:
         """Wait until a request is the last that was sent on the first line."""
         while self.sent[0][-1] != request:  # noqa: ASYNC110
@@ -486,16 +460,68 @@ class OnLines(Taken):
 
     def plans_nothing(self, text: str) -> None:
         """Require that what is planned is refused, with this text."""
-        assert text in str(self.group.sets.refusal_of({"a": [_layer(0, 0, 0.5, 100.0)]}))
+        assert text in str(self.group.sets.refusal_of({"a": [_layer((0, 0, 0.5, 100.0))]}))
 
-    async def applies(self, **rows: Sequence[Sequence[float]]) -> None:
-        """Apply rows of layer, channel, level, frequency [Hz], by amplifier; a layer alone ends."""
-        layers = {name: [_layer(*row) for row in each] for name, each in rows.items()}
-        await self.group.apply(layers)
+    async def applies(self, **rows: Sequence[Sequence[float] | Mapping[str, Any]]) -> None:
+        """Apply layers of rows by amplifier."""
+        layers = {name: [*map(_layer, each)] for name, each in rows.items()}
+        self.applied = await self.group.apply(layers)
 
     async def plays(self, level: float) -> None:
         """Play 100 Hz at a level on the first channel of all amplifiers, in layer 0."""
         await self.applies(**{name: [(0, 0, level, 100.0)] for name in self.group.amplifiers})
+
+    async def plays_unless_one_has_come(self, level: float) -> None:
+        """Do the same, and give way as soon as `has_come`."""
+        layers = [_layer((0, 0, level, 100.0))]
+        await self.group.apply(dict.fromkeys(self.group.amplifiers, layers), lambda: self.has_come)
+
+    def plans(self, level: float) -> None:
+        """Ask whether the first amplifier may play 100 Hz at a level: it may."""
+        self.planned = {"a": [_layer((0, 0, level, 100.0))]}
+        assert self.group.sets.refusal_of(self.planned) is None
+
+    async def plays_as_planned(self) -> None:
+        """Play what the first amplifier may play, as it was asked."""
+        await self.group.apply(self.planned)
+
+    def counts_checks(self) -> None:
+        """Count in `checks` how often the ledger of the first amplifier is asked."""
+        ledger = self.hosts.a.ledger
+        admit = ledger.admit
+
+        def counted(*asked: Any, **more: Any) -> Any:
+            self.checks += 1
+            return admit(*asked, **more)
+
+        ledger.admit = counted
+
+    async def waits_past_the_start(self, seconds: float) -> None:
+        """Wait until so long after the moment at which what was applied last starts."""
+        await asyncio.sleep(self.applied.starts_at + seconds - self.lines[0].loop.time())
+
+    def start_together(self, channel: int, seconds: float, *, as_said: bool = False) -> None:
+        """Require that each amplifier has one voice on a channel, and all began within a time.
+
+        as_said: at the moment that was said of the set that was applied last.
+        """
+        assert self.levels  # which lets happen what is due
+        began = [each.began for far in vars(self.far).values() for each in _voices(far, channel)]
+        assert len(began) == len(vars(self.far))
+        began += [self.applied.starts_at] * as_said
+        assert max(began) - min(began) < seconds
+
+    def voices(self, *frequencies: float) -> None:
+        """Require the voices of the first channel [Hz], as amplifier a and its host have them."""
+        for each in (self.far.a, self.hosts.a.ledger):
+            assert [voice.frequency for voice in _voices(each, 0)] == [*frequencies]
+
+    async def achieves(self, **values: int) -> None:
+        """Require what the first amplifier says of the first tone that was applied last."""
+        layer, token = self.applied.layers["a"][0], self.applied.token
+        (tone,) = (await self.hosts.a.read_achieved(layer, token)).commands
+        found = {what: getattr(tone, what) for what in values}
+        assert found == values
 
     async def reads(self, name: str, times: int = 1) -> None:
         """Read the status of one, so often at once."""
@@ -569,9 +595,32 @@ class OnLines(Taken):
         """Let replies to requests of these names come after these times, on the first line."""
         self.lines[0].outward = lambda name, data: [(delays.get(name, 0.0002), data)]
 
-    def arrives_after(self, seconds: float) -> None:
-        """Let requests on the first line arrive so much later."""
-        self.lines[0].inward = lambda _, data: [(seconds, data)]
+    def arrives_after(self, seconds: float, **by_name: float) -> None:
+        """Let requests on the first line arrive so much later, some by name."""
+        self.lines[0].inward = lambda name, data: [(by_name.get(name, seconds), data)]
+
+    def reply_cannot_be_read(self) -> None:
+        """Let the next reply on the first line be broken."""
+        wire, broken = self.lines[0].line.wire, [[BrokenReply("cut")]]
+        received = wire.received
+        wire.received = lambda data: broken.pop() if broken else received(data)  # type: ignore[method-assign]
+
+    def keeps_replies(self) -> None:
+        """Keep a copy of what comes to the host on the first line."""
+        self.lines[0].outward = lambda _, data: self.kept.append(data) or [(0.0, data)]  # type: ignore[func-returns-value]
+
+    def hands_over_the_copies(self) -> None:
+        """Let all copies come once more."""
+        for data in self.kept:
+            self.lines[0].line.received(data)
+
+    def timers_come_early(self, seconds: float) -> None:
+        """Let timers that are due later than that come so much earlier."""
+        loop = self.lines[0].loop
+        call_at = loop.call_at
+        loop.call_at = lambda when, *given, **more: call_at(  # type: ignore[method-assign]
+            when - seconds if when - loop.time() > seconds + 0.0005 else when, *given, **more
+        )
 
     def blocks_writes(self, line: int, *numbers: int) -> None:
         """Let the port of a line take none of the writes with these numbers, from 1 on."""
@@ -624,14 +673,13 @@ class OnLines(Taken):
         commit = playback.commit
         playback.commit = lambda layers, *when: count and commit(layers[:count], *when)
 
-    def is_busy_after(self, name: str, count: int) -> None:
-        """Let the first amplifier refuse requests of a name once it has taken so many."""
-        left = [count]
+    def refuses_after(self, name: str, count: int, status: str = "BUSY", times: int = 99) -> None:
+        """Let the first amplifier refuse requests of a name once it has taken some, so often."""
+        taken = itertools.count()
 
         def busy(asked: str, values: Values, now: float, handle: Callable[..., Values]) -> Values:
-            left[0] -= asked == name
-            if asked == name and left[0] < 0:
-                raise Refusal("busy", "BUSY")
+            if asked == name and count <= next(taken) < count + times:
+                raise Refusal("as told", status)
             return handle(asked, values, now)
 
         altered(self.far.a, busy)
@@ -646,6 +694,58 @@ class OnLines(Taken):
             return self.far.a.status(now) if asked == name else reply
 
         altered(self.far.a, trip)
+
+    async def has(self, **capabilities: Any) -> None:
+        """Give the first amplifier other capabilities, or features by name, then arm all."""
+        can = self.far.a.capabilities
+        features = sum(1 << FEATURES[each] for each in capabilities.pop("features", ()))
+        self.far.a.capabilities = {**can, "features": can["features"] | features, **capabilities}
+        await self.group.open()
+        await self.group.arm()
+
+    def rounds(self, **steps: int) -> None:
+        """Let the first amplifier play multiples of steps alone, and say that no set is exact."""
+        far = self.far.a
+        commit, take = far.playback.commit, far._take
+
+        def rounded(layers: Sequence[LayerSet], *when: float) -> None:
+            for each in layers:
+                tones = [
+                    replace(tone, **{what: step * round(getattr(tone, what) / step)})
+                    for tone in each.commands
+                    for what, step in steps.items() or [("level", 1)]
+                ]
+                commit([replace(each, commands=tuple(tones))], *when)
+
+        far.playback.commit = rounded
+        far._take = lambda part, now: {**take(part, now), "exact": 0}
+
+    def says_frequency(self, said: int) -> None:
+        """Let the first amplifier say a frequency of all tones that it achieves."""
+
+        def say(name: str, values: Values, now: float, handle: Callable[..., Values]) -> Values:
+            reply = handle(name, values, now)
+            for each in reply["commands"] if name == "GetAchieved" else ():
+                each["frequency"] = said
+            return reply
+
+        altered(self.far.a, say)
+
+    def has_clock(self, name: str, ahead: float, *, is_steered: bool = True) -> None:
+        """Give an amplifier a clock that is ahead by a time [s]."""
+        far = getattr(self.far, name)
+        far.clock = AmplifierClock(Crystal(ahead=ahead), since=self.lines[0].loop.time())
+        if not is_steered:
+            far.capabilities["clock_error"] = CLOCK_UNKNOWN
+
+    def feeds_without_end(self, name: str, times: int) -> None:
+        """Let so many heartbeats of an amplifier be under way at any time."""
+
+        async def feed() -> None:
+            while True:
+                await getattr(self.hosts, name).ping()
+
+        self.feeding = [asyncio.create_task(feed()) for _ in range(times)]
 
     def restarts(self, **capabilities: Any) -> None:
         """Switch the first amplifier off and on again, with other capabilities: CAN nodes boot."""
@@ -700,6 +800,11 @@ async def on_lines(*names: str, **options: Any) -> AsyncIterator[OnLines]:
     made = OnLines(lines=[MemoryLine(wire, *each) for each in names])
     made.group = await group_of(*made.lines, **options)
     yield made
+
+
+def _voices(of: FarEnd | Ledger, channel: int) -> Sequence[Any]:
+    """The voices of a channel, as an amplifier or a host has them."""
+    return of.playback.all_voices[channel]
 
 
 COURSES = courses(Path(__file__).with_name("courses.yaml"))

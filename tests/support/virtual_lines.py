@@ -15,7 +15,7 @@ import random
 import selectors
 import threading
 from collections import Counter
-from collections.abc import Awaitable, Callable, Coroutine, Mapping, Sequence
+from collections.abc import Callable, Coroutine, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, ParamSpec, Protocol, TypeAlias, TypeVar
@@ -27,6 +27,7 @@ from drivers.host.line import Line
 from drivers.playing import AmplifierLayer, AmplifierTone
 from drivers.ports import NETWORK_DELAY, PORT_OPENER
 from drivers.protocol.definition import BY_NUMBER, HELLO
+from drivers.protocol.sets import Envelope
 from drivers.wires.can_bus import CanWire
 from drivers.wires.can_frames import CANOPEN, REQUEST, CanFrame, cob_id, pack_frames, unpack_frames
 from drivers.wires.modbus import ModbusWire
@@ -669,20 +670,8 @@ async def group_of(*ends: MemoryLine, is_armed: bool = True, **options: Any) -> 
     return group
 
 
-def with_group(
-    test: Callable[[Group, list[MemoryLine]], Awaitable[None]], wire: str, *lines: tuple[str, ...]
-) -> None:
-    """Run a test with an armed group of amplifiers, by their names on each line of a kind."""
-
-    async def run() -> None:
-        ends = [MemoryLine(wire, *names) for names in lines]
-        await test(await group_of(*ends), ends)
-
-    run_virtual(run())
-
-
 def grouped(*lines: tuple[str, ...], wire: str = "") -> Callable[[Callable[..., Any]], Any]:
-    """Run a test with an armed group and the lines that it is on: `with_group` as a decorator.
+    """Run a test with an armed group of amplifiers, by their names on each line, and the lines.
 
     wire: the kind of all lines, else the argument or fixture of that name.
     """
@@ -696,8 +685,12 @@ def grouped(*lines: tuple[str, ...], wire: str = "") -> Callable[[Callable[..., 
         @functools.wraps(test)
         def run(**arguments: Any) -> None:
             passed = {name: arguments[name] for name in own}
-            kind = wire or arguments["wire"]
-            with_group(lambda group, ends: test(group, ends, **passed), kind, *lines)
+
+            async def play() -> None:
+                ends = [MemoryLine(wire or arguments["wire"], *names) for names in lines]
+                await test(await group_of(*ends), ends, **passed)
+
+            run_virtual(play())
 
         run.__signature__ = inspect.Signature(given)  # type: ignore[attr-defined]
         return run
@@ -717,6 +710,20 @@ def losing(*names: str, count: int = 1) -> Alter:
         return unaltered(name, data)
 
     return alter
+
+
+def of_parts(count: int, level: float = 0.05) -> list[AmplifierLayer]:
+    """Layers whose set has about so many parts: a layer of two onsets of 24 knots has 111 words."""
+    tones = [tone(each, level, onset=Envelope(20, ((100, 0),) * 24)) for each in (0, 1)]
+    return [layer(number, *tones) for number in range(count)]
+
+
+LATEST = 0.014  # s, each way
+
+
+def delayed(end: MemoryLine, rng: random.Random) -> None:
+    """Have what passes a line come late, as on a busy machine."""
+    end.inward = end.outward = lambda name, data: [(rng.uniform(0.0, LATEST), data)]
 
 
 PROTOCOLS = {"serial": "serial", "rtu": "Modbus RTU", "tcp": "Modbus TCP", "can": "CAN"}

@@ -21,9 +21,6 @@ import pytest
 import drivers
 from chain import set_running
 from courses import Acted
-from drivers.errors import (
-    DriverError,
-)
 from drivers.playing import AmplifierLayer, AmplifierTone
 from drivers.protocol.definition import MESSAGES
 from drivers.wires.can_bus import CanWire
@@ -37,7 +34,7 @@ from group_stops import play as play_stops
 from late_taps import AMPLIFIERS, play
 from late_taps import WIRES as LATE_WIRES
 from sim.amplifier.readings import AmplifierClock, Crystal
-from virtual_lines import KINDS, MemoryLine, group_of, in_virtual_time
+from virtual_lines import MemoryLine, group_of, in_virtual_time
 
 LAYER = AmplifierLayer(0, (AmplifierTone(0, 100.0, 0.5),), 0.001)
 # By hand, of what is written: bytes of ten bits; of eleven after 3.5 characters; CAN frames of at
@@ -127,69 +124,9 @@ async def test_sets_start_together_on_lines_of_any_speed_that_are_busy(
     assert await apart() < 1e-6
 
 
-@in_virtual_time
-async def test_stop_while_a_line_is_kept_for_its_commit_commits_nothing() -> None:
-    """One line is free, the other busy for 90 ms: the stop goes out at once on the first."""
-    ends = [MemoryLine("serial", "a"), MemoryLine("serial", "b")]
-    group = await group_of(*ends)
-    ends[1].outward = lambda name, data: [(0.025, data)]
-    applying = asyncio.ensure_future(group.apply({name: [LAYER] for name in group.amplifiers}))
-    reading = asyncio.ensure_future(group.amplifiers["b"].read_status())
-    selector = ends[0].loop._selector  # type: ignore[attr-defined]
-    moments, select = 0, selector.select
-
-    def counted(timeout: float | None) -> list[object]:
-        nonlocal moments
-        moments += 1
-        return select(timeout)  # type: ignore[no-any-return]
-
-    selector.select = counted
-    await asyncio.sleep(0.04)
-    assert [name for _, name in ends[0].sent][-1] == "1:5"
-    assert moments < 20  # a line that looked at what it keeps again and again would be busy
-    began = ends[0].loop.time()
-    stopped = await group.stop()
-    assert stopped["a"].is_confirmed
-    assert [each for each in ends[0].sent if each[0] == began] == [(began, "1:8")]
-    with pytest.raises(DriverError):
-        await applying
-    await reading
-    assert await started(*ends) == [[], []]
-
-
 def loud(number: int, level: float) -> AmplifierLayer:
     """A layer of 100 Hz on the first channel."""
     return AmplifierLayer(number, (AmplifierTone(0, 100.0, level),), 0.001)
-
-
-@pytest.mark.parametrize("layers", [[0], [1, 2], [], range(8)], ids=str)
-@pytest.mark.parametrize("kind", KINDS)
-@in_virtual_time
-async def test_amplifier_that_was_left_out_for_long_takes_the_next_set(
-    kind: str, layers: list[int]
-) -> None:
-    """65 536 tokens on: what it plays goes on to the sample, and its next set plays.
-
-    Of each 4096 sets to the other amplifier one is sent; the rest only count.
-    """
-    ends = [MemoryLine(kind, "a"), MemoryLine(kind, "b")]
-    group = await group_of(*ends)
-    await group.apply(
-        {"a": [loud(0, 0.5)], "b": [loud(each, 0.1) for each in layers] or [AmplifierLayer(0)]}
-    )
-    await started(*ends)
-    before = ends[1].far["b"].playback.all_voices[0]
-    for count in range(1, 17):
-        group.sets.token = 4096 * count % 65536 or 1
-        await group.apply({"a": [loud(0, 0.5)]})
-        await group.beat()
-    after = ends[1].far["b"].playback.all_voices[0]
-    assert [(each.began, each.layer) for each in after] == [
-        (each.began, each.layer) for each in before
-    ]
-    await group.apply({name: [loud(0, 0.2)] for name in group.amplifiers})
-    await group.silence(0.0)
-    assert [ends[0].levels("a")[0], ends[1].levels("b")[0]] == [0.0, 0.0]
 
 
 _ROWS = [(wire, amplifiers, 1) for wire in LATE_WIRES for amplifiers in AMPLIFIERS]

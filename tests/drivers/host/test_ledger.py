@@ -23,7 +23,6 @@ from drivers.playing import AmplifierLayer, AmplifierTone, Playback
 from drivers.protocol.sets import Envelope
 from drivers.wires.can_frames import CanFrame, pack_frames
 from drivers.wires.serial_frames import Frame, encode_frame
-from drivers.wires.serial_line import SerialWire
 from registry.limits import GuardLimits
 from sim.amplifier.readings import capabilities
 from virtual_lines import MemoryLine, in_virtual_time, unaltered
@@ -504,21 +503,6 @@ def test_what_waits_for_an_onset_ends_within_the_longest_vibration() -> None:
     assert one.valid_for == pytest.approx(800, abs=2)
 
 
-@pytest.mark.parametrize(("baud", "attempts"), [(921_600, 3), (9600, 2)])
-@in_virtual_time
-async def test_request_is_repeated_twice_and_once_on_a_slow_line(baud: int, attempts: int) -> None:
-    """A status of 41 bytes takes 43 ms at 9600 baud, more than the 30 ms of others."""
-    end = MemoryLine("serial", "a", wire=SerialWire(baud, sequence=0))
-    (host,) = end.hosts.values()
-    await host.open()
-    end.outward = lambda name, data: []
-    end.sent.clear()
-    with pytest.raises(LinkTimeout):
-        await host.read_status()
-    assert [each for _, each in end.sent] == ["1:9"] * attempts
-    assert (host.counts.timeouts, host.counts.retries) == (attempts, attempts - 1)
-
-
 @in_virtual_time
 async def test_read_behind_a_write_whose_response_was_found_late_is_awaited() -> None:
     """Modbus: only the last look at the port finds that response; the status comes 20 ms on."""
@@ -536,22 +520,6 @@ async def test_read_behind_a_write_whose_response_was_found_late_is_awaited() ->
     end.outward = lambda name, data: unread.append(data) or []  # type: ignore[func-returns-value]
     await host.read_status()
     assert host.counts.retries == 0
-
-
-@in_virtual_time
-async def test_statistics_are_those_of_the_amplifier_and_of_its_line() -> None:
-    """A retry of one of two amplifiers; both have sent frames, and the last round trip is known."""
-    end = MemoryLine("serial", "a", "b")
-    for host in end.hosts.values():
-        await host.open()
-    lost = iter([True])
-    end.outward = lambda name, data: [] if next(lost, False) else unaltered(name, data)
-    await end.hosts["a"].read_status()
-    one, other = (end.hosts[name].statistics for name in "ab")
-    assert (one.retries, one.timeouts, other.retries, other.timeouts) == (1, 1, 0, 0)
-    assert one.frames_out == other.frames_out == 8
-    assert one.frames_in == 7
-    assert one.last_round_trip == pytest.approx(0.0004)
 
 
 IN_PLACE: Mapping[str, tuple[str, Callable[[bytes], bytes], str]] = {
@@ -623,15 +591,6 @@ async def test_error_of_no_reply_names_what_came_in_its_place(case: str) -> None
     end = MemoryLine("serial", "a")  # its replies to Hello, of type 81, alone arrive
     end.outward = lambda name, data: unaltered(name, data) * (data[2:3] == b"\x81")
     with pytest.raises(LinkTimeout, match="; it answered Hello, but not GetCaps"):
-        await end.hosts["a"].open()
-
-
-@in_virtual_time
-async def test_error_of_late_replies_names_the_delay() -> None:
-    """The first requests wait longer than the next; 400 ms: two, of a write and of a read."""
-    end = MemoryLine("tcp", "a")
-    end.outward = lambda name, data: [(0.2, data)]
-    with pytest.raises(LinkTimeout, match="30 ms, but the reply before took 400 ms"):
         await end.hosts["a"].open()
 
 

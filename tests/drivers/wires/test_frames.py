@@ -5,16 +5,12 @@ damaged bytes in between; the host's side of a CAN bus with other hosts; and how
 of Modbus, with responses that belong to no request.
 """
 
-import asyncio
 import os
 import random
-from collections.abc import Awaitable, Callable
 
 import pytest
 from scipy.stats import poisson
 
-from drivers.errors import LinkError
-from drivers.host.group import Group
 from drivers.protocol.definition import IDENTITY, MESSAGES, STATUS
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Command, Envelope, LayerSet, pack_layers, parts
@@ -37,7 +33,7 @@ from drivers.wires.wire import (
 from real_wires import damage
 from sim.amplifier.simulated_amplifier import SimulatedAmplifier
 from sim.far_ends.modbus_amplifiers import ModbusAmplifiers
-from virtual_lines import KINDS, MemoryLine, group_of, in_virtual_time, run_virtual, unaltered
+from virtual_lines import KINDS, MemoryLine, in_virtual_time, unaltered
 
 PART: Values = {
     **{"session": 0x2A17, "token": 0x0102, "index": 0, "parts": 1, "now": 1},
@@ -314,70 +310,6 @@ def test_random_frames_raise_nothing_and_are_no_reply(wire: CanWire) -> None:
     assert wire.received(ANSWERS["reply"][0]) == ANSWERS["reply"][1]
 
 
-def beside_another_host(test: Callable[[Group, MemoryLine], Awaitable[None]]) -> None:
-    """Run a test with an opened group of one amplifier, which another host arms after that."""
-
-    async def run() -> None:
-        end = MemoryLine("can", "a")
-        group = await group_of(end, is_armed=False)
-        await test(group, end)
-
-    run_virtual(run())
-
-
-def heard(end: MemoryLine, kind: int = PING, session: int = 5) -> None:
-    """Let the host hear another one's request to node 1."""
-    end.line.received(frames(0x201, 99, kind, session, 250))
-
-
-def test_amplifier_that_another_host_drives_is_never_armed() -> None:
-    """Neither armed nor disarmed while its frames are heard; armed once they have ended."""
-
-    async def test(group: Group, end: MemoryLine) -> None:
-        far = end.far["a"]
-        values = {"session": 5, "watchdog": 250, "shift": 0}
-        far.handle("Arm", values, end.loop.time())
-        heard(end)
-        sent = len(end.sent)
-        with pytest.raises(LinkError):
-            await group.arm()
-        assert len(end.sent) == sent
-        assert far.state == "OPERATION_ENABLED"
-        far.handle("Disarm", {"ramp": 0}, end.loop.time())
-        await asyncio.sleep(2.1)
-        await group.arm()
-        assert far.session == 78  # 77 is drawn, and each line has the next one
-
-    beside_another_host(test)
-
-
-def test_another_host_beside_an_armed_one_ends_what_it_plays() -> None:
-    """The next heartbeat is not sent, and the amplifier is stopped."""
-
-    async def test(group: Group, end: MemoryLine) -> None:
-        await group.arm()
-        heard(end, MESSAGES["Arm"].number, 6)
-        with pytest.raises(LinkError):
-            await group.beat()
-        assert not group.is_armed
-        assert end.far["a"].state == "QUICK_STOP_ACTIVE"
-        assert f"1:{PING}" not in [each for _, each in end.sent]
-
-    beside_another_host(test)
-
-
-@in_virtual_time
-async def test_another_host_is_heard_while_opening() -> None:
-    """Its frames show it where its watchdog has not been seen to rise."""
-    end = MemoryLine("can", "a")
-    far = end.far["a"]
-    far.handle("Arm", {"session": 5, "watchdog": 2000, "shift": 0}, end.loop.time())
-    end.loop.call_later(0.1, heard, end)
-    with pytest.raises(LinkError):
-        await end.hosts["a"].open()
-    assert far.state == "OPERATION_ENABLED"
-
-
 class Peer:
     """An amplifier of four channels at unit 1, its bytes kept."""
 
@@ -553,24 +485,6 @@ async def test_damaged_length_costs_one_attempt() -> None:
     end.inward = lengthened
     await end.hosts["a"].read_status()
     assert end.retries == 1
-
-
-@in_virtual_time
-async def test_stop_is_not_sent_over_a_reply() -> None:
-    """On RTU a status of two channels, 8 + 39 characters and two silences, begins 4 ms late."""
-    end = MemoryLine("rtu", "a")
-    host = end.hosts["a"]
-    await host.open()
-    takes = 47 * 11 / 115_200 + 2 * 0.00175 + 0.004
-    end.outward = lambda name, data: [(takes if len(data) > 8 else 0.0, data)]
-    begin = end.loop.time()
-    reading = asyncio.ensure_future(host.read_status())
-    await asyncio.sleep(0.001)
-    assert (await host.stop()).is_confirmed
-    await reading
-    stopped = min(time for time, request in end.sent if request == "1:8")
-    assert stopped - begin >= takes
-    assert (end.retries, end.line.wire.counters.unexpected_frames) == (0, 0)
 
 
 def test_times_on_a_line_are_those_of_its_characters() -> None:

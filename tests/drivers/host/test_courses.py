@@ -6,21 +6,21 @@ feel is read from the simulated amplifiers themselves.
 """
 
 import asyncio
-import contextlib
 import itertools
 import random
 from collections.abc import AsyncIterator, Callable, Mapping, Sequence
-from contextlib import asynccontextmanager, suppress
+from contextlib import asynccontextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 
 from courses import Taken, courses, follow
-from drivers.errors import CommandRefused, DriverError, LinkTimeout
+from drivers.errors import LinkTimeout
 from drivers.host.amplifier_sensors import read_measured
 from drivers.host.group import Group
 from drivers.host.joint_sets import PlayedSet
@@ -29,235 +29,15 @@ from drivers.playing import AmplifierLayer, AmplifierTone
 from drivers.protocol.definition import CLOCK_UNKNOWN, FEATURES, MESSAGES, STATES
 from drivers.protocol.records import Refusal, Values
 from drivers.protocol.sets import Envelope, LayerSet
+from drivers.wires.can_frames import CanFrame, pack_frames, segments
 from drivers.wires.serial_frames import REPLY_BIT, FrameReader, encode_frame, pack_words
+from drivers.wires.serial_line import SerialWire
 from drivers.wires.wire import BrokenReply
 from sim.amplifier.readings import AmplifierClock, Crystal
 from sim.amplifier.simulated_amplifier import SimulatedAmplifier as FarEnd
-from virtual_lines import (
-    KINDS,
-    MemoryLine,
-    group_of,
-    grouped,
-    in_virtual_time,
-    layer,
-    losing,
-    run_virtual,
-    tone,
-    unaltered,
-)
+from virtual_lines import KINDS, MemoryLine, delayed, group_of, losing, of_parts, unaltered
 
-LOST = 0.1  # of the frames, either way
-LINES = {
-    "one": (("a",),),
-    "one line of two": (("a", "b"),),
-    "two lines": (("a",), ("b",)),
-}
 SET = MESSAGES["Set"].number
-
-
-def of_parts(count: int, level: float = 0.05) -> list[AmplifierLayer]:
-    """Layers whose set has about so many parts: a layer of two onsets of 24 knots has 111 words."""
-    tones = [tone(each, level, onset=Envelope(20, ((100, 0),) * 24)) for each in (0, 1)]
-    return [layer(number, *tones) for number in range(count)]
-
-
-async def _play(kind: str, lines: str, rng: random.Random, count: int) -> list[str]:
-    """Play so many sets while frames are lost; returns what was wrong."""
-    ends = [MemoryLine(kind, *names) for names in LINES[lines]]
-    group = await group_of(*ends, watchdog=2.0, draw=rng.randint)
-    far = {name: each for end in ends for name, each in end.far.items()}
-    found, committed = list[str](), dict[tuple[str, int], Sequence[LayerSet]]()
-
-    def noted(name: str) -> None:
-        commit = far[name].playback.commit
-
-        def note(layers: Sequence[LayerSet], token: int, time: float) -> None:
-            if (name, token) in committed:
-                found.append(f"{name} plays {token} twice")
-            committed[name, token] = layers
-            commit(layers, token, time)
-
-        far[name].playback.commit = note  # type: ignore[method-assign]
-
-    def losing(name: str, data: bytes) -> list[tuple[float, bytes]]:
-        return [] if rng.random() < LOST else unaltered(name, data)
-
-    for name in far:
-        noted(name)
-    played_sets = 0
-    for _ in range(count):
-        layers = of_parts(rng.randint(1, 8), rng.uniform(0.02, 0.06))
-        for end in ends:
-            end.inward = end.outward = losing
-        result = None
-        with suppress(DriverError):
-            result = await group.apply(dict.fromkeys(far, layers))
-        for end in ends:
-            end.inward = end.outward = unaltered
-        await asyncio.sleep(0.05)
-        for each in far.values():
-            each.tick(ends[0].loop.time())
-        token = group.sets.token
-        for name in far:
-            words = committed.get((name, token))
-            if words is not None and len(words) != len(layers):
-                found.append(f"{name} plays {token} in part")
-            if result is not None and words != result.layers[name]:
-                found.append(f"{name} does not play {token}, though it is said")
-        played_sets += result is not None
-        await _recovered(group)
-    if played_sets < 0.6 * count:  # of the rest it is said, as of 8 parts on Modbus RTU
-        found.append(f"{played_sets} of {count} sets play")
-    return found
-
-
-async def _recovered(group: Group) -> None:
-    """Read all amplifiers, and arm them again where they were stopped."""
-    await group.statuses()
-    if not group.is_armed:
-        await group.clear()
-        await group.arm()
-    await group.silence(0.001)
-    await asyncio.sleep(0.15)  # what was late has faded
-
-
-CASES = [
-    pytest.param(
-        *(kind, lines, count),
-        marks=pytest.mark.long if count > 40 or lines == "one line of two" else [],
-    )
-    for count in (40, 6700)
-    for kind in KINDS
-    for lines in LINES
-]
-
-
-@pytest.mark.parametrize(("kind", "lines", "count"), CASES)
-def test_sets_play_whole_and_once_though_frames_are_lost(kind: str, lines: str, count: int) -> None:
-    """One frame of ten either way, of sets of 1 to 8 parts; the long form: 20 000 on each wire."""
-    rng = random.Random(count)
-    assert run_virtual(_play(kind, lines, rng, count), rng=rng) == []
-
-
-@grouped(("a",), wire="serial")
-async def test_reply_to_a_part_but_the_last_is_none_of_its_set(
-    group: Group, ends: list[MemoryLine]
-) -> None:
-    """An amplifier says of each of eight parts that the set plays: all are sent, and it does."""
-    (end,) = ends
-    taken = {"token": group.sets.token + 1, "exact": 1, "staged": 0, "played": 1, "missing": 0}
-    payload = pack_words(MESSAGES["Set"].reply.pack(taken))
-
-    def replied(name: str, data: bytes) -> list[tuple[float, bytes]]:
-        (frame,) = FrameReader().feed(data)
-        if name == "Set":
-            reply = frame._replace(kind=SET | REPLY_BIT, payload=payload)
-            end.later(0.0001, end.line.received, encode_frame(reply))
-        return unaltered(name, data)
-
-    end.sent.clear()
-    end.inward = replied
-    await group.apply({"a": of_parts(8)})
-    assert [each for _, each in end.sent] == [f"1:{SET}"] * 8
-    await asyncio.sleep(0.06)
-    assert end.levels("a")[0] > 0.1
-
-
-@grouped(("a", "b"), wire="rtu")
-async def test_one_reply_is_due_at_a_time_where_two_share_a_line(
-    group: Group, ends: list[MemoryLine]
-) -> None:
-    """Each frame but a broadcast has a response, which comes before the next frame is sent."""
-    (end,) = ends
-    received, due, most = end.line.received, 0, 0
-
-    def sent(name: str, data: bytes) -> list[tuple[float, bytes]]:
-        nonlocal due, most
-        due += data[0] > 0
-        most = max(most, due)
-        return unaltered(name, data)
-
-    def taken(data: bytes) -> None:
-        nonlocal due
-        due -= 1
-        received(data)
-
-    end.inward = sent
-    end.line.received = taken  # type: ignore[method-assign]
-    await group.apply(dict.fromkeys("ab", of_parts(3)))
-    await group.beat()
-    assert (due, most) == (0, 1)
-
-
-LATEST = 0.014  # s, each way
-PULSE = tone(level=0.0, onset=Envelope(100, ((3000, 0), (3000, 0))))  # over after 30 ms
-
-
-def delayed(end: MemoryLine, rng: random.Random) -> None:
-    """Have what passes a line come late, as on a busy machine."""
-    end.inward = end.outward = lambda name, data: [(rng.uniform(0.0, LATEST), data)]
-
-
-async def read(group: Group) -> None:
-    """Read two statuses of the amplifier, which show a contradiction each."""
-    for _ in range(2):
-        await asyncio.sleep(0.02)
-        await group.amplifiers["a"].read_status()
-
-
-ENDING: dict[str, tuple[Sequence[AmplifierLayer], AmplifierLayer | None]] = {
-    "a pulse": ([layer(0, PULSE)], None),
-    "its time": ([layer(0, tone(ending=Envelope(50, ((8000, 0),))), valid_for=0.04)], None),
-    "what waited": (
-        [layer(0, PULSE), layer(1, tone(1, 0.1))],
-        layer(0, tone(level=0.4), after=True, valid_for=0.02),
-    ),
-    "a renewal": ([layer(0, tone(), valid_for=0.04)], layer(0, renew=True, valid_for=1.0)),
-}
-"""Layers that end within 40 ms, and one that follows; a renewal that comes about then."""
-
-
-@pytest.mark.parametrize("ends_by", ENDING)
-@in_virtual_time
-async def test_what_ends_amid_an_exchange_may_be_shown_or_not(ends_by: str) -> None:
-    """Up to 14 ms out, and back: a status may show the layer and its level, whenever it is read."""
-    rng, end, shown = random.Random(5), MemoryLine("serial", "a"), set[bool]()
-    group = await group_of(end, watchdog=2.0)
-    host, (layers, following) = group.amplifiers["a"], ENDING[ends_by]
-    for _ in range(60):
-        await group.apply({"a": layers})
-        if ends_by == "a renewal":
-            delayed(end, rng)
-            await asyncio.sleep(rng.uniform(0.02, 0.045))
-        if following:
-            await group.apply({"a": [following]})
-        delayed(end, rng)
-        for _ in range(4):
-            await asyncio.sleep(rng.uniform(0.0, 0.02))
-            shown.add((await host.read_status())["tokens"][0] > 0)
-            assert host._contradictions == 0
-        end.inward = end.outward = unaltered
-        await group.silence(0.0)
-        await asyncio.sleep(0.1)
-    assert shown == {False, True}
-
-
-@pytest.mark.parametrize("what", ["token", "level"])
-@in_virtual_time
-async def test_layer_that_is_dropped_is_found_where_statuses_are_late(what: str) -> None:
-    """Silent, or at half its level: by two statuses, however late."""
-    end = MemoryLine("serial", "a")
-    group = await group_of(end)
-    await group.apply({"a": [layer(0, tone())]})
-    delayed(end, random.Random(6))
-    await asyncio.sleep(0.05)
-    playback, now = end.far["a"].playback, end.loop.time()
-    if what == "token":
-        playback.silence(now, 0.0)
-    else:
-        playback.scale(now, 0.5, 0.0)
-    with pytest.raises(CommandRefused, match=f"{what} of"):
-        await read(group)
 
 
 def altered(
@@ -268,36 +48,6 @@ def altered(
     far.handle = lambda name, values, now, **options: change(  # type: ignore[method-assign]
         name, values, now, partial(handle, **options)
     )
-
-
-@pytest.mark.parametrize("what", ["cables", "replies"])
-@grouped(("a",), ("b",))
-async def test_lines_that_are_exchanged_while_armed_are_silenced(
-    group: Group, ends: list[MemoryLine], what: str
-) -> None:
-    """Each amplifier refuses the other's session, and a line takes no reply to the other's request.
-
-    Both are at address 1, alike and silent, so that no status contradicts what was sent.
-    """
-    first, second = ends
-    if what == "cables":
-        first._end, second._end = (
-            one.kind.far_end({1: far}, one._send)
-            for one, far in ((first, second.far["b"]), (second, first.far["a"]))
-        )
-    else:
-        await second.hosts["b"].read_status()  # numbers of requests begin anywhere on each line
-        first.line, second.line = second.line, first.line
-    async with asyncio.timeout(2.0):
-        while group.is_armed:
-            with contextlib.suppress(DriverError):
-                await group.beat()
-            await asyncio.sleep(0.05)
-    await asyncio.sleep(0.3)
-    for end in ends:
-        for far in end.far.values():
-            far.tick(end.loop.time())
-            assert far.state != "OPERATION_ENABLED"
 
 
 def _layer(row: Sequence[float] | Mapping[str, Any]) -> AmplifierLayer:
@@ -430,11 +180,10 @@ class OnLines(Taken):
         """Require that none of these was sent on a line."""
         assert not {*requests} & {*self.sent[line]}
 
-    def sent_within(self, request: str, seconds: float) -> None:
-        """Require that a request was sent on the first line so soon after `forget`."""
-        assert (
-            next(at for at, each in self.lines[0].sent if each == request) <= self.since + seconds
-        )
+    def sent_within(self, request: str, seconds: float, line: int = 0, least: float = 0.0) -> None:
+        """Require that a request was sent on a line so soon after `forget`, but not sooner."""
+        first = next(at for at, each in self.lines[line].sent if each == request)
+        assert least <= first - self.since <= seconds
 
     def was_sent(self, *requests: str) -> None:
         """Require that a line was sent these first since `forget`."""
@@ -444,6 +193,10 @@ class OnLines(Taken):
         """Require numbers of requests on the first line since `forget`: at least, at most."""
         found = {request: self.sent[0].count(request) for request in bounds}
         assert all(low <= found[each] <= high for each, (low, high) in bounds.items()), found
+
+    async def waits_until(self, seconds: float) -> None:
+        """Wait until so long after `forget`."""
+        await asyncio.sleep(self.since + seconds - self.lines[0].loop.time())
 
     async def waits_until_sent(self, request: str) -> None:
         """Wait until a request is the last that was sent on the first line."""
@@ -609,6 +362,17 @@ class OnLines(Taken):
         """Keep a copy of what comes to the host on the first line."""
         self.lines[0].outward = lambda _, data: self.kept.append(data) or [(0.0, data)]  # type: ignore[func-returns-value]
 
+    def keeps_requests_but(self, number: int) -> None:
+        """Keep what is sent on the first line; that of a number, from 0 on, arrives."""
+        self.kept.clear()
+        self.lines[0].inward = lambda _, data: (
+            self.kept.append(data) or [(0.0002, data)] * (len(self.kept) == number + 1)  # type: ignore[func-returns-value]
+        )
+
+    def last_request_arrives(self) -> None:
+        """Let the last request that was kept arrive."""
+        self.lines[0].later(0.0, self.lines[0]._arrived, "Ping", self.kept[-1])
+
     def hands_over_the_copies(self) -> None:
         """Let all copies come once more."""
         for data in self.kept:
@@ -756,6 +520,58 @@ class OnLines(Taken):
         if line.kind is KINDS["can"]:
             line.boot(1)
 
+    def scales(self, share: float) -> None:
+        """Let the first amplifier play all at a share of its level, by itself."""
+        self.far.a.playback.scale(self.lines[0].loop.time(), share, 0.0)
+
+    def is_randomly_late(self) -> None:
+        """Let what passes the first line come up to 14 ms late."""
+        delayed(self.lines[0], random.Random(6))
+
+    def long_replies_are_late(self, seconds: float) -> None:
+        """Let replies of more than 8 bytes come so much later on the first line."""
+        self.lines[0].outward = lambda _, data: [(seconds if len(data) > 8 else 0.0, data)]
+
+    def says_that_each_part_plays(self) -> None:
+        """Let the first amplifier reply to each part of a set that the set plays."""
+        (line, *_), taken = self.lines, {"exact": 1, "staged": 0, "played": 1, "missing": 0}
+        payload = pack_words(
+            MESSAGES["Set"].reply.pack({"token": self.group.sets.token + 1, **taken})
+        )
+
+        def replied(name: str, data: bytes) -> list[tuple[float, bytes]]:
+            (frame,) = FrameReader().feed(data)
+            if name == "Set":
+                reply = frame._replace(kind=SET | REPLY_BIT, payload=payload)
+                line.later(0.0001, line.line.received, encode_frame(reply))
+            return unaltered(name, data)
+
+        line.inward = replied
+
+    @property
+    def last_voices(self) -> list[tuple[float, int]]:
+        """When what the last amplifier plays on its first channel began, and its layers."""
+        assert self.levels  # which lets happen what is due
+        return [(each.began, each.layer) for each in _voices([*vars(self.far).values()][-1], 0)]
+
+    def remembers_voices(self) -> None:
+        """Remember what the last amplifier plays on its first channel."""
+        self.voices_before = self.last_voices
+
+    def plays_on(self) -> None:
+        """Require that it plays the same to the sample."""
+        assert self.last_voices == self.voices_before
+
+    def skips_tokens(self, count: int) -> None:
+        """Count sets that are not sent."""
+        self.group.sets.token = (self.group.sets.token + count) % 65536 or 1
+
+    def counts_turns(self) -> None:
+        """Count in `turns` how often the event loop turns."""
+        selector = self.lines[0].loop._selector  # type: ignore[attr-defined]
+        self.turns = Mock(side_effect=selector.select)
+        selector.select = self.turns
+
     def falls_silent(self) -> None:
         """Let the first amplifier end all that it plays, by itself."""
         self.far.a.playback.silence(self.lines[0].loop.time(), 0.0)
@@ -788,16 +604,30 @@ class OnLines(Taken):
         """Let this machine sleep."""
         self.lines[0].loop.now += seconds  # type: ignore[attr-defined]
 
+    def hears_another_host(self, name: str, session: int) -> None:
+        """Let another host's request to node 1 come on the first line, of CAN."""
+        data = segments(99, MESSAGES[name].number, (session, 250))
+        self.lines[0].line.received(pack_frames(CanFrame(0x201, each) for each in data))
+
+    async def another_host_feeds(self, name: str) -> None:
+        """Feed the watchdog of an amplifier as another host, without end."""
+        while True:
+            await asyncio.sleep(0.07)
+            self.asks(name, "Ping", session=5, rate=0)
+
     async def waits_for_the_loss(self) -> None:
         """Wait until an amplifier is lost, for the host."""
         await asyncio.sleep(self.group.members.lost_from - self.lines[0].loop.time())
 
 
 @asynccontextmanager
-async def on_lines(*names: str, **options: Any) -> AsyncIterator[OnLines]:
-    """An armed group; names: of the amplifiers on each line, a letter each; wire, is_armed."""
-    wire = options.pop("wire")
-    made = OnLines(lines=[MemoryLine(wire, *each) for each in names])
+async def on_lines(*names: str, wire: str, baud: int = 0, **options: Any) -> AsyncIterator[OnLines]:
+    """An armed group; names: of the amplifiers on each line, a letter each; baud: of serial lines.
+
+    options: of the group, and is_armed.
+    """
+    at_baud = SerialWire(baud, sequence=0) if baud else None
+    made = OnLines(lines=[MemoryLine(wire, *each, wire=at_baud) for each in names])
     made.group = await group_of(*made.lines, **options)
     yield made
 

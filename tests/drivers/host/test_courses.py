@@ -562,9 +562,9 @@ class OnLines(Taken):
         """Require that it plays the same to the sample."""
         assert self.last_voices == self.voices_before
 
-    def skips_tokens(self, count: int) -> None:
-        """Count sets that are not sent."""
-        self.group.sets.token = (self.group.sets.token + count) % 65536 or 1
+    def skips_tokens(self) -> None:
+        """Count sets that are not sent, until the next multiple of 4096."""
+        self.group.sets.token = (self.group.sets.token // 4096 + 1) * 4096 % 65536 or 1
 
     def counts_turns(self) -> None:
         """Count in `turns` how often the event loop turns."""

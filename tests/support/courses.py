@@ -81,11 +81,6 @@ class Taken:
         """Cancel a step that has begun."""
         self.under_way[_name(step)].cancel()
 
-    async def repeats(self, times: int, *steps: Step) -> None:
-        """Take steps one after the other, so often."""
-        for step in steps * times:
-            await self.take(step)
-
     def breaks(self, what: str) -> None:
         """Let a method, by its name, fail by a bug from now on."""
         owner, _, name = what.rpartition(".")
@@ -105,11 +100,6 @@ class Taken:
         """Require the numbers of what was reported."""
         found = {what: len(attrgetter(what)(self)) for what in numbers}
         assert found == numbers
-
-    def is_between(self, **bounds: Sequence[float]) -> None:
-        """Require values between two."""
-        found = {what: attrgetter(what)(self) for what in bounds}
-        assert all(low <= found[each] <= high for each, (low, high) in bounds.items()), found
 
     async def refuses(self, step: Step) -> None:
         """Require that a step is refused."""

@@ -480,7 +480,7 @@ def one_of(known: Iterable[object]) -> str:
     return " or ".join(map(str, known))
 
 
-_DRIFT = DRIFT + QUANTITIES["rate"].high
+CLOCK_DRIFT = DRIFT + QUANTITIES["rate"].high
 """Of the clock, at any rate."""
 
 
@@ -528,7 +528,7 @@ class ExpectedClock:
             self._read = shown, when
         elif self._read is not None:
             clock, read = self._read
-            slack = self._slack + _DRIFT * (marked[1] - read[0])
+            slack = self._slack + CLOCK_DRIFT * (marked[1] - read[0])
             low, high = marked[0] - read[1] - slack, marked[1] - read[0] + slack
             passed = ahead(shown, clock)
             if not low <= passed <= high:
@@ -544,7 +544,7 @@ class ExpectedClock:
             return when[0], when[1] + MAX_AHEAD
         clock, read = self._read
         left = ahead(at * HIGH_STEPS, clock)
-        drift = _DRIFT * max(when[1] - read[0], left)
+        drift = CLOCK_DRIFT * max(when[1] - read[0], left)
         early, late = read[0] + left - drift, read[1] + left + drift
         if early > when[1] and late <= when[0] + MAX_AHEAD:
             return early, late

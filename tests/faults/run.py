@@ -4,10 +4,10 @@
 
 Faults are data, in the files `AREA.yaml` beside this one; CONTRIBUTING.md has their format. A fault
 is found if every test named by it fails and shows what it must, missed if one of them does not or
-takes too long, stale if a text to change does not occur exactly once in its file, or no test can be
-run with it. Those of `missed.yaml` are not found by any test of today, with the reason: a line to
-fall behind never. --nightly lists, in place of judging, the faults that `make test` does not
-find, since all their tests are long.
+takes too long, stale if a text to change does not occur exactly once in its file, no test can be
+run with it, or one ends by a name or module that is not there. Those of `missed.yaml` are not found
+by any test of today, with the reason: a line to fall behind never. --nightly lists, in place of
+judging, the faults that `make test` does not find, since all their tests are long.
 Exit status 1 for anything missed or stale that is not among them, or found though it is.
 """
 
@@ -55,6 +55,8 @@ _PRELOADED_FOR_MANY = (
 )
 """Modules that some tests load, preloaded for more than so many faults."""
 _MANY = 20
+_BROKEN = "cannot be run", "ImportError", "ModuleNotFoundError", "NameError", '  File "'
+"""Begin how a test ends of a fault that does not plant what it says; the last, a SyntaxError."""
 
 
 @dataclass(frozen=True)
@@ -216,7 +218,7 @@ def judge(fault: PlantedFault, sound: Path) -> Judgement:
             (folder / file).hardlink_to(sound / file)
     ended = {test: ended.get(test, "cannot be run") for test in fault.tests}
     result = "found"
-    if "cannot be run" in ended.values():
+    if any(how.startswith(_BROKEN) for how in ended.values()):
         result = "stale"
     elif not ended or not all(_is_finding(how, fault.shows) for how in ended.values()):
         result = "missed"

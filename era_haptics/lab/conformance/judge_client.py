@@ -502,13 +502,27 @@ class Dating:
         if self._last is not None:
             self._last = (self._last[0] + steps * HIGH_STEPS) % SPAN, self._last[1]
 
+    def expect_steady(self, otherwise: type[ContractViolation] = ContractViolation) -> None:
+        """Raise ContractViolation, or another one, where readings contradict each other."""
+        if (wrong := f"{1e3 * self.error:.3g} ms") != "0 ms":
+            what = "by how much readings of its clock contradict each other"
+            raise otherwise(what, expected="0 ms", seen=wrong)
+
+    def between(self, earliest: float, latest: float) -> When:
+        """Return an interval; raises ContractViolation for an empty one."""
+        if earliest > latest:
+            self.expect_steady()
+        return When(min(earliest, latest), latest)
+
     def interval(self, when: When) -> When:
         """Return what is between two times of this machine, behind the last reading."""
         if self._last is None:
             return when
         drift = DRIFT * max(when.latest - self._last[1], 0.0)
         low, high = self._ahead
-        return When(max(when.earliest + low - drift, self._time), when.latest + high + drift)
+        return self.between(
+            max(when.earliest + low - drift, self._time), when.latest + high + drift
+        )
 
     def dated(self, clock: int, when: When, stated: int) -> When:
         """Return when a status was true that shows the clock and was read in an interval.

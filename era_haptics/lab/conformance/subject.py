@@ -283,7 +283,7 @@ class Subject(PlayableMaterial):
             dating.pace = 1.0
         elif name == "Ping":
             dating.pace = 1 + values["rate"] * RATE
-        return dated if name == "GetStatus" else When(between.earliest, dated.latest)
+        return dated if name == "GetStatus" else dating.between(between.earliest, dated.latest)
 
     async def _learn_achieved(self, token: int, *, is_exact: bool) -> None:
         """Read what is played of a set that is not played to the word."""

@@ -12,7 +12,9 @@ from functools import partial
 from itertools import product
 from typing import Any
 
+from drivers.playing import VoiceTransition
 from drivers.protocol.definition import (
+    CLOCK_UNKNOWN,
     COMMAND,
     ENVELOPE,
     HIGH_STEPS,
@@ -34,7 +36,6 @@ from era_haptics.lab.conformance.judge_client import (
     PlayableMaterial,
     Rows,
     Send,
-    expect_equal,
     expect_within,
     in_batches,
     layer,
@@ -44,6 +45,7 @@ from era_haptics.lab.conformance.judge_client import (
     stage,
 )
 from era_haptics.lab.conformance.subject import Subject
+from era_haptics.lab.expected_output import CLOCK_DRIFT
 from registry import threads
 
 _PLACE = "protocol.md#sets"
@@ -542,13 +544,12 @@ def sets_expire(subject: Subject) -> Rows:
     ]
 
 
-# s; of a moment, in which statuses are dense; that may be either: levels of 0.2 ms before, a sample
+# s; of a moment, in which statuses are dense; by which levels may be older, and a sample
 _AROUND, _NEAR = 0.015, 0.0003
+_RISE, _ROUGH = 10, 0.0015  # ms; of full level: rounding
 _SLOWEST, _FASTEST = QUANTITIES["rate"].minimum, QUANTITIES["rate"].maximum
-_STAGING_LONG, _BEHIND = (
-    0.2,
-    0.02,
-)  # s; in which a rate of the clock shows; what was dropped, that it is
+# s; in which a rate of the clock shows; what was dropped, that it is
+_STAGING_LONG, _BEHIND = 0.2, 0.02
 
 
 @driving(_PLACE)
@@ -649,21 +650,31 @@ async def starts_at_its_moment(subject: Subject) -> None:
 async def _starts(subject: Subject, duration: float, *, shift: int = 0) -> None:
     """Commit a set for a moment a time [s] ahead, which repeats do not move."""
     await subject.arm(shift=shift)
-    await subject.request("Ping", rate=_FASTEST if duration > _STAGING_LONG else 0)
-    one = subject.one()
+    is_ahead, is_long = 0 < duration <= MAX_AHEAD, duration > _STAGING_LONG
+    await subject.request("Ping", rate=_FASTEST if is_long else 0)
+    one, can = subject.one(ramp=_RISE), subject.can
     await subject.run([stage(one)])
     at, began = await subject.commit_in(duration), threads.now()
-    await subject.request("Ping", rate=_SLOWEST if duration > _STAGING_LONG else 0)
+    await subject.request("Ping", rate=_SLOWEST if is_long else 0)
     await subject.run([play(one, token=1), send("Commit", token=1)])
-    is_ahead = 0 < duration <= MAX_AHEAD
     await subject.pause(max(duration * is_ahead - _AROUND - threads.now() + began, 0.0))
     while threads.now() < began + duration * is_ahead + _AROUND:
         shown = await subject.status()
-        since = ahead(shown["clock"], at * HIGH_STEPS)
-        if is_ahead and abs(since) > _NEAR:
-            what = f"whether it plays {1e3 * since:.1f} ms behind its moment, by its clock"
-            expect_equal(shown["levels"][0] > 0, since > 0, what)
+        if is_ahead and can["clock_error"] != CLOCK_UNKNOWN:
+            since = ahead(shown["clock"], at * HIGH_STEPS)
+            ramp, error = min(_RISE, can["ramp_max"]) / 1000, can["clock_error"]
+            slack = QUANTITIES["clock_error"].from_wire(error) + CLOCK_DRIFT * abs(since)
+            rise = VoiceTransition(0.0, ramp, 0j, complex(one.commands[0].level / FULL), ramp)
+            low, high = (abs(rise.at(each)) for each in (since - _NEAR - slack, since + slack))
+            rough = _ROUGH + can["level_step"] / FULL
+            expect_within(
+                shown["levels"][0] / FULL,
+                low - rough,
+                high + rough,
+                f"level {1e3 * since:.2f} ms behind its moment, by its clock",
+            )
         await asyncio.sleep(_NEAR)
+    subject.dating.expect_steady()
     await subject.run([subject.follow])
 
 

@@ -5,18 +5,23 @@ fingers as there may be are served; and an answer that comes too late is reporte
 """
 
 import asyncio
+import cmath
 import logging
 import math
 from collections import Counter
-from dataclasses import replace
+from collections.abc import AsyncIterator, Callable, Mapping, Sequence
+from contextlib import asynccontextmanager
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from chain import FINGER, OTHER, Chain, set_chain, set_running
+from chain import FINGER, Chain, Sent, set_chain, set_running
 from controller.effects.kinds import Buzz, Click
 from controller.effects.layout import SurfaceLayout, default_effects
+from controller.effects.player import EffectPlayer
 from controller.operation.plate_controller import Controller
 from controller.play.intent import (
     CLICK,
@@ -27,20 +32,25 @@ from controller.play.intent import (
     Target,
     sums_db,
 )
-from controller.play.loop import Observers, PlayReport
+from controller.play.loop import ENDED, Observers, PlayReport
 from controller.play.selection import Chooser, Selector
 from controller.play.slots import Slot
 from controller.sources.touch import Contact, ContactKey, Touch, TouchFrame
-from courses import Acted, courses, follow
+from courses import Acted, Planted, courses, follow
 from drivers.errors import LinkError
 from drivers.host.group import GroupState
 from drivers.opening import Lines
+from drivers.protocol.definition import QUANTITIES
 from drivers.protocol.records import Refusal, Values
+from drivers.protocol.sets import Envelope
+from model.answer.answer import Layer
 from model.answer.answer_report import Timing
+from model.answer.stimulus import Placement
 from model.errors import InputError
 from model.rig.rig import Channel
+from model.transients.base_motion import BaseEnvelope
 from plates import small_problem, small_table
-from registry.limits import HAND_LOAD
+from registry import threads
 from set_table import BuzzNewestContact, SetTiming
 from several_fingers import (
     LAYOUT,
@@ -54,53 +64,313 @@ from several_fingers import (
 from sim.far_ends.wire_assignment import SimulatedWire
 from virtual_lines import in_virtual_time
 
+
+class Shapes(SetTiming):
+    """A timing whose envelopes are straight lines: up in 21 knots, down in 8.
+
+    largest: of the knots of an onset, beside the full level.
+    """
+
+    def __init__(self, largest: float = 1.0) -> None:
+        super().__init__()
+        self.largest = largest
+
+    def with_envelopes(
+        self, pattern: Layer, placed: Placement, *, onset: bool, ending: bool
+    ) -> Layer:
+        """The lines, for the ERAs that play."""
+        up = [number / 21 * self.largest for number in range(1, 21)] + [1.0]
+        down = [1 - number / 8 for number in range(1, 9)]
+        return replace(
+            pattern,
+            onset=_along(pattern, 0.0, up) if onset else pattern.onset,
+            ending=_along(pattern, 1.0, down) if ending else pattern.ending,
+        )
+
+
+def _along(pattern: Layer, start: float, shares: Sequence[float]) -> dict[str, BaseEnvelope]:
+    tones = {
+        name: (tone.frequency, cmath.rect(tone.amplitude, tone.phase))
+        for name, tone in pattern.excitation.items()
+    }
+    return {
+        name: BaseEnvelope(frequency, start * full, tuple(share * full for share in shares))
+        for name, (frequency, full) in tones.items()
+    }
+
+
+class Always:
+    """An intent source for which every contact is a target, unless it fails."""
+
+    fails = False
+
+    def intent(self, contacts: Sequence[Contact], now: float) -> HapticIntent:
+        """Return an intent with all contacts."""
+        if self.fails:
+            raise Planted("no intent")
+        return HapticIntent(tuple(Target(each.key, 20.0) for each in contacts))
+
+
+@dataclass
+class Played(Acted):
+    """A chain of which all sets are looked at: those since arming, and those that vibrate.
+
+    timing, source: of its control loop; seen: times [s] at which a channel was audible, since the
+    looks began, and levels; sessions: of the amplifiers, once they were noted.
+    """
+
+    timing: SetTiming = field(default_factory=SetTiming)
+    source: Any = None
+    seen: list[tuple[float, float]] = field(default_factory=list)
+    sessions: set[int] = field(default_factory=set)
+    marked_at: float = 0.0
+
+    def marks(self) -> None:
+        """Let times count from now on."""
+        self.marked_at = threads.now()
+
+    @property
+    def sets(self) -> list[Sent]:
+        """Every set since the silence that follows arming."""
+        return self.far_end.sent()[1:]
+
+    @property
+    def vibrations(self) -> list[Sent]:
+        """Those that vibrate."""
+        return [each for each in self.sets if not each.is_silent]
+
+    @property
+    def level(self) -> float:
+        """What the first channel plays."""
+        return self.far_end.levels[0]
+
+    @property
+    def last_request(self) -> str:
+        """Name of the last request."""
+        return self.far_end.names()[-1]
+
+    @property
+    def knots_of_onsets(self) -> list[int]:
+        """Of each set, for the first channel."""
+        return [_knots(each.layer.commands[0].onset) for each in self.vibrations]
+
+    @property
+    def knots_of_endings(self) -> list[int]:
+        """Of each set, for the first channel."""
+        return [_knots(each.layer.commands[0].ending) for each in self.vibrations]
+
+    @property
+    def first_onset(self) -> dict[str, Any]:
+        """Of the first channel, in the steps of the wire."""
+        return _lines(self.vibrations[0].layer.commands[0].onset)
+
+    @property
+    def last_ending(self) -> dict[str, Any]:
+        """Of the first channel, in the steps of the wire."""
+        return _lines(self.vibrations[-1].layer.commands[0].ending)
+
+    @property
+    def levels_of_sets(self) -> list[list[int]]:
+        """Of each channel in each set [1e-4]."""
+        return [[each.level for each in one.layer.commands] for one in self.vibrations]
+
+    @property
+    def continues(self) -> list[bool]:
+        """Whether each set continues the phase of the first channel."""
+        return [each.layer.commands[0].keep_phase for each in self.vibrations]
+
+    @property
+    def sent_after(self) -> list[float]:
+        """How long after the mark each set was committed [s]."""
+        return [each.time - self.marked_at for each in self.vibrations]
+
+    @property
+    def reported_after(self) -> list[float]:
+        """How long after the mark each report was made [s]."""
+        return [each.time - self.marked_at for each in self.applied]
+
+    @property
+    def levels_seen(self) -> list[float]:
+        """Levels since the looks began."""
+        return [level for _, level in self.seen]
+
+    @property
+    def ramps(self) -> list[int]:
+        """Of each set [ms]."""
+        return [each.layer.ramp for each in self.vibrations]
+
+    @property
+    def reported_onsets(self) -> list[bool]:
+        """Whether each report has an onset."""
+        return [bool(each.layer.onset) for each in self.applied]
+
+    @property
+    def lasts_until(self) -> list[float]:
+        """When each set ends by itself, after the mark [s]."""
+        return [each.time + _valid_for(each) - self.marked_at for each in self.vibrations]
+
+    @property
+    def pauses(self) -> list[float]:
+        """Times between sets that vibrate [s]."""
+        return [later.time - each.time for each, later in pairwise(self.vibrations)]
+
+    @property
+    def has_gaps(self) -> bool:
+        """Whether a set has ended by itself before the next."""
+        found = self.vibrations
+        return any(later.time > each.time + _valid_for(each) for each, later in pairwise(found))
+
+    @property
+    def valid_for(self) -> list[float]:
+        """How long each set lasts without another [s]."""
+        return [_valid_for(each) for each in self.vibrations]
+
+    @property
+    def is_renewal(self) -> list[bool]:
+        """Whether each set renews what plays, without any command."""
+        return [one.layer.renew and not one.layer.commands for one in self.vibrations]
+
+    @property
+    def played_for(self) -> float:
+        """From the first set until the last ends by itself [s]."""
+        return max(self.lasts_until) + self.marked_at - self.vibrations[0].time
+
+    @property
+    def said_after(self) -> float:
+        """How long after that end it is reported [s]."""
+        (ended,) = [each.time for each in self.silenced if each.reason == ENDED]
+        return ended - self.marked_at - max(self.lasts_until)
+
+    @property
+    def loads_asked(self) -> list[list[float]]:
+        """Loads of the fingers of each question."""
+        return [[each.load for each in fingers] for fingers in self.table.asked]
+
+    @property
+    def feeling_asked(self) -> list[list[bool]]:
+        """Of the fingers of each question, which shall feel something."""
+        return [[each.stimulus is not None for each in fingers] for fingers in self.table.asked]
+
+    @property
+    def requests_of_sets(self) -> list[str]:
+        """Sets, commits and silences since they were forgotten, the same of all amplifiers."""
+        kinds = "Set", "Commit", "Silence"
+        found = [[name for name in end.names() if name in kinds] for end in self.far_ends]
+        assert all(each == found[0] for each in found), found
+        return found[0]
+
+    async def looks(self, seconds: float) -> None:
+        """Look at the first channel every millisecond."""
+        began = threads.now()
+        for _ in range(round(1000 * seconds)):
+            self.seen.append((threads.now() - began, self.level))
+            await asyncio.sleep(0.001)
+
+    @property
+    def audible(self) -> list[float]:
+        """When it was, since the looks began [s]."""
+        return [time for time, level in self.seen if level > AUDIBLE]
+
+    @property
+    def audible_until(self) -> float:
+        """When it was audible last."""
+        return self.audible[-1]
+
+    @property
+    def audible_for(self) -> float:
+        """From when it was first."""
+        return self.audible[-1] - self.audible[0]
+
+    @property
+    def highest(self) -> float:
+        """The highest level seen."""
+        return max(level for _, level in self.seen)
+
+    def source_fails(self, is_failing: bool) -> None:
+        """Let what says who shall feel something fail, or work again."""
+        self.source.fails = is_failing
+
+    @property
+    def pings_amid(self) -> int:
+        """How many heartbeats came between a commit that was aborted and its silence."""
+        return sum(
+            end.times("Commit")[0] <= time <= end.times("Silence")[0]
+            for end in self.far_ends
+            for time in end.times("Ping")
+        )
+
+    def touch_for(self, timeout: float, *fingers: str) -> None:
+        """Put fingers down by a source that says how long they stay without a frame."""
+        self.timeout = timeout
+        self.touch(*fingers)
+
+    def presses(self, *loads: float) -> None:
+        """Have a finger down, and beside it one of each load."""
+        touches = Touch(1, 0.5, 0.5), *(Touch(2, 0.9, 0.9, load=load) for load in loads)
+        self.deliver(TouchFrame("panel", threads.now(), touches))
+
+    async def waits_for(self, kind: str) -> None:
+        """Wait until one more request of a kind has come."""
+        count = len(self.far_end.requests(kind))
+        while len(self.far_end.requests(kind)) == count:  # noqa: ASYNC110
+            await asyncio.sleep(0.0001)
+
+    def is_disarmed_by_another(self, of: int) -> None:
+        """Let another program disarm an amplifier; the sessions so far are noted."""
+        self.sessions = {each.amplifier.session for each in self.far_ends}
+        self.far_ends[of].obey("Disarm", {"ramp": 0}, threads.now())
+
+    @property
+    def keeps_a_session(self) -> bool:
+        """Whether an amplifier is in one of these."""
+        return not self.sessions.isdisjoint({each.amplifier.session for each in self.far_ends})
+
+
+def _knots(envelope: object) -> int:
+    return len(envelope.knots) if isinstance(envelope, Envelope) else 0
+
+
+def _lines(envelope: object) -> dict[str, Any]:
+    assert isinstance(envelope, Envelope)
+    levels, phases = zip(*envelope.knots, strict=True)
+    return {"step": envelope.step, "phases": {*phases}, "levels": [*levels]}
+
+
+def _valid_for(one: Sent) -> float:
+    return QUANTITIES["valid_for"].from_wire(one.layer.valid_for)
+
+
+@asynccontextmanager
+async def played(
+    *amplifiers: str,
+    shapes: Mapping[str, float] | None = None,
+    intents: str = "newest",
+    **options: Any,
+) -> AsyncIterator[Played]:
+    """A chain, armed; shapes: of a timing with envelopes; intents: of `SOURCES`."""
+    timing = SetTiming() if shapes is None else Shapes(**shapes)
+    given = {"knots": 0 if shapes is None else 32, "timing": timing, **options}
+    source = SOURCES[intents]()
+    async with set_running(*amplifiers, of=Played, intent_source=source, **given) as chain:
+        chain.timing, chain.source = timing, source
+        yield chain
+
+
+SOURCES: Mapping[str, Callable[[], Any]] = {
+    "newest": BuzzNewestContact,
+    "all": Always,
+    "clicks": lambda: EffectPlayer(SurfaceLayout(effects={"click": Click()}, elsewhere="click")),
+}
+AUDIBLE = 1e-3  # of full level
+
+
 COURSES = courses(Path(__file__).with_name("courses.yaml"))
 
 
 @pytest.mark.parametrize("name", COURSES)
 def test_control_loop_keeps_to_its_course(name: str) -> None:
     """Every step is as it is in the file."""
-    follow({"of": Acted, **COURSES[name]}, set_running)
-
-
-def now() -> float:
-    """The loop's time [s]."""
-    return asyncio.get_running_loop().time()
-
-
-@in_virtual_time
-async def test_controller_decides_anew_for_a_load_that_doubles_not_for_one_that_wavers() -> None:
-    """A panel at 100 Hz whose pressure wavers by a third in load, then doubles, then comes back."""
-
-    def press(*loads: float) -> None:
-        touches = (Touch(1, 0.5, 0.5), *(Touch(2, 0.9, 0.9, load=load) for load in loads))
-        chain.deliver(TouchFrame("panel", now(), touches))
-
-    async with set_running() as chain:
-        for base, decisions in ((1.0, 1), (2.0, 2), (1.2, 3)):
-            for number in range(50):
-                press(base * (1.15 if number % 2 else 1 / 1.15))
-                await asyncio.sleep(0.01)
-            assert len(chain.table.asked) == decisions
-        asked = [tuple(each.load for each in fingers) for fingers in chain.table.asked]
-    assert asked == [(1.0, 1.0), (pytest.approx(2 / 1.15), 1.0), (pytest.approx(1.2 / 1.15), 1.0)]
-
-
-@in_virtual_time
-async def test_a_hand_is_asked_for_with_its_load_and_feels_nothing() -> None:
-    """The newest contact is to buzz: a hand that comes after a finger is none of those."""
-
-    def touch(*hands: float) -> None:
-        touches = (Touch(1, 0.5, 0.5), *(Touch(2, 0.9, 0.9, load=each) for each in hands))
-        chain.deliver(TouchFrame("panel", now(), touches))
-
-    async with set_running() as chain:
-        for hands in ((), (HAND_LOAD,), ()):
-            for _ in range(10):
-                touch(*hands)
-                await asyncio.sleep(0.01)
-        asked = [[(each.load, each.stimulus is None) for each in one] for one in chain.table.asked]
-    assert asked == [[(1.0, False)], [(1.0, False), (HAND_LOAD, True)], [(1.0, False)]]
+    follow(COURSES[name], played)
 
 
 @in_virtual_time
@@ -139,21 +409,6 @@ async def test_controller_survives_a_failing_observer(caplog: pytest.LogCaptureF
         assert [each.is_silent for each in chain.far_end.sent()] == [True, False, True]
         assert len(chain.far_end.requests("Ping")) > 3
     assert "no disk space for this row" in caplog.text
-
-
-@in_virtual_time
-async def test_latency_counts_from_the_touch_though_its_first_set_is_lost() -> None:
-    """No reply for 80 ms from the moment that a finger comes down: a touch, not quicker than so."""
-    async with set_running() as chain:
-        chain.far_end.fault("drop", toward="host")
-        begin = now()
-        await chain.leave(0.08, FINGER)
-        chain.far_end.recover()
-        await chain.leave(0.2, FINGER)
-        applied = chain.applied[0]
-        assert applied.is_touch
-        assert applied.latency == pytest.approx(applied.time - begin)
-        assert applied.latency >= 0.08
 
 
 PLAYED = SurfaceLayout(LAYOUT.regions, {**default_effects(), **LAYOUT.effects}, elsewhere=None)
@@ -315,44 +570,6 @@ async def test_unexpected_exception_stops_all(kind: str) -> None:
             await running  # type: ignore[misc]
         assert states(chain) == {STOPPED}
         assert chain.controller.group.state is GroupState.STOPPED
-
-
-@in_virtual_time
-async def test_arm_arms_all_anew_when_one_no_longer_is() -> None:
-    """One that another program has disarmed plays again, in sessions of which none was held."""
-    async with set_running("a", "b", breaks="state") as chain:
-        held = {end.amplifier.session for end in chain.far_ends}
-        chain.far_ends[0].obey("Disarm", {"ramp": 0}, asyncio.get_running_loop().time())
-        await chain.controller.arm()
-        assert states(chain) == {ENABLED}
-        assert held.isdisjoint({end.amplifier.session for end in chain.far_ends})
-
-
-@in_virtual_time
-async def test_incomplete_set_is_silenced_before_the_next() -> None:
-    """A lift aborts the wait for commits, and a finger comes before silence: silence goes first.
-
-    Some amplifiers may play the aborted set and others not, which is another pattern. The heartbeat
-    that is due meanwhile waits for this silence.
-    """
-    async with set_running("a", "b") as chain:
-        await asyncio.sleep(0.02)  # the heartbeat is due 50 ms after the first
-        for end in chain.far_ends:
-            end.delay(0.02)
-        chain.put(FINGER)
-        await asyncio.sleep(0.025)  # staged after 20 ms, and the commits wait for their replies
-        assert [len(end.requests("Commit")) for end in chain.far_ends] == [1, 1]
-        chain.put()
-        chain.put(OTHER)
-        await chain.hold(0.2, down=[OTHER])
-        for end in chain.far_ends:
-            after_arming, *sent = [
-                name for name in end.names() if name in ("Set", "Commit", "Silence")
-            ]
-            assert after_arming == "Silence"
-            assert sent == ["Set", "Commit", "Silence", "Set", "Commit"]
-            commit, silence = end.times("Commit")[0], end.times("Silence")[1]
-            assert not [time for time in end.times("Ping") if commit <= time <= silence]
 
 
 @in_virtual_time

@@ -50,7 +50,7 @@ SLOWEST = (
     "test_sound_card.py",
     "test_errors.py",
     "test_dashboard.py",
-    "test_contents_at_once.py",
+    "test_contents.py",
     "test_clocks_of_a_group.py",
     "test_python_api.py",
     "test_courses_at_fingers.py",

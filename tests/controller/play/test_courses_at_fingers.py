@@ -1,12 +1,13 @@
 """Files of content at fingers, played over a wire in virtual time on the simulated plate.
 
 Beside other effects and each other, at the edge of the plate, and at other fingers; how far strong
-programs move magnets and how much they heat coils at the frequencies that move magnets most.
+programs, onsets and endings move magnets, sample by sample in another solution, and how much
+programs heat coils at the frequencies that move magnets most.
 """
 
 import logging
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -21,20 +22,24 @@ from controller.effects.effect import Effect, Region
 from controller.effects.kinds import Buzz, Click, File, Texture
 from controller.effects.layout import SurfaceLayout
 from controller.effects.player import EffectPlayer
+from controller.play.routing import RAMPS_ONLY, PlaybackCapabilities
 from controller.sources.touch import Contact, ContactKey
 from long_form import shortly
+from model.answer.answer import Answer, Limits
 from model.answer.answer_report import Timing
-from model.answer.stimulus import STRONGEST
-from model.arrays import ComplexArray
+from model.answer.plan import answer
+from model.answer.stimulus import STRONGEST, Finger, Stimulus
+from model.arrays import ComplexArray, Point
 from model.config.fields import Circle, Rectangle
 from model.rig.rig import Rig, Uncertainty
 from model.rig.rig_file import load_rig, parse_rig
 from model.table.table import LocalizationTable
 from model.table.table_file import build_table
+from model.transients.base_motion import Envelopes
 from several_fingers import ABOVE, LEFT, RIGHT, Fingers, fingers_on
 from several_fingers import table as paper_table
 from sim.far_ends.wire_assignment import SimulatedWire
-from sound_cards import Magnets, Outputs
+from sound_cards import STEP, Magnets, Outputs
 from virtual_lines import in_virtual_time, run_virtual
 
 SWELL = Pattern(1.5, ((0.0, 0.3), (0.7, 1.0), (1.5, 0.2)), ((0.0, 0.4),))
@@ -153,7 +158,7 @@ def rig(name: str) -> Rig:
     assert reach in text
     if name == "large":
         text = text.replace("DAEX25CT-4", "DAEX25FHE-4").replace("power: 1 W", "power: 24 W")
-    low = {"weekend": 90, "low": 60, "large": 40}[name]
+    low = {"weekend": 90, "low": 60, "onsets": 45, "large": 40}[name]
     found = parse_rig("rig.yaml", text.replace(reach, f"frequency: [{low} Hz, 300 Hz]"))
     return replace(found, uncertainty=Uncertainty.none())
 
@@ -306,6 +311,81 @@ def test_programs_keep_magnets_within_their_excursion(name: str) -> None:
     _logger.info("%s: %.2f of x_max, %.2g W", name, share, heat)
     assert 0.15 < share < 1.01
     assert heat < {"weekend": 10.0, "low": 10.0, "large": 24.0}[program.rig]
+
+
+ALLOWED = 0.5e-3  # m
+PAIRS = (((0.1, 0.1), (0.3, 0.2)), ((0.3, 0.22), (0.15, 0.1)))
+
+
+def onset_table() -> LocalizationTable:
+    """Of frequencies near the magnets' resonances, and one above."""
+    return table("onsets", (60.0, 70.0, 90.0, 120.0))
+
+
+def voltages(envelopes: Iterable[Envelopes]) -> ComplexArray:
+    """What each exciter gets (n, eras) of envelopes that begin together, and 50 ms of the last."""
+    times = STEP * np.arange(1600)
+    found = np.zeros((len(times), len(onset_table().eras)), dtype=complex)
+    for number, era in enumerate(onset_table().eras):
+        for each in envelopes:
+            if era.name in each:
+                one = each[era.name]
+                turning = np.exp(2j * np.pi * one.frequency * times)
+                found[:, number] += one.amplitude(times) * turning
+    return found
+
+
+def furthest(volts: ComplexArray) -> float:
+    """The largest motion [m] of a magnet from rest, in whichever phase."""
+    return float(np.abs(magnets("onsets").moved(volts)).max())
+
+
+def shaped(frequency: float) -> Iterable[Answer]:
+    """Answers for one of two fingers with as much as exciters give, with envelopes."""
+    for target, quiet in PAIRS:
+        fingers = [Finger(target, Stimulus(60.0, band_hz=(frequency, frequency))), Finger(quiet)]
+        yield Timing(onset_table()).shaped(
+            answer(onset_table(), fingers, drive_mode="phased", shaped=True)
+        )
+
+
+@pytest.mark.parametrize("frequency", [60.0, 70.0, 90.0])
+def test_onsets_keep_magnets_within_their_excursion(frequency: float) -> None:
+    """At the most that is asked, along shaped onsets and along a jump, in either phase."""
+    largest = []
+    for found in shaped(frequency):
+        (layer,) = found.layers
+        assert layer.onset is not None
+        largest.append(furthest(voltages([layer.onset])))
+        full = np.array([layer.excitation[era.name].phasor for era in onset_table().eras])
+        largest.append(furthest(jump(full, frequency)))
+    assert 0.6 * ALLOWED < max(largest) < 1.01 * ALLOWED
+
+
+def jump(amplitudes: ComplexArray, frequency: float) -> ComplexArray:
+    """Voltages (n, eras) of a tone that begins within a millisecond."""
+    times = STEP * np.arange(1600)
+    turning = np.exp(2j * np.pi * frequency * times) * np.minimum(times / 1e-3, 1)
+    return np.asarray(turning[:, None] * amplitudes)
+
+
+def test_contents_together_keep_magnets_within_their_excursion() -> None:
+    """Of a tone at 70 Hz that takes half of it, and one at 90 Hz that wants all beside it."""
+    largest, every = [], PlaybackCapabilities("phased", ("phased",), Limits(), RAMPS_ONLY)
+    for first, second in PAIRS:
+        one = alone(first, 70.0, Limits(excursion=0.5))
+        other = alone(second, 90.0, every.left_by(one.layers, onset_table()).limits)
+        onsets = [layer.onset for layer in (*one.layers, *other.layers) if layer.onset]
+        assert len(onsets) == 2
+        largest.append(furthest(voltages(onsets)))
+    assert 0.3 * ALLOWED < max(largest) < 1.01 * ALLOWED
+
+
+def alone(at: Point, frequency: float, limits: Limits) -> Answer:
+    """All that one finger can have within limits."""
+    finger = Finger(at, Stimulus(60.0, band_hz=(frequency, frequency)))
+    found = answer(onset_table(), [finger], drive_mode="phased", shaped=True, limits=limits)
+    return Timing(onset_table()).shaped(found)
 
 
 LEAKING = SurfaceLayout(

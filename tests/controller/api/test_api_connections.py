@@ -18,10 +18,7 @@ from controller.api.client import AsyncClient, Client
 from controller.api.methods import METHODS, TOPICS, ContactsEvent, EventParams, LogEvent
 from controller.api.schema import MAX_RATE, ApiMessage
 from controller.api.server import (
-    MAX_CONNECTIONS,
-    MAX_REQUEST_RATE,
     MAX_UNREAD_BYTES,
-    RESERVE,
     Connection,
     Hub,
 )
@@ -151,11 +148,6 @@ async def test_daemon_sends_exactly_the_documented_keys(tmp_path: Path) -> None:
 
 
 REQUEST = request("renew", '{"lease":"a"}')
-ARM = request("arm", '{"owner":"me","lease_s":5}', id=1)
-TOUCH = request("touch", '{"source":"a","touches":[]}', id=1)
-TOUCH_DOWN = TOUCH.replace(b"[]", b'[{"id":1,"x_m":0.1,"y_m":0.1}]')
-LOOKALIKE = request("renew", '{"lease":"stop"}')
-STOP = request("stop")
 
 
 def serve() -> ServedApi:
@@ -195,78 +187,6 @@ async def test_turn_ends_with_the_line_after_a_tenth_of_a_millisecond(
     feed(served.client()[0], REQUEST * 10)
     await iterate(3)
     assert lines == 4
-
-
-@in_virtual_time
-async def test_client_that_touches_waits_for_no_other_client() -> None:
-    """Its frames go before all that 30 ask without end, until 150 ms after its last one.
-
-    The others have their turns all the same.
-    """
-    served = serve()
-    touching, _ = served.client()
-    feed(touching, TOUCH_DOWN * 8)
-    asking = [served.client()[0] for _ in range(30)]
-    for each in asking:
-        feed(each, REQUEST * 100)
-    await iterate(40)
-    assert served.names[:15] == ["touch", *["touch", "renew"] * 7]  # at first it has not touched
-    await served.settle()
-    await asyncio.sleep(0.16)
-    others = len(served.names)
-    assert others == 3008
-    for each in asking:
-        feed(each, REQUEST)
-    feed(touching, TOUCH_DOWN)
-    await served.settle()
-    assert served.names[others:] == ["renew"] * 30 + ["touch"]
-
-
-@in_virtual_time
-async def test_requests_wait_while_a_touch_is_on_its_way_to_the_wire() -> None:
-    """Until it is sent, and for 3 ms at most if touches follow each other without a gap."""
-    served = serve()
-    client, _ = served.client()
-    served.is_busy = True
-    feed(client, REQUEST * 4)
-    await asyncio.sleep(0.0029)
-    assert served.calls == []
-    await asyncio.sleep(0.0049)
-    assert served.times("renew") == pytest.approx([0.003, 0.0065], abs=0.001)
-    served.is_busy = False
-    await asyncio.sleep(0.0006)
-    assert len(served.times("renew")) == 4
-
-
-@in_virtual_time
-async def test_stop_is_served_at_once_though_touches_come_first() -> None:
-    """Also behind other requests of its client, and in two parts."""
-    served = serve()
-    client, _ = served.client()
-    served.is_busy = True
-    feed(client, TOUCH * 100)
-    await asyncio.sleep(0.001)
-    assert served.calls == []
-    feed(client, STOP[:-5])
-    feed(client, STOP[-5:])
-    await asyncio.sleep(0.0001)
-    assert served.times("stop") == [pytest.approx(0.001)]
-    assert len(served.times("touch")) == 100
-
-
-@in_virtual_time
-async def test_lines_that_only_look_like_a_stop_keep_no_other_client_waiting() -> None:
-    """With a stop of another client among them, which comes first after one of them."""
-    served = serve()
-    for _ in range(3):
-        feed(served.client()[0], LOOKALIKE * 100)
-    feed(served.client()[0], REQUEST)
-    stopping, _ = served.client()
-    feed(stopping, STOP)
-    await iterate(12)
-    assert served.names.index("stop") <= 4
-    renewed = [params.model_dump()["lease"] for name, params, _ in served.calls if name == "renew"]
-    assert "a" in renewed
 
 
 def connect(now: Callable[[], float]) -> tuple[Connection, Wire]:
@@ -321,34 +241,6 @@ def test_client_that_does_not_read_loses_notifications_then_the_connection() -> 
         for _ in range(500):
             connection.notify(make)
     assert wire.is_aborted
-
-
-async def test_server_limits_the_request_rate_except_for_stop_and_touch() -> None:
-    """After 2000 requests at once the next is refused; stop and touch are served."""
-    served, client, _ = serving()
-    for line in [request("disarm")] * (int(MAX_REQUEST_RATE) + 1):
-        await served.takes(client, line)
-    assert served.names == ["disarm"] * 2000
-    for line in (
-        request("stop"),
-        request("touch", '{"source":"a","touches":[]}'),
-        request("clear"),
-    ):
-        await served.takes(client, line)
-    assert served.names[2000:] == ["stop", "touch"]
-
-
-async def test_refused_requests_count_in_the_rate() -> None:
-    """Whatever is wrong with them: after 2000 at once the connection is closed."""
-    for wrong in (b"\n", b"{}\n", request("nothing"), request("stop", '{"x":1}')):
-        served, client, wire = serving()
-        for _ in range(int(MAX_REQUEST_RATE)):
-            wire.waiting = b""
-            await served.takes(client, wrong)
-        assert client.is_open
-        await served.takes(client, wrong)
-        assert wire.is_aborted
-        assert wire.lines()[-1]["error"]["code"] == 1005
 
 
 API_BOUNDS_TOUCH = '{"id":1,"x_m":0.1,"y_m":0.1}'
@@ -421,52 +313,6 @@ async def test_no_line_takes_longer_than_some_fixed_work(name: str) -> None:
         runs.append(await callback_times(HEAVY[name]))
     longest = max(map(min, zip(*runs, strict=False)))
     assert longest < min(references)
-
-
-@pytest.mark.parametrize(
-    ("idle", "dropped"),
-    [
-        ([("holder", 99), ("pending", 99), ("asking", 0.9)], None),
-        ([("holder", 99), ("asking", 2), ("asking", 3)], 2),
-        ([("asking", 1.1), ("pending", 3)], 0),
-    ],
-)
-async def test_place_is_taken_from_the_client_that_is_idle_for_longest(
-    idle: list[tuple[str, float]], dropped: int | None
-) -> None:
-    """If it is so for a second; never from the holder of the lease, or from one that waits."""
-    served, made = ServedApi(), []
-    for kind, duration in [*idle, *[("asking", 0.0)] * (MAX_CONNECTIONS - len(idle))]:
-        served.clock = lambda duration=duration: 100.0 - duration  # type: ignore[misc]
-        client, wire = served.client()
-        await served.takes(client, ARM if kind == "pending" else REQUEST)
-        served.holder = client if kind == "holder" else served.holder
-        made.append(wire)
-    served.clock = lambda: 100.0
-    new, _ = served.client()
-    assert new.is_reserve is (dropped is None)
-    gone = [number for number, wire in enumerate(made) if wire.is_aborted]
-    assert gone == ([] if dropped is None else [dropped])
-    served.may_arm.set()
-    await served.settle()
-
-
-async def test_client_in_reserve_survives_a_process_that_connects_again_and_again() -> None:
-    """Before its first bytes and after them; the reserve stays bounded."""
-    now = 0.0
-    served = ServedApi(clock=lambda: now)
-    for _ in range(MAX_CONNECTIONS):
-        served.client()
-    flooding: list[Wire] = []
-    own, wire = served.client(process=4711)
-    for line in (b"", request("hello", '{"client":"a"}', id=1), request("stop", id=2)):
-        for _ in range(1000):
-            now += 0.0002
-            flooding.append(served.client(process=1)[1])
-        assert own.is_open
-        await served.takes(own, line)
-        assert ["result" in each for each in wire.lines()] == ([True] if line else [])
-    assert sum(not each.is_aborted for each in flooding) == RESERVE - 1
 
 
 async def test_hub_survives_an_exception_of_a_producer(caplog: pytest.LogCaptureFixture) -> None:

@@ -2,9 +2,15 @@
 
 import asyncio
 import json
+import re
 import socket
-from contextlib import suppress
+from collections import Counter
+from collections.abc import AsyncIterator, Mapping
+from contextlib import asynccontextmanager, suppress
+from dataclasses import dataclass, field
+from itertools import groupby
 from pathlib import Path
+from typing import Any
 from unittest.mock import Mock
 
 import pytest
@@ -24,41 +30,182 @@ from controller.api.jsonrpc import (
 )
 from controller.api.methods import METHODS, ArmParams, StatusResult, SubscribeParams
 from controller.api.schema import ApiMessage, Empty
-from controller.api.server import ApiServer
-from daemons import PATIENCE, ServedApi, request, serving
+from controller.api.server import ApiServer, Connection
+from courses import Taken, courses, fits, follow
+from daemons import PATIENCE, ServedApi, Wire, request, serving
+from registry import threads
 from virtual_lines import feed
 
-ARM = '{"owner":"me","lease_s":5}'
+PARAMS = {
+    "arm": '{"owner":"me","lease_s":5}',
+    "disarm level": '{"level":2}',
+    "hello": '{"client":"a"}',
+    "renew": '{"lease":"a"}',
+    "renew stop": '{"lease":"stop"}',
+    "stop x": '{"x":1}',
+    "touch": '{"source":"a","touches":[]}',
+    "touch down": '{"source":"a","touches":[{"id":1,"x_m":0.1,"y_m":0.1}]}',
+}
+"""Parameters of requests by their names, of which the first word is the method."""
 
 
-async def test_server_continues_after_invalid_lines() -> None:
-    """Invalid JSON, requests, methods and parameters get an error each; the next line is served."""
-    served, client, wire = serving()
-    feed(client, b"garbage\n\n\xff\n[]\n" + request("no_such_method", id=1))
-    await served.takes(client, request("disarm", '{"level": 2}', id=1) + request("disarm", id=9))
-    *errors, last = wire.lines()
-    codes = [each["error"]["code"] for each in errors]
-    assert codes == [-32700, -32700, -32700, -32600, -32601, -32602]
-    assert last == {"jsonrpc": "2.0", "id": 9, "result": {}}
-    assert served.names == ["disarm"]
+def bytes_of(line: str | Mapping[Any, Any]) -> bytes:
+    """A request by its name, so many of a line, or raw bytes."""
+    if isinstance(line, Mapping):
+        ((key, each),) = line.items()
+        return each.encode("latin-1") if key == "raw" else key * bytes_of(each)
+    name, _, id = line.partition(" #")
+    return request(name.split()[0], PARAMS.get(name, "{}"), id=id or None)
 
 
-async def test_server_closes_when_a_line_exceeds_64_kib() -> None:
-    """65 536 bytes with the line feed are served; a byte more, complete or not, is refused."""
-    served = ServedApi()
-    head, tail = b'{"jsonrpc":"2.0","id":1,"method":"disarm"', b"}\n"
-    longest = head + b" " * ((1 << 16) - len(head) - len(tail)) + tail
-    for line, is_served in (
-        (longest, True),
-        (longest[:-2] + b" }\n", False),
-        (b"x" * 65536, False),
-    ):
-        client, wire = served.client()
-        await served.takes(client, line)
-        (reply,) = wire.lines()
-        assert ("result" in reply, client.is_open) == (is_served, is_served)
-        assert is_served or reply["error"]["code"] == -32700
-    assert served.names == ["disarm"]
+@dataclass
+class Clients(Taken):
+    """Clients of a server in memory, by their names, and what they do; marked: of the calls."""
+
+    served: ServedApi = field(init=False)
+    made: dict[str, tuple[Connection, Wire]] = field(default_factory=dict)
+    marked: int = 0
+
+    def __post_init__(self) -> None:
+        """Make the server, which counts time from now on."""
+        began = threads.now()
+        self.served = ServedApi(clock=lambda: threads.now() - began)
+
+    def of(self, name: str) -> list[tuple[Connection, Wire]]:
+        """The client of a name, or those that differ by a number."""
+        return [each for key, each in self.made.items() if name in (key, key.rpartition(" ")[0])]
+
+    def connects(self, name: str) -> None:
+        """Connect a client."""
+        self.connects_of(1, name)
+
+    def connects_of(self, process: int, name: str) -> None:
+        """Connect a client of a process."""
+        self.made[name] = self.served.client(process=process)
+
+    def connects_many(self, count: int, name: str) -> None:
+        """Connect so many more, whose names end in numbers."""
+        for _ in range(count):
+            self.connects(f"{name} {len(self.made)}")
+
+    def sends(self, name: str, *lines: str | Mapping[Any, Any]) -> None:
+        """Let clients send lines at once."""
+        for client, _ in self.of(name):
+            feed(client, b"".join(map(bytes_of, lines)))
+
+    async def takes(self, name: str, *lines: str | Mapping[Any, Any]) -> None:
+        """Do the same for one after the other, and serve what is to be served at once."""
+        for client, _ in self.of(name):
+            await self.served.takes(client, b"".join(map(bytes_of, lines)))
+
+    async def settles(self) -> None:
+        """Serve what is to be served at once."""
+        await self.served.settle()
+
+    async def turns(self, count: int) -> None:
+        """Let the event loop turn so often."""
+        for _ in range(count):
+            await asyncio.sleep(0)
+
+    def hears(self, name: str, *lines: str) -> None:
+        """Require the responses to each of some clients since the last that it read."""
+        for _, wire in self.of(name):
+            found = [
+                f"{json.dumps(each['id'])} {each.get('error', {}).get('code', 'result')}"
+                for each in wire.lines()
+            ]
+            assert found == [*lines]
+
+    def reads(self) -> None:
+        """Let all clients read, and forget, what was sent to them."""
+        for _, wire in self.made.values():
+            wire.waiting = b""
+
+    def ends_its_input(self, name: str) -> None:
+        """Let a client close its side."""
+        self.made[name][0].eof_received()
+
+    def leaves(self, name: str) -> None:
+        """Let a client be gone."""
+        client, wire = self.made[name]
+        wire.abort()
+        client.connection_lost(None)
+
+    def is_busy(self, is_so: bool) -> None:
+        """Let a touch be on its way to the wire, or none."""
+        self.served.is_busy = is_so
+
+    def arming_may_end(self) -> None:
+        """Let all that is to be armed be."""
+        self.served.may_arm.set()
+
+    def holds_the_lease(self, name: str) -> None:
+        """Let a client be its holder."""
+        self.served.holder = self.made[name][0]
+
+    def marks(self) -> None:
+        """Look at the calls from now on."""
+        self.marked = len(self.names)
+
+    def calls_first(self, *names: str) -> None:
+        """Require the first calls."""
+        assert self.names[: len(names)] == [*names]
+
+    def served_at(self, method: str, *times: str) -> None:
+        """Require when a method was called."""
+        assert fits(self.served.times(method), [*times]), self.served.times(method)
+
+    @property
+    def names(self) -> list[str]:
+        """Names of the methods called."""
+        return self.served.names
+
+    @property
+    def runs(self) -> list[tuple[str, int]]:
+        """Names of calls since the mark, and how often in a row."""
+        return [(name, len([*some])) for name, some in groupby(self.names[self.marked :])]
+
+    @property
+    def stop_at(self) -> int:
+        """How many calls came before the first stop."""
+        return self.names.index("stop")
+
+    @property
+    def leases(self) -> list[str]:
+        """Leases that were renewed."""
+        calls = self.served.calls
+        return [params.model_dump()["lease"] for name, params, _ in calls if name == "renew"]
+
+    @property
+    def open_clients(self) -> Mapping[str, int]:
+        """How many are connected of each name, numbers left out."""
+        names = [name for name, (client, _) in self.made.items() if client.is_open]
+        return Counter(re.sub(r" \d+$", "", name) for name in names)
+
+    @property
+    def in_reserve(self) -> list[str]:
+        """Clients with a place in reserve."""
+        return [name for name, (client, _) in self.made.items() if client.is_reserve]
+
+
+@asynccontextmanager
+async def clients(*, turn: float = 0.0) -> AsyncIterator[Clients]:
+    """A server without clients; turn [s]: how long one is, none for a line of each client."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(server, "MAX_TURN", turn)
+        found = Clients()
+        yield found
+        found.arming_may_end()
+        await found.settles()
+
+
+COURSES = courses(Path(__file__).with_name("served.yaml"))
+
+
+@pytest.mark.parametrize("name", COURSES)
+def test_clients_are_served_by_their_course(name: str) -> None:
+    """Every step is as it is in the file."""
+    follow(COURSES[name], clients)
 
 
 async def test_connection_that_is_accepted_amid_closing_is_closed(tmp_path: Path) -> None:
@@ -77,13 +224,6 @@ async def test_connection_that_is_accepted_amid_closing_is_closed(tmp_path: Path
             with suppress(ConnectionResetError):  # it was never accepted
                 async with asyncio.timeout(PATIENCE / 6):
                     assert await asyncio.get_running_loop().sock_recv(client, 1) == b""
-
-
-async def test_request_without_id_gets_no_response() -> None:
-    """Not even an error; and without an id nothing is armed, as its lease would be unknown."""
-    served, client, wire = serving()
-    await served.takes(client, request("disarm") + request("nothing") + request("arm", ARM))
-    assert (wire.lines(), served.names) == ([], ["disarm"])
 
 
 async def test_bug_in_a_method_is_reported_without_details(
@@ -127,72 +267,6 @@ async def test_server_stops_all_when_a_stop_fails_on_its_way(
     await served.takes(client, request("stop", id=1) + request("status", id=2))
     assert served.stops == 1
     assert {"error" in line for line in wire.lines()} == {True}
-
-
-@pytest.mark.parametrize("silencing", ["stop", "disarm"])
-async def test_arm_is_not_carried_out_after_what_silences(
-    monkeypatch: pytest.MonkeyPatch, silencing: str
-) -> None:
-    """Both in the same bytes: it ends disarmed; the other way round it is armed."""
-    monkeypatch.setattr(server, "MAX_TURN", 1.0)  # else the arming may have begun by then
-    served = ServedApi()
-    served.may_arm.set()
-    client, wire = served.client()
-    await served.takes(client, request("arm", ARM, id=1) + request(silencing, id=2))
-    assert served.names == [silencing]
-    assert [line["error"]["code"] for line in wire.lines() if line["id"] == 1] == [ErrorCode.LEASE]
-    await served.takes(client, request(silencing, id=3) + request("arm", ARM, id=4))
-    assert served.names == [silencing] * 2 + ["arm"]
-
-
-async def test_stop_is_served_while_requests_are_pending() -> None:
-    """Eight may be pending, further ones are refused, a stop is served at once."""
-    served, client, wire = serving()
-    await served.takes(client, b"".join(request("arm", ARM, id=id) for id in range(10)))
-    await served.takes(client, request("stop", id=99))
-    lines = wire.lines()
-    assert {line["id"] for line in lines} == {8, 9, 99}
-    assert [line["error"]["code"] for line in lines if "error" in line] == [1005, 1005]
-    served.may_arm.set()
-    await asyncio.gather(*client.pending)
-    assert {line["id"] for line in wire.lines()} == set(range(8))
-
-
-async def test_client_that_closed_its_side_gets_pending_responses() -> None:
-    """End of input, then the responses, then the end; only arming is for those who stay."""
-    served, client, wire = serving()
-    feed(client, request("stop", id=1) + request("arm", ARM, id=2))
-    client.eof_received()
-    assert client.is_open
-    await served.settle()
-    assert {each["id"]: "result" in each for each in wire.lines()} == {1: True, 2: False}
-    assert (client.is_open, served.names) == (False, ["stop"])
-
-
-async def test_stop_is_served_among_silent_and_asking_clients() -> None:
-    """With 160 silent connections after 32 that ask: a place in reserve stops, but does not arm.
-
-    They are those of another process.
-    """
-    served = ServedApi()
-    asking = [served.client() for _ in range(32)]
-    for client, wire in asking:
-        await served.takes(client, request("effects", id=1))
-        assert "result" in wire.lines()[0]
-    for _ in range(160):
-        served.client()
-    client, wire = served.client(process=2)
-    feed(client, request("effects", id=1) + request("hello", '{"client":"me"}', id=2))
-    await served.takes(
-        client, b"".join(request(each, id=3) for each in ("status", "stop", "disarm"))
-    )
-    replies = wire.lines()
-    assert ["result" in each for each in replies] == [False, True, True, True, True]
-    assert replies[0]["error"]["code"] == 1005
-    asking[0][1].abort()
-    asking[0][0].connection_lost(None)
-    await served.takes(client, request("effects", id=1))
-    assert "result" in wire.lines()[0]  # there is a place for all methods now
 
 
 def refusal(line: bytes) -> RpcError:

@@ -1,9 +1,12 @@
 """The pages of protocol 4: a frame of each wire by hand, the files for masters and monitors."""
 
 import json
+import random
 import re
+import struct
 import textwrap
 import zlib
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +15,29 @@ import cantools
 import pytest
 
 from drivers.playing import Playback
+from drivers.protocol.definition import (
+    COMMAND,
+    ENVELOPE,
+    EVENT,
+    EVENT_RECORD,
+    FAULTS,
+    FEATURES,
+    HELLO,
+    IDENTITY,
+    KNOT,
+    LAYER,
+    MESSAGES,
+    NAK,
+    NAK_RECORD,
+    QUANTITIES,
+    READING_STATES,
+    REFUSALS,
+    SENSOR_UNITS,
+    STATES,
+    STATUS_FLAGS,
+    sensor_reading,
+)
+from drivers.protocol.records import Record
 from drivers.protocol.sets import Command, Envelope, LayerSet
 from era_haptics.lab.conformance.contract import CHECKS
 from protocol_bytes import BYTES
@@ -234,52 +260,87 @@ def test_checks_that_the_page_names_are_those_of_conformance() -> None:
 SHEET = json.loads((DOCS / "amplifier.json").read_text("utf-8"))
 
 
-def packed(fields: list[Any], values: dict[str, Any]) -> list[int]:
+RECORDS: dict[str, tuple[list[Any], Record]] = {
+    "Hello": (SHEET["messages"]["Hello"]["reply"], IDENTITY),
+    "Event": (SHEET["messages"]["Event"]["reply"], EVENT_RECORD),
+    "Nak": (SHEET["messages"]["Nak"]["reply"], NAK_RECORD),
+    "sensor_of_a_reading": (SHEET["records"]["sensor_of_a_reading"], sensor_reading(1)),
+    **{
+        name: (SHEET["records"][name.lower()], record)
+        for name, record in {
+            **{"Layer": LAYER, "Command": COMMAND, "Envelope": ENVELOPE, "Knot": KNOT}
+        }.items()
+    },
+    **{
+        f"{name}, request": (SHEET["messages"][name]["request"], m.request)
+        for name, m in MESSAGES.items()
+    },
+    **{
+        f"{name}, reply": (SHEET["messages"][name]["reply"], m.reply)
+        for name, m in MESSAGES.items()
+    },
+}
+ROWS = 3
+
+
+def packed(fields: list[Any], values: Mapping[str, Any]) -> list[int]:
     """The words of values by amplifier.json alone."""
     words: list[int] = []
     for field in fields:
-        if field["kind"] == "number":
-            size = 32 if SHEET["quantities"][field["quantity"]]["type"] == "u32" else 16
-            number = values[field["name"]] % (1 << size)
-            words += [number >> 16, number & 0xFFFF] if size == 32 else [number]
-        elif field["kind"] == "bits":
-            word = 0
-            for part in field["parts"]:
-                word = word << part["bits"] | values.get(part["name"], 0)
-            words.append(word)
-        else:
-            words += values[field["name"]]
+        value = values.get(field.get("name"))
+        match field["kind"]:
+            case "number":
+                is_long = SHEET["quantities"][field["quantity"]]["type"] == "u32"
+                words += [value >> 16, value & 0xFFFF] if is_long else [value & 0xFFFF]
+            case "bits":
+                packed_bits = 0
+                for part in field["parts"]:
+                    packed_bits = packed_bits << part["bits"] | values.get(part["name"], 0)
+                words.append(packed_bits)
+            case "f32":
+                words += struct.unpack(">HH", struct.pack(">f", value))
+            case "text":
+                raw = value.encode()
+                words.append(len(raw))
+                words += struct.unpack(f">{(len(raw) + 1) // 2}H", raw + b"\0" * (len(raw) % 2))
+            case "rows":
+                words += [word for row in value for word in packed(field["fields"], row)]
+            case "numbers" | "words to the end":
+                words += [each & 0xFFFF for each in value]
+            case kind:
+                pytest.fail(f"kind must be known, got {kind}")
     return words
 
 
-def unpacked(fields: list[Any], words: list[int]) -> dict[str, Any]:
-    """The values of words by amplifier.json alone: numbers in their units."""
+def drawn(fields: list[Any], rng: random.Random) -> dict[str, Any]:
+    """Values of fields anywhere in their ranges."""
     values: dict[str, Any] = {}
-    left = [*words]
+    counts = {field.get("count") for field in fields}
 
-    def number(name: str) -> float:
+    def number(name: str) -> int:
         quantity = SHEET["quantities"][name]
-        word = left.pop(0)
-        if quantity["type"] == "u32":
-            word = word << 16 | left.pop(0)
-        if quantity["type"] == "i16" and word > 0x7FFF:
-            word -= 0x10000
-        return (word - quantity["zero"]) / quantity["per_unit"]
+        return rng.randint(quantity["min"], quantity["max"])
 
     for field in fields:
-        if field["kind"] == "number":
-            values[field["name"]] = number(field["quantity"])
-        elif field["kind"] == "bits":
-            word = left.pop(0)
-            for part in reversed(field["parts"]):
-                values[part["name"]] = word & (1 << part["bits"]) - 1
-                word >>= part["bits"]
-        else:
-            assert field["kind"] == "numbers"
-            values[field["name"]] = [
-                number(field["quantity"]) for _ in range(values[field["count"]])
-            ]
-    assert not left
+        name = field.get("name")
+        match field["kind"]:
+            case "number":
+                values[name] = ROWS if name in counts else number(field["quantity"])
+            case "bits":
+                for part in field["parts"]:
+                    is_count = part["name"] in counts
+                    values[part["name"]] = ROWS if is_count else rng.getrandbits(part["bits"])
+            case "f32":
+                (values[name],) = struct.unpack(">f", struct.pack(">f", rng.uniform(0, 1000)))
+            case "text":
+                values[name] = "".join(rng.choices("aZ 9-µ", k=rng.randint(0, 15)))
+            case "numbers":
+                values[name] = [number(field["quantity"]) for _ in range(ROWS)]
+            case "rows":
+                count = ROWS if isinstance(field["count"], str) else field["count"]
+                values[name] = [drawn(field["fields"], rng) for _ in range(count)]
+            case _:
+                values[name] = [rng.getrandbits(16) for _ in range(ROWS)]
     return values
 
 
@@ -313,28 +374,84 @@ def test_data_alone_pack_the_set_and_read_the_status_of_the_page() -> None:
             frame += zlib.crc32(frame).to_bytes(field["bytes"], line["byte_order"])
         else:
             frame += contents[field["name"]].to_bytes(field["bytes"], line["byte_order"])
-    assert line["crc"]["check"] == zlib.crc32(b"123456789")
     stuffed = b"".join(bytes([len(piece) + 1]) + piece for piece in frame.split(b"\0"))
     sent = f"> {bytes([0, *stuffed, 0]).hex(' ').upper()}"
     assert sent == shown("serial", "Set, part 1 of 2")[0]
 
-    status = unpacked(SHEET["messages"]["GetStatus"]["reply"], listed_words()["Status"])
-    assert status["state"] == SHEET["states"]["OPERATION_ENABLED"]
-    assert (status["watchdog_left"], status["temperature"], status["high_voltage"]) == (
-        *(0.25, 25.0, 1800.0),
+    status = {"state": SHEET["states"]["OPERATION_ENABLED"], "fault": 0, "flags": 1, "latch": 0}
+    status |= {"watchdog_left": 250, "temperature": 250, "high_voltage": 1800}
+    status |= {"clock": 0x60000000, "token": 0x0102, "channels": 4, "layers": 8}
+    tokens = [0x0102, 0x0102, 0, 0x0101, 0, 0, 0, 0]
+    reply = SHEET["messages"]["GetStatus"]["reply"]
+    words = packed(reply, {**status, "levels": [3300, 3200, 0, 0], "tokens": tokens})
+    assert words == listed_words()["Status"]
+
+
+@pytest.mark.parametrize("name", RECORDS)
+def test_every_record_is_read_as_the_data_pack_it(name: str) -> None:
+    """Requests, replies, Events, Naks and parts of them, with values anywhere in their ranges."""
+    fields, record = RECORDS[name]
+    rng = random.Random(name)
+    for _ in range(20):
+        values = drawn(fields, rng)
+        assert record.unpack(packed(fields, values), is_strict=True) == values
+
+
+def test_numbers_and_names_are_all_there() -> None:
+    """Of messages, quantities, states, faults, codes, features, flags and units."""
+    numbers = {"Hello": HELLO, "Event": EVENT, "Nak": NAK}
+    numbers |= {name: each.number for name, each in MESSAGES.items()}
+    assert {name: each["number"] for name, each in SHEET["messages"].items()} == numbers
+    for name, each in MESSAGES.items():
+        listed = SHEET["messages"][name]
+        assert (listed["feeds"], listed["broadcast"]) == (each.feeds, each.is_broadcast)
+    assert SHEET["quantities"].keys() == QUANTITIES.keys()
+    for name, quantity in QUANTITIES.items():
+        listed = SHEET["quantities"][name]
+        for integer in (quantity.minimum, quantity.maximum):
+            value = (integer - listed["zero"]) / listed["per_unit"]
+            assert value == pytest.approx(quantity.from_wire(integer))
+        assert (listed["type"], listed["unit"]) == (quantity.wire, quantity.unit)
+    tables = {"states": STATES, "faults": FAULTS, "codes": REFUSALS, "features": FEATURES}
+    tables |= {"status_flags": STATUS_FLAGS, "sensor_units": SENSOR_UNITS}
+    tables["reading_states"] = READING_STATES
+    assert {name: SHEET[name] for name in tables} == {
+        name: json.loads(json.dumps(each)) for name, each in tables.items()
+    }
+
+
+def test_check_of_serial_frames_follows_from_its_parameters() -> None:
+    """Bit by bit as the parameters say, against zlib and the value that the sheet states."""
+    crc = SHEET["serial"]["crc"]
+    assert crc["reflected"]
+    polynomial = int(f"{crc['polynomial']:0{crc['width']}b}"[::-1], 2)
+    register = crc["initial"]
+    for byte in b"123456789":
+        register ^= byte
+        for _ in range(8):
+            register = register >> 1 ^ (polynomial if register & 1 else 0)
+    assert register ^ crc["xor"] == crc["check"] == zlib.crc32(b"123456789")
+
+
+def test_registers_hold_what_the_layout_lists() -> None:
+    """A commit of modbus.md: registers of its number, a tag before the request and its reply."""
+    sheet = SHEET["modbus"]
+    for name, each in sheet["registers"].items():
+        number = SHEET["messages"][name]["number"]
+        assert each == {"written_from": 0x100 * number, "reply_from": 0x100 * number + 0x80}
+    written = bytes.fromhex("0600 0004 08 0001 2A17 0102 6000")  # place, count, bytes, registers
+    assert struct.unpack_from(">H", written)[0] == sheet["registers"]["Commit"]["written_from"]
+    tag, *words = struct.unpack_from(">4H", written, 5)
+    assert sheet["layout"]["written"] == ["tag", "words of the request"]
+    assert (tag, MESSAGES["Commit"].request.unpack(words, is_strict=True)) == (
+        *(1, {"session": 0x2A17, "token": 0x0102, "at": 0x6000}),
     )
-    assert (status["clock"], status["token"]) == (0x60000000, 0x0102)
-    assert status["levels"] == [0.33, 0.32, 0.0, 0.0]
-    assert status["tokens"] == [0x0102, 0x0102, 0, 0x0101, 0, 0, 0, 0]
-
-
-def test_data_name_the_registers_that_the_page_shows() -> None:
-    """A commit is written and its reply read where the frames of modbus.md say so."""
-    commit, status = shown("modbus", "Commit")[0], shown("modbus", "Commit")[2]
-    registers = SHEET["modbus"]["registers"]["Commit"]
-    place = slice(26, 31)  # behind transaction, protocol, length, unit and function
-    assert int(commit[place].replace(" ", ""), 16) == registers["written_from"]
-    assert int(status[place].replace(" ", ""), 16) == registers["reply_from"]
+    tag, result, *words = struct.unpack(">5H", bytes.fromhex("0002 0000 0102 0006 0000"))
+    assert [each.partition(":")[0] for each in sheet["layout"]["reply"]] == [
+        *("tag", "result", "words of the reply", "zeros"),
+    ]
+    taken = MESSAGES["Set"].reply.unpack(words, is_strict=False)
+    assert (tag, result, taken["token"], taken["staged"], taken["played"]) == (2, 0, 0x0102, 1, 0)
 
 
 def test_each_read_of_the_status_object_is_a_status() -> None:

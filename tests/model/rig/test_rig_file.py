@@ -813,42 +813,60 @@ def test_a_file_that_reads_back_otherwise_is_refused(
     assert not (tmp_path / "rig.fitted.yaml").exists()
 
 
-def test_a_mass_that_is_found_comes_beside_supports(tmp_path: Path) -> None:
-    """Supports stay, and the mass is read back where it was found."""
-    found = PointLoad(0.05, 0.15, mass=0.004)
-    *_, output = fitted(
-        tmp_path, REWRITTEN_BOARD, lambda rig: replace(rig, masses=(*rig.masses, found))
+MASS_FOUND = PointLoad(0.05, 0.15, mass=0.004)
+TWO_FEET = "supports: {a: {at: [0.1, 0.1], kind: foam}, b: {at: [0.2, 0.1], kind: foam}}\n"
+
+
+def with_feet(rig: Rig, *stiffnesses: float, supports: float) -> Rig:
+    """The rig with feet of other stiffnesses [N/m], which are known by so much."""
+    masses = tuple(
+        replace(foot, stiffness=k) for foot, k in zip(rig.masses, stiffnesses, strict=True)
     )
-    back = load_rig(output).masses
-    assert sorted(each.stiffness for each in back) == [0.0, 2000.0]
-    assert found in back
+    return replace(rig, masses=masses, uncertainty=replace(rig.uncertainty, supports=supports))
 
 
-def test_feet_are_read_back_whichever_is_stiffer_by_a_hair(tmp_path: Path) -> None:
-    """Two that differ by less than a micronewton per metre keep their places and their order."""
-    feet = "supports: {a: {at: [0.1, 0.1], kind: foam}, b: {at: [0.2, 0.1], kind: foam}}"
-
-    def change(rig: Rig) -> Rig:
-        one, other = rig.masses
-        masses = (replace(one, stiffness=345.67800001), replace(other, stiffness=345.678))
-        return replace(rig, masses=masses, uncertainty=replace(rig.uncertainty, supports=0.05))
-
-    *_, output = fitted(tmp_path, FLOW.replace("mesh: 12x9", f"{feet}\nmesh: 12x9"), change)
-    back = load_rig(output).masses
-    assert [(each.x, each.stiffness) for each in back] == [(0.1, 345.67800001), (0.2, 345.678)]
-
-
-def test_feet_stay_as_uncertain_as_the_rig_states(tmp_path: Path) -> None:
-    """A foot of foam, uncertain by its kind, gets a stiffness and stays as uncertain: by 0.3."""
-
-    def softer(rig: Rig) -> Rig:
-        (foot,) = rig.masses
-        return replace(rig, masses=(replace(foot, stiffness=0.8 * foot.stiffness),))
-
-    _, after, output = fitted(tmp_path, REWRITTEN_BOARD, softer)
+@pytest.mark.parametrize(
+    ("text", "change", "read", "expected"),
+    [
+        (
+            REWRITTEN_BOARD,
+            lambda rig: replace(rig, masses=(*rig.masses, MASS_FOUND)),
+            lambda rig: [(each.stiffness, each.mass, each.x, each.y) for each in rig.masses],
+            [(0.0, 0.004, 0.05, 0.15), (2000.0, 0.0, 0.1, 0.1)],
+        ),
+        (
+            FLOW.replace("mesh: 12x9", f"{TWO_FEET}mesh: 12x9"),
+            lambda rig: with_feet(rig, 345.67800001, 345.678, supports=0.05),
+            lambda rig: [(each.x, each.stiffness) for each in rig.masses],
+            [(0.1, 345.67800001), (0.2, 345.678)],
+        ),
+        (
+            REWRITTEN_BOARD,
+            lambda rig: with_feet(rig, 1600.0, supports=rig.uncertainty.supports),
+            lambda rig: [rig.uncertainty.supports, *(each.stiffness for each in rig.masses)],
+            [0.3, 1600.0],
+        ),
+        (
+            FLOW,
+            lambda rig: replace(rig, uncertainty=replace(rig.uncertainty, gain=0.01)),
+            lambda rig: rig.document.over.data["uncertainty"],
+            {"gain": 0.01},
+        ),
+    ],
+    ids=["a mass beside supports", "feet alike but for a hair", "a foot by kind", "one term"],
+)
+def test_what_a_fit_changes_is_read_back_and_all_else_stays(
+    tmp_path: Path,
+    text: str,
+    change: Callable[[Rig], Rig],
+    read: Callable[[Rig], object],
+    expected: object,
+) -> None:
+    """A mass comes, feet keep places and order, errors of feet and other terms are as they were."""
+    _, after, output = fitted(tmp_path, text, change)
     back = load_rig(output)
-    assert back.uncertainty.supports == 0.3
-    assert back.masses == after.masses
+    assert read(back) == expected
+    assert back.uncertainty == after.uncertainty
 
 
 BASES = {
@@ -881,17 +899,6 @@ def test_a_base_that_is_a_file_of_another_kind_is_named(tmp_path: Path) -> None:
     (tmp_path / "rig.yaml").write_text("rig: other.yaml\nsocket: era.sock\n", "utf-8")
     with pytest.raises(InputError, match=r"rig\.yaml: must be a rig, got a daemon file"):
         load_rig(output)
-
-
-def test_what_a_fit_leaves_alone_is_that_of_the_base(tmp_path: Path) -> None:
-    """Only the terms of the uncertainty that a fit changed are written."""
-
-    def change(rig: Rig) -> Rig:
-        return replace(rig, uncertainty=replace(rig.uncertainty, gain=0.01))
-
-    _, after, output = fitted(tmp_path, FLOW, change)
-    assert "uncertainty: {gain: 0.01}" in output.read_text("utf-8")
-    assert load_rig(output).uncertainty == after.uncertainty
 
 
 def test_a_base_may_be_wired_anew_but_not_built_anew(tmp_path: Path) -> None:

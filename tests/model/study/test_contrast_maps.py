@@ -146,32 +146,51 @@ def test_export_mat_holds_names_of_sets_as_a_cell_array(table, tmp_path):
         assert [each.item() for each in struct.promised_thresholds.flat] == list(names)
 
 
-def test_export_mat_holds_layers_and_air(table, tmp_path):
-    """A laminate is a struct with its layers, each with its material and rows by frequency."""
-    metal, rows = table.plate.material, ((1.0, 1.0, 0.1), (900.0, 2.0, 0.1))
-    layers = (LaminateLayer(metal, 0.001), LaminateLayer(metal, 0.0005, by_frequency=rows))
-    plate = replace(table.plate, laminate=Laminate(layers), air_gap=AirGap(0.002, closed=True))
-    export_mat(replace(table, plate=plate), tmp_path / "t.mat")
-    struct = loadmat(tmp_path / "t.mat", squeeze_me=True, struct_as_record=False)["table"].plate
-    assert (struct.air_gap.depth_m, struct.air_gap.closed) == (0.002, 1)
-    first, second = struct.laminate.layers
-    assert (first.thickness_m, first.material.rho_kg_m3) == (0.001, metal.rho)
-    np.testing.assert_array_equal(second.by_frequency, rows)
+ROWS = ((1.0, 1.0, 0.1), (900.0, 2.0, 0.1))
 
 
-def test_export_mat_holds_masses(table, tmp_path):
-    """One mass is a struct of one, none is empty."""
-    attachment_shapes = np.vstack([table.attachment_shapes, table.attachment_shapes[:1]])
-    laden = replace(
-        table, masses=(PointLoad(0.1, 0.15, mass=0.06),), attachment_shapes=attachment_shapes
-    )
-    export_mat(laden, tmp_path / "t.mat")
-    struct = loadmat(tmp_path / "t.mat", squeeze_me=True, struct_as_record=False)["table"]
-    assert struct.masses.mass_kg == 0.06
-    assert struct.masses.y_m == 0.15
-    export_mat(table, tmp_path / "t.mat")
-    struct = loadmat(tmp_path / "t.mat", squeeze_me=True, struct_as_record=False)["table"]
-    assert struct.masses.size == 0
+def of_layers(table):
+    """The plate of the table of two layers, over air."""
+    metal = table.plate.material
+    layers = LaminateLayer(metal, 0.001), LaminateLayer(metal, 0.0005, by_frequency=ROWS)
+    return replace(table.plate, laminate=Laminate(layers), air_gap=AirGap(0.002, closed=True))
+
+
+@pytest.mark.parametrize(
+    ("changes", "read", "expected"),
+    [
+        (
+            lambda table: {"plate": of_layers(table)},
+            lambda found: [
+                (each.thickness_m, each.material.rho_kg_m3, np.ravel(each.by_frequency).tolist())
+                for each in found.plate.laminate.layers
+            ],
+            [(0.001, 2700.0, []), (0.0005, 2700.0, np.ravel(ROWS).tolist())],
+        ),
+        (
+            lambda table: {"plate": of_layers(table)},
+            lambda found: (found.plate.air_gap.depth_m, found.plate.air_gap.closed),
+            (0.002, 1),
+        ),
+        (
+            lambda table: {
+                "masses": (PointLoad(0.1, 0.15, mass=0.06),),
+                "attachment_shapes": np.vstack(
+                    [table.attachment_shapes, table.attachment_shapes[:1]]
+                ),
+            },
+            lambda found: (found.masses.mass_kg, found.masses.y_m),
+            (0.06, 0.15),
+        ),
+        (lambda _: {}, lambda found: found.masses.size, 0),
+    ],
+    ids=["layers", "air", "a mass", "no mass"],
+)
+def test_export_mat_holds_what_some_tables_have(table, tmp_path, changes, read, expected):
+    """A laminate with the rows of its layers, air, masses: of one a struct, of none nothing."""
+    export_mat(replace(table, **changes(table)), tmp_path / "t.mat")
+    found = loadmat(tmp_path / "t.mat", squeeze_me=True, struct_as_record=False)["table"]
+    assert read(found) == expected
 
 
 def test_export_mat_refuses_a_table_too_large(table, tmp_path, monkeypatch):

@@ -48,6 +48,7 @@ from model.structure.attachments import (
     damping_from_ratio,
     footprints_of,
 )
+from model.structure.exciter import Exciter
 from model.structure.material import Material
 from model.structure.plate import Plate
 from model.study.verification import Plates, harmonics_on, powers_on
@@ -194,6 +195,27 @@ def exciter_rig_text(
 def exciter_rig(keys: str = "type: DAEX13-4SM, power: 1 W", **more: str) -> Rig:
     """The rig of that text."""
     return parse_rig("board.yaml", exciter_rig_text(keys, **more))
+
+
+def as_sold(rig: Rig, rng: np.random.Generator, *, modulus: float) -> Rig:
+    """The rig with exciters whose parts differ as sold ones do, by 20 % and 10 degrees.
+
+    modulus: standard deviation of the logarithm of the board's own.
+    """
+
+    def factor(deviation: float) -> float:
+        return float(np.exp(deviation * rng.standard_normal()))
+
+    eras = []
+    for era in rig.eras:
+        assert isinstance(era, Exciter)
+        parts = {
+            key: factor(0.2) * getattr(era, key)
+            for key in ("stiffness", "magnet_mass", "force_factor")
+        }
+        gains = ((100.0, factor(0.2), float(np.radians(10) * rng.standard_normal())),)
+        eras.append(replace(era, gains=gains, **parts))
+    return replace(rig, eras=tuple(eras), plate=rig.plate.scaled(modulus=factor(modulus)))
 
 
 # Relative to the rig, bolt masses in kg: what assembly and ageing do.

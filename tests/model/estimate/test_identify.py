@@ -52,7 +52,7 @@ from model.structure.exciter import Exciter
 from model.structure.material import Material, Orthotropy
 from model.structure.plate import Bond, Laminate, LaminateLayer, equivalent_plate
 from model.study.verification import expected_contrast
-from plates import SETTLED_PATTERNS_FREQUENCIES, exciter_rig, exciter_rig_text
+from plates import SETTLED_PATTERNS_FREQUENCIES, as_sold, exciter_rig, exciter_rig_text
 
 FREQUENCIES = np.linspace(40.0, 500.0, 21)
 ONE_ROUND = (np.arange(len(FREQUENCIES))[:, None] + np.arange(4)) % 4 == 0
@@ -684,29 +684,12 @@ def test_moved_sensor_weighs_on_the_plate_where_it_measures() -> None:
 
 
 def as_built(rig: Rig, seed: int) -> Rig:
-    """A board of which parts differ as sold ones do, with another rigidity."""
-    rng = np.random.default_rng(seed)
-
-    def factor(deviation: float) -> float:
-        return float(np.exp(deviation * rng.standard_normal()))
-
-    eras = []
-    for era in rig.eras:
-        assert isinstance(era, Exciter)
-        eras.append(
-            replace(
-                era,
-                stiffness=factor(0.2) * era.stiffness,
-                magnet_mass=factor(0.2) * era.magnet_mass,
-                force_factor=factor(0.2) * era.force_factor,
-                gains=((100.0, factor(0.2), float(np.radians(10) * rng.standard_normal())),),
-            )
-        )
-    plate = replace(rig.plate.scaled(modulus=factor(0.05)), loss_factor=0.06)
+    """A board of which parts differ as sold ones do, with another rigidity, loss and feet."""
+    sold = as_sold(rig, np.random.default_rng(seed), modulus=0.05)
     feet = [
         replace(each, stiffness=each.stiffness / (1 + 0.2 * each.is_foot)) for each in rig.masses
     ]
-    return replace(rig, plate=plate, eras=tuple(eras), masses=tuple(feet))
+    return replace(sold, plate=replace(sold.plate, loss_factor=0.06), masses=tuple(feet))
 
 
 def measured(rig: Rig, tones: FloatArray, places: FloatArray) -> Measurement:

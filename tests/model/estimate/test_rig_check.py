@@ -52,8 +52,15 @@ from model.rig.rig import Rig
 from model.rig.rig_file import load_rig
 from model.spectral.direct_solution import direct_spectral_acceleration
 from model.spectral.modes import SpectralMesh
-from model.structure.exciter import Exciter
-from plates import DISTORTIONS, exciter_rig, make_paper_rig, noise_like, perturbed, random_gains
+from plates import (
+    DISTORTIONS,
+    as_sold,
+    exciter_rig,
+    make_paper_rig,
+    noise_like,
+    perturbed,
+    random_gains,
+)
 from plates import measured as measured_by_plates
 from yaml_files import read_yaml
 
@@ -147,24 +154,10 @@ def sold(seed: int, glue: Mapping[str, float]) -> tuple[Rig, Measurement]:
     """
     rig = exciter_rig("type: DAEX25FHE-4, power: 1 W", frequency="[40, 300]", more=PARTS)
     assert isinstance(rig.mesh, SpectralMesh)
-    rng = np.random.default_rng(seed)
-
-    def factor(deviation: float) -> float:
-        return float(np.exp(deviation * rng.standard_normal()))
-
-    eras = []
-    for era in rig.eras:
-        assert isinstance(era, Exciter)
-        stiffness = factor(0.2) * era.in_time.stiffness
-        magnet, force = factor(0.2) * era.magnet_mass, factor(0.2) * era.force_factor
-        gains = ((100.0, factor(0.2), float(np.radians(10) * rng.standard_normal())),)
-        eras.append(
-            replace(era, stiffness=stiffness, magnet_mass=magnet, force_factor=force, gains=gains)
-        )
-    plate = rig.plate.scaled(modulus=factor(0.1))
-    sources = [on_glue(era, glue[era.name]) if era.name in glue else era for era in eras]
+    true = as_sold(rig, np.random.default_rng(seed), modulus=0.1)
+    sources = [on_glue(era, glue[era.name]) if era.name in glue else era for era in true.eras]
     values = direct_spectral_acceleration(
-        plate, rig.mesh, sources, SOLD_TONES, PLACES, loads=rig.masses
+        true.plate, rig.mesh, sources, SOLD_TONES, PLACES, loads=rig.masses
     )
     values = values / np.array([era.full_level for era in rig.eras])[:, None]
     size = np.sqrt((np.abs(values) ** 2).mean(axis=2, keepdims=True))

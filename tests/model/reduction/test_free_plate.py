@@ -6,13 +6,15 @@ the thickness; modes that differ from the theory, and a loss factor that varies,
 
 import math
 from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import numpy as np
 import pytest
 from scipy import sparse
 from scipy.sparse.linalg import splu
 
-from benchmarks.direct_plate import direct_acceleration
+from benchmarks.direct_plate import direct_acceleration, direct_responder
+from long_form import shortly
 from model.arrays import FloatArray
 from model.errors import InputError
 from model.estimate.fit import sensed_plate
@@ -37,10 +39,17 @@ from model.reduction.reduced_plate import (
 )
 from model.rig.rig import Rig, Uncertainty
 from model.rig.rig_file import example_rig_path, load_rig
-from model.spectral.direct_solution import direct_spectral_acceleration
 from model.spectral.modes import SpectralMesh, local_compliance
 from model.structure.attachments import Era, PointLoad, damping_from_ratio, footprints_of
-from model.structure.plate import LOSS_FREQUENCY, Laminate, LaminateLayer, Plate
+from model.structure.material import Material
+from model.structure.plate import (
+    LOSS_FREQUENCY,
+    AirGap,
+    Laminate,
+    LaminateLayer,
+    Plate,
+    equivalent_plate,
+)
 from model.study.verification import verify_table
 from model.table.table_file import TableProblem, build_table, table_following
 from model.vibration import natural_modes
@@ -107,36 +116,93 @@ def test_acceleration_equals_direct_solve_for_any_layout(free):
 
 
 PAPER = Plate(LENGTH, WIDTH, 0.0015, ALUMINIUM)
+PANE = Plate(0.375, 0.225, 2.5e-3, Material("glass", 70e9, 2500.0, 0.2), loss_factor=0.02)
+ADHESIVE = LaminateLayer(Material("adhesive", 1e6, 1000.0, 0.49), 0.2e-3)
+ROWS = ((10.0, 0.5, 0.3), (100.0, 1.0, 0.4), (1000.0, 2.0, 0.5))
+
+
+def panel(**core: Any) -> Plate:
+    """Glass on glass by an adhesive with these losses."""
+    cover = LaminateLayer(Material("cover", 71.5e9, 2420.0, 0.21), 1.8e-3)
+    layers = (cover, replace(ADHESIVE, **core), LaminateLayer(PANE.material, 0.7e-3))
+    return equivalent_plate(
+        Laminate(layers), length=0.375, width=0.225, frequency=500.0, loss_factor=0.01
+    )
+
+
+def eras_at(*places: tuple[float, float], foot: float = 0.0) -> list[Era]:
+    """ERAs at places in shares of the sides."""
+    return [Era(f"E{n}", *at, 17e3, 3.5, 0.0, 1e-4, foot=foot) for n, at in enumerate(places)]
+
+
 BAR = (Era("A", 0.3, 1.0, 1e4, 1.0, 0.0, 1e-4), Era("B", 0.0, 0.0, 1e4, 1.0, 0.0, 1e-4))
 SPREAD = (
     Era("A", 0.16, 0.09, 3e4, 0.0, 0.01, 1e-4),
     Era("B", 0.95, 0.35, 1e5, 0.0, 0.0, 1e-4),
     Era("C", 0.39, 1.0, 8e3, 0.0, 0.0, 1e-4),
 )
+AT_CORNERS = ((0, 0), (1, 0), (0, 1), (1, 1))
+WITHIN = ((0.21, 0.3), (0.63, 0.11), (0.47, 0.83), (0.9, 0.6))
+TOGETHER = ((0.21, 0.3), (0.63, 0.11), (0.64, 0.11), (0.9, 0.6))
+MASS, SPRING = PointLoad(0.1, 0.1, mass=0.02, foot=0.01), PointLoad(0.1, 0.05, 2e3, 1.0, 0.01)
+BY_DEGREES = "polynomials"
+TWO_WAYS = {
+    # no damping to hide behind
+    "undamped": (replace(PAPER, loss_factor=0.0), (24, 18), SPREAD, (), 1e-4),
+    # only rocks up to 500 Hz
+    "block": (Plate(0.3, 0.2, 0.02, ALUMINIUM), (3, 3, "Q4"), SPREAD, (), 1e-4),
+    # many modes in a row
+    "bar": (Plate(1.0, 0.02, 0.002, ALUMINIUM), (60, 3), BAR, (), 1e-4),
+    "standing bar": (Plate(0.05, 0.4, 0.002, ALUMINIUM), (4, 40), BAR, (), 1e-4),
+    # hardly any degrees of freedom
+    "one element": (Plate(0.03, 0.03, 0.002, ALUMINIUM), (1, 1), BAR, (), 1e-4),
+    "two elements": (Plate(0.03, 0.03, 0.002, ALUMINIUM), (2, 1), BAR, (), 1e-4),
+    "feet": (PAPER, (24, 18), eras_at(*AT_CORNERS, foot=0.006), (MASS,), 1e-4),
+    **{
+        f"{name}, foot of {1e3 * foot:g} mm": (
+            *(PAPER, (12, 9, BY_DEGREES), eras_at(*places, foot=foot), (SPRING,), 1e-5),
+        )
+        for name, places in {"corners": AT_CORNERS, "within": WITHIN, "together": TOGETHER}.items()
+        for foot in (0.0, 0.004)
+    },
+    "loss that rises with frequency": (
+        *(replace(PAPER, loss_exponent=0.4), (13, 11, BY_DEGREES), eras_at(*WITHIN), (), 1e-4),
+    ),
+    **{
+        f"air, {closed=}": (
+            *(replace(PANE, air_gap=AirGap(5e-3, closed=closed)), (10, 8, BY_DEGREES)),
+            *(eras_at(*AT_CORNERS), (), 0.01),
+        )
+        for closed in (False, True)
+    },
+    "layers": (panel(), (18, 12, BY_DEGREES), eras_at(*AT_CORNERS), (), 1e-3),
+    "lossy layers": (
+        *(panel(loss_factor=0.3), (18, 12, BY_DEGREES), eras_at(*AT_CORNERS), (), 0.01),
+    ),
+    "layers by frequency": (
+        *(panel(by_frequency=ROWS), (18, 12, BY_DEGREES), eras_at(*AT_CORNERS), (), 0.02),
+    ),
+}
+"""By name: a plate, its mesh, ERAs in shares of the sides, loads, and the relative error (L2)."""
 
 
 @pytest.mark.parametrize(
-    ("plate", "mesh", "eras"),
-    [
-        (replace(PAPER, loss_factor=0.0), (24, 18), SPREAD),  # no damping to hide behind
-        (Plate(0.3, 0.2, 0.02, ALUMINIUM), (3, 3, "Q4"), SPREAD),  # only rocks up to 500 Hz
-        (Plate(1.0, 0.02, 0.002, ALUMINIUM), (60, 3), BAR),  # many modes in a row
-        (Plate(0.05, 0.4, 0.002, ALUMINIUM), (4, 40), BAR),
-        (Plate(0.03, 0.03, 0.002, ALUMINIUM), (1, 1), BAR),  # hardly any degrees of freedom
-        (Plate(0.03, 0.03, 0.002, ALUMINIUM), (2, 1), BAR),
-    ],
-    ids=["undamped", "block", "bar", "standing bar", "one element", "two elements"],
+    "name", shortly(TWO_WAYS, [name for name in TWO_WAYS if name not in ("layers", "lossy layers")])
 )
-def test_acceleration_equals_direct_solve_for_extreme_plates(plate, mesh, eras):
-    """Within 1e-4 (relative L2); places of the ERAs are shares of the sides."""
-    nx, ny, *names = mesh
-    mesh = Mesh(nx, ny, plate.length, plate.width, *(ELEMENTS[name] for name in names))
-    eras = tuple(replace(era, x=era.x * plate.length, y=era.y * plate.width) for era in eras)
-    frequencies = np.array([40.0, 187.0, 333.0, 471.0])
-    direct = direct_acceleration(assemble(plate, mesh), eras, frequencies, mesh.nodes)
-    quick = solve_free_plate(plate, mesh).acceleration(eras, frequencies, mesh.nodes)
+def test_modes_and_truncated_ones_respond_as_the_direct_solution(name):
+    """Of all unknowns at each frequency: extreme plates, feet, air, layers, losses."""
+    plate, (nx, ny, *kind), eras, loads, tolerance = TWO_WAYS[name]
+    sides = np.array([plate.length, plate.width])
+    elements = [ELEMENTS[each] for each in kind if each != BY_DEGREES]
+    mesh = (SpectralMesh if BY_DEGREES in kind else Mesh)(nx, ny, *sides, *elements)
+    eras = tuple(replace(era, x=era.x * sides[0], y=era.y * sides[1]) for era in eras)
+    frequencies = np.array([45.0, 106.4, 250.0, 480.0])
+    points = np.random.default_rng(1).uniform(0.01, 0.99, (25, 2)) * sides
+    free = solve_free_plate(plate, mesh, frequency_max=500.0)
+    quick = free.acceleration(eras, frequencies, points, loads=loads)
+    direct = direct_responder(plate, mesh)(eras, frequencies, points, loads=loads)
     error = np.linalg.norm(quick - direct, axis=2) / np.linalg.norm(direct, axis=2)
-    assert error.max() < 1e-4
+    assert error.max() < tolerance
 
 
 @pytest.mark.parametrize(
@@ -486,22 +552,6 @@ def test_only_the_modes_named_change_the_receptance(deviating_rig: Rig) -> None:
             oscillator = 1 / ((1 + 1j * eta * more) * eigenvalue * factor - omega**2)
             expected += sign * oscillator[:, None, None] * np.outer(phi, phi)
     np.testing.assert_allclose(found, expected, atol=1e-12 * np.abs(expected).max())
-
-
-def test_loss_varies_alike_in_modes_and_in_a_direct_solution(deviating_rig: Rig) -> None:
-    """Modal and direct accelerations agree where the loss factor rises with frequency."""
-    plate = replace(deviating_rig.plate, mode_deviations=())
-    assert isinstance(deviating_rig.mesh, SpectralMesh)
-    direct = direct_spectral_acceleration(
-        plate,
-        deviating_rig.mesh,
-        deviating_rig.eras,
-        DEVIATING_HZ,
-        DEVIATING_POINTS,
-    )
-    free = solve_free_plate(plate, deviating_rig.mesh, frequency_max=500.0)
-    found = free.acceleration(deviating_rig.eras, DEVIATING_HZ, DEVIATING_POINTS)
-    np.testing.assert_allclose(found, direct, atol=1e-4 * np.abs(direct).max())
 
 
 def test_a_table_is_verified_with_them(deviating_rig: Rig) -> None:

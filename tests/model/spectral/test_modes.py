@@ -14,7 +14,6 @@ import pytest
 from scipy import linalg, special
 from scipy.integrate import trapezoid
 
-from benchmarks.direct_plate import direct_responder
 from benchmarks.layers import air_pressure, cell_middles, strip_frequencies
 from long_form import in_turn
 from model.errors import InputError
@@ -24,14 +23,13 @@ from model.reduction.reduced_plate import reduce_free_plate, supported_modes
 from model.rig.rig_file import load_rig, mesh_of, parse_rig
 from model.spectral.direct_solution import (
     AtOneFrequency,
-    direct_spectral_acceleration,
     grain_slopes,
     stiffness_slopes,
 )
 from model.spectral.modes import Band, SpectralMesh, SpectralPlate, local_compliance
 from model.spectral.polynomials import CLASSES as PARITY_CLASSES
 from model.spectral.polynomials import EVEN, EdgedFunctions, air_motion
-from model.structure.attachments import Era, PointLoad, footprints_of
+from model.structure.attachments import Era, footprints_of
 from model.structure.material import Material, Orthotropy
 from model.structure.plate import (
     HEAT_RATIO,
@@ -256,24 +254,6 @@ def test_a_free_plate_over_a_sealed_gap_moves_up_and_down_on_its_air():
     assert modes.frequencies[1] > 4 * expected
 
 
-@pytest.mark.parametrize("closed", [False, True])
-def test_modes_over_air_answer_as_the_direct_solution(closed):
-    """Response over 5 mm of air within 1 % of the one at each frequency, relative L2."""
-    plate = replace(PANE, air_gap=AirGap(5e-3, closed=closed), loss_factor=0.02)
-    mesh = SpectralMesh(10, 8, PANE.length, PANE.width)
-    eras = [
-        Era(name, x, y, stiffness=17e3, damping=1.0, bolt_mass=0.0, stroke=1e-4)
-        for name, x, y in (("a", 0, 0), ("b", 0.375, 0), ("c", 0, 0.225), ("d", 0.375, 0.225))
-    ]
-    frequencies = np.array([150.0, 250.0, 400.0])
-    points = np.array([[0.05, 0.04], [0.2, 0.1], [0.3, 0.2], [0.375, 0.1]])
-    free = solve_free_plate(plate, mesh, frequency_max=500.0)
-    found = free.acceleration(eras, frequencies, points)
-    exact = direct_responder(plate, mesh)(eras, frequencies, points)
-    error = np.linalg.norm(found - exact, axis=2) / np.linalg.norm(exact, axis=2)
-    assert error.max() < 0.01
-
-
 EXAMPLE = Path(__file__).parents[3] / "examples" / "glass_panel.yaml"
 COVER = Material("cover", E=71.5e9, rho=2420.0, nu=0.21)
 LAYER_GLASS = Material("glass", E=70e9, rho=2500.0, nu=0.2)
@@ -362,28 +342,6 @@ def test_complex_modes_equal_a_complex_eigenproblem():
         assert loss == pytest.approx(exact.imag, rel=1e-2)
 
 
-@pytest.mark.parametrize(
-    ("core", "error"),
-    [
-        pytest.param({}, 1e-3, marks=pytest.mark.long),
-        pytest.param({"loss_factor": 0.3}, 0.01, marks=pytest.mark.long),
-        ({"by_frequency": ((10.0, 0.5, 0.3), (100.0, 1.0, 0.4), (1000.0, 2.0, 0.5))}, 0.02),
-    ],
-)
-def test_modes_answer_as_the_direct_solution(core, error):
-    """Response of the example by its modes against one at each frequency, relative L2."""
-    rig = load_rig(EXAMPLE)
-    layers = (PANEL[0], replace(PANEL[1], **core), PANEL[2])
-    plate = panel(layers, loss_factor=0.01)
-    frequencies = np.array([40.0, 150.0, 500.0])
-    points = np.array([[0.05, 0.04], [0.2, 0.1], [0.3, 0.2], [0.375, 0.1]])
-    free = solve_free_plate(plate, rig.mesh, frequency_max=500.0)
-    found = free.acceleration(rig.eras[:2], frequencies, points, loads=rig.masses)
-    exact = direct_responder(plate, rig.mesh)(rig.eras[:2], frequencies, points, loads=rig.masses)
-    difference = np.linalg.norm(found - exact, axis=2) / np.linalg.norm(exact, axis=2)
-    assert difference.max() < error
-
-
 def test_lossy_layers_damp_in_time_as_at_each_frequency():
     """On soft mounts a mode decays with half its loss factor, that of the free plate's mode."""
     layers = (PANEL[0], replace(PANEL[1], loss_factor=0.3), PANEL[2])
@@ -469,22 +427,6 @@ def test_response_on_feet_is_that_of_fine_elements(layout, foot):
     size = np.linalg.norm(exact)
     assert np.linalg.norm(low - exact) / size < 0.005
     assert np.linalg.norm(high - exact) / size < 0.001
-
-
-@pytest.mark.parametrize("foot", [0.0, 0.004])
-@pytest.mark.parametrize("layout", ["corners", "inside", "close together"])
-def test_reduction_equals_direct_solution(layout, foot):
-    """Modes and truncated ones against a solution of all unknowns at each frequency, 1e-5."""
-    eras = [replace(era, foot=foot) for era in _on_plate(PAPER, LAYOUTS[layout])]
-    loads = [PointLoad(0.1, 0.05, 2e3, 1.0, 0.01)]
-    frequencies = np.array([45.0, 106.4, 250.0, 480.0])
-    points = np.random.default_rng(1).uniform(0.01, 0.2, (25, 2))
-    mesh = SpectralMesh(12, 9, PAPER.length, PAPER.width)
-    free = solve_free_plate(PAPER, mesh, frequency_max=500.0)
-    found = free.acceleration(eras, frequencies, points, loads=loads)
-    exact = direct_spectral_acceleration(PAPER, mesh, eras, frequencies, points, loads=loads)
-    error = np.linalg.norm(found - exact, axis=2) / np.linalg.norm(exact, axis=2)
-    assert error.max() < 1e-5
 
 
 PLATES = {

@@ -90,13 +90,6 @@ def test_a_hand_that_rests_is_counted_and_not_protected():
     assert stds.tolist() == pytest.approx([table.uncertainty.fingertip, np.log(3)], rel=0.01)
 
 
-def test_a_hand_has_no_stimulus():
-    """Loads above ten fingertips are those of hands, which are to feel nothing."""
-    fingers = [Finger(NEAR, Stimulus(12), load=HAND_LOAD)]
-    with pytest.raises(InputError, match=r"between 0\.1 and 10 times"):
-        answer(smooth_table(), fingers)
-
-
 def test_drive_mode_of_the_table_is_obeyed():
     """Amplifiers that only switch get ERAs at full stroke, as one finger's query; or a refusal."""
     table = smooth_table()
@@ -397,6 +390,8 @@ def test_a_finger_without_protection_gives_way_to_more_contrast():
         ([wants(NEAR, (41, 42)), wants(FAR)], [], "hold a frequency"),
         ([wants((0.01 * n, 0.01)) for n in range(22)], [], "up to 20"),
         ([wants(NEAR, load=0.0)], [], "load"),
+        # Loads above ten fingertips are those of hands, which are to feel nothing.
+        ([wants(NEAR, load=HAND_LOAD)], [], r"between 0\.1 and 10 times"),
     ],
 )
 def test_answer_refuses_what_contradicts_itself(requests, fingers, named):

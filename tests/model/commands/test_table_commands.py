@@ -250,27 +250,26 @@ def test_layouts_are_ranked_by_the_promise_of_two_contents(small, tmp_path: Path
     assert found["contents"] == 2
 
 
-@pytest.mark.parametrize("contents", ["0", "3", "7"])
-def test_contents_other_than_those_of_the_sets_are_refused(small, tmp_path, contents) -> None:
-    """None, one more than the sets have, more than any plate keeps apart."""
-    path = tmp_path / "contacts.yaml"
-    path.write_text(TWO_CONTENTS)
-    result = design("--contents", contents, "--contacts", str(path), "-o", str(tmp_path / "out"))
+ONE_SIDE = "layouts: {side: [[0, 0], [0, 10 cm], [5 cm, 0]]}\n"
+
+
+@pytest.mark.parametrize(
+    ("options", "given"),
+    [
+        *((f"--contents {count} --contacts given.yaml", TWO_CONTENTS) for count in (0, 3, 7)),
+        ("--layouts given.yaml", ONE_SIDE),
+        ("--eras 4 --lowest 5000 --starts 1", ""),
+    ],
+    ids=["no content", "more than the sets have", "more than plates keep apart", "tips", "sags"],
+)
+def test_designs_that_cannot_be_are_refused(
+    small, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, options: str, given: str
+) -> None:
+    """Other contents than those of the sets, ERAs at one side alone, a bound out of reach."""
+    monkeypatch.chdir(tmp_path)
+    Path("given.yaml").write_text(given)
+    result = design(*options.split(), "-o", "out")
     assert result.exit_code == 2 or isinstance(result.exception, InputError)
-
-
-def test_layouts_of_which_none_supports_the_plate_are_refused(small, tmp_path: Path) -> None:
-    """Three ERAs at one side, wherever the plate would tip over them."""
-    path = tmp_path / "layouts.yaml"
-    path.write_text("layouts: {side: [[0, 0], [0, 10 cm], [5 cm, 0]]}\n")
-    result = design("--layouts", str(path), "-o", str(tmp_path / "out"))
-    assert isinstance(result.exception, InputError)
-
-
-def test_a_plate_that_sags_is_no_design(small, tmp_path: Path) -> None:
-    """No layout has its lowest rigid-body frequency above a bound out of reach."""
-    result = design("--eras", "4", "--lowest", "5000", "--starts", "1", "-o", str(tmp_path))
-    assert isinstance(result.exception, InputError)
 
 
 def test_design_of_python_is_that_of_the_command(small, tmp_path: Path) -> None:

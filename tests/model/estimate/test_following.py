@@ -14,7 +14,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -538,35 +538,26 @@ def taken(*, nis: float = 2.0, slope: float = 0.0, masses: int = 0) -> PlateUpda
     return cast(PlateUpdate, found)
 
 
-def test_change_along_one_direction_is_found_in_likely_patterns() -> None:
-    """Four patterns 2.4 deviations off along a direction are 4.8 together, though each is likely.
-
-    The patterns before them are left out.
-    """
-    alarm = Alarm()
-    before = [taken() for _ in range(5)]
-    off = [taken(slope=2.4) for _ in range(4)]
-    assert [alarm.take(each) for each in (*before, *off[:3])] == [None] * 8
-    assert alarm.take(off[3]) == off
-
-
-def test_deviations_that_change_their_sign_are_none() -> None:
-    """Deviations of 2.4 up and down cancel."""
-    alarm = Alarm()
-    assert all(alarm.take(taken(slope=2.4 * (-1) ** n)) is None for n in range(2 * WINDOW))
-
-
-def test_mass_can_only_be_added() -> None:
-    """A mass less than none raises no alarm."""
-    alarm = Alarm()
-    assert all(alarm.take(taken(slope=-2.4, masses=1)) is None for _ in range(WINDOW))
-
-
-def test_unlikely_innovations_raise_an_alarm() -> None:
-    """Of chi² of 32 120 has a probability of 4e-12."""
-    alarm = Alarm()
-    found = [alarm.take(taken(nis=30.0)) for _ in range(4)]
-    assert found[-1] is not None
+@pytest.mark.parametrize(
+    ("patterns", "since_change"),
+    [
+        # Four 2.4 deviations off along a direction are 4.8 together, though each is likely.
+        ([{}] * 5 + [{"slope": 2.4}] * 4, 4),
+        ([{"slope": 2.4 * (-1) ** n} for n in range(2 * WINDOW)], 0),
+        ([{"slope": -2.4, "masses": 1}] * WINDOW, 0),
+        # Of chi² of 16 60 has a probability of 5e-7, of 24 90 one of 1.4e-9.
+        ([{"nis": 30.0}] * 3, 3),
+    ],
+    ids=["along one direction", "changing sign", "less than no mass", "unlikely"],
+)
+def test_alarm_has_the_patterns_since_the_plate_changed(
+    patterns: list[dict[str, Any]], since_change: int
+) -> None:
+    """None before, and none where deviations cancel or a mass would be taken away."""
+    alarm, found = Alarm(), [taken(**each) for each in patterns]
+    *before, last = map(alarm.take, found)
+    assert before == [None] * len(before)
+    assert last == (found[-since_change:] if since_change else None)
 
 
 def test_one_unlikely_pattern_raises_none() -> None:

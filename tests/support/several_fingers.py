@@ -7,6 +7,7 @@ makes it, by python-osc: captures of it, and a panel of a daemon.
 import asyncio
 import itertools
 import socket
+from collections import Counter
 from collections.abc import AsyncIterator, Callable, Iterator, Mapping, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
@@ -53,6 +54,7 @@ from model.table.table_file import build_table
 from plates import smooth_rig
 from real_wires import after_each
 from registry import threads
+from set_table import SetTiming
 from sim.far_ends.wire_assignment import SimulatedWire
 from virtual_lines import run_virtual
 
@@ -353,6 +355,10 @@ class Hands(Acted, Fingers):
         """Let so many layers be all that may play."""
         self.controller.cycle.planner.slots._count = count
 
+    def has_no_envelopes(self) -> None:
+        """Answer from now on by a timing without envelopes."""
+        self.controller.replace_answers(table(), SetTiming())  # type: ignore[arg-type]
+
     def renews_not(self, layer: int) -> None:
         """Let a layer not be renewed any more."""
         renewal = Slots.renewal
@@ -501,6 +507,36 @@ class Hands(Acted, Fingers):
     def gained_db(self) -> float:
         """How much more that is than at the mark [dB]."""
         return _worst(self.applied[-1]) - _worst(self.before)
+
+    @property
+    def gained_nominal_db(self) -> float:
+        """How much more the first finger feels now than at the mark, as modelled [dB]."""
+        return float(
+            felt(self.applied[-1], "nominal_db_sl")[1] - felt(self.before, "nominal_db_sl")[1]
+        )
+
+    @property
+    def gained_since_db(self) -> float:
+        """How much more the first finger is to feel by the last new report than by the first."""
+        return float(felt(self.new[-1], "level_db_sl")[1] - felt(self.new[0], "level_db_sl")[1])
+
+    @property
+    def most_of_a_stroke(self) -> float:
+        """What all contents take of the stroke of the ERA that is driven most."""
+        levels = Counter[str]()
+        for one in self.applied[-1].contents.values():
+            levels.update({era: tone.level for era, tone in one.drive.items()})
+        return max(levels.values())
+
+    @property
+    def has_onsets(self) -> list[bool]:
+        """Whether contents that play have envelopes."""
+        return [bool(one.layer.onset) for one in self.applied[-1].contents.values()]
+
+    @property
+    def reasons(self) -> list[str]:
+        """Why fingers feel nothing of their own, each once."""
+        return sorted({each for each in self.held_back.values() if each})
 
     @property
     def held_back(self) -> dict[int, str | None]:

@@ -19,7 +19,7 @@ import pytest
 from chain import FINGER, set_running
 from controller.content.pattern import Pattern, Transient
 from controller.daemon.messages import PlateView
-from controller.effects.kinds import Buzz, Click, File
+from controller.effects.kinds import File
 from controller.effects.layout import SurfaceLayout, layout_of
 from controller.play.intent import CLICK, Content, HapticIntent, Pulse, Selection, Target
 from controller.play.routing import PlaybackCapabilities
@@ -36,14 +36,12 @@ from model.config.document import data_text, parse_document
 from model.vibration import Tone
 from plates import smooth_rig
 from registry import threads
-from set_table import SetTiming
 from several_fingers import (
     ABOVE,
     LAYOUT,
     LEFT,
     RIGHT,
     Hands,
-    answers_take,
     chosen_for,
     fingers_on,
     places_of,
@@ -456,66 +454,6 @@ async def test_a_click_of_a_file_is_felt_beside_what_lasts_of_it() -> None:
         due = {0.20: 1.0, 0.26: 1.0, 0.29: 1 / 3, 0.31: 0.0, 0.33: 0.0, 0.35: 1 / 3, 0.4: 1.0}
         played = np.interp([*due], np.array(times) - times[0] + 0.01, levels) / max(levels)
         assert played == pytest.approx([*due.values()], abs=0.01)
-
-
-@in_virtual_time
-async def test_what_lasts_has_what_a_loud_click_leaves_and_all_of_it_after_that() -> None:
-    """A finger's vibration is raised amid the 40 ms of another's click: both need 1.2 strokes.
-
-    It is never silent, nor refused by the amplifiers.
-    """
-    regions = (LAYOUT.regions[0], replace(LAYOUT.regions[1], on_press="click"))
-    effects = {**LAYOUT.effects, "click": Click(level=44.0), "loud": Buzz(level=44.0)}
-    layout = SurfaceLayout(regions, effects, elsewhere=None)
-    async with fingers_on(table(), layout, at={1: LEFT}, held=0.6) as fingers:
-        begin = asyncio.get_running_loop().time()
-        fingers.at[2] = RIGHT
-        await fingers.hold(0.012)
-        fingers.play("loud")
-        await fingers.hold(0.2)
-        raised = [each for each in fingers.applied if each.time > begin + 0.012]
-        felt = [each for applied in raised for each in applied.targets if each.contact.key.id == 1]
-        assert {each.held_back for each in felt} == {None}
-        assert felt[0].level_db_sl < felt[-1].level_db_sl - 0.5
-        assert not fingers.silenced
-        assert raised[-1].time - begin <= 0.15
-        await fingers.hold(0.3)
-        assert fingers.levels_db_sl()[1] >= 43
-
-
-@in_virtual_time
-async def test_an_answer_is_shaped_by_the_timing_it_began_with(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """Others are put in place meanwhile, whose timing has no envelopes: what was begun has one."""
-    answers_take(monkeypatch, 0.03)
-    async with fingers_on(table(), LAYOUT, at={1: LEFT, 2: RIGHT}, held=0.01) as fingers:
-        fingers.controller.replace_answers(table(), SetTiming())  # type: ignore[arg-type]
-        await fingers.hold(0.3)
-        (applied,) = fingers.applied
-        assert all(one.layer.onset for one in applied.contents.values())
-
-
-@in_virtual_time
-async def test_what_is_not_served_says_why() -> None:
-    """Of six fingers the four newest have the four layers; the plate cannot serve all of these."""
-    async with fingers_on(table(), LAYOUT, layers=4) as fingers:
-        x = (0.03, 0.08, 0.13, 0.18, 0.23, 0.28)
-        fingers.at = {id: (at, 0.05 + 0.12 * (id % 2)) for id, at in enumerate(x, start=1)}
-        await fingers.hold(0.5)
-        felt = {each.contact.key.id: each for each in fingers.applied[-1].targets}
-        assert felt.keys() == fingers.at.keys()
-        for each in felt.values():
-            assert each.verdict in ("own", "mixed", "shared", "held back")
-            assert (each.held_back is None) == (each.verdict in ("own", "mixed"))
-            assert "(" not in (each.held_back or "")  # no object of the program
-        assert {felt[id].verdict for id in (1, 2)} == {"held back"}  # the earliest
-        assert felt[1].held_back == (
-            "no layer is free: the amplifiers play 4 contents at once; lift a finger"
-        )
-        others = [felt[id] for id in (3, 4, 5, 6) if felt[id].verdict == "held back"]
-        assert others
-        assert all("6 dB of contrast" in (each.held_back or "") for each in others)
 
 
 @in_virtual_time

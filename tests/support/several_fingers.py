@@ -325,7 +325,7 @@ class Hands(Acted, Fingers):
             self.refusals.append(threads.now() - self.marked_at)
             return CommandRefused(why)
 
-        slots.check = refuse
+        self.patch.setattr(slots, "check", refuse)
 
     def has(self, **least: int) -> None:
         """Require that there is at least so much of something."""

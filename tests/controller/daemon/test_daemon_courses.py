@@ -11,6 +11,7 @@ import math
 import os
 import re
 import signal
+import time
 from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from contextlib import AsyncExitStack, asynccontextmanager
 from dataclasses import dataclass, field, replace
@@ -422,6 +423,13 @@ class Served(Taken):
     def signals(self, name: str) -> None:
         """Send a signal to the daemon."""
         os.kill(os.getpid(), signal.Signals[name])
+
+    async def clock_jumps(self, seconds: float) -> None:
+        """Let the wall clock be so far off, which the status shows."""
+        self.patch.undo()
+        real = time.time
+        self.patch.setattr(time, "time", lambda: real() + seconds)
+        assert (await self.era.status()).unix_time_s == pytest.approx(time.time(), abs=60)
 
     def marks(self) -> None:
         """Begin to measure a time."""

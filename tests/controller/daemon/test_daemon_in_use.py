@@ -17,7 +17,6 @@ import socket
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import replace
 from datetime import datetime
@@ -232,34 +231,6 @@ def test_commands_choose_a_layout_and_reload(
     log = [json.loads(line) for line in (tmp_path / "daemon.log").read_text("utf-8").splitlines()]
     verdicts = [each["level"] for each in log if each["message"].startswith("config: reload")]
     assert verdicts == ["info", "error", "info"]
-
-
-JUMPS = (86_400.0, -86_400.0, 0.4, -0.4, 3e8, -1.7e9, 0.0)
-"""How far [s] the wall clock is from the real one: days, less than a lease, decades."""
-
-
-@in_virtual_time
-async def test_daemon_ignores_jumps_of_wall_clock(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """By a day, back, by less than a lease, by years: it plays on, and leases keep their time."""
-    real = time.time
-    async with ready_daemon(tmp_path) as (bench, era):
-        await era.arm("test", lease_s=3)
-        armed = threads.now()
-        async with holding(era, far=bench.far):
-            for jump in JUMPS:
-                monkeypatch.setattr(time, "time", lambda jump=jump: real() + jump)
-                status = await era.status()
-                assert status.unix_time_s == pytest.approx(real() + jump, abs=60)
-                renewed = threads.now()
-                await until(lambda renewed=renewed: threads.now() > renewed + 0.3)
-                assert any(bench.far.summary().levels)
-            status = await era.status()
-            assert not status.rejected_touches
-            assert status.lease_left_s == pytest.approx(armed + 3 - threads.now(), abs=0.01)
-            await until_state(era, READY)
-            assert threads.now() - armed == pytest.approx(3, abs=0.1)
 
 
 @pytest.mark.parametrize(

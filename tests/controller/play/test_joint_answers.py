@@ -32,7 +32,6 @@ from controller.play.joint_answers import (
 from controller.play.loop import PlayReport
 from controller.play.slots import CROSSFADE
 from controller.sources.touch import AT_REST, Contact, ContactKey, Motion
-from drivers.errors import CommandRefused
 from drivers.host.group import Group
 from long_form import shortly
 from model.answer.answer import Limits
@@ -186,21 +185,6 @@ async def test_fingers_that_rest_are_served_within_limits_of_now() -> None:
         await chain.operate("disarm")
         await chain.operate("arm")
         await chain.hold(0.3)
-        assert served(chain) == 2
-
-
-@in_virtual_time
-async def test_fingers_that_rest_are_served_once_a_ledger_admits_them() -> None:
-    """It does not say when, as of a limit of duty: they are planned again within 1.1 s."""
-    async with two_fingers() as (chain, _):
-        planner = chain.controller.cycle.planner
-        assert planner is not None
-        check = planner.slots.check
-        planner.slots.check = lambda layers: CommandRefused("duty limit reached")
-        await chain.hold(0.5)
-        assert served(chain) == 0
-        planner.slots.check = check
-        await chain.hold(1.2)
         assert served(chain) == 2
 
 

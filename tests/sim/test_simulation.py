@@ -23,7 +23,6 @@ import pytest
 from rich.console import Console
 from typer.testing import CliRunner
 
-from controller.cli.main import run
 from daemons import SESSION as DAEMONS_SESSION
 from daemons import far_end_process, playing
 from drivers.by_hand.reaching import random_session
@@ -102,31 +101,6 @@ async def test_sim_serves_until_interrupted_or_eof(is_interrupted: bool) -> None
         assert ending == (0, "", "")
         assert not control.exists()
         assert not link.is_symlink()
-
-
-@pytest.mark.parametrize(
-    ("arguments", "status", "words"),
-    [
-        ([str(example_rig_path())], 2, "--serial"),
-        (["no_such_rig.yaml", "--serial"], 2, "no_such_rig.yaml"),
-        ([str(example_rig_path()), "--serial", "--finger", "0.1"], 2, "--finger"),
-        ([str(example_rig_path()), "--serial", "--finger", "9,9"], 2, "finger"),
-        ([str(example_rig_path()), "--serial", "--exact", "--seed", "1"], 2, "--seed"),
-        ([str(example_rig_path()), "--serial", "--control", "/no/where"], 3, "/no/where"),
-        ([str(example_rig_path()), "--serial", "--link", "side=/tmp/x"], 2, "--link"),
-        ([str(example_rig_path()), "--serial", "--link", "/no/where"], 2, "/no/where"),
-        ([str(example_rig_path()), "--modbus-tcp", "0", "--link", "/tmp/x"], 2, "--link"),
-    ],
-)
-def test_sim_refuses_bad_usage_in_one_line(
-    arguments: list[str], status: int, words: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """Exit status 2 for input, 3 for the link; one line that names the option or file."""
-    assert run(["sim", *arguments]) == status
-    out, err = capsys.readouterr()
-    assert out == ""
-    assert words in err
-    assert err.count("\n") == 1
 
 
 def shown(context: SimulationContext, plate: SimulationView) -> str:
@@ -582,58 +556,6 @@ def test_witness_replay_reports_a_damaged_frame_only(tmp_path: Path) -> None:
     assert status == 1
     assert (found["invariant"], found["wire"], found["time_s"]) == ("garbage", "wire1", 0.02)
     assert len(found["frames"]) == 6
-
-
-@pytest.mark.parametrize(
-    ("text", "line"),
-    [
-        ("", None),
-        ("0.1 wire1 > 0Z\n", 1),
-        ("0.1 wire1 = 00\n", 1),
-        ("0.2 wire1 > 00\n0.1 wire1 > 00\n", 2),
-        ("nan wire1 > 00\n", 1),
-        ("# begin\n0.1 wire1 > 00\n0.1 other > 00\n", 3),
-        ("0.1 wire1 > 00\n\udcff\n", 2),
-        ("0.1 wire1 > 00 04\n", None),
-    ],
-)
-def test_witness_replay_refuses_an_invalid_capture(
-    tmp_path: Path, text: str, line: int | None
-) -> None:
-    """The error names file and line."""
-    capture = tmp_path / "capture.txt"
-    capture.write_bytes(text.encode("utf-8", errors="surrogateescape"))
-    result = CliRunner().invoke(app, ["witness", URL, "--replay", str(capture)])
-    assert isinstance(result.exception, InputError | CommandError)
-    place = str(capture) if line is None else f"{capture}:{line}:"
-    assert str(result.exception).startswith(place)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "named"),
-    [
-        (["--frequency", "500,40"], "--frequency"),
-        (["--frequency", "nan,40"], "--frequency"),
-        (["--level", "7"], "--level"),
-        (["--level", "nan"], "--level"),
-        (["--slew", "-1"], "--slew"),
-        (["--slack", "-4"], "--slack"),
-        (["--slack", "inf"], "--slack"),
-        (["--replay", "missing.txt"], "missing.txt"),
-        (["--replay", "capture.txt", "--record", "capture.txt"], "--record"),
-        (["--replay", "."], "."),
-        ([f"{URL}?address=1"], f"{URL}?address=1"),
-        (["modbus+rtu:///dev/ttyUSB0"], "modbus+rtu:///dev/ttyUSB0"),
-    ],
-)
-def test_witness_refuses_invalid_arguments(
-    arguments: list[str], named: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The option, file or URL is named before anything is opened."""
-    monkeypatch.chdir(tmp_path)
-    result = CliRunner().invoke(app, ["witness", URL, *arguments])
-    assert isinstance(result.exception, InputError | CommandError)
-    assert named in str(result.exception)
 
 
 @pytest.mark.parametrize("room", shortly([RLIM_INFINITY, 64], [64]))

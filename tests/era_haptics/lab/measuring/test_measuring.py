@@ -78,16 +78,6 @@ def test_one_command_measures_a_plate_that_deviates_as_its_seed_draws_it(
     assert np.abs(found[2] / found[0] - 1).max() > 0.05
 
 
-@pytest.mark.parametrize("option", [("--device", "jack"), ("--resume",), ("--y-cable",)])
-def test_what_only_a_sound_card_does_is_refused(option: tuple[str, ...], tmp_path: Path) -> None:
-    """Exit status 2, and nothing is written."""
-    sensors, output = tmp_path / "sensors.csv", tmp_path / "measured.csv"
-    sensors.write_text("sensor,x_m,y_m,input,mv_per_m_s2\nP1,0.03,0.05,1,10\n")
-    arguments = ["measure", str(example_rig_path()), "--simulated", "--sensors", str(sensors)]
-    assert run([*arguments, "-o", str(output), *option]) == 2
-    assert not output.exists()
-
-
 RATE = 8_000.0
 DELAY = 73
 LEVEL = 0.3

@@ -190,35 +190,6 @@ def test_dead_and_clipped_inputs_keep_no_promise(
 
 
 @pytest.mark.parametrize(
-    ("options", "said"),
-    [
-        (["--device", "jack"], "--sensors"),
-        (["--url", "sim://"], "--device"),
-        ([], "rig is missing"),
-        (["--device", "memory", "--sensors", "sensors.csv", "--url", "sim://"], "rig is missing"),
-        (["--device", "memory", "--sensors", "sensors.csv"], "--level"),
-    ],
-)
-def test_options_that_say_too_little_are_refused(
-    table: LocalizationTable,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    options: list[str],
-    said: str,
-) -> None:
-    """A device without sensors; a table has no limits: an amplifier needs the rig, a card a level.
-
-    Nothing is opened.
-    """
-    monkeypatch.chdir(tmp_path)
-    save_table(table, Path("t.npz"))
-    Path("sensors.csv").write_text(SENSORS)
-    result = CliRunner().invoke(app, ["table", "verify", "t.npz", *options])
-    assert isinstance(result.exception, InputError)
-    assert said in str(result.exception)
-
-
-@pytest.mark.parametrize(
     ("limits", "level", "key"),
     [
         ({"level": 0.2}, 0.3, "--level"),

@@ -15,7 +15,7 @@ import subprocess
 import sys
 import termios
 import tty
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import Any
 from unittest.mock import Mock
@@ -317,7 +317,7 @@ def test_random_sets_never_jump_and_keep_their_bounds() -> None:
                 playback.silence(time, chance.choice((0.005, 0.05)))
             else:
                 token += 1
-                playback.commit([_random_layer(chance)], token, time)
+                playback.commit([random_layer(chance)], token, time)
             peak = sum(voice.transition.peak(time) for voice in playback.all_voices[0])
             slope = slope_of(playback, time)
             before = _field(playback.all_voices[0], time)
@@ -326,20 +326,6 @@ def test_random_sets_never_jump_and_keep_their_bounds() -> None:
                 after = _field(playback.all_voices[0], later)
                 assert playback.level(0, later) <= peak + 1e-9
                 assert abs(after - before) <= slope * (later - time) + 1e-9
-
-
-def _random_layer(chance: random.Random) -> LayerSet:
-    knots = tuple((chance.randrange(FULL), chance.randrange(-9000, 9000)) for _ in range(3))
-    shape = chance.choice((None, Envelope(chance.choice((5, 40)), knots)))
-    command = tone(
-        frequency=chance.choice((2000, 3000)),
-        level=chance.randrange(FULL),
-        keep_phase=chance.random() < 0.5,
-        onset=shape,
-        ending=chance.choice((None, shape)),
-    )
-    commands = (command,) if chance.random() < 0.8 else ()
-    return layer(chance.randrange(3), *commands, valid_for=chance.choice((0, 9)))
 
 
 def _field(voices: tuple[Voice, ...], time: float) -> complex:
@@ -465,8 +451,8 @@ def test_set_that_comes_as_another_layer_may_end_is_ambiguous() -> None:
     assert bounds.bounds(0, 0.161, 0.162) == (0.0, 0.0)
 
 
-def test_layer_may_have_ended_just_before_all_falls_silent() -> None:
-    """By hand: it ends at once within 100 to 112 ms, and all fades for 50 ms from 110 ms on."""
+def expecting() -> tuple[ExpectedOutputs, Callable[..., None], list[str]]:
+    """What is expected of outputs that were silent at 0 s, what reports, and rules it reported."""
     found: list[str] = []
 
     def report(rule: str, *_: object, **__: object) -> None:
@@ -474,6 +460,12 @@ def test_layer_may_have_ended_just_before_all_falls_silent() -> None:
 
     began = 0.0, 0.0
     outputs = ExpectedOutputs({}, report=report, unclear=None, slack=0.0, cause="", began=began)
+    return outputs, report, found
+
+
+def test_layer_may_have_ended_just_before_all_falls_silent() -> None:
+    """By hand: it ends at once within 100 to 112 ms, and all fades for 50 ms from 110 ms on."""
+    outputs, report, found = expecting()
     ended = Command(0, 2200, 5000, 0, ending=Envelope(10, ()))
     outputs.play([LayerSet(0, 0, 100, (ended,))], 1, (0.0, 0.01), is_exact=True)
     outputs.silence((0.11, 0.112), 0.05, "Disarm")
@@ -494,13 +486,7 @@ def test_way_to_silence_that_a_ramp_may_shorten_or_not_is_unknown_until_both_are
     the way, from 1.03 s on behind it; from 1.02 s on within 1.0400 to 1.0425 s, and the way within
     1.040 to 1.042 s.
     """
-    found: list[str] = []
-
-    def report(rule: str, *_: object, **__: object) -> None:
-        found.append(rule)
-
-    began = 0.0, 0.0
-    outputs = ExpectedOutputs({}, report=report, unclear=None, slack=0.0, cause="", began=began)
+    outputs, report, found = expecting()
     way, when = Envelope(100, ((5000, 0),) * 3), (begins, begins + 0.0005)
     if by_a_set:
         rises = Command(0, 2200, 0, 0, onset=way)

@@ -321,6 +321,17 @@ ELEMENT = b"< frame 185 1.000000 0102030405060708 >"
 SLCAN_SPOKEN = b"\rC\rS5\rO\rt18580102030405060708\r\rC\r"
 
 
+class Below:
+    """A port that keeps what is written."""
+
+    is_blocked = False
+    written = b""
+
+    def write(self, data: bytes) -> None:
+        """Keep it."""
+        self.written += data
+
+
 @asynccontextmanager
 async def server(*replies: bytes, accepted: asyncio.Event | None = None) -> AsyncIterator[str]:
     """A server that greets with the first text, and replies to each element with the next.
@@ -436,13 +447,6 @@ async def test_slcan_adapter_that_restarts_is_opened_again_until_it_speaks() -> 
     Text with BEL at its end is an error of the adapter, as frames have no such identifier.
     """
 
-    class Below:
-        is_blocked = False
-        written = b""
-
-        def write(self, data: bytes) -> None:
-            self.written += data
-
     heard: list[CanFrame] = []
     port = TextPort(SLCAN, lambda data: heard.extend(unpack_frames(data)), hello=b"O\r")
     port.below = below = Below()  # type: ignore[assignment]
@@ -462,9 +466,6 @@ async def test_text_that_no_adapter_replies_with_is_an_error() -> None:
     By LAWICEL's CANUSB manual: V, N, F and z.
     """
 
-    class Below:
-        is_blocked = False
-
     async def opener(name: str, on_data: object, on_loss: object) -> object:
         return Below()
 
@@ -483,14 +484,8 @@ async def test_text_that_no_adapter_replies_with_is_an_error() -> None:
 async def test_line_that_was_cut_off_is_ended_before_the_next_frame() -> None:
     """A port that has not taken all drops the rest of a line: a CR of its own ends that."""
 
-    class Blocked:
-        is_blocked = True
-        written = b""
-
-        def write(self, data: bytes) -> None:
-            self.written += data
-
     port = TextPort(SLCAN, lambda data: None, cut_off=b"\r")
-    port.below = below = Blocked()  # type: ignore[assignment]
+    port.below = below = Below()  # type: ignore[assignment]
+    below.is_blocked = True
     port.write(pack_frames([FRAME_AS_TEXT]))
     assert below.written == b"\rt18580102030405060708\r"

@@ -4,10 +4,16 @@
 """
 
 import math
+from collections.abc import AsyncIterator, Sequence
+from contextlib import asynccontextmanager
+from dataclasses import dataclass, field
 from fractions import Fraction
+from pathlib import Path
+from typing import Any
 
 import pytest
 
+from courses import Taken, courses, fits, follow
 from drivers.protocol.definition import FAULTS, STATES
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Command, LayerSet, pack_layers, parts
@@ -99,8 +105,6 @@ def test_moment_of_a_clock_without_errors() -> None:
 
 
 ARM = {"session": 7, "watchdog": 250, "shift": 0}
-OFF, *_, ENABLED = list(STATES)[1:5]
-_, REACTION, FAULT = list(STATES)[5:]
 
 
 def armed(*, channels: int = 2) -> SimulatedAmplifier:
@@ -135,19 +139,62 @@ def levels(amplifier: SimulatedAmplifier, at: float) -> list[int]:
     return list(amplifier.handle("GetStatus", {}, at)["levels"])
 
 
-def test_heat_derates_and_then_trips() -> None:
-    """Above 70 °C half of every level, told as inexact; above 85 °C a fault until cool."""
-    amplifier = armed()
-    play(amplifier, 1, 0.0, tone(), ramp=0)
-    amplifier.set_temperature(71.0, 0.1)
-    assert levels(amplifier, 0.13) == [2500, 0]
-    taken = play(amplifier, 2, 0.13, tone(1, 2000, 8000), layer=1, ramp=0)
-    assert (taken["exact"], levels(amplifier, 0.14)) == (False, [2500, 4000])
-    amplifier.set_temperature(86.0, 0.2)
-    assert amplifier.handle("GetStatus", {}, 0.21)["fault"] == FAULTS["OVER_TEMPERATURE"]
-    assert amplifier.handle("Clear", {"latch": 1}, 0.22)["state"] == STATES[FAULT]
-    amplifier.set_temperature(60.0, 0.3)
-    assert amplifier.handle("Clear", {"latch": 1}, 0.31)["state"] == STATES[OFF]
+@dataclass(kw_only=True)
+class Handled(Taken):
+    """An amplifier that handles requests; reply: the last one, at a time [s].
+
+    events: the name of the state, the latch and the time of each.
+    """
+
+    amplifier: SimulatedAmplifier
+    reply: Values = field(default_factory=dict)
+    at: float = 0.0
+    events: list[tuple[str, int, float]] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        """Note all events."""
+        self.amplifier.listeners.append(
+            lambda event, at: self.events.append((_named("state", event), event["latch"], at))
+        )
+
+    @property
+    def ahead(self) -> int:
+        """By how much the clock of the last reply is ahead of one without errors [2^-32 turns]."""
+        return int(self.reply["clock"]) - round(self.at * PER_SECOND)
+
+    def asks(self, name: str, at: float, **values: int) -> None:
+        """Handle a request at a time."""
+        self.at, self.reply = at, self.amplifier.handle(name, values, at)
+
+    def plays(self, token: int, at: float, tone: Sequence[int], layer: int = 0) -> None:
+        """Handle a set that plays a tone at once: channel, frequency and level."""
+        self.reply = play(self.amplifier, token, at, Command(*tone, 0), layer=layer, ramp=0)
+
+    def replies(self, **expected: Any) -> None:
+        """Require values of the last reply, states and faults by name."""
+        found = {what: _named(what, self.reply) for what in expected}
+        assert fits(found, expected), found
+
+
+def _named(what: str, values: Values) -> Any:
+    """A value, a state or fault by its name."""
+    names = {"state": STATES, "fault": FAULTS}.get(what, {})
+    return next((name for name, code in names.items() if code == values[what]), values[what])
+
+
+@asynccontextmanager
+async def handled(*, is_armed: bool = True) -> AsyncIterator[Handled]:
+    """An amplifier of two channels, armed by session 7 at time 0 with a watchdog of 0.25 s."""
+    yield Handled(amplifier=armed() if is_armed else SimulatedAmplifier("a", channels=2))
+
+
+COURSES = courses(Path(__file__).with_name("courses.yaml"))
+
+
+@pytest.mark.parametrize("name", COURSES)
+def test_amplifier_keeps_to_its_course(name: str) -> None:
+    """Every step is as it is in the file."""
+    follow(COURSES[name], handled)
 
 
 def test_temperature_follows_the_mean_square_level() -> None:
@@ -158,85 +205,6 @@ def test_temperature_follows_the_mean_square_level() -> None:
     for second in range(1, 121):
         status = amplifier.handle("Ping", {"session": 7, "rate": 0}, float(second))
     assert status["temperature"] == pytest.approx(250 + 75 * (1 - 1 / math.e), abs=1)
-
-
-def test_interlock_trips_and_keeps_disarmed() -> None:
-    """Neither cleared nor armed until it is closed; the event names state, fault and latch."""
-    amplifier, events = armed(), []
-    amplifier.listeners.append(lambda event, at: events.append((event["state"], event["latch"])))
-    amplifier.set_interlock(0.1, is_open=True)
-    amplifier.tick(0.2)
-    assert events == [(STATES[REACTION], 1), (STATES[FAULT], 1)]
-    assert amplifier.handle("Clear", {"latch": 1}, 0.2)["state"] == STATES[FAULT]
-    amplifier.set_interlock(0.3, is_open=False)
-    amplifier.handle("Clear", {"latch": 1}, 0.3)
-    assert (
-        amplifier.handle("Arm", {"session": 8, "watchdog": 250, "shift": 0}, 0.3)["state"]
-        == STATES[ENABLED]
-    )
-
-
-def test_restart_forgets_all_but_its_faults() -> None:
-    """Silent at once and disarmed, the next token may be any."""
-    amplifier = armed()
-    play(amplifier, 9, 0.0, tone())
-    amplifier.trip("ARC", 0.1, channel=1)
-    amplifier.restart(0.2)
-    status = amplifier.handle("GetStatus", {}, 0.2)
-    assert (status["state"], status["token"], status["levels"]) == (STATES[OFF], 0, [0, 0])
-    faults = amplifier.handle("GetFaults", {}, 0.3)["faults"]
-    assert faults == [{"fault": FAULTS["ARC"], "channel": 1, "age": 200}]
-
-
-def test_high_voltage_is_on_while_armed_and_discharges() -> None:
-    """1800 V; 1800/e after 20 ms without it, a current of 2 pi f/2 C U in a capacitor of 1 nF.
-
-    None in one that is stopped and was never armed.
-    """
-    amplifier = armed()
-    play(amplifier, 1, 0.0, tone(0, 2000, 10000), ramp=0)
-    measured = amplifier.handle("GetMeasured", {}, 0.01)["channels"][0]
-    voltage = 1800 / math.sqrt(2)
-    assert measured["channel_voltage"] == pytest.approx(10 * voltage, abs=1)
-    assert measured["channel_current"] == pytest.approx(math.pi * 100 * voltage * 1e-3, abs=1)
-    amplifier.handle("Disarm", {"ramp": 0}, 0.1)
-    assert amplifier.handle("GetStatus", {}, 0.12)["high_voltage"] == round(1800 / math.e)
-    assert SimulatedAmplifier("b", channels=1).handle("Stop", {"ramp": 5}, 0.0)["high_voltage"] == 0
-
-
-def test_rate_is_of_an_armed_session() -> None:
-    """100 ppm for a second are 21 475 steps of 2^32 in 20 s; disarmed there is no rate."""
-    amplifier = SimulatedAmplifier("a", channels=2)
-    ping, shown = {"session": 7, "rate": 1000}, []
-    amplifier.handle("Ping", ping, 0.0)
-    amplifier.handle("Arm", {**ARM, "watchdog": 2000}, 1.0)
-    for now in (1.0, 2.0):
-        shown.append(amplifier.handle("Ping", ping, now)["clock"])
-    amplifier.handle("Disarm", {"ramp": 0}, 2.0)
-    shown += [amplifier.handle("GetStatus", {}, now)["clock"] for now in (3.0, 4.0)]
-    fast = [clock - round(now * 2**32 / 20) for clock, now in zip(shown, (1, 2, 3, 4), strict=True)]
-    assert fast == pytest.approx([0, 21_475, 21_475, 21_475], abs=1)
-
-
-def test_watchdog_ends_the_rate_and_counts_real_time() -> None:
-    """3276.7 ppm fast, it trips after 0.25 s, and its clock is as fast as its crystal again."""
-    amplifier, events = armed(), []
-    amplifier.listeners.append(lambda event, at: events.append(at))
-    amplifier.handle("Ping", {"session": 7, "rate": 32767}, 0.0)
-    amplifier.tick(1.0)
-    assert events[0] == 0.25
-    ahead = amplifier.handle("GetStatus", {}, 1.0)["clock"] - round(2**32 / 20)
-    assert ahead == pytest.approx(0.25 * 3276.7e-6 * 2**32 / 20, abs=1)
-
-
-def test_shift_is_of_a_new_session() -> None:
-    """3 steps of the high word, once, though Arm is repeated; a restart shows 0."""
-    amplifier = SimulatedAmplifier("a", channels=2)
-    for now in (0.0, 0.1):
-        status = amplifier.handle("Arm", {**ARM, "shift": 3}, now)
-    assert status["clock"] == 3 * 65536 + round(0.1 * 2**32 / 20)
-    amplifier.restart(5.0)
-    assert amplifier.handle("GetStatus", {}, 5.0)["clock"] == 0
 
 
 def play_from(

@@ -126,7 +126,6 @@ class Learned(Taken):
     workers: Workers = field(default_factory=lambda: Workers())
     events: list[PlateEvent] = field(default_factory=list)
     taken: list[LocalizationTable] = field(default_factory=list)
-    log: list[logging.LogRecord] = field(default_factory=list)
     asked: int = 0
     sensors: str = ""
 
@@ -141,11 +140,6 @@ class Learned(Taken):
         """What the status says."""
         empty = LatencySummary(count=0, median=None, p99=None, p999=None, histogram=[])
         return self.learning.summary(empty)
-
-    @property
-    def logged(self) -> list[str]:
-        """Levels of what was logged since the last report."""
-        return [each.levelname for each in self.log]
 
     @property
     def is_corrected(self) -> bool:
@@ -221,9 +215,6 @@ async def learned(
     found = Learned(sensors=sensors)
     error = ERRORS[started] if isinstance(started, str) else None
     found.workers.started = error or report_of(**started)
-    handler, logger = logging.Handler(), logging.Logger("plate")
-    handler.emit = found.log.append  # type: ignore[method-assign]
-    logger.addHandler(handler)
     controller: Any = SimpleNamespace(
         drive_mode="switched",
         amplifiers={},
@@ -235,7 +226,7 @@ async def learned(
         patch.setattr(module, "SettledReadings", Readings)
         patch.setattr(module, "plate_sensors", found.plate_sensors)
         patch.setattr(module, "check_clocks", lambda amplifiers: None)
-        patch.setattr(module, "_logger", logger)
+        patch.setattr(module._logger, "isEnabledFor", lambda level: level >= logging.INFO)
         found.learning = Learning(
             make_paper_rig(12, 9),
             small_table(),

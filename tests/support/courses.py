@@ -7,6 +7,7 @@ A step is a method of what is played or, with dots, of its parts; or `is`: value
 
 import asyncio
 import inspect
+import logging
 import math
 import operator
 import sys
@@ -50,10 +51,24 @@ class Planted(Exception):
 
 @dataclass(kw_only=True)
 class Taken:
-    """What takes the steps of courses; under_way: those that have begun; error: the last of one."""
+    """What takes the steps of courses; under_way: those that have begun; error: the last of one.
+
+    log: what is logged meanwhile.
+    """
 
     under_way: dict[str, "asyncio.Task[None]"] = field(default_factory=dict)
     error: Exception | None = None
+    log: list[logging.LogRecord] = field(default_factory=list)
+
+    @property
+    def logged(self) -> str:
+        """The text of all that was logged, tracebacks included."""
+        return "\n".join(map(logging.Formatter().format, self.log))
+
+    @property
+    def levels_logged(self) -> list[str]:
+        """The level of each record."""
+        return [each.levelname for each in self.log]
 
     async def waits(self, seconds: float) -> None:
         """Let time pass."""
@@ -95,6 +110,10 @@ class Taken:
     def says(self, what: str, text: str) -> None:
         """Require a part of a text."""
         assert text in attrgetter(what)(self), attrgetter(what)(self)
+
+    def lacks(self, what: str, text: str) -> None:
+        """Require that a text is no part of another."""
+        assert text not in attrgetter(what)(self), attrgetter(what)(self)
 
     def counts(self, **numbers: int) -> None:
         """Require the numbers of what was reported."""
@@ -401,8 +420,14 @@ def follow(
     async def run() -> None:
         steps, amplifiers = given.pop("steps"), given.pop("amplifiers", ())
         async with made(*amplifiers, **given) as chain:
-            for step in steps:
-                await chain.take(step)
+            handler = logging.Handler()
+            handler.emit = chain.log.append  # type: ignore[method-assign]
+            logging.getLogger().addHandler(handler)
+            try:
+                for step in steps:
+                    await chain.take(step)
+            finally:
+                logging.getLogger().removeHandler(handler)
 
     run_virtual(run())
 

@@ -32,7 +32,7 @@ from controller.api.methods import METHODS, ArmParams, StatusResult, SubscribePa
 from controller.api.schema import ApiMessage, Empty
 from controller.api.server import ApiServer, Connection
 from courses import Taken, courses, fits, follow
-from daemons import PATIENCE, ServedApi, Wire, request, serving
+from daemons import PATIENCE, ServedApi, Wire, request
 from registry import threads
 from virtual_lines import feed
 
@@ -40,6 +40,7 @@ PARAMS = {
     "arm": '{"owner":"me","lease_s":5}',
     "disarm level": '{"level":2}',
     "hello": '{"client":"a"}',
+    "play": '{"effect":"x","x_m":0,"y_m":0}',
     "renew": '{"lease":"a"}',
     "renew stop": '{"lease":"stop"}',
     "stop x": '{"x":1}',
@@ -65,6 +66,7 @@ class Clients(Taken):
     served: ServedApi = field(init=False)
     made: dict[str, tuple[Connection, Wire]] = field(default_factory=dict)
     marked: int = 0
+    patch: pytest.MonkeyPatch = field(default_factory=pytest.MonkeyPatch)
 
     def __post_init__(self) -> None:
         """Make the server, which counts time from now on."""
@@ -120,6 +122,15 @@ class Clients(Taken):
         """Let all clients read, and forget, what was sent to them."""
         for _, wire in self.made.values():
             wire.waiting = b""
+
+    @property
+    def sent(self) -> str:
+        """All that clients have not read yet."""
+        return "".join(wire.waiting.decode() for _, wire in self.made.values())
+
+    def results_fail(self) -> None:
+        """Let the result of `status` be one that cannot be sent."""
+        self.patch.setattr(StatusResult, "model_dump_json", Mock(side_effect=UnicodeError))
 
     def ends_its_input(self, name: str) -> None:
         """Let a client close its side."""
@@ -193,7 +204,7 @@ async def clients(*, turn: float = 0.0) -> AsyncIterator[Clients]:
     """A server without clients; turn [s]: how long one is, none for a line of each client."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(server, "MAX_TURN", turn)
-        found = Clients()
+        found = Clients(patch=patch)
         yield found
         found.arming_may_end()
         await found.settles()
@@ -224,29 +235,6 @@ async def test_connection_that_is_accepted_amid_closing_is_closed(tmp_path: Path
             with suppress(ConnectionResetError):  # it was never accepted
                 async with asyncio.timeout(PATIENCE / 6):
                     assert await asyncio.get_running_loop().sock_recv(client, 1) == b""
-
-
-async def test_bug_in_a_method_is_reported_without_details(
-    caplog: pytest.LogCaptureFixture,
-) -> None:
-    """Code -32603; the details are in the log alone."""
-    served, client, wire = serving()
-    await served.takes(client, request("play", '{"effect":"x","x_m":0,"y_m":0}', id=1))
-    response = json.dumps(wire.lines())
-    assert "-32603" in response
-    assert "/a/path" not in response
-    assert "/a/path" in caplog.text
-
-
-async def test_result_that_cannot_be_sent_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
-    """As of a text that is not Unicode; the next line is served in the same turn."""
-    served, client, wire = serving()
-    monkeypatch.setattr(StatusResult, "model_dump_json", Mock(side_effect=UnicodeError))
-    async with asyncio.timeout(PATIENCE / 6):
-        await served.takes(client, request("status", id=1) + request("disarm", id=2))
-    failed, done = wire.lines()
-    assert (failed["id"], failed["error"]["code"]) == (1, ErrorCode.INTERNAL)
-    assert done == {"jsonrpc": "2.0", "id": 2, "result": {}}
 
 
 @pytest.mark.parametrize("where", ["the line", "the method"])

@@ -14,6 +14,7 @@ from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 
@@ -30,15 +31,14 @@ from controller.play.intent import (
     Target,
     sums_db,
 )
-from controller.play.loop import ENDED, Observers, PlayReport
+from controller.play.loop import ENDED, PlayReport
 from controller.play.selection import Chooser, Selector
 from controller.sources.touch import Contact, ContactKey, Touch, TouchFrame
 from courses import Acted, Planted, courses, follow
-from drivers.errors import LinkError
 from drivers.host.group import GroupState
 from drivers.opening import Lines
 from drivers.protocol.definition import QUANTITIES
-from drivers.protocol.records import Refusal, Values
+from drivers.protocol.records import Values
 from drivers.protocol.sets import Envelope
 from model.answer.answer import Layer
 from model.answer.answer_report import Timing
@@ -316,6 +316,27 @@ class Played(Acted):
         """Let an amplifier be on the line of another, with another address."""
         self.controller.urls[name] = f"{self.controller.urls[other]}&address=2"
 
+    def observers_fail(self) -> None:
+        """Let all that hear of contacts and reports fail."""
+        loop = self.controller.cycle.observers
+        for callbacks in (loop.contacts_changed, loop.reported):
+            callbacks.insert(0, Mock(side_effect=RuntimeError("no disk space for this row")))
+
+    def touches_as_arming_ends(self) -> None:
+        """Let a finger come as the amplifiers have just been armed."""
+        arm = self.controller.group.arm
+
+        async def armed_late() -> None:
+            await arm()
+            self.touch("finger")
+
+        self.controller.group.arm = armed_late
+
+    @property
+    def is_silence(self) -> list[bool]:
+        """Whether each set is of silence, from arming on."""
+        return [each.is_silent for each in self.far_end.sent()]
+
     def is_disarmed_by_another(self, of: int) -> None:
         """Let another program disarm an amplifier; the sessions so far are noted."""
         self.sessions = {each.amplifier.session for each in self.far_ends}
@@ -391,25 +412,6 @@ async def test_lift_as_a_set_is_confirmed_precedes_a_due_heartbeat() -> None:
         await chain.leave(0.05, FINGER)
         for end, count in zip(chain.far_ends, before, strict=True):
             assert end.names(count)[:2] == ["Silence", "Ping"]
-
-
-@in_virtual_time
-async def test_controller_survives_a_failing_observer(caplog: pytest.LogCaptureFixture) -> None:
-    """Its exceptions are logged; pattern, silence and heartbeats are sent all the same."""
-
-    def fail(*_: object) -> None:
-        raise RuntimeError("no disk space for this row")
-
-    def observe(loop: Observers) -> None:
-        for callbacks in (loop.contacts_changed, loop.reported):
-            callbacks.append(fail)
-
-    async with set_running(observe=observe) as chain:
-        await chain.leave(0.01, FINGER)
-        await chain.leave(0.2)
-        assert [each.is_silent for each in chain.far_end.sent()] == [True, False, True]
-        assert len(chain.far_end.requests("Ping")) > 3
-    assert "no disk space for this row" in caplog.text
 
 
 PLAYED = SurfaceLayout(LAYOUT.regions, {**default_effects(), **LAYOUT.effects}, elsewhere=None)
@@ -494,24 +496,6 @@ def states(chain: Chain) -> set[str]:
     return {end.state for end in chain.far_ends}
 
 
-@in_virtual_time
-async def test_a_touch_while_arming_ends_is_felt(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Its set may be on the wire when the amplifiers are armed and what played is forgotten."""
-    async with set_running() as chain:
-        await chain.controller.disarm()
-        arm = chain.controller.group.arm
-
-        async def armed_late() -> None:
-            await arm()
-            await chain.leave(0, FINGER)
-
-        monkeypatch.setattr(chain.controller.group, "arm", armed_late)
-        await chain.controller.arm()
-        await chain.hold(0.1, down=[FINGER])
-        assert states(chain) == {ENABLED}
-        assert chain.applied[-1].contents
-
-
 @pytest.mark.parametrize("kind", ["Set", "Commit", "Ping"])
 @in_virtual_time
 async def test_unexpected_exception_stops_all(kind: str) -> None:
@@ -532,38 +516,6 @@ async def test_unexpected_exception_stops_all(kind: str) -> None:
             await running  # type: ignore[misc]
         assert states(chain) == {STOPPED}
         assert chain.controller.group.state is GroupState.STOPPED
-
-
-@in_virtual_time
-async def test_no_plan_fails_while_an_amplifier_is_identified_again(
-    caplog: pytest.LogCaptureFixture,
-) -> None:
-    """A stop finds all closed, one by a lost line, and the other tells no capabilities any more.
-
-    The finger that rests is planned for meanwhile, and felt once both are open again and armed.
-    """
-    async with set_running("a", "b") as chain:
-        chain.far_ends[1].fault("unplug")
-        await chain.hold(0.5)
-        with pytest.raises(LinkError):
-            await chain.controller.open()
-        known, other = chain.far_ends
-
-        def refuse(name: str, values: Values) -> None:
-            if name == "GetCaps":
-                raise Refusal("as told", "WRONG_STATE")
-
-        known.lie(refuse)
-        await chain.controller.stop_all()
-        await chain.hold(0.5, down=[FINGER])
-        assert not [each for each in caplog.records if "plan failed" in each.getMessage()]
-        known.answer = lambda name, values: None
-        other.recover()
-        await chain.controller.open()
-        await chain.controller.clear()
-        await chain.controller.arm()
-        await chain.hold(0.1)
-        assert any(known.levels)
 
 
 @pytest.mark.parametrize(

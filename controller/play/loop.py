@@ -81,6 +81,8 @@ class Plan:
     """Empty where nothing changes."""
     is_reported: bool = True
     """Whether what is felt changes."""
+    before: Mapping[int, Slot] = field(default_factory=dict)
+    """What played before, by layer."""
 
     @property
     def since(self) -> float:
@@ -226,11 +228,19 @@ class Planner:
         self._plan, self._retry_at = None, math.inf
         self.slots.forget()
 
-    def not_played(self, plan: Plan) -> None:
-        """Discard what plays, since a plan has not been played; its fingers wait for the next."""
-        self.forget()
+    def not_played(self, plan: Plan, *, is_known: bool) -> None:
+        """Have the fingers of a plan that was not played wait for the next one.
+
+        What plays is discarded, unless it is known to be what played before; what the plan ends may
+        play, and is ended by the next.
+        """
+        if plan.is_reported or not is_known:
+            self.forget()
         if plan.is_reported:
             self._tracker.wait_again(plan.answered)
+            sets = plan.sets
+            left = plan.before.keys() - (sets.layers.keys() - sets.started) if is_known else ()
+            self.slots.contents = {number: plan.before[number] for number in left}
 
     def only_ends(self, plan: Plan) -> Plan:
         """Return a plan that starts and prolongs nothing; what it would start is planned again."""
@@ -238,9 +248,8 @@ class Planner:
             return replace(plan, sets=Sets())
         if not plan.sets.started:
             return plan
-        self.not_played(plan)
-        layers, started = plan.sets.layers, plan.sets.started
-        ends = {number: each for number, each in layers.items() if number not in started}
+        self.not_played(plan, is_known=True)
+        ends = {n: each for n, each in plan.sets.layers.items() if n not in plan.sets.started}
         return replace(plan, sets=Sets(ends), is_reported=False)
 
     def confirm(self, sets: Sets, played: PlayedSet, *, now: float) -> None:
@@ -280,6 +289,7 @@ class Planner:
                 if pulse.started_at is None:
                     self._too_late(1)
         before, contacts, has_failed = self._plan, self._tracker.contacts, False
+        playing = self.slots.contents
         try:
             # Where fingers change only if none was counted for long: their answer waits for it.
             if now >= self._clocks_due or not self._tracker.changed:
@@ -320,7 +330,7 @@ class Planner:
         for pulse in self._pulses(sets.started):
             self._awaited[id(pulse)] = pulse
         answered = self._answered(sets.started)
-        self._plan = plan = Plan(contacts, selection, now, answered, sets)
+        self._plan = plan = Plan(contacts, selection, now, answered, sets, before=playing)
         if sets or not (is_felt or is_awaited):
             return plan
         said = () if before is None else before.selection.predictions
@@ -537,11 +547,8 @@ class Cycle:
     def is_preparing(self) -> bool:
         """Whether a change of contacts is on its way to the amplifiers."""
         planner, plan = self.planner, self._plan
-        if planner is None:
-            return False
-        if plan is not None and self.group.members.last_sent_at < plan.since:
-            return True
-        return planner.is_waiting
+        is_unsent = plan is not None and self.group.members.last_sent_at < plan.since
+        return planner is not None and (is_unsent or planner.is_waiting)
 
     async def run(self) -> None:
         """Run the loop until `close` or cancellation, also while amplifiers are lost or closed.
@@ -636,7 +643,8 @@ class Cycle:
             is_overtaken = isinstance(error, Preempted) or not self.group.is_armed
             if isinstance(error, CommandRefused) and not is_overtaken and sets.silence is None:
                 return error
-            planner.not_played(plan)
+            is_known = isinstance(error, LinkDegraded) and not self.group.sets.is_in_doubt
+            planner.not_played(plan, is_known=is_known and sets.silence is None)
             raise
         planner.confirm(sets, played, now=threads.now())
         return played.starts_at

@@ -326,7 +326,16 @@ class CountedClocks:
             self._note(before)
         for name in [*self._held_since]:  # mostly none
             if threads.now() - self._held_since[name] >= SETTLED:
-                self._say_held(name)
+                _logger.info(
+                    "amplifier %s: clock held to %.0f us for %.0f s, its ERAs play with the "
+                    "others'; losses before: %d",
+                    name,
+                    1e6 * self.errors[name],
+                    SETTLED,
+                    self._losses[name],
+                )
+                self._losses[name] = 0
+                del self._held_since[name]
         return table.with_clocks(self._counted)
 
     def is_one_lost(self, known: Mapping[str, float]) -> bool:
@@ -368,19 +377,6 @@ class CountedClocks:
                         name,
                     )
                 self._losses[name] += 1
-
-    def _say_held(self, name: str) -> None:
-        """Log that an amplifier's clock has been held for long, and how often it was not."""
-        _logger.info(
-            "amplifier %s: clock held to %.0f us for %.0f s, its ERAs play with the others'; "
-            "losses before: %d",
-            name,
-            1e6 * self.errors[name],
-            SETTLED,
-            self._losses[name],
-        )
-        self._losses[name] = 0
-        del self._held_since[name]
 
 
 def piece_of(

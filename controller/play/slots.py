@@ -308,8 +308,7 @@ class Slots:
 
     def have_settled(self, now: float) -> bool:
         """Whether all that may play has settled, so that endings lead from there."""
-        settled = [self._may_end_shaped(number, now) for number in self.may_play]
-        return bool(settled) and all(settled)
+        return bool(self.may_play) and all(self._may_end_shaped(n, now) for n in self.may_play)
 
     def confirm(self, sets: Sets, played: PlayedSet, now: float) -> None:
         """Note what the amplifiers play of sets that were committed by now [s].
@@ -372,11 +371,10 @@ class Slots:
 
     def over_of(self, contents: Sequence[Content]) -> tuple[Content, ...]:
         """Return which of the wanted contents have ended by themselves."""
-        if self._over:
-            over = [(each.key, each.targets, each.placement) for each in self._over]
-            self._over = tuple(
-                [one for one in contents if (one.key, one.targets, one.placement) in over]
-            )
+        over = [(each.key, each.targets, each.placement) for each in self._over]
+        self._over = tuple(
+            [one for one in contents if (one.key, one.targets, one.placement) in over]
+        )
         return self._over
 
     def numbered(self, contents: Sequence[Content]) -> dict[int, Content]:

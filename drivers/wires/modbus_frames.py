@@ -25,11 +25,13 @@ from pymodbus.pdu.register_message import (
 )
 
 from drivers.protocol.definition import (
+    BY_NUMBER,
     HELLO,
     IDENTITY,
     MAX_WORDS,
     NAK,
     TEXTS,
+    Message,
     nak_of,
 )
 from drivers.protocol.records import TEXT_MAX, Refusal, Values
@@ -150,6 +152,20 @@ def parse_request(adu: Adu) -> Pdu | None:
     except Exception:  # whatever a library raises for bytes that were damaged
         return None
     return request if is_whole and 1 <= request.count <= _COUNT_MAX[pdu[0]] else None
+
+
+def message_written(request: Pdu) -> Message | None:
+    """Return the message that a request writes, None where it writes none."""
+    number, offset = divmod(request.address, BOX)
+    is_write = request.function_code == WRITE and request.count <= MAX_WORDS + 1
+    return BY_NUMBER.get(number) if is_write and offset == 0 else None
+
+
+def message_shown(request: Pdu) -> Message | None:
+    """Return the message from whose reply area a request reads, None where it reads another."""
+    number, offset = divmod(request.address, BOX)
+    is_read = request.function_code in READS
+    return BY_NUMBER.get(number) if is_read and offset >= REPLY_OFFSET else None
 
 
 def response_to(request: Pdu | None, adu: Adu) -> Response | None:

@@ -23,12 +23,10 @@ from collections.abc import Callable, Mapping, Sequence
 
 from drivers.errors import WireCounters
 from drivers.protocol.definition import (
-    BY_NUMBER,
     EVENT,
     EVENT_RECORD,
     FAULTS,
     MESSAGES,
-    NAK,
     QUANTITIES,
     TEXTS,
     name_of,
@@ -232,20 +230,14 @@ class CanAmplifiers(FarEnd):
                         each.command(frame.data[0], now)
         elif frame.id == REQUEST:
             if (message := self._broadcasts.add(frame.data, now)) is not None:
-                self._broadcast(message, now)
+                for each in self._nodes.values():
+                    each.carry_out(message, now)
+                self._note_numbers()
         elif node is not None and kind == REQUEST:
             node.request(frame.data, now)
             self._note_numbers()
         elif node is not None and kind == cob_id("sdo_request"):
             node.read(frame.data, now)
-
-    def _broadcast(self, message: CanMessage, now: float) -> None:
-        known = BY_NUMBER.get(message.type)
-        if known is not None and known.is_broadcast:
-            for node in self._nodes.values():
-                if node.is_listening:
-                    node.carry_out(message, now)
-            self._note_numbers()
 
     def _note_numbers(self) -> None:
         """Note the numbers of nodes, which may have taken others."""
@@ -319,15 +311,20 @@ class _Node:
             self.carry_out(message, now)
 
     def carry_out(self, message: CanMessage, now: float) -> None:
-        """Carry out a message; one without a number has no reply, nor a part of a set."""
-        sender = self.number
+        """Carry out a message, if it takes requests; one without a number is for all."""
+        if not self.is_listening:
+            return
+        number, sender = message.number, self.number
         kind, words = carry_out(
-            self._amplifier, message.type, message.words, now, address_max=NODE_MAX
+            self._amplifier,
+            message.type,
+            message.words,
+            now,
+            is_for_all=not number,
+            address_max=NODE_MAX,
         )
-        if message.number and words:
-            self._put(REPLY + sender, *segments(message.number, kind, words))
-        elif not message.number and kind != NAK:
-            self._amplifier.withdraw_status()
+        if number and words:
+            self._put(REPLY + sender, *segments(number, kind, words))
         if kind == _SET_ADDRESS:
             self.number = message.words[0]
         if self.number != sender:

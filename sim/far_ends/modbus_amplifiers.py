@@ -8,7 +8,7 @@ result, words). Not modelled: parity and collisions on a serial line.
 import math
 from collections.abc import Mapping, Sequence
 
-from drivers.protocol.definition import BY_NUMBER, MAX_WORDS, NAK, Message
+from drivers.protocol.definition import NAK, Message
 from drivers.wires.modbus_frames import (
     AREA,
     BOX,
@@ -23,6 +23,8 @@ from drivers.wires.modbus_frames import (
     answer,
     exception_to,
     framed,
+    message_shown,
+    message_written,
     pack_identity,
     parse_request,
 )
@@ -120,9 +122,9 @@ class _Unit:
             is_known = function in (*READS, WRITE)
             return exception_to(function, _ILLEGAL_VALUE if is_known else _ILLEGAL_FUNCTION)
         if function in READS:
-            shown = self._read(request.address, request.count, now)
+            shown = self._read(request, now)
             return answer(request, shown) if shown else exception_to(function, _ILLEGAL_ADDRESS)
-        message = _written(request)
+        message = message_written(request)
         if message is None:
             return exception_to(function, _ILLEGAL_ADDRESS)
         tag, *words = request.registers
@@ -134,18 +136,16 @@ class _Unit:
     def take_broadcast(self, adu: Adu, now: float) -> None:
         """Carry a request out that is for all units; its reply area stays as it is."""
         request = parse_request(adu)
-        message = None if request is None else _written(request)
-        if request is not None and message is not None and message.is_broadcast:
-            result, _ = self._execute(message, request.registers[1:], now)
-            if not result:
-                self.amplifier.withdraw_status()
+        message = None if request is None else message_written(request)
+        if request is not None and message is not None:
+            result, _ = self._execute(message, request.registers[1:], now, is_for_all=True)
             self.is_moving = message.name == "SetAddress" and result == 0
 
     def _execute(
-        self, message: Message, words: Sequence[int], now: float
+        self, message: Message, words: Sequence[int], now: float, *, is_for_all: bool = False
     ) -> tuple[int, Sequence[int]]:
         """Return the result and the words of the reply to a message."""
-        kind, reply = carry_out(self.amplifier, message.number, words, now)
+        kind, reply = carry_out(self.amplifier, message.number, words, now, is_for_all=is_for_all)
         if kind == NAK:
             _, code, channel = reply or (0, 0, 0)
             return code << 8 | channel, ()
@@ -153,12 +153,11 @@ class _Unit:
             self.address = words[0]
         return 0, reply
 
-    def _read(self, address: int, count: int, now: float) -> Sequence[int]:
-        """Return registers; none where some of them cannot be read."""
-        number, offset = divmod(address, BOX)
-        if offset >= REPLY_OFFSET and number in BY_NUMBER:
-            first = number * BOX + REPLY_OFFSET
-            message = BY_NUMBER[number]
+    def _read(self, request: Pdu, now: float) -> Sequence[int]:
+        """Return the registers that a request reads; none where some of them cannot be read."""
+        address, count = request.address, request.count
+        if (message := message_shown(request)) is not None:
+            first = message.number * BOX + REPLY_OFFSET
             tag, result, words = self._replies.get(message.number, (0, 0, ()))
             if message.name in PRESENT:
                 if result:  # a refusal is read once
@@ -173,10 +172,3 @@ class _Unit:
             first, area = IDENTITY_REGISTER, tuple(pack_identity(self.amplifier.identity))
         is_within = first <= address <= address + count <= first + len(area)
         return area[address - first :][:count] if is_within else ()
-
-
-def _written(request: Pdu) -> Message | None:
-    """Return the message that a request writes, None where it writes none."""
-    number, offset = divmod(request.address, BOX)
-    is_write = request.function_code == WRITE and request.count <= MAX_WORDS + 1
-    return BY_NUMBER.get(number) if is_write and offset == 0 else None

@@ -3,8 +3,7 @@
 On a shared line amplifiers have one address each, and send no events.
 """
 
-from collections.abc import Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Mapping
 
 from drivers.protocol.definition import (
     BROADCAST,
@@ -57,57 +56,40 @@ class SerialAmplifiers(FarEnd):
         for frame in self._reader.feed(data):
             if frame.is_reply or frame.type == EVENT:  # an echo
                 continue
-            if frame.address == BROADCAST:
-                self._broadcast(frame, now)
-                continue
-            amplifier = self._amplifiers.get(frame.address)
-            if amplifier is not None and amplifier.is_answering:
-                reply = self._answer(frame, amplifier, now)
-                if reply is not None:
-                    self._send(encode_frame(reply))
+            for address, amplifier in [*self._amplifiers.items()]:
+                if frame.address in (BROADCAST, address) and amplifier.is_answering:
+                    self._take(frame, amplifier, now)
 
-    def _answer(self, frame: Frame, amplifier: AmplifierPort, now: float) -> Frame | None:
-        """Return the reply to a request, a Nak where it is refused; None where it has none."""
-        version = NEUTRAL if frame.type == HELLO else VERSION
+    def _take(self, frame: Frame, amplifier: AmplifierPort, now: float) -> None:
+        """Have a request carried out by an amplifier, and send the reply if it has one.
+
+        One of another version, or with half a word, is refused.
+        """
+        version, is_for_all = (
+            NEUTRAL if frame.type == HELLO else VERSION,
+            frame.address == BROADCAST,
+        )
         try:
-            kind, words = self._carry_out(frame, amplifier, now)
+            if frame.version != version == VERSION:
+                raise Refusal(
+                    f"version must be {VERSION}, got {frame.version}", "UNSUPPORTED_VERSION"
+                )
+            words = words_of(frame) if frame.type in BY_NUMBER else ()
+            kind, reply = carry_out(amplifier, frame.type, words, now, is_for_all=is_for_all)
         except Refusal as refusal:
             whole = unpack_words(frame.payload[: len(frame.payload) & ~1])
             is_part = frame.version == VERSION and is_earlier_part(frame.type, whole)
-            kind, words = NAK, [] if is_part else nak_of(refusal, frame.type)
+            kind, reply = NAK, () if is_part else nak_of(refusal, frame.type)
             version = NEUTRAL if refusal.code == "UNSUPPORTED_VERSION" else VERSION
-        kind |= REPLY_BIT
-        reply = frame._replace(kind=kind, payload=payload_of(kind, words), version=version)
-        return reply if words else None
-
-    def _carry_out(
-        self, frame: Frame, amplifier: AmplifierPort, now: float
-    ) -> tuple[int, Sequence[int]]:
-        """Carry out a request by an amplifier; returns type and words of its reply, if it has one.
-
-        Raises Refusal for a frame of another version, or with half a word.
-        """
-        if frame.type != HELLO and frame.version != VERSION:
-            raise Refusal(f"version must be {VERSION}, got {frame.version}", "UNSUPPORTED_VERSION")
-        words = words_of(frame) if frame.type in BY_NUMBER else ()
-        kind, reply = carry_out(amplifier, frame.type, words, now)
         if kind == _SET_ADDRESS:
             self._amplifiers = {
                 words[0] if each is amplifier else address: each
                 for address, each in self._amplifiers.items()
             }
-        return kind, reply
-
-    def _broadcast(self, frame: Frame, now: float) -> None:
-        message = BY_NUMBER.get(frame.type)
-        if message is None or not message.is_broadcast:
-            return
-        for amplifier in self._amplifiers.values():
-            if amplifier.is_answering:
-                with suppress(Refusal):
-                    kind, _ = self._carry_out(frame, amplifier, now)
-                    if kind != NAK:
-                        amplifier.withdraw_status()
+        if reply and not is_for_all:
+            kind |= REPLY_BIT
+            payload = payload_of(kind, reply)
+            self._send(encode_frame(frame._replace(kind=kind, payload=payload, version=version)))
 
     def _send_event(self, event: Values, now: float) -> None:
         ((address, amplifier),) = self._amplifiers.items()

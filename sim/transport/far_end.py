@@ -256,22 +256,27 @@ def carry_out(
     words: Sequence[int],
     now: float,
     *,
+    is_for_all: bool = False,
     address_max: int = ADDRESS_MAX,
 ) -> tuple[int, Sequence[int]]:
     """Carry out a request, by type and words, at a time [s]; returns type and words of its reply.
 
-    A refusal is a Nak; no words: it has no reply, as an earlier part of a set. address_max: of the
-    wire.
+    A refusal is a Nak; no words: it has no reply, as an earlier part of a set. is_for_all: whether
+    it is for all amplifiers, which do not reply; address_max: of the wire.
     """
     if kind == HELLO:
         return HELLO, REQUESTS["Hello"].reply.pack(amplifier.identity)
     try:
         name, values = read_request(kind, words)
+        if is_for_all and not REQUESTS[name].is_broadcast:
+            raise Refusal(f"{name} must be for one amplifier")
         if name == "SetAddress" and values["address"] > address_max:
             raise Refusal(f"address must be 1 to {address_max}, got {values['address']}")
         reply = amplifier.handle(name, values, now)
     except Refusal as refusal:
         return NAK, () if is_earlier_part(kind, words) else nak_of(refusal, kind)
+    if is_for_all:
+        amplifier.withdraw_status()
     return kind, REQUESTS[name].reply.pack(reply) if reply else ()
 
 

@@ -10,11 +10,20 @@ docs/reference/modbus.md, and read by pymodbus.
 
 import re
 from collections import deque
-from collections.abc import Hashable, Sequence
+from collections.abc import Hashable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from drivers.errors import WireCounters
-from drivers.protocol.definition import BY_NUMBER, EVENT, MAX_WORDS, NAMES, REFUSALS
+from drivers.protocol.definition import (
+    EVENT,
+    MAX_WORDS,
+    NAK,
+    NAK_RECORD,
+    NAMES,
+    REFUSALS,
+    REQUESTS,
+)
 from drivers.protocol.records import Refusal
 from drivers.wires.can_frames import (
     BLOCK,
@@ -39,19 +48,22 @@ from drivers.wires.modbus_frames import (
     IDENTITY_COUNT,
     IDENTITY_REGISTER,
     PRESENT,
-    READS,
     REPLY_OFFSET,
     WRITE,
     Adu,
     AduReader,
     Pdu,
+    Response,
+    message_shown,
+    message_written,
     parse_request,
+    reply_in,
     response_to,
-    unpack_identity,
 )
 from era_haptics.lab.witness.capture import (
     A_READ,
     HELLO,
+    REPLIES,
     DecodedFrame,
     Decoder,
     Direction,
@@ -156,14 +168,17 @@ class _Written:
     is_read: bool = False
 
 
-@dataclass(frozen=True, slots=True)
-class _Transaction:
-    """One whose response is missing; request: None where it is none; tag: of what it reads."""
+class _Transaction(NamedTuple):
+    """One whose response is missing.
+
+    request: None where it is none; shows: the message whose reply it reads, as it was written.
+    """
 
     adu: Adu
     key: Hashable
-    request: Pdu | None = None
-    tag: int = 0
+    request: Pdu | None
+    shows: str = ""
+    written: _Written | None = None
 
 
 class ModbusDecoder(Decoder):
@@ -182,7 +197,7 @@ class ModbusDecoder(Decoder):
         }
         self._last: dict[Direction, float] = {}  # times of the last bytes [s]
         self._open: dict[int, _Transaction] = {}  # by number; over RTU at most one
-        self._written: dict[tuple[int, int], _Written] = {}  # by unit and number of the message
+        self._written: dict[tuple[int, str], _Written] = {}  # by unit and name of the message
         self._requests = 0
 
     def feed(self, direction: Direction, time: float, data: bytes) -> list[DecodedFrame]:
@@ -203,80 +218,64 @@ class ModbusDecoder(Decoder):
         self._requests += 1
         key = (adu.unit, self._requests) if adu.unit or self._over_tcp else None
         request = parse_request(adu)
+        opened, taken = _Transaction(adu, key, request), WitnessedRequest(A_READ, adu.unit, key)
         if request is None:
-            self._remember(_Transaction(adu, key))
-            problem = f"function {adu.pdu[0]} is malformed or none"
-            return WitnessedRequest(A_READ, adu.unit, key, problem=problem)
-        if adu.pdu[0] in READS:
-            return self._read(adu, key, request)
-        return self._write(adu, key, request)
-
-    def _write(self, adu: Adu, key: Hashable, request: Pdu) -> WitnessedRequest:
-        self._remember(_Transaction(adu, key, request))
-        words = request.registers
-        number, offset = divmod(request.address, BOX)
-        if offset or number not in BY_NUMBER or len(words) > MAX_WORDS + 1 or not words[0]:
-            problem = f"write of {len(words)} registers to {request.address}, tag {words[0]}"
-            return WitnessedRequest(A_READ, adu.unit, key, problem=problem)
-        if adu.unit:
-            self._written[adu.unit, number] = _Written(words[0], key)
-        return request_of(number, words[1:], adu.unit, key)
-
-    def _read(self, adu: Adu, key: Hashable, request: Pdu) -> WitnessedRequest | Notice:
-        number, offset = divmod(request.address, BOX)
-        written = self._written.get((adu.unit, number))
-        is_reply = number in BY_NUMBER and offset == REPLY_OFFSET
-        if is_reply and written is not None and not written.is_read:
-            self._remember(_Transaction(adu, written.key, request, written.tag))
-            return Notice("read on", key=written.key)
-        self._remember(_Transaction(adu, key, request, written.tag if written is not None else 0))
-        if request.address == IDENTITY_REGISTER:
-            return WitnessedRequest(HELLO, adu.unit, key)
-        is_present = is_reply and BY_NUMBER[number].name in PRESENT
-        return WitnessedRequest(BY_NUMBER[number].name if is_present else A_READ, adu.unit, key)
-
-    def _remember(self, transaction: _Transaction) -> None:
-        if transaction.key is not None:
-            self._open[transaction.adu.transaction] = transaction
+            taken.problem = f"function {adu.pdu[0]} is malformed or none"
+        elif request.function_code == WRITE:
+            message, tag = message_written(request), request.registers[0]
+            if message is None or not tag:
+                taken.problem = (
+                    f"write of {request.count} registers to {request.address}, tag {tag}"
+                )
+            else:
+                self._written[adu.unit, message.name] = _Written(tag, key)
+                taken = request_of(message.number, request.registers[1:], adu.unit, key)
+        elif request.address == IDENTITY_REGISTER:
+            opened, taken.name = opened._replace(shows=HELLO), HELLO
+        elif (message := message_shown(request)) and request.address % BOX == REPLY_OFFSET:
+            written = self._written.get((adu.unit, message.name))
+            opened = opened._replace(shows=message.name, written=written)
+            if written is not None and not written.is_read:
+                self._open[adu.transaction] = opened._replace(key=written.key)
+                return Notice("read on", key=written.key)
+            taken.name = message.name if message.name in PRESENT else A_READ
+        if key is not None:
+            self._open[adu.transaction] = opened
+        return taken
 
     def _response(self, adu: Adu) -> Message | None:
-        transaction = self._open.get(adu.transaction)
-        if transaction is None or transaction.adu.unit != adu.unit:
+        opened = self._open.get(adu.transaction)
+        if opened is None or opened.adu.unit != adu.unit:
             return WitnessedReply(adu.unit)
         del self._open[adu.transaction]
-        key, request, function = transaction.key, transaction.request, transaction.adu.pdu[0]
-        if adu.pdu[0] == function | EXCEPTION and len(adu.pdu) == 2:
+        key, request, sent = opened.key, opened.request, opened.adu.pdu
+        if adu.pdu[0] == sent[0] | EXCEPTION and len(adu.pdu) == 2:
             name = EXCEPTIONS.get(adu.pdu[1])  # what gateways refuse is no response
             return None if name is None else WitnessedReply(adu.unit, key, refusal=REFUSALS[name])
         response = response_to(request, adu)
         if request is None or response is None:
-            problem = f"function must be {function}, got {adu.pdu[0]}"
-            if adu.pdu[0] == function:
-                problem = f"response must fit {transaction.adu.pdu[:5].hex()}, got {adu.pdu.hex()}"
+            problem = f"function must be {sent[0]}, got {adu.pdu[0]}"
+            if adu.pdu[0] == sent[0]:
+                problem = f"response must fit {sent[:5].hex()}, got {adu.pdu.hex()}"
             return WitnessedReply(adu.unit, problem=problem)
         if request.function_code == WRITE:
             return Notice("carried out", key=key)
-        return self._reply(transaction, request.address, response.registers)
+        return self._reply(opened, response)
 
-    def _reply(
-        self, transaction: _Transaction, address: int, words: Sequence[int]
-    ) -> WitnessedReply:
-        unit, key, tag = transaction.adu.unit, transaction.key, transaction.tag
-        number, offset = divmod(address, BOX)
-        if address == IDENTITY_REGISTER and len(words) == IDENTITY_COUNT:
-            try:
-                return WitnessedReply(unit, key, unpack_identity(words))
-            except Refusal as refusal:
-                return WitnessedReply(unit, key, problem=str(refusal))
-        if offset != REPLY_OFFSET or number not in BY_NUMBER or len(words) < HEAD:
+    def _reply(self, opened: _Transaction, response: Response) -> WitnessedReply:
+        unit, key, written, shown = opened.adu.unit, opened.key, opened.written, response.registers
+        tag = 0 if written is None else written.tag
+        if not opened.shows or len(shown) < (IDENTITY_COUNT if opened.shows == HELLO else HEAD):
             return WitnessedReply(unit, key)
-        written = self._written.get((unit, number))
-        if words[0] != tag:
-            return WitnessedReply(unit, problem=f"tag must be {tag}, got {words[0]}")
+        if shown[0] != tag:
+            return WitnessedReply(unit, problem=f"tag must be {tag}, got {shown[0]}")
         if written is not None and written.key == key:
             written.is_read = True
-        if words[1]:
-            return WitnessedReply(unit, key, refusal=words[1] >> 8)
-        reply = reply_of(BY_NUMBER[number].reply, words[HEAD:], unit, key)
-        is_part = len(words) < AREA and reply.values is None
+        number = REQUESTS[opened.shows].number
+        try:
+            kind, words = reply_in(number, response)
+        except Refusal as refusal:
+            return WitnessedReply(unit, key, problem=str(refusal))
+        reply = reply_of(NAK_RECORD if kind == NAK else REPLIES[opened.shows], words, unit, key)
+        is_part = len(shown) < AREA and reply.values is None
         return WitnessedReply(unit, key) if is_part else reply

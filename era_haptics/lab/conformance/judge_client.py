@@ -29,6 +29,7 @@ from drivers.protocol.definition import (
     FEATURES,
     HIGH_STEPS,
     MESSAGES,
+    NAK,
     NAK_RECORD,
     NAMES,
     QUANTITIES,
@@ -196,8 +197,8 @@ class RequestOutcome:
 class JudgeClient(ABC):
     """One amplifier at an address of a line.
 
-    heard: messages that no request was waiting for, but Events; order: all, as they came.
-    known: the amplifier as it is judged, once it was identified.
+    number: of the last request. heard: messages that no request was waiting for, but Events; order:
+    all, as they came. known: the amplifier as it is judged, once it was identified.
     reply_words: the longest reply to each message by its number, where it is known. quiet: time [s]
     in which a reply comes; timeout: for which one is awaited. wire_time: on the wire [s], of a
     request and a reply by their words; transit: of the longest reply; pace: how much of that it
@@ -230,6 +231,7 @@ class JudgeClient(ABC):
 
     def __init__(self, address: int) -> None:
         self.address = address
+        self.number = 0
         self.heard: list[HeardMessage] = []
         self.order: list[HeardMessage] = []
         self.known: object = None
@@ -271,9 +273,24 @@ class JudgeClient(ABC):
     async def hello(self) -> Values:
         """Read the identity; raises ContractViolation."""
 
-    @abstractmethod
-    async def exchange(self, number: int, words: Sequence[int]) -> RequestOutcome:
-        """Send a message and await its reply; raises ContractViolation where none comes."""
+    async def exchange(self, number: int, words: Sequence[int], **more: Any) -> RequestOutcome:
+        """Send a message and await its reply; raises ContractViolation where none comes.
+
+        more: of the request.
+        """
+        data, sent = self.request(number, words, **more), threads.now()
+        self.write(data)
+        sequence = self.number
+        heard = await self.replied(lambda each: each.number == sequence, message_name(number))
+        outcome = RequestOutcome("", None, heard.words, When(sent, heard.at))
+        if heard.type == NAK:
+            outcome = self.refusal(sent, heard.at, number, heard.words)
+        self.check_reply(heard, NAK if outcome.code else number, outcome.code)
+        return outcome
+
+    def check_reply(self, heard: HeardMessage, number: int, code: str) -> None:
+        """Require the type of a reply, and what else belongs to it; code: of a refusal."""
+        expect_equal(heard.type, number, "type of a reply")
 
     async def part(self, number: int, words: Sequence[int]) -> None:
         """Send a message that has no reply: a part of a set but the last."""
@@ -281,7 +298,10 @@ class JudgeClient(ABC):
 
     @abstractmethod
     def request(self, number: int, words: Sequence[int], *, to: int | None = None) -> bytes:
-        """Return the frames of a request; to: its address, 0 for all, None for this amplifier."""
+        """Return the frames of a request; to: its address, 0 for all, None for this amplifier.
+
+        Its number is that of the request from then on.
+        """
 
     @abstractmethod
     def damaged(self, number: int, words: Sequence[int]) -> Iterator[tuple[str, bytes]]:

@@ -12,7 +12,7 @@ import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
-from typing import cast
+from typing import Any, cast
 
 from cobs import cobs
 
@@ -25,7 +25,6 @@ from drivers.protocol.definition import (
     IDENTITY,
     MAX_WORDS,
     MESSAGES,
-    NAK,
     NO_CHANNEL,
     REFUSALS,
     VERSION,
@@ -105,14 +104,13 @@ _SETTLING = 0.005  # s; after a command of network management
 
 
 class CanClient(JudgeClient):
-    """A bus; number: of the last request. frames: all of the node."""
+    """A bus; frames: all of the node."""
 
     kind = "can"
     addresses = NODE_MAX
 
     def __init__(self, address: int) -> None:
         super().__init__(address)
-        self.number = 0
         self.frames: list[CanFrame] = []
         self._counters = WireCounters()
         self._replies = Assembler(self._counters)
@@ -164,16 +162,6 @@ class CanClient(JudgeClient):
         await self.command("start")
         answer = await self.exchange(HELLO, ())
         return read_as("identity", IDENTITY.unpack, answer.words, is_strict=False)
-
-    async def exchange(self, number: int, words: Sequence[int]) -> RequestOutcome:
-        """Send a message and await its reply."""
-        sequence, sent = self.next_number(), threads.now()
-        self.put(REQUEST + self.address, *segments(sequence, number, words))
-        heard = await self.replied(lambda each: each.number == sequence, message_name(number))
-        if heard.type == NAK:
-            return self.refusal(sent, heard.at, number, heard.words)
-        expect_equal(heard.type, number, "type of a reply")
-        return RequestOutcome("", None, heard.words, When(sent, heard.at))
 
     def request(self, number: int, words: Sequence[int], *, to: int | None = None) -> bytes:
         """Return the frames of a request."""
@@ -288,7 +276,7 @@ _PRESENT = tuple(MESSAGES[name].number for name in PRESENT)
 
 
 class ModbusClient(JudgeClient):
-    """A line or a connection; number: of the last transaction and tag."""
+    """A line or a connection; numbers are of transactions and tags."""
 
     has_events = False
     transactions = 2
@@ -300,7 +288,6 @@ class ModbusClient(JudgeClient):
         self.kind = "rtu" if is_rtu else "tcp"  # type: ignore[misc]
         self.has_broadcasts = is_rtu  # type: ignore[misc]
         self.is_rtu = is_rtu
-        self.number = 0
         self._reader = AduReader(is_rtu=is_rtu, of_requests=False)
 
     def hear(self, data: bytes) -> bytes:
@@ -361,7 +348,7 @@ class ModbusClient(JudgeClient):
         expect_equal(registers[0], 0, "tag of the identity")
         return read_as("identity", unpack_identity, registers)
 
-    async def exchange(self, number: int, words: Sequence[int]) -> RequestOutcome:
+    async def exchange(self, number: int, words: Sequence[int], **more: Any) -> RequestOutcome:
         """Write a message, then read its reply; one that shows the present is read alone."""
         tag, when = None, None
         if number not in _PRESENT or words:
@@ -583,13 +570,12 @@ _SEQUENCE_AT, _CRC_SIZE = 3, 4
 
 
 class SerialClient(JudgeClient):
-    """A serial line; sequence: number of the last request."""
+    """A serial line; invalid: pieces that are no frame."""
 
     kind = "serial"
 
     def __init__(self, address: int) -> None:
         super().__init__(address)
-        self.sequence = 0
         self.invalid: list[bytes] = []
         self._reader = FrameReader(on_invalid=self.invalid.append)
 
@@ -601,7 +587,8 @@ class SerialClient(JudgeClient):
             except Refusal:
                 self.invalid.append(frame.payload)
                 continue
-            heard = HeardMessage(threads.now(), frame.sequence, frame.kind, words, frame)
+            kind = frame.kind ^ REPLY_BIT  # which is set where it is no reply
+            heard = HeardMessage(threads.now(), frame.sequence, kind, words, frame)
             self.take(heard, is_event=frame.kind == EVENT)
             self._others |= {frame.address} - {self.address}
         return data
@@ -618,53 +605,34 @@ class SerialClient(JudgeClient):
 
     def question(self, address: int) -> bytes:
         """Return the frame of a Hello to an address."""
-        return self.frame(HELLO, b"", to=address, version=NEUTRAL)
+        return self.request(HELLO, (), to=address, version=NEUTRAL)
 
     async def hello(self, payload: bytes = b"", version: int = NEUTRAL) -> Values:
         """Read the identity, by a Hello of any length and version."""
-        heard = await self._replied(HELLO, payload, version)
-        seen = heard.type, heard.frame.version
-        expect_equal(seen, (HELLO | REPLY_BIT, NEUTRAL), "type, version of the reply to Hello")
-        return read_as("identity", IDENTITY.unpack, heard.words, is_strict=False)
+        answer = await self.exchange(HELLO, (), behind=payload, version=version)
+        return read_as("identity", IDENTITY.unpack, answer.words, is_strict=False)
 
-    async def exchange(
-        self, number: int, words: Sequence[int], *, behind: bytes = b"", version: int = VERSION
-    ) -> RequestOutcome:
-        """Send a message, with bytes behind its words, under a version; await its reply."""
-        sent = threads.now()
-        heard = await self._replied(number, pack_words(words) + behind, version)
-        answer = RequestOutcome("", None, heard.words, When(sent, heard.at))
-        if heard.type == NAK | REPLY_BIT:
-            answer = self.refusal(sent, heard.at, number, heard.words)
-        is_refused, is_neutral = bool(answer.code), answer.code == "UNSUPPORTED_VERSION"
-        required = (
-            (NAK if is_refused else number) | REPLY_BIT,
-            NEUTRAL if is_neutral else VERSION,
-        )
-        seen = heard.type, heard.frame.version
-        expect_equal(seen, required, f"type, version of the reply to {message_name(number)}")
-        return answer
+    def check_reply(self, heard: HeardMessage, number: int, code: str) -> None:
+        """Require its address, too, and its version."""
+        is_neutral = number == HELLO or code == "UNSUPPORTED_VERSION"
+        seen = heard.type, heard.frame.version, heard.frame.address
+        required = number, NEUTRAL if is_neutral else VERSION, self.address
+        expect_equal(seen, required, "type, version, address of a reply")
 
-    async def _replied(self, number: int, payload: bytes, version: int) -> HeardMessage:
-        self.write(self.frame(number, payload, version=version))
-        sequence = self.sequence
-        heard = await self.replied(
-            lambda each: each.number == sequence and each.type != EVENT, message_name(number)
-        )
-        expect_equal(heard.frame.address, self.address, "address of a reply")
-        return heard
-
-    def request(self, number: int, words: Sequence[int], *, to: int | None = None) -> bytes:
-        """Return the frame of a request."""
-        return self.frame(number, pack_words(words), to=to)
-
-    def frame(
-        self, number: int, payload: bytes, *, to: int | None = None, version: int = VERSION
+    def request(
+        self,
+        number: int,
+        words: Sequence[int],
+        *,
+        to: int | None = None,
+        behind: bytes = b"",
+        version: int = VERSION,
     ) -> bytes:
-        """Return the frame of a payload under the next sequence number."""
-        self.sequence = (self.sequence + 1) % _SEQUENCES
+        """Return the frame of a request, with bytes behind its words, under the next number."""
+        self.number = (self.number + 1) % _SEQUENCES
         address = self.address if to is None else to
-        return encode_frame(Frame(number, address, self.sequence, payload, version))
+        payload = pack_words(words) + behind
+        return encode_frame(Frame(number, address, self.number, payload, version))
 
     def damaged(self, number: int, words: Sequence[int]) -> Iterator[tuple[str, bytes]]:
         """Yield frames with damage of all kinds."""
@@ -744,19 +712,20 @@ async def discarded_frames(subject: Subject) -> None:
     client = cast(SerialClient, subject.client)
     await client.look_around()
     subject.require_alone()
-    event = pack_words(EVENT_RECORD.pack({"state": 1, "fault": 0, "channel": 255, "latch": 1}))
-    await client.expect_silence(client.frame(EVENT, event), "an Event")
+    event = EVENT_RECORD.pack({"state": 1, "fault": 0, "channel": 255, "latch": 1})
+    await client.expect_silence(client.request(EVENT, event), "an Event")
     await subject.run([subject.arm, subject.one()])
     answer = await client.exchange(_SET, subject.words_of(subject.one())[1], behind=b"\0")
     expect_equal(answer.code, "BAD_LENGTH", "refusal of a set with half a word")
-    head = pack_words([subject.session, subject.token + 1, 2 << 1])
-    await client.expect_silence(client.frame(_SET, head + b"\0"), "a part with half a word")
+    head = [subject.session, subject.token + 1, 2 << 1]
+    part = client.request(_SET, head, behind=b"\0")
+    await client.expect_silence(part, "a part with half a word")
     await subject.run([stage(subject.one(level=0.5))])
     for name, values in (("Commit", {"token": subject.token}), ("Stop", {"ramp": 0})):
         message = MESSAGES[name]
-        words = pack_words(message.request.pack(subject.filled(values)))
+        words = message.request.pack(subject.filled(values))
         for version in (VERSION - 1, 0):
-            data = client.frame(message.number, words, to=0, version=version)
+            data = client.request(message.number, words, to=0, version=version)
             await client.expect_silence(data, f"a {name} of version {version} for all")
             await subject.run([subject.ping])
 
@@ -779,7 +748,7 @@ async def tolerated_frames(subject: Subject) -> None:
         ("300 bytes of noise before it", [b"\x77" * 300 + ping()], 1),
         (
             "the longest payload before it",
-            [client.frame(_SET, bytes(240)) + ping()],
+            [client.request(_SET, (), behind=bytes(240)) + ping()],
             2,
         ),
         ("its delimiter shared", [ping()[:-1] + ping()], 2),
@@ -787,10 +756,11 @@ async def tolerated_frames(subject: Subject) -> None:
         for piece in pieces[:-1]:
             client.write(piece)
             await asyncio.sleep(0.05)
-        heard = [each for each in await client.send(pieces[-1], count=count) if each.type & 0x80]
+        heard = await client.send(pieces[-1], count=count)
+        heard = [each for each in heard if not each.type & REPLY_BIT]
         expect_equal(len(heard), count, f"replies to a frame with {what}")
     for sequence in (0, 0xFFFF):
-        client.sequence = (sequence - 1) % 0x10000
+        client.number = (sequence - 1) % 0x10000
         await subject.request("Ping", session=1)
     client.invalid.clear()
     for _ in range(3):

@@ -42,7 +42,6 @@ from drivers.wires.can_frames import (
     SOCKETCAND,
     Assembler,
     CanFrame,
-    CanMessage,
     cob_id,
     pack_frames,
     segments,
@@ -197,51 +196,28 @@ class CanAmplifiers(FarEnd):
     """Amplifiers by their nodes on one bus; send: called with their frames."""
 
     def __init__(self, amplifiers: Mapping[int, AmplifierPort], send: Send) -> None:
-        self._nodes = {node: _Node(amplifier, node, send) for node, amplifier in amplifiers.items()}
-        self._broadcasts = Assembler(WireCounters(), is_numbered=False)
+        self._nodes = [_Node(amplifier, node, send) for node, amplifier in amplifiers.items()]
 
     def start(self, now: float) -> None:
         """Boot all nodes at a time [s]."""
-        for node in self._nodes.values():
+        for node in self._nodes:
             node.boot(now)
 
     @property
     def next_event(self) -> float:
         """Time of the next heartbeat or event [s]."""
-        return min(node.next_event for node in self._nodes.values())
+        return min(node.next_event for node in self._nodes)
 
     def tick(self, now: float) -> None:
         """Send the heartbeats and events due by now [s]."""
-        for node in self._nodes.values():
+        for node in self._nodes:
             node.tick(now)
 
     def receive(self, data: bytes, now: float) -> None:
         """Take frames of other devices at a time [s]."""
         for frame in unpack_frames(data):
-            self._receive(frame, now)
-
-    def _receive(self, frame: CanFrame, now: float) -> None:
-        number = frame.id & NODE_MAX
-        node, kind = self._nodes.get(number), frame.id - number
-        if frame.id == cob_id("nmt"):
-            if len(frame.data) == _NMT_LENGTH:
-                for each in self._nodes.values():
-                    if frame.data[1] in (0, each.number):
-                        each.command(frame.data[0], now)
-        elif frame.id == REQUEST:
-            if (message := self._broadcasts.add(frame.data, now)) is not None:
-                for each in self._nodes.values():
-                    each.carry_out(message, now)
-                self._note_numbers()
-        elif node is not None and kind == REQUEST:
-            node.request(frame.data, now)
-            self._note_numbers()
-        elif node is not None and kind == cob_id("sdo_request"):
-            node.read(frame.data, now)
-
-    def _note_numbers(self) -> None:
-        """Note the numbers of nodes, which may have taken others."""
-        self._nodes = {node.number: node for node in self._nodes.values()}
+            for node in self._nodes:
+                node.take(frame, now)
 
 
 class _Node:
@@ -250,7 +226,7 @@ class _Node:
     def __init__(self, amplifier: AmplifierPort, number: int, send: Send) -> None:
         self._amplifier = amplifier
         self._send = send
-        self.number = number
+        self._number = number
         self._was_faulty = False
         self._heartbeat_due = 0.0
         self._reset()
@@ -258,13 +234,11 @@ class _Node:
 
     def _reset(self) -> None:
         self._state = _PRE_OPERATIONAL
-        self._requests = Assembler(WireCounters())
-        self._objects = ObjectServer(self._amplifier, self.number)
-
-    @property
-    def is_listening(self) -> bool:
-        """Whether it takes requests."""
-        return self._state == _OPERATIONAL and self._amplifier.is_answering
+        self._requests = {
+            REQUEST: Assembler(WireCounters(), is_numbered=False),
+            REQUEST + self._number: Assembler(WireCounters()),
+        }
+        self._objects = ObjectServer(self._amplifier, self._number)
 
     @property
     def next_event(self) -> float:
@@ -277,19 +251,42 @@ class _Node:
         while self._heartbeat_due <= now:
             interval = self._objects.heartbeat
             if interval and self._amplifier.is_answering:
-                self._put(cob_id("heartbeat", self.number), bytes([self._state]))
+                self._put(cob_id("heartbeat", self._number), bytes([self._state]))
             self._heartbeat_due += interval / 1000 if interval else _POLL
 
     def boot(self, now: float) -> None:
         """Begin anew, not operational; what the amplifier plays is its own."""
         self._reset()
-        self._put(cob_id("heartbeat", self.number), bytes([_BOOT_UP]))
+        self._put(cob_id("heartbeat", self._number), bytes([_BOOT_UP]))
         self._heartbeat_due = now + self._objects.heartbeat / 1000
 
-    def command(self, command: int, now: float) -> None:
-        """Take a command of network management."""
+    def take(self, frame: CanFrame, now: float) -> None:
+        """Take a frame of another device; what a message without a number asks is for all."""
+        data, sender, is_operational = frame.data, self._number, self._state == _OPERATIONAL
         if not self._amplifier.is_answering:
             return
+        if frame.id == cob_id("nmt") and len(data) == _NMT_LENGTH and data[1] in (0, sender):
+            self._command(data[0], now)
+        elif frame.id == cob_id("sdo_request", sender) and self._state != _STOPPED:
+            if reply := self._objects.reply(data, now):
+                self._put(cob_id("sdo_answer", sender), reply)
+        elif is_operational and (requests := self._requests.get(frame.id)) is not None:
+            if (message := requests.add(data, now)) is None:
+                return
+            number, kind, words = message
+            is_for_all = not number
+            kind, reply_words = carry_out(
+                self._amplifier, kind, words, now, is_for_all=is_for_all, address_max=NODE_MAX
+            )
+            if number and reply_words:
+                self._put(REPLY + sender, *segments(number, kind, reply_words))
+            if kind == _SET_ADDRESS:
+                self._number = words[0]
+            if self._number != sender:
+                self.boot(now)
+
+    def _command(self, command: int, now: float) -> None:
+        """Take a command of network management."""
         if command == _NMT["start"]:
             self._state = _OPERATIONAL
         elif command == _NMT["reset_node"]:
@@ -297,37 +294,6 @@ class _Node:
         elif command in _LEADS_TO:
             self._leave(_LEADS_TO[command], now)
         if command in (_NMT["reset_node"], _NMT["reset_communication"]):
-            self.boot(now)
-
-    def read(self, data: bytes, now: float) -> None:
-        """Take a frame to the objects."""
-        is_served = self._state != _STOPPED and self._amplifier.is_answering
-        if is_served and (reply := self._objects.reply(data, now)):
-            self._put(cob_id("sdo_answer", self.number), reply)
-
-    def request(self, data: bytes, now: float) -> None:
-        """Take a frame of a request, and carry out the message that it completes."""
-        if self.is_listening and (message := self._requests.add(data, now)) is not None:
-            self.carry_out(message, now)
-
-    def carry_out(self, message: CanMessage, now: float) -> None:
-        """Carry out a message, if it takes requests; one without a number is for all."""
-        if not self.is_listening:
-            return
-        number, sender = message.number, self.number
-        kind, words = carry_out(
-            self._amplifier,
-            message.type,
-            message.words,
-            now,
-            is_for_all=not number,
-            address_max=NODE_MAX,
-        )
-        if number and words:
-            self._put(REPLY + sender, *segments(number, kind, words))
-        if kind == _SET_ADDRESS:
-            self.number = message.words[0]
-        if self.number != sender:
             self.boot(now)
 
     def _leave(self, state: int, now: float) -> None:
@@ -339,16 +305,16 @@ class _Node:
 
     def _tell(self, event: Values, now: float) -> None:
         """Send an event, with an emergency where a fault comes or goes."""
-        if self.is_listening:
-            self._put(REPLY + self.number, *segments(0, EVENT, EVENT_RECORD.pack(event)))
+        is_answering = self._amplifier.is_answering
+        if is_answering and self._state == _OPERATIONAL:
+            self._put(REPLY + self._number, *segments(0, EVENT, EVENT_RECORD.pack(event)))
         fault = name_of(FAULTS, event["fault"])
         is_faulty = fault != "NONE"
-        is_mute = self._state == _STOPPED or not self._amplifier.is_answering
-        if (is_faulty or self._was_faulty) and not is_mute:
+        if (is_faulty or self._was_faulty) and is_answering and self._state != _STOPPED:
             known = CANOPEN["emergencies"][fault]
             state = event["state"] | event["fault"] << 4
             head = (known["code"], known["error_register"], state, event["channel"])
-            self._put(cob_id("emergency", self.number), struct.pack("<HBBB3x", *head))
+            self._put(cob_id("emergency", self._number), struct.pack("<HBBB3x", *head))
         self._was_faulty = is_faulty
 
     def _put(self, can_id: int, *data: bytes) -> None:

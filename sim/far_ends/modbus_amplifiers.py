@@ -8,7 +8,7 @@ result, words). Not modelled: parity and collisions on a serial line.
 import math
 from collections.abc import Mapping, Sequence
 
-from drivers.protocol.definition import NAK, Message
+from drivers.protocol.definition import BROADCAST, NAK, Message
 from drivers.wires.modbus_frames import (
     AREA,
     BOX,
@@ -35,7 +35,6 @@ FRAME_TIMEOUT = 0.02
 TCP_TIMEOUT = 1.0
 """Longest pause [s] within a TCP frame, whose segments may be delayed."""
 _MARGIN = 0.001  # s; behind the end of a pause, which must be exceeded
-_BROADCAST = 0
 _ILLEGAL_FUNCTION, _ILLEGAL_ADDRESS, _ILLEGAL_VALUE = 1, 2, 3
 
 
@@ -80,20 +79,15 @@ class ModbusAmplifiers(FarEnd):
 
     def _take(self, requests: Sequence[Adu], now: float) -> None:
         for request in requests:
-            if not request.pdu:
+            is_for_all = self._is_rtu and request.unit == BROADCAST
+            if not request.pdu or (is_for_all and request.pdu[0] != WRITE):
                 continue
-            if request.unit == _BROADCAST and self._is_rtu:
-                for number, each in [*self._units.items()]:
-                    if each.amplifier.is_answering:
-                        each.take_broadcast(request, now)
-                        self._move(number)
-                continue
-            unit = self._units.get(request.unit)
-            if unit is not None and unit.amplifier.is_answering:
-                pdu = unit.reply(request, now)
-                frame = framed(request.unit, pdu, request.transaction, is_rtu=self._is_rtu)
-                self._send(frame)
-                self._move(request.unit)
+            for number, unit in [*self._units.items()]:
+                if unit.amplifier.is_answering and (is_for_all or number == request.unit):
+                    pdu = unit.reply(request, now, is_for_all=is_for_all)
+                    if not is_for_all:
+                        self._send(framed(number, pdu, request.transaction, is_rtu=self._is_rtu))
+                    self._move(number)
 
     def _move(self, number: int) -> None:
         """Move a unit to the address that it has taken."""
@@ -115,8 +109,11 @@ class _Unit:
         self.amplifier = amplifier
         self._replies: dict[int, tuple[int, int, Sequence[int]]] = {}  # tag, result, words
 
-    def reply(self, adu: Adu, now: float) -> bytes:
-        """Return the PDU of the response to a request, an exception where Modbus defines one."""
+    def reply(self, adu: Adu, now: float, *, is_for_all: bool) -> bytes:
+        """Return the PDU of the response to a request, an exception where Modbus defines one.
+
+        is_for_all: whether it is a write that is for all units; the reply area stays as it is.
+        """
         function, request = adu.pdu[0], parse_request(adu)
         if request is None:
             is_known = function in (*READS, WRITE)
@@ -129,17 +126,16 @@ class _Unit:
             return exception_to(function, _ILLEGAL_ADDRESS)
         tag, *words = request.registers
         is_made_by_reads = message.name in PRESENT and not words
-        done = (0, ()) if is_made_by_reads else self._execute(message, words, now)
-        self._replies[message.number] = tag, *done
-        return answer(request)
-
-    def take_broadcast(self, adu: Adu, now: float) -> None:
-        """Carry a request out that is for all units; its reply area stays as it is."""
-        request = parse_request(adu)
-        message = None if request is None else message_written(request)
-        if request is not None and message is not None:
-            result, _ = self._execute(message, request.registers[1:], now, is_for_all=True)
+        result, reply = (
+            (0, ())
+            if is_made_by_reads
+            else self._execute(message, words, now, is_for_all=is_for_all)
+        )
+        if is_for_all:
             self.is_moving = message.name == "SetAddress" and result == 0
+        else:
+            self._replies[message.number] = tag, result, reply
+        return answer(request)
 
     def _execute(
         self, message: Message, words: Sequence[int], now: float, *, is_for_all: bool = False

@@ -274,9 +274,8 @@ class _Node:
             if (message := requests.add(data, now)) is None:
                 return
             number, kind, words = message
-            is_for_all = not number
             kind, reply_words = carry_out(
-                self._amplifier, kind, words, now, is_for_all=is_for_all, address_max=NODE_MAX
+                self._amplifier, kind, words, now, is_for_all=not number, address_max=NODE_MAX
             )
             if number and reply_words:
                 self._put(REPLY + sender, *segments(number, kind, reply_words))

@@ -87,14 +87,9 @@ class ModbusAmplifiers(FarEnd):
                     pdu = unit.reply(request, now, is_for_all=is_for_all)
                     if not is_for_all:
                         self._send(framed(number, pdu, request.transaction, is_rtu=self._is_rtu))
-                    self._move(number)
-
-    def _move(self, number: int) -> None:
-        """Move a unit to the address that it has taken."""
-        unit = self._units[number]
-        if unit.is_moving:
-            unit.is_moving = False
-            self._units[unit.address] = self._units.pop(number)
+                    if unit.is_moving:  # to the address that it has taken
+                        unit.is_moving = False
+                        self._units[unit.address] = self._units.pop(number)
 
 
 class _Unit:
@@ -126,19 +121,19 @@ class _Unit:
             return exception_to(function, _ILLEGAL_ADDRESS)
         tag, *words = request.registers
         is_made_by_reads = message.name in PRESENT and not words
-        result, reply = (
+        done = (
             (0, ())
             if is_made_by_reads
             else self._execute(message, words, now, is_for_all=is_for_all)
         )
         if is_for_all:
-            self.is_moving = message.name == "SetAddress" and result == 0
+            self.is_moving = message.name == "SetAddress" and done[0] == 0
         else:
-            self._replies[message.number] = tag, result, reply
+            self._replies[message.number] = tag, *done
         return answer(request)
 
     def _execute(
-        self, message: Message, words: Sequence[int], now: float, *, is_for_all: bool = False
+        self, message: Message, words: Sequence[int], now: float, is_for_all: bool
     ) -> tuple[int, Sequence[int]]:
         """Return the result and the words of the reply to a message."""
         kind, reply = carry_out(self.amplifier, message.number, words, now, is_for_all=is_for_all)
@@ -159,7 +154,7 @@ class _Unit:
                 if result:  # a refusal is read once
                     self._replies[message.number] = tag, 0, ()
                 else:
-                    result, words = self._execute(message, (), now)
+                    result, words = self._execute(message, (), now, is_for_all=False)
             elif message.name == "SetAddress":
                 self.is_moving = self.address > 0 and result == 0
             row = (tag, result, *words)

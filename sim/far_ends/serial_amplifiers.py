@@ -65,10 +65,8 @@ class SerialAmplifiers(FarEnd):
 
         One of another version, or with half a word, is refused.
         """
-        version, is_for_all = (
-            NEUTRAL if frame.type == HELLO else VERSION,
-            frame.address == BROADCAST,
-        )
+        version = NEUTRAL if frame.type == HELLO else VERSION
+        is_for_all = frame.address == BROADCAST
         try:
             if frame.version != version == VERSION:
                 raise Refusal(

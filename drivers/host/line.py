@@ -267,23 +267,17 @@ class Job:
         return self.priority in _SUPERSEDED.get(priority, ()) and member in (self.member, None)
 
 
-class JobQueue:
-    """The requests that wait for one line."""
+class JobQueue(list[Job]):
+    """The requests that wait for one line, in the order in which they were queued.
 
-    def __init__(self) -> None:
-        self.jobs: list[Job] = []
-        """The jobs in the order in which they were queued; those of one rank are sent in it."""
-        self.add = self.jobs.append
-        self._had_waited = False  # whether the job that was taken last had waited for long
+    Those of one rank are sent in it.
+    """
 
-    def remove(self, job: Job) -> None:
-        """Remove a job if it is waiting."""
-        if job in self.jobs:
-            self.jobs.remove(job)
+    _had_waited = False  # whether the job that was taken last had waited for long
 
     def take(self, job: Job, now: float) -> None:
         """Remove the job whose turn it is."""
-        self.jobs.remove(job)
+        self.remove(job)
         self._had_waited = job.has_waited(now)
 
     def _rank(self, job: Job, now: float) -> tuple[int, int]:
@@ -298,14 +292,14 @@ class JobQueue:
 
     def has_before(self, job: Job, now: float) -> bool:
         """Whether any waiting job goes before this one; now [s]."""
-        first = self.next(now) if self.jobs else None
+        first = self.next(now) if self else None
         return first is not None and self._rank(first, now) < self._rank(job, now)
 
     def next(self, now: float) -> Job | None:
         """Return the job whose turn it is, or None while all of them pause, or a stop does."""
-        first: Job | None = self.jobs[0]
-        if len(self.jobs) > 1:
-            ready = [job for job in self.jobs if job.is_stop_class or not job.is_pausing]
+        first: Job | None = self[0]
+        if len(self) > 1:
+            ready = [job for job in self if job.is_stop_class or not job.is_pausing]
             first = min(ready, key=lambda job: self._rank(job, now), default=None)
         return None if first is None or first.is_pausing else first
 
@@ -393,13 +387,13 @@ class Line:
         if self.loss is not None:
             self._fail(job, LinkError(self.loss))
             return future
-        if self.current is None and not (self._queue.jobs or self._is_pumping):
+        if self.current is None and not (self._queue or self._is_pumping):
             self._start(job)
             return future
-        for queued in [*self._queue.jobs]:
+        for queued in [*self._queue]:
             if queued.is_superseded_by(priority, member):
                 self._fail(queued, Preempted(SUPERSEDED))
-        self._queue.add(job)
+        self._queue.append(job)
         if self.current is not None:
             self._preempt(self.current)
         self.pump()
@@ -433,7 +427,7 @@ class Line:
             self._sent_until = 0.0  # a request that has a reply has arrived
             if isinstance(arrival, Continuation):
                 self.late = max(self.late, min(self.time() - self._free_at, MAX_LATE))
-                if self._queue.jobs and self._must_yield(job):
+                if self._queue and self._must_yield(job):
                     self._not_answered(job)
                 else:
                     self._start(job, arrival.data, is_present=arrival.is_present)
@@ -465,7 +459,7 @@ class Line:
                     self._give_up(job, member)
             else:
                 job.result.set_result(arrival.values)
-        if self._queue.jobs:
+        if self._queue:
             self.pump()
         elif self.current is None and self._timer is not None:
             self._timer.cancel()  # no reply is awaited, so that nothing needs to be looked at
@@ -475,7 +469,7 @@ class Line:
         """Fail every request: the port is lost, or closed."""
         self.loss = cause
         current, self.current = self.current, None
-        for job in (*([] if current is None else [current]), *self._queue.jobs):
+        for job in (*([] if current is None else [current]), *self._queue):
             self._fail(job, LinkError(cause))
         if self._timer is not None:
             self._timer.cancel()
@@ -486,7 +480,7 @@ class Line:
             return
         self._is_pumping = True
         try:
-            while self.loss is None and self.current is None and self._queue.jobs:
+            while self.loss is None and self.current is None and self._queue:
                 job = self._queue.next(self.time())
                 if job is None:
                     break
@@ -575,7 +569,7 @@ class Line:
         """Send the next part of a set once the last one has nearly arrived."""
         now = self.time()
         due = max(self._sent_until - _AHEAD, now + _FULL_PAUSE * self._port.is_blocked)
-        if due <= now or (self._queue.jobs and self._queue.has_before(job, now)):
+        if due <= now or (self._queue and self._queue.has_before(job, now)):
             self._go_on(job)
         else:
             self._look_by(due)
@@ -587,14 +581,14 @@ class Line:
         job.part, job.values = job.part + 1, job.parts[job.part + 1]
         if self.wire.confirms_parts:
             job.reach(job.part)
-        if self._queue.jobs and self._queue.has_before(job, self.time()):
+        if self._queue and self._queue.has_before(job, self.time()):
             self._queue_again(job)
         else:
             self._start(job)
 
     def _must_yield(self, job: Job) -> bool:
         """Whether a request must give way to one that silences."""
-        return not job.is_stop_class and any(other.is_stop_class for other in self._queue.jobs)
+        return not job.is_stop_class and any(other.is_stop_class for other in self._queue)
 
     def _refused(self, job: Job, member: Member, arrival: Nak | BrokenReply) -> None:
         """Repeat a request that a busy amplifier refused; fail any other one."""
@@ -609,11 +603,11 @@ class Line:
 
     def _queue_again(self, job: Job) -> bool:
         """Queue a request again, and return True, unless a waiting request makes it obsolete."""
-        if any(job.is_superseded_by(other.priority, other.member) for other in self._queue.jobs):
+        if any(job.is_superseded_by(other.priority, other.member) for other in self._queue):
             self._fail(job, Preempted(SUPERSEDED))
             return False
         # It goes behind those of its priority, so that a mute amplifier does not delay others.
-        self._queue.add(job)
+        self._queue.append(job)
         return True
 
     def _repeat(self, job: Job, member: Member, *, pause: float = 0.0) -> None:
@@ -631,7 +625,8 @@ class Line:
 
     def _fail(self, job: Job, error: Exception) -> None:
         """End a request with an error, unless its caller was cancelled."""
-        self._queue.remove(job)
+        if job in self._queue:
+            self._queue.remove(job)
         if not job.result.done():
             job.result.set_exception(error)
             job.result.exception()  # so that asyncio does not report it as never retrieved
@@ -643,7 +638,7 @@ class Line:
         if current.has_further_parts and not self.wire.confirms_parts:  # no reply is due
             self._send_further(current)
             return
-        waiting = [job.priority for job in self._queue.jobs if job.priority < current.priority]
+        waiting = [job.priority for job in self._queue if job.priority < current.priority]
         first, is_reading = min(waiting, default=8), current.priority is Priority.READING
         free_at = max(self.time(), self._free_at)
         if first <= Priority.SILENCE:

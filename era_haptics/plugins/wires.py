@@ -1,18 +1,21 @@
 """Interfaces for further wires to amplifiers: entry points `era_haptics.wires`.
 
-A wire has an address made of a URL, a port of bytes, and one of the three protocols of bytes; a
-`CanWire` takes and gives frames as `pack_frames` and `unpack_frames` have them.
+A wire has an address made of a URL, a port of bytes, and one of the three protocols of bytes, or
+frames of its own. A `CanWire` takes and gives frames as `pack_frames` and `unpack_frames` have
+them.
 """
 
-from drivers.errors import CommandError, LinkError
+from drivers.errors import CommandError, LinkError, WireCounters
 from drivers.ports import Port
+from drivers.protocol.definition import REQUESTS
 from drivers.wires.can_bus import CanWire
 from drivers.wires.can_frames import CanFrame, pack_frames, unpack_frames
 from drivers.wires.modbus import ModbusWire
 from drivers.wires.serial_line import SerialWire
-from drivers.wires.wire import Wire, WireAddress
+from drivers.wires.wire import Wire, WireAddress, read_event, read_reply
 
 __all__ = [
+    "REQUESTS",
     "CanFrame",
     "CanWire",
     "CommandError",
@@ -22,6 +25,9 @@ __all__ = [
     "SerialWire",
     "Wire",
     "WireAddress",
+    "WireCounters",
     "pack_frames",
+    "read_event",
+    "read_reply",
     "unpack_frames",
 ]

@@ -10,7 +10,7 @@ import socket
 from collections import Counter
 from collections.abc import AsyncIterator, Callable, Iterator, Mapping, Sequence
 from contextlib import asynccontextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
 from types import MappingProxyType
@@ -48,7 +48,7 @@ from model.arrays import FloatArray
 from model.config.fields import Rectangle
 from model.errors import InputError
 from model.finger import detection_threshold
-from model.rig.rig import Rig
+from model.rig.rig import Channel, Rig
 from model.table.table import LocalizationTable
 from model.table.table_file import build_table
 from plates import smooth_rig
@@ -212,16 +212,19 @@ async def fingers_on(
     at: Mapping[int, Position] = MappingProxyType({}),
     held: float = 0.0,
     layers: int = 8,
+    amplifiers: Sequence[str] = ("main",),
     breaks: str | None = None,
 ) -> AsyncIterator[Placed]:
-    """Fingers on a layout, armed, with an amplifier of four channels.
+    """Fingers on a layout, armed, with four ERAs on amplifiers in turn.
 
     of: their class; at: those that are held for a time [s] first; breaks: the only rule of the
     witness that what is planted breaks.
     """
+    rig, count = smooth_rig(), len(amplifiers)
+    wired = [(era, Channel(amplifiers[n % count], n // count)) for n, era in enumerate(rig.wiring)]
     async with of.armed(
         SimulatedWire("serial", speed=921_600, unpluggable=True),
-        smooth_rig(),
+        replace(rig, wiring=dict(wired), amplifiers=dict.fromkeys(amplifiers, "memory://")),
         table,
         intent_source=EffectPlayer(layout),
         timing=Timing(table),

@@ -60,10 +60,13 @@ LAYOUTS = {
 
 @asynccontextmanager
 async def hands(
-    *, fingers: Mapping[int, Any] = MappingProxyType({}), layout: str = "plain", **options: Any
+    *amplifiers: str,
+    fingers: Mapping[int, Any] = MappingProxyType({}),
+    layout: str = "plain",
+    **options: Any,
 ) -> AsyncIterator[Hands]:
     """Fingers on a layout of the file, with a first mark; options: as of `fingers_on`."""
-    given = {"at": places_of(fingers), **options}
+    given = {"at": places_of(fingers), "amplifiers": amplifiers or ("main",), **options}
     async with fingers_on(table(), LAYOUTS[layout], of=Hands, **given) as found:
         with pytest.MonkeyPatch.context() as found.patch:
             found.layouts = LAYOUTS

@@ -256,9 +256,8 @@ async def _run(
     reason = str(finding)
     if is_late:
         late = client.slow_reply or f"this machine was late by {1e3 * client.lag:.0f} ms"
-        tried = f"in {client.attempts or 1} attempts"
-        if client.is_used_up:
-            tried = "since the time of the run is used up"
+        attempts = f"in {client.attempts or 1} attempts"
+        tried = "since the time of the run is used up" if client.is_used_up else attempts
         reason = f"no verdict {tried}: {reason}; {late}"
     if why and why != reason:
         reason = f"{reason}; then {why}"

@@ -8,18 +8,17 @@ violation of the contract, that it does not apply, or that this machine was too 
 shows u seconds came between s and r, so the clock is ahead of that of this machine by u - r to
 u - s. What is common to all these intervals is short.
 
-`Capabilities` and `PlayableMaterial` are what the amplifier states and can play, `Row` what a check
-sends, and `Judge` the amplifier as it must be.
+`Capabilities` are what the amplifier states, `Row` what a check sends, and `Judge` the amplifier as
+it must be.
 """
 
 import asyncio
-import math
 from abc import ABC, abstractmethod
 from collections import defaultdict
 from collections.abc import Awaitable, Callable, Collection, Iterator, Sequence, Sized
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
+from functools import partial
 from typing import Any, ClassVar, NamedTuple, TypeAlias, TypeVar
 
 from drivers import trace
@@ -37,11 +36,10 @@ from drivers.protocol.definition import (
     SPAN,
     ahead,
     capability_ranges,
-    has_feature,
 )
 from drivers.protocol.records import Field, Number, Record, Refusal, Values
 from drivers.protocol.records import Rows as RowsOf
-from drivers.protocol.sets import Command, Envelope, LayerSet, achieved_layer, achieved_problem
+from drivers.protocol.sets import Command, LayerSet, achieved_layer, achieved_problem
 from drivers.wires.wire import read_nak
 from era_haptics.lab.expected_amplifier import ExpectedAmplifier
 from era_haptics.lab.expected_output import DRIFT, Interval
@@ -142,11 +140,10 @@ FEW = 3
 """Times that this machine does not make wrong by chance."""
 _MAX_WASTED = 20.0  # s; of a run, for attempts that came too late
 _LOOK = 0.005  # s; between looks whether this machine is late
-BUSY, _STALLED = 0.02, 0.1
-"""Lateness [s] at which an amplifier is not judged by its silence, a few times, or ever."""
+BUSY = 0.02
+"""Lateness of this machine [s] with which what is found counts once it is found a few times."""
 REPLY_TIMEOUT = 0.5  # s; far above the reaction, so that a busy machine is no mute amplifier
-# s; beyond that, for a reply which the machine or line delivers late; in a check, so many at most
-_DELIVERED, _MAX_DELIVERED = 1.5, 8
+_DELIVERED = 1.5  # s; beyond that, for a reply which the machine or line delivers late
 GATEWAY_TIMEOUT = 1.5  # s; in which a gateway says that a unit does not reply
 _MAX_SHOWN = 300  # bytes
 _AT_ONCE = 16  # addresses
@@ -207,10 +204,9 @@ class JudgeClient(ABC):
 
     neighbours, free: other addresses that reply, and the highest at which nothing does, once it has
     looked around. fastest, reactions: the shortest exchange by the name of its message [s], and the
-    times until a reply began. attempts: of this check that came too late; mute: its requests
-    without a reply; wasted: the time [s] of all of the run. lag: by how much this machine was late
-    since the check began, at most; lateness: by how much this machine or a reply was, of all.
-    delivered: replies that came in a row after their timeout.
+    times until a reply began. attempts: of this check that came too late; wasted: the time [s] of
+    all of the run. lag: by how much this machine was late in an attempt, at most; lateness: by how
+    much this machine or a reply was, of all.
     """
 
     kind: ClassVar[str]
@@ -241,7 +237,7 @@ class JudgeClient(ABC):
         self.timeout = REPLY_TIMEOUT
         self.came = b""
         self.neighbours: frozenset[int] = frozenset()
-        self.free = self.attempts = self.mute = self.delivered = 0
+        self.free = self.attempts = 0
         self.fastest: dict[str, float] = {}
         self.reactions: dict[str, list[float]] = defaultdict(list)
         self.wasted = self.lag = self.lateness = 0.0
@@ -376,7 +372,7 @@ class JudgeClient(ABC):
                 self.lag = max(self.lag, late := threads.now() - due)
                 self.lateness = max(self.lateness, late)
 
-        self.attempts, self.mute, self.lag = 0, 0, 0.0
+        self.attempts, self.lag = 0, 0.0
         looking = asyncio.create_task(look(), name="how late this machine is")
         try:
             yield
@@ -445,27 +441,17 @@ class JudgeClient(ABC):
     async def replied(self, is_meant: Callable[[HeardMessage], bool], what: str) -> HeardMessage:
         """Return the reply to what was sent.
 
-        Raises ContractViolation where none comes, TooLate where one is late. Replies that
-        are late in a row, or time and again, show that the amplifier is slow.
+        Raises ContractViolation where none comes; one that is late counts as a machine that is.
         """
-        before, self.lag, began = self.lag, 0.0, threads.now()
+        began = threads.now()
         found = await self.next(is_meant, self.timeout)
-        is_in_time = self.lag <= (BUSY if self.mute < FEW else _STALLED)
-        self.lag = max(self.lag, before)
-        if found is None:
-            self.mute += 1
-            others = f", but {len(self.came)} other bytes{self.remark()}" if self.came else ""
-            is_sound = not others or any(each.at > began for each in self.order[-1:])
-            is_delivered = is_sound and await self.next(is_meant, _DELIVERED)
-            require_in_time(is_in_time, f"no reply came to {what}")
-            if is_delivered:
-                self.delivered += 1
-                is_slow = self.delivered >= FEW or self.mute > _MAX_DELIVERED
-                require_in_time(is_slow, f"the reply to {what} came later than {self.timeout:g} s")
-                others = ", but later"
-            raise NoReply(what, f"no reply within {self.timeout:g} s{others}")
-        self.delivered = 0
-        return found
+        if found is not None:
+            return found
+        others = f", but {len(self.came)} other bytes{self.remark()}" if self.came else ""
+        is_sound = not others or any(each.at > began for each in self.order[-1:])
+        if is_sound and await self.next(is_meant, _DELIVERED):
+            self.lag, others = max(self.lag, self.timeout), ", but later"
+        raise NoReply(what, f"no reply within {self.timeout:g} s{others}")
 
     def remark(self) -> str:
         """Return what is wrong with the bytes that came in place of a reply, if that is known."""
@@ -667,153 +653,6 @@ class Capabilities(dict[str, Any]):
 
 
 FULL = QUANTITIES["level"].per_unit
-
-
-class PlayableMaterial:
-    """What an amplifier can play.
-
-    A capability is looked at where it is needed.
-    """
-
-    def __init__(self, can: Capabilities, level: float) -> None:
-        self.can = can
-        self._level = level
-        self.channels = range(can["channels"])
-
-    @property
-    def layers(self) -> range:
-        """The numbers of its layers."""
-        return range(self.can["layers"])
-
-    @cached_property
-    def level(self) -> float:
-        """Of driven channels, at most; NotApplicable where it has none so low."""
-        limits, step = [self.can, *self.can["limits"]], self.can["level_step"] / FULL
-        level: float = min(self._level, *(one["level_max"] / FULL for one in limits))
-        require(level >= step, f"its level_max of {level:g} is below its level_step of {step:g}")
-        return level
-
-    @cached_property
-    def lowest(self) -> int:
-        """The lowest frequency of every channel, in steps; NotApplicable where they share none."""
-        limits = [self.can, *self.can["limits"]]
-        lowest = max(one["frequency_min"] for one in limits)
-        require(lowest <= self.highest, "its channels have no frequency in common")
-        return int(lowest)
-
-    @cached_property
-    def highest(self) -> int:
-        """The highest frequency of every channel, in steps."""
-        return int(min(one["frequency_max"] for one in (self.can, *self.can["limits"])))
-
-    @cached_property
-    def frequency(self) -> int:
-        """The usual frequency, in steps."""
-        ordinary = QUANTITIES["frequency"].to_wire(110.0)
-        return min(max(ordinary, self.lowest), self.highest)
-
-    @cached_property
-    def other(self) -> int:
-        """Another frequency, where there is one, in steps."""
-        both = self.frequency + 800, self.lowest, self.highest
-        return next(each for each in both if each <= self.highest)
-
-    def has(self, feature: str) -> bool:
-        """Whether it states a feature; empty: what all have."""
-        return not feature or has_feature(self.can, feature)
-
-    def require(self, feature: str) -> None:
-        """Raise NotApplicable where it does not state a feature."""
-        require(self.has(feature), f"it states no {feature}")
-
-    def require_knots(self) -> None:
-        """Raise NotApplicable where its envelopes have no knots."""
-        require(self.can["knots"] > 0, "it has no knots")
-
-    def tone(
-        self,
-        channel: int = 0,
-        fraction: float = 1.0,
-        phase: float = 0.0,
-        *,
-        frequency: int = 0,
-        keep: bool = False,
-        onset: Envelope | None = None,
-        ending: Envelope | None = None,
-    ) -> Command:
-        """Make a command at a fraction of the test level; frequency in steps, 0 for the usual.
-
-        Raises NotApplicable for a level that the amplifier may round to 0.
-        """
-        level, step = round(fraction * self.level * FULL), self.can["level_step"]
-        require(
-            not 0 < level < step,
-            f"its steps of level are coarser than {level / FULL:g}; see --level",
-        )
-        numbers = frequency or self.frequency, level, QUANTITIES["phase"].to_wire(phase)
-        return Command(channel, *numbers, keep, onset=onset, ending=ending)
-
-    def one(
-        self, *commands: Command, level: float = 1.0, ramp: int = 0, valid_for: int = 0
-    ) -> LayerSet:
-        """Make what layer 0 is to play, by default the usual tone on channel 0."""
-        tones = commands or [self.tone(0, level)]
-        return layer(0, *tones, ramp=ramp, valid_for=valid_for)
-
-    def whole(self) -> LayerSet:
-        """Make the usual tone on all channels."""
-        return layer(0, *map(self.tone, self.channels))
-
-    def transitions(self, ramp: int) -> list[list[Send]]:
-        """Make sets one after the other, amid which layers rise, fade, begin, end and wait."""
-        slow = self.envelope(0.1, 0.25, 0.25, 0.25)
-        tones = [self.beside(number, 0.25) for number in range(4)]
-        begins = [replace(each, onset=slow) for each in tones]
-        ends = [replace(each, ending=slow) for each in tones]
-        other = self.beside(len(self.layers), 0.25)
-        others = [layer(number, self.beside(number, 0.05)) for number in self.layers[4:]]
-        changes = [
-            layer(0, tones[0], ramp=ramp, valid_for=60_000),
-            layer(1, ramp=ramp),
-            layer(2, other, ramp=ramp),
-            layer(3, tones[3], ramp=ramp),
-        ]
-        shaped = layer(0, begins[0]), layer(1, ends[1]), layer(2, ends[2]), layer(3, begins[3])
-        return [
-            [play(layer(1, tones[1]), layer(2, tones[2]), *others), play(*changes)],
-            [play(*shaped), play(layer(2), layer(3, other, after=True))],
-        ]
-
-    def envelope(self, step: float, *amplitudes: complex) -> Envelope:
-        """Make an envelope of knots in fractions of the test level, or the nearest step [s].
-
-        Of as many knots as there can be.
-        """
-        amplitudes = amplitudes[: self.can["knots"]]
-        low, high = self.can["envelope_step_min"], self.can["envelope_step_max"]
-        steps = min(max(QUANTITIES["envelope_step"].to_wire(step), low), high)
-        phases = [math.degrees(math.atan2(each.imag, each.real)) for each in amplitudes]
-        knots = [
-            (round(abs(each) * self.level * FULL), QUANTITIES["phase"].to_wire(phase))
-            for each, phase in zip(amplitudes, phases, strict=True)
-        ]
-        return Envelope(steps, tuple(knots))
-
-    def beside(self, number: int, fraction: float) -> Command:
-        """Make a tone on channel 0 that does not interfere with those of other layers."""
-        return self.tone(0, fraction, frequency=self.apart(number))
-
-    def near(self, number: int) -> int:
-        """Return one of many frequencies, all alike where there is no room."""
-        room = max(self.highest - self.frequency, 0)
-        return int(self.frequency + min(max(10, self.can["frequency_step"]) * number, room))
-
-    def apart(self, number: int) -> int:
-        """Return a frequency of a layer of its own, so that layers do not interfere."""
-        step = self.can["frequency_step"]
-        above = self.frequency + max(40, step) * number
-        highest = self.highest - (len(self.layers) - number) * step
-        return int(max(min(above, highest), self.lowest))
 
 
 def layer(

@@ -4,7 +4,7 @@ import asyncio
 import math
 from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import replace
-from functools import partial
+from functools import cached_property, partial
 from typing import Any
 
 from drivers.protocol.definition import (
@@ -17,10 +17,11 @@ from drivers.protocol.definition import (
     REACTION,
     STATES,
     ahead,
+    has_feature,
     name_of,
 )
 from drivers.protocol.records import Values
-from drivers.protocol.sets import Envelope, LayerSet, is_last, pack_layers, parts
+from drivers.protocol.sets import Command, Envelope, LayerSet, is_last, pack_layers, parts
 from drivers.wires.wire import reply_words
 from era_haptics.lab.conformance.judge_client import (
     FULL,
@@ -31,7 +32,6 @@ from era_haptics.lab.conformance.judge_client import (
     Dating,
     Judge,
     JudgeClient,
-    PlayableMaterial,
     RequestOutcome,
     Rows,
     Send,
@@ -71,7 +71,7 @@ RATE = 1 / QUANTITIES["rate"].per_unit
 _MOVING = STATES["SWITCHED_ON"], STATES["FAULT_REACTION_ACTIVE"]
 
 
-class Subject(PlayableMaterial):
+class Subject:
     """An identified amplifier at the far end of a client; level: of driven channels, at most.
 
     expected: what it must show, None until it was brought to rest. token: of the last set made.
@@ -82,8 +82,8 @@ class Subject(PlayableMaterial):
     def __init__(
         self, client: JudgeClient, identity: Values, can: Capabilities, level: float
     ) -> None:
-        super().__init__(can, level)
-        self.client, self.identity = client, identity
+        self.client, self.identity, self.can = client, identity, can
+        self._level = level
         self.session, self.token = 1, 0
         self.expected: Judge | None = None
         self.is_starving, self.is_at_rest = True, False
@@ -93,9 +93,10 @@ class Subject(PlayableMaterial):
         self._parts: list[tuple[float, Values, int]] = []  # without a reply, when sent, words
         client.quiet = REPLY_TIMEOUT
         self.heard_at = threads.now()
-        channels, layers = can["channels"], can["layers"]
+        self.channels, layers = range(can["channels"]), can["layers"]
         client.reply_words = {
-            each.number: reply_words(name, channels, layers) for name, each in MESSAGES.items()
+            each.number: reply_words(name, can["channels"], layers)
+            for name, each in MESSAGES.items()
         }
 
     @property
@@ -103,6 +104,143 @@ class Subject(PlayableMaterial):
         """What it must show."""
         assert self.expected is not None  # noqa: S101
         return self.expected
+
+    # What it can play; a capability is looked at where it is needed
+
+    @property
+    def layers(self) -> range:
+        """The numbers of its layers."""
+        return range(self.can["layers"])
+
+    @cached_property
+    def level(self) -> float:
+        """Of driven channels, at most; NotApplicable where it has none so low."""
+        limits, step = [self.can, *self.can["limits"]], self.can["level_step"] / FULL
+        level: float = min(self._level, *(one["level_max"] / FULL for one in limits))
+        require(level >= step, f"its level_max of {level:g} is below its level_step of {step:g}")
+        return level
+
+    @cached_property
+    def lowest(self) -> int:
+        """The lowest frequency of every channel, in steps; NotApplicable where they share none."""
+        limits = [self.can, *self.can["limits"]]
+        lowest = max(one["frequency_min"] for one in limits)
+        require(lowest <= self.highest, "its channels have no frequency in common")
+        return int(lowest)
+
+    @cached_property
+    def highest(self) -> int:
+        """The highest frequency of every channel, in steps."""
+        return int(min(one["frequency_max"] for one in (self.can, *self.can["limits"])))
+
+    @cached_property
+    def frequency(self) -> int:
+        """The usual frequency, in steps."""
+        ordinary = QUANTITIES["frequency"].to_wire(110.0)
+        return min(max(ordinary, self.lowest), self.highest)
+
+    @cached_property
+    def other(self) -> int:
+        """Another frequency, where there is one, in steps."""
+        both = self.frequency + 800, self.lowest, self.highest
+        return next(each for each in both if each <= self.highest)
+
+    def has(self, feature: str) -> bool:
+        """Whether it states a feature; empty: what all have."""
+        return not feature or has_feature(self.can, feature)
+
+    def require(self, feature: str) -> None:
+        """Raise NotApplicable where it does not state a feature."""
+        require(self.has(feature), f"it states no {feature}")
+
+    def require_knots(self) -> None:
+        """Raise NotApplicable where its envelopes have no knots."""
+        require(self.can["knots"] > 0, "it has no knots")
+
+    def tone(
+        self,
+        channel: int = 0,
+        fraction: float = 1.0,
+        phase: float = 0.0,
+        *,
+        frequency: int = 0,
+        keep: bool = False,
+        onset: Envelope | None = None,
+        ending: Envelope | None = None,
+    ) -> Command:
+        """Make a command at a fraction of the test level; frequency in steps, 0 for the usual.
+
+        Raises NotApplicable for a level that the amplifier may round to 0.
+        """
+        level, step = round(fraction * self.level * FULL), self.can["level_step"]
+        require(
+            not 0 < level < step,
+            f"its steps of level are coarser than {level / FULL:g}; see --level",
+        )
+        numbers = frequency or self.frequency, level, QUANTITIES["phase"].to_wire(phase)
+        return Command(channel, *numbers, keep, onset=onset, ending=ending)
+
+    def one(
+        self, *commands: Command, level: float = 1.0, ramp: int = 0, valid_for: int = 0
+    ) -> LayerSet:
+        """Make what layer 0 is to play, by default the usual tone on channel 0."""
+        tones = commands or [self.tone(0, level)]
+        return layer(0, *tones, ramp=ramp, valid_for=valid_for)
+
+    def whole(self) -> LayerSet:
+        """Make the usual tone on all channels."""
+        return layer(0, *map(self.tone, self.channels))
+
+    def transitions(self, ramp: int) -> list[list[Send]]:
+        """Make sets one after the other, amid which layers rise, fade, begin, end and wait."""
+        slow = self.envelope(0.1, 0.25, 0.25, 0.25)
+        tones = [self.beside(number, 0.25) for number in range(4)]
+        begins = [replace(each, onset=slow) for each in tones]
+        ends = [replace(each, ending=slow) for each in tones]
+        other = self.beside(len(self.layers), 0.25)
+        others = [layer(number, self.beside(number, 0.05)) for number in self.layers[4:]]
+        changes = [
+            layer(0, tones[0], ramp=ramp, valid_for=60_000),
+            layer(1, ramp=ramp),
+            layer(2, other, ramp=ramp),
+            layer(3, tones[3], ramp=ramp),
+        ]
+        shaped = layer(0, begins[0]), layer(1, ends[1]), layer(2, ends[2]), layer(3, begins[3])
+        return [
+            [play(layer(1, tones[1]), layer(2, tones[2]), *others), play(*changes)],
+            [play(*shaped), play(layer(2), layer(3, other, after=True))],
+        ]
+
+    def envelope(self, step: float, *amplitudes: complex) -> Envelope:
+        """Make an envelope of knots in fractions of the test level, or the nearest step [s].
+
+        Of as many knots as there can be.
+        """
+        amplitudes = amplitudes[: self.can["knots"]]
+        low, high = self.can["envelope_step_min"], self.can["envelope_step_max"]
+        steps = min(max(QUANTITIES["envelope_step"].to_wire(step), low), high)
+        phases = [math.degrees(math.atan2(each.imag, each.real)) for each in amplitudes]
+        knots = [
+            (round(abs(each) * self.level * FULL), QUANTITIES["phase"].to_wire(phase))
+            for each, phase in zip(amplitudes, phases, strict=True)
+        ]
+        return Envelope(steps, tuple(knots))
+
+    def beside(self, number: int, fraction: float) -> Command:
+        """Make a tone on channel 0 that does not interfere with those of other layers."""
+        return self.tone(0, fraction, frequency=self.apart(number))
+
+    def near(self, number: int) -> int:
+        """Return one of many frequencies, all alike where there is no room."""
+        room = max(self.highest - self.frequency, 0)
+        return int(self.frequency + min(max(10, self.can["frequency_step"]) * number, room))
+
+    def apart(self, number: int) -> int:
+        """Return a frequency of a layer of its own, so that layers do not interfere."""
+        step = self.can["frequency_step"]
+        above = self.frequency + max(40, step) * number
+        highest = self.highest - (len(self.layers) - number) * step
+        return int(max(min(above, highest), self.lowest))
 
     # Requests
 

@@ -403,9 +403,6 @@ def voices(subject: Subject) -> Rows:
             await subject.play(*(layer(each, *tones(at), ramp=ramp) for each, at in several))
             await asyncio.sleep(pause)
 
-    def from_a_moment(at: int) -> Row:
-        return partial(subject.at, layer(0, *tones(at), ramp=ramp), lead=lead)
-
     async def count_until(left: float) -> None:
         """Begin a tone while the fade that began last has a time left [s]."""
         apart = math.ceil(2000 * lead)
@@ -413,7 +410,9 @@ def voices(subject: Subject) -> Rows:
         await subject.at(layer(0, *tones(fades), ramp=ramp), lead=lead, apart=apart / 1000 - left)
 
     look = partial(subject.follow, 0.015)
-    cuts = [row for at in range(len(_SHARES)) for row in (from_a_moment(fades + at), look)]
+    cuts: list[Row] = []
+    for at in range(fades, fades + len(_SHARES)):
+        cuts += [partial(subject.at, layer(0, *tones(at), ramp=ramp), lead=lead), look]
     lasting = play(*(layer(number, *tones(count + number)) for number in subject.layers[1:]))
     # A full pool refuses neither another layer nor a layer's silence, nor a fade of all.
     fade_all = play(*(layer(each, ramp=ramp) for each in subject.layers[:3]))

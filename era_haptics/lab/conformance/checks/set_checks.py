@@ -33,7 +33,6 @@ from drivers.protocol.sets import Command, Envelope, LayerSet, pack_layers
 from era_haptics.lab.conformance.check import driving
 from era_haptics.lab.conformance.judge_client import (
     FULL,
-    PlayableMaterial,
     Rows,
     Send,
     expect_within,
@@ -283,12 +282,12 @@ _SLOW = 0.03  # s; of a line, for an exchange of the longest messages
 _OLD = "BAD_TOKEN"
 
 
-def set_of(material: PlayableMaterial, room: int) -> list[LayerSet]:
+def set_of(subject: Subject, room: int) -> list[LayerSet]:
     """Make a set of this many words, or of as many as there can be."""
-    channels, max_knots = len(material.channels), material.can["knots"]
+    channels, max_knots = len(subject.channels), subject.can["knots"]
     # All but the heads of layers has an even number of words.
     bare = LAYER.words + _SHAPED * channels
-    max_layers = min(len(material.layers), room // bare)
+    max_layers = min(len(subject.layers), room // bare)
     counts = [each for each in range(1, max_layers + 1) if each % 2 == room % 2] or [max_layers]
     full = bare + 2 * KNOT.words * channels * max_knots
     count = next((each for each in counts if each * full >= room), counts[-1])
@@ -296,11 +295,11 @@ def set_of(material: PlayableMaterial, room: int) -> list[LayerSet]:
     layers = []
     for number in range(count):
         tones = []
-        for channel in material.channels:
+        for channel in subject.channels:
             knots = [min(left, max_knots), min(max(left - max_knots, 0), max_knots)]
             left -= sum(knots)
-            onset, ending = (material.envelope(0.001, *[0.1 + 0j] * each) for each in knots)
-            tones.append(material.tone(channel, 0.1, onset=onset, ending=ending))
+            onset, ending = (subject.envelope(0.001, *[0.1 + 0j] * each) for each in knots)
+            tones.append(subject.tone(channel, 0.1, onset=onset, ending=ending))
         layers.append(layer(number, *tones))
     return layers
 

@@ -294,8 +294,13 @@ class ExpectedAmplifier:
         if self.state not in (None, *_ONLY_IN.get(name, (self.state,))):
             rule = "latched" if name == "Arm" else "state" if name == "SetAddress" else "enabled"
             rule = rule if self.is_shown else "watchdog"
-            what = f"answer to {name} in {self._name_of(self.state)}"
-            self.report(rule, time, what, must="WRONG_STATE", seen="carried out")
+            self.report(
+                rule,
+                time,
+                f"answer to {name} in {self._name_of(self.state)}",
+                must="WRONG_STATE",
+                seen="carried out",
+            )
 
     def carry_out(self, name: str, values: Values, shown: Values, when: Interval) -> None:
         """Apply a request carried out between two times, as its reply or a later status shows."""
@@ -410,8 +415,9 @@ class ExpectedAmplifier:
         until = self.sets.staged_until(token)[1]
         if self.token is not None and until < when[0] - self.slack:
             seen = f"until {until:.4f} s" if until > -math.inf else "not staged"
-            what = f"set {token} that is committed"
-            self.report("token", when[1], what, must="staged", seen=seen)
+            self.report(
+                "token", when[1], f"set {token} that is committed", must="staged", seen=seen
+            )
         self._play(token, when, self.clock.moment(commit["at"], when))
 
     def may_start(self, when: Interval) -> bool:

@@ -408,8 +408,13 @@ class ExpectedOutputs:
             for layer, token in enumerate(tokens):
                 possible = self.tokens_of(layer, sure)
                 if token not in possible:
-                    what = f"token of layer {layer}, {self._since(when)}"
-                    self._report("token", when[1], what, must=one_of(possible), seen=token)
+                    self._report(
+                        "token",
+                        when[1],
+                        f"token of layer {layer}, {self._since(when)}",
+                        must=one_of(possible),
+                        seen=token,
+                    )
             is_limited = has_flag(shown, "limited")
             is_beyond = low > 1 + _TOLERANCE + 2 * self._half_step
             is_excused = is_limited or not is_beyond or not self.is_exact or self.may_derate

@@ -177,10 +177,8 @@ def reading(
     """Make a check that only reads of its steps, whose docstring begins with 'It'."""
 
     def make(steps: Steps) -> Check:
-        text = " ".join((steps.__doc__ or "").split())
-        requirement = text.removeprefix("It ").removesuffix(".")
-        name = getattr(steps, "__name__", "")
-        return Check(name, requirement, place, drives, kinds, steps, greets)
+        text = " ".join((steps.__doc__ or "").split()).removeprefix("It ").removesuffix(".")
+        return Check(getattr(steps, "__name__", ""), text, place, drives, kinds, steps, greets)
 
     return make
 
@@ -255,10 +253,10 @@ async def _run(
                 break
     reason = str(finding)
     if is_late:
-        late = client.slow_reply or f"this machine was late by {1e3 * client.lag:.0f} ms"
         attempts = f"in {client.attempts or 1} attempts"
         tried = "since the time of the run is used up" if client.is_used_up else attempts
-        reason = f"no verdict {tried}: {reason}; {late}"
+        late = f"this machine was late by {1e3 * client.lag:.0f} ms"
+        reason = f"no verdict {tried}: {reason}; {client.slow_reply or late}"
     if why and why != reason:
         reason = f"{reason}; then {why}"
     result = CheckResult(

@@ -155,8 +155,13 @@ class WatchedAmplifier(ExpectedAmplifier):
         until, _ = self.sets.staged_until(request.values.get("token"))
         is_held = self.is_enabled and request.values.get("session") == self.session
         if request.name == "Commit" and is_held and time + REACTION <= until:
-            what = f"answer to Commit of set {request.values['token']}, which is staged"
-            self.report("commit", time, what, must="a status", seen="a Nak")
+            self.report(
+                "commit",
+                time,
+                f"answer to Commit of set {request.values['token']}, which is staged",
+                must="a status",
+                seen="a Nak",
+            )
 
     def _resolve(self, number: int, status: Values, end: float) -> None:
         """Apply earlier requests without a reply that were carried out by a status."""
@@ -173,11 +178,17 @@ class WatchedAmplifier(ExpectedAmplifier):
                 case "Arm":
                     self.token = None  # 0, if it was carried out before what disarmed again
                 case "Stop" if is_broadcast:
-                    what = "answer to a broadcast Stop"
-                    self.report("stop", end, what, must="obeyed", seen="none")
+                    self.report(
+                        "stop", end, "answer to a broadcast Stop", must="obeyed", seen="none"
+                    )
                 case _ if is_broadcast and started_at + REACTION <= until:
-                    what = f"answer to a broadcast Commit of set {request.values['token']}"
-                    self.report("commit", end, what, must="obeyed", seen="none")
+                    self.report(
+                        "commit",
+                        end,
+                        f"answer to a broadcast Commit of set {request.values['token']}",
+                        must="obeyed",
+                        seen="none",
+                    )
 
     # reports
 
@@ -492,8 +503,9 @@ class HostRules:
             case "Arm":
                 was_stopped, session.is_stopped = session.is_stopped, False
                 if was_stopped:
-                    what = f"{session.name} armed before its stop was cleared"
-                    session.report("stop", time, what)
+                    session.report(
+                        "stop", time, f"{session.name} armed before its stop was cleared"
+                    )
                 session.armed_at = session.last_feed = time
             case "Clear":
                 session.is_stopped = False

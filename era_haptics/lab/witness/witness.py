@@ -266,15 +266,17 @@ class WatchedWire:
         self._replied.append(reply.key)
         amplifier = session.amplifier
         if reply.problem:
-            what = f"{session.name} replied to {request.name}: {reply.problem}"
-            session.report("garbage", time, what)
+            session.report(
+                "garbage", time, f"{session.name} replied to {request.name}: {reply.problem}"
+            )
         amplifier.unanswered = [one for one in amplifier.unanswered if one is not request]
         if reply.refusal:
             amplifier.refused(request, reply.refusal, time)
         elif reply.problem or (request.problem and request.name != HELLO):
             if request.problem:
-                what = f"{session.name} accepted {request.name}: {request.problem}"
-                session.report_always("garbage", time, what)
+                session.report_always(
+                    "garbage", time, f"{session.name} accepted {request.name}: {request.problem}"
+                )
             amplifier.forget()
         elif reply.values is not None:  # else not all of it was read
             self._granted(session, time, request, reply)
@@ -320,8 +322,7 @@ class WatchedWire:
             session.report_always("damage", time, f"{session.name} executed a damaged frame")
         else:
             why = f": {reply.problem}" if reply.problem else ""
-            what = f"{session.name}: reply without a pending request{why}"
-            session.report("credit", time, what)
+            session.report("credit", time, f"{session.name}: reply without a pending request{why}")
 
 
 class Witness:

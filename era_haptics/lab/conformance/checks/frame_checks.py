@@ -209,15 +209,10 @@ _LIFE, _FORGOTTEN = 0.09, 0.12  # s; for which a number is kept, after which any
 _FAST = 0.015  # s; exchanges that are quick enough to see for how long a number is kept
 
 
-def can_client(subject: Subject) -> CanClient:
-    """Return the client of an amplifier on a bus."""
-    return cast(CanClient, subject.client)
-
-
 @driving(_CAN_PLACE, "can")
 async def numbers(subject: Subject) -> None:
     """It takes newer numbers only, each message once, its frames in any order."""
-    client = can_client(subject)
+    client = cast(CanClient, subject.client)
     require(
         subject.exchange_time <= _FAST, "the line is too slow to see for how long it keeps a number"
     )
@@ -235,8 +230,9 @@ async def numbers(subject: Subject) -> None:
         for each, count in ((number, 1), *others):
             sent = threads.now()
             ping = segments(each, _PING, [subject.session, 0])
-            what = f"number {each} after {number}"
-            await expect_replies(count, what, *ping, since=min(accepted, sent))
+            await expect_replies(
+                count, f"number {each} after {number}", *ping, since=min(accepted, sent)
+            )
             accepted = sent if count else accepted
 
     for number, order in ((200, -1), (220, 1)):
@@ -261,8 +257,9 @@ async def numbers(subject: Subject) -> None:
     again = MESSAGES["Commit"].request.pack(subject.filled({"token": subject.token}))
     for number, kind, sent_words in ((9, _STATUS, []), (10, _COMMIT, again)):
         *others, last = segments(number, kind, sent_words)
-        what = f"message {kind} with bytes behind its words"
-        await expect_replies(1, what, *others, last[:4] + b"\xff" * 4)
+        await expect_replies(
+            1, f"message {kind} with bytes behind its words", *others, last[:4] + b"\xff" * 4
+        )
     client.number = 10
     shown = (await client.exchange(HELLO, [0xFFFF])).words
     named = read_as("identity", IDENTITY.unpack, shown, is_strict=False)
@@ -338,8 +335,11 @@ class ModbusClient(JudgeClient):
         """Read registers; ContractViolation for an exception."""
         pdu = read_pdu(first, count, function=function)
         response, _ = await self.transact(pdu)
-        what = f"function of the response to a read of {count} registers from {first}"
-        expect_equal(response[0], function, what)
+        expect_equal(
+            response[0],
+            function,
+            f"function of the response to a read of {count} registers from {first}",
+        )
         return struct.unpack(f">{count}H", response[2:])
 
     async def hello(self) -> Values:
@@ -405,14 +405,10 @@ _TOO_LONG, _BEYOND = (REFUSALS[name] << 8 | NO_CHANNEL for name in ("BAD_LENGTH"
 _NO_WORDS = (0,) * (AREA - HEAD)
 
 
-def _client(subject: Subject) -> ModbusClient:
-    return cast(ModbusClient, subject.client)
-
-
 @reading(_MODBUS_PLACE, "rtu", "tcp")
 async def areas(subject: Subject) -> None:
     """It keeps each reply under its tag, zeros behind it, and shows the present without a write."""
-    client = _client(subject)
+    client = cast(ModbusClient, subject.client)
 
     async def write(number: int, tag: int, *words: int) -> None:
         await client.transact(client.write_of(number, words, tag=tag))
@@ -442,8 +438,11 @@ async def areas(subject: Subject) -> None:
     expect_equal(seen, (6, _TOO_LONG, False), "tag, result of a word too many, registers behind")
     for tag, count, result in ((7, 1, _BEYOND), (8, 3, 0)):  # parts; of session 0
         await write(_SET, tag, 0, 1, count << 1)
-        what = f"reply area after the first of {count} parts that is wrong"
-        expect_equal(await area(_SET), [tag, result, *_NO_WORDS], what)
+        expect_equal(
+            await area(_SET),
+            [tag, result, *_NO_WORDS],
+            f"reply area after the first of {count} parts that is wrong",
+        )
     for number in (_CAPS, _STATUS):
         await write(number, 9, 0)
         expect_equal(await area(number, 2), [9, _TOO_LONG], "tag, result of a refusal")
@@ -458,7 +457,7 @@ async def areas(subject: Subject) -> None:
 @driving(_MODBUS_PLACE, "rtu", "tcp")
 async def present_areas(subject: Subject) -> None:
     """It shows the status of the moment at every read, and other replies as they were."""
-    client = _client(subject)
+    client = cast(ModbusClient, subject.client)
     await client.look_around()
     await subject.run([subject.arm, subject.one(), subject.ping])
     kept = await client.read(BOX * _PING + REPLY_OFFSET, AREA)
@@ -522,7 +521,7 @@ def _bad_pdus(client: ModbusClient, ping: bytes) -> Iterator[tuple[str, bytes, i
 @driving("modbus.md#functions-and-exceptions", "rtu", "tcp")
 async def exceptions(subject: Subject) -> None:
     """It raises exceptions for what Modbus defines, which change and feed nothing."""
-    client = _client(subject)
+    client = cast(ModbusClient, subject.client)
     await subject.arm()
     await subject.play(subject.one())
     known = READ, READ_HOLDING, WRITE
@@ -539,7 +538,7 @@ async def exceptions(subject: Subject) -> None:
 @reading("modbus.md#the-line", "rtu", "tcp")
 async def pieces(subject: Subject) -> None:
     """It takes a frame in pieces, gives half a frame up after a pause, and loses none behind it."""
-    client = _client(subject)
+    client = cast(ModbusClient, subject.client)
     pause, limit = (0.012, 0.02) if client.is_rtu else (0.2, 1.0)  # s; within a frame
 
     def frame() -> bytes:

@@ -593,8 +593,9 @@ async def measured(subject: Subject) -> None:
         await subject.play(layer(0, subject.tone(channel)))
         await asyncio.sleep(0.05)
         playing = (await voltages())[channel]
-        what = f"voltage of channel {channel} that plays"
-        expect_within(playing, silent[channel] + 1, math.inf, what)
+        expect_within(
+            playing, silent[channel] + 1, math.inf, f"voltage of channel {channel} that plays"
+        )
 
 
 async def _described(subject: Subject, first: int = 0) -> list[Values]:
@@ -638,8 +639,9 @@ async def _start(subject: Subject, request: Values) -> RequestOutcome:
     since = ahead(began["window_start"], fed["clock"])
     expect_within(since, low, high, "window_start since the clock of a Status before")
     again = await subject.request("Measure", **request)
-    what = "window_start of a Measure that comes again"
-    expect_equal(again["window_start"], began["window_start"], what)
+    expect_equal(
+        again["window_start"], began["window_start"], "window_start of a Measure that comes again"
+    )
     return began
 
 
@@ -692,8 +694,9 @@ async def _lead(subject: Subject, request: Values) -> None:
             found.append(await _complete(subject, await _start(subject, request)))
         heard = [[each["tones"] for each in rows] for rows in found]
         first, second = max(zip(*heard, strict=True), key=lambda each: each[0][0]["amplitude"])
-        what = f"phase of channel {channel} at 90 degrees against 0"
-        _expect_turned(first, second, 9_000, what, slack)
+        _expect_turned(
+            first, second, 9_000, f"phase of channel {channel} at 90 degrees against 0", slack
+        )
 
 
 @driving(_SENSORS_PLACE)

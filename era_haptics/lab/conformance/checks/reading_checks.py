@@ -36,7 +36,6 @@ from era_haptics.lab.conformance.checks.frame_checks import (
     UPLOAD,
     CanClient,
     SerialClient,
-    can_client,
 )
 from era_haptics.lab.conformance.judge_client import (
     AlreadyArmed,
@@ -141,8 +140,12 @@ async def _expect_prompt(
         fastest = min(subject.client.reactions[name])
         if fastest <= REACTION:
             break
-    what = f"time until the reply to {name} begins [ms], the shortest of {_TRIES}"
-    expect_within(1e3 * fastest, 0, 1e3 * REACTION, what)
+    expect_within(
+        1e3 * fastest,
+        0,
+        1e3 * REACTION,
+        f"time until the reply to {name} begins [ms], the shortest of {_TRIES}",
+    )
 
 
 @reading("protocol.md#messages")
@@ -254,8 +257,12 @@ async def events(subject: Subject) -> None:
         if is_stated and len(client.order) == count:
             await asyncio.sleep(client.timeout)
         if is_stated:
-            what = "Events of a watchdog that expires while nothing is asked"
-            expect(len(client.order) > count, what, expected="one at least", seen="none")
+            expect(
+                len(client.order) > count,
+                "Events of a watchdog that expires while nothing is asked",
+                expected="one at least",
+                seen="none",
+            )
 
     await subject.run([subject.one(), subject.starve])
     await unasked()
@@ -468,8 +475,11 @@ async def _object(
     answer = await _exchange(client, request)
     kind = _ABORT if code else UPLOAD if command == UPLOAD else _WRITTEN
     seen = answer[0] & 0xE0, answer[1:4], f"{int.from_bytes(answer[4:], 'little') * bool(code):08x}"
-    what = f"reply to SDO {command:02x} of object {index:04x}/{subindex}"
-    expect_equal(seen, (kind, request[1:4], f"{code:08x}"), what)
+    expect_equal(
+        seen,
+        (kind, request[1:4], f"{code:08x}"),
+        f"reply to SDO {command:02x} of object {index:04x}/{subindex}",
+    )
     return answer
 
 
@@ -490,8 +500,12 @@ async def read_object(client: CanClient, index: int, subindex: int = 0, *, code:
     while len(data) < size:
         answer = await _exchange(client, bytes([0x60 | toggle]) + bytes(7))
         is_next = answer[0] & 0xF0 == toggle
-        what = f"segment of object {index:04x}/{subindex}"
-        expect(is_next, what, expected="the next", seen=answer.hex())
+        expect(
+            is_next,
+            f"segment of object {index:04x}/{subindex}",
+            expected="the next",
+            seen=answer.hex(),
+        )
         data += answer[1 : 8 - (answer[0] >> 1 & 7)]
         toggle ^= 0x10
     return data
@@ -500,7 +514,7 @@ async def read_object(client: CanClient, index: int, subindex: int = 0, *, code:
 @driving("can.md#network-management", "can")
 async def network_management(subject: Subject) -> None:
     """It replies while operational only, and stops what plays when it is taken out of operation."""
-    client = can_client(subject)
+    client = cast(CanClient, subject.client)
     await client.look_around()
     for_all = None if client.neighbours else 0
 
@@ -556,7 +570,7 @@ async def network_management(subject: Subject) -> None:
 @driving("can.md#network-management", "can")
 async def heartbeats(subject: Subject) -> None:
     """It sends its state in the interval of object 1017, and emergencies of faults."""
-    client = can_client(subject)
+    client = cast(CanClient, subject.client)
 
     async def expect_objects(error_register: int, state: int) -> None:
         shown = [(await read_object(client, *each))[0] for each in ((0x1001, 0), (0x2002, 1))]
@@ -601,7 +615,7 @@ async def emergencies(subject: Subject) -> None:
 
 async def _fails_unheard(subject: Subject) -> None:
     """Take it out of operation amid the fade of a fault, between two emergencies."""
-    client = can_client(subject)
+    client = cast(CanClient, subject.client)
     await subject.run([partial(subject.arm, 0.0), subject.one(), subject.starve])
     client.frames.clear()
     due = threads.now() + subject.shown.watchdog + _BEYOND
@@ -625,7 +639,7 @@ async def _fails_unheard(subject: Subject) -> None:
 @reading("can.md#objects", "can")
 async def objects(subject: Subject) -> None:
     """It shows identity, capabilities and status as objects, of which 1017 alone can be written."""
-    client, caps = can_client(subject), (await subject.request("GetCaps")).words
+    client, caps = cast(CanClient, subject.client), (await subject.request("GetCaps")).words
     reply = await subject.request("GetStatus")
     status, still = reply.words, {STATUS.places[name] for name in _STILL}
     serial_number = zlib.crc32(str(subject.identity["serial_number"]).encode())

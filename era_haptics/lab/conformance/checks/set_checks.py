@@ -127,8 +127,9 @@ async def steps_as_stated(subject: Subject) -> None:
             await subject.play(layer(0, replace(base, **{name: value})))
             shown = await subject.request("GetAchieved", layer=0)
             found.update(each[name] for each in shown["commands"])
-        what = f"number of values achieved of {_SCANNED} within a step of {name}"
-        expect_within(len(found), 0, 2, what)
+        expect_within(
+            len(found), 0, 2, f"number of values achieved of {_SCANNED} within a step of {name}"
+        )
 
 
 def _part(words: list[int], code: str = "BAD_VALUE", *channels: int | None, **values: int) -> Send:
@@ -641,9 +642,8 @@ async def starts_at_its_moment(subject: Subject) -> None:
     beyond = 1.01 * MAX_AHEAD + 2 * min(subject.exchange_time, 1.0)
     for duration in (soon, 0.99 * MAX_AHEAD, beyond, -0.1, 0.0):
         await subject.in_time(partial(_starts, subject, duration))
-    present = subject.shown.clock.present
-    over_the_end = (HIGH_WORDS - present - round(0.05 / HIGH_TIME)) % HIGH_WORDS
-    await subject.in_time(partial(_starts, subject, soon, shift=over_the_end))
+    over_the_end = -subject.shown.clock.present - round(0.05 / HIGH_TIME)
+    await subject.in_time(partial(_starts, subject, soon, shift=over_the_end % HIGH_WORDS))
 
 
 async def _starts(subject: Subject, duration: float, *, shift: int = 0) -> None:

@@ -7,7 +7,6 @@ from itertools import chain
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from model.answer.answer import Limits
 from model.answer.answer_report import query_one
@@ -16,12 +15,11 @@ from model.answer.plan import prepare_answers, with_gains
 from model.answer.promise import felt_amplitudes, loudest_power
 from model.answer.stimulus import NEVER, Finger, Placement, Stimulus
 from model.answer.tone_search import choose_tones
-from model.cli import app
 from model.errors import InputError
 from model.finger import detection_threshold
 from model.structure.attachments import HAND_PATCHES, HAND_STD
 from model.study.verification import Plates, draw_plates
-from model.table.table_file import build_table, save_table
+from model.table.table_file import build_table
 from plates import SMALL_TABLE_HZ, contact_sets, realised, smooth_rig, smooth_table
 from registry.limits import HAND_LOAD
 from set_table import drives, only, wants
@@ -415,47 +413,6 @@ def test_a_request_refuses_what_no_content_has(given):
     """A band that ends before it begins, no level, and a priority without order."""
     with pytest.raises(InputError, match=r"must be"):
         wants(NEAR, **given)
-
-
-@pytest.fixture(scope="module")
-def table_file(tmp_path_factory):
-    """The table on disk."""
-    path = tmp_path_factory.mktemp("tables") / "t.npz"
-    save_table(replace(smooth_table(), drive_mode="phased"), path)
-    return str(path)
-
-
-def run(*words):
-    """`era table query` with options; its lines."""
-    return CliRunner().invoke(app, ["table", "query", *words])
-
-
-def test_the_command_answers_as_python_does(table_file):
-    """`--own` with a band and a quiet finger: the keys that scripts rely on."""
-    options = ["--own", "0.09,0.07@100-200", "--own", "0.25,0.18"]
-    options += ["--quiet", "0.16,0.20", "--level", "12"]
-    found = json.loads(run(table_file, *options, "--json").stdout)
-    same = answer(
-        smooth_table(),
-        [wants(NEAR, (100, 200), 12.0), wants(FAR, level_db_sl=12.0)],
-        [Finger(QUIET)],
-    )
-    assert found["promised_worst_db"] == pytest.approx(same.promised_worst_db, abs=1e-3)
-    for layer, expected in zip(found["layers"], same.layers, strict=True):
-        assert layer["frequency_hz"] == expected.frequency
-        assert set(layer["drive"]) == {"SW", "SE", "NE", "NW"}
-        assert layer["fingers"] == list(expected.fingers)
-    for finger, felt in zip(found["fingers"], same.fingers, strict=True):
-        assert finger["at_m"] == list(felt.finger.at)
-        assert (finger["verdict"], finger["layer"]) == (felt.verdict, felt.layer)
-        assert finger["promised_contrast_db"] < finger["contrast_db"]
-        assert finger["foreign_level_db_sl"] < 12.0
-        assert felt.layer is None or finger["level_db_sl"] > 12.0
-    assert found["fingers"][2]["verdict"] == "quiet"
-    assert found["applied"] == list(same.applied)
-    assert found["solve_time_s"] > 0
-    printed = run(table_file, *options).stdout
-    assert f"worst finger: {found['promised_worst_db']:.1f} dB promised" in printed
 
 
 @pytest.fixture(scope="module")

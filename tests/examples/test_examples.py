@@ -11,6 +11,7 @@ import json
 import math
 import os
 import re
+import runpy
 import shlex
 import shutil
 import subprocess
@@ -20,7 +21,6 @@ from asyncio.subprocess import PIPE
 from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import asynccontextmanager, closing
 from functools import partial
-from importlib import util
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -57,12 +57,7 @@ HEARTBEAT = Path(__file__).parents[2] / "examples" / "plugins" / "effect" / "hea
 
 def test_heartbeat_has_no_end() -> None:
     """It lasts as long as the finger, so a layout refuses it under `on_release`."""
-    spec = util.spec_from_file_location("heartbeat", HEARTBEAT)
-    assert spec is not None
-    assert spec.loader is not None
-    module = util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    assert module.Heartbeat().has_end is False
+    assert runpy.run_path(str(HEARTBEAT))["Heartbeat"]().has_end is False
 
 
 ROOT = Path(__file__).parents[2]
@@ -337,14 +332,10 @@ LIMITS = GuardLimits(20.0, 1000.0, 1.0)
 @pytest.fixture
 def address(monkeypatch: pytest.MonkeyPatch) -> Any:
     """The class of the example, which opens all URLs."""
-    spec = util.spec_from_file_location("unix_wire", MODULE)
-    assert spec is not None
-    assert spec.loader is not None
-    module = util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    monkeypatch.setattr(opening, "address_of", module.UnixAddress)
+    made = runpy.run_path(str(MODULE))["UnixAddress"]
+    monkeypatch.setattr(opening, "address_of", made)
     monkeypatch.setattr("drivers.host.amplifier.COMMIT_DELAY", 10.0)  # on a busy machine
-    return module.UnixAddress
+    return made
 
 
 @asynccontextmanager

@@ -172,7 +172,27 @@ def sudden(level: float) -> AmplifierLayer:
 
 PIECE = tone(level=0.9, keep_phase=True, onset=Envelope(1000, ((9000, 0),)))
 LOUD_END = tone(0, 1.0, 200.0, ending=Envelope(100, ((10000, 0),) * 10))
-COURSES: Mapping[str, tuple[GuardLimits, Sequence[Asked]]] = {
+LASTING = AmplifierLayer(0, (tone(),), ramp=0.0)
+
+
+def achieves(level: float, token: int) -> Callable[[Ledger], None]:
+    """What 0.45 has become in the set with this token."""
+
+    def correct(ledger: Ledger) -> None:
+        (sent,) = ledger.admit([AmplifierLayer(0, (tone(level=level),))], 0.5)
+        ledger.playback.correct(sent, token)
+
+    return correct
+
+
+def reopened(ledger: Ledger) -> Ledger:
+    """A ledger of other capabilities that goes on from one that had 0.1 of all time."""
+    other = Ledger(replace(WIDE, duty=0.1), {**CAN, "level_max": 4000})
+    other.go_on_from(ledger)
+    return other
+
+
+COURSES: Mapping[str, tuple[GuardLimits, Sequence[Asked | Callable[[Ledger], Ledger | None]]]] = {
     # 0.6 in one layer leaves 0.4 for another; once it has faded, 0.9 is admitted.
     "layers are bounded together": (
         WIDE,
@@ -301,6 +321,52 @@ COURSES: Mapping[str, tuple[GuardLimits, Sequence[Asked]]] = {
             Asked(4.0, AmplifierLayer(0, (tone(),)), valid_for=(740, 940)),
         ],
     ),
+    # 0.9 of one second within ten; a lower level limit does not give it back, reopened or not.
+    "other capabilities leave what was spent": (
+        replace(WIDE, duty=0.1),
+        [
+            plays(0.0, LASTING),
+            plays(0.9, AmplifierLayer(0, (), ramp=0.0)),
+            lambda ledger: ledger.adopt({**CAN, "level_max": 5000}),
+            refused(5.0, AmplifierLayer(0, (tone(level=0.51),))),
+            Asked(5.0, LASTING, valid_for=(1, 100)),
+            reopened,
+            Asked(5.0, AmplifierLayer(0, (tone(level=0.3),), ramp=0.0), valid_for=(1, 100)),
+        ],
+    ),
+    # 0.5 was sent, 0.45 plays: 0.54 beside it is admitted, 0.56 is not; of another set nothing is.
+    "what was achieved counts from then on": (
+        WIDE,
+        [
+            plays(0.0, AmplifierLayer(0, (tone(level=0.5),))),
+            achieves(0.45, token=2),
+            refused(1.0, AmplifierLayer(1, (HIGH(level=0.54),))),
+            achieves(0.45, token=1),
+            refused(1.0, AmplifierLayer(1, (HIGH(level=0.56),))),
+            Asked(1.0, AmplifierLayer(1, (HIGH(level=0.54),))),
+        ],
+    ),
+    # Of 2 s, 0.5 have gone by, ten steps of an onset last 0.5 more, and 0.1 may be on the way. A
+    # ramp of 0.1 s is left for its end: it may last for 0.8 s from where it begins.
+    "what waits for an onset ends within the longest vibration": (
+        replace(WIDE, on_time=2.0),
+        [
+            plays(
+                0.0,
+                AmplifierLayer(
+                    0,
+                    (tone(onset=Envelope(1000, ((1000, 0),) * 9)),),
+                    ramp=0.1,
+                    valid_for=1.5,
+                ),
+            ),
+            Asked(
+                0.5,
+                AmplifierLayer(0, (tone(keep_phase=True),), ramp=0.1, after=True),
+                valid_for=(798, 802),
+            ),
+        ],
+    ),
     # Three sets a second; silence is never refused.
     "rate": (
         replace(WIDE, rate=3.0),
@@ -316,10 +382,16 @@ COURSES: Mapping[str, tuple[GuardLimits, Sequence[Asked]]] = {
 
 @pytest.mark.parametrize("name", COURSES)
 def test_ledger_admits_what_is_within_the_limits(name: str) -> None:
-    """Each set of a course, with what was played before; a refusal names the first channel."""
+    """Each set of a course, with what was played before; a refusal names the first channel.
+
+    In between it may be told of something else.
+    """
     limits, course = COURSES[name]
     ledger = Ledger(limits, CAN)
     for token, asked in enumerate(course, start=1):
+        if not isinstance(asked, Asked):
+            ledger = asked(ledger) or ledger
+            continue
         if asked.is_refused:
             error = refusal(ledger, asked.layer, at=asked.at)
             assert error.channel in (0, None)
@@ -376,33 +448,6 @@ def test_check_that_fails_refuses_and_leaves_silence_possible() -> None:
     assert ledger.doubt is None
     assert ledger.playback.tokens == {0: 1}
     assert ledger.admit([AmplifierLayer(0, ())], 1.0)
-
-
-def test_what_was_achieved_counts_from_then_on() -> None:
-    """0.5 was sent, 0.45 plays: 0.54 beside it is admitted, 0.56 is not."""
-    ledger = Ledger(WIDE, CAN)
-    play(ledger, 1, 0.0, AmplifierLayer(0, (tone(level=0.5),)))
-    (sent,) = ledger.admit([AmplifierLayer(0, (tone(level=0.45),))], 0.5)
-    ledger.playback.correct(sent, 2)  # of another set: without effect
-    refusal(ledger, AmplifierLayer(1, (tone(level=0.54, frequency=200),)))
-    ledger.playback.correct(sent, 1)
-    refusal(ledger, AmplifierLayer(1, (tone(level=0.56, frequency=200),)))
-    assert ledger.admit([AmplifierLayer(1, (tone(level=0.54, frequency=200),))], 1.0)
-
-
-def test_other_capabilities_leave_what_was_spent() -> None:
-    """0.9 of one second within ten; a lower level limit does not give it back, reopened or not."""
-    ledger = Ledger(replace(WIDE, duty=0.1), CAN)
-    play(ledger, 1, 0.0, AmplifierLayer(0, (tone(),), ramp=0.0))
-    play(ledger, 2, 0.9, AmplifierLayer(0, (), ramp=0.0))
-    ledger.adopt({**CAN, "level_max": 5000})
-    refusal(ledger, AmplifierLayer(0, (tone(level=0.51),)), at=5.0)
-    (one,) = ledger.admit([AmplifierLayer(0, (tone(),), ramp=0.0)], 5.0)
-    assert 0 < one.valid_for <= 100
-    reopened = Ledger(replace(WIDE, duty=0.1), {**CAN, "level_max": 4000})
-    reopened.go_on_from(ledger)
-    (one,) = reopened.admit([AmplifierLayer(0, (tone(level=0.3),), ramp=0.0)], 5.0)
-    assert 0 < one.valid_for <= 100
 
 
 def test_doubt_admits_silence_only_until_it_is_resolved() -> None:
@@ -488,19 +533,6 @@ def test_what_is_admitted_stays_within_the_limits_whenever_it_is_played(seed: in
             before = levels
         ledger.resolve(token, min(commit + 0.001, until))
     assert admitted > 20
-
-
-def test_what_waits_for_an_onset_ends_within_the_longest_vibration() -> None:
-    """By hand: of 2 s, 0.5 have gone by, the onset lasts 0.5 more, and 0.1 may be on the way.
-
-    A ramp of 0.1 s is left for its end: it may last for 0.8 s from where it begins.
-    """
-    ledger = Ledger(replace(WIDE, on_time=2.0), CAN)
-    onset = Envelope(1000, ((1000, 0),) * 9)  # ten steps of 0.1 s
-    play(ledger, 1, 0.0, AmplifierLayer(0, (tone(onset=onset),), ramp=0.1, valid_for=1.5))
-    waits = AmplifierLayer(0, (tone(keep_phase=True),), ramp=0.1, after=True)
-    (one,) = ledger.admit([waits], 0.5)
-    assert one.valid_for == pytest.approx(800, abs=2)
 
 
 @in_virtual_time

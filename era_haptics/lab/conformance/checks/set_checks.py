@@ -546,7 +546,7 @@ def sets_expire(subject: Subject) -> Rows:
 
 # s; of a moment, in which statuses are dense; by which levels may be older, and a sample
 _AROUND, _NEAR = 0.015, 0.0003
-_RISE, _ROUGH = 10, 0.0015  # ms; of full level: rounding
+_RISE, _ROUGH, _SAMPLE = 5, 0.0015, 0.00007  # ms; of full level: rounding; s, at 16 kHz
 _SLOWEST, _FASTEST = QUANTITIES["rate"].minimum, QUANTITIES["rate"].maximum
 # s; in which a rate of the clock shows; what was dropped, that it is
 _STAGING_LONG, _BEHIND = 0.2, 0.02
@@ -664,7 +664,9 @@ async def _starts(subject: Subject, duration: float, *, shift: int = 0) -> None:
             ramp, error = min(_RISE, can["ramp_max"]) / 1000, can["clock_error"]
             slack = QUANTITIES["clock_error"].from_wire(error) + CLOCK_DRIFT * abs(since)
             rise = VoiceTransition(0.0, ramp, 0j, complex(one.commands[0].level / FULL), ramp)
-            low, high = (abs(rise.at(each)) for each in (since - _NEAR - slack, since + slack))
+            low, high = (
+                abs(rise.at(each)) for each in (since - _NEAR - slack, since + _SAMPLE + slack)
+            )
             rough = _ROUGH + can["level_step"] / FULL
             expect_within(
                 shown["levels"][0] / FULL,

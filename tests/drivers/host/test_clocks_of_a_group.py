@@ -95,19 +95,16 @@ async def stops_truthfully(group: Group, end: MemoryLine) -> None:
 
 
 @pytest.mark.parametrize("lie", CAPABILITIES)
-def test_capabilities_that_cannot_be_are_refused(
+@in_virtual_time
+async def test_capabilities_that_cannot_be_are_refused(
     wire: str, lie: str, altered: Callable[[str, str, int], None]
 ) -> None:
     """It is not opened, and nothing but questions was sent; one message says why."""
     altered("GetCaps", *CAPABILITIES[lie])
-
-    async def run() -> None:
-        end = MemoryLine(wire, "a")
-        with pytest.raises(DriverError, match=r"must|too short|limits"):
-            await end.hosts["a"].open()
-        assert {each for _, each in end.sent} <= {"1:1", "1:2"}
-
-    run_virtual(run())
+    end = MemoryLine(wire, "a")
+    with pytest.raises(DriverError, match=r"must|too short|limits"):
+        await end.hosts["a"].open()
+    assert {each for _, each in end.sent} <= {"1:1", "1:2"}
 
 
 @in_virtual_time
@@ -494,20 +491,17 @@ async def skew(group: Group, clocks: Sequence[AmplifierClock], duration: float) 
 
 
 @pytest.mark.parametrize("lost", [0.0, 0.05])
-def test_clocks_on_separate_lines_agree_to_microseconds(lost: float) -> None:
+@in_virtual_time
+async def test_clocks_on_separate_lines_agree_to_microseconds(lost: float) -> None:
     """USB of high speed, +-50 ppm, 1 ppm/s of warm-up: below 10 us from 1 s on, and so it says."""
-
-    async def run() -> None:
-        group, clocks = await held("usb-high-speed", 5, "a", "b", "c", lost=lost)
-        await skew(group, clocks, 1.0)
-        for duration in (1.0, 6.0):
-            assert await skew(group, clocks, duration) < 10e-6
-        said = group.clock_errors.values()
-        assert 2e-6 < math.hypot(*said) / math.sqrt(len(said)) < 10e-6
-        # Behind by what the quickest way out takes, its bits taken off: these are 0.15 ms.
-        assert -60e-6 < min(leads(clocks)) < max(leads(clocks)) < 15e-6
-
-    run_virtual(run())
+    group, clocks = await held("usb-high-speed", 5, "a", "b", "c", lost=lost)
+    await skew(group, clocks, 1.0)
+    for duration in (1.0, 6.0):
+        assert await skew(group, clocks, duration) < 10e-6
+    said = group.clock_errors.values()
+    assert 2e-6 < math.hypot(*said) / math.sqrt(len(said)) < 10e-6
+    # Behind by what the quickest way out takes, its bits taken off: these are 0.15 ms.
+    assert -60e-6 < min(leads(clocks)) < max(leads(clocks)) < 15e-6
 
 
 @pytest.mark.parametrize(
@@ -542,20 +536,19 @@ def test_clocks_are_held_when_a_group_is_armed(
     ("kind", "seed", "bound"),
     [pytest.param("usb-full-speed", 2, 17e-6, marks=pytest.mark.long), ("ftdi", 0, 105e-6)],
 )
-def test_frames_of_full_speed_are_read_at_all_phases(kind: str, seed: int, bound: float) -> None:
+@in_virtual_time
+async def test_frames_of_full_speed_are_read_at_all_phases(
+    kind: str, seed: int, bound: float
+) -> None:
     """In step with frames of 1 ms readings would show one phase of them: 290 us rms on each line.
 
     Where replies take 16 ms there is one reading a heartbeat. By hand: the lowest of five at any
     phase is late by 170 us, with a standard deviation of 140; at the end of a parabola through 16
     of them that is 140 x 3 / sqrt(16) = 105.
     """
-
-    async def run() -> None:
-        group, clocks = await held(kind, seed, "a", "b", "c")
-        await skew(group, clocks, 6.0)
-        assert await skew(group, clocks, 4.0) < bound
-
-    run_virtual(run())
+    group, clocks = await held(kind, seed, "a", "b", "c")
+    await skew(group, clocks, 6.0)
+    assert await skew(group, clocks, 4.0) < bound
 
 
 @pytest.mark.parametrize("lines", [("abc",), ("a", "b")], ids="-".join)
@@ -614,22 +607,19 @@ def test_clocks_are_read_the_seldomer_the_better_they_are_known(
 
 
 @pytest.mark.parametrize(("lost", "bound"), [(0.0, 2e-6), (0.02, 10e-6)], ids=["all", "lossy"])
-def test_one_mark_tells_the_clocks_of_a_shared_line(lost: float, bound: float) -> None:
+@in_virtual_time
+async def test_one_mark_tells_the_clocks_of_a_shared_line(lost: float, bound: float) -> None:
     """Behind USB of full speed 2 s after arming: better by far than what each reading shows.
 
     Where a Mark is not heard, or the reply that shows it is lost, the present clock is shown, up to
     50 ms later: it counts for nothing. A Ping that is lost leaves a clock off by what all are led
     in 50 ms, mostly at 100 ppm or more: 5 us, led back within 0.5 s.
     """
-
-    async def run() -> None:
-        group, clocks = await held("usb-full-speed", 1, "abc", lost=lost)
-        await skew(group, clocks, 2.0)
-        assert await skew(group, clocks, 2.0) < bound
-        assert max(group.clock_errors.values()) < 2 * bound
-        assert not any(each.reported_at for each in group.amplifiers.values())
-
-    run_virtual(run())
+    group, clocks = await held("usb-full-speed", 1, "abc", lost=lost)
+    await skew(group, clocks, 2.0)
+    assert await skew(group, clocks, 2.0) < bound
+    assert max(group.clock_errors.values()) < 2 * bound
+    assert not any(each.reported_at for each in group.amplifiers.values())
 
 
 def test_clocks_of_one_line_are_off_by_no_more_than_is_said() -> None:
@@ -651,114 +641,94 @@ def test_clocks_of_one_line_are_off_by_no_more_than_is_said() -> None:
 
 
 @pytest.mark.parametrize("plays", [False, True], ids=["silent", "playing"])
-def test_no_clock_of_a_line_follows_one_that_jumped(plays: bool) -> None:
+@in_virtual_time
+async def test_no_clock_of_a_line_follows_one_that_jumped(plays: bool) -> None:
     """10 ms of the one to which others are held: they stay within a frame, and are not accused."""
-
-    async def run() -> None:
-        group, clocks = await held("usb-high-speed", 1, "abc")
-        await skew(group, clocks, 4.0)
-        if plays:
-            await group.apply(
-                {
-                    each: [AmplifierLayer(0, (AmplifierTone(0, 100.0, 0.5),), 0.001)]
-                    for each in "abc"
-                }
-            )
-        (jumped,) = (
-            number
-            for number, each in enumerate("abc")
-            if not group.amplifiers[each].clock.is_compared
+    group, clocks = await held("usb-high-speed", 1, "abc")
+    await skew(group, clocks, 4.0)
+    if plays:
+        await group.apply(
+            {each: [AmplifierLayer(0, (AmplifierTone(0, 100.0, 0.5),), 0.001)] for each in "abc"}
         )
-        clocks[jumped].shift(33)  # of 305 us
-        for _ in range(10):
-            await skew(group, clocks, 0.6)
-            others = [each for number, each in enumerate(leads(clocks)) if number != jumped]
-            assert max(map(abs, others)) < 125e-6
-        reported = [each for each in "abc" if group.amplifiers[each].reported_at]
-        assert reported == ["abc"[jumped]]
-
-    run_virtual(run())
-
-
-def test_no_clock_of_a_line_follows_one_that_is_not_steered() -> None:
-    """The first ignores its rate and drifts 40 us a second: it alone is reported, and leaves."""
-
-    async def run() -> None:
-        group, clocks = await held("usb-high-speed", 0, "abc")
-        clocks[0].steer = lambda rate, time: None  # type: ignore[method-assign]
-        await skew(group, clocks, 12.0)
-        first, *others = leads(clocks)
-        assert abs(first) > 400e-6
+    (jumped,) = (
+        number for number, each in enumerate("abc") if not group.amplifiers[each].clock.is_compared
+    )
+    clocks[jumped].shift(33)  # of 305 us
+    for _ in range(10):
+        await skew(group, clocks, 0.6)
+        others = [each for number, each in enumerate(leads(clocks)) if number != jumped]
         assert max(map(abs, others)) < 125e-6
-        assert [each for each in "abc" if group.amplifiers[each].reported_at] == ["a"]
+    reported = [each for each in "abc" if group.amplifiers[each].reported_at]
+    assert reported == ["abc"[jumped]]
 
-    run_virtual(run())
+
+@in_virtual_time
+async def test_no_clock_of_a_line_follows_one_that_is_not_steered() -> None:
+    """The first ignores its rate and drifts 40 us a second: it alone is reported, and leaves."""
+    group, clocks = await held("usb-high-speed", 0, "abc")
+    clocks[0].steer = lambda rate, time: None  # type: ignore[method-assign]
+    await skew(group, clocks, 12.0)
+    first, *others = leads(clocks)
+    assert abs(first) > 400e-6
+    assert max(map(abs, others)) < 125e-6
+    assert [each for each in "abc" if group.amplifiers[each].reported_at] == ["a"]
 
 
 @pytest.mark.parametrize("baud", [38_400, 921_600])
 @pytest.mark.parametrize("is_stopped", [False, True], ids=["armed", "stopped"])
-def test_readings_before_arming_end_in_time(is_stopped: bool, baud: int) -> None:
+@in_virtual_time
+async def test_readings_before_arming_end_in_time(is_stopped: bool, baud: int) -> None:
     """16 on a line, of which all take 0.28 s at 38 400 baud: after 0.2 s, or at once by a stop.
 
     But for one reading, and 1 ms until the next.
     """
-
-    async def run() -> None:
-        end = MemoryLine("serial", *"abcdefghijklmnop", wire=SerialWire(baud, sequence=0))
-        end.inward = lambda _, data: [(end.line.wire.takes + 1e-4, data)]
-        end.outward = lambda _, data: [(len(data) * 10 / baud + 1e-4, data)]
-        group, time = await group_of(end, is_armed=False), end.loop.time
-        before, exchange = time(), group.amplifiers["a"].exchange_time("GetStatus")
-        arming = asyncio.ensure_future(group.arm())
-        if is_stopped:
-            await asyncio.sleep(0.05)
-            await group.stop()
-            before = time()
-            with pytest.raises(Preempted):
-                await arming
-            assert time() - before < 2 * exchange + 1e-3
-        else:
+    end = MemoryLine("serial", *"abcdefghijklmnop", wire=SerialWire(baud, sequence=0))
+    end.inward = lambda _, data: [(end.line.wire.takes + 1e-4, data)]
+    end.outward = lambda _, data: [(len(data) * 10 / baud + 1e-4, data)]
+    group, time = await group_of(end, is_armed=False), end.loop.time
+    before, exchange = time(), group.amplifiers["a"].exchange_time("GetStatus")
+    arming = asyncio.ensure_future(group.arm())
+    if is_stopped:
+        await asyncio.sleep(0.05)
+        await group.stop()
+        before = time()
+        with pytest.raises(Preempted):
             await arming
-            hello = min(at for at, name in end.sent if at > before and name.endswith(f":{HELLO}"))
-            assert hello - before < 0.2 + 2 * exchange + 1e-3
+        assert time() - before < 2 * exchange + 1e-3
+    else:
+        await arming
+        hello = min(at for at, name in end.sent if at > before and name.endswith(f":{HELLO}"))
+        assert hello - before < 0.2 + 2 * exchange + 1e-3
 
-    run_virtual(run())
 
-
-def test_half_of_an_exchange_is_unknown_where_lines_differ() -> None:
+@in_virtual_time
+async def test_half_of_an_exchange_is_unknown_where_lines_differ() -> None:
     """A product of another name: the way out may take all of it, or nothing; one alone has none."""
-
-    async def run() -> None:
-        ends = [MemoryLine("serial", "a"), MemoryLine("serial", "b")]
-        ends[1].far["b"].identity["product"] = "another"
-        group = await group_of(*ends)
-        for _ in range(60):
-            await asyncio.sleep(0.05)
-            await group.beat()
-        # 0.2 ms each way, of which the bits of request and reply are within.
-        bits = min(each.exchange_time("GetStatus") for each in group.amplifiers.values())
-        unknown = (0.4e-3 - bits) / 2 if bits < 0.4e-3 else 0.0
-        assert min(group.clock_errors.values()) >= unknown
-        alone = await group_of(MemoryLine("serial", "c"))
-        assert alone.clock_errors == {"c": 0.0}
-
-    run_virtual(run())
+    ends = [MemoryLine("serial", "a"), MemoryLine("serial", "b")]
+    ends[1].far["b"].identity["product"] = "another"
+    group = await group_of(*ends)
+    for _ in range(60):
+        await asyncio.sleep(0.05)
+        await group.beat()
+    # 0.2 ms each way, of which the bits of request and reply are within.
+    bits = min(each.exchange_time("GetStatus") for each in group.amplifiers.values())
+    unknown = (0.4e-3 - bits) / 2 if bits < 0.4e-3 else 0.0
+    assert min(group.clock_errors.values()) >= unknown
+    alone = await group_of(MemoryLine("serial", "c"))
+    assert alone.clock_errors == {"c": 0.0}
 
 
 @pytest.mark.parametrize("ahead", [-10.0, -0.01])
-def test_a_clock_that_is_not_held_spoils_no_other_of_its_line(ahead: float) -> None:
+@in_virtual_time
+async def test_a_clock_that_is_not_held_spoils_no_other_of_its_line(ahead: float) -> None:
     """One that states no error, beside two that are held by Marks."""
-
-    async def run() -> None:
-        end = MemoryLine("serial", *"abc")
-        end.far["a"].capabilities["clock_error"] = CLOCK_UNKNOWN
-        end.far["a"].clock = AmplifierClock(Crystal(ahead=ahead))
-        group = await group_of(end)
-        await skew(group, [end.far["b"].clock, end.far["c"].clock], 11.0)
-        assert group.clock_errors["a"] == math.inf
-        assert max(group.clock_errors[each] for each in "bc") < 20e-6
-
-    run_virtual(run())
+    end = MemoryLine("serial", *"abc")
+    end.far["a"].capabilities["clock_error"] = CLOCK_UNKNOWN
+    end.far["a"].clock = AmplifierClock(Crystal(ahead=ahead))
+    group = await group_of(end)
+    await skew(group, [end.far["b"].clock, end.far["c"].clock], 11.0)
+    assert group.clock_errors["a"] == math.inf
+    assert max(group.clock_errors[each] for each in "bc") < 20e-6
 
 
 def test_status_that_shows_an_older_mark_accuses_no_clock() -> None:

@@ -232,37 +232,33 @@ async def test_node_that_has_restarted_is_mute_until_it_is_identified(
         ("unplug", "WATCHDOG"),
     ],
 )
-def test_fault_silences_and_its_amplifier_is_found_again(
+@in_virtual_time
+async def test_fault_silences_and_its_amplifier_is_found_again(
     coarse_rig: Rig, wire: SimulatedWire, kind: FaultKind, fault: str
 ) -> None:
     """A second of it: silent in time; the host stops, and finds what has happened afterwards."""
-
-    @in_virtual_time
-    async def run() -> None:
-        async with rig_on_wire(coarse_rig, wire) as rig:
-            await rig.group.arm()
-            await rig.group.apply({"main": [layer((0, 110.0, 1.0))]})
-            await rig.beat_until(threads.now() + 0.2)
-            assert rig.levels("main")[0] == 1.0
-            rig.devices["main"].inject_fault(FaultWindow(fault=kind, lasts=1.0))
-            with pytest.raises((CommandRefused, LinkError)):
-                await rig.beat_until(threads.now() + 2.0)
-            assert not rig.group.is_armed
-            await asyncio.sleep(0.3)
-            assert not any(rig.levels("main"))
-            await asyncio.sleep(1.0)
-            await rig.reopen(within=5.0)
-            status = rig.group.amplifiers["main"].status
-            assert status is not None
-            assert status["fault"] == FAULTS[fault]
-            allowed = ["FAULT", "QUICK_STOP_ACTIVE", *(["SWITCH_ON_DISABLED"] * (kind == "reboot"))]
-            assert status["state"] in [STATES[each] for each in allowed]
-            await rig.group.clear()
-            await rig.group.arm()
-            await rig.group.apply({"main": [layer((0, 110.0, 0.5))]})
-            await rig.group.disarm()
-
-    run()
+    async with rig_on_wire(coarse_rig, wire) as rig:
+        await rig.group.arm()
+        await rig.group.apply({"main": [layer((0, 110.0, 1.0))]})
+        await rig.beat_until(threads.now() + 0.2)
+        assert rig.levels("main")[0] == 1.0
+        rig.devices["main"].inject_fault(FaultWindow(fault=kind, lasts=1.0))
+        with pytest.raises((CommandRefused, LinkError)):
+            await rig.beat_until(threads.now() + 2.0)
+        assert not rig.group.is_armed
+        await asyncio.sleep(0.3)
+        assert not any(rig.levels("main"))
+        await asyncio.sleep(1.0)
+        await rig.reopen(within=5.0)
+        status = rig.group.amplifiers["main"].status
+        assert status is not None
+        assert status["fault"] == FAULTS[fault]
+        allowed = ["FAULT", "QUICK_STOP_ACTIVE", *(["SWITCH_ON_DISABLED"] * (kind == "reboot"))]
+        assert status["state"] in [STATES[each] for each in allowed]
+        await rig.group.clear()
+        await rig.group.arm()
+        await rig.group.apply({"main": [layer((0, 110.0, 0.5))]})
+        await rig.group.disarm()
 
 
 @pytest.mark.parametrize("name", SHARED_WIRES)

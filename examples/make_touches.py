@@ -16,7 +16,7 @@ from pythonosc.osc_bundle_builder import IMMEDIATELY, OscBundleBuilder
 from pythonosc.osc_message_builder import OscMessageBuilder
 
 from controller.sources.touch import Touch, TouchFrame
-from controller.sources.tuio import ADDRESS, HEADER, RecordedDatagram
+from controller.sources.tuio import CURSORS, HEADER, RecordedDatagram
 
 PLATE = np.array([0.3048, 0.2286])  # metres
 MARGIN, APART = 0.015, 0.06  # metres
@@ -76,7 +76,7 @@ def tuio_datagram(frame: TouchFrame, sequence: int) -> bytes:
     ]
     types = {str: "s", int: "i", float: "f"}
     for arguments in messages:
-        message = OscMessageBuilder(ADDRESS)
+        message = OscMessageBuilder(CURSORS)
         for argument in arguments:
             message.add_arg(argument, types[type(argument)])
         bundle.add_content(message.build())

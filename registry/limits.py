@@ -6,6 +6,9 @@ from dataclasses import dataclass
 MAX_CONTACTS = 20
 """Most fingers: two people with ten each, or four with five; more are a forearm or a spill."""
 
+MAX_FINGERS = 10
+"""Most fingers that feel effects unless a daemon's file says otherwise: those of one person."""
+
 MAX_CONTENTS = 6
 """Most contents at the same time; with more, no plate has any contrast left."""
 
@@ -32,8 +35,8 @@ class GuardLimits:
 MAX_FINGER_LOAD = 10.0
 """Largest load of a finger, in fingertips; what loads a plate by more is a hand that rests."""
 
-HAND_LOAD = 12.0
-"""Load of a hand that rests on a plate, in fingertips.
+HAND_LOAD, MAX_HAND_LOAD = 12.0, 40.0
+"""Load of a hand that rests on a plate, in fingertips, where its size is unknown, and the largest.
 
 That of the heel of a hand with part of its weight lies between its force, to the power of two
 thirds (7 fingertips for 10 N), and its area (30 for 20 cm²). docs/concepts/people.md has the

@@ -8,18 +8,18 @@ import time
 
 from controller.cli.main import main
 from controller.sources.touch import TouchFrame
-from controller.sources.tuio import TuioReader
+from controller.sources.tuio import TuioSource
 from controller.sources.udp_source import Peer
 
 if __name__ == "__main__":
-    delay, read = float(sys.argv[1]), TuioReader.read
+    delay, read = float(sys.argv[1]), TuioSource.read
 
     def read_late(
-        self: TuioReader, datagram: bytes, peer: Peer, *, now: float
+        self: TuioSource, datagram: bytes, peer: Peer, arrived: float
     ) -> TouchFrame | None:
         time.sleep(delay)
-        return read(self, datagram, peer, now=now)
+        return read(self, datagram, peer, arrived)
 
-    TuioReader.read = read_late  # type: ignore[method-assign]
+    TuioSource.read = read_late  # type: ignore[method-assign]
     sys.argv[1:2] = ["daemon"]
     sys.exit(main())

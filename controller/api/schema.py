@@ -175,10 +175,10 @@ class ContactStatus(ApiMessage):
     id: int
     x_m: float
     y_m: float
-    role: Literal["target", "quiet", "hand"] | None = Field(
+    role: Literal["target", "quiet", "hand", "surplus"] | None = Field(
         None,
-        description="whether it is to feel the pattern, or is a hand that rests, whose load alone "
-        "counts; null before the first decision",
+        description="whether it is to feel the pattern, or only its load counts: of a hand that "
+        "rests, or of a finger beyond max_fingers; null before the first decision",
     )
     level_db_sl: float | None = Field(
         None, description="predicted sensation level of a target; null if unknown"

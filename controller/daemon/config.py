@@ -38,6 +38,7 @@ from model.rig.rig import Rig
 from model.rig.rig_file import rig_of, with_base
 from model.rig.rig_summary import clock_costs, gain_notes, whole_url
 from model.structure.attachments import check_supported
+from registry.limits import MAX_CONTACTS, MAX_FINGERS
 
 MAX_LAYOUTS = 64
 
@@ -119,6 +120,7 @@ class DaemonSection(Section):
     layouts: Annotated[dict[Identifier, File], Field(max_length=MAX_LAYOUTS, default_factory=dict)]
     strengths: File | None = None
     touch: Annotated[list[TouchSection], Field(max_length=16, default_factory=list)]
+    max_fingers: Annotated[int, Field(ge=1, le=MAX_CONTACTS)] = MAX_FINGERS
     serial_numbers: Annotated[dict[Identifier, str], Field(max_length=64, default_factory=dict)]
     socket: File | None = None
     log: LogSection = LogSection()

@@ -134,6 +134,7 @@ class Daemon:
             watchdog=watchdog,
         )
         cycle = self._controller.cycle
+        cycle.tracker.max_fingers = config.section.max_fingers
         self._supervisor.observe(cycle.observers)
         self._publisher.observe(cycle.observers)
         if config.learn is not None:

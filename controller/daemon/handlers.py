@@ -56,7 +56,7 @@ from controller.operation.operation_states import (
 from controller.operation.plate_controller import Controller
 from controller.operation.supervisor import LEASE_OVER, Supervisor
 from controller.play.intent import MAX_DB_SL
-from controller.sources.touch import LIGHT_MAJOR, Contact, LightPress, Touch, TouchFrame
+from controller.sources.touch import Contact, Touch, TouchFrame
 from drivers.host.ledger import StopOutcome
 from model.compiled.kernels import why_slow
 from model.errors import InputError
@@ -67,9 +67,6 @@ from registry.plugins import did_you_mean
 from registry.threads import in_thread
 
 _logger = logging.getLogger(__name__)
-
-BY_RADIUS = LightPress(touch_major=LIGHT_MAJOR)
-"""What the radius of a contact over the API says of its load."""
 
 PLAY_RADIUS = 0.020
 """Largest distance [m] from the position of a requested effect to the finger that feels it."""
@@ -292,7 +289,9 @@ class ApiService:
                 point.id,
                 point.x_m / plate.length,
                 1 - point.y_m / plate.width,
-                BY_RADIUS.load(pressure=0.0, touch_major=2e3 * (point.radius_m or 0.0)),
+                size=None
+                if (radius := point.radius_m) is None
+                else (2 * radius / plate.length, 2 * radius / plate.width),
             )
             for point in params.touches
         )
@@ -368,14 +367,19 @@ class ApiService:
         def distance(contact: Contact) -> float:
             return math.dist((contact.x, contact.y), (params.x_m, params.y_m))
 
-        nearest = min(self._publisher.view.contacts, key=distance, default=None)
-        if nearest is None or distance(nearest) > PLAY_RADIUS:
+        near = [each for each in self._publisher.view.contacts if distance(each) <= PLAY_RADIUS]
+        nearest = min(
+            near, key=lambda each: (bool(each.why_load_alone), distance(each)), default=None
+        )
+        if nearest is None:
             raise RpcError(
                 ErrorCode.REFUSED,
                 f"no finger within {1e3 * PLAY_RADIUS:g} mm of ({params.x_m:g}, {params.y_m:g}) m",
                 where="x_m",
                 remedy="touch the plate there, or send a touch over the API",
             )
+        if nearest.why_load_alone:
+            raise RpcError(ErrorCode.REFUSED, nearest.why_load_alone, where="x_m")
         return nearest
 
     def _played(self, params: PlayParams) -> tuple[str, Effect, float]:

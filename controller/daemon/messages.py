@@ -378,8 +378,9 @@ def _contact_status(
             "foreign_level_db_sl": _finite(highest),
             "is_foreign_felt": is_felt(highest),
         }
-    if contact.is_hand:
-        status |= {"role": "hand", "held_back": None, "is_foreign_felt": False}
+    if contact.why_load_alone:
+        role = "hand" if contact.is_hand else "surplus"
+        status |= {"role": role, "held_back": contact.why_load_alone, "is_foreign_felt": False}
     return ContactStatus.model_validate(status)
 
 

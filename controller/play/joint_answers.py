@@ -193,7 +193,14 @@ def fingers_of(
         )
     for contact in quiet:
         bound = IMPERCEPTIBLE_DB_SL if contact.key in protected else math.inf
-        found.append(Finger((contact.x, contact.y), load=contact.load, max_foreign_db_sl=bound))
+        found.append(
+            Finger(
+                (contact.x, contact.y),
+                load=contact.load,
+                is_protected=not contact.is_surplus,
+                max_foreign_db_sl=bound,
+            )
+        )
     return found
 
 

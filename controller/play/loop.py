@@ -299,7 +299,7 @@ class Planner:
                 return self._go_on(before, now)
             self._seen = contacts
             self._intent_due = math.inf
-            fingers = tuple([each for each in contacts if not each.is_hand])
+            fingers = tuple([each for each in contacts if not each.why_load_alone])
             intent = self._intent_source.intent(fingers, now)
             self._intent_due = intent.due(now)
             chosen = self._selector.select(contacts, intent, self.capabilities, now=now)

@@ -268,7 +268,7 @@ def _is_met_by(intended: Question, chosen: Selection) -> bool:
     follows = not intended.is_alone
     return same and all(
         math.dist((contact.x, contact.y), (then[key].x, then[key].y)) <= MOVE_TOLERANCE
-        and contact.load == then[key].load
+        and (contact.load, contact.is_surplus) == (then[key].load, then[key].is_surplus)
         and (key in intended.protected) == (key in chosen.protected)
         and not (follows and _has_set_out(contact, then[key]))
         for key, contact in now.items()

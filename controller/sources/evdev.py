@@ -274,8 +274,10 @@ class InputDevice:
                 fcntl.ioctl(self._descriptor, CLOCK, _INT.pack(time.CLOCK_MONOTONIC))
             if grab:
                 fcntl.ioctl(self._descriptor, GRAB, 1)
-        except OSError as error:
+        except (InputError, OSError) as error:
             self.close()
+            if isinstance(error, InputError):
+                raise
             if error.errno == errno.EBUSY:
                 raise InputError(
                     f"touch source {path}: grabbed by another program; stop that one "
@@ -285,9 +287,6 @@ class InputDevice:
                 f"touch source {path}: must be a touch panel ({error.strerror}); `libinput "
                 "list-devices` or `evtest` list the devices"
             ) from error
-        except InputError:
-            self.close()
-            raise
 
     def fileno(self) -> int:
         """Return the descriptor for a selector."""
@@ -447,8 +446,8 @@ class EvdevSource(TouchSource):
         happened: float = -math.inf,
     ) -> None:
         """Deliver a frame of what happened at a time [s], now if that is not of this clock."""
-        now = asyncio.get_running_loop().time()
-        deliver(TouchFrame(self._name, moment_of(happened, now), touches))
+        at = moment_of(happened, asyncio.get_running_loop().time())
+        deliver(TouchFrame(self._name, at, touches))
 
 
 def _panel_options(options: str) -> tuple[dict[str, str], dict[int, float]]:

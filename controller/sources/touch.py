@@ -27,7 +27,13 @@ from urllib.parse import parse_qsl
 
 from model.errors import InputError
 from registry import threads
-from registry.limits import HAND_LOAD, MAX_CONTACTS, MAX_FINGER_LOAD
+from registry.limits import (
+    HAND_LOAD,
+    MAX_CONTACTS,
+    MAX_FINGER_LOAD,
+    MAX_FINGERS,
+    MAX_HAND_LOAD,
+)
 from registry.plugins import PluginRegistry
 
 if TYPE_CHECKING:  # numpy is slow to import
@@ -83,8 +89,11 @@ class Touch:
     y: float
     """0..1 downwards."""
     load: float | None = None
-    """Load on the plate relative to the rig's fingertip, not bounded; None where nothing is
-    reported, HAND_LOAD of a hand that rests."""
+    """Load on the plate relative to the rig's fingertip, above MAX_FINGER_LOAD of a hand that
+    rests (HAND_LOAD where its size is unknown); None where nothing is reported."""
+    size: tuple[float, float] | None = None
+    """Width and height of the contact relative to the sensor's, from which its load follows where
+    none is reported; None where they are unknown."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,6 +109,13 @@ class TouchFrame:
     CONTACT_TIMEOUT."""
     origin: str | None = None
     """Host or client, which may have several sources; None: the source itself."""
+
+    @property
+    def expiry(self) -> float:
+        """When [s] its touches are lifted unless another frame of the source arrives."""
+        stated = self.timeout
+        is_valid = stated is not None and 0 < stated <= MAX_CONTACT_TIMEOUT  # NaN is not
+        return self.time + (stated if stated is not None and is_valid else CONTACT_TIMEOUT)
 
 
 MAX_FRAME_AGE = 1.0
@@ -194,10 +210,12 @@ class TouchCalibration:
     def apply(self, touch: Touch) -> Touch:
         """Map a touch to coordinates 0..1 across the plate; NaN stays NaN."""
         (a, b, c), (d, e, f) = self.matrix
+        wide, high = touch.size or (0.0, 0.0)
         return replace(
             touch,
             x=a * touch.x + b * touch.y + c,
             y=d * touch.x + e * touch.y + f,
+            size=touch.size and (math.hypot(a * wide, b * high), math.hypot(d * wide, e * high)),
         )
 
 
@@ -210,11 +228,10 @@ def turned(degrees: int = 0, *, mirror: str | None = None) -> TouchCalibration:
 
     mirror: "x" to swap left and right after that, "y" for top and bottom.
     """
-    x_row, y_row = _ROTATIONS[degrees]
-    if mirror == "x":
-        x_row = _reversed(x_row)
-    if mirror == "y":
-        y_row = _reversed(y_row)
+    x_row, y_row = (
+        (-a, -b, 1 - c) if axis == mirror else (a, b, c)
+        for axis, (a, b, c) in zip("xy", _ROTATIONS[degrees], strict=True)
+    )
     return TouchCalibration((x_row, y_row))
 
 
@@ -249,12 +266,6 @@ def fitted(
     return TouchCalibration(((a, b, c), (d, e, f)))
 
 
-def _reversed(row: Row) -> Row:
-    """Return the row of 1 - x' for the row of x'."""
-    a, b, c = row
-    return (-a, -b, 1 - c)
-
-
 LIGHT_FORCE = 0.5
 """Force [N] of a finger that presses lightly: the mean of a tap on a touch screen."""
 
@@ -268,8 +279,9 @@ They are two standard deviations of the rig's default `uncertainty` of a load. R
 say more about the panel than about the finger.
 """
 
-MAX_FINGER_MAJOR = 25.0
-"""Longer axis [mm] of a contact beyond which it is a hand: the largest of fingers have 20 mm."""
+MAX_FINGER_MAJOR, HAND_MAJOR = 25.0, 50.0
+"""Longer axis [mm] of a contact beyond which it is a hand, and of one with `HAND_LOAD`: the largest
+of fingers have 20 mm, and 50 mm are a circle of 20 cm²."""
 
 LANDING = 0.1
 """Time [s] after which a finger that lands has its area of contact; loads before it are ignored."""
@@ -290,18 +302,21 @@ class LightPress:
     pressure: float | None = None
     touch_major: float | None = None
 
-    def load(self, *, pressure: float, touch_major: float) -> float | None:
-        """Return the load of a contact with these values, not bounded; force is preferred.
+    def load(self, *, touch_major: float, pressure: float = 0.0) -> float | None:
+        """Return the load of a contact with these values; force is preferred.
 
-        None without a positive value of an axis, HAND_LOAD for what is larger than a finger.
+        None without a positive value of an axis. What is larger than a finger has a load of
+        HAND_LOAD or more, as a hand of its size; a finger has at most MAX_FINGER_LOAD.
         """
-        if touch_major > (self.touch_major or math.inf) * MAX_FINGER_MAJOR / LIGHT_MAJOR:
-            return HAND_LOAD
+        size = touch_major / (self.touch_major or math.inf)
+        if size > MAX_FINGER_MAJOR / LIGHT_MAJOR:
+            return HAND_LOAD * float(max(1.0, (size * LIGHT_MAJOR / HAND_MAJOR) ** _BY_SIZE))
         if self.pressure is not None and pressure > 0:
-            return float((pressure / self.pressure) ** _BY_FORCE)
-        if self.touch_major is not None and touch_major > 0:
-            return float((touch_major / self.touch_major) ** _BY_SIZE)
-        return None
+            return float(min((pressure / self.pressure) ** _BY_FORCE, MAX_FINGER_LOAD))
+        return float(size**_BY_SIZE) if size > 0 else None
+
+
+_IN_MM = LightPress(touch_major=LIGHT_MAJOR)
 
 
 def followed(known: float, reported: float) -> float:
@@ -401,6 +416,11 @@ TAP_TIME = 0.060
 """Such a contact is kept for this time [s], so that a click is decided, loaded and felt."""
 
 
+HAND_FEELS_NOTHING = "a hand that rests feels no effect; lift it, and touch with a finger"
+
+SURPLUS = "more fingers are on the plate than may feel effects (max_fingers); lift another one"
+
+
 class ContactKey(NamedTuple):
     """Identifies a contact: its source and the id within that source."""
 
@@ -423,11 +443,18 @@ class Contact:
     """Relative to the rig's fingertip, bounded and in steps; 1 where nothing is reported."""
     motion: Motion = field(default=AT_REST, compare=False)
     """Its recent way."""
+    is_surplus: bool = False
+    """Whether as many fingers as may feel effects came before it."""
 
     @property
     def is_hand(self) -> bool:
         """Whether it is a hand that rests: its load is on the plate, and it feels nothing."""
         return self.load > MAX_FINGER_LOAD
+
+    @property
+    def why_load_alone(self) -> str | None:
+        """Why nothing but its load counts; None for a finger that may feel effects."""
+        return HAND_FEELS_NOTHING if self.is_hand else SURPLUS if self.is_surplus else None
 
 
 @dataclass(frozen=True, slots=True)
@@ -437,7 +464,7 @@ class Change:
     down: tuple[Contact, ...] = ()
     moved: tuple[Contact, ...] = ()
     pressed: tuple[Contact, ...] = ()
-    """Contacts with another load."""
+    """Contacts with another load, or that have become surplus, or fingers again."""
     up: tuple[Contact, ...] = ()
     rejected: tuple[str, ...] = ()
     """A reason for each touch that was not accepted."""
@@ -447,19 +474,6 @@ class Change:
         return bool(self.down or self.moved or self.pressed or self.up)
 
 
-_UNCHANGED = Change()
-
-
-@dataclass(frozen=True, slots=True)
-class _Source:
-    """A source with contacts."""
-
-    received: float  # s; time of its last frame
-    timeout: float  # s
-    expiry: float  # s; when its contacts are lifted unless another frame arrives
-    origin: str
-
-
 class ContactTracker:
     """Follows the contacts on one plate; times are arguments.
 
@@ -467,13 +481,14 @@ class ContactTracker:
     the plate (0..1) is at its edge. Touches that are farther off, have non-finite coordinates or
     repeat an id within a frame (the last one counts) are rejected; a contact whose touch is
     rejected is lifted. Beyond the maximum number of contacts one is evicted (`to_evict`), or the
-    touch is rejected.
+    touch is rejected. Of fewer, those that come after max_fingers fingers are surplus until one of
+    these lifts, or turns out to be a hand.
     """
 
-    def __init__(self, plate: "Plate") -> None:
-        self._plate = plate
+    def __init__(self, plate: "Plate", *, max_fingers: int = MAX_FINGERS) -> None:
+        self._plate, self.max_fingers = plate, max_fingers
         self._contacts: dict[ContactKey, Contact] = {}
-        self._sources: dict[str, _Source] = {}
+        self._sources: dict[str, TouchFrame] = {}  # their last frames
         self._taps: dict[ContactKey, float] = {}  # s; when contacts end that are lifted already
         self._newest = -math.inf  # s; time of the newest frame
         self.contacts: tuple[Contact, ...] = ()
@@ -506,54 +521,36 @@ class ContactTracker:
             rejected.append("no_time")
         if keeps_taps:
             self._keep_taps(frame)
-        gone = []
-        for key in self._contacts:
-            if key.source == frame.source and (key in touches) == (key in self._taps):
-                gone.append(key)
-        up = self._lift(gone) if gone else ()
-        self._sources[frame.source] = _source_of(frame)
-        down: list[Contact] = []
-        moved: list[Contact] = []
-        pressed: list[Contact] = []
+        own = [key for key in self._contacts if key.source == frame.source]
+        up = self._lift([key for key in own if (key in touches) == (key in self._taps)])
+        self._sources[frame.source] = frame
+        before = {**self._contacts}
         for key, touch in touches.items():
-            known = self._contacts.get(key)
+            known = before.get(key)
             if known is None and len(self._contacts) >= MAX_CONTACTS:
-                origins = {name: each.origin for name, each in self._sources.items()}
+                origins = {name: each.origin or name for name, each in self._sources.items()}
                 evicted = to_evict([each.source for each in self._contacts], key.source, origins)
                 if evicted is None:
                     rejected.append("too_many")
                     continue
                 up += self._lift([[*self._contacts][evicted]])
-            contact = self._contacts[key] = self._contact(key, touch, known, frame.time)
-            if known is None:
-                down.append(contact)
-            elif (known.x, known.y) != (contact.x, contact.y):
-                moved.append(contact)
-            elif known.load != contact.load:
-                pressed.append(contact)
-        if up:
-            self._note_lifts(up, frame.time)
-        for contact in (*down, *moved, *pressed):
-            self.changed.setdefault(contact.key, frame.time)
-        self._note_next()
-        return Change(tuple(down), tuple(moved), tuple(pressed), up, tuple(rejected))
+            self._contacts[key] = self._contact(key, touch, known, frame.time)
+        return self._change(before, up, frame.time, rejected)
 
     def expire(self, now: float) -> Change:
         """Lift the contacts of all sources that have timed out at now [s]."""
         if self._newest <= now < self.next_expiry:
-            return _UNCHANGED
+            return Change()
         # Frames dated in the future are treated as received now.
         expired = [name for name, source in self._sources.items() if source.expiry <= now]
         ended = [key for key, end in self._taps.items() if end <= now]
-        up: tuple[Contact, ...] = ()
+        before, up = {**self._contacts}, tuple[Contact, ...]()
         if expired or ended:
             up = self._lift(key for key in self._contacts if key.source in expired or key in ended)
         for name, source in self._sources.items():
-            if source.received > now:
-                self._sources[name] = replace(source, received=now, expiry=now + source.timeout)
-        self._note_lifts(up, now)
-        self._note_next()
-        return Change(up=up) if up else _UNCHANGED
+            if source.time > now:
+                self._sources[name] = replace(source, time=now)
+        return self._change(before, up, now)
 
     def wait_again(self, answered: Mapping[ContactKey | None, float]) -> None:
         """Note contacts as changed since times [s] whose answer has not been played after all."""
@@ -566,15 +563,20 @@ class ContactTracker:
     ) -> Contact:
         """Return the contact of a touch, down since a time [s] unless it is known.
 
-        One whose panel stops reporting loads keeps its own; a hand is one until it is lifted, so
-        that what is left of it as it lifts is no finger.
+        One whose panel stops reporting loads keeps its own; a hand is one until it is lifted, of
+        the largest size so far, so that what is left of it as it lifts is no finger.
         """
+        length, width = self._plate.length, self._plate.width
         since, load = (time, 1.0) if known is None else (known.since, known.load)
-        x, y = touch.x * self._plate.length, (1 - touch.y) * self._plate.width
-        if load > MAX_FINGER_LOAD or touch.load == HAND_LOAD:
-            return Contact(key, x, y, since, HAND_LOAD)
-        if touch.load is not None and time - since >= LANDING:
-            load = followed(load, touch.load)
+        x, y, reported = touch.x * length, (1 - touch.y) * width, touch.load
+        if reported is None and touch.size is not None:
+            longer = max(touch.size[0] * length, touch.size[1] * width)
+            reported = _IN_MM.load(touch_major=1e3 * longer)
+        if (largest := max(load, reported or 0.0)) > MAX_FINGER_LOAD:
+            largest = min(largest, MAX_HAND_LOAD)
+            return Contact(key, x, y, since, load if largest < MIN_CHANGE * load else largest)
+        if reported is not None and time - since >= LANDING:
+            load = followed(load, reported)
         motion = AT_REST if known is None else known.motion
         return Contact(key, x, y, since, load, motion.followed(time, x, y))
 
@@ -593,35 +595,45 @@ class ContactTracker:
             self._taps.pop(contact.key, None)
         return lifted
 
-    def _note_lifts(self, up: Iterable[Contact], time: float) -> None:
-        """Note that contacts have changed for the last time at a time [s]."""
-        for contact in up:
-            first = self.changed.pop(contact.key, time)
-            self.changed[None] = min(first, self.changed.get(None, time))
+    def _change(
+        self,
+        before: Mapping[ContactKey, Contact],
+        up: tuple[Contact, ...],
+        time: float,
+        rejected: Sequence[str] = (),
+    ) -> Change:
+        """Tell surplus contacts from fingers, and note at a time [s] what differs from before.
 
-    def _note_next(self) -> None:
-        """Forget sources without contacts, and note when the others expire."""
-        sources, ends = {}, [*self._taps.values()]
-        for key in self._contacts:
-            sources[key.source] = self._sources[key.source]
-        self._newest = -math.inf
-        for source in sources.values():
-            ends.append(source.expiry)
-            self._newest = max(self._newest, source.received)
-        self._sources, self.contacts = sources, tuple(self._contacts.values())
-        self.next_expiry = min(ends, default=math.inf)
-
-
-def _source_of(frame: TouchFrame) -> _Source:
-    timeout = frame.timeout
-    if timeout is None or not 0 < timeout <= MAX_CONTACT_TIMEOUT:  # NaN is not
-        timeout = CONTACT_TIMEOUT
-    return _Source(
-        frame.time,
-        timeout,
-        frame.time + timeout,
-        frame.source if frame.origin is None else frame.origin,
-    )
+        up: contacts that have lifted since. Sources without contacts are forgotten.
+        """
+        down, moved, pressed, count = list[Contact](), list[Contact](), list[Contact](), 0
+        for contact in up:  # for the last time
+            self.changed[None] = min(
+                self.changed.pop(contact.key, time), self.changed.get(None, time)
+            )
+        for key, contact in self._contacts.items():
+            if count >= self.max_fingers and not contact.is_hand:
+                contact = replace(contact, is_surplus=True)
+            elif contact.is_surplus:
+                contact = replace(contact, is_surplus=False)
+            self._contacts[key], count = contact, count + (not contact.is_hand)
+            known = before.get(key)
+            if known is None:
+                down.append(contact)
+            elif (known.x, known.y) != (contact.x, contact.y):
+                moved.append(contact)
+            elif known != contact:
+                pressed.append(contact)
+        for contact in (*down, *moved, *pressed):
+            self.changed.setdefault(contact.key, time)
+        self.contacts = tuple(self._contacts.values())
+        self._sources = {each.source: self._sources[each.source] for each in self._contacts}
+        frames = self._sources.values()
+        self._newest = max([each.time for each in frames], default=-math.inf)
+        self.next_expiry = min(
+            [*self._taps.values(), *[each.expiry for each in frames]], default=math.inf
+        )
+        return Change(tuple(down), tuple(moved), tuple(pressed), up, tuple(rejected))
 
 
 def _valid_touches(

@@ -1,10 +1,12 @@
-"""TUIO 1.1 cursors (/tuio/2Dcur) over UDP, as touch tables and their simulators send them.
+"""TUIO 1.1 cursors and blobs (/tuio/2Dcur, /tuio/2Dblb) over UDP, as touch tables send them.
 
 A bundle has the name of its sender (source), the session ids that are down (alive), the positions
-of those that changed (set) and a sequence number (fseq); see tuio.org, "TUIO 1.1 Protocol
-Specification". Numbers count by their value, whatever their type, and further arguments are
-ignored. A malformed message is counted, and the others of its bundle are read. Messages are those
-of Open Sound Control 1.0 (opensoundcontrol.stanford.edu/spec-1_0.html), from untrusted datagrams.
+of those that changed (set) and a sequence number (fseq), each of one profile; see tuio.org, "TUIO
+1.1 Protocol Specification". A blob also has a width and a height, each relative to the sensor's,
+which tell a hand from a finger. Numbers count by their value, whatever their type, and further
+arguments are ignored. A malformed message is counted, and the others of its bundle are read.
+Messages are those of Open Sound Control 1.0 (opensoundcontrol.stanford.edu/spec-1_0.html), from
+untrusted datagrams.
 
 A capture is a text file with the datagrams of a sender and their times, to be replayed:
 
@@ -19,20 +21,23 @@ comments. Malformed datagrams are kept as received.
 import asyncio
 import math
 import re
+import socket
 import struct
 from collections import Counter
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
-from functools import cached_property, lru_cache
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+from itertools import islice, product
 from pathlib import Path
 from typing import TypeAlias
 
-from controller.sources.touch import RejectCounter, Touch, TouchFrame
+from controller.sources.touch import Touch, TouchFrame
 from controller.sources.udp_source import MAX_DATAGRAM, Datagram, Peer, UdpSource
 from drivers.errors import LinkError, system_message
 from model.errors import InputError
 from registry import threads
 from registry.files import read_regular
+from registry.limits import MAX_CONTACTS
 
 Argument: TypeAlias = str | int | float | None
 """Argument of a message; None for a blob, and for true, false, nil and impulse."""
@@ -43,10 +48,6 @@ _MAX_DEPTH = 8  # of bundles in bundles
 _ADDRESS = re.compile(rb"/[!-~]*")
 _RUNS = re.compile(rb"[sS]|b|[TFNI]+|[ifdhtcrm]+")
 _CODES = bytes.maketrans(b"htcrm", b"qQiII")  # of struct, which has those of i, f and d
-
-
-class OscError(ValueError):
-    """A message that cannot be read."""
 
 
 def osc_messages(datagram: bytes, *, limit: int) -> list[bytes]:
@@ -78,7 +79,7 @@ def osc_messages(datagram: bytes, *, limit: int) -> list[bytes]:
 # Most messages of a panel repeat: its name, the contacts that are alive, resting fingers.
 @lru_cache(maxsize=256)
 def read_message(message: bytes) -> tuple[str, tuple[Argument, ...]]:
-    """Return the address and the arguments of an encoded message; raises OscError.
+    """Return the address and the arguments of an encoded message; raises InputError.
 
     Bytes of a text that are not UTF-8 are written as \\xNN.
     """
@@ -87,9 +88,9 @@ def read_message(message: bytes) -> tuple[str, tuple[Argument, ...]]:
     tags = message[at:].partition(b"\0")[0]
     runs = _RUNS.findall(tags)
     if not (_ADDRESS.fullmatch(address) and tags.startswith(b",")):
-        raise OscError(f"element must be a message with argument types, got {message[:24]!r}")
+        raise InputError(f"element must be a message with argument types, got {message[:24]!r}")
     if b"".join(runs) != tags.translate(None, b",[]"):
-        raise OscError(f"argument types must be letters of OSC 1.0, got {tags[:32]!r}")
+        raise InputError(f"argument types must be letters of OSC 1.0, got {tags[:32]!r}")
     arguments: list[Argument] = []
     at += len(tags) // 4 * 4 + 4
     try:
@@ -109,11 +110,18 @@ def read_message(message: bytes) -> tuple[str, tuple[Argument, ...]]:
                 arguments += struct.unpack_from(layout, message, at)
                 at += struct.calcsize(layout)
     except (struct.error, ValueError) as error:
-        raise OscError(f"invalid message: {error}") from error
+        raise InputError(f"invalid message: {error}") from error
     return address.decode(), tuple(arguments)
 
 
-ADDRESS = "/tuio/2Dcur"
+CURSORS, BLOBS = SERVED = "/tuio/2Dcur", "/tuio/2Dblb"
+
+_Key: TypeAlias = tuple[str, int]
+"""Profile and session id of a contact."""
+
+_NEAR = 0.02  # of the sensor: a cursor so near to the middle of a small blob is the same contact
+_PARTED = 4.0  # times as far they are two again, which one that moves quickly is not
+_APART_IDS = 1 << 32  # added to the id of a contact that another has, beyond those of senders
 
 # What is not served, of TUIO 1.1 and 2.0; a custom profile is another address.
 _PROFILE = re.compile(r"/(?:tuio/)?(tuio2|(?:2|25|3)D(?:cur|obj|blb))(?=/|$)")
@@ -139,13 +147,22 @@ _MIN_REPEATS = 20  # frames without cursors in a row, of a sender that repeats i
 
 
 @dataclass
+class _Profile:
+    """The contacts of one profile: those of a bundle, or all that are known of a sender."""
+
+    alive: tuple[int, ...] | None = None  # until stated
+    touches: dict[int, Touch] = field(default_factory=dict)  # by session id
+    sequence: int = -1  # negative until numbered
+    numbered_at: float = -math.inf  # s; when that number arrived
+    last_heard: float = -math.inf  # s
+
+
+@dataclass
 class _Bundle:
-    """The messages of one bundle; None where missing."""
+    """The messages of one bundle."""
 
     source: str | None = None
-    alive: tuple[int, ...] | None = None
-    positions: dict[int, tuple[float, float]] = field(default_factory=dict)
-    sequence: int | None = None
+    profiles: dict[str, _Profile] = field(default_factory=dict)  # by address
     malformed: list[str] = field(default_factory=list)  # why messages were refused
     others: dict[str, bool] = field(default_factory=dict)  # unserved addresses; if with touches
 
@@ -157,59 +174,141 @@ class _Sender:
     last_heard: float
     peer: Peer  # its host and port
     former: Peer | None = None  # those before
-    sequence: int = 0
-    sequence_time: float = -math.inf  # when that sequence number arrived
-    alive: tuple[int, ...] | None = None  # until stated
-    positions: dict[int, tuple[float, float]] = field(default_factory=dict)
-    resting: int = 0  # frames in a row without cursors
+    profiles: dict[str, _Profile] = field(default_factory=dict)  # by address
+    ids: dict[_Key, int] = field(default_factory=dict)  # of its contacts, where there are blobs
+    resting: int = 0  # frames in a row without contacts
+
+    def touches(self, *, since: float) -> tuple[Touch, ...]:
+        """Return the contacts of profiles that were heard since a time [s].
+
+        One that is both a cursor and a blob is a cursor of that size, and keeps its id as long as
+        any of the two is alive.
+        """
+        known = {
+            (address, number): touch
+            for address, each in self.profiles.items()
+            for number, touch in each.touches.items()
+            if each.last_heard > since
+        }
+        if BLOBS not in self.profiles:
+            return tuple(known.values())
+        before, self.ids, found = self.ids, {}, dict[int, Touch]()
+        pairs = _paired(known, before)
+        alone = [each for each in known if each not in pairs.values()]
+        for one in sorted(alone, key=lambda each: each not in before):
+            two = pairs.get(one, one)
+            id = before.get(one, before.get(two, known[one].id))
+            while id in found:
+                id += _APART_IDS
+            self.ids[one] = self.ids[two] = id
+            found[id] = replace(known[one], id=id, size=known[two].size)
+        return tuple(found.values())
 
 
-class TuioReader:
-    """Decodes datagrams into touch frames, without I/O; times are arguments.
+def _paired(known: Mapping[_Key, Touch], before: Mapping[_Key, int]) -> dict[_Key, _Key]:
+    """Return which blob is the contact of which cursor: first as before, then the nearest ones.
+
+    before: ids of contacts. No more are compared than there may be contacts.
+    """
+    near, pairs = list[tuple[bool, float, _Key, _Key]](), dict[_Key, _Key]()
+    few = [[each for each in known if each[0] == of][:MAX_CONTACTS] for of in SERVED]
+    for one, two in product(*few):
+        cursor, blob = known[one], known[two]
+        was_one = before.get(one, math.nan) == before.get(two, math.nan)
+        radius = max(_NEAR, min(blob.size or (0.0,)) / 2)
+        gap = math.dist((cursor.x, cursor.y), (blob.x, blob.y)) / radius
+        if gap <= (_PARTED if was_one else 1.0):
+            near.append((not was_one, gap, one, two))
+    for _, _, one, two in sorted(near):
+        if one not in pairs and two not in pairs.values():
+            pairs[one] = two
+    return pairs
+
+
+class TuioSource(UdpSource):
+    """Listens for TUIO at `tuio:HOST:PORT`, `tuio:PORT` or `tuio:` (127.0.0.1:3333).
 
     Senders are distinguished by the name in their source message and their host, or without a name
     by host and port, as are programs that send under one name by turns. Beyond the most senders,
-    one of the busiest peer is dropped. Every bundle with cursors or an alive message confirms all
-    contacts of its sender for the timeout [s]. If a sender never states which cursors are alive,
-    those of a bundle are. Never raises: unusable input is counted in `rejects`.
+    one of the busiest peer is dropped. Every bundle with contacts or an alive message confirms all
+    contacts of its profile and sender for the timeout [s]. If a sender never states which are
+    alive, those of a bundle are. Reading never raises: unusable input is counted in `rejects`.
     """
 
-    def __init__(self, rejects: RejectCounter, *, timeout: float = DEFAULT_TIMEOUT) -> None:
-        self.rejects = rejects
-        self.others: set[str] = set()
-        """Profiles that were received and are not served."""
-        self._timeout = timeout
+    default_port = "3333"  # registered for TUIO
+    default_timeout = DEFAULT_TIMEOUT
+
+    def __init__(self, url: str) -> None:
+        super().__init__(url)
+        self._others: set[str] = set()  # profiles that were received and are not served
         self._senders: dict[str, _Sender] = {}
 
-    def read(self, datagram: bytes, peer: Peer, *, now: float) -> TouchFrame | None:
-        """Return the frame that a datagram completes at now [s], or None.
+    @property
+    def problem(self) -> str | None:
+        """Why no contacts come although the port is bound, and what to do."""
+        if not self.is_mute(since=self.opened, now=threads.now()):
+            return None
+        others = ", ".join(sorted(self._others))
+        return (
+            f"no {' or '.join(SERVED)} on UDP {self.host}:{self.port} for {MUTE_AFTER:g} s"
+            f"{f' ({others} arrives instead)' if others else ''}; start the sender, and let it "
+            "send TUIO 1.1 cursors or blobs to this address"
+        )
 
-        A cursor that is alive but was never set is omitted; positions may be NaN.
+    def read(self, datagram: bytes, peer: Peer, arrived: float) -> TouchFrame | None:
+        """Return the frame that a datagram completes when it arrives [s], or None.
+
+        A contact that is alive but was never set is omitted; positions may be NaN.
         """
         bundle = _read_bundle(datagram)
-        if bundle.others or bundle.malformed:
-            self._count(bundle, f"{peer[0]}:{peer[1]}")
-        if bundle.alive is None and not bundle.positions:
+        self._count(bundle, f"{peer[0]}:{peer[1]}")
+        if not bundle.profiles:
             return None
-        name = self._name(bundle, peer, now)
-        sender = self._sender(name, peer, now)
-        if sender is None or not self._accept_sequence(bundle.sequence, sender, name, now=now):
+        name = self._name(bundle, peer, arrived)
+        sender = self._sender(name, peer, arrived)
+        if sender is None:
             return None
+        changed = dict[str, _Profile]()
+        for address, new in bundle.profiles.items():
+            known = sender.profiles.get(address, _Profile())
+            if (added := self._added(new, known, name, arrived)) is not None:
+                changed[address] = added
+        if not changed:
+            return None
+        sender.profiles |= changed
         if sender.peer != peer:
             sender.former = sender.peer
-        sender.last_heard, sender.peer = now, peer
-        if bundle.alive is not None:
-            sender.alive = tuple(dict.fromkeys(bundle.alive))
-        known = sender.positions | bundle.positions
-        alive = tuple(bundle.positions) if sender.alive is None else sender.alive
-        sender.positions, touches = {}, list[Touch]()
-        for id in alive:
-            if id in known:
-                sender.positions[id] = known[id]
-                touches.append(Touch(id, *known[id]))
-        sender.resting = 0 if alive else sender.resting + 1
+        sender.last_heard, sender.peer = arrived, peer
+        touches = sender.touches(since=arrived - self.timeout)
+        sender.resting = 0 if touches else sender.resting + 1
         origin = f"tuio:{peer[0]}:{peer[1]}"
-        return TouchFrame(name, now, tuple(touches), self._timeout, origin=origin)
+        return TouchFrame(name, arrived, touches, self.timeout, origin=origin)
+
+    def drop_superseded(self, waiting: Sequence[Datagram]) -> list[Datagram]:
+        """Return waiting datagrams without those that the newest bundle of their kind supersedes.
+
+        Of one kind are bundles of one sender with the same profiles. One supersedes older ones if
+        it is complete: it has all contacts that are alive, with their positions.
+        """
+        is_complete: dict[tuple[object, ...], bool] = {}
+        kept = []
+        for each in reversed(waiting):
+            _, found, rest = each.data.partition(_SOURCE)
+            profiles = [address.encode() in each.data for address in SERVED]
+            kind = (each.peer, rest.partition(b"\0")[0] if found else b"", *profiles)
+            if kind not in is_complete:
+                stated = (
+                    _read_bundle(each.data).profiles.values()
+                    if len(is_complete) < _MAX_SENDERS
+                    else ()
+                )
+                is_complete[kind] = bool(stated) and all(
+                    one.alive is not None and one.touches.keys() >= {*one.alive} for one in stated
+                )
+            elif is_complete[kind]:
+                continue
+            kept.append(each)
+        return kept[::-1]
 
     def is_mute(self, *, since: float, now: float) -> bool:
         """Whether nothing was read since a time [s] though it should have been.
@@ -226,11 +325,11 @@ class TuioReader:
         for address, has_touches in bundle.others.items():
             profile = _PROFILE.match(address)
             if profile:
-                self.others.add(profile[0])
+                self._others.add(profile[0])
             if has_touches:
                 self.rejects.count(
                     f"profile_{profile[1]}" if profile else "other_address",
-                    f"{address:.80} of {place} arrives, {ADDRESS} is served",
+                    f"{address:.80} of {place} arrives, {' and '.join(SERVED)} are served",
                 )
         for problem in bundle.malformed:
             self.rejects.count("malformed", f"message from {place}: {problem}")
@@ -252,8 +351,12 @@ class TuioReader:
         known = self._senders.get(shared)
         if known is None or known.peer == peer:
             return shared
-        sequence = -1 if bundle.sequence is None else bundle.sequence
-        follows = sequence < 0 or 0 < sequence - known.sequence <= _LATE_FRAMES
+        follows = all(
+            new.sequence < 0
+            or (former := known.profiles.get(address)) is None
+            or 0 < new.sequence - former.sequence <= _LATE_FRAMES
+            for address, new in bundle.profiles.items()
+        )
         if known.former != peer and (follows or now - known.last_heard >= RESTART_PAUSE):
             return shared
         ports = f"ports {known.peer[1]} and {peer[1]}"
@@ -290,128 +393,83 @@ class TuioReader:
             return None
         return oldest(name for name, sender in self._senders.items() if sender.peer == busiest)
 
-    def _accept_sequence(
-        self, sequence: int | None, sender: _Sender, name: str, *, now: float
-    ) -> bool:
-        """Store a sequence number and return True, or False if a newer frame has arrived before.
+    def _added(self, new: _Profile, known: _Profile, name: str, now: float) -> _Profile | None:
+        """Return a profile of a sender with that of a bundle, None if a newer frame came before.
 
         Bundles without a number and redundant ones (-1) are never late; a frame split over
         several bundles repeats its number.
         """
-        if sequence is None or sequence < 0:
-            return True
-        behind = sender.sequence - sequence
-        if behind > 0:
-            if behind <= _LATE_FRAMES and now - sender.sequence_time < RESTART_PAUSE:
-                self.rejects.count("late", f"frame {sequence} of {name} after {sender.sequence}")
-                return False
-            sender.alive, sender.positions = None, {}  # a restarted sender
-        sender.sequence, sender.sequence_time = sequence, now
-        return True
+        sequence, numbered_at = known.sequence, known.numbered_at
+        if new.sequence >= 0:
+            if new.sequence < sequence:
+                if sequence - new.sequence <= _LATE_FRAMES and now - numbered_at < RESTART_PAUSE:
+                    self.rejects.count("late", f"frame {new.sequence} of {name} after {sequence}")
+                    return None
+                known = _Profile()  # of a restarted sender
+            sequence, numbered_at = new.sequence, now
+        alive = known.alive if new.alive is None else tuple(dict.fromkeys(new.alive))
+        touches = known.touches | new.touches
+        left = new.touches if alive is None else [id for id in alive if id in touches]
+        few = {id: touches[id] for id in islice(left, _MAX_MESSAGES)}
+        return _Profile(alive, few, sequence, numbered_at, now)
 
 
 def _read_bundle(datagram: bytes) -> _Bundle:
     """Read the messages of a datagram."""
-    bundle, cursors = _Bundle(), list[tuple[Argument, ...]]()
+    bundle = _Bundle()
     messages = osc_messages(datagram, limit=_MAX_MESSAGES + 1)
     if len(messages) > _MAX_MESSAGES:
         bundle.malformed.append(f"bundle must have at most {_MAX_MESSAGES} messages")
     for message in messages[:_MAX_MESSAGES]:
         try:
             address, arguments = read_message(message)
-        except OscError as error:
+            if address in SERVED:
+                _read_contacts(bundle, address, arguments)
+                continue
+        except InputError as error:
             bundle.malformed.append(str(error))
-            continue
-        if address == ADDRESS:
-            cursors.append(arguments)
             continue
         is_idle = arguments[:1] in (("source",), ("fseq",)) or arguments == ("alive",)
         is_idle |= address in _IDLE_ADDRESSES
         bundle.others[address] = not is_idle or bundle.others.get(address, False)
-    _read_cursors(bundle, cursors)
+    stated = bundle.profiles.items()
+    bundle.profiles = {key: each for key, each in stated if each.alive is not None or each.touches}
     return bundle
 
 
-def _read_cursors(bundle: _Bundle, messages: Iterable[tuple[Argument, ...]]) -> None:
-    """Add the messages of cursors, by their arguments, to a bundle."""
-    for arguments in messages:
-        try:
-            match arguments:
-                case ("source", str(name), *_):
-                    bundle.source = name[:_MAX_NAME]
-                case ("alive", *ids):
-                    bundle.alive = tuple(map(_whole, ids))
-                case ("set", id, int(x) | float(x), int(y) | float(y), *_):
-                    bundle.positions[_whole(id)] = (float(x), float(y))
-                case ("fseq", number, *_):
-                    bundle.sequence = _whole(number)
-                case _:
-                    raise OscError(f"arguments must be those of TUIO 1.1, got {arguments!s:.80}")
-        except OscError as error:
-            bundle.malformed.append(str(error))
+def _read_contacts(bundle: _Bundle, address: str, arguments: tuple[Argument, ...]) -> None:
+    """Add a message of a profile, by its arguments, to a bundle; raises InputError."""
+    profile = bundle.profiles.setdefault(address, _Profile())
+    match arguments:
+        case ("source", str(name), *_):
+            bundle.source = name[:_MAX_NAME]
+        case ("alive", *ids):
+            profile.alive = tuple(map(_whole, ids))
+        case ("set", id, int(x) | float(x), int(y) | float(y), *_) if address == CURSORS:
+            profile.touches[_whole(id)] = Touch(_whole(id), float(x), float(y))
+        case (
+            "set",
+            id,
+            int(x) | float(x),
+            int(y) | float(y),
+            _,
+            int(w) | float(w),
+            int(h) | float(h),
+            *_,
+        ):
+            size = float(w), float(h)
+            profile.touches[_whole(id)] = Touch(~_whole(id), float(x), float(y), size=size)
+        case ("fseq", number, *_):
+            profile.sequence = _whole(number)
+        case _:
+            raise InputError(f"arguments must be those of TUIO 1.1, got {arguments!s:.80}")
 
 
 def _whole(value: Argument) -> int:
-    """Return the value of a whole number of any type; raises OscError."""
+    """Return the value of a whole number of any type; raises InputError."""
     if not isinstance(value, int | float) or value % 1 != 0:  # NaN and infinity are not
-        raise OscError(f"session ids and frame numbers must be whole, got {value!r:.40}")
+        raise InputError(f"session ids and frame numbers must be whole, got {value!r:.40}")
     return int(value)
-
-
-def without_superseded(waiting: Sequence[Datagram]) -> list[Datagram]:
-    """Return waiting datagrams without those that the newest bundle of their sender supersedes.
-
-    A bundle supersedes older ones if it is complete.
-    """
-    is_complete: dict[tuple[Peer, bytes], bool] = {}
-    kept = []
-    for each in reversed(waiting):
-        _, found, rest = each.data.partition(_SOURCE)
-        sender = (each.peer, rest.partition(b"\0")[0] if found else b"")
-        if sender not in is_complete:
-            is_complete[sender] = len(is_complete) < _MAX_SENDERS and _is_complete_bundle(each.data)
-        elif is_complete[sender]:
-            continue
-        kept.append(each)
-    return kept[::-1]
-
-
-def _is_complete_bundle(datagram: bytes) -> bool:
-    """Whether a bundle has all cursors that are alive, with their positions."""
-    bundle = _read_bundle(datagram)
-    return bundle.alive is not None and set(bundle.alive) <= bundle.positions.keys()
-
-
-class TuioSource(UdpSource):
-    """Listens for TUIO at `tuio:HOST:PORT`, `tuio:PORT` or `tuio:` (127.0.0.1:3333)."""
-
-    default_port = "3333"  # registered for TUIO
-    default_timeout = DEFAULT_TIMEOUT
-
-    @cached_property
-    def _reader(self) -> TuioReader:
-        """The reader, made once a daemon has set its own counter of rejects."""
-        return TuioReader(self.rejects, timeout=self.timeout)
-
-    @property
-    def problem(self) -> str | None:
-        """Why no cursors come although the port is bound, and what to do."""
-        if not self._reader.is_mute(since=self.opened, now=threads.now()):
-            return None
-        others = ", ".join(sorted(self._reader.others))
-        return (
-            f"no {ADDRESS} on UDP {self.host}:{self.port} for {MUTE_AFTER:g} s"
-            f"{f' ({others} arrives instead)' if others else ''}; start the sender, and let it "
-            "send TUIO 1.1 cursors to this address"
-        )
-
-    def read(self, datagram: bytes, peer: Peer, arrived: float) -> TouchFrame | None:
-        """Return the frame of a bundle."""
-        return self._reader.read(datagram, peer, now=arrived)
-
-    def drop_superseded(self, waiting: Sequence[Datagram]) -> list[Datagram]:
-        """Return the datagrams that the newest bundle of their sender does not supersede."""
-        return without_superseded(waiting)
 
 
 HEADER = "# era-haptics TUIO capture 1"
@@ -431,7 +489,16 @@ class RecordedDatagram:
 def read_capture(path: Path | str) -> list[RecordedDatagram]:
     """Read a capture; raises InputError with file and line."""
     path = Path(path)
-    lines = _lines(path)
+    try:
+        content = read_regular(path, MAX_BYTES)
+        lines = content.decode("utf-8-sig").replace("\r\n", "\n").removesuffix("\n").split("\n")
+    except OSError as error:
+        raise InputError(
+            f"{path}: cannot be read ({error.strerror}); check the path, which is relative to the "
+            "working directory, and its permissions"
+        ) from error
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: must be a TUIO capture, got a binary file") from error
     if lines[0] != HEADER:
         raise InputError(f"{path}, line 1: must be {HEADER!r} for a TUIO capture")
     datagrams: list[RecordedDatagram] = []
@@ -458,55 +525,22 @@ def read_capture(path: Path | str) -> list[RecordedDatagram]:
     return datagrams
 
 
-def _lines(path: Path) -> list[str]:
-    """Read the lines of a capture; raises InputError."""
-    try:
-        content = read_regular(path, MAX_BYTES)
-        return content.decode("utf-8-sig").replace("\r\n", "\n").removesuffix("\n").split("\n")
-    except OSError as error:
-        raise InputError(
-            f"{path}: cannot be read ({error.strerror}); check the path, which is relative to the "
-            "working directory, and its permissions"
-        ) from error
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path}: must be a TUIO capture, got a binary file") from error
-
-
 async def replay_capture(datagrams: Sequence[RecordedDatagram], host: str, port: int) -> None:
     """Send datagrams to a UDP port at their recorded pace, on the event loop's clock.
 
     Raises LinkError if the port is closed.
     """
     loop = asyncio.get_running_loop()
-    sender = _ReplaySocket()
     try:
-        transport, _ = await loop.create_datagram_endpoint(lambda: sender, remote_addr=(host, port))
+        found = await loop.getaddrinfo(host, port, type=socket.SOCK_DGRAM)
+        with socket.socket(found[0][0], socket.SOCK_DGRAM) as sender:
+            sender.connect(found[0][4])
+            start = loop.time()
+            for datagram in datagrams:
+                await asyncio.sleep(max(0.0, start + datagram.time - loop.time()))
+                sender.send(datagram.payload)
     except OSError as error:
-        raise _refusal(host, port, error) from error
-    try:
-        start = loop.time()
-        for datagram in datagrams:
-            await asyncio.sleep(max(0.0, start + datagram.time - loop.time()))
-            if sender.refused is not None:
-                raise _refusal(host, port, sender.refused) from sender.refused
-            transport.sendto(datagram.payload)
-    finally:
-        transport.close()
-
-
-def _refusal(host: str, port: int, problem: Exception) -> LinkError:
-    return LinkError(
-        f"cannot send to UDP {host}:{port} ({system_message(problem)}); check the address, and "
-        "start the controller first"
-    )
-
-
-class _ReplaySocket(asyncio.DatagramProtocol):
-    """The UDP end of a replay; keeps an error that the network reported."""
-
-    def __init__(self) -> None:
-        self.refused: Exception | None = None
-
-    def error_received(self, exc: Exception) -> None:
-        """Keep the error."""
-        self.refused = exc
+        raise LinkError(
+            f"cannot send to UDP {host}:{port} ({system_message(error)}); check the address, and "
+            "start the controller first"
+        ) from error

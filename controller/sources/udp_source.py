@@ -54,7 +54,6 @@ DropSuperseded: TypeAlias = Callable[[Sequence[Datagram]], Iterable[Datagram]]
 _TIMESTAMPS = 35  # SO_TIMESTAMPNS and SCM_TIMESTAMPNS of Linux, which Python does not name
 _TIMESPEC = struct.Struct("@ll")
 _ANCILLARY = 64  # bytes; room for a timestamp and its header
-_CLOCK_READS, _MAX_READ_TIME = 3, 0.00005  # s; clocks read further apart are read again
 
 
 class Datagrams:
@@ -134,13 +133,8 @@ class Datagrams:
 
 def _clock_offset(clock: Callable[[], float]) -> float:
     """Return the offset [s] of a clock to the system clock."""
-    offset = 0.0
-    for _ in range(_CLOCK_READS):
-        before = clock()
-        offset = before - time.time()
-        if clock() - before < _MAX_READ_TIME:
-            break
-    return offset
+    # Of three readings the largest: least time has passed between its two clocks.
+    return max(clock() - time.time() for _ in range(3))
 
 
 async def listen(

@@ -417,8 +417,8 @@ export interface ContactStatus {
   id: number;
   x_m: number;
   y_m: number;
-  /** whether it is to feel the pattern, or is a hand that rests, whose load alone counts; null before the first decision */
-  role?: "target" | "quiet" | "hand" | null;
+  /** whether it is to feel the pattern, or only its load counts: of a hand that rests, or of a finger beyond max_fingers; null before the first decision */
+  role?: "target" | "quiet" | "hand" | "surplus" | null;
   /** predicted sensation level of a target; null if unknown */
   level_db_sl?: number | null;
   /** felt contrast, target over loudest quiet finger, that nine of ten plates within the rig's uncertainty give; null for a single finger */

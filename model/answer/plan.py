@@ -293,7 +293,10 @@ class _Answering:
         if not pairs:
             return math.inf
         one, other = best_by(pairs, lambda each: -math.dist(each[0].at, each[1].at))
-        both = replace(one, stimulus=Stimulus()), replace(other, stimulus=None)
+        both = (
+            replace(one, stimulus=Stimulus()),
+            replace(other, stimulus=None, is_protected=True),
+        )
         alone = replace(self, fingers=both, avoided=frozenset())
         return alone._measure(_Plan(((0,),))).tones.worst_db
 
@@ -302,7 +305,7 @@ class _Answering:
         return [
             number
             for number, each in enumerate(self.fingers)
-            if number not in felt and (each.is_protected if each.stimulus else not each.is_hand)
+            if number not in felt and each.is_protected and not each.is_load
         ]
 
     def _in_turn(self, plan: _Plan, tried: Sequence[Answer], min_contrast_db: float) -> Answer:
@@ -577,7 +580,7 @@ def _alone_at(table: LocalizationTable, found: Answer, number: int) -> Callable[
     stream, contents = found.contents.streams[number], found.contents
     (finger,), course = stream.targets, stream.course
     level_db_sl = stream.level_db_sl - (0.0 if course is None else course.strongest_db)
-    others = tuple(n for n, each in enumerate(found.asked) if n != finger and not each.is_hand)
+    others = tuple(n for n, each in enumerate(found.asked) if n != finger and not each.is_load)
     background = None if others else table.background([contents.places[finger]])
 
     def alone(row: int) -> Tones:

@@ -21,12 +21,12 @@ from model.arrays import FloatArray, Point
 from model.config.units import in_metres
 from model.errors import InputError, expect_number, shown
 from model.finger import FINGERTIP_RADIUS, STRONG_DB_SL
-from model.structure.attachments import MAX_HAND_LOAD, check_loads
+from model.structure.attachments import check_loads
 from model.structure.plate import Plate
 from model.transients.base_motion import rise
 from model.transients.excursions import CLICKS_APART, DECAYED, Swing
 from model.transients.knots import RISE
-from registry.limits import MAX_CONTACTS, MAX_FINGER_LOAD
+from registry.limits import MAX_CONTACTS, MAX_FINGER_LOAD, MAX_HAND_LOAD
 
 MIN_LEVEL_DB_SL, MAX_LEVEL_DB_SL = -100.0, 60.0
 """Bounds of a stimulus's level [dB SL].
@@ -154,7 +154,10 @@ class Finger:
     also feel that of a finger so near that no vibration could be kept from either.
     """
     is_protected: bool = True
-    """Whether others' vibrations are kept from it even where its own is given up."""
+    """Whether others' vibrations are kept from it even where its own is given up.
+
+    Without a stimulus and protection its load alone counts, wherever it is.
+    """
     min_contrast_db: float = -math.inf
     """Least promised contrast to others' vibrations; below it these or its own are given up."""
     max_foreign_db_sl: float = math.inf
@@ -195,9 +198,10 @@ class Finger:
             )
 
     @property
-    def is_hand(self) -> bool:
-        """Whether it is a hand that rests, rather than a finger."""
-        return self.load > MAX_FINGER_LOAD
+    def is_load(self) -> bool:
+        """Whether its load alone counts: a hand that rests, or what asks for nothing at all."""
+        is_quiet = self.stimulus is None and self.is_protected
+        return self.load > MAX_FINGER_LOAD or not (is_quiet or self.stimulus)
 
     @property
     def name(self) -> str | None:
@@ -281,7 +285,7 @@ def check_fingers(fingers: Sequence[Finger], plate: Plate) -> None:
         x, y = finger.at
         for other in fingers[:number]:
             gap = math.dist(other.at, finger.at)
-            if gap >= FINGERTIP_RADIUS or finger.is_hand or other.is_hand:
+            if gap >= FINGERTIP_RADIUS or finger.is_load or other.is_load:
                 continue
             is_one = finger.stimulus == other.stimulus is None or finger.must_feel_one_with(other)
             if not (is_one and gap > 0):

@@ -36,7 +36,7 @@ from scipy import sparse
 from model.arrays import ComplexArray, FloatArray, Point
 from model.errors import InputError, expect_values
 from model.structure.plate import Plate
-from registry.limits import MAX_FINGER_LOAD
+from registry.limits import HAND_LOAD, MAX_FINGER_LOAD
 
 Gain: TypeAlias = tuple[float, float, float]
 """Frequency [Hz], magnitude, phase [rad]."""
@@ -261,14 +261,14 @@ def damping_from_ratio(
 MIN_LOAD = 0.1
 """Least load of a finger relative to the rig's fingertip; the largest is MAX_FINGER_LOAD."""
 
-MAX_HAND_LOAD = 40.0
-"""Largest load of a hand that rests (`HAND_LOAD`)."""
-
 HAND_STD = 1.1
 """Standard deviation of the logarithm of the load of each patch of a hand, a factor of 3."""
 
 HAND_PATCHES = ((-0.0125, -0.0125), (0.0125, -0.0125), (-0.0125, 0.0125), (0.0125, 0.0125))
-"""Patches on which a hand rests, each with a quarter of its load, from its middle [m]."""
+"""Patches on which a hand of `HAND_LOAD` rests, each with a quarter of it, from its middle [m].
+
+Those of a heavier hand are farther apart, by the square root of its load.
+"""
 
 
 @dataclass(frozen=True)
@@ -374,8 +374,9 @@ def with_patches(
     places, by = [*contacts], [*loads]
     for number, ((x, y), load) in enumerate(zip(contacts, loads, strict=True)):
         if load > MAX_FINGER_LOAD:
+            wide = math.sqrt(load / HAND_LOAD)
             places[number], *others = [
-                (min(max(x + a, 0.0), size[0]), min(max(y + b, 0.0), size[1]))
+                (min(max(x + wide * a, 0.0), size[0]), min(max(y + wide * b, 0.0), size[1]))
                 for a, b in HAND_PATCHES
             ]
             places += others

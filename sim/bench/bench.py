@@ -42,7 +42,6 @@ from model.fem import Mesh
 from model.reduction.reduced_plate import ReducedPlate, reduce_plate
 from model.rig.rig import Rig
 from model.structure.attachments import (
-    MAX_HAND_LOAD,
     FingertipLoad,
     PointLoad,
     Source,
@@ -52,7 +51,7 @@ from model.structure.attachments import (
 )
 from model.structure.plate import Plate
 from model.transients.base_motion import Motion
-from registry import threads
+from registry import limits, threads
 from sim.amplifier.readings import AmplifierClock, StraightClock
 from sim.amplifier.simulated_amplifier import SimulatedAmplifier
 from sim.plant import imperfections
@@ -505,7 +504,7 @@ class Bench:
         The amplifiers go on; the plate waits at this time until `unsolved` is solved or read.
         """
         self._fingers.check(positions)
-        check_loads(loads.values(), highest=MAX_HAND_LOAD)
+        check_loads(loads.values(), highest=limits.MAX_HAND_LOAD)
         self.advance(now)
         self.observers = frozenset(observers) & positions.keys()
         self.loads = {name: load for name, load in loads.items() if name in positions}

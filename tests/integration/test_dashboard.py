@@ -329,10 +329,10 @@ async def test_touches_become_contacts_of_the_daemon(page: Page, era: Client) ->
 
 
 async def test_cancelled_touches_are_lifted(page: Page, era: Client) -> None:
-    """Cancelled, or when the window loses focus."""
+    """Cancelled, as a palm is, or when the window loses focus: a hand, of 100 pixels or 26 mm."""
     for end in ("touchCancel", "blur"):
-        await page.touch("touchStart", await on_plate(page, (0.5, 0.5)))
-        await contacts(era, 1)
+        await page.touch("touchStart", await on_plate(page, (0.5, 0.5)), radius=50)
+        await page.until("document.querySelectorAll('.contact.hand').length === 1")
         if end == "blur":
             await page.evaluate("window.dispatchEvent(new Event('blur'))")
             await contacts(era, 0)

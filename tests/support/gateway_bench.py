@@ -626,9 +626,12 @@ class Page:
         scheme = {"name": "prefers-color-scheme", "value": "dark" if is_dark else "light"}
         await self.call("Emulation.setEmulatedMedia", features=[scheme])
 
-    async def touch(self, kind: str, points: Sequence[tuple[float, float]]) -> None:
+    async def touch(
+        self, kind: str, points: Sequence[tuple[float, float]], *, radius: float = 1.0
+    ) -> None:
         """Real touches: touchStart, touchMove, touchEnd (no points) at x, y in CSS pixels."""
-        fingers = [{"x": x, "y": y, "id": id} for id, (x, y) in enumerate(points)]
+        sides = {"radiusX": radius, "radiusY": radius / 2}
+        fingers = [{"x": x, "y": y, "id": id} | sides for id, (x, y) in enumerate(points)]
         await self.call("Input.dispatchTouchEvent", type=kind, touchPoints=fingers)
 
     async def mouse(

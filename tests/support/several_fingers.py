@@ -279,6 +279,7 @@ class Hands(Acted, Fingers):
 
     def spreads(self, count: int) -> None:
         """Have so many fingers 5 cm apart or more, numbered from one on."""
+        self.controller.cycle.tracker.max_fingers = count
         places = [(0.04 + 0.055 * (n % 5), 0.035 + 0.05 * (n // 5)) for n in range(count)]
         self.at = dict(enumerate(places, start=1))
 

@@ -5,6 +5,8 @@ const STEP_M = 0.005;
 const KEYBOARD = -1;  // an id that no pointer has
 const RESTING = -2;  // the first of those that rest; the next ones are lower
 const NEAR_PX = 24;  // of a resting finger
+const PX_M = 0.0254 / 96;  // of a CSS pixel: a finger has its size whatever that of the picture
+const LEAST_M = 0.001;  // radius; a pointer of unknown size has sides of one or two pixels
 
 export class Fingers {
   // send(touches) is called with all fingers at every change.
@@ -32,12 +34,19 @@ export class Fingers {
       return;
     }
     plate.setPointerCapture(event.pointerId);
-    this.put(event.pointerId, this.overlay.position(event));
+    this.put(event.pointerId, this.contact(event));
+  }
+
+  // Place of a pointer, and the radius of a touch whose size is known.
+  contact(event) {
+    const place = this.overlay.position(event);
+    const radius_m = (Math.max(event.width, event.height) / 2) * PX_M;
+    return event.pointerType === "touch" && radius_m > LEAST_M ? { ...place, radius_m } : place;
   }
 
   move(event) {
     if (!this.positions.has(event.pointerId)) return;
-    this.positions.set(event.pointerId, this.overlay.position(event));
+    this.positions.set(event.pointerId, this.contact(event));
     if (this.isMoveScheduled) return;
     this.isMoveScheduled = true;
     requestAnimationFrame(() => {

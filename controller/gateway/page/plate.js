@@ -196,7 +196,7 @@ export class PlateOverlay {
     const layer = this.layerOf(contact);
     const rings = layer === undefined ? [ring] : [this.circle(contact, "halo", this.ringRadius), ring];
     if (layer !== undefined) ring.style.stroke = colourOf(layer);
-    const above = isKnown(level_db_sl) ? `${fixed(level_db_sl)} dB SL` : ["quiet", "hand"].includes(role) ? role : "";
+    const above = isKnown(level_db_sl) ? `${fixed(level_db_sl)} dB SL` : ["quiet", "hand", "surplus"].includes(role) ? role : "";
     let below = role === "target" && isKnown(promised) ? `≥ ${atLeast(promised)} dB over others` : "";
     if (layer !== undefined) below = `${fixed(frequency_hz)} Hz, ${felt(contact)}${isKnown(promised) ? `, ≥ ${atLeast(promised)} dB` : ""}`;
     if (held_back && verdict) below = verdict;

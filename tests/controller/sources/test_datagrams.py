@@ -23,10 +23,9 @@ from controller.sources.tuio import (
     HEADER,
     MAX_BYTES,
     RecordedDatagram,
-    TuioReader,
+    TuioSource,
     read_capture,
     replay_capture,
-    without_superseded,
 )
 from controller.sources.udp_source import BACKLOG_THRESHOLD, Datagram, Datagrams, Peer, listen
 from drivers.errors import LinkError
@@ -38,7 +37,6 @@ from several_fingers import bundle, cursor, message
 from virtual_lines import in_virtual_time
 
 Place = tuple[float, float]
-INTERVAL = 1.0  # s
 
 
 class ReferenceSender:
@@ -63,7 +61,7 @@ class ReferenceSender:
         """What it sends for a frame of its camera: cursors by session id."""
         self._frame += 1
         changed = {id: at for id, at in cursors.items() if self._cursors.get(id) != at}
-        is_due = self._periodic and now - self._sent_at >= INTERVAL
+        is_due = self._periodic and now - self._sent_at >= 1.0
         if not (changed or is_due) and cursors.keys() == self._cursors.keys():
             return None
         self._cursors, self._sent_at = dict(cursors), now
@@ -198,21 +196,26 @@ def waiting(*sent: tuple[bytes, Peer]) -> list[Datagram]:
     return [Datagram(data, peer, float(number)) for number, (data, peer) in enumerate(sent)]
 
 
-def test_without_superseded_keeps_the_newest_complete_bundle_of_each_sender() -> None:
-    """Another name or port is another sender; the order stays."""
-    all_of_it = waiting(
-        (full("a", 1), HERE), (full("b", 1), HERE), (full("a", 2), THERE), (full("a"), HERE)
-    )
-    assert without_superseded(all_of_it) == all_of_it[1:]
+BLOBS = full("a").replace(b"2Dcur", b"2Dblb")
 
 
-def test_without_superseded_keeps_bundles_before_an_incomplete_one() -> None:
-    """The position of a cursor that is alive may be in an older bundle only."""
-    all_of_it = waiting(
-        (full("a", 1, 2), HERE), (partial("a", [1, 2], {1: 0.1}), HERE), (b"no bundle", HERE)
-    )
-    assert without_superseded(all_of_it) == all_of_it
-    assert without_superseded(all_of_it[:2]) == all_of_it[:2]
+@pytest.mark.parametrize(
+    ("sent", "first"),
+    [
+        # another name, port or profile is of another kind; the order stays
+        ([(full("a", 1), HERE), (full("b"), HERE), (full("a"), THERE), (full("a"), HERE)], 1),
+        ([(full("a", 1), HERE), (BLOBS, HERE)], 0),
+        ([(BLOBS, HERE), (full("a", 1), HERE), (BLOBS, HERE)], 1),
+        # the position of a cursor that is alive may be in an older bundle only
+        ([(full("a", 1, 2), HERE), (partial("a", [1, 2], {1: 0.1}), HERE)], 0),
+        ([(full("a", 1, 2), HERE), (b"no bundle", HERE)], 0),
+    ],
+)
+def test_newest_complete_bundle_supersedes_those_of_its_kind(
+    sent: list[tuple[bytes, Peer]], first: int
+) -> None:
+    """All are kept from the first of these on."""
+    assert TuioSource("tuio:").drop_superseded(waiting(*sent)) == waiting(*sent)[first:]
 
 
 bundles = st.builds(
@@ -226,15 +229,15 @@ bundles = st.builds(
 
 
 @given(st.lists(st.tuples(bundles, st.sampled_from([HERE, THERE])), max_size=12))
-def test_without_superseded_preserves_the_final_touches(sent: list[tuple[bytes, Peer]]) -> None:
+def test_superseded_bundles_do_not_change_the_final_touches(sent: list[tuple[bytes, Peer]]) -> None:
     """Any bundles of senders with one port each leave the same touches with and without it."""
     sent = [(data, peer) for data, peer in sent if (peer == HERE) == (b"a\0\0\0" in data)]
     frames: list[dict[str, tuple[Touch, ...]]] = []
-    for each in (waiting(*sent), without_superseded(waiting(*sent))):
-        reader = TuioReader(RejectCounter(logging.getLogger(__name__)))
+    for each in (waiting(*sent), TuioSource("tuio:").drop_superseded(waiting(*sent))):
+        reader = TuioSource("tuio:")
         frames.append({})
         for data, peer, arrived in each:
-            frame = reader.read(data, peer, now=arrived)
+            frame = reader.read(data, peer, arrived)
             if frame is not None:
                 frames[-1][frame.source] = frame.touches
     assert frames[0] == frames[1]
@@ -251,7 +254,9 @@ async def test_listen_drops_superseded_bundles_of_a_flood() -> None:
         if data == up:
             done.set()
 
-    line = await listen("127.0.0.1", 0, feed, max_size=8192, drop_superseded=without_superseded)
+    line = await listen(
+        "127.0.0.1", 0, feed, max_size=8192, drop_superseded=TuioSource("tuio:").drop_superseded
+    )
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
         for number in range(200):
             sender.sendto(full("a", number), ("127.0.0.1", line.port))
@@ -264,19 +269,17 @@ async def test_listen_drops_superseded_bundles_of_a_flood() -> None:
 
 
 PLATE: Plate = make_paper_rig(12, 9).plate
-PEER = ("127.0.0.1", 40000)
 CAMERA = 1 / 64  # s; exact in binary
 
 
 class Scene:
     """A sender's camera at 64 frames a second, and the changes of contacts that come of it."""
 
-    def __init__(self, sender: ReferenceSender, *, timeout: float = 3.0) -> None:
+    def __init__(self, sender: ReferenceSender, *, options: str = "") -> None:
         self.now = 0.0
         self.log: list[tuple[float, str, int]] = []
-        self.sent = 0
         self._sender = sender
-        self._reader = TuioReader(RejectCounter(logging.getLogger("test")), timeout=timeout)
+        self._reader = TuioSource(f"tuio:{options}")
         self._tracker = ContactTracker(PLATE)
 
     def play(self, duration: float, cursors: Callable[[float], Mapping[int, Place]]) -> None:
@@ -289,9 +292,8 @@ class Scene:
 
     def send(self, datagram: bytes | None) -> None:
         """Deliver a datagram, if there is one."""
-        frame = None if datagram is None else self._reader.read(datagram, PEER, now=self.now)
+        frame = None if datagram is None else self._reader.read(datagram, HERE, self.now)
         if frame is not None:
-            self.sent += 1
             self._note(self._tracker.update(frame))
 
     def _note(self, change: Change) -> None:
@@ -299,21 +301,21 @@ class Scene:
         self.log += [(self.now, "up", contact.key.id) for contact in change.up]
 
 
-@pytest.mark.parametrize(("periodic", "ends"), [(False, [(3.0, "up", 1)]), (True, [])])
+@pytest.mark.parametrize(
+    ("periodic", "options", "ends"),
+    [
+        (False, "", [(3.0, "up", 1)]),
+        (True, "", []),
+        (False, "?timeout=0.5", [(0.5, "up", 1)]),
+    ],
+)
 def test_resting_finger_of_a_silent_sender_is_lifted_after_three_seconds(
-    periodic: bool, ends: list[tuple[float, str, int]]
+    periodic: bool, options: str, ends: list[tuple[float, str, int]]
 ) -> None:
-    """A sender that repeats what is alive keeps its finger, without positions."""
-    scene = Scene(ReferenceSender(periodic=periodic))
+    """Or as the URL says; a sender that repeats what is alive keeps it, without positions."""
+    scene = Scene(ReferenceSender(periodic=periodic), options=options)
     scene.play(10.0, lambda now: {1: (0.25, 0.5)})
     assert scene.log == [(0.0, "down", 1), *ends]
-
-
-def test_timeout_of_the_url_replaces_the_default() -> None:
-    """A sender that is known to repeat itself may have half a second."""
-    scene = Scene(ReferenceSender(), timeout=0.5)
-    scene.play(1.0, lambda now: {1: (0.25, 0.5)})
-    assert scene.log == [(0.0, "down", 1), (0.5, "up", 1)]
 
 
 def test_reject_counter_logs_once_per_interval(caplog: pytest.LogCaptureFixture) -> None:

@@ -1,7 +1,6 @@
-"""TUIO 1.1 cursors over UDP."""
+"""TUIO 1.1 cursors and blobs over UDP."""
 
 import asyncio
-import logging
 import math
 import socket
 import struct
@@ -13,8 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pythonosc.osc_message_builder import OscMessageBuilder
 
-from controller.sources.touch import RejectCounter, Touch, TouchFrame
-from controller.sources.tuio import TuioReader, TuioSource
+from controller.sources.touch import Touch, TouchFrame
+from controller.sources.tuio import TuioSource
 from examples.make_touches import tuio_datagram
 from model.errors import InputError
 from several_fingers import bundle, cursor, frame, free_port, message
@@ -24,23 +23,18 @@ PEER = ("192.0.2.7", 50000)
 
 
 @pytest.fixture
-def reader() -> TuioReader:
-    """A reader whose log line does not matter."""
-    return TuioReader(RejectCounter(logging.getLogger("test")))
+def reader() -> TuioSource:
+    """A source that is read without a port."""
+    return TuioSource("tuio:")
 
 
-def touches(frame: TouchFrame | None) -> list[tuple[int, float, float]]:
-    """What is on the plate, to compare."""
+def touches(frame: TouchFrame | None) -> list[tuple[float, ...]]:
+    """What is on the plate, to compare; of a blob with its width and height."""
     assert frame is not None
-    return [(touch.id, touch.x, touch.y) for touch in frame.touches]
+    return [(touch.id, touch.x, touch.y, *(touch.size or ())) for touch in frame.touches]
 
 
-def counts(reader: TuioReader) -> dict[str, int]:
-    """What the reader has counted."""
-    return dict(reader.rejects.counts)
-
-
-def test_reader_reads_a_golden_bundle(reader: TuioReader) -> None:
+def test_reader_reads_a_golden_bundle(reader: TuioSource) -> None:
     """The bytes of a bundle, written out from the OSC 1.0 and TUIO 1.1 specifications, are read."""
 
     def element(raw: bytes) -> bytes:
@@ -56,7 +50,7 @@ def test_reader_reads_a_golden_bundle(reader: TuioReader) -> None:
         )
         + element(b"/tuio/2Dcur\0,si\0fseq\0\0\0\0\0\0\0\1")
     )
-    result = reader.read(golden, PEER, now=5.0)
+    result = reader.read(golden, PEER, 5.0)
     sender = "tuio:192.0.2.7:50000"
     assert result == TouchFrame(sender, 5.0, (Touch(42, 0.5, 0.25),), 3.0, sender)
 
@@ -81,6 +75,20 @@ HERE = cursor(1, 0.5, 0.5)
 OBJECT = message("set", 3, 1, 0.5, 0.5, 0.1, address="/tuio/2Dobj")
 POINTER = message(1, 0, 0, 0.5, 0.5, 0.0, 0.0, 0.0, address="/tuio2/ptr")
 NO_OBJECTS = [message(*part, address="/tuio/2Dobj") for part in (["alive"], ["fseq", 7])]
+
+BLOB, PALM, TIP = "/tuio/2Dblb", (0.25, 0.5), (0.03125, 0.0625)  # an address, and sizes
+
+
+def blobs(*each: tuple[int, float, float, float, float], fseq: int = -1) -> bytes:
+    """A complete bundle of blobs: session id, place, width and height; the angle is left at 1."""
+    parts = [
+        ("source", "table@a"),
+        ("alive", *[one[0] for one in each]),
+        *[("set", id, x, y, 1.0, w, h, w * h, *[0.0] * 5) for id, x, y, w, h in each],
+        ("fseq", fseq),
+    ]
+    return bundle(*[message(*part, address=BLOB) for part in parts])
+
 
 Read = tuple[float, tuple[str, int], bytes, Any]
 """Time [s], peer, datagram, and the touches that are read: None for no frame, ... for anything."""
@@ -198,6 +206,100 @@ COURSES: Mapping[str, tuple[dict[str, Any], Sequence[Read]]] = {
             (0, PEER, of(HERE), []),
         ],
     ),
+    # Each with its size; a message without a height is refused, the others count.
+    "blobs": (
+        {"malformed": 1},
+        [
+            (0, PEER, blobs((7, 0.5, 0.5, *PALM)), [(-8, 0.5, 0.5, *PALM)]),
+            (
+                0.01,
+                PEER,
+                bundle(
+                    message("source", "table@a", address=BLOB),
+                    message("alive", 7, 8, 9, address=BLOB),
+                    message("set", 8, 0.25, 0.5, 0.0, *TIP, address=BLOB),
+                    message("set", 9, 0.75, 0.5, 0.0, 0.1, address=BLOB),
+                ),
+                [(-8, 0.5, 0.5, *PALM), (-9, 0.25, 0.5, *TIP)],
+            ),
+            (0.02, PEER, blobs((8, 0.25, 0.5, *TIP)), [(-9, 0.25, 0.5, *TIP)]),
+            (0.03, PEER, blobs(), []),
+        ],
+    ),
+    # Whichever comes first keeps its number, also as it moves faster than the other is reported,
+    # and while one of the two is left, as of a finger that lies down: the blob alone.
+    "a contact that is a cursor and a blob": (
+        {},
+        [
+            (0, PEER, frame(*HALF), HALF),
+            (0, PEER, blobs((7, 0.5, 0.484375, *TIP)), [(*HALF[0], *TIP)]),
+            (0.01, PEER, frame((1, 0.5625, 0.5)), [(1, 0.5625, 0.5, *TIP)]),
+            (0.01, PEER, blobs((7, 0.5625, 0.5, *PALM)), [(1, 0.5625, 0.5, *PALM)]),
+            (0.02, PEER, frame(), [(1, 0.5625, 0.5, *PALM)]),
+            (0.03, PEER, frame(*HALF), [(1, 0.5, 0.5, *PALM)]),
+            (0.04, PEER, blobs(), HALF),
+            (0.05, PEER, frame(), []),
+        ],
+    ),
+    "a blob whose cursor was lost": (
+        {},
+        [
+            (0, PEER, blobs((1, 0.5, 0.5, *TIP)), [(-2, 0.5, 0.5, *TIP)]),
+            (0.01, PEER, frame(*HALF), [(-2, 0.5, 0.5, *TIP)]),
+            (0.02, PEER, blobs(), [(-2, 0.5, 0.5)]),
+        ],
+    ),
+    # Side by side, the nearest of each; a palm beside a finger is a contact of its own, and so is
+    # a blob that its cursor has left.
+    "blobs beside cursors": (
+        {},
+        [
+            (0, PEER, frame((1, 0.5, 0.5), (2, 0.515625, 0.5)), ...),
+            (
+                0,
+                PEER,
+                blobs((4, 0.515625, 0.5, *TIP), (3, 0.5, 0.5, *TIP), (5, 0.25, 0.5, *PALM)),
+                [(1, 0.5, 0.5, *TIP), (2, 0.515625, 0.5, *TIP), (-6, 0.25, 0.5, *PALM)],
+            ),
+            (0.01, PEER, frame((1, 0.75, 0.5)), ...),
+            (
+                0.01,
+                PEER,
+                blobs((3, 0.5, 0.5, *TIP)),
+                [(1, 0.75, 0.5), (1 + (1 << 32), 0.5, 0.5, *TIP)],
+            ),
+        ],
+    ),
+    # Each profile has numbers of its own: a late bundle of one changes nothing, and a restart of
+    # one leaves the other.
+    "numbers of two profiles": (
+        {"late": 1},
+        [
+            (0, PEER, frame(*HALF, fseq=500), HALF),
+            (0, PEER, blobs((7, 0.25, 0.5, *PALM), fseq=500), ...),
+            (0.01, PEER, blobs(fseq=499), None),
+            (0.01, PEER, still(1, fseq=501), [*HALF, (-8, 0.25, 0.5, *PALM)]),
+            (0.02, PEER, blobs(fseq=1), HALF),
+        ],
+    ),
+    # A number that comes back is another blob, which was never set; one profile does not confirm
+    # the other, whose last bundle may have been lost.
+    "blobs that end": (
+        {},
+        [
+            (0, PEER, blobs((7, 0.5, 0.5, *TIP)), ...),
+            (0.01, PEER, blobs(), []),
+            (
+                0.02,
+                PEER,
+                bundle(message("source", "table@a"), message("alive", 7, address=BLOB)),
+                [],
+            ),
+            (0.03, PEER, blobs((7, 0.25, 0.5, *PALM)), [(-8, 0.25, 0.5, *PALM)]),
+            (3.02, PEER, frame(*HALF), [(-8, 0.25, 0.5, *PALM), *HALF]),
+            (3.04, PEER, still(1, fseq=1), HALF),
+        ],
+    ),
     # As much as UDP carries, but no more messages than ten times as many contacts need.
     "big bundles": (
         {"malformed": 1},
@@ -211,14 +313,14 @@ COURSES: Mapping[str, tuple[dict[str, Any], Sequence[Read]]] = {
 
 
 @pytest.mark.parametrize("name", COURSES)
-def test_reader_follows_its_senders(reader: TuioReader, name: str) -> None:
+def test_reader_follows_its_senders(reader: TuioSource, name: str) -> None:
     """What is read of each datagram, and what is counted in the end."""
     expected, datagrams = COURSES[name]
     for time, peer, datagram, wanted in datagrams:
-        result = reader.read(datagram, peer, now=time)
+        result = reader.read(datagram, peer, time)
         if wanted is not ...:
             assert (None if result is None else touches(result)) == wanted
-    found = counts(reader)
+    found = reader.rejects.counts
     assert found.keys() == expected.keys()
     assert all(count in (..., found[what]) for what, count in expected.items())
 
@@ -251,15 +353,15 @@ MALFORMED = {
 
 @pytest.mark.parametrize("datagram", MALFORMED.values(), ids=MALFORMED.keys())
 def test_reader_counts_malformed_datagrams(
-    reader: TuioReader, datagram: bytes, caplog: pytest.LogCaptureFixture
+    reader: TuioSource, datagram: bytes, caplog: pytest.LogCaptureFixture
 ) -> None:
     """Each is counted and logged, none raises or changes a touch."""
-    reader.read(frame((1, 0.25, 0.5), fseq=1), PEER, now=0)
-    assert reader.read(datagram, PEER, now=0) is None
-    assert counts(reader) == {"malformed": 1}
-    assert [record.name for record in caplog.records] == ["test"]
+    reader.read(frame((1, 0.25, 0.5), fseq=1), PEER, 0)
+    assert reader.read(datagram, PEER, 0) is None
+    assert reader.rejects.counts == {"malformed": 1}
+    assert [record.name for record in caplog.records] == ["controller.sources.touch"]
     still = bundle(message("source", "table@a"), message("alive", 1, 2), message("fseq", 2))
-    assert touches(reader.read(still, PEER, now=0)) == [(1, 0.25, 0.5)]
+    assert touches(reader.read(still, PEER, 0)) == [(1, 0.25, 0.5)]
 
 
 def typed(tags: str, *values: Any) -> Any:
@@ -292,10 +394,10 @@ LIBERAL = {
 
 
 @pytest.mark.parametrize("datagram", LIBERAL.values(), ids=LIBERAL.keys())
-def test_reader_is_liberal(reader: TuioReader, datagram: bytes) -> None:
+def test_reader_is_liberal(reader: TuioSource, datagram: bytes) -> None:
     """Whatever its types, further arguments, name and bundles: a cursor is where it says."""
-    assert touches(reader.read(datagram, PEER, now=0)) == QUARTER
-    assert not counts(reader)
+    assert touches(reader.read(datagram, PEER, 0)) == QUARTER
+    assert not reader.rejects.counts
 
 
 @pytest.mark.parametrize(
@@ -311,30 +413,30 @@ def test_reader_is_liberal(reader: TuioReader, datagram: bytes) -> None:
     ],
 )
 def test_reader_tells_programs_of_one_name_apart(
-    reader: TuioReader, sent: list[tuple[int, int, float]], seconds: set[int]
+    reader: TuioSource, sent: list[tuple[int, int, float]], seconds: set[int]
 ) -> None:
     """By port, frame number and time [s]: those of a second program, counted once, and others."""
     for number, (port, fseq, now) in enumerate(sent):
         datagram = frame((port, 0.5, 0.5), fseq=fseq, source="a")
-        result = reader.read(datagram, ("192.0.2.7", port), now=now)
+        result = reader.read(datagram, ("192.0.2.7", port), now)
         assert [id for id, _, _ in touches(result)] == [port]
         is_second = port in seconds and number > 0
         assert result is not None
         assert result.source == f"tuio:192.0.2.7{f':{port}' if is_second else ''}/a"
-    assert counts(reader) == ({"same_name": 1} if seconds else {})
+    assert reader.rejects.counts == ({"same_name": 1} if seconds else {})
 
 
-def test_reader_knows_that_a_sender_is_mute(reader: TuioReader) -> None:
+def test_reader_knows_that_a_sender_is_mute(reader: TuioSource) -> None:
     """After 10 s without anything, but not of a panel at rest.
 
     A sender that repeats itself at rest and falls silent is mute, too.
     """
     assert [reader.is_mute(since=0, now=now) for now in (9.9, 10.1)] == [False, True]
     for now in range(11, 14):
-        reader.read(frame((1, 0.5, 0.5)) if now < 13 else frame(), PEER, now=now)
+        reader.read(frame((1, 0.5, 0.5)) if now < 13 else frame(), PEER, now)
     assert not reader.is_mute(since=0, now=100)
     for now in range(100, 120):
-        reader.read(frame(), PEER, now=now)
+        reader.read(frame(), PEER, now)
     assert [reader.is_mute(since=0, now=now) for now in (128.9, 129.1)] == [False, True]
 
 
@@ -347,21 +449,21 @@ def test_reader_knows_that_a_sender_is_mute(reader: TuioReader) -> None:
 def test_reader_reads_cursors_among_noise(parts: list[int | bytes]) -> None:
     """Every cursor is read, and every other element is counted."""
     raw = [each if isinstance(each, bytes) else cursor(each, 0.5, 0.5).dgram for each in parts]
-    reader = TuioReader(RejectCounter(logging.getLogger("test")))
-    result = reader.read(_raw(*((len(each), each) for each in raw)), PEER, now=0)
+    reader = TuioSource("tuio:")
+    result = reader.read(_raw(*((len(each), each) for each in raw)), PEER, 0)
     found = set() if result is None else {touch.id for touch in result.touches}
     assert found == {each for each in parts if isinstance(each, int)}
     noise = sum(isinstance(each, bytes) for each in parts)
-    assert counts(reader) == ({"malformed": noise} if noise else {})
+    assert reader.rejects.counts == ({"malformed": noise} if noise else {})
 
 
 @given(st.binary(max_size=200), st.integers(0, 300))
 def test_reader_never_raises(noise: bytes, cut: int) -> None:
     """Any bytes are read or counted, alone or within a valid bundle."""
-    reader = TuioReader(RejectCounter(logging.getLogger("test")))
+    reader = TuioSource("tuio:")
     good = frame((1, 0.25, 0.5), fseq=1)
     for datagram in (noise, good[:cut], good[:cut] + noise, good[:cut] + noise + good[cut:]):
-        reader.read(datagram, PEER, now=0)
+        reader.read(datagram, PEER, 0)
 
 
 @given(
@@ -375,7 +477,7 @@ def test_tuio_datagram_round_trip(places: dict[int, tuple[float, float]]) -> Non
     """What tuio_datagram writes, the reader reads: ids and positions of single precision."""
     wanted = tuple(Touch(id, x, y) for id, (x, y) in places.items())
     datagram = tuio_datagram(TouchFrame("table@a", 0.0, wanted), 7)
-    result = TuioReader(RejectCounter(logging.getLogger("test"))).read(datagram, PEER, now=2.0)
+    result = TuioSource("tuio:").read(datagram, PEER, 2.0)
     assert result is not None
     assert (result.source, result.time, result.touches) == ("tuio:192.0.2.7/table@a", 2.0, wanted)
 

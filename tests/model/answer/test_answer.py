@@ -88,6 +88,16 @@ def test_a_hand_that_rests_is_counted_and_not_protected():
     assert stds.tolist() == pytest.approx([table.uncertainty.fingertip, np.log(3)], rel=0.01)
 
 
+def test_what_asks_for_nothing_is_counted_and_not_protected():
+    """A finger beside two with contents, solved exactly; it may also lie where one feels."""
+    own = [wants(NEAR, level_db_sl=12), wants(FAR, level_db_sl=12)]
+    for at in (HAND, (NEAR[0] + 0.003, NEAR[1])):
+        found = answer(smooth_table(), own, [Finger(at, is_protected=False)], min_contrast_db=-99)
+        nominal = realised(smooth_table(), found, as_modelled(3), resting=[at]).contrast[:2, 0]
+        assert [each.contrast_db for each in found.fingers[:2]] == pytest.approx(nominal, abs=0.02)
+        assert found.fingers[2].contrast_db is None
+
+
 def test_drive_mode_of_the_table_is_obeyed():
     """Amplifiers that only switch get ERAs at full stroke, as one finger's query; or a refusal."""
     table = smooth_table()

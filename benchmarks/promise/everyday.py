@@ -4,10 +4,11 @@
 
 Two contents of 14 dB SL at fingers at least 5 cm apart, on plates solved exactly and drawn within
 the uncertainty of a rig. The heel of a hand is four patches 25 mm apart, whose loads together are
-so many fingertips'; the hand that is far is one. An object lies anywhere, 3 cm from fingers or
-more: its mass on a contact spring of 100 kN/m; expected, `uncertainty.foreign_mass` says so. Each
-row: the promise at the worst finger (median, worst tenth) [dB], share of the promises that is kept,
-and what nine of ten plates lack to it [dB].
+so many fingertips'; those of a hand of another size are farther apart, and the hand that is far is
+one. An object lies anywhere, 3 cm from fingers or more: its mass on a contact spring of 100 kN/m;
+expected, `uncertainty.foreign_mass` says so. Surplus fingers are as far from others. Each row: the
+promise at the worst finger (median, worst tenth) [dB], share of the promises that is kept, and what
+nine of ten plates lack to it [dB].
 """
 
 import argparse
@@ -19,7 +20,7 @@ import numpy as np
 
 from benchmarks.promise.cases import Case
 from benchmarks.setting import random_contacts
-from controller.sources.touch import LIGHT_FORCE
+from controller.sources.touch import HAND_MAJOR, LIGHT_FORCE, LIGHT_MAJOR, LightPress
 from model.answer.answer import Answer
 from model.answer.plan import answer
 from model.answer.stimulus import Finger, Stimulus
@@ -29,10 +30,10 @@ from model.structure.attachments import Fingertip, FingertipLoad, object_load
 from model.study.verification import Plates, accelerations_on, draw_plates
 from model.table.table import LocalizationTable, read_fingertips
 from model.vibration import base_amplitudes
-from registry.limits import HAND_LOAD
 
 RIGS = (("paper_plate", False), ("paper_plate", True), ("car_display", True))
 OBJECT_AWAY = 0.03  # m
+BY_SIZE = LightPress(touch_major=LIGHT_MAJOR)
 PATCH = 0.0125  # m; of a patch of the heel from its middle, along x and along y
 OH_AND_CHOI = ((40.0, 3.5), (250.0, -7.0))
 """Thresholds of pressing fingers above those of the probe, by frequency [Hz] in dB."""
@@ -45,10 +46,11 @@ class Situation:
     """What differs from what the answer counts.
 
     hand: how many fingertips' load it has, 0 for none; distance [m]: of its middle from the nearer
-    finger, 0 for the corner farthest from both; is_counted: whether the answer counts a hand there;
-    force [N]: of all fingers; person: how their thresholds differ; fingertip: of the uncertainty
-    that the answer counts, None for that of the rig; mass [kg]: of an object that lies anywhere, 0
-    for none, which the answer counts as a hand.
+    finger, 0 for the corner farthest from both; is_counted: whether the answer counts a hand there,
+    and surplus fingers; force [N]: of all fingers; person: how their thresholds differ; fingertip:
+    of the uncertainty that the answer counts, None for that of the rig; mass [kg]: of an object
+    that lies anywhere, 0 for none, which the answer counts as a hand; size, reported [mm]: of the
+    hand's longer axis, and what its source reports; surplus: number of fingers that feel nothing.
     """
 
     name: str
@@ -59,11 +61,22 @@ class Situation:
     is_counted: bool = True
     fingertip: float | None = None
     mass: float = 0.0
+    size: float = HAND_MAJOR
+    reported: float = HAND_MAJOR
+    surplus: int = 0
 
 
 def situations() -> Iterator[Situation]:
     """The rows of a rig."""
-    yield Situation("as asked")
+    palm = Situation("hand of 40 fingertips and 75 mm, of unknown size", 40, 0.09, size=75.0)
+    yield from (
+        Situation("as asked"),
+        replace(palm, name="hand of 40 fingertips and 75 mm, unseen", is_counted=False),
+        palm,
+        replace(palm, name="hand of 40 fingertips and 75 mm, with its size", reported=75.0),
+        Situation("ten surplus fingers, not counted", surplus=10, is_counted=False),
+        Situation("ten surplus fingers, counted", surplus=10),
+    )
     for load, distance, where in (
         (20, 0.09, "9 cm away"),
         (5, 0.09, "9 cm away"),
@@ -110,16 +123,16 @@ def main() -> None:
                 continue
             promised, above = [], []
             for seed in range(options.sets):
-                rng = np.random.default_rng([seed, 14])
-                found, plates = _row(case.table, each, rng, options.plates)
-                worst = min(x.promised_contrast_db or np.nan for x in found.fingers[:2])
-                promised.append(worst)
+                found, plates = _row(
+                    case.table, each, np.random.default_rng([seed, 14]), options.plates
+                )
+                promised.append(min(x.promised_contrast_db or np.nan for x in found.fingers[:2]))
                 above.append(plates)
-            below = -np.percentile(np.concatenate(above, axis=1), 10)
             print(
                 f"| {title} | {each.name} | {np.median(promised):.1f} "
                 f"({np.percentile(promised, 10):.1f}) | "
-                f"{100 * np.mean(np.array(above) >= 0):.0f} % | {below:+.1f} |",
+                f"{100 * np.mean(np.array(above) >= 0):.0f} % | "
+                f"{-np.percentile(np.concatenate(above, axis=1), 10):+.1f} |",
                 flush=True,
             )
 
@@ -144,9 +157,16 @@ def _row(
     if changed:
         table = replace(table, uncertainty=replace(table.uncertainty, **changed))
     fingers = [Finger(at, Stimulus(14.0)) for at in places]
-    quiet = [Finger(hand, load=HAND_LOAD)] if hand is not None and of.is_counted else []
-    found = answer(table, [*fingers, *quiet], drive_mode="phased", min_contrast_db=-np.inf)
     patches = _patches(table, places, hand, of, rng)
+    quiet = [Finger((each.x, each.y), is_protected=False) for each in patches[: of.surplus]]
+    if hand is not None:
+        quiet = [Finger(hand, load=BY_SIZE.load(touch_major=of.reported) or 0.0)]
+    found = answer(
+        table,
+        [*fingers, *(quiet if of.is_counted else [])],
+        drive_mode="phased",
+        min_contrast_db=-np.inf,
+    )
     plates = draw_plates(
         rng,
         replace(
@@ -158,9 +178,8 @@ def _row(
     )
     if of.mass:
         plates.load[:, 2:] = 1.0
-    promised = np.array([x.promised_contrast_db for x in found.fingers[:2]], dtype=float)
-    contrasts = contrasts_on(table, found, plates, of, patches, rng)
-    return found, contrasts - promised[:, None]
+    promised = [[x.promised_contrast_db or np.nan] for x in found.fingers[:2]]
+    return found, contrasts_on(table, found, plates, of, patches, rng) - np.array(promised)
 
 
 def _hand_at(
@@ -175,8 +194,7 @@ def _hand_at(
     if not distance:
         corners = [(x, y) for x in (margin, size[0] - margin) for y in (margin, size[1] - margin)]
         return max(corners, key=lambda at: min(np.hypot(*np.subtract(at, p)) for p in places))
-    for _ in range(100):
-        angle = rng.uniform(0, 2 * np.pi)
+    for angle in (rng.uniform(0, 2 * np.pi) for _ in range(100)):
         x, y = np.array(places[0]) + distance * np.array([np.cos(angle), np.sin(angle)])
         is_on = margin <= x <= size[0] - margin and margin <= y <= size[1] - margin
         if is_on and np.hypot(x - places[1][0], y - places[1][1]) >= distance:
@@ -191,19 +209,21 @@ def _patches(
     of: Situation,
     rng: np.random.Generator,
 ) -> list[FingertipLoad]:
-    """Loads of a hand's patches, or of an object at least 3 cm from fingers."""
+    """Loads of a hand's patches, or of objects or fingers at least 3 cm from others."""
 
-    if of.mass:
-        sides, at = (table.plate.length, table.plate.width), places[0]
-        while min(math.dist(at, each) for each in places) < OBJECT_AWAY:
-            at = float(rng.uniform(0, sides[0])), float(rng.uniform(0, sides[1]))
-        return [FingertipLoad(*at, object_load(of.mass))]
+    tip, sides = table.fingertip or Fingertip(), (table.plate.length, table.plate.width)
     if hand is None:
-        return []
-    (x, y), tip = hand, table.fingertip or Fingertip()
+        load, spots = object_load(of.mass) if of.mass else tip, list[Point]()
+        while len(spots) < of.surplus + (of.mass > 0):
+            at = float(rng.uniform(0, sides[0])), float(rng.uniform(0, sides[1]))
+            if min(math.dist(at, each) for each in (*places, *spots)) >= OBJECT_AWAY:
+                spots.append(at)
+        return [FingertipLoad(*at, load) for at in spots]
+    x, y = hand
     if not of.distance:
         return [FingertipLoad(x, y, tip.multiplied(of.hand))]
-    quarter, ways = tip.multiplied(of.hand / 4), (-PATCH, PATCH)
+    quarter = tip.multiplied(of.hand / 4)
+    ways = [each * PATCH * of.size / HAND_MAJOR for each in (-1, 1)]
     return [FingertipLoad(x + a, y + b, quarter) for a in ways for b in ways]
 
 

@@ -60,7 +60,6 @@ RETIRED_WORDS = {
     "nearness": "suggestions",
     "unaware": "imperceptible",
     "because": "reason",
-    "surplus": "to_evict",
     "trouble": "errors",
     "nobody|somebody|anybody|everybody|whoever": "the component's name",
     "patience": "_TIMEOUT",

@@ -551,9 +551,9 @@ class Crossfades:
         Other frequencies must promise 2 dB more to the worst finger, other weights alone 0.5 dB;
         either to the same fingers, and not more weakly. The way ends where a step promises no more.
         Where nothing is better, the only step is what plays, if its promised contrast differs by
-        0.5 dB from what was promised while fingers moved.
+        0.5 dB from what was promised while fingers moved. No step where nothing plays.
         """
-        if self.capabilities.drive_mode != UNRESTRICTED:
+        if self.capabilities.drive_mode != UNRESTRICTED or not self.question.before:
             return ()
         question, same = self.question, tuple[Selection, ...]()
         playing = _by_finger(question.before.values())

@@ -350,6 +350,7 @@ async def test_names_with_a_strength_are_bounded(tmp_path: Path) -> None:
                     await era.strength(name=name, gain_db=-1)
                 await era.strength(name=names[0], gain_db=0)
             await era.strength(name=name, gain_db=-1)
+            await era.touch([], source=name)
     kept = json.loads((tmp_path / "kept.json").read_text())
     assert kept == dict.fromkeys(names[1:], -1)
 

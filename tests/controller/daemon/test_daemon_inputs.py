@@ -281,11 +281,11 @@ async def test_daemon_names_inputs_that_are_missing_or_mute(tmp_path: Path) -> N
         '  - {name: gone, url: "evdev:/dev/input/event987"}\n'
         f'  - {{name: table, url: "tuio:127.0.0.1:{port}"}}\n'
     )
-    blob = bundle(message("set", 1, 0.5, 0.5, 0.1, address="/tuio/2Dblb"))
+    other = bundle(message("set", 1, 0.5, 0.5, 0.1, address="/tuio/25Dblb"))
     fingers = TouchFrame("table", 0.0, (Touch(1, 0.5, 0.5), Touch(2, 1.5, 0.5)))
     async with ready_daemon(tmp_path, more) as (_, era):
         shown = []
-        for datagram in (blob, tuio_datagram(fingers, 1)):
+        for datagram in (other, tuio_datagram(fingers, 1)):
             with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
                 sender.sendto(datagram, ("127.0.0.1", port))
             await asyncio.sleep(12)
@@ -296,8 +296,8 @@ async def test_daemon_names_inputs_that_are_missing_or_mute(tmp_path: Path) -> N
     gone, ready = ["touch gone", " missing"], ["ready", *shown[0][2][1:]]
     assert shown[0][:3] == [gone, ["touch table", " mute"], ready]
     assert shown[1][:2] == [gone, ready]
-    assert status.rejected_touches == {"profile_2Dblb": 1, "off_plate": 1}
-    assert "/tuio/2Dblb" in status.rejected_examples["profile_2Dblb"]
+    assert status.rejected_touches == {"profile_25Dblb": 1, "off_plate": 1}
+    assert "/tuio/25Dblb" in status.rejected_examples["profile_25Dblb"]
     assert event is not None
     assert InputsEvent.model_validate(event.data).inputs == status.inputs
     exposed = exposition(status).decode()

@@ -3,10 +3,10 @@
 A frequency that a finger feels is content: it is kept, and its phase at that finger, unless another
 one serves more fingers.
 
-Moving fingers are answered for the next 8 mm of their way, at three places at once, with their own
-content and as quiet for all others: from where a finger is once the weights have half changed, to
-where they do again. Weights that change have side bands, which a steady promise does not count: a
-margin does.
+Moving fingers are answered for 16 mm of their way, at three places at once, with their own content
+and as quiet for all others: around the middle of the 8 mm from where a finger is once the weights
+have half changed, to where they do again. What is promised is the mean power there on drawn plates,
+with a share of others' contents for the side bands of weights that change (`model.answer.promise`).
 
 What fingers feel depends on the order of their arrival, since frequencies are kept. Once all rest,
 the answer with none kept is led to along cross-fades (`Crossfades`), one content after the other,
@@ -21,7 +21,6 @@ import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
 
 import numpy as np
 
@@ -43,15 +42,12 @@ from model.answer.answer import (
     HELD_BACK,
     IMPERCEPTIBLE_DB_SL,
     MIN_CONTRAST_DB,
-    MIXED,
-    OWN,
     OWN_CONTRAST_DB,
     SAME_LEVEL,
     SHARED,
     Answer,
     Layer,
     Sensation,
-    verdict_of,
 )
 from model.answer.plan import answer, worst_of
 from model.answer.promise import with_tones
@@ -66,10 +62,7 @@ from model.vibration import Excitation, base_amplitudes
 from registry.limits import MAX_CONTACTS
 
 STRETCH = 0.008
-"""Way [m] that a moving finger is answered for; once it has gone that far it is asked anew."""
-
-MARGIN_DB = 2.0
-"""Reduction [dB] of promises to a moving finger, and beside one, from those at rest."""
+"""Way [m] after which a moving finger is asked anew; it is answered for twice as much of it."""
 
 WORTH = 2.0
 """How much more [dB] the worst finger must be promised for other frequencies."""
@@ -83,16 +76,6 @@ NEIGHBOURS_LEAVE_NOTHING = (
     "a quiet finger must stay at -10 dB SL, but at every level that reaches the target it does "
     "not; lift or move that finger away"
 )
-
-_WORST = {
-    "level_db_sl": (1, 0.0),
-    "promised_level_db_sl": (1, 0.0),
-    "contrast_db": (1, 0.0),
-    "median_contrast_db": (1, 0.0),
-    "promised_contrast_db": (1, MARGIN_DB),
-    "foreign_level_db_sl": (-1, MARGIN_DB),
-}
-"""Figures of a sensation: 1 where less is worse and -1 where more is, and the margin [dB]."""
 
 _ANSWER_TIME = 0.020  # s; until what is asked now has begun to play
 _SHORT_OF = 1.0  # dB; by which what keeps its frequency may be weaker than asked
@@ -127,9 +110,8 @@ def answered(
     fingers = fingers_of(table, targets, quiet, capabilities, question.protected)
     if len(targets) > 1 or targets[0][1].modulation_hz is not None:
         fingers = _as_layers_allow(fingers, len(targets), capabilities)
-    if math.isfinite(now):
-        contacts = [*[contact for contact, _ in targets], *quiet]
-        fingers = with_ways(fingers, contacts, now, table.plate)
+    contacts = [*[contact for contact, _ in targets], *quiet]
+    fingers = with_ways(fingers, contacts, now, table.plate)
     request = partial(
         answer,
         table,
@@ -139,16 +121,15 @@ def answered(
         avoided_hz=avoided_hz,
     )
     kept = _kept(fingers, targets, question.before) if keeps else fingers
-    if kept == fingers:
-        return request(fingers)
     found = request(kept)
     served, lowered = len(found.layers), _lowered_db(found)
     is_loud = lowered < _SHORT_OF
-    if is_loud and served == len(targets):
-        return found
-    other = request(fingers)
-    is_better = not is_loud and _lowered_db(other) < lowered
-    return other if (len(other.layers), is_better) > (served, False) else found
+    if kept != fingers and not (is_loud and served == len(targets)):
+        other = request(fingers)
+        is_better = not is_loud and _lowered_db(other) < lowered
+        if (len(other.layers), is_better) > (served, False):
+            found = other
+    return _on_ways(table, found, len(contacts))
 
 
 def fingers_of(
@@ -277,13 +258,10 @@ def selection_of(
     The phases of contents that play are kept if is_in_phase; shape: adds envelopes.
     """
     before, quiet = question.before, question.quiet_beside(targets)
-    count = len(question.contacts)
-    sensed = felt_on_ways(found, count)
-    here = replace(found, asked=found.asked[:count])  # without the ends of ways
     fields: Complex64Array | None = None  # seldom needed
     contents: list[Content] = []
     skipped: list[Prediction] = []
-    felt, unfelt = [*zip(targets, sensed, strict=False)], set[ContactKey]()
+    felt, unfelt = [*zip(targets, found.fingers, strict=False)], set[ContactKey]()
     for (contact, _), each in felt:
         if each.verdict == HELD_BACK:
             skipped.append(_held_back(contact, each))
@@ -291,7 +269,6 @@ def selection_of(
             unfelt.add(contact.key)
             skipped.append(not_served(contact, reason))
     for layer in found.layers:
-        layer = replace(layer, fingers=tuple([each for each in layer.fingers if each < count]))
         own, sensations = list[tuple[Contact, Target]](), list[Sensation]()
         for number in layer.fingers:
             finger, sensation = felt[number]
@@ -300,7 +277,7 @@ def selection_of(
                 sensations.append(sensation)
         if not own:
             continue
-        (contact, target), placed, voices = own[0], here.placement(layer), layer.voices
+        (contact, target), placed, voices = own[0], found.placement(layer), layer.voices
         carrier = before.get((contact.key, target.voice))
         is_continued = carrier is not None and all(
             (then := before.get((contact.key, voice))) is not None
@@ -310,7 +287,7 @@ def selection_of(
         for voice, played in enumerate(voices):
             if layer.side_bands or (is_in_phase and carrier is not None):
                 if fields is None:
-                    places = [each.finger.at for each in sensed[: len(targets)]]
+                    places = [each.at for each in found.asked[: len(targets)]]
                     fields = table.unit_fields(np.array(places), contacts=places)
                 then = carrier if is_continued else None
                 played = _in_phase(played, then, fields, layer.fingers[0], table)
@@ -324,7 +301,8 @@ def selection_of(
                 )
             )
     contacts = [*[contact for contact, _ in targets], *quiet]
-    levels = zip(contacts, foreign_on_ways(found, count), strict=True)
+    heard = np.array(found.tones.foreign_db_sl)
+    levels = zip(contacts, np.where(np.isnan(heard), -math.inf, heard).tolist(), strict=False)
     return Selection(
         targets,
         quiet,
@@ -447,9 +425,9 @@ def with_ways(
 ) -> list[Finger]:
     """Return the fingers of contacts at a time [s], moving ones at the middle of their ways.
 
-    The two ends of each way follow all of them, as fingers of the same stimulus that share its
-    load. Fingers that may share with others, whose strength comes and goes, or that come too near
-    another are only moved.
+    Two places as far before and after it as each way is long follow all of them, as fingers of the
+    same stimulus that share its load: weights for these change more slowly. Fingers that may share
+    with others, whose strength comes and goes, or that come too near another are only moved.
     """
     found, ends = [*fingers], list[Finger]()
     for number, (finger, contact) in enumerate(zip(fingers, contacts, strict=True)):
@@ -457,9 +435,10 @@ def with_ways(
         if not (speed := math.hypot(vx, vy)):
             continue
         since = now - contact.motion.places[-1][0] + _ANSWER_TIME + ONSET_RAMP / 2
+        reach = STRETCH / speed
         way = [
             _on_plate((contact.x + vx * each, contact.y + vy * each), plate)
-            for each in (since, since + STRETCH / 2 / speed, since + STRETCH / speed)
+            for each in (since - reach / 2, since + reach / 2, since + 3 * reach / 2)
         ]
         others = [each for each in (*found, *ends) if each is not finger]
         if any(math.dist(at, each.at) < FINGERTIP_RADIUS for at in way for each in others):
@@ -488,49 +467,24 @@ def _is_steady_and_alone(finger: Finger, others: Sequence[Finger]) -> bool:
     return finger.stimulus.modulation_hz is None and not may_share
 
 
-def felt_on_ways(found: Answer, count: int) -> list[Sensation]:
-    """Return the sensations of the first fingers of an answer; the others are ends of their ways.
-
-    Where weights change for a way, resting fingers feel side bands, too.
-    """
-    if len(found.fingers) == count:
-        return [*found.fingers]
-    return [_on_way([found.fingers[each] for each in way]) for way in _ways(found, count)]
-
-
-def foreign_on_ways(found: Answer, count: int) -> list[list[float]]:
-    """Return the highest foreign levels [dB SL] of these fingers, by set of thresholds."""
-    levels = found.tones.foreign_db_sl
-    heard = np.where(np.isnan(levels), -math.inf, levels)[: len(found.asked)]
-    if len(heard) == count:
-        return heard.tolist()  # type: ignore[no-any-return]
-    return [(heard[way].max(axis=0) + MARGIN_DB).tolist() for way in _ways(found, count)]
-
-
-def _ways(found: Answer, count: int) -> list[list[int]]:
-    """Return, for each of the first fingers, its number and those of the ends of its way."""
+def _on_ways(table: LocalizationTable, found: Answer, count: int) -> Answer:
+    """Return the answer for the first fingers; the others are ends of their ways."""
+    if len(found.asked) == count:
+        return found
     ways, places = [[number] for number in range(count)], [each.at for each in found.asked]
     for end in range(count, len(places)):
         near = [math.dist(at, places[end]) for at in places[:count]]
         ways[near.index(min(near))].append(end)
-    return ways
-
-
-def _on_way(places: Sequence[Sensation]) -> Sensation:
-    """Return the worst sensation of a finger among the places of its way."""
-    first = places[0]
-    if first.verdict == HELD_BACK:
-        return first
-    least = dict[str, Any]()
-    for name, (sign, margin) in _WORST.items():
-        values = [each for one in places if (each := getattr(one, name)) is not None]
-        if values:
-            least[name] = sign * min(sign * each for each in values) - sign * margin
-    found: Sensation = replace(first, **least)
-    if found.verdict not in (OWN, MIXED):
-        return found
-    judged = found.promised_contrast_db, found.foreign_level_db_sl
-    return replace(found, verdict=verdict_of(*judged, pauses=found.pauses))
+    if found.layers:
+        tones = found.tones
+        of_tones = np.array(tones.rows), tones.weights, np.array(tones.owners)
+        found = with_tones(table, found, *of_tones, np.array(tones.gains), ways)
+    return replace(
+        found,
+        asked=found.asked[:count],
+        contents=found.contents.of_first(count),
+        held=tuple([each for each in found.held if each[0] < count]),
+    )
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,7 @@ from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
@@ -156,6 +156,19 @@ class Contents:
         """Fingers that a content, by its number, is kept from."""
         every = {*self.quiet}.union(*(stream.targets for stream in self.streams))
         return sorted(every - {*self.streams[number].targets})
+
+    def of_first(self, count: int) -> Self:
+        """Return the contents of the first fingers alone."""
+        return replace(
+            self,
+            places=self.places[:count],
+            loads=self.loads[:count],
+            streams=tuple(
+                replace(each, targets=tuple(one for one in each.targets if one < count))
+                for each in self.streams
+            ),
+            quiet=tuple(each for each in self.quiet if each < count),
+        )
 
     @property
     def levels(self) -> Float32Array:

@@ -113,7 +113,8 @@ def answer(
     every = (*fingers, *[each if isinstance(each, Finger) else Finger(each) for each in quiet])
     check_fingers(every, table.plate)
     mode = checked_mode(drive_mode or table.drive_mode)
-    avoided = _avoided(table, avoided_hz, apart_hz)
+    near = [np.abs(table.frequencies - each) < apart_hz - SAME_FREQUENCY for each in avoided_hz]
+    avoided = frozenset(np.flatnonzero(np.any(near, axis=0)).tolist() if near else ())
     answering = _Answering(table, every, mode, shaped, apart_hz, avoided, bands_may_swap, limits)
     found = answering.within_limits(answering.solve(min_contrast_db), min_contrast_db)
     changed = _changed(found)
@@ -139,14 +140,6 @@ def prepare_answers(table: LocalizationTable, drive_mode: str | None = None) -> 
     for quiet in ((), ((0.0, 0.0),)):
         placed = Placement((centre,), quiet)
         query(table, placed, MIN_LEVEL_DB_SL, drive_mode=drive_mode)
-
-
-def _avoided(
-    table: LocalizationTable, avoided_hz: Sequence[float], apart_hz: float
-) -> frozenset[int]:
-    """Rows of a table's frequencies that are too near to frequencies that play already."""
-    near = [np.abs(table.frequencies - each) < apart_hz - SAME_FREQUENCY for each in avoided_hz]
-    return frozenset(np.flatnonzero(np.any(near, axis=0)).tolist() if near else ())
 
 
 def _changed(found: Answer) -> list[str]:

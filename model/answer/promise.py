@@ -66,6 +66,13 @@ MIN_RAISED_CONTRAST_DB = 6.0
 
 _TINY = 1e-20
 
+SIDE_BANDS = 0.01
+"""Share of a content's power, for one ERA, in side bands at other fingers while weights change.
+
+Of n ERAs it is an n-th: their changes have no common phase, while their fields at their own finger
+have. It is what promises on ways need for nine of ten to be kept (decision 0112).
+"""
+
 
 @dataclass(frozen=True, eq=False)
 class FingersOnPlate:
@@ -378,11 +385,12 @@ def promised(
     is_apart: bool = True,
     gains: FloatArray | None = None,
     ringing: Sequence[RingingUnderFingers | None] = (),
+    ways: Sequence[Sequence[int]] = (),
 ) -> Tones:
     """Compute what fingers feel of tones at rows (m,), of weights (m, n).
 
     owners (m,): the content of each tone; gains (m,): None for those to the contents' levels;
-    ringing: of each content, None for those that last or are shaped.
+    ringing: of each content, None for those that last or are shaped; ways: as in `with_tones`.
     """
     shares, streams = fingers.tips.fine_weights, contents.streams
     steady = power = fingers.powers(PROMISED_DRAWS, rows, weights)
@@ -398,6 +406,16 @@ def promised(
         by_tone = of_contents[owners]
     squares = np.square(by_tone, dtype=np.float32)[:, None, None]
     power, harmonics, table = power * squares[..., None], harmonics * squares, fingers.table
+    if ways:
+        contents, shares = contents.of_first(len(ways)), shares[: len(ways)]
+        power, harmonics = (
+            np.stack([each[:, [*way]].mean(axis=1) for way in ways], axis=1)
+            for each in (power, harmonics)
+        )
+        for tone, owner in enumerate(owners.tolist()):
+            own = [*contents.streams[owner].targets]
+            others, of_own = np.setdiff1d(range(len(ways)), own), power[tone, own]
+            power[tone, others] += SIDE_BANDS / weights.shape[1] * of_own.mean(axis=(0, 1))
     sensitivities = table.sensitivities[:, rows], table.harmonic_sensitivities[:, rows]
     by_set = [
         _compared(
@@ -432,16 +450,18 @@ def with_tones(
     weights: Sequence[Sequence[complex]],
     owners: IntArray,
     gains: FloatArray | None,
+    ways: Sequence[Sequence[int]] = (),
 ) -> Answer:
     """Return the answer with other tones and what these promise together.
 
-    gains: of the tones, None for those to the contents' levels.
+    gains: of the tones, None for those to the contents' levels. ways: the fingers, by number, that
+    are places on the way of each of the first ones, which remain: each feels the mean power there.
     """
     contents = found.contents
     fingers = FingersOnPlate.of(table, contents.places, contents.loads)
     of_tones = rows, np.array(weights, dtype=np.complex64), owners
     ringing = RingingUnderFingers.of_streams(table, contents)
-    tones = promised(fingers, contents, *of_tones, gains=gains, ringing=ringing)
+    tones = promised(fingers, contents, *of_tones, gains=gains, ringing=ringing, ways=ways)
     factor = tones.stroke_factor if gains is None else found.stroke_factor
     return replace(found, tones=replace(tones, stroke_factor=factor))
 

@@ -532,7 +532,12 @@ class Verdict:
 
 def judged(verdict: Verdict) -> Verdict:
     """The verdict with the findings that follow from it, besides those that it has."""
-    found = [*_of_channels(verdict), *_of_plate(verdict), *_of_mounts(verdict), *verdict.findings]
+    mounts = [  # an ERA that hardly holds the plate
+        Finding("detached", each.era, each.value / each.expected)
+        for each in verdict.hypotheses[:1]
+        if each.era and each.explains and each.value < 0.1 * each.expected
+    ]
+    found = [*_of_channels(verdict), *_of_plate(verdict), *mounts, *verdict.findings]
     ordered = sorted(found, key=lambda each: _ORDER.index(each.about))
     return replace(verdict, findings=tuple(ordered))
 
@@ -619,13 +624,6 @@ def _of_plate(verdict: Verdict) -> Iterator[Finding]:
         )
     details = {"why": why, "hypotheses": "\n".join(rows)}
     yield Finding("plate", good[0].key if good else "", match.worst, details=details)
-
-
-def _of_mounts(verdict: Verdict) -> Iterator[Finding]:
-    """Find an ERA that hardly holds the plate."""
-    for each in verdict.hypotheses[:1]:
-        if each.era and each.explains and each.value < 0.1 * each.expected:
-            yield Finding("detached", each.era, each.value / each.expected)
 
 
 def match_beyond(match: Match) -> tuple[Match, list[Finding]]:

@@ -200,7 +200,9 @@ def fit(
     low, high = space.lower[own], space.upper[own]
     mean, root = np.zeros(int(own.sum())), np.eye(int(own.sum()))
     if prior is not None:
-        mean, root = prior[0][own], _inverse_root(prior[1][np.ix_(own, own)])
+        variances, axes = linalg.eigh(prior[1][np.ix_(own, own)])
+        scaled = axes / np.sqrt(np.maximum(variances, _MIN_VARIANCE * variances[-1]))
+        mean, root = prior[0][own], np.asarray(scaled.T)  # R^T R = C^-1, though some are tiny
     last: dict[bytes, Fit] = {}
 
     def at(y: FloatArray) -> Fit:
@@ -233,12 +235,6 @@ def fit(
         xtol=_CONVERGED,
     )
     return replace(at(best.x), cost=float(best.cost))
-
-
-def _inverse_root(covariance: FloatArray) -> FloatArray:
-    """Matrix R (q, q) with R^T R = C^-1 of a covariance C, whose variances may be tiny."""
-    variances, axes = linalg.eigh(covariance)
-    return np.asarray((axes / np.sqrt(np.maximum(variances, _MIN_VARIANCE * variances[-1]))).T)
 
 
 def _linearised(

@@ -44,7 +44,6 @@ from model.files.uff import (
 )
 from model.rig.rig import Rig
 from model.structure.attachments import GRAVITY
-from model.structure.exciter import Actuator
 from model.structure.plate import Plate
 
 # Tolerances of a ruler [m]: of an ERA's position, and of a sensor beyond the plate's edge.
@@ -316,7 +315,15 @@ def measurement_of(measured: Sequence[MeasuredValue], rig: Rig) -> Measurement:
         if (each.era, each.era_point) not in eras:
             eras[each.era, each.era_point] = _era_of(each, rig)
         number = eras[each.era, each.era_point]
-        _check_unit(each, rig.eras[number])
+        actuator = rig.eras[number]
+        if each.is_per_volt != (actuator.UNIT == "V"):
+            right, wrong = ("volt at the exciter", "displacement of the base of an ERA")
+            if each.is_per_volt:
+                right, wrong = wrong, right
+            raise InputError(
+                f"{each.place}: response to {actuator.name} must be acceleration per {right}, got "
+                f"per {wrong}; check the rig, or its unit"
+            )
         if (each.frequency, number, each.sensor) in found:
             raise InputError(
                 f"{each.place}: response of sensor {each.sensor} to ERA {rig.eras[number].name} "
@@ -364,17 +371,6 @@ def _check_point(measured: MeasuredValue, rig: Rig) -> None:
             f"{measured.place}: sensor {measured.sensor} must be on the rig's plate, from "
             f"(0, 0) to ({plate.length:g}, {plate.width:g}) m, got {_shown(measured.point)} m; "
             "check the plate and the unit"
-        )
-
-
-def _check_unit(measured: MeasuredValue, actuator: Actuator) -> None:
-    if measured.is_per_volt != (actuator.UNIT == "V"):
-        right, wrong = ("volt at the exciter", "displacement of the base of an ERA")
-        if measured.is_per_volt:
-            right, wrong = wrong, right
-        raise InputError(
-            f"{measured.place}: response to {actuator.name} must be acceleration per {right}, got "
-            f"per {wrong}; check the rig, or its unit"
         )
 
 

@@ -278,7 +278,8 @@ class _Space:
                 break
             mode = np.linalg.solve(A - value * (1 + 1e-12) * B, B @ mode)
             mode /= np.linalg.norm(mode)
-        if not _is_alike(mode, start):
+        norms = np.vdot(mode, mode) * np.vdot(start, start)
+        if abs(np.vdot(mode, start)) ** 2 <= 0.5 * norms.real:  # mostly another than that of before
             values, modes = np.linalg.eig(np.linalg.solve(B, A))
             nearest = int(np.argmax(np.abs(start @ self._mass @ modes)))
             value, mode = complex(values[nearest]), modes[:, nearest]
@@ -306,12 +307,6 @@ class _Space:
             stiffness -= 1j * omega**2 * inertia.imag * self._air_mass
             mass = mass + inertia.real * self._air_mass
         return stiffness, mass
-
-
-def _is_alike(mode: ComplexArray, start: ComplexArray) -> bool:
-    """Whether a mode (n,) is still mostly the one that it was solved from."""
-    norms = np.vdot(mode, mode) * np.vdot(start, start)
-    return bool(abs(np.vdot(mode, start)) ** 2 > 0.5 * norms.real)
 
 
 # How far below its degree a polynomial resolves, against 1/2 for a string of free ends: fitted to

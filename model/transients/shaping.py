@@ -328,7 +328,11 @@ class Shaper:
         """Read the responses of all ERAs at targets and quiet fingers [m], else over the plate."""
         weights, shapes = self._fingertips(targets)
         means = (weights[:, None] @ shapes)[:, 0]
-        others = self._resting(quiet) if quiet else self._surroundings(targets)
+        if quiet:
+            others = self._resting(quiet)
+        else:  # the plate beyond 50 mm of all targets, or all of a small plate
+            around = self._shapes[is_background(self._centres, targets)]
+            others = np.asarray(around / math.sqrt(len(around)))
         return responses_at(self.prepare(frequency), means, others, is_alone=not quiet)
 
     def _quiet_rows(self, positions: tuple[Position, ...]) -> FloatArray:
@@ -350,11 +354,6 @@ class Shaper:
             known.pop(each, None)
         weights, shapes = map(np.stack, zip(*map(found.__getitem__, positions), strict=True))
         return weights, self._plate.with_far_ends(shapes)
-
-    def _surroundings(self, targets: Sequence[Position]) -> FloatArray:
-        """Return such rows for the plate beyond 50 mm of all targets, or all of a small plate."""
-        shapes = self._shapes[is_background(self._centres, targets)]
-        return np.asarray(shapes / math.sqrt(len(shapes)))
 
 
 def responses_at(

@@ -21,11 +21,8 @@ import pytest
 from chain import Chain, Position
 from controller.play.intent import HapticIntent, Target
 from controller.play.joint_answers import (
-    MARGIN_DB,
-    STRETCH,
     Crossfades,
     answered,
-    felt_on_ways,
     selection_of,
     with_ways,
 )
@@ -37,12 +34,13 @@ from long_form import shortly
 from model.answer.answer import Limits
 from model.answer.answer_report import Timing
 from model.answer.plan import answer
-from model.answer.stimulus import Finger, Stimulus
+from model.answer.stimulus import Finger, Placement, Stimulus
 from model.config.fields import Rectangle
-from model.rig.rig import Rig
+from model.rig.rig import Rig, Uncertainty
 from model.rig.rig_file import load_rig
 from model.study.contrast_maps import random_contacts
-from model.table.table import LocalizationTable
+from model.study.verification import draw_plates, harmonics_on, powers_on
+from model.table.table import LocalizationTable, read_fingertips
 from model.table.table_file import build_table
 from plates import contact_sets, smooth_rig
 from real_wires import on_two_amplifiers
@@ -243,14 +241,16 @@ def fingers(contacts: Sequence[Contact]) -> list[Finger]:
     return [Finger((each.x, each.y), Stimulus(14.0, name=str(each.key.id))) for each in contacts]
 
 
-def test_a_moving_finger_is_answered_for_the_next_8_mm() -> None:
-    """At 0.2 m/s 20 ms until it plays and 20 until weights have half changed: 8, 12, 16 mm on."""
+def test_a_moving_finger_is_answered_around_the_next_8_mm() -> None:
+    """At 0.2 m/s 20 ms until it plays and 20 until weights have half changed: from 8 to 16 mm on.
+
+    Its three places are 8 mm apart, the middle one in the middle of that way.
+    """
     contacts = [contact(1, MOVER, vx=0.2), contact(2, OTHER)]
     middle, other, first, last = with_ways(fingers(contacts), contacts, NOW, paper_table().plate)
     assert [each.at[0] - MOVER[0] for each in (first, middle, last)] == pytest.approx(
-        [0.008, 0.012, 0.016]
+        [0.004, 0.012, 0.020]
     )
-    assert math.dist(first.at, last.at) == pytest.approx(STRETCH)
     assert other == fingers(contacts)[1]
     assert sum(each.load for each in (first, middle, last)) == pytest.approx(1.0)
 
@@ -282,23 +282,46 @@ def test_ends_of_ways_are_fingers_where_they_can_be(
     assert len(answer(paper_table(), found, drive_mode="phased").fingers) == count
 
 
-def test_what_is_promised_is_the_least_on_the_way_and_2_db_less() -> None:
-    """Of three places that are answered as fingers of their own; beside it 2 dB less as well."""
-    contacts = [contact(1, MOVER, vx=0.2), contact(2, OTHER)]
+def test_what_is_felt_on_a_way_is_the_mean_power_there_and_a_share_for_side_bands() -> None:
+    """Nominal contrasts of both, by three places on the plate solved exactly.
+
+    To the foreign power at either finger comes a hundredth, over the number of ERAs, of what the
+    other one feels of its own. The promise is kept on nine of ten plates that deviate, within eight
+    in a hundred.
+    """
+    contacts, table = [contact(1, MOVER, vx=0.2), contact(2, OTHER)], paper_table()
     question = asked(
         [(each, Target(each.key, 14.0, content=str(each.key.id))) for each in contacts]
     )
-    found = answered(paper_table(), question, question.lasting, playable(), now=NOW)
-    middle, other, *ends = found.fingers
-    promised = [each.promised_contrast_db or 0.0 for each in (middle, *ends)]
-    levels = [each.promised_level_db_sl for each in (middle, *ends)]
-    moving, resting = selection_of(paper_table(), question, found, question.lasting).predictions
-    assert moving.promised_contrast_db == pytest.approx(min(promised) - MARGIN_DB)
-    assert moving.level_db_sl == pytest.approx(min(levels))
-    assert resting.promised_contrast_db == pytest.approx((other.promised_contrast_db or 0) - 2.0)
-    assert resting.foreign_level_db_sl == pytest.approx((other.foreign_level_db_sl or 0) + 2.0)
-    assert len(found.layers) == 2
-    assert felt_on_ways(found, 4) == [*found.fingers]
+    found = answered(table, question, question.lasting, playable(), now=NOW)
+    middle, other, first, last = with_ways(fingers(contacts), contacts, NOW, table.plate)
+    at = (middle, first, last, other)
+    placed = Placement(
+        tuple([each.at for each in at[:3]]), (other.at,), tuple([each.load for each in at])
+    )
+    shares, rng = read_fingertips(table, [other.at]).fine_weights[0], np.random.default_rng(3)
+    of_plates = []
+    for known, count in ((Uncertainty.none(), 1), (table.uncertainty, 300)):
+        plates = draw_plates(rng, known, of=table, count=count, contact_count=4)
+        powers = []
+        for layer in found.layers:
+            rows, power = powers_on(table, placed, layer.excitation, plates)
+            felt = power[0] * table.sensitivities[:, rows, None] ** 2 / table.thresholds[rows] ** 2
+            felt += harmonics_on(table, placed, layer.excitation, plates)
+            felt = felt.reshape(len(felt), 4, -1, count)
+            powers.append((felt[:, :3].mean(axis=1), felt[:, 3]))
+        contrasts = []
+        for own in (0, 1):
+            foreign, of_other = powers[1 - own][own], powers[1 - own][1 - own].mean(axis=1)
+            heard = (foreign + 0.01 / len(table.eras) * of_other[:, None]).max(axis=1)
+            level = (shares[:, None] * np.sqrt(powers[own][own])).sum(axis=1)
+            contrasts.append(20 * np.log10(level / np.sqrt(heard)).min(axis=0))
+        of_plates.append(np.array(contrasts))
+    nominal, drawn = of_plates
+    for sensed, felt_here, on_plates in zip(found.fingers, nominal, drawn, strict=True):
+        assert sensed.contrast_db == pytest.approx(float(felt_here[0]), abs=0.8)
+        assert np.mean(on_plates >= sensed.promised_contrast_db) == pytest.approx(0.9, abs=0.08)
+    assert len(found.layers) == len(found.fingers) == 2
 
 
 def test_a_promise_for_a_way_holds_at_places_between() -> None:
@@ -454,7 +477,7 @@ def test_every_step_keeps_30_hz_between_all_that_sounds() -> None:
 def test_what_does_not_fit_beside_what_plays_is_not_led_to() -> None:
     """Of stroke for 1.2 times what plays: both together need more.
 
-    What it was promised for a way, 2 dB less, is said anew as of fingers that rest.
+    What it was promised for a way, here 2 dB less, is said anew as of fingers that rest.
     """
     targets = tuple((each, Target(each.key, 14.0)) for each in contacts_at(FIRST, SECOND))
     first = chosen_for(targets[:1], playable())

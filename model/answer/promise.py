@@ -66,7 +66,7 @@ MIN_RAISED_CONTRAST_DB = 6.0
 
 _TINY = 1e-20
 
-SIDE_BANDS = 0.01
+SIDE_BANDS = 0.02
 """Share of a content's power, for one ERA, in side bands at other fingers while weights change.
 
 Of n ERAs it is an n-th: their changes have no common phase, while their fields at their own finger

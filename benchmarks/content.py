@@ -74,7 +74,6 @@ def main() -> None:
 
 def _print_alone(patterns: Sequence[Pattern]) -> bool:
     """Print what is kept; returns whether that is enough."""
-
     table, delays = CASE.table, np.linspace(0, MAX_DELAY, 11)
     shares, lost = [], 0
     for pattern in patterns:
@@ -110,7 +109,6 @@ def _print_alone(patterns: Sequence[Pattern]) -> bool:
 
 def _print_beside(patterns: Sequence[Pattern], pairs: int, workers: int) -> bool:
     """Print what is promised and felt beside other fingers; returns whether enough is kept."""
-
     with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
         running = [
             pool.submit(outcome, each, LEVEL_DB_SL, pair, len(patterns) * pair + number)
@@ -134,7 +132,6 @@ def _print_beside(patterns: Sequence[Pattern], pairs: int, workers: int) -> bool
 
 def _patterns(folder: Path | None) -> Iterator[Pattern]:
     """What can be read of a folder in order of name, or the named contents."""
-
     paths = [named_content(each) for each in named_contents()]
     for path in paths if folder is None else sorted(folder.iterdir()):
         try:

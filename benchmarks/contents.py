@@ -100,7 +100,6 @@ def _sets(
     table: LocalizationTable, contents: int, quiet: int, *, count: int, apart: float
 ) -> Iterator[list[tuple[float, float]]]:
     """Places [m] of fingers, those with contents first."""
-
     rng = np.random.default_rng([contents, quiet])
     size = (table.plate.length, table.plate.width)
     for _ in range(count):
@@ -159,7 +158,6 @@ def promised_worst(found: Answer) -> float:
 
 def _print_sharing(names: tuple[str, str], table: LocalizationTable, *, count: int) -> None:
     """Print what a search that takes its time finds beyond the answers."""
-
     chosen = coherent.TARGET_STARTS, coherent.ALIGNMENTS, coherent.REALIGNMENTS
     coherent.TARGET_STARTS, coherent.ALIGNMENTS, coherent.REALIGNMENTS = 20, 400, 100
     patient = replace(table)
@@ -214,7 +212,6 @@ def _print_modulated(
     apart: float,
 ) -> None:
     """Print what side bands cost the worst finger."""
-
     steady, cost = [], []
     for places in _sets(table, contents, quiet, count=count, apart=apart):
         fingers, others = [Finger(at, Stimulus()) for at in places[:contents]], places[contents:]
@@ -244,7 +241,6 @@ def _print_distorted(
     apart: float,
 ) -> None:
     """Print how far each content is above the second harmonics, sums and differences there."""
-
     above, near = [], []
     strokes = np.array([era.full_level for era in table.eras])
     for places in _sets(table, contents, quiet, count=count, apart=apart):
@@ -290,7 +286,6 @@ def share_kept(
     table: LocalizationTable, found: Answer, quiet: list[tuple[float, float]], *, seed: int
 ) -> float:
     """Share of held-out plates on which the worst finger has what is promised."""
-
     count = len(found.layers) + len(quiet)
     plates = draw_plates(
         np.random.default_rng([9, seed]),

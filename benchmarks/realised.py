@@ -82,7 +82,6 @@ def main() -> None:
 
 def _line(row: Row, sets: int) -> str:
     """A line of the table: medians over sets, and over all draws."""
-
     rig = load_rig(RIG.parent / f"{row.rig}.yaml")
     known = replace(DRIVES, gain=row.error, phase_deg=100 * row.error)
     fingertip = rig.fingertip if row.is_loaded else None
@@ -116,7 +115,6 @@ def realised(
     rig: Rig, asked: Placement, excitation: Excitation, number: int
 ) -> tuple[FloatArray, FloatArray]:
     """Felt contrast [dB] and level [dB SL] on plates (d,), drawn by the number of the set."""
-
     plate, eras = rig.plate, rig.eras
     around = np.exp(0.25j * np.pi * np.arange(8))
     at = np.concatenate([[0], np.sqrt(0.5) * around, around])

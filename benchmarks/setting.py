@@ -37,7 +37,6 @@ def random_contacts(
 
     beside: places [m] on the plate that they are as far from.
     """
-
     while True:
         places = rng.uniform(margin, np.array(size) - margin, (count, 2))
         every = np.array([*places, *beside])

@@ -75,7 +75,6 @@ def main() -> None:
 
 def _of_the_plate(sets: int) -> tuple[list[str], bool]:
     """Rows of the paper's plate."""
-
     rig = load_rig(RIG)
     own = build_table(rig, drive_mode="phased")
     size = rig.plate.length, rig.plate.width
@@ -121,7 +120,6 @@ def _of_the_plate(sets: int) -> tuple[list[str], bool]:
 
 def _of_the_glass(sets: int) -> tuple[list[str], bool]:
     """Rows of the curved glass, and whether they are good."""
-
     rows = [
         "| modes up to | drive | field differs, most | mean | stated, mean | nominal / dB "
         "| promised / dB | median of the glasses / dB | kept |",
@@ -185,7 +183,6 @@ def _of_the_glass(sets: int) -> tuple[list[str], bool]:
 
 def _through_the_wire(sets: int) -> tuple[list[str], bool]:
     """Rows of three contents on glasses that deviate, and whether they are good."""
-
     found = {}
     with tempfile.TemporaryDirectory() as folder:
         CurvedGlass(Path(folder))
@@ -202,7 +199,6 @@ def _through_the_wire(sets: int) -> tuple[list[str], bool]:
 
 def _places_on(rig: Rig) -> FloatArray:
     """Places (n, 2) [m] for fingers, whole fingertips away from the edges of a surface."""
-
     around = MARGIN * np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]])
     found = list[Any]()
     for place in np.random.default_rng(2).uniform(0, (rig.plate.length, rig.plate.width), (999, 2)):
@@ -213,7 +209,6 @@ def _places_on(rig: Rig) -> FloatArray:
 
 def _some_of(places: FloatArray, number: int) -> Placement:
     """A target and one to three quiet fingers, 5 cm apart, of these places [m]."""
-
     rng = np.random.default_rng([5, number])
     while True:
         chosen = places[rng.choice(len(places), 2 + number % 3, replace=False)]
@@ -225,7 +220,6 @@ def _some_of(places: FloatArray, number: int) -> Placement:
 
 def _as_surface(rig: Rig, highest: float, folder: Path) -> Rig:
     """Return a rig with a surface in place of its plate, by the plate's modes up to a frequency."""
-
     arrays: dict[str, Any] = {**exported_modes(rig, highest, NODES)}
     arrays["damping_ratios"] = np.full(len(arrays["frequencies"]), rig.plate.loss_factor / 2)
     np.savez(folder / "modes.npz", **arrays)
@@ -242,7 +236,6 @@ def exported_modes(rig: Rig, highest: float, nodes: tuple[int, int]) -> dict[str
 
     nodes: numbers of nodes along x and y, at which shapes along z are given.
     """
-
     plate = rig.plate
     free = solve_free_plate(plate, rig.mesh, frequency_max=highest / FREQUENCY_MARGIN)
     places = lattice(np.linspace(0, plate.length, nodes[0]), np.linspace(0, plate.width, nodes[1]))

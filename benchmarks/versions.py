@@ -64,7 +64,6 @@ def main() -> None:
 
 def _tables() -> Iterator[tuple[str, str, Rig, LocalizationTable]]:
     """Names of plates, their uncertainty in words, rigs with it, and their tables."""
-
     known = replace(Uncertainty.none(), gain=0.01, phase_deg=1.0)
     for name in PLATES:
         rig = load_rig(RIG.parent / f"{name}.yaml")
@@ -76,7 +75,6 @@ def _tables() -> Iterator[tuple[str, str, Rig, LocalizationTable]]:
 
 def _placement(rig: Rig, quiet: int, number: int) -> Placement:
     """The fingers of a set."""
-
     rng = np.random.default_rng([SEED, quiet, number])
     size = (rig.plate.length, rig.plate.width)
     target, *others = random_contacts(rng, 1 + quiet, size, margin=MARGIN).tolist()
@@ -104,7 +102,6 @@ def _answers(sets: int) -> dict[str, list[dict[str, list[float]]]]:
 
 def _compared(before: dict[str, Any], after: dict[str, Any]) -> str:
     """A table of differences; its lines are printed as they come."""
-
     quiet_fingers = " / ".join(map(str, QUIET))
     lines = [
         f"| plate, uncertainty | contrast before, {quiet_fingers} quiet | mean difference | "
@@ -143,7 +140,6 @@ def _score(
     table: LocalizationTable, rig: Rig, quiet: int, number: int, tones: dict[str, list[float]]
 ) -> tuple[float, float]:
     """Felt contrast [dB] and level [dB SL] that nine of ten plates give."""
-
     question = _placement(rig, quiet, number)
     excitation = {era: Tone(*tone) for era, tone in tones.items()}
     if not rig.uncertainty.thickness:  # other plates of it would each take a solution

@@ -69,7 +69,6 @@ def score_entry(
 
     The score is the felt contrast that nine of ten of them give.
     """
-
     name, excitations = read_entry(file)
     with progress_bar("contact sets") as progress:
         scores = score(excitations, in_time=in_time, progress=progress)
@@ -111,7 +110,6 @@ def export_data_set(
     ],
 ) -> None:
     """Write the data set and the rig of each plate."""
-
     folder.mkdir(parents=True, exist_ok=True)
     for name, content in (
         (FILE.name, FILE.read_text(encoding="utf-8")),

@@ -473,7 +473,7 @@ def sizes(samples: FloatArray, status: StatusResult, rate: float) -> FloatArray:
     return np.asarray(np.linalg.norm(felt, axis=0))
 
 
-_AT_BOLT = 5e-3  # m; an additional mass nearer than that cannot be told from the bolt
+_AT_BOLT = 5e-3  # m; an additional mass nearer than that cannot be distinguished from the bolt
 
 
 @dataclass(frozen=True)

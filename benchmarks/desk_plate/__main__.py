@@ -128,7 +128,6 @@ def _run(running: JackPlate, plate: DeskPlate, *, until_eof: bool) -> None:
 
 def _changed(running: JackPlate, plate: DeskPlate, line: str) -> dict[str, object]:
     """Change what a line says; return what is there now."""
-
     try:
         wanted = json.loads(line)
         if "sensor" in wanted:

@@ -76,7 +76,6 @@ def main() -> None:
 
 def clicks_on(table: LocalizationTable, sets: int, seed: int) -> Clicks:
     """What is played for a click with one to three quiet fingers in turn."""
-
     rng, found = np.random.default_rng(seed), []
     for number in range(sets):
         places = random_contacts(rng, 2 + number % 3, table.plate, margin=0.013)
@@ -93,7 +92,6 @@ def given(
     Of each answer (a, plates): its level above the others' content at it, or of an only content
     above what is felt of it at the loudest other finger.
     """
-
     found = np.empty((len(answers), plates))
     for number, drawn in enumerate(_drawn_plates(table, rig, plates, seed)):
         for row, each in enumerate(answers):
@@ -107,7 +105,6 @@ def _drawn_plates(
     table: LocalizationTable, rig: Rig, plates: int, seed: int
 ) -> Iterator[tuple[LocalizationTable, ComplexArray, ComplexArray]]:
     """The table of each plate, and gains and second harmonics of its drives (eras,)."""
-
     drawn = draw_plates(
         np.random.default_rng(seed),
         rig.uncertainty,
@@ -153,7 +150,6 @@ def _felt_on(
 
     In time: over a duration, or at the strongest moments of a course; of what lasts the steady one.
     """
-
     contents, power = answer.contents, 0.0
     steady = RingingUnderFingers(
         table, contents.places, contents.loads, DriveEnvelope(np.ones(2), 1e-3, 1, share=0.0)

@@ -54,7 +54,6 @@ def main() -> None:
 
 def with_errors(sets: int, count: int, place: float | None) -> Iterator[tuple[str, list[str]]]:
     """Yield rows of plates with harmonics and further errors; place [m]: of ERAs, if given."""
-
     for case in [each for each in CASES if each.with_errors]:
         known = case.rig.uncertainty
         if place is not None:
@@ -68,7 +67,6 @@ def with_errors(sets: int, count: int, place: float | None) -> Iterator[tuple[st
 
 def after_weather(sets: int, count: int) -> Iterator[tuple[str, list[str]]]:
     """Yield rows of plates that were measured, after the weather has changed."""
-
     acrylic = load_rig(EXAMPLES / "paper_plate.yaml").replaced(
         plate={
             "material": "acrylic",
@@ -107,7 +105,6 @@ def kept_by(
     changed: Callable[[Plates], Plates] = lambda plates: plates,
 ) -> str:
     """Return cells of what is promised and kept on plates of an uncertainty, changed after."""
-
     kept, promised = [], []
     for number in range(sets):
         rng = np.random.default_rng([number, 77])
@@ -123,7 +120,6 @@ def kept_by(
 
 def contrasts_on(table: LocalizationTable, found: Answer, plates: Plates) -> FloatArray:
     """Contrast of each finger to the other's content on plates [dB], (2, d)."""
-
     places = [each.at for each in found.asked]
     placed, tips = Placement((places[0],), (places[1],)), read_fingertips(table, places)
     powers = []

@@ -20,7 +20,7 @@ import numpy as np
 
 from benchmarks.promise.cases import Case
 from benchmarks.setting import random_contacts
-from controller.sources.touch import HAND_MAJOR, LIGHT_FORCE, LIGHT_MAJOR, LightPress
+from controller.sources.touch import HAND_MAJOR, IN_MM, LIGHT_FORCE
 from model.answer.answer import Answer
 from model.answer.plan import answer
 from model.answer.stimulus import Finger, Stimulus
@@ -33,7 +33,6 @@ from model.vibration import base_amplitudes
 
 RIGS = (("paper_plate", False), ("paper_plate", True), ("car_display", True))
 OBJECT_AWAY = 0.03  # m
-BY_SIZE = LightPress(touch_major=LIGHT_MAJOR)
 PATCH = 0.0125  # m; of a patch of the heel from its middle, along x and along y
 OH_AND_CHOI = ((40.0, 3.5), (250.0, -7.0))
 """Thresholds of pressing fingers above those of the probe, by frequency [Hz] in dB."""
@@ -141,7 +140,6 @@ def _row(
     table: LocalizationTable, of: Situation, rng: np.random.Generator, count: int
 ) -> tuple[Answer, FloatArray]:
     """An answer, and by how much plates are above its promises (2, d) [dB]."""
-
     size = table.plate.length, table.plate.width
     margin = FINGERTIP_RADIUS + 0.001
     hand: Point | None = None
@@ -160,7 +158,7 @@ def _row(
     patches = _patches(table, places, hand, of, rng)
     quiet = [Finger((each.x, each.y), is_protected=False) for each in patches[: of.surplus]]
     if hand is not None:
-        quiet = [Finger(hand, load=BY_SIZE.load(touch_major=of.reported) or 0.0)]
+        quiet = [Finger(hand, load=IN_MM.load(touch_major=of.reported) or 0.0)]
     found = answer(
         table,
         [*fingers, *(quiet if of.is_counted else [])],
@@ -189,7 +187,6 @@ def _hand_at(
     distance: float,
 ) -> Point | None:
     """Where a hand rests: so far from the nearer finger, or in the corner farthest from both."""
-
     margin = 2 * PATCH
     if not distance:
         corners = [(x, y) for x in (margin, size[0] - margin) for y in (margin, size[1] - margin)]
@@ -210,7 +207,6 @@ def _patches(
     rng: np.random.Generator,
 ) -> list[FingertipLoad]:
     """Loads of a hand's patches, or of objects or fingers at least 3 cm from others."""
-
     tip, sides = table.fingertip or Fingertip(), (table.plate.length, table.plate.width)
     if hand is None:
         load, spots = object_load(of.mass) if of.mass else tip, list[Point]()
@@ -239,7 +235,6 @@ def contrasts_on(
 
     The least over all sets of thresholds; by those of a person if there is one.
     """
-
     tip, places = table.fingertip or Fingertip(), [each.at for each in found.asked[:2]]
     pressed = tip.scaled((of.force / LIGHT_FORCE) ** (2 / 3))
     loads = [*(FingertipLoad(*at, pressed) for at in places), *patches]

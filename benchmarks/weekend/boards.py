@@ -69,7 +69,6 @@ class Board:
     @property
     def rig(self) -> Rig:
         """Its rig, from where magnets stay within their excursion; raises ConfigError."""
-
         rig = load_rig(ROOT / "examples" / "weekend" / "rig.yaml")
         data: Any = rig.document.data if rig.document else {}
         made = rig.replaced(
@@ -164,7 +163,6 @@ def _line(board: Board, found: Expected) -> str:
 
 def expected(board: Board, touches: int, plates: int) -> Expected:
     """Answers and levels of a board."""
-
     rig = board.rig
     frequencies = np.arange(rig.limits.frequency_min, rig.limits.frequency_max + 1, STEP)
     table = build_table(rig, frequencies=frequencies, drive_mode="phased")
@@ -184,7 +182,6 @@ def _touches(
     table: LocalizationTable, drawn: Sequence[SolvedPlate], quiet: int, count: int
 ) -> Iterator[tuple[float, bool]]:
     """Yield what is promised to random touches, and whether a drawn board keeps it."""
-
     plate = table.plate
     rng = np.random.default_rng([SEED, quiet])
     for number in range(count):
@@ -198,7 +195,6 @@ def _touches(
 
 def contrast(plate: SolvedPlate, answer: Any) -> float:
     """Felt contrast [dB] of an answer in the steady state of a plate under its fingers."""
-
     fingers, size = [each.finger.at for each in answer.fingers], plate.rig.plate
     points, weights = fingertips_on(np.array(fingers), length=size.length, width=size.width)
 
@@ -213,7 +209,6 @@ def sensed(
     answer: Any, rig: Rig, response: Callable[[float], ComplexArray], weights: FloatArray
 ) -> float:
     """Felt contrast [dB]; response: of a frequency, (e, k p) [m/s²] under k fingertips."""
-
     names = [each.name for each in rig.eras]
     squares: FloatArray = np.zeros(weights.size)
     for layer in answer.layers:
@@ -227,13 +222,11 @@ def sensed(
 
 def felt_contrast(felt: FloatArray, weights: FloatArray) -> float:
     """Contrast [dB] of what is felt (k, p), relative to the threshold, the target first."""
-
     return float(decibels(felt[0] @ np.reshape(weights, felt.shape)[0] / felt[1:].max()))
 
 
 def levels(plate: SolvedPlate, frequencies: Sequence[float]) -> dict[float, float]:
     """Least level [dB SL] over the board but its edges, under a finger, all exciters in phase."""
-
     rig = plate.rig
     x, y = (
         np.linspace(EDGE, side - EDGE, count)

@@ -316,7 +316,8 @@ class LightPress:
         return float(size**_BY_SIZE) if size > 0 else None
 
 
-_IN_MM = LightPress(touch_major=LIGHT_MAJOR)
+IN_MM = LightPress(touch_major=LIGHT_MAJOR)
+"""What the longer axis [mm] of a contact says of its load."""
 
 
 def followed(known: float, reported: float) -> float:
@@ -571,7 +572,7 @@ class ContactTracker:
         x, y, reported = touch.x * length, (1 - touch.y) * width, touch.load
         if reported is None and touch.size is not None:
             longer = max(touch.size[0] * length, touch.size[1] * width)
-            reported = _IN_MM.load(touch_major=1e3 * longer)
+            reported = IN_MM.load(touch_major=1e3 * longer)
         if (largest := max(load, reported or 0.0)) > MAX_FINGER_LOAD:
             largest = min(largest, MAX_HAND_LOAD)
             return Contact(key, x, y, since, load if largest < MIN_CHANGE * load else largest)

@@ -200,8 +200,8 @@ class Finger:
     @property
     def is_load(self) -> bool:
         """Whether its load alone counts: a hand that rests, or what asks for nothing at all."""
-        is_quiet = self.stimulus is None and self.is_protected
-        return self.load > MAX_FINGER_LOAD or not (is_quiet or self.stimulus)
+        asks_nothing = self.stimulus is None and not self.is_protected
+        return asks_nothing or self.load > MAX_FINGER_LOAD
 
     @property
     def name(self) -> str | None:

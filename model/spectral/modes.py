@@ -279,7 +279,7 @@ class _Space:
             mode = np.linalg.solve(A - value * (1 + 1e-12) * B, B @ mode)
             mode /= np.linalg.norm(mode)
         norms = np.vdot(mode, mode) * np.vdot(start, start)
-        if abs(np.vdot(mode, start)) ** 2 <= 0.5 * norms.real:  # mostly another than that of before
+        if not abs(np.vdot(mode, start)) ** 2 > 0.5 * norms.real:  # mostly another mode, or NaN
             values, modes = np.linalg.eig(np.linalg.solve(B, A))
             nearest = int(np.argmax(np.abs(start @ self._mass @ modes)))
             value, mode = complex(values[nearest]), modes[:, nearest]

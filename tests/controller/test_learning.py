@@ -131,7 +131,7 @@ class Learned(Taken):
 
     @property
     def event(self) -> PlateEvent:
-        """What clients are told; a change that is logged has been told to them."""
+        """What is published to clients; a change that is logged has been published."""
         assert self.learning.event in (self.events or [self.learning.event])[-1:] or not self.log
         return self.learning.event
 

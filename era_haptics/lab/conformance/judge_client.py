@@ -510,9 +510,9 @@ class Dating:
 
     def expect_steady(self, otherwise: type[ContractViolation] = ContractViolation) -> None:
         """Raise ContractViolation, or another one, where readings contradict each other."""
-        if (wrong := f"{1e3 * self.error:.3g} ms") != "0 ms":
+        if self.error > 0:
             what = "by how much readings of its clock contradict each other"
-            raise otherwise(what, expected="0 ms", seen=wrong)
+            raise otherwise(what, expected="0 ms", seen=f"{1e3 * self.error:.3g} ms")
 
     def between(self, earliest: float, latest: float) -> When:
         """Return an interval; raises ContractViolation for an empty one."""

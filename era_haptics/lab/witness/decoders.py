@@ -169,9 +169,10 @@ class _Written:
 
 
 class _Transaction(NamedTuple):
-    """One whose response is missing.
+    """A transaction whose response is missing.
 
-    request: None where it is none; shows: the message whose reply it reads, as it was written.
+    request: None for a malformed one; shows: name of the message whose reply is read; written: the
+    write of that message before it.
     """
 
     adu: Adu

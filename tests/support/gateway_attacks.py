@@ -140,7 +140,7 @@ class Attacker:
                 writer.transport.pause_reading()  # type: ignore[attr-defined]
             discarding = asyncio.create_task(_discard(reader)) if reads else None
             writer.write(first)
-            with contextlib.suppressTimeoutError, ConnectionError:
+            with contextlib.suppress(TimeoutError, ConnectionError):
                 async with asyncio.timeout(self.seconds):
                     while not writer.transport.is_closing():
                         writer.write(data)
@@ -190,7 +190,7 @@ class Attacker:
     async def _send_all(self, parts: Sequence[bytes]) -> str:
         """The status of the response to a request in parts."""
         reader, writer = await self._open()
-        with contextlib.suppressConnectionError:
+        with contextlib.suppress(ConnectionError):
             for part in parts:
                 writer.write(part)
                 await asyncio.wait_for(writer.drain(), self.seconds)
@@ -204,7 +204,7 @@ class Attacker:
 
 
 async def _discard(reader: asyncio.StreamReader) -> None:
-    with contextlib.suppressConnectionError:
+    with contextlib.suppress(ConnectionError):
         while await reader.read(1 << 16):
             pass
 

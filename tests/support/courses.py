@@ -1,14 +1,14 @@
 """Courses in virtual time: lists of steps in a YAML file, by the sentence that they prove.
 
-A step is a method of what is played or, with dots, of its parts; or `is`: values of properties as
-`fits` compares them. What is given by number, as of fingers, is given as it is.
-`calls` lists calls of the project's own functions, without those of far ends and judges.
+A step is a method of what is played or, with dots, of its parts; or `is`: values as `fits` compares
+them, each by the name of a property or method, or by a Python expression of such names:
+`len(taken)`, `hosts.a.status["levels"][0]`. What is given by number, as of fingers, is given as it
+is. `calls` lists calls of the project's own functions, without those of far ends and judges.
 """
 
 import asyncio
 import inspect
 import logging
-import math
 import operator
 import sys
 import types
@@ -49,6 +49,21 @@ class Planted(Exception):
     """A bug."""
 
 
+class Names(dict[str, Any]):
+    """What the names in an expression mean: attributes of what is played, and a few functions.
+
+    A property is looked up only when the expression names it.
+    """
+
+    def __init__(self, played: object) -> None:
+        few = (abs, all, any, dict, len, list, max, min, round, set, sorted, sum)
+        super().__init__({each.__name__: each for each in few}, __builtins__={})
+        self.played = played
+
+    def __missing__(self, name: str) -> Any:
+        return getattr(self.played, name)
+
+
 @dataclass(kw_only=True)
 class Taken:
     """What takes the steps of courses; under_way: those that have begun; error: the last of one.
@@ -69,6 +84,12 @@ class Taken:
     def levels_logged(self) -> list[str]:
         """The level of each record."""
         return [each.levelname for each in self.log]
+
+    def value(self, expression: str) -> Any:
+        """What an expression is, or what the method that it names returns."""
+        names = Names(self)
+        found = eval(expression, names, names)
+        return found() if callable(found) else found
 
     async def waits(self, seconds: float) -> None:
         """Let time pass."""
@@ -109,15 +130,15 @@ class Taken:
 
     def says(self, what: str, text: str) -> None:
         """Require a part of a text."""
-        assert text in attrgetter(what)(self), attrgetter(what)(self)
+        assert text in self.value(what), self.value(what)
 
     def lacks(self, what: str, text: str) -> None:
         """Require that a text is no part of another."""
-        assert text not in attrgetter(what)(self), attrgetter(what)(self)
+        assert text not in self.value(what), self.value(what)
 
     def counts(self, **numbers: int) -> None:
         """Require the numbers of what was reported."""
-        found = {what: len(attrgetter(what)(self)) for what in numbers}
+        found = {what: len(self.value(what)) for what in numbers}
         assert found == numbers
 
     async def refuses(self, step: Step) -> None:
@@ -133,7 +154,7 @@ class Taken:
         """Take a step."""
         ((name, given),) = step.items() if isinstance(step, Mapping) else [(step, [])]
         if name == "is":
-            found = {what: _value(attrgetter(what)(self)) for what in given}
+            found = {what: self.value(what) for what in given}
             assert fits(found, given), {what: found[what] for what in given}
             return
         method = attrgetter(name.replace(" ", "_"))(self)
@@ -177,34 +198,9 @@ class Acted(Taken, Chain):
         return any(map(any, self.levels().values()))
 
     @property
-    def opened(self) -> int:
-        """How often a line to the first amplifier was opened."""
-        return self.operation.attempts[self.far_end.port]
-
-    @property
-    def degraded(self) -> list[str]:
-        """Amplifiers that do not reply but may play."""
-        return [*self.controller.group.members.degraded]
-
-    @property
     def is_armed(self) -> bool:
         """Whether any amplifier is."""
         return "OPERATION_ENABLED" in self.amplifiers.split(", ")
-
-    @property
-    def latencies_ms(self) -> list[float]:
-        """Of each pattern."""
-        return [round(1e3 * (each.latency or math.nan), 2) for each in self.applied]
-
-    @property
-    def latencies_from_ms(self) -> list[float]:
-        """Of each pattern, down to 5 ms."""
-        return [each // 5 * 5 for each in self.latencies_ms]
-
-    @property
-    def reason(self) -> str:
-        """Why it fell silent last."""
-        return self.silenced[-1].reason
 
     def played(self) -> list[list[Any]]:
         """The commands of each set that vibrates, of the first amplifier."""
@@ -214,11 +210,6 @@ class Acted(Taken, Chain):
     def keep_phase(self) -> list[list[bool]]:
         """Of each set that vibrates, the channels that continue their phase."""
         return [[each.keep_phase for each in commands] for commands in self.played()]
-
-    @property
-    def frequencies(self) -> list[int]:
-        """Of each set that vibrates, that of the first channel [0.05 Hz]."""
-        return [commands[0].frequency for commands in self.played()]
 
     def touch(self, *fingers: str, ago: float = 0.0) -> None:
         """Put fingers down in place of all that are, once."""
@@ -354,11 +345,6 @@ class Acted(Taken, Chain):
         kinds = self.far_end.names()
         found = [kinds.index(name) for name in names]
         assert found == sorted(found), kinds
-
-
-def _value(found: Any) -> Any:
-    """What a property is, or a method returns."""
-    return found() if callable(found) else found
 
 
 _COMPARED = {"<": operator.lt, "<=": operator.le, ">": operator.gt, ">=": operator.ge}

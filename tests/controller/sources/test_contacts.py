@@ -1,5 +1,9 @@
-"""Contacts that are tracked from touch frames, and the speed of a finger on a panel with errors."""
+"""Contacts that are tracked from touch frames, and the speed of a finger on a panel with errors.
 
+What a source rejects is counted.
+"""
+
+import logging
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -17,6 +21,7 @@ from controller.sources.touch import (
     ContactKey,
     ContactTracker,
     Motion,
+    RejectCounter,
     Touch,
     TouchFrame,
     turned,
@@ -492,3 +497,24 @@ def test_a_hand_is_one_until_it_is_lifted() -> None:
         (contact,) = tracker.contacts
         seen.append((contact.is_hand, contact.load, contact.motion.is_under_way))
     assert seen == [(load > 1, load, False) for load in (1.0, *[12.0] * 3, *[19.0] * 2)]
+
+
+def test_reject_counter_logs_once_per_interval(caplog: pytest.LogCaptureFixture) -> None:
+    """A thousand bad datagrams within a second are all counted and make one line, as do later.
+
+    The first of another reason makes one at once.
+    """
+    now = 0.0
+    rejects = RejectCounter(logging.getLogger("bad input"), clock=lambda: now)
+    for _ in range(1000):
+        rejects.count("malformed", "ends too early")
+    assert rejects.counts == {"malformed": 1000}
+    assert len(caplog.records) == 1
+    rejects.count("late", "frame\x1b[2J 3")
+    assert len(caplog.records) == 2
+    assert "new=1000" in caplog.records[1].getMessage()
+    assert "late 1, malformed 1000" in caplog.records[1].getMessage()
+    assert "\x1b" not in rejects.examples["late"]
+    now = 1.0
+    rejects.count("late", "frame 4")
+    assert len(caplog.records) == 3

@@ -8,7 +8,7 @@ import contextlib
 import errno
 import os
 import struct
-from collections.abc import Callable, Coroutine, Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -24,7 +24,6 @@ from controller.sources.evdev import (
     EvdevSource,
     InputDevice,
     InputEvent,
-    PanelReport,
     SlotReader,
     SlotState,
     as_slot_event,
@@ -34,8 +33,9 @@ from controller.sources.evdev import (
 )
 from controller.sources.touch import TouchFrame
 from model.errors import InputError
+from registry import threads
 from registry.limits import HAND_LOAD
-from virtual_lines import run_virtual
+from virtual_lines import START, run_virtual
 
 EMPTY = SlotState(-1, 0, 0)
 KINDS = {
@@ -63,7 +63,7 @@ class PipePanel:
         self.resolutions: dict[int, int] = {}
         self.current_slot = 0
         self.state = {0: EMPTY, 1: EMPTY}
-        self.is_gone = 0  # the number of an error
+        self.error: OSError | None = None
         self._out, self.into = os.pipe()
         os.set_blocking(self._out, False)
 
@@ -73,14 +73,14 @@ class PipePanel:
 
     def slots(self) -> dict[int, SlotState]:
         """Return the state that a test has set."""
-        if self.is_gone:
-            raise OSError(self.is_gone, "gone")
+        if self.error:
+            raise self.error
         return self.state
 
     def read(self) -> list[InputEvent]:
         """Return the events in the pipe."""
-        if self.is_gone:
-            raise OSError(self.is_gone, "gone")
+        if self.error:
+            raise self.error
         try:
             return list(parse_events(os.read(self._out, 4096)))
         except BlockingIOError:
@@ -92,33 +92,47 @@ class PipePanel:
         os.close(self.into)
 
 
-async def follow(
-    panels: list[PipePanel], play: Callable[[], Coroutine[Any, Any, None]], *, options: str = ""
-) -> list[TouchFrame]:
-    """What a source delivers [s from the start] while something plays; panels are opened in turn.
+Happens: TypeAlias = bytes | float | Mapping[int, SlotState] | OSError
+"""Bytes that a panel sends, a time [s] that passes, or a state or an error of it from then on."""
 
-    An exception that the source raises is raised here. options: of its URL.
+
+def delivered(panel: PipePanel, *happens: Happens, options: str = "") -> list[TouchFrame]:
+    """What a source delivers [s from the start] while things happen; options: of its URL.
+
+    An exception that the source raises is raised here.
     """
     seen: list[TouchFrame] = []
-    start = asyncio.get_running_loop().time()
 
-    def deliver(frame: TouchFrame) -> None:
-        assert frame.source == "evdev:p"
-        seen.append(replace(frame, time=round(frame.time - start, 6)))
+    async def follow() -> None:
+        start = threads.now()
 
-    def open_panel(path: str, *, grab: bool) -> PipePanel:
-        if not panels:
-            raise InputError("not there")
-        return panels.pop(0)
+        def deliver(frame: TouchFrame) -> None:
+            assert frame.source == "evdev:p"
+            seen.append(replace(frame, time=round(frame.time - start, 6)))
 
-    source = EvdevSource(f"evdev:p{options}", open_panel=open_panel)
-    running = asyncio.create_task(source.run(deliver))
-    await asyncio.sleep(0)
-    await play()
-    running.cancel()
-    with contextlib.suppress(asyncio.CancelledError):
-        await running
+        source = EvdevSource(f"evdev:p{options}", open_panel=lambda path, *, grab: panel)
+        running = asyncio.create_task(source.run(deliver))
+        await asyncio.sleep(0)
+        for each in happens:
+            if isinstance(each, bytes):
+                os.write(panel.into, each)
+            elif isinstance(each, Mapping):
+                panel.state = {0: EMPTY, 1: EMPTY, **each}
+            elif isinstance(each, OSError):
+                panel.error = each
+            else:
+                await asyncio.sleep(each)
+        running.cancel()
+        with contextlib.suppress(asyncio.CancelledError):
+            await running
+
+    run_virtual(follow())
     return seen
+
+
+def spaced(seconds: float, *reports: str) -> list[Happens]:
+    """Reports, each followed by a time [s]."""
+    return [each for words in reports for each in (raw(words), seconds)]
 
 
 def touches_of(frames: Iterable[TouchFrame]) -> list[dict[int, tuple[float, float]]]:
@@ -135,16 +149,9 @@ def test_evdev_source_follows_fingers() -> None:
     panel = PipePanel()
     panel.state = {0: EMPTY, 1: SlotState(5, 500, 250)}
     panel.current_slot = 1
-
-    async def play() -> None:
-        for words in ("x 600", "slot 0 id 7 x 250 y 100", "x 300", "slot 1 id -1"):
-            os.write(panel.into, raw(words))
-            await asyncio.sleep(0.01)
-        panel.state = {0: EMPTY, 1: SlotState(9, 1000, 0)}
-        os.write(panel.into, raw("slot 0 x 900", dropped=True))
-        await asyncio.sleep(0.01)
-
-    assert touches_of(run_virtual(follow([panel], play))) == [
+    reports = spaced(0.01, "x 600", "slot 0 id 7 x 250 y 100", "x 300", "slot 1 id -1")
+    dropped = raw("slot 0 x 900", dropped=True)
+    assert touches_of(delivered(panel, *reports, {1: SlotState(9, 1000, 0)}, dropped, 0.01)) == [
         {5: (0.5, 0.5)},
         {5: (0.6, 0.5)},
         {5: (0.6, 0.5), 7: (0.25, 0.2)},
@@ -159,16 +166,8 @@ def test_evdev_source_repeats_resting_fingers() -> None:
 
     A lift without an event is noticed then.
     """
-    panel = PipePanel()
-
-    async def play() -> None:
-        os.write(panel.into, raw("id 7 x 0 y 0"))
-        panel.state = {0: SlotState(7, 0, 0), 1: EMPTY}
-        await asyncio.sleep(0.12)
-        panel.state = {0: EMPTY, 1: EMPTY}
-        await asyncio.sleep(0.2)
-
-    seen = run_virtual(follow([panel], play))
+    landed = raw("id 7 x 0 y 0")
+    seen = delivered(PipePanel(), landed, {0: SlotState(7, 0, 0)}, 0.12, {}, 0.2)
     assert [frame.time for frame in seen] == [0.0, 0.0, 0.05, 0.1, 0.15]
     assert touches_of(seen) == [{}, *[{7: (0.0, 0.0)}] * 3, {}]
 
@@ -181,19 +180,13 @@ def test_evdev_source_knows_palms_and_no_pens() -> None:
     """
     panel = PipePanel()
     panel.state = {0: SlotState(5, 500, 250, tool=2), 1: SlotState(6, 500, 250, distance=3)}
-
-    async def play() -> None:
-        for words in (
-            *("slot 0 tool 0", "tool 2", "tool 1", "slot 1 distance 0", "distance 1"),
-            *("id -1 slot 0 id -1", "id 7 tool 2 x 250 y 100", "id 8", "id 9 tool 0"),
-        ):
-            os.write(panel.into, raw(words))
-            await asyncio.sleep(0.001)
-        panel.state = {0: SlotState(9, 250, 100, tool=2), 1: EMPTY}
-        await asyncio.sleep(0.05)
-
+    reports = spaced(
+        0.001,
+        *("slot 0 tool 0", "tool 2", "tool 1", "slot 1 distance 0", "distance 1"),
+        *("id -1 slot 0 id -1", "id 7 tool 2 x 250 y 100", "id 8", "id 9 tool 0"),
+    )
     middle, corner = (0.5, 0.5), (0.25, 0.2)
-    seen = run_virtual(follow([panel], play))
+    seen = delivered(panel, *reports, {0: SlotState(9, 250, 100, tool=2)}, 0.05)
     assert touches_of(seen) == [
         {5: middle},
         *({5: middle}, {5: middle}, {}, {6: middle}, {}),
@@ -224,54 +217,42 @@ def test_evdev_source_reports_loads(
     """By force where the pressure has a unit or a value of its own, else by size."""
     panel = PipePanel()
     panel.resolutions = resolutions
-
-    async def play() -> None:
-        os.write(panel.into, raw("id 7 x 0 y 0 pressure 510 major 188"))
-        await asyncio.sleep(0.01)
-
-    seen = run_virtual(follow([panel], play, options=options))
-    (touch,) = seen[-1].touches
+    landed = raw("id 7 x 0 y 0 pressure 510 major 188")
+    (touch,) = delivered(panel, landed, 0.01, options=options)[-1].touches
     assert touch.load == (None if load is None else pytest.approx(load, rel=2e-3))
 
 
+GONE = OSError(errno.ENODEV, "gone")
+
+
 @pytest.mark.parametrize(
-    ("notices", "number", "words"),
+    ("at_first", "happens", "words"),
     [
-        ("by reading", errno.ENODEV, "lost.*plug it in"),
-        ("by polling", errno.ENODEV, "lost.*plug it in"),
-        ("at once", errno.EINVAL, "type A"),
+        (None, (0.01, GONE, b"x", 0.05), "lost.*plug it in"),  # one that goes becomes readable
+        (None, (0.01, GONE, 0.05), "lost.*plug it in"),
+        (OSError(errno.EINVAL, "no slots"), (), "type A"),
     ],
+    ids=["noticed by reading", "noticed by polling", "at once"],
 )
-def test_evdev_source_ends_without_a_panel(notices: str, number: int, words: str) -> None:
+def test_evdev_source_ends_without_a_panel(
+    at_first: OSError | None, happens: tuple[Happens, ...], words: str
+) -> None:
     """Within 60 ms of being unplugged, and at once for a panel without slots: EINVAL."""
     panel = PipePanel()
     panel.state = {0: SlotState(7, 0, 0), 1: EMPTY}
-    panel.is_gone = number if notices == "at once" else 0
-
-    async def play() -> None:
-        await asyncio.sleep(0.01)
-        panel.is_gone = number
-        if notices == "by reading":
-            os.write(panel.into, b"x")  # a device that goes becomes readable
-        await asyncio.sleep(0.05)
-
+    panel.error = at_first
     with pytest.raises(InputError, match=words):
-        run_virtual(follow([panel], play))
+        delivered(panel, *happens)
 
 
 def test_evdev_source_has_the_times_of_the_kernel() -> None:
     """When an event happened, not when it was read; now, if it is of another clock."""
-    panel = PipePanel()
-
-    async def play() -> None:
-        start = asyncio.get_running_loop().time()
-        await asyncio.sleep(5)
-        for happened in (4.98, 6.0, 3.0):
-            os.write(panel.into, raw("id 7 x 0 y 0", at=start + happened))
-            os.write(panel.into, raw("id -1", at=start + happened))
-        await asyncio.sleep(0.01)
-
-    seen = run_virtual(follow([panel], play))
+    happened = [
+        raw(words, at=START + time)
+        for time in (4.98, 6.0, 3.0)
+        for words in ("id 7 x 0 y 0", "id -1")
+    ]
+    seen = delivered(PipePanel(), 5.0, *happened, 0.01)
     assert [frame.time for frame in seen] == [0.0, 4.98, 4.98, 5.0, 5.0, 5.0, 5.0]
 
 
@@ -351,23 +332,20 @@ def test_input_device_refuses_what_is_no_usable_panel(
 def test_input_device_opens_a_panel(monkeypatch: pytest.MonkeyPatch, slots: int) -> None:
     """It has the ranges of its axes, and the kernel's values of all slots, of an only one, too."""
     kernel(monkeypatch, width=1000, slots=slots)
-    device = InputDevice("/dev/null")
-    assert device.ranges == {0x35: (0, 1000), 0x36: (0, 1000)}
-    assert device.resolutions == {0x35: 12, 0x36: 0, 0x3A: 3, 0x30: 0}
-    assert len(device.slots()) == slots
-    assert device.slots()[slots - 1] == SlotState(
-        *(axis + slots - 1 for axis in (0x39, 0x35, 0x36, 0x37, 0x3B, 0x3A, 0x30))
-    )
-    device.close()
+    with contextlib.closing(InputDevice("/dev/null")) as device:
+        assert device.ranges == {0x35: (0, 1000), 0x36: (0, 1000)}
+        assert device.resolutions == {0x35: 12, 0x36: 0, 0x3A: 3, 0x30: 0}
+        axes = (0x39, 0x35, 0x36, 0x37, 0x3B, 0x3A, 0x30)
+        expected = {n: SlotState(*(axis + n for axis in axes)) for n in range(slots)}
+        assert device.slots() == expected
 
 
 def test_input_device_reads_a_panel_for_a_single_finger(monkeypatch: pytest.MonkeyPatch) -> None:
     """Without multi-touch axes: ABS_X, ABS_Y, ABS_PRESSURE and BTN_TOUCH, as those of a slot."""
     kernel(monkeypatch, width=1000, missing=(0x35, 0x36, 0x3A, 0x2F))
-    device = InputDevice("/dev/null")
-    assert device.ranges == {0x35: (0, 1000), 0x36: (0, 1000)}
-    assert device.slots() == {0: SlotState(0, x=0x0, y=0x1, pressure=0x18)}
-    device.close()
+    with contextlib.closing(InputDevice("/dev/null")) as device:
+        assert device.ranges == {0x35: (0, 1000), 0x36: (0, 1000)}
+        assert device.slots() == {0: SlotState(0, x=0x0, y=0x1, pressure=0x18)}
     events = [(3, 0, 250), (3, 1, 100), (3, 0x18, 9), (1, 0x14A, 1), (1, 0x14A, 0), (0, 0, 0)]
     assert [as_slot_event((2.5, *event)) for event in events] == [
         *((2.5, 3, 0x35, 250), (2.5, 3, 0x36, 100), (2.5, 3, 0x3A, 9)),
@@ -381,24 +359,17 @@ CODES = KINDS | {"dropped": (0, 3)}
 RANGES = {0x35: (0, 1000), 0x36: (-100, 100), 0x3A: (0, 255), 0x30: (0, 255)}
 
 
-def report(reader: SlotReader, words: str) -> PanelReport:
-    """The report of events such as `slot 0 id 7 x 100 y 50`."""
-    pairs = words.split()
-    for code, value in zip(pairs[::2], pairs[1::2], strict=True):
-        assert reader.feed(*CODES[code], int(value)) is None
-    found = reader.feed(0, 0, 0)
-    assert found is not None
-    return found
-
-
 def shown(reports: Iterable[tuple[float, str]]) -> Shown:
-    """States of a panel with their times, touches by id."""
-    reader = SlotReader(RANGES)
-    return [
-        (time, {touch.id: (touch.x, touch.y) for touch in touches})
-        for time, words in reports
-        for touches in report(reader, words).states
-    ]
+    """States of a panel by reports such as `slot 0 id 7 x 100 y 50`, at times; touches by id."""
+    reader, found = SlotReader(RANGES), list[tuple[float, dict[int, tuple[float, float]]]]()
+    for time, words in reports:
+        pairs = words.split()
+        for code, value in zip(pairs[::2], pairs[1::2], strict=True):
+            assert reader.feed(*CODES[code], int(value)) is None
+        report = reader.feed(0, 0, 0)
+        assert report is not None
+        found += [(time, {one.id: (one.x, one.y) for one in each}) for each in report.states]
+    return found
 
 
 SEQUENCES: dict[str, tuple[list[tuple[float, str]], Shown]] = {

@@ -1,21 +1,41 @@
-"""TUIO 1.1 cursors and blobs over UDP."""
+"""TUIO 1.1 cursors and blobs over UDP, and recorded streams of them.
+
+Also datagrams that come too many or while the loop is busy, and none from a finger that rests.
+"""
 
 import asyncio
 import math
+import os
 import socket
 import struct
-from collections.abc import Mapping, Sequence
-from typing import Any
+import sys
+import time
+from collections.abc import AsyncIterator, Awaitable, Callable, Mapping, Sequence
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Any, TypeAlias
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from pythonosc.osc_message_builder import OscMessageBuilder
 
-from controller.sources.touch import Touch, TouchFrame
-from controller.sources.tuio import TuioSource
-from examples.make_touches import tuio_datagram
+from controller.cli.main import run
+from controller.sources.touch import ContactTracker, Touch, TouchFrame
+from controller.sources.tuio import (
+    HEADER,
+    MAX_BYTES,
+    RecordedDatagram,
+    TuioSource,
+    read_capture,
+    replay_capture,
+)
+from controller.sources.udp_source import BACKLOG_THRESHOLD, Datagram, Datagrams, Peer, listen
+from drivers.errors import LinkError
+from examples.make_touches import tuio_datagram, write_capture
 from model.errors import InputError
+from plates import make_paper_rig
 from several_fingers import bundle, cursor, frame, free_port, message
 from virtual_lines import in_virtual_time
 
@@ -316,8 +336,8 @@ COURSES: Mapping[str, tuple[dict[str, Any], Sequence[Read]]] = {
 def test_reader_follows_its_senders(reader: TuioSource, name: str) -> None:
     """What is read of each datagram, and what is counted in the end."""
     expected, datagrams = COURSES[name]
-    for time, peer, datagram, wanted in datagrams:
-        result = reader.read(datagram, peer, time)
+    for at, peer, datagram, wanted in datagrams:
+        result = reader.read(datagram, peer, at)
         if wanted is not ...:
             assert (None if result is None else touches(result)) == wanted
     found = reader.rejects.counts
@@ -524,3 +544,298 @@ def test_tuio_source_defaults_of_urls(url: str, host: str, port: int) -> None:
     """A URL without host or port means the loopback and the registered port."""
     source = TuioSource(url)
     assert (source.host, source.port) == (host, port)
+
+
+PAUSE = 0.02  # s
+
+Send: TypeAlias = Callable[..., Awaitable[list[tuple[bytes, float]]]]
+
+
+@asynccontextmanager
+async def receiving() -> AsyncIterator[Send]:
+    """Sends datagrams while the loop is busy; returns them with their reported arrival.
+
+    pause [s]: after each of them.
+    """
+    received: asyncio.Queue[tuple[bytes, float]] = asyncio.Queue()
+
+    def feed(data: bytes, peer: Peer, arrived: float) -> None:
+        assert peer == sender.getsockname()
+        received.put_nowait((data, arrived))
+
+    async def send(*datagrams: bytes, pause: float = 0.0) -> list[tuple[bytes, float]]:
+        for datagram in datagrams:
+            sender.sendto(datagram, ("127.0.0.1", line.port))
+            time.sleep(pause)  # noqa: ASYNC251  the loop is to be busy
+        async with asyncio.timeout(60):
+            return [await received.get() for _ in datagrams]
+
+    line = await listen("127.0.0.1", 0, feed, max_size=100)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        sender.bind(("127.0.0.1", 0))
+        try:
+            yield send
+        finally:
+            line.close()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="timestamps of Linux")
+async def test_datagrams_have_their_time_of_arrival() -> None:
+    """However late they are read, arrivals are as far apart as they were sent, and in the past.
+
+    Linux begins some time after the first socket requested it; until then they have the time at
+    which they are read.
+    """
+    loop = asyncio.get_running_loop()
+    async with receiving() as send, asyncio.timeout(60):
+        arrived = math.inf
+        while arrived >= loop.time() - PAUSE / 2:
+            ((_, arrived),) = await send(b"0", pause=PAUSE)
+        begin = loop.time()
+        received = await send(b"1", b"2", b"3", pause=PAUSE)
+    assert [data for data, _ in received] == [b"1", b"2", b"3"]
+    first, *others = [arrived for _, arrived in received]
+    assert begin - 0.1 * PAUSE <= first
+    assert min(np.diff([first, *others, loop.time()])) > 0.9 * PAUSE
+
+
+async def test_oversized_datagram_is_cut_to_one_byte_more() -> None:
+    """The receiver sees by its size that it was cut."""
+    async with receiving() as send:
+        (short, _), (long, _) = await send(bytes(100), bytes(150))
+    assert (len(short), len(long)) == (100, 101)
+
+
+async def test_receiver_may_close_within_its_callback() -> None:
+    """Datagrams that arrived after that one are not handed on."""
+    received: list[bytes] = []
+    lines: list[Datagrams] = []
+    done = asyncio.Event()
+
+    def feed(data: bytes, peer: Peer, arrived: float) -> None:
+        received.append(data)
+        lines[0].close()
+        done.set()
+
+    lines.append(await listen("127.0.0.1", 0, feed, max_size=100))
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        for datagram in (b"1", b"2"):
+            sender.sendto(datagram, ("127.0.0.1", lines[0].port))
+    async with asyncio.timeout(60):
+        await done.wait()
+    await asyncio.sleep(0)
+    assert received == [b"1"]
+
+
+async def test_datagrams_have_the_time_of_reading_when_the_clock_was_set(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A clock that jumps by an hour between arrival and reading does not make touches old."""
+    loop = asyncio.get_running_loop()
+    begin = loop.time()
+    clock = time.time
+    monkeypatch.setattr(time, "time", lambda: clock() + 3600)
+    async with receiving() as send:
+        ((_, arrived),) = await send(b"1", pause=PAUSE)
+    assert begin + 0.9 * PAUSE < arrived <= loop.time()
+
+
+def partial(source: str, alive: list[int], places: dict[int, float]) -> bytes:
+    """A bundle with the positions of only some cursors, as TUIO 1.1 allows."""
+    cursors = (cursor(id, x, x) for id, x in places.items())
+    return bundle(message("source", source), message("alive", *alive), *cursors)
+
+
+def full(source: str, *ids: int) -> bytes:
+    """A bundle with all positions."""
+    return tuio_datagram(TouchFrame(source, 0.0, tuple(Touch(id, 0.5, 0.5) for id in ids)), -1)
+
+
+def waiting(*sent: tuple[bytes, Peer]) -> list[Datagram]:
+    """Datagrams in order of arrival."""
+    return [Datagram(data, peer, float(number)) for number, (data, peer) in enumerate(sent)]
+
+
+BLOBS = full("a").replace(b"2Dcur", b"2Dblb")
+
+
+@pytest.mark.parametrize(
+    ("sent", "first"),
+    [
+        # another name, port or profile is of another kind; the order stays
+        (
+            [
+                (full("a", 1), PEER),
+                (full("b"), PEER),
+                (full("a"), OTHER),
+                (full("a"), PEER),
+            ],
+            1,
+        ),
+        ([(full("a", 1), PEER), (BLOBS, PEER)], 0),
+        ([(BLOBS, PEER), (full("a", 1), PEER), (BLOBS, PEER)], 1),
+        # the position of a cursor that is alive may be in an older bundle only
+        ([(full("a", 1, 2), PEER), (partial("a", [1, 2], {1: 0.1}), PEER)], 0),
+        ([(full("a", 1, 2), PEER), (b"no bundle", PEER)], 0),
+    ],
+)
+def test_newest_complete_bundle_supersedes_those_of_its_kind(
+    sent: list[tuple[bytes, Peer]], first: int
+) -> None:
+    """All are kept from the first of these on."""
+    assert TuioSource("tuio:").drop_superseded(waiting(*sent)) == waiting(*sent)[first:]
+
+
+bundles = st.builds(
+    lambda source, alive, placed: partial(
+        source, alive, {id: 0.1 * id for id in alive if id in placed}
+    ),
+    st.sampled_from("ab"),
+    st.lists(st.integers(1, 4), unique=True, max_size=3),
+    st.sets(st.integers(1, 4)),
+)
+
+
+@given(st.lists(st.tuples(bundles, st.sampled_from([PEER, OTHER])), max_size=12))
+def test_superseded_bundles_do_not_change_the_final_touches(sent: list[tuple[bytes, Peer]]) -> None:
+    """Any bundles of senders with one port each leave the same touches with and without it."""
+    sent = [(data, peer) for data, peer in sent if (peer == PEER) == (b"a\0\0\0" in data)]
+    frames: list[dict[str, tuple[Touch, ...]]] = []
+    for each in (waiting(*sent), TuioSource("tuio:").drop_superseded(waiting(*sent))):
+        reader = TuioSource("tuio:")
+        frames.append({})
+        for data, peer, arrived in each:
+            frame = reader.read(data, peer, arrived)
+            if frame is not None:
+                frames[-1][frame.source] = frame.touches
+    assert frames[0] == frames[1]
+
+
+async def test_listen_drops_superseded_bundles_of_a_flood() -> None:
+    """Of 200 frames that arrived while the loop was busy a few and the newest are delivered."""
+    received: list[bytes] = []
+    done = asyncio.Event()
+    up = full("a")
+
+    def feed(data: bytes, peer: Peer, arrived: float) -> None:
+        received.append(data)
+        if data == up:
+            done.set()
+
+    line = await listen(
+        "127.0.0.1", 0, feed, max_size=8192, drop_superseded=TuioSource("tuio:").drop_superseded
+    )
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        for number in range(200):
+            sender.sendto(full("a", number), ("127.0.0.1", line.port))
+        sender.sendto(up, ("127.0.0.1", line.port))
+        async with asyncio.timeout(60):
+            await done.wait()
+    line.close()
+    assert len(received) <= BACKLOG_THRESHOLD
+    assert received[-1] == up
+
+
+@pytest.mark.parametrize(
+    ("is_periodic", "options", "ends"),
+    [(False, "", [3.0]), (True, "", []), (False, "?timeout=0.5", [0.5])],
+)
+def test_resting_finger_of_a_silent_sender_is_lifted_after_three_seconds(
+    is_periodic: bool, options: str, ends: list[float]
+) -> None:
+    """Or as the URL says; a sender that repeats what is alive keeps it, without positions.
+
+    The reference implementation, TUIO11_CPP's TuioServer, sends on change only; as its option is,
+    it also repeats what is alive once a second. The camera has 64 frames a second.
+    """
+    reader, tracker = TuioSource(f"tuio:{options}"), ContactTracker(make_paper_rig(12, 9).plate)
+    up = list[float]()
+    for number in range(640):
+        now, alive, fseq = number / 64, message("alive", 1), message("fseq", number + 1)
+        if number == 0 or (is_periodic and number % 64 == 0):
+            set_once = [cursor(1, 0.25, 0.5)] if number == 0 else []
+            frame = reader.read(bundle(alive, *set_once, fseq), PEER, now)
+            assert frame is not None
+            assert bool(tracker.update(frame)) is (number == 0)
+        up += [now for _ in tracker.expire(now).up]
+    assert up == ends
+
+
+@given(
+    st.lists(
+        st.tuples(st.integers(0, 10**8), st.binary(min_size=1, max_size=40)), min_size=1, max_size=9
+    )
+)
+def test_capture_round_trip(
+    tmp_path_factory: pytest.TempPathFactory, sent: list[tuple[int, bytes]]
+) -> None:
+    """What was written to a microsecond comes back, malformed datagrams too."""
+    path = tmp_path_factory.mktemp("capture") / "stream.tuio"
+    datagrams = [RecordedDatagram(micros / 1e6, payload) for micros, payload in sorted(sent)]
+    write_capture(path, datagrams)
+    assert read_capture(path) == datagrams
+
+
+def test_read_capture_reads_the_documented_format_up_to_its_maximum_size(tmp_path: Path) -> None:
+    """As documented, comments included.
+
+    A sparse file one byte above it is refused before it is read as text; so is a datagram's.
+    """
+    path = tmp_path / "golden.tuio"
+    path.write_text(f"{HEADER}\n# two fingers\n0 2f00ff\n1.5 0a\n", encoding="ascii")
+    assert read_capture(path) == [
+        RecordedDatagram(0.0, b"\x2f\x00\xff"),
+        RecordedDatagram(1.5, b"\n"),
+    ]
+    path.write_text(f"{HEADER}\n1 {'00' * 65508}\n")
+    with pytest.raises(InputError, match=r"line 2.*65507"):
+        read_capture(path)
+    os.truncate(path, MAX_BYTES + 1)
+    with pytest.raises(InputError, match="16 MiB"):
+        read_capture(path)
+
+
+@in_virtual_time
+async def test_replay_capture_keeps_times_over_udp() -> None:
+    """Datagrams arrive unchanged, each at its own time."""
+    loop = asyncio.get_running_loop()
+    start = loop.time()
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
+        receiver.bind(("127.0.0.1", 0))
+        receiver.setblocking(False)
+        datagrams = [
+            RecordedDatagram(0.0, b"one"),
+            RecordedDatagram(0.25, b"two"),
+            RecordedDatagram(1.0, b"three"),
+        ]
+        port = receiver.getsockname()[1]
+        replay = asyncio.create_task(replay_capture(datagrams, "127.0.0.1", port))
+        received = [(await loop.sock_recv(receiver, 100), loop.time() - start) for _ in datagrams]
+        await replay
+    assert received == [(b"one", 0.0), (b"two", 0.25), (b"three", 1.0)]
+
+
+@in_virtual_time
+async def test_replay_capture_raises_when_a_port_is_closed_or_the_system_refuses() -> None:
+    """The refusal of one datagram at the next; an address to which none may be sent at once."""
+    datagrams = [RecordedDatagram(t, b"x") for t in (0.0, 0.1, 0.2)]
+    port = free_port()
+    with pytest.raises(LinkError, match=rf"127.0.0.1:{port} \(Connection refused\)"):
+        await replay_capture(datagrams, "127.0.0.1", port)
+    with pytest.raises(LinkError, match=r"255\.255\.255\.255:3333 \(Perm"):
+        await replay_capture(datagrams[:1], "255.255.255.255", 3333)
+
+
+def test_era_touch_sends_a_capture(tmp_path: Path) -> None:
+    """To the UDP port of the daemon's source; fingers and a capture exclude each other."""
+    commands = ["controller.cli.commands"]
+    path = tmp_path / "taps.tuio"
+    write_capture(path, [RecordedDatagram(0.0, b"one"), RecordedDatagram(0.0, b"two")])
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
+        receiver.bind(("127.0.0.1", 0))
+        receiver.settimeout(10)
+        options = ["--replay", str(path), "--port", str(receiver.getsockname()[1])]
+        assert run(["touch", *options], commands) == 0
+        assert [receiver.recv(100) for _ in range(2)] == [b"one", b"two"]
+        assert run(["touch", "0.1,0.1", *options], commands) == 2
+    assert run(["touch"], commands) == 2

@@ -264,6 +264,9 @@ def test_head_that_a_proxy_may_misread_is_refused(gateway: GatewayProcess, name:
 OWN = f"era-haptics.token.{TOKEN}"
 
 
+KEY = b"Sec-WebSocket-Key: "
+
+
 @pytest.mark.parametrize(
     "changes",
     [
@@ -277,20 +280,22 @@ OWN = f"era-haptics.token.{TOKEN}"
         {"protocols": [OWN]},
         {"protocols": []},
         {"target": "/api/v1/arm"},
+        {"more": ["Content-Length: 100"]},
+        {"more": ["Transfer-Encoding: chunked"]},
+        {"replaced": (KEY, KEY + b"\xe9")},
+        {"replaced": (b"HTTP/1.1", b"HTTP/1.0")},
+        {"replaced": (b"GET", b"HEAD")},
     ],
     ids=str,
 )
 def test_websocket_is_refused(gateway: GatewayProcess, changes: dict[str, Any]) -> None:
-    """A foreign origin or host, a missing, wrong or repeated token, no subprotocol, other paths."""
-    assert raw(gateway, upgrade(gateway, **changes)).status == 403
+    """A foreign origin or host, a missing, wrong or repeated token, no subprotocol, other paths.
 
-
-@pytest.mark.parametrize("changed", [(b"HTTP/1.1", b"HTTP/1.0"), (b"GET", b"HEAD")])
-def test_websocket_needs_a_get_of_http_1_1(
-    gateway: GatewayProcess, changed: tuple[bytes, bytes]
-) -> None:
-    """RFC 6455 4.1."""
-    assert raw(gateway, upgrade(gateway).replace(*changed)).status == 403
+    A body, a key that is not ASCII, and what is no GET of HTTP/1.1 (RFC 6455 4.1).
+    """
+    given = {key: value for key, value in changes.items() if key != "replaced"}
+    asked = upgrade(gateway, **given).replace(*changes.get("replaced", (b"", b"")), 1)
+    assert raw(gateway, asked).status == 403
 
 
 Misuse: TypeAlias = Callable[[RawWebSocket], None]
@@ -320,39 +325,20 @@ def test_websocket_closes_after_an_invalid_frame(gateway: GatewayProcess, name: 
         assert ws.close_code() in codes
 
 
-@pytest.mark.parametrize(
-    "more", [["Content-Length: 100"], ["Transfer-Encoding: chunked"], ["Sec-WebSocket-Key: \xe9"]]
-)
-def test_websocket_with_a_body_or_a_key_that_is_not_ascii_is_refused(
-    gateway: GatewayProcess, more: list[str]
-) -> None:
-    """Without a record in the log."""
-    lines = upgrade(gateway).decode().split("\r\n")
-    kept = [each for each in lines if not each.startswith(more[0].partition(":")[0])]
-    with gateway.connect() as connection:
-        connection.sendall("\r\n".join([*kept[:-2], *more, "", ""]).encode())
-        assert connection.recv(1 << 16)[9:12] == b"403"
-
-
-def test_websocket_is_accepted_byte_by_byte_after_a_page(
+def test_websocket_is_accepted_byte_by_byte_after_a_page_without_compression(
     gateway: GatewayProcess,
 ) -> None:
-    """Its head ends with its last byte, wherever the bytes were divided."""
+    """Its head ends with its last byte, wherever the bytes were divided.
+
+    The offer of permessage-deflate is declined.
+    """
     first = f"GET /icon.svg HTTP/1.1\r\nHost: {gateway.host}\r\n\r\n".encode()
     with gateway.connect() as connection:
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         connection.sendall(first)
         assert b"</svg>" in connection.recv(1 << 16)
-        for byte in upgrade(gateway):
+        for byte in upgrade(gateway, more=["Sec-WebSocket-Extensions: permessage-deflate"]):
             connection.sendall(bytes([byte]))
-        assert connection.recv(1 << 16)[9:12] == b"101"
-
-
-def test_websocket_has_no_compression(gateway: GatewayProcess) -> None:
-    """The offer of permessage-deflate is declined."""
-    with gateway.connect() as connection:
-        offer = ["Sec-WebSocket-Extensions: permessage-deflate"]
-        connection.sendall(upgrade(gateway, more=offer))
         head = connection.recv(1 << 16)
     assert head.startswith(b"HTTP/1.1 101 ")
     assert b"deflate" not in head

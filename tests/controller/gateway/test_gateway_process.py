@@ -1,6 +1,8 @@
 """`era gateway` as a process: start, refusals, end, stops during attacks, and reverse proxies.
 
 The proxies serve TLS by the lines of the page on deployment.
+
+Stops through the gateway are passed on or answered, whatever other clients do.
 """
 
 import asyncio
@@ -12,20 +14,27 @@ import signal
 import socket
 import ssl
 import subprocess
-from collections.abc import Iterator
+from collections.abc import AsyncIterator, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import cast
-from unittest.mock import AsyncMock
+from unittest.mock import AsyncMock, Mock
 
 import pytest
+from aiohttp import WSMessage, WSMsgType
 
 import controller
+from controller.api import link
+from controller.api.client import AsyncClient
+from controller.api.jsonrpc import RpcError
+from controller.api.link import Unreachable
+from controller.api.schema import API_VERSION, Empty
 from controller.demo.demonstration import check_page
+from controller.gateway import connections
 from controller.gateway.app import Gateway, listen, serve
 from controller.gateway.gateway_settings import GatewaySettings, read_token
-from daemons import PATIENCE
+from daemons import PATIENCE, until
 from gateway_attacks import ATTACKS, LIMIT, attack
 from gateway_bench import (
     TOKEN,
@@ -42,6 +51,7 @@ from gateway_bench import (
 )
 from model.errors import InputError
 from typed_page import installed_program
+from virtual_lines import in_virtual_time
 
 
 def test_gateway_exits_at_sigint_with_open_connections(
@@ -123,9 +133,15 @@ def test_gateway_refuses_a_port_in_use(tmp_path: Path) -> None:
             check_page(page)
 
 
-def test_read_token_refuses_unsafe_and_unreadable_files(tmp_path: Path) -> None:
-    """Readable by others, not text, not a file: a pipe does not block, an endless file ends."""
-    file = tmp_path / "token"
+def test_read_token_refuses_unsafe_and_unreadable_files(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Readable by others, not text, not a file: a pipe does not block, an endless file ends.
+
+    Nor one of another user, who can read it, also with mode 600.
+    """
+    file, pipe = tmp_path / "token", tmp_path / "pipe"
+    os.mkfifo(pipe, 0o600)
     file.write_text(f"{TOKEN}\n")
     file.chmod(0o600)
     assert read_token(file) == TOKEN
@@ -134,27 +150,18 @@ def test_read_token_refuses_unsafe_and_unreadable_files(tmp_path: Path) -> None:
         with pytest.raises(InputError, match=f"{file}: .*chmod 600"):
             read_token(file)
     file.chmod(0o600)
+    with monkeypatch.context() as patched:
+        if file.stat().st_uid == 0:  # root's files are trusted
+            os.chown(file, 12345, -1)
+        else:
+            patched.setattr(os, "geteuid", lambda: file.stat().st_uid + 1)
+        with pytest.raises(InputError, match="another user"):
+            read_token(file)
+    os.chown(file, os.geteuid(), -1)
     file.write_bytes(b"\xff" * 30)
-    pipe = tmp_path / "pipe"
-    os.mkfifo(pipe, 0o600)
     for path in (pipe, Path("/dev/zero"), tmp_path, tmp_path / "missing", file):
         with pytest.raises(InputError, match=f"{path}: .*--token-file"):
             read_token(path)
-
-
-def test_read_token_refuses_a_file_of_another_user(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Its owner can read it, also with mode 600."""
-    file = tmp_path / "token"
-    file.write_text(TOKEN)
-    file.chmod(0o600)
-    if file.stat().st_uid == 0:  # root's files are trusted
-        os.chown(file, 12345, -1)
-    else:
-        monkeypatch.setattr(os, "geteuid", lambda: file.stat().st_uid + 1)
-    with pytest.raises(InputError, match="another user"):
-        read_token(file)
 
 
 SETTINGS: dict[str, tuple[dict[str, object], str]] = {
@@ -229,27 +236,15 @@ def test_settings_show_and_allow_the_address_listened_on() -> None:
     assert settings.allowed_names == {"localhost", "127.0.0.1", "[::1]", "127.0.0.2"}
 
 
-async def test_gateway_starts_where_its_priority_cannot_be_lowered(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """As within the system service, whose filter of system calls forbids it."""
-
-    def forbidden(_: int) -> int:
-        raise PermissionError(errno.EPERM, os.strerror(errno.EPERM))
-
-    def reached(_: object) -> None:
-        raise InputError("reached")
-
-    monkeypatch.setattr("os.nice", forbidden)
-    monkeypatch.setattr("controller.gateway.app.listen", reached)
-    with pytest.raises(InputError, match="reached"):
-        await serve(GatewaySettings(socket=Path("era.sock")), announce=lambda port: None)
-
-
-async def test_gateway_ends_with_what_it_keeps_of_the_daemon(
+async def test_gateway_starts_without_its_priority_and_ends_with_what_it_keeps_of_the_daemon(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A failure there is raised: a process that went on would have no connection for a stop."""
+    """The filter of system calls of the system service forbids to lower the priority.
+
+    A failure of what is kept is raised: a process that went on would have no connection for a stop.
+    """
+    forbidden = PermissionError(errno.EPERM, os.strerror(errno.EPERM))
+    monkeypatch.setattr("os.nice", Mock(side_effect=forbidden))
     monkeypatch.setattr(Gateway, "keep_connected", AsyncMock(side_effect=ZeroDivisionError))
     with pytest.raises(ZeroDivisionError):
         async with asyncio.timeout(PATIENCE / 6):
@@ -280,31 +275,24 @@ def attacked_daemon(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
         yield path
 
 
-@pytest.fixture
-def attacked(attacked_daemon: Path, tmp_path: Path) -> Iterator[GatewayProcess]:
-    """A gateway that logs nothing."""
-    with gateway_process(tmp_path, attacked_daemon) as gateway:
-        wait_for_daemon(gateway)
-        yield gateway
-        assert gateway.log() == ""
-
-
 @pytest.mark.long
 @pytest.mark.real_time
 @pytest.mark.alone
 @pytest.mark.parametrize("name", ATTACKS)
-def test_stops_get_through_an_attack(attacked: GatewayProcess, name: str) -> None:
+def test_stops_get_through_an_attack(attacked_daemon: Path, tmp_path: Path, name: str) -> None:
     """Each is carried out, and the gateway takes less than half a second of a processor meanwhile.
 
-    Other programs do not lengthen that, unlike the duration on a busy machine.
+    Other programs do not lengthen that, unlike the duration on a busy machine. It logs nothing.
     """
-    outcome = attack(attacked, name, seconds=6.0)
-    print(outcome.row(name))  # noqa: T201 (with -s it is the table)
-    assert len(outcome.stops) >= 5
-    assert all(each.is_done for each in outcome.stops)
-    assert max(each.processor for each in outcome.stops) < LIMIT
-    grown = outcome.memory_most - outcome.memory_before
-    assert grown < MAX_GROWTH
+    with gateway_process(tmp_path, attacked_daemon) as gateway:
+        wait_for_daemon(gateway)
+        outcome = attack(gateway, name, seconds=6.0)
+        print(outcome.row(name))  # noqa: T201 (with -s it is the table)
+        assert len(outcome.stops) >= 5
+        assert all(each.is_done for each in outcome.stops)
+        assert max(each.processor for each in outcome.stops) < LIMIT
+        assert outcome.memory_most - outcome.memory_before < MAX_GROWTH
+        assert gateway.log() == ""
 
 
 PAGE = Path(controller.__file__).parents[1] / "docs" / "how-to" / "deployment.md"
@@ -349,39 +337,14 @@ class Proxy:
         return trusting.wrap_socket(plain, server_hostname="localhost")
 
 
-def site(program: str) -> str:
-    """The lines of the page for a program."""
-    text = PAGE.read_text(encoding="utf-8")
-    begin = {"caddy": "panel.local:8443 {", "nginx": "server {"}[program]
-    (lines,) = re.findall(
-        rf"^    {re.escape(begin)}\n(?:^(?:     .*|    }})\n)+", text, re.MULTILINE
-    )
-    return lines
-
-
 @pytest.fixture
 def proxy(tmp_path: Path) -> Proxy:
     """A place for a proxy, with a certificate and its key."""
     certificate, key = tmp_path / "panel.pem", tmp_path / "panel.key"
-    make = (installed_program("openssl", package="openssl"), "req", "-x509", "-newkey", "ec")
-    make += (
-        "-pkeyopt",
-        "ec_paramgen_curve:P-256",
-        "-nodes",
-        "-days",
-        "1",
-        "-subj",
-        "/CN=localhost",
-    )
-    make += (
-        "-addext",
-        "subjectAltName=DNS:localhost",
-        "-keyout",
-        str(key),
-        "-out",
-        str(certificate),
-    )
-    subprocess.run(make, check=True, capture_output=True)
+    make = [installed_program("openssl", package="openssl"), "req", "-x509"]
+    make += ["-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:P-256", "-nodes", "-days", "1"]
+    make += ["-subj", "/CN=localhost", "-addext", "subjectAltName=DNS:localhost"]
+    subprocess.run([*make, "-keyout", key, "-out", certificate], check=True, capture_output=True)
     with socket.create_server(("127.0.0.1", 0)) as free:
         return Proxy(free.getsockname()[1], certificate)
 
@@ -392,7 +355,10 @@ def proxied(
 ) -> Iterator[GatewayProcess]:
     """Run a proxy before a gateway by the lines of the page, but those that match a pattern."""
     folder = proxy.certificate.parent
-    lines = "\n".join(line for line in site(program).splitlines() if not re.search(without, line))
+    begin = {"caddy": "panel.local:8443 {", "nginx": "server {"}[program]
+    site = rf"^    {re.escape(begin)}\n(?:^(?:     .*|    }})\n)+"
+    (found,) = re.findall(site, PAGE.read_text(encoding="utf-8"), re.MULTILINE)
+    lines = "\n".join(line for line in found.splitlines() if not re.search(without, line))
     lines = re.sub(r"/etc/\w+/panel", str(folder / "panel"), lines)
     lines = lines.replace("8138", str(behind.port)).replace("8443", str(proxy.port))
     config = folder / program
@@ -490,3 +456,252 @@ def test_page_of_a_proxy_is_foreign_unless_it_is_allowed(
     ):
         wait_for_daemon(behind)
         assert http(panel, more=[f"Origin: {proxy.url.removesuffix('/')}"]).status == 403
+
+
+def test_stops_are_passed_on_although_other_hosts_connect_often(
+    tmp_path: Path, daemon: ScriptedDaemon
+) -> None:
+    """Whose requests have all places that the daemon has for them; no host had one before."""
+    with gateway_process(tmp_path, daemon.socket) as gateway, contextlib.ExitStack() as opened:
+        wait_for_daemon(gateway)
+        daemon.calls.clear()
+
+        def sent(method: str, host: str) -> socket.socket:
+            """A connection of a host over which one request was sent."""
+            made = opened.enter_context(
+                socket.create_connection(
+                    ("127.0.0.1", gateway.port), timeout=PATIENCE, source_address=(host, 0)
+                )
+            )
+            made.sendall(
+                f"POST /api/v1/{method} HTTP/1.1\r\nHost: {gateway.host}\r\nConnection: close\r\n"
+                f"Authorization: Bearer {TOKEN}\r\nContent-Length: 0\r\n\r\n".encode()
+            )
+            return made
+
+        for _ in range(45):
+            for host in ("127.0.0.2", "127.0.0.3"):
+                sent("status", host)
+        asked = [sent("stop", "127.0.0.4") for _ in range(70)]
+        asked += [sent("disarm", "127.0.0.4") for _ in range(20)]
+        assert {each.recv(1 << 16)[9:12] for each in asked} == {b"200"}
+        assert (daemon.methods.count("stop"), daemon.methods.count("disarm")) == (70, 20)
+
+
+@pytest.fixture
+def full_queue(tmp_path: Path) -> Iterator[Path]:
+    """The socket of a daemon that hangs: no further connection is queued."""
+    path = tmp_path / "era.sock"
+    waiting: list[socket.socket] = []
+    with socket.socket(socket.AF_UNIX) as bound:
+        bound.bind(str(path))
+        bound.listen(0)
+        while True:
+            waiting.append(socket.socket(socket.AF_UNIX))
+            waiting[-1].setblocking(False)
+            try:
+                waiting[-1].connect(str(path))
+            except BlockingIOError:
+                break
+        yield path
+        for each in waiting:
+            each.close()
+
+
+async def test_stop_is_answered_although_the_daemon_hangs(
+    full_queue: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Otherwise nobody is told to switch the amplifiers off by hand."""
+    monkeypatch.setattr(link, "RESPONSE_TIMEOUT", 0.05)
+    async with asyncio.timeout(100 * link.RESPONSE_TIMEOUT):
+        with pytest.raises(Unreachable, match="does not respond"):
+            await link.DaemonLink.open(full_queue, "browser")
+        with pytest.raises(Unreachable, match="does not respond"):
+            await AsyncClient(full_queue, name="gateway", timeout=0.05).stop()
+
+
+async def test_clients_that_leave_while_the_daemon_hangs_keep_their_places(
+    full_queue: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Until their connections have failed: else any number of them would wait for the daemon."""
+    monkeypatch.setattr(connections, "RESPONSE_TIMEOUT", 0.3)
+    kept: dict[connections.ClientConnection, AsyncClient] = {}
+
+    def request(*, leaves: bool = True) -> "asyncio.Task[object]":
+        made = connections.ClientConnection(Mock(), full_queue, {}, kept)
+        transport = Mock(is_closing=lambda: False, get_extra_info=lambda _: ("192.0.2.1", 1))
+        made.connection_made(transport)
+        task = asyncio.create_task(made.request("status", Empty()))
+        if leaves:
+            asyncio.get_running_loop().call_soon(made.connection_lost, None)
+        made.stop_waiting()
+        return task
+
+    waiting = [request() for _ in range(connections.MAX_KEPT)]
+    await asyncio.sleep(0.01)
+    with pytest.raises(RpcError, match="too many connections"):
+        await request(leaves=False)
+    with pytest.raises(Unreachable):
+        await asyncio.gather(*waiting)
+    await until(lambda: not kept)
+
+
+@in_virtual_time
+async def test_connection_that_waits_is_closed(tmp_path: Path) -> None:
+    """The oldest beside 128 that wait, and after 5 s without a complete request, bytes or not.
+
+    None before what has come of it is read, and those that had an answer before new ones.
+    """
+    waiting: dict[connections.ClientConnection, asyncio.TimerHandle] = {}
+    made = [
+        connections.ClientConnection(Mock(), tmp_path, waiting, {})
+        for _ in range(connections.MAX_WAITING + 3)
+    ]
+    wires = [Mock(is_closing=lambda: False) for _ in made]
+    for each, wire in zip(made, wires, strict=True):
+        each.connection_made(wire)
+
+    def closed() -> list[int]:
+        return [number for number, wire in enumerate(wires) if wire.abort.called]
+
+    made[4].stop_waiting()
+    made[4].wait()  # answered
+    assert closed() == []
+    await asyncio.sleep(0.01)
+    assert closed() == [0, 1, 4]
+    made[-2].stop_waiting()  # its request has come
+    await asyncio.sleep(4.9)
+    made[-1].data_received(b"G")
+    assert closed() == [0, 1, 4]
+    await asyncio.sleep(0.2)
+    assert closed() == [each for each in range(len(made)) if each != len(made) - 2]
+
+
+LEFT = WSMessage(WSMsgType.CLOSED, None, None)
+HELLO = b'{"jsonrpc":"2.0","id":"web","result":{"api_version":"%s"}}\n' % API_VERSION.encode()
+
+
+class Browser:
+    """A WebSocket of a browser that has sent frames, and reads the first that it is sent only.
+
+    leaves: whether it reads on and leaves instead, when it is sent its second frame.
+    """
+
+    close_code = None
+
+    def __init__(self, *texts: str, leaves: bool = False) -> None:
+        self.frames: asyncio.Queue[WSMessage] = asyncio.Queue()
+        self.leaves = leaves
+        self.sent = 0
+        for text in texts:
+            self.frames.put_nowait(WSMessage(WSMsgType.TEXT, text, ""))
+
+    def __aiter__(self) -> "Browser":
+        return self
+
+    async def __anext__(self) -> WSMessage:
+        """The next frame."""
+        message = await self.frames.get()
+        if message is LEFT:
+            raise StopAsyncIteration
+        return message
+
+    async def send_str(self, _: str) -> None:
+        """Send the first frame."""
+
+    async def send_frame(self, _: bytes, opcode: WSMsgType) -> None:
+        """Send another; the event loop sees after the first of them that the browser has left."""
+        self.sent += 1
+        if not self.leaves:
+            await asyncio.Event().wait()
+        if self.sent == 1:
+            asyncio.get_running_loop().call_soon(self.frames.put_nowait, LEFT)
+
+    async def close(self, *, code: int = 1000, drain: bool = True) -> None:
+        """Answer that it has left."""
+
+    async def bridged(self, path: Path) -> None:
+        """Be bridged to a daemon's socket, until it has left or is given up."""
+        opened = await link.DaemonLink.open(path, "browser")
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(link.DaemonLink, "open", AsyncMock(return_value=opened))
+            await connections.bridge(self, "192.0.2.1:1", path, None)  # type: ignore[arg-type]
+        opened.abort()
+        await asyncio.sleep(0)
+
+
+@pytest.fixture
+async def busy_daemon(tmp_path: Path) -> AsyncIterator[tuple[Path, asyncio.Future[list[bytes]]]]:
+    """The socket of a daemon that sends an event, and reads only later; what it read."""
+    path = tmp_path / "era.sock"
+    read: asyncio.Future[list[bytes]] = asyncio.get_running_loop().create_future()
+
+    async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        await reader.readline()
+        writer.write(HELLO + b"{}\n")
+        writer.transport.pause_reading()  # type: ignore[attr-defined]
+        await given_up.wait()
+        writer.transport.resume_reading()  # type: ignore[attr-defined]
+        read.set_result((await reader.read()).splitlines())
+        writer.close()
+
+    given_up = asyncio.Event()
+    asyncio.get_running_loop().call_later(0.3, given_up.set)
+    async with await asyncio.start_unix_server(serve, path, limit=1 << 12):
+        yield path, read
+
+
+async def test_stop_of_a_browser_that_is_given_up_is_passed_on(
+    busy_daemon: tuple[Path, "asyncio.Future[list[bytes]]"], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It waits behind touches that a busy daemon has not read, and the browser does not read.
+
+    However its name is written; what only looks like it is not passed on.
+    """
+    path, read = busy_daemon
+    monkeypatch.setattr(connections, "SEND_TIMEOUT", 0.05)
+    touch = (
+        '{"jsonrpc":"2.0","method":"touch","params":{"source":"page","touches":[]}}' + " " * 4000
+    )
+    stop = '{"jsonrpc":"2.0","id":9,"method":"st\\u006fp"}'
+    play = '{"jsonrpc":"2.0","id":8,"method":"play","params":{"effect":"stop","x_m":0,"y_m":0}}'
+    async with asyncio.timeout(PATIENCE):
+        await Browser(*[touch] * 1000, stop, play).bridged(path)
+        lines = await read
+    assert len(lines) < 900
+    assert lines[-1] == stop.encode()
+
+
+async def test_others_have_a_turn_after_each_frame(
+    busy_daemon: tuple[Path, "asyncio.Future[list[bytes]]"], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """However many frames of a browser wait."""
+    path, read = busy_daemon
+    monkeypatch.setattr(connections, "SEND_TIMEOUT", 0.5)
+    browser, turns = Browser(*["{}"] * 100), 0
+    bridging = asyncio.create_task(browser.bridged(path))
+    async with asyncio.timeout(PATIENCE):
+        while not browser.frames.empty():
+            await asyncio.sleep(0)
+            turns += 1
+        browser.frames.put_nowait(LEFT)
+        await bridging
+        await read
+    assert turns >= 100
+
+
+async def test_lines_that_came_together_are_not_sent_to_a_browser_that_has_left(
+    tmp_path: Path,
+) -> None:
+    """Each of them would be a warning in the log."""
+
+    async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        await reader.readline()
+        writer.write(HELLO + 1000 * b"{}\n")
+        await reader.read()
+        writer.close()
+
+    path, browser = tmp_path / "era.sock", Browser(leaves=True)
+    async with await asyncio.start_unix_server(serve, path), asyncio.timeout(PATIENCE):
+        await browser.bridged(path)
+    assert 1 <= browser.sent < 10

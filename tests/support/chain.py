@@ -197,9 +197,9 @@ class Chain:
         is but the plate may play.
         """
         found = self.witness.finish(threads.now())
-        assert {one.invariant for one in found} == {*(breaks or "").split()} - {"plate"}, [
-            *map(str, found[:1])
-        ]
+        broken = sorted({one.invariant for one in found})
+        first = "".join(map(str, found[:1]))
+        assert {*broken} == {*(breaks or "").split()} - {"plate"}, f"{', '.join(broken)}: {first}"
         assert breaks or not self.plate_judge.violations, self.plate_judge.violations
         assert self.witness.frames
 

@@ -10,6 +10,7 @@ import asyncio
 import inspect
 import logging
 import operator
+import random
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractAsyncContextManager
 from dataclasses import dataclass, field
@@ -395,9 +396,14 @@ def courses(path: Path) -> dict[str, Mapping[str, Any]]:
 
 
 def follow(
-    course: Mapping[str, Any], made: Callable[..., AbstractAsyncContextManager[Taken]]
+    course: Mapping[str, Any],
+    made: Callable[..., AbstractAsyncContextManager[Taken]],
+    rng: random.Random | None = None,
 ) -> None:
-    """Take all steps of a course, in virtual time, on what is made with its options."""
+    """Take all steps of a course, in virtual time, on what is made with its options.
+
+    rng: of the virtual loop.
+    """
     given = {**course}
 
     async def run() -> None:
@@ -412,4 +418,4 @@ def follow(
             finally:
                 logging.getLogger().removeHandler(handler)
 
-    run_virtual(run())
+    run_virtual(run(), rng=rng)

@@ -27,11 +27,9 @@ from controller.play.selection import Chooser, Selector
 from controller.play.slots import Slot, Slots
 from controller.sources.touch import Contact, ContactKey
 from courses import Acted, courses, fits, follow
-from model.answer import answer
 from model.answer.answer import Layer
 from model.answer.answer_report import Timing
 from model.answer.stimulus import Course, Placement
-from model.arrays import Complex64Array
 from model.config.document import data_text, parse_document
 from model.vibration import Tone
 from plates import smooth_rig
@@ -58,6 +56,9 @@ LAYOUTS = {
 }
 
 
+CONTACTS = [Contact(ContactKey("a", n), *at, since=0.0) for n, at in enumerate((LEFT, RIGHT))]
+
+
 @asynccontextmanager
 async def hands(
     *amplifiers: str,
@@ -82,13 +83,11 @@ def test_fingers_keep_to_their_course(name: str) -> None:
 
 def test_a_shared_content_that_changes_beside_a_click_of_its_finger_keeps_its_layer() -> None:
     """The click has begun first: what is decided next restarts neither of the two."""
-    contacts = [Contact(ContactKey("a", n), *at, since=0.0) for n, at in enumerate((LEFT, RIGHT))]
-    shared = tuple((each, Target(each.key, 14.0)) for each in contacts)
-    click = Target(contacts[0].key, 14.0, pulse=Pulse(0.04, requested_at=0.0))
+    shared = tuple((each, Target(each.key, 14.0)) for each in CONTACTS)
+    click = Target(CONTACTS[0].key, 14.0, pulse=Pulse(0.04, requested_at=0.0))
     pattern = Layer({"SW": Tone(100.0, 1e-6)})
     lasting = Content((shared[0][0].key, 0), shared, Placement((LEFT,)), pattern)
-    alone = ((contacts[0], click),)
-    clicking = Content((contacts[0].key, 0), alone, Placement((LEFT,)), pattern)
+    clicking = Content((CONTACTS[0].key, 0), ((CONTACTS[0], click),), Placement((LEFT,)), pattern)
     playing = Slots(smooth_rig(), playable(4), Timing(table()), expiry_of=lambda key: 0.0)
     playing.contents = {
         number: Slot(one, pattern, drive={}) for number, one in ((1, clicking), (0, lasting))
@@ -98,13 +97,7 @@ def test_a_shared_content_that_changes_beside_a_click_of_its_finger_keeps_its_la
     assert not playing.plan([lasting, clicking], 0.0).started
 
 
-CONTACTS = [Contact(ContactKey("a", n), *at, since=0.0) for n, at in enumerate((LEFT, RIGHT))]
 FREE = playable()
-
-
-def a_selector() -> Selector:
-    """One that has chosen nothing yet."""
-    return Selector(Chooser(table()))
 
 
 def chosen(capabilities: PlaybackCapabilities, *targets: Target) -> Selection:
@@ -215,12 +208,11 @@ def test_a_click_is_within_the_power_that_what_lasts_leaves() -> None:
     """Both at once take no more than the limit; with hardly any left it is held back."""
     click = Target(CONTACTS[1].key, 20.0, pulse=Pulse(0.04, requested_at=0.0))
     intent = HapticIntent((Target(CONTACTS[0].key, 20.0), click))
-    selector = a_selector()
-    free = selector.select(CONTACTS, intent, FREE)
+    free = Selector(Chooser(table())).select(CONTACTS, intent, FREE)
     lasting = np.linalg.norm(sums(replace(free, contents=free.contents[:1])))
     for share, count in ((1.3, 2), (1.001, 1)):
         capabilities = within(power=(share * lasting) ** 2)
-        found = a_selector().select(CONTACTS, intent, capabilities)
+        found = Selector(Chooser(table())).select(CONTACTS, intent, capabilities)
         assert len(found.contents) == count
         assert (
             np.linalg.norm(sums(found)) <= share * lasting * (1 + 1e-6) < np.linalg.norm(sums(free))
@@ -233,9 +225,9 @@ def test_what_a_click_leaves_nothing_for_says_so_and_is_felt_after_it() -> None:
     """The limits are no cause: without the click they allow it."""
     click = Target(CONTACTS[1].key, 20.0, pulse=Pulse(0.04, requested_at=0.0))
     lasting = Target(CONTACTS[0].key, 20.0)
-    alone = a_selector().select(CONTACTS, HapticIntent((click,)), FREE)
+    alone = Selector(Chooser(table())).select(CONTACTS, HapticIntent((click,)), FREE)
     hardly = within(power=(1.001 * np.linalg.norm(sums(alone))) ** 2)
-    selector = a_selector()
+    selector = Selector(Chooser(table()))
     selector.select(CONTACTS, HapticIntent((click,)), hardly, now=0.0)
     both = HapticIntent((lasting, click))
     (held_back,) = selector.select(CONTACTS, both, hardly, now=0.01).not_served
@@ -249,14 +241,13 @@ def test_what_a_click_leaves_nothing_for_says_so_and_is_felt_after_it() -> None:
 @pytest.mark.parametrize("what", ["level", "power"])
 def test_a_lone_steady_content_is_within_a_limit(what: str) -> None:
     """It is lowered to the limit, 0.8 of its amplitude, instead of refused by the amplifiers."""
-    target = Target(CONTACTS[0].key, 14.0)
-    intent = HapticIntent((target,))
-    free = a_selector().select(CONTACTS, intent, FREE)
+    intent = HapticIntent((Target(CONTACTS[0].key, 14.0),))
+    free = Selector(Chooser(table())).select(CONTACTS, intent, FREE)
     most = 0.8 * sums(free).max()
     capabilities = within(power=0.8**2 * float((sums(free) ** 2).sum()))
     if what == "level":
         capabilities = within(most=most)
-    found = a_selector().select(CONTACTS, intent, capabilities)
+    found = Selector(Chooser(table())).select(CONTACTS, intent, capabilities)
     assert sums(found) == pytest.approx(0.8 * sums(free), rel=1e-6)
     (before,), (after,) = free.predictions, found.predictions
     assert before.level_db_sl is not None
@@ -354,14 +345,6 @@ class Looked(Acted):
         began = self.feels.started_at
         assert fits([level for time, level in self.seen if start <= time - began <= end], level)
 
-    def stalls(self) -> None:
-        """Let the control loop not turn."""
-        self.turning.clear()
-
-    def turns(self) -> None:
-        """Let it turn again."""
-        self.turning.set()
-
     def taps(self) -> None:
         """Let the finger feel a tap of 40 ms beside the course."""
         self.feels.tap = Pulse(0.04, threads.now())
@@ -370,21 +353,6 @@ class Looked(Acted):
     def beside_others(self, **tones: Sequence[float]) -> None:
         """Have the table answer by these tones where another finger rests."""
         self.table.shared = {era: Tone(*tone) for era, tone in tones.items()}
-
-    @property
-    def is_appended(self) -> list[bool]:
-        """Of each set that vibrates, whether it begins as the one before ends."""
-        return [one.layer.after for one in self.far_end.sent()[1:] if not one.is_silent]
-
-    @property
-    def set_count(self) -> int:
-        """How many sets that vibrate there were."""
-        return len(self.is_appended)
-
-    @property
-    def highest(self) -> float:
-        """The highest level that was seen."""
-        return max(level for _, level in self.seen)
 
 
 @asynccontextmanager
@@ -499,26 +467,19 @@ async def test_what_is_shared_stays_weak_while_its_weakest_finger_feels_a_click(
 
 def test_a_content_whose_own_contrast_is_not_why_it_is_held_back_says_so() -> None:
     """Both in one narrow band: the first would have had 3 dB beside it, it 16 itself."""
-    contacts = [
-        Contact(ContactKey("a", n), *at, since=0.0)
-        for n, at in enumerate(((0.06, 0.06), (0.2, 0.1)))
-    ]
+    places = (0.06, 0.06), (0.2, 0.1)
+    contacts = [Contact(ContactKey("a", n), *at, since=0.0) for n, at in enumerate(places)]
     targets = [(each, Target(each.key, 20.0, band=(99.0, 101.0))) for each in contacts]
-    found = chosen_for(targets, playable(4))
-    (held_back,) = found.not_served
-    assert held_back.promised_contrast_db is not None
-    assert held_back.promised_contrast_db > 12
-    assert held_back.held_back is not None
-    assert "another finger" in held_back.held_back
+    (held_back,) = chosen_for(targets, playable(4)).not_served
+    assert (held_back.promised_contrast_db or 0.0) > 12
+    assert "another finger" in (held_back.held_back or "")
 
 
 def test_a_kept_frequency_keeps_its_phase_at_the_finger() -> None:
     """As it moves by 1 cm and another joins, at its new place; by the fields of the table."""
-    contacts = [Contact(ContactKey("a", n), *at, since=0.0) for n, at in enumerate((LEFT, RIGHT))]
-    targets = [(each, Target(each.key, 14.0)) for each in contacts]
-    first = chosen_for(targets, playable(4))
-    before = {each.key: each for each in first.contents}
-    moved = replace(contacts[0], x=contacts[0].x + 0.01)
+    targets = [(each, Target(each.key, 14.0)) for each in CONTACTS]
+    before = {each.key: each for each in chosen_for(targets, playable(4)).contents}
+    moved = replace(CONTACTS[0], x=CONTACTS[0].x + 0.01)
     third = Contact(ContactKey("a", 2), *ABOVE, since=0.0)
     joined = [(moved, targets[0][1]), targets[1], (third, Target(third.key, 14.0))]
     second = chosen_for(joined, playable(4), before=before)
@@ -529,20 +490,15 @@ def test_a_kept_frequency_keeps_its_phase_at_the_finger() -> None:
         then = before.get(content.key)
         if then is not None and then.frequency == content.frequency:
             at = places.index((content.targets[0][0].x, content.targets[0][0].y))
-            now, old = (_felt(each.layer, fields[:, :, at]) for each in (content, then))
+            (row,) = np.flatnonzero(table().frequencies == content.frequency)
+            now, old = [
+                sum(
+                    each.layer.excitation[era.name].phasor / era.stroke * fields[row, number, at]
+                    for number, era in enumerate(table().eras)
+                    if era.name in each.layer.excitation
+                )
+                for each in (content, then)
+            ]
             assert np.angle(now / old) == pytest.approx(0.0, abs=1e-3)
             kept += 1
     assert kept
-
-
-def _felt(pattern: answer.Layer, fields: Complex64Array) -> complex:
-    """Acceleration at a finger of a pattern of one frequency, by each ERA's field (f, eras)."""
-    (frequency,) = {tone.frequency for tone in pattern.excitation.values()}
-    row = int(np.flatnonzero(table().frequencies == frequency)[0])
-    eras = {era.name: (number, era.stroke) for number, era in enumerate(table().eras)}
-    return complex(
-        sum(
-            tone.amplitude / eras[name][1] * np.exp(1j * tone.phase) * fields[row, eras[name][0]]
-            for name, tone in pattern.excitation.items()
-        )
-    )

@@ -1,7 +1,8 @@
-"""The control loop in virtual time, with amplifiers that record their requests.
+"""The control loop in virtual time, with amplifiers that record their requests, and its selector.
 
 It opens, arms, stops, closes and loses several amplifiers; clicks play beside what lasts; as many
 fingers as there may be are served; and an answer that comes too late is reported and never played.
+A selector asks a table for an intent, and again when it must.
 """
 
 import asyncio
@@ -13,9 +14,11 @@ from contextlib import asynccontextmanager
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 from unittest.mock import Mock
 
+import numpy as np
 import pytest
 
 from chain import FINGER, Chain, Sent, set_chain, set_running
@@ -23,41 +26,31 @@ from controller.effects.kinds import Click
 from controller.effects.layout import SurfaceLayout, default_effects
 from controller.effects.player import EffectPlayer
 from controller.operation.plate_controller import Controller
-from controller.play.intent import (
-    HapticIntent,
-    Prediction,
-    Pulse,
-    Selection,
-    Target,
-    sums_db,
-)
-from controller.play.loop import ENDED, PlayReport
+from controller.play.intent import HapticIntent, Prediction, Pulse, Selection, Target, sums_db
+from controller.play.loop import PlayReport
+from controller.play.routing import RAMPS_ONLY, PlaybackCapabilities
 from controller.play.selection import Chooser, Selector
-from controller.sources.touch import Contact, ContactKey, Touch, TouchFrame
+from controller.sources.touch import Change, Contact, ContactKey, ContactTracker, Touch, TouchFrame
 from courses import Acted, Planted, courses, follow
 from drivers.host.group import GroupState
 from drivers.opening import Lines
 from drivers.protocol.definition import QUANTITIES
 from drivers.protocol.records import Values
-from drivers.protocol.sets import Envelope
-from model.answer.answer import Layer
+from drivers.protocol.sets import Command
+from model.answer.answer import Answer, Layer, Limits
 from model.answer.answer_report import Timing
-from model.answer.stimulus import Placement
+from model.answer.stimulus import Finger, Placement, Stimulus
 from model.errors import InputError
 from model.rig.rig import Channel
+from model.structure.material import Material
+from model.structure.plate import Plate
 from model.transients.base_motion import BaseEnvelope
+from model.vibration import Excitation, Tone
 from plates import small_problem, small_table
 from registry import threads
-from set_table import BuzzNewestContact, SetTiming
-from several_fingers import (
-    LAYOUT,
-    LEFT,
-    RIGHT,
-    Fingers,
-    fingers_on,
-    playable,
-    table,
-)
+from registry.limits import HAND_LOAD
+from set_table import BuzzNewestContact, SetTiming, set_answer
+from several_fingers import LAYOUT, LEFT, RIGHT, fingers_on, playable, table
 from sim.far_ends.wire_assignment import SimulatedWire
 from virtual_lines import in_virtual_time
 
@@ -127,165 +120,47 @@ class Played(Acted):
         self.marked_at = threads.now()
 
     @property
-    def sets(self) -> list[Sent]:
-        """Every set since the silence that follows arming."""
-        return self.far_end.sent()[1:]
-
-    @property
     def vibrations(self) -> list[Sent]:
-        """Those that vibrate."""
-        return [each for each in self.sets if not each.is_silent]
+        """Every set that vibrates."""
+        return [each for each in self.far_end.sent() if not each.is_silent]
 
     @property
-    def level(self) -> float:
-        """What the first channel plays."""
-        return self.far_end.levels[0]
+    def commands(self) -> list[Command]:
+        """What each of them says of the first channel."""
+        return [each.layer.commands[0] for each in self.vibrations]
+
+    def knots(self, envelope: str) -> list[int]:
+        """How many an envelope of the first channel has in each of them, onset or ending."""
+        return [len(getattr(getattr(each, envelope), "knots", ())) for each in self.commands]
 
     @property
-    def last_request(self) -> str:
-        """Name of the last request."""
-        return self.far_end.names()[-1]
-
-    @property
-    def knots_of_onsets(self) -> list[int]:
-        """Of each set, for the first channel."""
-        return [_knots(each.layer.commands[0].onset) for each in self.vibrations]
-
-    @property
-    def knots_of_endings(self) -> list[int]:
-        """Of each set, for the first channel."""
-        return [_knots(each.layer.commands[0].ending) for each in self.vibrations]
-
-    @property
-    def first_onset(self) -> dict[str, Any]:
-        """Of the first channel, in the steps of the wire."""
-        return _lines(self.vibrations[0].layer.commands[0].onset)
-
-    @property
-    def last_ending(self) -> dict[str, Any]:
-        """Of the first channel, in the steps of the wire."""
-        return _lines(self.vibrations[-1].layer.commands[0].ending)
-
-    @property
-    def levels_of_sets(self) -> list[list[int]]:
-        """Of each channel in each set [1e-4]."""
-        return [[each.level for each in one.layer.commands] for one in self.vibrations]
-
-    @property
-    def continues(self) -> list[bool]:
-        """Whether each set continues the phase of the first channel."""
-        return [each.layer.commands[0].keep_phase for each in self.vibrations]
-
-    @property
-    def sent_after(self) -> list[float]:
-        """How long after the mark each set was committed [s]."""
-        return [each.time - self.marked_at for each in self.vibrations]
-
-    @property
-    def reported_after(self) -> list[float]:
-        """How long after the mark each report was made [s]."""
-        return [each.time - self.marked_at for each in self.applied]
-
-    @property
-    def levels_seen(self) -> list[float]:
-        """Levels since the looks began."""
-        return [level for _, level in self.seen]
-
-    @property
-    def ramps(self) -> list[int]:
-        """Of each set [ms]."""
-        return [each.layer.ramp for each in self.vibrations]
-
-    @property
-    def reported_onsets(self) -> list[bool]:
-        """Whether each report has an onset."""
-        return [bool(each.layer.onset) for each in self.applied]
-
-    @property
-    def lasts_until(self) -> list[float]:
-        """When each set ends by itself, after the mark [s]."""
-        return [each.time + _valid_for(each) - self.marked_at for each in self.vibrations]
+    def expiries(self) -> list[float]:
+        """When each of them ends by itself [s]."""
+        valid_for = QUANTITIES["valid_for"]
+        return [each.time + valid_for.from_wire(each.layer.valid_for) for each in self.vibrations]
 
     @property
     def pauses(self) -> list[float]:
-        """Times between sets that vibrate [s]."""
+        """Times between them [s]."""
         return [later.time - each.time for each, later in pairwise(self.vibrations)]
 
     @property
     def has_gaps(self) -> bool:
-        """Whether a set has ended by itself before the next."""
-        found = self.vibrations
-        return any(later.time > each.time + _valid_for(each) for each, later in pairwise(found))
-
-    @property
-    def valid_for(self) -> list[float]:
-        """How long each set lasts without another [s]."""
-        return [_valid_for(each) for each in self.vibrations]
-
-    @property
-    def is_renewal(self) -> list[bool]:
-        """Whether each set renews what plays, without any command."""
-        return [one.layer.renew and not one.layer.commands for one in self.vibrations]
-
-    @property
-    def played_for(self) -> float:
-        """From the first set until the last ends by itself [s]."""
-        return max(self.lasts_until) + self.marked_at - self.vibrations[0].time
-
-    @property
-    def said_after(self) -> float:
-        """How long after that end it is reported [s]."""
-        (ended,) = [each.time for each in self.silenced if each.reason == ENDED]
-        return ended - self.marked_at - max(self.lasts_until)
-
-    @property
-    def loads_asked(self) -> list[list[float]]:
-        """Loads of the fingers of each question."""
-        return [[each.load for each in fingers] for fingers in self.table.asked]
-
-    @property
-    def feeling_asked(self) -> list[list[bool]]:
-        """Of the fingers of each question, which shall feel something."""
-        return [[each.stimulus is not None for each in fingers] for fingers in self.table.asked]
-
-    @property
-    def requests_of_sets(self) -> list[str]:
-        """Sets, commits and silences since they were forgotten, the same of all amplifiers."""
-        kinds = "Set", "Commit", "Silence"
-        found = [[name for name in end.names() if name in kinds] for end in self.far_ends]
-        assert all(each == found[0] for each in found), found
-        return found[0]
+        """Whether one of them has ended by itself before the next."""
+        nexts = self.vibrations[1:]
+        return any(each.time > end for each, end in zip(nexts, self.expiries, strict=False))
 
     async def looks(self, seconds: float) -> None:
         """Look at the first channel every millisecond."""
         began = threads.now()
         for _ in range(round(1000 * seconds)):
-            self.seen.append((threads.now() - began, self.level))
+            self.seen.append((threads.now() - began, self.far_end.levels[0]))
             await asyncio.sleep(0.001)
 
     @property
     def audible(self) -> list[float]:
         """When it was, since the looks began [s]."""
         return [time for time, level in self.seen if level > AUDIBLE]
-
-    @property
-    def audible_until(self) -> float:
-        """When it was audible last."""
-        return self.audible[-1]
-
-    @property
-    def audible_for(self) -> float:
-        """From when it was first."""
-        return self.audible[-1] - self.audible[0]
-
-    @property
-    def highest(self) -> float:
-        """The highest level seen."""
-        return max(level for _, level in self.seen)
-
-    def source_fails(self, is_failing: bool) -> None:
-        """Let what says who shall feel something fail, or work again."""
-        self.source.fails = is_failing
 
     @property
     def pings_amid(self) -> int:
@@ -295,11 +170,6 @@ class Played(Acted):
             for end in self.far_ends
             for time in end.times("Ping")
         )
-
-    def touch_for(self, timeout: float, *fingers: str) -> None:
-        """Put fingers down by a source that says how long they stay without a frame."""
-        self.timeout = timeout
-        self.touch(*fingers)
 
     def presses(self, *loads: float) -> None:
         """Have a finger down, and beside it one of each load."""
@@ -332,34 +202,10 @@ class Played(Acted):
 
         self.controller.group.arm = armed_late
 
-    @property
-    def is_silence(self) -> list[bool]:
-        """Whether each set is of silence, from arming on."""
-        return [each.is_silent for each in self.far_end.sent()]
-
     def is_disarmed_by_another(self, of: int) -> None:
         """Let another program disarm an amplifier; the sessions so far are noted."""
         self.sessions = {each.amplifier.session for each in self.far_ends}
         self.far_ends[of].obey("Disarm", {"ramp": 0}, threads.now())
-
-    @property
-    def keeps_a_session(self) -> bool:
-        """Whether an amplifier is in one of these."""
-        return not self.sessions.isdisjoint({each.amplifier.session for each in self.far_ends})
-
-
-def _knots(envelope: object) -> int:
-    return len(envelope.knots) if isinstance(envelope, Envelope) else 0
-
-
-def _lines(envelope: object) -> dict[str, Any]:
-    assert isinstance(envelope, Envelope)
-    levels, phases = zip(*envelope.knots, strict=True)
-    return {"step": envelope.step, "phases": {*phases}, "levels": [*levels]}
-
-
-def _valid_for(one: Sent) -> float:
-    return QUANTITIES["valid_for"].from_wire(one.layer.valid_for)
 
 
 @asynccontextmanager
@@ -418,26 +264,17 @@ PLAYED = SurfaceLayout(LAYOUT.regions, {**default_effects(), **LAYOUT.effects}, 
 """Contents of 14 dB SL, and a click without a level of its own."""
 
 
-async def clicked(fingers: Fingers, name: str = "click") -> tuple[PlayReport, PlayReport, int]:
-    """Play a click at finger 1: what was reported before it, of it, and how often in all."""
-    count, before = len(fingers.applied), fingers.applied[-1]
-    fingers.play(name)
-    await fingers.hold(0.3)
-    return before, fingers.applied[count], len(fingers.applied) - count
-
-
-def by_finger(report: PlayReport) -> dict[int, Prediction]:
-    """What each finger is predicted to feel."""
-    return {each.contact.key.id: each for each in report.targets}
-
-
 @in_virtual_time
 async def test_a_click_restates_what_its_neighbour_feels_and_only_meanwhile() -> None:
     """Foreign level: none of 40 ms is above it on this plate; contrast: by powers, by hand."""
     async with fingers_on(table(), PLAYED, at={1: LEFT, 2: RIGHT}, held=0.6) as fingers:
-        before, during, count = await clicked(fingers)
-        old, new, again = (by_finger(each)[2] for each in (before, during, fingers.applied[-1]))
-        assert count == 2
+        before = len(fingers.applied)
+        fingers.play("click")
+        await fingers.hold(0.3)
+        old, new, again = [
+            {each.contact.key.id: each for each in report.targets}[2]
+            for report in fingers.applied[before - 1 :]
+        ]
         assert again == old
         figures = old.level_db_sl, old.promised_contrast_db, old.foreign_level_db_sl
         level, contrast, foreign = (10 ** ((each or 0.0) / 10) for each in figures)
@@ -488,19 +325,11 @@ async def test_a_click_without_a_free_layer_is_refused_and_the_buzz_plays_on() -
     assert "no layer is free" in (new.held_back or "")
 
 
-ENABLED, STOPPED = "OPERATION_ENABLED", "QUICK_STOP_ACTIVE"
-
-
-def states(chain: Chain) -> set[str]:
-    """The states of all amplifiers."""
-    return {end.state for end in chain.far_ends}
-
-
 @pytest.mark.parametrize("kind", ["Set", "Commit", "Ping"])
 @in_virtual_time
 async def test_unexpected_exception_stops_all(kind: str) -> None:
     """A bug anywhere, between stage and commit too, leaves nothing vibrating."""
-    async with set_running("a", "b") as chain:
+    async with set_running("a", "b", of=Acted) as chain:
         wire = chain.controller.amplifiers["b"].line.wire
         request = wire.request
 
@@ -514,7 +343,7 @@ async def test_unexpected_exception_stops_all(kind: str) -> None:
         running, chain.running = chain.running, None
         with pytest.raises(ZeroDivisionError):
             await running  # type: ignore[misc]
-        assert states(chain) == {STOPPED}
+        assert chain.amplifiers == "QUICK_STOP_ACTIVE"
         assert chain.controller.group.state is GroupState.STOPPED
 
 
@@ -577,3 +406,326 @@ async def test_open_refuses_a_table_without_playable_frequencies() -> None:
             await chain.controller.open()
         assert chain.controller.group.state is GroupState.CLOSED
         assert not chain.far_end.is_open
+
+
+CAPABILITIES = PlaybackCapabilities(
+    "phased", ("switched", "phased"), Limits((45.0, 300.0), {"SW": 1e-4}), RAMPS_ONLY
+)
+
+
+class RecordingTable:
+    """A table that records its questions, and refuses targets left of `refuse_below`."""
+
+    plate = Plate(0.3, 0.2, 0.0015, Material("aluminium", 70e9, 2700.0, 0.33))
+    frequencies = np.array([100.0])
+    full_levels: Mapping[str, float] = MappingProxyType({"SW": 1e-4})
+
+    def __init__(self) -> None:
+        self.asked: list[list[Finger]] = []
+        self.given: list[dict[str, Any]] = []
+        self.refuse_below = 0.0
+        self.most: float | None = None
+        self.error: Exception | None = None
+
+    def excursion_of(self, drives: Sequence[Any]) -> float:
+        """An ERA has no magnet."""
+        return 0.0
+
+    def prepare(self, mode: str) -> None:
+        """Do nothing."""
+
+    def levels_by_set(self, level_db_sl: float, excitation: Excitation) -> list[float]:
+        """The same by its only set of thresholds."""
+        return [level_db_sl]
+
+    def answer(self, fingers: Sequence[Finger], **others: Any) -> Answer:
+        """One of a frequency that names how often it was asked, at the level asked for."""
+        self.asked.append([*fingers])
+        self.given.append(others)
+        (stimulus,) = [each.stimulus for each in fingers if each.stimulus is not None]
+        if self.error is not None:
+            raise self.error
+        if fingers[0].at[0] < self.refuse_below:
+            raise InputError("nothing is felt there")
+        drive = {"SW": Tone(100.0 + len(self.asked), 1e-6)}
+        level, mode = stimulus.level_db_sl, others["drive_mode"]
+        level = level if self.most is None else self.most
+        limits = others["limits"]
+        return set_answer(fingers, drive, level_db_sl=level, drive_mode=mode, limits=limits)
+
+
+def wanting(**levels: float | None) -> HapticIntent:
+    """An intent for contacts c1, c2 and so on, at their levels, be they on the plate or not."""
+    targets = (Target(ContactKey("a", int(name[1:])), each) for name, each in levels.items())
+    return HapticIntent(tuple(targets), "nothing is wanted")
+
+
+def at(id: int, x: float, y: float = 0.1) -> Contact:
+    """A contact."""
+    return Contact(ContactKey("a", id), x, y, since=0.0)
+
+
+@pytest.fixture
+def recorder() -> Any:
+    """A table that refuses nothing."""
+    return RecordingTable()
+
+
+def test_selector_keeps_other_contacts_quiet(recorder: Any) -> None:
+    """The fingers have the target's level, and drive mode and band of the amplifiers."""
+    contacts = (at(1, 0.1), at(2, 0.2), at(3, 0.25))
+    shaped = replace(CAPABILITIES, envelope_support=replace(RAMPS_ONLY, onset_knots=20))
+    Selector(Chooser(recorder)).select(contacts, wanting(c3=17.0), shaped)
+    selection = Selector(Chooser(recorder)).select(contacts, wanting(c3=17.0), CAPABILITIES)
+    assert [each["shaped"] for each in recorder.given] == [True, False]
+    assert recorder.given[1]["drive_mode"] == "phased"
+    target, *quiet = recorder.asked[1]
+    assert (target.at, [each.at for each in quiet]) == ((0.25, 0.1), [(0.1, 0.1), (0.2, 0.1)])
+    assert target.stimulus == Stimulus(17.0, (45.0, 300.0))
+    (predicted,) = selection.predictions
+    assert (predicted.contact.key.id, predicted.level_db_sl) == (3, 17.0)
+
+
+@pytest.mark.parametrize(
+    ("band", "asked"),
+    [
+        ((90.0, 260.0), (90.0, 260.0)),
+        ((60.0, 100.0), (60.0, 100.0)),
+        ((200.0, 400.0), (200.0, 300.0)),
+        ((105.0, 105.0), (100.0, 100.0)),
+        ((310.0, 400.0), (45.0, 300.0)),
+    ],
+)
+def test_selector_asks_within_the_band_of_its_target(
+    recorder: Any, band: tuple[float, float], asked: tuple[float, float]
+) -> None:
+    """Within what the amplifiers play, 45 to 300 Hz; a single frequency is the table's nearest.
+
+    One that shares no frequency with that is ignored.
+    """
+    recorder.frequencies = np.array([80.0, 100.0, 120.0, 250.0, 350.0])
+    intent = HapticIntent((Target(ContactKey("a", 1), 12.0, band=band),))
+    Selector(Chooser(recorder)).select((at(1, 0.1),), intent, CAPABILITIES)
+    stimulus = recorder.asked[0][0].stimulus
+    assert stimulus is not None
+    assert stimulus.band_hz == asked
+
+
+def test_selector_asks_for_what_the_neighbours_allow(recorder: Any) -> None:
+    """Up to 26 dB SL; where less than 0 are left it says that a finger is in the way."""
+    contacts = (at(1, 0.1), at(2, 0.2))
+    Selector(Chooser(recorder)).select(contacts, wanting(c1=None), CAPABILITIES)
+    assert recorder.asked[0][0].stimulus == Stimulus(26.0, (45.0, 300.0), is_limit=True)
+    recorder.most = -0.1
+    selection = Selector(Chooser(recorder)).select(contacts, wanting(c1=None), CAPABILITIES)
+    assert selection.contents == ()
+    assert "quiet finger" in (selection.reason or "")
+
+
+def test_selector_saturates_at_full_stroke_on_a_plate() -> None:
+    """60 dB SL is more than the ERAs of the paper reach."""
+    table, full = small_table(), dict.fromkeys(("SW", "SE", "NE", "NW"), 0.0001)
+    capabilities = PlaybackCapabilities(
+        "switched", ("switched",), Limits((40.0, 500.0), full), RAMPS_ONLY
+    )
+    selection = Selector(Chooser(table)).select((at(1, 0.1),), wanting(c1=60.0), capabilities)
+    (content,) = selection.contents
+    assert 12 < selection.predictions[0].level_db_sl < 60
+    loudest = max(tone.amplitude for tone in content.layer.excitation.values())
+    assert loudest == pytest.approx(1e-4)
+
+
+@dataclass(frozen=True)
+class Chosen:
+    """What a selector chooses for contacts and an intent.
+
+    is_asked: whether it asks the table for it, else it keeps what it chose before, or asks nothing;
+    reason: for silence; loads, frequencies: of the question. The table refuses targets left of
+    refuse_below [m], or fails with an error.
+    """
+
+    contacts: Sequence[Contact]
+    intent: HapticIntent
+    is_asked: bool
+    reason: str = ""
+    loads: tuple[float, ...] | None = None
+    frequencies: tuple[float, float] | None = None
+    refuse_below: float = 0.0
+    error: Exception | None = None
+
+
+def moving(mover: int) -> list[Chosen]:
+    """One of two contacts moves; its distance counts from where the pattern was selected."""
+    at_distance = [
+        (at(1, 0.1, 0.1 + (distance if mover == 0 else 0.0)),
+         at(2, 0.2, 0.1 - (distance if mover == 1 else 0.0)))
+        for distance in (0.0, 0.004, 0.0079, 0.0081, 0.0)
+    ]  # fmt: skip
+    asked = (True, False, False, True, True)
+    return [Chosen(c, wanting(c2=20.0), a) for c, a in zip(at_distance, asked, strict=True)]
+
+
+ONE, TWO, NONE = at(1, 0.1), at(2, 0.2), "nothing is wanted"
+PULSE = Pulse(0.04, requested_at=0.0, is_raised=False)
+PULSED = HapticIntent((Target(ContactKey("a", 1), 20.0, pulse=PULSE),))
+REFUSED = "nothing is felt there"
+BAND, ALONE = (45.0, 300.0), (101.0, 101.0)
+FAILED = "ZeroDivisionError: by no ERA"
+
+QUESTIONS: Mapping[str, Sequence[Chosen]] = {
+    # No target, or none on the plate; the reason is that of the intent.
+    "no target": [
+        *(Chosen(contacts, wanting(), False, NONE) for contacts in ((), (ONE,), (at(1, 0.29),))),
+        *(Chosen(contacts, wanting(c9=20.0), False, NONE) for contacts in ((), (ONE,))),
+    ],
+    "the quiet contact moves": moving(0),
+    "the target moves": moving(1),
+    # Loads are asked for in the order of the question, and not at all where all are 1.
+    "another load": [
+        Chosen((ONE, TWO), wanting(c2=20.0), True, loads=(1.0, 1.0)),
+        Chosen((replace(ONE, load=1.6), TWO), wanting(c2=20.0), True, loads=(1.0, 1.6)),
+        Chosen((replace(ONE, load=1.6), TWO), wanting(c2=20.0), False),
+        Chosen(
+            (replace(ONE, load=1.6), replace(TWO, load=2.4)),
+            wanting(c2=20.0),
+            True,
+            loads=(2.4, 1.6),
+        ),
+        Chosen((ONE, TWO), wanting(c2=20.0), True, loads=(1.0, 1.0)),
+    ],
+    # It is over before a change would help.
+    "a short pulse": [
+        Chosen((ONE,), PULSED, True),
+        Chosen((replace(ONE, load=2.0),), PULSED, False),
+    ],
+    # Another level, another target; the level first at the frequency that plays.
+    "another intent": [
+        Chosen((ONE, TWO), wanting(c1=20.0), True, frequencies=BAND),
+        Chosen((ONE, TWO), wanting(c1=20.0), False),
+        Chosen((ONE, TWO), wanting(c1=14.0), True, frequencies=ALONE),
+        Chosen((ONE, TWO), wanting(c1=14.0), False),
+        Chosen((ONE, TWO), wanting(c2=14.0), True),
+        Chosen((ONE, TWO), wanting(c2=14.0), False),
+    ],
+    # A change would be felt at the target.
+    "a quiet contact lifts": [
+        Chosen((ONE, TWO), wanting(c2=20.0), True),
+        Chosen((TWO,), wanting(c2=20.0), False),
+    ],
+    # So is its load, without which the plate answers otherwise.
+    "a hand lifts": [
+        Chosen((replace(ONE, load=HAND_LOAD), TWO), wanting(c2=20.0), True, loads=(1.0, HAND_LOAD)),
+        Chosen((TWO,), wanting(c2=20.0), True, loads=(1.0,)),
+    ],
+    # The reason is that of the table; contacts that change cause another query: without the quiet
+    # one it might have been possible.
+    "the table refuses": [
+        Chosen((at(1, 0.25), at(2, 0.1)), wanting(c2=20.0), True, REFUSED, refuse_below=0.2),
+        Chosen((at(1, 0.25), at(2, 0.1)), wanting(c2=20.0), False, REFUSED, refuse_below=0.2),
+        Chosen((at(2, 0.1),), wanting(c2=20.0), True, REFUSED, refuse_below=0.2),
+        Chosen((at(2, 0.21),), wanting(c2=20.0), True, refuse_below=0.2),
+    ],
+    # Its exception is the reason for silence until the contacts change.
+    "the table fails": [
+        Chosen((ONE,), wanting(c1=20.0), True, FAILED, error=ZeroDivisionError("by no ERA")),
+        Chosen((ONE,), wanting(c1=20.0), False, FAILED, error=ZeroDivisionError("by no ERA")),
+        Chosen((at(1, 0.2),), wanting(c1=20.0), True),
+    ],
+}
+
+
+@pytest.mark.parametrize("name", QUESTIONS)
+def test_selector_asks_again_when_it_must(recorder: Any, name: str) -> None:
+    """And keeps what it has chosen otherwise; silence has its reason."""
+    selector, before = Selector(Chooser(recorder)), None
+    for step in QUESTIONS[name]:
+        recorder.refuse_below, recorder.error, count = (
+            step.refuse_below,
+            step.error,
+            len(recorder.asked),
+        )
+        chosen = selector.select(step.contacts, step.intent, CAPABILITIES)
+        assert len(recorder.asked) - count == step.is_asked, step
+        assert step.is_asked is (chosen is not before) or not chosen.targets, step
+        assert bool(chosen.contents) is not bool(step.reason), step
+        assert step.reason in ("", chosen.reason), step
+        if step.loads is not None:
+            assert tuple(each.load for each in recorder.asked[-1]) == step.loads, step
+        if step.frequencies is not None:
+            stimulus = recorder.asked[-1][0].stimulus
+            assert stimulus is not None
+            assert stimulus.band_hz == step.frequencies, step
+        before = chosen
+
+
+def test_a_pulse_is_held_back_where_others_use_the_whole_stroke(recorder: Any) -> None:
+    """Beside 1 µm of 1 µm nothing is left of its stroke: it is said, not played at level zero."""
+    pulse = Target(ContactKey("a", 2), 12.0, pulse=Pulse(0.03, requested_at=0.0))
+    intent = HapticIntent((Target(ContactKey("a", 1), 12.0), pulse))
+    full = replace(CAPABILITIES, limits=Limits((45.0, 300.0), {"SW": 1e-6}), layers=2)
+    selection = Selector(Chooser(recorder)).select((at(1, 0.1), at(2, 0.2)), intent, full)
+    assert [each.targets[0][0].key.id for each in selection.contents] == [1]
+    (held,) = selection.not_served
+    assert held.held_back == "the contents of other fingers use the whole stroke; lift a finger"
+
+
+@pytest.mark.parametrize(("since", "left"), [(0.0, 0.6e-6), (0.02, 0.6e-6), (0.5, 1e-6)])
+def test_a_click_leaves_what_another_drives_until_that_has_ended(
+    recorder: Any, since: float, left: float
+) -> None:
+    """Of 1.6 µm, of which each would take 1 µm: at once, while the first plays, and after it."""
+    limits = replace(CAPABILITIES, limits=Limits((45.0, 300.0), {"SW": 1.6e-6}), layers=2)
+    selector, contacts = Selector(Chooser(recorder)), (at(1, 0.1), at(2, 0.2))
+    first, second = (
+        Target(ContactKey("a", id), 12.0, pulse=Pulse(0.03, requested_at=requested_at))
+        for id, requested_at in ((1, 0.0), (2, since))
+    )
+    if since:
+        selector.select(contacts[:1], HapticIntent((first,)), limits, now=0.0)
+    both = HapticIntent((first, second))
+    selection = selector.select(contacts, both, limits, now=since)
+    amplitudes = [each.layer.excitation["SW"].amplitude for each in selection.contents]
+    assert amplitudes == pytest.approx([1e-6, left])
+    assert selection.predictions[1].level_db_sl == pytest.approx(12 + 20 * math.log10(left / 1e-6))
+
+
+@pytest.mark.parametrize(
+    ("until", "due"), [(math.inf, math.inf), (7.0, 7.0), (3.0, 5.001), (math.nan, 5.001)]
+)
+def test_due_of_an_expired_intent_is_later(until: float, due: float) -> None:
+    """So that it does not keep the loop busy."""
+    assert HapticIntent((), until=until).due(5.0) == due
+
+
+@in_virtual_time
+async def test_vibration_ends_by_itself_if_a_contact_of_a_dead_panel_stays(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Were it never lifted, heartbeats alone would keep nothing playing."""
+    async with set_running(breaks="lift", of=Played) as chain:
+        never = property(lambda tracker: math.inf, lambda tracker, at: None)
+        monkeypatch.setattr(ContactTracker, "next_expiry", never, raising=False)
+        monkeypatch.setattr(ContactTracker, "expire", lambda tracker, now: Change())
+        chain.marks()
+        await chain.leave(60.0, FINGER)
+        assert not chain.far_end.sent()[-1].is_silent
+        assert 0.0 < max(chain.expiries) - chain.marked_at < 2.1
+
+
+@in_virtual_time
+async def test_vibration_of_a_finger_that_moves_whenever_the_loop_turns_is_renewed() -> None:
+    """By half a millimetre, which changes nothing else: there is no gap."""
+    async with set_running(of=Played) as chain:
+        number, x, y = FINGER
+        step, chain.at = chain.controller.cycle.step, {number: (x, y)}
+
+        async def turn() -> None:
+            await asyncio.sleep(0.002)
+            chain.put((number, x + 0.0005 * (chain.at[number][0] == x), y))
+            await step()
+
+        chain.controller.cycle.step = turn  # type: ignore[method-assign]
+        await asyncio.sleep(6.0)
+        assert len(chain.vibrations) > 3
+        assert not chain.has_gaps
+        assert chain.far_end.levels[0] == 0.2  # of the table's pattern

@@ -237,12 +237,6 @@ class Program:
                 chain.at = {}
             await chain.hold(0.15)
 
-    def volts(self) -> ComplexArray:
-        """What exciters get."""
-        with Outputs.recorded() as outputs:
-            run_virtual(self.play())
-        return outputs.volts(len(rig(self.rig).eras))
-
 
 TAPS = tuple(np.arange(0.1, 0.8, 0.06).tolist())
 
@@ -306,10 +300,12 @@ def test_programs_keep_magnets_within_their_excursion(name: str) -> None:
     In any cycle. Motion of the other exciters adds 1 % to that at most.
     """
     program = PROGRAMS[name]
-    volts, solved = program.volts(), magnets(program.rig)
+    with Outputs.recorded() as outputs:
+        run_virtual(program.play())
+    eras, solved = rig(program.rig).eras, magnets(program.rig)
+    volts = outputs.volts(len(eras))
     moved = solved.moved(volts)
-    limit = rig(program.rig).eras[0].excursion
-    share = np.abs(moved).max() / limit
+    share = np.abs(moved).max() / eras[0].excursion
     held, heat = (solved.heat(volts, each).max() for each in (0 * moved, moved))
     _logger.info("%s: %.2f of x_max, %.3g W, %.3g W held still", name, share, heat, held)
     bears = {"weekend": 10.0, "low": 10.0, "large": 24.0}[program.rig]
@@ -345,33 +341,20 @@ def furthest(volts: ComplexArray) -> float:
     return float(np.abs(magnets("onsets").moved(volts)).max())
 
 
-def shaped(frequency: float) -> Iterable[Answer]:
-    """Answers for one of two fingers with as much as exciters give, with envelopes."""
-    for target, quiet in PAIRS:
-        fingers = [Finger(target, Stimulus(60.0, band_hz=(frequency, frequency))), Finger(quiet)]
-        yield Timing(onset_table()).shaped(
-            answer(onset_table(), fingers, drive_mode="phased", shaped=True)
-        )
-
-
 @pytest.mark.parametrize("frequency", [60.0, 70.0, 90.0])
 def test_onsets_keep_magnets_within_their_excursion(frequency: float) -> None:
-    """At the most that is asked, along shaped onsets and along a jump, in either phase."""
-    largest = []
-    for found in shaped(frequency):
-        (layer,) = found.layers
+    """At the most that is asked, along shaped onsets and along a jump, in either phase.
+
+    Of answers for one of two fingers with as much as exciters give; a jump takes a millisecond.
+    """
+    largest, times = [], STEP * np.arange(1600)
+    jump = np.exp(2j * np.pi * frequency * times) * np.minimum(times / 1e-3, 1)
+    for target, quiet in PAIRS:
+        (layer,) = alone(target, frequency, Limits(), Finger(quiet)).layers
         assert layer.onset is not None
-        largest.append(furthest(voltages([layer.onset])))
         full = np.array([layer.excitation[era.name].phasor for era in onset_table().eras])
-        largest.append(furthest(jump(full, frequency)))
+        largest += [furthest(voltages([layer.onset])), furthest(jump[:, None] * full)]
     assert 0.6 * ALLOWED < max(largest) < 1.01 * ALLOWED
-
-
-def jump(amplitudes: ComplexArray, frequency: float) -> ComplexArray:
-    """Voltages (n, eras) of a tone that begins within a millisecond."""
-    times = STEP * np.arange(1600)
-    turning = np.exp(2j * np.pi * frequency * times) * np.minimum(times / 1e-3, 1)
-    return np.asarray(turning[:, None] * amplitudes)
 
 
 def test_contents_together_keep_magnets_within_their_excursion() -> None:
@@ -386,10 +369,10 @@ def test_contents_together_keep_magnets_within_their_excursion() -> None:
     assert 0.3 * ALLOWED < max(largest) < 1.01 * ALLOWED
 
 
-def alone(at: Point, frequency: float, limits: Limits) -> Answer:
-    """All that one finger can have within limits."""
-    finger = Finger(at, Stimulus(60.0, band_hz=(frequency, frequency)))
-    found = answer(onset_table(), [finger], drive_mode="phased", shaped=True, limits=limits)
+def alone(at: Point, frequency: float, limits: Limits, *quiet: Finger) -> Answer:
+    """All that one finger can have within limits, beside others that feel nothing."""
+    fingers = [Finger(at, Stimulus(60.0, band_hz=(frequency, frequency))), *quiet]
+    found = answer(onset_table(), fingers, drive_mode="phased", shaped=True, limits=limits)
     return Timing(onset_table()).shaped(found)
 
 
@@ -415,7 +398,10 @@ def statuses(fingers: Fingers) -> dict[int, float]:
 
 @in_virtual_time
 async def test_status_says_what_leaks_to_a_finger_that_has_moved() -> None:
-    """Slowly, by less than 8 mm, no weights change: within a decibel of what is measured there."""
+    """Slowly, by less than 8 mm, no weights change: within a decibel of what is measured there.
+
+    Nothing leaks when the last finger has lifted and its silence is not confirmed yet.
+    """
     async with fingers_on(
         paper_table(), LEAKING, at={1: LEFT, 2: RIGHT, 3: ABOVE}, held=1.2
     ) as fingers:
@@ -432,6 +418,8 @@ async def test_status_says_what_leaks_to_a_finger_that_has_moved() -> None:
         moved = statuses(fingers)
         assert moved == pytest.approx(fingers.levels_db_sl(foreign=True), abs=1.0)
         assert moved[3] > rested[3]
+        fingers.at.clear()
+        assert statuses(fingers) == {}
 
 
 @pytest.mark.long
@@ -455,11 +443,3 @@ async def test_weights_follow_a_finger_at_half_a_metre_a_second() -> None:
         assert statuses(fingers)[3] == pytest.approx(fingers.levels_db_sl(foreign=True)[3], abs=1.0)
         assert max(on_the_way) > rested
         assert statuses(fingers)[3] < max(on_the_way)
-
-
-@in_virtual_time
-async def test_nothing_leaks_without_fingers() -> None:
-    """The status is read when the last has lifted and its silence is not confirmed yet."""
-    async with fingers_on(paper_table(), LEAKING, at={1: LEFT}, held=0.3) as fingers:
-        view = PlateView(lambda key: None, (), fingers.applied[-1])
-        assert view.statuses_now(paper_table()) == []

@@ -7,7 +7,8 @@ one of them back has passed; and the way from what plays to a better answer. Two
 """
 
 import math
-from collections.abc import AsyncIterator, Mapping, Sequence
+from collections import Counter
+from collections.abc import AsyncIterator, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, replace
 from functools import cache
@@ -80,12 +81,6 @@ def table() -> LocalizationTable:
     return build_table(eight_eras(), frequencies=np.linspace(40.0, 500.0, 24))
 
 
-@cache
-def timing() -> Timing:
-    """Of that table."""
-    return Timing(table())
-
-
 def served(chain: Chain) -> int:
     """How many fingers feel something of their own."""
     felt = chain.applied[-1].targets if chain.applied else ()
@@ -95,7 +90,7 @@ def served(chain: Chain) -> int:
 @asynccontextmanager
 async def bus(number: int) -> AsyncIterator[Chain]:
     """Eight ERAs on one bus, open, and three fingers at random places for 0.3 s."""
-    given: dict[str, Any] = {"intent_source": EachItsOwn(), "timing": timing()}
+    given: dict[str, Any] = {"intent_source": EachItsOwn(), "timing": Timing(table())}
     async with Chain.on(BUS, eight_eras(), table(), **given) as chain:
         chain.is_felt = chain.must_be_felt = False
         await chain.open()
@@ -160,15 +155,29 @@ async def two_fingers(
 
 
 @in_virtual_time
-async def test_fingers_that_rest_are_served_by_another_table() -> None:
-    """Of one frequency only one of two feels its own; of those of the paper both do."""
+async def test_fingers_that_rest_are_served_by_another_table_and_as_is_wanted_now() -> None:
+    """Of one frequency only one of two feels its own; of those of the paper both do.
+
+    In one narrow band, or 40 dB weaker, a finger feels nothing; without that both do.
+    """
     few = build_table(smooth_rig(), frequencies=np.array([100.0]))
-    async with two_fingers(few) as (chain, _):
+    async with two_fingers(few) as (chain, source):
         await chain.hold(0.5)
         assert served(chain) < 2
         chain.controller.replace_answers(paper_table(), Timing(paper_table()))
         await chain.hold(0.5)
         assert served(chain) == 2
+        for wanted, before, after in (("band", (99.0, 101.0), None), ("gain_db", -40.0, 0.0)):
+            chain.at = {}
+            await chain.hold(0.3)
+            setattr(source, wanted, before)
+            chain.at = {1: LEFT, 2: RIGHT}
+            await chain.hold(0.5)
+            assert served(chain) < 2
+            setattr(source, wanted, after)
+            chain.controller.cycle.request_update()
+            await chain.hold(0.3)
+            assert served(chain) == 2
 
 
 @in_virtual_time
@@ -199,26 +208,6 @@ async def test_fingers_that_rest_are_served_once_a_lost_amplifier_is_back() -> N
         await chain.controller.clear()
         chain.applied.clear()
         await chain.operate("arm")
-        await chain.hold(0.3)
-        assert served(chain) == 2
-
-
-@pytest.mark.parametrize(
-    ("before", "after"),
-    [({"band": (99.0, 101.0)}, {"band": None}), ({"gain_db": -40.0}, {"gain_db": 0.0})],
-    ids=["layout", "strength"],
-)
-@in_virtual_time
-async def test_fingers_that_rest_are_served_as_is_wanted_now(
-    before: Mapping[str, Any], after: Mapping[str, Any]
-) -> None:
-    """In one narrow band, or 40 dB weaker, a finger feels nothing; without that both do."""
-    async with two_fingers() as (chain, source):
-        vars(source).update(before)
-        await chain.hold(0.5)
-        assert served(chain) < 2
-        vars(source).update(after)
-        chain.controller.cycle.request_update()
         await chain.hold(0.3)
         assert served(chain) == 2
 
@@ -274,12 +263,16 @@ def test_a_moving_finger_is_answered_around_the_next_8_mm() -> None:
 def test_ends_of_ways_are_fingers_where_they_can_be(
     at: tuple[float, float], vx: float, stimulus: Stimulus | None, count: int
 ) -> None:
-    """Else the finger alone, on the plate; any of these is answered."""
-    contacts = [contact(1, at, vx=vx), contact(2, OTHER)]
+    """Else the finger alone, on the plate; any of these is answered.
+
+    So is one that moved until 60 ms ago, of which its source says nothing since.
+    """
+    contacts = [contact(1, at, vx=vx), replace(contact(2, OTHER), motion=Motion())]
     given = [Finger(at, stimulus), fingers(contacts)[1]]
     found = with_ways(given, contacts, NOW, paper_table().plate)
     assert len(found) == count
     assert len(answer(paper_table(), found, drive_mode="phased").fingers) == count
+    assert with_ways(given, contacts, NOW + 0.06, paper_table().plate) == given
 
 
 def test_what_is_felt_on_a_way_is_the_mean_power_there_and_a_share_for_side_bands() -> None:
@@ -354,15 +347,6 @@ def test_a_promise_for_a_way_holds_at_places_between() -> None:
     assert least[-1] < min(least[:-1])
 
 
-def test_a_finger_that_rests_is_answered_where_it_is() -> None:
-    """Also one that moved until 60 ms ago, of which its source says nothing since."""
-    moved = contact(1, MOVER, vx=0.2)
-    contacts = [moved, replace(contact(2, OTHER), motion=Motion())]
-    assert with_ways(fingers(contacts), contacts, NOW + 0.06, paper_table().plate) == fingers(
-        contacts
-    )
-
-
 FIRST, SECOND = (0.2133, 0.0366), (0.1206, 0.1132)
 
 
@@ -401,26 +385,14 @@ def contacts_at(*places: Position) -> list[Contact]:
 
 @in_virtual_time
 async def test_fingers_that_land_apart_come_to_the_promise_of_those_that_land_together() -> None:
-    """Within 1 dB, a content at a time; all that sounds at once is 30 Hz apart, and it is felt."""
+    """Within 1 dB, a content at a time; all that sounds at once is 30 Hz apart, and it is felt.
+
+    It rises in a layer of its own along 300 ms, and what it replaces falls as long, 81 ms later, to
+    below any threshold; then that has ended.
+    """
     targets = tuple((each, Target(each.key, 14.0)) for each in contacts_at(FIRST, SECOND))
     together = chosen_for(targets, playable())
-    async with fingers_on(paper_table(), WHOLE) as fingers:
-        await apart(fingers, then=1.5)
-        landed, *steps = fingers.applied[1:]
-        promised = min(each.promised_contrast_db or 0.0 for each in together.predictions)
-        assert worst(landed) < promised - 6
-        assert worst(steps[-1]) >= promised - 1
-        for before, after in pairwise([landed, *steps]):
-            (led,) = {*frequencies(after).values()} - {*frequencies(before).values()}
-            assert all(abs(led - each) >= 30 for each in frequencies(before).values())
-            if before is not landed:
-                assert after.time - before.time >= 0.38  # no two fade at once
-        assert min(fingers.contrasts().values()) >= worst(steps[-1])
-
-
-@in_virtual_time
-async def test_one_content_rises_in_a_layer_of_its_own_and_the_other_falls_later() -> None:
-    """Along 300 ms both, the other 81 ms later, to below any threshold; then it has ended."""
+    promised = min(each.promised_contrast_db or 0.0 for each in together.predictions)
     async with fingers_on(paper_table(), WHOLE) as fingers:
         count = await apart(fingers, then=0.6)
         fades = [each for each in fingers.committed[count:] if each[2][0].ramp == 300]
@@ -432,6 +404,16 @@ async def test_one_content_rises_in_a_layer_of_its_own_and_the_other_falls_later
         await fingers.hold(0.3)
         assert fingers.far_end.status()["tokens"][old.layer] == 0
         assert old.layer not in fingers.applied[-1].contents
+        await fingers.hold(0.6)
+        landed, *steps = fingers.applied[1:]
+        assert worst(landed) < promised - 6
+        assert worst(steps[-1]) >= promised - 1
+        for before, after in pairwise([landed, *steps]):
+            (led,) = {*frequencies(after).values()} - {*frequencies(before).values()}
+            assert all(abs(led - each) >= 30 for each in frequencies(before).values())
+            if before is not landed:
+                assert after.time - before.time >= 0.38  # no two fade at once
+        assert min(fingers.contrasts().values()) >= worst(steps[-1])
 
 
 @in_virtual_time
@@ -482,10 +464,9 @@ def test_what_does_not_fit_beside_what_plays_is_not_led_to() -> None:
     targets = tuple((each, Target(each.key, 14.0)) for each in contacts_at(FIRST, SECOND))
     first = chosen_for(targets[:1], playable())
     landed = chosen_for(targets, playable(), before={each.key: each for each in first.contents})
-    felt, drives = {each.key: each for each in landed.contents}, dict[str, float]()
+    felt, drives = {each.key: each for each in landed.contents}, Counter[str]()
     for each in landed.contents:
-        for name, tone in each.layer.excitation.items():
-            drives[name] = drives.get(name, 0.0) + tone.amplitude
+        drives.update({name: tone.amplitude for name, tone in each.layer.excitation.items()})
     limited = replace(
         playable(), limits=Limits((40.0, 320.0), {n: 1.2 * each for n, each in drives.items()})
     )

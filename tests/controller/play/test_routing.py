@@ -8,9 +8,10 @@ import logging
 import math
 from collections.abc import AsyncIterator, Mapping
 from contextlib import asynccontextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from functools import cache
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -40,11 +41,7 @@ from model.answer.answer_report import Timing
 from model.ensemble.attached_plate import AttachedPlate, PlateOnEras
 from model.ensemble.draws import EXACT_CLOCKS
 from model.errors import InputError
-from model.fem import Mesh
 from model.rig.rig import Channel, Rig, Uncertainty
-from model.structure.attachments import Era
-from model.structure.material import Material
-from model.structure.plate import Plate
 from model.table.table import LocalizationTable
 from model.table.table_file import build_table
 from model.transients.base_motion import BaseEnvelope
@@ -67,12 +64,18 @@ HALVES = replace(
 
 
 def test_answers_count_clocks_before_they_are_worse_than_counted() -> None:
-    """A quarter more than is known; anew where that is passed, or far too much: not in between."""
+    """A quarter more than is known; anew where that is passed, or far too much: not in between.
+
+    Whatever table is answered by, of which nothing else changes. One amplifier is not even asked.
+    """
     now = {"a": 8e-6, "b": 4e-6}
     clocks, table = CountedClocks(HALVES, lambda: now), smooth_table()
     first = clocks.counted_by(table)
     assert first.clocks.errors == pytest.approx((10e-6, 5e-6))
     assert clocks.errors == pytest.approx({"a": 10e-6, "b": 5e-6})
+    learned = replace(table)
+    other = clocks.counted_by(learned)
+    assert (other.clocks, other.omega is learned.omega) == (first.clocks, True)
     now |= {"a": 9.9e-6, "b": 3e-6}
     assert clocks.counted_by(first) is first
     now["a"] = 10.1e-6
@@ -80,15 +83,10 @@ def test_answers_count_clocks_before_they_are_worse_than_counted() -> None:
     assert worse.clocks.errors[0] == pytest.approx(12.625e-6)
     now["a"] = 5e-6
     assert clocks.counted_by(worse).clocks.errors[0] == pytest.approx(6.25e-6)
-
-
-def test_a_table_that_is_learned_has_the_same_clocks() -> None:
-    """Whatever table is answered by; nothing else of it changes."""
-    clocks = CountedClocks(HALVES, lambda: {"a": 8e-6, "b": 4e-6})
-    first, learned = clocks.counted_by(smooth_table()), replace(smooth_table())
-    other = clocks.counted_by(learned)
-    assert other.clocks == first.clocks
-    assert other.omega is learned.omega
+    one = replace(RIG, wiring={era.name: Channel("a", n) for n, era in enumerate(RIG.eras)})
+    alone = CountedClocks(one, lambda: pytest.fail("not to be asked"))
+    assert alone.counted_by(table) is table
+    assert table.clocks == EXACT_CLOCKS
 
 
 def test_clocks_that_come_and_go_are_told_once_with_how_often(
@@ -130,14 +128,6 @@ def test_clock_that_is_not_known_yet_is_no_warning(caplog: pytest.LogCaptureFixt
     with caplog.at_level(logging.INFO, logger="controller.play.routing"):
         assert clocks.counted_by(smooth_table()).clocks.groups == (0, 1, 0, 1)
     assert [each.levelno for each in caplog.records] == [logging.INFO]
-
-
-def test_one_amplifier_has_no_clock_that_counts() -> None:
-    """It is not even asked."""
-    one = replace(RIG, wiring={era.name: Channel("a", n) for n, era in enumerate(RIG.eras)})
-    clocks = CountedClocks(one, lambda: pytest.fail("not to be asked"))
-    assert clocks.counted_by(smooth_table()) is smooth_table()
-    assert smooth_table().clocks == EXACT_CLOCKS
 
 
 IDENTIFIED = Uncertainty(0.015, 1.5, 0.002, 0.01, 1.1, 0.5, modulus=0.0, place=0.0, harmonic=0.0)
@@ -270,54 +260,33 @@ async def test_status_of_several_amplifiers_eliminates_no_plate(
         assert not eliminated
 
 
-LIMITS = GuardLimits(40.0, 500.0, 0.8)
+PAIRED_RIG = replace(
+    RIG,
+    eras=tuple(
+        replace(era, name=name, stroke=stroke)
+        for era, name, stroke in zip(RIG.eras, "ABC", (1e-4, 2e-4, 1e-4), strict=False)
+    ),
+    wiring={"A": Channel("left", 1), "B": Channel("left", 0), "C": Channel("right", 0)},
+    amplifiers={"left": "sim://", "right": "sim://"},
+    limits=GuardLimits(40.0, 500.0, 0.8),
+)
+"""Two ERAs on the left amplifier, one on the right."""
 
 
-@dataclass
-class Wire:
-    """A wire on which a word takes a time [s]."""
-
-    word: float
-
-    def transit(self, words: int) -> float:
-        """In proportion to the words."""
-        return words * self.word
+def amplifier(*, line: Any = None, **changed: int) -> Any:
+    """An amplifier on a line, with some capabilities of its own."""
+    own: Values = {**capabilities(4), **changed}
+    return Mock(line=line or line_of(0.0), capabilities=own, ledger=Ledger(PAIRED_RIG.limits, own))
 
 
-@dataclass(eq=False)
-class Line:
-    """A line with a wire."""
-
-    wire: Wire = field(default_factory=lambda: Wire(0.0))
+def line_of(word: float) -> Any:
+    """A line on whose wire a word takes a time [s]."""
+    return Mock(wire=Mock(transit=lambda words: words * word))
 
 
-class Opened:
-    """An amplifier with some capabilities of its own."""
-
-    def __init__(self, line: Line | None = None, **changed: int) -> None:
-        self.line = line or Line()
-        self.capabilities: Values = {**capabilities(4), **changed}
-        self.ledger = Ledger(LIMITS, self.capabilities)
-
-
-def paired_rig() -> Rig:
-    """Two ERAs on the left amplifier, one on the right."""
-    return Rig(
-        plate=Plate(0.3, 0.2, 0.0015, Material("aluminium", 70e9, 2700.0, 0.33)),
-        mesh=Mesh(4, 4, 0.3, 0.2),
-        eras=tuple(
-            Era(name, x, 0.0, 17_000.0, 1.0, 0.0, stroke)
-            for name, x, stroke in (("A", 0.0, 1e-4), ("B", 0.15, 2e-4), ("C", 0.3, 1e-4))
-        ),
-        wiring={"A": Channel("left", 3), "C": Channel("right", 0), "B": Channel("left", 1)},
-        amplifiers={"left": "fake://", "right": "fake://"},
-        limits=LIMITS,
-    )
-
-
-def both(left: Opened | None = None, right: Opened | None = None) -> Mapping[str, Any]:
+def both(left: Any = None, right: Any = None) -> Mapping[str, Any]:
     """The two amplifiers of the rig."""
-    return {"left": left or Opened(), "right": right or Opened()}
+    return {"left": left or amplifier(), "right": right or amplifier()}
 
 
 @pytest.mark.parametrize(
@@ -332,28 +301,26 @@ def test_capabilities_choose_the_best_common_drive_mode(
     steps: list[tuple[int, int]], mode: str
 ) -> None:
     """By the steps of level (1e-4) and phase (0.01 degrees) of each amplifier."""
-    left, right = (Opened(level_step=level, phase_step=phase) for level, phase in steps)
-    found = playback_capabilities(paired_rig(), both(left, right))
+    left, right = (amplifier(level_step=level, phase_step=phase) for level, phase in steps)
+    found = playback_capabilities(PAIRED_RIG, both(left, right))
     assert found.drive_mode == mode
     assert found.playable[-1] == mode
 
 
-def test_capabilities_refuse_an_unplayable_drive_mode() -> None:
-    """With those that can be played."""
-    plain = both(Opened(phase_step=18_000), Opened(phase_step=18_000))
-    assert (
-        playback_capabilities(paired_rig(), plain, drive_mode="switched").drive_mode == "switched"
-    )
-    with pytest.raises(InputError, match=r"switched.*phased"):
-        playback_capabilities(paired_rig(), plain, drive_mode="phased")
-
-
 def test_capabilities_are_the_tightest_limits() -> None:
-    """Of the rig and all amplifiers: 50 Hz and half of full level, and 300 Hz."""
-    left = Opened(frequency_min=1000, level_max=5000)
-    found = playback_capabilities(paired_rig(), both(left, Opened(frequency_max=6000)))
+    """Of the rig and all amplifiers: 50 Hz and half of full level, and 300 Hz.
+
+    A drive mode that cannot be played is refused, with those that can be.
+    """
+    left = amplifier(frequency_min=1000, level_max=5000)
+    found = playback_capabilities(PAIRED_RIG, both(left, amplifier(frequency_max=6000)))
     assert found.limits.frequencies == (50.0, 300.0)
     assert found.limits.amplitudes == pytest.approx({"A": 5e-5, "B": 1e-4, "C": 8e-5})
+    plain = both(amplifier(phase_step=18_000), amplifier(phase_step=18_000))
+    only = playback_capabilities(PAIRED_RIG, plain, drive_mode="switched")
+    assert only.drive_mode == "switched"
+    with pytest.raises(InputError, match=r"switched.*phased"):
+        playback_capabilities(PAIRED_RIG, plain, drive_mode="phased")
 
 
 @pytest.mark.parametrize(
@@ -379,9 +346,9 @@ def test_envelopes_have_as_many_knots_as_wires_carry(
     By hand: two channels on the left have 18 words of heads, and 4 words for each knot; with the
     third channel 30 and 6. An ending has 7 knots, in a set of its own.
     """
-    lines = [Line(Wire(0.010 / (words + 0.5))) for _ in range(2)]
-    left, right = (Opened(lines[0 if is_shared else number]) for number in range(2))
-    assert envelope_support(paired_rig(), both(left, right)) == EnvelopeSupport(*expected)
+    lines = [line_of(0.010 / (words + 0.5)) for _ in range(2)]
+    left, right = (amplifier(line=lines[0 if is_shared else number]) for number in range(2))
+    assert envelope_support(PAIRED_RIG, both(left, right)) == EnvelopeSupport(*expected)
 
 
 @pytest.mark.parametrize(
@@ -396,7 +363,7 @@ def test_envelopes_have_as_many_knots_as_wires_carry(
 )
 def test_envelopes_need_capabilities(changed: dict[str, int], expected: tuple[int, int]) -> None:
     """Knots, steps of 5 ms and words of a set, of every amplifier."""
-    found = envelope_support(paired_rig(), both(Opened(**changed)))
+    found = envelope_support(PAIRED_RIG, both(amplifier(**changed)))
     assert found == EnvelopeSupport(*expected)
 
 
@@ -406,24 +373,21 @@ STROKES = {"A": 1e-4, "B": 2e-4, "C": 1e-4}
 def test_envelopes_on_the_wire_by_hand() -> None:
     """Levels in strokes of 1e-4, phases in 0.01 degrees and steps of 0.1 ms, without the last knot.
 
-    Half a turn is the lowest phase that the wire has.
+    Half a turn is the lowest phase that the wire has. What rounding makes more than full stroke is
+    full stroke: the ledger would refuse it.
     """
     onset = {
         "B": BaseEnvelope(110.0, 0, (1e-4j, -2e-4, 0), 0.01),
         "A": BaseEnvelope(110.0, 0, (2e-5, 5e-5)),
+        "C": BaseEnvelope(110.0, 0, (cmath.rect(1e-4 * (1 + 1e-12), 0.0), 0)),
     }
     found, none, ending = on_wire(STROKES, onset, None, {"C": BaseEnvelope(110.0, 0, (5e-5,))})
     assert (none, ending) == ({}, {"C": Envelope(50, ())})
-    assert found["A"] == Envelope(50, ((2000, 0),))
-    assert found["B"] == Envelope(100, ((5000, 9000), (10000, -18000)))
-
-
-def test_envelopes_round_full_stroke_to_one() -> None:
-    """A rounding error above it would be refused by the ledger."""
-    full = cmath.rect(1e-4 * (1 + 1e-12), 1.0)
-    (found,) = on_wire(STROKES, {"A": BaseEnvelope(110.0, 0, (full, 0))})
-    ((level, _),) = found["A"].knots
-    assert level == 10000
+    assert found == {
+        "A": Envelope(50, ((2000, 0),)),
+        "B": Envelope(100, ((5000, 9000), (10000, -18000))),
+        "C": Envelope(50, ((10000, 0),)),
+    }
 
 
 def test_thinned_envelope_follows_the_same_lines() -> None:
@@ -435,37 +399,24 @@ def test_thinned_envelope_follows_the_same_lines() -> None:
     assert whole is line
 
 
-PLATE = Plate(0.3, 0.2, 0.0015, Material("aluminium", 70e9, 2700.0, 0.33))
-PAIRED_RIG = Rig(
-    plate=PLATE,
-    mesh=Mesh(4, 4, 0.3, 0.2),
-    eras=tuple(
-        Era(name, x, y, 17_000.0, 1.0, 0.0, stroke)
-        for name, x, y, stroke in (
-            ("SW", 0.0, 0.0, 100e-6),
-            ("SE", 0.3, 0.0, 50e-6),
-            ("NE", 0.3, 0.2, 100e-6),
-        )
-    ),
-    wiring={"SW": Channel("left", 1), "SE": Channel("right", 0), "NE": Channel("left", 0)},
-    amplifiers={"left": "sim://", "right": "sim://"},
-    limits=GuardLimits(40.0, 500.0, 1.0),
-)
-
-
 def test_route_by_hand() -> None:
-    """20 of 100 µm is level 0.2, 20 of 50 is 0.4; pi/2 is 90°; other channels are silent."""
-    layers = route(
-        {"SW": Tone(110.0, 20e-6, math.pi / 2), "SE": Tone(250.0, 20e-6)},
-        PAIRED_RIG,
-        ramp=0.02,
-    )
-    played = Played(1, 110.0, pytest.approx(0.2), pytest.approx(90.0))
+    """20 of 100 µm is level 0.2, 20 of 200 is 0.1; pi/2 is 90°; other channels are silent.
+
+    More than full stroke and NaN reach the ledger unchanged; a pattern of another rig is refused as
+    a whole.
+    """
     silent = Played(0, 40.0, 0.0, skip_ending=True)
-    assert layers == {
+    drive = {"A": Tone(110.0, 20e-6, math.pi / 2), "C": Tone(250.0, 20e-6)}
+    played = Played(1, 110.0, pytest.approx(0.2), pytest.approx(90.0))
+    assert route(drive, PAIRED_RIG, ramp=0.02) == {
         "left": AmplifierLayer(0, (played, silent), ramp=0.02),
-        "right": AmplifierLayer(0, (Played(0, 250.0, pytest.approx(0.4)),), ramp=0.02),
+        "right": AmplifierLayer(0, (Played(0, 250.0, pytest.approx(0.2)),), ramp=0.02),
     }
+    over = route({"B": Tone(1e9, 4e-4, math.nan)}, PAIRED_RIG, ramp=0)["left"].tones[1]
+    assert (over.frequency, over.level) == (1e9, pytest.approx(2.0))
+    assert math.isnan(over.phase)
+    with pytest.raises(InputError, match="got NW"):
+        route({"A": Tone(100.0, 1e-6), "NW": Tone(100.0, 1e-6)}, PAIRED_RIG, ramp=0)
 
 
 @pytest.mark.parametrize(
@@ -482,39 +433,25 @@ def test_route_by_hand() -> None:
 )
 def test_route_wraps_phases(radians: float, degrees: float) -> None:
     """Phases lie within half a turn, of which both ends are one."""
-    command = route({"SE": Tone(100.0, 1e-6, radians)}, PAIRED_RIG, ramp=0)["right"].tones[0]
+    command = route({"C": Tone(100.0, 1e-6, radians)}, PAIRED_RIG, ramp=0)["right"].tones[0]
     assert command.phase == pytest.approx(degrees)
-
-
-def test_route_applies_no_limits() -> None:
-    """More than full stroke and NaN reach the ledger unchanged."""
-    over = route({"SE": Tone(1e9, 1e-4, math.nan)}, PAIRED_RIG, ramp=0)["right"].tones[0]
-    assert over.frequency == 1e9
-    assert over.level == pytest.approx(2.0)
-    assert math.isnan(over.phase)
-
-
-def test_route_refuses_an_unknown_era() -> None:
-    """A pattern of another rig is refused as a whole."""
-    with pytest.raises(InputError, match="got NW"):
-        route({"SW": Tone(100.0, 1e-6), "NW": Tone(100.0, 1e-6)}, PAIRED_RIG, ramp=0)
 
 
 @pytest.mark.parametrize(
     ("wanted", "kept"),
     [
-        ({"SW": Tone(110.0, 5e-6), "SE": Tone(110.0, 9e-6)}, {"SW", "SE"}),
-        ({"SW": Tone(110.0, 5e-6, 1.0), "SE": Tone(110.0, 9e-6)}, {"SW", "SE"}),
-        ({"SE": Tone(110.0, 9e-6)}, {"SE"}),
-        ({"SW": Tone(110.0, 5e-6), "SE": Tone(250.0, 9e-6)}, {"SW"}),
-        ({"SW": Tone(110.0, 5e-6), "NE": Tone(110.0, 9e-6)}, set()),
-        ({"SW": Tone(110.01, 5e-6), "SE": Tone(110.01, 9e-6)}, set()),
-        ({"SW": Tone(250.0, 5e-6), "SE": Tone(250.0, 9e-6)}, set()),
+        ({"A": Tone(110.0, 5e-6), "C": Tone(110.0, 9e-6)}, {"A", "C"}),
+        ({"A": Tone(110.0, 5e-6, 1.0), "C": Tone(110.0, 9e-6)}, {"A", "C"}),
+        ({"C": Tone(110.0, 9e-6)}, {"C"}),
+        ({"A": Tone(110.0, 5e-6), "C": Tone(250.0, 9e-6)}, {"A"}),
+        ({"A": Tone(110.0, 5e-6), "B": Tone(110.0, 9e-6)}, set()),
+        ({"A": Tone(110.01, 5e-6), "C": Tone(110.01, 9e-6)}, set()),
+        ({"A": Tone(250.0, 5e-6), "C": Tone(250.0, 9e-6)}, set()),
     ],
 )
 def test_route_keeps_phase_only_if_all_eras_continue(wanted: Excitation, kept: set[str]) -> None:
     """A frequency restarts if an ERA joins it."""
-    playing = {name: Played(0, 110.0, 0.5) for name in ("SW", "SE")}
+    playing = {name: Played(0, 110.0, 0.5) for name in ("A", "C")}
     layers = route(wanted, PAIRED_RIG, ramp=0, playing=playing)
     assert {
         name
@@ -533,6 +470,6 @@ def test_drive_of_eras_by_hand() -> None:
         "right": [LayerSet(0, 20, 0, (Command(0, 5000, 4000, 0),))],
     }
     assert tones_by_era(achieved, PAIRED_RIG) == {
-        "SW": Played(1, 110.05, 0.1999, -90.0),
-        "SE": Played(0, 250.0, 0.4),
+        "A": Played(1, 110.05, 0.1999, -90.0),
+        "C": Played(0, 250.0, 0.4),
     }

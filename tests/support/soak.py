@@ -6,52 +6,56 @@ python tests/support/soak.py --seed 17 --trace trace.txt         one of the long
 
 import argparse
 import gc
+import hashlib
 import os
 import resource
 import sys
 import time
 from collections import Counter
 from collections.abc import Iterable
-from contextlib import nullcontext
 from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
+from typing import TypeAlias
 
 for _variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ[_variable] = "1"  # before numpy loads
 
-from soak_runs import KINDS, PLATES, Outcome, Trace, make_plan, run_plan  # noqa: E402
+from soak_runs import KINDS, PLATES, Plan, make_plan, run_plan  # noqa: E402
 
 _PROGRESS_INTERVAL = 250  # runs
 gc.freeze()  # what is loaded stays
 gc.set_threshold(100_000)  # a run leaves few cycles
 
 
-def run_seed(
-    job: tuple[int, bool], wire: str | None = None, plate: str | None = None
-) -> tuple[Outcome, bool]:
-    """Run a seed, on one kind of wire or plate if it is named; whether it is short is beside."""
+Run: TypeAlias = tuple[Plan, bool, list[str], Counter[str]]
+"""A plan, whether it is short, and what came of it."""
+
+
+def run_seed(job: tuple[int, bool], wire: str | None = None, plate: str | None = None) -> Run:
+    """Run a seed, on one kind of wire or plate if it is named."""
     seed, short = job
-    return run_plan(make_plan(seed, wire, plate, short=short)), short
+    plan = make_plan(seed, wire, plate, short=short)
+    return plan, short, *run_plan(plan)
 
 
-def report(found: Iterable[tuple[Outcome, bool]], *, minutes: float, again: str) -> int:
+def report(found: Iterable[Run], *, minutes: float, again: str) -> int:
     """Print what comes of runs, the failed ones as they come, for some minutes; exit status."""
     begin = time.perf_counter()
     totals: Counter[str] = Counter()
     runs: Counter[bool] = Counter()
     failed = 0
     virtual = busy = 0.0
-    for outcome, short in found:
+    for plan, short, violations, counts in found:
         runs[short] += 1
-        virtual += outcome.virtual
-        busy += outcome.busy
-        totals.update(outcome.counts)
-        if outcome.violations:
+        virtual += plan.lasts
+        busy += plan.busy
+        totals.update(counts)
+        if violations:
             failed += 1
-            options = f"--seed {outcome.seed}" + " --short" * short
-            _print(f"seed {outcome.seed} failed:", *(f"    {each}" for each in outcome.violations))
-            _print(f"    again: {again} {options} --trace seed-{outcome.seed}.txt")
+            options = f"--seed {plan.seed}" + " --short" * short
+            _print(f"seed {plan.seed} failed:", *(f"    {each}" for each in violations))
+            _print(f"    again: {again} {options} --trace seed-{plan.seed}.txt")
         if runs.total() % _PROGRESS_INTERVAL == 0:
             _print(f"    {runs.total()} seeds, {virtual / 3600:.1f} h, {failed} failed")
         if time.perf_counter() - begin > 60 * minutes:
@@ -101,12 +105,14 @@ def main() -> int:
 def _run_one(options: argparse.Namespace) -> int:
     """Run one seed."""
     plan = make_plan(options.seed, options.wire, options.plate, short=options.short)
-    with options.trace.open("w") if options.trace else nullcontext() as file:
-        trace = Trace(file)
-        outcome = run_plan(plan, trace=trace)
-    ends = f"{len(outcome.violations)} violations, trace {trace.digest}"
-    _print(*outcome.violations, f"seed {outcome.seed} on {plan.wire}, {plan.plate}: {ends}")
-    return 1 if outcome.violations else 0
+    trace: list[str] = []
+    violations, _ = run_plan(plan, trace=trace)
+    if options.trace:
+        options.trace.write_text("".join(trace), encoding="utf-8")
+    digest = hashlib.sha256("".join(trace).encode()).hexdigest()
+    ends = f"{len(violations)} violations, trace {digest}"
+    _print(*violations, f"seed {plan.seed} on {plan.wire}, {plan.plate}: {ends}")
+    return 1 if violations else 0
 
 
 def _print(*lines: str) -> None:

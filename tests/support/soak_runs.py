@@ -7,17 +7,15 @@ a weekend on exciters, with a layout.
 """
 
 import asyncio
-import hashlib
 import logging
 import math
 import random
 from collections import Counter
-from collections.abc import Coroutine, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass, field
+from collections.abc import Coroutine, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
 from pathlib import Path
-from typing import Any, TextIO, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -102,15 +100,6 @@ GESTURES = ("tap", "hold", "drag", "chord", "vanish", "flood", "wrong")
 
 
 @dataclass(frozen=True)
-class Line:
-    """A wire: kind, kind of line as `sim.far_ends.wire_assignment` has them, speed [bit/s]."""
-
-    kind: str
-    speed: int | None
-    line_kind: str = PROMPT
-
-
-@dataclass(frozen=True)
 class TouchSequence:
     """Touches of one source: frames at times [s] after `at`, each (time, stamp, touches).
 
@@ -153,7 +142,7 @@ class Plan:
     """Lines, one for each amplifier or one for all, actions in order of time; plate: by name."""
 
     seed: int
-    lines: tuple[Line, ...]
+    lines: tuple[SimulatedWire, ...]
     amplifiers: int
     actions: tuple[Action, ...]
     lasts: float
@@ -190,7 +179,7 @@ def make_plan(
     for _ in range(rng.choice((1, amplifiers))):
         kind = wire or rng.choice(tuple(KINDS))
         line_kind = PROMPT if amplifiers == 1 else rng.choice(LINES[kind])
-        lines.append(Line(kind, rng.choice(KINDS[kind]), line_kind))
+        lines.append(SimulatedWire(kind, rng.choice(KINDS[kind]), line_kind=line_kind))
     actions: list[Action] = []
     time, busy = BEGIN, BEGIN
     for _ in range(1 if short else rng.randint(2, 5)):
@@ -411,65 +400,42 @@ NAMES = ("east", "west", "north")
 _QUIET_END = 1.0  # s; duration of the check for silence after closing
 
 
-@dataclass
-class Outcome:
-    """Outcome of a run; counts: of touches, faults, patterns, frames and so on, by name."""
+def run_plan(plan: Plan, *, trace: list[str] | None = None) -> tuple[list[str], Counter[str]]:
+    """Run a plan to its end; trace: takes a line of each event, if it is kept.
 
-    seed: int
-    violations: list[str]
-    counts: Counter[str]
-    virtual: float
-    busy: float
-
-
-class Trace:
-    """Trace of a run, one line per event: hashed, and written to a file if any."""
-
-    def __init__(self, file: TextIO | None = None) -> None:
-        self._hash = hashlib.sha256()
-        self._file = file
-
-    @property
-    def digest(self) -> str:
-        """Hash of all lines so far."""
-        return self._hash.hexdigest()
-
-    def note(self, time: float, *words: object) -> None:
-        """One line; time [s] since the start."""
-        line = f"{time:.9f} {' '.join(map(str, words))}\n"
-        self._hash.update(line.encode())
-        if self._file is not None:
-            self._file.write(line)
-
-
-def run_plan(plan: Plan, *, trace: Trace | None = None) -> Outcome:
-    """Run a plan to its end; trace: of all that happens, if it is kept."""
+    Returns what was violated, and the counts of touches, faults, patterns, frames and so on.
+    """
     counts: Counter[str] = Counter(f"on {line.kind}" for line in plan.lines)
     counts[f"of {plan.plate}"] += 1
     violations: list[str] = []
-    with _errors_in(violations):
-        try:
-            run_virtual(_run(plan, trace, counts, violations), rng=random.Random(plan.seed + 1))
-        except Stuck as problem:
-            violations.append(str(problem))
-    return Outcome(plan.seed, violations, counts, plan.lasts, plan.busy)
+    errors = logging.Handler(logging.ERROR)
+    errors.emit = lambda record: _note_traceback(record, violations)  # type: ignore[method-assign]
+    loggers = [logging.getLogger(name) for name in ("controller", "drivers", "sim")]
+    for logger in loggers:
+        logger.addHandler(errors)
+    try:
+        run_virtual(_run(plan, trace, counts, violations), rng=random.Random(plan.seed + 1))
+    except Stuck as problem:
+        violations.append(str(problem))
+    finally:
+        for logger in loggers:
+            logger.removeHandler(errors)
+    return violations, counts
+
+
+def _note_traceback(record: logging.LogRecord, violations: list[str]) -> None:
+    if record.exc_info:
+        violations.append(f"logged: {record.getMessage()} {record.exc_info[1]!r}")
 
 
 async def _run(
-    plan: Plan, trace: Trace | None, counts: Counter[str], violations: list[str]
+    plan: Plan, trace: list[str] | None, counts: Counter[str], violations: list[str]
 ) -> None:
     """Run a plan from the start of the far ends to their end."""
     rig = soak_rig(plan.plate, NAMES[: plan.amplifiers] if plan.amplifiers > 1 else ())
+    own = {"shared": len(plan.lines) < len(rig.amplifiers), "unpluggable": True, "seed": plan.seed}
     wires = {
-        name: SimulatedWire(
-            line.kind,
-            speed=line.speed,
-            shared=len(plan.lines) < len(rig.amplifiers),
-            unpluggable=True,
-            line=str(number % len(plan.lines)),
-            line_kind=line.line_kind,
-            seed=plan.seed,
-        )
+        name: replace(line, line=str(number % len(plan.lines)), **own)
         for number, (name, line) in enumerate(zip(rig.amplifiers, 3 * plan.lines, strict=False))
     }
     options: dict[str, Any] = {
@@ -524,7 +490,7 @@ class Soak(Chain):
     """A chain whose control loop a supervisor runs, and what a plan does to it."""
 
     plan: Plan = field(init=False)
-    trace: Trace | None = None
+    trace: list[str] | None = None
     counts: Counter[str] = field(default_factory=Counter)
     tasks: list[asyncio.Task[Any]] = field(default_factory=list)
     supervisor: Supervisor = field(init=False)
@@ -548,9 +514,10 @@ class Soak(Chain):
             )
 
     def note(self, *words: object) -> None:
-        """Write a line of the trace."""
+        """Write a line of the trace: seconds since the start, and what happens."""
         if self.trace is not None:
-            self.trace.note(self.loop.time() - START, *words)
+            line = " ".join(map(str, words))
+            self.trace.append(f"{self.loop.time() - START:.9f} {line}\n")
 
     def _count_request(self, *_: object) -> None:
         self.counts["requests"] += 1
@@ -733,23 +700,3 @@ class Soak(Chain):
         self.plate_judge.check()
         self.plate_judge.violations += map(str, self.witness.finish(threads.now()))
         self.counts["frames seen by the witness"] = self.witness.frames
-
-
-@contextmanager
-def _errors_in(violations: list[str]) -> Iterator[None]:
-    """Count logged tracebacks as violations."""
-
-    class Handler(logging.Handler):
-        def emit(self, record: logging.LogRecord) -> None:
-            if record.exc_info:
-                violations.append(f"logged: {record.getMessage()} {record.exc_info[1]!r}")
-
-    handler = Handler(logging.ERROR)
-    names = ("controller", "drivers", "sim")
-    for name in names:
-        logging.getLogger(name).addHandler(handler)
-    try:
-        yield
-    finally:
-        for name in names:
-            logging.getLogger(name).removeHandler(handler)

@@ -4,7 +4,7 @@ Each block goes up to the next section, below the comment that has its names: `<
 Drive: frequency, level; Client(): * -->` is a function, a class with two of its members, and one
 that is made elsewhere, with all of its members. Functions are a list, a class has a heading and a
 list of its members, of which the fields with docstrings come first. Defaults are of what a program
-makes. `Example:` at the end of a docstring is a session, which tests/docs/test_python_examples.py
+makes. `Example:` at the end of a docstring is a session, which tests/docs/test_pages.py
 types.
 """
 

@@ -5,8 +5,11 @@ other pages, files); the references of commands, of the daemon's file and of the
 a reader that knows nothing else; the ways through the files in docs/architecture.md; links and
 names of pages in code; the comparison of shown with printed output; and the tutorials, typed.
 `make docs` builds the pages.
+
+What pages show of Python: the examples of the API's page, typed in one session; notebooks.
 """
 
+import doctest
 import json
 import re
 import shutil
@@ -24,6 +27,8 @@ from typer.core import TyperCommand, TyperGroup
 from typer.testing import CliRunner
 
 import constraints
+import era_haptics
+import notebooks
 import pages
 from controller.api.methods import StateEvent
 from controller.api.schema import headline
@@ -34,10 +39,7 @@ from controller.sources.touch import CONTACT_TIMEOUT
 from drivers.by_hand.cli import amp
 from drivers.by_hand.reaching import check_links
 from drivers.errors import CommandError
-from drivers.protocol.definition import (
-    BOOT_TIME,
-    REACTION,
-)
+from drivers.protocol.definition import BOOT_TIME, REACTION
 from drivers.wires.wire import address_of
 from model.answer.answer import MIN_CONTRAST_DB, OWN_CONTRAST_DB
 from model.answer.promise import MIN_RAISED_CONTRAST_DB
@@ -589,3 +591,67 @@ def test_decisions_that_are_named_are_there() -> None:
     assert len(named) > 50
     there = {path.name[:4] for path in (ROOT / "docs" / "decisions").glob("0*.md")}
     assert {(number, name) for number, name in named if number not in there} == set()
+
+
+PYTHON_EXAMPLES_PAGE = (ROOT / "docs" / "reference" / "python-api.md").read_text("utf-8")
+
+
+def test_every_function_has_an_example() -> None:
+    """Each entry of a function is followed by a session; methods may do without."""
+    entries = re.findall(r"^- `(\w+)\(.*\n((?:  .*\n)*)", PYTHON_EXAMPLES_PAGE, re.MULTILINE)
+    shown = {name: ">>> " in text for name, text in entries if hasattr(era_haptics, name)}
+    assert len(shown) > 15
+    assert [name for name, has_example in shown.items() if not has_example] == []
+
+
+@pytest.mark.long
+def test_examples_print_what_the_page_shows(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In the order of the page, from a folder beside the examples."""
+    shutil.copytree(
+        ROOT / "examples",
+        tmp_path / "examples",
+        ignore=shutil.ignore_patterns("*.c", "node_modules"),
+    )
+    monkeypatch.chdir(tmp_path)
+    sessions = "\n".join(
+        re.findall(r"^ *```pycon\n(.*?)^ *```$", PYTHON_EXAMPLES_PAGE, re.MULTILINE | re.DOTALL)
+    )
+    test = doctest.DocTestParser().get_doctest(sessions, {"era": era_haptics}, "page", None, 0)
+    printed: list[str] = []
+    doctest.DocTestRunner().run(test, out=printed.append)
+    assert len(test.examples) > 25
+    assert "".join(printed) == ""
+
+
+NOTEBOOK = '''# %% [markdown]
+"""
+# A title
+"""
+
+# %%
+from matplotlib.figure import Figure
+print("seen")
+
+# %%
+Figure()
+'''
+
+
+def test_a_notebook_is_shown_with_what_it_prints_and_draws(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Text as text, a cell with its output, and a figure that ends a cell as a picture."""
+    monkeypatch.setattr(notebooks, "ROOT", tmp_path)
+    pictures = tmp_path / "docs"
+    pictures.mkdir()
+    (tmp_path / "small.py").write_text(NOTEBOOK, "utf-8")
+    shown = notebooks.as_markdown(tmp_path / "small.py", pictures)
+    title, code, printed, figure, picture = shown.split("\n\n")
+    assert title == "# A title"
+    assert 'print("seen")' in code
+    assert printed == "````text\nseen\n````"
+    assert "Figure()" in figure
+    assert picture == "![The figure of this cell](/small-2.png)"
+    assert (pictures / "small-2.png").read_bytes().startswith(b"\x89PNG")

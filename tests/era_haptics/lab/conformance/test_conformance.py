@@ -7,7 +7,7 @@ import pty
 import random
 import re
 from collections.abc import Callable, Sequence
-from contextlib import nullcontext
+from contextlib import closing, nullcontext
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -85,6 +85,22 @@ def expect_passed(results: list[CheckResult], skipped: set[str], *, within: floa
     assert {each.check.name for each in results if each.result == "skipped"} == skipped
     assert {each.attempts for each in results} == {1}
     assert sum(each.seconds for each in results) < within
+
+
+def changed(
+    monkeypatch: pytest.MonkeyPatch, method: str, change: Callable[[bytes], tuple[float, bytes]]
+) -> None:
+    """Let lines pass on by a method, after a time [s], what becomes of each message.
+
+    write: of the host; _send: of its amplifier.
+    """
+    pass_on = getattr(JudgedLine, method)
+
+    def passed(line: JudgedLine, data: bytes) -> None:
+        delay, sent = change(data)
+        asyncio.get_running_loop().call_later(delay, pass_on, line, sent)
+
+    monkeypatch.setattr(JudgedLine, method, passed)
 
 
 @pytest.mark.parametrize("kind", shortly(JUDGED_LINE_KINDS, ["serial"]))
@@ -249,17 +265,15 @@ def test_amplifier_that_is_not_identified_fails_once(
     alter: Callable[[bytes], bytes], passed: int, reason: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """With the message and the cause; a good Hello has passed, and what follows is not run."""
-    send = JudgedLine._send
-    monkeypatch.setattr(JudgedLine, "_send", lambda line, data: send(line, alter(data)))
+    changed(monkeypatch, "_send", lambda data: (0.0, alter(data)))
     before, (failed, *others) = (found := judged("serial", far=plain()))[:passed], found[passed:]
     assert [each.result for each in before] == [Result.PASSED] * passed
     assert failed.result is Result.FAILED
     assert re.fullmatch(reason, failed.reason), failed.reason
     after = {(each.result, each.reason) for each in others}
     assert after == {(Result.NOT_RUN, f"{failed.check.name} failed")}
-    assert (
-        ConformanceReport("x", 0.2, tuple(found), 0).to_json()["level"] == 0
-    )  # nothing was driven
+    report = ConformanceReport("x", 0.2, tuple(found), 0)
+    assert report.to_json()["level"] == 0  # nothing was driven
 
 
 def _stall(duration: float) -> None:
@@ -303,34 +317,27 @@ async def test_check_is_made_again_where_this_program_was_late(
     steps: Callable[[list[float], Subject], Any], stalls: list[float], result: str
 ) -> None:
     """Its third attempt decides, undisturbed or not: a stall is no fault of the amplifier."""
-    line = JudgedLine("serial", varied())
-    (found,) = await run_checks([(1, _tried(stalls, steps))], line.client, level=0.2)
-    line.close()
+    with closing(JudgedLine("serial", varied())) as line:
+        (found,) = await run_checks([(1, _tried(stalls, steps))], line.client, level=0.2)
     assert (found.result, found.attempts) == (result, 3)
 
 
 @in_virtual_time
 async def test_machine_that_is_always_late_has_no_verdict() -> None:
-    """It is no failure of the amplifier, and not passed; what follows is checked."""
-    line = JudgedLine("serial", varied())
-    late, good = await run_checks(
-        [(1, _tried([0.11] * 20)), (2, _tried([]))], line.client, level=0.2
-    )
-    line.close()
+    """It is no failure of the amplifier, and not passed; what follows is checked.
+
+    After 20 s of attempts that came too late no attempt follows, and the reason says so.
+    """
+    checks = [(1, _tried([0.11] * 20)), (2, _tried([]))]
+    with closing(JudgedLine("serial", varied())) as line:
+        late, good = await run_checks(checks, line.client, level=0.2)
+        line.client.wasted = 20.0
+        (last,) = await run_checks([(1, _tried([0.11]))], line.client, level=0.2)
     assert (late.result, good.result) == ("skipped", "passed")
     assert isinstance(late.finding, TooLate)
     assert ConformanceReport("x", 0.2, (late, good), 0).overall == "incomplete"
-
-
-@in_virtual_time
-async def test_check_says_that_the_time_of_the_run_is_used_up() -> None:
-    """It is late after 20 s of attempts that came too late before it, so that none follows."""
-    line = JudgedLine("serial", varied())
-    line.client.wasted = 20.0
-    (late,) = await run_checks([(1, _tried([0.11]))], line.client, level=0.2)
-    line.close()
-    assert isinstance(late.finding, TooLate)
-    assert late.reason.startswith("no verdict since the time of the run is used up: "), late.reason
+    assert isinstance(last.finding, TooLate)
+    assert last.reason.startswith("no verdict since the time of the run is used up: "), last.reason
 
 
 @in_virtual_time
@@ -341,11 +348,10 @@ async def test_machine_that_was_late_once_has_a_verdict_on_voices(
     monkeypatch.setattr("virtual_lines.DELAY", 0.0045)
     far = varied()
     far.capabilities.update(ramp_max=700)
-    line = JudgedLine("tcp", far)
-    line.client.lateness = 1.0
     chosen = [each for each in of_kind("tcp") if each[1].name == "voices"]
-    (result,) = await run_checks(chosen, line.client, level=0.2)
-    line.close()
+    with closing(JudgedLine("tcp", far)) as line:
+        line.client.lateness = 1.0
+        (result,) = await run_checks(chosen, line.client, level=0.2)
     assert result.result is Result.PASSED, result.reason
 
 
@@ -377,14 +383,13 @@ def test_slow_line_has_its_verdicts(kind: str, monkeypatch: pytest.MonkeyPatch) 
 
 def obey_late(monkeypatch: pytest.MonkeyPatch, delay: float) -> None:
     """Let the amplifier of a serial line reply late [s] to all but what is only read."""
-    send = JudgedLine._send
 
-    def late(line: JudgedLine, data: bytes) -> None:
+    def late(data: bytes) -> tuple[float, bytes]:
         (frame,) = FrameReader().feed(data)
         is_late = NAMES.get(frame.type & 0x7F) not in ("GetStatus", "GetCaps", "GetFaults")
-        asyncio.get_running_loop().call_later(is_late * delay, send, line, data)
+        return is_late * delay, data
 
-    monkeypatch.setattr(JudgedLine, "_send", late)
+    changed(monkeypatch, "_send", late)
 
 
 class _LongWatchdog(SimulatedAmplifier):
@@ -438,16 +443,14 @@ def test_request_that_comes_after_an_onset_is_no_violation(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """The first question what is achieved takes 300 ms, until the set that waited plays."""
-    delays, write = [0.3], JudgedLine.write
+    delays = [0.3]
 
-    def late(line: JudgedLine, data: bytes) -> None:
+    def late(data: bytes) -> tuple[float, bytes]:
         (frame,) = FrameReader().feed(data)
-        if frame.type == MESSAGES["GetAchieved"].number and delays:
-            asyncio.get_running_loop().call_later(delays.pop(), write, line, data)
-        else:
-            write(line, data)
+        is_meant = frame.type == MESSAGES["GetAchieved"].number and delays
+        return delays.pop() if is_meant else 0.0, data
 
-    monkeypatch.setattr(JudgedLine, "write", late)
+    changed(monkeypatch, "write", late)
     (result,) = judged("serial", ["after"])
     assert (result.result, delays) == (Result.PASSED, []), result.reason
 
@@ -458,23 +461,16 @@ def test_set_whose_reply_is_late_is_no_violation(
     delay: float, is_obeyed_late: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It began at once or late, and what waits for its onset counts from then, renewed too."""
-    write, send, late = JudgedLine.write, JudgedLine._send, list[bool]()
+    is_meant = [False]
 
-    def written(line: JudgedLine, data: bytes) -> None:
+    def written(data: bytes) -> tuple[float, bytes]:
         (frame,) = FrameReader().feed(data)
-        is_meant = frame.type == MESSAGES["Set"].number and b"\x84\x03" in frame.payload  # 900 ms
-        late[:] = [is_meant]
-        asyncio.get_running_loop().call_later(
-            delay * (is_meant and is_obeyed_late), write, line, data
-        )
+        is_set = frame.type == MESSAGES["Set"].number
+        is_meant[0] = is_set and b"\x84\x03" in frame.payload  # 900 ms
+        return delay * (is_meant[0] and is_obeyed_late), data
 
-    def sent(line: JudgedLine, data: bytes) -> None:
-        asyncio.get_running_loop().call_later(
-            delay * (late == [True] and not is_obeyed_late), send, line, data
-        )
-
-    monkeypatch.setattr(JudgedLine, "write", written)
-    monkeypatch.setattr(JudgedLine, "_send", sent)
+    changed(monkeypatch, "write", written)
+    changed(monkeypatch, "_send", lambda data: (delay * (is_meant[0] and not is_obeyed_late), data))
     (result,) = judged("serial", ["what_waits_for_an_onset"])
     assert result.result is Result.PASSED, result.reason
 
@@ -484,19 +480,12 @@ def test_reply_that_is_delivered_late_is_no_violation(
     late: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The seventh takes 0.7 s more, as on a terminal of a busy machine; a slow amplifier fails."""
-    send, count = JudgedLine._send, iter(range(1_000_000))
-
-    def sent(line: JudgedLine, data: bytes) -> None:
-        is_late = 7 <= next(count) < 7 + late
-        asyncio.get_running_loop().call_later(0.7 * is_late, send, line, data)
-
-    monkeypatch.setattr(JudgedLine, "_send", sent)
+    count = iter(range(1_000_000))
+    changed(monkeypatch, "_send", lambda data: (0.7 * (7 <= next(count) < 7 + late), data))
     found = [each for each in judged("serial", ["arming", "stop"]) if each.result != "passed"]
     assert bool(found) is (late > 1)
-    for each in found:
-        assert each.result in (Result.FAILED, Result.NOT_RUN), each
-    if found:
-        assert ", but later" in found[0].reason
+    assert {each.result for each in found} <= {Result.FAILED, Result.NOT_RUN}, found
+    assert all(", but later" in each.reason for each in found[:1])
 
 
 class _Unsteered(SimulatedAmplifier):
@@ -560,7 +549,7 @@ async def test_verdict_over_a_real_port(tmp_path: Path) -> None:
     """Those that only read; the keys of the report are a contract, and all frames are traced."""
     far, near = pty.openpty()
     loop = asyncio.get_running_loop()
-    end = SerialAmplifiers({1: plain()}, lambda data: _written(far, data))
+    end = SerialAmplifiers({1: plain()}, partial(os.write, far))
     loop.add_reader(far, lambda: end.receive(os.read(far, 4096), threads.now()))
     url = f"serial://{os.ttyname(near)}"
     with tracing(tmp_path / "trace"):
@@ -598,10 +587,6 @@ async def test_verdict_over_a_real_port(tmp_path: Path) -> None:
         "came",
     ]
     assert shown["not_run"] == sum(check.drives for _, check in of_kind("serial"))
-
-
-def _written(far: int, data: bytes) -> None:
-    os.write(far, data)
 
 
 def test_report_says_the_worst() -> None:
@@ -709,18 +694,6 @@ def test_levels_are_those_of_the_page(moment: float, level: float) -> None:
 # What goes wrong
 
 
-def altered_reply(
-    monkeypatch: pytest.MonkeyPatch, at: int, alter: Callable[[bytes], bytes]
-) -> None:
-    """Let the amplifiers of lines send something else in place of their reply with a number."""
-    send, count = JudgedLine._send, iter(range(10_000_000))
-
-    def sent(line: JudgedLine, data: bytes) -> None:
-        send(line, alter(data) if next(count) == at else data)
-
-    monkeypatch.setattr(JudgedLine, "_send", sent)
-
-
 @pytest.mark.parametrize("kind", JUDGED_LINE_KINDS)
 def test_malformed_reply_fails_one_check_with_its_bytes(
     kind: str, monkeypatch: pytest.MonkeyPatch
@@ -733,7 +706,8 @@ def test_malformed_reply_fails_one_check_with_its_bytes(
         bad.append(data[:middle] if kind == "can" else data[:middle] + b"\x55\0")
         return bad[0]
 
-    altered_reply(monkeypatch, 10, alter)
+    count = iter(range(10_000_000))
+    changed(monkeypatch, "_send", lambda data: (0.0, alter(data) if next(count) == 10 else data))
     names = ["identity", "capabilities", "starts_disarmed", "replies_in_time", "stop"]
     results = judged(kind, names)
     (failed,) = (each for each in results if each.result == "failed")
@@ -774,24 +748,20 @@ def test_one_bad_capability_is_one_failure() -> None:
     assert all("envelope_step_max" in results[name].reason for name in not_run)
 
 
-class _OtherClock(SimulatedAmplifier):
-    """An amplifier that shows another clock than its own."""
-
-    def __init__(self, other: Callable[[int], int]) -> None:
-        super().__init__("other clock", channels=2)
-        self._other = other
-
-    def status(self, now: float) -> Values:
-        shown = super().status(now)
-        return {**shown, "clock": self._other(shown["clock"])}
-
-
 @pytest.mark.parametrize(
     "other", [lambda clock: (clock & 0xFFFF) << 16 | clock >> 16, lambda clock: 7]
 )
-def test_clock_that_does_not_go_on_is_one_failure(other: Callable[[int], int]) -> None:
+def test_clock_that_does_not_go_on_is_one_failure(
+    other: Callable[[int], int], monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Its words exchanged, or standing still: nothing is driven then, and each check says why."""
-    results = judged("serial", far=_OtherClock(other))
+    status = SimulatedAmplifier.status
+    monkeypatch.setattr(
+        SimulatedAmplifier,
+        "status",
+        lambda far, now: (shown := status(far, now)) | {"clock": other(shown["clock"])},
+    )
+    results = judged("serial")
     assert [each.check.name for each in results if each.result == "failed"] == ["clock_goes_on"]
     driven = [each for each in results if each.check.drives]
     assert {each.result for each in driven} == {Result.NOT_RUN}
@@ -824,12 +794,12 @@ def garbled(kind: str, rng: random.Random, data: bytes) -> bytes:
 @pytest.mark.parametrize("share", shortly([0.003, 0.03, 0.3, 1.0], [0.3]))
 def test_garbage_has_a_verdict(kind: str, share: float, monkeypatch: pytest.MonkeyPatch) -> None:
     """In place of a share of all replies: every check has a result, and the whole has failed."""
-    rng, send = random.Random(5), JudgedLine._send
-
-    def sent(line: JudgedLine, data: bytes) -> None:
-        send(line, garbled(kind, rng, data) if rng.random() < share else data)
-
-    monkeypatch.setattr(JudgedLine, "_send", sent)
+    rng = random.Random(5)
+    changed(
+        monkeypatch,
+        "_send",
+        lambda data: (0.0, garbled(kind, rng, data) if rng.random() < share else data),
+    )
     results = judged(kind)
     assert [each.number for each in results] == [number for number, _ in of_kind(kind)]
     assert ConformanceReport("x", 0.2, tuple(results), 0).overall == "failed"
@@ -844,8 +814,8 @@ async def test_busy_machine_has_its_verdicts(
     names: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It stands still every 80 ms on the average, for 30 ms, and a reply is lost: nothing fails."""
-    altered_reply(monkeypatch, 60, lambda data: b"")
-    rng, results = random.Random(2), list[CheckResult]()
+    count, rng = iter(range(10_000_000)), random.Random(2)
+    changed(monkeypatch, "_send", lambda data: (0.0, b"" if next(count) == 60 else data))
 
     async def stand_still() -> None:
         while True:
@@ -853,7 +823,7 @@ async def test_busy_machine_has_its_verdicts(
             _stall(0.03)
 
     stalling = asyncio.ensure_future(stand_still())
-    results += await results_of("serial", varied(), names)
+    results = await results_of("serial", varied(), names)
     stalling.cancel()
     assert not [(each.check.name, each.reason) for each in results if each.result == "failed"]
     assert [each.check.name for each in results if isinstance(each.finding, TooLate)] == []

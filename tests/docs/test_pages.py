@@ -44,7 +44,6 @@ from drivers.wires.wire import address_of
 from model.answer.answer import MIN_CONTRAST_DB, OWN_CONTRAST_DB
 from model.answer.promise import MIN_RAISED_CONTRAST_DB
 from model.cli import app
-from model.config.fields import Section
 from model.study import overview
 from model.study.contrast_maps import WANTED_CONTRAST_DB
 from model.study.verification import MIN_KEPT_SHARE
@@ -53,13 +52,6 @@ from typed_page import PORTS, PageError, Reader, Typed, Written, difference, rea
 from ways import WAYS, steps_of
 
 BEGIN, END = "<!-- begin: written by a.py -->", "<!-- end -->"
-
-
-def test_the_text_stands_between_the_marks_of_its_name() -> None:
-    """What was there is replaced, what stands around stays, and again it changes nothing."""
-    page = pages.insert(f"a\n{BEGIN}\nold\n{END}\nb\n", "new\n", name="a.py")
-    assert page == f"a\n{BEGIN}\n\nnew\n\n{END}\nb\n"
-    assert pages.insert(page, "new\n", name="a.py") == page
 
 
 @pytest.mark.parametrize("page", ["a\nb\n", f"a\n<!-- begin: written by b.py -->\n{END}\n"])
@@ -72,17 +64,20 @@ def test_a_page_without_these_marks_is_left_alone(page: str) -> None:
 def test_check_names_what_is_stale_until_it_is_written(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """A file that is missing, and one whose part has another text; the check writes neither."""
+    """A file that is missing, and one whose part has another text; the check writes neither.
+
+    What was between the marks is replaced, what stands around stays, and again it changes nothing.
+    """
     written = {"b.h": [pages.whole(lambda: "1\n")], "a.md": [pages.part("a.py", lambda: "new")]}
     monkeypatch.setattr(pages, "WRITTEN", written)
-    (tmp_path / "a.md").write_text(f"{BEGIN}\nold\n{END}\n", "utf-8")
+    (tmp_path / "a.md").write_text(f"a\n{BEGIN}\nold\n{END}\nb\n", "utf-8")
     assert pages.main(["--check"], root=tmp_path) == 1
     assert re.findall(r"^(\S+) is stale: run `make pages`$", capsys.readouterr().err, re.M) == [
         *written
     ]
     assert [path.name for path in tmp_path.iterdir()] == ["a.md"]
     assert pages.main([], root=tmp_path) == 0
-    assert (tmp_path / "a.md").read_text("utf-8") == f"{BEGIN}\n\nnew\n\n{END}\n"
+    assert (tmp_path / "a.md").read_text("utf-8") == f"a\n{BEGIN}\n\nnew\n\n{END}\nb\n"
     assert (tmp_path / "b.h").read_text("utf-8") == "1\n"
     assert pages.main(["--check"], root=tmp_path) == 0
 
@@ -138,24 +133,20 @@ ROOT = Path(__file__).parents[2]
 PAGES = ROOT / "docs" / "tutorials"
 
 
-@pytest.fixture
-def home() -> Iterator[Path]:
-    """A short path: a Unix socket's has room for a hundred letters."""
-    folder = Path(tempfile.mkdtemp(prefix="era"))
-    yield folder
-    shutil.rmtree(folder)
-
-
 @pytest.mark.long
 @pytest.mark.parametrize("page", sorted(path.stem for path in PAGES.glob("*.md")))
-def test_a_reader_sees_what_the_page_shows(page: str, tmp_path: Path, home: Path) -> None:
+def test_a_reader_sees_what_the_page_shows(page: str, tmp_path: Path) -> None:
     """A tutorial typed from an empty folder beside the examples prints what it shows."""
     folder = tmp_path / "my_plate"
     folder.mkdir()
     (tmp_path / "examples").symlink_to(ROOT / "examples")
     steps = read_steps(PAGES / f"{page}.md")
     assert sum(isinstance(step, Typed) and step.shown is not None for step in steps) >= 3
-    with Reader(folder, home=home) as reader:
+    # A short path: a Unix socket's has room for a hundred letters.
+    with (
+        tempfile.TemporaryDirectory(prefix="era") as home,
+        Reader(folder, home=Path(home)) as reader,
+    ):
         for step in steps:
             reader.follow(step)
 
@@ -177,12 +168,6 @@ def rows(page: str, head: str) -> list[list[str]]:
     return [[cell.strip() for cell in line[1:-1].split("|")] for line in table.splitlines()[2:]]
 
 
-def test_every_key_of_the_daemons_file_is_in_its_table() -> None:
-    """As the configuration's model has them, and no others."""
-    keys = [row[0].strip("`") for row in rows("daemon.md", "| key | meaning | default |")]
-    assert sorted(keys) == sorted(DaemonSection.model_fields)
-
-
 def test_people_see_the_word_that_the_page_has_for_each_state() -> None:
     """In the status, in the event of a change, and in a line unless the cause begins with it."""
     shown = {row[0]: row[1].strip("*") for row in rows("daemon.md", "| state | shown |")}
@@ -194,17 +179,13 @@ def test_people_see_the_word_that_the_page_has_for_each_state() -> None:
         assert headline(state, f"{word} by 'era'") == f"{word} by 'era'"
 
 
-@pytest.mark.parametrize(
-    ("key", "section"), [("touch", TouchSection), ("log", LogSection), ("dumps", DumpSection)]
-)
-def test_a_section_is_told_in_its_row(key: str, section: type[Section]) -> None:
-    """`{name, url, ...}`: the keys that it takes, and no others."""
-    (row,) = [
-        row for row in rows("daemon.md", "| key | meaning | default |") if row[0] == f"`{key}`"
-    ]
-    found = re.search(r"`\{(.*?)\}`", row[1])
-    assert found is not None
-    assert found[1].split(", ") == list(section.model_fields)
+def test_every_key_of_the_daemons_file_is_in_its_table() -> None:
+    """As the configuration's model has them, and no others; a section's keys in its row."""
+    told = {row[0].strip("`"): row[1] for row in rows("daemon.md", "| key | meaning | default |")}
+    assert sorted(told) == sorted(DaemonSection.model_fields)
+    for key, section in {"touch": TouchSection, "log": LogSection, "dumps": DumpSection}.items():
+        (listed,) = re.findall(r"`\{(.*?)\}`", told[key])[:1]
+        assert listed.split(", ") == list(section.model_fields)
 
 
 @pytest.mark.parametrize(
@@ -284,7 +265,6 @@ def commands(group: TyperGroup, name: str = "era") -> Iterator[tuple[str, TyperC
         if isinstance(command, TyperGroup):
             yield from commands(command, full)
         else:
-            assert isinstance(command, TyperCommand)
             yield full, command
             for flag, variant in getattr(command, "variants", {}).items():
                 yield f"{full} {flag}", variant

@@ -37,7 +37,8 @@ from real_wires import SHARED_WIRES, on_two_amplifiers, rig_on_wire
 from registry import threads
 from virtual_lines import in_virtual_time
 
-PAGE = Path(__file__).parents[2] / "docs" / "reference" / "python-api.md"
+ROOT = Path(__file__).parents[2]
+PAGE = (ROOT / "docs" / "reference" / "python-api.md").read_text("utf-8")
 
 
 @pytest.mark.parametrize(
@@ -55,21 +56,21 @@ PAGE = Path(__file__).parents[2] / "docs" / "reference" / "python-api.md"
 )
 def test_page_has_what_docstrings_say(fact: str) -> None:
     """As it is read in a checkout: shapes, units and errors, not first sentences alone."""
-    assert fact.casefold() in " ".join(PAGE.read_text("utf-8").casefold().split())
+    assert fact.casefold() in " ".join(PAGE.casefold().split())
 
 
 STUB = Path(era.__file__).with_suffix(".pyi")
 
 
-def modules_after(program: str) -> set[str]:
-    """Names of the modules that a program has loaded."""
-    done = subprocess.run(
-        [sys.executable, "-c", f"import sys; {program}; print(*sys.modules)"],
+def ran(program: str, *flags: str, **environment: str) -> "subprocess.CompletedProcess[str]":
+    """A program of Python in a process of its own, with these variables beside those of others."""
+    return subprocess.run(
+        [sys.executable, *flags, "-c", program],
         capture_output=True,
         text=True,
-        check=True,
+        check=False,
+        env=os.environ | environment,
     )
-    return set(done.stdout.split())
 
 
 def test_every_name_is_loaded_from_where_type_checkers_find_it() -> None:
@@ -122,10 +123,11 @@ def test_name_loads_only_what_it_needs(module: str, not_loaded: str) -> None:
     """A client of the daemon is loaded without linear algebra, a plate without pyplot."""
     names = module.partition(".")
     load = f"import era_haptics.{module}" if names[1] else f"import era_haptics as e; e.{module}"
-    assert modules_after(load) & set(not_loaded.split()) == set()
+    done = ran(f"import sys; {load}; print(*sys.modules)")
+    assert (done.returncode, done.stderr) == (0, "")
+    assert set(done.stdout.split()) & set(not_loaded.split()) == set()
 
 
-ROOT = Path(__file__).parents[2]
 PLUGINS_PAGE = (ROOT / "docs" / "reference" / "plugins.md").read_text("utf-8")
 PACKAGE = Path(era_haptics.plugins.__file__).parent
 KINDS = sorted(path.stem for path in PACKAGE.glob("[!_]*.py"))
@@ -255,7 +257,6 @@ def test_play_without_targets_needs_an_answer(answer: era.Answer) -> None:
 
 
 EXAMPLES = ROOT / "examples"
-API_PAGE = (ROOT / "docs" / "reference" / "python-api.md").read_text("utf-8")
 
 # Founding paper, in-house column of Table 2 [Hz].
 TABLE_2 = ["31.98", "68.50", "76.62", "107.84", "160.77"]
@@ -267,6 +268,14 @@ def cache(table_cache: Path) -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_CACHE_HOME", str(table_cache))
         yield
+
+
+@pytest.fixture
+def beside_examples(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A folder beside the examples' own plate."""
+    (tmp_path / "examples").mkdir()
+    shutil.copy(EXAMPLES / "paper_plate.yaml", tmp_path / "examples")
+    monkeypatch.chdir(tmp_path)
 
 
 def run(name: str) -> str:
@@ -281,12 +290,6 @@ def run(name: str) -> str:
     errors = [line for line in done.stderr.splitlines() if '"level": "warning"' not in line]
     assert (done.returncode, errors) == (0, [])
     return done.stdout
-
-
-def number_in(text: str, pattern: str) -> float:
-    """The only number that matches a pattern."""
-    (found,) = re.findall(pattern, text)
-    return float(found)
 
 
 @pytest.mark.long
@@ -321,22 +324,18 @@ def test_researcher_example_reproduces_the_paper(
 def test_hmi_engineer_example_feels_what_was_predicted() -> None:
     """The contrast on the plate in time is the predicted one, and the daemon ends with status 0."""
     said = run("hmi_engineer.py")
-    felt = number_in(said, r"contrast (\S+) dB felt")
-    predicted = number_in(said, r"(\S+) dB predicted")
-    assert predicted > 20
-    assert felt == pytest.approx(predicted, abs=1.5)  # it has vibrated for a second
+    (felt,) = re.findall(r"contrast (\S+) dB felt", said)
+    (predicted,) = re.findall(r"(\S+) dB predicted", said)
+    assert float(predicted) > 20
+    # It has vibrated for a second.
+    assert float(felt) == pytest.approx(float(predicted), abs=1.5)
     assert "daemon ended with status 0" in said
 
 
-@pytest.mark.usefixtures("cache")
-def test_page_example_feels_what_was_predicted(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.mark.usefixtures("cache", "beside_examples")
+def test_page_example_feels_what_was_predicted(tmp_path: Path) -> None:
     """Twelve lines, executed as printed; played contrast is the predicted one."""
-    (tmp_path / "examples").mkdir()
-    shutil.copy(EXAMPLES / "paper_plate.yaml", tmp_path / "examples")
-    monkeypatch.chdir(tmp_path)
-    lines = re.findall(r"^```python\n(.*?)^```$", API_PAGE, re.MULTILINE | re.DOTALL)[0]
+    lines = re.findall(r"^```python\n(.*?)^```$", PAGE, re.MULTILINE | re.DOTALL)[0]
     assert len(lines.split("\n\n")[1].splitlines()) == 12
     (tmp_path / "page.py").write_text(lines, "utf-8")
     ran = runpy.run_path("page.py")
@@ -344,15 +343,12 @@ def test_page_example_feels_what_was_predicted(
     assert (tmp_path / "contents.png").stat().st_size > 10_000
 
 
-@pytest.mark.usefixtures("cache")
+@pytest.mark.usefixtures("cache", "beside_examples")
 def test_readme_program_prints_what_is_said_of_each_finger(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """As the README shows it, a line a finger; the quiet one has no contrast of its own."""
     readme = (EXAMPLES.parent / "README.md").read_text("utf-8")
-    (tmp_path / "examples").mkdir()
-    shutil.copy(EXAMPLES / "paper_plate.yaml", tmp_path / "examples")
-    monkeypatch.chdir(tmp_path)
     (lines,) = re.findall(r"^```python\n(.*?)^```$", readme, re.MULTILINE | re.DOTALL)
     (shown,) = re.findall(r"^```text\n(.*?)^```$", readme, re.MULTILINE | re.DOTALL)
     (tmp_path / "readme.py").write_text(lines, "utf-8")
@@ -367,7 +363,7 @@ def test_page_rig_needs_no_file(
 ) -> None:
     """Nine lines, executed as printed: of three plates the thickest has the most contrast."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    lines = re.findall(r"^```python\n(.*?)^```$", API_PAGE, re.MULTILINE | re.DOTALL)[1]
+    lines = re.findall(r"^```python\n(.*?)^```$", PAGE, re.MULTILINE | re.DOTALL)[1]
     exec(lines, {"era": era})
     contrasts = [float(line.split()[1]) for line in capsys.readouterr().out.splitlines()]
     assert len(contrasts) == 3
@@ -377,8 +373,8 @@ def test_page_rig_needs_no_file(
 def test_page_documents_every_name() -> None:
     """Exactly the exported names."""
 
-    documented = named(API_PAGE)
-    errors = set(re.findall(r"`(\w+)`", API_PAGE.partition("| exception")[2].partition("\n## ")[0]))
+    documented = named(PAGE)
+    errors = set(re.findall(r"`(\w+)`", PAGE.partition("| exception")[2].partition("\n## ")[0]))
     assert documented | (errors & set(era.__all__)) == set(era.__all__)
     assert documented & errors == set()
 
@@ -389,13 +385,7 @@ PROGRAM = "import era_haptics"
 
 def said(program: str, *path: Path) -> tuple[int, list[str]]:
     """The exit status and lines of a program, with folders before others of Python's path."""
-    done = subprocess.run(
-        [sys.executable, "-P", "-c", program],
-        capture_output=True,
-        text=True,
-        check=False,
-        env={**os.environ, "PYTHONPATH": os.pathsep.join(map(str, path))},
-    )
+    done = ran(program, "-P", PYTHONPATH=os.pathsep.join(map(str, path)))
     return done.returncode, done.stderr.splitlines()
 
 
@@ -480,16 +470,9 @@ def test_backend_of_a_notebook_is_kept_where_it_is_installed(
     name = f"backend_{tmp_path.name.lower()}"
     if is_installed:
         (tmp_path / f"{name}.py").write_text('"""A backend."""\n', "utf-8")
-    given = {"MPLBACKEND": f"module://{name}", "PYTHONPATH": str(tmp_path)}
-    done = subprocess.run(
-        [sys.executable, "-c", BACKEND],
-        capture_output=True,
-        text=True,
-        check=False,
-        env=os.environ | given,
-    )
+    done = ran(BACKEND, MPLBACKEND=f"module://{name}", PYTHONPATH=str(tmp_path))
     assert (done.returncode, done.stderr) == (0, "")
-    assert (done.stdout.strip() == given["MPLBACKEND"]) == is_installed
+    assert (done.stdout.strip() == f"module://{name}") == is_installed
 
 
 @pytest.mark.parametrize("backend", shortly([NOTEBOOK, "module://", "Qt4Agg"], ["Qt4Agg"]))
@@ -499,13 +482,7 @@ def test_command_draws_into_files_whatever_backend_is_named(backend: str) -> Non
         "import os, sys; sys.argv[1:] = ['--version']; from era_haptics.command import main; "
         "main(); import model.figures; print(os.environ['MPLBACKEND'])"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", program],
-        capture_output=True,
-        text=True,
-        check=False,
-        env=os.environ | {"MPLBACKEND": backend},
-    )
+    done = ran(program, MPLBACKEND=backend)
     assert (done.returncode, done.stderr) == (0, "")
     assert done.stdout.splitlines()[-1] == "agg"
 
@@ -636,10 +613,9 @@ def test_every_function_and_argument_is_listed() -> None:
         assert arguments == set(given)
 
 
-EXAMPLE_FOLDER = Path(__file__).parents[2] / "examples"
 FILES = sorted(
     path
-    for path in (*EXAMPLE_FOLDER.glob("*.yaml"), EXAMPLE_FOLDER / "desk" / "rig.yaml")
+    for path in (*EXAMPLES.glob("*.yaml"), EXAMPLES / "desk" / "rig.yaml")
     if "plate" in yaml.safe_load(path.read_text("utf-8"))
 )
 CORNERS = {"SW": (0, 0), "SE": ("12 in", 0), "NE": ("12 in", "9 in"), "NW": (0, "9 in")}
@@ -671,7 +647,7 @@ def test_rig_with_defaults_is_the_papers_and_has_its_table(
     """Without damping, loss factor and stroke, which the example states as they are by default."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     rig = era.rig(SHEET_OF_KEYS, SPRINGS, amplifiers=MAIN)
-    assert rig == era.load_rig(EXAMPLE_FOLDER / "paper_plate.yaml")
+    assert rig == era.load_rig(EXAMPLES / "paper_plate.yaml")
     bare = {name: era.Era(at=each["at"], stiffness=17e3) for name, each in SPRINGS.items()}
     assert era.rig(SHEET_OF_KEYS, bare) == rig  # a simulated amplifier, channels in order
     steps: list[tuple[int, int]] = []

@@ -272,7 +272,6 @@ def test_recording_fails_without_a_file_when_the_disk_is_full(home: Path) -> Non
         stderr=subprocess.PIPE,
         text=True,
     ) as process:
-        assert process.stdout is not None
         assert "serial://" in process.stdout.readline()
         try:
             fill_disk(process.pid)

@@ -8,7 +8,7 @@ import sys
 from collections import deque
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from subprocess import PIPE, Popen
 
@@ -22,7 +22,6 @@ from drivers.host.group import Group
 from drivers.opening import Lines
 from drivers.playing import AmplifierLayer, AmplifierTone
 from drivers.protocol.definition import FAULTS, STATES
-from model.arrays import FloatArray
 from registry import threads
 from registry.limits import GuardLimits
 
@@ -46,25 +45,45 @@ class Output:
     origin: float = 0.0
 
 
-@dataclass
-class Generator:
-    """The instrument; log: program messages, as they came."""
+class Instrument:
+    """The signal generator, which may stop replying; log: program messages, as they came."""
 
-    outputs: tuple[Output, Output] = field(default_factory=lambda: (Output(), Output()))
-    errors: deque[tuple[int, str]] = field(default_factory=deque)
-    event_enable: int = 0
-    log: list[str] = field(default_factory=list)
+    def __init__(self) -> None:
+        self.outputs = Output(), Output()
+        self.errors: deque[tuple[int, str]] = deque()
+        self.event_enable, self.is_mute = 0, False
+        self.log: list[str] = []
+        self._heard = asyncio.Event()
 
-    def voltage(self, channel: int, times: FloatArray) -> FloatArray:
-        """Open-circuit voltage [V] of a channel (from 1) at times [s]."""
+    @property
+    def is_silent(self) -> bool:
+        """Whether both outputs are off."""
+        return not any(output.is_on for output in self.outputs)
+
+    async def until(self, *, silent: bool) -> None:
+        """Wait until both outputs are off, or one is on."""
+        async with asyncio.timeout(PATIENCE):
+            while self.is_silent is not silent:
+                self._heard.clear()
+                await self._heard.wait()
+
+    def force(self, channel: int, frequency: float) -> complex:
+        """Amplitude and phase at a frequency [Hz] of a channel's squared voltage, 1 for full.
+
+        Channels are numbered from 1.
+        """
         output = self.outputs[channel - 1]
-        if not output.is_on:
-            return np.zeros(len(times))
+        times = np.arange(10_000) / 10_000.0 + max(each.origin for each in self.outputs)
         angle = 2 * np.pi * output.frequency * (times - output.origin) + np.radians(output.phase)
-        return output.offset + output.amplitude / 2 * np.sin(angle)
+        voltage = output.is_on * (output.offset + output.amplitude / 2 * np.sin(angle))
+        wave = np.exp(-2j * np.pi * frequency * (times - times[0]))
+        return complex(2 * np.mean(voltage**2 * wave) / (FULL**2 / 2) * 1j)
 
     def message(self, text: str) -> str | None:
-        """Execute a program message; its response message, None without queries."""
+        """Execute a program message unless mute; its response message, None without queries."""
+        self._heard.set()
+        if self.is_mute:
+            return None
         self.log.append(text)
         answers = []
         for unit in text.split(";"):
@@ -119,13 +138,13 @@ class Generator:
 
 
 @asynccontextmanager
-async def on_tcp(generator: Generator) -> AsyncIterator[int]:
-    """Serve a generator over TCP; its port."""
+async def on_tcp(instrument: Instrument) -> AsyncIterator[int]:
+    """Serve the instrument over TCP; its port."""
 
     async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         try:
             while line := await reader.readline():
-                answer = generator.message(line.decode("ascii").strip())
+                answer = instrument.message(line.decode("ascii").strip())
                 if answer is not None:
                     writer.write(f"{answer}\n".encode("ascii"))
         finally:
@@ -145,45 +164,6 @@ PATIENCE = 60.0  # s
 pytestmark = pytest.mark.real_time
 
 
-class Instrument(Generator):
-    """A generator that may stop replying, and can be waited for."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.is_mute = False
-        self._heard = asyncio.Event()
-
-    def message(self, text: str) -> str | None:
-        """Execute a message, unless it is mute."""
-        self._heard.set()
-        return None if self.is_mute else super().message(text)
-
-    @property
-    def is_silent(self) -> bool:
-        """Whether both outputs are off."""
-        return not any(output.is_on for output in self.outputs)
-
-    async def until(self, *, silent: bool) -> None:
-        """Wait until both outputs are off, or one is on."""
-        async with asyncio.timeout(PATIENCE):
-            while self.is_silent is not silent:
-                self._heard.clear()
-                await self._heard.wait()
-
-    def force(self, channel: int, frequency: float) -> complex:
-        """Amplitude and phase at a frequency [Hz] of the squared voltage, 1 for full voltage."""
-        times = np.arange(10_000) / 10_000.0 + max(each.origin for each in self.outputs)
-        squared = self.voltage(channel, times) ** 2
-        wave = np.exp(-2j * np.pi * frequency * (times - times[0]))
-        return complex(2 * np.mean(squared * wave) / (FULL**2 / 2) * 1j)
-
-
-async def printed(running: Popen[bytes]) -> str:
-    """Wait for the next line that a program prints."""
-    assert running.stdout is not None
-    return (await asyncio.to_thread(running.stdout.readline)).decode().strip()
-
-
 async def ended(running: Popen[bytes]) -> int:
     """Wait until a program has ended; its status."""
     return await asyncio.to_thread(running.wait, PATIENCE)
@@ -197,7 +177,8 @@ async def driven() -> AsyncIterator[tuple[Instrument, Popen[bytes], str]]:
         program = [sys.executable, str(SCRIPT), f"127.0.0.1:{port}"]
         with Popen(program, stdout=PIPE) as running:  # noqa: ASYNC220
             try:
-                yield instrument, running, await printed(running)
+                url = await asyncio.to_thread(running.stdout.readline)
+                yield instrument, running, url.decode().strip()
             finally:
                 instrument.is_mute = False
                 running.send_signal(signal.SIGCONT)
@@ -263,7 +244,10 @@ async def failing(group: Group, one: AmplifierLayer) -> None:
 
 
 async def test_force_is_that_of_the_set_and_follows_it() -> None:
-    """A quarter of the force is half the voltage, at half the frequency; then along a ramp."""
+    """A quarter of the force is half the voltage, at half the frequency; then along a ramp.
+
+    A stop has switched the outputs off at the moment at which the host takes it for confirmed.
+    """
     async with driven() as (instrument, _, url), armed(url) as (group, host):
         await group.apply({"a": [layer(0.25)]})
         async with asyncio.timeout(PATIENCE):
@@ -283,11 +267,6 @@ async def test_force_is_that_of_the_set_and_follows_it() -> None:
         assert np.degrees(np.angle(instrument.force(1, 100.0) / second)) == pytest.approx(
             120.0, abs=0.1
         )
-
-
-async def test_confirmed_stop_has_switched_the_outputs_off() -> None:
-    """At the moment at which the host takes it for confirmed."""
-    async with playing() as (instrument, _, group, _host):
         stopped = await group.stop()
         assert stopped["a"].is_confirmed
         assert instrument.is_silent

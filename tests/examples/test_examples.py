@@ -29,8 +29,6 @@ import numpy as np
 import pytest
 import yaml
 
-import era_haptics
-import model
 from benchmarks.weekend.chain import BuiltBoard
 from controller.cli.main import run
 from daemons import ENABLED, PATIENCE, READY, DaemonBench, next_event, ready_daemon, until_state
@@ -52,17 +50,15 @@ from sim.transport.far_end import make_terminal
 from typed_page import Reader, Typed, installed_program, read_steps
 from virtual_lines import judged
 
-HEARTBEAT = Path(__file__).parents[2] / "examples" / "plugins" / "effect" / "heartbeat.py"
+ROOT = Path(__file__).parents[2]
+PLUGINS = ROOT / "examples" / "plugins"
+UNITS, WEEKEND = ROOT / "examples" / "systemd", ROOT / "examples" / "weekend"
+MODULES = sorted(PLUGINS.glob("*/*.py"))
 
 
 def test_heartbeat_has_no_end() -> None:
     """It lasts as long as the finger, so a layout refuses it under `on_release`."""
-    assert runpy.run_path(str(HEARTBEAT))["Heartbeat"]().has_end is False
-
-
-ROOT = Path(__file__).parents[2]
-PLUGINS = ROOT / "examples" / "plugins"
-MODULES = sorted(PLUGINS.glob("*/*.py"))
+    assert runpy.run_path(str(PLUGINS / "effect" / "heartbeat.py"))["Heartbeat"]().has_end is False
 
 
 @pytest.mark.parametrize("path", MODULES, ids=[path.stem for path in MODULES])
@@ -73,9 +69,6 @@ def test_example_plugin_imports_stable_names_only(path: Path) -> None:
     assert homes & {"registry", "controller", "drivers", "model", "sim"} == set()
 
 
-FOLDER = Path(__file__).parents[2] / "examples" / "weekend"
-
-
 @pytest.mark.long
 def test_the_board_is_found_from_the_file_of_its_sensor(tmp_path: Path, capsys) -> None:
     """Modulus within 2 % of that built, held-out places within 5 %, and drives known to 10 %.
@@ -83,12 +76,12 @@ def test_the_board_is_found_from_the_file_of_its_sensor(tmp_path: Path, capsys) 
     No sheet tells force factors to less than 20 %; with its gain each is known by the responses.
     """
     found = tmp_path / "calibrated.yaml"
-    believed = shutil.copy(FOLDER / "rig.yaml", tmp_path)
-    arguments = [str(believed), str(FOLDER / "measured.uff"), "-o", str(found)]
+    believed = shutil.copy(WEEKEND / "rig.yaml", tmp_path)
+    arguments = [str(believed), str(WEEKEND / "measured.uff"), "-o", str(found)]
     assert run(["calibrate", *arguments, "--json"]) == 0
     report = json.loads(capsys.readouterr().out)
     assert report["held_out"]["error_after"] < 0.05
-    true = BuiltBoard.drawn(load_rig(FOLDER / "rig.yaml"), 0).rig.plate
+    true = BuiltBoard.drawn(load_rig(WEEKEND / "rig.yaml"), 0).rig.plate
     rig = load_rig(found)
     rigidity = rig.plate.flexural_rigidity / rig.plate.mass
     assert rigidity == pytest.approx(true.flexural_rigidity / true.mass, rel=0.02)
@@ -100,7 +93,7 @@ def test_the_board_is_found_from_the_file_of_its_sensor(tmp_path: Path, capsys) 
     assert np.median(errors / sizes) < 0.1
 
 
-EXAMPLE = Path(era_haptics.__file__).parents[1] / "examples" / "modbus_server" / "modbus_server.py"
+EXAMPLE = ROOT / "examples" / "modbus_server" / "modbus_server.py"
 FAILED = {"pieces", "exceptions"}
 """What docs/how-to/write-an-amplifier.md says that the server cannot do."""
 SKIPPED = {"sensors", "steps_as_stated", "limited", "readings", "events"}
@@ -120,7 +113,6 @@ async def served(kind: str) -> AsyncIterator[str]:
         command = sys.executable, str(EXAMPLE), kind, *place
         process = await asyncio.create_subprocess_exec(*command, stdout=PIPE)
         try:
-            assert process.stdout is not None
             url = (await process.stdout.readline()).decode().strip()
             yield url.replace(there.port, here.port)
         finally:
@@ -149,8 +141,6 @@ async def test_conformance_finds_what_the_server_cannot_do(kind: str, drives: bo
     assert bool(left) == (drives and kind == "rtu")
 
 
-UNITS = Path(model.__file__).parents[1] / "examples" / "systemd"
-WEEKEND = UNITS.parent / "weekend"
 AT_HOME = ("era-sound-server", "era-soft-amp", "era-plate")
 """In the order in which they start."""
 MAX_EXPOSURE = 2.0
@@ -274,6 +264,19 @@ SHORT = "add-a-material"
 """Executed by every run of the tests; the others by `make test-long`, and when they change."""
 
 
+@pytest.fixture(scope="session")
+def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with all example plug-ins, built by pip without a package index."""
+    target = tmp_path_factory.mktemp("site")
+    options = ["--no-deps", "--no-build-isolation", "--disable-pip-version-check", "--quiet"]
+    subprocess.run(
+        [sys.executable, "-m", "pip", "install", *options, "--target", target]
+        + [str(path.parent) for path in PLUGINS.glob("*/pyproject.toml")],
+        check=True,
+    )
+    return target
+
+
 @pytest.fixture
 def reader(tmp_path: Path, installed: Path) -> Iterator[Reader]:
     """A reader in a checkout with examples and firmware alone, for whom kernels were compiled.
@@ -325,14 +328,13 @@ def test_page_includes_code_from_files(name: str) -> None:
     assert "```python" not in text
 
 
-MODULE = Path(__file__).parents[2] / "examples" / "plugins" / "wire" / "unix_wire.py"
 LIMITS = GuardLimits(20.0, 1000.0, 1.0)
 
 
 @pytest.fixture
 def address(monkeypatch: pytest.MonkeyPatch) -> Any:
     """The class of the example, which opens all URLs."""
-    made = runpy.run_path(str(MODULE))["UnixAddress"]
+    made = runpy.run_path(str(PLUGINS / "wire" / "unix_wire.py"))["UnixAddress"]
     monkeypatch.setattr(opening, "address_of", made)
     monkeypatch.setattr("drivers.host.amplifier.COMMIT_DELAY", 10.0)  # on a busy machine
     return made
@@ -406,8 +408,7 @@ async def test_url_and_socket_must_be_there(address: Any, tmp_path: Path) -> Non
         await Lines().amplifier(f"serial+unix://{tmp_path / 'none'}", LIMITS, name="a")
 
 
-SOURCE = Path(era_haptics.__file__).parents[1] / "examples" / "smallest_amplifier" / "amplifier.c"
-MOVED = Path(__file__).parents[1] / "support" / "moved_smallest.c"
+SOURCE = ROOT / "examples" / "smallest_amplifier" / "amplifier.c"
 BUILD = "-std=c11 -D_GNU_SOURCE -Wall -Wextra -Werror -O1 -fsanitize=undefined -shared -fPIC"
 NOT_IN_SMALLEST = {
     *("sensors", "steps_as_stated", "limited", "measured", "readings", "addresses", "mark"),
@@ -439,7 +440,8 @@ def compiled(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The program as a library whose time is that of its caller."""
     made = tmp_path_factory.mktemp("smallest") / "moved.so"
     compiler = installed_program("cc", package="gcc")
-    command = [compiler, *BUILD.split(), f"-I{SOURCE.parent}", "-o", made, MOVED, "-lm"]
+    command = [compiler, *BUILD.split(), f"-I{SOURCE.parent}", "-o", made]
+    command += [ROOT / "tests" / "support" / "moved_smallest.c", "-lm"]
     subprocess.run(command, check=True)
     return made
 
@@ -509,7 +511,6 @@ def test_program_serves_a_pseudo_terminal_and_leaves_the_users_alone(tmp_path: P
     assert (bare.returncode, bare.stdout) == (2, "")
     assert bare.stderr == "usage: amplifier TTY | --pty\n"
     with subprocess.Popen([program, "--pty"], stdout=subprocess.PIPE, text=True) as running:
-        assert running.stdout is not None
         url = running.stdout.readline().strip()
         assert asyncio.run(identify(url))["serial_number"] == "SMALLEST-1"
         running.kill()
@@ -522,10 +523,9 @@ def test_source_is_small() -> None:
     assert max(map(len, lines)) <= 100
 
 
-BUTTON = Path(__file__).parents[2] / "examples" / "javascript" / "button.mjs"
+BUTTON = ROOT / "examples" / "javascript" / "button.mjs"
 TARGET, QUIET = "0.08,0.06", "0.22,0.16"
 
-CLIENT_ROOT = BUTTON.parents[2]
 PAGE = "controller/gateway/page/connection.js"
 
 MEMBERS = """
@@ -566,10 +566,21 @@ async def ended(process: asyncio.subprocess.Process) -> tuple[int | None, str, s
 
 
 @pytest.mark.real_time
-async def test_button_is_felt_and_disarmed(tmp_path: Path) -> None:
-    """It prints the contrast that the daemon promises, and leaves it disarmed."""
+async def test_button_is_felt_and_ends_safely(tmp_path: Path) -> None:
+    """Killed, it lifts its fingers: the daemon is silent once the connection has ended.
+
+    Else it prints the contrast that the daemon promises, and leaves it disarmed. Ctrl-C ends it
+    after a stop, which stays latched.
+    """
     async with ready_daemon(tmp_path) as (bench, era):
-        await era.subscribe("pattern")
+        await era.subscribe("pattern", "silence")
+        process = await started(bench, QUIET, TARGET)
+        await next_event(era, "pattern")
+        process.kill()
+        await ended(process)
+        await next_event(era, "silence")
+        assert not (await era.status()).contacts
+        await until_state(era, READY)
         process = await started(bench, QUIET, TARGET)
         pattern = (await next_event(era, "pattern")).data
         while len(pattern["contacts"]) < 2:
@@ -580,31 +591,12 @@ async def test_button_is_felt_and_disarmed(tmp_path: Path) -> None:
         assert float(shown) == pytest.approx(pattern["predicted_contrast_db"], abs=0.05)
         assert await until_state(era, READY) == READY
         assert not (await era.status()).contacts
-
-
-@pytest.mark.real_time
-async def test_interrupt_stops_all_amplifiers(tmp_path: Path) -> None:
-    """Ctrl-C ends it after a stop, which stays latched."""
-    async with ready_daemon(tmp_path) as (bench, era):
         process = await started(bench, QUIET, TARGET)
         await until_state(era, ENABLED)
         process.send_signal(2)
         assert (await ended(process))[0] == 130
         await until_state(era, "QUICK_STOP_ACTIVE")
         assert not any(bench.far.summary().levels)
-
-
-@pytest.mark.real_time
-async def test_killed_client_lifts_its_fingers(tmp_path: Path) -> None:
-    """The daemon is silent once the connection has ended."""
-    async with ready_daemon(tmp_path) as (bench, era):
-        await era.subscribe("pattern", "silence")
-        process = await started(bench, QUIET, TARGET)
-        await next_event(era, "pattern")
-        process.kill()
-        await ended(process)
-        await next_event(era, "silence")
-        assert not (await era.status()).contacts
 
 
 @pytest.mark.real_time
@@ -632,7 +624,6 @@ async def test_connection_is_made_again_with_topics_and_lease(tmp_path: Path) ->
     layouts = "layouts: {home: layout.yaml, climate: layout.yaml}\n"
     async with ready_daemon(tmp_path, layouts) as (bench, era):
         process = await started(bench, program=tmp_path / "kept.mjs")
-        assert process.stdout is not None
         awaited = {  # in either order
             *(b"armed on climate\n", f"{ENABLED}\n".encode()),
             b"TypeError gain_db must be a finite number, got NaN\n",
@@ -671,7 +662,7 @@ def test_package_is_installed_with_types_of_what_it_has(tmp_path: Path) -> None:
     source, user = tmp_path / "examples" / "javascript", tmp_path / "user"
     shutil.copytree(BUTTON.parent, source)
     (tmp_path / PAGE).parent.mkdir(parents=True)
-    shutil.copy(CLIENT_ROOT / PAGE, tmp_path / PAGE)
+    shutil.copy(ROOT / PAGE, tmp_path / PAGE)
     user.mkdir()
     package = json.loads((source / "package.json").read_text("utf-8"))
     installed = user / "node_modules" / "era-haptics"

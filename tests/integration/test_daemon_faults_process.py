@@ -14,8 +14,7 @@ import signal
 import socket
 import sys
 import time
-from collections.abc import AsyncIterator, Callable, Mapping
-from contextlib import asynccontextmanager
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cache
 from itertools import pairwise
@@ -125,7 +124,6 @@ async def test_start_that_is_stuck_ends_by_sigterm(tmp_path: Path) -> None:
         stdout=asyncio.subprocess.PIPE,
         stderr=asyncio.subprocess.DEVNULL,
     )
-    assert process.stdout is not None
     assert await asyncio.wait_for(process.stdout.readline(), PATIENCE)
     process.terminate()
     try:
@@ -190,53 +188,32 @@ async def test_daemon_ends_while_a_large_rig_is_prepared(tmp_path: Path) -> None
             assert await daemon.status() == 0
 
 
-def serves(port: int) -> bool:
-    """Whether connections are accepted."""
-    with socket.socket() as client:
-        return client.connect_ex(("127.0.0.1", port)) == 0
-
-
-async def page(port: int, path: str) -> str:
-    """Get a page."""
-    url = f"http://127.0.0.1:{port}{path}"
-    return (await asyncio.to_thread(httpx.get, url, timeout=PATIENCE)).text
-
-
 @pytest.mark.real_time
 async def test_dashboard_process_ends_with_killed_daemon(tmp_path: Path) -> None:
     """`--dashboard` prints the address of the page."""
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
+    with socket.create_server(("127.0.0.1", 0)) as free:
         port = free.getsockname()[1]
+
+    def serves() -> bool:
+        with socket.socket() as client:
+            return client.connect_ex(("127.0.0.1", port)) == 0
+
+    async def page(path: str) -> str:
+        url = f"http://127.0.0.1:{port}{path}"
+        return (await asyncio.to_thread(httpx.get, url, timeout=PATIENCE)).text
+
     async with far_end(tmp_path) as far:
         options = ("--dashboard", f"127.0.0.1:{port}")
         async with daemon_process(tmp_path, far, options=options) as daemon:
-            assert daemon.process.stdout is not None
             line = await asyncio.wait_for(daemon.process.stdout.readline(), PATIENCE)
             assert line.decode().startswith(f"dashboard: http://127.0.0.1:{port}/")
-            await until(lambda: serves(port))
-            assert "<html" in await page(port, "/")
-            while "era_up 1.0" not in (metrics := await page(port, "/metrics")):
+            await until(serves)
+            assert "<html" in await page("/")
+            while "era_up 1.0" not in (metrics := await page("/metrics")):
                 assert "era_up 0.0" in metrics  # not connected to the daemon yet
             daemon.process.kill()
             await daemon.process.wait()
-            await until(lambda: not serves(port))
-
-
-@asynccontextmanager
-async def running(program: str) -> AsyncIterator[None]:
-    """Run a Python program as a process until the context ends."""
-    process = await asyncio.create_subprocess_exec(sys.executable, "-c", program)
-    try:
-        yield
-    finally:
-        process.kill()
-        await process.wait()
-
-
-def threads(pid: int) -> list[int]:
-    """Return the thread ids of a process."""
-    return [int(name) for name in os.listdir(f"/proc/{pid}/task")]  # noqa: PTH208
+            await until(lambda: not serves())
 
 
 def limited(pid: int, what: int, limit: int) -> tuple[int, int]:
@@ -244,9 +221,9 @@ def limited(pid: int, what: int, limit: int) -> tuple[int, int]:
     return resource.prlimit(pid, what, (limit, resource.prlimit(pid, what)[1]))
 
 
-def descriptors(pid: int) -> list[int]:
-    """Return the open descriptors of a process."""
-    return [int(name) for name in os.listdir(f"/proc/{pid}/fd")]  # noqa: PTH208
+def numbers_in(folder: str) -> list[int]:
+    """What /proc lists there: threads or open descriptors of a process."""
+    return [int(path.name) for path in Path(folder).iterdir()]
 
 
 @pytest.mark.real_time
@@ -324,14 +301,15 @@ async def test_daemon_replays_nothing_when_starved(tmp_path: Path) -> None:
     async with far_end(tmp_path) as far, daemon_process(tmp_path, far) as daemon:
         journal = Journal(far)
         async with await daemon.client() as era:
-            async with contextlib.AsyncExitStack() as starving:
+            with contextlib.ExitStack() as starving:
                 async with holding(era):
                     await play(era, far)
-                    for thread in threads(daemon.process.pid):
+                    for thread in numbers_in(f"/proc/{daemon.process.pid}/task"):
                         os.sched_setaffinity(thread, {processor})
                         os.setpriority(os.PRIO_PROCESS, thread, 10)  # at 19 none is served
                     for _ in range(4):
-                        await starving.enter_async_context(running(busy))
+                        process = await asyncio.create_subprocess_exec(sys.executable, "-c", busy)
+                        starving.callback(process.kill)
                     await asyncio.sleep(1.0)
                 await era.touch([])
                 lifted = time.monotonic()
@@ -350,7 +328,7 @@ async def test_daemon_plays_on_and_stops_without_descriptors(tmp_path: Path) -> 
     more = "dumps: {folder: dumps}\n"
     async with playing_daemon(tmp_path, more) as (daemon, era, journal):
         pid = daemon.process.pid
-        before = limited(pid, resource.RLIMIT_NOFILE, max(descriptors(pid)) + 1)
+        before = limited(pid, resource.RLIMIT_NOFILE, max(numbers_in(f"/proc/{pid}/fd")) + 1)
         waiting = []
         try:
             for _ in range(40):
@@ -446,7 +424,6 @@ class Truth:
 
     def resting(self, situation: Situation) -> dict[str, FingertipLoad]:
         """The fingers of a situation by place, each with its load."""
-        assert self.rig.fingertip is not None
         return {
             place: FingertipLoad(
                 *self.stream.places[place], self.drawn.load_of(place, self.rig.fingertip)
@@ -485,7 +462,6 @@ def plate_response_matches_model(played: Played, truth: Truth) -> None:
     points = np.array(list(SENSORS.values()))
     for heard in _touched(played):
         _, wanted = truth.fields(heard, points)
-        assert heard.phasors is not None
         apart = _apart(heard.phasors, wanted)
         assert apart <= 0.01, (heard.situation, apart)
 
@@ -536,7 +512,6 @@ def onset_matches_prediction(played: Played, truth: Truth) -> None:
     first, *_ = _touched(played)
     layer = truth.layer(first)
     pattern = timing.with_envelopes(layer, truth.placed(first.situation), ending=False)
-    assert pattern.onset is not None
     if truth.onset_knots is not None:
         onset = {name: _sampled(each, truth.onset_knots) for name, each in pattern.onset.items()}
         pattern = replace(pattern, onset=onset)
@@ -555,7 +530,6 @@ def _onset_contrast(truth: Truth, situation: Situation, pattern: Layer) -> float
     real = truth.drawn.plate.realised(truth.rig)
     plant = Plant(reduce_plate(real.plate, real.mesh, footprints_of(real.eras)), real.eras)
     plant.set_contacts(truth.resting(situation))
-    assert pattern.onset is not None
     errors = {name: truth.drawn.channels[channel] for name, channel in truth.rig.wiring.items()}
     shares = {name: each.harmonic for name, each in errors.items()}
     onsets = [each.onset or {} for each in (pattern, *imperfections.of_layer(pattern, shares))]

@@ -19,8 +19,9 @@ import sys
 import threading
 import time
 from collections.abc import Awaitable, Callable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractAsyncContextManager, suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -228,7 +229,6 @@ async def test_daemon_reaches_it_at_the_first_opening(
 ) -> None:
     """Within 6 s (docs/reference/urls.md), else while the port stays open; also after a loss."""
     async with far_end(tmp_path) as far:
-        assert far.machine is not None
         far.machine.boots = boots
         async with daemon_at(far, tmp_path) as bench, await bench.client() as era:
             await until_state(era, READY)
@@ -250,7 +250,6 @@ async def _conformance(url: str) -> Any:
 async def test_command_reaches_it(wire: str, action: Callable[[str], Awaitable[Any]]) -> None:
     """Each opens the port for itself; a stop is confirmed as soon as the board has started."""
     async with far_side(WIRES[wire], RIG) as far:
-        assert far.machine is not None
         far.machine.boots = 5.0
         began = threads.now()
         found = await action(far.url)
@@ -377,10 +376,13 @@ async def test_full_gateway_is_shown_as_full(tab: Page, tmp_path: Path) -> None:
 
 
 @pytest.mark.asyncio(loop_scope="module")
-async def test_page_without_a_place_at_the_daemon_connects_again(
+async def test_page_connects_again_and_reports_a_stop_without_an_answer(
     tab: Page, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Instead of showing a state that no event changes."""
+    """Without a place at the daemon, instead of showing a state that no event changes.
+
+    A stop is not confirmed, after the time in which an answer may come, when the gateway hangs.
+    """
     busy = RpcError(ErrorCode.BUSY, "too many clients", remedy="try again later")
     with ScriptedDaemon(tmp_path) as daemon, gateway_process(tmp_path, daemon.socket) as gateway:
         with monkeypatch.context() as full:
@@ -388,14 +390,6 @@ async def test_page_without_a_place_at_the_daemon_connects_again(
             await tab.show(f"{gateway.url}#token={gateway.token}")
             async with asyncio.timeout(PATIENCE / 6):
                 await tab.until(f"{REASON} === 'gateway-full'")
-        await tab.until(f"{REASON} === 'simulated'")
-
-
-@pytest.mark.asyncio(loop_scope="module")
-async def test_stop_without_an_answer_is_reported(tab: Page, tmp_path: Path) -> None:
-    """As not confirmed, after the time in which an answer may come: the gateway hangs."""
-    with ScriptedDaemon(tmp_path) as daemon, gateway_process(tmp_path, daemon.socket) as gateway:
-        await tab.show(f"{gateway.url}#token={gateway.token}")
         await tab.until(f"{REASON} === 'simulated'")
         gateway.process.send_signal(signal.SIGSTOP)
         await tab.click("#stop")
@@ -523,7 +517,8 @@ def test_far_end_ends_when_the_demo_is_killed(capture, environment, tmp_path):
         cwd=tmp_path,
         stdout=subprocess.DEVNULL,
     ) as process:
-        far_end = far_end_of(process.pid)
+        children = Path(f"/proc/{process.pid}/task/{process.pid}/children")
+        far_end = int(wait_for(lambda: children.read_text().split(), timeout=60)[0])
         process.kill()
     try:
         wait_for(lambda: not is_running(far_end), timeout=60)
@@ -540,12 +535,6 @@ def is_running(pid):
         return False
 
 
-def far_end_of(pid):
-    """The process that a running demonstration started for its amplifiers."""
-    children = Path(f"/proc/{pid}/task/{pid}/children")
-    return int(wait_for(lambda: children.read_text().split(), timeout=60)[0])
-
-
 @pytest.mark.long
 def test_page_and_daemon(tmp_path: Path) -> None:
     """It says where its page is, its daemon is disarmed and answers; Ctrl-C leaves nothing."""
@@ -558,7 +547,6 @@ def test_page_and_daemon(tmp_path: Path) -> None:
         text=True,
     ) as process:
         try:
-            assert process.stdout is not None
             told = process.stdout.readline()
             assert told.startswith("dashboard: http://127.0.0.1:")
             assert told.endswith(f" (token in {socket.with_name('dashboard-token')})\n")
@@ -588,35 +576,6 @@ sys.exit(main())
 """`era` with shorter timeouts of the gateway."""
 
 
-@dataclass
-class Watch:
-    """A client of the daemon that holds a finger down."""
-
-    looks: int = 0
-    has_failed: bool = False
-    over: threading.Event = field(default_factory=threading.Event)
-
-    def run(self, path: Path) -> None:
-        """Watch, and note a failure."""
-        try:
-            self._run(path)
-        except BaseException:
-            self.has_failed = True
-            raise
-
-    def _run(self, path: Path) -> None:
-        """Renew the lease, repeat the touch and read the status fifty times a second."""
-        with Client.connect(path, name="watch", timeout=PATIENCE) as era:
-            lease = era.arm("watch", lease_s=60).lease
-            while not self.over.wait(0.02):
-                era.touch([PLACE])
-                status = era.status()
-                assert status.state == ENABLED, status.cause
-                era.renew(lease)
-                self.looks += 1
-            era.disarm()
-
-
 @pytest.fixture(scope="module")
 def daemon(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """The socket of one daemon for all tests."""
@@ -624,26 +583,37 @@ def daemon(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
         yield path
 
 
+def watch(path: Path, looks: list[str], over: threading.Event) -> None:
+    """Hold a finger down: renew the lease, touch and read the status fifty times a second."""
+    with Client.connect(path, name="watch", timeout=PATIENCE) as era:
+        lease = era.arm("watch", lease_s=60).lease
+        while not over.wait(0.02):
+            era.touch([PLACE])
+            status = era.status()
+            assert status.state == ENABLED, status.cause
+            era.renew(lease)
+            looks.append(status.state)
+        era.disarm()
+
+
 @pytest.fixture
-def watched(daemon: Path) -> Iterator[Watch]:
+def watched(daemon: Path) -> Iterator[None]:
     """The daemon armed and watched; it must stay armed."""
-    watch = Watch()
-    thread = threading.Thread(target=watch.run, args=(daemon,))
-    with Client.connect(daemon, name="test") as era:
+    looks, over = list[str](), threading.Event()
+    with Client.connect(daemon, name="test") as era, ThreadPoolExecutor() as thread:
         wait_for_state(era, "READY_TO_SWITCH_ON")
-        thread.start()
+        watching = thread.submit(watch, daemon, looks, over)
         try:
-            wait_for(lambda: watch.looks > 5 or not thread.is_alive())
-            yield watch
+            wait_for(lambda: len(looks) > 5 or watching.done())
+            yield
         finally:
-            watch.over.set()
-            thread.join()
-        assert not watch.has_failed
+            over.set()
+        watching.result()
 
 
 @pytest.fixture
 def gateway(
-    request: pytest.FixtureRequest, watched: Watch, daemon: Path, tmp_path: Path
+    request: pytest.FixtureRequest, watched: None, daemon: Path, tmp_path: Path
 ) -> Iterator[GatewayProcess]:
     """A gateway, which must not log anything; parameter: the command instead of `era`."""
     program = getattr(request, "param", (INSTALLED_ERA,))
@@ -662,15 +632,6 @@ def assert_served(gateway: GatewayProcess) -> None:
         assert ws.response()["result"]
 
 
-def deaf_connection(gateway: GatewayProcess) -> socket.socket:
-    """A connection with a small receive buffer."""
-    made = socket.socket()
-    made.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 2048)
-    made.settimeout(60)
-    made.connect(("127.0.0.1", gateway.port))
-    return made
-
-
 @pytest.mark.long
 @pytest.mark.real_time
 def test_gateway_serves_with_two_thousand_silent_connections(gateway: GatewayProcess) -> None:
@@ -682,34 +643,30 @@ def test_gateway_serves_with_two_thousand_silent_connections(gateway: GatewayPro
         assert_served(gateway)
 
 
-def trickles(gateway: GatewayProcess) -> list[bytes]:
-    """Incomplete requests: a header, a body, a refused request, a second request."""
-    head = f"POST /api/v1/arm HTTP/1.1\r\nHost: {gateway.host}\r\n"
-    full = f"{head}Authorization: Bearer {TOKEN}\r\nContent-Type: application/json\r\n"
-    begun = (
-        head,
-        f"{full}Content-Length: 100\r\n\r\n",
-        f"{full}Transfer-Encoding: chunked\r\n\r\n",
-        f"{head}Content-Length: 100\r\n\r\n",  # refused at once, without a token
-        f"{full}Content-Length: 2\r\n\r\n{{}}{head}",
-    )
-    return [request.encode() for request in begun]
-
-
 @pytest.mark.real_time
 @pytest.mark.parametrize("gateway", [(sys.executable, "-c", IMPATIENT)], indirect=True)
 def test_gateway_closes_connections_that_trickle_or_do_not_read(gateway: GatewayProcess) -> None:
     """Single bytes do not extend a timeout; other clients are served meanwhile."""
+    head = f"POST /api/v1/arm HTTP/1.1\r\nHost: {gateway.host}\r\n"
+    full = f"{head}Authorization: Bearer {TOKEN}\r\nContent-Type: application/json\r\n"
     page = f"GET /app.js HTTP/1.1\r\nHost: {gateway.host}\r\n\r\n".encode()
     hello = frame(b'{"jsonrpc":"2.0","id":1,"method":"hello","params":{"client":"me"}}')
     with contextlib.ExitStack() as held:
         left: list[tuple[socket.socket, bytes]] = []
-        for begun in trickles(gateway):
+        for begun in (
+            head,
+            f"{full}Content-Length: 100\r\n\r\n",
+            f"{full}Transfer-Encoding: chunked\r\n\r\n",
+            f"{head}Content-Length: 100\r\n\r\n",  # refused at once, without a token
+            f"{full}Content-Length: 2\r\n\r\n{{}}{head}",  # a second request
+        ):
             slow = held.enter_context(gateway.connect())
-            slow.sendall(begun)
+            slow.sendall(begun.encode())
             left.append((slow, b"1"))
         for number in range(20):
-            deaf = held.enter_context(deaf_connection(gateway))
+            deaf = held.enter_context(socket.socket())
+            deaf.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 2048)
+            deaf.connect(("127.0.0.1", gateway.port))
             if number % 2:
                 deaf.sendall(upgrade(gateway))
             left.append((deaf, 20 * (hello if number % 2 else page)))
@@ -732,7 +689,7 @@ def test_gateway_closes_connections_that_trickle_or_do_not_read(gateway: Gateway
 
 @pytest.mark.real_time
 def test_daemon_continues_when_gateways_are_killed_under_load(
-    watched: Watch, daemon: Path, tmp_path: Path
+    watched: None, daemon: Path, tmp_path: Path
 ) -> None:
     """Two in turn, each under a flood; the next one serves again."""
     for _ in range(2):

@@ -55,7 +55,6 @@ from model.estimate.measurement import write_responses_csv, write_responses_uff
 from model.rig.rig import Rig
 from model.rig.rig_file import example_rig_path, load_rig
 from model.structure.plate import Plate
-from model.table.table import LocalizationTable
 from model.table.table_file import build_table
 from plates import write_rig
 from real_wires import WIRES, FarSide, far_side
@@ -88,15 +87,28 @@ def typed(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Typed:
     return run
 
 
-@pytest.fixture
-def plate() -> Rig:
-    """The plate of the example's file."""
-    return load_rig(example_rig_path())
+def _long(name: str, *values: Any) -> Any:
+    return pytest.param(*values, id=name, marks=pytest.mark.long)
 
 
-def test_plate_of_the_file_is_well(typed: Typed, plate: Rig) -> None:
+PLATE = load_rig(example_rig_path())
+"""The plate of the example's file."""
+
+
+def with_first(**changes: Any) -> Rig:
+    """That plate with another first ERA."""
+    first, *others = PLATE.eras
+    return replace(PLATE, eras=(replace(first, **changes), *others))
+
+
+STROKE, WIRING = PLATE.eras[0].stroke, PLATE.wiring
+EXCHANGED = replace(PLATE, wiring={**WIRING, "SW": WIRING["SE"], "SE": WIRING["SW"]})
+THINNER = replace(PLATE, plate=replace(PLATE.plate, thickness=0.9 * PLATE.plate.thickness))
+
+
+def test_plate_of_the_file_is_well(typed: Typed) -> None:
     """By four sensors at its ERAs; keys of the check and of the measurement."""
-    result = typed("check", "--url", PORT, "--yes", "--json", on=plate)
+    result = typed("check", "--url", PORT, "--yes", "--json", on=PLATE)
     told = json.loads(result.stdout)
     assert result.exit_code == 0
     assert told["wiring_matches"]
@@ -106,110 +118,76 @@ def test_plate_of_the_file_is_well(typed: Typed, plate: Rig) -> None:
     assert told["measure_time_s"] < 40
 
 
-def _weak(rig: Rig, factor: float) -> Rig:
-    first, *others = rig.eras
-    return replace(rig, eras=(replace(first, stroke=factor * first.stroke), *others))
-
-
-def _inverted(rig: Rig) -> Rig:
-    first, *others = rig.eras
-    return replace(rig, eras=(replace(first, gains=((100.0, 1.0, math.pi),)), *others))
-
-
-def _exchanged(rig: Rig) -> Rig:
-    wiring = {**rig.wiring} | {"SW": rig.wiring["SE"], "SE": rig.wiring["SW"]}
-    return replace(rig, wiring=wiring)
-
-
-def _thinner(rig: Rig) -> Rig:
-    return replace(rig, plate=replace(rig.plate, thickness=0.9 * rig.plate.thickness))
-
-
-def _long(name: str, *values: Any) -> Any:
-    return pytest.param(*values, id=name, marks=pytest.mark.long)
-
-
 @pytest.mark.parametrize(
-    ("spoil", "verdicts", "plate_matches"),
+    ("real", "verdicts", "plate_matches"),
     [
-        _long("dead", lambda rig: _weak(rig, 1e-6), ["dead", "well", "well", "well"], True),
-        _long("weak", lambda rig: _weak(rig, 0.5), ["weak", "well", "well", "well"], True),
-        pytest.param(_inverted, ["inverted", "well", "well", "well"], True, id="inverted"),
+        _long("dead", with_first(stroke=1e-6 * STROKE), ["dead", "well", "well", "well"], True),
+        _long("weak", with_first(stroke=0.5 * STROKE), ["weak", "well", "well", "well"], True),
+        pytest.param(
+            with_first(gains=((100.0, 1.0, math.pi),)),
+            ["inverted", "well", "well", "well"],
+            True,
+            id="inverted",
+        ),
         # Thinner as far as sheets tell of its modulus; the sensors of an exchanged ERA go with it.
-        pytest.param(_thinner, ["well"] * 4, True, id="thinner"),
-        _long("exchanged", _exchanged, ["well"] * 4, False),
+        pytest.param(THINNER, ["well"] * 4, True, id="thinner"),
+        _long("exchanged", EXCHANGED, ["well"] * 4, False),
     ],
 )
 def test_faults_of_wiring_and_plate_are_told(
-    typed: Typed,
-    plate: Rig,
-    spoil: Callable[[Rig], Rig],
-    verdicts: list[str],
-    plate_matches: bool,
+    typed: Typed, real: Rig, verdicts: list[str], plate_matches: bool
 ) -> None:
     """Exit status 1, and the verdict of each channel; a thinner plate by the promises it misses.
 
     Its modulus stands for the square of its thickness.
     """
-    result = typed("check", "--url", PORT, "--yes", "--json", on=spoil(plate))
+    result = typed("check", "--url", PORT, "--yes", "--json", on=real)
     told = json.loads(result.stdout)
     assert result.exit_code == 1
     assert [each["states"] for each in told["channels"]] == [[verdict] for verdict in verdicts]
     assert told["wiring_matches"] == (verdicts == ["well"] * 4)
     assert told["plate"]["matches"] == plate_matches
-    if spoil is _thinner:
+    if real is THINNER:
         assert told["plate"]["changes"]["modulus"] == pytest.approx(0.9**2 - 1, abs=0.03)
         assert told["plate"]["kept_share"] < 0.5
 
 
-def test_daemon_that_runs_keeps_its_amplifiers(typed: Typed, plate: Rig, tmp_path: Path) -> None:
-    """Its file names the rig; refused while it holds its socket."""
-    (tmp_path / "daemon.yaml").write_text("rig: rig.yaml\nsocket: d.sock\n")
-    lock = SocketLock(tmp_path / "d.sock")
-    try:
-        with pytest.raises(InputError, match="daemon is running"):
-            typed("check", "--url", PORT, "--yes", on=plate, file="daemon.yaml")
-    finally:
-        lock.release()
-    assert typed("check", "--url", PORT, "--yes", on=plate, file="daemon.yaml").exit_code == 0
-
-
-def test_amplifier_that_is_not_there_or_has_no_sensors_is_named(
-    typed: Typed, plate: Rig, monkeypatch: pytest.MonkeyPatch
+def test_amplifiers_that_cannot_measure_are_named(
+    typed: Typed, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """By its port or its name, before anything plays."""
+    """Those of a daemon that holds its socket, and whose file names the rig, are refused.
+
+    One that is not there and one without sensors by port or name, before anything plays; a plate
+    whose first tones, played last again, differ, at the end.
+    """
+    (tmp_path / "daemon.yaml").write_text("rig: rig.yaml\nsocket: d.sock\n")
+    check = partial(typed, "check", "--yes", "--url")
+    lock = SocketLock(tmp_path / "d.sock")
+    with pytest.raises(InputError, match="daemon is running"):
+        check(PORT, on=PLATE, file="daemon.yaml")
+    lock.release()
+    assert check(PORT, on=PLATE, file="daemon.yaml").exit_code == 0
     with pytest.raises(LinkError, match="/dev/nowhere"):
-        typed("check", "--url", "serial:///dev/nowhere?baud=921600", "--yes", on=plate)
+        check("serial:///dev/nowhere?baud=921600", on=PLATE)
+    with monkeypatch.context() as patch:
+        patch.setattr("model.estimate.measurement.DRIFTED", 1e-9)
+        with pytest.raises(InputError, match="at the end"):
+            check(PORT, on=PLATE)
     monkeypatch.setattr(SimulatedAmplifier, "attach", lambda amplifier, sensing: None)
     with pytest.raises(CommandError, match=r"main.*sensors"):
-        typed("check", "--url", PORT, "--yes", on=plate)
-
-
-def test_plate_that_changes_while_it_is_measured_is_refused(
-    typed: Typed, plate: Rig, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The first tones, played last again, differ."""
-    monkeypatch.setattr("model.estimate.measurement.DRIFTED", 1e-9)
-    with pytest.raises(InputError, match="at the end"):
-        typed("check", "--url", PORT, "--yes", on=plate)
-
-
-@pytest.fixture
-def truth() -> Rig:
-    """The plate on the table: of the example's file, thinner, on one softer spring."""
-    rig = load_rig(example_rig_path())
-    first, *others = rig.eras
-    eras = (replace(first, stiffness=0.88 * first.stiffness), *others)
-    return replace(rig, plate=replace(rig.plate, thickness=0.985 * rig.plate.thickness), eras=eras)
+        check(PORT, on=PLATE)
 
 
 def test_rig_is_written_with_the_plate_that_is_there(
-    tmp_path: Path, truth: Rig, typed: Typed
+    tmp_path: Path, typed: Typed, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The spring that is softer, with less uncertainty, in a file that reads back; keys of JSON.
 
-    Named by a daemon's file.
+    Named by a daemon's file. A plate that is not explained ends with exit status 1, nothing is
+    promised, and what was at the output stays.
     """
+    softer = with_first(stiffness=0.88 * PLATE.eras[0].stiffness)
+    truth = replace(softer, plate=replace(PLATE.plate, thickness=0.985 * PLATE.plate.thickness))
     new = tmp_path / "rig2.yaml"
     (tmp_path / "daemon.yaml").write_text("rig: rig.yaml\nsocket: d.sock\n")
     options = ("--url", PORT, "-o", str(new), "--yes", "--quick", "--json")
@@ -231,34 +209,25 @@ def test_rig_is_written_with_the_plate_that_is_there(
     assert written == pytest.approx(
         {key: getattr(found.uncertainty, key) for key in written}, rel=1e-4
     )
-    assert "identified in place" in new.read_text("utf-8")
-
-
-def test_plate_that_is_not_explained_is_refused_and_nothing_written(
-    tmp_path: Path, truth: Rig, typed: Typed, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Exit status 1, nothing promised, and what was at the output stays."""
-    new = tmp_path / "rig2.yaml"
-    new.write_text(before := "# Fitted by `era rig identify`:\n")
+    assert "identified in place" in (before := new.read_text("utf-8"))
     monkeypatch.setattr("model.estimate.identify.MAX_CHI2", 1e-3)
-    options = ("--url", PORT, "-o", str(new), "--yes", "--quick", "--json")
     result = typed("identify", *options, on=truth)
     told = json.loads(result.stdout)
     assert result.exit_code == 1
     assert (told["explained"], told["expected_contrast"], told["files"]) == (False, [], [])
-    assert new.read_text() == before
+    assert new.read_text("utf-8") == before
 
 
 @pytest.mark.parametrize("command", [["check"], ["identify", "-o", "rig2.yaml"]])
 def test_plate_with_a_part_that_does_not_scale_is_refused_before_it_is_measured(
-    tmp_path: Path, typed: Typed, plate: Rig, monkeypatch: pytest.MonkeyPatch, command: list[str]
+    tmp_path: Path, typed: Typed, monkeypatch: pytest.MonkeyPatch, command: list[str]
 ) -> None:
     """Before a port is opened, where none is; also of a known thickness, which would not help."""
     monkeypatch.setattr(Plate.__dataclass_fields__["loss_exponent"], "metadata", {})
     known = "uncertainty: {thickness: 0}\nplate:\n  loss_exponent: 0.2\n"
     write_rig(tmp_path / "rig.yaml", ("plate:\n", known), mesh="auto")
     with pytest.raises(InputError, match=r"^plate\.loss_exponent: (?!.*set unc).*era rig identify"):
-        typed(*command, "--url", "serial:///dev/none", "--yes", on=plate)
+        typed(*command, "--url", "serial:///dev/none", "--yes", on=PLATE)
 
 
 @pytest.mark.parametrize("ending", shortly(["csv", "uff"], ["uff"]))
@@ -323,9 +292,6 @@ class LearningBench:
     @property
     def estimator(self) -> int:
         """Process number of the estimator."""
-        assert self.daemon.learning is not None
-        assert self.daemon.learning.worker is not None
-        assert self.daemon.learning.worker.pid is not None
         return self.daemon.learning.worker.pid
 
     def is_estimating(self) -> bool:
@@ -334,9 +300,7 @@ class LearningBench:
 
     async def learning(self) -> LearningSummary:
         """What it has learned."""
-        found = (await self.era.status()).learning
-        assert found is not None
-        return found
+        return (await self.era.status()).learning
 
     async def until(self, state: str, cause: str = "") -> LearningSummary:
         """Wait until it is in a state for a cause."""
@@ -398,8 +362,6 @@ async def learning_bench(
     folder: Path, *, uncertainty: str = IDENTIFIED, limit: float = 1e9
 ) -> AsyncIterator[LearningBench]:
     """A daemon that learns of a plate; uncertainty: in its rig's text, limit: for a pattern [s]."""
-    loop = asyncio.get_running_loop()
-    assert isinstance(loop, _StandingLoop)
     changes = [("\nplate:", f"\n{uncertainty}plate:")]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(learning_module, "Worker", BusyWorker)
@@ -414,19 +376,14 @@ async def learning_bench(
             async with era.armed("test", lease_s=60):
                 rng = np.random.default_rng(0)
                 learning = LearningBench(far, era, folder / "learned.npz", bench.daemon, rng)
-                loop.stands = learning.is_estimating
+                asyncio.get_running_loop().stands = learning.is_estimating
                 try:
                     yield learning
                 finally:
-                    loop.stands = _never
+                    asyncio.get_running_loop().stands = bool
 
 
-def _table(rig: Rig) -> LocalizationTable:
-    return build_table(rig, drive_mode="phased")
-
-
-def _never() -> bool:
-    return False
+_table = partial(build_table, drive_mode="phased")
 
 
 class _StandingLoop(VirtualLoop):
@@ -434,7 +391,7 @@ class _StandingLoop(VirtualLoop):
 
     def __init__(self) -> None:
         super().__init__()
-        self.stands: Callable[[], bool] = _never
+        self.stands: Callable[[], object] = bool
         jumping = self._selector.select
 
         def select(timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
@@ -608,19 +565,6 @@ async def shown(tmp_path: Path) -> AsyncIterator[tuple[Page, Network, ExitStack,
             yield tab, network, ended, ended.enter_context(pages(page, network))
 
 
-@asynccontextmanager
-async def shown_scripted(tmp_path: Path) -> AsyncIterator[tuple[Page, Network, ScriptedDaemon]]:
-    """A tab with the page, ready over the network on a scripted daemon."""
-    async with shown(tmp_path) as (tab, network, ended, origin):
-        daemon = ended.enter_context(ScriptedDaemon(tmp_path))
-        options = ("--allow-origin", origin)
-        gateway = ended.enter_context(gateway_process(tmp_path, daemon.socket, *options))
-        network.target = gateway.port
-        await tab.show(url(origin))
-        await tab.until(SAID, lambda text: text.startswith("ready: "))
-        yield tab, network, daemon
-
-
 def url(origin: str) -> str:
     """The page's address; it takes no gateway from a link."""
     return f"{origin}/plate.html?gateway=http://127.0.0.1:1/#{TOKEN}"
@@ -699,8 +643,18 @@ def test_program_holds_fingers_and_prints_what_plays(tmp_path: Path) -> None:
 
 @pytest.mark.real_time
 async def test_page_leaves_a_silent_network_and_repeats_no_arm(tmp_path: Path) -> None:
-    """A pending arm is given up with the connection; the page subscribes anew."""
-    async with shown_scripted(tmp_path) as (tab, network, daemon):
+    """A pending arm is given up with the connection; the page subscribes anew.
+
+    Its stop needs nothing that old browsers lack: without AbortSignal.timeout it goes both ways;
+    where HTTP throws, over the WebSocket.
+    """
+    async with shown(tmp_path) as (tab, network, ended, origin):
+        daemon = ended.enter_context(ScriptedDaemon(tmp_path))
+        options = ("--allow-origin", origin)
+        gateway = ended.enter_context(gateway_process(tmp_path, daemon.socket, *options))
+        network.target = gateway.port
+        await tab.show(url(origin))
+        await tab.until(SAID, lambda text: text.startswith("ready: "))
         with daemon.holding():
             await tab.click("#arm")
             await asyncio.to_thread(wait_for, lambda: "arm" in daemon.methods)
@@ -715,12 +669,6 @@ async def test_page_leaves_a_silent_network_and_repeats_no_arm(tmp_path: Path) -
         daemon.publish("state", cut)
         await tab.until(f"{SAID} === 'fault: a cable was cut'")
         assert daemon.methods.count("arm") == 1
-
-
-@pytest.mark.real_time
-async def test_stop_of_a_page_needs_nothing_that_old_browsers_lack(tmp_path: Path) -> None:
-    """Without AbortSignal.timeout it goes both ways; where HTTP throws, over the WebSocket."""
-    async with shown_scripted(tmp_path) as (tab, _, daemon):
         await tab.evaluate("delete AbortSignal.timeout")
         await tab.click("#stop")
         await asyncio.to_thread(wait_for, lambda: daemon.methods.count("stop") == 2)

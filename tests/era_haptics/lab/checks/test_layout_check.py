@@ -110,7 +110,6 @@ def test_check_says_what_the_plate_behind_a_wire_makes_felt(effect: Effect, rest
     )
     ((felt,),) = chain.press(lambda since: touch.at, held=0.42)
     assert touch.frequencies == (felt.frequency,)
-    assert touch.felt_db_sl is not None
     assert felt.level_db_sl(duration, since=since) == pytest.approx(touch.felt_db_sl, abs=1.0)
     expected = effect.level - touch.held_back_db
     assert expected - 0.5 <= touch.felt_db_sl <= expected + 2.0
@@ -194,7 +193,6 @@ def test_strongest_target_of_every_kind(
     region = Region("knob", Circle(0.15, 0.1, 0.05))
     layout = SurfaceLayout((region,), {"it": effect})
     felt = strongest_target(layout, "it", region, at=(0.15, 0.1))
-    assert felt is not None
     assert felt.level_db_sl == level
     assert (felt.pulse and felt.pulse.duration) == duration
 
@@ -440,7 +438,6 @@ def test_places_are_the_worst_of_their_regions() -> None:
         if len(pair) == 2:
             fingers = [wants(shape.centre, level_db_sl=14.0) for shape in shapes]
             centred = phased(paper_table(), fingers, min_contrast_db=-math.inf)
-            assert centred.promised_worst_db is not None
             assert each.worst_db <= centred.promised_worst_db
             assert each.worst_db <= min(each.contrasts)
     assert by_name["west", "near"].worst_db < by_name["west", "east"].worst_db
@@ -535,7 +532,6 @@ def test_felt_level_is_that_of_the_plate_in_time() -> None:
         swell, click = (each.answer.layers[0].excitation[era.name] for each in found.parts)
         ramp, omega = tap.answer.layers[0].ramp, 2 * math.pi * click.frequency
         course = lasting.stimulus.course
-        assert course is not None
         end = click.phasor * np.exp(0.04j * omega)
         bases.append(
             (
@@ -609,7 +605,6 @@ def test_beside_a_quiet_finger_content_is_smoothed_and_promised() -> None:
     """The course starts and ends at rest; each part has a promise, the least counts."""
     found = check_content(SWELL, content_check_table(), 20.0, at=AT, quiet=[QUIET])
     course = found.parts[0].stimulus.course
-    assert course is not None
     assert course.shares[0] == course.shares[-1] == 0
     promises = [each.answer.fingers[0].promised_contrast_db for each in found.parts]
     assert found.as_json()["promised_contrast_db"] == min(each for each in promises if each)

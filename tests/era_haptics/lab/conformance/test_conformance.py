@@ -52,7 +52,6 @@ from sim.far_ends.serial_amplifiers import SerialAmplifiers
 from virtual_lines import (
     JUDGED_LINE_KINDS,
     JudgedLine,
-    VirtualLoop,
     in_virtual_time,
     judged,
     plain,
@@ -129,7 +128,6 @@ async def test_sensors_on_a_plate_pass(coarse_rig: Rig) -> None:
     """Those at the feet of a rig's actuators, which read what plays."""
     bench = Bench(coarse_rig, now=threads.now())
     (far,) = bench.amplifiers.values()
-    assert isinstance(far, SimulatedAmplifier)
     running = asyncio.ensure_future(keep_time(bench))
     results = await results_of("serial", far, ["sensors", "readings"])
     running.cancel()
@@ -278,7 +276,6 @@ def test_amplifier_that_is_not_identified_fails_once(
 
 def _stall(duration: float) -> None:
     loop = asyncio.get_running_loop()
-    assert isinstance(loop, VirtualLoop)
     loop.now += duration
 
 

@@ -7,7 +7,7 @@ machines.
 import json
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import cache, partial
+from functools import partial
 from itertools import combinations
 
 import numpy as np
@@ -47,12 +47,15 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("era_haptics.lab.design.design_run.CHUNK", 4)
 
 
+COARSE = make_paper_rig(12, 9)
+FEW = tuple(anywhere(COARSE.plate).sets(3, seed=1))
+EDGE = area_of("edge", COARSE.plate), replace(anywhere(COARSE.plate), given=FEW)
+"""ERAs along the edge, judged by three contact sets."""
+
+
 def ranked(runner: Runner, *, seed: int = 0) -> Design:
     """Ten layouts of four ERAs, two of them judged by three contact sets."""
-    rig = make_paper_rig(12, 9)
-    few = tuple(anywhere(rig.plate).sets(3, seed=1))
-    contacts = replace(anywhere(rig.plate), given=few)
-    some = DesignProblem(rig, 4, area_of("edge", rig.plate), contacts, seed=seed)
+    some = DesignProblem(COARSE, 4, *EDGE, seed=seed)
     return rank_layouts({some: layouts_of("random:10", some)}, finalists=2, runner=runner)
 
 
@@ -81,17 +84,13 @@ def test_processes_and_a_cluster_find_the_same_to_the_bit() -> None:
         assert figures(ranked(there)) == here
 
 
-def test_a_layout_is_judged_with_the_eras_of_its_problem(tmp_path) -> None:
+def test_a_layout_is_judged_with_the_eras_of_its_problem() -> None:
     """The same places with ERAs of two stiffnesses: each has the answers of its own rig."""
-    rig = make_paper_rig(12, 9)
-    few = tuple(anywhere(rig.plate).sets(3, seed=1))
-    contacts = replace(anywhere(rig.plate), given=few)
-    area = area_of("edge", rig.plate)
-    soft, stiff = (DesignProblem(rig, 4, area, contacts, stiffness=each) for each in (1e4, 3e4))
+    soft, stiff = (DesignProblem(COARSE, 4, *EDGE, stiffness=each) for each in (1e4, 3e4))
     corners = {"corners": soft.own_positions}
     found = rank_layouts({soft: corners, stiff: corners}, finalists=1, runner=Runner())
     for each in found.layouts:
-        alone = judge(each.problem.rig_with(soft.own_positions), few)
+        alone = judge(each.problem.rig_with(soft.own_positions), FEW)
         assert sorted(each.answers.contrast_db) == pytest.approx(sorted(alone.contrast_db))
 
 
@@ -109,7 +108,14 @@ def test_layouts_of_exciters_state_their_own_keys() -> None:
     assert [era.damping for era in found.eras] == pytest.approx([rig.eras[0].damping] * 4, rel=1e-5)
 
 
-PLATE = load_rig(example_rig_path()).plate
+RIG = load_rig(example_rig_path())
+PLATE = RIG.plate
+GAINS = Uncertainty(0.05, 5.0, 0.0, 0.0, 1.0, 0.0)
+"""Errors of the gains only, 5 % and 5 degrees."""
+LOUD = replace(RIG, uncertainty=GAINS, eras=tuple(replace(era, stroke=0.01) for era in RIG.eras))
+"""Weights of any kind reach the level, so that it does not matter."""
+PAIRS = tuple(replace(anywhere(PLATE), quiet=(1, 1)).sets(4, seed=4))
+OF_PAIRS = ContactRule((1, 1), 0.05, lambda rng, n: np.zeros((n, 2)), PAIRS)
 
 
 def test_polygons_hold_their_points(tmp_path) -> None:
@@ -178,10 +184,6 @@ def test_contacts_in_regions_of_a_layout(tmp_path) -> None:
         assert gaps[np.triu_indices(3, 1)].min() > 0.04
 
 
-GAINS = Uncertainty(0.05, 5.0, 0.0, 0.0, 1.0, 0.0)
-"""Errors of the gains only, 5 % and 5 degrees."""
-
-
 def dense_score(
     rig: Rig,
     places: FloatArray,
@@ -205,7 +207,6 @@ def dense_score(
     eras = [replace(rig.eras[0], name=str(n), x=x, y=y) for n, (x, y) in enumerate(places)]
     omega = 2 * np.pi * frequencies
     z, force = attached_stiffness(omega, eras), drive_forces(omega, eras)
-    assert rig.fingertip is not None
     tip = rig.fingertip.dynamic_stiffness(omega)
     sigma2, found = rig.uncertainty.gain_variance, []
     for contacts in sets:
@@ -255,29 +256,18 @@ def _field(
     return np.asarray(-((2 * np.pi * frequency) ** 2) * to[0].T @ forces)
 
 
-@cache
-def rig():
-    """The paper's plate."""
-    return load_rig(example_rig_path())
-
-
 def test_search_finds_the_best_of_all_layouts_on_a_coarse_raster(monkeypatch) -> None:
     """The best of some starts is the best of all triples of ERAs that a dense solve gives."""
     monkeypatch.setitem(problem_module.CANDIDATES, True, 7)
     monkeypatch.setattr(problem_module, "SEARCH_FREQUENCIES", 2)
-    # Weights of any kind reach the level, so that it does not matter.
-    strong = tuple(replace(era, stroke=0.01) for era in rig().eras)
-    loud = replace(rig(), uncertainty=GAINS, eras=strong)
-    pairs = tuple(replace(anywhere(loud.plate), quiet=(1, 1)).sets(4, seed=4))
-    rule = ContactRule((1, 1), 0.05, lambda rng, n: np.zeros((n, 2)), pairs)
-    search = LayoutSearch(problem(rig=loud, count=3, contacts=rule))
+    search = LayoutSearch(problem(rig=LOUD, count=3, contacts=OF_PAIRS))
     candidates = search.problem.candidates
-    ends = np.array([loud.limits.frequency_min, loud.limits.frequency_max])
+    ends = np.array([LOUD.limits.frequency_min, LOUD.limits.frequency_max])
     dense = {}
     for triple in combinations(range(len(candidates)), 3):
         places = candidates[list(triple)]
         if search.problem.shortfall(places) == 0:
-            dense[triple] = dense_score(loud, places, pairs, ends)
+            dense[triple] = dense_score(LOUD, places, PAIRS, ends)
             (scored,) = search.scored([places])
             assert scored.score_db == pytest.approx(dense[triple], abs=0.05)
     rng = np.random.default_rng(0)
@@ -294,7 +284,7 @@ def test_search_finds_the_best_of_all_layouts_on_a_coarse_raster(monkeypatch) ->
 
 def problem(**changes) -> DesignProblem:
     """Four ERAs along the edge of the paper's plate."""
-    some = changes.pop("rig", rig())
+    some = changes.pop("rig", RIG)
     usual = {
         "count": 4, "kept": (), "area": area_of("edge", some.plate),
         "contacts": replace(anywhere(some.plate), quiet=(1, 2)),
@@ -323,7 +313,7 @@ def test_kept_eras_stay_and_all_keep_their_distance() -> None:
     """A start at random, exchanged and moved, leaves what is kept and the least distance."""
     search = LayoutSearch(problem(kept=("SW", "NE"), apart=0.08))
     found = search.from_random(np.random.default_rng(2))
-    plate = rig().plate
+    plate = RIG.plate
     assert found.positions[:2].tolist() == [[0, 0], [plate.length, plate.width]]
     gaps = np.linalg.norm(found.positions[:, None] - found.positions, axis=-1)
     assert gaps[np.triu_indices(4, 1)].min() >= 0.08
@@ -332,7 +322,7 @@ def test_kept_eras_stay_and_all_keep_their_distance() -> None:
 
 def test_static_loads_of_a_seesaw() -> None:
     """Three ERAs at two corners and the middle of the far side carry a quarter, a quarter, half."""
-    some, one = rig(), rig().eras[0]
+    some, one = RIG, RIG.eras[0]
     length, width = some.plate.length, some.plate.width
     eras = [
         replace(one, name=str(number), x=x, y=y)
@@ -349,7 +339,7 @@ def test_static_loads_of_a_seesaw() -> None:
 
 def test_steps_along_the_edge_end_at_its_corners_and_turn_there() -> None:
     """A step past a corner ends on it, one from there goes along either side."""
-    plate = replace(rig().plate, length=0.3, width=0.2)
+    plate = replace(RIG.plate, length=0.3, width=0.2)
     edge = area_of("edge", plate)
     assert sorted(edge.moved(np.array([0.29, 0.0]), 0.03).tolist()) == [[0.26, 0], [0.3, 0]]
     assert sorted(edge.moved(np.array([0.3, 0.0]), 0.03).tolist()) == [[0.27, 0], [0.3, 0.03]]
@@ -363,7 +353,7 @@ def test_area_without_room_is_refused() -> None:
     """Too many ERAs too far apart, and no place at all, are named."""
     with pytest.raises(InputError, match=r"room"):
         problem(apart=0.3).random_layout(np.random.default_rng(0))
-    plate = rig().plate
+    plate = RIG.plate
     nowhere = Area("none", plate.length, plate.width, lambda points: ~everywhere(points))
     with pytest.raises(InputError, match=r"^where must"):
         candidates_of(nowhere, count=20)
@@ -371,7 +361,7 @@ def test_area_without_room_is_refused() -> None:
 
 def test_era_without_foot_is_like_the_others() -> None:
     """New ERAs are like the first that is not kept, with names that no kept one has."""
-    some = rig()
+    some = RIG
     first = replace(some.eras[0], name="E1", stroke=5e-5)
     case = problem(rig=replace(some, eras=(first, *some.eras[1:])), kept=("E1",))
     eras: tuple[Era, ...] = case.eras(np.zeros((3, 2)))
@@ -382,16 +372,15 @@ def test_era_without_foot_is_like_the_others() -> None:
 def test_scores_count_plates_of_other_thickness_exactly(monkeypatch) -> None:
     """As plates that are solved anew, dense: 4 % of thickness move resonances past a tone."""
     monkeypatch.setattr(problem_module, "SEARCH_FREQUENCIES", 2)
-    strong = tuple(replace(era, stroke=0.01) for era in rig().eras)
-    loud = replace(rig(), uncertainty=replace(GAINS, thickness=0.04), eras=strong)
-    pairs = tuple(replace(anywhere(loud.plate), quiet=(1, 1)).sets(4, seed=4))
-    rule = ContactRule((1, 1), 0.05, lambda rng, n: np.zeros((n, 2)), pairs)
-    some = problem(rig=loud, contacts=rule)
+    thick = replace(LOUD, uncertainty=replace(GAINS, thickness=0.04))
+    some = problem(rig=thick, contacts=OF_PAIRS)
     (found,) = LayoutSearch(some).scored([some.own_positions])
-    dense = dense_score(loud, some.own_positions, pairs, some.searched_frequencies)
+    dense, certain = (
+        dense_score(each, some.own_positions, PAIRS, some.searched_frequencies)
+        for each in (thick, LOUD)
+    )
     assert found.score_db == pytest.approx(dense, abs=0.05)
-    certain = replace(loud, uncertainty=GAINS)
-    assert dense < dense_score(certain, some.own_positions, pairs, some.searched_frequencies) - 1
+    assert dense < certain - 1
 
 
 def test_scores_fall_with_the_error_of_fields_as_answers_do() -> None:
@@ -402,7 +391,7 @@ def test_scores_fall_with_the_error_of_fields_as_answers_do() -> None:
         known = Uncertainty(
             *(0.005, 0.5, 0.002, 0.01, 1.1, 0.5), field=field, modulus=0.0, place=0.0, harmonic=0.0
         )
-        some = replace(rig(), uncertainty=known)
+        some = replace(RIG, uncertainty=known)
         scorer = Scorer(some, np.arange(60.0, 320.0, 10.0), pairs, eras=some.eras)
         places = scorer.places(np.array([[era.x, era.y] for era in some.eras]))
         scores.append(scorer.mean(places, np.arange(4)))
@@ -414,14 +403,12 @@ def test_scores_fall_with_the_error_of_fields_as_answers_do() -> None:
 def test_the_score_of_two_contents_is_that_of_the_worse(monkeypatch) -> None:
     """Each with the other finger quiet, by a dense solve of either."""
     monkeypatch.setattr(problem_module, "SEARCH_FREQUENCIES", 2)
-    strong = tuple(replace(era, stroke=0.01) for era in rig().eras)
-    loud = replace(rig(), uncertainty=GAINS, eras=strong)
-    (pair,) = replace(anywhere(loud.plate), quiet=(1, 1)).sets(1, seed=4)
+    (pair,) = replace(anywhere(PLATE), quiet=(1, 1)).sets(1, seed=4)
     for one, other in ((pair, pair[::-1]), (pair[::-1], pair)):
-        some = problem(rig=loud, contacts=replace(anywhere(loud.plate, 2), given=(one,)))
+        some = problem(rig=LOUD, contacts=replace(anywhere(PLATE, 2), given=(one,)))
         (found,) = LayoutSearch(some).scored([some.own_positions])
         each = [
-            dense_score(loud, some.own_positions, (way,), some.searched_frequencies)
+            dense_score(LOUD, some.own_positions, (way,), some.searched_frequencies)
             for way in (one, other)
         ]
         assert abs(each[0] - each[1]) > 0.5

@@ -11,8 +11,9 @@ import re
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
@@ -32,7 +33,7 @@ from benchmarks.direct_plate import direct_responder
 from controller.cli.main import run
 from controller.plate_measurement import MeasuredPlate
 from drivers.errors import LinkError
-from era_haptics.lab.measuring.measure import PositionsFile, measure_positions, measure_through
+from era_haptics.lab.measuring.measure import measure_through
 from era_haptics.lab.measuring.sound_card import (
     Desk,
     DeviceLost,
@@ -43,16 +44,15 @@ from era_haptics.lab.measuring.sound_card import (
     read_sensors,
 )
 from gateway_bench import wait_for
-from model.arrays import ComplexArray, Float32Array, FloatArray
+from model.arrays import Float32Array, FloatArray
 from model.errors import InputError
-from model.estimate.fit import sensed_plate
 from model.estimate.identify import identify
 from model.estimate.measurement import measurement_of, read_measured, sensors_at
 from model.finger import fingertips_on
 from model.rig.rig import Rig
 from model.rig.rig_file import example_rig_path, parse_rig
-from model.spectral.direct_solution import direct_spectral_acceleration
 from model.structure.attachments import PointLoad, fingertip_loads
+from plates import apart, lock_in
 from sim.soft_amp.output import open_output
 from sim.soft_amp.settings import Protocol, SoftAmplifierSettings
 from sound_cards import DeskCard, JackServer, capture_on, jack_server
@@ -78,9 +78,10 @@ FEET = tuple(
     for y in (0.01, 0.22)
 )
 MESH = "9x8 Legendre"
-RATE = 24_000.0
-LINES_X, LINES_Y = (0.034, 0.112, 0.19, 0.259), (0.035, 0.114, 0.194)  # m
 POINTS = np.array([[0.05, 0.05], [0.15, 0.11], [0.27, 0.2]])
+PLATE_POINTS = np.array([[0.03, 0.05], [0.20, 0.11], [0.29, 0.20]])
+PLATE_HZ = np.array([61.0, 150.0, 233.0, 410.0])
+FINGERS = [(0.1, 0.1), (0.25, 0.06)]
 
 
 @pytest.fixture(scope="module")
@@ -89,19 +90,26 @@ def board() -> Rig:
     return replace(parse_rig("board.yaml", BOARD), masses=FEET)
 
 
-def test_exciters_in_time_are_those_of_the_direct_solution(board: Rig) -> None:
-    """Coil, magnet and back EMF, solved at each frequency: within 0.5 %.
+@pytest.mark.parametrize("places", [[], FINGERS, None], ids=["bare", "fingers", "board"])
+def test_plates_in_time_are_those_of_the_direct_solution(
+    truth: Truth, board: Rig, places: list[tuple[float, float]] | None
+) -> None:
+    """At each frequency within 0.5 %: ERAs, without and with fingers; exciters on their board.
 
-    What differs is damping, viscous here and hysteretic there, and the coil's inductance, of which
-    equations in time have the first order.
+    Coil, magnet and back EMF are solved at each frequency, and the ERA by its differential equation
+    is gain w² / (w² - omega² + 2 i zeta w omega). What differs is damping, viscous here and
+    hysteretic there, and a coil's inductance, of which equations in time have the first order.
     """
-    truth = draw_truth(board, seed=5, mesh=MESH)
-    found = DeskModel(truth, POINTS).under().response(FREQUENCIES).swapaxes(1, 2)
-    exact = direct_spectral_acceleration(
-        truth.rig.plate, board.mesh, truth.rig.eras, FREQUENCIES, POINTS, loads=truth.rig.masses
-    )
-    for number, actuator in enumerate(truth.actuators):
-        exact[:, number] *= actuator.response(FREQUENCIES)[:, None]
+    real = draw_truth(board, seed=5, mesh=MESH) if places is None else truth
+    hertz, points = (FREQUENCIES, POINTS) if places is None else (PLATE_HZ, PLATE_POINTS)
+    fingers = fingertip_loads(real.rig.fingertip, places or [])
+    found = DeskModel(real, points).under(fingers).response(hertz).swapaxes(1, 2)
+    respond = direct_responder(real.rig.plate, real.rig.mesh)
+    exact = respond(real.rig.eras, hertz, points, loads=[*real.rig.masses, *fingers])
+    for number, each in enumerate(real.actuators):
+        w, omega = 2 * np.pi * each.resonance, 2 * np.pi * hertz
+        moved = each.gain * w**2 / (w**2 - omega**2 + 2j * each.ratio * w * omega)
+        exact[:, number] *= (each.response(hertz) if places is None else moved)[:, None]
     wrong = np.linalg.norm(found - exact, axis=(1, 2)) / np.linalg.norm(exact, axis=(1, 2))
     assert wrong.max() < 0.005
 
@@ -122,62 +130,12 @@ def test_a_board_that_is_given_is_not_drawn(board: Rig) -> None:
     assert -0.3 < np.angle(lag[0]) < 0
 
 
-@pytest.mark.long
-def test_board_is_identified_by_one_sensor_of_known_mass(board: Rig, tmp_path: Path) -> None:
-    """5 g at twelve places: fields between them are known to 3 %, and worse without the mass.
-
-    Where no sensor was, and without it, up to the common gain that no measurement has: against the
-    board's own closed form. Of acrylic, which has a loss factor of 0.05.
-    """
-    lossy = replace(board, plate=replace(board.plate, loss_factor=0.05))
-    truth = draw_truth(lossy, seed=4, mesh=MESH)
-    sensors = tuple(
-        WiredSensor(f"P{n}", x, y, 1, 2e-3, 5e-3)
-        for n, (x, y) in enumerate(((x, y) for y in LINES_Y for x in LINES_X), start=1)
-    )
-    plate = DeskPlate(truth, sensors, rate=RATE, converters=Converters(), seed=1)
-    desk = Desk(lossy, sensors)
-    sines = Multisine(np.arange(41.0, 300.0, 20.0), len(desk.eras) + 1, RATE, 0.3)
-    file = PositionsFile(tmp_path / "measured.csv", desk, sines)
-
-    def moved(text: str) -> str:
-        plate.move_sensor(text.split("sensor at ")[1].split(",")[0])
-        return ""
-
-    card = DeskCard(plate, rate=RATE)
-    measure_positions(file, card, periods=2, prompt=moved, tell=lambda text: None)
-    responses = measurement_of(read_measured(file.path), lossy)
-    full = np.array([era.full_level for era in lossy.eras])
-    exact = DeskModel(truth, POINTS).under().response(FREQUENCIES) / full
-    errors = []
-    for places in (responses.sensors, sensors_at(responses.points, responses.names)):
-        found = identify(lossy, replace(responses, sensors=places))
-        gains = np.array([era.gain(FREQUENCIES) for era in found.rig.eras]).T
-        field = sensed_plate(found.rig, sensors_at(POINTS), FREQUENCIES).responses()
-        field = field * gains[:, None]
-        common = np.vdot(field, exact) / np.vdot(field, field)
-        errors.append(np.linalg.norm(common * field - exact) / np.linalg.norm(exact))
-    assert errors[0] < 0.03
-    assert errors[1] > 1.25 * errors[0]
-
-
 DESK = Path(__file__).parents[4] / "examples" / "desk"
 STALLED = 8.0  # s; without a message of the server it would be ten
 CHANNELS = 5  # of that desk: four ERAs and the loop-back
 SETTINGS = SoftAmplifierSettings(
     device="jack:card", channels=CHANNELS, protocol=Protocol.SERIAL, serial_number="S"
 )
-
-
-@pytest.fixture
-def server() -> Iterator[JackServer]:
-    """A server with a client of this process, `card`, that takes as many channels."""
-    name = f"card{os.getpid()}"
-    with pytest.MonkeyPatch.context() as patch, jack_server(name) as running:
-        patch.setenv("JACK_DEFAULT_SERVER", name)
-        capture = capture_on(name, "card", CHANNELS)
-        yield running
-        capture.close()
 
 
 def card(device: str, *, outputs: int = CHANNELS, inputs: int = 0) -> SoundCard:
@@ -211,39 +169,39 @@ def measure(server: JackServer, device: str, folder: Path) -> tuple[int, str]:
 @pytest.mark.real_time
 @pytest.mark.needs("jackd", "cc")
 @pytest.mark.needs("portaudio")
-def test_unsuitable_cards_are_refused(server: JackServer, tmp_path: Path) -> None:
-    """No such one; too few channels; no inputs: one message, exit status 2, and no file."""
-    for device, ports, cause in (
-        ("jack:nothing", {}, "5 outputs, got 0"),
-        ("jack:card", {"outputs": CHANNELS + 1}, "6 outputs, got 5"),
-        ("jack:card", {"inputs": 1}, "1 inputs, got 0"),
-    ):
-        with pytest.raises(InputError, match=cause):
-            card(device, **ports)
-    for device, cause in (("card", "inputs, got 0"), ("no such device", "no such device")):
-        status, message = measure(server, device, tmp_path)
-        assert (status, message.count("\n")) == (2, 1)
-        assert cause in message
-    assert not any(tmp_path.iterdir())
+def test_unsuitable_and_busy_cards_are_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """No such one; too few channels; no inputs: one message, exit status 2, and no file.
 
-
-@pytest.mark.real_time
-@pytest.mark.needs("jackd", "cc")
-@pytest.mark.needs("portaudio")
-def test_card_that_is_played_to_is_busy(server: JackServer) -> None:
-    """For measurement and amplifier, also by PortAudio: JACK would add up what two play.
-
-    A device that there is not is one message, too.
+    One that is played to is busy for measurement and amplifier, also by PortAudio: JACK would add
+    up what two play.
     """
-    playing = card("jack:card")
-    with pytest.raises(LinkError, match="busy"):
-        card("jack:card")
-    with pytest.raises(LinkError, match="busy"):
-        open_output(SETTINGS)
-    for device, status, cause in (("card", 3, "busy"), ("no such device", 2, "no such device")):
-        done = refusal(server, "soft-amp", "--device", device, "--channels", "2")
-        assert (done[0], done[1].count("\n"), cause in done[1]) == (status, 1, True)
-    playing.close()
+    name = f"card{os.getpid()}"
+    monkeypatch.setenv("JACK_DEFAULT_SERVER", name)
+    with jack_server(name) as server:
+        capture = capture_on(name, "card", CHANNELS)
+        for device, ports, cause in (
+            ("jack:nothing", {}, "5 outputs, got 0"),
+            ("jack:card", {"outputs": CHANNELS + 1}, "6 outputs, got 5"),
+            ("jack:card", {"inputs": 1}, "1 inputs, got 0"),
+        ):
+            with pytest.raises(InputError, match=cause):
+                card(device, **ports)
+        for device, cause in (("card", "inputs, got 0"), ("no such device", "no such device")):
+            status, message = measure(server, device, tmp_path)
+            assert (status, message.count("\n")) == (2, 1)
+            assert cause in message
+        assert not any(tmp_path.iterdir())
+        with closing(card("jack:card")):
+            with pytest.raises(LinkError, match="busy"):
+                card("jack:card")
+            with pytest.raises(LinkError, match="busy"):
+                open_output(SETTINGS)
+            for device, status, cause in (("card", 3, "busy"), ("none such", 2, "none such")):
+                done = refusal(server, "soft-amp", "--device", device, "--channels", "2")
+                assert (done[0], done[1].count("\n"), cause in done[1]) == (status, 1, True)
+        capture.close()
 
 
 @pytest.mark.real_time
@@ -283,41 +241,12 @@ def test_rate_that_gives_no_whole_milliseconds_is_refused(monkeypatch: pytest.Mo
             open_output(SETTINGS)
         status, message = refusal(server, "soft-amp", "--device", "card", "--channels", "2")
         assert (status, "got 44100 Hz" in message) == (2, True)
-        measuring = card("jack:card")
-        assert measuring.rate == 44_100
-        measuring.close()
+        with closing(card("jack:card")) as measuring:
+            assert measuring.rate == 44_100
         capture.close()
 
 
 PLATE_RATE = 48_000.0
-PLATE_POINTS = np.array([[0.03, 0.05], [0.20, 0.11], [0.29, 0.20]])
-PLATE_HZ = np.array([61.0, 150.0, 233.0, 410.0])
-FINGERS = [(0.1, 0.1), (0.25, 0.06)]
-
-
-@pytest.fixture(scope="module")
-def model(truth: Truth) -> DeskModel:
-    """That plate, solved."""
-    return DeskModel(truth, PLATE_POINTS)
-
-
-@pytest.mark.parametrize("places", [[], FINGERS])
-def test_model_agrees_with_the_direct_solution(
-    truth: Truth, model: DeskModel, places: list[tuple[float, float]]
-) -> None:
-    """Without and with fingers; what differs is damping, viscous here and hysteretic there."""
-    rig = truth.rig
-    fingers = fingertip_loads(rig.fingertip, places)
-    found = model.under(fingers).response(PLATE_HZ).swapaxes(1, 2)
-    direct = direct_responder(rig.plate, rig.mesh)
-    exact = direct(rig.eras, PLATE_HZ, PLATE_POINTS, loads=[*rig.masses, *fingers])
-    # The actuator by its differential equation: gain w² / (w² - omega² + 2 i zeta w omega).
-    for number, actuator in enumerate(truth.actuators):
-        w, omega = 2 * np.pi * actuator.resonance, 2 * np.pi * PLATE_HZ
-        moved = actuator.gain * w**2 / (w**2 - omega**2 + 2j * actuator.ratio * w * omega)
-        exact[:, number] *= moved[:, None]
-    wrong = np.linalg.norm(found - exact, axis=(1, 2)) / np.linalg.norm(exact, axis=(1, 2))
-    assert wrong.max() < 0.005
 
 
 def test_fingers_feel_the_plate_under_them(truth: Truth) -> None:
@@ -346,11 +275,11 @@ def test_fingers_feel_the_plate_under_them(truth: Truth) -> None:
     exact = direct(rig.eras, hertz, places, loads=[*rig.masses, *loads])[0, 1]
     exact = exact * truth.actuators[1].response(hertz)
     times = (38_400 + 16 * np.arange(len(felt))) / PLATE_RATE
-    found = phasors(felt.reshape(len(felt), -1), times, frequency)
-    assert np.linalg.norm(found - exact) < 0.01 * np.linalg.norm(exact)
+    found = lock_in(times, felt.reshape(len(felt), -1), frequency)
+    assert apart(found, exact) < 0.01
 
 
-def test_fingers_are_swapped_without_a_jump(truth: Truth, model: DeskModel) -> None:
+def test_fingers_are_swapped_without_a_jump(truth: Truth) -> None:
     """The vibration goes on where it was, and settles to that of the plate under fingers."""
     sensors = [WiredSensor(f"P{n}", x, y, n + 1, 1e-3) for n, (x, y) in enumerate(PLATE_POINTS)]
     quiet = Converters(delay=0, noise=0.0)
@@ -365,26 +294,11 @@ def test_fingers_are_swapped_without_a_jump(truth: Truth, model: DeskModel) -> N
     steps = np.abs(np.diff(joined, n=2, axis=0)).max(axis=1)
     # A contact mass that joins changes accelerations by a few percent, no more.
     assert steps[46:49].max() < 0.1 * np.abs(joined).max()
-    loaded = model.under(fingertip_loads(truth.rig.fingertip, FINGERS))
+    loaded = DeskModel(truth, PLATE_POINTS).under(fingertip_loads(truth.rig.fingertip, FINGERS))
     (exact,) = sampled(loaded, rate=PLATE_RATE).response(np.array([233.0]))
-    found = phasors(after[-9600:, :3], times[-9600:], 233.0)
+    found = lock_in(times[-9600:], after[-9600:, :3], 233.0)
     late = quiet.response(np.array([233.0]), rate=PLATE_RATE)[0]
     np.testing.assert_allclose(found / (1e-3 * late), exact[:, 0], rtol=0.01)
-
-
-def test_sensitivity_is_in_full_scale(rig: Rig, tmp_path: Path) -> None:
-    """A charge of 5 pC/(m/s²), amplified by 2 mV/pC, at 4 V full scale: 2.5e-3 a m/s²."""
-    path = tmp_path / "sensors.csv"
-    path.write_text("sensor,x_m,y_m,input,mv_per_m_s2,gain,full_scale_v\nP1,0.1,0.2,3,5,2,4\n")
-    (sensor,) = read_sensors(path, rig.plate)
-    assert (sensor.name, sensor.x, sensor.y, sensor.input) == ("P1", 0.1, 0.2, 3)
-    assert sensor.sensitivity == pytest.approx(2.5e-3)
-
-
-def phasors(samples: FloatArray, times: FloatArray, frequency: float) -> ComplexArray:
-    """Complex amplitudes a of Im[a exp(i omega t)] over whole periods."""
-    turning = np.exp(-2j * np.pi * frequency * times)
-    return np.asarray(2j * (samples * turning[:, None]).mean(axis=0))
 
 
 CARD_RATE, LEVEL = 8_000.0, 0.3
@@ -458,7 +372,8 @@ Places = Mapping[str, tuple[float, float]]
 MOVED_SENSOR_PLACES: Places = {"P1": (0.03, 0.05), "P2": (0.20, 0.11), "P3": (0.29, 0.20)}
 MOVED_HZ = np.array([61.0, 141.0, 221.0, 301.0])
 HEAD = "sensor,x_m,y_m,input,mv_per_m_s2,mass_g\n"
-PLAIN = "sensor,x_m,y_m,input,mv_per_m_s2\n"
+
+
 KEPT = "of 3 places are measured, in measured"
 GO_ON = "go on with --resume"
 
@@ -609,8 +524,17 @@ def test_measurement_that_was_stopped_goes_on(make: Make, ending: str) -> None:
 
 
 def test_files_of_another_measurement_are_not_gone_on_with(make: Make) -> None:
-    """Another level, frequency, mass, place and rig, each by its name."""
+    """Another level, frequency, mass, place and rig, each by its name; before it is none to go on.
+
+    A mass in other units is refused.
+    """
     bench = make()
+    for more, cause in (
+        (["--resume"], "to go on from"),
+        (["--sensor-mass", "900"], "mass_g must be from 0"),
+    ):
+        assert bench.measure(*more) == 2
+        assert cause in bench.said
     bench.measure(keys=[""])
     changes = {
         "sensors.csv": ("0.03,", "0.04,"),
@@ -689,20 +613,6 @@ def test_place_that_fails_a_check_is_told_and_asked_for_again(
     assert not Path(bench.output).exists()
 
 
-@pytest.mark.parametrize(
-    ("more", "cause"),
-    [
-        (["--resume"], "to go on from"),
-        (["--sensor-mass", "900"], "mass_g must be from 0"),
-    ],
-)
-def test_options_that_do_not_fit_are_refused(make: Make, more: list[str], cause: str) -> None:
-    """Nothing to resume, a mass in other units."""
-    bench = make()
-    assert bench.measure(*more) == 2
-    assert cause in bench.said
-
-
 @pytest.mark.long
 def test_plate_is_identified_better_with_the_mass_of_the_sensor(
     rig: Rig, truth: Truth, make: Make
@@ -729,9 +639,16 @@ def test_plate_is_identified_better_with_the_mass_of_the_sensor(
         assert mass * era.stiffness == pytest.approx(real.stiffness, rel=4 * std)
 
 
-def test_sensors_file_of_one_sensor(rig: Rig, tmp_path: Path) -> None:
-    """One input in all lines; its mass from the file or the option."""
+def test_sensors_are_read_with_their_units(rig: Rig, tmp_path: Path) -> None:
+    """A charge of 5 pC/(m/s²), amplified by 2 mV/pC, at 4 V full scale: 2.5e-3 a m/s².
+
+    One that is moved has one input in all lines, and its mass from the file or the option.
+    """
     path = tmp_path / "sensors.csv"
+    path.write_text("sensor,x_m,y_m,input,mv_per_m_s2,gain,full_scale_v\nP1,0.1,0.2,3,5,2,4\n")
+    (sensor,) = read_sensors(path, rig.plate)
+    assert (sensor.name, sensor.x, sensor.y, sensor.input) == ("P1", 0.1, 0.2, 3)
+    assert sensor.sensitivity == pytest.approx(2.5e-3)
     path.write_text(HEAD + "P1,0.1,0.1,2,10,2.5\nP2,0.2,0.1,2,10,2.5\n")
     places = read_sensors(path, rig.plate, may_move=True)
     assert [place.mass for place in places] == [2.5e-3, 2.5e-3]

@@ -9,6 +9,7 @@ import shutil
 import threading
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -78,6 +79,30 @@ class EndingCard(SoundCard):
         """Nothing is open."""
 
 
+@pytest.fixture
+def sensors_file(tmp_path: Path) -> Path:
+    """The places of four accelerometers."""
+    path = tmp_path / "sensors.csv"
+    path.write_text(SENSORS)
+    return path
+
+
+def check_on_card(
+    monkeypatch: pytest.MonkeyPatch,
+    table: LocalizationTable,
+    rig: Rig,
+    path: Path,
+    opened: Callable[..., SoundCard],
+    *,
+    url: str | None = None,
+    level: float | None = LEVEL,
+) -> None:
+    """Check one promise of a table by sensors of a file, through a card that is opened."""
+    monkeypatch.setattr(table_measurement, "open_card", opened)
+    settings = CheckSettings("memory", path, url, 1, 0, level)
+    table_measurement.check_table(table, rig, settings, progress=lambda _done, _count: None)
+
+
 def as_written(known: Rig) -> Truth:
     """The plate as its rig has it, its bases stiff up to high frequencies."""
     return replace(draw_truth(known, seed=1), rig=known, actuators=(Actuator(3e3, 0.7, 1.0),) * 4)
@@ -97,15 +122,14 @@ def felt_contrast(known: Rig, promise: Promise) -> float:
 def measured_on(
     truth: Truth,
     table: LocalizationTable,
-    folder: Path,
+    path: Path,
     monkeypatch: pytest.MonkeyPatch,
     *more: str,
     **wires: object,
 ) -> tuple[int, dict[str, object]]:
     """`era table verify --device` on a plate in memory: exit status and report."""
-    (folder / "sensors.csv").write_text(SENSORS)
-    save_table(table, folder / "t.npz")
-    sensors = read_sensors(folder / "sensors.csv", truth.rig.plate)
+    save_table(table, path.with_name("t.npz"))
+    sensors = read_sensors(path, truth.rig.plate)
 
     def opened(_device: str, **_counts: int) -> DeskCard:
         converters = Converters(noise=5e-3)
@@ -113,8 +137,8 @@ def measured_on(
         return DeskCard(plate, rate=RATE, **wires)  # type: ignore[arg-type]
 
     monkeypatch.setattr(table_measurement, "open_card", opened)
-    arguments = ["table", "verify", str(folder / "t.npz"), "--device", "memory", "--samples", "4"]
-    arguments += ["--sensors", str(folder / "sensors.csv"), "--json", "--level", "0.5", *more]
+    arguments = ["table", "verify", str(path.with_name("t.npz")), "--device", "memory"]
+    arguments += ["--samples", "4", "--sensors", str(path), "--json", "--level", "0.5", *more]
     result = CliRunner().invoke(app, arguments)
     if result.exception is not None and not isinstance(result.exception, SystemExit):
         raise result.exception
@@ -135,16 +159,15 @@ def test_promises_of_a_known_plate_are_the_direct_solution(
 
 
 def test_contrast_that_is_measured_is_that_of_the_plate(
-    known: Rig, table: LocalizationTable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    known: Rig, table: LocalizationTable, sensors_file: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Played, recorded and fitted: what the direct solver says of the same patterns.
 
     In time damping is viscous, and the direct solver's hysteretic, which moves nulls.
     """
-    _, report = measured_on(as_written(known), table, tmp_path, monkeypatch)
+    _, report = measured_on(as_written(known), table, sensors_file, monkeypatch)
     asked = list(promises(table, PLACES, count=4, level=LEVEL, seed=0))
     rows = report["promises"]
-    assert isinstance(rows, list)
     assert [len(row["quiet"]) for row in rows] == [1, 2, 3, 1]
     for row, promise in zip(rows, asked, strict=True):
         exact = min(felt_contrast(known, promise), 25.0)
@@ -153,13 +176,13 @@ def test_contrast_that_is_measured_is_that_of_the_plate(
 
 
 def test_plate_that_is_another_breaks_promises(
-    known: Rig, table: LocalizationTable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    known: Rig, table: LocalizationTable, sensors_file: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A plate built from the same drawing, not measured: exit status 1, with its picture."""
     loose = replace(known, uncertainty=Uncertainty())
-    picture = tmp_path / "p.png"
+    picture = sensors_file.with_name("p.png")
     truth = draw_truth(loose, seed=3, mesh="6x4 Q3")
-    status, report = measured_on(truth, table, tmp_path, monkeypatch, "--picture", str(picture))
+    status, report = measured_on(truth, table, sensors_file, monkeypatch, "--picture", str(picture))
     assert (status, report["passed"]) == (1, False)
     assert picture.read_bytes().startswith(b"\x89PNG")
 
@@ -175,7 +198,7 @@ def test_plate_that_is_another_breaks_promises(
 def test_dead_and_clipped_inputs_keep_no_promise(
     known: Rig,
     table: LocalizationTable,
-    tmp_path: Path,
+    sensors_file: Path,
     monkeypatch: pytest.MonkeyPatch,
     factors: dict[int, float],
     error: type[Exception],
@@ -186,7 +209,7 @@ def test_dead_and_clipped_inputs_keep_no_promise(
     A silent loop-back cannot tell of lost blocks.
     """
     with pytest.raises(error, match=cause):
-        measured_on(as_written(known), table, tmp_path, monkeypatch, factors=factors)
+        measured_on(as_written(known), table, sensors_file, monkeypatch, factors=factors)
 
 
 @pytest.mark.parametrize(
@@ -203,53 +226,41 @@ def test_dead_and_clipped_inputs_keep_no_promise(
 def test_limits_of_the_rig_hold_for_a_card(
     known: Rig,
     table: LocalizationTable,
-    tmp_path: Path,
+    sensors_file: Path,
     monkeypatch: pytest.MonkeyPatch,
     limits: dict[str, float],
     level: float,
     key: str,
 ) -> None:
     """No guard is behind a card: each limit is checked before a sample is played."""
-
-    def refuse() -> None:
-        raise AssertionError
-
-    monkeypatch.setattr(
-        table_measurement, "open_card", lambda _device, **_counts: EndingCard(refuse)
-    )
-    (tmp_path / "sensors.csv").write_text(SENSORS)
     bounded = replace(known, limits=replace(known.limits, **limits))
-    settings = CheckSettings("memory", tmp_path / "sensors.csv", None, 1, 0, level)
+    card = EndingCard(lambda: pytest.fail("a sample was played"))
     with pytest.raises(InputError, match=key):
-        table_measurement.check_table(table, bounded, settings, progress=lambda _done, _count: None)
+        check_on_card(monkeypatch, table, bounded, sensors_file, lambda *_, **__: card, level=level)
 
 
 def test_no_output_exceeds_half_of_what_the_rig_allows(
-    known: Rig, table: LocalizationTable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    known: Rig, table: LocalizationTable, sensors_file: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Nor does the loop-back's: 0.05 of a level of 0.1."""
-    cards = []
+    sensors = read_sensors(sensors_file, known.plate)
+    plate = DeskPlate(as_written(known), sensors, rate=RATE, converters=Converters(), seed=1)
+    card = DeskCard(plate, rate=RATE)
 
     def opened(_device: str, *, limit: float, **_counts: int) -> DeskCard:
         assert limit == pytest.approx(0.05)
-        plate = DeskPlate(as_written(known), sensors, rate=RATE, converters=Converters(), seed=1)
-        cards.append(DeskCard(plate, rate=RATE))
-        return cards[0]
+        return card
 
-    monkeypatch.setattr(table_measurement, "open_card", opened)
-    (tmp_path / "sensors.csv").write_text(SENSORS)
-    sensors = read_sensors(tmp_path / "sensors.csv", known.plate)
     bounded = replace(known, limits=replace(known.limits, level=0.1))
-    settings = CheckSettings("memory", tmp_path / "sensors.csv", None, 1, 0, None)
-    table_measurement.check_table(table, bounded, settings, progress=lambda _done, _count: None)
-    assert cards[0].loudest[[cards[0].loudest.argmax(), -1]] == pytest.approx(0.05, rel=1e-3)
+    check_on_card(monkeypatch, table, bounded, sensors_file, opened, level=None)
+    assert card.loudest[[card.loudest.argmax(), -1]] == pytest.approx(0.05, rel=1e-3)
 
 
 @pytest.mark.parametrize("trouble", [KeyboardInterrupt, LinkError])
 def test_amplifier_is_disarmed_as_soon_as_the_card_ends(
     known: Rig,
     table: LocalizationTable,
-    tmp_path: Path,
+    sensors_file: Path,
     monkeypatch: pytest.MonkeyPatch,
     trouble: type[BaseException],
 ) -> None:
@@ -278,12 +289,11 @@ def test_amplifier_is_disarmed_as_soon_as_the_card_ends(
         raise trouble
 
     monkeypatch.setattr(table_measurement, "BlockingAmplifier", Observed)
-    monkeypatch.setattr(table_measurement, "open_card", lambda _device, **_counts: EndingCard(end))
-    (tmp_path / "sensors.csv").write_text(SENSORS)
     url = f"sim://{example_rig_path()}"
-    settings = CheckSettings("memory", tmp_path / "sensors.csv", url, 1, 0, LEVEL)
     with pytest.raises(trouble):
-        table_measurement.check_table(table, known, settings, progress=lambda _done, _count: None)
+        check_on_card(
+            monkeypatch, table, known, sensors_file, lambda *_, **__: EndingCard(end), url=url
+        )
     assert ended == ["disarmed"]
 
 
@@ -331,33 +341,27 @@ def cabled(
     return card
 
 
-def heard(rig: Rig, card: Cabled) -> list[OutputFinding]:
-    """What an accelerometer beside each ERA tells."""
-    return listen(Desk(rig, ()), card, 1, outputs=4, level=0.1, move=card.move)
+def test_accelerometer_tells_swapped_backwards_dead_and_weak(rig: Rig, truth: Truth) -> None:
+    """Of a plate that deviates from the rig, with an unknown delay: as it was wired here.
 
+    One plays nothing, another a quarter as loud: 12 dB, to the 3 dB that plates deviate by. An
+    accelerometer that stays in the middle has all four corners of a symmetric plate alike.
+    """
 
-def test_accelerometer_tells_swapped_and_backwards(rig: Rig, truth: Truth) -> None:
-    """Of a plate that deviates from the rig, with an unknown delay: as it was wired here."""
-    names = [era.name for era in rig.eras]
-    found = heard(rig, cabled(truth, order=(0, 2, 1, 3), gains=(1, 1, -1, 1)))
-    assert [each.era for each in found] == [names[n] for n in (0, 2, 1, 3)]
+    def heard(card: Cabled) -> list[OutputFinding]:
+        return listen(Desk(rig, ()), card, 1, outputs=4, level=0.1, move=card.move)
+
+    found = heard(cabled(truth, order=(0, 2, 1, 3), gains=(1, 1, -1, 1)))
+    assert [each.era for each in found] == [rig.eras[n].name for n in (0, 2, 1, 3)]
     assert [each.polarity for each in found] == [1, 1, -1, 1]
     assert [each.verdict == "ok" for each in found] == [True, True, False, True]
-
-
-def test_dead_and_weak_outputs_are_said(rig: Rig, truth: Truth) -> None:
-    """One plays nothing, another a quarter as loud: 12 dB, to the 3 dB that plates deviate by."""
-    found = heard(rig, cabled(truth, gains=(1, 0, 1, 0.25)))
+    found = heard(cabled(truth, gains=(1, 0, 1, 0.25)))
     assert [each.era for each in found] == ["SW", None, "NE", "NW"]
     assert "dead" in found[1].verdict
     assert "loose" in found[3].verdict
     assert 20 * np.log10(found[3].relative_level) == pytest.approx(-12, abs=3)
-
-
-def test_accelerometer_that_stays_is_refused(rig: Rig, truth: Truth) -> None:
-    """In the middle all four corners of a symmetric plate are alike."""
     with pytest.raises(InputError, match="was moved each time"):
-        heard(rig, cabled(truth, apart=1.0))
+        heard(cabled(truth, apart=1.0))
 
 
 def test_exciters_are_told_apart_on_a_board_of_the_shop() -> None:
@@ -531,30 +535,25 @@ def test_recordings_of_places_and_outputs_are_told_by_their_names(rig: Rig, tmp_
     assert [each.mass for each in found.sensors] == [2e-3, 2e-3]
 
 
+FORMS: dict[str, tuple[str, Callable[[complex], tuple[float, float]]]] = {
+    "real": ("real,imag", lambda r: (r.real, r.imag)),
+    "magnitude": ("magnitude,phase_deg", lambda r: (abs(r), np.degrees(np.angle(r)))),
+    "db": ("magnitude_db,phase_deg", lambda r: (20 * np.log10(abs(r)), np.degrees(np.angle(r)))),
+}
+"""How other programs export a value: names of columns, and what is in them."""
+
+
 def loopback_table(rig: Rig, form: str, separator: str) -> str:
     """All values as another program exports them."""
-    columns = {
-        "real": ("real", "imag"),
-        "magnitude": ("magnitude", "phase_deg"),
-        "db": ("magnitude_db", "phase_deg"),
-    }[form]
-    lines = [separator.join(["Frequency_Hz".lower(), "output", "sensor", *columns])]
-    for t, frequency in enumerate(TONES):
-        for e, era in enumerate(rig.eras):
-            for s in range(2):
-                r = ratio(t, e, s)
-                size, phase = abs(r), np.degrees(np.angle(r))
-                pair = {
-                    "real": (r.real, r.imag),
-                    "magnitude": (size, phase),
-                    "db": (20 * np.log10(size), phase),
-                }[form]
-                numbers = [f"{each:.9g}" for each in (frequency, *pair)]
-                if separator == ";":
-                    numbers = [each.replace(".", ",") for each in numbers]
-                output = str(e + 1) if form == "db" else era.name
-                lines.append(separator.join([numbers[0], output, f"P{s + 1}", *numbers[1:]]))
-    return "\n".join(lines) + "\n"
+    columns, numbers_of = FORMS[form]
+    rows = [["frequency_hz", "output", "sensor", *columns.split(",")]]
+    for t, e, s in product(range(3), range(4), range(2)):
+        numbers = [f"{each:.9g}" for each in (TONES[t], *numbers_of(ratio(t, e, s)))]
+        if separator == ";":
+            numbers = [each.replace(".", ",") for each in numbers]
+        output = str(e + 1) if form == "db" else rig.eras[e].name
+        rows.append([numbers[0], output, f"P{s + 1}", *numbers[1:]])
+    return "\n".join(map(separator.join, rows)) + "\n"
 
 
 @pytest.mark.parametrize(
@@ -608,23 +607,17 @@ def test_a_distorted_reference_has_the_frequency_of_its_tone(
         assert sorted(tones) == pytest.approx(TONES, rel=2e-5)
 
 
-def test_tones_that_cannot_be_told_are_refused_with_their_time(rig: Rig, tmp_path: Path) -> None:
-    """Noise in the reference amid the second tone of the first ERA, which no tone is made of."""
-    path = tmp_path / "steps.wav"
-    recording(path, range(4), references=1)
-    rate, samples = wavfile.read(path)
-    noisy = slice(round(2.3 * rate), round(3.5 * rate))
-    noise = np.random.default_rng(0).standard_normal(noisy.stop - noisy.start)
-    samples[noisy, 2] += (3000 * noise).astype(np.int16)
-    wavfile.write(path, rate, samples)
-    with pytest.raises(InputError, match=r"at 2\.\d s: the reference must be one steady tone"):
-        read_stepped(path, Desk(rig, FIXED))
-
-
 def sweep() -> FloatArray:
     """A glide from 60 to 100 Hz in 10 s."""
     times = np.arange(10 * FILE_RATE) / FILE_RATE
     return np.asarray(0.4 * np.sin(2 * np.pi * (60 + 2 * times) * times))
+
+
+def noisy(samples: FloatArray) -> FloatArray:
+    """Noise in the reference amid the second tone of the first ERA, which no tone is made of."""
+    rows = slice(round(2.3 * FILE_RATE), round(3.5 * FILE_RATE))
+    samples[rows, 2] += 0.1 * np.random.default_rng(0).standard_normal(rows.stop - rows.start)
+    return samples
 
 
 @pytest.mark.parametrize(
@@ -637,12 +630,13 @@ def sweep() -> FloatArray:
         (lambda s: s[:, [0, 1, 2, 2, 2, 2]], "one output must play at a time"),
         (lambda s: s[: len(s) // 2], "tones must be of all of"),
         (lambda s: np.tile(sweep()[:, None], (1, 6)), "each tone must be held"),
+        pytest.param(noisy, r"at 2\.\d s: the reference must be one steady tone", id="noisy"),
     ],
 )
 def test_recordings_that_are_none_of_a_stepped_sine_are_refused(
     rig: Rig, tmp_path: Path, change: object, cause: str
 ) -> None:
-    """Wrong channels, a missing sensor, clipping, no cable, all at once, too short, a sweep."""
+    """Wrong channels, no sensor, clipping, no cable, all at once, too short, a sweep, noise."""
     path = tmp_path / "steps.wav"
     recording(path, range(4), references=4)
     rate, samples = wavfile.read(path)

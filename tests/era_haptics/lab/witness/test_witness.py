@@ -174,7 +174,6 @@ async def scene(*amplifiers: str, wire: str) -> AsyncIterator[Scene]:
             async with asyncio.timeout(_LONGEST):
                 await chain.open()
                 yield chain
-                assert chain.holding is not None
                 chain.holding.cancel()
                 chain.witness.contacts(threads.now(), ())
                 await chain.close()

@@ -124,7 +124,7 @@ fault-test: .venv/installed-test
 STOPS := 10000
 FIRST := 0
 stop-test: .venv/installed-test
-	STOPS=$(STOPS) FIRST=$(FIRST) $(BIN)/pytest -q tests/drivers/host/test_joint_sets.py
+	STOPS=$(STOPS) FIRST=$(FIRST) $(BIN)/pytest -q tests/drivers/host/test_group.py -k stop_is_true
 
 # Ten thousand taps while every frame is late by up to 16 ms, with one and three amplifiers on a line;
 # `make test` takes some. Others: make late-test LATE='--taps 100000'

@@ -3,7 +3,7 @@
 A step is a method of what is played or, with dots, of its parts; or `is`: values as `fits` compares
 them, each by the name of a property or method, or by a Python expression of such names:
 `len(taken)`, `hosts.a.status["levels"][0]`. What is given by number, as of fingers, is given as it
-is.
+is; `now` in a list is the time [s].
 """
 
 import asyncio
@@ -156,6 +156,8 @@ class Taken:
             assert fits(found, given), {what: found[what] for what in given}
             return
         method = attrgetter(name.replace(" ", "_"))(self)
+        if isinstance(given, list):
+            given = [threads.now() if each == "now" else each for each in given]
         is_by_number = isinstance(given, Mapping) and any(isinstance(key, int) for key in given)
         if name in _OF_A_STEP or is_by_number or not isinstance(given, list | Mapping):
             done = method(given)

@@ -55,7 +55,7 @@ SLOWEST = (
     "test_python_api.py",
     "test_courses_at_fingers.py",
     "test_layout_check.py",
-    "test_joint_sets.py",
+    "test_group.py",
     "test_promises.py",
     "test_printed.py",
     "test_stimulus.py",

@@ -173,16 +173,6 @@ async def test_set_taken_under_another_token_is_sent_again(
     assert end.levels("a") == [0.5 if times == 1 else 0.0, 0.0]
 
 
-@pytest.mark.parametrize("text", ["vendor\n", "a\x1b[2J"])
-@in_virtual_time
-async def test_name_with_control_characters_is_refused(wire: str, text: str) -> None:
-    """It could rewrite a terminal."""
-    end = MemoryLine(wire, "a")
-    end.far["a"].identity["vendor"] = text
-    with pytest.raises(DriverError, match="control characters"):
-        await end.hosts["a"].open()
-
-
 Lie = Callable[[str, list[bytes], random.Random], list[tuple[float, bytes]]]
 """What comes of a reply, by the kind of wire, all replies so far and a source of chance."""
 

@@ -28,11 +28,12 @@ from drivers.host.ledger import Ledger, StopOutcome
 from drivers.playing import AmplifierLayer, AmplifierTone
 from drivers.protocol.definition import CLOCK_UNKNOWN, FEATURES, MESSAGES, STATES
 from drivers.protocol.records import Refusal, Values
-from drivers.protocol.sets import Envelope, LayerSet
+from drivers.protocol.sets import Command, Envelope
 from drivers.wires.can_frames import CanFrame, pack_frames, segments
 from drivers.wires.serial_frames import REPLY_BIT, FrameReader, encode_frame, pack_words
 from drivers.wires.serial_line import SerialWire
 from drivers.wires.wire import BrokenReply
+from registry import threads
 from sim.amplifier.readings import AmplifierClock, Crystal
 from sim.amplifier.simulated_amplifier import SimulatedAmplifier as FarEnd
 from virtual_lines import KINDS, MemoryLine, delayed, group_of, losing, of_parts, unaltered
@@ -78,7 +79,6 @@ class OnLines(Taken):
     applied: PlayedSet = field(init=False)
     stopped: dict[str, StopOutcome] = field(default_factory=dict)
     kept: list[bytes] = field(default_factory=list)
-    checks: int = 0
     has_come: bool = False
     since: float = 0.0
 
@@ -110,65 +110,14 @@ class OnLines(Taken):
         return sum(line.line.wire.counters.unexpected_frames for line in self.lines)
 
     @property
-    def tokens(self) -> dict[str, Any]:
-        """Tokens of layers, as the host has them."""
-        return {name: each.ledger.playback.tokens for name, each in self.group.amplifiers.items()}
-
-    @property
     def is_loud(self) -> bool:
         """Whether any amplifier plays."""
         return any(map(any, self.levels.values()))
 
     @property
-    def shown(self) -> int:
-        """The token of layer 0 that the last status of the first amplifier shows."""
-        return int((self.hosts.a.status or {})["tokens"][0])
-
-    @property
-    def shown_level(self) -> int:
-        """The level of the first channel in it."""
-        return int((self.hosts.a.status or {})["levels"][0])
-
-    @property
-    def is_shown_armed(self) -> bool:
-        """Whether it shows the first amplifier armed."""
-        return (self.hosts.a.status or {})["state"] == STATES["OPERATION_ENABLED"]
-
-    @property
-    def contradictions(self) -> int:
-        """How many statuses of the first amplifier have contradicted its requests, in a row."""
-        return int(self.hosts.a._contradictions)
-
-    @property
     def retries(self) -> int:
         """Requests that were repeated."""
         return sum(line.retries for line in self.lines)
-
-    @property
-    def degraded(self) -> list[str]:
-        """Amplifiers that do not reply but may play."""
-        return [*self.group.members.degraded]
-
-    @property
-    def applied_frequency(self) -> int:
-        """Of the first tone that was applied last [0.05 Hz]."""
-        return self.applied.layers["a"][0].commands[0].frequency
-
-    @property
-    def plays_for(self) -> float:
-        """How long after `forget` the first amplifier may play [s]."""
-        return float(self.hosts.a.feeding.may_play_until) - self.since
-
-    @property
-    def may_play(self) -> list[str]:
-        """What the last stop said may play on, with a time and a cause."""
-        left = {name: each for name, each in self.stopped.items() if not each.is_confirmed}
-        return [name for name, each in left.items() if each.may_play_until > self.since]
-
-    @property
-    def causes(self) -> list[str]:
-        """Why each is not confirmed."""
-        return [each.cause for each in self.stopped.values()]
 
     def forget(self) -> None:
         """Forget what was sent so far."""
@@ -184,15 +133,6 @@ class OnLines(Taken):
         """Require that a request was sent on a line so soon after `forget`, but not sooner."""
         first = next(at for at, each in self.lines[line].sent if each == request)
         assert least <= first - self.since <= seconds
-
-    def was_sent(self, *requests: str) -> None:
-        """Require that a line was sent these first since `forget`."""
-        assert self.sent[0][: len(requests)] == [*requests]
-
-    def sends(self, **bounds: Sequence[int]) -> None:
-        """Require numbers of requests on the first line since `forget`: at least, at most."""
-        found = {request: self.sent[0].count(request) for request in bounds}
-        assert all(low <= found[each] <= high for each, (low, high) in bounds.items()), found
 
     async def waits_until(self, seconds: float) -> None:
         """Wait until so long after `forget`."""
@@ -237,17 +177,6 @@ class OnLines(Taken):
     async def plays_as_planned(self) -> None:
         """Play what the first amplifier may play, as it was asked."""
         await self.group.apply(self.planned)
-
-    def counts_checks(self) -> None:
-        """Count in `checks` how often the ledger of the first amplifier is asked."""
-        ledger = self.hosts.a.ledger
-        admit = ledger.admit
-
-        def counted(*asked: Any, **more: Any) -> Any:
-            self.checks += 1
-            return admit(*asked, **more)
-
-        ledger.admit = counted
 
     async def waits_past_the_start(self, seconds: float) -> None:
         """Wait until so long after the moment at which what was applied last starts."""
@@ -339,6 +268,10 @@ class OnLines(Taken):
         said = {"exact": 0, "staged": 0, "played": 0, "missing": 0}
         self.far.a._take = lambda part, now: {**said, "token": part["token"]}
 
+    def replies_come_twice(self) -> None:
+        """Let each reply on the first line come once more."""
+        self.lines[0].outward = lambda _, data: [(0.0002, data), (0.004, data)]
+
     def loses_replies(self, name: str, count: int) -> None:
         """Lose so many replies to requests of a name on each line."""
         for line in self.lines:
@@ -399,19 +332,11 @@ class OnLines(Taken):
 
     def broadcasts_fail(self) -> None:
         """Let a bug end each broadcast on the first line."""
-        (line, *_) = self.lines
-        submit = line.line.submit
-
-        def fail(member: object, *values: Any, **other: Any) -> Any:
-            if member is None:
-                raise ZeroDivisionError("planted")
-            return submit(member, *values, **other)  # type: ignore[arg-type]
-
-        line.line.submit = fail  # type: ignore[method-assign]
-
-    def cuts(self, line: int) -> None:
-        """Cut a line."""
-        self.lines[line].line.lose("cut")
+        line = self.lines[0].line
+        submit, fail = line.submit, Mock(side_effect=ZeroDivisionError("planted"))
+        line.submit = lambda member, *given, **more: (submit if member else fail)(
+            member, *given, **more
+        )
 
     def lies(self, **said: Any) -> None:
         """Let the first amplifier say something else in each status."""
@@ -422,14 +347,12 @@ class OnLines(Taken):
 
     def obeys_instead(self, **instead: str) -> None:
         """Let the first amplifier take requests of some names for others."""
-        far = self.far.a
-        handle = far.handle
-
-        def obey(name: str, values: Values, now: float, **options: bool) -> Any:
-            given = {} if name in instead else values
-            return handle(instead.get(name, name), given, now, **options)
-
-        far.handle = obey
+        altered(
+            self.far.a,
+            lambda name, values, now, handle: handle(
+                instead.get(name, name), {} if name in instead else values, now
+            ),
+        )
 
     def commits(self, name: str, count: int) -> None:
         """Let an amplifier play so many layers of each set, and say that it plays the set."""
@@ -472,16 +395,15 @@ class OnLines(Taken):
         far = self.far.a
         commit, take = far.playback.commit, far._take
 
-        def rounded(layers: Sequence[LayerSet], *when: float) -> None:
-            for each in layers:
-                tones = [
-                    replace(tone, **{what: step * round(getattr(tone, what) / step)})
-                    for tone in each.commands
-                    for what, step in steps.items() or [("level", 1)]
-                ]
-                commit([replace(each, commands=tuple(tones))], *when)
+        def rounded(tone: Command) -> Command:
+            shares = {
+                what: step * round(getattr(tone, what) / step) for what, step in steps.items()
+            }
+            return replace(tone, **shares)
 
-        far.playback.commit = rounded
+        far.playback.commit = lambda layers, *when: commit(
+            [replace(each, commands=tuple(map(rounded, each.commands))) for each in layers], *when
+        )
         far._take = lambda part, now: {**take(part, now), "exact": 0}
 
     def says_frequency(self, said: int) -> None:
@@ -502,14 +424,10 @@ class OnLines(Taken):
         if not is_steered:
             far.capabilities["clock_error"] = CLOCK_UNKNOWN
 
-    def feeds_without_end(self, name: str, times: int) -> None:
-        """Let so many heartbeats of an amplifier be under way at any time."""
-
-        async def feed() -> None:
-            while True:
-                await getattr(self.hosts, name).ping()
-
-        self.feeding = [asyncio.create_task(feed()) for _ in range(times)]
+    async def feeds(self, name: str) -> None:
+        """Feed an amplifier without end, each time that it has replied."""
+        while True:
+            await getattr(self.hosts, name).ping()
 
     def restarts(self, **capabilities: Any) -> None:
         """Switch the first amplifier off and on again, with other capabilities: CAN nodes boot."""
@@ -519,10 +437,6 @@ class OnLines(Taken):
         far.latch = 0
         if line.kind is KINDS["can"]:
             line.boot(1)
-
-    def scales(self, share: float) -> None:
-        """Let the first amplifier play all at a share of its level, by itself."""
-        self.far.a.playback.scale(self.lines[0].loop.time(), share, 0.0)
 
     def is_randomly_late(self) -> None:
         """Let what passes the first line come up to 14 ms late."""
@@ -566,39 +480,15 @@ class OnLines(Taken):
         """Count sets that are not sent, until the next multiple of 4096."""
         self.group.sets.token = (self.group.sets.token // 4096 + 1) * 4096 % 65536 or 1
 
-    def counts_turns(self) -> None:
-        """Count in `turns` how often the event loop turns."""
-        selector = self.lines[0].loop._selector  # type: ignore[attr-defined]
-        self.turns = Mock(side_effect=selector.select)
-        selector.select = self.turns
-
-    def falls_silent(self) -> None:
-        """Let the first amplifier end all that it plays, by itself."""
-        self.far.a.playback.silence(self.lines[0].loop.time(), 0.0)
+    def counts_calls(self, what: str) -> None:
+        """Count in `calls` how often a method is called, by its name."""
+        owner, _, name = what.rpartition(".")
+        self.calls = Mock(side_effect=getattr(self.value(owner), name))
+        setattr(self.value(owner), name, self.calls)
 
     def draws(self, session: int) -> None:
         """Let the session that is armed next have a number."""
         self.group._draw = lambda low, high: session
-
-    def trips(self, name: str, fault: str) -> None:
-        """Let an amplifier trip."""
-        getattr(self.far, name).trip(fault, self.lines[0].loop.time())
-
-    def heats(self, celsius: float) -> None:
-        """Let the first amplifier be so warm."""
-        self.far.a.set_temperature(celsius, self.lines[0].loop.time())
-
-    def had_another_session(self) -> None:
-        """Let the first have been armed by another: that of these tests is not taken twice."""
-        self.far.a.session = 1
-
-    def asks(self, name: str, request: str, **values: int) -> None:
-        """Let another host ask something of an amplifier."""
-        getattr(self.far, name).handle(request, values, self.lines[0].loop.time())
-
-    def becomes(self, name: str, serial_number: str) -> None:
-        """Have another amplifier in its place."""
-        getattr(self.far, name).identity["serial_number"] = serial_number
 
     def sleeps(self, seconds: float) -> None:
         """Let this machine sleep."""
@@ -613,7 +503,7 @@ class OnLines(Taken):
         """Feed the watchdog of an amplifier as another host, without end."""
         while True:
             await asyncio.sleep(0.07)
-            self.asks(name, "Ping", session=5, rate=0)
+            getattr(self.far, name).handle("Ping", {"session": 5, "rate": 0}, threads.now())
 
     async def waits_for_the_loss(self) -> None:
         """Wait until an amplifier is lost, for the host."""

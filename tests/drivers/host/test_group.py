@@ -1,27 +1,46 @@
 """Lines, amplifiers and their group on every kind of wire of protocol 4, in virtual time.
 
-What a person would feel is read from the simulated amplifiers themselves. Also times of a line: how
-long its bits take, what is late, what a delay of this process costs, and sets of which a tenth of
-all frames is lost.
+What a person would feel is read from the simulated amplifiers themselves. Times of a line: how long
+its bits take, what is late, what a delay of this process costs, sets of which a tenth of all frames
+is lost. Commits and stops over several lines, whatever happens to frames on the way; and no path of
+the source leads from the controller to a wire past the ledger.
 """
 
+import ast
 import asyncio
 import contextlib
+import logging
+import math
+import os
 import random
-from collections.abc import Callable, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from functools import cache
+from itertools import combinations
+from pathlib import Path
 
 import pytest
 
-from drivers.errors import DriverError, LinkError, LinkTimeout
-from drivers.host.amplifier import Amplifier
+import drivers
+from chain import set_running
+from courses import Acted
+from drivers.errors import DriverError, LinkTimeout
 from drivers.host.group import Group
-from drivers.host.line import Priority
 from drivers.playing import AmplifierLayer
-from drivers.protocol.records import Values
+from drivers.protocol.definition import MESSAGES
 from drivers.protocol.sets import Envelope, LayerSet
+from drivers.wires.can_bus import CanWire
+from drivers.wires.can_frames import unpack_frames
 from drivers.wires.modbus import ModbusWire
 from drivers.wires.serial_line import SerialWire
 from drivers.wires.wire import Wire
+from group_stops import LINES as STOPPED_LINES
+from group_stops import PER_CHAIN, PROGRAMMES, Tally
+from group_stops import play as play_stops
+from late_taps import AMPLIFIERS
+from late_taps import WIRES as LATE_WIRES
+from late_taps import play as play_late_taps
+from sim.amplifier.readings import AmplifierClock, Crystal
 from virtual_lines import (
     KINDS,
     MemoryLine,
@@ -37,66 +56,17 @@ from virtual_lines import (
 )
 
 
-@grouped(*map(tuple, "abcdefgh"), wire="serial")
-async def test_lines_come_in_the_order_of_the_amplifiers(
-    group: Group, ends: list[MemoryLine]
-) -> None:
-    """Not by where they are in memory: runs of one random seed send the same bytes."""
-    assert [*group.members.lines] == [end.line for end in ends]
-
-
-IDENTITIES: Values = {"versions": 0b110, "serial_number": "SIM-b"}
-
-
-@pytest.mark.parametrize("name", IDENTITIES)
-@in_virtual_time
-async def test_another_amplifier_or_version_is_refused(wire: str, name: str) -> None:
-    """An amplifier of version 2, and one of another serial number."""
-    end = MemoryLine(wire, "a")
-    end.far["a"].identity[name] = IDENTITIES[name]
-    host = Amplifier(end.line, 1, end.hosts["a"].limits, name="a", serial_number="SIM-a")
-    with pytest.raises(LinkError):
-        await host.open()
-
-
-@grouped(("a", "b"))
-async def test_broadcast_may_have_fed_every_amplifier(
-    group: Group, ends: list[MemoryLine], wire: str
-) -> None:
-    """How long each may play counts from the commit of both."""
-    await asyncio.sleep(0.1)
-    before = ends[0].loop.time()
-    await group.apply({name: [layer(0, tone())] for name in "ab"})
-    commit = max(at for at, each in ends[0].sent if each == "0:6") if wire != "tcp" else before
-    assert all(each.feeding.may >= commit for each in group.amplifiers.values())
-
-
-@grouped(("a", "b"), wire="serial")
-async def test_status_on_a_late_line_is_not_cut_short(group: Group, ends: list[MemoryLine]) -> None:
-    """A heartbeat waits for it: one that may reply again would else never be heard."""
-    first, second = group.amplifiers.values()
-    ends[0].outward = lambda name, data: [(0.02, data)]
-    await second.ping()
-    reading, feeding = first.read_status(Priority.READING), second.ping()
-    await reading
-    assert not feeding.done()
-    await feeding
-
-
-REACTION = 0.0099  # s; a reply may begin 10 ms after its request (decision 0088)
-
-
 class Paced:
     """A line whose frames take as long as their characters, one after the other.
 
-    bits: of a character; gap [s]: before each frame; collisions: frames of the host that were sent
-    while a reply was on its way.
+    character, gap [s]: of each, and before each frame; collisions: frames of the host that were
+    sent while a reply was on its way.
     """
 
-    def __init__(self, end: MemoryLine, baud: int, bits: int, gap: float) -> None:
-        self._end, self._character, self._gap = end, bits / baud, gap
+    def __init__(self, end: MemoryLine, character: float, gap: float) -> None:
+        self._end, self._character, self._gap = end, character, gap
         self._free = self._reply_until = 0.0
-        self.reaction = REACTION
+        self.reaction = 0.0099  # s; a reply may begin 10 ms after its request (decision 0088)
         self.collisions = 0
         end.inward, end.outward = self._inward, self._outward
 
@@ -116,28 +86,22 @@ class Paced:
         return [(self._free - now, data)]
 
 
-def rtu(baud: int) -> tuple[str, Callable[[], Wire], int, float]:
-    """A kind of line, its wire, bits of a character and silence [s] before each frame."""
-    silence = max(3.5 * 11 / baud, 0.00175)  # Modbus over serial line V1.02, 2.5.1.1
-    return "rtu", lambda: ModbusWire(baud, is_rtu=True, number=0), 11, silence
-
-
-def serial(baud: int) -> tuple[str, Callable[[], Wire], int, float]:
-    """The same of the project's own frames."""
-    return "serial", lambda: SerialWire(baud, sequence=0), 10, 0.0
-
-
-TIMED_LINES = {
-    **{f"rtu at {baud}": rtu(baud) for baud in (9600, 19_200, 38_400, 57_600, 115_200)},
-    **{f"serial at {baud}": serial(baud) for baud in (9600, 19_200, 115_200)},
-}
+TIMED_LINES = [
+    *(f"rtu at {baud}" for baud in (9600, 19_200, 38_400, 57_600, 115_200)),
+    *(f"serial at {baud}" for baud in (9600, 19_200, 115_200)),
+]
 
 
 async def armed(name: str, *amplifiers: str) -> tuple[Group, MemoryLine, Paced]:
-    """An armed group on one line with the times of its characters."""
-    kind, make, bits, gap = TIMED_LINES[name]
-    end = MemoryLine(kind, *amplifiers, wire=make())
-    paced = Paced(end, int(name.split()[-1]), bits, gap)
+    """An armed group on one line with the times of its characters, of 11 bits on RTU or of 10."""
+    kind, baud = name.split()[0], int(name.split()[-1])
+    if kind == "serial":
+        end = MemoryLine(kind, *amplifiers, wire=SerialWire(baud, sequence=0))
+        paced = Paced(end, 10 / baud, 0.0)
+    else:
+        end = MemoryLine(kind, *amplifiers, wire=ModbusWire(baud, is_rtu=True, number=0))
+        # The silence of Modbus over serial line V1.02, 2.5.1.1.
+        paced = Paced(end, 11 / baud, max(3.5 * 11 / baud, 0.00175))
     return await group_of(end, watchdog=2.0), end, paced
 
 
@@ -239,9 +203,6 @@ async def test_reply_that_never_comes_to_a_process_that_is_often_delayed_is_give
     stalling.cancel()
 
 
-LOST = 0.1  # of the frames, either way
-
-
 LINES = {
     "one": (("a",),),
     "one line of two": (("a", "b"),),
@@ -268,7 +229,7 @@ async def _play(kind: str, lines: str, rng: random.Random, count: int) -> list[s
         far[name].playback.commit = note  # type: ignore[method-assign]
 
     def losing(name: str, data: bytes) -> list[tuple[float, bytes]]:
-        return [] if rng.random() < LOST else unaltered(name, data)
+        return [] if rng.random() < 0.1 else unaltered(name, data)
 
     for name in far:
         noted(name)
@@ -293,34 +254,29 @@ async def _play(kind: str, lines: str, rng: random.Random, count: int) -> list[s
             if result is not None and words != result.layers[name]:
                 found.append(f"{name} does not play {token}, though it is said")
         played_sets += result is not None
-        await _recovered(group)
+        await group.statuses()
+        if not group.is_armed:
+            await group.clear()
+            await group.arm()
+        await group.silence(0.001)
+        await asyncio.sleep(0.15)  # what was late has faded
     if played_sets < 0.6 * count:  # of the rest it is said, as of 8 parts on Modbus RTU
         found.append(f"{played_sets} of {count} sets play")
     return found
 
 
-async def _recovered(group: Group) -> None:
-    """Read all amplifiers, and arm them again where they were stopped."""
-    await group.statuses()
-    if not group.is_armed:
-        await group.clear()
-        await group.arm()
-    await group.silence(0.001)
-    await asyncio.sleep(0.15)  # what was late has faded
-
-
-CASES = [
-    pytest.param(
-        *(kind, lines, count),
-        marks=pytest.mark.long if count > 40 or lines == "one line of two" else [],
-    )
-    for count in (40, 6700)
-    for kind in KINDS
-    for lines in LINES
-]
-
-
-@pytest.mark.parametrize(("kind", "lines", "count"), CASES)
+@pytest.mark.parametrize(
+    ("kind", "lines", "count"),
+    [
+        pytest.param(
+            *(kind, lines, count),
+            marks=pytest.mark.long if count > 40 or lines == "one line of two" else [],
+        )
+        for count in (40, 6700)
+        for kind in KINDS
+        for lines in LINES
+    ],
+)
 def test_sets_play_whole_and_once_though_frames_are_lost(kind: str, lines: str, count: int) -> None:
     """One frame of ten either way, of sets of 1 to 8 parts; the long form: 20 000 on each wire."""
     rng = random.Random(count)
@@ -421,3 +377,202 @@ async def test_lines_that_are_exchanged_while_armed_are_silenced(
         for far in end.far.values():
             far.tick(end.loop.time())
             assert far.state != "OPERATION_ENABLED"
+
+
+# By hand, of what is written: bytes of ten bits; of eleven after 3.5 characters; CAN frames of at
+# most 111 bits and 24 stuffed, of which each is packed with a head.
+SPEEDS: dict[str, tuple[str, Callable[[], Wire], Callable[[bytes], float]]] = {
+    "slow serial": ("serial", lambda: SerialWire(19_200, sequence=0), lambda d: len(d) / 1920),
+    "serial": ("serial", lambda: SerialWire(921_600, sequence=0), lambda d: len(d) / 92_160),
+    "rtu": (
+        "rtu",
+        lambda: ModbusWire(19_200, is_rtu=True, number=0),
+        lambda d: 11 * (len(d) + 3.5) / 19_200,
+    ),
+    "tcp": ("tcp", lambda: ModbusWire(0, is_rtu=False, number=0), lambda _: 0.0),
+    "slow can": (
+        "can",
+        lambda: CanWire(20_000, sequence=0),
+        lambda d: 135 * len(unpack_frames(d)) / 20_000,
+    ),
+}
+STATUS, COMMIT = (f"1:{MESSAGES[name].number}" for name in ("GetStatus", "Commit"))
+
+
+@pytest.mark.parametrize("names", [*combinations(SPEEDS, 2)], ids="-".join)
+@in_virtual_time
+async def test_sets_start_together_on_lines_of_any_speed_that_are_busy(
+    names: tuple[str, str],
+) -> None:
+    """Just armed: within a step of the shift. 3 s later: within 1 us, as their amplifiers state.
+
+    With crystals of +40 and -40 ppm, bytes that take 0.2 ms longer than their bits, and a status
+    under way whose reply takes 9 ms. No clock is read before the commit, which would wait for it.
+    """
+    ends: list[MemoryLine] = []
+    for name, each, error in zip(names, "ab", (40e-6, -40e-6), strict=True):
+        kind, wire, takes = SPEEDS[name]
+        end = MemoryLine(kind, each, wire=wire())
+        end.inward = end.outward = lambda _, data, takes=takes: [(takes(data) + 0.0002, data)]
+        end.far[each].clock = AmplifierClock(Crystal(error), since=end.loop.time())
+        ends.append(end)
+    group, outward = await group_of(*ends, watchdog=1.0), ends[1].outward
+
+    async def apart() -> float:
+        """By how much the starts of a set are apart [s]."""
+        ends[1].outward = lambda name, data: (
+            [(0.009, data)] if name == "GetStatus" else outward(name, data)
+        )
+        ends[0].sent.clear()
+        applying = asyncio.ensure_future(
+            group.apply({name: [layer(0, tone())] for name in group.amplifiers})
+        )
+        await asyncio.sleep(0.0005)
+        await group.amplifiers["b"].read_status()
+        await applying
+        ends[1].outward = outward
+        sent = [each for _, each in ends[0].sent]
+        assert sent.index(COMMIT) < (sent.index(STATUS) if STATUS in sent else math.inf)
+        await asyncio.sleep(0.02)
+        assert all(end.levels() for end in ends)  # which lets happen what is due
+        (first,), (second,) = (
+            far.playback.all_voices[0] for end in ends for far in end.far.values()
+        )
+        await group.silence(0.0)
+        return abs(first.began - second.began)
+
+    assert await apart() < 305e-6
+    for _ in range(60):
+        await asyncio.sleep(0.05)
+        await group.beat()
+    assert await apart() < 1e-6
+
+
+_FOUND = [("modbus", 3, 12), ("modbus", 3, 64)]
+"""Three on a line that were not fed in time; one that replied again and was not heard."""
+
+_SHORT = [("modbus", 1, 1), ("serial", 3, 1), ("can", 1, 1), _FOUND[0]]
+
+
+@pytest.mark.parametrize(
+    ("wire", "amplifiers", "seed"),
+    [
+        pytest.param(*row, marks=[] if row in _SHORT else pytest.mark.long)
+        for row in [*((wire, count, 1) for wire in LATE_WIRES for count in AMPLIFIERS), *_FOUND]
+    ],
+)
+def test_late_frames_are_no_fault(wire: str, amplifiers: int, seed: int) -> None:
+    """Up to 16 ms either way: nothing is wrong, and each click that was not played is counted.
+
+    But for some that come while all is disarmed. On one amplifier, in one exchange, all may be.
+    """
+    counts = play_late_taps(wire, amplifiers, seed)
+    taps, played, too_late = map(counts.pop, ("taps", "played", "too late"))
+    assert not counts - Counter(["clicks"] * taps)
+    assert too_late > 0 or amplifiers == 1
+    assert played + too_late >= 0.9 * taps
+
+
+@in_virtual_time
+async def test_watchdog_that_stands_still_is_found_where_replies_are_late() -> None:
+    """On a line that amplifiers share, where one commit feeds all of them before each in turn."""
+    async with set_running("a", "b", of=Acted, wire="modbus-rtu") as chain:
+        chain.witness.disturb()  # a status goes before what feeds
+        chain.delays(0.012)
+        await chain.holds(1.0, "finger")
+        assert chain.controller.group.is_armed
+        chain.answer("GetStatus", watchdog_left=250)
+        await chain.holds(3.0, "finger")
+        assert not chain.controller.group.is_armed
+
+
+STOPS, FIRST = (int(os.environ.get(name, value)) for name, value in (("STOPS", 84), ("FIRST", 0)))
+
+
+@pytest.fixture
+def unlogged() -> Iterator[None]:
+    """Losses and planted exceptions are logged by the thousand."""
+    logger = logging.getLogger("drivers")
+    logger.setLevel(logging.CRITICAL)
+    yield
+    logger.setLevel(logging.NOTSET)
+
+
+@pytest.mark.parametrize(
+    ("programme", "share", "least"),
+    [*zip(PROGRAMMES, (PER_CHAIN, 12, 12), (0.25, 0.25, 1 / 3), strict=True)],
+)
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")  # coroutines that were never awaited
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+@pytest.mark.usefixtures("unlogged")
+def test_stop_is_true(programme: str, share: int, least: float) -> None:
+    """On every wire: what is confirmed silent is silent, and stays so.
+
+    With faults of frames in every scene; with an exception at any line of the drivers that runs
+    meanwhile; of an amplifier that a killed host has left playing.
+    """
+    tally = Tally()
+    for seed in range(FIRST, FIRST + STOPS // share):
+        play_stops(programme, seed, tally)
+    assert tally.found == []
+    assert tally.total("confirmed") > tally.total("stops") * least
+    if programme.startswith("frames"):
+        assert all(tally.counts[wire, "may play"] for wire in STOPPED_LINES)
+        assert tally.total("raised") == 0
+
+
+ROOT = Path(drivers.__file__).parents[1]
+ON_THE_WAY = sorted(
+    file for package in ("drivers", "controller") for file in (ROOT / package).rglob("*.py")
+)
+
+# Kinds of wire make the bytes of requests; ports of CAN adapters take and give packed frames.
+WIRES = ROOT / "drivers" / "wires"
+
+# One class makes requests of sets.
+HOST = ROOT / "drivers" / "host"
+
+
+@cache
+def nodes(file: Path) -> list[ast.AST]:
+    """All nodes of a file."""
+    return list(ast.walk(ast.parse(file.read_text(encoding="utf-8"))))
+
+
+def calls(file: Path, part: str) -> Iterator[tuple[str, ast.Call]]:
+    """Calls in a file that has a part of a name, with the last part of their name."""
+    for node in nodes(file) if part in file.read_text(encoding="utf-8") else ():
+        if isinstance(node, ast.Call):
+            called = node.func
+            yield getattr(called, "attr", "") or getattr(called, "id", ""), node
+
+
+def test_only_wires_use_encoders() -> None:
+    """`encode_...` and `pack_...` are called by wires, codecs and the table, not from above."""
+    users = {
+        file
+        for file in ON_THE_WAY
+        for part in ("encode_", "pack_")
+        for name, _ in calls(file, part)
+        if name.startswith(part)
+    }
+    wires = {file for file in users if WIRES in file.parents}
+    assert {file.name for file in wires} == {"can_bus.py", "serial_frames.py", "serial_line.py"}
+    above = [file for file in users - wires if "protocol" not in file.parts]
+    assert above == [HOST / "amplifier.py"]
+
+
+def test_only_what_a_ledger_admits_is_packed() -> None:
+    """The host makes the words of sets in one place, of what `admit` returned."""
+    (packed,) = (
+        ast.unparse(call.args[0])
+        for file in ON_THE_WAY
+        for name, call in calls(file, "pack_layers")
+        if name == "pack_layers"
+    )
+    admitted = [
+        ast.unparse(node.targets[0])
+        for node in nodes(HOST / "amplifier.py")
+        if isinstance(node, ast.Assign) and ".ledger.admit(" in ast.unparse(node.value)
+    ]
+    assert admitted == [packed]

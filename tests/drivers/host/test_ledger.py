@@ -562,8 +562,16 @@ IN_PLACE: Mapping[str, tuple[str, Callable[[bytes], bytes], str]] = {
         lambda data: data[:-5] + b"\1" + data[-4:],
         "no valid frame.*cable",
     ),
-    "serial, echo": ("serial", lambda data: ECHO, "request itself came back"),
-    "serial, late": ("serial", lambda data: LINE_LATE, "address 1 to another request.*delays"),
+    "serial, echo": (
+        "serial",
+        lambda data: encode_frame(Frame(9, 1, 4, b"", 3)),
+        "request itself came back",
+    ),
+    "serial, late": (
+        "serial",
+        lambda data: encode_frame(Frame(0x89, 1, 3, b"", 3)),
+        "address 1 to another request.*delays",
+    ),
     "rtu, wrong speed": ("rtu", lambda data: b"\xf8\x80" * 9, "18 bytes .*f8 80.*parity"),
     "can, text that is none": ("can", lambda data: frames((0x800, b"\xf8")), r"\(f8\).*baud rate"),
     "rtu, other unit": (
@@ -597,10 +605,6 @@ IN_PLACE: Mapping[str, tuple[str, Callable[[bytes], bytes], str]] = {
 def frames(*given: tuple[int, bytes]) -> bytes:
     """Frames by identifier and data, as a port of frames has them."""
     return pack_frames(starmap(CanFrame, given))
-
-
-ECHO = encode_frame(Frame(9, 1, 4, b"", 3))
-LINE_LATE = encode_frame(Frame(0x89, 1, 3, b"", 3))
 
 
 @pytest.mark.parametrize("case", IN_PLACE)

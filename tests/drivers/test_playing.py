@@ -5,6 +5,7 @@ opened, written without waiting, and lost.
 """
 
 import asyncio
+import contextlib
 import errno
 import math
 import os
@@ -17,6 +18,7 @@ import termios
 import tty
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from itertools import product
 from typing import Any
 from unittest.mock import Mock
 
@@ -80,9 +82,6 @@ async def test_port_that_fails_amid_its_opening_is_released(
     os.close(far)
 
 
-TIMEOUT = 60.0  # s; for what is expected
-
-
 @pytest.fixture
 def ends() -> Iterator[tuple[serial.Serial, int]]:
     """A port, and the descriptor at its other end."""
@@ -95,28 +94,20 @@ def ends() -> Iterator[tuple[serial.Serial, int]]:
     os.close(far)
 
 
-async def read_until(far: int, end: bytes) -> bytes:
-    """Read from the other end until these bytes."""
-    os.set_blocking(far, False)
-    got = b""
-    async with asyncio.timeout(TIMEOUT):
-        while not got.endswith(end):
-            try:
-                got += os.read(far, 1 << 16)
-            except BlockingIOError:
-                await asyncio.sleep(0)
-    return got
-
-
 async def test_blocked_port_takes_the_newest_frame(ends: tuple[serial.Serial, int]) -> None:
     """Unsent bytes of an older one are dropped; the newest follows without another call."""
     port, far = ends
-    watched = SerialPort(port, "/dev/ttyUSB9", lambda data: None, lambda what: None)
+    watched, got = SerialPort(port, "/dev/ttyUSB9", lambda data: None, lambda what: None), b""
     watched.write(b"a" * (1 << 20))
     assert watched.is_blocked
     watched.write(b"b" * (1 << 20))
     watched.write(b"stop")
-    got = await read_until(far, b"stop")
+    os.set_blocking(far, False)
+    async with asyncio.timeout(60.0):
+        while not got.endswith(b"stop"):
+            with contextlib.suppress(BlockingIOError):
+                got += os.read(far, 1 << 16)
+            await asyncio.sleep(0)
     assert got.count(b"b") < 1 << 20
     assert got.count(b"a") < 1 << 20
     assert not watched.is_blocked
@@ -142,32 +133,35 @@ async def test_closed_port_is_a_link_error(ends: tuple[serial.Serial, int]) -> N
 async def test_error_of_whoever_takes_the_data_is_no_loss(ends: tuple[serial.Serial, int]) -> None:
     """A LinkError is an OSError, as those of a port that is gone."""
     port, far = ends
-    losses: list[str] = []
-
-    def fail(data: bytes) -> None:
-        raise LinkError("of another line")
-
-    watched = SerialPort(port, "/dev/ttyUSB9", fail, losses.append)
+    fail, lost = Mock(side_effect=LinkError("of another line")), Mock()
+    watched = SerialPort(port, "/dev/ttyUSB9", fail, lost)
     os.write(far, b"reply")
     with pytest.raises(LinkError, match="of another line"):
         watched.poll()
-    assert not losses
+    lost.assert_not_called()
     watched.close()
     await watched.wait_closed()
 
 
-MEGABYTE = 1 << 20
+@pytest.fixture
+def listening() -> Iterator[tuple[socket.socket, int]]:
+    """A socket that listens, and its port."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        yield server, server.getsockname()[1]
+
+
+async def connected(port: int) -> Port:
+    """A connection to a port."""
+    return await open_connection("127.0.0.1", port, lambda _: None, lambda _: None)
 
 
 async def test_connection_timeout_has_a_remedy(
-    monkeypatch: pytest.MonkeyPatch,
+    listening: tuple[socket.socket, int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The connection is neither accepted nor refused."""
     monkeypatch.setattr(ports, "_CONNECT_TIMEOUT", 0.0)
-    with socket.create_server(("127.0.0.1", 0)) as listening:
-        port = listening.getsockname()[1]
-        with pytest.raises(LinkError, match=rf"127.0.0.1:{port}: .*check the address"):
-            await open_connection("127.0.0.1", port, lambda _: None, lambda _: None)
+    with pytest.raises(LinkError, match=rf"127.0.0.1:{listening[1]}: .*check the address"):
+        await connected(listening[1])
 
 
 @pytest.mark.parametrize("first", ["hangs", "refuses"])
@@ -200,18 +194,23 @@ async def test_next_address_of_a_host_is_tried(first: str, monkeypatch: pytest.M
     server.close()
 
 
-async def test_connection_gives_up_what_is_not_taken_within_a_second() -> None:
-    """RFC 5482: the kernel's option, in milliseconds; frames are sent at once."""
-    with socket.create_server(("127.0.0.1", 0)) as listening:
-        port = listening.getsockname()[1]
-        connection = await open_connection("127.0.0.1", port, lambda _: None, lambda _: None)
-        taken, _ = listening.accept()
-        endpoint = connection._transport.get_extra_info("socket")  # type: ignore[attr-defined]
-        options = (socket.TCP_USER_TIMEOUT, socket.TCP_NODELAY)
-        assert [endpoint.getsockopt(socket.IPPROTO_TCP, each) for each in options] == [1000, 1]
-        taken.close()
-        connection.close()
-        await connection.wait_closed()
+async def test_connection_gives_up_what_is_not_taken(
+    listening: tuple[socket.socket, int],
+) -> None:
+    """Within a second (RFC 5482): the kernel's option, in milliseconds; frames are sent at once.
+
+    What blocks is a timeout before memory fills; closing discards unsent data.
+    """
+    connection = await connected(listening[1])
+    endpoint = connection._transport.get_extra_info("socket")  # type: ignore[attr-defined]
+    options = (socket.TCP_USER_TIMEOUT, socket.TCP_NODELAY)
+    assert [endpoint.getsockopt(socket.IPPROTO_TCP, each) for each in options] == [1000, 1]
+    connection.write(bytes(64 << 20))
+    with pytest.raises(LinkTimeout, match="check the network"):
+        connection.write(b"x")
+    connection.close()
+    await connection.wait_closed()
+    await asyncio.sleep(0)  # the transport reports the end
 
 
 async def test_link_local_address_keeps_its_zone(
@@ -244,41 +243,14 @@ except LinkError as problem:
     assert "amplifier.test:502: no connection" in ran.stdout
 
 
-async def test_blocked_connection_is_a_timeout_before_memory_fills() -> None:
-    """Closing discards unsent data."""
-    with socket.create_server(("127.0.0.1", 0)) as listening:
-        port = listening.getsockname()[1]
-        connection = await open_connection("127.0.0.1", port, lambda _: None, lambda _: None)
-        connection.write(bytes(64 * MEGABYTE))
-        with pytest.raises(LinkTimeout, match="check the network"):
-            connection.write(b"x")
-        connection.close()
-        await connection.wait_closed()
-        await asyncio.sleep(0)  # the transport reports the end
-
-
-RAMP = 20  # ms
-FULL = 10_000
-
-
 def layer(number: int, *commands: Command, **other: int | bool) -> LayerSet:
     """A layer with a ramp of 20 ms that does not end."""
-    return LayerSet(number, RAMP, int(other.pop("valid_for", 0)), commands, **other)  # type: ignore[arg-type]
+    return LayerSet(number, 20, int(other.pop("valid_for", 0)), commands, **other)  # type: ignore[arg-type]
 
 
 def tone(channel: int = 0, frequency: int = 2000, level: int = 5000, **other: object) -> Command:
     """A tone of 100 Hz at half level unless told otherwise."""
     return Command(channel, frequency, level, 0, **other)  # type: ignore[arg-type]
-
-
-def amplitudes(playback: Playback, time: float) -> list[complex]:
-    """The amplitude of each voice of channel 0."""
-    return [voice.transition.at(time) for voice in playback.all_voices[0]]
-
-
-def slope_of(playback: Playback, time: float) -> float:
-    """The steepest change of channel 0 from a time on."""
-    return sum(voice.transition.slope(time) for voice in playback.all_voices[0])
 
 
 def test_voice_that_has_faded_is_not_continued_however_seldom_time_advances() -> None:
@@ -319,7 +291,7 @@ def test_random_sets_never_jump_and_keep_their_bounds() -> None:
                 token += 1
                 playback.commit([random_layer(chance)], token, time)
             peak = sum(voice.transition.peak(time) for voice in playback.all_voices[0])
-            slope = slope_of(playback, time)
+            slope = sum(voice.transition.slope(time) for voice in playback.all_voices[0])
             before = _field(playback.all_voices[0], time)
             for _ in range(12):
                 later = time + chance.random() * 5e-4
@@ -337,7 +309,7 @@ def test_fade_that_is_cut_short_is_as_fast_as_the_amplifier_can() -> None:
     """A raised cosine from 1 is steepest at pi/2 over its length: 157 ms at 10 full levels/s."""
     for slew, length in ((math.inf, 0.002), (10.0, math.pi / 20)):
         playback = Playback(1, 8, slew)
-        playback.commit([layer(0, tone(level=FULL))], 1, 0.0)
+        playback.commit([layer(0, tone(level=10_000))], 1, 0.0)
         for n in range(9):
             played = replace(layer(0, tone(frequency=3000 + n)), ramp=1000)
             playback.commit([played], 2 + n, 1.0 + 1e-6 * n)
@@ -346,9 +318,7 @@ def test_fade_that_is_cut_short_is_as_fast_as_the_amplifier_can() -> None:
 
 
 CHANNELS, LAYERS = 2, 3
-FREQUENCIES = (400, 2200)  # 20 and 110 Hz
 AMPLIFIERS = 12  # of each course
-ROUNDING = 1e-9
 
 
 def random_envelope(chance: random.Random) -> Envelope | None:
@@ -371,7 +341,7 @@ def random_layer(chance: random.Random) -> LayerSet:
     commands = tuple(
         Command(
             channel,
-            chance.choice(FREQUENCIES),
+            chance.choice((400, 2200)),
             chance.choice((0, 1500, 3000)),
             chance.randrange(-18000, 18000, 500),
             chance.random() < 0.4,
@@ -385,8 +355,9 @@ def random_layer(chance: random.Random) -> LayerSet:
     return LayerSet(number, ramp, valid_for, commands, bool(commands) and kind > 0.85, False)
 
 
-def check_course(seed: int) -> None:
-    """Send sets to amplifiers that each commit them at times of their own; compare levels."""
+@pytest.mark.parametrize("seed", [*range(40), 68, 508, 771, 1284])
+def test_bounds_contain_every_amplifier(seed: int) -> None:
+    """Whenever within its interval each carried each set out, early, late, or in between."""
     chance = random.Random(seed)
     bounds = UncertainPlayback(Playback(CHANNELS, 64))
     amplifiers = [Playback(CHANNELS, 64) for _ in range(AMPLIFIERS)]
@@ -401,15 +372,16 @@ def check_course(seed: int) -> None:
         layers, ramp = (None if chance.random() < 0.1 else [one]), chance.choice((0.0, 0.03))
         if bounds.is_ambiguous((begin, end), layers, ramp):
             continue
+        last_token += 1
         if layers is None:
             bounds.silence((begin, end), ramp)
-            for each, moment in zip(amplifiers, moments, strict=True):
-                each.silence(moment, ramp)
         else:
-            last_token += 1
-            bounds.commit([one], last_token, (begin, end))
-            for each, moment in zip(amplifiers, moments, strict=True):
-                each.commit([one], last_token, moment)
+            bounds.commit(layers, last_token, (begin, end))
+        for each, moment in zip(amplifiers, moments, strict=True):
+            if layers is None:
+                each.silence(moment, ramp)
+            else:
+                each.commit(layers, last_token, moment)
         now = end
         for _ in range(3):
             begin = now + chance.choice((0.0, 0.004, 0.03))
@@ -417,24 +389,10 @@ def check_course(seed: int) -> None:
             for each in amplifiers:
                 moment = chance.uniform(begin, now)
                 each.advance(moment)
-                expect_bounded(each, moment, bounds, (begin, now))
-
-
-def expect_bounded(
-    one: Playback, moment: float, bounds: UncertainPlayback, when: tuple[float, float]
-) -> None:
-    """Require that each channel's level is within the bounds of what may play."""
-    for channel in range(CHANNELS):
-        for is_exact in (True, False):
-            low, high = bounds.bounds(channel, *when, is_exact=is_exact)
-            level = one.level(channel, moment)
-            assert low - ROUNDING <= level <= high + ROUNDING, (channel, is_exact, moment)
-
-
-@pytest.mark.parametrize("seed", [*range(40), 68, 508, 771, 1284])
-def test_bounds_contain_every_amplifier(seed: int) -> None:
-    """Whenever within its interval it carried each set out, early, late, or in between."""
-    check_course(seed)
+                for channel, is_exact in product(range(CHANNELS), (True, False)):
+                    low, high = bounds.bounds(channel, begin, now, is_exact=is_exact)
+                    level = each.level(channel, moment)
+                    assert low - 1e-9 <= level <= high + 1e-9, (channel, is_exact, moment)
 
 
 def test_set_that_comes_as_another_layer_may_end_is_ambiguous() -> None:
@@ -454,12 +412,10 @@ def test_set_that_comes_as_another_layer_may_end_is_ambiguous() -> None:
 def expecting() -> tuple[ExpectedOutputs, Callable[..., None], list[str]]:
     """What is expected of outputs that were silent at 0 s, what reports, and rules it reported."""
     found: list[str] = []
-
-    def report(rule: str, *_: object, **__: object) -> None:
-        found.append(rule)
-
-    began = 0.0, 0.0
-    outputs = ExpectedOutputs({}, report=report, unclear=None, slack=0.0, cause="", began=began)
+    report = Mock(side_effect=lambda rule, *_, **__: found.append(rule))
+    outputs = ExpectedOutputs(
+        {}, report=report, unclear=None, slack=0.0, cause="", began=(0.0, 0.0)
+    )
     return outputs, report, found
 
 

@@ -3,12 +3,12 @@
 An older or newer amplifier differs by one word of Status.
 """
 
-import io
 import os
 import re
 import stat
 import threading
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 
@@ -58,14 +58,13 @@ _UNSTATED = [0] * sum(each.words for each in STATUS.added)
 """What the table has added, of an amplifier that states only what is later than the table."""
 _OLDER = 11 + 4 + 8 + len(_UNSTATED)
 """Words of 4 channels and 8 layers."""
-_CHECKS = ("capabilities", "starts_disarmed", "areas", "present_areas", "objects", "lengths")
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_conformance_takes_another_edition(kind: str, age: str) -> None:
     """Words behind those that are known, or fewer, break no rule."""
-    results = judged(kind, _CHECKS)
-    assert {each.result for each in results} == {"passed"}
+    checks = "capabilities", "starts_disarmed", "areas", "present_areas", "objects", "lengths"
+    assert {each.result for each in judged(kind, checks)} == {"passed"}
 
 
 def test_witness_takes_another_edition(age: str, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -142,18 +141,15 @@ def test_places_of_words_are_those_of_the_page() -> None:
     assert (caps.places["envelope_step_max"], caps.words) == (17, 19)
 
 
-def fail() -> str:
-    """Fail to decode."""
-    raise ValueError("no such type")
-
-
 def test_trace_has_time_direction_bytes_and_meaning(tmp_path: Path) -> None:
     """A line each, only while the context lasts; a frame that cannot be decoded is shown too."""
     path = tmp_path / "trace.txt"
     trace.frame(Direction.OUT, b"\x01", "before", lambda: "before")
     with tracing(path):
         trace.frame(Direction.OUT, b"\x2c\x01", "serial:///dev/x", lambda: "Ping()")
-        trace.frame(Direction.IN, b"\xff", "serial:///dev/x", fail)
+        trace.frame(
+            Direction.IN, b"\xff", "serial:///dev/x", Mock(side_effect=ValueError("no such type"))
+        )
         trace.request("Ping()", "Status", 0.0123)
     trace.frame(Direction.OUT, b"\x01", "after", lambda: "after")
     lines = path.read_text("utf-8").splitlines()
@@ -167,38 +163,23 @@ def test_trace_has_time_direction_bytes_and_meaning(tmp_path: Path) -> None:
     assert stat.S_IMODE(path.stat().st_mode) == 0o600
 
 
-class SlowFile(io.StringIO):
-    """A file that does not take more until it may."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.may_go_on = threading.Event()
-        self.is_writing = threading.Event()
-        self.text = ""
-
-    def write(self, text: str) -> int:
-        self.is_writing.set()
-        self.may_go_on.wait(60)
-        self.text += text
-        return len(text)
-
-
 def test_slow_file_drops_and_counts(monkeypatch: pytest.MonkeyPatch) -> None:
     """The caller never waits; the number of dropped records stands in the file."""
     monkeypatch.setattr(trace, "MAX_PENDING", 10)
-    file = SlowFile()
+    file, may_go_on, is_writing = Mock(), threading.Event(), threading.Event()
+    file.write.side_effect = lambda text: is_writing.set() or may_go_on.wait(60)
     writer = TraceWriter(file)
-    trace._writers.append(writer)
+    monkeypatch.setattr(trace, "_writers", [writer])
     trace.frame(Direction.OUT, b"", "first", str)
-    assert file.is_writing.wait(60)
+    assert is_writing.wait(60)
     for _ in range(25):
         trace.frame(Direction.OUT, b"", "later", str)
     assert writer.dropped == 15
-    file.may_go_on.set()
+    may_go_on.set()
     writer.close()
-    trace._writers.remove(writer)
-    assert file.text.count("later") == 10
-    assert file.text.endswith("trace: 15 records dropped\n")
+    text = "".join(each.args[0] for each in file.write.call_args_list)
+    assert text.count("later") == 10
+    assert text.endswith("trace: 15 records dropped\n")
 
 
 def test_full_disk_ends_only_the_trace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -253,6 +253,13 @@ def layer(
     return AmplifierLayer(number, tuple(AmplifierTone(*tone) for tone in tones), ramp)
 
 
+async def until(condition: Callable[[], object]) -> None:
+    """Let the event loop turn until a condition holds, for a minute at most."""
+    async with asyncio.timeout(60.0):
+        while not condition():  # noqa: ASYNC110  it has no event
+            await asyncio.sleep(0.0)
+
+
 _READ_TIMEOUT = 0.02  # s; after which the thread of a bus notices its end
 Numbered = Mapping[int, AmplifierDevice]
 

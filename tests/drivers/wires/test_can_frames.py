@@ -8,8 +8,9 @@ losses.
 import asyncio
 import errno
 import os
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import asynccontextmanager, suppress
+from unittest.mock import AsyncMock, Mock
 
 import can
 import pytest
@@ -36,6 +37,7 @@ from drivers.wires.can_frames import (
     unpack_frames,
 )
 from drivers.wires.wire import address_of
+from real_wires import until
 from registry.limits import GuardLimits
 from virtual_lines import in_virtual_time
 
@@ -126,44 +128,59 @@ def test_frames_of_every_length_hold_all_words(words: int) -> None:
     assert last == CanMessage(9, 5, tuple(range(words)))
 
 
-@pytest.mark.parametrize(
-    ("last", "number", "is_taken"),
-    [(1, 2, True), (255, 1, True), (1, 128, True), (1, 129, False), (2, 1, False), (1, 255, False)],
-)
-def test_numbers_wrap_from_255_to_1(last: int, number: int, is_taken: bool) -> None:
-    """Newer is one that follows by at most 127; after 0.1 s without a frame any is."""
-    whole = Assembler(WireCounters())
-    (before,), (data,) = segments(last, 9, []), segments(number, 9, [])
-    assert whole.add(before, 0.0) is not None
-    assert (whole.add(data, 0.05) is not None) is is_taken
-    assert whole.add(data, 0.2) is not None
+_FIRST, _SECOND = segments(5, 5, range(5))
+_EVENT, _END = segments(0, 30, [4, 0, 255, 1])
+_OTHER_EVENT, _ = segments(0, 30, [5, 0, 255, 1])
+_MINE, _YOURS = segments(6, 5, range(8)), segments(6, 5, range(1, 9))
+ASSEMBLED: dict[str, tuple[bool, Sequence[tuple[bytes, float, CanMessage | None]], int]] = {
+    # Newer is one that follows by at most 127; after 0.1 s without a frame any is.
+    **{
+        f"{number} after {last}": (
+            True,
+            [
+                (*segments(last, 9, []), 0.0, CanMessage(last, 9, ())),
+                (*segments(number, 9, []), 0.05, CanMessage(number, 9, ()) if is_taken else None),
+                (*segments(number, 9, []), 0.2, CanMessage(number, 9, ())),
+            ],
+            0,
+        )
+        for last, number, is_taken in (
+            *((1, 2, True), (255, 1, True), (1, 128, True)),
+            *((1, 129, False), (2, 1, False), (1, 255, False)),
+        )
+    },
+    # A frame 0.11 s later is no part of it, though its number is the same.
+    "incomplete": (True, [(_FIRST, 0.0, None), (_SECOND, 0.11, None)], 0),
+    # Two that differ under one number and index are believed neither way.
+    "of two senders": (
+        True,
+        [(each, 0.0, None) for each in (_MINE[0], _YOURS[0], *_MINE[1:], *_YOURS[1:])],
+        1,
+    ),
+    # An event that lost its end is followed by a whole one; none has a number.
+    "without a number": (
+        False,
+        [
+            *((each, 0.0, None) for each in (_END, _OTHER_EVENT, _EVENT)),
+            (_END, 0.0, CanMessage(0, 30, (4, 0, 255, 1))),
+        ],
+        0,
+    ),
+}
+"""Frames with the times at which they come [s], and the message that each completes.
+
+Whether they are numbered, and how many are invalid.
+"""
 
 
-def test_incomplete_message_is_forgotten() -> None:
-    """A frame 0.11 s later is no part of it, though its number is the same."""
-    whole = Assembler(WireCounters())
-    first, second = segments(5, 5, range(5))
-    assert whole.add(first, 0.0) is None
-    assert whole.add(second, 0.11) is None
-
-
-def test_frames_of_two_senders_make_no_message() -> None:
-    """Two that differ under one number and index are believed neither way."""
+@pytest.mark.parametrize("case", ASSEMBLED)
+def test_frames_make_the_message_that_was_sent_or_none(case: str) -> None:
+    """Numbers wrap from 255 to 1; what is incomplete, late or of two senders makes none."""
+    is_numbered, frames, invalid = ASSEMBLED[case]
     counters = WireCounters()
-    whole = Assembler(counters)
-    mine, other = segments(5, 5, range(8)), segments(5, 5, range(1, 9))
-    for data in (mine[0], other[0], *mine[1:], *other[1:]):
-        assert whole.add(data, 0.0) is None
-    assert counters.invalid_frames == 1
-
-
-def test_frames_of_number_0_begin_anew_with_each_first() -> None:
-    """An event that lost its end is followed by a whole one."""
-    whole = Assembler(WireCounters(), is_numbered=False)
-    first, second = segments(0, 30, [4, 0, 255, 1])
-    lost, _ = segments(0, 30, [5, 0, 255, 1])
-    assert [whole.add(data, 0.0) for data in (second, lost, first)] == [None] * 3
-    assert whole.add(second, 0.0) == CanMessage(0, 30, (4, 0, 255, 1))
+    whole = Assembler(counters, is_numbered=is_numbered)
+    assert [whole.add(data, at) for data, at, _ in frames] == [expected for *_, expected in frames]
+    assert counters.invalid_frames == invalid
 
 
 BURST = [CanFrame(0x201, bytes([number])) for number in range(22)]
@@ -208,15 +225,6 @@ async def opened(
         await port.wait_closed()
         for each in adapter.ends:
             os.close(each)
-
-
-async def until(condition: Callable[[], bool]) -> None:
-    """Let the event loop turn until a condition holds, for a minute at most."""
-    async with asyncio.timeout(60.0):
-        while True:
-            if condition():
-                return
-            await asyncio.sleep(0)
 
 
 async def test_long_set_is_sent_as_the_queue_takes_it() -> None:
@@ -288,7 +296,8 @@ async def test_bus_off_is_a_loss_and_other_error_frames_are_none() -> None:
 async def test_failed_send_is_a_loss() -> None:
     """The adapter is unplugged: LinkError for the request, and the line is lost with its text."""
     async with opened() as (port, adapter, losses):
-        adapter.send = _unplugged  # type: ignore[method-assign]
+        unplugged = can.CanOperationError("No such device", error_code=errno.ENODEV)
+        adapter.send = Mock(side_effect=unplugged)  # type: ignore[method-assign]
         with pytest.raises(LinkError) as failed:
             port.write(pack_frames(STOP))
         assert losses == [str(failed.value)]
@@ -312,24 +321,14 @@ async def test_reader_thread_hands_over_frames_in_order_until_the_adapter_is_gon
     assert len(losses) == 1
 
 
-def _unplugged(msg: can.Message, timeout: float | None = None) -> None:
-    raise can.CanOperationError("No such device", error_code=errno.ENODEV)
-
-
 FRAME_AS_TEXT = CanFrame(0x185, bytes.fromhex("0102030405060708"))
 ELEMENT = b"< frame 185 1.000000 0102030405060708 >"
 SLCAN_SPOKEN = b"\rC\rS5\rO\rt18580102030405060708\r\rC\r"
 
 
-class Below:
-    """A port that keeps what is written."""
-
-    is_blocked = False
-    written = b""
-
-    def write(self, data: bytes) -> None:
-        """Keep it."""
-        self.written += data
+def written(port: TextPort) -> bytes:
+    """All that was written to a mock port below."""
+    return b"".join(data for ((data,), _) in port.below.write.call_args_list)
 
 
 @asynccontextmanager
@@ -449,14 +448,14 @@ async def test_slcan_adapter_that_restarts_is_opened_again_until_it_speaks() -> 
 
     heard: list[CanFrame] = []
     port = TextPort(SLCAN, lambda data: heard.extend(unpack_frames(data)), hello=b"O\r")
-    port.below = below = Below()  # type: ignore[assignment]
+    port.below = Mock(is_blocked=False)
     for came in (b"\r\nrst:0x1 (POWERON_RESET)\r\n", b"\r\x07", b"t18580102030405060708\r", b"\r"):
         port.write(pack_frames([FRAME_AS_TEXT]))
         port.received(came)
     await asyncio.sleep(1.1)
     port.write(pack_frames([FRAME_AS_TEXT]))
     sent = b"t18580102030405060708\r"
-    assert below.written == 3 * (b"O\r" + sent) + sent + b"O\r" + sent
+    assert written(port) == 3 * (b"O\r" + sent) + sent + b"O\r" + sent
     assert heard == [CanFrame(0x800, b"\r\x07"), FRAME_AS_TEXT]
 
 
@@ -465,11 +464,7 @@ async def test_text_that_no_adapter_replies_with_is_an_error() -> None:
 
     By LAWICEL's CANUSB manual: V, N, F and z.
     """
-
-    async def opener(name: str, on_data: object, on_loss: object) -> object:
-        return Below()
-
-    PORT_OPENER.set(opener)  # type: ignore[arg-type]
+    PORT_OPENER.set(AsyncMock(return_value=Mock(is_blocked=False)))
     heard: list[CanFrame] = []
     port = await SlcanAddress("can+slcan:///dev/ttyACM0#5").open_port(
         lambda data: heard.extend(unpack_frames(data)), lambda cause: None
@@ -485,7 +480,6 @@ async def test_line_that_was_cut_off_is_ended_before_the_next_frame() -> None:
     """A port that has not taken all drops the rest of a line: a CR of its own ends that."""
 
     port = TextPort(SLCAN, lambda data: None, cut_off=b"\r")
-    port.below = below = Below()  # type: ignore[assignment]
-    below.is_blocked = True
+    port.below = Mock(is_blocked=True)
     port.write(pack_frames([FRAME_AS_TEXT]))
-    assert below.written == b"\rt18580102030405060708\r"
+    assert written(port) == b"\rt18580102030405060708\r"

@@ -17,6 +17,7 @@ from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
 from typing import Any
+from unittest.mock import Mock
 
 import can
 import pytest
@@ -53,82 +54,61 @@ BYTE = 11 / 19_200  # s
 SILENCE = 3.5 * BYTE  # Modbus over serial line V1.02, 2.5.1.1
 
 
-class Below:
-    """A port that keeps when what was written."""
-
-    is_blocked = False
-
-    def __init__(self) -> None:
-        self.sent: list[tuple[float, bytes]] = []
-
-    def write(self, data: bytes) -> None:
-        self.sent.append((asyncio.get_running_loop().time(), data))
-
-    def poll(self) -> None:
-        """Do nothing."""
-
-    def close(self) -> None:
-        """Do nothing."""
-
-    async def wait_closed(self) -> None:
-        """Return at once."""
-
-
-async def opened() -> tuple[SilentPort, Below]:
-    """A port at 19 200 baud."""
-    assert ModbusWire(19_200, is_rtu=True, number=0).silence == pytest.approx(SILENCE)
-    below = Below()
+async def opened() -> tuple[SilentPort, list[tuple[float, bytes]]]:
+    """A port at 19 200 baud, and when what is written below it."""
+    sent, loop = list[tuple[float, bytes]](), asyncio.get_running_loop()
     port = SilentPort(SILENCE, BYTE, lambda data: None)
-    port.below = below
+    port.below = Mock(is_blocked=False, write=lambda data: sent.append((loop.time(), data)))
     await asyncio.sleep(1.0)
-    return port, below
+    return port, sent
 
 
 @in_virtual_time
 async def test_frame_waits_for_the_line_to_be_silent() -> None:
     """After a frame of 8 bytes for 11.5 characters, after what is heard for 3.5 from there on."""
-    port, below = await opened()
+    assert ModbusWire(19_200, is_rtu=True, number=0).silence == pytest.approx(SILENCE)
+    port, sent = await opened()
     loop = asyncio.get_running_loop()
     port.write(b"\1first")
     port.write(b"\0second ")
     port.write(b"\1third")
     await asyncio.sleep(0.1)
-    assert [data for _, data in below.sent] == [b"\1first", b"\0second ", b"\1third"]
-    (first, _), (second, _), (third, _) = below.sent
+    assert [data for _, data in sent] == [b"\1first", b"\0second ", b"\1third"]
+    (first, _), (second, _), (third, _) = sent
     assert second - first == pytest.approx((6 + 3.5) * BYTE)
     assert third - second == pytest.approx((8 + 3.5) * BYTE)
     port.received(b"reply")
     heard = loop.time()
     port.write(b"\1fourth")
     await asyncio.sleep(0.1)
-    assert below.sent[-1][0] - heard == pytest.approx(SILENCE)
+    assert sent[-1][0] - heard == pytest.approx(SILENCE)
 
 
 @in_virtual_time
 async def test_newer_request_replaces_one_that_waits_but_no_broadcast() -> None:
     """A stop need not wait behind the request that it has preempted."""
-    port, below = await opened()
+    port, sent = await opened()
     for frame in (b"\1first", b"\0commit", b"\1read", b"\1stop"):
         port.write(frame)
     await asyncio.sleep(0.1)
-    assert [data for _, data in below.sent] == [b"\1first", b"\0commit", b"\1stop"]
-    assert all(after > before for (before, _), (after, _) in pairwise(below.sent))
+    assert [data for _, data in sent] == [b"\1first", b"\0commit", b"\1stop"]
+    assert all(after > before for (before, _), (after, _) in pairwise(sent))
 
 
 @in_virtual_time
 async def test_noise_does_not_keep_a_stop_waiting_for_ever() -> None:
     """It goes after the longest frame, of 256 characters, and one that follows after that."""
-    port, below = await opened()
+    port, sent = await opened()
     loop = asyncio.get_running_loop()
     begin = loop.time()
     port.received(b"?")
     port.write(b"\0stops")
     port.write(b"\1stop")
-    while len(below.sent) < 2:
+    while len(sent) < 2:
         assert loop.time() < begin + 1.0
         await asyncio.sleep(BYTE)
         port.received(b"?")
-    (first, _), (second, _) = below.sent
+    (first, _), (second, _) = sent
     assert first - begin == pytest.approx((256 + 3.5) * BYTE, abs=BYTE)
     assert second - first == pytest.approx((6 + 3.5) * BYTE)
 
@@ -148,16 +128,6 @@ class Stream:
     end: bytes
 
 
-def slcan_sent(frame: CanFrame) -> bytes:
-    """A frame as a serial adapter writes it."""
-    return f"t{frame.id:03X}{len(frame.data):X}{frame.data.hex()}\r".encode()
-
-
-def socketcand_sent(frame: CanFrame) -> bytes:
-    """A frame as the daemon writes it."""
-    return f"< frame {frame.id:03X} 1700000000.123456 {frame.data.hex().upper()} >".encode()
-
-
 CAN_FRAMES = st.builds(CanFrame, st.integers(0, 0x7FF), st.binary(max_size=8))
 FRAMES = st.builds(
     Frame,
@@ -172,9 +142,17 @@ STREAMS = {
     "serial": Stream(
         *(lambda: FrameReader().feed, encode_frame, Frame(12, 1, 1, b"x", 3), FRAMES, b"\0")
     ),
-    "slcan": Stream(lambda: TextReader(SLCAN).feed, slcan_sent, CAN_FRAME, CAN_FRAMES, b"\r"),
+    "slcan": Stream(
+        lambda: TextReader(SLCAN).feed,
+        lambda frame: f"t{frame.id:03X}{len(frame.data):X}{frame.data.hex()}\r".encode(),
+        *(CAN_FRAME, CAN_FRAMES, b"\r"),
+    ),
     "socketcand": Stream(
-        *(lambda: TextReader(SOCKETCAND).feed, socketcand_sent, CAN_FRAME, CAN_FRAMES, b">")
+        lambda: TextReader(SOCKETCAND).feed,
+        lambda frame: (
+            f"< frame {frame.id:03X} 1700000000.123456 {frame.data.hex().upper()} >".encode()
+        ),
+        *(CAN_FRAME, CAN_FRAMES, b">"),
     ),
 }
 of_every_kind = pytest.mark.parametrize("stream", STREAMS.values(), ids=STREAMS)
@@ -201,15 +179,11 @@ def test_stream_without_an_end_takes_no_memory(stream: Stream) -> None:
     assert len(reader.rest) <= 512
 
 
-def cobs_by_hand(data: bytes) -> bytes:
-    """COBS of blocks below 254 bytes, by its definition."""
-    return b"".join(bytes([len(part) + 1]) + part for part in data.split(b"\0"))
-
-
 def frame_by_hand(kind: int, version: int, address: int, sequence: int, payload: bytes) -> bytes:
-    """A frame from the specification, without the code under test."""
+    """A frame from the specification, without the code under test; COBS of short blocks."""
     body = struct.pack("<BBBH", kind, version, address, sequence) + payload
-    return b"\0" + cobs_by_hand(body + struct.pack("<I", zlib.crc32(body))) + b"\0"
+    blocks = (body + struct.pack("<I", zlib.crc32(body))).split(b"\0")
+    return b"\0" + b"".join(bytes([len(block) + 1]) + block for block in blocks) + b"\0"
 
 
 @given(FRAMES)
@@ -359,11 +333,10 @@ def test_damaged_bytes_raise_and_log_nothing(caplog: pytest.LogCaptureFixture) -
     assert caplog.records == []
 
 
-NOISE = [b"\x03\xfa", b"\x01\x63", b"\x17", b"\x18\x00\xf0"]
-
-
 @pytest.mark.parametrize("waits", shortly([True, False], [True]))
-@pytest.mark.parametrize(("noise", "part"), in_turn(NOISE, [250, 1 << 16]))
+@pytest.mark.parametrize(
+    ("noise", "part"), in_turn([b"\x03\xfa", b"\x01\x63", b"\x17", b"\x18\x00\xf0"], [250, 1 << 16])
+)
 def test_noise_without_end_is_neither_kept_nor_searched_without_bound(
     noise: bytes, waits: bool, part: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -391,7 +364,6 @@ def test_noise_without_end_is_neither_kept_nor_searched_without_bound(
     assert [each.raw for each in found if each.pdu] == [WHOLE if waits else response]
 
 
-OWN = ("slcan", "socketcan", "socketcand")
 CHANNELS = {
     "etas": "ETAS://ETH/ES910:abcd/CAN:1",
     "nixnet": "CAN1",
@@ -410,7 +382,7 @@ OPTIONS = {
     "udp_multicast": {"port": 43114},
     "vector": {"app_name": "plate", "serial": 4711},
 }
-INTERFACES = sorted(set(BACKENDS) - set(OWN))
+INTERFACES = sorted(set(BACKENDS) - {"slcan", "socketcan", "socketcand"})
 
 
 def address(interface: str, query: str = "") -> PythonCanAddress:
@@ -458,10 +430,13 @@ def test_frames_are_those_of_classic_can() -> None:
 
 
 class _Hanging:
-    """A port or adapter whose opening, reading and closing block until allowed."""
+    """A port or adapter whose opening, reading and closing block until allowed.
 
-    def __init__(self) -> None:
-        self.port = "/dev/ttyUSB9"
+    timeout [s]: of its reading, however long it was given; None for as long.
+    """
+
+    def __init__(self, timeout: float | None) -> None:
+        self.port, self._timeout = "/dev/ttyUSB9", timeout
         self.may_open, self.may_read, self.may_close = (threading.Event() for _ in range(3))
         self.is_opening, self.is_closed = threading.Event(), threading.Event()
         self._pipe = os.pipe()
@@ -475,7 +450,7 @@ class _Hanging:
         return self._pipe[0]
 
     def recv(self, timeout: float) -> can.Message | None:
-        if not self.may_read.wait(timeout):
+        if not self.may_read.wait(self._timeout or timeout):
             return None
         return can.Message(arbitration_id=0x701, is_extended_id=False, data=[5])
 
@@ -486,11 +461,6 @@ class _Hanging:
         self.is_closed.set()
 
     shutdown = close
-
-
-class _HangingRead(_Hanging):
-    def recv(self, timeout: float) -> can.Message | None:
-        return super().recv(20)
 
 
 HEARD: list[bytes] = []
@@ -511,10 +481,10 @@ OPENINGS: dict[str, Callable[[], Coroutine[Any, Any, Port]]] = {
 }
 
 
-@pytest.fixture(params=[_Hanging, _HangingRead])
+@pytest.fixture(params=[None, 20.0])
 def device(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[_Hanging]:
     """The device that is opened; released after the test."""
-    device: _Hanging = request.param()
+    device = _Hanging(request.param)
     monkeypatch.setattr(ports, "_open_device", device.open)
     monkeypatch.setattr(can, "Bus", lambda **how: device.open())
     monkeypatch.setattr(threads, "CLOSE_TIMEOUT", 0.05)

@@ -12,7 +12,9 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -102,9 +104,10 @@ def test_recorder_records_sensors_and_fingers_without_gaps(
 
 
 def test_recorder_follows_moved_fingers_and_zeroes_lifted_ones(
-    coarse_rig: Rig, tmp_path: Path
+    coarse_rig: Rig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The columns are those of the start."""
+    """The columns are those of the start. At its maximum size further samples are dropped."""
+    monkeypatch.setattr("sim.sensors.max_values", lambda path: 3000)
     bench = Bench(coarse_rig, now=0.0)
     bench.place_fingers({"a": (0.1, 0.08), "b": (0.2, 0.1)}, now=0.0)
     path = tmp_path / "run.csv"
@@ -112,29 +115,17 @@ def test_recorder_follows_moved_fingers_and_zeroes_lifted_ones(
     play(bench, HALF_STROKE, now=0.0, watchdog=2.0)
     bench.advance(0.1)
     bench.place_fingers({"b": (0.02, 0.02)}, now=0.1)
-    bench.advance(0.2)
-    recorder.stop()
-    recorder.finish()
-    late = read_recording(path).during(0.101, 0.2)
-    assert not late.samples[:, 0].any()
-    assert np.abs(late.samples[:, 1]).max() > 1
-
-
-def test_recorder_stops_at_its_maximum_size(
-    coarse_rig: Rig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Further samples are dropped, and is_full is set."""
-    monkeypatch.setattr("sim.sensors.max_values", lambda path: 1000)
-    bench = Bench(coarse_rig, now=0.0)
-    sensors = [Accelerometer("P1", 0.1, 0.08), Accelerometer("P2", 0.1, 0.1)]
-    recorder = Recorder(bench, tmp_path / "run.csv", sensors=sensors, fingers=[])
-    bench.advance(0.049)
+    bench.advance(0.149)
     assert not recorder.is_full
-    bench.advance(0.3)
+    bench.advance(0.2)
     assert recorder.is_full
     recorder.stop()
     recorder.finish()
-    assert len(read_recording(tmp_path / "run.csv").samples) == 500
+    found = read_recording(path)
+    assert len(found.samples) == 1500
+    late = found.during(0.101, 0.2)
+    assert not late.samples[:, 0].any()
+    assert np.abs(late.samples[:, 1]).max() > 1
 
 
 def test_recorder_refuses_an_unusable_file_at_the_start(coarse_rig: Rig, tmp_path: Path) -> None:
@@ -196,21 +187,21 @@ def test_recording_round_trip(
     np.testing.assert_allclose(back.samples, recorded.samples, rtol=0, atol=step * largest)
 
 
+@pytest.mark.parametrize(
+    ("ending", "changes", "text"),
+    [
+        ("txt", {}, r"run.txt: .*csv"),
+        ("csv", {"samples": np.full((500, 2), np.nan)}, "finite"),
+        ("wav", {"sample_rate": 4999.5}, r"4999.5"),
+        ("uff", {"names": ("P1", "a long name")}, "a long name"),
+    ],
+)
 def test_write_recording_refuses_what_a_format_cannot_hold(
-    recorded: Recording, tmp_path: Path
+    recorded: Recording, tmp_path: Path, ending: str, changes: dict[str, Any], text: str
 ) -> None:
     """Unknown suffix, values that are not finite, fractional rates in WAV, long names in UFF."""
-    with pytest.raises(InputError, match=r"run.txt: .*csv"):
-        write_recording(tmp_path / "run.txt", recorded)
-    bad = Recording(recorded.names, recorded.points, 5000.0, 0.0, recorded.samples * np.nan)
-    with pytest.raises(InputError, match="finite"):
-        write_recording(tmp_path / "run.csv", bad)
-    slow = Recording(recorded.names, recorded.points, 4999.5, 0.0, recorded.samples)
-    with pytest.raises(InputError, match=r"4999.5"):
-        write_recording(tmp_path / "run.wav", slow)
-    named = Recording(("P1", "a long name"), recorded.points, 5000.0, 0.0, recorded.samples)
-    with pytest.raises(InputError, match="a long name"):
-        write_recording(tmp_path / "run.uff", named)
+    with pytest.raises(InputError, match=text):
+        write_recording(tmp_path / f"run.{ending}", replace(recorded, **changes))
     assert not list(tmp_path.iterdir())
 
 
@@ -219,7 +210,10 @@ FRAME_ERROR = 50e-6  # of a frame's length, relative
 
 
 def test_usb_moves_bytes_in_the_next_frame() -> None:
-    """Either way 0 to 1 ms later, 0.5 ms on average, at whole frames from each other."""
+    """Either way 0 to 1 ms later, 0.5 ms on average, at whole frames from each other.
+
+    1 500 bytes at 12 Mbit/s take 1 ms.
+    """
     delays = LineKind(PROMPT, PROMPT, frame=1e-3).delays(1)
     times = [number * 1.3717e-3 for number in range(2000)]
     for shift in (delays.leave, delays.arrive):
@@ -230,13 +224,8 @@ def test_usb_moves_bytes_in_the_next_frame() -> None:
         assert statistics.mean(late) == pytest.approx(0.5e-3, rel=0.05)
         frames = [(time - moved[0]) / 1e-3 for time in moved]
         assert all(abs(frame - round(frame)) <= FRAME_ERROR * frame + 1e-6 for frame in frames)
-
-
-def test_bytes_take_their_time_on_usb() -> None:
-    """1 500 bytes at 12 Mbit/s: 1 ms."""
     delays = LineKind(PROMPT, PROMPT, usb_byte=8 / 12e6).delays(1)
-    assert delays.leave(2.0, 1500) == pytest.approx(2.001)
-    assert delays.arrive(3.0, 1500) == pytest.approx(3.001)
+    assert [delays.leave(2.0, 1500), delays.arrive(3.0, 1500)] == pytest.approx([2.001, 3.001])
 
 
 def test_ftdi_holds_small_replies_until_its_timer_has_run() -> None:
@@ -316,18 +305,20 @@ def test_options_that_name_no_line_are_refused(options: list[str]) -> None:
         links_by_amplifier(options, amplifiers=["a", "b"])
 
 
-def test_a_line_has_one_link_and_a_network_none(tmp_path: Path, terminal: str) -> None:
+@pytest.mark.parametrize(
+    ("urls", "text"),
+    [
+        (["serial://{}?address=1", "serial://{}?address=2"], "one per line"),
+        (["modbus+tcp://127.0.0.1:502/1"], "pseudo-terminal"),
+    ],
+)
+def test_a_line_has_one_link_and_a_network_none(
+    urls: list[str], text: str, tmp_path: Path, terminal: str
+) -> None:
     """Nothing is linked then."""
-    urls = {"a": f"serial://{terminal}?address=1", "b": f"serial://{terminal}?address=2"}
-    with (
-        pytest.raises(InputError, match="one per line"),
-        linked_urls(urls, {"a": tmp_path / "a", "b": tmp_path / "b"}),
-    ):
-        pass
-    with (
-        pytest.raises(InputError, match="pseudo-terminal"),
-        linked_urls({"a": "modbus+tcp://127.0.0.1:502/1"}, {"a": tmp_path / "a"}),
-    ):
+    named = {name: url.format(terminal) for name, url in zip("ab", urls, strict=False)}
+    links = {name: tmp_path / name for name in named}
+    with pytest.raises(InputError, match=text), linked_urls(named, links):
         pass
     assert not any(path.is_symlink() for path in tmp_path.iterdir())
 

@@ -12,7 +12,7 @@ import socket
 import stat
 import sys
 import tempfile
-from collections.abc import AsyncIterator, Iterator, Sequence
+from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager
 from pathlib import Path
 from resource import RLIM_INFINITY, RLIMIT_FSIZE, prlimit
@@ -52,26 +52,8 @@ from sim.simulation import SimulationView, draw
 from sound_cards import read_recording
 from virtual_lines import in_virtual_time
 
-ROOT = example_rig_path().parent.parent
+LIMITS = GuardLimits(40.0, 500.0, 1.0)
 TIMEOUT = 120  # s; for a loaded machine, not an expectation
-
-
-async def start(arguments: Sequence[str]) -> asyncio.subprocess.Process:
-    """Start a simulation as users do."""
-    return await asyncio.create_subprocess_exec(
-        *(sys.executable, "-P", "-m", "sim", *arguments),
-        stdin=asyncio.subprocess.PIPE,
-        stdout=asyncio.subprocess.PIPE,
-        stderr=asyncio.subprocess.PIPE,
-        cwd=ROOT,
-    )
-
-
-async def wait(process: asyncio.subprocess.Process) -> tuple[int, str, str]:
-    """Exit status and the rest of both outputs."""
-    out, err = await asyncio.wait_for(process.communicate(), TIMEOUT)
-    assert process.returncode is not None
-    return process.returncode, out.decode(), err.decode()
 
 
 @pytest.mark.parametrize("is_interrupted", shortly([True, False], [True]))
@@ -80,9 +62,12 @@ async def test_sim_serves_until_interrupted_or_eof(is_interrupted: bool) -> None
     with tempfile.TemporaryDirectory() as folder:
         control, link = Path(folder) / "control", Path(folder) / "amp"
         options = ["--serial", "--link", str(link), "--control", str(control), "--until-eof"]
-        process = await start([str(example_rig_path()), *options])
+        process = await asyncio.create_subprocess_exec(
+            *(sys.executable, "-P", "-m", "sim", str(example_rig_path()), *options),
+            **dict.fromkeys(("stdin", "stdout", "stderr"), asyncio.subprocess.PIPE),
+            cwd=example_rig_path().parent.parent,
+        )
         try:
-            assert process.stdout is not None
             line = (await asyncio.wait_for(process.stdout.readline(), TIMEOUT)).decode()
             assert line == f"main: serial://{link}?baud=921600\n"
             assert link.readlink().is_char_device()
@@ -95,25 +80,21 @@ async def test_sim_serves_until_interrupted_or_eof(is_interrupted: bool) -> None
         finally:
             if is_interrupted:
                 process.send_signal(signal.SIGINT)
-            elif process.stdin is not None:
+            else:
                 process.stdin.close()
-            ending = await wait(process)
-        assert ending == (0, "", "")
+            out, err = await asyncio.wait_for(process.communicate(), TIMEOUT)
+        assert (process.returncode, out, err) == (0, b"", b"")
         assert not control.exists()
         assert not link.is_symlink()
 
 
-def shown(context: SimulationContext, plate: SimulationView) -> str:
-    """The view as text on a usual terminal."""
+def shown(context: SimulationContext, plate: SimulationView) -> tuple[str, list[str]]:
+    """The view as text on a usual terminal, and the plate's rows, the top one first."""
     console = Console(width=80, force_terminal=False)
     with console.capture() as capture:
         console.print(draw(context, plate))
-    return capture.get()
-
-
-def rows_of(text: str) -> list[str]:
-    """The plate's rows, the top one first."""
-    return [line[1:-1] for line in text.splitlines() if line.startswith("|")]
+    text = capture.get()
+    return text, [line[1:-1] for line in text.splitlines() if line.startswith("|")]
 
 
 def test_view_shows_eras_fingers_and_peaks_in_place(coarse_rig: Rig) -> None:
@@ -122,12 +103,11 @@ def test_view_shows_eras_fingers_and_peaks_in_place(coarse_rig: Rig) -> None:
     context = SimulationContext(bench, urls={"main": "serial:///dev/pts/7?baud=921600"})
     plate = SimulationView(bench)
     bench.probes.append(plate)
-    untouched = shown(context, plate).splitlines()
+    untouched = shown(context, plate)[0].splitlines()
     assert len(untouched) < 24
     assert max(map(len, untouched)) <= 80
     bench.place_fingers({"1": (0.25, 0.05)}, now=0.0)
-    still = shown(context, plate)
-    rows = rows_of(still)
+    _, rows = shown(context, plate)
     assert [row[0] + row[-1] for row in (rows[0], rows[-1])] == ["EE", "EE"]
     # 0.25 of 0.3048 m from the left, 0.05 of 0.2286 m from below.
     assert rows[-1 - int(0.05 / 0.2286 * len(rows))].index("O") == int(0.25 / 0.3048 * 28)
@@ -135,12 +115,11 @@ def test_view_shows_eras_fingers_and_peaks_in_place(coarse_rig: Rig) -> None:
     play(bench, AmplifierTone(0, 40.0, 0.5), now=0.1, watchdog=2.0)
     bench.advance(1.0)
     bench.advance(1.3)
-    moving = shown(context, plate)
+    moving, rows = shown(context, plate)
     assert "OPERATION_ENABLED" in moving
     assert " 50%    0%    0%    0%" in moving
     assert "1.3 s" in moving
-    shades = " ·-+*#@"
-    depth = np.array([[max(shades.find(c), 0) for c in row] for row in rows_of(moving)])
+    depth = np.array([[max(" ·-+*#@".find(shade), 0) for shade in row] for row in rows])
     # SW, where the drive is, is below on the left.
     assert depth[-3:, :8].mean() > depth[:3, -8:].mean()
 
@@ -248,9 +227,6 @@ async def test_simulation_writes_its_recording_on_a_signal(
 @pytest.mark.parametrize("after", [0.1, 0.4])
 async def test_simulation_exits_on_a_signal_while_it_starts(tmp_path: Path, after: float) -> None:
     """It exits without a traceback."""
-    import asyncio
-    import sys
-
     for command in (["-m", "sim"], ["-c", "from controller.cli.main import main; main()", "sim"]):
         process = await asyncio.create_subprocess_exec(
             *(sys.executable, "-P", *command, str(write_rig(tmp_path / "rig.yaml")), "--serial"),
@@ -277,9 +253,9 @@ def mode(path: Path) -> int | None:
     return stat.S_IMODE(path.stat().st_mode) if path.exists() else None
 
 
-async def ask(bench: Bench, now: float, **request: Any) -> dict[str, Any]:
+async def ask(context: SimulationContext, now: float, **request: Any) -> dict[str, Any]:
     """One line of control."""
-    return await carry_out(SimulationContext(bench), json.dumps(request).encode(), now=now)
+    return await carry_out(context, json.dumps(request).encode(), now=now)
 
 
 async def test_control_keeps_loads_of_fingers(coarse_rig: Rig) -> None:
@@ -295,7 +271,7 @@ async def test_control_keeps_loads_of_fingers(coarse_rig: Rig) -> None:
         {"op": "touch", "finger": "a", "at_m": [0.1, 0.08]},
         {"op": "fingers", "fingers": {"c": [0.1, 0.08]}},
     ):
-        assert (await ask(bench, 1.0, **request))["ok"]
+        assert (await ask(SimulationContext(bench), 1.0, **request))["ok"]
         loads.append(dict(bench.loads))
     assert loads == [
         {"a": 2.0},
@@ -335,7 +311,7 @@ async def test_control_keeps_loads_of_fingers(coarse_rig: Rig) -> None:
 async def test_control_refuses_an_invalid_line(coarse_rig: Rig, line: bytes) -> None:
     """The response is a short error, and nothing changes."""
     bench = Bench(coarse_rig, now=1.0)
-    await ask(bench, 1.0, op="fingers", fingers={"a": [0.1, 0.1]})
+    await ask(SimulationContext(bench), 1.0, op="fingers", fingers={"a": [0.1, 0.1]})
     reply = await carry_out(SimulationContext(bench), line, now=1.0)
     assert reply.keys() == {"error"}
     assert len(reply["error"]) < 300
@@ -343,47 +319,32 @@ async def test_control_refuses_an_invalid_line(coarse_rig: Rig, line: bytes) -> 
 
 
 async def test_control_socket_is_private_and_removed(coarse_rig: Rig, socket_path: Path) -> None:
-    """Mode 0600; several lines per connection; no file is left."""
-    bench = Bench(coarse_rig, now=0.0)
-    async with control_socket(SimulationContext(bench), socket_path):
+    """In place of a stale one of a killed simulation: mode 0600; several lines per connection.
+
+    An endless line ends its connection with an error, others continue; no file is left.
+    """
+    context = SimulationContext(Bench(coarse_rig, now=0.0))
+    with socket.socket(socket.AF_UNIX) as dead:
+        dead.bind(str(socket_path))
+    async with control_socket(context, socket_path):
         assert mode(socket_path) == 0o600
         reader, writer = await asyncio.open_unix_connection(socket_path)
         writer.write(b'{"op": "state"}\nnonsense\n{"op": "state"}\n')
         replies = [json.loads(await reader.readline()) for _ in range(3)]
         assert ["error" in reply for reply in replies] == [False, True, False]
         with pytest.raises(LinkError, match=str(socket_path)):
-            async with control_socket(SimulationContext(bench), socket_path):
+            async with control_socket(context, socket_path):
                 pass
-        writer.close()
-        await writer.wait_closed()
+        endless, deaf = await asyncio.open_unix_connection(socket_path)
+        deaf.write(b" " * (2 * LINE_MAX))
+        assert str(LINE_MAX) in json.loads(await endless.readline())["error"]
+        writer.write(b'{"op": "state"}\n')
+        assert "amplifiers" in json.loads(await reader.readline())
+        for each in (writer, deaf):
+            each.close()
+            with contextlib.suppress(ConnectionError):
+                await each.wait_closed()
     assert mode(socket_path) is None
-
-
-async def test_control_closes_on_an_endless_line(coarse_rig: Rig, socket_path: Path) -> None:
-    """The client gets an error; other connections continue."""
-    bench = Bench(coarse_rig, now=0.0)
-    async with control_socket(SimulationContext(bench), socket_path):
-        reader, writer = await asyncio.open_unix_connection(socket_path)
-        writer.write(b" " * (2 * LINE_MAX))
-        assert str(LINE_MAX) in json.loads(await reader.readline())["error"]
-        writer.close()
-        with contextlib.suppress(ConnectionError):
-            await writer.wait_closed()
-        again, other = await asyncio.open_unix_connection(socket_path)
-        other.write(b'{"op": "state"}\n')
-        assert "amplifiers" in json.loads(await again.readline())
-        other.close()
-        await other.wait_closed()
-
-
-async def test_control_replaces_a_stale_socket(coarse_rig: Rig, socket_path: Path) -> None:
-    """A killed simulation leaves one behind."""
-    with socket.socket(socket.AF_UNIX) as dead:
-        dead.bind(str(socket_path))
-    async with control_socket(SimulationContext(Bench(coarse_rig, now=0.0)), socket_path):
-        _, writer = await asyncio.open_unix_connection(socket_path)
-        writer.close()
-        await writer.wait_closed()
 
 
 async def test_control_refuses_an_unusable_path(coarse_rig: Rig, socket_path: Path) -> None:
@@ -420,17 +381,11 @@ async def felt_after(rig: Rig, imperfections: Imperfections, *changes: dict[str,
     """Amplitude under a finger [m/s²] of a vibration on the plate after some changes of it."""
     bench = Bench(rig, now=0.0, imperfections=imperfections)
     context = SimulationContext(bench)
-
-    async def asked(now: float, **request: Any) -> dict[str, Any]:
-        reply = await carry_out(context, json.dumps(request).encode(), now=now)
-        assert "error" not in reply, reply
-        return reply
-
-    await asked(0.1, op="fingers", fingers={"1": [0.1, 0.08]})
+    assert (await ask(context, 0.1, op="fingers", fingers={"1": [0.1, 0.08]}))["ok"]
     for change in changes:
-        await asked(0.1, op="plate", **change)
+        assert (await ask(context, 0.1, op="plate", **change))["ok"]
     play(bench, AmplifierTone(0, 110.0, 0.5), now=0.2, token=9, watchdog=2.0)
-    reply = await asked(2.0, op="felt", since_s=1.5, until_s=2.0)
+    reply = await ask(context, 2.0, op="felt", since_s=1.5, until_s=2.0)
     return float(reply["fingers"]["1"]["amplitude_m_s2"][0][0])
 
 
@@ -450,7 +405,7 @@ async def test_plate_operation_refuses_what_is_no_plate(
 ) -> None:
     """An error, and the plate stays."""
     bench = Bench(coarse_rig, now=5.0)
-    assert "error" in await ask(bench, 5.1, op="plate", **request_)
+    assert "error" in await ask(SimulationContext(bench), 5.1, op="plate", **request_)
     assert bench.imperfections == Imperfections()
 
 
@@ -458,32 +413,26 @@ def _witness(url: str, *, level: float) -> Witness:
     return Witness(witness_config({"main": url}, level=level))
 
 
-async def _drive(url: str) -> None:
-    lines = Lines()
-    try:
-        amplifier = await lines.amplifier(url, GuardLimits(40.0, 500.0, 1.0), name="main")
-        await amplifier.open()
-        assert (await amplifier.arm(random_session()))["state"] == STATES["OPERATION_ENABLED"]
-        tone = AmplifierTone(0, 110.0, 0.4, 90.0)
-        await amplifier.stage(1, [AmplifierLayer(0, (tone,), ramp=0.01)], now=True)
-        await amplifier.ping()
-        assert (await amplifier.stop()).is_confirmed
-        assert (await amplifier.clear())["state"] == STATES["SWITCH_ON_DISABLED"]
-    finally:
-        await lines.close()
-
-
 @pytest.mark.parametrize("wire", WIRES)
 @in_virtual_time
 async def test_relay_shows_a_session_to_the_witness(wire: str, coarse_rig: Rig) -> None:
     """A session passes at a limit of 0.5, and breaks a limit of 0.3."""
+    layer = AmplifierLayer(0, (AmplifierTone(0, 110.0, 0.4, 90.0),), ramp=0.01)
     for level, broken in ((0.5, set()), (0.3, {"limits"})):
         async with far_side(WIRES[wire], coarse_rig) as far:
-            witness = _witness(far.url, level=level)
-            endpoint = parse_endpoint(far.url)
+            witness, endpoint = _witness(far.url, level=level), parse_endpoint(far.url)
             async with relays([endpoint], [endpoint.location], witness) as (url,):
                 assert url != far.url
-                await _drive(url)
+                lines = Lines()
+                amplifier = await lines.amplifier(url, LIMITS, name="main")
+                await amplifier.open()
+                armed = await amplifier.arm(random_session())
+                assert armed["state"] == STATES["OPERATION_ENABLED"]
+                await amplifier.stage(1, [layer], now=True)
+                await amplifier.ping()
+                assert (await amplifier.stop()).is_confirmed
+                assert (await amplifier.clear())["state"] == STATES["SWITCH_ON_DISABLED"]
+                await lines.close()
             found = witness.finish()
             assert {one.invariant for one in found} == broken, [str(one) for one in found]
             assert witness.frames > 10
@@ -534,7 +483,6 @@ SESSION = """
 0.012 wire1 < 000583040107020401010201010102FA02FA0308070260010101030804010101
 0.012 wire1 < 0101010101010101010101010101010101010101055A35DF5500
 """
-DAMAGED = "0.020 wire1 > 00 05 0C 04 01 08 02 07 01 01 05 20 58 84 54 00\n"
 
 
 def _replay(tmp_path: Path, text: str, *options: str) -> tuple[int, str]:
@@ -551,7 +499,8 @@ def test_witness_replay_reports_a_damaged_frame_only(tmp_path: Path) -> None:
     """Five good frames break no rule; a damaged one is named, with the frames before it."""
     status, out = _replay(tmp_path, SESSION)
     assert (status, json.loads(out)) == (0, {"frames": 5, "violations": []})
-    status, out = _replay(tmp_path, SESSION + DAMAGED)
+    damaged = "0.020 wire1 > 00 05 0C 04 01 08 02 07 01 01 05 20 58 84 54 00\n"
+    status, out = _replay(tmp_path, SESSION + damaged)
     (found,) = json.loads(out)["violations"]
     assert status == 1
     assert (found["invariant"], found["wire"], found["time_s"]) == ("garbage", "wire1", 0.02)
@@ -579,7 +528,7 @@ async def test_witness_relays_a_wire_until_interrupted(
         prlimit(process.pid, RLIMIT_FSIZE, (room, RLIM_INFINITY))
         url = line.decode().split()[1]
         lines = Lines()
-        amplifier = await lines.amplifier(url, GuardLimits(40.0, 500.0, 1.0), name="main")
+        amplifier = await lines.amplifier(url, LIMITS, name="main")
         await amplifier.open()
         await amplifier.read_status()
         await lines.close()

@@ -10,7 +10,7 @@ import gc
 import json
 import math
 import threading
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
 from contextlib import asynccontextmanager, nullcontext
 from dataclasses import replace
 from pathlib import Path
@@ -20,7 +20,6 @@ import pytest
 
 from drivers.errors import CommandError, CommandRefused, DriverError, LinkDegraded, LinkError
 from drivers.host.amplifier import Amplifier
-from drivers.host.amplifier import Amplifier as Host
 from drivers.host.group import Group
 from drivers.host.line import Line
 from drivers.opening import Lines
@@ -54,7 +53,6 @@ from real_wires import (
     rig_on_wire,
 )
 from registry import threads
-from registry import threads as clock
 from registry.threads import no_long_collections
 from sim.bench.amplifier_device import AmplifierDevice
 from sim.far_ends.wire_assignment import SimulatedWire, assign_wires, choose_lines, links_of
@@ -64,7 +62,6 @@ from sim.simulation import STEP, SteppedLoop
 from sim.transport.simulated_line import SimulatedLine as MemoryLine
 from virtual_lines import VirtualLoop, in_virtual_time
 
-DEFAULTS = SimulatedWire("serial")
 URLS = {
     "a": "serial:///dev/ttyUSB0?baud=115200&address=3",
     "b": "serial:///dev/ttyUSB0?address=4",
@@ -75,10 +72,22 @@ URLS = {
 }
 
 
+def assigned(
+    urls: Mapping[str, str] = URLS,
+    *options: str,
+    common: SimulatedWire | None = None,
+) -> Mapping[str, SimulatedWire]:
+    """The wires of amplifiers by their URLs and by options."""
+    return assign_wires(urls, common=common, options=options, defaults=SimulatedWire("serial"))
+
+
 def test_assign_wires_follows_the_urls() -> None:
-    """Kind, port and address are those of the URL; equal lines are shared."""
-    assigned = assign_wires(URLS, common=None, options=[], defaults=DEFAULTS)
-    assert [(wire.kind, wire.port, wire.address) for wire in assigned.values()] == [
+    """Kind, port and address are those of the URL; equal lines are shared.
+
+    An own option goes before a common one, and that before the URL; in the order of the rig.
+    """
+    wires = assigned()
+    assert [(wire.kind, wire.port, wire.address) for wire in wires.values()] == [
         ("serial", 0, 3),
         ("serial", 0, 4),
         ("modbus-tcp", 5020, 9),
@@ -86,37 +95,26 @@ def test_assign_wires_follows_the_urls() -> None:
         ("socketcand", 29536, 5),
         ("slcan", 0, 7),
     ]
-    assert assigned["a"] == assigned["b"]
-    assert assigned["a"].shared
+    assert wires["a"] == wires["b"]
+    assert wires["a"].shared
+    modbus = SimulatedWire("modbus-tcp", port=1502)
+    chosen = assigned(URLS, "c=slcan", "a=socketcand:7", common=modbus)
+    assert list(chosen) == list(URLS)
+    assert [chosen[each] for each in "abc"] == [
+        *(SimulatedWire("socketcand", port=7), modbus, SimulatedWire("slcan"))
+    ]
 
 
 def test_terminals_are_placed_where_urls_outside_dev_have_them() -> None:
     """One a line; not of a device, of a network, or where an option chooses the wire."""
-    urls = {
-        **URLS,
-        "g": "serial:///tmp/g",
-        "h": "serial:///tmp/g?address=2",
-        "i": "serial:///tmp/i",
-    }
-    wires = assign_wires(urls, common=None, options=["i=serial"], defaults=DEFAULTS)
+    more = {"g": "serial:///tmp/g", "h": "serial:///tmp/g?address=2", "i": "serial:///tmp/i"}
+    wires = assigned(URLS | more, "i=serial")
     assert links_of(wires) in ({"g": Path("/tmp/g")}, {"h": Path("/tmp/g")})
-
-
-def test_assign_wires_prefers_own_option_to_common_to_url() -> None:
-    """The result is in the order of the rig."""
-    modbus = SimulatedWire("modbus-tcp", port=1502)
-    assigned = assign_wires(
-        URLS, common=modbus, options=["c=slcan", "a=socketcand:7"], defaults=DEFAULTS
-    )
-    assert list(assigned) == list(URLS)
-    assert assigned["a"] == SimulatedWire("socketcand", port=7)
-    assert assigned["b"] == modbus
-    assert assigned["c"] == SimulatedWire("slcan")
 
 
 def test_choose_lines_prefers_a_name_to_all_and_keeps_a_line_whole() -> None:
     """Amplifiers of one line have one kind, in whatever order the options come."""
-    wires = assign_wires(URLS, common=None, options=[], defaults=DEFAULTS)
+    wires = assigned()
     chosen = choose_lines(wires, ["b=ftdi", "native"])
     assert [wire.line_kind for wire in chosen.values()] == ["ftdi", "ftdi", *["native"] * 4]
     assert chosen["a"] == chosen["b"]
@@ -131,15 +129,13 @@ READ_STATUS = encode_frame(Frame(MESSAGES["GetStatus"].number, ADDRESS, 1, b"", 
 async def delays_of_requests(port: str, rig: Rig) -> list[float]:
     """How long each of 200 requests is on its way to the first amplifier of a rig [s], sorted."""
     urls = {name: f"serial://{port}{n or ''}" for n, name in enumerate(rig.amplifiers)}
-    wires = assign_wires(urls, common=None, options=[], defaults=DEFAULTS)
-    arrived: list[float] = []
-    async with far_side(wires, rig) as far:
+    arrived, sent = list[float](), list[float]()
+    async with far_side(assigned(urls), rig) as far:
         assert far.machine is not None
         far.machine.passing = (0.0, 0.0)
         after_each(far.device, lambda name, values, reply, now: arrived.append(now))
         place = far.url.removeprefix("serial://").partition("?")[0]
         open_port = await far.machine.open_port(place, lambda data: None, lambda why: None)
-        sent = []
         for _ in range(200):
             await asyncio.sleep(0.0207)
             sent.append(threads.now())
@@ -330,7 +326,7 @@ async def test_unplugged_line_is_lost_and_opens_again_once_plugged_in(coarse_rig
 
 async def opened_group(line: Line) -> Group:
     """The group of the only amplifier of a line, open."""
-    group = Group({"main": Host(line, 1, LIMITS, name="main")})
+    group = Group({"main": Amplifier(line, 1, LIMITS, name="main")})
     await group.open()
     return group
 
@@ -421,21 +417,14 @@ async def test_invalid_url_is_refused(url: str) -> None:
 FRAME = bytes(range(40))
 
 
-def write(tmp_path: Path, text: str) -> Path:
-    """A fault file."""
-    path = tmp_path / "faults.yaml"
-    path.write_text(text, encoding="utf-8")
-    return path
-
-
 def test_load_faults_reads_times_units_and_amplifiers(tmp_path: Path) -> None:
     """Times are in seconds or with a unit; a named amplifier gets its own faults only."""
-    path = write(
-        tmp_path,
+    (path := tmp_path / "faults.yaml").write_text(
         "seed: 7\n"
         "faults:\n"
         "  - {fault: drop, at: 2, lasts: 1500 ms, share: 20 %, toward: host}\n"
         "  - {fault: unplug, at: 5, amplifier: west}\n",
+        encoding="utf-8",
     )
     file = load_faults(path, amplifiers=["east", "west"])
     east = file.of("east", begin=100.0)
@@ -457,7 +446,12 @@ def test_load_faults_reads_times_units_and_amplifiers(tmp_path: Path) -> None:
         ),
         ("incomplete_set", lambda arrived: len(arrived[0][1]) < 40),
         ("delay", lambda arrived: 0 < arrived[0][0] <= 0.1 and arrived[0][1] == FRAME),
-        ("corrupt", lambda arrived: 1 <= flipped_bits(arrived[0][1]) <= 3),
+        (
+            "corrupt",
+            lambda arrived: (
+                1 <= (int.from_bytes(arrived[0][1]) ^ int.from_bytes(FRAME)).bit_count() <= 3
+            ),
+        ),
     ],
 )
 def test_fault_changes_frames_while_active(kind: str, is_so: "object") -> None:
@@ -468,20 +462,15 @@ def test_fault_changes_frames_while_active(kind: str, is_so: "object") -> None:
         assert faults.pass_on(FRAME, toward="amplifier", time=time) == [(0.0, FRAME)]
 
 
-def flipped_bits(data: bytes) -> int:
-    """How many bits differ from the frame."""
-    return sum((a ^ b).bit_count() for a, b in zip(data, FRAME, strict=True))
-
-
 def test_fault_hits_a_share_of_one_direction() -> None:
     """A fifth of the frames to the host; the same seed hits the same ones."""
-    runs = []
-    for _ in range(2):
-        faults = Faults([FaultWindow(fault="drop", share=0.2, toward="host")], seed=5)
-        runs.append([bool(faults.pass_on(FRAME, toward="host", time=1.0)) for _ in range(2000)])
-    assert runs[0] == runs[1]
-    assert 0.17 < runs[0].count(False) / 2000 < 0.23
-    assert faults.pass_on(FRAME, toward="amplifier", time=1.0)
+    one, other = (
+        Faults([FaultWindow(fault="drop", share=0.2, toward="host")], seed=5) for _ in range(2)
+    )
+    run = [bool(one.pass_on(FRAME, toward="host", time=1.0)) for _ in range(2000)]
+    assert run == [bool(other.pass_on(FRAME, toward="host", time=1.0)) for _ in range(2000)]
+    assert 0.17 < run.count(False) / 2000 < 0.23
+    assert one.pass_on(FRAME, toward="amplifier", time=1.0)
 
 
 @pytest.mark.parametrize("is_closed", [False, True])
@@ -491,26 +480,26 @@ def test_line_delivers_frames_at_its_speed_until_closed(is_closed: bool) -> None
     They come in pieces of at most 10 ms.
     """
 
-    async def arrivals() -> list[float]:
+    arrived: list[float] = []
+
+    async def pass_frames() -> None:
         loop = asyncio.get_running_loop()
         assert isinstance(loop, SteppedLoop)
-        arrived: list[float] = []
         line = MemoryLine(
             lambda data, now: arrived.append(loop.time()),
             toward="host",
             faults=Faults(),
             byte_time=1e-3,
         )
-        line.send(FRAME)
-        line.send(FRAME)
+        for _ in range(2):
+            line.send(FRAME)
         await loop.step(0.06)
         if is_closed:
             line.close()
         await loop.step(0.1)
-        return arrived
 
     with asyncio.Runner(loop_factory=SteppedLoop) as runner:
-        arrived = runner.run(arrivals())
+        runner.run(pass_frames())
     pieces = [0.01 * number for number in range(1, 7 if is_closed else 9)]
     assert arrived == pytest.approx(pieces, abs=STEP)
 
@@ -559,11 +548,6 @@ async def linked(wire: str, rig: Rig, *, watchdog: float = WATCHDOG) -> AsyncIte
         yield hosted
 
 
-def host_of(hosted: HostedRig) -> Amplifier:
-    """The host of the only amplifier."""
-    return hosted.group.amplifiers["main"]
-
-
 def fault(hosted: HostedRig, kind: FaultKind, **options: object) -> None:
     """Begin a fault."""
     hosted.devices["main"].inject_fault(FaultWindow(fault=kind, **options))  # type: ignore[arg-type]
@@ -590,8 +574,9 @@ async def set_after_a_heartbeat(hosted: HostedRig) -> None:
 
 async def lost(hosted: HostedRig) -> None:
     """Wait for the loss of the line."""
+    line = hosted.group.amplifiers["main"].line
     async with asyncio.timeout(60):
-        while host_of(hosted).line.loss is None:  # noqa: ASYNC110  it has no event
+        while line.loss is None:  # noqa: ASYNC110  it has no event
             await asyncio.sleep(0.001)
 
 
@@ -630,17 +615,17 @@ async def test_loss_is_detected_in_time(
     async with linked(wire, coarse_rig, watchdog=2.0) as hosted:
         bound = 0.190 if wire in SLOWEST else THREE_HEARTBEATS  # 3 x 30 to 63 ms, by their bytes
         if at_work is set_after_a_heartbeat:
-            bound = loss_detection_time([host_of(hosted).exchange_time("Set")])
+            bound = loss_detection_time([hosted.group.amplifiers["main"].exchange_time("Set")])
         elif kind == "unplug":
             bound = 0.060
         for _ in range(3):
             await again(hosted)
             fault(hosted, kind)
-            begun = clock.now()
+            begun = threads.now()
             noticed = pytest.raises(LinkDegraded) if at_work is not lost else nullcontext()
             with noticed:
                 await at_work(hosted)
-            assert clock.now() - begun <= bound
+            assert threads.now() - begun <= bound
 
 
 @at_every_speed
@@ -652,7 +637,7 @@ async def test_slow_wire_is_not_lost(wire: str, coarse_rig: Rig) -> None:
             await play(hosted, *(0.2 + 0.01 * (number % 2),) * 4)
             for _ in range(3):
                 await hosted.group.beat()
-        assert host_of(hosted).statistics.retries == 0
+        assert hosted.group.amplifiers["main"].statistics.retries == 0
 
 
 def in_use() -> tuple[int, int, int]:

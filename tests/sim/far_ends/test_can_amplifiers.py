@@ -11,7 +11,7 @@ import socket
 import struct
 import tty
 from collections.abc import AsyncIterator, Callable
-from contextlib import asynccontextmanager, closing
+from contextlib import asynccontextmanager
 from functools import partial
 
 import can
@@ -19,54 +19,30 @@ import pytest
 
 from drivers.errors import LinkError
 from drivers.protocol.definition import REFUSALS
-from drivers.wires.can_frames import CanFrame, pack_frames, unpack_frames
+from drivers.wires.can_frames import CanFrame, pack_frames
 from drivers.wires.serial_frames import Frame, FrameReader, encode_frame
 from model.rig.rig import Rig
-from real_wires import MASTERS, drive, make_bench
-from registry import threads
+from real_wires import MASTERS, drive, far_side, make_bench, until
 from sim.amplifier.simulated_amplifier import SimulatedAmplifier
 from sim.far_ends.can_amplifiers import CanAmplifiers, CanBus, SlcanAdapter, SocketcandClient
 from sim.far_ends.modbus_amplifiers import ModbusAmplifiers
 from sim.far_ends.serial_amplifiers import SerialAmplifiers
+from sim.far_ends.wire_assignment import SimulatedWire
 from sim.faults import Faults
-from sim.transport.far_end import FarEnd, TcpEnd, TerminalEnd, make_terminal
-
-
-@asynccontextmanager
-async def served(line: str) -> AsyncIterator[str]:
-    """An amplifier of four channels as unit 1 on a pseudo-terminal or a TCP port; its URL."""
-    amplifiers = {1: SimulatedAmplifier("a", channels=4)}
-
-    async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        end = ModbusAmplifiers(amplifiers, writer.write, is_rtu=False)
-        while data := await reader.read(4096):
-            end.receive(data, threads.now())
-        writer.close()
-
-    if line == "tcp":
-        async with await asyncio.start_server(serve, "127.0.0.1", 0) as server:
-            yield f"modbus+tcp://127.0.0.1:{server.sockets[0].getsockname()[1]}/1"
-        return
-    terminal = make_terminal(lambda data: end.receive(data, threads.now()))
-    end = ModbusAmplifiers(amplifiers, terminal.write, is_rtu=True)
-    with closing(terminal):
-        terminal.listen()
-        yield f"modbus+rtu://{terminal.port}#1"
+from sim.transport.far_end import TcpEnd, TerminalEnd
 
 
 @pytest.mark.parametrize("name", MASTERS)
-async def test_foreign_master_drives_it(name: str) -> None:
+async def test_foreign_master_drives_it(name: str, coarse_rig: Rig) -> None:
     """Reads by both functions, writes, a set, and an exception, over a real line."""
     line, make = MASTERS[name]
-    async with served(line) as url:
-        assert await asyncio.to_thread(drive, make, url) == "era-haptics"
+    async with far_side(SimulatedWire(f"modbus-{line}"), coarse_rig) as far:
+        assert await asyncio.to_thread(drive, make, far.url) == "era-haptics"
 
 
 TIMEOUT = 60.0  # s; of a busy machine
 IDENTITY = struct.pack(">HHHBBHH", 1, 0, 6, 1, 3, 1065, 66)  # read of 66 registers, TCP
 IDENTITY_SIZE = 9 + 2 * 66
-HELLO = encode_frame(Frame(kind=1, address=1, sequence=1, payload=b"", version=0))
-
 Client = tuple[asyncio.StreamReader, asyncio.StreamWriter]
 
 
@@ -75,12 +51,6 @@ def tcp_end(rig: Rig, port: int = 0) -> TcpEnd:
     device = make_bench(rig)[1]["main"]
     registers = ModbusAmplifiers({1: device}, lambda data: None, is_rtu=False)
     return TcpEnd(device, registers.of_connection, port=port)
-
-
-def terminal_end(rig: Rig, make_end: Callable[..., FarEnd]) -> TerminalEnd:
-    """The amplifier of a rig on a pseudo-terminal."""
-    device = make_bench(rig)[1]["main"]
-    return TerminalEnd(device, partial(make_end, {1: device}))
 
 
 @asynccontextmanager
@@ -99,24 +69,6 @@ async def ask(one: Client, request: bytes, size: int) -> bytes:
     """What a client receives for bytes that it sends."""
     one[1].write(request)
     return await asyncio.wait_for(one[0].readexactly(size), TIMEOUT)
-
-
-async def read(fd: int, size: int) -> bytes:
-    """So many bytes of a terminal."""
-    data = b""
-    async with asyncio.timeout(TIMEOUT):
-        while len(data) < size:
-            with contextlib.suppress(BlockingIOError):
-                data += os.read(fd, size - len(data))
-            await asyncio.sleep(0.001)
-    return data
-
-
-def opened(port: str) -> int:
-    """The host's side of a terminal, raw."""
-    fd = os.open(port, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
-    tty.setraw(fd)
-    return fd
 
 
 async def test_connections_share_the_registers_of_a_unit(coarse_rig: Rig) -> None:
@@ -168,11 +120,18 @@ async def test_port_in_use_is_refused(coarse_rig: Rig) -> None:
 
 async def test_frame_of_unknown_function_ends_with_silence(coarse_rig: Rig) -> None:
     """Over RTU its length is not known: exception 1 comes once the line was silent."""
-    async with terminal_end(coarse_rig, partial(ModbusAmplifiers, is_rtu=True)) as end:
-        fd = opened(end.port)
+    device, got = make_bench(coarse_rig)[1]["main"], b""
+    async with TerminalEnd(device, partial(ModbusAmplifiers, {1: device}, is_rtu=True)) as end:
+        fd = os.open(end.port, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
+        tty.setraw(fd)
         os.write(fd, _with_check(bytes([1, 0x41, 1, 2, 3])))
-        assert await read(fd, 5) == _with_check(bytes([1, 0xC1, 1]))
+        async with asyncio.timeout(TIMEOUT):
+            while len(got) < 5:
+                with contextlib.suppress(BlockingIOError):
+                    got += os.read(fd, 5)
+                await asyncio.sleep(0.001)
         os.close(fd)
+    assert got == _with_check(bytes([1, 0xC1, 1]))
 
 
 def _with_check(body: bytes) -> bytes:
@@ -185,25 +144,19 @@ def _with_check(body: bytes) -> bytes:
     return body + check.to_bytes(2, "little")
 
 
-NAK = 0x9F
+def on_a_line() -> Callable[..., list[Frame]]:
+    """An amplifier on a serial line: what comes back for the kind and the bytes of a request."""
+    replies, reader = list[Frame](), FrameReader()
+    end = SerialAmplifiers(
+        {1: SimulatedAmplifier("a", channels=2)}, lambda data: replies.extend(reader.feed(data))
+    )
 
+    def ask(kind: int, payload: str, version: int = 4) -> list[Frame]:
+        replies.clear()
+        end.receive(encode_frame(Frame(kind, 1, 9, bytes.fromhex(payload), version)), 0.0)
+        return replies
 
-class OnALine:
-    """An amplifier on a serial line; state by the word of its status."""
-
-    def __init__(self) -> None:
-        self.amplifier = SimulatedAmplifier("a", channels=2)
-        self.replies: list[Frame] = []
-        reader = FrameReader()
-        self.end = SerialAmplifiers(
-            {1: self.amplifier}, lambda data: self.replies.extend(reader.feed(data))
-        )
-
-    def ask(self, kind: int, payload: str, *, version: int = 4) -> Frame:
-        """The reply to a request with these bytes, in hexadecimal."""
-        self.replies.clear()
-        self.end.receive(encode_frame(Frame(kind, 1, 9, bytes.fromhex(payload), version)), 0.0)
-        return self.replies[-1]
+    return ask
 
 
 @pytest.mark.parametrize(
@@ -220,102 +173,58 @@ class OnALine:
 )
 def test_first_fault_wins_while_disarmed(kind: int, payload: str, version: int, code: str) -> None:
     """Version, type, words, state."""
-    reply = OnALine().ask(kind, payload, version=version)
-    assert (reply.kind, reply.payload[2]) == (NAK, REFUSALS[code])
+    (reply,) = on_a_line()(kind, payload, version)
+    assert (reply.kind, reply.payload[2]) == (0x9F, REFUSALS[code])
 
 
 def test_session_wins_over_what_a_request_asks_for() -> None:
     """While armed by session 7: a set of session 8 that is cut short, an Arm of another host."""
-    line = OnALine()
-    line.ask(3, "0700 FA00 0000")
-    assert line.ask(5, "0800 0100 0200 0100").payload[2] == REFUSALS["WRONG_SESSION"]
-    assert line.ask(5, "0700 0100 0200 0100").payload[2] == REFUSALS["BAD_LENGTH"]
-    assert line.ask(3, "0800 D007 0000").payload[2] == REFUSALS["WRONG_SESSION"]
+    ask = on_a_line()
+    ask(3, "0700 FA00 0000")
+    for kind, payload, code in (
+        (5, "0800 0100 0200 0100", "WRONG_SESSION"),
+        (5, "0700 0100 0200 0100", "BAD_LENGTH"),
+        (3, "0800 D007 0000", "WRONG_SESSION"),
+    ):
+        assert ask(kind, payload)[-1].payload[2] == REFUSALS[code]
 
 
 def test_echo_of_an_event_gets_no_reply() -> None:
     """Of an adapter that hears what it sends: neither Nak nor anything else."""
-    line = OnALine()
-    line.end.receive(encode_frame(Frame(30, 1, 9, bytes(8), 3)), 0.0)
-    assert line.replies == []
+    assert on_a_line()(30, "00" * 8, 3) == []
 
 
-START = (0x000, "0100")
-ARM = ((0x201, "010003033412fa00"), (0x201, "0101000000000000"))  # session 1234, 250 ms
 SET = (  # session 1234, token 7: layer 0 along 0 ms, channel 0 at 100 Hz and half level
-    (0x201, "0200050a34120700"),
-    (0x201, "0201020001000000"),
-    (0x201, "020200000000d007"),
-    (0x201, "0203881300000000"),
+    "201 0200050a34120700",
+    "201 0201020001000000",
+    "201 020200000000d007",
+    "201 0203881300000000",
 )
-COMMIT = ((0x200, "0000060334120700"), (0x200, "0001000000000000"))
-
-
-class Bus:
-    """Amplifiers of one channel from node 1 on, and the frames that they have sent."""
-
-    def __init__(self, *names: str) -> None:
-        self.far = [SimulatedAmplifier(name, channels=1) for name in names]
-        self.sent: list[tuple[int, str]] = []
-        self.end = CanAmplifiers(dict(enumerate(self.far, 1)), self._note)
-        self.end.start(0.0)
-
-    def _note(self, data: bytes) -> None:
-        self.sent.extend((frame.id, frame.data.hex()) for frame in unpack_frames(data))
-
-    def put(self, now: float, *frames: tuple[int, str]) -> list[tuple[int, str]]:
-        """Send frames at a time [s]; returns what comes back at once."""
-        self.sent.clear()
-        self.end.receive(pack_frames(CanFrame(i, bytes.fromhex(data)) for i, data in frames), now)
-        return [*self.sent]
-
-    def level(self, at: float, of: int = 0) -> float:
-        """What an amplifier plays."""
-        self.end.tick(at)
-        return self.far[of].playback.level(0, at)
-
-
-@pytest.fixture
-def bus() -> Bus:
-    """One amplifier, operational."""
-    bus = Bus("a")
-    bus.put(0.0, START)
-    return bus
+COMMIT = ("200 0000060334120700", "200 0001000000000000")
 
 
 @pytest.mark.parametrize("lost", range(4))
-def test_set_without_one_of_its_frames_is_not_played(bus: Bus, lost: int) -> None:
+def test_set_without_one_of_its_frames_is_not_played(lost: int) -> None:
     """No reply, nothing to commit; the repetition under a newer number is."""
-    bus.put(0.0, *ARM)
-    kept = [*SET[:lost], *SET[lost + 1 :]]
-    assert bus.put(0.1, *kept, *COMMIT) == []
-    assert bus.level(0.1) == 0.0
-    bus.put(0.11, *((can_id, f"03{data[2:]}") for can_id, data in SET), *COMMIT)
-    assert bus.level(0.11) == 0.5
+    far, sent = SimulatedAmplifier("a", channels=1), list[bytes]()
+    end = CanAmplifiers({1: far}, sent.append)
+
+    def put(now: float, *frames: str) -> tuple[list[bytes], float]:
+        """Send frames; returns what comes back at once, and what it plays then."""
+        sent.clear()
+        pairs = ((int(each[:3], 16), bytes.fromhex(each[4:])) for each in frames)
+        end.receive(pack_frames(CanFrame(*pair) for pair in pairs), now)
+        back = [*sent]
+        end.tick(now)
+        return back, far.playback.level(0, now)
+
+    end.start(0.0)
+    put(0.0, "000 0100", "201 010003033412fa00", "201 0101000000000000")  # starts it, and arms it
+    assert put(0.1, *SET[:lost], *SET[lost + 1 :], *COMMIT) == ([], 0.0)
+    assert put(0.11, *(f"201 03{each[6:]}" for each in SET), *COMMIT)[1] == 0.5
 
 
 FRAME = CanFrame(0x181, bytes.fromhex("0102030405060708"))
-
-
-class Member:
-    """A member of the bus, with the frames `heard`."""
-
-    def __init__(self, bus_of_adapters: CanBus) -> None:
-        self.heard: list[CanFrame] = []
-        self._bus = bus_of_adapters
-        self._listener = self.heard.append
-        bus_of_adapters.join(self._listener)
-
-    def send(self, frame: CanFrame) -> None:
-        """To all others."""
-        self._bus.send(frame, sender=self._listener)
-
-    async def hears(self, count: int) -> list[CanFrame]:
-        """Wait for so many frames."""
-        async with asyncio.timeout(TIMEOUT):
-            while len(self.heard) < count:  # noqa: ASYNC110
-                await asyncio.sleep(0.001)
-        return self.heard
 
 
 @pytest.fixture
@@ -365,12 +274,13 @@ async def talk(server: TcpEnd) -> AsyncIterator[Talk]:
 
 async def test_socketcand_session(bus_of_adapters: CanBus, talk: Talk) -> None:
     """Greeting, open, raw mode, frames each way, echo; elements in pieces and in a row."""
-    member = Member(bus_of_adapters)
+    heard: list[CanFrame] = []
+    bus_of_adapters.join(heard.append)
     await talk.open()
     await talk.ask("< send 123 2 1 F")
     await talk.ask("F >< send 7FF 0 >< echo >", "< echo >")
-    assert member.heard == [CanFrame(0x123, b"\x01\xff"), CanFrame(0x7FF, b"")]
-    member.send(FRAME)
+    assert heard == [CanFrame(0x123, b"\x01\xff"), CanFrame(0x7FF, b"")]
+    bus_of_adapters.send(FRAME, sender=heard.append)
     async with asyncio.timeout(TIMEOUT):
         text = (await talk.reader.readuntil(b">")).decode()
     assert text.startswith("< frame 181 ")
@@ -396,13 +306,14 @@ async def test_socketcand_ignores_malformed_frames(
     bus_of_adapters: CanBus, talk: Talk, nonsense: str
 ) -> None:
     """Whatever is wrong with an element, no frame comes of it, and the next is understood."""
-    member = Member(bus_of_adapters)
+    heard: list[CanFrame] = []
+    bus_of_adapters.join(heard.append)
     await talk.open()
     await talk.ask(nonsense + " >")
     async with asyncio.timeout(TIMEOUT):
         talk.writer.write(b"< send 123 1 5 >< echo >")
         assert (await talk.reader.readuntil(b"< echo >")).endswith(b"< echo >")
-    assert member.heard == [CanFrame(0x123, b"\x05")]
+    assert heard == [CanFrame(0x123, b"\x05")]
 
 
 async def test_socketcand_refuses_another_bus(talk: Talk) -> None:
@@ -422,7 +333,8 @@ async def adapter(bus_of_adapters: CanBus, coarse_rig: Rig) -> AsyncIterator[Ter
 
 async def test_slcan_serves_python_can(bus_of_adapters: CanBus, adapter: TerminalEnd) -> None:
     """Its own interface sets the bit rate, opens the channel, sends and hears."""
-    member = Member(bus_of_adapters)
+    heard: list[CanFrame] = []
+    bus_of_adapters.join(heard.append)
 
     def connect() -> can.BusABC:
         return can.Bus(
@@ -437,8 +349,9 @@ async def test_slcan_serves_python_can(bus_of_adapters: CanBus, adapter: Termina
     try:
         sent = can.Message(arbitration_id=FRAME.id, data=FRAME.data, is_extended_id=False)
         await asyncio.to_thread(client.send, sent)
-        assert await member.hears(1) == [FRAME]
-        member.send(FRAME)
+        await until(lambda: heard)
+        assert heard == [FRAME]
+        bus_of_adapters.send(FRAME, sender=heard.append)
         received = None
         async with asyncio.timeout(TIMEOUT):
             while received is None:
@@ -446,16 +359,6 @@ async def test_slcan_serves_python_can(bus_of_adapters: CanBus, adapter: Termina
         assert (received.arbitration_id, bytes(received.data)) == (FRAME.id, FRAME.data)
     finally:
         await asyncio.to_thread(client.shutdown)
-
-
-def answers(adapter_bus: CanBus, text: bytes) -> tuple[bytes, list[CanFrame]]:
-    """What an adapter writes to text, and what goes onto the bus."""
-    written: list[bytes] = []
-    adapter = SlcanAdapter(adapter_bus, written.append)
-    member = Member(adapter_bus)
-    adapter.receive(text, 0.0)
-    adapter.close()
-    return b"".join(written), member.heard
 
 
 @pytest.mark.parametrize(
@@ -475,4 +378,9 @@ def test_slcan_replies_like_lawicel(
     bus_of_adapters: CanBus, text: bytes, written: bytes, sent: list[CanFrame]
 ) -> None:
     """CR for what was done, BELL for what makes no sense, z and Z for frames that were sent."""
-    assert answers(bus_of_adapters, text) == (written, sent)
+    answered, heard = list[bytes](), list[CanFrame]()
+    bus_of_adapters.join(heard.append)
+    adapter = SlcanAdapter(bus_of_adapters, answered.append)
+    adapter.receive(text, 0.0)
+    adapter.close()
+    assert (b"".join(answered), heard) == (written, sent)

@@ -20,14 +20,13 @@ from model.answer.answer import Layer
 from model.answer.answer_report import Timing
 from model.answer.plan import query
 from model.answer.stimulus import Finger, Placement, Stimulus
-from model.arrays import ComplexArray, FloatArray
+from model.arrays import FloatArray
 from model.errors import InputError
 from model.fem import Mesh, PlateMatrices, assemble
 from model.finger import contrast_db, felt_part, fingertip_points, fingertip_weights
 from model.reduction.reduced_plate import ReducedPlate, modal_matrices, reduce_plate
 from model.rig.rig import Rig
 from model.structure.attachments import Era, Fingertip, FingertipLoad, footprints_of
-from model.structure.material import Material
 from model.structure.plate import Plate
 from model.table.table_file import build_table
 from model.transients.base_motion import Term, raised_cosine
@@ -36,7 +35,6 @@ from model.transients.time_response import from_rest
 from plates import BASES as MOVED_BASES
 from plates import (
     FINGERTIP,
-    Base,
     apart,
     exciter_rig,
     faded_base,
@@ -50,35 +48,18 @@ from set_table import only
 from sim.plant.excited_plate import play
 from sim.plant.plant import Plant
 
-PLATE = Plate(0.3048, 0.2286, 0.0015, Material("aluminium", 70e9, 2700.0, 0.33), loss_factor=0.01)
-CORNERS = [(0.0, 0.0), (0.3048, 0.0), (0.3048, 0.2286), (0.0, 0.2286)]
 STROKE = 1e-4
 
 
-def eras(damping: float = 3.46, bolt_mass: float = 0.02) -> list[Era]:
-    """Four alike, one in each corner."""
-    return [
-        Era(name, x, y, 17000.0, damping, bolt_mass, STROKE)
-        for name, (x, y) in zip("abcd", CORNERS, strict=True)
-    ]
-
-
-MESH = Mesh(16, 12, PLATE.length, PLATE.width)
-
-
-@pytest.fixture(scope="module")
-def reduced() -> ReducedPlate:
-    """The paper's plate on a coarse mesh."""
-    return reduce_plate(PLATE, MESH, np.array(CORNERS))
-
-
 @pytest.mark.parametrize("damping", [3.46, 3000.0])
-def test_plant_is_continuous_when_drives_change(reduced: ReducedPlate, damping: float) -> None:
+def test_plant_is_continuous_when_drives_change(
+    coarse_rig: Rig, reduced: ReducedPlate, damping: float
+) -> None:
     """Starting, replacing and ending a drive abruptly changes neither at that moment.
 
     With the larger damping some eigenvalues are real.
     """
-    plant = Plant(reduced, eras(damping))
+    plant = Plant(reduced, [replace(era, damping=damping) for era in coarse_rig.eras])
     assert (plant.loaded.plate.eigenvalues.imag == 0).any() == (damping > 1000)
     plant.set_input(0, [Term(0.0, 0.1, 700.0, STROKE * np.exp(0.7j), 3j * STROKE)])
     plant.skip(0.0345)
@@ -94,18 +75,10 @@ def test_plant_is_continuous_when_drives_change(reduced: ReducedPlate, damping: 
         np.testing.assert_allclose(new, old, rtol=1e-6, atol=1e-9 * np.abs(old).max())
 
 
-def test_plant_refuses_an_unsupported_plate(reduced: ReducedPlate) -> None:
+def test_plant_refuses_an_unsupported_plate(coarse_rig: Rig, reduced: ReducedPlate) -> None:
     """Two ERAs leave the axis through them free to rotate."""
     with pytest.raises(InputError, match="supported"):
-        Plant(reduced, eras()[:2])
-
-
-@pytest.fixture(scope="module")
-def rig() -> Rig:
-    """The paper's plate; no two ERAs damp alike, one hardly at all."""
-    paper = make_paper_rig(12, 9)
-    unlike = zip(paper.eras, (0.1, 3.5, 10.0, 20.0), (0.0, 0.005, 0.01, 0.02), strict=True)
-    return replace(paper, eras=tuple(replace(era, damping=c, bolt_mass=m) for era, c, m in unlike))
+        Plant(reduced, coarse_rig.eras[:2])
 
 
 RATE = 48_000.0
@@ -484,57 +457,25 @@ COMING_AND_GOING: list[tuple[float, Mapping[str, FingertipLoad]]] = [
 ]
 
 
-@pytest.fixture(scope="module")
-def whole_rig() -> Rig:
-    """The paper's plate on a mesh for a stepping solver; no two ERAs damp alike."""
-    coarse = make_paper_rig(8, 6)
-    unlike = zip(coarse.eras, (0.5, 3.5, 10.0, 20.0), (0.0, 0.005, 0.01, 0.02), strict=True)
-    return replace(coarse, eras=tuple(replace(era, damping=c, bolt_mass=m) for era, c, m in unlike))
-
-
-@pytest.fixture(scope="module")
-def whole(whole_rig: Rig) -> WholePlate:
-    """All its degrees of freedom."""
-    return whole_plate(
-        whole_rig.plate,
-        whole_rig.mesh,
-        whole_rig.eras,
-    )
-
-
-@pytest.fixture(scope="module")
-def whole_reduced(whole_rig: Rig) -> ReducedPlate:
-    """A few dozen coordinates of it, as the bench takes them."""
-    return reduce_plate(
-        whole_rig.plate,
-        whole_rig.mesh,
-        footprints_of(whole_rig.eras),
-    )
-
-
-def set_bases(plant: Plant, bases: Sequence[Base]) -> None:
-    """Let all bases move as they do."""
-    for number, base in enumerate(bases):
-        plant.set_input(number, base.terms)
-
-
 def felt(samples: FloatArray) -> FloatArray:
     """What lies below 1 kHz, all that a finger can feel and more, without delay."""
     return np.asarray(sosfiltfilt(butter(6, 1000.0, fs=FINE_RATE, output="sos"), samples, axis=0))
 
 
-def test_plant_with_changing_contacts_agrees_with_newmark(
-    whole_rig: Rig,
-    whole: WholePlate,
-    whole_reduced: ReducedPlate,
-) -> None:
+def test_plant_with_changing_contacts_agrees_with_newmark() -> None:
     """Ramps, an envelope and two fingers: displacement, velocity and what can be felt within 1 %.
 
-    Over the plate, and under the fingers, in every stretch between two changes.
+    Over the plate, and under the fingers, in every stretch between two changes; no two ERAs damp
+    alike.
     """
-    plant = Plant(whole_reduced, whole_rig.eras)
-    set_bases(plant, MOVED_BASES)
-    points = np.vstack([whole_rig.mesh.nodes, [FIRST, SECOND, MOVED]])
+    rig = make_paper_rig(8, 6)
+    losses = zip(rig.eras, (0.5, 3.5, 10.0, 20.0), (0.0, 0.005, 0.01, 0.02), strict=True)
+    eras = [replace(era, damping=c, bolt_mass=m) for era, c, m in losses]
+    whole = whole_plate(rig.plate, rig.mesh, eras)
+    plant = Plant(reduce_plate(rig.plate, rig.mesh, footprints_of(eras)), eras)
+    for number, base in enumerate(MOVED_BASES):
+        plant.set_input(number, base.terms)
+    points = np.vstack([rig.mesh.nodes, [FIRST, SECOND, MOVED]])
     pieces, states = [], []
     for until, contacts in [*COMING_AND_GOING, (0.12, None)]:
         shapes = plant.reduced.at(points)
@@ -557,35 +498,26 @@ def test_plant_with_changing_contacts_agrees_with_newmark(
         assert apart(state[1], v[row]) < 0.01
 
 
-def phasors(
-    plant: Plant, points: FloatArray, driven: int, frequency: float, since: float
-) -> ComplexArray:
-    """Accelerations per base amplitude [1/s²] at points, of one ERA that has been driven long."""
-    times, samples = plant.advance(
-        since + 0.2, sample_rate=10_000.0, shapes=plant.reduced.at(points)
-    )
-    return lock_in(times, samples, frequency) / BASE_STROKE
-
-
 def test_plant_viscous_equivalent_agrees_with_the_loss_factor() -> None:
     """Against the hysteretic direct solve: magnitudes over the plate, 0.1 % in the median.
 
     No causal law of damping can have the same loss at all frequencies; this is what is left.
     """
     fine = make_paper_rig(24, 18)
-    eras: Sequence[Era] = fine.eras
-    reduced = reduce_plate(fine.plate, fine.mesh, footprints_of(eras))
+    eras = fine.eras
     frequencies = np.arange(40.0, 501.0, 46.0)
     direct = direct_acceleration(
         assemble(fine.plate, fine.mesh), eras, frequencies, fine.mesh.nodes
     )
-    plant = Plant(reduced, eras)
-    off = []
+    plant, off = Plant(reduce_plate(fine.plate, fine.mesh, footprints_of(eras)), eras), []
     for row, frequency in enumerate(frequencies):
         begin = plant.time
         plant.set_input(0, [Term(begin, np.inf, 2 * np.pi * frequency, BASE_STROKE)])
         plant.skip(begin + 20.0)
-        found = phasors(plant, fine.mesh.nodes, 0, float(frequency), begin + 20.0)
+        times, samples = plant.advance(
+            begin + 20.2, sample_rate=10_000.0, shapes=plant.reduced.at(fine.mesh.nodes)
+        )
+        found = lock_in(times, samples, float(frequency)) / BASE_STROKE
         off.append(apart(np.abs(found), np.abs(direct[row, 0]) / eras[0].stroke))
     assert np.median(off) < 0.001
     assert max(off) < 0.002

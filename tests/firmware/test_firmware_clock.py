@@ -166,11 +166,6 @@ def test_voices_count_on_the_clock(rate: int, built: Path) -> None:
     np.testing.assert_allclose(samples, expected, atol=6e-5)
 
 
-def first_at(moment: int, shift: int, rate: int) -> int:
-    """The first sample at or behind a high word of the clock."""
-    return math.ceil((moment - shift) % 65536 * 20 * rate / 65536)
-
-
 @pytest.mark.parametrize("ahead", [1, 2, 300, 1638])
 def test_commit_starts_with_the_first_sample_of_its_moment(
     rate: int, built: Path, ahead: int
@@ -184,7 +179,8 @@ def test_commit_starts_with_the_first_sample_of_its_moment(
     firmware.receive(SERIAL, commit(1, at))
     firmware.receive(SERIAL, commit(1, at + 50))
     status = values_of(firmware, hand.GET_STATUS)
-    first = max(first_at(at, shift, rate), math.floor(0.01234 * rate))
+    # The first sample at or behind the high word of the clock.
+    first = max(math.ceil((at - shift) % 65536 * 20 * rate / 65536), math.floor(0.01234 * rate))
     assert (status["token"], status["tokens"][0]) == (1, 0 if ahead > 1 else status["tokens"][0])
     firmware.move(0.6)
     sounding = np.flatnonzero(firmware.samples()[:, 0])
@@ -221,17 +217,16 @@ def test_set_starts_though_a_layer_ends_at_its_moment(replaying: Path) -> None:
     np.testing.assert_allclose(samples, 0.5 * np.cos(2 * np.pi * 100 * k / 16_000), atol=6e-5)
 
 
-def on_lines(kind: int) -> dict[int, bytes]:
-    """A broadcast without words on each line."""
-    modbus = bytes([16]) + (256 * kind).to_bytes(2, "big") + bytes([0, 1, 2, 0, 5])
-    return {
-        SERIAL: hand.frame(kind, sequence=1, address=0),
-        MODBUS: framed(0, modbus, is_rtu=True),
-        CAN: f"t2008{0:02X}{0:02X}{kind:02X}{0:02X}00000000\r".encode(),
-    }
+_MODBUS = bytes([16]) + (256 * MARK).to_bytes(2, "big") + bytes([0, 1, 2, 0, 5])
+MARKS = {
+    SERIAL: hand.frame(MARK, sequence=1, address=0),
+    MODBUS: framed(0, _MODBUS, is_rtu=True),
+    CAN: f"t2008{0:02X}{0:02X}{MARK:02X}{0:02X}00000000\r".encode(),
+}
+"""The broadcast on each line."""
 
 
-@pytest.mark.parametrize("line", [SERIAL, MODBUS, CAN])
+@pytest.mark.parametrize("line", MARKS)
 def test_mark_keeps_the_clock_of_its_last_byte(replaying: Path, line: int) -> None:
     """The next Status has it, once; on RTU the silence behind the frame does not count."""
     firmware = MovedFirmware(replaying)
@@ -239,7 +234,7 @@ def test_mark_keeps_the_clock_of_its_last_byte(replaying: Path, line: int) -> No
     firmware.receive(CAN, OPERATIONAL)
     firmware.move(0.0123456)
     firmware.sent(line)
-    firmware.receive(line, on_lines(MARK)[line])
+    firmware.receive(line, MARKS[line])
     firmware.move(0.05)
     said = [each for each in firmware.sent(line).split(b"\r") if not each.startswith(b"t701")]
     assert not any(said)  # but heartbeats

@@ -77,7 +77,7 @@ from sim.far_ends.serial_amplifiers import SerialAmplifiers
 
 _ROOT = Path(__file__).parents[2]
 _run_virtual: Any = support("virtual_lines").run_virtual
-_Recorder: Any = support("courses").Recorder
+_Recorder: Any = support("ways").Recorder
 _FRAME_INTERVAL, _RESTING = 0.05, 2.0  # s
 _LEVEL = 15.0  # dB SL
 

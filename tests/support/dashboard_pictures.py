@@ -1,8 +1,7 @@
 """`python tests/support/dashboard_pictures.py FOLDER`: the dashboard as it looks, on every screen.
 
 A daemon over a simulated amplifier, armed, two people with a finger each on the plate: on a
-desktop, a tablet and a phone, in light and dark; with `_one` in its name only the field of one
-content. docs/pictures/dashboard.png is dashboard_desktop_light.png of these.
+desktop, a tablet and a phone. docs/pictures/dashboard.png is dashboard_desktop.png of these.
 """
 
 import asyncio
@@ -97,45 +96,28 @@ def two_people(folder: Path) -> Iterator[Path]:
 
 
 async def _take(folder: Path) -> None:
-    with tempfile.TemporaryDirectory() as scratch:
-        work = Path(scratch)
-        with (
-            two_people(work) as daemon,
-            gateway_process(work, daemon) as gateway,
-        ):
-            async with open_browser(work / "profile") as browser:
-                for screen in SCREENS:
-                    for is_dark in (False, True):
-                        async with browser.open_page() as page:
-                            await page.dark(is_dark)
-                            await _take_one(page, gateway, screen, folder, is_dark=is_dark)
-
-
-async def _take_one(
-    page: Page, gateway: GatewayProcess, screen: Screen, folder: Path, *, is_dark: bool
-) -> None:
-    await open_dashboard(page, gateway, screen)
-    await page.until("!document.querySelector('#arm').disabled")
-    await page.click("#arm")
-    await page.until(f"{STATE} === 'OPERATION_ENABLED'")
-    async with fingers_down(page, *TWO_PEOPLE):
-        await page.until("document.querySelectorAll('.contact').length === 2")
-        await page.until("document.querySelectorAll('#layers button').length === 3")
-        # Solved after the event.
-        await page.until("document.querySelector('#scale-high').textContent.includes('threshold')")
-        await asyncio.sleep(0.3)
-        name = f"dashboard_{screen.name}_{'dark' if is_dark else 'light'}"
-        await page.screenshot(folder / f"{name}.png")
-        if screen.is_phone:
-            await page.evaluate("window.scrollTo(0, document.body.scrollHeight)")
-            await asyncio.sleep(0.3)
-            await page.screenshot(folder / f"{name}_below.png")
-        await page.evaluate("window.scrollTo(0, 0)")
-        await page.click("#layers button:nth-child(2)")
-        await asyncio.sleep(0.3)
-        await page.screenshot(folder / f"{name}_one.png")
-    await page.click("#disarm")
-    await page.until(f"{STATE} === 'READY_TO_SWITCH_ON'")
+    with (
+        tempfile.TemporaryDirectory() as work,
+        two_people(Path(work)) as daemon,
+        gateway_process(Path(work), daemon) as gateway,
+    ):
+        async with open_browser(Path(work) / "profile") as browser:
+            for screen in SCREENS:
+                async with browser.open_page() as page:
+                    await open_dashboard(page, gateway, screen)
+                    await page.until("!document.querySelector('#arm').disabled")
+                    await page.click("#arm")
+                    await page.until(f"{STATE} === 'OPERATION_ENABLED'")
+                    async with fingers_down(page, *TWO_PEOPLE):
+                        await page.until("document.querySelectorAll('.contact').length === 2")
+                        await page.until("document.querySelectorAll('#layers button').length === 3")
+                        # Solved after the event.
+                        field = "document.querySelector('#scale-high').textContent"
+                        await page.until(f"{field}.includes('threshold')")
+                        await asyncio.sleep(0.3)
+                        await page.screenshot(folder / f"dashboard_{screen.name}.png")
+                    await page.click("#disarm")
+                    await page.until(f"{STATE} === 'READY_TO_SWITCH_ON'")
 
 
 if __name__ == "__main__":

@@ -339,7 +339,8 @@ def real_daemon(
         ) as process,
     ):
         try:
-            raise_priority(process.pid)
+            with contextlib.suppress(PermissionError):  # as the daemon's systemd unit does
+                os.setpriority(os.PRIO_PROCESS, process.pid, -10)
             wait_for(lambda: daemon_socket.is_socket() or process.poll() is not None)
             assert process.poll() is None, (folder / "daemon.log").read_text()
             yield daemon_socket
@@ -349,12 +350,6 @@ def real_daemon(
                 process.wait(PATIENCE)
             except subprocess.TimeoutExpired:
                 process.kill()
-
-
-def raise_priority(process: int) -> None:
-    """Raise a process's priority as the daemon's systemd unit does, if permitted."""
-    with contextlib.suppress(PermissionError):
-        os.setpriority(os.PRIO_PROCESS, process, -10)
 
 
 def wait_for(condition: Callable[[], T], *, timeout: float = PATIENCE) -> T:

@@ -29,7 +29,6 @@ ROOT = Path(__file__).parents[2]
 TESTS = (
     "tests/model",
     "tests/docs/test_pages.py",
-    "tests/docs/test_pages.py",
     "tests/examples/test_examples.py",
     "tests/integration/test_four_amplifiers.py",
 )
@@ -76,27 +75,11 @@ KINDS = [
 """As they are built: kernels of OpenBLAS, and the most lanes that go with them."""
 
 
-@dataclass(frozen=True)
-class Answer:
-    """Frequencies [Hz] that play, and contrast [dB], None without a quiet finger."""
-
-    frequencies: tuple[float, ...]
-    contrast: float | None
+Answers = list[tuple[list[float], float | None]]
+"""Of each question the frequencies [Hz] that play, and the contrast [dB] beside quiet fingers."""
 
 
-def differences(one: Sequence[Answer], other: Sequence[Answer]) -> tuple[list[int], float]:
-    """Numbers of answers with other frequencies, and the largest difference of contrast [dB]."""
-    pairs = list(zip(one, other, strict=True))
-    turned = [number for number, (a, b) in enumerate(pairs) if a.frequencies != b.frequencies]
-    contrasts = [
-        abs(a.contrast - b.contrast)
-        for a, b in pairs
-        if a.contrast is not None and b.contrast is not None
-    ]
-    return turned, max(contrasts, default=0.0)
-
-
-def answers() -> list[Answer]:
+def answers() -> Answers:
     """Answers to the fixed questions: one target, none to five quiet fingers, both drive modes."""
     from plates import contact_sets, smooth_table
     from set_table import only
@@ -108,7 +91,7 @@ def answers() -> list[Answer]:
                 placed = Placement((target,), tuple(others[:quiet]))
                 layer, felt = only(smooth_table(), placed, 10.0, drive_mode=drive_mode)
                 tones = sorted({tone.frequency for tone in layer.excitation.values()})
-                found.append(Answer(tuple(tones), felt.promised_contrast_db))
+                found.append((tones, felt.promised_contrast_db))
     return found
 
 
@@ -147,14 +130,6 @@ def environment_of(processor: Processor) -> Iterator[dict[str, str]]:
         }
 
 
-def answers_as_on(processor: Processor) -> list[Answer]:
-    """Answers of a process that computes as on a processor."""
-    with environment_of(processor) as environment:
-        command = [sys.executable, __file__, "--here", f"{processor.blas}:{processor.lanes}"]
-        done = subprocess.run(command, env=environment, check=True, stdout=subprocess.PIPE)
-    return [Answer(tuple(each[0]), each[1]) for each in json.loads(done.stdout)]
-
-
 def answer_here(expected: str) -> None:
     """Print the answers of this process, if it computes as it should."""
     from model.compiled.kernels import kernels
@@ -163,20 +138,28 @@ def answer_here(expected: str) -> None:
     blas, lanes = expected.split(":")
     if blas_in_use() != {blas.lower()} or own is None or own.lanes != int(lanes):
         raise SystemExit(f"expected {expected}, got {blas_in_use()} and {own}")
-    json.dump([(each.frequencies, each.contrast) for each in answers()], sys.stdout)
+    json.dump(answers(), sys.stdout)
 
 
 def compare(processors: Sequence[Processor]) -> bool:
     """Print how answers differ from those of the first processor; whether they may."""
-    first = answers_as_on(processors[0])
-    _say(f"{len(first)} answers, beside {processors[0]}:")
+    first: Answers = []
     is_same = True
-    for processor in processors[1:]:
-        turned, contrast = differences(first, answers_as_on(processor))
-        is_same &= not turned and contrast < MAX_CONTRAST
+    for processor in processors:
+        with environment_of(processor) as environment:
+            command = [sys.executable, __file__, "--here", f"{processor.blas}:{processor.lanes}"]
+            done = subprocess.run(command, env=environment, check=True, stdout=subprocess.PIPE)
+        found = json.loads(done.stdout)
+        first = first or found
+        pairs = list(zip(first, found, strict=True))
+        turned = [number for number, (one, other) in enumerate(pairs) if one[0] != other[0]]
+        contrasts = [
+            abs(one[1] - other[1]) for one, other in pairs if None not in (one[1], other[1])
+        ]
+        is_same &= not turned and max(contrasts) < MAX_CONTRAST
         _say(
-            f"  {processor}: {len(turned)} other frequencies {turned or ''}, "
-            f"contrast differs by {contrast:.1e} dB at most"
+            f"{processor}: {len(found)} answers, {len(turned)} other frequencies {turned or ''}, "
+            f"contrast differs by {max(contrasts):.1e} dB at most"
         )
     return is_same
 
@@ -205,15 +188,13 @@ def main() -> int:
         return 0
     has = processor_features()
     for processor in EVERY:
-        if not processor.features <= has:
-            _say(
-                f"{processor}: not run, this processor lacks "
-                f"{', '.join(sorted(processor.features - has))}"
-            )
-    results = [compare([each for each in EVERY if each.features <= has])]
-    if not options.answers:
-        results += [passes(each, options.workers) for each in KINDS if each.features <= has]
-    return 0 if all(results) else 1
+        if lacks := sorted(processor.features - has):
+            _say(f"{processor}: not run, this processor lacks {', '.join(lacks)}")
+    is_good = compare([each for each in EVERY if each.features <= has])
+    for processor in KINDS if not options.answers else ():
+        if processor.features <= has:
+            is_good &= passes(processor, options.workers)
+    return 0 if is_good else 1
 
 
 if __name__ == "__main__":

@@ -6,8 +6,7 @@ The founding paper's plate, also on a mesh that is quick to solve, with a table 
 moment or in time on its ERAs; boards on exciters; a plate that is not quite the paper's, with
 responses measured on it, sound ones and others that are not what they claim; settled patterns of a
 hidden plate, whose theory is not the model's. Second solutions are a stepping solver, bases that
-move in a way known twice, scores of a drive tone by tone, and derivatives by Richardson's
-extrapolation of central differences.
+move in a way known twice, and scores of a drive tone by tone.
 """
 
 import cmath
@@ -20,7 +19,6 @@ from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
 from benchmarks.direct_plate import direct_acceleration
@@ -527,22 +525,6 @@ def by_hand(forms: Forms, drive: Drive) -> tuple[float, float]:
         for q, form in enumerate(forms.quiet[f].astype(complex)):
             quiet[q] += (w.conj() @ form @ w).real / threshold_power
     return float(np.sqrt(target.min() / quiet.max())), float(np.sqrt(target.min()))
-
-
-_Number = TypeVar("_Number", np.float64, np.complex128)
-
-
-def extrapolated_slopes(
-    function: Callable[[FloatArray], NDArray[_Number]], at: FloatArray, *, step: float
-) -> NDArray[_Number]:
-    """Derivatives (n, ...) of a function (...) by each of its arguments (n,), right to step⁴."""
-
-    def difference(number: int, size: float) -> NDArray[_Number]:
-        moved = size * np.eye(len(at))[number]
-        return np.asarray((function(at + moved) - function(at - moved)) / (2 * size))
-
-    pairs = [(difference(n, step / 2), difference(n, step)) for n in range(len(at))]
-    return np.array([(4 * half - whole) / 3 for half, whole in pairs])
 
 
 SETTLED_PATTERNS_FREQUENCIES = np.linspace(40.0, 500.0, 27)

@@ -43,23 +43,49 @@ from model.estimate.following import (
     LivePlate,
     NoiseLevel,
     PatternReport,
+    PlateChange,
     PlateEstimate,
     PlateUpdate,
     SettledPattern,
     update,
 )
 from model.estimate.forward import Sensor
-from model.estimate.identify import fit_in_stages, model_of, solved_with_modes_of
+from model.estimate.identify import (
+    Identification,
+    fit_in_stages,
+    identify,
+    model_of,
+    solved_with_modes_of,
+)
 from model.estimate.measurement import Measurement
 from model.reduction.free_plate import solve_free_plate
 from model.rig.rig import Rig, Uncertainty
-from model.rig.rig_file import example_rig_path, load_rig
 from model.table.table import LocalizationTable
 from model.table.table_file import build_table
-from plates import played, settled_patterns
+from plates import SETTLED_PATTERNS_FREQUENCIES, played, settled_patterns
 
 TONES = np.array([85.0, 150.0, 215.0, 330.0])
 POINTS = np.array([[0.06, 0.05], [0.15, 0.11], [0.26, 0.17], [0.22, 0.04]])
+
+
+@pytest.fixture(scope="session")
+def hidden() -> Hidden:
+    """A plate with places and a mass of its own."""
+    return draw("form", 1)
+
+
+@pytest.fixture(scope="session")
+def found(rig: Rig, hidden: Hidden) -> Identification:
+    """The paper's rig identified on it."""
+    sensors = [Sensor(era.name, era.name) for era in rig.eras]
+    values = hidden.measured(SETTLED_PATTERNS_FREQUENCIES, np.random.default_rng(1))
+    return identify(rig, Measurement(sensors, SETTLED_PATTERNS_FREQUENCIES, values))
+
+
+@pytest.fixture(scope="session")
+def known(found: Identification) -> PlateEstimate:
+    """What a daemon knows of that plate when it starts: what the identified rig states."""
+    return PlateEstimate.of_rig(found.rig, found.fitted.model.sensors)
 
 
 @pytest.fixture(scope="module")
@@ -74,33 +100,21 @@ def learned_table(table: LocalizationTable, known: PlateEstimate, file: Path) ->
 
 
 @pytest.mark.long
-def test_answers_wait_for_an_explanation(
-    hidden: Hidden, known: PlateEstimate, table: LocalizationTable, tmp_path: Path
-) -> None:
-    """A quiet pattern gives a new table, odd ones that raise an alarm none."""
-    learned = learned_table(table, known, tmp_path / "learned.npz")
-    quiet = played(learned.take, hidden, hidden.mounted, count=12)
-    assert all(each.table is not None for each in quiet)
-    odd = replace(hidden.mounted, stiffness=hidden.mounted.stiffness * [0.5, 1.0, 2.0, 1.0])
-    first, second = played(learned.take, hidden, odd, count=2, start=12)
-    assert second.is_alarm
-    assert (first.table, second.table) == (None, None)
-
-
-@pytest.mark.long
 def test_unexplained_change_widens_the_errors_of_answers(
     hidden: Hidden, known: PlateEstimate, table: LocalizationTable, tmp_path: Path
 ) -> None:
-    """Answers then allow for the errors of a plate that was not measured, also when resumed."""
+    """A quiet pattern gives a new table, odd ones that raise an alarm none.
+
+    Answers then allow for the errors of a plate that was not measured, also when resumed.
+    """
     file = tmp_path / "learned.npz"
     learned = learned_table(table, known, file)
-    played(learned.take, hidden, hidden.mounted, count=12)
-    odd = replace(
-        hidden.mounted,
-        stiffness=hidden.mounted.stiffness * [0.5, 1.0, 2.0, 1.0],
-        gain=hidden.mounted.gain * [1.0, 0.5j, 1.0, 1.0],
-    )
-    report = played(learned.take, hidden, odd, count=7, start=12)[-1]
+    quiet = played(learned.take, hidden, hidden.mounted, count=12)
+    assert all(each.table is not None for each in quiet)
+    odd = CHANGES["retuned"](hidden.mounted)
+    first, second, *_, report = played(learned.take, hidden, odd, count=7, start=12)
+    assert second.is_alarm
+    assert first.table is second.table is None
     assert report.state == "changed"
     assert "most as if" in report.cause
     assert report.table is not None
@@ -191,17 +205,27 @@ NE = 2  # number of that ERA
 HAND = np.array([0.25, 0.05])  # m
 
 
-def test_loosened_mount_is_named_and_followed(hidden: Hidden, known: PlateEstimate) -> None:
-    """Quiet patterns raise no alarm; a mount 20 % softer does within 8, and is named NE."""
+def changed_to(
+    hidden: Hidden, known: PlateEstimate, changed: Mounted, *, count: int
+) -> tuple[LivePlate, PlateChange]:
+    """A plate followed into so many patterns of a change, and what explains it.
+
+    Ten patterns before it raise no alarm.
+    """
     live = LivePlate(known)
     quiet = played(live.take, hidden, hidden.mounted, count=10)
     assert not any(report.alarm for report in quiet)
     assert np.mean([report.nis / report.count for report in quiet]) < 1.5
+    after = played(live.take, hidden, changed, count=count, start=10)
+    (explanation,) = (each.explanation for each in after if each.explanation)
+    return live, explanation
+
+
+def test_loosened_mount_is_named_and_followed(hidden: Hidden, known: PlateEstimate) -> None:
+    """A mount 20 % softer is named NE within 8 patterns."""
     factors = np.where(np.arange(4) == NE, 0.8, 1.0)
     loose = replace(hidden.mounted, stiffness=factors * hidden.mounted.stiffness)
-    after = played(live.take, hidden, loose, count=8, start=10)
-    assert any(report.alarm for report in after)
-    (explanation,) = (each.explanation for each in after if each.explanation)
+    live, explanation = changed_to(hidden, known, loose, count=8)
     assert explanation.name == "stiffness NE"
     assert explanation.change == pytest.approx(np.log(0.8), abs=0.03)
     assert live.known.rig.eras[NE].stiffness == pytest.approx(loose.stiffness[NE], rel=0.02)
@@ -229,12 +253,9 @@ def test_an_idle_plate_is_known_at_least_as_one_that_nobody_measured(
 @pytest.mark.long
 def test_sticker_is_named_in_its_place(hidden: Hidden, known: PlateEstimate) -> None:
     """3 g are named a mass within ten patterns, to 0.6 g and 1.5 cm."""
-    live = LivePlate(known)
-    played(live.take, hidden, hidden.mounted, count=10)
     sticker = np.array([0.11, 0.16, 3e-3])
     changed = replace(hidden.mounted, masses=np.vstack([hidden.mounted.masses, sticker]))
-    after = played(live.take, hidden, changed, count=10, start=10)
-    (explanation,) = (each.explanation for each in after if each.explanation)
+    live, explanation = changed_to(hidden, known, changed, count=10)
     assert explanation.name == "a mass"
     stated = re.search(r"g at \((\S+), (\S+)\) m$", str(explanation))
     assert stated is not None
@@ -274,20 +295,16 @@ def test_object_is_noticed_where_it_lies_until_it_is_gone(
 
 
 @pytest.mark.parametrize("hours", shortly([0.2, 1.0], [0.2]))
-def test_nothing_is_accused_of_lying_there(
-    hidden: Hidden, known: PlateEstimate, hours: float
-) -> None:
-    """Not in hours of a touch each 12 s under one to three contents at once."""
+def test_fingers_are_no_change(hidden: Hidden, known: PlateEstimate, hours: float) -> None:
+    """Nothing is accused of lying there in hours of a touch each 12 s.
+
+    They are under one to three contents at once. Fingers of six times the usual load, beyond three
+    standard deviations, raise no alarm either.
+    """
     live, rng = LivePlate(known), np.random.default_rng(4)
-    quiet = [
-        live.take(pattern_of_touches(hidden, rng, time=time))
-        for time in np.arange(0.0, 3600 * hours, 12.0)
-    ]
-    assert not any(each.alarm for each in quiet)
-
-
-def test_heavy_finger_is_no_change(hidden: Hidden, known: PlateEstimate) -> None:
-    """Fingers of six times the usual load, beyond three standard deviations, raise no alarm."""
+    times = np.arange(0.0, 3600 * hours, 12.0)
+    touches = (pattern_of_touches(hidden, rng, time=time) for time in times)
+    assert not any(live.take(each).alarm for each in touches)
     live = LivePlate(known)
     heavy = settled_patterns(hidden, hidden.mounted, count=12, start=0, heaviest=6.0)
     assert not any(live.take(each).alarm for each in heavy)
@@ -320,36 +337,30 @@ class Rested(Mounted):
         return super().accelerations(frequency, points, fingers=fingers, loads=hand)
 
 
-def retuned(mounted: Mounted) -> Mounted:
-    """Two mounts and a gain at once."""
-    return replace(
+CHANGES: dict[str, Callable[[Mounted], Mounted]] = {
+    # Two mounts and a gain at once.
+    "retuned": lambda mounted: replace(
         mounted,
         stiffness=mounted.stiffness * [0.5, 1.0, 2.0, 1.0],
         gain=mounted.gain * [1.0, 0.5j, 1.0, 1.0],
-    )
-
-
-def cracked(mounted: Mounted) -> Mounted:
-    """A patch of 2.3 by 6.9 cm at an edge that has lost half of its stiffness."""
-    soft = (0.188, 0.211, 0.0, 0.069, -0.5, 0.0)  # m; more of its rigidity, and of its mass
-    return replace(mounted, plate=replace(mounted.plate, parts=(soft,)))
-
-
-def rested(mounted: Mounted) -> Mounted:
-    """A hand on the plate."""
-    return Rested(**{each.name: getattr(mounted, each.name) for each in fields(Mounted)})
+    ),
+    # A patch [m] of 2.3 by 6.9 cm at an edge that has lost half of its stiffness, and no mass.
+    "cracked": lambda mounted: replace(
+        mounted, plate=replace(mounted.plate, parts=((0.188, 0.211, 0.0, 0.069, -0.5, 0.0),))
+    ),
+    "a hand": lambda mounted: Rested(
+        **{each.name: getattr(mounted, each.name) for each in fields(Mounted)}
+    ),
+}
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("change", [retuned, cracked, rested])
+@pytest.mark.parametrize("change", CHANGES)
 def test_change_that_nothing_explains_is_said_until_it_is_gone(
-    hidden: Hidden, known: PlateEstimate, change: Callable[[Mounted], Mounted]
+    hidden: Hidden, known: PlateEstimate, change: str
 ) -> None:
     """It is followed as no other: the state stays and says so; then service goes on."""
-    live = LivePlate(known)
-    played(live.take, hidden, hidden.mounted, count=10)
-    reports = played(live.take, hidden, change(hidden.mounted), count=6, start=10)
-    (explanation,) = (each.explanation for each in reports if each.explanation)
+    live, explanation = changed_to(hidden, known, CHANGES[change](hidden.mounted), count=6)
     assert explanation.name == ""
     assert live.known.change
     before = live.known.x
@@ -359,9 +370,8 @@ def test_change_that_nothing_explains_is_said_until_it_is_gone(
 
 
 @pytest.mark.long
-def test_hard_plate_gives_the_contrast_of_the_plate_known() -> None:
+def test_hard_plate_gives_the_contrast_of_the_plate_known(rig: Rig) -> None:
     """Identified, weightless fingers feel within 2 dB of the plate known, and more than before."""
-    rig = load_rig(example_rig_path())
     written = {loaded: table_of(rig, PLATES_FREQUENCIES, loaded=loaded) for loaded in (False, True)}
     found = outcome(draw("hard", 1), rig, written, "hard", 1, sets=2)
     assert found.chi2 < 1.5
@@ -373,26 +383,10 @@ def test_hard_plate_gives_the_contrast_of_the_plate_known() -> None:
     assert mean["identified"] > mean["written"] + 2
 
 
-FREQUENCIES = np.linspace(40.0, 500.0, 27)
-
-
-def identified(hidden: Hidden, *, rounds: int = 4) -> Fit:
-    """The paper's rig fitted to a hidden plate; each ERA plays as many in four tones."""
-    rig = load_rig(example_rig_path())
-    sensors = [Sensor(era.name, era.name) for era in rig.eras]
-    values = hidden.measured(FREQUENCIES, np.random.default_rng(1))
-    played = (np.arange(len(FREQUENCIES))[:, None] + np.arange(4)) % 4 < rounds
-    values = np.where(played[:, None], values, np.nan)
-    return fit_in_stages(rig, Measurement(sensors, FREQUENCIES, values))
-
-
-@pytest.mark.parametrize("seed", shortly([1, 2], [1]))
-def test_hidden_mass_and_places_are_found(seed: int) -> None:
+def test_hidden_mass_and_places_are_found(hidden: Hidden, found: Identification) -> None:
     """A mass of 3 g is found within 5 % and 2 mm, places within 0.5 mm, springs within 2 %."""
-    hidden = draw("form", seed)
-    found = identified(hidden)
     assert found.chi2 < 1.3
-    values = found.plate.values
+    values = found.values
     ((x, y, mass),) = hidden.mounted.masses
     assert values["masses"][0, 0] == pytest.approx(mass, rel=0.05)
     np.testing.assert_allclose(values["masses"][0, 1:], [x, y], atol=2e-3)
@@ -401,19 +395,21 @@ def test_hidden_mass_and_places_are_found(seed: int) -> None:
 
 
 @pytest.mark.long
-def test_one_round_of_interleaved_tones_finds_the_springs() -> None:
+def test_one_round_of_interleaved_tones_finds_the_springs(rig: Rig) -> None:
     """Where each ERA plays every fourth tone only, springs are found within 2 %, and no mass."""
-    hidden = draw("plain", 4)
-    found = identified(hidden, rounds=1)
+    hidden, tones = draw("plain", 4), SETTLED_PATTERNS_FREQUENCIES
+    plays = (np.arange(len(tones))[:, None] + np.arange(4)) % 4 == 0
+    values = np.where(plays[:, None], hidden.measured(tones, np.random.default_rng(1)), np.nan)
+    sensors = [Sensor(era.name, era.name) for era in rig.eras]
+    found = fit_in_stages(rig, Measurement(sensors, tones, values))
     assert found.chi2 < 1.4
     values = found.plate.values
     np.testing.assert_allclose(values["stiffness"], hidden.mounted.stiffness, rtol=0.02)
     assert values["masses"][0, 0] < 0.3e-3
 
 
-def test_plate_solved_anew_keeps_the_modes_of_the_fit() -> None:
+def test_plate_solved_anew_keeps_the_modes_of_the_fit(rig: Rig) -> None:
     """One a tenth thicker, with tones to 180 Hz, has its eighth mode above twice that."""
-    rig = load_rig(example_rig_path())
     free = solve_free_plate(rig.plate, rig.mesh, frequency_max=180.0)
     measurement = Measurement(
         [Sensor("A1", rig.eras[0].name)], np.array([60.0]), np.ones((1, 1, 4))
@@ -430,9 +426,8 @@ def test_plate_solved_anew_keeps_the_modes_of_the_fit() -> None:
 
 
 @pytest.fixture(scope="module")
-def drawn() -> PlateEstimate:
+def drawn(rig: Rig) -> PlateEstimate:
     """The paper's plate by its drawing."""
-    rig = load_rig(example_rig_path())
     return PlateEstimate.of_rig(rig, [Sensor(era.name, era.name) for era in rig.eras])
 
 
@@ -444,15 +439,12 @@ def pattern() -> SettledPattern:
     return one
 
 
-def turned(pattern: SettledPattern, phase: float, *, has_phase: bool) -> SettledPattern:
-    """The pattern, read from another moment on."""
-    return replace(pattern, values=np.exp(1j * phase) * pattern.values, has_phase=has_phase)
-
-
-def state_after(drawn: PlateEstimate, pattern: SettledPattern) -> FloatArray:
-    """Parameters after the pattern."""
+def state_after(
+    drawn: PlateEstimate, pattern: SettledPattern, *, phase: float, has_phase: bool
+) -> FloatArray:
+    """Parameters after the pattern, read from another moment on."""
     live = LivePlate(drawn)
-    live.take(pattern)
+    live.take(replace(pattern, values=np.exp(1j * phase) * pattern.values, has_phase=has_phase))
     return live.known.x
 
 
@@ -460,10 +452,10 @@ def test_update_does_not_depend_on_a_phase_that_is_unknown(
     drawn: PlateEstimate, pattern: SettledPattern
 ) -> None:
     """A turn of all readings together changes nothing; where their phase counts, it does."""
-    before = state_after(drawn, turned(pattern, 0.0, has_phase=False))
-    after = state_after(drawn, turned(pattern, 2.0, has_phase=False))
+    before = state_after(drawn, pattern, phase=0.0, has_phase=False)
+    after = state_after(drawn, pattern, phase=2.0, has_phase=False)
     np.testing.assert_allclose(after, before, atol=1e-9)
-    counted = state_after(drawn, turned(pattern, 2.0, has_phase=True))
+    counted = state_after(drawn, pattern, phase=2.0, has_phase=True)
     assert np.abs(counted - before).max() > 0.1
 
 
@@ -510,7 +502,7 @@ def test_numbers_change_as_their_derivatives_say(
     drawn: PlateEstimate, pattern: SettledPattern
 ) -> None:
     """Central differences of the residuals of one without a phase; none lies along its turn."""
-    without = turned(pattern, 1.0, has_phase=False)
+    without = replace(pattern, values=1j * pattern.values, has_phase=False)
     size, step = drawn.model.space.size, 1e-5
 
     def fitted(x: FloatArray) -> Fit:

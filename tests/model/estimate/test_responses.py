@@ -111,17 +111,28 @@ def responses() -> Measurement:
     return Measurement(sensors, np.array([50.0, 110.25, 320.0]), values.swapaxes(1, 2))
 
 
+@pytest.fixture(params=WRITERS)
+def ending(request: pytest.FixtureRequest) -> str:
+    """Each kind of file."""
+    return str(request.param)
+
+
+@pytest.fixture
+def path(ending: str, responses: Measurement, coarse_rig: Rig, tmp_path: Path) -> Path:
+    """A file of these responses."""
+    file = tmp_path / f"measured.{ending}"
+    WRITERS[ending](file, responses, coarse_rig)
+    return file
+
+
 def with_masses(measurement: Measurement, masses: Sequence[float]) -> Measurement:
     """The same by sensors that weigh something [kg]."""
     each = zip(measurement.sensors, masses, strict=True)
     return replace(measurement, sensors=[replace(one, mass=mass) for one, mass in each])
 
 
-@pytest.mark.parametrize("ending", WRITERS)
-def test_responses_files_read_back_what_was_written(responses, coarse_rig, tmp_path, ending):
+def test_responses_files_read_back_what_was_written(responses, coarse_rig, path):
     """Sensors, places, frequencies and complex values, gaps among them."""
-    path = tmp_path / f"measured.{ending}"
-    WRITERS[ending](path, responses, coarse_rig)
     back = measurement_of(read_measured(path), coarse_rig)
     order = [back.names.index(name) for name in responses.names]
     np.testing.assert_allclose(back.points[order], responses.points, rtol=1e-12)
@@ -175,22 +186,19 @@ def test_read_measured_reads_uff_of_another_program(coarse_rig: Rig, tmp_path: P
 # pyuff does not close a file that it has written bytes to.
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 @pytest.mark.filterwarnings("ignore::ResourceWarning")
-@pytest.mark.parametrize("is_whole", [True, False])
+@pytest.mark.parametrize("ending", ["uff"])
 def test_read_measured_reads_binary_uff(
-    responses: Measurement, coarse_rig: Rig, tmp_path: Path, *, is_whole: bool
+    responses: Measurement, coarse_rig: Rig, path: Path, tmp_path: Path
 ) -> None:
     """Records as bytes (58b) are read to the last bit; one that lost some of them is refused."""
-    write_responses_uff(tmp_path / "ascii.uff", responses, coarse_rig)
-    sets = pyuff.UFF(str(tmp_path / "ascii.uff")).read_sets()
+    sets = pyuff.UFF(str(path)).read_sets()
     for each in sets[2:]:
         each.update(binary=1, n_bytes=0)
-    path = tmp_path / "binary.uff"
-    pyuff.UFF(str(path)).write_sets(sets, "overwrite")
-    if is_whole:
-        back = measurement_of(read_measured(path), coarse_rig)
-        np.testing.assert_allclose(back.values, responses.values, rtol=1e-11)
-        return
-    content = path.read_bytes()
+    binary = tmp_path / "binary.uff"
+    pyuff.UFF(str(binary)).write_sets(sets, "overwrite")
+    back = measurement_of(read_measured(binary), coarse_rig)
+    np.testing.assert_allclose(back.values, responses.values, rtol=1e-11)
+    content = binary.read_bytes()
     cut = content.rindex(b"    -1")
     (size, *_) = re.findall(rb"58b.*?(\d+)     0", content)
     for wrong in (
@@ -198,16 +206,9 @@ def test_read_measured_reads_binary_uff(
         content.replace(size, b"%d" % (int(size) + 8), 1),  # would run into the next record
         content[:cut] + b"7\r\n" + content[cut:],
     ):
-        path.write_bytes(wrong)
+        binary.write_bytes(wrong)
         with pytest.raises(InputError, match=r"binary\.uff:?\d*: "):
-            read_measured(path)
-
-
-def damage(path: Path, before: str, after: str) -> None:
-    """Replace the first occurrence of a text in a file."""
-    text = path.read_bytes().decode()
-    assert before in text
-    path.write_bytes(text.replace(before, after, 1).encode("latin-1"))
+            read_measured(binary)
 
 
 DAMAGED = {
@@ -244,24 +245,21 @@ DAMAGED = {
     ("ending", "before", "after", "named"),
     [(ending, *row) for ending, rows in DAMAGED.items() for row in rows],
 )
-def test_read_measured_refuses_damaged_files(
-    responses, coarse_rig, tmp_path, ending, before, after, named
-):
+def test_read_measured_refuses_damaged_files(coarse_rig, path, before, after, named):
     """Wrong units, unknown columns, bad values, broken records; other functions are skipped."""
-    path = tmp_path / f"measured.{ending}"
-    WRITERS[ending](path, responses, coarse_rig)
-    damage(path, before, after)
+    text = path.read_bytes().decode()
+    assert before in text
+    path.write_bytes(text.replace(before, after, 1).encode("latin-1"))
     if not named:
         assert len(read_measured(path)) == 17 - 3
         return
-    with pytest.raises(InputError, match=rf"measured\.{ending}.*{named}"):
+    with pytest.raises(InputError, match=rf"measured\.\w+.*{named}"):
         measurement_of(read_measured(path), coarse_rig)
 
 
-def test_comma_may_separate_thousands(responses, coarse_rig, tmp_path):
+@pytest.mark.parametrize("ending", ["csv"])
+def test_comma_may_separate_thousands(path):
     """Where other numbers have a decimal point, 1,234 is not read as one and a bit."""
-    path = tmp_path / "measured.csv"
-    write_responses_csv(path, responses, coarse_rig)
     text = path.read_text("utf-8").replace(",", ";").replace("320.0", "1,234")
     path.write_text(text, "utf-8")
     with pytest.raises(InputError, match=r"csv:\d+: frequency_hz .*'1,234'"):
@@ -283,17 +281,17 @@ SPREADSHEETS = {
 }
 
 
+@pytest.mark.parametrize("ending", ["csv"])
 @pytest.mark.parametrize("write", SPREADSHEETS.values(), ids=SPREADSHEETS)
-def test_read_measured_reads_csv_of_spreadsheets(responses, coarse_rig, tmp_path, write, caplog):
+def test_read_measured_reads_csv_of_spreadsheets(responses, coarse_rig, path, write, caplog):
     """Separators, decimal commas, UTF-16, a coherence, and what lies beyond the last value."""
-    path = tmp_path / "measured.csv"
-    write_responses_csv(path, responses, coarse_rig)
     path.write_bytes(write(path.read_text("utf-8")))
     back = measurement_of(read_measured(path), coarse_rig)
     np.testing.assert_array_equal(back.values, responses.values)
     assert ("coherence" in caplog.text) == ("coherence" in path.read_text("utf-8", "replace"))
 
 
+@pytest.mark.parametrize("ending", ["uff"])
 @pytest.mark.parametrize(
     ("label", "factor", "end", "encoding"),
     [
@@ -310,14 +308,12 @@ def test_read_measured_reads_csv_of_spreadsheets(responses, coarse_rig, tmp_path
     ],
 )
 def test_read_measured_reads_uff_of_analysers(
-    responses, coarse_rig, tmp_path, label, factor, end, encoding
+    responses, coarse_rig, path, label, factor, end, encoding
 ):
     """By dataset 58's definition: any label of a unit, numbers of Fortran, the counted values.
 
     As editors save it, too.
     """
-    path = tmp_path / "measured.uff"
-    write_responses_uff(path, responses, coarse_rig)
     above, _, below = label.partition(" over ")
     text = path.read_text("ascii").replace("m/s^2".ljust(20), above.ljust(20))
     text = text.replace(" m".ljust(21), f" {below or 'm'}".ljust(21))
@@ -335,15 +331,12 @@ def test_read_measured_reads_uff_of_analysers(
     np.testing.assert_allclose(back.values[:, order], factor * responses.values, rtol=1e-11)
 
 
+@pytest.mark.parametrize("ending", ["uff"])
 @pytest.mark.parametrize(
     ("label", "factor"), [("NONE", 1.0), ("kHz", 1000.0), ("rad/s", 0.15915494309), ("RPM", None)]
 )
-def test_frequencies_of_uff_are_in_the_unit_of_their_label(
-    responses, coarse_rig, tmp_path, label, factor
-):
+def test_frequencies_of_uff_are_in_the_unit_of_their_label(responses, path, label, factor):
     """One radian a second is 1/(2 pi) Hz; a unit that is not known is refused."""
-    path = tmp_path / "measured.uff"
-    write_responses_uff(path, responses, coarse_rig)
     path.write_text(path.read_text("ascii").replace("Hz   ", label.ljust(5)), "ascii")
     if factor is None:
         with pytest.raises(InputError, match=r"uff:\d+: unit must be .*'RPM'"):
@@ -353,43 +346,36 @@ def test_frequencies_of_uff_are_in_the_unit_of_their_label(
     np.testing.assert_allclose(found, factor * responses.frequencies, rtol=1e-9)
 
 
-def test_values_beyond_the_limits_are_left_out(responses, coarse_rig, tmp_path, caplog):
+@pytest.mark.parametrize("ending", ["csv"])
+def test_values_beyond_the_limits_are_left_out(coarse_rig, path, caplog):
     """An analyser's line of 0 Hz, and all beyond its rig's highest frequency, are counted."""
-    path = tmp_path / "measured.csv"
-    write_responses_csv(path, responses, coarse_rig)
     path.write_text(path.read_text("utf-8").replace(",50.0,", ",0.0,"), "utf-8")
     back = measurement_of(read_measured(path), coarse_rig)
     assert (back.skipped, back.count, back.frequencies.tolist()) == (6, 11, [110.25, 320.0])
     assert "6 of 17" in caplog.text
 
 
-@pytest.mark.parametrize("ending", WRITERS)
-def test_read_measured_refuses_files_without_measurements(
-    responses, coarse_rig, tmp_path, monkeypatch, ending
-):
-    """No file, an empty one, text, one cut off or too large, and an unknown ending."""
-    path = tmp_path / f"measured.{ending}"
-    with pytest.raises(InputError, match=path.name):
-        read_measured(path)
-    WRITERS[ending](path, responses, coarse_rig)
-    cut = path.read_bytes()[:-30]
-    for content in (b" \n", b"Dear all, the measurement was a success.\n", cut):
+def test_read_measured_refuses_files_without_measurements(path, monkeypatch):
+    """An empty one, text, one cut off or too large, no file, and an unknown ending."""
+    good = path.read_bytes()
+    monkeypatch.setattr("model.files.uff._MAX_BYTES", len(good) - 1)
+    for content, said in (
+        (b" \n", path.name),
+        (b"Dear all, the measurement was a success.\n", path.name),
+        (good[:-30], path.name),
+        (good, "MiB"),
+    ):
         path.write_bytes(content)
-        with pytest.raises(InputError, match=path.name):
+        with pytest.raises(InputError, match=said):
             read_measured(path)
-    WRITERS[ending](path, responses, coarse_rig)
-    monkeypatch.setattr("model.files.uff._MAX_BYTES", 100)
-    with pytest.raises(InputError, match="MiB"):
-        read_measured(path)
-    with pytest.raises(InputError, match=r"\.csv, \.uff"):
-        read_measured(path.with_suffix(".mat"))
+    path.unlink()
+    for missing, said in ((path, path.name), (path.with_suffix(".mat"), r"\.csv, \.uff")):
+        with pytest.raises(InputError, match=said):
+            read_measured(missing)
 
 
-@pytest.mark.parametrize("ending", WRITERS)
-def test_responses_of_refuses_another_plate(responses, coarse_rig, tmp_path, ending):
+def test_responses_of_refuses_another_plate(coarse_rig, path):
     """Points off the plate, ERAs elsewhere or unknown, frequencies beyond limits, repetitions."""
-    path = tmp_path / f"measured.{ending}"
-    WRITERS[ending](path, responses, coarse_rig)
     measured = read_measured(path)
     plate, eras = coarse_rig.plate, coarse_rig.eras
     small = Plate(0.25, 0.2, plate.thickness, plate.material)
@@ -410,7 +396,6 @@ def test_responses_of_refuses_another_plate(responses, coarse_rig, tmp_path, end
             measurement_of(given, rig)
 
 
-@pytest.mark.parametrize("ending", WRITERS)
 def test_responses_per_volt_are_of_exciters(responses, coarse_rig, tmp_path, ending):
     """Of a rig with exciters they read back, masses of the sensor too; one of ERAs refuses them."""
     exciters = tuple(
@@ -431,14 +416,15 @@ def test_responses_per_volt_are_of_exciters(responses, coarse_rig, tmp_path, end
         measurement_of(measured, coarse_rig)
 
 
-def test_sensor_that_cannot_be_moved_is_refused(responses, coarse_rig, tmp_path):
+@pytest.mark.parametrize("ending", ["csv"])
+def test_sensor_that_cannot_be_moved_is_refused(responses, coarse_rig, path):
     """Two masses at one place, one below zero, and one that is a paperweight's."""
-    path = tmp_path / "measured.csv"
-    for grams, cause in (("-1", "sensor_mass_g must be"), ("900", "sensor_mass_g must be")):
-        write_responses_csv(path, with_masses(responses, (2e-3,) * 3), coarse_rig)
-        path.write_text(path.read_text().replace(",2.0\n", f",{grams}\n", 1))
-        with pytest.raises(InputError, match=f"measured.csv:2: {cause}"):
+    write_responses_csv(path, with_masses(responses, (2e-3,) * 3), coarse_rig)
+    right = path.read_text()
+    for grams in ("-1", "900"):
+        path.write_text(right.replace(",2.0\n", f",{grams}\n", 1))
+        with pytest.raises(InputError, match=r"measured\.csv:2: sensor_mass_g must be"):
             read_measured(path)
-    path.write_text(path.read_text().replace(",900\n", ",3.0\n"))
+    path.write_text(right.replace(",2.0\n", ",3.0\n", 1))
     with pytest.raises(InputError, match="must have one mass, got"):
         measurement_of(read_measured(path), coarse_rig)

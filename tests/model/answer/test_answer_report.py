@@ -57,24 +57,24 @@ def test_exposure_is_the_weighted_root_mean_square_of_all_that_a_finger_feels():
     A finger's own content counts at its loudest point, up to 6 dB above the mean of its level.
     """
     table = smooth_table()
-    found = answer(table, [wants((0.09, 0.07)), wants((0.25, 0.18))], [Finger((0.16, 0.20))])
-    weighted = []
-    for layer in found.layers:
-        f = np.array([layer.frequency])
-        weighted.append(float(hand_weighting(f)[0] * detection_threshold(f)[0] / np.sqrt(2)))
-    first, second, quiet = exposures(table, found)
-    for exposure, each, own in zip((first, second), found.fingers, weighted, strict=False):
-        mean = own * 10 ** (each.promised_level_db_sl / 20)
+    found, louder = (
+        answer(
+            table,
+            [wants(at, level_db_sl=level) for at in ((0.09, 0.07), (0.25, 0.18))],
+            [Finger((0.16, 0.20))],
+        )
+        for level in (20.0, 26.0)
+    )
+    hertz = np.array([layer.frequency for layer in found.layers])
+    weighted = hand_weighting(hertz) * detection_threshold(hertz) / np.sqrt(2)
+    *own, quiet = exposures(table, found)
+    for exposure, each, alone in zip(own, found.fingers, weighted, strict=False):
+        mean = alone * 10 ** (each.promised_level_db_sl / 20)
         assert mean < exposure < 2.5 * mean
     heard = 10 ** (found.fingers[2].foreign_level_db_sl / 20)
     assert min(weighted) * heard <= quiet <= max(weighted) * heard
-    louder = answer(
-        table,
-        [wants((0.09, 0.07), level_db_sl=26.0), wants((0.25, 0.18), level_db_sl=26.0)],
-        [Finger((0.16, 0.20))],
-    )
     assert exposures(table, louder) == pytest.approx(
-        [10 ** (6 / 20) * each for each in (first, second, quiet)], rel=1e-3
+        [10 ** (6 / 20) * each for each in (*own, quiet)], rel=1e-3
     )
 
 
@@ -156,16 +156,13 @@ def table(rig):
     return build_table(rig, frequencies=np.array([90.0, 130.0, 220.0, 300.0]), drive_mode="phased")
 
 
-@pytest.fixture(scope="module")
-def solved(rig):
-    """The same plate solved in time without the table."""
+def test_transient_measures_agree_with_another_solution_of_the_plate(rig, table):
+    """Measures of ramps and envelopes agree with those of the plate in time, without the table.
+
+    Envelopes do better with the same excitation.
+    """
     reduced = reduce_plate(rig.plate, rig.mesh, footprints_of(rig.eras), frequency_max=300.0)
-    return Transients(plate_in_time(reduced, rig.eras))
-
-
-def test_transient_measures_agree_with_another_solution_of_the_plate(rig, table, solved):
-    """Measures of ramps and envelopes agree; envelopes do better with the same excitation."""
-    timing = Timing(table)
+    solved, timing = Transients(plate_in_time(reduced, rig.eras)), Timing(table)
     plain, _ = only(table, PLACED, drive_mode="phased")
     shaped_layer = timing.with_envelopes(plain, PLACED)
     assert plain.onset is plain.ending is None
@@ -180,8 +177,8 @@ def test_transient_measures_agree_with_another_solution_of_the_plate(rig, table,
         left = solved.residual_db(layer.excitation, ending)
         both = timing.transient_contrast_db(layer, PLACED), timing.residual_db(layer, PLACED)
         found.append(both)
-        assert found[-1][0] == pytest.approx(contrast, abs=0.1)
-        assert found[-1][1] == pytest.approx(left, abs=0.2)
+        assert both[0] == pytest.approx(contrast, abs=0.1)
+        assert both[1] == pytest.approx(left, abs=0.2)
     assert found[1][0] > found[0][0] + 3
     assert found[1][1] < found[0][1] - 10
     assert shaped_layer.excitation == plain.excitation
@@ -189,23 +186,20 @@ def test_transient_measures_agree_with_another_solution_of_the_plate(rig, table,
 
 @pytest.mark.parametrize("quiet", [(), ((0.25, 0.18), (0.005, 0.1))])
 def test_envelopes_are_those_of_fingertips_read_point_by_point(table, quiet):
-    """Knots within a per mille of the largest, at an edge of the plate as well."""
-    placed = replace(PLACED, quiet=quiet)
+    """Knots within a per mille of the largest, at an edge of the plate as well.
+
+    Without quiet fingers there is no contrast; what is left after the end is known all the same.
+    """
+    placed, timing = replace(PLACED, quiet=quiet), Timing(table)
     layer, _ = only(table, placed, drive_mode="phased")
-    found = Timing(table).with_envelopes(layer, placed)
+    found = timing.with_envelopes(layer, placed)
     shaper = Shaper(table.in_time, gain_variance=table.uncertainty.gain_variance)
     onset = shaper.onset(found.excitation, targets=placed.targets, quiet=quiet)
     largest = max(each.largest for each in onset.values())
     for name, each in onset.items():
         np.testing.assert_allclose(found.onset[name].knots, each.knots, atol=1e-3 * largest)
-
-
-def test_transient_measures_without_quiet_fingers(table):
-    """There is no contrast; what is left after the end is known all the same."""
-    alone, timing = Placement(((0.09, 0.07),)), Timing(table)
-    layer = timing.with_envelopes(only(table, alone, drive_mode="phased")[0], alone)
-    assert timing.transient_contrast_db(layer, alone) is None
-    assert timing.residual_db(layer, alone) < -20
+    assert (timing.transient_contrast_db(found, placed) is None) == (not quiet)
+    assert timing.residual_db(found, placed) < -20
 
 
 def test_query_batch_has_knots_only_with_envelopes(table):
@@ -214,44 +208,17 @@ def test_query_batch_has_knots_only_with_envelopes(table):
     plain, with_knots = query_batch(
         table, [json.dumps(line), json.dumps(line | {"envelopes": True})]
     )
-    before, after = plain["transient_contrast_db"], with_knots["transient_contrast_db"]
+    assert with_knots["transient_contrast_db"] > plain["transient_contrast_db"]
     (plain,), (with_knots,) = plain["layers"], with_knots["layers"]
     assert plain["onset"] is plain["ending"] is None
-    assert {len(each["knots"]) for each in with_knots["onset"].values()} == {21}
-    assert {len(each["knots"]) for each in with_knots["ending"].values()} == {8}
-    assert {each["start"]["level"] for each in with_knots["onset"].values()} == {0.0}
     for era, tone in with_knots["drive"].items():
-        start = with_knots["ending"][era]["start"]
-        assert start["level"] == pytest.approx(tone["level"])
-        assert start["phase_deg"] == pytest.approx(tone["phase_deg"], abs=1e-6)
-        last = with_knots["onset"][era]["knots"][-1]
-        assert last["level"] == pytest.approx(tone["level"])
-        assert last["phase_deg"] == pytest.approx(tone["phase_deg"], abs=1e-6)
-        assert with_knots["onset"][era]["frequency_hz"] == tone["frequency_hz"]
-        assert with_knots["ending"][era]["knots"][-1]["level"] == 0
-    assert after > before
-
-
-@pytest.fixture(scope="module")
-def table_file(tmp_path_factory):
-    """The table on disk."""
-    path = tmp_path_factory.mktemp("tables") / "t.npz"
-    save_table(smooth_table(), path)
-    return path
-
-
-def test_a_line_of_a_batch_is_read_key_by_key():
-    """Targets, quiet fingers, mode, level and loads."""
-    line = (
-        '{"targets": [[0.1, 0.1], [0.2, 0.2]], "quiet": [[0.05, 0.02]], "mode": "switched",'
-        ' "level_db_sl": 15, "loads": [1, 2, 0.5]}'
-    )
-    (found,) = query_batch(smooth_table(), [line])
-    placed = Placement(((0.1, 0.1), (0.2, 0.2)), ((0.05, 0.02),), (1.0, 2.0, 0.5))
-    layer, felt = only(smooth_table(), placed, 15.0, drive_mode="switched")
-    assert found["layers"][0]["drive"] == smooth_table().drive_of(layer.excitation)
-    assert found["layers"][0]["fingers"] == [0, 1]
-    assert found["fingers"][0]["promised_contrast_db"] == felt.promised_contrast_db
+        onset, ending = with_knots["onset"][era], with_knots["ending"][era]
+        assert (len(onset["knots"]), len(ending["knots"])) == (21, 8)
+        assert onset["start"]["level"] == ending["knots"][-1]["level"] == 0
+        assert onset["frequency_hz"] == tone["frequency_hz"]
+        for joint in (ending["start"], onset["knots"][-1]):
+            assert joint["level"] == pytest.approx(tone["level"])
+            assert joint["phase_deg"] == pytest.approx(tone["phase_deg"], abs=1e-6)
 
 
 BAD_LINES = {
@@ -263,21 +230,31 @@ BAD_LINES = {
     '{"target": [0.1, 0.1], "targets": [[0.2, 0.1]]}': "target must be given without targets",
     "{}": "at least one finger",
 }
+GOOD_LINE = (
+    '{"targets": [[0.1, 0.1], [0.2, 0.2]], "quiet": [[0.05, 0.02]], "mode": "switched",'
+    ' "level_db_sl": 15, "loads": [1, 2, 0.5]}'
+)
 
 
-def test_a_bad_line_of_a_batch_is_refused():
-    """The key that is wrong is named."""
-    found = list(query_batch(smooth_table(), BAD_LINES))
-    for number, (row, named) in enumerate(zip(found, BAD_LINES.values(), strict=True), start=1):
+def test_a_line_of_a_batch_is_read_key_by_key_or_refused():
+    """Targets, quiet fingers, mode, level and loads; else the key that is wrong is named."""
+    *refused, found = query_batch(smooth_table(), [*BAD_LINES, GOOD_LINE])
+    for number, (row, named) in enumerate(zip(refused, BAD_LINES.values(), strict=True), start=1):
         assert row["line"] == number
         assert re.search(named, row["error"])
+    placed = Placement(((0.1, 0.1), (0.2, 0.2)), ((0.05, 0.02),), (1.0, 2.0, 0.5))
+    layer, felt = only(smooth_table(), placed, 15.0, drive_mode="switched")
+    assert found["layers"][0]["drive"] == smooth_table().drive_of(layer.excitation)
+    assert found["layers"][0]["fingers"] == [0, 1]
+    assert found["fingers"][0]["promised_contrast_db"] == felt.promised_contrast_db
 
 
-def test_batch_is_not_blamed_where_its_reader_closes(table_file, tmp_path, monkeypatch):
+def test_batch_is_not_blamed_where_its_reader_closes(tmp_path, monkeypatch):
     """As in `era table query TABLE --batch FILE | head`: the error is of the answers' pipe."""
-    batch = tmp_path / "b.jsonl"
+    batch, file = tmp_path / "b.jsonl", tmp_path / "t.npz"
+    save_table(smooth_table(), file)
     batch.write_text('{"target": [0.1, 0.1]}\n')
     broken = Mock(side_effect=BrokenPipeError(errno.EPIPE, "Broken pipe"))
     monkeypatch.setattr("builtins.print", broken)
     with pytest.raises(BrokenPipeError):
-        query_command(table_file, batch=batch)
+        query_command(file, batch=batch)

@@ -19,7 +19,6 @@ from model.answer.stimulus import (
     NEVER,
     DriveEnvelope,
     Finger,
-    OverDuration,
     Placement,
     Stimulus,
     pulse_ramp,
@@ -33,30 +32,13 @@ from model.table.table import LocalizationTable
 from model.table.table_file import build_table
 from model.transients.base_motion import ramped_onset, ramped_pulse
 from model.transients.shaping import SAMPLE_RATE, Transients
-from model.vibration import Excitation, Tone, base_amplitudes
+from model.vibration import Tone, base_amplitudes
 from plates import contact_sets, small_table, smooth_rig, smooth_table
 from set_table import drives, wants
 from set_table import phased as set_answer
 
 TARGET, QUIET = (0.09, 0.07), (0.24, 0.17)
-ALONE = Placement((TARGET,))
 STROKE = 100e-6  # m
-
-
-def excitation(frequency: float, *, level: float = 0.2) -> Excitation:
-    """Two ERAs, out of phase."""
-    return {
-        "SW": Tone(frequency, level * STROKE, 0.3),
-        "NE": Tone(frequency, 0.5 * level * STROKE, -1.1),
-    }
-
-
-def over(drive: Excitation, duration: float, loads: tuple[float, ...] = ()) -> OverDuration:
-    """What a finger at TARGET and one at QUIET feel of a drive over a duration [s]."""
-    table, envelope = small_table(), DriveEnvelope.of_pulse(duration, pulse_ramp(duration))
-    ringing = RingingUnderFingers(table, (TARGET, QUIET), loads, envelope)
-    frequencies, bases = base_amplitudes(drive, table.eras)
-    return ringing.over(zip(frequencies.tolist(), bases, strict=True))
 
 
 @pytest.mark.parametrize("loads", [(), (2.5, 0.4)])
@@ -67,13 +49,16 @@ def test_gain_is_that_of_the_plate_in_time(
 ) -> None:
     """Root mean square of samples over the duration, relative to a second later, within 0.5 dB.
 
-    Under a finger; and over as long at the loudest point of another one, both on the plate, at its
-    strongest until all has rung out. A carrier of 60 Hz has little more than a
-    period in 20 ms, where its own phase counts: 1.5 dB.
+    Under a finger, of two ERAs out of phase; and over as long at the loudest point of another one,
+    both on the plate, at its strongest until all has rung out. A carrier of 60 Hz has little more
+    than a period in 20 ms, where its own phase counts: 1.5 dB.
     """
-    table = small_table()
-    drive, ramp = excitation(frequency), pulse_ramp(duration)
-    found = over(drive, duration, loads)
+    table, ramp = small_table(), pulse_ramp(duration)
+    drive = {"SW": Tone(frequency, 0.2 * STROKE, 0.3), "NE": Tone(frequency, 0.1 * STROKE, -1.1)}
+    envelope = DriveEnvelope.of_pulse(duration, ramp)
+    frequencies, bases = base_amplitudes(drive, table.eras)
+    ringing = RingingUnderFingers(table, (TARGET, QUIET), loads, envelope)
+    found = ringing.over(zip(frequencies.tolist(), bases, strict=True))
     points = [fingertip_points(*at, table.plate) for at in (TARGET, QUIET)]
     plate = Transients(table.in_time_under((TARGET, QUIET), loads))
     acceleration = plate.acceleration(
@@ -104,9 +89,10 @@ def test_shaped_gain_is_that_of_a_raised_cosine() -> None:
 
 def test_drive_is_raised_by_the_lag() -> None:
     """Felt as requested over the duration, along the ramp of it."""
-    table = small_table()
-    found = query(table, ALONE, 20.0, duration=0.04, drive_mode="phased")
+    table, placed = small_table(), Placement((TARGET,))
+    found = query(table, placed, 20.0, duration=0.04, drive_mode="phased")
     (layer,), (felt,) = found.layers, found.fingers
+    assert layer.ramp == pulse_ramp(0.04) == 0.01
     frequencies, bases = base_amplitudes(layer.excitation, table.eras)
     envelope = DriveEnvelope.of_pulse(0.04, layer.ramp)
     ringing = RingingUnderFingers(table, (TARGET,), (), envelope)
@@ -114,10 +100,9 @@ def test_drive_is_raised_by_the_lag() -> None:
     points = fingertip_points(*TARGET, table.plate)
     _, amplitudes = table.amplitudes(layer.excitation, points, contacts=(TARGET,))
     steady = amplitudes[0] @ fingertip_weights(*TARGET, table.plate)
-    above = steady / detection_threshold(frequencies)[0]
+    above = lag * steady / detection_threshold(frequencies)[0]
     assert felt.level_db_sl == pytest.approx(20.0, abs=1e-3)
-    assert 20 * math.log10(lag * above) == pytest.approx(20.0, abs=0.02)
-    assert layer.ramp == pulse_ramp(0.04) == 0.01
+    assert 20 * math.log10(above) == pytest.approx(20.0, abs=0.02)
 
 
 @pytest.mark.parametrize("duration", [None, 0.04])
@@ -134,17 +119,13 @@ def test_drive_stays_within_its_limits(limits: Limits, duration: float | None) -
     table = small_table()
     finger = Finger(TARGET, Stimulus(60.0, duration=duration))
     found = answer(table, [finger], drive_mode="phased", limits=limits)
-    strokes = table.full_levels
     assert limits.factor_within(found.layers, table) == pytest.approx(1.0, abs=1e-6)
-    used = [
-        amplitude / (limits.amplitudes or strokes)[name]
-        for name, amplitude in found.amplitudes.items()
-    ]
+    allowed = limits.amplitudes or table.full_levels
+    used = [amplitude / allowed[name] for name, amplitude in found.amplitudes.items()]
     power = sum((each / STROKE) ** 2 for each in found.amplitudes.values()) / limits.power
     assert max([*used, power]) == pytest.approx(1.0, rel=1e-3)
-    (felt,), softer = found.fingers, query(table, ALONE, 20.0, drive_mode="phased")
-    assert softer.fingers[0].level_db_sl < felt.level_db_sl < 60.0
-    assert felt.lowered_db > 1.0
+    assert 20.0 < found.fingers[0].level_db_sl < 60.0
+    assert found.fingers[0].lowered_db > 1.0
 
 
 def test_ramp_is_as_long_as_the_rise_of_levels_allows() -> None:
@@ -163,17 +144,16 @@ def test_ramp_is_as_long_as_the_rise_of_levels_allows() -> None:
 
 def test_quiet_fingers_limit_a_raise() -> None:
     """They are 6 dB below it on nine of ten plates, or the drive is that of what lasts."""
-    table, lowered = smooth_table(), 0
+    lowered = 0
     for target, *quiet in contact_sets(6, fingers=9, seed=8):
         placed = Placement((target,), tuple(quiet))
-        found = query(table, placed, 20.0, duration=0.02, drive_mode="phased")
+        found = query(smooth_table(), placed, 20.0, duration=0.02, drive_mode="phased")
         felt = found.fingers[0]
         assert felt.level_db_sl <= 20.0 + 1e-3
         if felt.lowered_db:
             lowered += 1
-            assert felt.promised_contrast_db is not None
             quiet_level = felt.level_db_sl - felt.promised_contrast_db
-            assert quiet_level == pytest.approx(14.0, abs=0.01) or quiet_level > 14.0
+            assert quiet_level > 14.0 - 0.01
             assert "quiet fingers" in found.applied[-1]
     assert lowered
 
@@ -245,19 +225,16 @@ def table():
     return build_table(load_rig(PAPER_PLATE))
 
 
-def hands(count):
+def hands():
     """Three fingers in a row, 2.1 cm apart, and one of somebody else at least 9 cm from them."""
     rng, found = np.random.default_rng(1), []
-    length, width = table().plate.length, table().plate.width
-
-    def anywhere():
-        return rng.uniform(EDGE, [length - EDGE, width - EDGE])
-
-    while len(found) < count:
-        middle, angle, far = anywhere(), rng.uniform(0, 2 * math.pi), anywhere()
+    inside = np.array([table().plate.length, table().plate.width]) - EDGE
+    while len(found) < 8:
+        middle, far = rng.uniform(EDGE, inside, (2, 2))
+        angle = rng.uniform(0, 2 * math.pi)
         along = APART * np.array([math.cos(angle), math.sin(angle)])
         hand = middle + np.outer([-1, 0, 1], along)
-        is_inside = (hand >= EDGE).all() and (hand <= [length - EDGE, width - EDGE]).all()
+        is_inside = ((hand >= EDGE) & (hand <= inside)).all()
         if is_inside and np.linalg.norm(hand - far, axis=1).min() >= AWAY:
             found.append([(float(x), float(y)) for x, y in (*hand, far)])
     return found
@@ -281,40 +258,34 @@ def is_served(felt):
 def test_a_hand_of_three_contents_silences_nobody(first):
     """Whom one content on the hand would leave served is served beside three, in any order."""
     order = [0, 1, 2, 3] if first == "hand" else [3, 0, 1, 2]
-    would = 0
-    for places in hands(8):
+    for places in hands():
         alike = set_answer(table(), fingers(places, is_one=True))
-        would += is_served(alike.fingers[3])
+        assert is_served(alike.fingers[3])
         found = set_answer(table(), [fingers(places)[each] for each in order])
         *hand, far = [found.fingers[order.index(each)] for each in range(4)]
-        assert is_served(far) or not is_served(alike.fingers[3])
+        assert is_served(far)
         assert [each.verdict for each in hand[1:]] == ["shared", "shared"]
         assert is_served(hand[0])
         assert len({each.layer for each in hand}) == 1
         assert found.promised_worst_db == pytest.approx(alike.promised_worst_db, abs=1.0)
-    assert would == 8
 
 
 def test_a_hand_that_may_not_share_gives_way():
     """Its contents, which no plan serves, are held back for the one that all of them can stay off.
 
-    Where somebody else is not there, what is best is played at the hand.
+    Where somebody else is not there, what is best is played at the hand. Of two fingers of a hand
+    that feel nothing the third's content is held back, nobody else's.
     """
-    for places in hands(8):
+    for places in hands():
         asked = fingers(places, sharing=NEVER)
         found = set_answer(table(), asked)
         assert is_served(found.fingers[3])
         assert [each.verdict for each in found.fingers[:3]] == ["held back"] * 3
-    assert "mixed" in {each.verdict for each in set_answer(table(), asked[:3]).fingers}
-
-
-def test_a_content_beside_a_quiet_finger_of_its_hand_gives_way():
-    """Two fingers of a hand that feel nothing: the third's content is held back, nobody else's."""
-    for places in hands(8):
         own = fingers(places)
-        found = set_answer(table(), [own[0], own[3]], [Finger(at) for at in places[1:3]])
-        assert found.fingers[0].verdict == "held back"
-        assert is_served(found.fingers[1])
+        beside = set_answer(table(), [own[0], own[3]], [Finger(at) for at in places[1:3]])
+        assert beside.fingers[0].verdict == "held back"
+        assert is_served(beside.fingers[1])
+    assert "mixed" in {each.verdict for each in set_answer(table(), asked[:3]).fingers}
 
 
 def test_fingers_that_can_be_apart_do_not_share():
@@ -336,7 +307,7 @@ def test_fingers_that_can_be_apart_do_not_share():
 
 def test_what_may_share_and_is_near_is_one_drive():
     """Fingers that allow any content have one, as those that cannot be kept apart."""
-    places = hands(1)[0]
+    places = hands()[0]
     may, near = (set_answer(table(), fingers(places, sharing=how)) for how in (ANY, BY_NAME))
     assert drives(may) == drives(near)
 
@@ -349,14 +320,6 @@ ONE_EACH = [wants((0.09, 0.07)), wants((0.25, 0.18))]
 def faint_table(*sets: str) -> LocalizationTable:
     """Of the paper's rig, whose promises hold by these sets of thresholds."""
     rig = replace(smooth_rig(), promised_thresholds=sets)
-    return build_table(rig, frequencies=np.linspace(40.0, 320.0, 29))
-
-
-@cache
-def known_table() -> LocalizationTable:
-    """Of the same rig as known as after an identification, by all sets."""
-    well = Uncertainty(0.015, 1.5, 0.002, 0.01, 1.1, 0.5)
-    rig = replace(smooth_rig(), promised_thresholds=THRESHOLDS, uncertainty=well)
     return build_table(rig, frequencies=np.linspace(40.0, 320.0, 29))
 
 
@@ -393,8 +356,12 @@ def test_an_only_content_has_the_frequency_that_promises_most_by_every_set():
     assert found.promised_worst_db > each[50.0] + 6
 
 
-def test_levels_are_above_the_rigs_own_thresholds():
-    """Another set beside it changes neither the level nor, of one content alone, the contrast."""
+def test_levels_and_bounds_are_above_the_rigs_own_thresholds():
+    """Another set beside it changes neither the level nor, of one content alone, the contrast.
+
+    What holds by one set holds where others are promised, too: bounds that fingers state are by the
+    rig's own.
+    """
     one, every = (
         set_answer(of, ONE_EACH[:1], [Finger((0.16, 0.20))])
         for of in (faint_table(PROBE), faint_table(*THRESHOLDS))
@@ -407,17 +374,10 @@ def test_levels_are_above_the_rigs_own_thresholds():
     ratio = detection_threshold(frequency, PROBE) / detection_threshold(frequency, PRESSING)
     heard = [each.fingers[1].foreign_level_db_sl for each in (one, every)]
     assert heard[1] - heard[0] == pytest.approx(20 * np.log10(ratio[0]), abs=1e-3)
-
-
-def test_bounds_that_fingers_state_are_above_the_rigs_own_thresholds():
-    """What holds by one set holds where others are promised, too: what is asked is by that set."""
-    alone = set_answer(faint_table(PROBE), ONE_EACH[:1], [Finger((0.16, 0.20))])
-    bound = alone.fingers[1].foreign_level_db_sl + 0.1
-    found = set_answer(
-        faint_table(*THRESHOLDS), ONE_EACH[:1], [Finger((0.16, 0.20), max_foreign_db_sl=bound)]
-    )
+    bounded = Finger((0.16, 0.20), max_foreign_db_sl=heard[0] + 0.1)
+    found = set_answer(faint_table(*THRESHOLDS), ONE_EACH[:1], [bounded])
     assert found.fingers[0].verdict == OWN
-    assert found.fingers[1].foreign_level_db_sl > bound + 20
+    assert found.fingers[1].foreign_level_db_sl > heard[0] + 20
 
 
 @pytest.mark.parametrize(
@@ -442,10 +402,11 @@ def test_a_texture_is_mixed_where_a_steady_content_is_own():
 
     On a plate that is well known, where both have 12 dB.
     """
-    of = known_table()
-    requests = [wants((0.09, 0.07)), wants((0.25, 0.18))]
-    steady = set_answer(of, requests)
-    found = set_answer(of, [wants((0.09, 0.07), modulation_hz=20.0), requests[1]])
+    well = Uncertainty(0.015, 1.5, 0.002, 0.01, 1.1, 0.5)
+    rig = replace(smooth_rig(), promised_thresholds=THRESHOLDS, uncertainty=well)
+    of = build_table(rig, frequencies=np.linspace(40.0, 320.0, 29))
+    steady = set_answer(of, ONE_EACH)
+    found = set_answer(of, [wants((0.09, 0.07), modulation_hz=20.0), ONE_EACH[1]])
     assert found.layers[0].side_bands
     assert [each.pauses for each in found.fingers] == [True, False]
     assert all(each.is_foreign_felt for each in (*steady.fingers, *found.fingers))

@@ -2,6 +2,7 @@
 
 import math
 import pickle
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cache
 from typing import Any
@@ -46,7 +47,8 @@ from plates import (
     smooth_rig,
     smooth_table,
 )
-from set_table import only
+from registry.limits import HAND_LOAD
+from set_table import only, phased, wants
 
 TARGET, QUIET, STROKE = (0.09, 0.07), (0.24, 0.17), 100e-6
 
@@ -79,28 +81,25 @@ def test_strongest_moments_of_a_course() -> None:
     assert along(0.5, np.zeros(3)).strongest_db == pytest.approx(-120)
 
 
-def beats(frequency: float) -> Course:
-    """Beats of a frequency [Hz] that come and go along a raised cosine of 8 s."""
-    times = np.linspace(0, 8.0, 1601)
-    slow = (1 - np.cos(2 * np.pi * times / 8.0)) / 2
-    return along(8.0, slow * (1 - np.cos(2 * np.pi * frequency * times)) / 2)
-
-
 def test_a_sinusoidal_modulation_has_three_tones() -> None:
-    """Each side tone has half of the amplitude of the carrier, a quarter of its power."""
-    off = np.arange(-60.0, 61.0, 10.0)
-    shares = DriveEnvelope.of_course(beats(20.0)).shares_at(off)
-    expected = 0.25 * (np.abs(off) == 20) + (off == 0)
-    assert shares / shares.max() == pytest.approx(expected, abs=0.01)
+    """Of beats that come and go along a raised cosine of 8 s.
 
-
-def test_next_to_a_null_little_is_felt_of_slow_changes() -> None:
-    """Side bands at 2 Hz are a fifth of the way to the next tone, of whose power they cause 1/25.
-
-    At the top of a beat the carrier has half of the amplitude, each side band a quarter.
+    Each side tone has half of the amplitude of the carrier, a quarter of its power. Next to a null
+    little is felt of slow changes: side bands at 2 Hz are a fifth of the way to the next tone, of
+    whose power they cause 1/25. At the top of a beat the carrier has half of the amplitude, each
+    side band a quarter.
     """
-    shares = DriveEnvelope.of_course(beats(2.0)).shares_at(np.array([-10.0, 0.0, 10.0]))
-    assert shares[[0, 2]] == pytest.approx(0.25**2 / 25, rel=0.1)
+    off, times = np.arange(-60.0, 61.0, 10.0), np.linspace(0, 8.0, 1601)
+    slow = (1 - np.cos(2 * np.pi * times / 8.0)) / 2
+    quick, hardly = (
+        DriveEnvelope.of_course(
+            along(8.0, slow * (1 - np.cos(2 * np.pi * frequency * times)) / 2)
+        ).shares_at(off)
+        for frequency in (20.0, 2.0)
+    )
+    expected = 0.25 * (np.abs(off) == 20) + (off == 0)
+    assert quick / quick.max() == pytest.approx(expected, abs=0.01)
+    assert hardly[np.abs(off) == 10] == pytest.approx(0.25**2 / 25, rel=0.1)
 
 
 def jump() -> Course:
@@ -164,62 +163,55 @@ def test_a_course_that_is_a_click_is_answered_as_the_click() -> None:
 @pytest.mark.parametrize("quiet", [(), (QUIET,)], ids=["alone", "beside"])
 def test_a_course_that_stays_faint_is_answered_as_a_strong_one(quiet: tuple[Point, ...]) -> None:
     """A fiftieth of it, 34 dB fainter, 34 dB above: all is linear, so it is the same drive."""
-    table, placed = smooth_table(), Placement((TARGET,), quiet)
-    found = []
-    for height in (1.0, 0.02):
-        course = along(1.0, np.array([0.0, height, 0.0]))
-        level = -14 - 20 * math.log10(height)
-        found.append(query(table, placed, level, course=course, drive_mode="phased"))
-    strong, faint = found
-    assert faint.layers[0].frequency == strong.layers[0].frequency
-    for name, tone in strong.layers[0].excitation.items():
-        other = faint.layers[0].excitation[name]
-        assert abs(0.02 * other.phasor / tone.phasor - 1) < 1e-3
+    strong, faint = (
+        query(
+            smooth_table(),
+            Placement((TARGET,), quiet),
+            -14 - 20 * math.log10(height),
+            course=along(1.0, np.array([0.0, height, 0.0])),
+            drive_mode="phased",
+        ).layers[0]
+        for height in (1.0, 0.02)
+    )
+    assert faint.frequency == strong.frequency
+    for name, tone in strong.excitation.items():
+        assert abs(0.02 * faint.excitation[name].phasor / tone.phasor - 1) < 1e-3
 
 
 @pytest.mark.long
-def test_promise_over_a_course_is_kept() -> None:
-    """By nine of ten of 120 plates in time, beside a quiet finger and beside a steady content."""
-    table, rig, stimulus = smooth_table(), smooth_rig(), Stimulus(20.0, course=strokes())
-    steady = Stimulus(14.0)
-    for has_other, first in ((False, stimulus), (True, stimulus), (True, steady)):
-        answers = []
-        for places in contact_sets(10, fingers=2, seed=3):
-            second = (steady if first is stimulus else stimulus) if has_other else None
-            fingers = [Finger(places[0], first), Finger(places[1], second)]
-            answers.append(answer(table, fingers, drive_mode="phased", min_contrast_db=-99.0))
-        promised = np.array([each.fingers[0].promised_contrast_db for each in answers])
-        found = given(table, rig, answers, 12, seed=4)
-        assert 0.86 <= np.mean(found >= promised[:, None]) <= 0.95, (has_other, first)
-
-
-@pytest.mark.long
-def test_side_bands_of_a_course_are_promised_too() -> None:
-    """A texture of 20 Hz along a course: on nine of ten plates in time."""
-    table, rig, answers = smooth_table(), smooth_rig(), []
-    for places in contact_sets(10, fingers=2, seed=5):
-        fingers = [Finger(places[0], Stimulus(20.0, course=strokes(), modulation_hz=20.0))]
-        answers.append(answer(table, fingers, quiet=places[1:], drive_mode="phased"))
-    assert sum(bool(each.layers[0].side_bands) for each in answers) >= 5
+@pytest.mark.parametrize(
+    ("first", "second"),
+    [
+        (Stimulus(20.0, course=strokes()), None),
+        (Stimulus(20.0, course=strokes()), Stimulus(14.0)),
+        (Stimulus(14.0), Stimulus(20.0, course=strokes())),
+        (Stimulus(20.0, course=strokes(), modulation_hz=20.0), None),
+    ],
+    ids=["alone", "beside a steady one", "a steady one beside it", "with side bands"],
+)
+def test_promise_over_a_course_is_kept(first: Stimulus, second: Stimulus | None) -> None:
+    """By nine of ten plates in time, beside a quiet finger and beside a steady content."""
+    table, answers = smooth_table(), []
+    for places in contact_sets(10, fingers=2, seed=3):
+        fingers = [Finger(places[0], first), Finger(places[1], second)]
+        answers.append(answer(table, fingers, drive_mode="phased", min_contrast_db=-99.0))
+    if first.modulation_hz:
+        assert sum(bool(each.layers[0].side_bands) for each in answers) >= 5
     promised = np.array([each.fingers[0].promised_contrast_db for each in answers])
-    found = given(table, rig, answers, 30, seed=6)
+    found = given(table, smooth_rig(), answers, 12, seed=4)
     assert 0.86 <= np.mean(found >= promised[:, None]) <= 0.97
 
 
 def test_a_stimulus_has_the_duration_of_its_course() -> None:
-    """And no other; a course must be one."""
-    course = along(0.5, np.array([0.0, 1.0, 0.0]))
-    stimulus = Stimulus(20.0, course=course)
-    assert stimulus.duration == 0.5
-    assert replace(stimulus, level_db_sl=10.0).duration == 0.5
-    with pytest.raises(InputError, match="duration must be left out of a stimulus with a course"):
-        Stimulus(20.0, duration=0.2, course=course)
-    with pytest.raises(InputError, match="course must be one such as"):
-        Stimulus(20.0, course=(0.0, 1.0))  # type: ignore[arg-type]
+    """Also with another level."""
+    stimulus = Stimulus(20.0, course=along(0.5, np.array([0.0, 1.0, 0.0])))
+    assert stimulus.duration == replace(stimulus, level_db_sl=10.0).duration == 0.5
 
 
-RNG = np.random.default_rng(5)
-PLACES = [(float(x), float(y)) for x, y in RNG.uniform([0.02, 0.02], [0.29, 0.21], (8, 2))]
+PLACES = [
+    (float(x), float(y))
+    for x, y in np.random.default_rng(5).uniform([0.02, 0.02], [0.29, 0.21], (8, 2))
+]
 IDENTIFIED = Uncertainty(0.015, 1.5, 0.002, 0.01, 1.1, 0.5, modulus=0.002, place=0.0002)
 FLAT = Uncertainty(0.02, 1.0, 0.0, 0.02, 1.2, 0.3)  # of a thickness that is certain
 
@@ -377,9 +369,8 @@ def test_level_that_no_kept_frequency_reaches_is_sought_at_all(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Where the ranking keeps only a frequency that is too weak the answer is that of all."""
-    for module in (tone_search, tone_search):
-        monkeypatch.setattr(module, "KEPT", 1)
-        monkeypatch.setattr(module, "MISSING", 1)
+    monkeypatch.setattr(tone_search, "KEPT", 1)
+    monkeypatch.setattr(tone_search, "MISSING", 1)
     of = replace(table())  # that keeps no rules yet
     contents = content(of, Placement((PLACES[0],), (PLACES[1],)), 50.0)
     (kept,) = ranked(FingersOnPlate.of(of, contents.places, ()), contents).tolist()
@@ -436,84 +427,115 @@ def test_stroke_is_shared_by_one_factor_for_each_priority() -> None:
     assert factor == pytest.approx(0.175)
 
 
-FINGERS_TARGET, FINGERS_QUIET = (0.09, 0.07), ((0.25, 0.18),)
+FINGERS_QUIET = ((0.25, 0.18),)
 
 
-@pytest.mark.parametrize(
-    "placed",
-    [
-        Placement(()),
-        Placement((FINGERS_TARGET,), tuple((x, y / 50) for x in (0.2, 0.24) for y in range(10))),
-        Placement((FINGERS_TARGET, (0.2, 0.1), FINGERS_TARGET)),
-        Placement((FINGERS_TARGET,), FINGERS_QUIET * 2),
-        Placement((FINGERS_TARGET,), (FINGERS_TARGET,)),
-        Placement(((0.2, 0.1), FINGERS_TARGET), ((0.095, 0.07),)),
-        Placement((FINGERS_TARGET,), loads=(1.0, 1.0)),
-        *(Placement((FINGERS_TARGET,), loads=(load,)) for load in (0.0, -1.0, math.nan, math.inf)),
-        Placement(((0.1, math.inf),)),
-        Placement((FINGERS_TARGET,), ((math.nan, 0.1),)),
+def placed(*given: Any, **more: Any) -> None:
+    """Check fingers at these places."""
+    check_fingers(together(Placement(*given, **more), Stimulus()), smooth_table().plate)
+
+
+def asked(**given: Any) -> None:
+    """Ask for a stimulus with these keys."""
+    query(smooth_table(), Placement((TARGET,)), **given)
+
+
+def of_finger(**given: Any) -> None:
+    """Ask for a finger with these keys."""
+    answer(smooth_table(), [Finger(TARGET, Stimulus(), **given)])
+
+
+def of_fingers(*fingers: Finger, quiet: Sequence[Finger] = ()) -> None:
+    """Ask for these fingers."""
+    phased(smooth_table(), fingers, quiet)
+
+
+REFUSED: dict[str, list[Callable[[], object]]] = {
+    "at least one finger": [lambda: placed(()), lambda: of_fingers()],
+    "up to 20 fingers, got 2": [
+        lambda: placed((TARGET,), tuple((x, y / 50) for x in (0.2, 0.24) for y in range(10))),
+        lambda: of_fingers(*(wants((0.01 * n, 0.01)) for n in range(22))),
     ],
-    ids=str,
-)
-def test_fingers_that_contradict_each_other_are_refused(placed):
-    """Their number, loads, places on top of each other, and off the plate."""
-    plate = smooth_table().plate
-    check_fingers(
-        together(Placement((FINGERS_TARGET, (0.095, 0.07)), FINGERS_QUIET), Stimulus()), plate
-    )
-    with pytest.raises(InputError):
-        check_fingers(together(placed, Stimulus()), plate)
-
-
-@pytest.mark.parametrize(
-    "more",
-    [
-        {"level_db_sl": math.nan},
-        {"level_db_sl": 60.5},
-        {"level_db_sl": -300.0},
-        {"level_db_sl": 10**400},
-        {"duration": 0.0},
-        {"duration": 1e-9},
-        {"duration": 10**400},
-        {"is_limit": "no"},
-        {"duration": math.inf},
-        {"duration": 0.04, "modulation_hz": 20.0},
-        {"drive_mode": "loud"},
-        {"band_hz": (600.0, 800.0)},
+    "at least 13 mm": [
+        lambda: placed((TARGET, (0.2, 0.1), TARGET)),
+        lambda: placed((TARGET,), FINGERS_QUIET * 2),
+        lambda: placed((TARGET,), (TARGET,)),
+        lambda: placed(((0.2, 0.1), TARGET), ((0.095, 0.07),)),
+        lambda: of_fingers(wants(TARGET), wants(TARGET)),
+        lambda: of_fingers(wants(TARGET), quiet=[Finger(TARGET)]),
     ],
-    ids=str,
-)
-def test_stimuli_that_no_table_has_are_refused(more):
-    """Levels, durations and modes that there are not, and frequencies that the table lacks."""
-    with pytest.raises(InputError):
-        query(smooth_table(), Placement((FINGERS_TARGET,)), **more)
-
-
-@pytest.mark.parametrize(
-    "given",
-    [
-        {"priority": 10**400},
-        {"priority": 1 << 31},
-        {"priority": -(1 << 31) - 1},
-        {"load": 10**400},
-        {"min_contrast_db": math.nan},
-        {"sharing": np.array([1, 2])},
-        {"is_protected": "no"},
+    "loads must have one value": [lambda: placed((TARGET,), loads=(1.0, 1.0))],
+    # Loads above ten fingertips are those of hands, which are to feel nothing.
+    r"load must be between 0\.1 and 10 times": [
+        *(lambda load=load: placed((TARGET,), loads=(load,)) for load in (0.0, -1.0, math.inf)),
+        *(lambda load=load: of_fingers(wants(TARGET, load=load)) for load in (0.0, HAND_LOAD)),
     ],
-    ids=lambda given: next(iter(given)),
-)
-def test_what_no_finger_asks_is_refused(given):
-    """Numbers that no plate or kernel has, and values that are no answer to the question."""
-    with pytest.raises(InputError):
-        answer(smooth_table(), [Finger(FINGERS_TARGET, Stimulus(), **given)])
+    "load must be a number": [
+        lambda: placed((TARGET,), loads=(math.nan,)),
+        lambda: of_finger(load=10**400),
+    ],
+    "finger must be on the plate": [
+        lambda: placed(((0.1, math.inf),)),
+        lambda: placed((TARGET,), ((math.nan, 0.1),)),
+        lambda: of_fingers(wants((0.4, 0.1))),
+    ],
+    "level must be between -100 and 60": [
+        *(lambda db=db: asked(level_db_sl=db) for db in (math.nan, 60.5, -300.0)),
+        lambda: wants(TARGET, level_db_sl=np.nan),
+    ],
+    "level_db_sl must be a number": [lambda: asked(level_db_sl=10**400)],
+    r"duration must be from 0\.001 to": [
+        lambda: asked(duration=0.0),
+        lambda: asked(duration=1e-9),
+        lambda: asked(duration=math.inf),
+    ],
+    "duration must be a number": [lambda: asked(duration=10**400)],
+    "duration must be left out of a stimulus with a course": [
+        lambda: Stimulus(20.0, duration=0.2, course=along(0.5, np.array([0.0, 1.0, 0.0])))
+    ],
+    "course must be one such as": [lambda: Stimulus(20.0, course=(0.0, 1.0))],
+    "modulation_hz must be left out": [lambda: asked(duration=0.04, modulation_hz=20.0)],
+    "is_limit must be True or False": [lambda: asked(is_limit="no")],
+    "drive mode must be one of": [lambda: asked(drive_mode="loud")],
+    "hold a frequency": [
+        lambda: asked(band_hz=(600.0, 800.0)),
+        lambda: of_fingers(wants(TARGET, (41, 42)), wants(FINGERS_QUIET[0])),
+    ],
+    "band_hz must be from a lowest": [lambda: wants(TARGET, band_hz=(90, 60))],
+    "priority must be from -2147483647 to": [
+        *(lambda n=n: of_finger(priority=n) for n in (10**400, 1 << 31, -(1 << 31) - 1))
+    ],
+    "priority must be a whole number": [
+        lambda: wants(TARGET, priority=1.5),
+        lambda: wants(TARGET, priority=True),
+    ],
+    "min_contrast_db must be a number": [lambda: of_finger(min_contrast_db=math.nan)],
+    "max_foreign_db_sl must be a number": [lambda: wants(TARGET, max_foreign_db_sl=np.nan)],
+    "sharing must be one of": [lambda: of_finger(sharing=np.array([1, 2]))],
+    "is_protected must be True or False": [lambda: of_finger(is_protected="no")],
+    "name of a stimulus must be text": [lambda: wants(TARGET, name=3)],
+}
+"""What is said, and each question of which it is."""
+
+
+@pytest.mark.parametrize("said", REFUSED)
+def test_what_contradicts_itself_or_has_no_answer_is_refused(said: str) -> None:
+    """Fingers by their number, loads and places, stimuli by levels, durations and modes.
+
+    Also numbers that no plate or kernel has, and values that are no answer to the question.
+    """
+    placed((TARGET, (0.095, 0.07)), FINGERS_QUIET)
+    for refused in REFUSED[said]:
+        with pytest.raises(InputError, match=said):
+            refused()
 
 
 @pytest.mark.parametrize(
     ("targets", "quiet", "mode"),
     [
-        ((FINGERS_TARGET,), FINGERS_QUIET, "phased"),
-        ((FINGERS_TARGET, (0.2, 0.1)), (), "phased"),
-        ((FINGERS_TARGET, (0.2, 0.1)), (), "switched"),
+        ((TARGET,), FINGERS_QUIET, "phased"),
+        ((TARGET, (0.2, 0.1)), (), "phased"),
+        ((TARGET, (0.2, 0.1)), (), "switched"),
     ],
 )
 def test_a_level_out_of_reach_is_lowered_to_one_in_reach(targets, quiet, mode):
@@ -533,13 +555,12 @@ def test_a_level_out_of_reach_is_lowered_to_one_in_reach(targets, quiet, mode):
 
 def test_a_limit_is_as_strong_as_quiet_fingers_allow():
     """These are at -10 dB SL on nine of ten plates, or the limit is reached, in both modes."""
-    table, near = smooth_table(), (0.14, 0.09)
+    finger = Finger(TARGET, Stimulus(26.0, is_limit=True))
     for mode in ("switched", "phased"):
-        for quiet, bound in (((near,), True), ((), False)):
-            finger = Finger(FINGERS_TARGET, Stimulus(26.0, is_limit=True))
-            found = answer(table, [finger], quiet=quiet, drive_mode=mode)
+        for quiet in (((0.14, 0.09),), ()):
+            found = answer(smooth_table(), [finger], quiet=quiet, drive_mode=mode)
             felt = found.fingers[0]
-            if bound:
+            if quiet:
                 assert found.fingers[1].foreign_level_db_sl == pytest.approx(-10.0, abs=1e-3)
                 assert felt.level_db_sl < 26.0
             else:
@@ -550,9 +571,9 @@ def test_a_limit_is_as_strong_as_quiet_fingers_allow():
 @pytest.mark.parametrize("slew", [math.inf, 0.3, 0.1])
 def test_a_click_that_is_a_limit_stays_so_along_the_ramp_that_the_slew_needs(slew: float):
     """Quiet fingers have -10 dB SL at most; it does not return to the level of its search."""
-    click = Finger(FINGERS_TARGET, Stimulus(26.0, duration=0.04, is_limit=True))
+    click = Finger(TARGET, Stimulus(26.0, duration=0.04, is_limit=True))
     for quiet in contact_sets(6, fingers=2, seed=5):
-        if min(math.dist(at, FINGERS_TARGET) for at in quiet) < 0.02:
+        if min(math.dist(at, TARGET) for at in quiet) < 0.02:
             continue
         found = answer(
             smooth_table(), [click], quiet=quiet, drive_mode="phased", limits=Limits(slew=slew)
@@ -562,7 +583,7 @@ def test_a_click_that_is_a_limit_stays_so_along_the_ramp_that_the_slew_needs(sle
 
 def test_a_limit_is_not_lowered_for_what_others_play():
     """Of the other vibration nothing counts; beside no quiet finger both have their levels."""
-    limit = Finger(FINGERS_TARGET, Stimulus(26.0, is_limit=True))
+    limit = Finger(TARGET, Stimulus(26.0, is_limit=True))
     other = Finger((0.05, 0.17), Stimulus(20.0))
     found = answer(smooth_table(), [limit, other], drive_mode="phased")
     assert [each.verdict in ("own", "mixed") for each in found.fingers] == [True, True]
@@ -582,13 +603,13 @@ def test_frequencies_are_those_of_the_band():
     for mode in ("switched", "phased"):
         layer, _ = only(
             smooth_table(),
-            Placement((FINGERS_TARGET,), FINGERS_QUIET),
+            Placement((TARGET,), FINGERS_QUIET),
             drive_mode=mode,
             band_hz=(150.0, 250.0),
         )
         assert all(150 <= tone.frequency <= 250 for tone in layer.excitation.values())
     end = float(SMALL_TABLE_HZ[9])
-    layer, _ = only(smooth_table(), Placement((FINGERS_TARGET,), FINGERS_QUIET), band_hz=(end, end))
+    layer, _ = only(smooth_table(), Placement((TARGET,), FINGERS_QUIET), band_hz=(end, end))
     assert layer.frequency == end
 
 
@@ -624,18 +645,18 @@ def test_query_reaches_the_level_at_both_targets():
 def test_the_grid_of_summaries_decides_no_answer(mode):
     """A lone finger feels the same whatever it is."""
     table = smooth_table()
-    expected, _ = only(table, Placement((FINGERS_TARGET,)), drive_mode=mode)
+    expected, _ = only(table, Placement((TARGET,)), drive_mode=mode)
     for cells in ((1, 1), (2, 2), (6, 4), (30, 20)):
         other = replace(table, grid=Grid(*cells))
-        found, _ = only(other, Placement((FINGERS_TARGET,)), drive_mode=mode)
+        found, _ = only(other, Placement((TARGET,)), drive_mode=mode)
         assert found == expected
 
 
 @pytest.mark.parametrize(
     ("targets", "mode"),
     [
-        *(((FINGERS_TARGET,), mode) for mode in ("switched", "phased")),
-        ((FINGERS_TARGET, FINGERS_QUIET[0]), "phased"),
+        *(((TARGET,), mode) for mode in ("switched", "phased")),
+        ((TARGET, FINGERS_QUIET[0]), "phased"),
     ],
 )
 def test_query_without_quiet_fingers_contrasts_with_the_plate_around(targets, mode):

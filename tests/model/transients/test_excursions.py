@@ -93,8 +93,9 @@ def test_magnets_on_a_board_as_light_as_they_are() -> None:
 def test_excursion_within_the_frequencies_of_a_rig() -> None:
     """By its level: half of it is half as far, and from a frequency on all are within."""
     rig = exciter_rig("type: DAEX13-4SM, power: 1 W", frequency="[60, 300]")
-    full = excursions_of(rig)
-    half = excursions_of(replace(rig, limits=replace(rig.limits, level=0.5)))
+    full, half = (
+        excursions_of(replace(rig, limits=replace(rig.limits, level=level))) for level in (1.0, 0.5)
+    )
     assert half.largest == pytest.approx(full.largest / 2)
     assert full.passed.all()
     assert 60 < half.allowed < full.allowed < 300
@@ -154,30 +155,32 @@ def test_bursts_are_followed_as_scipy_integrates() -> None:
     tips = fingertip_loads(Fingertip(), [(0.1, 0.08)])
     reduced = reduce_plate(rig.plate, rig.mesh, footprints_of(rig.eras, (), tips))
     plate = plate_in_time(reduced, rig.eras, contacts=tips)
-    points = np.array([[0.1, 0.08], [0.25, 0.2]])
+    points, driven = np.array([[0.1, 0.08], [0.25, 0.2]]), [0, 3]
 
-    def played(rate: float, count: int) -> np.ndarray:
-        times, signals = np.arange(count) / rate, np.zeros((4, count))
-        signals[0], signals[3] = 0.8 * chirp(times), -0.5 * chirp(times - 0.003)
-        factors = np.ones(4, dtype=complex)
-        return from_rest(plate, signals, reduced.at(points), sample_rate=rate, factors=factors)
+    def bases(by: int) -> np.ndarray:
+        times = np.arange(COUNT * by) / (RATE * by)
+        return np.array([0.8 * chirp(times), -0.5 * chirp(times - 0.003)])
 
-    found = played(RATE, COUNT)
-    finer = played(2 * RATE, 2 * COUNT)[::2]
+    def played(by: int) -> np.ndarray:
+        signals, shapes = np.zeros((4, by * COUNT)), reduced.at(points)
+        signals[driven] = bases(by)
+        return from_rest(plate, signals, shapes, sample_rate=by * RATE, factors=np.ones(4))[::by]
+
+    found, finer = played(1), played(2)
     np.testing.assert_allclose(found, finer, atol=1e-7 * np.abs(finer).max())
 
     M, C, K = modal_matrices(reduced, rig.eras, contacts=tips)
     r, inverse = len(M), np.linalg.inv(M)
-    phi = np.pad(reduced.at(footprints_of(rig.eras)), ((0, 0), (0, 1)))[[0, 3]].T
+    phi = np.pad(reduced.at(footprints_of(rig.eras)), ((0, 0), (0, 1)))[driven].T
     A = np.block([[np.zeros((r, r)), np.eye(r)], [-inverse @ K, -inverse @ C]])
-    eras = [rig.eras[0], rig.eras[3]]
-    k, c = (np.array([getattr(era, key) for era in eras]) for key in ("stiffness", "damping"))
+    k, c = (
+        np.array([getattr(rig.eras[n], key) for n in driven]) for key in ("stiffness", "damping")
+    )
     B = np.vstack([np.zeros((r, 4)), inverse @ np.hstack([phi * k, phi * c])])
     shapes = np.pad(reduced.at(points), ((0, 0), (0, 1)))
     system = StateSpace(A, B, shapes @ A[r:], shapes @ B[r:])  # gives the acceleration
-    fine = np.arange(COUNT * FINER) / (RATE * FINER)
-    bases = np.array([0.8 * chirp(fine), -0.5 * chirp(fine - 0.003)]).T * rig.eras[0].stroke
-    _, expected, _ = lsim(system, np.hstack([bases, np.gradient(bases, fine, axis=0)]), fine)
+    moved, fine = bases(FINER).T * rig.eras[0].stroke, np.arange(COUNT * FINER) / (RATE * FINER)
+    _, expected, _ = lsim(system, np.hstack([moved, np.gradient(moved, fine, axis=0)]), fine)
     np.testing.assert_allclose(found, expected[::FINER], atol=1e-4 * np.abs(expected).max())
 
 
@@ -294,20 +297,17 @@ def test_knots_are_those_of_numpy(eras, quiet, level):
     carrier, found = random_plate(rng, eras, quiet)
     weights = rng.standard_normal(eras) + 1j * rng.standard_normal(eras)
     weights *= level / np.abs(weights).max()
-    knots = onset_knots(weights, found, VARIANCE)
-    expected = onset_by_numpy(weights, found, VARIANCE)
-    np.testing.assert_allclose(knots[1:-1], expected, atol=2e-3 * np.abs(expected).max())
-    np.testing.assert_array_equal(knots[0], 0)
-    np.testing.assert_array_equal(knots[-1], weights)
-    assert np.abs(knots[1:-1]).max() <= 1
+    onset = onset_knots(weights, found, VARIANCE), onset_by_numpy(weights, found, VARIANCE)
+    ways = [(0 * weights, *onset, weights)]
     active = np.arange(eras)[rng.permutation(eras) > 0]
     for felt in (None, of_eras(found, active)):
         weight = 0.0 if felt is None else quiet_weight(carrier, weights, active, felt)
         knots = ending_knots(carrier, weights, active, felt)
         expected = ending_by_numpy(carrier, weights, active, felt, weight)
+        ways.append((weights[active], knots, expected, 0 * weights[active]))
+    for first, knots, expected, last in ways:
         np.testing.assert_allclose(knots[1:-1], expected, atol=2e-3 * np.abs(expected).max())
-        np.testing.assert_array_equal(knots[0], weights[active])
-        np.testing.assert_array_equal(knots[-1], 0)
+        np.testing.assert_array_equal(knots[[0, -1]], [first, last])
         assert np.abs(knots[1:-1]).max() <= 1
 
 
@@ -327,7 +327,11 @@ def test_onsets_and_endings_do_what_those_of_numpy_do(rig, without_kernels):
         places = [tuple(each) for each in (size * rng.uniform(0.1, 0.9, (1 + quiet, 2))).tolist()]
         weights = rng.standard_normal((len(table.eras), 2)) @ [1, 1j]
         weights *= level / np.abs(weights).max()
-        cases.append((places, excitation(table, weights)))
+        tones = {
+            era.name: Tone.from_phasor(130.0, complex(era.stroke * w))
+            for era, w in zip(table.eras, weights, strict=True)
+        }
+        cases.append((places, tones))
 
     def measured():
         found = []
@@ -341,18 +345,9 @@ def test_onsets_and_endings_do_what_those_of_numpy_do(rig, without_kernels):
 
     by_kernel = measured()
     without_kernels()
-    by_numpy = measured()
-    np.testing.assert_allclose(by_kernel[:, 0], by_numpy[:, 0], atol=0.02)
-    np.testing.assert_allclose(by_kernel[:, 1], by_numpy[:, 1], atol=0.2)
-    assert np.abs(by_kernel - by_numpy).max() > 0  # two ways indeed
-
-
-def excitation(table, weights):
-    """Tones of 130 Hz from weights in strokes."""
-    return {
-        era.name: Tone(130.0, float(era.stroke * abs(w)), float(np.angle(w)))
-        for era, w in zip(table.eras, weights, strict=True)
-    }
+    apart = np.abs(by_kernel - measured()).max(axis=0)
+    assert (apart < [0.02, 0.2]).all()
+    assert apart.max() > 0  # two ways indeed
 
 
 K, C, M, BL, R, VOLTS = 3189.2, 0.7553, 0.10929, 3.63, 4.4, 3.0008
@@ -393,17 +388,18 @@ def test_pulses_over_and_over_add_up_where_they_come_at_the_worst_pace() -> None
     """The worst of trains whose pauses are tried one by one; a single one moves it less."""
     magnets, frequency = held(), 40.0
     single, _ = swings_of_pulse(0.04, 0.01)
-    once, largest = replace(single, again=math.inf), 0.0
+    trains = []
     for pause in range(60, 120, 4):
-        train = np.zeros(900)
-        for start in range(0, 500, pause):
-            part = single.shares[: len(train) - start]
-            train[start : start + len(part)] += part
-        largest = max(largest, by_hand(frequency, Swing(tuple(train.tolist()), 0.001)))
+        starts = np.zeros(900)
+        starts[0:500:pause] = 1
+        shares = np.convolve(starts, single.shares)[:900]
+        trains.append(by_hand(frequency, Swing(tuple(shares.tolist()), 0.001)))
     assert single.again == CLICKS_APART == 0.06
-    found = motions_along(magnets.plate, magnets.rows, frequency, single)
-    assert found == pytest.approx([largest] * 4, rel=0.05)
-    alone = motions_along(magnets.plate, magnets.rows, frequency, once)
+    found, alone = (
+        motions_along(magnets.plate, magnets.rows, frequency, each)
+        for each in (single, replace(single, again=math.inf))
+    )
+    assert found == pytest.approx([max(trains)] * 4, rel=0.05)
     assert found[0] > 1.1 * alone[0]
 
 
@@ -412,9 +408,8 @@ def test_courses_swing_as_they_are_played_from_knot_to_knot() -> None:
     times = np.arange(0.0, 0.6, 0.001)
     shares = (1 + np.cos(2 * math.pi * 95 * times)) / 2
     swing = Course(tuple(times.tolist()), tuple(shares.tolist())).swings[0]
-    found = np.array(swing.shares)
     expected = (1 + np.cos(2 * math.pi * 5 * swing.step * np.arange(1, 60))) / 2
     assert swing.step == 0.01
-    assert found[1:60] == pytest.approx(expected, abs=1e-6)
-    assert (found[60:85] == 0).all()
-    assert found[85:].max() > 0.99
+    assert swing.shares[1:60] == pytest.approx(expected, abs=1e-6)
+    assert not any(swing.shares[60:85])
+    assert max(swing.shares[85:]) > 0.99

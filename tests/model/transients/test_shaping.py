@@ -2,18 +2,17 @@
 
 import cmath
 import math
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import pytest
 from scipy.optimize import minimize
 
 from model.answer.stimulus import Placement
+from model.arrays import lattice
 from model.errors import InputError
-from model.finger import fingertip_points, fingertip_weights
+from model.finger import Grid, fingertip_points, fingertip_weights
 from model.reduction.reduced_plate import ReducedPlate
 from model.rig.rig_file import load_rig
 from model.structure.attachments import Era
@@ -25,7 +24,6 @@ from model.transients.base_motion import (
     BaseMotions,
     Envelopes,
     Motion,
-    Term,
     raised_cosine,
     ramped_ending,
     ramped_onset,
@@ -44,7 +42,15 @@ from model.transients.knots import (
 from model.transients.shaping import SAMPLE_RATE, Shaper, Transients, responses_at
 from model.transients.time_response import plate_in_time
 from model.vibration import Excitation, Tone
-from plates import make_paper_rig, make_plate_in_time, stepped_acceleration
+from plates import (
+    STILL,
+    faded_base,
+    make_paper_rig,
+    make_plate_in_time,
+    motion_of,
+    shaped_base,
+    stepped_acceleration,
+)
 from set_table import only
 
 EXAMPLES = Path(__file__).parents[3] / "examples"
@@ -120,20 +126,21 @@ def test_shaped_envelopes_stay_within_the_stroke_and_stop_the_plate(setup, frequ
     """
     rig, _, shaper, transients = setup
     excitation = random_excitation(rig, frequency, np.random.default_rng(int(frequency)))
-    onset = shaper.onset(excitation, targets=[(0.08, 0.06)], quiet=[(0.2, 0.17)])
-    ending = shaper.ending(excitation)
+    onsets = shaper.onset(excitation, targets=[(0.08, 0.06)], quiet=[(0.2, 0.17)])
+    endings = shaper.ending(excitation)
     for era in rig.eras:
-        tone = excitation[era.name]
-        amplitude = tone.amplitude * np.exp(1j * tone.phase)
-        assert onset[era.name].largest <= era.stroke * (1 + 1e-9)
-        assert ending[era.name].largest <= era.stroke * (1 + 1e-9)
-        assert onset[era.name].start == 0
-        assert onset[era.name].knots[-1] == pytest.approx(amplitude)
-        assert ending[era.name].start == pytest.approx(amplitude)
-        assert ending[era.name].knots[-1] == 0
-        assert len(onset[era.name].knots) == ONSET_KNOTS == 21
-        assert ending[era.name].duration == pytest.approx(0.040)
-    left = transients.residual_db(excitation, shaped(ending, rig.eras))
+        onset, ending, amplitude = (
+            onsets[era.name],
+            endings[era.name],
+            excitation[era.name].phasor,
+        )
+        assert max(onset.largest, ending.largest) <= era.stroke * (1 + 1e-9)
+        assert onset.start == ending.knots[-1] == 0
+        assert onset.knots[-1] == pytest.approx(amplitude)
+        assert ending.start == pytest.approx(amplitude)
+        assert len(onset.knots) == ONSET_KNOTS == 21
+        assert ending.duration == pytest.approx(0.040)
+    left = transients.residual_db(excitation, shaped(endings, rig.eras))
     for ramp in (0.0, 0.04):
         plain = ramped_ending(excitation, rig.eras, ramp=ramp)
         assert left < transients.residual_db(excitation, plain) - 6
@@ -188,23 +195,15 @@ def test_onset_of_many_eras_is_as_good_as_of_few():
     gained = []
     for *places, _ in PAIRS:
         target, quiet = (tuple((size * place).tolist()) for place in places)
+        at = {"targets": [target], "quiet": [quiet]}
         layer, _ = only(table, Placement((target,), (quiet,)), drive_mode="phased")
-        excitation = layer.excitation
-        onset = shaper.onset(excitation, targets=[target], quiet=[quiet])
+        onset = shaper.onset(layer.excitation, **at)
         for era in table.eras:
-            tone = excitation[era.name]
             assert onset[era.name].largest <= era.stroke
-            assert onset[era.name].knots[-1] == pytest.approx(
-                tone.amplitude * np.exp(1j * tone.phase)
-            )
-        shaped_db, ramped_db = (
-            transients.contrast_db(bases, targets=[target], quiet=[quiet])
-            for bases in (
-                shaped(onset, table.eras),
-                ramped_onset(excitation, table.eras, ramp=0.04),
-            )
-        )
-        gained.append(shaped_db - ramped_db)
+            assert onset[era.name].knots[-1] == pytest.approx(layer.excitation[era.name].phasor)
+        ramp = ramped_onset(layer.excitation, table.eras, ramp=0.04)
+        shaped_db = transients.contrast_db(shaped(onset, table.eras), **at)
+        gained.append(shaped_db - transients.contrast_db(ramp, **at))
     assert np.median(gained) > 6
 
 
@@ -275,50 +274,46 @@ def test_ending_keeps_known_quiet_finger_quiet(setup):
 
 
 def test_envelopes_keep_the_frequency_of_each_era(setup):
-    """With two frequencies each ERA keeps its own, and one that is silent stays silent."""
+    """With two frequencies each ERA keeps its own, and one that is silent stays silent.
+
+    Of one frequency it plays during the onset, and is silent again at its end and during the
+    ending.
+    """
     rig, _, shaper, transients = setup
-    excitation = {"SW": Tone(110.8, 8e-5), "NE": Tone(217.0, 6e-5, 1.0)}
-    onset = shaper.onset(excitation, targets=[(0.05, 0.05)], quiet=[(0.2, 0.15)])
-    ending = shaper.ending(excitation)
+    at = {"targets": [(0.05, 0.05)], "quiet": [(0.2, 0.15)]}
+    two = {"SW": Tone(110.8, 8e-5), "NE": Tone(217.0, 6e-5, 1.0)}
+    onset, ending = shaper.onset(two, **at), shaper.ending(two)
     assert {name: each.frequency for name, each in onset.items()} == {"SW": 110.8, "NE": 217.0}
     assert onset["NE"].knots[-1] == pytest.approx(6e-5 * np.exp(1j))
-    residual_shaped = transients.residual_db(excitation, shaped(ending, rig.eras))
-    stopped = transients.residual_db(excitation, ramped_ending(excitation, rig.eras, ramp=0.0))
-    assert residual_shaped < stopped - 3
+    stopped = transients.residual_db(two, ramped_ending(two, rig.eras, ramp=0.0))
+    assert transients.residual_db(two, shaped(ending, rig.eras)) < stopped - 3
 
-
-def test_silent_era_plays_in_onset_of_one_frequency(setup):
-    """It plays during the onset, and is silent again at its end and during the ending."""
-    rig, _, shaper, _ = setup
-    excitation = {"SW": Tone(110.8, 8e-5), "NE": Tone(110.8, 6e-5, 1.0)}
-    onset = shaper.onset(excitation, targets=[(0.05, 0.05)], quiet=[(0.2, 0.15)])
-    ending = shaper.ending(excitation)
+    one = {"SW": Tone(110.8, 8e-5), "NE": Tone(110.8, 6e-5, 1.0)}
+    onset = shaper.onset(one, **at)
     assert set(onset) == {era.name for era in rig.eras}
     assert onset["SE"].knots[-1] == 0
     assert onset["SE"].largest > 1e-7
-    assert set(ending) == set(excitation)
+    assert set(shaper.ending(one)) == set(one)
 
 
 def test_onset_of_a_lone_finger_keeps_the_surroundings_quiet(setup):
-    """Without quiet fingers the rest of the plate moves less during the onset than with a ramp."""
+    """Without quiet fingers the rest of the plate moves less during the onset than with a ramp.
+
+    Or than with a quiet finger nearby. Relative to the target's peak, as contrast is.
+    """
     rig, _, shaper, transients = setup
     target = (0.05, 0.18)
     excitation = random_excitation(rig, 217.0, np.random.default_rng(5))
-    onset = shaper.onset(excitation, targets=[target])
-    x, y = np.meshgrid(np.linspace(0.12, 0.3, 8), np.linspace(0.01, 0.12, 6))
-    rest = np.column_stack([x.ravel(), y.ravel()])
-    one_finger = shaper.onset(excitation, targets=[target], quiet=[(0.05, 0.05)])
-    # Relative to the target's peak, as contrast is.
+    rest = lattice(np.linspace(0.12, 0.3, 8), np.linspace(0.01, 0.12, 6))
     share = []
     for bases in (
-        shaped(onset, rig.eras),
+        shaped(shaper.onset(excitation, targets=[target]), rig.eras),
         ramped_onset(excitation, rig.eras, ramp=0.02),
-        shaped(one_finger, rig.eras),
+        shaped(shaper.onset(excitation, targets=[target], quiet=[(0.05, 0.05)]), rig.eras),
     ):
         felt = transients.acceleration(bases, np.vstack([[target], rest]))
         share.append(np.sqrt((felt[:, 1:] ** 2).mean()) / np.abs(felt[:, 0]).max())
     assert share[0] < 0.9 * min(share[1:])
-    assert len(onset["SW"].knots) == 21
 
 
 STEP = 0.005
@@ -330,34 +325,16 @@ def few_modes():
     return make_plate_in_time(frequency_max=100.0)
 
 
-@pytest.fixture(scope="module")
-def plate():
-    """Rig and plate with modes for 500 Hz."""
-    return make_plate_in_time()
-
-
-def resting(_time: float) -> tuple[float, float]:
-    """A base that does not move."""
-    return 0.0, 0.0
-
-
 def test_hat_response_equals_time_stepping(few_modes):
     """Closed form, back on its carrier, follows Runge-Kutta through rise, fall and ringing."""
     rig, plate = few_modes
-    omega = 2 * math.pi * 90.0
-    samples = 4
+    omega, samples = 2 * math.pi * 90.0, 4
     hats = hat_accelerations(plate, omega, step=STEP, steps=6, samples=samples)
     times = STEP * (np.arange(len(hats)) + 0.5) / samples
-    stroke = rig.eras[1].stroke
-
-    def hat(t: float) -> tuple[float, float]:
-        height = max(0.0, 1 - abs(t - STEP) / STEP)
-        rise = 0.0 if t >= 2 * STEP else math.copysign(1 / STEP, STEP - t)
-        sine, cosine = math.sin(omega * t), math.cos(omega * t)
-        return stroke * height * sine, stroke * (rise * sine + height * omega * cosine)
-
+    hat = shaped_base(rig.eras[1].stroke, 90.0, start=0.0, step=STEP, knots=(0, 1, 0))
     breaks = np.array([0, STEP, 2 * STEP, 6 * STEP])
-    stepped = stepped_acceleration(plate, [resting, hat, resting, resting], times, breaks=breaks)
+    bases = [each.motion for each in (STILL, hat, STILL, STILL)]
+    stepped = stepped_acceleration(plate, bases, times, breaks=breaks)
     found = (hats[:, 1] * np.exp(1j * omega * times)[:, None]).imag
     np.testing.assert_allclose(found, stepped, atol=1e-5 * np.abs(stepped).max())
 
@@ -365,89 +342,63 @@ def test_hat_response_equals_time_stepping(few_modes):
 def test_acceleration_equals_time_stepping(few_modes):
     """A ramped tone and an envelope at another frequency together follow Runge-Kutta."""
     rig, plate = few_modes
-    envelope = BaseEnvelope(120.0, 0j, (3e-5 + 2e-5j, -1e-5j, 5e-5 + 0j))
-    tone = Tone(70.0, 8e-5, 0.4)
-    ramp = ramped_onset({"SW": tone}, rig.eras, ramp=0.01)
-    bases = (ramp[0], (), envelope.terms(), ())
-
-    def ramped(t: float) -> tuple[float, float]:
-        omega, share = 2 * math.pi * tone.frequency, math.pi * min(t, 0.01) / 0.01
-        gain = (1 - math.cos(share)) / 2
-        slope = math.pi / 0.01 * math.sin(share) / 2
-        angle = omega * t + tone.phase
-        return (
-            tone.amplitude * gain * math.sin(angle),
-            tone.amplitude * (slope * math.sin(angle) + gain * omega * math.cos(angle)),
-        )
-
-    def knotted(t: float) -> tuple[float, float]:
-        values = [0j, *envelope.knots, envelope.knots[-1]]
-        piece = min(int(t / STEP), 3)
-        slope = (values[piece + 1] - values[piece]) / STEP
-        amplitude = values[piece] + slope * (t - piece * STEP)
-        omega = 2 * math.pi * 120.0
-        turn = np.exp(1j * omega * t)
-        return (amplitude * turn).imag, ((slope + 1j * omega * amplitude) * turn).imag
-
+    knots = (3e-5 + 2e-5j, -1e-5j, 5e-5 + 0j)
+    ramp = ramped_onset({"SW": Tone(70.0, 8e-5, 0.4)}, rig.eras, ramp=0.01)
+    bases = (ramp[0], (), BaseEnvelope(120.0, 0j, knots).terms(), ())
+    tone = faded_base(8e-5, 70.0, 0.4, rise=(0.0, 0.01), fall=(1.0, 2.0))
+    on = 4 * knots[-1:]  # the last knot stays
+    envelope = shaped_base(1.0, 120.0, start=0.0, step=STEP, knots=(0, *knots, *on))
     points = fingertip_points(0.07, 0.16, rig.plate)
     found = Transients(plate).acceleration(bases, points, duration=0.03)
     times = np.arange(len(found)) / SAMPLE_RATE
     breaks = np.array([0, 0.005, 0.01, 0.015, 0.03])
-    stepped = stepped_acceleration(plate, [ramped, resting, knotted, resting], times, breaks=breaks)
+    motions = [each.motion for each in (tone, STILL, envelope, STILL)]
+    stepped = stepped_acceleration(plate, motions, times, breaks=breaks)
     expected = stepped @ plate.reduced.at(points).T
     np.testing.assert_allclose(found, expected, atol=1e-5 * np.abs(expected).max())
 
 
-def test_contrast_db_is_that_of_the_weakest_target(plate):
+def test_contrast_db_is_that_of_the_weakest_target(setup):
     """Contrast of an onset is that of the target which has less."""
-    rig, in_time = plate
+    rig, *_, transients = setup
     onset = ramped_onset({"SW": Tone(180.0, 1e-4)}, rig.eras, ramp=0.02)
     *alone, both = (
-        Transients(in_time).contrast_db(onset, targets=targets, quiet=[(0.25, 0.2)])
+        transients.contrast_db(onset, targets=targets, quiet=[(0.25, 0.2)])
         for targets in ([(0.02, 0.02)], [(0.15, 0.11)], [(0.02, 0.02), (0.15, 0.11)])
     )
     assert abs(alone[0] - alone[1]) > 0.3
     assert both == pytest.approx(min(alone), abs=1e-9)
 
 
-def test_residual_db_equals_sampled_plate(plate):
+def test_residual_db_equals_sampled_plate(setup):
     """Root mean square over plate, 100 ms and four phases agrees with the closed form."""
-    rig, in_time = plate
-    transients = Transients(in_time)
-    tone = Tone(110.0, 1e-4)
-    ramp = 0.015
-    x, y = np.meshgrid((np.arange(32) + 0.5) / 32, (np.arange(24) + 0.5) / 24)
-    points = np.column_stack([x.ravel() * rig.plate.length, y.ravel() * rig.plate.width])
+    rig, *_, transients = setup
+    points = Grid(32, 24).centres(rig.plate)
     left = steady = 0.0
     for phase in (0.0, math.pi / 2):  # the two make up the mean over all phases
-        excitation = {"SE": Tone(tone.frequency, tone.amplitude, phase)}
-        ending = ramped_ending(excitation, rig.eras, ramp=ramp)
-        felt = transients.acceleration(ending, points, duration=ramp + 0.1, after=excitation)
-        left += (felt[round(ramp * SAMPLE_RATE) :] ** 2).mean()
-        steady += (
-            transients.acceleration(
-                ramped_onset(excitation, rig.eras, ramp=0.0), points, duration=0.1, after=excitation
-            )
-            ** 2
-        ).mean()
-    expected = 10 * math.log10(left / steady)
-    found = transients.residual_db({"SE": tone}, ramped_ending({"SE": tone}, rig.eras, ramp=ramp))
-    assert found == pytest.approx(expected, abs=0.1)
+        excitation = {"SE": Tone(110.0, 1e-4, phase)}
+        ending = ramped_ending(excitation, rig.eras, ramp=0.015)
+        felt = transients.acceleration(ending, points, duration=0.115, after=excitation)
+        left += (felt[round(0.015 * SAMPLE_RATE) :] ** 2).mean()
+        lasting = ramped_onset(excitation, rig.eras, ramp=0.0)
+        on = transients.acceleration(lasting, points, duration=0.1, after=excitation)
+        steady += (on**2).mean()
+    found = transients.residual_db(excitation, ending)
+    assert found == pytest.approx(10 * math.log10(left / steady), abs=0.1)
 
 
-def test_while_ending_is_the_mean_square_of_the_response():
+def test_while_ending_is_the_mean_square_of_the_response(setup):
     """For knots at random, what the form adds to a tone that stops is that of sampled vibrations.
 
     Mean over phases.
     """
-    rig, plate = make_plate_in_time()
+    rig, plate, _, transients = setup
     frequency = 217.0
     carrier = solve_carrier(
         plate, frequency, residual_form=mean_square(plate, 0.1), gain_variance=0.0
     )
     point = np.array([[0.21, 0.06]])
     rows = plate.reduced.at(point)
-    transients = Transients(plate)
 
     def sampled(knots) -> float:
         found = 0.0
@@ -476,44 +427,26 @@ def test_while_ending_is_the_mean_square_of_the_response():
         assert added == pytest.approx(sampled(knots) - sampled(stopped), abs=0.03 * sampled(knots))
 
 
-def motion(terms: tuple[Term, ...], time: float) -> float:
-    """Displacement of a base [m] at a time [s]: the sum of the terms that hold then."""
-    return sum(
-        (
-            (term.c0 + term.c1 * (time - term.start))
-            * cmath.exp(1j * term.omega * (time - term.start))
-        ).imag
-        for term in terms
-        if term.start <= time < term.end
-    )
-
-
 def test_envelope_terms_are_linear_between_knots():
     """Half way between knots the complex amplitude is their mean, at its carrier's phase."""
     envelope = BaseEnvelope(100.0, 0j, (2e-5 + 1e-5j, -4e-5j), step=0.005)
-    terms = envelope.terms()
-    for time, amplitude in [
-        (0.0025, 1e-5 + 0.5e-5j),
-        (0.0075, 1e-5 - 1.5e-5j),
-        (0.02, -4e-5j),  # the last knot stays
-    ]:
-        expected = (amplitude * cmath.exp(2j * math.pi * 100.0 * time)).imag
-        assert motion(terms, time) == pytest.approx(expected, abs=1e-17)
-        assert envelope.amplitude(np.array([time]))[0] == pytest.approx(amplitude)
+    times = np.array([0.0025, 0.0075, 0.02])
+    amplitudes = np.array([1e-5 + 0.5e-5j, 1e-5 - 1.5e-5j, -4e-5j])  # the last knot stays
+    expected = (amplitudes * np.exp(2j * math.pi * 100.0 * times)).imag
+    assert motion_of(envelope.terms(), times) == pytest.approx(expected, abs=1e-17)
+    assert envelope.amplitude(times) == pytest.approx(amplitudes)
 
 
 def test_ramped_onset_and_ending_are_raised_cosines():
     """Half way through a ramp, up or down, the amplitude is half, and none or all at its ends."""
     rig = make_paper_rig(2, 2)
     excitation = {"SE": Tone(50.0, 1e-4, 0.3)}
-    up = ramped_onset(excitation, rig.eras, ramp=0.02)
-    down = ramped_ending(excitation, rig.eras, ramp=0.02)
+    up, down = (each(excitation, rig.eras, ramp=0.02) for each in (ramped_onset, ramped_ending))
     assert [len(base) > 0 for base in up] == [era.name == "SE" for era in rig.eras]
-    se = [era.name for era in rig.eras].index("SE")
-    for time, share in [(0.0, 0.0), (0.01, 0.5), (0.03, 1.0)]:
-        tone = 1e-4 * math.sin(2 * math.pi * 50.0 * time + 0.3)
-        assert motion(up[se], time) == pytest.approx(share * tone, abs=1e-17)
-        assert motion(down[se], time) == pytest.approx((1 - share) * tone, abs=1e-17)
+    times, shares = np.array([0.0, 0.01, 0.03]), np.array([0.0, 0.5, 1.0])
+    tone = 1e-4 * np.sin(2 * math.pi * 50.0 * times + 0.3)
+    assert motion_of(up[1], times) == pytest.approx(shares * tone, abs=1e-17)
+    assert motion_of(down[1], times) == pytest.approx((1 - shares) * tone, abs=1e-17)
 
 
 def random_form(seed: int, n: int):
@@ -575,44 +508,27 @@ def test_bounded_minimum_of_few_rows_is_right_in_single_precision():
 OMEGA = 2 * math.pi * 110.0
 
 
-class Fade(NamedTuple):
-    """From one complex amplitude [m] to another; start and ramp [s]."""
-
-    start: float
-    ramp: float
-    omega: float
-    first: complex
-    last: complex
-
-
 FADES = [
-    Fade(1.0, 0.02, OMEGA, 0j, 1e-4 * cmath.exp(0.7j)),
-    Fade(1.005, 0.01, 2 * OMEGA, 1.6e-4j, 6e-5 - 2e-5j),
-    Fade(1.01, 0.03, OMEGA, 5e-5 + 0j, 0j),
-    Fade(1.015, 0.0, OMEGA / 2, 0j, 6e-5 + 0j),
+    (1.0, 0.02, OMEGA, 0j, 1e-4 * cmath.exp(0.7j)),
+    (1.005, 0.01, 2 * OMEGA, 1.6e-4j, 6e-5 - 2e-5j),
+    (1.01, 0.03, OMEGA, 5e-5 + 0j, 0j),
+    (1.015, 0.0, OMEGA / 2, 0j, 6e-5 + 0j),
 ]
+"""From one complex amplitude [m] to another: start, ramp [s], frequency [rad/s], first and last."""
 
 
-def moved(motions: BaseMotions, number: int, era: int, time: float) -> float:
-    """Displacement [m] of a base at a time [s] by the definition of a term."""
-    (of_set,) = motions.active([number], [time])
-    tau = time - motions.start
-    value = motions.c0 + (0j if motions.c1 is None else motions.c1) * tau
-    y = (value * np.exp(1j * motions.omega * tau)).imag
-    return float(y[of_set & (motions.era == era)].sum())
-
-
-def faded(fade: Fade, time: float) -> float:
+def faded(
+    time: float, start: float, ramp: float, omega: float, first: complex, last: complex
+) -> float:
     """Displacement [m] along a raised cosine."""
-    tau = time - fade.start
+    tau = time - start
     if tau < 0:
         return 0.0
-    share = 1.0 if tau >= fade.ramp else (1 - math.cos(math.pi * tau / fade.ramp)) / 2
-    amplitude = fade.first + (fade.last - fade.first) * share
-    return (amplitude * cmath.exp(1j * fade.omega * tau)).imag
+    share = 1.0 if tau >= ramp else (1 - math.cos(math.pi * tau / ramp)) / 2
+    return ((first + (last - first) * share) * cmath.exp(1j * omega * tau)).imag
 
 
-def terms(fades: Sequence[Fade]) -> Motion:
+def terms(*fades: tuple[float, float, float, complex, complex]) -> Motion:
     """The motion of a base by some fades."""
     return [term for fade in fades for term in raised_cosine(*fade)]
 
@@ -620,21 +536,24 @@ def terms(fades: Sequence[Fade]) -> Motion:
 @pytest.mark.parametrize("time", [0.99, 1.0, 1.0031, 1.0142, 1.015, 1.0199, 1.03, 1.2])
 def test_terms_of_fades_add_up_to_raised_cosines(time: float) -> None:
     """Of two sets of motions each base has its own, at every moment of a fade and after it."""
-    rest: Motion = ()
-    motions = BaseMotions([terms(FADES[:1]), terms(FADES[1:3])], [rest, terms(FADES[3:])])
+    motions = BaseMotions([terms(FADES[0]), terms(*FADES[1:3])], [(), terms(FADES[3])])
+    tau = time - motions.start
+    value = motions.c0 + (0j if motions.c1 is None else motions.c1) * tau
+    y = (value * np.exp(1j * motions.omega * tau)).imag  # by the definition of a term
     for number, era, fades in (
         (0, 0, FADES[:1]),
         (0, 1, FADES[1:3]),
         (1, 0, []),
         (1, 1, FADES[3:]),
     ):
-        expected = sum(faded(fade, time) for fade in fades)
-        assert moved(motions, number, era, time) == pytest.approx(expected, abs=1e-17)
+        (of_set,) = motions.active([number], [time])
+        moved = y[of_set & (motions.era == era)].sum()
+        assert moved == pytest.approx(sum(faded(time, *fade) for fade in fades), abs=1e-17)
 
 
 def test_terms_that_have_ended_are_left_out() -> None:
     """A fade to silence is forgotten once it is silent, a lasting tone is not."""
-    motions = BaseMotions([terms([FADES[0], FADES[2]])], since=1.05)
+    motions = BaseMotions([terms(FADES[0], FADES[2])], since=1.05)
     assert motions.omega.tolist() == [OMEGA]
     assert motions.end.tolist() == [math.inf]
 

@@ -38,27 +38,24 @@ eras:
 amplifiers: {main: {url: "sim://"}}
 limits: {frequency: [40, 150]}
 """
-PLATE = "plate: {length: 0.3048, width: 0.2286, thickness: 1.5 mm, material: aluminium}" + ERAS
+PAPER = parse_rig(
+    "plate.yaml",
+    "plate: {length: 0.3048, width: 0.2286, thickness: 1.5 mm, material: aluminium}" + ERAS,
+)
 HIGHEST = 2000.0  # Hz; modes are exported up to it: by fewer, resonances on ERAs are off
 ODD = read_yaml(Path(__file__).parent / "odd_modes.yaml")
 
 
 @pytest.fixture(scope="module")
-def plate() -> Rig:
-    """The paper's plate up to 150 Hz, by its sizes and material."""
-    return parse_rig("plate.yaml", PLATE)
+def own() -> LocalizationTable:
+    """The table of the paper's plate up to 150 Hz, by its sizes and material."""
+    return build_table(PAPER)
 
 
 @pytest.fixture(scope="module")
-def own(plate: Rig) -> LocalizationTable:
-    """The table of that plate."""
-    return build_table(plate)
-
-
-@pytest.fixture(scope="module")
-def modes(plate: Rig) -> Mapping[str, FloatArray]:
+def modes() -> Mapping[str, FloatArray]:
     """Its modes at 21 x 16 nodes as another program would export them, along z."""
-    return exported_modes(plate, HIGHEST, (21, 16))
+    return exported_modes(PAPER, HIGHEST, (21, 16))
 
 
 def _universal(modes: Mapping[str, FloatArray], *, kind: int, length: float) -> str:
@@ -152,38 +149,29 @@ def test_few_modes_are_off_as_much_as_stated(
 def test_table_of_a_surface_is_verified_and_read_again(
     modes: Mapping[str, FloatArray], tmp_path: Path
 ) -> None:
-    """Fields, answers, promises and motion in time agree; table and rig need no other folder."""
-    rig = load_rig(_write(tmp_path, modes))
+    """Fields, answers, promises and motion in time agree; table and rig need no other folder.
+
+    The table of another surface is refused, which differs by any key or by its modes.
+    """
+    path = _write(tmp_path, modes)
+    rig = load_rig(path)
     table = build_table(rig)
     assert verify_table(table, rig, samples=1).failed_count == 0
     save_table(table, tmp_path / "table.npz")
     (elsewhere := tmp_path / "elsewhere").mkdir()
     save_rig(rig, elsewhere / "rig.yaml")
     load_table(tmp_path / "table.npz", rig=load_rig(elsewhere / "rig.yaml"))
-    _write(tmp_path, modes, shapes=1.01 * modes["shapes"])
-    with pytest.raises(InputError, match="must be a table of this rig: plate"):
-        load_table(tmp_path / "table.npz", rig=load_rig(tmp_path / "rig.yaml"))
-
-
-@pytest.mark.parametrize(
-    "other",
-    [
+    for other in (
         "{modes: modes.npz, normal: -z}",
         "{modes: modes.npz, mass: 290 g}",
         "{modes: modes.npz, loss_factor: 0.02}",
         "{modes: modes.npz, outline: [[[0, 0], [0.31, 0], [0.31, 0.23], [0, 0.23]]]}",
-    ],
-)
-def test_table_of_another_surface_is_refused(
-    other: str, modes: Mapping[str, FloatArray], tmp_path: Path
-) -> None:
-    """By any key of the surface."""
-    rig = _write(tmp_path, modes)
-    save_table(build_table(load_rig(rig)), tmp_path / "table.npz")
-    rig.write_text(f"surface: {other}" + ERAS)
-    changed = load_rig(rig)
-    with pytest.raises(InputError, match="must be a table of this rig: plate"):
-        load_table(tmp_path / "table.npz", rig=changed)
+        "louder.npz",
+    ):
+        np.savez(tmp_path / "louder.npz", **dict(modes) | {"shapes": 1.01 * modes["shapes"]})
+        path.write_text(f"surface: {other}" + ERAS)
+        with pytest.raises(InputError, match="must be a table of this rig: plate"):
+            load_table(tmp_path / "table.npz", rig=load_rig(path))
 
 
 def test_curved_surface_counts_along_its_arc(
@@ -296,41 +284,28 @@ def test_odd_modes_are_read_or_refused_with_their_place(
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    """A damaged or unusual file of modes is read rightly, or one message says what and where."""
-    text, keys = _universal(modes, kind=55, length=1.0), "surface: modes.uff" + ERAS
+    """A damaged or unusual file of modes is read rightly, or one message says what and where.
+
+    What needs a plate says of a surface that is read that it has no thickness, size or modulus.
+    """
+    text, rig = _universal(modes, kind=55, length=1.0), tmp_path / "rig.yaml"
     old, new = odd.get("modes", ("", ""))
-    everywhere = old in ("E+", "\n")
     if old == "cut":
         text = text[: int(new)]
     elif old:
         assert old in text
-        text = text.replace(old, new, -1 if everywhere else 1)
-    before, after = odd.get("rig", ("", ""))
-    keys = keys.replace(before, after, 1)
+        text = text.replace(old, new, -1 if old in ("E+", "\n") else 1)
     (tmp_path / "modes.uff").write_bytes(text.encode())
-    (tmp_path / "rig.yaml").write_text(keys)
-    status = run(["plate", "show", str(tmp_path / "rig.yaml")])
+    rig.write_text(("surface: modes.uff" + ERAS).replace(*odd.get("rig", ("", "")), 1))
+    status = run(["plate", "show", str(rig)])
     said = capsys.readouterr()
     assert status == (2 if odd["said"] else 0), said.err
     shown = r"surface by \d+ modes up to \d+ Hz of .*modes.uff, 3 of the rigid body(.|\n)*mass  282"
     assert re.search(odd["said"] or shown, said.err if odd["said"] else said.out)
     if not odd["said"]:
-        assert run(["config", "check", str(tmp_path / "rig.yaml")]) == 0
-
-
-@pytest.mark.parametrize(
-    "command",
-    ["plate convergence rig.yaml", "rig identify rig.yaml -o new.yaml --yes --url sim://"],
-)
-def test_what_needs_a_plate_says_so(
-    command: str,
-    modes: Mapping[str, FloatArray],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    """Thickness, size and modulus of a surface are refused by name."""
-    _write(tmp_path, modes)
-    monkeypatch.chdir(tmp_path)
-    assert run(command.split()) == 2
-    assert "a surface by its modes, which has no thickness, size or" in capsys.readouterr().err
+        assert run(["config", "check", str(rig)]) == 0
+        for command in ("plate convergence {}", "rig identify {} -o new.yaml --yes --url sim://"):
+            assert run(command.format(rig).split()) == 2
+            assert (
+                "surface by its modes, which has no thickness, size or" in capsys.readouterr().err
+            )

@@ -4,7 +4,7 @@
 """
 
 import math
-from collections.abc import AsyncIterator, Sequence
+from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
 from fractions import Fraction
@@ -13,12 +13,15 @@ from typing import Any
 
 import pytest
 
-from courses import Taken, courses, fits, follow
-from drivers.protocol.definition import FAULTS, STATES
-from drivers.protocol.records import Values
+from courses import Step, Taken, courses, fits, follow
+from drivers.protocol.definition import FAULTS, READING_STATES, STATES
+from drivers.protocol.records import Refusal, Values
 from drivers.protocol.sets import Command, LayerSet, pack_layers, parts
+from plates import make_paper_rig
+from real_wires import on_amplifiers
 from sim.amplifier.readings import AmplifierClock, Crystal
 from sim.amplifier.simulated_amplifier import SimulatedAmplifier
+from sim.bench.bench import Bench
 
 PER_SECOND = 214_748_364.8
 
@@ -140,10 +143,12 @@ def levels(amplifier: SimulatedAmplifier, at: float) -> list[int]:
 class Handled(Taken):
     """An amplifier that handles requests; reply: the last one, at a time [s].
 
-    events: the name of the state, the latch and the time of each.
+    handle: of the name of an amplifier, for several; events: the name of the state, the latch and
+    the time of each.
     """
 
     amplifier: SimulatedAmplifier
+    handle: Callable[[str, str, Values, float], Values]
     reply: Values = field(default_factory=dict)
     at: float = 0.0
     events: list[tuple[str, int, float]] = field(default_factory=list)
@@ -159,13 +164,26 @@ class Handled(Taken):
         """By how much the clock of the last reply is ahead of one without errors [2^-32 turns]."""
         return int(self.reply["clock"]) - round(self.at * PER_SECOND)
 
-    def asks(self, name: str, at: float, **values: int) -> None:
+    def asks(self, name: str, at: float, of: str = "", **values: Any) -> None:
         """Handle a request at a time."""
-        self.at, self.reply = at, self.amplifier.handle(name, values, at)
+        self.at, self.reply = at, self.handle(of, name, values, at)
 
-    def plays(self, token: int, at: float, tone: Sequence[int], layer: int = 0) -> None:
+    def plays(
+        self, token: int, at: float, tone: Sequence[int], layer: int = 0, valid_for: int = 0
+    ) -> None:
         """Handle a set that plays a tone at once: channel, frequency and level."""
-        self.reply = play(self.amplifier, token, at, Command(*tone, 0), layer=layer, ramp=0)
+        one = LayerSet(layer, 0, valid_for, (Command(*tone, 0),))
+        self.reply = self.handle("", "Set", part_of(token, one), at)
+
+    def renews(self, token: int, at: float, valid_for: int) -> None:
+        """Handle a set that renews the first layer."""
+        self.handle("", "Set", part_of(token, LayerSet(0, 0, valid_for, renew=True)), at)
+
+    async def is_refused(self, code: str, step: Step) -> None:
+        """Require that a step is refused with a code."""
+        with pytest.raises(Refusal) as caught:
+            await self.take(step)
+        assert caught.value.code == code
 
     def replies(self, **expected: Any) -> None:
         """Require values of the last reply, states and faults by name."""
@@ -175,14 +193,26 @@ class Handled(Taken):
 
 def _named(what: str, values: Values) -> Any:
     """A value, a state or fault by its name."""
-    names = {"state": STATES, "fault": FAULTS}.get(what, {})
+    states = READING_STATES if "window_left" in values else STATES
+    names = {"state": states, "fault": FAULTS}.get(what, {})
     return next((name for name, code in names.items() if code == values[what]), values[what])
 
 
 @asynccontextmanager
-async def handled(*, is_armed: bool = True) -> AsyncIterator[Handled]:
-    """An amplifier of two channels, armed by session 7 at time 0 with a watchdog of 0.25 s."""
-    yield Handled(amplifier=armed() if is_armed else SimulatedAmplifier("a", channels=2))
+async def handled(*names: str, is_armed: bool = True) -> AsyncIterator[Handled]:
+    """An amplifier of two channels, armed by session 7 at time 0 with a watchdog of 0.25 s.
+
+    names: those of amplifiers at the paper's plate instead.
+    """
+    if not names:
+        one = armed() if is_armed else SimulatedAmplifier("a", channels=2)
+        yield Handled(amplifier=one, handle=lambda _, *request: one.handle(*request))
+        return
+    bench = Bench(on_amplifiers(make_paper_rig(12, 9), names), now=0.0)
+    yield Handled(
+        amplifier=bench.amplifiers[names[0]],
+        handle=lambda of, name, values, at: bench.exchange(of or names[0], name, values, now=at),
+    )
 
 
 COURSES = courses(Path(__file__).with_name("courses.yaml"))

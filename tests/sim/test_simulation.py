@@ -14,6 +14,7 @@ import sys
 import tempfile
 from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
 from resource import RLIM_INFINITY, RLIMIT_FSIZE, prlimit
 from typing import Any
@@ -23,8 +24,9 @@ import pytest
 from rich.console import Console
 from typer.testing import CliRunner
 
+from courses import Taken
 from daemons import SESSION as DAEMONS_SESSION
-from daemons import far_end_process, playing
+from daemons import FarEndProcess, far_end_process, playing
 from drivers.by_hand.reaching import random_session
 from drivers.errors import CommandError, LinkError
 from drivers.opening import Lines
@@ -51,6 +53,7 @@ from sim.plant.imperfections import Imperfections, PlateErrors
 from sim.simulation import SimulationView, draw
 from sound_cards import read_recording
 from virtual_lines import in_virtual_time
+from yaml_files import read_yaml
 
 LIMITS = GuardLimits(40.0, 500.0, 1.0)
 TIMEOUT = 120  # s; for a loaded machine, not an expectation
@@ -124,59 +127,35 @@ def test_view_shows_eras_fingers_and_peaks_in_place(coarse_rig: Rig) -> None:
     assert depth[-3:, :8].mean() > depth[:3, -8:].mean()
 
 
+@dataclass(kw_only=True)
+class Asked(Taken):
+    """A simulation as a process that is asked by its control socket; reply: the last one."""
+
+    far_end: FarEndProcess
+    reply: dict[str, Any] = field(default_factory=dict)
+
+    async def asks(self, op: str, **values: Any) -> None:
+        """Ask for an operation."""
+        self.reply = await self.far_end.ask(op, **values)
+
+
 async def test_simulation_in_virtual_time_advances_only_by_steps(tmp_path: Path) -> None:
     """Watchdog, faults and recordings follow the steps."""
     rig, file = write_rig(tmp_path / "rig.yaml"), tmp_path / "run.csv"
+    courses = read_yaml(Path(__file__).with_name("simulation.yaml"))
     async with far_end_process(
         rig, "--serial", "--virtual-time", "--rate", "2000", "--finger", "0.1,0.1"
     ) as far_end:
-        hello = await far_end.ask("hello")
-        assert (hello["protocol"], hello["version"], hello["clock"]) == (
-            "era-sim-control",
-            3,
-            "virtual",
-        )
-        assert hello["urls"] == far_end.urls
-        assert (await far_end.ask("state"))["time_s"] == 0
-        noisy = {"at_m": [0.2, 0.1], "noise_m_s2_rthz": 0.01, "resolution_m_s2": 0.5}
-        assert (await far_end.ask("sensors", sensors={"P1": noisy}))["ok"]
+        asked = Asked(far_end=far_end)
+        await asked.repeats(1, courses["before it plays"])
         assert (await far_end.ask("record", file=str(file)))["ok"]
         tone = AmplifierTone(0, 110.0, 0.5)
         async with playing(far_end.urls["main"], tone, watchdog=0.5) as amplifier:
-            assert await far_end.ask("step", seconds=0.4) == {"ok": True, "time_s": 0.4}
-            assert (await far_end.ask("state"))["amplifiers"]["main"]["levels"][0] == 0.5
-            assert (await far_end.ask("move", finger="1", at_m=[0.05, 0.05]))["ok"]
-            assert (await far_end.ask("touch", finger="2", at_m=[0.2, 0.2]))["ok"]
-            assert "2" in (await far_end.ask("touch", finger="2", at_m=[0.2, 0.2]))["error"]
-            assert (await far_end.ask("lift", finger="1"))["ok"]
-            assert "1" in (await far_end.ask("move", finger="1"))["error"]
-            assert (await far_end.ask("state"))["fingers"] == {"2": [0.2, 0.2]}
-            tones = await far_end.ask("tones", since_s=0.2, until_s=0.4, frequencies_hz=[110.0])
-            assert abs(complex(tones["sensors"]["P1"]["real_m_s2"][0])) > 0
-            signals = await far_end.ask("signals", since_s=0.2, until_s=0.4)
-            readings = np.array(signals["sensors"]["P1"]["m_s2"])
-            assert (signals["sample_rate_hz"], len(readings)) == (2000, 400)
-            np.testing.assert_array_equal(readings, 0.5 * np.round(readings / 0.5))
-            # The watchdog of 0.5 s expires 0.1 s later.
-            assert (await far_end.ask("step", seconds=0.09)) == {"ok": True, "time_s": 0.49}
-            assert (await far_end.ask("state"))["amplifiers"]["main"]["fault"] == "NONE"
-            await far_end.ask("step", seconds=0.51)
-            assert (await far_end.ask("state"))["amplifiers"]["main"]["fault"] == "WATCHDOG"
+            await asked.repeats(1, courses["while it plays"])
             await amplifier.read_status()
             await amplifier.clear()
             await amplifier.arm(DAEMONS_SESSION + 1, 0.5)
-            assert (await far_end.ask("inject_fault", fault="arc", amplifier="main"))["ok"]
-            assert (await far_end.ask("state"))["amplifiers"]["main"]["fault"] == "ARC"
-            begin = (await far_end.ask("state"))["time_s"]
-            assert (await far_end.ask("faults"))["faults"]["main"] == [
-                {"fault": "arc", "begin_s": begin, "end_s": None, "is_on": True}
-            ]
-            assert (await far_end.ask("recover"))["ok"]
-            assert (await far_end.ask("faults")) == {"faults": {"main": []}}
-            unknown = await far_end.ask("inject_fault", fault="arc", amplifier="x")
-            assert "amplifier" in unknown["error"]
-            assert "share" in (await far_end.ask("inject_fault", fault="drop", share=2))["error"]
-            assert "seconds" in (await far_end.ask("step", seconds=-1))["error"]
+            await asked.repeats(1, courses["once it is armed again"])
         assert not file.exists()
         finished = await far_end.ask("finish")
         assert finished == {"file": str(file), "seconds": 1.0, "is_full": False}

@@ -19,7 +19,6 @@ from drivers.host.group import Group
 from drivers.host.joint_sets import Clocks
 from drivers.playing import AmplifierLayer, AmplifierTone
 from drivers.protocol.definition import CLOCK_UNKNOWN, FEATURES, HELLO, HIGH_TIME, MESSAGES, SPAN
-from drivers.protocol.records import Values
 from drivers.wires.can_frames import CanFrame, pack_frames
 from drivers.wires.serial_line import SerialWire
 from sim.amplifier.readings import AmplifierClock, Crystal
@@ -54,25 +53,18 @@ CAPABILITIES = {
 }
 
 
-@pytest.fixture
-def altered(monkeypatch: pytest.MonkeyPatch) -> Callable[[str, str, int], None]:
-    """A function that has all replies of a record say a value in a word.
+def alter(patch: pytest.MonkeyPatch, name: str, field: str, value: int) -> None:
+    """Have all replies of a record say a value in a word.
 
     field: in it; of a variable number of words the first one.
     """
-
-    def alter(name: str, field: str, value: int) -> None:
-        record = MESSAGES[name].reply
-        pack, at = record.pack, record.places.get(field, record.words)
-
-        def lying(values: Values) -> list[int]:
-            words = pack(values)
-            words[at] = value
-            return words
-
-        monkeypatch.setattr(record, "pack", lying)
-
-    return alter
+    record = MESSAGES[name].reply
+    pack, at = record.pack, record.places.get(field, record.words)
+    patch.setattr(
+        record,
+        "pack",
+        lambda values: [value if n == at else word for n, word in enumerate(pack(values))],
+    )
 
 
 def loud(level: float = 0.5, number: int = 0) -> AmplifierLayer:
@@ -97,12 +89,13 @@ async def stops_truthfully(group: Group, end: MemoryLine) -> None:
 
 
 @pytest.mark.parametrize("lie", CAPABILITIES)
+@pytest.mark.parametrize("wire", KINDS)
 @in_virtual_time
 async def test_capabilities_that_cannot_be_are_refused(
-    wire: str, lie: str, altered: Callable[[str, str, int], None]
+    wire: str, lie: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It is not opened, and nothing but questions was sent; one message says why."""
-    altered("GetCaps", *CAPABILITIES[lie])
+    alter(monkeypatch, "GetCaps", *CAPABILITIES[lie])
     end = MemoryLine(wire, "a")
     with pytest.raises(DriverError, match=r"must|too short|limits"):
         await end.hosts["a"].open()
@@ -111,11 +104,16 @@ async def test_capabilities_that_cannot_be_are_refused(
 
 @in_virtual_time
 async def test_watchdog_that_stands_still_is_found_amid_sets(
-    altered: Callable[[str, str, int], None],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Ten sets a second feed it, each with a heartbeat that comes too early to tell."""
     group, _ = await armed("serial")
-    altered("GetStatus", "watchdog_left", round(1000 * group.amplifiers["a"].feeding.watchdog))
+    alter(
+        monkeypatch,
+        "GetStatus",
+        "watchdog_left",
+        round(1000 * group.amplifiers["a"].feeding.watchdog),
+    )
 
     async def play() -> None:
         for _ in range(10):
@@ -129,15 +127,16 @@ async def test_watchdog_that_stands_still_is_found_amid_sets(
 
 
 @pytest.mark.parametrize("lie", STATUS)
+@pytest.mark.parametrize("wire", KINDS)
 @in_virtual_time
 async def test_status_that_cannot_be_ends_in_silence(
-    wire: str, lie: str, altered: Callable[[str, str, int], None]
+    wire: str, lie: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Two beats at most; a stop that cannot be read is not confirmed."""
     group, end = await armed(wire)
     await group.apply({"a": [loud()]})
     await asyncio.sleep(0.01)
-    altered("GetStatus", *STATUS[lie])
+    alter(monkeypatch, "GetStatus", *STATUS[lie])
     if lie != "latch":
         with contextlib.suppress(DriverError):
             await group.beat()
@@ -152,6 +151,7 @@ async def test_status_that_cannot_be_ends_in_silence(
 
 
 @pytest.mark.parametrize("times", [1, 2])
+@pytest.mark.parametrize("wire", KINDS)
 @in_virtual_time
 async def test_set_taken_under_another_token_is_sent_again(
     wire: str, times: int, monkeypatch: pytest.MonkeyPatch
@@ -160,11 +160,11 @@ async def test_set_taken_under_another_token_is_sent_again(
     group, end = await armed(wire)
     record, lies = MESSAGES["Set"].reply, [1] * times
     pack = record.pack
-
-    def lying(values: Values) -> list[int]:
-        return pack({**values, "token": values["token"] ^ lies.pop() if lies else values["token"]})
-
-    monkeypatch.setattr(record, "pack", lying)
+    monkeypatch.setattr(
+        record,
+        "pack",
+        lambda values: pack({**values, "token": values["token"] ^ (lies.pop() if lies else 0)}),
+    )
     is_refused = pytest.raises(DriverError, match="token")
     with contextlib.nullcontext() if times == 1 else is_refused:
         await group.apply({"a": [loud()]})

@@ -91,7 +91,6 @@ lint: .venv/installed-test
 	$(BIN)/lint-imports
 	$(BIN)/mypy
 	$(BIN)/python tests/support/vocabulary.py
-	$(BIN)/python tests/support/names.py
 	$(BIN)/python tests/support/ceilings.py
 	$(PAGES) --check
 

@@ -18,8 +18,7 @@ import pytest
 import changed_tests
 import vocabulary
 from changed_tests import ALSO, also, nearest
-from names import misleading_names
-from vocabulary import retired_identifiers
+from vocabulary import misleading_names, retired_identifiers
 
 ROOT = Path(__file__).parents[1]
 FOLDERS = ("tests", "docs", "examples", "firmware")

@@ -48,7 +48,7 @@ from model.study import overview
 from model.study.contrast_maps import WANTED_CONTRAST_DB
 from model.study.verification import MIN_KEPT_SHARE
 from registry.limits import GuardLimits
-from typed_page import PORTS, PageError, Reader, Typed, Written, difference, read_steps
+from typed_page import PORTS, PageError, Reader, difference, read_steps
 from ways import WAYS, steps_of
 
 BEGIN, END = "<!-- begin: written by a.py -->", "<!-- end -->"
@@ -141,7 +141,7 @@ def test_a_reader_sees_what_the_page_shows(page: str, tmp_path: Path) -> None:
     folder.mkdir()
     (tmp_path / "examples").symlink_to(ROOT / "examples")
     steps = read_steps(PAGES / f"{page}.md")
-    assert sum(isinstance(step, Typed) and step.shown is not None for step in steps) >= 3
+    assert sum(step.shown is not None for step in steps) >= 3
     # A short path: a Unix socket's has room for a hundred letters.
     with (
         tempfile.TemporaryDirectory(prefix="era") as home,
@@ -153,7 +153,7 @@ def test_a_reader_sees_what_the_page_shows(page: str, tmp_path: Path) -> None:
 
 def test_the_first_tutorial_writes_the_rig_of_the_others() -> None:
     """Who skipped it copies the same file from the examples."""
-    written = [step for step in read_steps(PAGES / "own-plate.md") if isinstance(step, Written)]
+    written = [step for step in read_steps(PAGES / "own-plate.md") if step.kind == "written"]
     example = (ROOT / "examples" / "tutorial_rig.yaml").read_text("utf-8")
     assert [(step.name, step.text) for step in written] == [("my_rig.yaml", example)]
 

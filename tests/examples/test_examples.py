@@ -47,7 +47,7 @@ from registry.limits import GuardLimits
 from sim.amplifier.simulated_amplifier import SimulatedAmplifier
 from sim.far_ends.serial_amplifiers import SerialAmplifiers
 from sim.transport.far_end import make_terminal
-from typed_page import Reader, Typed, installed_program, read_steps
+from typed_page import Reader, installed_program, read_steps
 from virtual_lines import judged
 
 ROOT = Path(__file__).parents[2]
@@ -313,7 +313,7 @@ def reader(tmp_path: Path, installed: Path) -> Iterator[Reader]:
 def test_page_commands_print_what_is_shown(name: str, reader: Reader) -> None:
     """Commands, run in order, print the output on the page."""
     steps = read_steps(PAGES / f"{name}.md")
-    assert sum(isinstance(step, Typed) and step.shown is not None for step in steps) >= 2
+    assert sum(step.shown is not None for step in steps) >= 2
     for step in steps:
         reader.follow(step)
 

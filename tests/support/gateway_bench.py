@@ -731,13 +731,8 @@ def has_ended(connection: socket.socket) -> bool:
     """Whether the other side has closed, without reading."""
     try:
         connection.send(b"")
-        return bool(connection.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)) or _is_reset(
-            connection
-        )
+        is_failed = bool(connection.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR))
+        state = connection.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, 1)[0]
     except OSError:
         return True
-
-
-def _is_reset(connection: socket.socket) -> bool:
-    """By the kernel's state of the connection: 1 is established, see tcp_states.h of Linux."""
-    return connection.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, 1)[0] != 1
+    return is_failed or state != 1  # which is established, see tcp_states.h of Linux

@@ -46,6 +46,8 @@ from typing import Any, NoReturn
 
 import pytest
 from markdown_it import MarkdownIt
+from websockets.sync.client import connect
+from websockets.typing import Subprotocol
 
 from patient_daemon import RESTING
 
@@ -58,53 +60,21 @@ class PageError(ValueError):
 
 
 @dataclass(frozen=True)
-class Typed:
-    """Commands, where they are typed, and what they print (None: the page does not say)."""
+class Step:
+    """What a reader does, by the line of the page.
+
+    kind: `typed` commands, with their exit status; `seen`, what a terminal goes on to print;
+    `interrupted`, Ctrl-C in a terminal; a file that is `written` as a whole or `edited`. name: of
+    the terminal or file; text: as it is on the page; shown: what commands print, None where the
+    page does not say.
+    """
 
     line: int
-    commands: str
-    terminal: str | None
-    status: int
-    shown: str | None
-
-
-@dataclass(frozen=True)
-class Seen:
-    """What a terminal goes on to print."""
-
-    line: int
-    terminal: str
-    shown: str
-
-
-@dataclass(frozen=True)
-class Interrupted:
-    """Ctrl-C in a terminal, after which that program ends."""
-
-    line: int
-    terminal: str
-
-
-@dataclass(frozen=True)
-class Written:
-    """A file as a whole."""
-
-    line: int
-    name: str
-    text: str
-
-
-@dataclass(frozen=True)
-class Edited:
-    """Lines of a file, replaced by others."""
-
-    line: int
-    name: str
-    old: str
-    new: str
-
-
-Step = Typed | Seen | Interrupted | Written | Edited
+    kind: str
+    text: str = ""
+    name: str = ""
+    status: int = 0
+    shown: str | None = None
 
 
 def read_steps(page: Path) -> list[Step]:
@@ -120,7 +90,7 @@ def read_steps(page: Path) -> list[Step]:
         elif token.type == "html_block":
             for key, value in _COMMENT.findall(token.content):
                 if key == "interrupt":
-                    steps.append(Interrupted(line, value))
+                    steps.append(Step(line, "interrupted", name=value))
                 elif key in _OF_A_FENCE:
                     said[key] = value
                 elif key != "begin":  # of a part that is written from the code
@@ -128,7 +98,9 @@ def read_steps(page: Path) -> list[Step]:
         elif token.type == "fence":
             kind = token.info.strip()
             if kind == "text" and may_print and "seen in" not in said:
-                steps[-1] = _with_output(steps[-1], token.content, where=where)
+                if steps[-1].kind != "typed" or steps[-1].shown is not None:
+                    raise PageError(f"{where}: nothing is typed above this output")
+                steps[-1] = replace(steps[-1], shown=token.content)
                 may_print = False
             elif "not typed" not in said:
                 step = _step(kind, token.content, said, line=line)
@@ -142,25 +114,15 @@ def read_steps(page: Path) -> list[Step]:
 
 def _step(kind: str, text: str, said: dict[str, str], *, line: int) -> Step | None:
     if kind == "sh":
-        return Typed(line, text, said.get("terminal"), int(said.get("status", "0")), None)
+        status = int(said.get("status", "0"))
+        return Step(line, "typed", text, said.get("terminal", ""), status)
     if kind == "text" and "seen in" in said:
-        return Seen(line, said["seen in"], text)
+        return Step(line, "seen", text, said["seen in"])
     if "file" in said:
-        return Written(line, said["file"], text)
+        return Step(line, "written", text, said["file"])
     if kind == "diff" and "edit" in said:
-        lines = text.splitlines(keepends=True)
-        old = "".join(each[1:] for each in lines if not each.startswith("+"))
-        new = "".join(each[1:] for each in lines if not each.startswith("-"))
-        return Edited(line, said["edit"], old, new)
+        return Step(line, "edited", text, said["edit"])
     return None
-
-
-def _with_output(step: Step, shown: str, *, where: str) -> Step:
-    match step:
-        case Typed(line, commands, terminal, status, None):
-            return Typed(line, commands, terminal, status, shown)
-        case _:
-            raise PageError(f"{where}: nothing is typed above this output")
 
 
 _TOKEN = "a-token-of-the-smoke-test"
@@ -289,29 +251,12 @@ def try_gateway(era: InstalledEra) -> None:
     with era.running("daemon", "panel.yaml"), era.running(*listening) as gateway:
         assert gateway.stdout is not None
         url = gateway.stdout.readline().split()[1]
-        with urllib.request.urlopen(url, timeout=PATIENCE) as page:
-            expect(b"<html" in page.read(), "no page")
-        with urllib.request.urlopen(f"{url}app.js", timeout=PATIENCE) as program:
-            expect(b"import" in program.read(), "a page without its program")
-        expect("101 " in _websocket(url), "no WebSocket")
-
-
-def _websocket(url: str) -> str:
-    """The first line of what is answered to a WebSocket's handshake; its key is RFC 6455's."""
-    host, _, port = url.removeprefix("http://").strip("/").partition(":")
-    lines = [
-        "GET /api/v1/ws HTTP/1.1",
-        f"Host: {host}:{port}",
-        "Upgrade: websocket",
-        "Connection: Upgrade",
-        "Sec-WebSocket-Version: 13",
-        "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==",
-        f"Sec-WebSocket-Protocol: era-haptics.v1, era-haptics.token.{_TOKEN}",
-    ]
-    with socket.create_connection((host, int(port)), PATIENCE) as connection:
-        connection.sendall("\r\n".join([*lines, "", ""]).encode())
-        with connection.makefile(encoding="latin-1") as answer:
-            return answer.readline()
+        for name, text in (("", b"<html"), ("app.js", b"import")):
+            with urllib.request.urlopen(f"{url}{name}", timeout=PATIENCE) as page:
+                expect(text in page.read(), f"no page {name}")
+        protocols = [Subprotocol("era-haptics.v1"), Subprotocol(f"era-haptics.token.{_TOKEN}")]
+        with connect(f"ws{url.removeprefix('http')}api/v1/ws", subprotocols=protocols) as socket:
+            expect(bool(socket.recv(PATIENCE)), "no WebSocket")
 
 
 def expect(holds: bool, what: str) -> None:
@@ -504,24 +449,21 @@ class Reader:
 
     def follow(self, step: Step) -> None:
         """Do one step; raises PageError where anything else comes of it than the page says."""
-        step = self._here(step)
-        match step:
-            case Written():
+        told: dict[str, Any] = {key: self._swapped(value) for key, value in asdict(step).items()}
+        step = replace(step, **told)
+        match step.kind:
+            case "written":
                 (self._folder / step.name).write_text(step.text, encoding="utf-8")
-            case Edited():
+            case "edited":
                 self._edit(step)
-            case Interrupted():
+            case "interrupted":
                 self._interrupt(step)
-            case Typed(terminal=None):
-                self._type(step)
-            case Typed():
+            case "seen":
+                self._wait_for(step.line, step.name, f"...\n{step.text}")
+            case "typed" if step.name:
                 self._begin(step)
-            case Seen():
-                self._wait_for(step.line, step.terminal, f"...\n{step.shown}")
-
-    def _here(self, step: Step) -> Step:
-        told: dict[str, Any] = {k: self._swapped(v) for k, v in asdict(step).items()}
-        return replace(step, **told)
+            case _:
+                self._type(step)
 
     def _swapped(self, told: object) -> object:
         if isinstance(told, str):
@@ -529,16 +471,18 @@ class Reader:
                 told = re.sub(rf"(?<![\w.]){theirs}(?!\w)", ours, told)
         return told
 
-    def _edit(self, step: Edited) -> None:
+    def _edit(self, step: Step) -> None:
         path = self._folder / step.name
-        text = path.read_text(encoding="utf-8")
-        if text.count(step.old) != 1:
-            raise PageError(f"line {step.line}: {text.count(step.old)} times in {step.name}")
-        path.write_text(text.replace(step.old, step.new), encoding="utf-8")
+        text, lines = path.read_text(encoding="utf-8"), step.text.splitlines(keepends=True)
+        old = "".join(each[1:] for each in lines if not each.startswith("+"))
+        new = "".join(each[1:] for each in lines if not each.startswith("-"))
+        if text.count(old) != 1:
+            raise PageError(f"line {step.line}: {text.count(old)} times in {step.name}")
+        path.write_text(text.replace(old, new), encoding="utf-8")
 
-    def _type(self, step: Typed) -> None:
+    def _type(self, step: Step) -> None:
         printed, status = "", 0
-        for words in _commands(step.commands):
+        for words in _commands(step.text):
             done = subprocess.run(
                 words,
                 cwd=self._folder,
@@ -556,13 +500,12 @@ class Reader:
             raise PageError(f"line {step.line}: exit status {status}\n{printed}")
         _compare(step.line, step.shown, printed)
 
-    def _begin(self, step: Typed) -> None:
-        assert step.terminal is not None
-        output = self._folder.parent / f"{step.terminal}.txt"
-        commands = _commands(step.commands)
+    def _begin(self, step: Step) -> None:
+        output = self._folder.parent / f"{step.name}.txt"
+        commands = _commands(step.text)
         with output.open("wb") as file:
             process = subprocess.Popen(
-                commands[0] if len(commands) == 1 else ["bash", "-e", "-c", step.commands],
+                commands[0] if len(commands) == 1 else ["bash", "-e", "-c", step.text],
                 cwd=self._folder,
                 env=self._environment,
                 stdin=subprocess.DEVNULL,
@@ -570,8 +513,8 @@ class Reader:
                 stderr=subprocess.STDOUT,
                 start_new_session=True,
             )
-        self._terminals[step.terminal] = process, output
-        self._wait_for(step.line, step.terminal, step.shown or "")
+        self._terminals[step.name] = process, output
+        self._wait_for(step.line, step.name, step.shown or "")
 
     def _wait_for(self, line: int, terminal: str, shown: str) -> None:
         process, output = self._terminals[terminal]
@@ -597,8 +540,8 @@ class Reader:
         self._swaps[theirs[0]] = ours[0]
         return shown.replace(theirs[0], ours[0])
 
-    def _interrupt(self, step: Interrupted) -> None:
-        process, output = self._terminals[step.terminal]
+    def _interrupt(self, step: Step) -> None:
+        process, output = self._terminals[step.name]
         os.killpg(process.pid, signal.SIGINT)
         try:
             process.wait(READER_PATIENCE)

@@ -276,6 +276,27 @@ class Stopping(RandomGroup):
         await self.apply()
         await asyncio.sleep(self.rng.uniform(0.0, 0.08))
 
+    async def begin(self, scene: str) -> None:
+        """Do what a scene says; what it begins may go on while all is stopped."""
+        if scene not in ("arming", "clearing"):
+            await self.play()
+        if scene == "disarmed":
+            with suppress(DriverError):
+                await self.operate("disarm")
+        begun: Mapping[str, tuple[Callable[[], Awaitable[object]], float]] = {
+            "applying": (self.apply, 0.01),
+            "arming": (partial(self.operate, "arm"), 0.03),
+            "clearing": (partial(self.operate, "clear"), 0.005),
+            "stopping": (partial(self.operate, "stop"), 0.01),
+        }
+        if scene in begun:
+            work, longest = begun[scene]
+            task = asyncio.ensure_future(work())
+            task.add_done_callback(lambda done: done.cancelled() or done.exception())
+            await asyncio.sleep(self.rng.uniform(0.0, longest))
+            if scene == "stopping" and self.rng.random() < 0.5:
+                task.cancel()
+
     def _loud(self, name: str) -> str:
         """Describe what an amplifier plays, or will without a request; empty if nothing."""
         level = self.plate_judge.loudest(name, LONGEST, _MOMENTS)
@@ -327,54 +348,8 @@ def _drawn(rng: random.Random, toward: Toward) -> list[FaultWindow]:
     ]
 
 
-async def _playing(chain: Stopping) -> None:
-    await chain.play()
-
-
-async def _applying(chain: Stopping) -> None:
-    await chain.play()
-    await _begun(chain, chain.apply(), longest=0.01)
-
-
-async def _arming(chain: Stopping) -> None:
-    await _begun(chain, chain.operate("arm"), longest=0.03)
-
-
-async def _clearing(chain: Stopping) -> None:
-    await _begun(chain, chain.operate("clear"), longest=0.005)
-
-
-async def _disarmed(chain: Stopping) -> None:
-    await chain.play()
-    with suppress(DriverError):
-        await chain.operate("disarm")
-
-
-async def _stopping(chain: Stopping) -> None:
-    await chain.play()
-    stopping = await _begun(chain, chain.operate("stop"), longest=0.01)
-    if chain.rng.random() < 0.5:
-        stopping.cancel()
-
-
-async def _begun(
-    chain: Stopping, work: Awaitable[object], *, longest: float
-) -> "asyncio.Future[object]":
-    """Begin what goes on while all is stopped."""
-    task = asyncio.ensure_future(work)
-    task.add_done_callback(lambda done: done.cancelled() or done.exception())
-    await asyncio.sleep(chain.rng.uniform(0.0, longest))
-    return task
-
-
-SCENES: Mapping[str, Callable[[Stopping], Awaitable[None]]] = {
-    "playing": _playing,
-    "applying": _applying,
-    "arming": _arming,
-    "clearing": _clearing,
-    "disarmed": _disarmed,
-    "stopping": _stopping,
-}
+SCENES = ("playing", "applying", "arming", "clearing", "disarmed", "stopping")
+"""What a host does while all is stopped, or has done before."""
 
 
 async def _stop(chain: Stopping, wire: str, scene: str, tally: Tally) -> None:
@@ -403,11 +378,11 @@ async def _disturbed_stops(chain: Stopping, wire: str, tally: Tally, seed: int) 
     """Stops of one chain while frames are lost, late and doubled."""
     rng = chain.rng
     for _ in range(PER_CHAIN):
-        scene = rng.choice(tuple(SCENES))
+        scene = rng.choice(SCENES)
         is_early = rng.random() < 0.5
         if is_early:
             chain.lose_some()
-        await SCENES[scene](chain)
+        await chain.begin(scene)
         if not is_early:
             chain.lose_some()
         await asyncio.sleep(rng.choice((0.0, 0.07, 0.12, 0.5)) * rng.random())
@@ -420,7 +395,7 @@ async def _stop_with_exception(chain: Stopping, wire: str, tally: Tally, seed: i
     """One stop, on the way of which an exception is raised at a line whose number is drawn."""
     at = random.Random(-seed).randint(1, random.Random(seed).choice((100, 500, _MOST_LINES)))
     scene = chain.rng.choice(("playing", "applying", "stopping"))
-    await SCENES[scene](chain)
+    await chain.begin(scene)
     if chain.rng.random() < 0.5:
         chain.lose_some()
     with _exception_at(at) as planted:
@@ -431,8 +406,8 @@ async def _stop_with_exception(chain: Stopping, wire: str, tally: Tally, seed: i
 async def _stop_by_command(chain: Stopping, wire: str, tally: Tally, seed: int) -> None:
     """Stop one amplifier of a killed host by `era amp stop`."""
     rng = chain.rng
-    scene = rng.choice(tuple(SCENES))
-    await SCENES[scene](chain)
+    scene = rng.choice(SCENES)
+    await chain.begin(scene)
     if is_early := rng.random() < 0.5:
         chain.lose_some()
     await asyncio.sleep(rng.uniform(0.0, 0.02))

@@ -51,6 +51,7 @@ from registry.limits import GuardLimits
 from typed_page import PORTS, PageError, Reader, difference, read_steps
 from ways import WAYS, steps_of
 
+ROOT = Path(__file__).parents[2]
 BEGIN, END = "<!-- begin: written by a.py -->", "<!-- end -->"
 
 
@@ -115,12 +116,13 @@ def test_page_follows_the_code(name: str) -> None:
     assert 5 <= len({file for file, _ in steps}) <= MOST_FILES[name]
 
 
-FILE = Path(constraints.__file__).parents[2] / "constraints.txt"
-
-
 def test_constraints_pin_every_dependency_within_its_bounds() -> None:
     """One tested version of each that the extras for users require, directly or not."""
-    lines = [line for line in FILE.read_text("utf-8").splitlines() if not line.startswith("#")]
+    lines = [
+        line
+        for line in (ROOT / "constraints.txt").read_text("utf-8").splitlines()
+        if not line.startswith("#")
+    ]
     pinned = dict(line.split("==") for line in lines)
     assert constraints.closure("era-haptics", *constraints.EXTRAS).keys() == pinned.keys()
     for text in requires("era-haptics") or ():
@@ -129,7 +131,6 @@ def test_constraints_pin_every_dependency_within_its_bounds() -> None:
             assert pinned[canonicalize_name(required.name)] in required.specifier
 
 
-ROOT = Path(__file__).parents[2]
 PAGES = ROOT / "docs" / "tutorials"
 
 
@@ -158,12 +159,9 @@ def test_the_first_tutorial_writes_the_rig_of_the_others() -> None:
     assert [(step.name, step.text) for step in written] == [("my_rig.yaml", example)]
 
 
-REFERENCE = Path(__file__).parents[2] / "docs" / "reference"
-
-
 def rows(page: str, head: str) -> list[list[str]]:
     """The cells of the table that begins with this head, one list a row."""
-    text = (REFERENCE / page).read_text("utf-8")
+    text = (ROOT / "docs" / "reference" / page).read_text("utf-8")
     table = text[text.index(head) :].partition("\n\n")[0]
     return [[cell.strip() for cell in line[1:-1].split("|")] for line in table.splitlines()[2:]]
 
@@ -241,7 +239,7 @@ def test_read_steps_refuses_an_unknown_comment(tmp_path: Path, comment: str) -> 
 
 def test_ports_include_all_ports_of_pages() -> None:
     """Every port of a page is replaced by a free one."""
-    docs = Path(__file__).parents[2] / "docs"
+    docs = ROOT / "docs"
     pages = [*docs.glob("tutorials/*.md"), *docs.glob("how-to/*.md")]
     named = {
         port
@@ -286,8 +284,7 @@ def test_page_lists_every_command_with_its_options() -> None:
         named = {*own, *also}
         shown = [each for each in command.params if not getattr(each, "hidden", False)]
         names = {max(option.opts, key=len) for option in shown}
-        options = {name for name in names if name.startswith("--")}
-        assert named == options - {"--help"}, name
+        assert named == {name for name in names if name.startswith("--")} - {"--help"}, name
 
 
 def test_every_command_with_json_tells_its_keys() -> None:

@@ -157,8 +157,7 @@ def test_master_finds_the_objects_of_the_eds_in_the_amplifier() -> None:
             if each.data_type != canopen.objectdictionary.VISIBLE_STRING:
                 assert len(served) == len(each) // 8
     number = list(sheet[0x2001].names).index("limits 3 level_max")
-    limits = objects.read(0x2001, number, 0.0)
-    assert int.from_bytes(limits, "little") == 10000
+    assert int.from_bytes(objects.read(0x2001, number, 0.0), "little") == 10000
 
 
 PAGE = (DOCS / "protocol.md").read_text("utf-8")
@@ -199,8 +198,7 @@ def test_levels_by_hand_are_those_of_the_playback(number: int, sets: list[LayerS
 
 def test_timeline_is_that_of_the_playback() -> None:
     """A set that waits for an onset, the token of each moment, a renewal, the end and silence."""
-    names = ("t [ms]", "commit", "voice", "valid_for", "token")
-    for name in names:
+    for name in ("t [ms]", "commit", "voice", "valid_for", "token"):
         assert f"\n    {name} " in PAGE
     assert "0            30            60     70           120          160" in PAGE
     assert "220   230" in PAGE

@@ -152,21 +152,16 @@ LONG = {
 """Other slow commands, with their slow function."""
 
 
-def furnish(folder: Path, shelf: Path) -> None:
-    """Write a rig, a table, and every fourth frequency of a measurement."""
+@pytest.fixture
+def home(shelf: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder with a rig, a table and every fourth frequency of a measurement."""
     rig = CASE_RIG.replace("[40, 300]", "[40, 500]").replace("mesh: 12x9", "mesh: auto")
-    (folder / "rig.yaml").write_text(rig, encoding="utf-8")
-    (folder / "table.npz").write_bytes((shelf / "table.npz").read_bytes())
+    (tmp_path / "rig.yaml").write_text(rig, encoding="utf-8")
+    (tmp_path / "table.npz").write_bytes((shelf / "table.npz").read_bytes())
     head, *rows = (shelf / "measured.csv").read_text("utf-8").splitlines(keepends=True)
     frequencies = list(dict.fromkeys(row.split(",")[6] for row in rows))[::4]
     measured = head + "".join(row for row in rows if row.split(",")[6] in frequencies)
-    (folder / "measured.csv").write_text(measured, encoding="utf-8")
-
-
-@pytest.fixture
-def home(shelf: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A folder with a rig, a table and a measurement."""
-    furnish(tmp_path, shelf)
+    (tmp_path / "measured.csv").write_text(measured, encoding="utf-8")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / ".cache"))
     return tmp_path
@@ -368,17 +363,12 @@ def test_what_is_wrong_is_said(
 _DIGITS = b"9" * 100_000
 
 
-def _sparse(path: Path) -> None:
-    with path.open("wb") as stream:
-        stream.truncate(1 << 40)
-
-
 HOSTILE: dict[str, Callable[[Path], object]] = {
     "pipe": os.mkfifo,
     "device": lambda path: path.symlink_to("/dev/zero"),
     "folder": Path.mkdir,
     "missing": lambda path: None,
-    "sparse": _sparse,
+    "sparse": lambda path: [path.touch(), os.truncate(path, 1 << 40)],
     "zeros": lambda path: path.write_bytes(bytes(1 << 16)),
     "digits": lambda path: path.write_bytes(_DIGITS),
     "digits in JSON": lambda path: path.write_bytes(b'{"a": %s}' % _DIGITS),

@@ -174,8 +174,7 @@ async def driven() -> AsyncIterator[tuple[Instrument, Popen[bytes], str]]:
     """The instrument, the adapter in front of it, and its URL."""
     instrument = Instrument()
     async with on_tcp(instrument) as port:
-        program = [sys.executable, str(SCRIPT), f"127.0.0.1:{port}"]
-        with Popen(program, stdout=PIPE) as running:  # noqa: ASYNC220
+        with Popen([sys.executable, str(SCRIPT), f"127.0.0.1:{port}"], stdout=PIPE) as running:  # noqa: ASYNC220
             try:
                 url = await asyncio.to_thread(running.stdout.readline)
                 yield instrument, running, url.decode().strip()
@@ -267,8 +266,7 @@ async def test_force_is_that_of_the_set_and_follows_it() -> None:
         assert np.degrees(np.angle(instrument.force(1, 100.0) / second)) == pytest.approx(
             120.0, abs=0.1
         )
-        stopped = await group.stop()
-        assert stopped["a"].is_confirmed
+        assert (await group.stop())["a"].is_confirmed
         assert instrument.is_silent
 
 
@@ -286,8 +284,7 @@ async def test_mute_instrument_is_never_reported_silent() -> None:
         instrument.is_mute = True
         with pytest.raises((CommandRefused, LinkError)):
             await failing(group, layer(0.3))
-        stopped = await group.stop()
-        assert not stopped["a"].is_confirmed
+        assert not (await group.stop())["a"].is_confirmed
         assert not instrument.is_silent
         with pytest.raises(CommandRefused):
             await group.arm()

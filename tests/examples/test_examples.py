@@ -18,7 +18,7 @@ import subprocess
 import sys
 import tempfile
 from asyncio.subprocess import PIPE
-from collections.abc import AsyncIterator, Callable, Iterator
+from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager, closing
 from functools import partial
 from itertools import pairwise
@@ -277,32 +277,6 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return target
 
 
-@pytest.fixture
-def reader(tmp_path: Path, installed: Path) -> Iterator[Reader]:
-    """A reader in a checkout with examples and firmware alone, for whom kernels were compiled.
-
-    `pip` installs prebuilt packages.
-    """
-    home = Path(tempfile.mkdtemp(prefix="era"))
-    folder, site, programs = tmp_path / "checkout", home / "site", home / "bin"
-    folder.mkdir()
-    programs.mkdir()
-    for part in ("examples", "firmware"):
-        shutil.copytree(ROOT / part, folder / part)
-    kernels()  # compiled here, if nowhere before
-    kept = home / "cache" / cache_folder().name
-    kept.mkdir(parents=True)
-    for library in cache_folder().glob("kernels-*"):
-        shutil.copy2(library, kept)
-    pip = programs / "pip"
-    words = [sys.executable, str(PIP), str(installed), str(site)]
-    pip.write_text(f'#!/bin/sh\nexec {shlex.join(words)} "$@"\n', encoding="utf-8")
-    pip.chmod(0o755)
-    with Reader(folder, home=home, programs=programs, site=site) as made:
-        yield made
-    shutil.rmtree(home)
-
-
 @pytest.mark.parametrize(
     "name",
     [
@@ -310,12 +284,31 @@ def reader(tmp_path: Path, installed: Path) -> Iterator[Reader]:
         for name in [*NAMES, *WITH_CONFORMANCE, *WITHOUT_CODE]
     ],
 )
-def test_page_commands_print_what_is_shown(name: str, reader: Reader) -> None:
-    """Commands, run in order, print the output on the page."""
-    steps = read_steps(PAGES / f"{name}.md")
+def test_page_commands_print_what_is_shown(name: str, tmp_path: Path, installed: Path) -> None:
+    """Commands, run in order, print the output on the page.
+
+    In a checkout with examples and firmware alone, for a reader for whom kernels were compiled;
+    `pip` installs prebuilt packages.
+    """
+    steps, folder = read_steps(PAGES / f"{name}.md"), tmp_path / "checkout"
     assert sum(step.shown is not None for step in steps) >= 2
-    for step in steps:
-        reader.follow(step)
+    for part in ("examples", "firmware"):
+        shutil.copytree(ROOT / part, folder / part)
+    with tempfile.TemporaryDirectory(prefix="era") as short:
+        home = Path(short)
+        site, programs = home / "site", home / "bin"
+        programs.mkdir()
+        kernels()  # compiled here, if nowhere before
+        kept = home / "cache" / cache_folder().name
+        kept.mkdir(parents=True)
+        for library in cache_folder().glob("kernels-*"):
+            shutil.copy2(library, kept)
+        words = [sys.executable, str(PIP), str(installed), str(site)]
+        (pip := programs / "pip").write_text(f'#!/bin/sh\nexec {shlex.join(words)} "$@"\n', "utf-8")
+        pip.chmod(0o755)
+        with Reader(folder, home=home, programs=programs, site=site) as reader:
+            for step in steps:
+                reader.follow(step)
 
 
 @pytest.mark.parametrize("name", [*NAMES, *WITH_CONFORMANCE])
@@ -385,8 +378,7 @@ async def test_group_plays_behind_a_socket_until_it_is_closed(address: Any, tmp_
         statuses = [await each.read_status() for each in amplifiers.values()]
         assert [status["levels"] for status in statuses] == [[5000], [5000]]
         assert all(each.is_confirmed for each in (await group.stop()).values())
-        line = amplifiers["1"].line
-        line._port.write(b"hang up")
+        amplifiers["1"].line._port.write(b"hang up")
         async with asyncio.timeout(60.0):
             with pytest.raises(LinkError, match="was lost"):
                 await read_for_ever(amplifiers["2"])

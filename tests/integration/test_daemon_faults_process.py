@@ -87,28 +87,6 @@ from sim.plant.plant import SAMPLE_RATE, Plant
 
 
 @pytest.mark.real_time
-async def test_second_daemon_is_refused_while_first_plays_on(tmp_path: Path) -> None:
-    """Exit status 2 with the process id of the first; at another socket it waits for the link."""
-    async with playing_daemon(tmp_path) as (daemon, era, _):
-        status, _, err = await run_era("daemon", tmp_path / "daemon.yaml")
-        assert status == 2
-        assert f"process {daemon.process.pid}" in err
-        text = (tmp_path / "daemon.yaml").read_text("utf-8")
-        (tmp_path / "other.yaml").write_text(text.replace("era.sock", "b.sock"), "utf-8")
-        other = await asyncio.create_subprocess_exec(
-            *(ERA, "daemon", tmp_path / "other.yaml"), stderr=asyncio.subprocess.PIPE
-        )
-        await until((tmp_path / "b.sock").is_socket)
-        async with await AsyncClient.connect(tmp_path / "b.sock", name="test") as waiting:
-            await until_state(waiting, "COMM_LOST")
-        other.terminate()
-        _, log = await other.communicate()
-        assert b"Traceback" not in log
-        assert (await era.status()).state == "OPERATION_ENABLED"
-        await until(lambda: any(daemon.far.summary().levels))
-
-
-@pytest.mark.real_time
 async def test_start_that_is_stuck_ends_by_sigterm(tmp_path: Path) -> None:
     """In a library that looks at no signal, as one that waits for memory."""
     stuck = (
@@ -323,11 +301,29 @@ async def test_daemon_replays_nothing_when_starved(tmp_path: Path) -> None:
 
 
 @pytest.mark.real_time
-async def test_daemon_plays_on_and_stops_without_descriptors(tmp_path: Path) -> None:
-    """A connected client stops it; with descriptors again, new clients connect."""
-    more = "dumps: {folder: dumps}\n"
-    async with playing_daemon(tmp_path, more) as (daemon, era, journal):
+async def test_daemon_plays_on_beside_a_second_one_and_without_descriptors(tmp_path: Path) -> None:
+    """A second one ends with status 2 and the process id of the first; at another socket it waits.
+
+    Without descriptors a connected client stops it; with them again, new clients connect.
+    """
+    async with playing_daemon(tmp_path, "dumps: {folder: dumps}\n") as (daemon, era, journal):
         pid = daemon.process.pid
+        status, _, err = await run_era("daemon", tmp_path / "daemon.yaml")
+        assert status == 2
+        assert f"process {pid}" in err
+        text = (tmp_path / "daemon.yaml").read_text("utf-8")
+        (tmp_path / "other.yaml").write_text(text.replace("era.sock", "b.sock"), "utf-8")
+        other = await asyncio.create_subprocess_exec(
+            *(ERA, "daemon", tmp_path / "other.yaml"), stderr=asyncio.subprocess.PIPE
+        )
+        await until((tmp_path / "b.sock").is_socket)
+        async with await AsyncClient.connect(tmp_path / "b.sock", name="test") as waiting:
+            await until_state(waiting, "COMM_LOST")
+        other.terminate()
+        _, log = await other.communicate()
+        assert b"Traceback" not in log
+        assert (await era.status()).state == "OPERATION_ENABLED"
+        await until(lambda: any(daemon.far.summary().levels))
         before = limited(pid, resource.RLIMIT_NOFILE, max(numbers_in(f"/proc/{pid}/fd")) + 1)
         waiting = []
         try:

@@ -179,20 +179,6 @@ async def test_page_shows_the_rig_without_console_messages(page: Page) -> None:
     assert page.complaints == []
 
 
-@pytest.mark.long
-async def test_plate_is_to_scale_on_every_screen(page: Page) -> None:
-    """Its aspect ratio is that in metres; nothing exceeds the screen."""
-    for screen in SCREENS:
-        await show_on(page, screen)
-        width, height, overflow = await page.evaluate(
-            "(({width, height}) => [width, height, document.documentElement.scrollWidth - "
-            "innerWidth])(document.querySelector('#plate').getBoundingClientRect())"
-        )
-        assert width / height == pytest.approx(LENGTH / WIDTH, rel=0.02), screen
-        assert height < screen.height, screen
-        assert overflow <= 0, screen
-
-
 async def test_field_is_drawn_at_the_frame_rate(page: Page, era: Client) -> None:
     """Many colours on the plate while a finger is felt, one without."""
     await arm(page, era)
@@ -279,8 +265,7 @@ async def test_shift_and_click_leaves_fingers_resting(page: Page, era: Client) -
             await page.mouse(kind, *place, shift=True)
     await contacts(era, 2)
     await page.mouse("mousePressed", *third)
-    seen = await contacts(era, 3)
-    assert seen[-1] == pytest.approx((0.5 * LENGTH, 0.2 * WIDTH), abs=1e-3)
+    assert (await contacts(era, 3))[-1] == pytest.approx((0.5 * LENGTH, 0.2 * WIDTH), abs=1e-3)
     await page.mouse("mouseReleased", *third)
     await contacts(era, 2)
     await page.mouse("mousePressed", *one, shift=True)
@@ -306,8 +291,7 @@ async def test_touches_become_contacts_of_the_daemon(page: Page, era: Client) ->
     """Two at once, at their places in metres, moved and lifted; the last one is the target."""
     await arm(page, era)
     async with fingers_down(page, *PLACES):
-        seen = await contacts(era, 2)
-        for (x, y), (right, down) in zip(seen, PLACES, strict=True):
+        for (x, y), (right, down) in zip((await contacts(era, 2)), PLACES, strict=True):
             assert x == pytest.approx(right * LENGTH, abs=1e-3)
             assert y == pytest.approx((1 - down) * WIDTH, abs=1e-3)
         await page.until("document.querySelectorAll('.contact').length === 2")
@@ -441,23 +425,30 @@ async def test_space_bar_stops_with_any_focus(fresh: Page, era: Client) -> None:
         await settled(fresh, era)
 
 
-async def test_stop_button_is_uncovered_on_every_screen(page: Page) -> None:
-    """Wholly within the screen at any scroll position."""
+async def test_every_screen_has_the_plate_to_scale_and_the_stop_button(page: Page) -> None:
+    """The plate's aspect ratio is that in metres, and nothing exceeds the screen.
+
+    The button is wholly within it at any scroll position. Every button and switch is 44 pixels
+    wide and high on a phone.
+    """
     uncovered = f"({PROBES}).isUncovered('#stop')"
-    zoomed = Screen("400 %", 320, 215)
-    for screen in (*SCREENS, Screen("wide", 1920, 1080), Screen("narrow", 360, 640), zoomed):
+    others = Screen("wide", 1920, 1080), Screen("narrow", 360, 640), Screen("400 %", 320, 215)
+    for screen in (*SCREENS, *others):
         await show_on(page, screen)
-        bottom = await page.evaluate("document.documentElement.scrollHeight")
+        width, height, overflow, bottom = await page.evaluate(
+            "(({width, height}, {scrollWidth, scrollHeight}) =>"
+            " [width, height, scrollWidth - innerWidth, scrollHeight])"
+            "(document.querySelector('#plate').getBoundingClientRect(), document.documentElement)"
+        )
+        assert width / height == pytest.approx(LENGTH / WIDTH, rel=0.02), screen
+        if screen in SCREENS:
+            assert height < screen.height, screen
+            assert overflow <= 0, screen
         for scrolled in range(0, bottom, max(200, screen.height // 2)):
             await page.evaluate(f"window.scrollTo(0, {scrolled})")
             assert await page.evaluate(uncovered), (screen, scrolled)
     await page.evaluate("document.querySelector('.skip').focus()")
     assert await page.evaluate(uncovered)
-
-
-@pytest.mark.long
-async def test_touch_targets_are_large_enough(page: Page) -> None:
-    """Every button and switch is 44 pixels wide and high on a phone."""
     await show_on(page, PHONE)
     small = await page.evaluate(
         "[...document.querySelectorAll('button, .switch, input:not([type=checkbox])')]"

@@ -17,7 +17,7 @@ import subprocess
 import sys
 import time
 from collections import Counter
-from collections.abc import AsyncIterator, Callable, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
@@ -35,7 +35,6 @@ from benchmarks.latency.session import daemon_session, plain_session, taps
 from controller.api.client import AsyncClient, Client
 from controller.api.jsonrpc import RpcError
 from controller.api.link import Unreachable
-from controller.api.methods import StatusResult
 from controller.daemon.daemon import check_daemon
 from controller.demo.demonstration import Scene, example_scenes, run_demo
 from controller.effects.layout import load_layout
@@ -89,63 +88,47 @@ PEOPLE = {
 """Where each person rests a finger, and the band [Hz] that the layout gives it."""
 
 
-@contextlib.asynccontextmanager
-async def example_daemon(name: str, folder: Path, cache: Path) -> AsyncIterator[AsyncClient]:
-    """`era daemon examples/NAME_daemon.yaml` as on its page, ready, and a client of it."""
-    process = await asyncio.create_subprocess_exec(
-        *(*RESTING, "daemon", str(EXAMPLES / f"{name}_daemon.yaml")),
-        env=os.environ | {"XDG_CACHE_HOME": str(cache), "XDG_RUNTIME_DIR": str(folder)},
-        stderr=asyncio.subprocess.DEVNULL,
-    )
-    socket = folder / "era-haptics" / "daemon.sock"
-    try:
-        await until_seen(lambda: socket.is_socket() or process.returncode, patience=STARTING)
-        async with await AsyncClient.connect(socket, name="test", timeout=PATIENCE) as era:
-            await ready(era)
-            yield era
-    finally:
-        process.terminate()
-        await process.wait()
-
-
-async def until_all_feel(era: AsyncClient, level_db_sl: float) -> StatusResult:
-    """Wait until every finger feels a content at nearly this level."""
-    async with asyncio.timeout(PATIENCE):
-        while True:
-            status = await era.status()
-            levels = [each.level_db_sl for each in status.contacts if each.role == "target"]
-            felt = [level for level in levels if level is not None and level > level_db_sl - 3]
-            if levels and len(felt) == len(status.contacts):
-                return status
-            await asyncio.sleep(0.02)
-
-
 @pytest.mark.real_time
 @pytest.mark.alone
 @pytest.mark.parametrize("name", shortly(PEOPLE, []))
 async def test_everyone_at_an_example_feels_their_own(
     name: str, tmp_path: Path, table_cache: Path
 ) -> None:
-    """Each in the band of its region, at least 30 Hz apart, 6 dB and more above all others there.
+    """`era daemon examples/NAME_daemon.yaml` as on its page.
 
-    With nobody at the plate nothing plays.
+    Each in the band of its region, at least 30 Hz apart, 6 dB and more above all others there. With
+    nobody at the plate nothing plays.
     """
-    people = PEOPLE[name]
-    async with example_daemon(name, tmp_path, table_cache) as era, era.armed("test"):
-        async with holding(era, *people):
-            status = await until_all_feel(era, 20.0)
-        contacts = sorted(status.contacts, key=lambda each: each.id)
-        assert len(contacts) == len(people)
-        frequencies = []
-        for contact, (low, high) in zip(contacts, people.values(), strict=True):
-            assert contact.verdict in ("own", "mixed")
-            assert contact.promised_contrast_db > 6
-            assert low <= contact.frequency_hz <= high
-            frequencies.append(contact.frequency_hz)
-        assert all(abs(one - other) >= 30 for one, other in combinations(frequencies, 2))
-        await era.subscribe("silence")
-        await era.touch([])
-        await next_event(era, "silence")
+    process = await asyncio.create_subprocess_exec(
+        *(*RESTING, "daemon", str(EXAMPLES / f"{name}_daemon.yaml")),
+        env=os.environ | {"XDG_CACHE_HOME": str(table_cache), "XDG_RUNTIME_DIR": str(tmp_path)},
+        stderr=asyncio.subprocess.DEVNULL,
+    )
+    socket, people = tmp_path / "era-haptics" / "daemon.sock", PEOPLE[name]
+    try:
+        await until_seen(lambda: socket.is_socket() or process.returncode, patience=STARTING)
+        async with await AsyncClient.connect(socket, name="test", timeout=PATIENCE) as era:
+            await ready(era)
+            async with era.armed("test"):
+                contacts, frequencies = [], []
+                async with holding(era, *people), asyncio.timeout(PATIENCE):
+                    # until every finger feels a content at nearly its level of 20 dB SL
+                    while not contacts or any((each.level_db_sl or 0) < 17 for each in contacts):
+                        contacts = sorted((await era.status()).contacts, key=lambda each: each.id)
+                assert len(contacts) == len(people)
+                for contact, (low, high) in zip(contacts, people.values(), strict=True):
+                    assert contact.verdict in ("own", "mixed")
+                    assert contact.promised_contrast_db > 6
+                    assert low <= contact.frequency_hz <= high
+                    frequencies.append(contact.frequency_hz)
+                pairs = combinations(frequencies, 2)
+                assert all(abs(one - other) >= 30 for one, other in pairs)
+                await era.subscribe("silence")
+                await era.touch([])
+                await next_event(era, "silence")
+    finally:
+        process.terminate()
+        await process.wait()
 
 
 COUNT, PLANTED = 10, 0.08  # s
@@ -299,8 +282,7 @@ async def test_daemon_plays_on_with_idle_and_unreading_clients(tmp_path: Path) -
             flood("idle", daemon.socket, 2000) as idle,
         ):
             await plays_on("clients connecting", daemon, era, journal)
-            line = await asyncio.wait_for(idle.stdout.readline(), 3 * PATIENCE)
-            assert int(line) == 2000
+            assert int(await asyncio.wait_for(idle.stdout.readline(), 3 * PATIENCE)) == 2000
             await plays_on("2000 idle, 10 unreading", daemon, era, journal)
             await stop_by_new_client(daemon)
             assert resident(daemon.process.pid) - before < MAX_GROWTH

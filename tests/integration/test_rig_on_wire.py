@@ -14,8 +14,8 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import AsyncIterator, Callable, Coroutine, Iterator
-from contextlib import ExitStack, asynccontextmanager, contextmanager, suppress
+from collections.abc import AsyncIterator, Callable, Coroutine
+from contextlib import ExitStack, asynccontextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
@@ -259,7 +259,6 @@ IDENTIFIED = (
 )
 """Of a rig's file: what an identification leaves."""
 
-_APART, _MARGIN = 0.05, 0.02  # m
 _FELT = 0.2  # s
 _REAL_WAIT = 0.05  # s; for a reply of the process
 
@@ -286,7 +285,6 @@ class LearningBench:
     era: AsyncClient
     file: Path
     daemon: Daemon
-    rng: np.random.Generator
     stands: bool = True
 
     @property
@@ -315,17 +313,6 @@ class LearningBench:
         plate = replace(self.far.bench.imperfections.plate, stiffness=stiffness)
         self.far.bench.change_plate(plate, now=threads.now())
 
-    def places(self) -> list[Place]:
-        """Two or three fingers at random."""
-        plate = self.far.bench.rig.plate
-        size = np.array([plate.length, plate.width])
-        count = int(self.rng.integers(2, 4))
-        while True:
-            found = self.rng.uniform(_MARGIN, size - _MARGIN, (count, 2))
-            gaps = np.linalg.norm(found[:, None] - found, axis=-1)
-            if gaps[np.triu_indices(count, 1)].min() > _APART:
-                return [(float(x), float(y)) for x, y in found]
-
     async def touch(self, *places: Place, seconds: float = 1.2) -> float | None:
         """Fingers rest on the plate; contrast felt by the last one [dB], None if nothing plays."""
         named = {f"finger {number}": place for number, place in enumerate(places)}
@@ -347,11 +334,11 @@ class LearningBench:
         return steady_contrast_db(target, quiet) if is_playing else None
 
     async def patterns(self, count: int) -> LearningSummary:
-        """Touch at random until so many patterns more are estimated."""
+        """Touch here and there until so many patterns more are estimated."""
         requested = (await self.learning()).estimates + count
         while (found := await self.learning()).estimates < requested:
             if found.readings < requested:
-                await self.touch(*self.places())
+                await self.touch(*PAIRS[found.readings % len(PAIRS)])
             else:
                 await asyncio.sleep(0.05)
         return found
@@ -374,8 +361,7 @@ async def learning_bench(
         ):
             await ready(era)
             async with era.armed("test", lease_s=60):
-                rng = np.random.default_rng(0)
-                learning = LearningBench(far, era, folder / "learned.npz", bench.daemon, rng)
+                learning = LearningBench(far, era, folder / "learned.npz", bench.daemon)
                 asyncio.get_running_loop().stands = learning.is_estimating
                 try:
                     yield learning
@@ -475,8 +461,7 @@ async def test_plate_that_was_not_measured_is_only_watched(tmp_path: Path) -> No
     """With the thickness of a drawing, to 2 %, answers stay as built, and the cause says so."""
     async with learning_bench(tmp_path, uncertainty="uncertainty: {}\n") as bench:
         await bench.until("off", "thickness")
-        found = await bench.patterns(1)
-        assert found.corrections == 0
+        assert (await bench.patterns(1)).corrections == 0
 
 
 FOLDER = Path(__file__).parents[2] / "examples" / "application"
@@ -486,12 +471,11 @@ FELT = "document.querySelector('#felt').textContent"
 
 
 class Network:
-    """Between browser and gateway: passes bytes on, loses them, or refuses connections."""
+    """Between browser and gateway: passes bytes on, or refuses connections while it is cut."""
 
     def __init__(self) -> None:
-        self.port = 0
-        self.target = 0  # port of the gateway
-        self._is_muted = self._is_cut = False
+        self.port = self.target = 0  # target: port of the gateway
+        self.is_cut = False
         self._writers: set[asyncio.StreamWriter] = set()
 
     @asynccontextmanager
@@ -502,67 +486,48 @@ class Network:
             yield self
             self.cut()
 
-    def mute(self) -> None:
-        """Lose every byte from now on; nothing closes."""
-        self._is_muted = True
-
     def cut(self) -> None:
         """Close all connections and refuse others."""
-        self._is_cut = True
+        self.is_cut = True
         for writer in self._writers:
             writer.transport.abort()
 
-    def restore(self) -> None:
-        """Close what has lost bytes, and pass everything on."""
-        self.cut()
-        self._is_muted = self._is_cut = False
-
     async def _accept(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         self._writers.add(writer)
-        if self._is_cut:
-            writer.transport.abort()
-            return
         with suppress(OSError):
-            back, forth = await asyncio.open_connection("127.0.0.1", self.target)
-            self._writers.add(forth)
-            await asyncio.gather(self._pass(reader, forth), self._pass(back, writer))
-        if not self._is_muted:
-            writer.transport.abort()
+            if not self.is_cut:
+                back, forth = await asyncio.open_connection("127.0.0.1", self.target)
+                self._writers.add(forth)
+                await asyncio.gather(self._pass(reader, forth), self._pass(back, writer))
+        writer.transport.abort()
 
     async def _pass(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         while data := await reader.read(1 << 16):
-            if not self._is_muted:
-                writer.write(data)
-        if not self._is_muted:
-            writer.close()
-
-
-@contextmanager
-def pages(folder: Path, network: Network) -> Iterator[str]:
-    """The origin of a server of the example's page, which is not the gateway but names it."""
-    page = (FOLDER / "plate.html").read_text(encoding="utf-8")
-    assert page.count(GATEWAY) == 1
-    own = page.replace(GATEWAY, f"http://127.0.0.1:{network.port}/")
-    (folder / "plate.html").write_text(own, encoding="utf-8")
-    handler = partial(SimpleHTTPRequestHandler, directory=str(folder))
-    with ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
-        threading.Thread(target=server.serve_forever, daemon=True).start()
-        yield f"http://127.0.0.1:{server.server_port}"
-        server.shutdown()
+            writer.write(data)
+        writer.close()
 
 
 @asynccontextmanager
 async def shown(tmp_path: Path) -> AsyncIterator[tuple[Page, Network, ExitStack, str]]:
-    """A tab, the network, what ends at the end, and the origin of the page."""
-    page = tmp_path / "page"
-    page.mkdir()
+    """A tab, the network, what ends at the end, and the origin of the page.
+
+    The example's page comes from a server that is not the gateway but names it.
+    """
+    text = (FOLDER / "plate.html").read_text(encoding="utf-8")
+    assert text.count(GATEWAY) == 1
+    (folder := tmp_path / "page").mkdir()
+    handler = partial(SimpleHTTPRequestHandler, directory=str(folder))
     async with (
         Network().serving() as network,
         open_browser(tmp_path / "profile") as browser,
         browser.open_page() as tab,
     ):
-        with ExitStack() as ended:
-            yield tab, network, ended, ended.enter_context(pages(page, network))
+        own = text.replace(GATEWAY, f"http://127.0.0.1:{network.port}/")
+        (folder / "plate.html").write_text(own, encoding="utf-8")
+        with ThreadingHTTPServer(("127.0.0.1", 0), handler) as server, ExitStack() as ended:
+            threading.Thread(target=server.serve_forever, daemon=True).start()
+            ended.callback(server.shutdown)
+            yield tab, network, ended, f"http://127.0.0.1:{server.server_port}"
 
 
 def url(origin: str) -> str:
@@ -602,7 +567,7 @@ async def test_page_plays_and_comes_back_after_every_loss(tmp_path: Path) -> Non
                 assert contact.y_m == pytest.approx(rig.width_m / 2, abs=2e-3)
                 network.cut()
                 await until_said("no connection: ")
-                network.restore()
+                network.is_cut = False
                 await until_said("on: armed by 'my application'")
                 await asyncio.to_thread(wait_for, lambda: (era.status().lease_left_s or 0) < 4.2)
                 await asyncio.to_thread(wait_for, lambda: (era.status().lease_left_s or 0) > 4.5)
@@ -658,10 +623,10 @@ async def test_page_leaves_a_silent_network_and_repeats_no_arm(tmp_path: Path) -
         with daemon.holding():
             await tab.click("#arm")
             await asyncio.to_thread(wait_for, lambda: "arm" in daemon.methods)
-            network.mute()
+            gateway.process.send_signal(signal.SIGSTOP)  # nothing comes, and nothing closes
             async with asyncio.timeout(PATIENCE / 6):
                 await tab.until(SAID, lambda text: "gateway" in text or "no connection" in text)
-            network.restore()
+            gateway.process.send_signal(signal.SIGCONT)
             await tab.until(SAID, lambda text: text.startswith("ready: "))
         cut = StateEvent(
             old="READY_TO_SWITCH_ON", new="FAULT", cause="a cable was cut", remedy=None, epoch=1
@@ -691,8 +656,7 @@ async def test_page_that_loses_its_user_lifts_and_disarms(tmp_path: Path) -> Non
         wait_for_state(era, "READY_TO_SWITCH_ON")
         era.subscribe("state")
         options = ("--allow-origin", origin)
-        gateway = ended.enter_context(gateway_process(tmp_path, socket, *options))
-        network.target = gateway.port
+        network.target = ended.enter_context(gateway_process(tmp_path, socket, *options)).port
         opened = (
             "(async () => {"
             f"  const {{ Connection }} = await import('http://127.0.0.1:{network.port}/connection.js');"

@@ -16,36 +16,38 @@ HOME = Path("/home/user")
 
 
 @pytest.mark.parametrize(
-    ("text", "expected"),
+    ("text", "expected", "is_recorded"),
     [
-        ("thickness: 1.5mm, mesh: auto 1 %", "thickness: 1.5mm, mesh: auto 1 %"),
-        ("url: serial:///dev/ttyUSB0?baud=921600", "url: serial:///dev/ttyUSB0?baud=921600"),
-        ("url: 'socket://me:1234@amp:4000'", "url: 'socket://hidden'"),
-        ("url: modbus+tcp://plc.example/7", "url: modbus+tcp://hidden/7"),
-        ("url: socket:///x?pin=1234&baud=9600", "url: socket:///x?pin=hidden&baud=9600"),
-        ("token: 123456  # my bank's", "token: hidden"),
-        ('{"access_key": 1234, "stroke": 1}', '{"access_key": hidden, "stroke": 1}'),
-        ('serial_numbers: {main: "A1234"}', "serial_numbers: {main: hidden}"),
-        ('{"serial_number": "A1234"}', '{"serial_number": hidden}'),
-        ("rig: /home/user/rig.yaml", "rig: ~/rig.yaml"),
+        *(
+            (text, expected, False)
+            for text, expected in (
+                ("thickness: 1.5mm, mesh: auto 1 %", "thickness: 1.5mm, mesh: auto 1 %"),
+                (
+                    "url: serial:///dev/ttyUSB0?baud=921600",
+                    "url: serial:///dev/ttyUSB0?baud=921600",
+                ),
+                ("url: 'socket://me:1234@amp:4000'", "url: 'socket://hidden'"),
+                ("url: modbus+tcp://plc.example/7", "url: modbus+tcp://hidden/7"),
+                ("url: socket:///x?pin=1234&baud=9600", "url: socket:///x?pin=hidden&baud=9600"),
+                ("token: 123456  # my bank's", "token: hidden"),
+                ('{"access_key": 1234, "stroke": 1}', '{"access_key": hidden, "stroke": 1}'),
+                ('serial_numbers: {main: "A1234"}', "serial_numbers: {main: hidden}"),
+                ('{"serial_number": "A1234"}', '{"serial_number": hidden}'),
+                ("rig: /home/user/rig.yaml", "rig: ~/rig.yaml"),
+            )
+        ),
+        (  # of a record: state, fault and message, neither a host nor a home in free text
+            '"state": 7, "serial_number": "A-17", "access_token": 4, '
+            '"cause": "no tcp://me:1@amp # /home/user/x"',
+            '"state": 7, "serial_number": hidden, "access_token": hidden, '
+            '"cause": "no tcp://hidden # ~/x"',
+            True,
+        ),
     ],
 )
-def test_report_hides_values_of_unknown_keys(text: str, expected: str) -> None:
+def test_report_hides_values_of_unknown_keys(text: str, expected: str, is_recorded: bool) -> None:
     """And hosts, serial numbers, comments and the home folder."""
-    assert shown(text, home=HOME).rstrip() == expected
-
-
-def test_records_are_shown_but_for_secrets() -> None:
-    """State, fault and message, not a serial number, and neither a host nor a home in free text."""
-    line = (
-        '"state": 7, "serial_number": "A-17", "access_token": 4, '
-        '"cause": "no tcp://me:1@amp # {}/x"'
-    )
-    kept = shown(line.replace("{}", str(HOME)), home=HOME, is_recorded=True)
-    assert kept == (
-        '"state": 7, "serial_number": hidden, "access_token": hidden, '
-        '"cause": "no tcp://hidden # ~/x"'
-    )
+    assert shown(text, home=HOME, is_recorded=is_recorded).rstrip() == expected
 
 
 def test_example_rig_is_shown_without_its_comments() -> None:

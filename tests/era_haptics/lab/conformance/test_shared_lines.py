@@ -1,7 +1,7 @@
 """Conformance on lines with other amplifiers, to which nothing is said that could change them."""
 
 from collections.abc import Callable, Mapping
-from typing import Any
+from functools import partial
 
 import pytest
 
@@ -131,13 +131,9 @@ class Gateway:
 
 def test_units_behind_one_gateway() -> None:
     """The gateway replies for absent units after a second, and lets what comes behind wait."""
-    others = {each: Neighbour(f"at {each}") for each in (NEXT, 247)}
+    others = neighbours_of("tcp")
     units: dict[int, SimulatedAmplifier] = {1: varied(), **others}
-
-    def far(send: Callable[[bytes], None]) -> Any:
-        return Gateway(units, send)
-
     names = ["identity", "obeys_in_time", "damaged_frames", "addresses"]
-    results = judged("tcp", names, far=far)
+    results = judged("tcp", names, far=partial(Gateway, units))
     assert [each.result for each in results] == ["passed"] * len(names), results
     assert [each.got for each in others.values()] == [[], []]

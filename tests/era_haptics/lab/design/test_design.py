@@ -135,8 +135,7 @@ def test_white_of_a_picture_is_where_eras_may_stand(tmp_path) -> None:
     pixels = np.zeros((21, 28))
     pixels[:5, 14:] = 1.0
     imsave(tmp_path / "mask.png", pixels, cmap="gray", vmin=0, vmax=1)
-    area = area_of(str(tmp_path / "mask.png"), PLATE)
-    x, y = area.candidates(0.01).T
+    x, y = area_of(str(tmp_path / "mask.png"), PLATE).candidates(0.01).T
     assert x.min() >= PLATE.length / 2
     assert y.min() >= 0.75 * PLATE.width
     assert y.max() == PLATE.width
@@ -332,15 +331,13 @@ def test_static_loads_of_a_seesaw() -> None:
     assert static_loads(some.plate, eras) == pytest.approx([weight / 4, weight / 4, weight / 2])
     assert shortfall(some, eras, lowest=10.0) == 0
     # The centre of mass behind all of them: the plate tips.
-    tipping = [replace(era, y=0.2 * era.y) for era in eras]
-    assert shortfall(some, tipping, lowest=1.0) > 0
+    assert shortfall(some, [replace(era, y=0.2 * era.y) for era in eras], lowest=1.0) > 0
     assert shortfall(some, eras, lowest=1e4) > 0
 
 
 def test_steps_along_the_edge_end_at_its_corners_and_turn_there() -> None:
     """A step past a corner ends on it, one from there goes along either side."""
-    plate = replace(RIG.plate, length=0.3, width=0.2)
-    edge = area_of("edge", plate)
+    edge = area_of("edge", replace(RIG.plate, length=0.3, width=0.2))
     assert sorted(edge.moved(np.array([0.29, 0.0]), 0.03).tolist()) == [[0.26, 0], [0.3, 0]]
     assert sorted(edge.moved(np.array([0.3, 0.0]), 0.03).tolist()) == [[0.27, 0], [0.3, 0.03]]
     places = edge.candidates(0.03)

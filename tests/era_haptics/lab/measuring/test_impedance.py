@@ -251,18 +251,24 @@ def test_parts_come_from_two_runs_and_a_scale(
             app, ["--impedance", "--free", str(free), "--weight", "110.9", *more]
         )
         assert done.exit_code == 0
-        assert exciter_of_lines(done.stdout) == pytest.approx(
-            {
-                "stiffness": ExciterCircuit.STIFFNESS,
-                "damping": ExciterCircuit.DAMPING,
-                "force_factor": ExciterCircuit.FORCE_FACTOR,
-                "coil_mass": ExciterCircuit.COIL,
-                "magnet_mass": ExciterCircuit.MAGNET,
-                "inductance": ExciterCircuit.INDUCTANCE,
-                "resistance": ExciterCircuit.RESISTANCE,
-            },
-            rel=0.01,
-        )
+        # The printed keys, pasted into a rig.
+        keys = [
+            line.partition("#")[0].strip()
+            for line in done.stdout.splitlines()
+            if line[:4] == "    "
+        ]
+        rig = parse_rig("pasted.yaml", exciter_rig_text(", ".join([*keys, "power: 1 W"])))
+        exciter = {
+            "stiffness": ExciterCircuit.STIFFNESS,
+            "damping": ExciterCircuit.DAMPING,
+            "force_factor": ExciterCircuit.FORCE_FACTOR,
+            "coil_mass": ExciterCircuit.COIL,
+            "magnet_mass": ExciterCircuit.MAGNET,
+            "inductance": ExciterCircuit.INDUCTANCE,
+            "resistance": ExciterCircuit.RESISTANCE,
+        }
+        found = {name: getattr(rig.eras[0], name) for name in exciter}
+        assert found == pytest.approx(exciter, rel=0.01)
 
 
 def test_a_light_base_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -278,14 +284,6 @@ def test_a_light_base_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
         values.append(found["values"]["stiffness"]["value"])
     assert values[1] / values[0] == pytest.approx(1 / (1 + 110.9 / 300), rel=1e-3)
     assert not found["change_by_light_base"]
-
-
-def exciter_of_lines(told: str) -> dict[str, float]:
-    """The exciter of a rig in which the printed keys are pasted, in SI units."""
-    keys = [line.partition("#")[0].strip() for line in told.splitlines() if line[:4] == "    "]
-    rig = parse_rig("pasted.yaml", exciter_rig_text(", ".join([*keys, "power: 1 W"])))
-    names = "stiffness damping force_factor coil_mass magnet_mass inductance resistance"
-    return {name: getattr(rig.eras[0], name) for name in names.split()}
 
 
 def test_wrong_circuits_write_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -317,8 +315,7 @@ def test_parts_are_found_through_a_real_server(
     with jack_server(name) as server:
         for is_glued in (False, True):
             with closing(open_client("desk")) as client:
-                circuit = ExciterCircuit(is_glued=is_glued, rate=RATE)
-                plate = JackPlate(client, circuit)  # type: ignore[arg-type]  # called by JACK
+                plate = JackPlate(client, ExciterCircuit(is_glued=is_glued, rate=RATE))  # type: ignore[arg-type]  # called by JACK
                 plate.start()
                 more = ("--free", "0.csv", "--weight", str(EXCITER_GRAMS)) if is_glued else ()
                 done = subprocess.run(

@@ -70,8 +70,7 @@ def test_one_command_measures_a_plate_that_deviates_as_its_seed_draws_it(
     for seed in ("0", "0", "1"):
         output = tmp_path / f"{len(found)}.csv"
         options = ["--simulated", "--sensors", str(sensors), "-o", str(output), "--seed", seed]
-        status = run(["measure", str(rig), *options, "--frequencies", "61:301:40"])
-        assert status == 0
+        assert run(["measure", str(rig), *options, "--frequencies", "61:301:40"]) == 0
         assert f"-o {tmp_path / 'calibrated.yaml'}" in capsys.readouterr().out
         found.append(measurement_of(read_measured(output), load_rig(rig)).values)
     np.testing.assert_array_equal(found[0], found[1])
@@ -133,8 +132,7 @@ def test_multisine_has_its_level_and_orthogonal_runs() -> None:
     """No sample above the level in any run; at each line the runs form a unitary matrix."""
     multisine = Multisine(default_frequencies(40, 500), 5, RATE, LEVEL)
     runs = [multisine.signal(run, periods=2) for run in range(5)]
-    peaks = [np.abs(run).max() for run in runs]
-    assert 0.9 * LEVEL < max(peaks) <= LEVEL * (1 + 1e-9)
+    assert 0.9 * LEVEL < max([np.abs(run).max() for run in runs]) <= LEVEL * (1 + 1e-9)
     assert (multisine.frequencies % 2 == 1).all()
     spectra = np.array([np.fft.rfft(run[4000:12000], axis=0) for run in runs])
     for line in (41, 251, 499):
@@ -297,8 +295,7 @@ def test_levels_and_frequencies_that_cannot_be_played_are_refused(rig: Rig) -> N
 def test_delay_follows_from_the_slope_of_phases() -> None:
     """3.7 ms by hand, also of lines at equal distances; random phases are no delay."""
     evenly = np.arange(61.0, 500.0, 60.0)
-    late = np.exp(-2j * np.pi * evenly * 3.7e-3)
-    assert latency(late, evenly) == pytest.approx(3.7e-3)
+    assert latency(np.exp(-2j * np.pi * evenly * 3.7e-3), evenly) == pytest.approx(3.7e-3)
     response = 0.4 * np.exp(-2j * np.pi * PLAYED_HZ * 3.7e-3)
     assert latency(response, PLAYED_HZ) == pytest.approx(3.7e-3)
     lines = default_frequencies(40, 500)

@@ -123,8 +123,7 @@ def test_a_board_that_is_given_is_not_drawn(board: Rig) -> None:
     assert [replace(era, gains=()) for era in eras] == [*truth.rig.eras]
     middle = np.array([np.sqrt(40.0 * 300.0)])
     found = np.array([each.response(middle)[0] for each in truth.actuators])
-    wanted = np.array([size * np.exp(1j * phase) for size, phase in gains.values()])
-    lag = found / wanted
+    lag = found / np.array([size * np.exp(1j * phase) for size, phase in gains.values()])
     np.testing.assert_allclose(lag, lag[0], rtol=1e-12)
     assert abs(lag[0]) == pytest.approx(1)
     assert -0.3 < np.angle(lag[0]) < 0
@@ -275,8 +274,7 @@ def test_fingers_feel_the_plate_under_them(truth: Truth) -> None:
     exact = direct(rig.eras, hertz, places, loads=[*rig.masses, *loads])[0, 1]
     exact = exact * truth.actuators[1].response(hertz)
     times = (38_400 + 16 * np.arange(len(felt))) / PLATE_RATE
-    found = lock_in(times, felt.reshape(len(felt), -1), frequency)
-    assert apart(found, exact) < 0.01
+    assert apart(lock_in(times, felt.reshape(len(felt), -1), frequency), exact) < 0.01
 
 
 def test_fingers_are_swapped_without_a_jump(truth: Truth) -> None:
@@ -517,8 +515,7 @@ def test_measurement_that_was_stopped_goes_on(make: Make, ending: str) -> None:
     assert (last.count("lost"), f"2 {KEPT}" in last) == (1, True)
     assert Path(bench.output).read_bytes() == before
     bench.card.pulled = None
-    told = bench.measured("--resume", keys=[""])
-    assert told == {"measured": ["P3"], "missing": []}
+    assert bench.measured("--resume", keys=[""]) == {"measured": ["P3"], "missing": []}
     assert json.loads(bench.out)["sensors"]["P3"]["coherence_min"] > 0.9
     assert {each.sensor for each in read_measured(Path(bench.output))} == set(MOVED_SENSOR_PLACES)
 

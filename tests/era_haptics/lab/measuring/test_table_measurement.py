@@ -132,8 +132,7 @@ def measured_on(
     sensors = read_sensors(path, truth.rig.plate)
 
     def opened(_device: str, **_counts: int) -> DeskCard:
-        converters = Converters(noise=5e-3)
-        plate = DeskPlate(truth, sensors, rate=RATE, converters=converters, seed=1)
+        plate = DeskPlate(truth, sensors, rate=RATE, converters=Converters(noise=5e-3), seed=1)
         return DeskCard(plate, rate=RATE, **wires)  # type: ignore[arg-type]
 
     monkeypatch.setattr(table_measurement, "open_card", opened)
@@ -461,21 +460,6 @@ def ratio(tone: int, era: int, sensor: int) -> complex:
     return complex((0.1 + 0.05 * tone) * np.exp(1j * (era - 2.5 * sensor + tone)))
 
 
-def played(era: int, *, held: float) -> list[tuple[FloatArray, list[FloatArray]]]:
-    """Reference and sensors of each tone of an ERA; sensors settle with a tenth of its time."""
-    found = []
-    times = np.arange(round(held * FILE_RATE)) / FILE_RATE
-    for number, frequency in enumerate(TONES):
-        angle = 2 * np.pi * frequency * times
-        rise = 1 - np.exp(-times / (0.1 * held))
-        heard = [
-            rise * 0.5 * abs(r) * np.sin(angle + np.angle(r))
-            for r in (ratio(number, era, sensor) for sensor in range(2))
-        ]
-        found.append((0.5 * np.sin(angle), heard))
-    return found
-
-
 def recording(
     path: Path,
     eras: Sequence[int],
@@ -485,33 +469,36 @@ def recording(
     gap: float = 0.3,
     held: float = 1.5,
 ) -> None:
-    """Write 16 bits of sensors and references, with noise of 0.1 % of full scale."""
+    """Write 16 bits of sensors and references, with noise of 0.1 % of full scale.
+
+    Sensors settle with a tenth of the time for which each tone of an ERA is held.
+    """
     rng = np.random.default_rng([*path.stem.encode()])
-    pieces = []
-    for era in eras:
-        for reference, heard in played(era, held=held):
-            piece = np.zeros((len(reference) + round(gap * FILE_RATE), len(sensors) + references))
-            for column, sensor in enumerate(sensors):
-                piece[: len(reference), column] = heard[sensor]
-            piece[: len(reference), len(sensors) + (era if references > 1 else 0)] = reference
-            pieces.append(piece)
-    samples = np.concatenate([np.zeros((FILE_RATE // 3, pieces[0].shape[1])), *pieces])
+    times = np.arange(round(held * FILE_RATE)) / FILE_RATE
+    rise = 0.5 * (1 - np.exp(-times / (0.1 * held)))
+    pieces = [np.zeros((FILE_RATE // 3, len(sensors) + references))]
+    for era, (number, frequency) in product(eras, enumerate(TONES)):
+        angle = 2 * np.pi * frequency * times
+        piece = np.zeros((len(times) + round(gap * FILE_RATE), len(sensors) + references))
+        for column, sensor in enumerate(sensors):
+            size = ratio(number, era, sensor)
+            piece[: len(times), column] = rise * abs(size) * np.sin(angle + np.angle(size))
+        reference = len(sensors) + (era if references > 1 else 0)
+        piece[: len(times), reference] = 0.5 * np.sin(angle)
+        pieces.append(piece)
+    samples = np.concatenate(pieces)
     samples += 1e-3 * rng.standard_normal(samples.shape)
     wavfile.write(path, FILE_RATE, (32767 * samples).astype(np.int16))
 
 
-def expected(rig: Rig, sensor: int) -> ComplexArray:
-    """Responses (f, eras) by hand: samples by samples, over stroke and sensitivity 2e-3."""
-    strokes = [era.stroke for era in rig.eras]
-    return np.array([[ratio(t, e, sensor) / 2e-3 / strokes[e] for e in range(4)] for t in range(3)])
-
-
 def check(rig: Rig, found: Measurement, *, rtol: float) -> None:
-    """All values are what made them."""
+    """All values are what made them: samples by samples, over stroke and sensitivity 2e-3."""
     np.testing.assert_allclose(found.frequencies, TONES, rtol=2e-5)
+    strokes = [era.stroke for era in rig.eras]
     for sensor in range(2):
-        column = found.names.index(f"P{sensor + 1}")
-        np.testing.assert_allclose(found.values[:, column], expected(rig, sensor), rtol=rtol)
+        column = found.values[:, found.names.index(f"P{sensor + 1}")]
+        sizes = [[ratio(t, e, sensor) / 2e-3 / strokes[e] for e in range(4)] for t in range(3)]
+        np.testing.assert_allclose(column, sizes, rtol=rtol)
 
 
 @pytest.mark.parametrize(("references", "gap"), [(4, 0.3), (4, 0.0), (1, 0.3), (1, 0.0)])
@@ -654,8 +641,7 @@ def test_tones_that_have_not_settled_are_left_out(rig: Rig, tmp_path: Path) -> N
     recording(path, range(4), references=4, held=0.6)
     rate, samples = wavfile.read(path)
     rising = samples.astype(float)
-    times = np.arange(len(samples)) / rate
-    rising[:, 0] *= np.exp(-((times % 0.9) / 0.5))
+    rising[:, 0] *= np.exp(-(((np.arange(len(samples)) / rate) % 0.9) / 0.5))
     wavfile.write(path, rate, rising.astype(np.int16))
     found = read_stepped(path, Desk(rig, FIXED))
     assert {each.sensor for each in found} == {"P2"}

@@ -129,8 +129,7 @@ class Scene(Acted):
 
     def asks_for(self, frequency: float, level: float, phase: float | str = 0.0) -> None:
         """Touch where the table has this tone for one ERA, which may not be played."""
-        tone = Tone(frequency, level * STROKE, float(phase))
-        self.table.excitation = {**ALONE, "NE": tone}
+        self.table.excitation = {**ALONE, "NE": Tone(frequency, level * STROKE, float(phase))}
         self.fingers(1, is_played=False)
 
     def touches_beside(self) -> None:
@@ -437,8 +436,7 @@ def ended(after: float, level: int) -> Talk:
 
 def at_new_address(talk: Talk) -> Talk:
     """A status at address 3, which is its own, and another that has no reply."""
-    limited = hand.status(hand.SWITCHED_OFF, limited=True)
-    talk.exchange(hand.GET_STATUS, (), limited, address=3)
+    talk.exchange(hand.GET_STATUS, (), hand.status(hand.SWITCHED_OFF, limited=True), address=3)
     return talk.sends(hand.GET_STATUS, address=3).rest(0.04)
 
 

@@ -4,8 +4,7 @@ import csv
 import json
 import math
 from dataclasses import replace
-from functools import partial
-from itertools import combinations
+from itertools import combinations, product
 from pathlib import Path
 
 import numpy as np
@@ -87,10 +86,9 @@ def test_config_check_tells_what_clocks_cost(
     tmp_path: Path, more: str, error_us: float | None, warnings: int
 ) -> None:
     """Over USB: that of the line, and 5 us / sqrt(3) of the amplifier; and which plays alone."""
-    file = tmp_path / "rig.yaml"
-    file.write_text(RIG % more)
-    run = partial(CliRunner().invoke, app)
-    found = json.loads(run(["config", "check", str(file), "--json"]).output)
+    (tmp_path / "rig.yaml").write_text(RIG % more)
+    ran = CliRunner().invoke(app, ["config", "check", str(tmp_path / "rig.yaml"), "--json"])
+    found = json.loads(ran.output)
     assert found["ok"]
     clocks = found["clocks"]
     assert clocks["error_us"] == {"a": USB_US, "b": error_us}
@@ -262,60 +260,40 @@ QUIET = (0.2286, 0.0381)  # m; centre of the fourth cell of the lowest row
 MODES = ("switched", "phased")
 
 
-@pytest.fixture(scope="module")
-def map_table() -> era.LocalizationTable:
-    """A small table of the paper's plate, cells of 61 x 76 mm."""
-    return build_table(
-        make_paper_rig(12, 9),
-        frequencies=np.array([60.0, 110.0, 250.0]),
-        grid=era.Grid(5, 3),
-        drive_mode="phased",
+def test_map_has_the_answer_of_every_place(tmp_path: Path) -> None:
+    """Promised and nominal contrast of a query there; none where the quiet finger itself is.
+
+    Of both drive modes side by side, in cells of 61 x 76 mm. As a frame, as pandas has it, places
+    along x come first, with a column for each mode and number. The command prints it as JSON, with
+    null for no answer.
+    """
+    table = build_table(
+        make_paper_rig(12, 9), frequencies=FREQUENCIES, grid=era.Grid(5, 3), drive_mode="phased"
     )
+    found = era.contrast_map(table, QUIET, drive_modes=MODES)
+    for (row, y), (column, x) in product(enumerate(found.y), enumerate(found.x)):
+        far = math.dist((x, y), QUIET) >= 0.013
+        for mode in MODES:
+            promised = found.promised_db[mode][row, column]
+            assert np.isfinite(promised) == far
+            if far:
+                felt = era.query(table, (x, y), quiet=[QUIET], drive_mode=mode).fingers[0]
+                assert promised == pytest.approx(felt.promised_contrast_db, abs=1e-3)
+                nominal = found.nominal_db[mode][row, column]
+                assert nominal == pytest.approx(felt.contrast_db, abs=1e-3)
 
-
-@pytest.fixture(scope="module")
-def found(map_table: era.LocalizationTable) -> era.ContrastMap:
-    """Both drive modes, side by side."""
-    return era.contrast_map(map_table, QUIET, drive_modes=MODES)
-
-
-def test_map_has_the_answer_of_every_place(
-    map_table: era.LocalizationTable, found: era.ContrastMap
-) -> None:
-    """Promised and nominal contrast of a query there; none where the quiet finger itself is."""
-    for row, y in enumerate(found.y):
-        for column, x in enumerate(found.x):
-            far = math.dist((x, y), QUIET) >= 0.013
-            for mode in MODES:
-                promised = found.promised_db[mode][row, column]
-                assert np.isfinite(promised) == far
-                if far:
-                    felt = era.query(map_table, (x, y), quiet=[QUIET], drive_mode=mode).fingers[0]
-                    assert promised == pytest.approx(felt.promised_contrast_db, abs=1e-3)
-                    nominal = found.nominal_db[mode][row, column]
-                    assert nominal == pytest.approx(felt.contrast_db, abs=1e-3)
-
-
-def test_frame_has_a_row_a_place(found: era.ContrastMap) -> None:
-    """As pandas has it: places along x first, a column for each mode and number."""
     frame = found.to_frame()
     assert frame.shape == (15, 6)
     best = frame.loc[frame["phased_promised_db"].idxmax()]
     row, column = np.unravel_index(np.nanargmax(found.promised_db["phased"]), (3, 5))
     assert (best["x_m"], best["y_m"]) == (found.x[column], found.y[row])
 
-
-def test_command_prints_the_map(
-    map_table: era.LocalizationTable, found: era.ContrastMap, tmp_path: Path
-) -> None:
-    """As JSON, with null for no answer."""
-    era.save_table(map_table, tmp_path / "t.npz")
+    era.save_table(table, tmp_path / "t.npz")
     words = ["map", str(tmp_path / "t.npz"), "--quiet", "{},{}".format(*QUIET), "--json"]
     result = CliRunner().invoke(app, ["table", *words, "--modes", ",".join(MODES)])
-    printed = json.loads(result.stdout)["promised_contrast_db"]
-    for mode in MODES:
-        rows = np.array(printed[mode], dtype=float)
-        assert rows == pytest.approx(found.promised_db[mode], abs=0.1, nan_ok=True)
+    for mode, rows in json.loads(result.stdout)["promised_contrast_db"].items():
+        expected = pytest.approx(found.promised_db[mode], abs=0.1, nan_ok=True)
+        assert np.array(rows, dtype=float) == expected
 
 
 def test_weak_cells_take_percentiles_over_fingers_all_over_the_plate(table):
@@ -407,14 +385,11 @@ def test_sampling_error_is_how_much_a_percentile_of_random_samples_varies():
     assert math.isnan(sampling_error([-np.inf, -np.inf, 1.0, 2.0], 50))
 
 
-def test_map_grid_is_coarser_than_a_fine_grid(table):
-    """A cell of the map is no smaller than an eighth by a sixth of the plate."""
-    assert map_grid(replace(table, grid=Grid(24, 5))) == Grid(8, 5)
-    assert map_grid(replace(table, grid=Grid(4, 20))) == Grid(4, 6)
+def test_weak_and_feasible_follow_from_twelve_decibels(table):
+    """Feasible by the median other finger, weak by one in ten; a text map shows both.
 
-
-def test_weak_and_feasible_follow_from_twelve_decibels():
-    """Feasible by the median other finger, weak by one in ten; a text map shows both."""
+    A cell of the map is no smaller than an eighth by a sixth of the plate.
+    """
     weak = WeakCells(
         Grid(2, 2),
         np.zeros((4, 2)),
@@ -426,6 +401,8 @@ def test_weak_and_feasible_follow_from_twelve_decibels():
     assert weak.feasible.tolist() == [True, True, False, False]
     assert weak.weak.tolist() == [False, True, True, True]
     assert list(text_map(weak)) == ["   -*   9*", "  20   12*"]  # the largest y first
+    assert map_grid(replace(table, grid=Grid(24, 5))) == Grid(8, 5)
+    assert map_grid(replace(table, grid=Grid(4, 20))) == Grid(4, 6)
 
 
 def test_summary_of_a_plate_too_small_for_two_fingers():
@@ -484,16 +461,15 @@ def test_summary_counts_levels_and_shares(table):
 
 @pytest.mark.parametrize("others", [1, 3])
 def test_contact_sets_are_of_fingers_apart(table, others):
-    """As many sets as are wanted, all at least 5 cm apart, no two alike."""
+    """As many sets as are wanted, all at least 5 cm apart, no two alike.
+
+    Of three answers the one without contrast, which misses the level, is left out.
+    """
     questions = set_questions(table, others=others, rng=np.random.default_rng(1))
     assert len({question.contacts for question in questions}) == CONTACT_SETS
     for question in questions:
         assert len(question.quiet) == others
         for one, other in combinations(question.contacts, 2):
             assert math.dist(one, other) >= 0.05
-
-
-def test_sets_that_miss_the_level_are_left_out():
-    """Of three answers the one without contrast."""
     assert contrasts_reached([(1.0, 2.0), None, (3.0, 4.0)]).tolist() == [[1, 3], [2, 4]]
     assert contrasts_reached([None]).shape == (2, 0)

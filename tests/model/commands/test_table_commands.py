@@ -8,7 +8,6 @@ import json
 import os
 import re
 import shlex
-import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -36,7 +35,6 @@ from plates import write_rig
 pytestmark = pytest.mark.usefixtures("plain_pictures")
 
 RIG = str(example_rig_path())
-ERA = str(Path(sys.executable).with_name("era"))
 QUICK = ["--mesh", "12x9", "--frequencies", "60,110,250", "--grid", "4x3"]
 
 
@@ -62,20 +60,10 @@ def few_sets() -> Iterator[None]:
         yield
 
 
-@pytest.fixture(scope="module")
-def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A small table of the example rig."""
-    path = tmp_path_factory.mktemp("built") / "t.npz"
-    era("table", "build", RIG, "-o", path, *QUICK)
-    return path
-
-
-def test_show_prints_summary_map_and_a_query_that_has_an_answer(
-    built: Path, tmp_path: Path
-) -> None:
+def test_show_prints_summary_map_and_a_query_that_has_an_answer(tmp_path: Path) -> None:
     """The map is 4 by 3, each star of it is in the list, and the next command is quoted."""
     spaced = tmp_path / "my table.npz"
-    spaced.write_bytes(built.read_bytes())
+    era("table", "build", RIG, "-o", spaced, *QUICK)
     lines = era("table", "show", spaced, "--weak").stdout.splitlines()
     rows = {line[:20].strip(): line[20:].strip() for line in lines}
     assert rows["dead zones"].startswith("0 %")
@@ -118,18 +106,19 @@ def small(monkeypatch):
     monkeypatch.setattr(problem, "JUDGED_SETS", 3)
 
 
-def design(*arguments: str):
-    """Run `era design` in this process."""
-    return CliRunner().invoke(lab_app, ["design", RIG, "--workers", "1", *arguments])
+def design(*arguments: str | Path) -> dict[str, Any]:
+    """What `era design --json` prints, by its keys; `stderr` beside it."""
+    typed = ["design", RIG, "--workers", "1", "--json", *map(str, arguments)]
+    result = CliRunner().invoke(lab_app, typed)
+    assert result.exit_code == 0, result.output
+    return {**json.loads(result.stdout), "stderr": result.stderr}
 
 
 @pytest.mark.long
 def test_design_writes_a_rig_that_loads(small, tmp_path: Path) -> None:
     """Five ERAs, one kept: channels are distinct, pictures there, and what is printed."""
-    arguments = ("--eras", "5", "--keep", "NE", "--starts", "1", "-o", str(tmp_path), "--json")
-    result = design(*arguments)
-    assert result.exit_code == 0, result.output
-    found = json.loads(result.stdout)
+    arguments = ("--eras", "5", "--keep", "NE", "--starts", "1", "-o", str(tmp_path))
+    found = design(*arguments)
     rig = load_rig(tmp_path / "rig.yaml")
     before = load_rig(RIG)
     assert [era.name for era in rig.eras] == list(found["eras"])
@@ -144,7 +133,7 @@ def test_design_writes_a_rig_that_loads(small, tmp_path: Path) -> None:
     weight = sum(era["static_load_n"] for era in found["eras"].values())
     assert weight == pytest.approx(9.80665 * rig.plate.mass)
     assert list(found["by_count_db"]) == ["3", "4", "5", "6"]
-    again = design(*arguments[:-1]).stdout
+    again = CliRunner().invoke(lab_app, ["design", RIG, "--workers", "1", *arguments]).stdout
     assert load_rig(tmp_path / "rig.yaml").eras == rig.eras
     assert f"the rig's own 4 ERAs: mean {found['own_contrast_db']['mean']:.1f} dB" in again
 
@@ -152,27 +141,20 @@ def test_design_writes_a_rig_that_loads(small, tmp_path: Path) -> None:
 @pytest.mark.long
 def test_the_best_of_several_stiffnesses_is_written(small, tmp_path: Path) -> None:
     """Two are designed; the rig has the one whose layout has more contrast, at new ERAs alone."""
-    arguments = ("--eras", "4", "--keep", "NE", "--starts", "1", "-o", str(tmp_path), "--json")
-    result = design(*arguments, "--stiffness", "8 kN/m,30 kN/m")
-    assert result.exit_code == 0, result.output
-    found = json.loads(result.stdout)
+    arguments = ("--eras", "4", "--keep", "NE", "--starts", "1", "-o", tmp_path)
+    found = design(*arguments, "--stiffness", "8 kN/m,30 kN/m")
     by_stiffness = found["by_stiffness_db"]
     assert set(by_stiffness) == {"8000", "30000"}
     assert found["contrast_db"]["mean"] == max(by_stiffness.values())
-    best = float(max(by_stiffness, key=by_stiffness.get))
-    rig = load_rig(tmp_path / "rig.yaml")
-    assert {era.name: era.stiffness for era in rig.eras if era.name != "NE"} == {
-        era.name: best for era in rig.eras if era.name != "NE"
-    }
+    best, rig = max(by_stiffness, key=by_stiffness.get), load_rig(tmp_path / "rig.yaml")
+    assert {era.stiffness for era in rig.eras if era.name != "NE"} == {float(best)}
     assert rig.era("NE").stiffness == load_rig(RIG).era("NE").stiffness
 
 
 def test_given_layouts_are_ranked_and_the_best_written(small, tmp_path: Path) -> None:
     """Judged ones first, by contrast, others by score; a row each."""
-    arguments = ("--layouts", "random:20", "--eras", "3-4", "--finalists", "2", "--json")
-    result = design(*arguments, "-o", str(tmp_path))
-    assert result.exit_code == 0, result.output
-    found = json.loads(result.stdout)
+    arguments = ("--layouts", "random:20", "--eras", "3-4", "--finalists", "2")
+    found = design(*arguments, "-o", tmp_path)
     with (tmp_path / "layouts.csv").open(encoding="utf-8") as stream:
         rows = list(csv.DictReader(stream))
     assert len(rows) == found["layout_count"]
@@ -196,12 +178,8 @@ def test_design_warns_of_a_plate_that_nearly_tips(small, tmp_path: Path, depth, 
     """An ERA a tenth of an inch behind the centre of mass carries all but 2 % of the weight."""
     layout = f"layouts:\n  tee: [[0, 0], [12 in, 0], [6 in, {depth}]]\n"
     (tmp_path / "layouts.yaml").write_text(layout)
-    result = design("--layouts", str(tmp_path / "layouts.yaml"), "-o", str(tmp_path), "--json")
-    assert result.exit_code == 0, result.output
-    light = [
-        name for name, era in json.loads(result.stdout)["eras"].items() if name in result.stderr
-    ]
-    assert len(light) == 2 * is_light
+    found = design("--layouts", tmp_path / "layouts.yaml", "-o", tmp_path)
+    assert sum(name in found["stderr"] for name in found["eras"]) == 2 * is_light
 
 
 LAYOUTS = """layouts:
@@ -230,18 +208,14 @@ def test_layouts_are_ranked_by_the_promise_of_two_contents(small, tmp_path: Path
         eras = zip(rig["eras"].values(), places, strict=True)
         moved = {f"E{n}": {**era, "at": at} for n, (era, at) in enumerate(eras, start=1)}
         of.write_text(json.dumps({**rig, "eras": moved}))
-        arguments = ["table", "build", str(of), "-o", str(table), "--mode", "phased"]
-        assert CliRunner().invoke(app, arguments).exit_code == 0
-        lines = ["table", "query", str(table), "--batch", str(tmp_path / "own.jsonl"), "--json"]
-        answers = map(json.loads, CliRunner().invoke(app, lines).stdout.splitlines())
-        promised[name] = [each["promised_worst_db"] for each in answers]
+        era("table", "build", of, "-o", table, "--mode", "phased")
+        lines = era("table", "query", table, "--batch", tmp_path / "own.jsonl", "--json").stdout
+        promised[name] = [json.loads(each)["promised_worst_db"] for each in lines.splitlines()]
     means = {name: sum(each) / 2 for name, each in promised.items()}
-    result = design(
-        *("--layouts", str(tmp_path / "layouts.yaml"), "--contents", "2", "--json"),
-        *("--contacts", str(tmp_path / "contacts.yaml"), "-o", str(tmp_path / "out")),
+    found = design(
+        *("--layouts", tmp_path / "layouts.yaml", "--contents", "2"),
+        *("--contacts", tmp_path / "contacts.yaml", "-o", tmp_path / "out"),
     )
-    assert result.exit_code == 0, result.output
-    found = json.loads(result.stdout)
     ranked = {each["layout"]: each["contrast_db"] for each in found["layouts"]}
     assert list(ranked) == sorted(means, key=means.get, reverse=True)
     for name, (without, with_quiet) in promised.items():
@@ -268,14 +242,15 @@ def test_designs_that_cannot_be_are_refused(
     """Other contents than those of the sets, ERAs at one side alone, a bound out of reach."""
     monkeypatch.chdir(tmp_path)
     Path("given.yaml").write_text(given)
-    result = design(*options.split(), "-o", "out")
+    typed = ["design", RIG, "--workers", "1", *options.split(), "-o", "out"]
+    result = CliRunner().invoke(lab_app, typed)
     assert result.exit_code == 2 or isinstance(result.exception, InputError)
 
 
 def test_design_of_python_is_that_of_the_command(small, tmp_path: Path) -> None:
     """The best of ten layouts and two stiffnesses with a kept ERA, saved; what is done is all."""
     names = ("--layouts", "random:10", "--finalists", "1", "--keep", "NE")
-    assert design(*names, "--stiffness", "8 kN/m,30 kN/m", "-o", str(tmp_path)).exit_code == 0
+    design(*names, "--stiffness", "8 kN/m,30 kN/m", "-o", tmp_path)
     steps: list[tuple[int, int]] = []
     found = api.design(
         load_rig(RIG), layouts="random:10", finalists=1, keep=["NE"], stiffness=[8e3, 30e3],
@@ -288,14 +263,18 @@ def test_design_of_python_is_that_of_the_command(small, tmp_path: Path) -> None:
 
 def test_map_has_its_maximum_and_is_in_proportion_to_the_level():
     """A raster row per y, its maximum named; half the level is half."""
-    options = ("map", RIG, "--mesh", "24x18", "--points", "13x10")
-    result = as_json("plate", *options, "--drive", "SW=110", "--drive", "NE=110@0.5:90")
+    result, half = (
+        as_json(
+            *("plate", "map", RIG, "--mesh", "24x18", "--points", "13x10"),
+            *("--drive", f"SW=110@{level}", "--drive", f"NE=110@{level / 2}:90"),
+        )
+        for level in (1, 0.5)
+    )
     peak = np.array(result["peak_acceleration_m_s2"])
     assert peak.shape == (10, 13)
     x, y = result["max_at_m"]
     at = result["y_m"].index(y), result["x_m"].index(x)
     assert result["max_m_s2"] == peak.max() == peak[at]
-    half = as_json("plate", *options, "--drive", "SW=110@0.5", "--drive", "NE=110@0.25:90")
     np.testing.assert_allclose(half["peak_acceleration_m_s2"], peak / 2, rtol=1e-12)
 
 

@@ -7,16 +7,21 @@ of Modbus, with responses that belong to no request.
 
 import os
 import random
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
 from unittest.mock import Mock
 
 import pytest
 from scipy.stats import poisson
 
+from courses import Taken, courses, follow
 from drivers.protocol.definition import IDENTITY, MESSAGES, STATUS
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Command, Envelope, LayerSet, pack_layers, parts
 from drivers.wires.can_bus import CanWire
-from drivers.wires.can_frames import CanFrame, pack_frames, segments, unpack_frames
+from drivers.wires.can_frames import CanFrame, pack_frames, unpack_frames
 from drivers.wires.modbus import ModbusWire
 from drivers.wires.modbus_frames import HEAD
 from drivers.wires.serial_line import SerialWire
@@ -24,10 +29,7 @@ from drivers.wires.wire import (
     Arrival,
     BrokenReply,
     Continuation,
-    DuplicateAddress,
-    Event,
     Nak,
-    OtherHost,
     Reply,
     Wire,
 )
@@ -174,124 +176,64 @@ def test_damaged_frames_are_counted_and_change_nothing(kind: str) -> None:
     assert isinstance(ask("GetStatus", {}, damaged=0.0)[-1], Reply)
 
 
-NODE = 5
-PING, GET_STATUS, STOP = 12, 9, 8
+@dataclass(kw_only=True)
+class OnAWire(Taken):
+    """A wire of the host; sent: its last request, arrived: what came of the last bytes."""
+
+    kind: str
+    wire: Wire
+    sent: bytes = b""
+    arrived: list[Arrival] = field(default_factory=list)
+
+    @property
+    def frames(self) -> list[str]:
+        """The frames of the last request on CAN, by identifier and data."""
+        return [f"{each.id:03x} {each.data.hex()}" for each in unpack_frames(self.sent)]
+
+    @property
+    def came(self) -> list[str]:
+        """What came of the last bytes, as text."""
+        return [*map(str, self.arrived)]
+
+    def requests(self, unit: int, name: str, **values: int) -> None:
+        """Make a request."""
+        self.sent = self.wire.request(unit, name, values)
+
+    def receives(self, text: str) -> None:
+        """Take bytes in hexadecimal digits, on CAN with identifiers."""
+        self.arrived = self.wire.received(as_bytes(self.kind, text))
 
 
-def frames(can_id: int, number: int, kind: int, *words: int) -> bytes:
-    """Packed frames of a message."""
-    return pack_frames(CanFrame(can_id, data) for data in segments(number, kind, words))
-
-
-@pytest.fixture
-def wire() -> CanWire:
-    """A bus at 500 kbit/s on which node 5 was asked for its faults under number 255."""
-    wire = CanWire(500_000, sequence=254)
-    wire.request(NODE, "GetFaults", {})
-    return wire
-
-
-def test_versions_of_another_protocol_end_hello() -> None:
-    """Bit 3 for version 3: such an amplifier has the object, and does not reply to the message."""
-    wire = CanWire(500_000, sequence=0)
-    wire.request(NODE, "Hello", {})
-    versions = [
-        pack_frames([CanFrame(can_id, bytes.fromhex(data))])
-        for can_id, data in (
-            (0x585, "4B00200518000000"),  # 3 and 4
-            (0x586, "4B00200508000000"),  # of another node
-            (0x585, "8000200500000206"),  # no such object
-            (0x585, "4B00200508000000"),
-        )
-    ]
-    assert [wire.received(each) for each in versions] == [[], [], [], [Reply({"versions": 8})]]
-    wire.request(NODE, "GetStatus", {})
-    assert not wire.received(versions[-1])
-
-
-def test_broadcast_has_number_0_and_no_reply(wire: CanWire) -> None:
-    """On identifier 200; the next request to node 5 goes on from 255 with 1."""
-    values = {"session": 0x1234, "token": 7, "at": 0x0102}
-    sent, more = unpack_frames(wire.request(0, "Commit", values))
-    assert (sent.id, sent.data.hex()) == (0x200, "0000060334120700")
-    assert (more.id, more.data.hex()) == (0x200, "0001020100000000")
-    (sent,) = unpack_frames(wire.request(NODE, "GetFaults", {}))
-    assert sent.data.hex() == "01000a0000000000"
-
-
-ANSWERS: dict[str, tuple[bytes, list[Arrival]]] = {
-    "reply": (frames(0x185, 255, 10, 0), [Reply({"count": 0, "faults": []})]),
-    "refusal": (frames(0x185, 255, 31, 10, 5, 255), [Nak("WRONG_STATE", None)]),
-    "refusal of a channel": (frames(0x185, 255, 31, 10, 4, 3), [Nak("BAD_CHANNEL", 3)]),
-    "older number": (frames(0x185, 254, 10, 0), []),
-    "another node": (frames(0x186, 255, 10, 0), []),
-    "event": (
-        frames(0x185, 0, 30, 7, 1, 255, 3),
-        [Event(NODE, {"state": 7, "fault": 1, "channel": 255, "latch": 3})],
-    ),
-}
-
-
-@pytest.mark.parametrize("answer", ANSWERS)
-def test_reply_has_number_and_node_of_its_request(wire: CanWire, answer: str) -> None:
-    """What is neither that nor an event is unexpected, and leaves the request on the wire.
-
-    After a reply another one that differs is of a second amplifier.
-    """
-    data, expected = ANSWERS[answer]
-    assert wire.received(data) == expected
-    assert wire.counters.unexpected_frames == (not expected)
-    rest = wire.received(ANSWERS["reply"][0])
-    if expected in ([], ANSWERS["event"][1]):
-        assert len(rest) == 1
+@asynccontextmanager
+async def on_a_wire(*, kind: str, rate: int = 500_000, number: int = 0) -> AsyncIterator[OnAWire]:
+    """A wire of a kind and a rate [bit/s], whose last request had a number."""
+    if kind == "can":
+        yield OnAWire(kind=kind, wire=CanWire(rate, sequence=number))
     else:
-        assert rest == ([DuplicateAddress(NODE)] if isinstance(expected[0], Nak) else [])
+        yield OnAWire(kind=kind, wire=ModbusWire(rate, is_rtu=kind == "rtu", number=number))
 
 
-def test_reply_of_another_type_is_broken(wire: CanWire) -> None:
-    """As is one that is too short for its type."""
-    (arrival,) = wire.received(frames(0x185, 255, GET_STATUS, 0))
-    assert isinstance(arrival, BrokenReply)
-    wire.request(NODE, "GetStatus", {})
-    (arrival,) = wire.received(frames(0x185, 1, GET_STATUS, 0))
-    assert isinstance(arrival, BrokenReply)
+COURSES = courses(Path(__file__).with_name("courses.yaml"))
 
 
-@pytest.mark.parametrize(
-    ("kind", "expected"),
-    [(PING, [OtherHost(NODE)]), (3, [OtherHost(NODE)]), (GET_STATUS, []), (STOP, []), (99, [])],
-)
-def test_request_that_needs_a_session_is_another_hosts(
-    wire: CanWire, kind: int, expected: list[Arrival]
-) -> None:
-    """Reading and stopping are anyone's; the next number follows the one that was heard."""
-    assert wire.received(frames(0x205, 77, kind, 5, 250)) == expected
-    assert unpack_frames(wire.request(NODE, "GetStatus", {}))[0].data[0] == 78
+@pytest.mark.parametrize("name", COURSES)
+def test_wire_keeps_to_its_course(name: str) -> None:
+    """Every step is as it is in the file."""
+    follow(COURSES[name], on_a_wire)
 
 
-def test_echo_of_own_frames_is_none(wire: CanWire) -> None:
-    """An adapter may hand over what it sent."""
-    echo = wire.request(NODE, "Ping", {"session": 9, "rate": 0})
-    assert wire.received(echo) == []
-    assert wire.counters.unexpected_frames == 0
-
-
-def test_exchange_time_counts_the_stuffed_bits() -> None:
-    """A frame has 47 + 64 bits and at most 24 stuffed ones; one, and 41 of the longest reply."""
-    wire = CanWire(125_000, sequence=0)
-    assert wire.exchange_time(0, 120) == pytest.approx(42 * 135 / 125_000)
-
-
-def test_random_frames_raise_nothing_and_are_no_reply(wire: CanWire) -> None:
+def test_random_frames_raise_nothing_and_are_no_reply() -> None:
     """20 000 of any length; the reply that comes after them is understood."""
-    draw = random.Random(5)
+    wire, draw = CanWire(500_000, sequence=254), random.Random(5)
+    wire.request(5, "GetFaults", {})
     for _ in range(20_000):
         can_id = draw.choice((0x185, 0x205, draw.randrange(0x800)))
         data = draw.randbytes(draw.choice((8, 8, 8, draw.randrange(9))))
         if data[:1] != b"\xff" or can_id != 0x185:
             assert wire.received(pack_frames([CanFrame(can_id, data)])) == []
     assert wire.counters.unexpected_frames > 0
-    assert wire.received(ANSWERS["reply"][0]) == ANSWERS["reply"][1]
+    reply = as_bytes("can", "185 FF00 0A01 0000 0000")
+    assert wire.received(reply) == [Reply({"count": 0, "faults": []})]
 
 
 class Peer:
@@ -378,16 +320,6 @@ def test_exceptions_are_refusals_or_no_response(exception: int, expected: list[o
     assert wire.received(bytes([0, 1, 0, 0, 0, 3, 1, 0x90, exception])) == expected
 
 
-@pytest.mark.parametrize("exception", [1, 2, 3, 4])
-def test_device_without_an_identity_is_no_amplifier(exception: int) -> None:
-    """As another Modbus device at this address, which has no such registers."""
-    wire = ModbusWire(0, is_rtu=False, number=0)
-    wire.request(7, "Hello", {})
-    (arrival,) = wire.received(bytes([0, 1, 0, 0, 0, 3, 7, 0x84, exception]))
-    assert isinstance(arrival, BrokenReply)
-    assert "unit 7 is no amplifier" in arrival.reason
-
-
 @pytest.mark.parametrize("is_rtu", [True, False])
 def test_reply_to_another_master_is_credited_to_nothing(is_rtu: bool) -> None:
     """It wrote the same message before the reply was read; the next attempt has it."""
@@ -399,24 +331,6 @@ def test_reply_to_another_master_is_credited_to_nothing(is_rtu: bool) -> None:
     assert wire.received(peer.reply(more.data)) == []
     assert wire.counters.unexpected_frames == 1
     assert isinstance(reply_to(wire, peer, "GetStatus", {}), Reply)
-
-
-def test_request_of_all_units_has_no_reply() -> None:
-    """Unit 0 on a line; over TCP a write to each unit that is known, whose responses pass."""
-    commit = ("Commit", {"session": 9, "token": 7, "at": 0})
-    wire = ModbusWire(0, is_rtu=True, number=0)
-    frame = wire.request(0, *commit)
-    assert frame[:-2] == bytes.fromhex("00 10 0600 0004 08 0001 0009 0007 0000")
-
-    wire = ModbusWire(0, is_rtu=False, number=0)
-    for unit in (1, 2):
-        wire.request(unit, "GetStatus", {})
-    frames = wire.request(0, *commit)
-    assert [frames[6], frames[13:15], frames[27], len(frames)] == [1, b"\0\x03", 2, 42]
-    for number in (3, 4):
-        echo = bytes([0, number, 0, 0, 0, 6, number - 2, 16, 6, 0, 0, 3])
-        assert wire.received(echo) == []
-    assert wire.counters.unexpected_frames == 0
 
 
 def test_echo_without_a_response_is_named() -> None:
@@ -469,30 +383,3 @@ async def test_damaged_length_costs_one_attempt() -> None:
     end.inward = lengthened
     await end.hosts["a"].read_status()
     assert end.retries == 1
-
-
-def test_times_on_a_line_are_those_of_its_characters() -> None:
-    """A set of 22 words: 55 + 8 + 8 + 5 + 2 · 5 characters of 11 bits, four silences."""
-    wire = ModbusWire(115_200, is_rtu=True, number=0)
-    assert wire.exchange_time(22, 3) == pytest.approx(86 * 11 / 115_200 + 4 * 0.00175)
-    slow = ModbusWire(9600, is_rtu=True, number=0)
-    assert slow.silence == pytest.approx(3.5 * 11 / 9600)
-    assert ModbusWire(0, is_rtu=False, number=0).exchange_time(22, 3) == 0
-
-
-def test_broadcast_over_a_gateway_arrives_after_the_writes_before() -> None:
-    """By hand: to three units 3 · 17 characters at 9600 baud, two echoes of 8, five silences.
-
-    Each echo may begin 10 ms late. A network has no time of its own.
-    """
-    commit = ("Commit", {"session": 9, "token": 7, "at": 0})
-    wire = ModbusWire(9600, is_rtu=False, number=0)
-    for unit in (1, 2, 3):
-        wire.request(unit, "GetStatus", {})
-    wire.request(0, *commit)
-    characters = 3 * 17 + 2 * 8 + 5 * 3.5
-    assert wire.takes == pytest.approx(characters * 11 / 9600 + 2 * 0.01)
-    network = ModbusWire(0, is_rtu=False, number=0)
-    network.request(1, "GetStatus", {})
-    network.request(0, *commit)
-    assert network.takes == 0

@@ -10,11 +10,14 @@ import errno
 import os
 from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import asynccontextmanager, suppress
+from dataclasses import dataclass, field
+from pathlib import Path
 from unittest.mock import AsyncMock, Mock
 
 import can
 import pytest
 
+from courses import Taken, courses, follow
 from drivers.errors import LinkError, WireCounters
 from drivers.opening import Lines
 from drivers.ports import PORT_OPENER
@@ -184,8 +187,11 @@ def test_frames_make_the_message_that_was_sent_or_none(case: str) -> None:
 
 
 BURST = [CanFrame(0x201, bytes([number])) for number in range(22)]
-STOP = [CanFrame(0x201, b"stop")]
 COMMIT = [CanFrame(0x200, b"commit")]
+FRAMES = {
+    **{"burst": BURST, "commit": COMMIT, "commit and burst": COMMIT + BURST},
+    "stop": [CanFrame(0x201, b"stop")],
+}
 
 
 class Adapter(can.BusABC):
@@ -227,80 +233,47 @@ async def opened(
             os.close(each)
 
 
-async def test_long_set_is_sent_as_the_queue_takes_it() -> None:
-    """All 22 frames in order, of which there is room for ten; blocked until then."""
-    async with opened() as (port, adapter, losses):
-        port.write(pack_frames(BURST))
-        assert port.is_blocked
-        while port.is_blocked:
-            await asyncio.sleep(0)
-            adapter.room = 1
-        assert adapter.taken == [frame.data for frame in BURST]
-        assert not losses
+@dataclass(kw_only=True)
+class OnABus(Taken):
+    """A port of a bus, its adapter, and its losses."""
 
+    port: BusPort
+    adapter: Adapter
+    losses: list[str]
+    burst: list[bytes] = field(default_factory=lambda: [frame.data for frame in BURST])
 
-async def test_stop_replaces_the_rest_of_a_set_but_no_broadcast() -> None:
-    """Ten frames of the set were taken; of the others only the commit of all precedes the stop."""
-    async with opened() as (port, adapter, _):
-        port.write(pack_frames(BURST))
-        for frames in (COMMIT, BURST, STOP):
-            port.write(pack_frames(frames))
-        adapter.room = 30
-        await until(lambda: not port.is_blocked)
-        assert adapter.taken[10:] == [b"commit", b"stop"]
+    def writes(self, *names: str) -> None:
+        """Write frames by their names, each at once."""
+        for name in names:
+            self.port.write(pack_frames(FRAMES[name]))
 
+    def hears_errors(self, *classes: int) -> None:
+        """Let the adapter give error frames of these classes."""
+        self.adapter.incoming += [
+            can.Message(arbitration_id=each, is_error_frame=True) for each in classes
+        ]
+        self.port.poll()
 
-async def test_frames_of_a_stuck_queue_are_dropped() -> None:
-    """Nobody acknowledges on the bus: what waited is not sent when it is mended much later."""
-    async with opened() as (port, adapter, losses):
-        adapter.room = 0
-        port.write(pack_frames(COMMIT + BURST))
-        await until(lambda: not port._unsent)
-        assert port.is_blocked
-        adapter.room = 30
-        port.write(pack_frames(STOP))
-        assert adapter.taken == [b"stop"]
-        assert not losses
-
-
-async def test_broadcast_waits_no_longer_while_others_are_written(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """A commit amid requests that are repeated every 20 ms: gone after the 30 ms of a reply."""
-    async with opened() as (port, adapter, _):
-        now = port.loop.time()
-        monkeypatch.setattr(port.loop, "time", lambda: now)
-        adapter.room = 0
-        port.write(pack_frames(COMMIT))
-        for _ in range(2):
-            now += 0.02
-            port.write(pack_frames(STOP))
-        adapter.room = 30
-        port.write(pack_frames(STOP))
-        monkeypatch.undo()
-        assert adapter.taken == [b"stop"]
-
-
-async def test_bus_off_is_a_loss_and_other_error_frames_are_none() -> None:
-    """Error class 0x40 of linux/can/error.h; told once."""
-    async with opened() as (port, adapter, losses):
-        adapter.incoming.append(can.Message(arbitration_id=0x04, is_error_frame=True))
-        port.poll()
-        assert not losses
-        adapter.incoming += [can.Message(arbitration_id=0x40, is_error_frame=True)] * 2
-        port.poll()
-        (loss,) = losses
-        assert "bus-off" in loss
-
-
-async def test_failed_send_is_a_loss() -> None:
-    """The adapter is unplugged: LinkError for the request, and the line is lost with its text."""
-    async with opened() as (port, adapter, losses):
+    def is_unplugged(self) -> None:
+        """Let the adapter be gone for the next frame."""
         unplugged = can.CanOperationError("No such device", error_code=errno.ENODEV)
-        adapter.send = Mock(side_effect=unplugged)  # type: ignore[method-assign]
-        with pytest.raises(LinkError) as failed:
-            port.write(pack_frames(STOP))
-        assert losses == [str(failed.value)]
+        self.adapter.send = Mock(side_effect=unplugged)  # type: ignore[method-assign]
+
+
+@asynccontextmanager
+async def on_a_bus() -> AsyncIterator[OnABus]:
+    """A port that is open."""
+    async with opened() as (port, adapter, losses):
+        yield OnABus(port=port, adapter=adapter, losses=losses)
+
+
+COURSES = courses(Path(__file__).with_name("bus.yaml"))
+
+
+@pytest.mark.parametrize("name", COURSES)
+def test_port_of_a_bus_keeps_to_its_course(name: str) -> None:
+    """Every step is as it is in the file."""
+    follow(COURSES[name], on_a_bus)
 
 
 async def test_reader_thread_hands_over_frames_in_order_until_the_adapter_is_gone() -> None:

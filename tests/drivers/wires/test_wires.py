@@ -12,10 +12,12 @@ import random
 import struct
 import threading
 import zlib
-from collections.abc import Callable, Coroutine, Iterable, Iterator
+from collections.abc import AsyncIterator, Callable, Coroutine, Iterable, Iterator
+from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
 from unittest.mock import Mock
 
@@ -26,6 +28,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pymodbus.logging import Log
 
+from courses import Taken, courses, follow
 from drivers import ports
 from drivers.errors import CommandError, LinkError
 from drivers.ports import Port
@@ -48,69 +51,57 @@ from drivers.wires.serial_frames import PAYLOAD_MAX, Frame, FrameReader, encode_
 from drivers.wires.wire import address_of
 from long_form import in_turn, shortly
 from registry import threads
-from virtual_lines import in_virtual_time
 
 BYTE = 11 / 19_200  # s
 SILENCE = 3.5 * BYTE  # Modbus over serial line V1.02, 2.5.1.1
 
 
-async def opened() -> tuple[SilentPort, list[tuple[float, bytes]]]:
-    """A port at 19 200 baud, and when what is written below it."""
-    sent, loop = list[tuple[float, bytes]](), asyncio.get_running_loop()
-    port = SilentPort(SILENCE, BYTE, lambda data: None)
-    port.below = Mock(is_blocked=False, write=lambda data: sent.append((loop.time(), data)))
-    await asyncio.sleep(1.0)
-    return port, sent
+@dataclass(kw_only=True)
+class OnALine(Taken):
+    """A port that keeps silences; sent: what was written below it, with its times [s].
+
+    heard: when bytes came last [s]; byte: the time of a character [s].
+    """
+
+    port: SilentPort
+    sent: list[tuple[float, bytes]]
+    heard: float = 0.0
+    byte: float = BYTE
+
+    @property
+    def gaps(self) -> list[float]:
+        """Between the frames, from start to start, in characters."""
+        return [(after - before) / BYTE for (before, _), (after, _) in pairwise(self.sent)]
+
+    def writes(self, *texts: str) -> None:
+        """Write frames at once."""
+        for each in texts:
+            self.port.write(each.encode())
+
+    def hears(self, text: str) -> None:
+        """Let bytes come."""
+        self.heard = threads.now()
+        self.port.received(text.encode())
 
 
-@in_virtual_time
-async def test_frame_waits_for_the_line_to_be_silent() -> None:
-    """After a frame of 8 bytes for 11.5 characters, after what is heard for 3.5 from there on."""
+@asynccontextmanager
+async def on_a_line() -> AsyncIterator[OnALine]:
+    """A line at 19 200 baud that has been silent for a second."""
     assert ModbusWire(19_200, is_rtu=True, number=0).silence == pytest.approx(SILENCE)
-    port, sent = await opened()
-    loop = asyncio.get_running_loop()
-    port.write(b"\1first")
-    port.write(b"\0second ")
-    port.write(b"\1third")
-    await asyncio.sleep(0.1)
-    assert [data for _, data in sent] == [b"\1first", b"\0second ", b"\1third"]
-    (first, _), (second, _), (third, _) = sent
-    assert second - first == pytest.approx((6 + 3.5) * BYTE)
-    assert third - second == pytest.approx((8 + 3.5) * BYTE)
-    port.received(b"reply")
-    heard = loop.time()
-    port.write(b"\1fourth")
-    await asyncio.sleep(0.1)
-    assert sent[-1][0] - heard == pytest.approx(SILENCE)
+    sent: list[tuple[float, bytes]] = []
+    port = SilentPort(SILENCE, BYTE, lambda data: None)
+    port.below = Mock(is_blocked=False, write=lambda data: sent.append((threads.now(), data)))
+    await asyncio.sleep(1.0)
+    yield OnALine(port=port, sent=sent)
 
 
-@in_virtual_time
-async def test_newer_request_replaces_one_that_waits_but_no_broadcast() -> None:
-    """A stop need not wait behind the request that it has preempted."""
-    port, sent = await opened()
-    for frame in (b"\1first", b"\0commit", b"\1read", b"\1stop"):
-        port.write(frame)
-    await asyncio.sleep(0.1)
-    assert [data for _, data in sent] == [b"\1first", b"\0commit", b"\1stop"]
-    assert all(after > before for (before, _), (after, _) in pairwise(sent))
+COURSES = courses(Path(__file__).with_name("silence.yaml"))
 
 
-@in_virtual_time
-async def test_noise_does_not_keep_a_stop_waiting_for_ever() -> None:
-    """It goes after the longest frame, of 256 characters, and one that follows after that."""
-    port, sent = await opened()
-    loop = asyncio.get_running_loop()
-    begin = loop.time()
-    port.received(b"?")
-    port.write(b"\0stops")
-    port.write(b"\1stop")
-    while len(sent) < 2:
-        assert loop.time() < begin + 1.0
-        await asyncio.sleep(BYTE)
-        port.received(b"?")
-    (first, _), (second, _) = sent
-    assert first - begin == pytest.approx((256 + 3.5) * BYTE, abs=BYTE)
-    assert second - first == pytest.approx((6 + 3.5) * BYTE)
+@pytest.mark.parametrize("name", COURSES)
+def test_silent_port_keeps_to_its_course(name: str) -> None:
+    """Every step is as it is in the file."""
+    follow(COURSES[name], on_a_line)
 
 
 @dataclass(frozen=True)

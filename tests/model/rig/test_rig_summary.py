@@ -46,8 +46,12 @@ ROOT = Path(model.__file__).parent.parent
 PAGE = (ROOT / "docs" / "reference" / "rig.md").read_text("utf-8")
 
 
-def test_tables_of_keys_are_those_of_the_sections() -> None:
-    """Of every section; unit, default, limits and meaning of a key."""
+def test_tables_of_keys_are_those_of_the_sections(tmp_path: Path) -> None:
+    """Of every section; unit, default, limits and meaning of a key.
+
+    Choices are in the row of a key that may be left out, as in that of one with a default. The page
+    lists all materials by name, and the minimal rig that it prints loads, with three ERAs.
+    """
     every = {each for _, each in inspect.getmembers(sections, inspect.isclass)}
     every |= {*KINDS.values()}
     assert {each for each in every if issubclass(each, Section)} - {Section} == {
@@ -61,28 +65,16 @@ def test_tables_of_keys_are_those_of_the_sections() -> None:
         "| `frequency` | Hz | `[40, 500]` | at least 1, at most 2000 | lowest and highest",
         "| `resonance_is` | | required with `resonance` | `free`, `mounted` | whose resonance",
         "| `kind` | | none | `foam`, `rubber` | kind of",
+        "| `magnet` | | `free` | `free`, `held` |",
         "| `E` | Pa | required, or those with a grain | at least 1000, at most 1e+13 | Young's",
     ):
         assert f"\n{row}" in PAGE
-
-
-def test_page_has_a_minimal_rig_that_loads(tmp_path):
-    """The rig that the page prints loads, with three ERAs."""
-    path = tmp_path / "rig.yaml"
-    path.write_text(re.search(r"```yaml\n(.*?)```", PAGE, re.DOTALL)[1], encoding="utf-8")
-    assert [era.name for era in load_rig(path).eras] == ["SW", "SE", "N"]
-
-
-def test_page_lists_the_known_materials():
-    """By name, all of them and no other."""
+    assert "| `kind` | | none | `foam`, `rubber` |" in rig_page.PARTS["supports"]()
     (names,) = re.findall(r"Materials by name are (.+?);", PAGE, re.DOTALL)
     assert re.findall(r"`([\w-]+)`", names) == [*KNOWN_MATERIALS]
-
-
-def test_choices_of_a_key_that_may_be_left_out() -> None:
-    """They are in its row, as those of a key with a default are."""
-    assert "| `kind` | | none | `foam`, `rubber` |" in rig_page.PARTS["supports"]()
-    assert "| `magnet` | | `free` | `free`, `held` |" in rig_page.PARTS["exciters"]()
+    minimal = re.search(r"```yaml\n(.*?)```", PAGE, re.DOTALL)
+    (tmp_path / "rig.yaml").write_text(minimal[1] if minimal else "", encoding="utf-8")
+    assert [era.name for era in load_rig(tmp_path / "rig.yaml").eras] == ["SW", "SE", "N"]
 
 
 PLATE = {"length": 0.3, "width": 0.2, "thickness": 0.002}
@@ -269,16 +261,17 @@ BOTH_WAYS = f"{OWN}, resonance: 224 Hz, resonance_is: free, stiffness: 3 kN/m"
     ],
 )
 def test_what_is_wrong_is_found_at_its_key(keys: str, key: str, said: str) -> None:
-    """Of the type, a resonance that does not say which, and what only ERAs have."""
-    assert said in refused(keys)[key]
+    """Of the type, a resonance that does not say which, and what only ERAs have.
 
-
-def test_a_misspelt_type_is_no_reason_to_ask_for_all_that_it_has() -> None:
-    """Each of the other exciters is named once; a type is not blamed for another key."""
-    misspelt = refused("type: DAEX25CT-5")
-    assert len(misspelt) == 4
-    assert [key for key in misspelt if not key.startswith("eras.")] == ["type"]
-    assert "DAEX25CT-4" not in str(refused("type: DAEX25CT-4, q: -1"))
+    A misspelt type is no reason to ask for all that it has: each of the other exciters is named
+    once. A type is not blamed for another key.
+    """
+    found = refused(keys)
+    assert said in found[key]
+    if key == "type":
+        assert len(found) == 4
+        assert [each for each in found if not each.startswith("eras.")] == ["type"]
+        assert "DAEX25CT-4" not in str(refused("type: DAEX25CT-4, q: -1"))
 
 
 @pytest.mark.parametrize(
@@ -296,11 +289,8 @@ def test_a_misspelt_type_is_no_reason_to_ask_for_all_that_it_has() -> None:
 def test_a_wrong_exciter_is_found_in_its_line(right: str, wrong: str, key: str, said: str) -> None:
     """Of another kind, without an amplifier, and beside the plate."""
     text = exciter_rig_text("type: DAEX25CT-4").replace(right, wrong, 1)
-    with pytest.raises(ConfigError) as error:
+    with pytest.raises(ConfigError, match=rf"board\.yaml:3: eras\.SW\.{key}: .*{re.escape(said)}"):
         parse_rig("board.yaml", text)
-    problem = error.value.problems[0]
-    assert (problem.line, problem.key) == (3, f"eras.SW.{key}")
-    assert said in problem.message
 
 
 def warned(keys: str, frequency: str) -> list[str]:
@@ -326,10 +316,13 @@ def test_check_warns_near_the_resonance_of_the_magnets_and_of_one_that_is_misrea
 def test_check_says_at_which_frequencies_a_magnet_would_leave_its_excursion() -> None:
     """On a rigid heavy board a magnet moves as on one that is held, and furthest in an onset.
 
-    Within 1 % of the magnet's own equation, M x'' + c' x' + k x = F exp(st), from rest.
+    Within 1 % of the magnet's own equation, M x'' + c' x' + k x = F exp(st), from rest. A check of
+    a file that plays down to 40 Hz warns of it.
     """
-    far, _ = warned("type: DAEX13-4SM, power: 1 W", "[40, 300]")
-    assert "from 40 Hz on limits.level 1 can move the magnets of SW, SE, NE, NW beyond" in far
+    text = exciter_rig_text("type: DAEX13-4SM, power: 1 W", frequency="[40, 300]")
+    warnings = RIG.check(parse_document("board.yaml", text)).warnings
+    far = "from 40 Hz on limits.level 1 can move the magnets of SW, SE, NE, NW beyond"
+    assert [each for each in warnings if far in each]
     exciter = first("type: DAEX13-4SM, power: 1 W")
     heavy = exciter_rig_text("type: DAEX13-4SM, power: 1 W").replace("rho: 1190", "rho: 100000")
     stiff = parse_rig("board.yaml", heavy.replace("E: 4.5 GPa", "E: 9000 GPa"))
@@ -345,8 +338,9 @@ def test_check_says_at_which_frequencies_a_magnet_would_leave_its_excursion() ->
     stated = re.search(r"within from (\S+) Hz on.*at most (\S+) is safe", said)
     assert stated is not None
     allowed = frequencies[moved > 0.5e-3][-1] + 1
-    assert float(stated[1]) == pytest.approx(allowed, rel=0.01)
-    assert float(stated[2]) == pytest.approx(0.5e-3 / moved.max(), rel=0.01)
+    assert [*map(float, stated.groups())] == pytest.approx(
+        [allowed, 0.5e-3 / moved.max()], rel=0.01
+    )
 
 
 def test_what_may_harm_an_exciter_is_said() -> None:
@@ -470,10 +464,3 @@ def test_schema_knows_whole_rigs_and_fitted_ones(keys: dict[str, Any], is_good: 
     """As a validator of another project reads it: the example, and what differs from a base."""
     whole = {} if "base" in keys else yaml.safe_load(example_rig_path().read_text("utf-8"))
     assert jsonschema_rs.is_valid(RIG.schema(), {**whole, **keys}) == is_good
-
-
-def test_config_check_warns_of_excursions() -> None:
-    """Of an exciter that plays down to 40 Hz."""
-    text = exciter_rig_text("type: DAEX25CT-4", frequency="[40, 300]")
-    warnings = RIG.check(parse_document("board.yaml", text)).warnings
-    assert [each for each in warnings if "beyond their excursion" in each]

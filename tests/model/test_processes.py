@@ -107,17 +107,6 @@ def _process(shared: None, task: int) -> int:
     return os.getpid()
 
 
-def test_cluster_without_workers_is_refused() -> None:
-    """Waiting for ever for a worker to come is no answer."""
-    from distributed import LocalCluster
-
-    with (
-        LocalCluster(n_workers=0, dashboard_address=":0") as empty,
-        pytest.raises(InputError, match="has no workers"),
-    ):
-        dict(on_cluster(empty.scheduler_address, divmod, 1, TASKS))
-
-
 @pytest.mark.long
 def test_cluster_gives_up_on_a_task_that_kills_its_workers(address: str, monkeypatch) -> None:
     """A task that ends whichever worker takes it, as one does for which memory is too short."""
@@ -137,18 +126,26 @@ def _allow_failures(count, dask_scheduler):
     dask_scheduler.allowed_failures = count
 
 
-def test_cluster_without_dask_names_the_extra(monkeypatch) -> None:
-    """The error names the extra to install."""
+def test_cluster_without_workers_or_scheduler_is_refused(monkeypatch) -> None:
+    """Waiting for ever for a worker to come is no answer.
+
+    Nothing listens at an address: the error says so, and how to start one; without Dask it names
+    the extra to install.
+    """
+    from distributed import LocalCluster
+
+    monkeypatch.setattr(processes, "_CONNECT_TIMEOUT", 0.2)
+    nowhere = "tcp://127.0.0.1:1"
+    with LocalCluster(n_workers=0, dashboard_address=":0") as empty:
+        for address, said in (
+            (empty.scheduler_address, "has no workers"),
+            (nowhere, r"no Dask scheduler answers at tcp://127\.0\.0\.1:1 "),
+        ):
+            with pytest.raises(InputError, match=said):
+                dict(on_cluster(address, divmod, 1, TASKS))
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(InputError, match=r"\[cluster\]"):
-        dict(on_cluster("tcp://127.0.0.1:1", divmod, 1, TASKS))
-
-
-def test_cluster_without_scheduler_is_refused(monkeypatch) -> None:
-    """Nothing listens at the address: the error says so, and how to start one."""
-    monkeypatch.setattr(processes, "_CONNECT_TIMEOUT", 0.2)
-    with pytest.raises(InputError, match=r"no Dask scheduler answers at tcp://127\.0\.0\.1:1 "):
-        dict(on_cluster("tcp://127.0.0.1:1", divmod, 1, TASKS))
+        dict(on_cluster(nowhere, divmod, 1, TASKS))
 
 
 def test_every_worker_checks_its_code() -> None:
@@ -189,6 +186,9 @@ ALIKE = ([1.0, 3.0, 2.0, 3.0], [-5.0, -1.0, -2.0, -1.0], [0.0, np.inf, 1.0, np.i
             [2.0, 1.0, 2.0, 3.0, 3.0],
             "deacb",
         ),
+        # What is better by more than rounding, however little more.
+        (best_of, [1.0, 1 + 3 * NEARLY], 1),
+        (lambda s: best_first(s).tolist(), [1.0, 1 + 3 * NEARLY], [1, 0]),
     ],
 )
 def test_the_first_of_the_nearly_equal_best_is_chosen(choose, scores, expected):
@@ -198,56 +198,33 @@ def test_the_first_of_the_nearly_equal_best_is_chosen(choose, scores, expected):
         assert choose(np.array(scores) * (1 + NEARLY / 4 * rounding)) == expected
 
 
-def test_what_is_better_by_more_than_rounding_is_chosen():
-    """However little more."""
-    assert best_of([1.0, 1 + 3 * NEARLY]) == 1
-    assert best_first([1.0, 1 + 3 * NEARLY]).tolist() == [1, 0]
-
-
 @pytest.mark.parametrize(
-    ("value", "unit", "digits", "expected"),
+    ("shown", "expected"),
     [
-        (70e9, "Pa", 3, "70 GPa"),
-        (19041.2, "N/m", 5, "19.041 kN/m"),
-        (0.0015, "m", 3, "1.5 mm"),
-        (0.012006, "kg", 2, "12 g"),
-        (4.8489, "N s/m", 3, "4.85 N s/m"),
-        (0.01302, "", 2, "0.013"),
-        (1.2, "m", 3, "1200 mm"),
-        (0.9996, "m", 3, "1000 mm"),
-        (117e3, "N/m", 2, "117 kN/m"),
+        (lambda: in_display_unit(70e9, "Pa", digits=3), "70 GPa"),
+        (lambda: in_display_unit(19041.2, "N/m", digits=5), "19.041 kN/m"),
+        (lambda: in_display_unit(0.0015, "m", digits=3), "1.5 mm"),
+        (lambda: in_display_unit(0.012006, "kg", digits=2), "12 g"),
+        (lambda: in_display_unit(4.8489, "N s/m", digits=3), "4.85 N s/m"),
+        (lambda: in_display_unit(0.01302, "", digits=2), "0.013"),
+        (lambda: in_display_unit(1.2, "m", digits=3), "1200 mm"),
+        (lambda: in_display_unit(0.9996, "m", digits=3), "1000 mm"),
+        (lambda: in_display_unit(117e3, "N/m", digits=2), "117 kN/m"),
+        *((lambda by=by: percent(by), f"{said} %") for by, said in ((1.43, 143), (0.124, 12))),
+        *((lambda by=by: percent(by), f"{said} %") for by, said in ((0.0999, 10), (0.0123, 1.2))),
+        (lambda: percent(0.0), "0 %"),
+        (lambda: with_error(74.0241e9, 0.8712e9, "Pa"), "74.02 ± 0.87 GPa"),
+        (lambda: with_error(0.0130284, 2.72e-5, ""), "0.013028 ± 0.000027"),
+        (lambda: with_error(0.0119941, 0.000996, "kg"), "12.0 ± 1.0 g"),
+        (lambda: with_error(1231.4, 217.0, "Hz", sign="+"), "+1231 ± 217 Hz"),
+        (lambda: with_error(1.25, math.inf, ""), "1.25 ± inf"),
+        (lambda: with_error(1.0, 0.0, "m"), "1000 ± 0 mm"),
     ],
 )
-def test_in_display_unit_scales_to_giga_kilo_or_milli(
-    value: float, unit: str, digits: int, expected: str
-) -> None:
-    """Giga, kilo and milli where plates have them; any other unit as it is, and none without."""
-    assert in_display_unit(value, unit, digits=digits) == expected
+def test_quantities_are_shown_in_the_unit_of_plates(shown, expected) -> None:
+    """Giga, kilo and milli where plates have them; any other unit as it is, and none without.
 
-
-@pytest.mark.parametrize(
-    ("share", "expected"),
-    [(1.43, "143 %"), (0.124, "12 %"), (0.0999, "10 %"), (0.0123, "1.2 %"), (0.0, "0 %")],
-)
-def test_percent_has_two_significant_digits(share: float, expected: str) -> None:
-    """Whole per cents from ten on, below with two digits."""
-    assert percent(share) == expected
-
-
-@pytest.mark.parametrize(
-    ("value", "error", "unit", "expected"),
-    [
-        (74.0241e9, 0.8712e9, "Pa", "74.02 ± 0.87 GPa"),
-        (0.0130284, 2.72e-5, "", "0.013028 ± 0.000027"),
-        (0.0119941, 0.000996, "kg", "12.0 ± 1.0 g"),
-        (1231.4, 217.0, "Hz", "1231 ± 217 Hz"),
-        (1.25, math.inf, "", "1.25 ± inf"),
-        (1.0, 0.0, "m", "1000 ± 0 mm"),
-    ],
-)
-def test_with_error_shows_no_digit_below_two_of_the_error(
-    value: float, error: float, unit: str, expected: str
-) -> None:
-    """Value and error have the same decimals, in the unit of plates."""
-    assert with_error(value, error, unit) == expected
-    assert with_error(value, error, unit, sign="+") == f"+{expected}"
+    Per cents are whole from ten on, below with two digits. A value and its error have the same
+    decimals, none below two digits of the error.
+    """
+    assert shown() == expected

@@ -73,31 +73,16 @@ def seven(folder: Path) -> int:
     return int(done.stdout)
 
 
-def forge(path: Path) -> None:
-    """Put a library there that returns eight, with its checksum."""
+def forge(path: Path, *, mode: int = 0o755, checksum_mode: int = 0o644) -> None:
+    """Put a library there that returns eight, with its checksum, of these rights."""
     source = path.with_suffix(".c")
     source.write_text("int seven(void) { return 8; }")
     compile_library(path, [source], flags=(), what="eight")
     source.unlink()
-    checksum = hashlib.sha256(path.read_bytes()).hexdigest()
-    path.with_name(f"{path.name}.sha256").write_text(checksum)
-
-
-def truncate(path: Path) -> None:
-    """Leave the first page, as after a power failure: what is mapped beyond it is SIGBUS."""
-    os.truncate(path, 4096)
-
-
-def let_others_write(path: Path) -> None:
-    """Put a library there that every user may have written."""
-    forge(path)
-    path.chmod(0o777)
-
-
-def let_others_write_checksum(path: Path) -> None:
-    """The same of its checksum."""
-    forge(path)
-    path.with_name(f"{path.name}.sha256").chmod(0o666)
+    path.chmod(mode)
+    checksum = path.with_name(f"{path.name}.sha256")
+    checksum.write_text(hashlib.sha256(path.read_bytes()).hexdigest())
+    checksum.chmod(checksum_mode)
 
 
 def exchange(path: Path) -> None:
@@ -107,12 +92,21 @@ def exchange(path: Path) -> None:
 
 
 def test_library_unsafe_or_not_whole_is_compiled_again(folder: Path) -> None:
-    """It is not loaded, and the next process finds a good one."""
+    """It is not loaded, and the next process finds a good one.
+
+    The first page alone is left after a power failure: what is mapped beyond it is SIGBUS. Every
+    user may have written a library or its checksum.
+    """
     assert seven(folder) == 7
     (path,) = folder.glob("*.so")
     good = path.read_bytes()
-    for damage in (truncate, let_others_write, let_others_write_checksum, exchange):
-        damage(path)
+    for damage in (
+        lambda: os.truncate(path, 4096),
+        lambda: forge(path, mode=0o777),
+        lambda: forge(path, checksum_mode=0o666),
+        lambda: exchange(path),
+    ):
+        damage()
         assert seven(folder) == 7
         assert path.read_bytes() == good
     forge(path)  # safe and whole: what is kept is loaded
@@ -182,15 +176,6 @@ def test_least_recently_used_libraries_are_removed(folder: Path) -> None:
     assert os.confstr("CS_GNU_LIBC_VERSION").replace(" ", "") in path.name
 
 
-def test_machine_without_a_compiler_has_none(without_kernels: Callable[[], None]) -> None:
-    """No library, no error, and words that say how much slower; with one there is a library."""
-    assert kernels() is not None
-    assert why_slow() is None
-    without_kernels()
-    assert kernels() is None
-    assert why_slow()
-
-
 @pytest.fixture
 def source(tmp_path: Path) -> Path:
     """Of a function that returns seven."""
@@ -201,14 +186,27 @@ def source(tmp_path: Path) -> Path:
 
 @pytest.mark.parametrize("cc", ["/nowhere/cc", "false", "sleep 60 #"])
 def test_compiler_that_gives_no_library_is_bad_input(
-    cc: str, source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    cc: str,
+    source: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    without_kernels: Callable[[], None],
 ) -> None:
-    """Neither is there a file then, nor a part of one."""
-    monkeypatch.setenv("CC", cc)
-    monkeypatch.setattr(library_cache, "_TIMEOUT", 0.01)
-    with pytest.raises(InputError):
-        compile_library(tmp_path / "seven.so", [source], flags=(), what="seven")
+    """Neither is there a file then, nor a part of one.
+
+    Without a compiler there is no library, no error, and words that say how much slower it is.
+    """
+    assert kernels() is not None
+    assert why_slow() is None
+    with monkeypatch.context() as patch:
+        patch.setenv("CC", cc)
+        patch.setattr(library_cache, "_TIMEOUT", 0.01)
+        with pytest.raises(InputError):
+            compile_library(tmp_path / "seven.so", [source], flags=(), what="seven")
     assert [path.name for path in tmp_path.iterdir()] == ["seven.c"]
+    without_kernels()
+    assert kernels() is None
+    assert why_slow()
 
 
 def test_threads_compile_the_same_at_once(source: Path, tmp_path: Path) -> None:

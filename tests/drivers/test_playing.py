@@ -16,15 +16,18 @@ import subprocess
 import sys
 import termios
 import tty
-from collections.abc import Callable, Iterator
-from dataclasses import replace
+from collections.abc import AsyncIterator, Iterator, Mapping, Sequence
+from contextlib import asynccontextmanager
+from dataclasses import dataclass
 from itertools import product
+from pathlib import Path
 from typing import Any
 from unittest.mock import Mock
 
 import pytest
 import serial
 
+from courses import Taken, courses, follow
 from drivers import ports
 from drivers.errors import LinkError, LinkTimeout
 from drivers.playing import Playback, Voice
@@ -243,38 +246,82 @@ except LinkError as problem:
     assert "amplifier.test:502: no connection" in ran.stdout
 
 
-def layer(number: int, *commands: Command, **other: int | bool) -> LayerSet:
-    """A layer with a ramp of 20 ms that does not end."""
-    return LayerSet(number, 20, int(other.pop("valid_for", 0)), commands, **other)  # type: ignore[arg-type]
+def layer_of(
+    number: int = 0,
+    *,
+    ramp: int = 0,
+    valid_for: int = 0,
+    tones: Sequence[Mapping[str, Any]] = (),
+    after: bool = False,
+) -> LayerSet:
+    """A layer of rows of tones, with the step [0.1 ms] and knots of each onset and ending."""
+    commands = []
+    for tone in tones:
+        shapes = {name: tone[name] for name in ("onset", "ending") if name in tone}
+        made = {
+            name: Envelope(step, tuple(map(tuple, knots)))
+            for name, (step, *knots) in shapes.items()
+        }
+        commands.append(Command(**{"channel": 0, "phase": 0, **tone, **made}))
+    return LayerSet(number, ramp, valid_for, tuple(commands), after)
 
 
-def tone(channel: int = 0, frequency: int = 2000, level: int = 5000, **other: object) -> Command:
-    """A tone of 100 Hz at half level unless told otherwise."""
-    return Command(channel, frequency, level, 0, **other)  # type: ignore[arg-type]
+@dataclass(kw_only=True)
+class OfLayers(Taken):
+    """What plays, the bounds of what may play, and what is expected of outputs silent at 0 s.
+
+    found: the rules that are reported to be broken.
+    """
+
+    playback: Playback
+    bounds: UncertainPlayback
+    outputs: ExpectedOutputs
+    report: Mock
+    found: list[str]
+
+    def commits(self, token: int, at: float, **layer: Any) -> None:
+        """Let a layer play at a moment."""
+        self.playback.commit([layer_of(**layer)], token, at)
+
+    def may_commit(self, token: int, since: float, until: float, **layer: Any) -> None:
+        """Let a layer play at some moment within."""
+        self.bounds.commit([layer_of(**layer)], token, (since, until))
+
+    def expects(self, token: int, since: float, until: float, **layer: Any) -> None:
+        """Let a layer be expected that began at some moment within."""
+        self.outputs.play([layer_of(**layer)], token, (since, until), is_exact=True)
+
+    def shows(self, levels: Sequence[float], at: float) -> None:
+        """Let the outputs show levels at a moment."""
+        self.outputs.check_levels(levels, (at, at), self.report)
+
+    def is_ambiguous(self, expected: bool, since: float, until: float, **layer: Any) -> None:
+        """Require that it is unknown, or not, what a layer would play that comes within."""
+        assert self.bounds.is_ambiguous((since, until), [layer_of(**layer)]) is expected
 
 
-def test_voice_that_has_faded_is_not_continued_however_seldom_time_advances() -> None:
-    """Its onset to level 0 ended at 20 ms, before that of the channel for which a set waits."""
-    playback = Playback(2, 8)
-    short, long = Envelope(100, ((2000, 0),)), Envelope(200, ((2000, 0),))
-    playback.commit([layer(0, tone(level=0, onset=short), tone(1, onset=long))], 1, 0.0)
-    playback.commit([layer(0, tone(keep_phase=True), after=True)], 2, 0.01)
-    playback.advance(1.0)
-    assert [voice.began for voice in playback.all_voices[0]] == pytest.approx([0.04])
+@asynccontextmanager
+async def of_layers() -> AsyncIterator[OfLayers]:
+    """Two channels, of eight voices each."""
+    found: list[str] = []
+    report = Mock(side_effect=lambda rule, *_, **__: found.append(rule))
+    how = {"unclear": None, "slack": 0.0, "cause": "", "began": (0.0, 0.0)}
+    yield OfLayers(
+        playback=Playback(2, 8),
+        bounds=UncertainPlayback(Playback(2, 8)),
+        outputs=ExpectedOutputs({}, report=report, **how),
+        report=report,
+        found=found,
+    )
 
 
-def test_tones_of_one_frequency_interfere_whenever_they_began() -> None:
-    """By hand: 0.3, 0.4 i and -0.3 of 99.95 Hz add to 0.7 or less, however far apart they begin."""
-    playback = Playback(1, 8)
-    for number, (time, level, phase, sum_of_all) in enumerate(
-        [(0.0, 3000, 0, 0.3), (1.2345, 4000, 9000, 0.5), (7.7777, 3000, 18000, 0.4)]
-    ):
-        one = Command(0, 1999, level, phase)
-        playback.commit([LayerSet(number, 0, 0, (one,))], number + 1, time)
-        assert playback.level(0, time) == pytest.approx(sum_of_all)
-    other = Command(0, 2000, 1000, 0)
-    playback.commit([LayerSet(3, 0, 0, (other,))], 4, 8.0)
-    assert playback.level(0, 9.0) == pytest.approx(0.4 + 0.1)
+COURSES = courses(Path(__file__).with_name("playing.yaml"))
+
+
+@pytest.mark.parametrize("name", COURSES)
+def test_layers_keep_to_their_course(name: str) -> None:
+    """Every step is as it is in the file, by hand."""
+    follow(COURSES[name], of_layers)
 
 
 def test_random_sets_never_jump_and_keep_their_bounds() -> None:
@@ -309,9 +356,9 @@ def test_fade_that_is_cut_short_is_as_fast_as_the_amplifier_can() -> None:
     """A raised cosine from 1 is steepest at pi/2 over its length: 157 ms at 10 full levels/s."""
     for slew, length in ((math.inf, 0.002), (10.0, math.pi / 20)):
         playback = Playback(1, 8, slew)
-        playback.commit([layer(0, tone(level=10_000))], 1, 0.0)
+        playback.commit([LayerSet(0, 20, 0, (Command(0, 2000, 10_000, 0),))], 1, 0.0)
         for n in range(9):
-            played = replace(layer(0, tone(frequency=3000 + n)), ramp=1000)
+            played = LayerSet(0, 1000, 0, (Command(0, 3000 + n, 5000, 0),))
             playback.commit([played], 2 + n, 1.0 + 1e-6 * n)
         first = playback.all_voices[0][0].transition
         assert first.end - first.start == pytest.approx(length, rel=1e-3)
@@ -393,90 +440,3 @@ def test_bounds_contain_every_amplifier(seed: int) -> None:
                     low, high = bounds.bounds(channel, begin, now, is_exact=is_exact)
                     level = each.level(channel, moment)
                     assert low - 1e-9 <= level <= high + 1e-9, (channel, is_exact, moment)
-
-
-def test_set_that_comes_as_another_layer_may_end_is_ambiguous() -> None:
-    """By hand: what began within 0 to 60 ms and is valid for 100 ends within 100 to 160 ms."""
-    bounds = UncertainPlayback(Playback(2, 8))
-    first = LayerSet(0, 0, 100, (Command(0, 2200, 5000, 0),))
-    bounds.commit([first], 1, (0.0, 0.06))
-    other = LayerSet(1, 0, 0, (Command(1, 400, 5000, 0),))
-    cases = (0.09, 0.099), (0.09, 0.101), (0.131, 0.133), (0.159, 0.17), (0.161, 0.17)
-    found = [bounds.is_ambiguous(when, [other]) for when in cases]
-    assert found == [False, True, True, True, False]
-    bounds.commit([other], 2, (0.131, 0.133))  # for whoever cannot wait for another moment
-    assert bounds.bounds(0, 0.134, 0.136) == pytest.approx((0.0, 0.5))
-    assert bounds.bounds(0, 0.161, 0.162) == (0.0, 0.0)
-
-
-def expecting() -> tuple[ExpectedOutputs, Callable[..., None], list[str]]:
-    """What is expected of outputs that were silent at 0 s, what reports, and rules it reported."""
-    found: list[str] = []
-    report = Mock(side_effect=lambda rule, *_, **__: found.append(rule))
-    outputs = ExpectedOutputs(
-        {}, report=report, unclear=None, slack=0.0, cause="", began=(0.0, 0.0)
-    )
-    return outputs, report, found
-
-
-def test_layer_may_have_ended_just_before_all_falls_silent() -> None:
-    """By hand: it ends at once within 100 to 112 ms, and all fades for 50 ms from 110 ms on."""
-    outputs, report, found = expecting()
-    ended = Command(0, 2200, 5000, 0, ending=Envelope(10, ()))
-    outputs.play([LayerSet(0, 0, 100, (ended,))], 1, (0.0, 0.01), is_exact=True)
-    outputs.silence((0.11, 0.112), 0.05, "Disarm")
-    assert not outputs.sure((0.113, 0.113))
-    assert outputs.sure((0.17, 0.17))
-    outputs.check_levels([0.1], (0.17, 0.17), report)
-    assert found == ["silent"]
-
-
-@pytest.mark.parametrize("by_a_set", [False, True])
-@pytest.mark.parametrize(("begins", "is_known"), [(1.01, True), (1.02, False), (1.03, True)])
-def test_way_to_silence_that_a_ramp_may_shorten_or_not_is_unknown_until_both_are_over(
-    begins: float, is_known: bool, by_a_set: bool
-) -> None:
-    """By hand: an ending or an onset to 0 of 40 ms begins within 1.000 to 1.002 s.
-
-    A ramp of 20 ms begins within 2.5 ms, of a silence or of a set. From 1.01 s on it arrives before
-    the way, from 1.03 s on behind it; from 1.02 s on within 1.0400 to 1.0425 s, and the way within
-    1.040 to 1.042 s.
-    """
-    outputs, report, found = expecting()
-    way, when = Envelope(100, ((5000, 0),) * 3), (begins, begins + 0.0005)
-    if by_a_set:
-        rises = Command(0, 2200, 0, 0, onset=way)
-        outputs.play([LayerSet(0, 0, 0, (rises,))], 1, (1.0, 1.0), is_exact=True)
-        outputs.play([LayerSet(0, 20, 0, ())], 2, when, is_exact=True)
-    else:
-        ends = Command(0, 2200, 5000, 0, ending=way)
-        outputs.play([LayerSet(0, 0, 0, (ends,))], 1, (0.0, 0.0), is_exact=True)
-        outputs.play([LayerSet(0, 20, 0, ())], 2, (1.0, 1.0), is_exact=True)
-        outputs.silence(when, 0.02, "Silence")
-    assert bool(outputs.sure((begins + 0.003, begins + 0.003))) is is_known
-    assert outputs.sure((1.06, 1.06))
-    outputs.check_levels([0.1], (1.06, 1.06), report)
-    assert found == ["plays" if by_a_set else "silent"]
-
-
-def test_tones_that_may_cancel_leave_those_of_other_frequencies_what_they_play() -> None:
-    """By hand: 0.5 at 20 Hz lasts; three tones of 0.3 at 110 Hz cancel, or are added up to 0.9."""
-    bounds = UncertainPlayback(Playback(1, 8))
-    thirds = [(2200, 3000, degrees) for degrees in (0, 12000, -12000)]
-    for number, (frequency, level, phase) in enumerate([(400, 5000, 0), *thirds]):
-        one = LayerSet(number, 0, 0, (Command(0, frequency, level, phase),))
-        bounds.commit([one], number + 1, (0.1 * number, 0.1 * number + 0.001))
-    assert bounds.bounds(0, 1.0, 1.01) == pytest.approx((0.5, 1.4))
-    assert bounds.bounds(0, 1.0, 1.01, is_exact=True) == pytest.approx((0.5, 0.5))
-
-
-def test_bounds_are_no_wider_than_need_be() -> None:
-    """By hand: a rise to 0.5 along 100 ms that began within 2 ms is at 0.25 at half, +/- 0.008."""
-    bounds = UncertainPlayback(Playback(1, 8))
-    bounds.commit([LayerSet(0, 100, 0, (Command(0, 2200, 5000, 0),))], 1, (0.0, 0.002))
-    low, high = bounds.bounds(0, 0.051, 0.051)
-    # The steepest change of a raised cosine is pi/2 of its height in its duration.
-    steepest = 0.5 * 3.1416 / 2 / 0.1 * 0.001
-    assert 0.25 - 1.001 * steepest <= low < 0.25 < high <= 0.25 + 1.001 * steepest
-    bounds.commit([LayerSet(0, 0, 0, (Command(0, 2200, 5000, 0, True),))], 2, (0.2, 0.21))
-    assert bounds.bounds(0, 0.22, 0.23) == pytest.approx((0.5, 0.5))

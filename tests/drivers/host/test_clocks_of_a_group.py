@@ -102,30 +102,6 @@ async def test_capabilities_that_cannot_be_are_refused(
     assert {each for _, each in end.sent} <= {"1:1", "1:2"}
 
 
-@in_virtual_time
-async def test_watchdog_that_stands_still_is_found_amid_sets(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """Ten sets a second feed it, each with a heartbeat that comes too early to tell."""
-    group, _ = await armed("serial")
-    alter(
-        monkeypatch,
-        "GetStatus",
-        "watchdog_left",
-        round(1000 * group.amplifiers["a"].feeding.watchdog),
-    )
-
-    async def play() -> None:
-        for _ in range(10):
-            await group.apply({"a": [loud()]})
-            for _ in range(2):
-                await group.beat()
-                await asyncio.sleep(0.05)
-
-    with pytest.raises(DriverError, match="watchdog"):
-        await play()
-
-
 @pytest.mark.parametrize("lie", STATUS)
 @pytest.mark.parametrize("wire", KINDS)
 @in_virtual_time
@@ -612,74 +588,3 @@ async def test_readings_before_arming_end_in_time(is_stopped: bool, baud: int) -
         await arming
         hello = min(at for at, name in end.sent if at > before and name.endswith(f":{HELLO}"))
         assert hello - before < 0.2 + 2 * exchange + 1e-3
-
-
-@in_virtual_time
-async def test_half_of_an_exchange_is_unknown_where_lines_differ() -> None:
-    """A product of another name: the way out may take all of it, or nothing; one alone has none."""
-    ends = [MemoryLine("serial", "a"), MemoryLine("serial", "b")]
-    ends[1].far["b"].identity["product"] = "another"
-    group = await group_of(*ends)
-    for _ in range(60):
-        await asyncio.sleep(0.05)
-        await group.beat()
-    # 0.2 ms each way, of which the bits of request and reply are within.
-    bits = min(each.exchange_time("GetStatus") for each in group.amplifiers.values())
-    unknown = (0.4e-3 - bits) / 2 if bits < 0.4e-3 else 0.0
-    assert min(group.clock_errors.values()) >= unknown
-    alone = await group_of(MemoryLine("serial", "c"))
-    assert alone.clock_errors == {"c": 0.0}
-
-
-@pytest.mark.parametrize("ahead", [-10.0, -0.01])
-@in_virtual_time
-async def test_a_clock_that_is_not_held_spoils_no_other_of_its_line(ahead: float) -> None:
-    """One that states no error, beside two that are held by Marks."""
-    end = MemoryLine("serial", *"abc")
-    end.far["a"].capabilities["clock_error"] = CLOCK_UNKNOWN
-    end.far["a"].clock = AmplifierClock(Crystal(ahead=ahead))
-    group = await group_of(end)
-    await skew(group, [end.far["b"].clock, end.far["c"].clock], 11.0)
-    assert group.clock_errors["a"] == math.inf
-    assert max(group.clock_errors[each] for each in "bc") < 20e-6
-
-
-@in_virtual_time
-async def test_status_that_shows_an_older_mark_accuses_no_clock() -> None:
-    """The request that would show a Mark is lost, and the next Mark: the first is shown then."""
-    end = MemoryLine("serial", "a", "b")
-    group = await group_of(end)
-    lost = ["0:19", "1:12", "0:19"]  # the first is heard
-
-    def inward(name: str, data: bytes) -> list[tuple[float, bytes]]:
-        if not lost or end.sent[-1][1] != lost[0]:
-            return unaltered(name, data)
-        lost.pop(0)
-        return [] if len(lost) < 2 else unaltered(name, data)
-
-    for beat in range(50):
-        if beat == 40:  # Marks are read
-            end.inward = inward
-        await asyncio.sleep(0.05)
-        await group.beat()
-    assert not lost
-    assert not group.amplifiers["a"].reported_at
-    assert max(group.clock_errors.values()) < 1e-4
-
-
-@in_virtual_time
-async def test_marks_that_come_twice_accuse_no_clock() -> None:
-    """Every third once more, up to 60 ms later: a status may show that again, while sets play."""
-    end, rng = MemoryLine("serial", "a", "b"), random.Random(1)
-    end.inward = lambda name, data: (
-        unaltered(name, data)
-        + ([(rng.uniform(0.0, 0.06), data)] * (name == "Mark" and rng.random() < 1 / 3))
-    )
-    group = await group_of(end)
-    for number in range(100):
-        await asyncio.sleep(0.05)
-        await group.beat()
-        await asyncio.sleep(rng.uniform(0.0, 0.04))
-        await group.apply({each: [loud(0.1 + number / 200)] for each in "ab"})
-        assert max(group.clock_errors.values()) < 1e-4
-    assert not any(each.reported_at for each in group.amplifiers.values())

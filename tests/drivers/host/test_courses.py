@@ -272,6 +272,23 @@ class OnLines(Taken):
         """Let each reply on the first line come once more."""
         self.lines[0].outward = lambda _, data: [(0.0002, data), (0.004, data)]
 
+    def loses_in_turn(self, *requests: str) -> None:
+        """Lose these requests on the first line, as they come one after the other."""
+        (line, *_), self.to_lose = self.lines, [*requests]
+        line.inward = lambda name, data: (
+            []
+            if self.to_lose and line.sent[-1][1] == self.to_lose[0] and self.to_lose.pop(0)
+            else unaltered(name, data)
+        )
+
+    def marks_come_twice(self) -> None:
+        """Let every third Mark come once more, up to 60 ms later."""
+        rng = random.Random(1)
+        self.lines[0].inward = lambda name, data: (
+            unaltered(name, data)
+            + ([(rng.uniform(0.0, 0.06), data)] * (name == "Mark" and rng.random() < 1 / 3))
+        )
+
     def loses_replies(self, name: str, count: int) -> None:
         """Lose so many replies to requests of a name on each line."""
         for line in self.lines:

@@ -12,15 +12,18 @@ import math
 import threading
 from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
 from contextlib import asynccontextmanager, nullcontext
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
+from courses import Taken, courses, follow
 from drivers.errors import CommandError, CommandRefused, DriverError, LinkDegraded, LinkError
 from drivers.host.amplifier import Amplifier
 from drivers.host.group import Group
+from drivers.host.ledger import StopOutcome
 from drivers.host.line import Line
 from drivers.opening import Lines
 from drivers.playing import AmplifierLayer, AmplifierTone
@@ -28,8 +31,6 @@ from drivers.protocol.definition import (
     FAULTS,
     HEARTBEAT,
     MESSAGES,
-    STATES,
-    STATUS,
     VERSION,
     loss_detection_time,
 )
@@ -39,7 +40,7 @@ from drivers.wires.serial_line import SerialWire
 from long_form import shortly
 from model.rig.rig import Rig
 from model.rig.rig_file import example_rig_path
-from plates import TWO_AMPLIFIERS, write_rig
+from plates import TWO_AMPLIFIERS, make_paper_rig, write_rig
 from real_wires import (
     LIMITS,
     SHARED_WIRES,
@@ -49,6 +50,7 @@ from real_wires import (
     far_side,
     layer,
     make_bench,
+    on_amplifiers,
     on_two_amplifiers,
     rig_on_wire,
 )
@@ -197,104 +199,60 @@ async def test_broadcast_commit_starts_all_at_one_moment(
         await rig.group.disarm()
 
 
-@pytest.mark.parametrize("name", ["can+slcan", "can+socketcand"])
-@in_virtual_time
-async def test_node_that_has_restarted_is_mute_until_it_is_identified(
-    coarse_rig: Rig, name: str
-) -> None:
-    """Its network state is lost with its supply, and heartbeats with it."""
-    async with rig_on_wire(coarse_rig, WIRES[name]) as rig:
-        main = rig.group.amplifiers["main"]
-        rig.devices["main"].inject_fault(FaultWindow(fault="reboot", lasts=0.2))
-        await asyncio.sleep(0.3)
-        with pytest.raises(LinkError):
-            await main.read_status()
-        await main.identify()
-        assert (await main.read_status())["state"] == STATES["SWITCH_ON_DISABLED"]
+@dataclass(kw_only=True)
+class OnARig(Taken):
+    """The amplifiers of a rig on a wire; stopped: what the last stop confirmed, begun at since."""
+
+    rig: HostedRig
+    stopped: Mapping[str, StopOutcome] = field(default_factory=dict)
+    since: float = 0.0
+
+    @property
+    def hosts(self) -> SimpleNamespace:
+        """What the host has of the amplifiers, by name."""
+        return SimpleNamespace(**self.rig.group.amplifiers)
+
+    def injects(self, of: str, **window: Any) -> None:
+        """Let a fault of an amplifier begin."""
+        self.rig.devices[of].inject_fault(FaultWindow(**window))
+
+    async def plays(self, level: float) -> None:
+        """Play 110 Hz at a level on the first channel of all."""
+        await self.rig.group.apply(
+            {name: [layer((0, 110.0, level))] for name in self.rig.group.amplifiers}
+        )
+
+    async def beats(self, seconds: float) -> None:
+        """Feed the watchdogs for a time."""
+        await self.rig.beat_until(threads.now() + seconds)
+
+    async def stops(self) -> None:
+        """Stop all."""
+        self.since = threads.now()
+        self.stopped = await self.rig.group.stop()
+
+
+@asynccontextmanager
+async def on_a_rig(*names: str, wire: str, speed: int = 0) -> AsyncIterator[OnARig]:
+    """The paper's plate on a wire at a speed; names: of several amplifiers that share it."""
+    rig, kind = make_paper_rig(12, 9), (SHARED_WIRES if names else WIRES)[wire]
+    rig = on_amplifiers(rig, names) if names else rig
+    at_speed = replace(kind, speed=speed or SPEEDS.get(kind.kind))
+    async with rig_on_wire(rig, at_speed, watchdog=2.0 if speed else WATCHDOG) as hosted:
+        yield OnARig(rig=hosted)
+
+
+COURSES = courses(Path(__file__).with_name("courses.yaml"))
 
 
 @pytest.mark.parametrize(
-    ("kind", "fault"),
-    [
-        ("over_voltage", "OVER_VOLTAGE"),
-        ("arc", "ARC"),
-        ("over_current", "OVER_CURRENT"),
-        ("channel", "CHANNEL"),
-        ("over_temperature", "OVER_TEMPERATURE"),
-        ("interlock", "INTERLOCK"),
-        ("hang", "WATCHDOG"),
-        ("nak_storm", "WATCHDOG"),
-        ("reboot", "NONE"),
-        ("unplug", "WATCHDOG"),
-    ],
+    ("name", "wire"),
+    [(name, wire) for name, each in COURSES.items() for wire in each.get("wires", WIRES)],
 )
-@in_virtual_time
-async def test_fault_silences_and_its_amplifier_is_found_again(
-    coarse_rig: Rig, wire: SimulatedWire, kind: FaultKind, fault: str
-) -> None:
-    """A second of it: silent in time; the host stops, and finds what has happened afterwards."""
-    async with rig_on_wire(coarse_rig, wire) as rig:
-        await rig.group.arm()
-        await rig.group.apply({"main": [layer((0, 110.0, 1.0))]})
-        await rig.beat_until(threads.now() + 0.2)
-        assert rig.levels("main")[0] == 1.0
-        rig.devices["main"].inject_fault(FaultWindow(fault=kind, lasts=1.0))
-        with pytest.raises((CommandRefused, LinkError)):
-            await rig.beat_until(threads.now() + 2.0)
-        assert not rig.group.is_armed
-        await asyncio.sleep(0.3)
-        assert not any(rig.levels("main"))
-        await asyncio.sleep(1.0)
-        await rig.reopen(within=5.0)
-        status = rig.group.amplifiers["main"].status
-        assert status is not None
-        assert status["fault"] == FAULTS[fault]
-        allowed = ["FAULT", "QUICK_STOP_ACTIVE", *(["SWITCH_ON_DISABLED"] * (kind == "reboot"))]
-        assert status["state"] in [STATES[each] for each in allowed]
-        await rig.group.clear()
-        await rig.group.arm()
-        await rig.group.apply({"main": [layer((0, 110.0, 0.5))]})
-        await rig.group.disarm()
-
-
-@pytest.mark.parametrize("name", SHARED_WIRES)
-@in_virtual_time
-async def test_hung_amplifier_of_a_line_leaves_the_other_to_be_stopped(
-    coarse_rig: Rig, name: str
-) -> None:
-    """East hangs: west is silent within 50 ms of the stop, east by its watchdog."""
-    async with rig_on_wire(on_two_amplifiers(coarse_rig), SHARED_WIRES[name]) as rig:
-        await rig.group.arm()
-        played = [layer((0, 110.0, 0.5))]
-        await rig.group.apply({"east": played, "west": played})
-        rig.devices["east"].inject_fault(FaultWindow(fault="hang"))
-        begin = threads.now()
-        stopping = asyncio.create_task(rig.group.stop())
-        await asyncio.sleep(0.05)
-        assert not any(rig.levels("west"))
-        assert rig.levels("east")[0] == 0.5
-        stopped = await stopping
-        assert stopped["west"].is_confirmed
-        assert not stopped["east"].is_confirmed
-        await asyncio.sleep(begin + 0.3 - threads.now())
-        assert not any(rig.levels("east"))
-        assert stopped["east"].may_play_until > begin
-
-
-@pytest.mark.parametrize(("kind", "bits"), [("serial", 10), ("modbus-rtu", 11)])
-@in_virtual_time
-async def test_frames_take_their_time_on_a_slow_line(coarse_rig: Rig, kind: str, bits: int) -> None:
-    """At 9600 bit/s a status of an amplifier of four channels takes as long as its bytes do.
-
-    Request and reply have 19 words and 8 to 9 bytes more each way on a serial line.
-    """
-    async with rig_on_wire(coarse_rig, SimulatedWire(kind, speed=9600), watchdog=2.0) as rig:
-        main = rig.group.amplifiers["main"]
-        begin = threads.now()
-        await main.read_status()
-        words = STATUS.words + 4 + 8  # levels, tokens
-        least = 2 * words * bits / 9600
-        assert least < threads.now() - begin < 2 * least + 0.02
+def test_rig_keeps_to_its_course(name: str, wire: str) -> None:
+    """Every step is as it is in the file, on every wire that it names, or on all."""
+    course = {key: value for key, value in COURSES[name].items() if key != "wires"}
+    follow({**course, "wire": wire}, on_a_rig)
 
 
 def line_to(device: AmplifierDevice) -> Line:

@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 import pytest
 from matplotlib.colors import to_hex
-from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 from typer.testing import CliRunner
 
@@ -355,26 +354,19 @@ def test_results_become_frames(table: era.LocalizationTable) -> None:
     assert list(felt.columns[1:]) == ["target_1_m_s2", "quiet_1_m_s2", "quiet_2_m_s2"]
 
 
-def markers(figure: Figure) -> dict[str, str]:
-    """Colours of the ERAs' marks, by place in centimetres."""
-    (axes, *_) = figure.axes
-    return {
-        f"{float(line.get_xdata()[0]):.0f},{float(line.get_ydata()[0]):.0f}": to_hex(
-            line.get_color()
-        )
+def test_draw_map_marks_driven_eras() -> None:
+    """Red where driven, green elsewhere, by place in cm; the scale ends at the largest value."""
+    drive = {"SW": 110, "NE": era.Drive(110, level=0.5)}
+    axes, scale = era.draw_map(PLATE, drive, title="a diagonal").axes
+    red, green = "#d62728", "#2ca02c"
+    colours = {
+        tuple(np.round(line.get_xydata()[0]).tolist()): to_hex(line.get_color())
         for line in axes.lines
         if line.get_marker() == "o"
     }
-
-
-def test_draw_map_marks_driven_eras() -> None:
-    """Red where driven, green elsewhere; the scale ends at the largest value."""
-    figure = era.draw_map(PLATE, {"SW": 110, "NE": era.Drive(110, level=0.5)}, title="a diagonal")
-    red, green = "#d62728", "#2ca02c"
-    assert markers(figure) == {"0,0": red, "30,0": green, "30,23": red, "0,23": green}
-    assert figure.axes[0].get_title() == "a diagonal"
-    peak = PLATE.map({"SW": 110, "NE": era.Drive(110, level=0.5)}).peak.max() / 9.8
-    assert figure.axes[1].get_ylim()[1] == pytest.approx(peak)
+    assert colours == {(0, 0): red, (30, 0): green, (30, 23): red, (0, 23): green}
+    assert axes.get_title() == "a diagonal"
+    assert scale.get_ylim()[1] == pytest.approx(PLATE.map(drive).peak.max() / 9.8)
 
 
 def test_draw_answer_shows_fingers_and_levels(table: era.LocalizationTable) -> None:

@@ -592,7 +592,7 @@ def test_every_function_and_argument_is_listed() -> None:
     public = {getattr(era, name) for name in era.__all__}
     assert {each for each in public if inspect.isfunction(each)} <= set(GOOD)
     for function, given in GOOD.items():
-        assert (set(inspect.signature(function).parameters) - TAKES_ANYTHING) == set(given)
+        assert set(inspect.signature(function).parameters) - TAKES_ANYTHING == set(given)
 
 
 FILES = sorted(

@@ -7,7 +7,7 @@ import signal
 import sys
 from collections import deque
 from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, closing
 from dataclasses import dataclass
 from pathlib import Path
 from subprocess import PIPE, Popen
@@ -137,26 +137,6 @@ class Instrument:
         return what in NUMBERS
 
 
-@asynccontextmanager
-async def on_tcp(instrument: Instrument) -> AsyncIterator[int]:
-    """Serve the instrument over TCP; its port."""
-
-    async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        try:
-            while line := await reader.readline():
-                answer = instrument.message(line.decode("ascii").strip())
-                if answer is not None:
-                    writer.write(f"{answer}\n".encode("ascii"))
-        finally:
-            writer.close()
-
-    server = await asyncio.start_server(serve, "127.0.0.1", 0)
-    try:
-        yield server.sockets[0].getsockname()[1]
-    finally:
-        server.close()
-
-
 SCRIPT = Path(era_haptics.__file__).parents[1] / "examples" / "adapter" / "scpi.py"
 LIMITS = GuardLimits(20.0, 900.0, 1.0)
 FULL = 5.0  # V
@@ -171,10 +151,19 @@ async def ended(running: Popen[bytes]) -> int:
 
 @asynccontextmanager
 async def driven() -> AsyncIterator[tuple[Instrument, Popen[bytes], str]]:
-    """The instrument, the adapter in front of it, and its URL."""
+    """The instrument on TCP, the adapter in front of it, and its URL."""
     instrument = Instrument()
-    async with on_tcp(instrument) as port:
-        with Popen([sys.executable, str(SCRIPT), f"127.0.0.1:{port}"], stdout=PIPE) as running:  # noqa: ASYNC220
+
+    async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        with closing(writer):
+            while line := await reader.readline():
+                answer = instrument.message(line.decode("ascii").strip())
+                if answer is not None:
+                    writer.write(f"{answer}\n".encode("ascii"))
+
+    with closing(await asyncio.start_server(serve, "127.0.0.1", 0)) as server:
+        address = f"127.0.0.1:{server.sockets[0].getsockname()[1]}"
+        with Popen([sys.executable, str(SCRIPT), address], stdout=PIPE) as running:  # noqa: ASYNC220
             try:
                 url = await asyncio.to_thread(running.stdout.readline)
                 yield instrument, running, url.decode().strip()

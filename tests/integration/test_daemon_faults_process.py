@@ -76,7 +76,7 @@ from model.rig.rig_file import load_rig
 from model.structure.attachments import FingertipLoad, footprints_of
 from model.table.table import LocalizationTable
 from model.table.table_file import build_table
-from model.transients.base_motion import BaseEnvelope, shaped
+from model.transients.base_motion import shaped
 from plates import TWO_AMPLIFIERS, write_rig
 from set_table import only
 from several_fingers import free_port, panel
@@ -453,12 +453,16 @@ def patterns_match_table(played: Played, truth: Truth) -> None:
 def plate_response_matches_model(played: Played, truth: Truth) -> None:
     """Sensors agree with the direct solver for that drive; phases have any common origin.
 
-    Within 1 % of the largest: structural damping is viscous in time, and other modes still ring.
+    Within 1 % of the largest, each frequency turned to where they agree best: structural damping is
+    viscous in time, and other modes still ring.
     """
     points = np.array(list(SENSORS.values()))
     for heard in _touched(played):
         _, wanted = truth.fields(heard, points)
-        apart = _apart(heard.phasors, wanted)
+        assert heard.phasors.shape == wanted.shape
+        common = (wanted.conj() * heard.phasors).sum(axis=1)
+        turned = heard.phasors * np.exp(-1j * np.angle(common))[:, None]
+        apart = (np.abs(turned - wanted).max(axis=1) / np.abs(wanted).max(axis=1)).max()
         assert apart <= 0.01, (heard.situation, apart)
 
 
@@ -501,28 +505,20 @@ def localization_matches_prediction(played: Played, truth: Truth) -> None:
 def onset_matches_prediction(played: Played, truth: Truth) -> None:
     """Contrast of the peaks over the first 100 ms from rest within 2 dB.
 
-    Of the onset that the table gives, with as many knots as the wire carries, played without wires
-    on the plate that was drawn.
+    Of the onset that the table gives, with as many knots as the wire carries, at moments equally
+    far apart, played without wires on the plate that was drawn.
     """
-    timing = Timing(truth.table)
     first, *_ = _touched(played)
-    layer = truth.layer(first)
-    pattern = timing.with_envelopes(layer, truth.placed(first.situation), ending=False)
-    if truth.onset_knots is not None:
-        onset = {name: _sampled(each, truth.onset_knots) for name, each in pattern.onset.items()}
+    situation, knots = first.situation, truth.onset_knots
+    placed = truth.placed(situation)
+    pattern = Timing(truth.table).with_envelopes(truth.layer(first), placed, ending=False)
+    if knots is not None:
+        onset = {}
+        for name, each in pattern.onset.items():
+            times = np.linspace(0, each.duration, knots + 2)[1:]
+            values = tuple(each.amplitude(times))
+            onset[name] = replace(each, knots=values, step=float(times[0]))
         pattern = replace(pattern, onset=onset)
-    predicted = _onset_contrast(truth, first.situation, pattern)
-    measured = _contrast(
-        {p: felt.peak for p, felt in first.onset.items()},
-        first.situation,
-        first.onset[first.situation.felt_at].weights,
-    )
-    judged = min(predicted, JUDGED_UP_TO)
-    assert abs(min(measured, JUDGED_UP_TO) - judged) <= 2, (measured, predicted)
-
-
-def _onset_contrast(truth: Truth, situation: Situation, pattern: Layer) -> float:
-    """Contrast of the peaks over the first 100 ms of a pattern from rest [dB]."""
     real = truth.drawn.plate.realised(truth.rig)
     plant = Plant(reduce_plate(real.plate, real.mesh, footprints_of(real.eras)), real.eras)
     plant.set_contacts(truth.resting(situation))
@@ -542,13 +538,11 @@ def _onset_contrast(truth: Truth, situation: Situation, pattern: Layer) -> float
         for place, part in zip(discs, np.split(samples, ends, axis=1), strict=True)
     }
     weights = fingertip_weights(*truth.stream.places[situation.felt_at], truth.rig.plate)
-    return _contrast(peaks, situation, weights)
-
-
-def _sampled(envelope: BaseEnvelope, knots: int) -> BaseEnvelope:
-    """The values of an envelope at so many moments, equally far apart, and at its end."""
-    times = np.linspace(0, envelope.duration, knots + 2)[1:]
-    return replace(envelope, knots=tuple(envelope.amplitude(times)), step=float(times[0]))
+    predicted = _contrast(peaks, situation, weights)
+    peaks = {place: felt.peak for place, felt in first.onset.items()}
+    measured = _contrast(peaks, situation, first.onset[situation.felt_at].weights)
+    judged = min(predicted, JUDGED_UP_TO)
+    assert abs(min(measured, JUDGED_UP_TO) - judged) <= 2, (measured, predicted)
 
 
 def plate_decays(played: Played, truth: Truth) -> None:
@@ -598,14 +592,6 @@ def _touched(played: Played) -> list[Heard]:
     touched = [heard for heard in played.heard if heard.situation.fingers]
     assert all(heard.patterns for heard in touched)
     return touched
-
-
-def _apart(got: ComplexArray, wanted: ComplexArray) -> float:
-    """Largest difference of phasors (f, s), each frequency turned to where they agree best."""
-    assert got.shape == wanted.shape
-    common = (wanted.conj() * got).sum(axis=1)
-    turned = got * np.exp(-1j * np.angle(common))[:, None]
-    return float((np.abs(turned - wanted).max(axis=1) / np.abs(wanted).max(axis=1)).max())
 
 
 def _contrast(peaks: Mapping[str, FloatArray], situation: Situation, weights: FloatArray) -> float:

@@ -226,7 +226,8 @@ async def test_each_finger_has_its_content_in_a_colour_of_its_own(
             for number in (2, 3):
                 button = f"#layers button:nth-child({number})"
                 name = await tab.evaluate(f"document.querySelector('{button}').textContent")
-                own = f"{frequency_at(era, TWO_PEOPLE[0]):.0f} Hz" != name
+                west = min(era.status().contacts, key=lambda each: each.x_m)
+                own = f"{west.frequency_hz:.0f} Hz" != name
                 await tab.click(button)
                 await tab.until(fingers, partial(is_brighter_at, own))
             await tab.click("#layers button")
@@ -249,12 +250,6 @@ def is_brighter_at(own: int, fingers: list[list[list[int]]]) -> bool:
     """Whether the ground of one of two fingers is brighter than that of the other."""
     brightness = [sum(ground) for _, ground in fingers]
     return len(brightness) == 2 and brightness[own] > brightness[1 - own]
-
-
-def frequency_at(era: Client, share: tuple[float, float]) -> float | None:
-    """The frequency [Hz] that the finger at a place feels."""
-    contact = min(era.status().contacts, key=lambda each: abs(each.x_m - share[0] * LENGTH))
-    return contact.frequency_hz
 
 
 async def test_shift_and_click_leaves_fingers_resting(page: Page, era: Client) -> None:
@@ -291,7 +286,7 @@ async def test_touches_become_contacts_of_the_daemon(page: Page, era: Client) ->
     """Two at once, at their places in metres, moved and lifted; the last one is the target."""
     await arm(page, era)
     async with fingers_down(page, *PLACES):
-        for (x, y), (right, down) in zip((await contacts(era, 2)), PLACES, strict=True):
+        for (x, y), (right, down) in zip(await contacts(era, 2), PLACES, strict=True):
             assert x == pytest.approx(right * LENGTH, abs=1e-3)
             assert y == pytest.approx((1 - down) * WIDTH, abs=1e-3)
         await page.until("document.querySelectorAll('.contact').length === 2")

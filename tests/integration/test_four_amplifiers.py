@@ -399,7 +399,7 @@ SCHEDULE = [
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory):
     """A TUIO capture of the schedule."""
-    return write_schedule((tmp_path_factory.mktemp("touches") / "touches.tuio"), SCHEDULE, 2.1)
+    return write_schedule(tmp_path_factory.mktemp("touches") / "touches.tuio", SCHEDULE, 2.1)
 
 
 @pytest.fixture(scope="module")

@@ -55,7 +55,7 @@ from model.transients.base_motion import along_lines, raised_cosine
 from model.transients.shaping import SAMPLE_RATE, Transients
 from plates import smooth_rig
 from set_table import phased, wants
-from several_fingers import WIRES, Felt, Pressed, playable
+from several_fingers import WIRES, Pressed, playable
 from several_fingers import table as paper_table
 
 EXAMPLE = Path(__file__).parents[4] / "examples" / "panel_layout.yaml"
@@ -331,26 +331,19 @@ def test_every_kind_has_its_rows() -> None:
     )
 
 
-@cache
-def pressed(case: Case, wire: str) -> list[Felt]:
-    """What equal presses feel."""
-    where = "on_move" if case.effect.is_for_motion else "on_press"
-    region = Region("all", Circle(*CENTRE, 0.06), **{where: "it"})
-    layout = SurfaceLayout((region,), {"it": case.effect}, elsewhere=None)
-    chain = Pressed(smooth_rig(), table(), layout, wire)
-    presses = chain.press(*[case.way] * PRESSES.get(wire, FEW), held=case.held)
-    assert all(len(each) == 1 for each in presses)
-    return [felt for (felt,) in presses]
-
-
 @pytest.mark.usefixtures("plain_pictures")
 @pytest.mark.parametrize(("name", "wire"), in_turn(CASES, [*WIRES]))
 def test_effect_is_felt_as_promised_and_alike_at_every_press(name: str, wire: str) -> None:
     """Within 3 dB of what layout and report promise, all presses within 2 dB, on the plate."""
     case = CASES[name]
-    presses = pressed(case, wire)
+    where = "on_move" if case.effect.is_for_motion else "on_press"
+    region = Region("all", Circle(*CENTRE, 0.06), **{where: "it"})
+    layout = SurfaceLayout((region,), {"it": case.effect}, elsewhere=None)
+    chain = Pressed(smooth_rig(), table(), layout, wire)
+    ways = [case.way] * PRESSES.get(wire, FEW)
+    presses = [felt for (felt,) in chain.press(*ways, held=case.held)]
     levels = [felt.level_db_sl(case.duration, since=case.since) for felt in presses]
-    assert levels == pytest.approx([case.effect.level] * len(presses), abs=3.0)
+    assert levels == pytest.approx([case.effect.level] * len(ways), abs=3.0)
     if name != "ramp":  # which reports each of its steps
         assert levels == pytest.approx([felt.promised_db_sl for felt in presses], abs=3.0)
     assert max(levels) - min(levels) <= 2.0

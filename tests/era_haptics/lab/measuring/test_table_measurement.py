@@ -641,7 +641,7 @@ def test_tones_that_have_not_settled_are_left_out(rig: Rig, tmp_path: Path) -> N
     recording(path, range(4), references=4, held=0.6)
     rate, samples = wavfile.read(path)
     rising = samples.astype(float)
-    rising[:, 0] *= np.exp(-(((np.arange(len(samples)) / rate) % 0.9) / 0.5))
+    rising[:, 0] *= np.exp(-(np.arange(len(samples)) / rate % 0.9) / 0.5)
     wavfile.write(path, rate, rising.astype(np.int16))
     found = read_stepped(path, Desk(rig, FIXED))
     assert {each.sensor for each in found} == {"P2"}

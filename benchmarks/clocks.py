@@ -22,6 +22,8 @@ from itertools import combinations
 from typing import Any, TypeAlias
 
 from benchmarks.setting import support
+from controller.effects.layout import SurfaceLayout
+from controller.effects.player import EffectPlayer
 from controller.operation.plate_controller import Controller
 from controller.sources.touch import Touch, TouchFrame
 from drivers.host.amplifier import Amplifier
@@ -39,7 +41,6 @@ _far_side: Any = support("real_wires").far_side
 _on_amplifiers: Any = support("real_wires").on_amplifiers
 _small_table: Any = support("plates").small_table
 _paper_rig: Any = support("plates").make_paper_rig
-_intents: Any = support("set_table").BuzzNewestContact
 run_virtual: Any = support("virtual_lines").run_virtual
 
 NAMES = ("west", "middle", "east")
@@ -102,7 +103,7 @@ def make_rig(names: tuple[str, ...]) -> Rig:
 def make_controller(rig: Rig, urls: Mapping[str, str], **more: Any) -> Controller:
     """A control loop in which the newest finger feels a buzz; more: as a `Controller` takes."""
     table = _small_table()
-    intents, timing = _intents(), Timing(table)
+    intents, timing = EffectPlayer(SurfaceLayout()), Timing(table)
     return Controller(
         rig, table, lines=Lines, urls=urls, intent_source=intents, timing=timing, **more
     )

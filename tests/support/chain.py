@@ -41,7 +41,7 @@ from plate_witness import STEP, WATCHDOG, LoopWitness, OperatorCommand, PlateJud
 from real_wires import FarSide, far_side
 from registry import threads
 from registry.limits import GuardLimits
-from set_table import BuzzNewestContact, SetTable, SetTiming, make_rig
+from set_table import SetTable, SetTiming, make_rig
 from sim.amplifier.readings import AmplifierSummary
 from sim.amplifier.simulated_amplifier import SimulatedAmplifier
 from sim.far_ends.wire_assignment import SimulatedWire
@@ -162,7 +162,7 @@ class Chain:
             plate_judge = PlateJudge(far, witness, step=sensed_every, watchdog=watchdog)
 
             def make(**more: Any) -> Controller:
-                own = {"intent_source": BuzzNewestContact(), **given, **more}
+                own = {"intent_source": EffectPlayer(SurfaceLayout()), **given, **more}
                 controller = Controller(rig, table, lines=Lines, urls=far.urls, **own)
                 observe(controller.cycle.observers)
                 return controller

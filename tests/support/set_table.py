@@ -14,15 +14,12 @@ from typing import Any
 import numpy as np
 
 from controller.play import joint_answers, loop
-from controller.play.intent import NO_CONTACTS, HapticIntent, Target
-from controller.sources.touch import Contact, ContactKey
 from model.answer.answer import NO_LIMITS, Answer, Contents, Layer, Limits, Sensation, Stream, Tones
 from model.answer.plan import answer, prepare_answers, query, scaled
 from model.answer.stimulus import ANY, ANY_BAND, BY_NAME, Finger, Placement, Stimulus, together
 from model.arrays import FloatArray, Point
 from model.ensemble.draws import ClockErrors
 from model.fem import Mesh
-from model.finger import STRONG_DB_SL
 from model.rig.rig import Channel, Rig
 from model.structure.attachments import Era
 from model.structure.material import Material
@@ -266,24 +263,3 @@ def drives(found: Answer) -> list[Excitation]:
     """What plays for each finger, empty where nothing does."""
     numbers = [each.layer for each in found.fingers]
     return [{} if n is None else found.layers[n].excitation for n in numbers]
-
-
-class BuzzNewestContact:
-    """Targets the newest contact; after it lifts, none until the next one."""
-
-    def __init__(self, level_db_sl: float | None = STRONG_DB_SL) -> None:
-        self._level = level_db_sl
-        self._seen: frozenset[ContactKey] = frozenset()
-        self._target: ContactKey | None = None
-
-    def intent(self, contacts: Sequence[Contact], now: float) -> HapticIntent:
-        """Target the newest contact if it is new, else the previous target while it is down."""
-        keys = [contact.key for contact in contacts]
-        if keys and keys[-1] not in self._seen:
-            self._target = keys[-1]
-        elif self._target not in keys:
-            self._target = None
-        self._seen = frozenset(keys)
-        if self._target is not None:
-            return HapticIntent((Target(self._target, self._level),))
-        return HapticIntent((), "the target was lifted" if keys else NO_CONTACTS)

@@ -44,7 +44,6 @@ from plate_witness import PlateTimes
 from plates import make_paper_rig, small_table
 from real_wires import after_each, on_amplifiers
 from registry import threads
-from set_table import BuzzNewestContact
 from sim.far_ends.wire_assignment import SimulatedWire
 from sim.faults import FaultKind, FaultWindow
 from sim.plant.imperfections import Imperfections, draw_imperfections
@@ -351,7 +350,7 @@ def soak_rig(plate: str, amplifiers: tuple[str, ...]) -> Rig:
 
 def soak_source(plate: str) -> IntentSource:
     """What its fingers shall feel, as a new process begins it."""
-    return BuzzNewestContact() if plate == "eras" else EffectPlayer(_layout())
+    return EffectPlayer(SurfaceLayout() if plate == "eras" else _layout())
 
 
 @cache

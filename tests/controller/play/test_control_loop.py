@@ -21,7 +21,8 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 
-from chain import FINGER, Chain, Sent, set_chain, set_running
+from chain import FINGER, OTHER, Chain, Sent, set_chain, set_running
+from controller.effects.effect import Region
 from controller.effects.kinds import Click
 from controller.effects.layout import SurfaceLayout, default_effects
 from controller.effects.player import EffectPlayer
@@ -40,6 +41,7 @@ from drivers.protocol.sets import Command
 from model.answer.answer import Answer, Layer, Limits
 from model.answer.answer_report import Timing
 from model.answer.stimulus import Finger, Placement, Stimulus
+from model.config.fields import Circle
 from model.errors import InputError
 from model.rig.rig import Channel
 from model.structure.material import Material
@@ -49,7 +51,7 @@ from model.vibration import Excitation, Tone
 from plates import small_problem, small_table
 from registry import threads
 from registry.limits import HAND_LOAD
-from set_table import BuzzNewestContact, SetTiming, set_answer
+from set_table import SetTiming, set_answer
 from several_fingers import LAYOUT, LEFT, RIGHT, fingers_on, playable, table
 from sim.far_ends.wire_assignment import SimulatedWire
 from virtual_lines import in_virtual_time
@@ -224,8 +226,13 @@ async def played(
         yield chain
 
 
+REST = Region("rest", Circle(*OTHER[1:], 0.02))
+"""Where the other finger is, which feels nothing there."""
 SOURCES: Mapping[str, Callable[[], Any]] = {
-    "newest": BuzzNewestContact,
+    "newest": lambda: EffectPlayer(SurfaceLayout()),
+    "but the other": lambda: EffectPlayer(
+        SurfaceLayout((Region("rest", Circle(*OTHER[1:], 0.02)),))
+    ),
     "all": Always,
     "clicks": lambda: EffectPlayer(SurfaceLayout(effects={"click": Click()}, elsewhere="click")),
 }
@@ -389,7 +396,7 @@ async def test_controller_refuses_amplifiers_that_do_not_fit_the_rig() -> None:
                     changed,
                     chain.table,
                     lines=Lines,
-                    intent_source=BuzzNewestContact(),
+                    intent_source=EffectPlayer(SurfaceLayout()),
                     timing=SetTiming(),
                     urls=given,
                 ).open()

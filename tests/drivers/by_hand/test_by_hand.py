@@ -50,7 +50,6 @@ from sim.far_ends.can_amplifiers import CanBus, SlcanAdapter
 from sim.transport.far_end import make_terminal
 from sim.transport.simulated_line import LINE_KINDS, PROMPT
 
-LIMITS = GuardLimits(20.0, 1000.0, 1.0)
 ADDRESSED = [wire for wire in WORD_WIRES if not wire.endswith(("tcp", "server", "socketcand"))]
 """Wires whose far end lasts: the others have one for each connection, at the first addresses."""
 
@@ -70,7 +69,9 @@ def started(monkeypatch: pytest.MonkeyPatch) -> None:
 async def leave_playing(far: WordFarSide, number: int = 1) -> None:
     """Play at half level, as a host that then ends without a word."""
     lines = Lines()
-    amplifier = await lines.amplifier(far.url(number), LIMITS, name="a", is_output=None)
+    amplifier = await lines.amplifier(
+        far.url(number), GuardLimits(20.0, 1000.0, 1.0), name="a", is_output=None
+    )
     await amplifier.open()
     await amplifier.arm(77, 2.0)
     await amplifier.stage(5, [AmplifierLayer(0, (AmplifierTone(0, 100.0, 0.5),), 0.0)], now=True)

@@ -218,7 +218,6 @@ async def test_voltage_and_current_of_each_channel(kind: str) -> None:
 
 LIMITS = GuardLimits(20.0, 1000.0, 1.0)
 SERVED = [name for name in WORD_WIRES if name.endswith(("tcp", "server", "socketcand"))]
-CUT = [name for name in WORD_WIRES if "python-can" not in name]
 
 
 @asynccontextmanager
@@ -337,7 +336,11 @@ async def test_group_plays_over_a_wire_and_stops(
 
 @pytest.mark.real_time
 @pytest.mark.parametrize(
-    "wire", shortly(CUT, ["modbus+rtu", "serial+tcp", "modbus+tcp", "can+slcan server"])
+    "wire",
+    shortly(
+        [name for name in WORD_WIRES if "python-can" not in name],
+        ["modbus+rtu", "serial+tcp", "modbus+tcp", "can+slcan server"],
+    ),
 )
 async def test_cut_line_is_lost_once_and_opened_again(wire: str) -> None:
     """Requests of both amplifiers fail with the same message, and those of a new line do not."""

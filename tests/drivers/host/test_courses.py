@@ -38,8 +38,6 @@ from sim.amplifier.readings import AmplifierClock, Crystal
 from sim.amplifier.simulated_amplifier import SimulatedAmplifier as FarEnd
 from virtual_lines import KINDS, MemoryLine, delayed, group_of, losing, of_parts, unaltered
 
-SET = MESSAGES["Set"].number
-
 
 def altered(
     far: FarEnd, change: Callable[[str, Values, float, Callable[..., Values]], Values]
@@ -473,7 +471,7 @@ class OnLines(Taken):
         def replied(name: str, data: bytes) -> list[tuple[float, bytes]]:
             (frame,) = FrameReader().feed(data)
             if name == "Set":
-                reply = frame._replace(kind=SET | REPLY_BIT, payload=payload)
+                reply = frame._replace(kind=MESSAGES["Set"].number | REPLY_BIT, payload=payload)
                 line.later(0.0001, line.line.received, encode_frame(reply))
             return unaltered(name, data)
 

@@ -247,9 +247,6 @@ def test_contacts_drop_vectors_of_lifted_fingers(coarse_rig: Rig, reduced: Reduc
         assert_allclose(new, old, rtol=0, atol=1e-4 * np.abs(old).max())
 
 
-POINTS = np.array([[0.11, 0.07], [0.03, 0.2], [0.3, 0.02]])
-
-
 def test_contacts_are_solved_once(
     coarse_rig: Rig, reduced: ReducedPlate, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -268,7 +265,7 @@ def test_contacts_are_solved_once(
 def test_plant_sampling_rate_may_change(coarse_rig: Rig, reduced: ReducedPlate) -> None:
     """Every tenth sample at 10 kHz is the sample at 1 kHz, also right after the other rate."""
     quick, mixed = (vibrating(reduced, coarse_rig) for _ in range(2))
-    shapes = reduced.at(POINTS)
+    shapes = reduced.at(np.array([[0.11, 0.07], [0.03, 0.2], [0.3, 0.02]]))
     _, expected = quick.advance(0.12, sample_rate=10_000.0, shapes=shapes)
     mixed.advance(0.07, sample_rate=10_000.0, shapes=shapes)
     assert mixed.advance(0.10, sample_rate=1000.0, shapes=shapes[:0])[1].shape == (30, 0)
@@ -282,10 +279,6 @@ def test_plant_sampling_rate_may_change(coarse_rig: Rig, reduced: ReducedPlate) 
     )
 
 
-COARSE_RATE = 10_000.0
-AT = np.array([[0.11, 0.09]])
-
-
 def plant_of(rig: Rig) -> Plant:
     """Its plate at rest."""
     places = footprints_of(rig.eras, rig.masses)
@@ -296,8 +289,8 @@ def plant_of(rig: Rig) -> Plant:
 def settled(plant: Plant, until: float, frequency: float) -> complex:
     """Amplitude at a point in the last fifth of a second up to a time."""
     plant.skip(until - 0.2)
-    shapes = plant.reduced.at(AT)
-    times, felt = plant.advance(until, sample_rate=COARSE_RATE, shapes=shapes)
+    shapes = plant.reduced.at(np.array([[0.11, 0.09]]))
+    times, felt = plant.advance(until, sample_rate=10_000.0, shapes=shapes)
     return complex(lock_in(times, felt, frequency)[0])
 
 

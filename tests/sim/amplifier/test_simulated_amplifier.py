@@ -129,9 +129,9 @@ def test_moment_of_a_high_word(rate: int) -> None:
 ARM = {"session": 7, "watchdog": 250, "shift": 0}
 
 
-def armed(*, channels: int = 2) -> SimulatedAmplifier:
+def armed() -> SimulatedAmplifier:
     """An amplifier armed by session 7 at time 0, watchdog 0.25 s."""
-    amplifier = SimulatedAmplifier("a", channels=channels)
+    amplifier = SimulatedAmplifier("a", channels=2)
     amplifier.handle("Arm", ARM, 0.0)
     return amplifier
 
@@ -145,15 +145,6 @@ def part_of(token: int, *layers: LayerSet, now: bool = True) -> Values:
     """The only part of a set of session 7."""
     (part,) = parts(pack_layers(layers), session=7, token=token, now=now)
     return part
-
-
-def play(
-    amplifier: SimulatedAmplifier, token: int, at: float, *commands: Command, **layer: int
-) -> Values:
-    """Play commands in a layer at once, with a ramp of 20 ms."""
-    number = layer.pop("layer", 0)
-    one = LayerSet(number, layer.pop("ramp", 20), layer.pop("valid_for", 0), commands)
-    return amplifier.handle("Set", part_of(token, one), at)
 
 
 def levels(amplifier: SimulatedAmplifier, at: float) -> list[int]:
@@ -250,7 +241,7 @@ def test_temperature_follows_the_mean_square_level() -> None:
     """Half level on both channels: a quarter of 30 K, 1 - 1/e of it after 120 s."""
     amplifier = SimulatedAmplifier("a", channels=2)
     amplifier.handle("Arm", {"session": 7, "watchdog": 2000, "shift": 0}, 0.0)
-    play(amplifier, 1, 0.0, tone(0), tone(1), ramp=0)
+    amplifier.handle("Set", part_of(1, LayerSet(0, 0, 0, (tone(0), tone(1)))), 0.0)
     for second in range(1, 121):
         status = amplifier.handle("Ping", {"session": 7, "rate": 0}, float(second))
     assert status["temperature"] == pytest.approx(250 + 75 * (1 - 1 / math.e), abs=1)

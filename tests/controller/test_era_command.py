@@ -1,36 +1,67 @@
-"""The `era` command, errors and their exit statuses, and the socket reserved for one daemon."""
+"""The `era` command with its exit statuses, and what a daemon's process needs.
+
+The socket reserved for one daemon, its log, notices to systemd, dumps and latencies; none may block
+it.
+"""
 
 import errno
+import io
+import json
+import logging
 import os
 import signal
 import socket
 import subprocess
 import sys
+import threading
+from collections.abc import Iterator, Mapping
+from contextlib import closing, contextmanager
 from importlib.metadata import version
 from pathlib import Path
 from textwrap import dedent
+from unittest.mock import Mock
 
 import pytest
 
+from chain import set_chain
 from controller.cli.main import main, run
 from controller.daemon.children import gateway_options
-from controller.process.daemon_process import SocketLock
+from controller.daemon.messages import LatencyStatistics
+from controller.operation.fault_dumps import DUMP_PATTERN, MAX_DUMPS, FaultDumps, write_dump
+from controller.operation.operation_states import DaemonState, Operation
+from controller.process.daemon_process import ServiceManager, SocketLock
+from controller.process.log import LogFormatter, LogThread, RateLimitFilter
+from drivers.wires.wire import Reply
+from gateway_bench import wait_for
 from interrupted import full_disk
 from model.errors import InputError
+from registry import threads
+from virtual_lines import in_virtual_time
 
 
-def test_socket_is_for_its_user_only(tmp_path: Path) -> None:
-    """Mode 0600 in a folder of mode 0700 whatever the umask, which stays; removed at the end."""
-    before = os.umask(0)
+@pytest.mark.parametrize(
+    ("folder", "mode"), [(None, 0o600), (0o750, 0o660), (0o755, 0o600), (0o710, 0o660)]
+)
+def test_socket_is_for_its_user_and_the_group_of_its_folder_only(
+    tmp_path: Path, folder: int | None, mode: int
+) -> None:
+    """For the group where the folder is closed to others; a new folder has mode 0700.
+
+    Whatever the umask, which stays; removed at the end.
+    """
+    before, path = os.umask(0), tmp_path / "new" / "era.sock"
     try:
-        lock = SocketLock(tmp_path / "new" / "era.sock")
+        if folder is not None:
+            path.parent.mkdir()
+            path.parent.chmod(folder)
+        lock = SocketLock(path)
         with lock.bind():
-            for name in ("era.sock", "era.sock.lock"):
-                assert lock.path.with_name(name).stat().st_mode & 0o777 == 0o600
-            assert lock.path.parent.stat().st_mode & 0o777 == 0o700
+            assert path.stat().st_mode & 0o777 == mode
+            assert path.with_name("era.sock.lock").stat().st_mode & 0o777 == 0o600
+            assert path.parent.stat().st_mode & 0o777 == (folder or 0o700)
         assert os.umask(0) == 0
         lock.release()
-        assert not lock.path.exists()
+        assert not path.exists()
     finally:
         os.umask(before)
 
@@ -56,44 +87,26 @@ def test_client_that_sees_the_socket_is_never_refused(
     assert [each.name for each in tmp_path.iterdir()] == ["era.sock.lock"]
 
 
-def test_socket_that_cannot_listen_leaves_no_file(
+def test_socket_that_cannot_be_locked_or_listen_is_no_second_daemon(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Neither under its name nor under the one before."""
+    """A file system without locks, as over a network, is named; a socket leaves no file.
 
-    class Deaf(socket.socket):
-        def listen(self, *backlog: int) -> None:
-            raise OSError(98, "Address already in use")
-
-    lock = SocketLock(tmp_path / "era.sock")
-    monkeypatch.setattr(socket, "socket", Deaf)
-    with pytest.raises(InputError, match="Address already in use"):
+    Neither under its name nor under the one before.
+    """
+    path = tmp_path / "era.sock"
+    with monkeypatch.context() as patched:
+        refused = OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
+        patched.setattr("fcntl.flock", Mock(side_effect=refused))
+        with pytest.raises(InputError, match=os.strerror(errno.ENOLCK)):
+            SocketLock(path)
+    deaf = type("Deaf", (socket.socket,), {"listen": Mock(side_effect=OSError(98, "in use"))})
+    lock = SocketLock(path)
+    monkeypatch.setattr(socket, "socket", deaf)
+    with pytest.raises(InputError, match="in use"):
         lock.bind()
     assert [each.name for each in tmp_path.iterdir()] == ["era.sock.lock"]
     lock.release()
-
-
-@pytest.mark.parametrize(("folder", "mode"), [(0o750, 0o660), (0o755, 0o600), (0o710, 0o660)])
-def test_socket_is_shared_with_group_of_its_folder(tmp_path: Path, folder: int, mode: int) -> None:
-    """Only where the folder is closed to others."""
-    tmp_path.chmod(folder)
-    lock = SocketLock(tmp_path / "era.sock")
-    with lock.bind():
-        assert lock.path.stat().st_mode & 0o777 == mode
-    lock.release()
-
-
-def test_socket_lock_says_that_a_file_system_has_no_locks(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """As over a network; it is no second daemon."""
-
-    def no_locks(*_: object) -> None:
-        raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
-
-    monkeypatch.setattr("fcntl.flock", no_locks)
-    with pytest.raises(InputError, match=os.strerror(errno.ENOLCK)):
-        SocketLock(tmp_path / "era.sock")
 
 
 def test_full_disk_is_named_by_the_file_that_has_no_room(tmp_path: Path) -> None:
@@ -127,37 +140,31 @@ def test_socket_lock_cannot_be_prepared_by_others(
         SocketLock(tmp_path / "era.sock")
 
 
-def test_socket_lock_refuses_folder_that_others_can_write(tmp_path: Path) -> None:
-    """Another user could listen there in the daemon's place."""
-    folder = tmp_path / "open"
-    folder.mkdir()
-    folder.chmod(0o777)
-    with pytest.raises(InputError, match=str(folder)):
-        SocketLock(folder / "era.sock")
-
-
-def test_socket_lock_refuses_symbolic_link_of_another_user(
+def test_socket_lock_refuses_folders_that_others_can_change_and_long_paths(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Its owner could redirect it to another folder later; a link of the same user is allowed."""
-    (tmp_path / "ours").mkdir()
-    link = tmp_path / "link"
-    link.symlink_to("ours")
-    SocketLock(link / "era.sock").release()
-    theirs = os.stat_result((0o120777, *link.lstat()[1:4], os.getuid() + 1, *link.lstat()[5:10]))
-    monkeypatch.setattr(Path, "lstat", lambda path: theirs)
-    with pytest.raises(InputError, match=str(link)):
-        SocketLock(link / "era.sock")
+    """Another user could listen in a folder open to all, or redirect a link of his to another.
 
-
-def test_socket_lock_refuses_path_too_long_for_a_socket(tmp_path: Path) -> None:
-    """The system's own error would name no length."""
+    A link of the same user is allowed. The system's own error would name no length of a path.
+    """
     room = 106 - len(str(tmp_path)) - 1
     with pytest.raises(InputError, match="106 bytes, got 107"):
         SocketLock(tmp_path / ("x" * (room + 1)))
     lock = SocketLock(tmp_path / ("x" * room))
     lock.bind().close()
     lock.release()
+    link, open_to_all = tmp_path / "link", tmp_path / "open"
+    open_to_all.mkdir()
+    open_to_all.chmod(0o777)
+    with pytest.raises(InputError, match=str(open_to_all)):
+        SocketLock(open_to_all / "era.sock")
+    (tmp_path / "ours").mkdir()
+    link.symlink_to("ours")
+    SocketLock(link / "era.sock").release()
+    theirs = os.stat_result((0o120777, *link.lstat()[1:4], os.getuid() + 1, *link.lstat()[5:10]))
+    monkeypatch.setattr(Path, "lstat", lambda path: theirs)
+    with pytest.raises(InputError, match=str(link)):
+        SocketLock(link / "era.sock")
 
 
 @pytest.mark.parametrize("kind", ["file", "folder", "link"])
@@ -245,8 +252,9 @@ def entries(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
     return [MODULE]
 
 
-def process(folder: Path, *arguments: str, **environment: str) -> "subprocess.Popen[str]":
-    """A process that runs the test commands of a folder."""
+def run_typed(folder: Path, *arguments: str, **environment: str) -> "subprocess.Popen[str]":
+    """A process that runs the test commands, which are written to a folder."""
+    (folder / f"{MODULE}.py").write_text(dedent(COMMANDS), encoding="utf-8")
     script = (
         f"import controller.cli.main as m; m.COMMANDS = [{MODULE!r}]; raise SystemExit(m.main())"
     )
@@ -260,15 +268,31 @@ def process(folder: Path, *arguments: str, **environment: str) -> "subprocess.Po
 
 
 def test_run_runs_a_command_and_returns_zero(
-    entries: list[str], capsys: pytest.CaptureFixture[str]
+    entries: list[str], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Commands and groups of a package are at the root, with their options."""
+    """Commands and groups of a package are at the root, with their options; so are help, version.
+
+    Without a command the help is shown as it is, not as an error message. The program is called era
+    however it was started; by some services with a closed standard output, for which Python has
+    None.
+    """
     assert run(["good", "--number", "5"], entries) == 0
     assert run(["parts", "list"], entries) == 0
     written = capsys.readouterr()
     assert written.out.startswith("number 5 ")
     assert written.out.endswith("none\n")
     assert written.err == ""
+    for arguments in ([], ["parts"]):
+        assert run(arguments, entries) == 2
+        assert capsys.readouterr().err.startswith("Usage: era")
+    assert run(["--version"], entries) == 0
+    assert capsys.readouterr().out == f"era-haptics {version('era-haptics')}\n"
+    assert run(["--help"], entries) == 0
+    text = capsys.readouterr().out
+    assert text.startswith("Usage: era ")
+    assert all(word in text for word in ("good", "ends", "parts", "--version", "--debug"))
+    monkeypatch.setattr("sys.stdout", None)
+    assert run(["--version"], entries) == 0
 
 
 @pytest.mark.parametrize(
@@ -307,15 +331,6 @@ def test_run_reports_an_error_in_one_line_with_its_status(
     assert written.err.count("\n") == (1 if words else 0)
 
 
-@pytest.mark.parametrize("arguments", [[], ["parts"]])
-def test_run_shows_the_help_without_a_command(
-    entries: list[str], capsys: pytest.CaptureFixture[str], arguments: list[str]
-) -> None:
-    """As it is, not as an error message."""
-    assert run(arguments, entries) == 2
-    assert capsys.readouterr().err.startswith("Usage: era")
-
-
 @pytest.mark.parametrize(
     "arguments",
     [["--debug", "ends", "bug"], ["ends", "--debug", "bug"], ["ends", "bug", "--debug"]],
@@ -330,53 +345,30 @@ def test_run_shows_the_traceback_with_debug(
     assert "\x1b" not in written.err
 
 
-def test_run_prints_help_and_version(
-    entries: list[str], capsys: pytest.CaptureFixture[str]
+def test_main_ends_quietly_and_prints_what_its_output_cannot_encode(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """On standard output; the program is called era however it was started."""
-    assert run(["--version"], entries) == 0
-    assert capsys.readouterr().out == f"era-haptics {version('era-haptics')}\n"
-    assert run(["--help"], entries) == 0
-    text = capsys.readouterr().out
-    assert text.startswith("Usage: era ")
-    assert all(word in text for word in ("good", "ends", "parts", "--version", "--debug"))
+    """Quietly when its reader closes, as in `era ... | head`.
 
-
-def test_main_ends_quietly_when_its_reader_closes(tmp_path: Path) -> None:
-    """As in `era ... | head`."""
-    (tmp_path / "era_test_commands.py").write_text(dedent(COMMANDS), encoding="utf-8")
-    with process(tmp_path, "flood") as flood:
+    Escaped: a unit in an output of ASCII, and the name of a file that is not UTF-8. Before any
+    command is loaded it limits linear algebra to one thread, unless the user has chosen.
+    """
+    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
+    with run_typed(tmp_path, "flood") as flood:
         assert flood.stdout is not None
         assert flood.stderr is not None
         assert flood.stdout.readline() == "line 0\n"
         flood.stdout.close()
         assert flood.stderr.read() == ""
         assert flood.wait() == 141
-
-
-def test_main_ends_well_without_an_output(entries, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Started with a closed standard output, for which Python has None, as by some services."""
-    monkeypatch.setattr("sys.stdout", None)
-    assert run(["--version"], entries) == 0
-
-
-def test_main_prints_what_its_output_cannot_encode(tmp_path: Path) -> None:
-    """Escaped: a unit in an output of ASCII, and the name of a file that is not UTF-8."""
-    (tmp_path / "era_test_commands.py").write_text(dedent(COMMANDS), encoding="utf-8")
-    with process(tmp_path, "letters", PYTHONIOENCODING="ascii") as letters:
-        assert letters.communicate()[0] == "m/s\\xb2 p\\udcfc\n"
-        assert letters.returncode == 0
-
-
-@pytest.mark.parametrize(("given", "seen"), [({}, "1"), ({"OMP_NUM_THREADS": "7"}, "7")])
-def test_main_limits_linear_algebra_to_one_thread(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, given: dict[str, str], seen: str
-) -> None:
-    """Before any command is loaded, unless the user has chosen."""
-    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
-    (tmp_path / "era_test_commands.py").write_text(dedent(COMMANDS), encoding="utf-8")
-    with process(tmp_path, "good", **given) as good:
-        assert good.communicate()[0] == f"number 1 {seen}\n"
+    for command, given, said in (
+        ("letters", {"PYTHONIOENCODING": "ascii"}, "m/s\\xb2 p\\udcfc\n"),
+        ("good", {}, "number 1 1\n"),
+        ("good", {"OMP_NUM_THREADS": "7"}, "number 1 7\n"),
+    ):
+        with run_typed(tmp_path, command, **given) as done:
+            assert done.communicate()[0] == said
+            assert done.returncode == 0
 
 
 LOADED = """
@@ -435,3 +427,292 @@ def test_main_loads_every_package_of_the_project(
         monkeypatch.setenv(variable, "1")  # main sets them; restored after the test
     assert main() == 0
     assert capsys.readouterr().err == ""
+
+
+FAULT = Operation(DaemonState.FAULT, "arc")
+
+
+def record(message: str, line: int = 1, **extra: object) -> logging.LogRecord:
+    """A record of a logging call at a line."""
+    made = logging.LogRecord("era.x", logging.WARNING, "/x.py", line, message, (), None)
+    made.__dict__.update(extra)
+    return made
+
+
+def test_log_lines_cannot_be_forged_and_are_bounded() -> None:
+    """Any text stays inside one JSON string of printable ASCII, and a long message is cut."""
+    evil = 'x\n{"level":"info","message":"all is well"}\r\x1b[2J\x00\u2028"'
+    line = LogFormatter().format(record(evil, cause=evil))
+    assert line.isascii()
+    assert line.isprintable()
+    fields = json.loads(line)
+    assert (fields["message"], fields["cause"], fields["level"]) == (evil, evil, "warning")
+    assert len(LogFormatter().format(record("x" * 10**6))) < 10_000
+
+
+def test_log_line_has_the_keys_of_its_page() -> None:
+    """Time in UTC with milliseconds, level, logger, message, what a call adds, and a traceback."""
+    made = record("link: %s", cause=OSError("gone"), remedy=None, skipped=3)
+    made.args = ("lost",)
+    made.created, made.msecs = 1_000_000_000.25, 250.0
+    expected = {"time": "2001-09-09T01:46:40.250Z", "level": "warning", "logger": "era.x"}
+    more = {"message": "link: lost", "cause": "gone", "remedy": None, "skipped": 3}
+    assert json.loads(LogFormatter().format(made)) == {**expected, **more}
+    try:
+        raise ValueError("x" * 10**5)
+    except ValueError:
+        made.exc_info = sys.exc_info()
+    fields = json.loads(LogFormatter().format(made))
+    assert fields.keys() - expected.keys() - more.keys() == {"traceback"}
+    assert fields["traceback"] == "x" * 8000
+
+
+def test_log_limits_rate_of_each_call_except_state_changes() -> None:
+    """Five lines at once, then one a second with the number skipped; transitions are unlimited."""
+    now = 0.0
+    limit = RateLimitFilter(clock=lambda: now)
+    assert sum(limit.filter(record("again")) for _ in range(1000)) == 5
+    assert limit.filter(record("another call", line=2))
+    now = 1.0
+    allowed = record("again")
+    assert limit.filter(allowed)
+    assert allowed.__dict__["skipped"] == 995
+    assert not limit.filter(record("again"))
+    transition = record("READY -> ON")
+    transition.__dict__["topic"] = "state"
+    assert all(limit.filter(transition) for _ in range(1000))
+
+
+@pytest.fixture
+def logger() -> Iterator[logging.Logger]:
+    """A logger without handlers."""
+    made = logging.getLogger("era.test_daemon_log")
+    made.propagate = False
+    yield made
+    made.handlers.clear()
+
+
+@contextmanager
+def logging_to(logger: logging.Logger, file: Path | None) -> Iterator[LogThread]:
+    """A thread that writes what is logged to a file, or on the standard error."""
+    thread = LogThread(file)
+    logger.addHandler(thread)
+    yield thread
+    thread.close()
+
+
+def lines_of(file: Path) -> list[str]:
+    """The messages of a log."""
+    return [json.loads(line)["message"] for line in file.read_text("utf-8").splitlines()]
+
+
+def test_log_does_not_block_while_disk_hangs(
+    logger: logging.Logger, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """During a write that does not return, lines are queued up to a bound; clients get them all."""
+    hangs, released = threading.Event(), threading.Event()
+
+    class Hanging(io.StringIO):
+        def write(self, text: str, /) -> int:
+            hangs.set()
+            released.wait(20)
+            return len(text)
+
+    monkeypatch.setattr(sys, "stderr", Hanging())
+    with logging_to(logger, None) as thread:
+        thread.subscriber = heard = Mock()
+        logger.warning("first")
+        assert hangs.wait(20)
+        for _ in range(3000):
+            logger.warning("more")
+        assert thread.queue.qsize() == 2000
+        assert heard.call_count == 3001
+    released.set()
+    wait_for(lambda: not thread.queue.unfinished_tasks)  # or they go to the real standard error
+
+
+def test_full_disk_cuts_no_line_of_the_log(logger: logging.Logger, tmp_path: Path) -> None:
+    """Each line is in the file as a whole or not at all, and a later one follows a whole one.
+
+    A subscriber gets all records from info on.
+    """
+    logger.setLevel(logging.DEBUG)
+    messages = [f"{number} {'x' * 300}" for number in range(5)]
+    heard: list[str] = []
+    with logging_to(logger, tmp_path / "log") as thread:
+        thread.subscriber = lambda record: heard.append(record.getMessage())
+        with full_disk(at=1024):  # bytes, amid the third line
+            for each in messages:
+                logger.debug(each)
+            wait_for(lambda: not thread.queue.unfinished_tasks)
+        logger.info("after")
+    assert heard == ["after"]
+    assert lines_of(tmp_path / "log") == [*messages[:2], "after"]
+
+
+def test_log_is_reopened_after_rotation_and_once_its_folder_is_there(
+    logger: logging.Logger, tmp_path: Path
+) -> None:
+    """Where the folder of its file is missing for a while, what is logged meanwhile is lost.
+
+    Lines after a rotation are in a new file, which only its owner may read.
+    """
+    file, rotated = tmp_path / "later" / "log", tmp_path / "log.1"
+    with logging_to(logger, file) as thread:
+        logger.warning("lost")
+        wait_for(lambda: not thread.queue.unfinished_tasks)
+        file.parent.mkdir()
+        logger.warning("before")
+        wait_for(lambda: file.exists() and file.read_text("utf-8"))
+        file.rename(rotated)
+        logger.warning("after")
+    assert (lines_of(rotated), lines_of(file)) == (["before"], ["after"])
+    assert file.stat().st_mode & 0o777 == 0o600
+
+
+@pytest.mark.parametrize(
+    ("more", "count"),
+    [
+        ({"WATCHDOG_USEC": "2000000"}, 4),  # at 0, 1, 2 and 3 s
+        ({}, 0),
+        ({"WATCHDOG_USEC": "x"}, 0),
+        ({"WATCHDOG_USEC": "2000000", "WATCHDOG_PID": "1"}, 0),
+    ],
+)
+def test_service_manager_is_told_and_its_watchdog_fed_at_twice_its_rate(
+    more: dict[str, str], count: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Not one of another process, nor without a valid interval; no assignment can be forged.
+
+    Fed when no descriptor is left, too. Neither a missing variable nor a missing socket is an
+    error.
+    """
+    path = str(tmp_path / "notify")
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as bound:
+        bound.bind(path)
+        bound.settimeout(60)
+        for environment in (
+            {},
+            {"NOTIFY_SOCKET": "/nowhere/at/all"},
+            {"NOTIFY_SOCKET": path, **more},
+        ):
+            with closing(ServiceManager(environment)) as told, monkeypatch.context() as patched:
+                no_descriptor = Mock(side_effect=OSError(errno.EMFILE, "too many"))
+                patched.setattr(socket, "socket", no_descriptor)
+                told.ready("all is well\nERRNO=5")
+                for milliseconds in range(0, 3500, 50):
+                    told.alive(milliseconds / 1000)
+                told.notify("STOPPING=1")
+        assert bound.recv(4096).startswith(b"READY=1\nSTATUS=all is wellERRNO=5")
+        messages = []
+        while (message := bound.recv(100)) != b"STOPPING=1":
+            messages.append(message)
+        assert messages == [b"WATCHDOG=1"] * count
+
+
+def test_dump_is_json_lines_for_owner_only(tmp_path: Path) -> None:
+    """The cause first, then each message with its content by name; only the newest files stay."""
+    folder = tmp_path / "new" / "folder"
+    where = {"link": "main", "time_s": 1.5, "way": "out"}
+    records = [
+        {**where, "message": "Arm", "content": {"watchdog": 250, "session": 9}},
+        {**where, "message": "Reply", "content": Reply({"state": 6, "levels": [5000, 0]})},
+        {**where, "message": "no reply", "content": ""},
+    ]
+    for _ in range(MAX_DUMPS + 2):
+        path = write_dump(folder, records, cause="arc\nx")
+    assert path.stat().st_mode & 0o777 == 0o600
+    head, *lines = [json.loads(line) for line in path.read_text("utf-8").splitlines()]
+    assert head["cause"] == "arc\nx"
+    read = {**records[1], "content": {"state": 6, "levels": [5000, 0]}}
+    assert lines == [records[0], read, {**where, "message": "no reply"}]
+    assert len(list(folder.iterdir())) == 20
+
+
+def test_latency_percentiles_are_values_that_occurred() -> None:
+    """Of 1, 2, ... 1000 ms the 500th, 990th and 999th; the histogram counts each once."""
+    latencies = LatencyStatistics()
+    assert latencies.summary().median is None
+    for milliseconds in range(1, 1001):
+        latencies.add(milliseconds / 1e3)
+    summary = latencies.summary()
+    assert (summary.median, summary.p99, summary.p999) == (500, 990, 999)
+    counts = dict(summary.histogram)
+    assert (counts[1.0], counts[5.0], counts[50.0], counts[100.0]) == (1, 1, 30, 950)
+    assert sum(counts.values()) == summary.count == 1000
+
+
+@in_virtual_time
+async def test_failing_recorder_prevents_no_stop(tmp_path: Path) -> None:
+    """The wire gets the Stop, and the caller its outcome."""
+
+    def fail(record: Mapping[str, object]) -> None:
+        raise MemoryError
+
+    recorder = FaultDumps(tmp_path)
+    async with set_chain(connected=recorder.follow) as chain:
+        await chain.open()
+        assert recorder._ring
+        vars(recorder)["note"] = fail
+        assert (await chain.controller.stop())["main"].is_confirmed
+        assert chain.far_end.requests("Stop")
+        await chain.close()
+
+
+@pytest.fixture
+def now(monkeypatch: pytest.MonkeyPatch) -> list[float]:
+    """The time [s] that the dumps see."""
+    times = [0.0]
+    monkeypatch.setattr(threads, "now", lambda: times[0])
+    return times
+
+
+def _writers() -> list[threading.Thread]:
+    return [thread for thread in threading.enumerate() if thread.name == "dump"]
+
+
+def wait_for_writers() -> None:
+    """Wait until all dumps are written."""
+    for thread in _writers():
+        thread.join(20)
+
+
+def test_dump_that_fails_is_only_logged(
+    tmp_path: Path, now: list[float], caplog: pytest.LogCaptureFixture
+) -> None:
+    """A file in place of the folder raises nothing at the daemon."""
+    (tmp_path / "dumps").write_text("in the way", "utf-8")
+    FaultDumps(tmp_path / "dumps").state_changed(Operation(), FAULT)
+    wait_for_writers()
+    (warning,) = caplog.messages
+    assert str(tmp_path / "dumps") in warning
+
+
+def test_dumps_use_one_thread_when_disk_hangs(
+    tmp_path: Path,
+    now: list[float],
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    """Further dumps are skipped with a warning until the disk works again."""
+    hangs, released = threading.Event(), threading.Event()
+
+    def hang(*args: object, **kwargs: object) -> Path:
+        hangs.set()
+        released.wait(20)
+        return tmp_path
+
+    dumps = FaultDumps(tmp_path)
+    with monkeypatch.context() as patched, caplog.at_level(logging.WARNING):
+        patched.setattr("controller.operation.fault_dumps.write_dump", hang)
+        for now[0] in (0.0, 10.0, 20.0):
+            dumps.state_changed(Operation(), FAULT)
+        assert hangs.wait(20)
+        assert len(_writers()) == 1
+        assert len(caplog.messages) == 2
+        released.set()
+        wait_for_writers()
+    now[0] = 30.0
+    dumps.state_changed(Operation(), FAULT)
+    wait_for_writers()
+    assert len(list(tmp_path.glob(DUMP_PATTERN))) == 1

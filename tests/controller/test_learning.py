@@ -6,7 +6,7 @@ import os
 import signal
 import sys
 import time
-from collections.abc import AsyncIterator, Callable, Sequence
+from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -25,7 +25,6 @@ from controller.learning.learning import Learning, SettledReadings
 from controller.learning.worker import MAX_MEMORY, Worker, make
 from controller.plate_measurement import PlateSensor, settling
 from controller.play.loop import Observers
-from controller.play.routing import Drive
 from controller.sources.touch import Contact, ContactKey
 from courses import Taken, courses, follow
 from drivers.errors import LinkError
@@ -251,40 +250,6 @@ def test_plate_keeps_to_its_course(name: str) -> None:
     follow(COURSES[name], learned)
 
 
-def tone(frequency: float, level: float, phase: float) -> AmplifierTone:
-    """One in Hz, as a share of full level, in degrees."""
-    return AmplifierTone(0, frequency, level, phase)
-
-
-def settled_readings(take: Callable[[SettledPattern], None]) -> SettledReadings:
-    """Of the paper's rig, whose amplifier has a sensor at each ERA."""
-    rig = make_paper_rig(12, 9)
-    found = SettledReadings(rig, cast(Any, SimpleNamespace(amplifiers={"main": None})), take=take)
-    found.sensors = [
-        PlateSensor("main", number, Sensor(era.name, era.name), 0, 500.0)
-        for number, era in enumerate(rig.eras)
-    ]
-    return found
-
-
-async def read_of(readings: SettledReadings, drives: Sequence[Drive], *, load: float = 1.0) -> None:
-    """Have a second pass in which contents of some drives play under a finger of a load."""
-    observers = Observers()
-    playing = SimpleNamespace(
-        lasts=True,
-        contents={n: SimpleNamespace(drive=drive) for n, drive in enumerate(drives)},
-        contacts=(Contact(ContactKey("a", 1), 0.1, 0.1, 0.0, load),),
-        time=0.0,
-        settled_after=0.1,
-    )
-    readings.observe(observers)
-    running = asyncio.create_task(readings.run())
-    for callback in observers.reported:
-        callback(cast(Any, playing))
-    await asyncio.sleep(1.0)
-    running.cancel()
-
-
 @pytest.fixture
 def heard(monkeypatch: pytest.MonkeyPatch) -> list[Sequence[float]]:
     """Tones that were read; each sensor hears each tone by its frequency and its own number."""
@@ -306,28 +271,48 @@ def heard(monkeypatch: pytest.MonkeyPatch) -> list[Sequence[float]]:
     return asked
 
 
-@pytest.mark.parametrize(("load", "count"), [(1.0, 1), (HAND_LOAD, 0)])
-@in_virtual_time
-async def test_nothing_is_read_while_a_hand_rests(
-    heard: list[Sequence[float]], load: float, count: int
-) -> None:
-    """Its load is hardly known, so that it would be taken for a change of the plate."""
-    read = list[SettledPattern]()
-    await read_of(settled_readings(read.append), [{"SW": tone(100.0, 0.1, 0.0)}], load=load)
-    assert len(read) == count
+async def read_of(
+    *drives: Mapping[str, tuple[float, float, float]], load: float = 1.0
+) -> list[SettledPattern]:
+    """What is read in a second in which contents of drives play under a finger of a load.
+
+    On the paper's rig, whose amplifier has a sensor at each ERA; drives: frequency [Hz], share of
+    full level and phase in degrees by ERA.
+    """
+    rig, observers, read = make_paper_rig(12, 9), Observers(), list[SettledPattern]()
+    controller = cast(Any, SimpleNamespace(amplifiers={"main": None}))
+    readings = SettledReadings(rig, controller, take=read.append)
+    readings.sensors = [
+        PlateSensor("main", number, Sensor(era.name, era.name), 0, 500.0)
+        for number, era in enumerate(rig.eras)
+    ]
+    playing = SimpleNamespace(
+        lasts=True,
+        contents={
+            n: SimpleNamespace(drive={era: AmplifierTone(0, *each) for era, each in drive.items()})
+            for n, drive in enumerate(drives)
+        },
+        contacts=(Contact(ContactKey("a", 1), 0.1, 0.1, 0.0, load),),
+        time=0.0,
+        settled_after=0.1,
+    )
+    readings.observe(observers)
+    running = asyncio.create_task(readings.run())
+    for callback in observers.reported:
+        callback(cast(Any, playing))
+    await asyncio.sleep(1.0)
+    running.cancel()
+    return read
 
 
 @in_virtual_time
 async def test_contents_that_play_at_once_are_read_together(heard: list[Sequence[float]]) -> None:
     """Each tone with the bases that play it; not one where the harmonic of another is heard."""
-    read = list[SettledPattern]()
-    drives = [
-        {"NE": tone(200.0, 0.5, 0.0)},
-        {"SW": tone(100.0, 0.1, 90.0), "SE": tone(100.0, 0.2, 180.0)},
-        {"NW": tone(150.0, 0.3, 0.0)},
-    ]
-    await read_of(settled_readings(read.append), drives)
-    (found,) = read
+    (found,) = await read_of(
+        {"NE": (200.0, 0.5, 0.0)},
+        {"SW": (100.0, 0.1, 90.0), "SE": (100.0, 0.2, 180.0)},
+        {"NW": (150.0, 0.3, 0.0)},
+    )
     assert heard == [[100.0, 150.0, 200.0]]
     assert found.frequencies.tolist() == [100.0, 150.0]
     np.testing.assert_allclose(found.values, [100 + np.arange(4), 150 + np.arange(4)])
@@ -337,17 +322,19 @@ async def test_contents_that_play_at_once_are_read_together(heard: list[Sequence
 
 
 @in_virtual_time
-async def test_contents_that_no_reading_tells_apart_are_not_read(
+async def test_contents_are_not_read_together_that_no_reading_tells_apart_nor_beside_a_hand(
     heard: list[Sequence[float]],
 ) -> None:
-    """Two of one frequency, or 3 Hz apart where a window is 0.2 s."""
+    """Two of one frequency, or 3 Hz apart where a window is 0.2 s.
+
+    The load of a hand is hardly known, so that it would be taken for a change of the plate.
+    """
     for frequency in (100.0, 103.0):
-        drives = [
-            {"SW": tone(100.0, 0.1, 0.0)},
-            {"SE": tone(frequency, 0.1, 0.0)},
-        ]
-        await read_of(settled_readings(lambda pattern: None), drives)
+        await read_of({"SW": (100.0, 0.1, 0.0)}, {"SE": (frequency, 0.1, 0.0)})
+    await read_of({"SW": (100.0, 0.1, 0.0)}, load=HAND_LOAD)
     assert not heard
+    await read_of({"SW": (100.0, 0.1, 0.0)})
+    assert len(heard) == 1
 
 
 def learned_table(file: Path) -> LearnedTable:
@@ -357,39 +344,37 @@ def learned_table(file: Path) -> LearnedTable:
     return LearnedTable(rig, small_table(), sensors, "switched", file)
 
 
+def test_rig_that_was_not_measured_is_only_watched(tmp_path: Path) -> None:
+    """Off, with the thickness that an identification would state, and how to get it.
+
+    A damaged file is set aside: it is renamed, byte for byte, the note names it, and the plate is
+    learned anew. Files of writers that were killed are removed, those of this file only.
+    """
+    file, half = tmp_path / "learned.npz", tmp_path / ".learned.npz.0123456789ab"
+    for path, content in (
+        (file, b"something else"),
+        (half, b"half"),
+        (tmp_path / ".learned.npz.old", b"somebody's"),
+    ):
+        path.write_bytes(content)
+    report, cautious = learned_table(file).start()
+    assert (report.state, report.table) == ("off", None)
+    assert "thickness" in report.cause
+    assert "identify" in str(report.remedy)
+    assert cautious.uncertainty == small_table().uncertainty
+    assert {each.name for each in tmp_path.iterdir()} == {"learned.npz.old", ".learned.npz.old"}
+    assert (tmp_path / "learned.npz.old").read_bytes() == b"something else"
+    assert "learned.npz.old" in report.note
+
+
 def test_pattern_of_nothing_is_noted_and_leaves_no_file(tmp_path: Path) -> None:
     """Sensors that read 0 give a note, no alarm and no table; nothing is to be saved."""
     file = tmp_path / "learned.npz"
-    found = learned_table(file)
-    count = len(small_table().eras)
-    none = np.zeros((1, count), complex)
-    nothing = SettledPattern(1.0, TONE, none + 1e-5, none)
-    report = found.take(nothing)
+    found, none = learned_table(file), np.zeros((1, len(small_table().eras)), complex)
+    report = found.take(SettledPattern(1.0, TONE, none + 1e-5, none))
     assert "not used" in report.note
-    assert (report.is_alarm, report.table) == (False, None)
-    assert found.keep() == ("", None)
+    assert (report.is_alarm, report.table, found.keep()) == (False, None, ("", None))
     assert not file.exists()
-
-
-def test_rig_that_was_not_measured_is_only_watched(tmp_path: Path) -> None:
-    """Off, with the thickness that an identification would state, and how to get it."""
-    report, cautious = learned_table(tmp_path / "learned.npz").start()
-    assert report.state == "off"
-    assert "thickness" in report.cause
-    assert "identify" in str(report.remedy)
-    assert report.table is None
-    assert cautious.uncertainty == small_table().uncertainty
-
-
-def test_damaged_file_is_set_aside(tmp_path: Path) -> None:
-    """It is renamed, byte for byte, the note names it, and the plate is learned anew."""
-    file = tmp_path / "learned.npz"
-    file.write_bytes(b"something else")
-    report, _ = learned_table(file).start()
-    assert not file.exists()
-    assert (tmp_path / "learned.npz.old").read_bytes() == b"something else"
-    assert "learned.npz.old" in report.note
-    assert report.table is None
 
 
 def test_folder_without_room_is_noted_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -418,16 +403,6 @@ def test_folder_without_room_is_noted_once(tmp_path: Path, monkeypatch: pytest.M
         errors.append(errors.pop(0))
     assert notes == [[True, False], [True, False], [False, False]]
     assert written == 1
-
-
-def test_files_of_writers_that_were_killed_are_removed(tmp_path: Path) -> None:
-    """Those of this file only."""
-    left, other = tmp_path / ".learned.npz.0123456789ab", tmp_path / ".learned.npz.old"
-    left.write_bytes(b"half")
-    other.write_bytes(b"somebody's")
-    learned_table(tmp_path / "learned.npz")
-    assert not left.exists()
-    assert other.exists()
 
 
 PATIENCE = 300.0  # s; a worker gives way to all else that runs
@@ -490,38 +465,31 @@ async def test_worker_that_hangs_holds_nothing() -> None:
 
 
 @pytest.mark.real_time
-async def test_worker_that_dies_is_reported() -> None:
-    """At the call that it was killed in, and at the next one."""
+async def test_worker_goes_on_after_signals_and_without_memory_and_is_reported_when_it_dies() -> (
+    None
+):
+    """Signals such as Ctrl-C, `systemctl kill` and a reload: the daemon ends it when it is done.
+
+    Twice its limit of memory is refused to it; the unit leaves 0.6 GB to the daemon. Its death is
+    reported at the call that it was killed in, and at the next one.
+    """
+    unit = (example_rig_path().parent / "systemd" / "era-haptics.service").read_text("utf-8")
+    assert "\nMemoryMax=1G\n" in unit
+    assert MAX_MEMORY <= 2**30 - 0.6e9
     async with working() as worker:
         assert worker.pid is not None
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1):
+            os.kill(worker.pid, number)
+        assert await worker.call(PATIENCE, nap, 0.0) == worker.pid
+        with pytest.raises(MemoryError):
+            await worker.call(PATIENCE, grow, 2 * MAX_MEMORY)
+        assert await worker.call(PATIENCE, grow, 1000) == 1000
         napping = asyncio.create_task(worker.call(PATIENCE, nap, 1e3))
         await asyncio.sleep(0.1)
         os.kill(worker.pid, signal.SIGKILL)
         for call in (napping, worker.call(PATIENCE, nap, 0.0)):
             with pytest.raises(ChildProcessError):
                 await call
-
-
-@pytest.mark.real_time
-async def test_worker_may_not_take_all_memory() -> None:
-    """Twice its limit is refused to it, and it goes on; the unit leaves 0.6 GB to the daemon."""
-    unit = (example_rig_path().parent / "systemd" / "era-haptics.service").read_text("utf-8")
-    assert "\nMemoryMax=1G\n" in unit
-    assert MAX_MEMORY <= 2**30 - 0.6e9
-    async with working() as worker:
-        with pytest.raises(MemoryError):
-            await worker.call(PATIENCE, grow, 2 * MAX_MEMORY)
-        assert await worker.call(PATIENCE, grow, 1000) == 1000
-
-
-@pytest.mark.real_time
-async def test_signals_to_all_processes_of_a_daemon_do_not_end_a_worker() -> None:
-    """Such as Ctrl-C, `systemctl kill` and a reload: the daemon ends it when it is done."""
-    async with working() as worker:
-        assert worker.pid is not None
-        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1):
-            os.kill(worker.pid, number)
-        assert await worker.call(PATIENCE, nap, 0.0) == worker.pid
 
 
 PARENT = """

@@ -38,8 +38,14 @@ EXAMPLES = Path(__file__).parents[3] / "examples"
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """A folder with the example's rig in it."""
-    (tmp_path / "rig.yaml").write_text(example_rig_path().read_text("utf-8"), "utf-8")
+    """A folder with two rigs, two layouts and a table."""
+    rig = example_rig_path().read_text("utf-8")
+    (tmp_path / "rig.yaml").write_text(rig, "utf-8")
+    (tmp_path / "other.yaml").write_text(rig.replace("level: 1.0", "level: 0.5"), "utf-8")
+    for level in ("10", "neighbours"):
+        effect = f"effects: {{hum: {{kind: buzz, level: {level}}}}}\n"
+        (tmp_path / f"{level}.yaml").write_text(f"{effect}regions: {{}}\nelsewhere: hum\n", "utf-8")
+    (tmp_path / "t.npz").touch()
     return tmp_path
 
 
@@ -58,7 +64,10 @@ def problems(path: Path) -> list[tuple[int | None, str]]:
 
 
 def test_config_has_defaults_for_all_keys_but_rig(folder: Path) -> None:
-    """The amplifier is then simulated over the rig itself."""
+    """The amplifier is then simulated over the rig itself.
+
+    ERA_HAPTICS_SOCKET names the socket; else XDG_RUNTIME_DIR is used if it is set.
+    """
     config = load_daemon_config(written(folder))
     assert [era.name for era in config.rig.eras] == ["SW", "SE", "NE", "NW"]
     assert config.urls == {"main": f"sim://{folder}/rig.yaml?amplifier=main"}
@@ -66,6 +75,10 @@ def test_config_has_defaults_for_all_keys_but_rig(folder: Path) -> None:
     assert (config.table, config.dump_folder, config.log_file, *config.layouts) == (None,) * 4
     assert config.socket == default_socket()
     assert config.rig_text == example_rig_path().read_text("utf-8")
+    named = {"ERA_HAPTICS_SOCKET": "/a/b.sock", "XDG_RUNTIME_DIR": "/run/x"}
+    assert default_socket(named) == Path("/a/b.sock")
+    assert default_socket({"XDG_RUNTIME_DIR": "/run/x"}) == Path("/run/x/era-haptics/daemon.sock")
+    assert default_socket({}).name == "daemon.sock"
 
 
 def test_config_of_a_folder_that_is_not_utf8(folder: Path) -> None:
@@ -82,7 +95,6 @@ def test_config_paths_are_relative_to_its_folder(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The working directory does not matter."""
-    (folder / "t.npz").touch()
     elsewhere = folder / "elsewhere"
     elsewhere.mkdir()
     monkeypatch.chdir(elsewhere)
@@ -207,14 +219,6 @@ def test_calibrations_map_sensor_to_plate(folder: Path) -> None:
     assert (placed.x * 0.3048, (1 - placed.y) * 0.2286) == pytest.approx((0.3148, 0.2286))
 
 
-def test_default_socket_is_named_or_in_runtime_folder() -> None:
-    """ERA_HAPTICS_SOCKET names it; else XDG_RUNTIME_DIR is used if it is set."""
-    named = {"ERA_HAPTICS_SOCKET": "/a/b.sock", "XDG_RUNTIME_DIR": "/run/x"}
-    assert default_socket(named) == Path("/a/b.sock")
-    assert default_socket({"XDG_RUNTIME_DIR": "/run/x"}) == Path("/run/x/era-haptics/daemon.sock")
-    assert default_socket({}).name == "daemon.sock"
-
-
 def test_config_commands_create_and_check_daemon_files(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -230,7 +234,6 @@ def test_config_commands_create_and_check_daemon_files(
     assert all(word in good.stdout for word in ("SW", "NW", "main"))
     assert "--check" not in good.stdout  # it would read no table
     text = (folder / "d.yaml").read_text("utf-8")
-    (folder / "t.npz").touch()
     (folder / "e.yaml").write_text(f"{text}\ntable: t.npz\n", "utf-8")
     assert "era daemon e.yaml --check" in RUNNER.invoke(config_app, ["check", "e.yaml"]).stdout
     (folder / "d.yaml").write_text(text.replace("level_db_sl: 20", "level: 20"), "utf-8")
@@ -275,81 +278,52 @@ DEFAULTS = {
 }
 
 
-@pytest.fixture
-def reload_folder(tmp_path: Path) -> Path:
-    """A folder with two rigs, two layouts and a table."""
-    rig = example_rig_path().read_text("utf-8")
-    (tmp_path / "rig.yaml").write_text(rig, "utf-8")
-    (tmp_path / "other.yaml").write_text(rig.replace("level: 1.0", "level: 0.5"), "utf-8")
-    for level in ("10", "neighbours"):
-        layout = (
-            f"effects: {{hum: {{kind: buzz, level: {level}}}}}\nregions: {{}}\nelsewhere: hum\n"
-        )
-        (tmp_path / f"{level}.yaml").write_text(layout, "utf-8")
-    (tmp_path / "t.npz").touch()
-    return tmp_path
-
-
-def config(reload_folder: Path, **changes: str) -> DaemonConfig:
-    """The default configuration with other values at some keys."""
-    path = reload_folder / "daemon.yaml"
-    text = "".join(f"{key}: {value}\n" for key, value in (DEFAULTS | changes).items())
-    path.write_text(text, "utf-8")
-    return load_daemon_config(path)
-
-
-def problem(old: DaemonConfig, new: DaemonConfig, *, is_armed: bool) -> str:
-    """Why a change is not applied."""
-    return "; ".join(config_change(old, new).refusals(is_armed=is_armed))
-
-
-@pytest.mark.parametrize("is_armed", [False, True])
-@pytest.mark.parametrize("change", [{}, {"level_db_sl": "19"}, {"layouts": "{a: 10.yaml}"}])
-def test_reload_applies_a_layout(
-    reload_folder: Path, change: dict[str, str], is_armed: bool
-) -> None:
-    """Armed or not, one that is not stronger."""
-    assert not problem(config(reload_folder), config(reload_folder, **change), is_armed=is_armed)
-
-
 @pytest.mark.parametrize(
-    ("key", "value"),
+    ("change", "while_armed", "disarmed"),
     [
-        ("rig", "other.yaml"),
-        ("table", "t.npz"),
-        ("mode", "switched"),
-        ("serial_numbers", "{main: A1}"),
-        ("touch", "[]"),
-        ("log", "{level: debug}"),
-        ("dumps", "{folder: d}"),
-        ("socket", "t"),
-        ("dashboard", "127.0.0.1:1"),
+        ({}, "", ""),
+        ({"level_db_sl": "19"}, "", ""),
+        ({"layouts": "{a: 10.yaml}"}, "", ""),
+        ({"level_db_sl": "21"}, "while armed", ""),
+        ({"layouts": "{a: 10.yaml, b: neighbours.yaml}"}, "while armed", ""),
+        *(
+            ({"level_db_sl": "10", key: value}, key, key)
+            for key, value in (
+                ("rig", "other.yaml"),
+                ("table", "t.npz"),
+                ("mode", "switched"),
+                ("serial_numbers", "{main: A1}"),
+                ("touch", "[]"),
+                ("log", "{level: debug}"),
+                ("dumps", "{folder: d}"),
+                ("socket", "t"),
+                ("dashboard", "127.0.0.1:1"),
+            )
+        ),
     ],
 )
-def test_reload_is_refused_when_anything_else_changes(
-    reload_folder: Path, key: str, value: str
+def test_reload_applies_layouts_alone_and_raises_no_level_while_armed(
+    folder: Path, change: dict[str, str], while_armed: str, disarmed: str
 ) -> None:
-    """A layout that changed with it is not applied either; the key is named."""
-    new = config(reload_folder, level_db_sl="10", **{key: value})
-    assert key in problem(config(reload_folder), new, is_armed=False)
+    """From 20 dB SL to 21, or to whatever the neighbours allow, in use or not, only once disarmed.
 
+    A layout that changed with another key is not applied either; the key is named. Of the rig's
+    file the content counts, not its name, for limits may have changed in it.
+    """
 
-def test_reload_is_refused_when_rig_file_was_edited(reload_folder: Path) -> None:
-    """The file's content counts, not its name, for limits may have changed in it."""
-    old = config(reload_folder)
-    text = (reload_folder / "rig.yaml").read_text("utf-8")
-    (reload_folder / "rig.yaml").write_text(text.replace("level: 1.0", "level: 0.9"), "utf-8")
-    assert problem(old, config(reload_folder), is_armed=False)
+    def loaded(changes: dict[str, str]) -> DaemonConfig:
+        keys = {"rig": "rig.yaml", **DEFAULTS, **changes}
+        lines = "".join(f"{key}: {value}\n" for key, value in keys.items() if key != "rig")
+        return load_daemon_config(written(folder, lines, rig=keys["rig"]))
 
-
-@pytest.mark.parametrize(
-    "change", [{"level_db_sl": "21"}, {"layouts": "{a: 10.yaml, b: neighbours.yaml}"}]
-)
-def test_reload_raises_no_level_while_armed(reload_folder: Path, change: dict[str, str]) -> None:
-    """From 20 dB SL to 21, or to whatever the neighbours allow, in use or not, once disarmed."""
-    old, new = config(reload_folder), config(reload_folder, **change)
-    assert problem(old, new, is_armed=True)
-    assert not problem(old, new, is_armed=False)
+    old, new = loaded({}), loaded(change)
+    for is_armed, reason in ((True, while_armed), (False, disarmed)):
+        found = "; ".join(config_change(old, new).refusals(is_armed=is_armed))
+        assert reason in found
+        assert bool(found) is bool(reason)
+    text = (folder / "rig.yaml").read_text("utf-8")
+    (folder / "rig.yaml").write_text(text.replace("level: 1.0", "level: 0.9"), "utf-8")
+    assert config_change(old, loaded(change)).refusals(is_armed=False)
 
 
 REGIONS = 64  # as many as a layout may have
@@ -421,7 +395,7 @@ def test_reading_a_configuration_in_a_child_is_bounded_in_time(
 
 
 def test_plugin_installed_meanwhile_needs_a_restart(
-    reload_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """What the child reads by a plug-in that this process cannot load is bad input."""
     package = tmp_path / "installed"
@@ -433,10 +407,10 @@ def test_plugin_installed_meanwhile_needs_a_restart(
         "from controller.effects.kinds import Click\nclass Late(Click):\n    kind = 'late'\n"
     )
     monkeypatch.setenv("PYTHONPATH", str(package))  # of children started from now on
-    (reload_folder / "layout.yaml").write_text("effects: {tap: {kind: late}}\nelsewhere: null\n")
-    (reload_folder / "daemon.yaml").write_text("rig: rig.yaml\nlayouts: {panel: layout.yaml}\n")
+    (folder / "layout.yaml").write_text("effects: {tap: {kind: late}}\nelsewhere: null\n")
+    (folder / "daemon.yaml").write_text("rig: rig.yaml\nlayouts: {panel: layout.yaml}\n")
     with pytest.raises(InputError, match="restart the daemon"):
-        read_in_child(reload_folder / "daemon.yaml", FREQUENCIES)
+        read_in_child(folder / "daemon.yaml", FREQUENCIES)
 
 
 def test_child_ends_by_none_of_the_daemons_own_signals() -> None:

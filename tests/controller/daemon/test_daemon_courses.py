@@ -125,39 +125,14 @@ class Served(Taken):
         return any(self.bench.far.summary().levels)
 
     @property
-    def level(self) -> float:
-        """What the configuration in use has at its key [dB SL]."""
-        return self.bench.daemon._config.section.level_db_sl
-
-    @property
     def feels(self) -> list[str | None]:
         """What the fingers feel."""
         return [each.feels for each in self.bench.daemon._publisher.view.contact_statuses()]
 
     @property
-    def silence_event(self) -> object:
-        """What clients that subscribe to silences get."""
-        return self.bench.daemon._publisher.view.silence_event()
-
-    @property
-    def on_press(self) -> str | None:
-        """The effect of the second region of the layout in use."""
-        return self.bench.daemon._layouts.player.layout.regions[1].on_press
-
-    @property
-    def has_ended(self) -> bool:
-        """Whether the daemon has."""
-        return self.bench.running.done()
-
-    @property
     def levels(self) -> list[float]:
         """Of the fingers shown [dB SL]."""
         return [round(each.level_db_sl or 0.0, 1) for each in self.shown.contacts]
-
-    @property
-    def whole_levels(self) -> list[int]:
-        """The same, in whole dB."""
-        return [*map(round, self.levels)]
 
     @property
     def held_back(self) -> list[str | None]:
@@ -171,31 +146,6 @@ class Served(Taken):
     def effects(self) -> list[str | None]:
         """Of the fingers shown."""
         return [each.effect for each in self.shown.contacts]
-
-    @property
-    def verdicts(self) -> list[str | None]:
-        """Of the fingers shown."""
-        return [each.verdict for each in self.shown.contacts]
-
-    @property
-    def roles(self) -> list[str | None]:
-        """Of the fingers shown."""
-        return [each.role for each in self.shown.contacts]
-
-    @property
-    def least_level(self) -> float:
-        """Of the fingers shown [dB SL]."""
-        return min(self.levels)
-
-    @property
-    def is_exchange_told(self) -> bool:
-        """Whether the cause names another amplifier."""
-        return "A1" in self.operation.cause
-
-    @property
-    def tells_of_cables(self) -> bool:
-        """Whether the remedy shown does."""
-        return "cables" in (self.shown.remedy or "")
 
     @property
     def losses(self) -> dict[str, str]:
@@ -232,13 +182,13 @@ class Served(Taken):
         await until_state(self.era, state)
 
     def _differ(self, expected: Mapping[str, object]) -> dict[str, object]:
-        """Those values of properties, or of the status shown, that are not as expected."""
-        found = {}
-        for what, value in expected.items():
-            owner = self if hasattr(type(self), what.partition(".")[0]) else self.shown
-            if (each := attrgetter(what)(owner)) != value:
-                found[what] = each
-        return found
+        """Those values of expressions, or of the status shown, that are not as expected."""
+        shown = StatusResult.model_fields.keys() - dir(type(self))
+        found = {
+            what: self.value(f"shown.{what}" if what.partition(".")[0] in shown else what)
+            for what in expected
+        }
+        return {what: each for what, each in found.items() if each != expected[what]}
 
     async def status(self, **expected: object) -> None:
         """Read the status, and require values of it."""
@@ -268,7 +218,7 @@ class Served(Taken):
 
     def between(self, least: float, most: float, what: str) -> None:
         """Require that a value is within these bounds."""
-        assert least <= attrgetter(what)(self) <= most
+        assert least <= self.value(what) <= most
 
     def shows(self, *patterns: str) -> None:
         """Require that `era status` prints a match of each pattern."""
@@ -336,10 +286,6 @@ class Served(Taken):
 
         self.patch.setattr(self.bench.daemon._controller, "arm", slow)
 
-    def goes_on(self) -> None:
-        """Let go on what waits."""
-        self.going_on.set()
-
     def skips(self, *methods: str, work: Callable[..., None] = lambda *_: None) -> None:
         """Let methods of the daemon do nothing from now on, or this work."""
         for owner, _, method in (each.rpartition(".") for each in methods):
@@ -348,10 +294,6 @@ class Served(Taken):
     def fails(self, *methods: str) -> None:
         """Let methods of the daemon fail from now on."""
         self.skips(*methods, work=Mock(side_effect=Planted(*methods)))
-
-    def repairs(self) -> None:
-        """Let all that was changed work again."""
-        self.patch.undo()
 
     def hang(self, amplifier: str = "main") -> None:
         """Let an amplifier reply no more."""

@@ -6,6 +6,7 @@ and an end; names and files of strengths are bounded.
 
 import asyncio
 import contextlib
+import itertools
 import json
 import logging
 import math
@@ -17,17 +18,18 @@ import socket
 import subprocess
 import sys
 import threading
-from collections.abc import Awaitable, Callable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 from typing import Any
+from unittest.mock import DEFAULT, Mock
 
 import pytest
 import serial
 from typer.testing import CliRunner
 
-from controller.api.client import AsyncClient, Client
+from controller.api.client import Client
 from controller.api.jsonrpc import ErrorCode, RpcError
 from controller.api.link import Notification
 from controller.api.methods import TOPICS
@@ -56,7 +58,6 @@ from daemons import (
     PATIENCE,
     PLACE,
     READY,
-    DaemonBench,
     Journal,
     daemon_at,
     energised,
@@ -87,47 +88,28 @@ def dumped(folder: Path, kind: str) -> list[str]:
     return [each.read_text("utf-8") for each in folder.glob(f"dumps/era-{kind}-*.jsonl")]
 
 
-async def fails_in_the_loop(bench: DaemonBench, era: AsyncClient) -> None:
-    """Let a turn of the control loop fail once."""
-
-    def fail() -> bool:
-        del vars(bench.daemon._controller.cycle._wake)["clear"]
-        raise Planted("in the loop")
-
-    vars(bench.daemon._controller.cycle._wake)["clear"] = fail
-
-
-async def reports_a_fault(bench: DaemonBench, era: AsyncClient) -> None:
-    """Let the amplifier have a fault."""
-    bench.far.device.inject_fault(FaultWindow(fault="over_voltage"))
-
-
-async def is_stopped(bench: DaemonBench, era: AsyncClient) -> None:
-    """Stop as a client."""
-    await era.stop()
-
-
-@pytest.mark.parametrize(
-    ("stops", "kind", "cause"),
-    [
-        (fails_in_the_loop, "fault", "in the loop"),
-        (reports_a_fault, "fault", "OVER_VOLTAGE"),
-        (is_stopped, "stop", "stopped by 'test'"),
-    ],
-)
+@pytest.mark.parametrize("cause", ["in the loop", "OVER_VOLTAGE", "stopped by 'test'"])
 @in_virtual_time
 async def test_dump_names_the_last_touch_and_request_before_a_stop(
-    tmp_path: Path,
-    stops: Callable[[DaemonBench, AsyncClient], Awaitable[None]],
-    kind: str,
-    cause: str,
+    tmp_path: Path, cause: str
 ) -> None:
-    """With what was played for the finger, what was refused, and how the plate came to stop."""
+    """With what was played for the finger, what was refused, and how the plate came to stop.
+
+    By a turn of the control loop that fails once, a fault of the amplifier, or a client.
+    """
+    kind = "stop" if cause.startswith("stopped") else "fault"
     async with ready_daemon(tmp_path, "dumps: {folder: dumps}\n") as (bench, era):
         lease = await era.arm("me", lease_s=30)
         assert await error_code(era.play("none", PLACE)) is ErrorCode.REFUSED
         async with holding(era, far=bench.far):
-            await stops(bench, era)
+            wake = bench.daemon._controller.cycle._wake
+            if kind == "stop":
+                await era.stop()
+            elif cause == "OVER_VOLTAGE":
+                bench.far.device.inject_fault(FaultWindow(fault="over_voltage"))
+            else:
+                once = itertools.chain([Planted(cause)], itertools.repeat(DEFAULT))
+                vars(wake)["clear"] = Mock(wraps=wake.clear, side_effect=once)
             await until(lambda: dumped(tmp_path, kind))
         bench.far.device.recover()
     (text,) = dumped(tmp_path, kind)
@@ -339,8 +321,16 @@ async def test_a_disk_that_hangs_delays_no_other_request(
 
 @in_virtual_time
 async def test_names_with_a_strength_are_bounded(tmp_path: Path) -> None:
-    """A client that invents sources fills neither memory nor file: 64 names may have one."""
-    async with ready_daemon(tmp_path, "strengths: kept.json\n") as (_, era):
+    """A client that invents sources fills neither memory nor file: 64 names may have one.
+
+    Every name that is listed can be set, also that of a sender whose own name is as long as may be,
+    and not printable.
+    """
+    async with ready_daemon(tmp_path, "strengths: kept.json\n") as (bench, era):
+        sender = f"table:tuio:10.0.0.2/{chr(0x1F600) * 100!a}"
+        bench.daemon._layouts.player.strengths.note(sender)
+        assert (await era.strength(name=sender, gain_db=-6)).strengths == {sender: -6}
+        await era.strength(name=sender, gain_db=0)
         names = [f"{number} {'x' * 70}" for number in range(MAX_NAMES + 1)]
         for name in names:
             await era.touch([PLACE], source=name)
@@ -353,15 +343,6 @@ async def test_names_with_a_strength_are_bounded(tmp_path: Path) -> None:
             await era.touch([], source=name)
     kept = json.loads((tmp_path / "kept.json").read_text())
     assert kept == dict.fromkeys(names[1:], -1)
-
-
-@in_virtual_time
-async def test_every_name_that_is_listed_can_be_set(tmp_path: Path) -> None:
-    """Also that of a sender whose own name is as long as may be, and not printable."""
-    async with ready_daemon(tmp_path) as (bench, era):
-        sender = f"table:tuio:10.0.0.2/{chr(0x1F600) * 100!a}"
-        bench.daemon._layouts.player.strengths.note(sender)
-        assert (await era.strength(name=sender, gain_db=-6)).strengths == {sender: -6}
 
 
 @in_virtual_time
@@ -384,33 +365,25 @@ async def test_event_read_late_takes_nothing_back_that_was_seen(tmp_path: Path) 
 
 
 @in_virtual_time
-async def test_reload_ends_after_unexpected_error(
+async def test_reload_ends_after_unexpected_error_and_as_the_daemon_is_shut_down(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The service manager gets the end of it, and the next reload works."""
+    """The service manager gets the end of it, and the next reload works.
+
+    One whose configuration is still being read at the shutdown applies nothing.
+    """
     async with ready_daemon(tmp_path) as (bench, _):
-        notices: list[str] = []
-        await bench.daemon._supervisor.started.wait()
+        daemon, is_reading, notices = bench.daemon, asyncio.Event(), list[str]()
+        await daemon._supervisor.started.wait()
         for _ in range(10):  # the start is reported within three cycles of the event loop
             await asyncio.sleep(0)
-        manager = bench.daemon._manager
-        monkeypatch.setattr(manager, "notify", lambda first, *_: notices.append(first))
-
-        def fail(*_: object) -> None:
-            raise RuntimeError("injected")
-
+        monkeypatch.setattr(daemon._manager, "notify", lambda first, *_: notices.append(first))
         with monkeypatch.context() as patched:
-            patched.setattr("controller.daemon.layouts.read_in_child", fail)
-            await bench.daemon.reload()
-        await bench.daemon.reload()
+            failing = Mock(side_effect=RuntimeError("injected"))
+            patched.setattr("controller.daemon.layouts.read_in_child", failing)
+            await daemon.reload()
+        await daemon.reload()
         assert notices == ["RELOADING=1", "READY=1"] * 2
-
-
-@in_virtual_time
-async def test_shutdown_cancels_reload(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """One whose configuration is still being read applies nothing."""
-    async with running_daemon(tmp_path) as bench:
-        daemon, is_reading = bench.daemon, asyncio.Event()
 
         async def read_for_ever(load: object, *, name: str) -> object:
             is_reading.set()
@@ -462,28 +435,22 @@ async def test_log_event_escapes_bytes_that_are_not_text(tmp_path: Path) -> None
         assert event.data["message"] == r"wrote /tmp/\udcff"
 
 
-def test_lease_lasts_its_duration_from_each_renewal() -> None:
-    """5 s from when it is armed and 5 s from the renewal, but not from an attempt after its end."""
+def test_lease_lasts_its_duration_from_each_renewal_by_its_token() -> None:
+    """5 s from when it is armed and 5 s from the renewal, but not from an attempt after its end.
+
+    A refusal names the owner, not the token; without a lease every token is refused.
+    """
     lease = Lease("me", 5).renewed(100)
     assert check_lease(lease, lease.token, 104.999) == lease
     renewed = check_lease(lease, lease.token, 104).renewed(104)
     assert (renewed.token, renewed.expires_at) == (lease.token, 109)
-    with pytest.raises(RpcError) as caught:
-        check_lease(renewed, lease.token, 109)
-    assert caught.value.code is ErrorCode.LEASE
-
-
-@pytest.mark.parametrize("token", ["", "x", "ü" * 32])
-def test_lease_is_renewed_by_its_token_only(token: str) -> None:
-    """A refusal names the owner, not the token; without a lease every token is refused."""
-    lease = Lease("me", 5).renewed(0)
-    with pytest.raises(RpcError, match="'me'") as caught:
-        check_lease(lease, token, 1)
-    assert caught.value.code is ErrorCode.LEASE
-    assert lease.token not in str(caught.value)
-    with pytest.raises(RpcError) as caught:
-        check_lease(None, token, 1)
-    assert caught.value.code is ErrorCode.LEASE
+    wrong = [(held, token, 101.0) for token in ("", "x", "ü" * 32) for held in (lease, None)]
+    for held, token, now in [(renewed, lease.token, 109.0), *wrong]:
+        with pytest.raises(RpcError) as caught:
+            check_lease(held, token, now)
+        assert caught.value.code is ErrorCode.LEASE
+        assert lease.token not in str(caught.value)
+        assert held is not lease or "'me'" in str(caught.value)
 
 
 @pytest.mark.parametrize("state", DaemonState)
@@ -563,19 +530,21 @@ def test_daemon_goes_on_without_the_page_of_its_file_when_not_installed(
     assert "pip install -e '.[gateway]'" in line
 
 
-def test_daemon_refuses_to_start_with_few_descriptors(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Below 64 its own files and 40 clients would use them up."""
-    monkeypatch.setattr("controller.daemon.daemon.allow_many_descriptors", lambda: 63)
-    with pytest.raises(InputError, match="64, got 63"):
-        run_daemon(Path("missing.yaml"), dashboard=None)
+def test_daemon_refuses_to_start_with_little_memory_or_few_descriptors(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Within 300 MB of addresses a library waits for more of them for ever.
 
-
-def test_daemon_refuses_to_start_with_little_memory(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Within 300 MB of addresses a library waits for more of them for ever."""
+    Below 64 descriptors its own files and 40 clients would use them up.
+    """
     limits = {resource.RLIMIT_AS: (300 << 20, resource.RLIM_INFINITY)}
     others = resource.getrlimit
-    monkeypatch.setattr(resource, "getrlimit", lambda what: limits.get(what) or others(what))
-    with pytest.raises(InputError, match="512 MB, got 300 MB"):
+    with monkeypatch.context() as patched:
+        patched.setattr(resource, "getrlimit", lambda what: limits.get(what) or others(what))
+        with pytest.raises(InputError, match="512 MB, got 300 MB"):
+            run_daemon(Path("missing.yaml"), dashboard=None)
+    monkeypatch.setattr("controller.daemon.daemon.allow_many_descriptors", lambda: 63)
+    with pytest.raises(InputError, match="64, got 63"):
         run_daemon(Path("missing.yaml"), dashboard=None)
 
 

@@ -56,28 +56,16 @@ from virtual_lines import MemoryMachine, VirtualLoop, in_virtual_time
 
 
 @in_virtual_time
-async def test_touches_of_clients_are_delivered_in_places_of_the_sensor(tmp_path: Path) -> None:
-    """Shares of a plate of 0.3048 by 0.2286 m, from its north-west corner, by client and source."""
-    frames: list[TouchFrame] = []
-    async with ready_daemon(tmp_path) as (bench, one), await bench.client() as other:
-        tell_first(bench.daemon._controller.cycle, "deliver", frames.append)
-        await one.touch([(0.0762, 0.1143), (0.2286, 0.05715)], source="me")
-        await other.touch([(0.1, 0.1)], source="me")
-        touched, second = frames
-        assert (touched.source, touched.origin) == ("api:1:me", "api:1")
-        assert (second.source, second.origin) == ("api:2:me", "api:2")
-        assert touched.time <= threads.now()
-        assert [(each.x, each.y) for each in touched.touches] == [
-            pytest.approx(place) for place in ((0.25, 0.5), (0.75, 0.75))
-        ]
-
-
-@in_virtual_time
-async def test_fingers_of_a_leaving_client_are_lifted(
+async def test_touches_of_clients_are_delivered_and_lifted_when_one_leaves(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """At once, of every source but one where that fails, which times out; others' stay."""
+    """Shares of a plate of 0.3048 by 0.2286 m, from its north-west corner, by client and source.
+
+    They lift at once, of every source but one where that fails, which times out; others' stay.
+    """
+    frames: list[TouchFrame] = []
     async with ready_daemon(tmp_path) as (bench, era):
+        tell_first(bench.daemon._controller.cycle, "deliver", frames.append)
         tracker = bench.daemon._controller.cycle.tracker
         update = tracker.update
 
@@ -88,12 +76,20 @@ async def test_fingers_of_a_leaving_client_are_lifted(
 
         monkeypatch.setattr(tracker, "update", failing)
         async with await bench.client() as leaving:
-            for source in ("fails", "one", "lifted"):
+            await leaving.touch([(0.0762, 0.1143), (0.2286, 0.05715)], source="lifted")
+            for source in ("fails", "one"):
                 await leaving.touch([(0.1, 0.1)], source=source)
             await leaving.touch([], source="lifted")
             await era.touch([(0.2, 0.1)], source="one")
             down = [each.source for each in (await era.status()).contacts]
             assert down == ["api:1:fails", "api:1:one", "api:2:one"]
+        first, *_, last = frames
+        assert (first.source, first.origin) == ("api:1:lifted", "api:1")
+        assert (last.source, last.origin) == ("api:2:one", "api:2")
+        assert first.time <= threads.now()
+        assert [(each.x, each.y) for each in first.touches] == [
+            pytest.approx(place) for place in ((0.25, 0.5), (0.75, 0.75))
+        ]
         await asyncio.sleep(0.02)
         down = [each.source for each in (await era.status()).contacts]
         assert down == ["api:1:fails", "api:2:one"]
@@ -306,9 +302,14 @@ async def test_daemon_names_inputs_that_are_missing_or_mute(tmp_path: Path) -> N
 
 
 @in_virtual_time
-async def test_touch_that_came_and_went_during_a_pause_plays_nothing(tmp_path: Path) -> None:
-    """Its frames are read together, 120 ms and 60 ms after they came."""
-    async with ready_daemon(tmp_path) as (bench, era):
+async def test_few_of_a_flood_of_touches_become_sets(tmp_path: Path) -> None:
+    """Of three fingers that jump at 10 kHz fewer than a quarter; silent once they lift.
+
+    A touch that came and went during a pause, whose frames are read together, 120 ms and 60 ms
+    after they came, plays nothing.
+    """
+    port, chance, count = free_port(), random.Random(3), 1000
+    async with ready_daemon(tmp_path, panel(port)) as (bench, era):
         journal = Journal(bench.far)
         await era.arm("me", lease_s=60)
         begin = threads.now()
@@ -316,15 +317,6 @@ async def test_touch_that_came_and_went_during_a_pause_plays_nothing(tmp_path: P
             bench.daemon._controller.cycle.deliver(TouchFrame("brief", begin - ago, touches))
         await journal.hear(10)
         assert not journal.raising_since(begin)
-
-
-@in_virtual_time
-async def test_few_of_a_flood_of_touches_become_sets(tmp_path: Path) -> None:
-    """Of three fingers that jump at 10 kHz fewer than a quarter; silent once they lift."""
-    port, chance, count = free_port(), random.Random(3), 1000
-    async with ready_daemon(tmp_path, panel(port)) as (bench, era):
-        journal = Journal(bench.far)
-        await era.arm("me", lease_s=60)
         begin = threads.now()
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
             for number in range(count + 1):

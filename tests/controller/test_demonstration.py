@@ -31,6 +31,8 @@ from controller.play.loop import Observers, PlayReport
 from controller.sources.touch import Change, Contact, ContactKey
 from daemons import ENABLED, ready_daemon, until, until_state
 from drivers.errors import LinkError
+from model.answer.plan import query
+from model.answer.stimulus import Placement
 from model.finger import detection_threshold
 from model.rig.rig_file import example_rig_path
 from model.table import table_file
@@ -203,14 +205,29 @@ def test_lines_say_of_each_touch_what_was_promised_and_felt(
 
 
 def test_picture_shows_highest_contrasts_of_each_number_of_fingers():
-    """Six panels, fewest fingers first; a touch without measurement is left out."""
-    rows = [row(n, contrast=float(n), others=1 + n % 2) for n in range(10)]
+    """Six panels, fewest fingers first, one finger alone once; none without a measurement.
+
+    Each has its title, and the level over the plate if it was driven.
+    """
+    rows = [row(n, contrast=float(n), others=n % 3) for n in range(12)]
     silent = replace(row(99.0, contrast=99.0, others=1), measured_level_db_sl=None)
     chosen = choose_rows([*rows, silent])
-    assert [len(each.quiet) for each in chosen] == [1, 1, 1, 2, 2, 2]
-    assert {each.time_s for each in chosen} == {8, 6, 4, 9, 7, 5}
+    assert [(len(each.quiet), each.time_s) for each in chosen] == [
+        *((0, 9), (1, 10), (1, 7), (1, 4), (2, 11), (2, 8))
+    ]
+    table = small_table()
+    (layer,) = query(table, Placement(((0.1, 0.1),), ((0.2, 0.1),))).layers
+    alone = replace(chosen[0], measured_contrast_db=None, pattern=layer)
+    beside = replace(chosen[1], promised_contrast_db=8.0)
+    panels = demonstration.touches_figure(table, [alone, beside]).axes[:2]
+    assert [each.get_title() for each in panels] == [
+        "one finger alone",
+        "felt contrast 10.0 dB, promised 8.0",
+    ]
+    assert [len(each.collections) + len(each.images) > 0 for each in panels] == [True, False]
 
 
+FELT = vibration([[1.0], [1.0]])
 FAULT = "amplifier d: state must be OPERATION_ENABLED, got FAULT with fault WATCHDOG"
 
 
@@ -226,10 +243,12 @@ async def nothing(*_: object) -> dict[str, FingerVibration]:
 
 @asynccontextmanager
 async def recorder_of(
-    rows: list[TouchRow], vibration: Callable[[float, float], Awaitable[object]] = nothing
+    rows: list[TouchRow],
+    vibration: Callable[[float, float], Awaitable[object]] = nothing,
+    place_fingers: Callable[[Any, Any], Awaitable[object]] = nothing,
 ) -> AsyncIterator[TouchRecorder]:
     """A recorder of a plate that is not there; its rows are made at the end."""
-    plate = cast(SimulatedPlate, SimpleNamespace(vibration=vibration, place_fingers=nothing))
+    plate = cast(SimulatedPlate, SimpleNamespace(vibration=vibration, place_fingers=place_fingers))
     async with asyncio.TaskGroup() as tasks:
         yield TouchRecorder(plate, tasks, on_row=rows.append)
 
@@ -263,39 +282,68 @@ async def test_rows_after_a_fault_name_it_until_the_plate_is_armed_again() -> No
 
 
 @in_virtual_time
-async def test_pattern_is_measured_while_no_finger_moves(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Before a slide that lasts until the next pattern; what it rings to afterwards is no level."""
+async def test_pattern_is_measured_while_no_finger_moves_or_lands(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Before a slide that lasts until the next pattern; what it rings to afterwards is no level.
+
+    The plate hears of each place, and of a load alone. Without what a quiet finger felt there is no
+    contrast.
+    """
     monkeypatch.setattr(threads, "now", asyncio.get_running_loop().time)
     windows: list[tuple[float, float]] = []
+    placed: list[tuple[Any, Any]] = []
+    rows: list[TouchRow] = []
 
     async def vibration(since: float, until: float) -> dict[str, FingerVibration]:
         windows.append((since, until))
-        return {}
+        return {"test#1": FELT}
 
-    async with recorder_of([], vibration) as recorder:
+    async def place(positions: Any, loads: Any) -> None:
+        placed.append((positions, loads))
+
+    async with recorder_of(rows, vibration, place) as recorder:
         start, loop = threads.now(), Observers()
         recorder.observe(loop)
         (changed,), (applied_now,) = loop.contacts_changed, loop.reported
-        finger = contact(1)
+        finger, other = contact(1), contact(3)
         changed((finger,), Change(down=(finger,)))
+        played = SimpleNamespace(
+            content=SimpleNamespace(targets=((finger, None),)),
+            layer=SimpleNamespace(drive_mode="phased"),
+            drive={},
+        )
         for quiet in ((), (contact(2),), (contact(2),)):
             applied = SimpleNamespace(
                 time=threads.now(),
                 targets=(Prediction(finger, 20.0),),
                 layer=SimpleNamespace(ramp=0.04),
                 quiet=quiet,
-                contents=(1,),
+                contents={1: played},
+                latency=0.01,
             )
             applied_now(cast(PlayReport, applied))
             await asyncio.sleep(1.0)
+            if len(windows) == 2:
+                changed((finger, other), Change(down=(other,)))
+                await asyncio.sleep(0.8)
+                continue
             for _ in range(8):
                 finger = replace(finger, x=finger.x + 0.004)
                 changed((finger,), Change(moved=(finger,)))
                 await asyncio.sleep(0.1)
+        finger = replace(finger, load=2.0)
+        changed((finger, other), Change(moved=(finger,)))
+        changed((other,), Change(up=(finger,)))
+        applied_now(PlayReport((other,), (), None, threads.now()))
     assert windows == [
         pytest.approx((start + since, start + until))
-        for since, until in ((0.755, 0.995), (2.555, 2.795))
+        for since, until in ((0.755, 0.995), (2.555, 2.795), (4.355, 4.595))
     ]
+    assert len(placed) == 1 + 16 + 1 + 1 + 1
+    assert [loads.get("test#1") for _, loads in placed[-2:]] == [2.0, None]
+    (row,) = rows
+    assert (row.steady, row.measured_level_db_sl, row.measured_contrast_db) == (True, None, None)
 
 
 @in_virtual_time

@@ -7,6 +7,7 @@ three regions that are touched at once it is checked what they are promised.
 import asyncio
 import json
 import math
+import re
 import wave
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -474,6 +475,24 @@ def test_matrix_has_two_below_and_three_above_the_diagonal() -> None:
         assert (promised[other, one], promised[one, other]) == (pair.worst_db, third)
 
 
+def test_picture_has_the_plate_in_centimetres_and_the_names_of_its_regions() -> None:
+    """Upright beside one that is more than twice as tall as wide; marks and crosses on it."""
+    tall = Region("tall", Rectangle(0.2, 0.05, 0.02, 0.12), on_press="it")
+    flat = Region("flat", BUTTON, on_press="it")
+    shown = SurfaceLayout((tall, flat), {"it": Buzz(level=15.0)}, elsewhere=None)
+    found = check_together(shown, paper_table())
+    figure = layout_picture.check_figure(shown, paper_table(), (), found)
+    plate, *_, matrix = [each for each in figure.axes if each.get_title()]
+    named = {each.get_text(): each.get_rotation() for each in plate.texts}
+    assert (named["tall"], named["flat"]) == (90, 0)
+    outline = tuple(plate.patches[0].get_xy()[2])
+    assert outline == pytest.approx((30.48, 22.86))
+    assert plate.get_xlim()[1] > 30.48
+    assert plate.get_ylim()[1] > 22.86
+    assert [each.get_text() for each in matrix.get_xticklabels()] == ["tall", "flat"]
+    assert any("worst finger" in each.get_ylabel() for each in figure.axes)
+
+
 def test_of_many_regions_the_nearest_are_checked(monkeypatch: pytest.MonkeyPatch) -> None:
     """A bound on what is computed keeps the pair that is hardest to tell apart."""
     monkeypatch.setattr(layout_picture, "MAX_PAIRS", 1)
@@ -628,6 +647,12 @@ def test_command_tries_several_places_and_says_what_a_tap_loses(tmp_path: Path) 
         assert off / 100 == pytest.approx(1 - found["kept_share"], abs=0.06)
         shares.append(found["kept_share"])
     assert shares[0] == np.median(shares[1:])
+    (told,) = re.findall(
+        r"of 5 places (\d) keep at least 80 %: (\d+) % at \S+, (\d+) % at ",
+        CliRunner().invoke(app, arguments).stdout,
+    )
+    worst, *_, best = (round(100 * each) for each in sorted(shares[1:]))
+    assert [*map(int, told)] == [sum(each >= 0.8 for each in shares[1:]), worst, best]
 
 
 @pytest.mark.usefixtures("plain_pictures")

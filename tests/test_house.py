@@ -11,7 +11,6 @@ import subprocess
 import sys
 from graphlib import TopologicalSorter
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 
@@ -77,7 +76,9 @@ def importing(module: str) -> set[str]:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("path", ["drivers/protocol/sets.py", "model/rig/air_gap.py", "sim/cli.py"])
+@pytest.mark.parametrize(
+    "path", ["drivers/wires/can_frames.py", "model/rig/air_gap.py", "sim/cli.py"]
+)
 def test_tests_of_the_folder_come_before_those_that_import(path: str) -> None:
     """And those before all others, which only import what imports it.
 
@@ -125,61 +126,23 @@ def test_rows_name_what_there_is() -> None:
 
 
 @pytest.mark.long
-def test_tests_run_in_the_order_given_until_the_time_is_over(tmp_path: Path) -> None:
-    """What has no time is counted apart, and its files are named."""
-    for name in ("test_a.py", "test_b.py"):
-        (tmp_path / name).write_text("def test_one(): pass\n", "utf-8")
-    command = [
-        sys.executable,
-        "-m",
-        "pytest",
-        "-v",
-        "-p",
-        "changed_tests",
-        "test_b.py",
-        "test_a.py",
-    ]
-    for until, outcome in (("inf", "2 passed"), ("0", "2 without time")):
-        more = {
-            "PYTHONPATH": str(ROOT / "tests" / "support"),
-            "ERA_TESTS_UNTIL": until,
-        }
-        more["PYTEST_DISABLE_PLUGIN_AUTOLOAD"] = "1"  # they take seconds to load
-        done = subprocess.run(
-            command,
-            cwd=tmp_path,
-            env=os.environ | more,
-            capture_output=True,
-            text=True,
-            check=False,
-        )
-        assert done.returncode == (3 if until == "0" else 0)
-        assert re.findall(r"^test_(.)\.py::", done.stdout, re.MULTILINE) == ["b", "a"]
-        assert outcome in done.stdout.splitlines()[-1]
-        assert ("test_b.py test_a.py" in done.stdout.splitlines()) == (until == "0")
-
-
-def test_changed_page_is_typed_although_that_is_long(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Its case loses the marks by which it is left out; that of another page keeps them."""
-    monkeypatch.setenv("ERA_TESTS_PAGES", "play-content your-own-application")
-    for page, left in (("play-content", ["needs"]), ("add-an-effect", ["long", "alone", "needs"])):
-        marks = [getattr(pytest.mark, name).mark for name in ("long", "alone", "needs")]
-        item = SimpleNamespace(name=f"test_page[{page}]", own_markers=marks)
-        changed_tests.pytest_itemcollected(item)  # type: ignore[arg-type]
-        assert [mark.name for mark in item.own_markers] == left
-
-
-@pytest.mark.long
+@pytest.mark.parametrize(
+    ("seconds", "status", "said"), [("0", 3, "No test had time"), ("300", 0, "Next: make test")]
+)
 def test_command_fails_where_no_test_had_time(
-    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+    seconds: str,
+    status: int,
+    said: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     """And its last line says so, which nothing passed would not."""
     monkeypatch.setattr(
         changed_tests, "changed_since", lambda commit: ["tests/registry/test_threads.py"]
     )
-    monkeypatch.setattr(sys, "argv", ["changed_tests", "--seconds", "0"])
-    assert changed_tests.main() == 3
-    assert capfd.readouterr().out.splitlines()[-1].startswith("No test had time")
+    monkeypatch.setattr(sys, "argv", ["changed_tests", "--seconds", seconds])
+    assert changed_tests.main() == status
+    assert capsys.readouterr().out.splitlines()[-1].startswith(said)
 
 
 def test_what_users_copy_keeps_the_rule(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -3,19 +3,19 @@
     python tests/support/changed_tests.py [--since COMMIT] [--seconds N] [--list]
 
 A test is near what has changed by its folder, then by the number of imports between both. A file
-that is no module has the tests that name it and those of its folder; a tutorial or a how-to page
-that has changed is typed, although that is long. What only `pyproject.toml` or
-an example leads to comes last. What is not reached and what the minute has no time for is printed;
-exit status 3 where no test had time. pytest loads this file as a plug-in, too.
+that is no module has the tests that name it and those of its folder. What only `pyproject.toml` or
+an example leads to comes last. The first failure ends the run, and so does the end of the minute.
+What is left out is printed; exit status 3 where no test had time.
 """
 
 import argparse
 import ast
 import os
 import re
+import signal
 import subprocess
 import sys
-import time
+import threading
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import cache
@@ -70,13 +70,9 @@ ALSO: Sequence[tuple[Sequence[str], Sequence[str]]] = (
 
 _MAX_FILES = 60  # collecting more leaves no time to run them
 _SECONDS = 45.0  # for tests, of a minute
-_UNTIL = "ERA_TESTS_UNTIL"
-_PAGES = "ERA_TESTS_PAGES"
-_NO_TIME = "without time"
 _NOTHING_RAN = 3
 _MODULES = (".py", ".pyi")
 _WRITER = re.compile(r"<!-- begin: written by \S*?(\w+)\.py")
-_TYPED = ("docs/how-to/", "docs/tutorials/")
 _LAST = ("pyproject.toml", "examples/")
 """What many tests name or import that its change does not concern."""
 
@@ -146,8 +142,8 @@ def nearest(changed: Sequence[str]) -> dict[str, int]:
 
 
 def _reached(changed: Sequence[str]) -> dict[str, int]:
-    """The least distance of each module and test from changed files."""
-    start: dict[str, int] = {}
+    """The least number of imports from each module and test to one of the changed files."""
+    distances: dict[str, int] = {}
     for path in changed:
         first, second = [_node(path)], [] if path in _tests() else [*_tests_beside(path)]
         if path.endswith(_MODULES):
@@ -156,9 +152,14 @@ def _reached(changed: Sequence[str]) -> dict[str, int]:
             package = str(Path(path).parent).replace("/", ".")
             first += [each for each in _importers() if each.rpartition(".")[0] == package]
             first += _tests_of_page(path)
-        start = dict.fromkeys(second, 1) | start | dict.fromkeys(first, 0)
-    distances = _distances(start)
-    return dict.fromkeys(_tests(), 1) | distances if "conftest" in start else distances
+        distances = dict.fromkeys(second, 1) | distances | dict.fromkeys(first, 0)
+    is_for_all, found = "conftest" in distances, sorted(distances, key=lambda one: distances[one])
+    for node in found:
+        for importer in sorted(_importers().get(node, ())):
+            if importer not in distances:
+                distances[importer] = distances[node] + 1
+                found.append(importer)
+    return dict.fromkeys(_tests(), 1) | distances if is_for_all else distances
 
 
 @cache
@@ -184,28 +185,12 @@ def _tests_beside(path: str) -> Iterator[str]:
         folder = folder.parent
 
 
-def _tests_that_name(file: str) -> Iterator[str]:
-    return (path for path in _tests() if file in (ROOT / path).read_text("utf-8"))
-
-
 def _tests_of_page(path: str) -> Iterator[str]:
     """The tests that name a file, and those that import what writes parts of it, by its marks."""
-    yield from _tests_that_name(Path(path).name)
+    yield from (test for test in _tests() if Path(path).name in (ROOT / test).read_text("utf-8"))
     if path.endswith(".md") and (ROOT / path).exists():
         for writer in {*_WRITER.findall((ROOT / path).read_text("utf-8"))}:
             yield from _importers().get(writer, set()) & {*_tests()}
-
-
-def _distances(start: Mapping[str, int]) -> dict[str, int]:
-    """The least number of imports from each module or test to one of the first."""
-    importers = _importers()
-    distances, found = dict(start), sorted(start, key=lambda each: start[each])
-    for node in found:
-        for importer in sorted(importers.get(node, ())):
-            if importer not in distances:
-                distances[importer] = distances[node] + 1
-                found.append(importer)
-    return distances
 
 
 @cache
@@ -235,57 +220,24 @@ def _imports(file: Path) -> set[str]:
     return names
 
 
-def pytest_itemcollected(item: pytest.Item) -> None:
-    """Take what types a page that has changed, although it has the marks of what is long."""
-    if any(item.name.endswith(f"[{page}]") for page in os.environ.get(_PAGES, "").split()):
-        item.own_markers[:] = [
-            mark for mark in item.own_markers if mark.name not in ("long", "alone")
-        ]
+def _run(files: Sequence[str], *, seconds: float) -> int:
+    """Run tests for some seconds, as if Ctrl-C ended them; return pytest's status, or another.
 
-
-@pytest.hookimpl(trylast=True)
-def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Run files in the order in which they are named."""
-    places = {path: number for number, path in enumerate(config.args)}
-    items.sort(key=lambda item: places[item.nodeid.partition("::")[0]])
-
-
-@pytest.hookimpl(tryfirst=True)
-def pytest_runtest_setup() -> None:
-    """Skip what comes when the time is over."""
-    if time.time() > float(os.environ[_UNTIL]):
-        pytest.skip(_NO_TIME)
-
-
-def pytest_report_teststatus(report: pytest.TestReport) -> tuple[str, str, str] | None:
-    """Count them apart from what is skipped."""
-    return (_NO_TIME, "", "") if report.skipped and _NO_TIME in str(report.longrepr) else None
-
-
-def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
-    """List the files of which not all tests had time."""
-    late = [each.nodeid.partition("::")[0] for each in terminalreporter.stats.get(_NO_TIME, ())]
-    if late:
-        terminalreporter.section(f"{len(late)} tests had no time")
-        terminalreporter.line(" ".join(dict.fromkeys(late)))
-
-
-def pytest_sessionfinish(session: pytest.Session) -> None:
-    """Fail where no test had time, which a worker of xdist does not know."""
-    reporter = session.config.pluginmanager.get_plugin("terminalreporter")
-    ran = {"passed", "failed", "error", "xfailed"}
-    if reporter and _NO_TIME in reporter.stats and not reporter.stats.keys() & ran:
-        session.exitstatus = _NOTHING_RAN
-
-
-def _run(files: Sequence[str], pages: Iterable[str], *, until: float) -> int:
-    """Run tests until a time; return pytest's status, or that of no test that had time."""
-    options = ["-p", "changed_tests", "-q", "-r", "fE", "-m", "not long and not alone"]
+    _NOTHING_RAN where no test had time; 0 where those that had time have passed.
+    """
+    options = ["-q", "-r", "fE", "-x", "-m", "not long and not alone"]
     spread = ["--numprocesses", "2", "--dist", "loadfile", "--no-loadscope-reorder"]
-    environment = os.environ | {"PYTHONPATH": "tests/support", _UNTIL: str(until)}
-    environment[_PAGES] = " ".join(pages)
     command = [sys.executable, "-m", "pytest", *options, *spread, *files]
-    return subprocess.run(command, cwd=ROOT, env=environment, check=False).returncode
+    said = ""
+    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True) as process:
+        timer = threading.Timer(seconds, process.send_signal, [signal.SIGINT])
+        timer.start()
+        for said in process.stdout or ():
+            sys.stdout.write(said)
+        timer.cancel()
+    if process.returncode not in (pytest.ExitCode.INTERRUPTED, -signal.SIGINT):
+        return process.returncode
+    return 0 if " passed" in said else _NOTHING_RAN
 
 
 def main() -> int:
@@ -295,7 +247,6 @@ def main() -> int:
     parser.add_argument("--seconds", type=float, default=_SECONDS, help="for tests")
     parser.add_argument("--list", action="store_true", help="list the tests, and run none")
     options = parser.parse_args()
-    until = time.time() + options.seconds
     since = options.since or default_commit()
     changed = changed_since(since)
     reached = nearest(changed)
@@ -306,8 +257,7 @@ def main() -> int:
     sys.stdout.write(f"{len(changed)} files differ from {since}; tests in {len(chosen)} files\n")
     sys.stdout.flush()
     if chosen:
-        pages = [Path(each).stem for each in changed if each.startswith(_TYPED)]
-        status = _run(chosen, pages, until=until)
+        status = _run(chosen, seconds=options.seconds)
     sys.stdout.write(
         f"Left out: tests in {len(reached) - len(chosen)} files that more imports lead to and in "
         f"{len(_tests()) - len(reached)} that none do, and all that is long or loads the machine.\n"

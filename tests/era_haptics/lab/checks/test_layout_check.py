@@ -485,7 +485,7 @@ def test_picture_has_the_plate_in_centimetres_and_the_names_of_its_regions() -> 
     plate, *_, matrix = [each for each in figure.axes if each.get_title()]
     named = {each.get_text(): each.get_rotation() for each in plate.texts}
     assert (named["tall"], named["flat"]) == (90, 0)
-    outline = tuple(plate.patches[0].get_xy()[2])
+    outline = plate.patches[0].get_path().vertices[2]
     assert outline == pytest.approx((30.48, 22.86))
     assert plate.get_xlim()[1] > 30.48
     assert plate.get_ylim()[1] > 22.86

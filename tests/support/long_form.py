@@ -57,7 +57,7 @@ SLOWEST = (
     "test_layout_check.py",
     "test_group.py",
     "test_promises.py",
-    "test_printed.py",
+    "test_table_commands.py",
     "test_stimulus.py",
     "test_draws.py",
     "test_operation.py",

@@ -1,14 +1,18 @@
 """Commands on tables, designs, figures, plates and configuration files, as typed by a user.
 
-What they write and print: files and pictures, progress and next lines.
+What they write and print: files and pictures, progress and next lines; what others print that
+succeed, by the cases of `printed.yaml`.
 """
 
 import csv
+import io
 import json
 import os
 import re
 import shlex
-from collections.abc import Callable, Iterator
+import shutil
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +23,7 @@ from click.testing import Result
 from typer.testing import CliRunner
 
 import era_haptics as api
+from controller.cli.main import run
 from era_haptics.lab.cli import app as lab_app
 from era_haptics.lab.design import problem, score
 from model.cli import app
@@ -29,10 +34,10 @@ from model.config.document import read_document
 from model.errors import InputError
 from model.rig.rig_file import example_rig_path, load_rig
 from model.study import overview
+from model.table.table_file import save_table
 from model.vibration import study_convergence
-from plates import write_rig
-
-pytestmark = pytest.mark.usefixtures("plain_pictures")
+from plates import small_table, smooth_table, write_rig
+from yaml_files import read_yaml
 
 RIG = str(example_rig_path())
 QUICK = ["--mesh", "12x9", "--frequencies", "60,110,250", "--grid", "4x3"]
@@ -60,6 +65,7 @@ def few_sets() -> Iterator[None]:
         yield
 
 
+@pytest.mark.usefixtures("plain_pictures")
 def test_show_prints_summary_map_and_a_query_that_has_an_answer(tmp_path: Path) -> None:
     """The map is 4 by 3, each star of it is in the list, and the next command is quoted."""
     spaced = tmp_path / "my table.npz"
@@ -83,6 +89,7 @@ def test_show_prints_summary_map_and_a_query_that_has_an_answer(tmp_path: Path) 
     assert as_json("table", *words)["promised_worst_db"] > 0
 
 
+@pytest.mark.usefixtures("plain_pictures")
 def test_commands_say_that_there_is_no_compiler(
     without_kernels: Callable[[], None], tmp_path: Path
 ) -> None:
@@ -114,6 +121,7 @@ def design(*arguments: str | Path) -> dict[str, Any]:
     return {**json.loads(result.stdout), "stderr": result.stderr}
 
 
+@pytest.mark.usefixtures("plain_pictures")
 @pytest.mark.long
 def test_design_writes_a_rig_that_loads(small, tmp_path: Path) -> None:
     """Five ERAs, one kept: channels are distinct, pictures there, and what is printed."""
@@ -138,6 +146,7 @@ def test_design_writes_a_rig_that_loads(small, tmp_path: Path) -> None:
     assert f"the rig's own 4 ERAs: mean {found['own_contrast_db']['mean']:.1f} dB" in again
 
 
+@pytest.mark.usefixtures("plain_pictures")
 @pytest.mark.long
 def test_the_best_of_several_stiffnesses_is_written(small, tmp_path: Path) -> None:
     """Two are designed; the rig has the one whose layout has more contrast, at new ERAs alone."""
@@ -151,6 +160,7 @@ def test_the_best_of_several_stiffnesses_is_written(small, tmp_path: Path) -> No
     assert rig.era("NE").stiffness == load_rig(RIG).era("NE").stiffness
 
 
+@pytest.mark.usefixtures("plain_pictures")
 def test_given_layouts_are_ranked_and_the_best_written(small, tmp_path: Path) -> None:
     """Judged ones first, by contrast, others by score; a row each."""
     arguments = ("--layouts", "random:20", "--eras", "3-4", "--finalists", "2")
@@ -173,6 +183,7 @@ def test_given_layouts_are_ranked_and_the_best_written(small, tmp_path: Path) ->
     assert set(found["by_count_db"]) == {"3", "4"}
 
 
+@pytest.mark.usefixtures("plain_pictures")
 @pytest.mark.parametrize(("depth", "is_light"), [("4.6 in", True), ("9 in", False)])
 def test_design_warns_of_a_plate_that_nearly_tips(small, tmp_path: Path, depth, is_light) -> None:
     """An ERA a tenth of an inch behind the centre of mass carries all but 2 % of the weight."""
@@ -196,6 +207,7 @@ OWN_LINES = """{"own": [{"at": [0.03, 0.03]}, {"at": [0.26, 0.18]}]}
 """
 
 
+@pytest.mark.usefixtures("plain_pictures")
 def test_layouts_are_ranked_by_the_promise_of_two_contents(small, tmp_path: Path) -> None:
     """By what tables of all layouts, built and queried as commands, promise at the worst finger."""
     names = {"layouts.yaml": LAYOUTS, "contacts.yaml": TWO_CONTENTS, "own.jsonl": OWN_LINES}
@@ -227,6 +239,7 @@ def test_layouts_are_ranked_by_the_promise_of_two_contents(small, tmp_path: Path
 ONE_SIDE = "layouts: {side: [[0, 0], [0, 10 cm], [5 cm, 0]]}\n"
 
 
+@pytest.mark.usefixtures("plain_pictures")
 @pytest.mark.parametrize(
     ("options", "given"),
     [
@@ -247,6 +260,7 @@ def test_designs_that_cannot_be_are_refused(
     assert result.exit_code == 2 or isinstance(result.exception, InputError)
 
 
+@pytest.mark.usefixtures("plain_pictures")
 def test_design_of_python_is_that_of_the_command(small, tmp_path: Path) -> None:
     """The best of ten layouts and two stiffnesses with a kept ERA, saved; what is done is all."""
     names = ("--layouts", "random:10", "--finalists", "1", "--keep", "NE")
@@ -261,6 +275,7 @@ def test_design_of_python_is_that_of_the_command(small, tmp_path: Path) -> None:
     assert steps[-1][0] == steps[-1][1] > 0
 
 
+@pytest.mark.usefixtures("plain_pictures")
 def test_map_has_its_maximum_and_is_in_proportion_to_the_level():
     """A raster row per y, its maximum named; half the level is half."""
     result, half = (
@@ -278,6 +293,7 @@ def test_map_has_its_maximum_and_is_in_proportion_to_the_level():
     np.testing.assert_allclose(half["peak_acceleration_m_s2"], peak / 2, rtol=1e-12)
 
 
+@pytest.mark.usefixtures("plain_pictures")
 @pytest.mark.long
 def test_convergence_lists_errors_of_finer_and_finer_meshes(monkeypatch, tmp_path):
     """Errors fall from mesh to mesh, and the rig's own is marked; text and JSON agree."""
@@ -306,6 +322,7 @@ def test_convergence_lists_errors_of_finer_and_finer_meshes(monkeypatch, tmp_pat
     assert all(f"{error:.3f} %" in text for error in [*errors, *estimates[-2]])
 
 
+@pytest.mark.usefixtures("plain_pictures")
 def test_log_gets_a_line_every_two_seconds(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -319,6 +336,7 @@ def test_log_gets_a_line_every_two_seconds(
     assert capsys.readouterr().err.splitlines() == ["4 of 10 cells", "8 of 10 cells"]
 
 
+@pytest.mark.usefixtures("plain_pictures")
 @pytest.mark.parametrize(
     ("system", "line"),
     [
@@ -334,3 +352,90 @@ def test_next_line_is_for_the_shell(
         elsewhere.setattr(os, "name", system)
         said = next_line("era", "table", "show", "my $plates/t.npz", "--weak")
     assert said == line
+
+
+CASES: list[dict[str, Any]] = read_yaml(Path(__file__).with_name("printed.yaml"))
+
+
+@pytest.fixture(scope="module")
+def tables(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the tables."""
+    folder, small = tmp_path_factory.mktemp("tables"), small_table()
+    save_table(small, folder / "table.npz")
+    save_table(replace(small, omega=1.1 * small.omega), folder / "false.npz")
+    save_table(smooth_table(), folder / "smooth.npz")
+    return folder
+
+
+def agrees(found: Any, expected: Any) -> bool:
+    """Whether a value is the expected one, or as it must be."""
+    match expected:
+        case {"within": [least, most]}:
+            return bool(least <= found <= most)
+        case {"has": count}:
+            return len(found) == count
+        case {"says": text}:
+            return text in found
+        case int() | float():
+            return bool(found == pytest.approx(expected, rel=1e-4))
+        case [*each]:
+            return len(found) == len(each) and all(map(agrees, found, each))
+    return bool(found == expected)
+
+
+def at_path(printed: Any, path: str) -> Any:
+    """The value at a path of keys and numbers."""
+    for key in path.split("."):
+        printed = printed[int(key)] if isinstance(printed, list) else printed[key]
+    return printed
+
+
+@pytest.fixture
+def folder(tables: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The current folder, with a rig and tables."""
+    shutil.copy(example_rig_path(), tmp_path / "rig.yaml")
+    shutil.copytree(tables, tmp_path, dirs_exist_ok=True)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.mark.usefixtures("plain_pictures")
+@pytest.mark.parametrize("case", [pytest.param(case, id=case["printed"]) for case in CASES])
+def test_a_command_prints_and_writes_what_its_case_says(
+    case: Mapping[str, Any],
+    folder: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """As a person reads it and, with `--json`, as a program does; no other file is left."""
+    rig = folder / "rig.yaml"
+    for old, new in case.get("edit", {}).items():
+        assert old in rig.read_text("utf-8")
+        rig.write_text(rig.read_text("utf-8").replace(old, new, 1), "utf-8")
+    for name, text in case.get("files", {}).items():
+        (folder / name).write_text(text, "utf-8")
+    before = {*folder.rglob("*")}
+
+    def printed(line: str) -> tuple[str, str]:
+        monkeypatch.setattr("sys.stdin", io.StringIO(case.get("input", "")))
+        assert run(shlex.split(line)[1:]) == case.get("status", 0)
+        return tuple(capsys.readouterr())
+
+    *first, last = [case["typed"]] if isinstance(case["typed"], str) else case["typed"]
+    for line in first:
+        printed(line)
+    out, err = printed(last)
+    for text, patterns in ((out, case.get("prints", ())), (err, case.get("warns", ()))):
+        for pattern in patterns:
+            assert re.search(pattern, text, re.MULTILINE), text
+    assert not (case.get("silent") and err)
+    made = {path for path in {*folder.rglob("*")} - before if path.is_file()}
+    for name, pattern in case.get("wrote", {}).items():
+        assert re.search(pattern.encode(), (folder / name).read_bytes(), re.MULTILINE), name
+    if "wrote" in case:
+        assert made == {folder / name for name in case["wrote"]}
+    if "json" in case:
+        lines = [json.loads(line) for line in printed(f"{last} --json")[0].splitlines()]
+        for path, expected in case["json"].items():
+            found = at_path(lines if path[0].isdigit() else lines[0], path)
+            assert agrees(found, expected), (path, found)

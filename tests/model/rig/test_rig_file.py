@@ -95,26 +95,8 @@ TAPE = "supports:\n  a: {along: edges, stiffness_per_length: 3000}\n"
 MASS = "masses:\n  cam:\n    at: [0, 0]\n    mass: 5 g"
 
 
-def check_refusal(
-    folder: Path, good: str, lines: int | tuple[int, int], text: str, where: str
-) -> None:
-    """Replace lines of a good rig; where: `LINE key, suggestion` of an expected problem."""
-    first, last = lines if isinstance(lines, tuple) else (lines, lines)
-    rows = good.splitlines()
-    rows[first - 1 : last] = text.splitlines()
-    place, _, suggestion = where.partition(", ")
-    with pytest.raises(ConfigError) as caught:
-        load_rig(write(folder, "\n".join(rows)))
-    assert any(
-        f"{each.line} {each.key}" == place
-        and f"did you mean {suggestion}?" in f"{each.message}did you mean ?"
-        for each in caught.value.problems
-    )
-
-
-@pytest.mark.parametrize(
-    ("lines", "text", "where"),
-    [
+INVALID: dict[str, list[tuple[int | tuple[int, int], str, str]]] = {
+    GOOD: [
         (2, "  length: .nan", "2 plate.length"),
         (2, "  length:", "2 plate.length"),
         (2, "  length: 304.8", "2 plate.length"),
@@ -187,17 +169,7 @@ def check_refusal(
         (23, "  level: 0.5\nfingertip: 5", "24 fingertip"),
         (23, "  level: 0.5\nfingertip: {phalanx: 1 g}", "24 fingertip.phalanx, phalanx_mass"),
     ],
-)
-def test_load_rig_refuses_an_invalid_value_with_line_and_key(
-    tmp_path: Path, lines: int | tuple[int, int], text: str, where: str
-) -> None:
-    """Each kind of value, section and reference is checked; a mistyped name gets a suggestion."""
-    check_refusal(tmp_path, GOOD, lines, text, where)
-
-
-@pytest.mark.parametrize(
-    ("lines", "text", "where"),
-    [
+    LAMINATE: [
         ((4, 9), "  layers: []", "4 plate.layers"),
         ((4, 9), "  layers:\n    - 7", "5 plate.layers[0]"),
         ((4, 9), "  layers: {a: 1}", "4 plate.layers"),
@@ -224,12 +196,33 @@ def test_load_rig_refuses_an_invalid_value_with_line_and_key(
         (10, "  bond: glue", "10 plate.bond"),
         (10, "  bond: shear", "10 plate.bond"),
     ],
+}
+"""Of a good rig: lines that are replaced, by what, and `LINE key, suggestion` of a problem."""
+
+
+@pytest.mark.parametrize(
+    ("good", "lines", "text", "where"),
+    [(good, *row) for good, rows in INVALID.items() for row in rows],
+    ids=[where for rows in INVALID.values() for *_, where in rows],
 )
-def test_load_rig_refuses_an_invalid_laminate_with_line_and_key(
-    tmp_path: Path, lines: int | tuple[int, int], text: str, where: str
+def test_load_rig_refuses_an_invalid_value_with_line_and_key(
+    tmp_path: Path, good: str, lines: int | tuple[int, int], text: str, where: str
 ) -> None:
-    """The key leads to the layer that is wrong."""
-    check_refusal(tmp_path, LAMINATE, lines, text, where)
+    """Each kind of value, section and reference is checked; a mistyped name gets a suggestion.
+
+    Of a laminate the key leads to the layer that is wrong.
+    """
+    first, last = lines if isinstance(lines, tuple) else (lines, lines)
+    rows = good.splitlines()
+    rows[first - 1 : last] = text.splitlines()
+    place, _, suggestion = where.partition(", ")
+    with pytest.raises(ConfigError) as caught:
+        load_rig(write(tmp_path, "\n".join(rows)))
+    assert any(
+        f"{each.line} {each.key}" == place
+        and f"did you mean {suggestion}?" in f"{each.message}did you mean ?"
+        for each in caught.value.problems
+    )
 
 
 CAMERA, PLUG = "camera: {at: [50 mm, 9 in], mass: 20 g}", "plug: {at: [0, 0], mass: 5 g}"

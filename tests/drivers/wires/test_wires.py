@@ -12,10 +12,9 @@ import random
 import struct
 import threading
 import zlib
-from collections.abc import AsyncIterator, Callable, Coroutine, Iterable, Iterator
+from collections.abc import AsyncIterator, Callable, Iterable
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
-from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -420,85 +419,49 @@ def test_frames_are_those_of_classic_can() -> None:
             address_of(f"can+socketcan://can0{query}")
 
 
-class _Hanging:
-    """A port or adapter whose opening, reading and closing block until allowed.
+@pytest.mark.parametrize("timeout", [None, 20.0], ids=["as it is given", "20 s"])
+@pytest.mark.parametrize("kind", ["port", "adapter"])
+async def test_close_does_not_wait_for_a_device_that_hangs(
+    kind: str,
+    timeout: float | None,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    """It continues in its thread, with a log line; frames read then are discarded.
 
-    timeout [s]: of its reading, however long it was given; None for as long.
+    timeout [s]: of reading a device, which blocks as closing does until it is allowed.
     """
+    heard, ends = list[bytes](), os.pipe()
+    may_read, may_close, is_closed = (threading.Event() for _ in range(3))
 
-    def __init__(self, timeout: float | None) -> None:
-        self.port, self._timeout = "/dev/ttyUSB9", timeout
-        self.may_open, self.may_read, self.may_close = (threading.Event() for _ in range(3))
-        self.is_opening, self.is_closed = threading.Event(), threading.Event()
-        self._pipe = os.pipe()
-
-    def open(self, *_: object) -> "_Hanging":
-        self.is_opening.set()
-        self.may_open.wait(60)
-        return self
-
-    def fileno(self) -> int:
-        return self._pipe[0]
-
-    def recv(self, timeout: float) -> can.Message | None:
-        if not self.may_read.wait(self._timeout or timeout):
+    def recv(given: float) -> can.Message | None:
+        if not may_read.wait(timeout or given):
             return None
         return can.Message(arbitration_id=0x701, is_extended_id=False, data=[5])
 
-    def close(self) -> None:
-        self.may_close.wait(60)
-        for descriptor in self._pipe:
-            os.close(descriptor)
-        self.is_closed.set()
+    def close() -> None:
+        may_close.wait(60)
+        for each in ends:
+            os.close(each)
+        is_closed.set()
 
-    shutdown = close
-
-
-HEARD: list[bytes] = []
-OPENINGS: dict[str, Callable[[], Coroutine[Any, Any, Port]]] = {
-    "port": partial(
-        ports.open_port,
-        Endpoint("/dev/ttyUSB9", baud=9600),
-        lambda data: None,
-        lambda what: None,
-    ),
-    "adapter": partial(
-        can_bus.open_bus,
-        "can+python-can://pcan/usb",
-        {"interface": "pcan"},
-        HEARD.append,
-        lambda what: None,
-    ),
-}
-
-
-@pytest.fixture(params=[None, 20.0])
-def device(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[_Hanging]:
-    """The device that is opened; released after the test."""
-    device = _Hanging(request.param)
-    monkeypatch.setattr(ports, "_open_device", device.open)
-    monkeypatch.setattr(can, "Bus", lambda **how: device.open())
+    device = Mock(port="/dev/ttyUSB9", recv=recv, close=close, shutdown=close)
+    device.fileno.return_value = ends[0]
+    monkeypatch.setattr(ports, "_open_device", lambda *_: device)
+    monkeypatch.setattr(can, "Bus", lambda **how: device)
     monkeypatch.setattr(threads, "CLOSE_TIMEOUT", 0.05)
-    HEARD.clear()
-    yield device
-    for event in (device.may_open, device.may_read, device.may_close):
-        event.set()
-    assert device.is_closed.wait(60)
-
-
-@pytest.mark.parametrize("kind", OPENINGS)
-async def test_close_does_not_wait_for_a_device_that_hangs(
-    device: _Hanging, kind: str, caplog: pytest.LogCaptureFixture
-) -> None:
-    """It continues in its thread, with a log line; frames read then are discarded."""
-    device.may_open.set()
-    opened = await OPENINGS[kind]()
+    if kind == "port":
+        place = Endpoint("/dev/ttyUSB9", baud=9600)
+        opened: Port = await ports.open_port(place, heard.append, lambda what: None)
+    else:
+        how = {"interface": "pcan"}
+        opened = await can_bus.open_bus("can+python-can://pcan/usb", how, heard.append, print)
     opened.close()
     with caplog.at_level(logging.WARNING, "drivers"):
         await asyncio.wait_for(opened.wait_closed(), 30)
-    assert not device.is_closed.is_set()
+    assert not is_closed.is_set()
     assert "era-close" in caplog.text
-    device.may_read.set()
-    device.may_close.set()
-    assert await asyncio.to_thread(device.is_closed.wait, 60)
-    assert HEARD == []
+    may_read.set()
+    may_close.set()
+    assert await asyncio.to_thread(is_closed.wait, 60)
+    assert heard == []

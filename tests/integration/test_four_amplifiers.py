@@ -402,16 +402,10 @@ def capture(tmp_path_factory):
     return write_schedule(tmp_path_factory.mktemp("touches") / "touches.tuio", SCHEDULE, 2.1)
 
 
-@pytest.fixture(scope="module")
-def environment(table_cache):
-    """The tests' own cache folder."""
-    return os.environ | {"XDG_CACHE_HOME": str(table_cache)}
-
-
 @pytest.fixture
-def demo(environment, tmp_path, monkeypatch, capsys):
+def demo(table_cache, tmp_path, monkeypatch, capsys):
     """Run `era demo --json` in this process; returns exit status, output and errors."""
-    monkeypatch.setenv("XDG_CACHE_HOME", environment["XDG_CACHE_HOME"])
+    monkeypatch.setenv("XDG_CACHE_HOME", str(table_cache))
     monkeypatch.chdir(tmp_path)
 
     def run_demo(*arguments):
@@ -495,11 +489,11 @@ def test_demo_reports_a_far_end_that_ended(capture, demo, monkeypatch):
     assert out == ""
 
 
-def test_far_end_ends_when_the_demo_is_killed(capture, environment, tmp_path):
+def test_far_end_ends_when_the_demo_is_killed(capture, table_cache, tmp_path):
     """After SIGKILL of the command, the amplifiers' process ends by itself."""
     with subprocess.Popen(
         [str(ERA), "demo", "--touches", str(capture), "--out", str(tmp_path)],
-        env=environment,
+        env=os.environ | {"XDG_CACHE_HOME": str(table_cache)},
         cwd=tmp_path,
         stdout=subprocess.DEVNULL,
     ) as process:

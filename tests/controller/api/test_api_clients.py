@@ -248,41 +248,36 @@ def responding(path: Path, *answers: bytes, rest: bytes = b"") -> Iterator[list[
             thread.join()
 
 
-async def connect_error(folder: Path, *lines: bytes) -> tuple[Exception, Exception]:
-    """The errors of both clients' `connect` to a server that sends these lines."""
-    with responding(folder / "a", b"".join(lines)), pytest.raises((Unreachable, RpcError)) as one:
-        await asyncio.to_thread(Client.connect, folder / "a")
-    with responding(folder / "b", b"".join(lines)), pytest.raises((Unreachable, RpcError)) as other:
-        await AsyncClient.connect(folder / "b")
-    return one.value, other.value
-
-
 @pytest.mark.parametrize(
-    ("lines", "words"),
+    ("line", "error", "words"),
     [
-        ((b'{"jsonrpc":"2.0","id":1,"result":{"api_version":"2.0"}}\n',), "version 2.0"),
-        ((b'{"jsonrpc":"2.0","id":1,"result":{"mood":"good"}}\n',), "update"),
-        ((b'{"jsonrpc":"2.0","id":1,"error":{"code":1,"message":"?"}}\n',), "update"),
-        ((b"SSH-2.0-OpenSSH_9.2\n",), "update"),
-        ((), "log"),
-        ((b'{"jso',), "log"),
+        (b'{"jsonrpc":"2.0","id":1,"result":{"api_version":"2.0"}}\n', Unreachable, "version 2.0"),
+        (b'{"jsonrpc":"2.0","id":1,"result":{"mood":"good"}}\n', Unreachable, "update"),
+        (b'{"jsonrpc":"2.0","id":1,"error":{"code":1,"message":"?"}}\n', Unreachable, "update"),
+        (b"SSH-2.0-OpenSSH_9.2\n", Unreachable, "update"),
+        (b"", Unreachable, "log"),
+        (b'{"jso', Unreachable, "log"),
+        (
+            b'{"jsonrpc":"2.0","id":null,"error":{"code":1005,"message":"too many connections"}}\n',
+            RpcError,
+            "too many connections",
+        ),
     ],
 )
 async def test_connect_fails_when_the_peer_is_no_compatible_daemon(
-    tmp_path: Path, lines: tuple[bytes, ...], words: str
+    tmp_path: Path, line: bytes, error: type[Unreachable | RpcError], words: str
 ) -> None:
-    """Another major version, another program, a closed connection: Unreachable with a remedy."""
-    for error in await connect_error(tmp_path, *lines):
-        assert isinstance(error, Unreachable)
-        assert words in str(error)
+    """Another major version, another program, a closed connection: Unreachable with a remedy.
 
-
-async def test_connect_raises_an_error_without_id(tmp_path: Path) -> None:
-    """As sent by a daemon with too many clients before it reads anything."""
-    busy = b'{"jsonrpc":"2.0","id":null,"error":{"code":1005,"message":"too many connections"}}\n'
-    for error in await connect_error(tmp_path, busy):
-        assert isinstance(error, RpcError)
-        assert error.code is ErrorCode.BUSY
+    An error without an id is raised as sent by a daemon with too many clients before it reads
+    anything.
+    """
+    with responding(tmp_path / "a", line), pytest.raises(error, match=words) as one:
+        await asyncio.to_thread(Client.connect, tmp_path / "a")
+    with responding(tmp_path / "b", line), pytest.raises(error, match=words) as other:
+        await AsyncClient.connect(tmp_path / "b")
+    if error is RpcError:
+        assert {getattr(each.value, "code", None) for each in (one, other)} == {ErrorCode.BUSY}
 
 
 def test_client_subscribes_again_with_the_rate_of_each_topic(tmp_path: Path) -> None:
@@ -403,27 +398,26 @@ def test_peer_is_believed_only_as_root_caller_or_service(
         check_peer(Path("/run/x/era.sock"), connected, environment={"ERA_HAPTICS_USER": "plate"})
 
 
-def test_clients_use_the_socket_of_the_environment(
+def test_clients_use_the_socket_of_the_environment_or_the_system_socket(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It is taken whether or not a daemon is there; a given path goes first."""
-    monkeypatch.setenv("ERA_HAPTICS_SOCKET", str(tmp_path / "own.sock"))
-    monkeypatch.setattr("controller.api.link.SYSTEM_SOCKET", tmp_path)  # exists
-    assert find_socket(None) == tmp_path / "own.sock"
-    assert find_socket("given.sock") == Path("given.sock")
+    """It is taken whether or not a daemon is there; a given path goes first.
 
-
-def test_find_socket_returns_the_system_socket_of_another_user(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """Also in a folder that cannot be read; connecting then reports whose it is."""
+    Else that of the system, also in a folder of another user that cannot be read; connecting then
+    reports whose it is.
+    """
+    with monkeypatch.context() as patched:
+        patched.setenv("ERA_HAPTICS_SOCKET", str(tmp_path / "own.sock"))
+        patched.setattr("controller.api.link.SYSTEM_SOCKET", tmp_path)  # exists
+        assert find_socket(None) == tmp_path / "own.sock"
+        assert find_socket("given.sock") == Path("given.sock")
 
     def forbidden(path: Path, **options: bool) -> os.stat_result:
         if path == SYSTEM_SOCKET:
             raise PermissionError(13, "Permission denied", str(path))
         raise FileNotFoundError(2, "No such file or directory", str(path))
 
-    monkeypatch.setattr(Path, "stat", forbidden)
-    assert find_socket(None) == SYSTEM_SOCKET
-    monkeypatch.undo()
+    with monkeypatch.context() as patched:
+        patched.setattr(Path, "stat", forbidden)
+        assert find_socket(None) == SYSTEM_SOCKET
     assert "another user" in str(Unreachable.at(SYSTEM_SOCKET, PermissionError()))

@@ -220,15 +220,13 @@ LATCHED = [DaemonState.QUICK_STOP_ACTIVE, DaemonState.FAULT_REACTION_ACTIVE, Dae
 LOST_AT, ENERGISED_UNTIL = 0.0, 0.35
 
 
-def grid() -> dict[tuple[DaemonState, Trigger], str]:
-    """The table above by state and trigger, without those that have tests of their own."""
-    head, *rows = EVENTS.strip("\n").splitlines()
-    cells = {}
-    for row in rows:
-        state, *entries = row.split()
-        for trigger, entry in zip(head.split(), entries, strict=True):
-            cells[DaemonState(state), Trigger[trigger]] = entry
-    return cells
+HEAD, *ROWS = (line.split() for line in EVENTS.strip("\n").splitlines())
+TABLE = {
+    (DaemonState(state), Trigger[trigger]): entry
+    for state, *entries in ROWS
+    for trigger, entry in zip(HEAD, entries, strict=True)
+}
+"""The table above by state and trigger, without those that have tests of their own."""
 
 
 def operations(state: DaemonState) -> list[Operation]:
@@ -246,15 +244,12 @@ def operations(state: DaemonState) -> list[Operation]:
 )
 def test_step_follows_table(state: DaemonState, trigger: Trigger) -> None:
     """The next state and the actions are those of the table, whatever the flags."""
-    entry = grid()[state, trigger]
-    to, _, letters = entry.partition(":")
+    to, _, letters = TABLE[state, trigger].partition(":")
     for operation in operations(state):
         after, actions = step(operation, DaemonEvent(trigger, "because", "do this"), LOST_AT)
-        match trigger:
-            case Trigger.OPENED if state is DaemonState.NOT_READY and operation.is_latched:
-                expected = (DaemonState.QUICK_STOP_ACTIVE, [Action.STOP])
-            case _:
-                expected = (STATE_CODES.get(to, state), [ACTIONS[letter] for letter in letters])
+        expected = (STATE_CODES.get(to, state), [ACTIONS[letter] for letter in letters])
+        if (state, trigger) == (DaemonState.NOT_READY, Trigger.OPENED) and operation.is_latched:
+            expected = (DaemonState.QUICK_STOP_ACTIVE, [Action.STOP])
         assert (after.state, [*actions]) == expected
         if after.state is not state:
             is_fault = after.state in (DaemonState.FAULT_REACTION_ACTIVE, DaemonState.FAULT)
@@ -624,20 +619,15 @@ async def test_second_clear_leaves_a_plate_alone_that_the_first_has_cleared() ->
         assert daemon.far_end.state == ARMED
 
 
-async def stall(daemon: Watched, seconds: float) -> None:
-    """Let the amplifier hear nothing for a time [s]."""
-    daemon.fault("drop", toward="amplifier")
-    await asyncio.sleep(seconds)
-    daemon.recovers()
-
-
 @in_virtual_time
 async def test_amplifier_that_plays_another_set_after_a_stall_is_stopped() -> None:
     """Another program may have played it meanwhile."""
     async with watched(breaks="plate") as daemon:
         await daemon.handle(ARM)
         await asyncio.sleep(0.02)
-        await stall(daemon, 0.15)
+        daemon.fault("drop", toward="amplifier")
+        await asyncio.sleep(0.15)  # in which the amplifier hears nothing
+        daemon.recovers()
         far = daemon.far_end.amplifier
         (part,) = parts(
             pack_layers([LayerSet(0, 0, 0, (Command(0, 2000, 1000, 0),))]),

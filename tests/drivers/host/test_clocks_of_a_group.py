@@ -126,29 +126,6 @@ async def test_status_that_cannot_be_ends_in_silence(
     await stops_truthfully(group, end)
 
 
-@pytest.mark.parametrize("times", [1, 2])
-@pytest.mark.parametrize("wire", KINDS)
-@in_virtual_time
-async def test_set_taken_under_another_token_is_sent_again(
-    wire: str, times: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Once; two such replies in a row stop it."""
-    group, end = await armed(wire)
-    record, lies = MESSAGES["Set"].reply, [1] * times
-    pack = record.pack
-    monkeypatch.setattr(
-        record,
-        "pack",
-        lambda values: pack({**values, "token": values["token"] ^ (lies.pop() if lies else 0)}),
-    )
-    is_refused = pytest.raises(DriverError, match="token")
-    with contextlib.nullcontext() if times == 1 else is_refused:
-        await group.apply({"a": [loud()]})
-    assert group.is_armed is (times == 1)
-    await asyncio.sleep(0.02)
-    assert end.levels("a") == [0.5 if times == 1 else 0.0, 0.0]
-
-
 Lie = Callable[[str, list[bytes], random.Random], list[tuple[float, bytes]]]
 """What comes of a reply, by the kind of wire, all replies so far and a source of chance."""
 

@@ -266,6 +266,13 @@ class OnLines(Taken):
         said = {"exact": 0, "staged": 0, "played": 0, "missing": 0}
         self.far.a._take = lambda part, now: {**said, "token": part["token"]}
 
+    def says_other_tokens(self, count: int) -> None:
+        """Let the first amplifier take so many parts under another token."""
+        take, left = self.far.a._take, [1] * count
+        self.far.a._take = lambda part, now: (
+            take(part, now) | {"token": part["token"] ^ (left.pop() if left else 0)}
+        )
+
     def replies_come_twice(self) -> None:
         """Let each reply on the first line come once more."""
         self.lines[0].outward = lambda _, data: [(0.0002, data), (0.004, data)]

@@ -190,9 +190,8 @@ def test_two_fingers_that_share_and_no_other_are_served():
     requests = [wants(at, may_share=True) for at in ((0.16, 0.06), (0.19, 0.06))]
     found = answer(smooth_table(), requests)
     assert "shares" in found.applied[-1]
-    for felt in found.fingers:
-        assert felt.promised_level_db_sl > 19.9
-        assert felt.promised_contrast_db is None
+    assert min(felt.promised_level_db_sl for felt in found.fingers) > 19.9
+    assert {felt.promised_contrast_db for felt in found.fingers} == {None}
 
 
 def test_what_is_held_back_is_null_in_json_and_what_has_little_contrast_is_said():
@@ -351,7 +350,10 @@ def test_a_finger_that_must_not_be_disturbed_is_not():
 
 
 def test_the_lowest_priority_is_held_back():
-    """With the contrast that it would have had, and the level of the others there."""
+    """With the contrast that it would have had, and the level of the others there.
+
+    A content that is left alone keeps its band: that of the one held back is not its own.
+    """
     requests = [wants(at, priority=int(at != FAR)) for at in (NEAR, FAR, THIRD, FOURTH)]
     every = answer(smooth_table(), requests, min_contrast_db=-99)
     found = answer(smooth_table(), requests, min_contrast_db=every.promised_worst_db + 0.1)
@@ -362,31 +364,26 @@ def test_the_lowest_priority_is_held_back():
     assert held.foreign_level_db_sl < 20
     assert sorted(each.layer for each in found.fingers if each is not held) == [0, 1, 2]
 
-
-def test_a_content_that_is_left_alone_keeps_its_band():
-    """The band of the one that is held back is not its own."""
-    bands = ((470, 500), (40, 320))
-    requests = [
-        replace(wants(at, band, priority=-n), sharing=NEVER)
-        for n, (at, band) in enumerate(zip((NEAR, FAR), bands, strict=True))
-    ]
-    found = answer(smooth_table(), requests, min_contrast_db=99)
-    assert found.fingers[1].verdict == "held back"
-    assert {470 <= tone.frequency <= 500 for tone in drives(found)[0].values()} == {True}
+    banded = wants(NEAR, (470, 500)), wants(FAR, (40, 320), priority=-1)
+    requests = [replace(each, sharing=NEVER) for each in banded]
+    alone = answer(smooth_table(), requests, min_contrast_db=99)
+    assert alone.fingers[1].verdict == "held back"
+    assert {470 <= tone.frequency <= 500 for tone in drives(alone)[0].values()} == {True}
 
 
 def test_a_finger_without_protection_gives_way_to_more_contrast():
     """The others have more than where the finger is kept quiet."""
-    places, contrast = (NEAR, FAR, THIRD), []
-    for is_protected in (False, True):
-        requests = [
-            wants(at, is_protected=is_protected or at != THIRD, priority=int(at != THIRD))
-            for at in places
-        ]
-        found = answer(smooth_table(), requests, min_contrast_db=9.0)
-        assert found.fingers[2].verdict == "held back"
-        contrast.append(found.promised_worst_db)
-    assert contrast[0] > contrast[1] + 1
+    first, second, third = (wants(at, priority=int(at != THIRD)) for at in (NEAR, FAR, THIRD))
+    alone, beside = (
+        answer(
+            smooth_table(),
+            [first, second, replace(third, is_protected=is_protected)],
+            min_contrast_db=9.0,
+        )
+        for is_protected in (False, True)
+    )
+    assert alone.fingers[2].verdict == beside.fingers[2].verdict == "held back"
+    assert alone.promised_worst_db > beside.promised_worst_db + 1
 
 
 @pytest.fixture(scope="module")

@@ -120,8 +120,8 @@ def test_nine_of_ten_boards_stay_within_their_excursion(frequency: float) -> Non
 
     On boards drawn and integrated here, whose exciters jump in the phases that add.
     """
-    path = Path(__file__).parents[3] / "examples/weekend/rig.yaml"
-    rig, rng = load_rig(path).replaced(limits={"frequency": [60, 300]}), np.random.default_rng(3)
+    rig = load_rig(EXAMPLES / "weekend" / "rig.yaml").replaced(limits={"frequency": [60, 300]})
+    rng = np.random.default_rng(3)
     free = solve_free_plate(rig.plate, rig.mesh, frequency_max=300.0)
     exact = replace(rig, uncertainty=Uncertainty.none())
     known, counted = (magnets_of(each, free).shares(np.array([frequency])) for each in (exact, rig))
@@ -184,6 +184,7 @@ def test_bursts_are_followed_as_scipy_integrates() -> None:
     np.testing.assert_allclose(found, expected[::FINER], atol=1e-4 * np.abs(expected).max())
 
 
+EXAMPLES = Path(__file__).parents[3] / "examples"
 POINTS = np.array([[0.05, 0.05], [0.15, 0.12], [0.28, 0.2]])
 FINGER = FingertipLoad(0.11, 0.09, Fingertip())
 
@@ -260,7 +261,6 @@ def test_lowest_modes_are_those_of_a_board_and_magnets_worked_out() -> None:
     assert rigid[0] == pytest.approx(math.sqrt(foam / (board + magnets)) / (2 * math.pi), rel=0.02)
 
 
-EXAMPLES = Path(__file__).parents[3] / "examples"
 VARIANCE = 0.05**2 + np.radians(5) ** 2
 
 

@@ -54,22 +54,29 @@ def test_dial_clicks_at_every_detent_of_two_turns(sense: int) -> None:
     assert passed == expected
 
 
-def test_dial_ignores_the_radius_and_noise_around_a_detent() -> None:
-    """A finger that moves out and in feels nothing, nor one that trembles at a detent."""
-    way = [at(0, radius=radius) for radius in (0.03, 0.04, 0.02, 0.01)]
-    assert clicks(way, spacing=math.radians(20)) == []
-    way = [at(0), *(at(10 + degrees) for degrees in (2, -1, 1, -1, 1))]
-    assert clicks(way, spacing=math.radians(20)) == [1]
-
-
-def test_dial_turns_nothing_near_its_centre() -> None:
+@pytest.mark.parametrize(
+    ("way", "expected"),
+    [
+        ([at(0, radius=radius) for radius in (0.03, 0.04, 0.02, 0.01)], []),
+        ([at(0), *(at(10 + degrees) for degrees in (2, -1, 1, -1, 1))], [1]),
+        ([at(0), at(0, radius=0.003), at(180, radius=0.003), at(180), at(185), at(195)], [5]),
+    ],
+    ids=["out and in", "trembling at a detent", "across the centre"],
+)
+def test_dial_ignores_radius_noise_and_its_centre(way: list[Contact], expected: list[int]) -> None:
     """Across the centre the angle jumps by half a turn; then it goes on from there."""
-    way = [at(0), at(0, radius=0.003), at(180, radius=0.003), at(180), at(185), at(195)]
-    assert clicks(way, spacing=math.radians(20)) == [5]
+    assert clicks(way, spacing=math.radians(20)) == expected
 
 
 def test_player_gives_a_dial_the_centre_of_its_region() -> None:
-    """A quarter of a turn about that centre is nine detents of 10 degrees; elsewhere nothing."""
+    """A quarter of a turn about that centre is nine detents of 10 degrees; elsewhere nothing.
+
+    Centres by hand: of a rectangle, and of an L of three unit squares at (5/6, 5/6).
+    """
+    assert Rectangle(1.0, 2.0, 4.0, 2.0).centre == (3.0, 3.0)
+    corners = ((0.0, 0.0), (2.0, 0.0), (2.0, 1.0), (1.0, 1.0), (1.0, 2.0), (0.0, 2.0))
+    for points in (corners, corners[::-1]):
+        assert Polygon(points).centre == pytest.approx((5 / 6, 5 / 6))
     layout = SurfaceLayout((KNOB,), {"dial": Dial(spacing=math.radians(10))}, elsewhere=None)
     player = EffectPlayer(layout)
     player.intent([at(0)], 0.0)
@@ -80,14 +87,6 @@ def test_player_gives_a_dial_the_centre_of_its_region() -> None:
         if target.pulse is not None
     }
     assert len(starts) == 9
-
-
-def test_centres_of_shapes() -> None:
-    """By hand: of a rectangle, and of an L of three unit squares at (5/6, 5/6)."""
-    assert Rectangle(1.0, 2.0, 4.0, 2.0).centre == (3.0, 3.0)
-    corners = ((0.0, 0.0), (2.0, 0.0), (2.0, 1.0), (1.0, 1.0), (1.0, 2.0), (0.0, 2.0))
-    for points in (corners, corners[::-1]):
-        assert Polygon(points).centre == pytest.approx((5 / 6, 5 / 6))
 
 
 def test_region_fixes_the_frequency_of_its_effects() -> None:

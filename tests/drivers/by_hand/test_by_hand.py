@@ -24,7 +24,6 @@ from typer.testing import CliRunner, Result
 from drivers.by_hand import actions, reaching
 from drivers.by_hand.actions import BlockingAmplifier
 from drivers.by_hand.cli import app
-from drivers.by_hand.cli import app as amp_app
 from drivers.by_hand.reaching import (
     Arrangement,
     Candidate,
@@ -330,7 +329,7 @@ COMMON = {
 
 def invoke(*args: str) -> Result:
     """Run `era amp` with these arguments."""
-    return CliRunner().invoke(lab_app if args[0] == "conformance" else amp_app, ["amp", *args])
+    return CliRunner().invoke(lab_app if args[0] == "conformance" else app, ["amp", *args])
 
 
 def result_of(*args: str) -> dict[str, Any]:

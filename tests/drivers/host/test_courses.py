@@ -25,6 +25,7 @@ from drivers.host.amplifier_sensors import read_measured
 from drivers.host.group import Group
 from drivers.host.joint_sets import PlayedSet
 from drivers.host.ledger import Ledger, StopOutcome
+from drivers.host.line import Priority
 from drivers.playing import AmplifierLayer, AmplifierTone
 from drivers.protocol.definition import CLOCK_UNKNOWN, FEATURES, MESSAGES, STATES
 from drivers.protocol.records import Refusal, Values
@@ -206,6 +207,10 @@ class OnLines(Taken):
     async def reads(self, name: str, times: int = 1) -> None:
         """Read the status of one, so often at once."""
         await asyncio.gather(*(self.group.amplifiers[name].read_status() for _ in range(times)))
+
+    async def reads_last(self, name: str) -> None:
+        """Read the status of one with the priority of readings, which go after all else."""
+        await getattr(self.hosts, name).read_status(Priority.READING)
 
     async def beats(self, times: int) -> None:
         """Beat so often, 50 ms after one another."""

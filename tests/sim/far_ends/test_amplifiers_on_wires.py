@@ -494,7 +494,6 @@ SLOWEST = ("modbus+rtu, 19 200 baud", "can+slcan, 125 kbit/s")
 SHORT_WIRES = ("serial", "modbus+rtu", *SLOWEST)
 """One of each family, and the slowest; `make test-long` takes the others."""
 
-over_every_wire = pytest.mark.parametrize("wire", shortly(WIRES, SHORT_WIRES))
 at_every_speed = pytest.mark.parametrize("wire", shortly(ALL_WIRES, SHORT_WIRES))
 
 
@@ -605,7 +604,7 @@ def in_use() -> tuple[int, int, int]:
     return len(list(Path("/dev/fd").iterdir())), len(threads), len(asyncio.all_tasks())
 
 
-@over_every_wire
+@pytest.mark.parametrize("wire", shortly(WIRES, SHORT_WIRES))
 async def test_replugging_leaks_nothing(wire: str, coarse_rig: Rig) -> None:
     """Real ports: unplug, plug in, reopen: descriptors, threads and tasks stay constant."""
     before = (math.inf,) * 3

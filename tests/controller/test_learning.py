@@ -516,7 +516,6 @@ async def test_worker_ends_with_a_daemon_that_was_killed(tmp_path: Path, is_stop
     file.write_text(PARENT)
     pipe = asyncio.subprocess.PIPE
     parent = await asyncio.create_subprocess_exec(sys.executable, str(file), stdout=pipe)
-    assert parent.stdout is not None
     worker, *others = map(int, (await parent.stdout.readline()).split())
     assert worker in others
     if is_stopped:

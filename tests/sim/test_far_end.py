@@ -357,7 +357,6 @@ def test_firmware_ends_when_its_parent_is_killed(tmp_path: Path) -> None:
     program.write_text(PROGRAM.replace("&3", str(notes)))
     program.chmod(0o755)
     with subprocess.Popen([sys.executable, "-c", PARENT, program], stdout=-1) as parent:
-        assert parent.stdout is not None
         assert parent.stdout.readline() == b"serial:///dev/pts/7\n"
         parent.send_signal(signal.SIGKILL)
     until = threads.now() + 10

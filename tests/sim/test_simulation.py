@@ -502,7 +502,6 @@ async def test_witness_relays_a_wire_until_interrupted(
             stderr=asyncio.subprocess.PIPE,
             cwd=example_rig_path().parent.parent,
         )
-        assert process.stdout is not None
         line = await asyncio.wait_for(process.stdout.readline(), TIMEOUT)
         prlimit(process.pid, RLIMIT_FSIZE, (room, RLIM_INFINITY))
         url = line.decode().split()[1]

@@ -167,7 +167,6 @@ class Chain:
                 observe(controller.cycle.observers)
                 return controller
 
-            assert far.machine is not None
             far.machine.passing = passing or far.machine.passing
             try:
                 yield cls(far, far.machine, witness, plate_judge, make)
@@ -627,7 +626,6 @@ class Streamed(Chain):
     def _note_clocks(self, applied: PlayReport) -> None:
         """Keep how far off clocks are counted in what has just begun to play."""
         planner = self.controller.cycle.planner
-        assert planner is not None
         self._counted.append((applied.time, planner.clocks.errors))
 
     def _touch(self, stream: Stream, fingers: Mapping[int, str]) -> None:
@@ -639,7 +637,6 @@ class Streamed(Chain):
 
 def _pattern(applied: PlayReport) -> Mapping[str, Any]:
     event = PlateView(effect_of=lambda key: None, report=applied).pattern_event()
-    assert event is not None
     return event.model_dump()
 
 

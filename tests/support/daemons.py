@@ -594,7 +594,6 @@ async def far_end_process(rig: Path, *options: str) -> AsyncIterator[FarEndProce
             cwd=example_rig_path().parent.parent,
         )
         try:
-            assert process.stdout is not None
             line = (await asyncio.wait_for(process.stdout.readline(), PROCESS_PATIENCE)).decode()
             name, _, url = line.strip().partition(": ")
             reader, writer = await asyncio.open_unix_connection(control, limit=1 << 24)

@@ -63,8 +63,6 @@ def running_firmware(folder: Path, *options: str) -> Iterator[tuple[str, int]]:
         stdout=subprocess.PIPE,
         text=True,
     ) as process:
-        assert process.stdin is not None
-        assert process.stdout is not None
         yield process.stdout.readline().strip(), process.pid
         process.stdin.close()
 

@@ -35,7 +35,6 @@ async def flood(kind: str, *arguments: object) -> AsyncIterator[asyncio.subproce
         stdin=asyncio.subprocess.PIPE,
         stdout=asyncio.subprocess.PIPE,
     )
-    assert process.stdout is not None
     try:
         assert await process.stdout.readline() == b"ready\n"
         yield process

@@ -231,7 +231,6 @@ def attack(gateway: GatewayProcess, name: str, seconds: float) -> Outcome:
             begin = time.monotonic()
             outcome.stops.append(_stop(gateway))
             time.sleep(max(0.0, begin + _INTERVAL - time.monotonic()))
-        assert attacking.stdout is not None
         outcome.attackers = attacking.stdout.read().strip()
         assert attacking.returncode == 0, "the attackers have failed"
     finally:

@@ -300,7 +300,6 @@ def gateway_process(
         ) as process,
     ):
         try:
-            assert process.stdout is not None
             line = process.stdout.readline()
             assert line.startswith("dashboard: "), errors.read_text()
             url, _, own = line.split()[1].partition("#token=")

@@ -328,7 +328,6 @@ class Stopping(RandomGroup):
 
     def end(self) -> None:
         """End the control loop."""
-        assert self.running is not None
         self.running.cancel()
 
 

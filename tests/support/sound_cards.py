@@ -101,7 +101,6 @@ class SoftAmp:
                 text=True,
                 env=environment,
             )
-        assert self.process.stdout is not None
         self.url = self.process.stdout.readline().strip()
 
     @property
@@ -117,8 +116,6 @@ class SoftAmp:
 
     def end(self) -> None:
         """End it as the end of its input does."""
-        assert self.process.stdin is not None
-        assert self.process.stdout is not None
         self.process.stdin.close()
         self.process.wait(START)
         self.process.stdout.close()
@@ -133,7 +130,6 @@ def host(url: str, channels: int) -> Iterator["subprocess.Popen[str]"]:
         stderr=subprocess.DEVNULL,
         text=True,
     ) as process:
-        assert process.stdout is not None
         assert process.stdout.readline() == "armed\n"
         yield process
         with contextlib.suppress(ProcessLookupError):

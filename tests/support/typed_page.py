@@ -219,7 +219,6 @@ def try_files(era: InstalledEra) -> None:
 def try_wire(era: InstalledEra) -> None:
     """A simulated amplifier on a pseudo-terminal, and what is asked of it by hand."""
     with era.running("sim", "rig.yaml", "--serial") as sim:
-        assert sim.stdout is not None
         name, _, url = sim.stdout.readline().strip().partition(": ")
         expect(name == "main" and url.startswith("serial:"), f"not an amplifier: {name} {url}")
         expect("4" in era("amp", "identify", url), "an amplifier without channels")
@@ -249,7 +248,6 @@ def try_gateway(era: InstalledEra) -> None:
     (era.folder / "token").write_text(f"{_TOKEN}\n", encoding="utf-8")
     listening = ("gateway", "--listen", "127.0.0.1:0", "--token-file", "token")
     with era.running("daemon", "panel.yaml"), era.running(*listening) as gateway:
-        assert gateway.stdout is not None
         url = gateway.stdout.readline().split()[1]
         for name, text in (("", b"<html"), ("app.js", b"import")):
             with urllib.request.urlopen(f"{url}{name}", timeout=PATIENCE) as page:

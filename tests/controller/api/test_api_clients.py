@@ -201,7 +201,6 @@ async def test_reply_to_a_subscription_comes_before_its_first_event(tmp_path: Pa
 async def test_example_of_the_page_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The Python lines of docs/reference/api.md, with the socket at its default path."""
     found = re.search(r"## In Python\n\n((?:    .*\n|\n)+)", PAGE.read_text("utf-8"))
-    assert found is not None
     code = re.sub(r"^    ", "", found[1], flags=re.MULTILINE)
     async with running_daemon(tmp_path) as bench:
         monkeypatch.setattr("controller.api.client.find_socket", lambda path: bench.socket)

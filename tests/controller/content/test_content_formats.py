@@ -264,7 +264,6 @@ def test_course_follows_levels_in_decibels_and_is_silent_at_0() -> None:
     """From intensity 1 to 0.5 of 20 dB SL are 5 dB, a share of 0.562; of 0 nothing is left."""
     pattern = Pattern(1.0, ((0.0, 1.0), (0.4, 1.0), (0.4, 0.5), (0.8, 0.5), (0.8, 0.0), (1.0, 0.0)))
     course = rendered(pattern, 20.0, EVERY_10_HZ).course
-    assert course is not None
     shares = course.at(np.array([0.2, 0.6, 0.9]))
     assert shares == pytest.approx([1.0, 10 ** (-5 / 20), 0.0])
 
@@ -304,7 +303,6 @@ def test_what_lasts_fades_for_30_ms_around_a_tap_of_40_ms() -> None:
     """Half of it 15 ms before a tap and 15 ms after its end, nothing within it."""
     pattern = replace(SECOND, transients=(Transient(0.5, 1.0, 0.5),))
     found = rendered(pattern, 20.0, EVERY_10_HZ)
-    assert found.course is not None
     shares = found.course.at(np.array([0.46, 0.485, 0.5, 0.54, 0.555, 0.58]))
     assert shares == pytest.approx([1.0, 0.5, 0.0, 0.0, 0.5, 1.0])
     assert found.remarks == ("what lasts, 30 ms before and after each tap",)
@@ -319,7 +317,6 @@ def test_of_taps_closer_than_60_ms_the_strongest_stay() -> None:
         "2 of 4 taps, less than 60 ms from a stronger one: left to what lasts"
     )
     assert found.level_db_sl == pytest.approx(16.0)
-    assert found.course is not None
     shares = found.course.at(np.array([0.07, 0.155, 0.17, 0.3]))
     assert shares == pytest.approx([10 ** (-4 / 20), 0.5, 1.0, 0.0])
 
@@ -345,7 +342,6 @@ def test_smoothed_step_is_a_raised_cosine_of_20_ms() -> None:
     """10 ms after a step its integral is 30 of 40 ms and 20 / pi more: 0.91 of it."""
     pattern = Pattern(1.0, ((0.0, 0.0), (0.5, 0.0), (0.5, 1.0), (1.0, 1.0)))
     course = rendered(pattern, 20.0, EVERY_10_HZ).smoothed().course
-    assert course is not None
     moments = np.array([0.48, 0.4975, 0.5075, 0.52, 0.9, 1.0])
     after = (30 + 20 / math.pi) / 40
     assert course.at(moments) == pytest.approx([0.0, 0.5, after, 1.0, 1.0, 0.0], abs=0.03)
@@ -367,7 +363,6 @@ def test_modulation_of_10_to_30_hz_is_a_texture_that_smoothing_keeps(
         return
     assert found.modulation_hz == pytest.approx(hertz, abs=1)
     for each in (found, found.smoothed()):
-        assert each.course is not None
         middle = each.course.at(np.arange(0.2, 0.8, 0.005))
         depth = (middle.max() - middle.min()) / (middle.max() + middle.min())
         assert depth == pytest.approx((1 - 0.32) / 1.32, abs=0.1)  # not below 10 dB SL

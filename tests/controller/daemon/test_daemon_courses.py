@@ -256,7 +256,6 @@ class Served(Taken):
 
     async def renews(self) -> None:
         """Renew the lease, as its client does."""
-        assert self.operation.lease is not None
         await self.era.renew(self.operation.lease.token)
 
     def expires(self) -> None:
@@ -447,7 +446,6 @@ async def test_gain_of_a_source_is_felt_at_its_finger_alone_along_a_fade() -> No
         await asyncio.sleep(1.0)
         tones = {each.effect: each.frequency_hz for each in (await era.status()).contacts}
         planner = bench.daemon._controller.cycle.planner
-        assert planner is not None
         (sent,) = [
             n for n, one in planner.slots.contents.items() if "right" in one.content.key[0].source
         ]

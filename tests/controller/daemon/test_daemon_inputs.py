@@ -294,7 +294,6 @@ async def test_daemon_names_inputs_that_are_missing_or_mute(tmp_path: Path) -> N
     assert shown[1][:2] == [gone, ready]
     assert status.rejected_touches == {"profile_25Dblb": 1, "off_plate": 1}
     assert "/tuio/25Dblb" in status.rejected_examples["profile_25Dblb"]
-    assert event is not None
     assert InputsEvent.model_validate(event.data).inputs == status.inputs
     exposed = exposition(status).decode()
     assert 'era_touch_input_open{input="gone"} 0.0' in exposed

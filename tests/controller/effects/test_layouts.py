@@ -132,7 +132,6 @@ def test_load_layout_reads_the_example() -> None:
     assert layout.effects["notches"] == Detents(spacing=0.012, along="x", duration=0.03)
     assert layout.elsewhere is None
     found = layout.region_at(0.255, 0.045)
-    assert found is not None
     assert found.name == "knob"
     assert layout.region_at(0.30, 0.01) is None
 
@@ -310,7 +309,6 @@ def test_times_count_from_when_the_amplifiers_have_started() -> None:
     player = player_of(it=file_of())
     play(player, 0.0)
     pulse = felt(player, 0.0)[False].pulse
-    assert pulse is not None
     pulse.started_at = 0.08
     assert True not in felt(player, 0.27)
     assert True in felt(player, 0.285)
@@ -346,7 +344,6 @@ def test_a_finger_that_is_alone_feels_the_file_as_it_is() -> None:
     rises = []
     for others in ((), (TWO,)):
         course = felt(player, 0.1, *others)[False].course
-        assert course is not None
         shares = course.at(np.arange(0.4, 0.6, 0.001))
         rises.append(int(((shares > 0.01) & (shares < 0.99)).sum()))
     assert rises[0] <= 5
@@ -355,7 +352,6 @@ def test_a_finger_that_is_alone_feels_the_file_as_it_is() -> None:
     assert among == pytest.approx((51.1, 91.6), abs=0.1)
     assert lone == (58.5, 80.0)
     alone = felt(player, 0.2)[False]
-    assert alone.course is not None
     assert alone.course.at(np.array([0.51]))[0] == 1.0
 
 
@@ -406,7 +402,6 @@ def test_a_layout_names_files_beside_it_and_contents_that_come_along(tmp_path: P
     (tmp_path / "door.ahap").write_text("{}")
     player = EffectPlayer(layout)
     course = felt(player, 0.0)[False].course
-    assert course is not None
     assert course.duration == pytest.approx(0.4)
     assert load_layout(write(tmp_path, "{kind: file, file: door.ahap}", door=AHAP), None) == layout
     longer = json.loads(json.dumps(AHAP).replace("0.4", "0.5"))

@@ -136,7 +136,6 @@ def limited(found: Selection, what: str) -> PlaybackCapabilities:
 def is_used(found: Selection, capabilities: PlaybackCapabilities) -> bool:
     """Whether contents are within a limit, and take nearly all of it."""
     limits = capabilities.limits
-    assert limits.amplitudes is not None
     (share,) = {limits.amplitudes[each.name] / each.stroke for each in table().eras}
     of_limit = max(sums(found).max() / share, np.linalg.norm(sums(found)) / np.sqrt(limits.power))
     return bool(0.95 < of_limit < 1.0 + 1e-6)
@@ -155,12 +154,9 @@ def test_a_higher_priority_keeps_its_level_within_a_limit(
     found = chosen(capabilities, first, second)
     kept, lowered = found.predictions
     assert kept.level_db_sl == pytest.approx(14.0, abs=0.2)
-    assert lowered.level_db_sl is not None
     assert lowered.level_db_sl < 13.0
     assert is_used(found, capabilities)
     before = free.predictions[1].promised_contrast_db
-    assert before is not None
-    assert lowered.promised_contrast_db is not None
     change = lowered.promised_contrast_db - before
     assert change == pytest.approx(lowered.level_db_sl - 14.0, abs=1.0)
 
@@ -199,7 +195,6 @@ def test_of_equal_priority_the_louder_content_is_lowered(what: str) -> None:
     found = chosen(capabilities, *targets)
     louder, softer = (each.level_db_sl for each in found.predictions)
     assert softer == pytest.approx(8.0, abs=0.2)
-    assert louder is not None
     assert 8.0 < louder < 13.5
     assert is_used(found, capabilities)
 
@@ -250,7 +245,6 @@ def test_a_lone_steady_content_is_within_a_limit(what: str) -> None:
     found = Selector(Chooser(table())).select(CONTACTS, intent, capabilities)
     assert sums(found) == pytest.approx(0.8 * sums(free), rel=1e-6)
     (before,), (after,) = free.predictions, found.predictions
-    assert before.level_db_sl is not None
     assert after.level_db_sl == pytest.approx(before.level_db_sl + 20 * np.log10(0.8))
     assert after.promised_contrast_db == pytest.approx(before.promised_contrast_db)
 
@@ -408,7 +402,6 @@ async def test_a_click_of_a_file_is_felt_beside_what_lasts_of_it() -> None:
             for one in report.contents.values()
             if one.content.key[1] == CLICK
         }
-        assert short is not None
         assert short.started_at - began == pytest.approx(0.3, abs=0.01)
         (lasting,) = {
             layer.layer for _, _, layers in fingers.committed for layer in layers if layer.after
@@ -434,12 +427,10 @@ async def test_status_says_what_each_finger_feels() -> None:
         applied = fingers.applied[-1]
         view = PlateView(lambda key: "buzz", applied.contacts, applied)
         event = view.pattern_event()
-        assert event is not None
         assert len(event.layers) == 3
         for contact, (number, one) in zip(event.contacts, applied.contents.items(), strict=True):
             assert (contact.role, contact.held_back) == ("target", None)
             promised = contact.promised_contrast_db
-            assert promised is not None
             assert contact.verdict == ("own" if promised >= 12 else "mixed")
             assert contact.level_db_sl == pytest.approx(14.0, abs=0.5)
             assert contact.foreign_level_db_sl == pytest.approx(14.0 - promised, abs=2.0)

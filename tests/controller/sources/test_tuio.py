@@ -50,7 +50,6 @@ def reader() -> TuioSource:
 
 def touches(frame: TouchFrame | None) -> list[tuple[float, ...]]:
     """What is on the plate, to compare; of a blob with its width and height."""
-    assert frame is not None
     return [(touch.id, touch.x, touch.y, *(touch.size or ())) for touch in frame.touches]
 
 
@@ -441,7 +440,6 @@ def test_reader_tells_programs_of_one_name_apart(
         result = reader.read(datagram, ("192.0.2.7", port), now)
         assert [id for id, _, _ in touches(result)] == [port]
         is_second = port in seconds and number > 0
-        assert result is not None
         assert result.source == f"tuio:192.0.2.7{f':{port}' if is_second else ''}/a"
     assert reader.rejects.counts == ({"same_name": 1} if seconds else {})
 
@@ -498,7 +496,6 @@ def test_tuio_datagram_round_trip(places: dict[int, tuple[float, float]]) -> Non
     wanted = tuple(Touch(id, x, y) for id, (x, y) in places.items())
     datagram = tuio_datagram(TouchFrame("table@a", 0.0, wanted), 7)
     result = TuioSource("tuio:").read(datagram, PEER, 2.0)
-    assert result is not None
     assert (result.source, result.time, result.touches) == ("tuio:192.0.2.7/table@a", 2.0, wanted)
 
 

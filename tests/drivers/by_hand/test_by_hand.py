@@ -565,7 +565,6 @@ def test_clocks_are_held_as_closely_as_the_line_allows(
 ) -> None:
     """By separate lines of each kind, named or not, one bus, simulated; sums of squares."""
     found = arranged(*urls)
-    assert found is not None
     errors = [math.hypot(STATED, CLOCK_ERRORS[each]) for each in kinds]
     assert [*found.errors.values()] == pytest.approx(errors)
     assert bool(found.remedy) == has_remedy
@@ -574,11 +573,9 @@ def test_clocks_are_held_as_closely_as_the_line_allows(
 def test_what_would_be_better_is_not_there_already() -> None:
     """One bus of full speed is held by Marks, whatever its adapter; 0.2 ms are of the clocks."""
     found = arranged(*(f"serial:///dev/ttyACM0?address={each}" for each in (1, 2)))
-    assert found is not None
     assert found.remedy == ""
     assert found.errors["a"] == pytest.approx(math.hypot(STATED, 7e-6))
     wide = arranged("serial:///dev/ttyACM0", "serial:///dev/ttyACM1", stated=[5e-6, 2e-4])
-    assert wide is not None
     assert "clock_error" in wide.remedy
 
 
@@ -598,7 +595,6 @@ def test_one_amplifier_with_eras_has_no_arrangement() -> None:
 def test_a_clock_that_cannot_be_steered_is_held_to_nothing() -> None:
     """Whatever the line; the other one is as before."""
     found = arranged("serial:///dev/ttyS0", "serial:///dev/ttyS1", stated=[2e-6, math.inf])
-    assert found is not None
     assert found.errors == {
         "a": pytest.approx(math.hypot(2e-6 / math.sqrt(3), CLOCK_ERRORS["native"])),
         "b": math.inf,
@@ -669,7 +665,6 @@ async def test_adapter_without_listen_only_mode_is_not_opened(adapter: Adapter) 
     usual = adapter.receive
     adapter.receive = lambda data: usual(data.replace(b"L\r", b"nonsense\r"))
     found = await adapter.detect()
-    assert found is not None
     assert found.urls == ()
     assert "listen-only" in found.description
     assert b"O" not in adapter.said

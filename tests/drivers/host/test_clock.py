@@ -162,7 +162,6 @@ class Exchanges(Taken):
 
     def compare(self) -> None:
         """Compare the other's clock with this one by Marks."""
-        assert self.other is not None
         self.other.held.compare(self.held)
 
     def marks(self, count: int, least: float = 0.0, most: float = 0.0) -> None:

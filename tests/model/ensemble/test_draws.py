@@ -188,7 +188,6 @@ def test_two_equal_halves_leave_what_their_delay_says() -> None:
     by_hand = 2 * np.abs(np.sin(math.pi * 250 * (delays[0] - delays[1])))
     np.testing.assert_allclose(left, by_hand, atol=2e-4)
     shares = off.power_shares(np.array([250.0]))
-    assert shares is not None
     power = (1 + shares[0]) * [[1, -1], [-1, 1]]
     assert power.sum() == pytest.approx(2 * math.expm1((2 * math.pi * 250 * 20e-6) ** 2), rel=1e-4)
 

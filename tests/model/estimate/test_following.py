@@ -258,7 +258,6 @@ def test_sticker_is_named_in_its_place(hidden: Hidden, known: PlateEstimate) -> 
     live, explanation = changed_to(hidden, known, changed, count=10)
     assert explanation.name == "a mass"
     stated = re.search(r"g at \((\S+), (\S+)\) m$", str(explanation))
-    assert stated is not None
     assert [*map(float, stated.groups())] == pytest.approx([0.11, 0.16], abs=0.015)
     added = live.known.rig.masses[-1]
     assert added.mass == pytest.approx(3e-3, abs=0.6e-3)

@@ -336,7 +336,6 @@ def test_check_says_at_which_frequencies_a_magnet_would_leave_its_excursion() ->
     shape = np.exp(s * times) - share * np.exp(p * times) - (1 - share) * np.exp(q * times)
     moved = np.abs(1.118 / (mass * s**2 + c * s + k) * shape).max(axis=0)
     stated = re.search(r"within from (\S+) Hz on.*at most (\S+) is safe", said)
-    assert stated is not None
     allowed = frequencies[moved > 0.5e-3][-1] + 1
     assert [*map(float, stated.groups())] == pytest.approx(
         [allowed, 0.5e-3 / moved.max()], rel=0.01

@@ -133,7 +133,6 @@ async def delays_of_requests(port: str, rig: Rig) -> list[float]:
     urls = {name: f"serial://{port}{n or ''}" for n, name in enumerate(rig.amplifiers)}
     arrived, sent = list[float](), list[float]()
     async with far_side(assigned(urls), rig) as far:
-        assert far.machine is not None
         far.machine.passing = (0.0, 0.0)
         after_each(far.device, lambda name, values, reply, now: arrived.append(now))
         place = far.url.removeprefix("serial://").partition("?")[0]

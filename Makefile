@@ -91,8 +91,8 @@ lint: .venv/installed-test
 	$(BIN)/ruff format --check .
 	$(BIN)/lint-imports
 	$(BIN)/mypy
-	$(BIN)/python tests/support/vocabulary.py
-	$(BIN)/python tests/support/ceilings.py
+	$(BIN)/python tests/support/checks/vocabulary.py
+	$(BIN)/python tests/support/checks/ceilings.py
 	$(PAGES) --check
 
 # Every page, part of a page, client stub and C header that is written from the code.

@@ -37,11 +37,11 @@ from sim.far_ends.wire_assignment import SimulatedWire
 from sim.plant.imperfections import draw_imperfections
 from sim.simulation import find_firmware, running_firmware
 
-_far_side: Any = support("real_wires").far_side
-_on_amplifiers: Any = support("real_wires").on_amplifiers
-_small_table: Any = support("plates").small_table
-_paper_rig: Any = support("plates").make_paper_rig
-run_virtual: Any = support("virtual_lines").run_virtual
+_far_side: Any = support("kit.wires").far_side
+_on_amplifiers: Any = support("kit.wires").on_amplifiers
+_small_table: Any = support("kit.plates").small_table
+_paper_rig: Any = support("kit.plates").make_paper_rig
+run_virtual: Any = support("kit.clock").run_virtual
 
 NAMES = ("west", "middle", "east")
 SPEEDS = {"serial": 921_600, "modbus-rtu": 115_200, "slcan": 500_000, "socketcand": 500_000}

@@ -12,7 +12,7 @@ from typing import Any
 from benchmarks.setting import support
 from era_haptics.lab.conformance.judge_client import TooLate
 
-virtual_lines: Any = support("virtual_lines")
+virtual_lines: Any = support("kit.clock")
 
 
 def main() -> None:

@@ -143,8 +143,8 @@ def _patterns(folder: Path | None) -> Iterator[Pattern]:
             yield pattern
 
 
-_chain: Any = support("chain").Chain
-_run_virtual: Any = support("virtual_lines").run_virtual
+_chain: Any = support("kit.chain").Chain
+_run_virtual: Any = support("kit.clock").run_virtual
 
 CASE = Case("files", None)
 _BEFORE, _AFTER = 0.3, 0.3  # s; of the quiet finger alone, and after the file

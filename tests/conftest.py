@@ -20,14 +20,14 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 import pytest  # noqa: E402
 from hypothesis import HealthCheck, settings  # noqa: E402
 
-from long_form import COLLECTED, SLOWEST  # noqa: E402
+from cases import COLLECTED, SLOWEST  # noqa: E402
+from kit.plates import make_paper_rig  # noqa: E402
 from model.reduction import free_plate  # noqa: E402
 from model.rig.rig import Rig  # noqa: E402
 from model.rig.rig_file import example_rig_path, load_rig  # noqa: E402
 from model.table.table_file import cached_table  # noqa: E402
-from plates import make_paper_rig  # noqa: E402
+from processes.typed_page import needs  # noqa: E402
 from registry import threads  # noqa: E402
-from typed_page import needs  # noqa: E402
 
 # Forty examples of each property, a hundred without it, however long a busy machine takes.
 settings.register_profile(

@@ -15,9 +15,9 @@ from pathlib import Path
 import pytest
 
 import changed_tests
-import vocabulary
 from changed_tests import ALSO, also, nearest
-from vocabulary import misleading_names, retired_identifiers
+from checks import vocabulary
+from checks.vocabulary import misleading_names, retired_identifiers
 
 ROOT = Path(__file__).parents[1]
 FOLDERS = ("tests", "docs", "examples", "firmware")
@@ -100,7 +100,7 @@ def test_tests_of_the_folder_come_before_those_that_import(path: str) -> None:
 
 def test_module_of_tests_and_page_lead_to_their_tests() -> None:
     """Over imports within tests/support; a page over its name, whatever folder names it."""
-    assert nearest(["tests/support/set_table.py"]).keys() >= importing("set_table")
+    assert nearest(["tests/support/kit/set_table.py"]).keys() >= importing("kit.set_table")
     assert nearest(["docs/reference/rig.md"])["tests/model/rig/test_rig_summary.py"] == 0
     assert nearest(["tests/docs/test_pages.py"]) == {"tests/docs/test_pages.py": 0}
     assert len(nearest(["tests/conftest.py"])) == len([*ROOT.glob("tests/**/test_*.py")])
@@ -162,7 +162,7 @@ def test_what_users_copy_keeps_the_rule(tmp_path: Path, monkeypatch: pytest.Monk
 
 CONFTEST = """
 import pytest
-from typed_page import needs
+from processes.typed_page import needs
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_setup(item):

@@ -16,11 +16,11 @@ from pathlib import Path
 import pytest
 from packaging.tags import platform_tags
 
+from cases import shortly
 from licences import NOTES
-from long_form import shortly
 from model.compiled.kernels import versions
+from processes.typed_page import InstalledEra, try_first
 from smoke import lowest, requirements
-from typed_page import InstalledEra, try_first
 
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("registry", "controller", "drivers", "era_haptics", "model", "sim")

@@ -15,7 +15,7 @@ Own calls and files on the way are counted with amplifiers in this process, on a
 each, which are left out; time is virtual, so that the counts do not depend on the machine. A touch
 goes from its frame to the last byte of its set, answer included, after the first such touch; a
 finger rests for two seconds, its frames coming 20 times a second. The floods of clients are those
-of the tests (tests/support/floods.py), each a process.
+of the tests (tests/support/processes/floods.py), each a process.
 """
 
 import argparse
@@ -76,7 +76,7 @@ from sim.amplifier.simulated_amplifier import SimulatedAmplifier as SimulatedAmp
 from sim.far_ends.serial_amplifiers import SerialAmplifiers
 
 _ROOT = Path(__file__).parents[2]
-_run_virtual: Any = support("virtual_lines").run_virtual
+_run_virtual: Any = support("kit.clock").run_virtual
 _Recorder: Any = support("ways").Recorder
 _FRAME_INTERVAL, _RESTING = 0.05, 2.0  # s
 _LEVEL = 15.0  # dB SL
@@ -194,7 +194,7 @@ def table(rigs: Mapping[str, str]) -> str:
     return "\n".join(rows)
 
 
-_FLOODS = Path(__file__).parents[2] / "tests" / "support" / "floods.py"
+_FLOODS = Path(__file__).parents[2] / "tests" / "support" / "processes/floods.py"
 RECONNECTING = ("again", 200)
 SLOW, MALFORMED, ASKING = ("unreading", 10), ("garbage", 1), ("asking", 5)
 ALL = (SLOW, MALFORMED, ASKING, RECONNECTING)  # these last: they leave no place to others

@@ -284,8 +284,8 @@ def _layers_of(report: PlayReport, owner: int) -> list[int]:
     return [n for n, one in report.contents.items() if owner_of(one) == owner]
 
 
-_chain: Any = support("chain").Chain
-_run_virtual: Any = support("virtual_lines").run_virtual
+_chain: Any = support("kit.chain").Chain
+_run_virtual: Any = support("kit.clock").run_virtual
 
 SETTLING, STEADY, FIRST, NEXT = 2.0, 0.25, 0.100, 0.080  # s
 EARLY = 0.020  # s; by which amplifiers may start before another: less than between two cross-fades

@@ -15,7 +15,6 @@ from typing import TypeAlias
 import changed_tests
 import client_stub
 import effects_page
-import error_cases
 import rig_page
 import ways
 from amplifier_dbc import dbc_text
@@ -28,6 +27,7 @@ from findings_page import finding_kinds
 from firmware_header import header
 from firmware_records import records_header
 from metrics_page import metrics
+from processes import error_cases
 from protocol_bytes import BYTES
 from protocol_tables import TABLES
 from python_page import with_entries

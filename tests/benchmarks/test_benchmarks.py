@@ -30,10 +30,10 @@ from benchmarks.contrast.__main__ import (
     score,
     summary,
 )
+from kit.plates import smooth_rig
 from model.arrays import least_gap
 from model.errors import InputError
 from model.table.table_file import build_table
-from plates import smooth_rig
 
 ROOT = Path(__file__).parents[2]
 _BEGUN_EARLY = re.compile(r"^if __name__ ==.*\n(\s.*\n|\n)*\S", re.MULTILINE)

@@ -29,17 +29,17 @@ from controller.demo.recorder import (
 from controller.play.intent import Prediction, not_served
 from controller.play.loop import Observers, PlayReport
 from controller.sources.touch import Change, Contact, ContactKey
-from daemons import ENABLED, ready_daemon, until, until_state
 from drivers.errors import LinkError
+from kit.clock import in_virtual_time
+from kit.plates import small_table
 from model.answer.plan import query
 from model.answer.stimulus import Placement
 from model.finger import detection_threshold
 from model.rig.rig_file import example_rig_path
 from model.table import table_file
-from plates import small_table
+from processes.daemons import ENABLED, ready_daemon, until, until_state
 from registry import threads
 from sim.faults import FaultWindow
-from virtual_lines import in_virtual_time
 
 FIGURES = ("contrast_db", "level_db_sl")
 PROMISED = ("promised_contrast_db",)

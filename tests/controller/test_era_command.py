@@ -23,7 +23,6 @@ from unittest.mock import Mock
 
 import pytest
 
-from chain import set_chain
 from controller.cli.main import main, run
 from controller.daemon.children import gateway_options
 from controller.daemon.messages import LatencyStatistics
@@ -32,11 +31,12 @@ from controller.operation.operation_states import DaemonState, Operation
 from controller.process.daemon_process import ServiceManager, SocketLock
 from controller.process.log import LogFormatter, LogThread, RateLimitFilter
 from drivers.wires.wire import Reply
-from gateway_bench import wait_for
-from interrupted import full_disk
+from kit.chain import set_chain
+from kit.clock import in_virtual_time
 from model.errors import InputError
+from processes.gateways import wait_for
+from processes.interrupted import full_disk
 from registry import threads
-from virtual_lines import in_virtual_time
 
 
 @pytest.mark.parametrize(

@@ -26,19 +26,19 @@ from controller.learning.worker import MAX_MEMORY, Worker, make
 from controller.plate_measurement import PlateSensor, settling
 from controller.play.loop import Observers
 from controller.sources.touch import Contact, ContactKey
-from courses import Taken, courses, follow
 from drivers.errors import LinkError
 from drivers.host.amplifier_sensors import Reading, SensorReading
 from drivers.playing import AmplifierTone
+from kit.clock import in_virtual_time
+from kit.courses import Taken, courses, follow
+from kit.plates import make_paper_rig, small_table
 from model.answer.answer_report import Timing
 from model.errors import InputError
 from model.estimate.following import PatternReport, SettledPattern
 from model.estimate.forward import Sensor
 from model.rig.rig_file import example_rig_path
 from model.table.table import LocalizationTable
-from plates import make_paper_rig, small_table
 from registry.limits import HAND_LOAD
-from virtual_lines import in_virtual_time
 
 
 class Readings:

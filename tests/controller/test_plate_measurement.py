@@ -21,6 +21,8 @@ from controller.plate_measurement import (
 from drivers.errors import CommandRefused
 from drivers.host.amplifier_sensors import Reading, SensorReading, measure_tones
 from drivers.opening import Lines
+from kit.clock import run_virtual
+from kit.wires import SHARED_WIRES, WIRES, FarSide, far_side, on_two_amplifiers
 from model.answer.plan import query
 from model.answer.stimulus import Placement
 from model.errors import InputError
@@ -30,12 +32,10 @@ from model.rig.rig import Rig
 from model.rig.rig_file import example_rig_path, load_rig
 from model.structure.attachments import PointLoad
 from model.table.table_file import build_table
-from real_wires import SHARED_WIRES, WIRES, FarSide, far_side, on_two_amplifiers
 from sim.bench import bench
 from sim.far_ends.wire_assignment import SimulatedWire
 from sim.plant.fingers import Accelerometer
 from sim.sensors import Accelerometers
-from virtual_lines import run_virtual
 
 TONES = np.arange(60.0, 480.0, 35.0)
 FINGERS = (

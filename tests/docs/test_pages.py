@@ -47,8 +47,8 @@ from model.cli import app
 from model.study import overview
 from model.study.contrast_maps import WANTED_CONTRAST_DB
 from model.study.verification import MIN_KEPT_SHARE
+from processes.typed_page import PORTS, PageError, Reader, difference, read_steps
 from registry.limits import GuardLimits
-from typed_page import PORTS, PageError, Reader, difference, read_steps
 from ways import WAYS, steps_of
 
 ROOT = Path(__file__).parents[2]

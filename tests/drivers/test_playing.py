@@ -27,7 +27,6 @@ from unittest.mock import Mock
 import pytest
 import serial
 
-from courses import Taken, courses, follow
 from drivers import ports
 from drivers.errors import LinkError, LinkTimeout
 from drivers.playing import Playback, Voice
@@ -35,7 +34,8 @@ from drivers.ports import Port, SerialPort, open_connection
 from drivers.protocol.sets import Command, Envelope, LayerSet
 from drivers.urls import Endpoint
 from era_haptics.lab.expected_output import ExpectedOutputs, UncertainPlayback
-from virtual_lines import in_virtual_time
+from kit.clock import in_virtual_time
+from kit.courses import Taken, courses, follow
 
 
 @pytest.mark.parametrize(

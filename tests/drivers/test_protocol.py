@@ -15,7 +15,6 @@ from unittest.mock import Mock
 
 import pytest
 
-import hand_written as hand
 from amplifier_eds import eds_text
 from drivers import trace
 from drivers.by_hand.reaching import status_rows
@@ -37,14 +36,15 @@ from drivers.protocol.sets import Assembly, is_last, pack_layers, parts, unpack_
 from drivers.trace import Direction, TraceWriter, tracing
 from drivers.wires.wire import address_of
 from firmware_records import records_header
-from hand_written import HALF, Talk
-from interrupted import full_disk
+from kit import conversation as hand
+from kit.clock import KINDS, MemoryLine, group_of, in_virtual_time, judged
+from kit.conversation import HALF, Talk
+from kit.wires import LATER, WORD
+from kit.wires import age as age
+from processes.interrupted import full_disk
 from protocol_tables import records
-from real_wires import LATER, WORD
-from real_wires import age as age
 from sim.amplifier.simulated_amplifier import SimulatedAmplifier
 from sim.far_ends.can_amplifiers import ObjectServer, SdoAbort
-from virtual_lines import KINDS, MemoryLine, group_of, in_virtual_time, judged
 
 STATED = {"older": {"later_voltage": None}, "same": {"later_voltage": WORD}, "newer": {}}
 """Of what is added, by the age of the amplifier."""

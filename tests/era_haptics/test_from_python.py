@@ -20,13 +20,13 @@ from typer.testing import CliRunner
 import era_haptics as era
 from era_haptics.drive import as_points, layers_of
 from era_haptics.lab.design import problem
+from kit.plates import make_paper_rig
 from model.answer.answer import Layer
 from model.cli import app
 from model.rig.rig import Channel
 from model.structure.attachments import PointLoad
 from model.table.table_file import build_table
 from model.vibration import plate_map
-from plates import make_paper_rig
 
 TARGET, QUIET, BOTH = (0.08, 0.06), [(0.22, 0.16)], [(0.22, 0.16), (0.25, 0.04)]
 RIG = era.load_rig(era.example_rig_path())

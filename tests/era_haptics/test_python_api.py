@@ -28,14 +28,14 @@ import yaml
 
 import era_haptics as era
 import era_haptics.plugins
-from long_form import shortly
+from cases import shortly
+from kit.clock import in_virtual_time
+from kit.plates import small_table
+from kit.wires import SHARED_WIRES, on_two_amplifiers, rig_on_wire
 from model.reduction.free_plate import solve_free_plate
 from model.table.table_file import build_table
-from plates import small_table
 from python_page import named
-from real_wires import SHARED_WIRES, on_two_amplifiers, rig_on_wire
 from registry import threads
-from virtual_lines import in_virtual_time
 
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "reference" / "python-api.md").read_text("utf-8")

@@ -21,6 +21,7 @@ from typing import Any
 
 import pytest
 
+from cases import read_yaml, shortly
 from controller.cli.main import run
 from controller.content.formats import read_content
 from controller.effects.layout import load_layout
@@ -44,10 +45,6 @@ from era_haptics.lab.measuring.sound_card import Desk, WiredSensor, read_sensors
 from era_haptics.lab.paper_figures import paper_figures
 from era_haptics.lab.witness import capture
 from era_haptics.lab.witness.relay import parse_endpoint
-from error_cases import PAGE, Case, Quotation, cases, filled, provoke, quotations
-from error_cases import RIG as CASE_RIG
-from interrupted import full_disk, interrupted
-from long_form import shortly
 from model.config.document import read_document
 from model.config.units import parse_frequencies
 from model.errors import InputError
@@ -59,9 +56,11 @@ from model.rig.rig_file import example_rig_path, load_rig, mesh_of
 from model.structure.material import material
 from model.structure.plate import Plate
 from model.table.table_file import load_table
+from processes.error_cases import PAGE, Case, Quotation, cases, filled, provoke, quotations
+from processes.error_cases import RIG as CASE_RIG
+from processes.interrupted import full_disk, interrupted
 from sim.far_ends.wire_assignment import SimulatedWire, assign_wires, choose_lines
 from sim.faults import load_faults
-from yaml_files import read_yaml
 
 INTERNALS = re.compile(
     r"Traceback|File \"|<class |object at 0x|np\.\w+\(|PosixPath\(|\[Errno|Field required|"

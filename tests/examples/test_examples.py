@@ -31,7 +31,6 @@ import yaml
 
 from benchmarks.weekend.chain import BuiltBoard
 from controller.cli.main import run
-from daemons import ENABLED, PATIENCE, READY, DaemonBench, next_event, ready_daemon, until_state
 from drivers import opening
 from drivers.by_hand.actions import identify
 from drivers.errors import CommandError, LinkError
@@ -40,15 +39,24 @@ from drivers.opening import Lines
 from drivers.playing import AmplifierLayer, AmplifierTone
 from drivers.wires.serial_frames import Frame, encode_frame
 from era_haptics.lab.conformance.contract import judge, of_kind
+from kit.clock import judged
 from model.caching import cache_folder
 from model.compiled.kernels import kernels
 from model.rig.rig_file import load_rig
+from processes.daemons import (
+    ENABLED,
+    PATIENCE,
+    READY,
+    DaemonBench,
+    next_event,
+    ready_daemon,
+    until_state,
+)
+from processes.typed_page import Reader, installed_program, read_steps
 from registry.limits import GuardLimits
 from sim.amplifier.simulated_amplifier import SimulatedAmplifier
 from sim.far_ends.serial_amplifiers import SerialAmplifiers
 from sim.transport.far_end import make_terminal
-from typed_page import Reader, installed_program, read_steps
-from virtual_lines import judged
 
 ROOT = Path(__file__).parents[2]
 PLUGINS = ROOT / "examples" / "plugins"
@@ -236,7 +244,7 @@ def test_units_at_home_are_valid_and_start_one_after_the_other(tmp_path: Path) -
 
 
 PAGES = ROOT / "docs" / "how-to"
-PIP = ROOT / "tests" / "support" / "built_pip.py"
+PIP = ROOT / "tests" / "support" / "processes/built_pip.py"
 NAMES = [
     "a-plate-for-a-weekend",
     "add-a-content-format",

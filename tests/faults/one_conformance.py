@@ -11,10 +11,10 @@ from pathlib import Path
 
 import pytest
 
+from cases import shortly
 from era_haptics.lab.conformance.contract import CHECKS, Result, of_kind
-from firmware_machine import FirmwareEnd, build_firmware
-from long_form import shortly
-from virtual_lines import JUDGED_LINE_KINDS, judged, plain, short_checks
+from kit.clock import JUDGED_LINE_KINDS, judged, plain, short_checks
+from processes.firmware_machine import FirmwareEnd, build_firmware
 
 _CASES = [
     pytest.param(

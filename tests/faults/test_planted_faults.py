@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from long_form import COLLECTED
+from cases import COLLECTED
 
 RUN = Path(__file__).with_name("run.py")
 FAULT = """

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from firmware_machine import build_firmware
-from typed_page import needs
+from processes.firmware_machine import build_firmware
+from processes.typed_page import needs
 
 
 @pytest.fixture(scope="session")

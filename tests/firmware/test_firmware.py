@@ -27,7 +27,7 @@ import numpy as np
 import pytest
 from cobs import cobs
 
-import hand_written as hand
+from cases import shortly
 from drivers.errors import CommandRefused
 from drivers.host.amplifier import Amplifier
 from drivers.host.line import Line, Priority
@@ -44,7 +44,13 @@ from drivers.protocol.definition import (
 from drivers.protocol.records import Bits, Number, Numbers, Record, Rows, Values, WireQuantity
 from drivers.wires.can_frames import REQUEST, SLCAN, CanFrame, segments
 from drivers.wires.modbus_frames import framed
-from firmware_machine import (
+from firmware_records import records_header
+from kit import conversation as hand
+from kit.clock import judged
+from kit.conversation import tone as command
+from kit.wires import MASTERS, damage, drive
+from model.arrays import FloatArray
+from processes.firmware_machine import (
     CAN,
     MODBUS,
     PER_MS,
@@ -64,16 +70,10 @@ from firmware_machine import (
     running_firmware,
     values_of,
 )
-from firmware_machine import LINES as FIRMWARE_KINDS
-from firmware_records import records_header
-from hand_written import tone as command
-from long_form import shortly
-from model.arrays import FloatArray
-from real_wires import MASTERS, damage, drive
+from processes.firmware_machine import LINES as FIRMWARE_KINDS
+from processes.typed_page import installed_program
 from registry.limits import GuardLimits
 from sim.amplifier.simulated_amplifier import SimulatedAmplifier as SimulatedEnd
-from typed_page import installed_program
-from virtual_lines import judged
 
 ROOT = Path(__file__).parents[2]
 WORD = WireQuantity("word", "u16", 1, "", 0, 0xFFFF)

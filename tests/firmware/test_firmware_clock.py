@@ -11,10 +11,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import hand_written as hand
 from drivers.protocol.definition import MESSAGES
 from drivers.wires.modbus_frames import framed
-from firmware_machine import CAN, MODBUS, SERIAL, SESSION, MovedFirmware, apply, request, values_of
+from kit import conversation as hand
+from processes.firmware_machine import (
+    CAN,
+    MODBUS,
+    SERIAL,
+    SESSION,
+    MovedFirmware,
+    apply,
+    request,
+    values_of,
+)
 
 TURN = 20.0  # s
 STEP = TURN / 2**16  # s; of the high word

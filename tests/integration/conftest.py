@@ -5,7 +5,7 @@ from collections.abc import AsyncIterator
 import pytest
 import pytest_asyncio
 
-from gateway_bench import Browser, Page, open_browser
+from processes.gateways import Browser, Page, open_browser
 
 
 @pytest_asyncio.fixture(scope="module", loop_scope="module")

@@ -24,13 +24,40 @@ import httpx
 import numpy as np
 import pytest
 
-import patient_daemon
 from benchmarks.direct_plate import direct_responder
-from chain import LEVEL_DB_SL, ONSET, SENSORS, Heard, Played, Situation, Stream, play_stream
+from cases import shortly
 from controller.api.client import AsyncClient
 from controller.play.selection import GIVEN_UP
 from controller.sources.touch import Touch, TouchFrame
-from daemons import (
+from examples.make_touches import tuio_datagram
+from kills import PLACES as KILLED_AT
+from kills import kill_everywhere
+from kit.chain import LEVEL_DB_SL, ONSET, SENSORS, Heard, Played, Situation, Stream, play_stream
+from kit.fingers import free_port, panel
+from kit.plates import TWO_AMPLIFIERS, write_rig
+from kit.set_table import only
+from model.answer.answer import Layer
+from model.answer.answer_report import Timing
+from model.answer.stimulus import Placement
+from model.arrays import ComplexArray, FloatArray
+from model.ensemble.draws import ClockErrors
+from model.finger import (
+    Grid,
+    contrast_db,
+    felt_part,
+    fingertip_points,
+    fingertip_weights,
+    mean_level_db_sl,
+)
+from model.reduction.reduced_plate import reduce_plate
+from model.rig.rig import Rig
+from model.rig.rig_file import load_rig
+from model.structure.attachments import FingertipLoad, footprints_of
+from model.table.table import LocalizationTable
+from model.table.table_file import build_table
+from model.transients.base_motion import shaped
+from processes import patient_daemon
+from processes.daemons import (
     ERA,
     PATIENCE,
     REACTION,
@@ -53,33 +80,6 @@ from daemons import (
     until_state,
     write_daemon,
 )
-from examples.make_touches import tuio_datagram
-from kills import PLACES as KILLED_AT
-from kills import kill_everywhere
-from long_form import shortly
-from model.answer.answer import Layer
-from model.answer.answer_report import Timing
-from model.answer.stimulus import Placement
-from model.arrays import ComplexArray, FloatArray
-from model.ensemble.draws import ClockErrors
-from model.finger import (
-    Grid,
-    contrast_db,
-    felt_part,
-    fingertip_points,
-    fingertip_weights,
-    mean_level_db_sl,
-)
-from model.reduction.reduced_plate import reduce_plate
-from model.rig.rig import Rig
-from model.rig.rig_file import load_rig
-from model.structure.attachments import FingertipLoad, footprints_of
-from model.table.table import LocalizationTable
-from model.table.table_file import build_table
-from model.transients.base_motion import shaped
-from plates import TWO_AMPLIFIERS, write_rig
-from set_table import only
-from several_fingers import free_port, panel
 from sim.faults import FaultWindow
 from sim.plant import imperfections
 from sim.plant.imperfections import Imperfections, draw_imperfections, realised

@@ -16,11 +16,10 @@ import pytest
 import pytest_asyncio
 
 import dashboard_pictures
-import patient_daemon
+from cases import shortly
 from controller.api.client import Client
 from controller.api.jsonrpc import RpcError
 from controller.effects.layout import LAYOUT, load_layout
-from daemons import PATIENCE
 from dashboard_pictures import (
     PLACES,
     REASON,
@@ -33,7 +32,9 @@ from dashboard_pictures import (
     open_dashboard,
     two_people,
 )
-from gateway_bench import (
+from processes import patient_daemon
+from processes.daemons import PATIENCE
+from processes.gateways import (
     TOKEN,
     Browser,
     GatewayProcess,
@@ -43,7 +44,6 @@ from gateway_bench import (
     wait_for,
     wait_for_state,
 )
-from long_form import shortly
 
 pytestmark = pytest.mark.asyncio(loop_scope="module")
 

@@ -34,7 +34,7 @@ import controller.demo.recorder
 import dashboard_pictures
 import live_demonstration
 import model
-from chain import Chain
+from cases import in_turn, shortly
 from controller.api.client import Client
 from controller.api.jsonrpc import ErrorCode, RpcError
 from controller.api.methods import LayoutEvent, PatternEvent, StateEvent
@@ -46,7 +46,6 @@ from controller.demo.recorder import TouchRecorder
 from controller.gateway.app import MAX_SESSIONS
 from controller.plate_measurement import TonePlayer
 from controller.sources.tuio import read_capture
-from daemons import PATIENCE, PLACE, READY, daemon_at, far_end, ready, running_daemon, until_state
 from dashboard_pictures import REASON, SCREENS, STATE, open_dashboard
 from drivers.by_hand import actions
 from drivers.errors import LinkError, LinkTimeout
@@ -54,8 +53,27 @@ from drivers.host.group import GroupState
 from drivers.opening import Lines
 from era_haptics.lab.conformance.contract import opened
 from era_haptics.lab.witness.capture import TimeLimits
-from gateway_bench import ERA as INSTALLED_ERA
-from gateway_bench import (
+from kit.chain import Chain
+from kit.clock import in_virtual_time, run_virtual
+from kit.fingers import write_schedule
+from kit.set_table import SetTable, make_rig
+from kit.wires import WIRES, far_side
+from model.fem import Mesh
+from model.rig.rig import Rig
+from model.rig.rig_file import example_rig_path, load_rig
+from model.vibration import Tone
+from processes.daemons import (
+    PATIENCE,
+    PLACE,
+    READY,
+    daemon_at,
+    far_end,
+    ready,
+    running_daemon,
+    until_state,
+)
+from processes.gateways import ERA as INSTALLED_ERA
+from processes.gateways import (
     TOKEN,
     UNCONFIRMED,
     GatewayProcess,
@@ -72,21 +90,12 @@ from gateway_bench import (
     wait_for_daemon,
     wait_for_state,
 )
-from long_form import in_turn, shortly
-from model.fem import Mesh
-from model.rig.rig import Rig
-from model.rig.rig_file import example_rig_path, load_rig
-from model.vibration import Tone
-from patient_daemon import PROGRAM, wait_long
-from real_wires import WIRES, far_side
+from processes.patient_daemon import PROGRAM, wait_long
+from processes.typed_page import ERA
 from registry import threads
 from registry.limits import GuardLimits
-from set_table import SetTable, make_rig
-from several_fingers import write_schedule
 from sim.far_ends.wire_assignment import SimulatedWire
 from sim.faults import FaultWindow
-from typed_page import ERA
-from virtual_lines import in_virtual_time, run_virtual
 
 NAMES = ("a", "b", "c", "d")
 BUSES = {

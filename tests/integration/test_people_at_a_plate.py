@@ -32,6 +32,7 @@ import model
 from benchmarks.desk.session import BLOCK, PLATE, Desk, chain, desk, identified_errors
 from benchmarks.desk_plate.desk_plate import DeskModel, draw_truth
 from benchmarks.latency.session import daemon_session, plain_session, taps
+from cases import shortly
 from controller.api.client import AsyncClient, Client
 from controller.api.jsonrpc import RpcError
 from controller.api.link import Unreachable
@@ -39,7 +40,16 @@ from controller.daemon.daemon import check_daemon
 from controller.demo.demonstration import Scene, example_scenes, run_demo
 from controller.effects.layout import load_layout
 from controller.sources.tuio import read_capture
-from daemons import (
+from examples.make_measured import record_responses, scanning_grid
+from kit.clock import in_virtual_time, run_virtual
+from kit.fingers import write_schedule
+from kit.plates import PERTURBED_PLATE_FREQUENCIES, perturbed
+from model.cli import app
+from model.errors import InputError
+from model.estimate.measurement import measurement_of, read_measured, write_responses_csv
+from model.rig.rig_file import example_rig_path, load_rig
+from model.table.table_file import build_table
+from processes.daemons import (
     ENABLED,
     PATIENCE,
     PLACE,
@@ -61,22 +71,12 @@ from daemons import (
     until_state,
     write_daemon,
 )
-from daemons import until as until_seen
-from examples.make_measured import record_responses, scanning_grid
-from floods import flood
-from gateway_bench import TOKEN, gateway_process, real_daemon, wait_for
-from long_form import shortly
-from model.cli import app
-from model.errors import InputError
-from model.estimate.measurement import measurement_of, read_measured, write_responses_csv
-from model.rig.rig_file import example_rig_path, load_rig
-from model.table.table_file import build_table
-from patient_daemon import RESTING, wait_long
-from plates import PERTURBED_PLATE_FREQUENCIES, perturbed
-from several_fingers import write_schedule
+from processes.daemons import until as until_seen
+from processes.floods import flood
+from processes.gateways import TOKEN, gateway_process, real_daemon, wait_for
+from processes.patient_daemon import RESTING, wait_long
+from processes.sound_cards import SoftAmp, capture_on, jack_server
 from sim.plant.fingers import Accelerometer
-from sound_cards import SoftAmp, capture_on, jack_server
-from virtual_lines import in_virtual_time, run_virtual
 
 EXAMPLES = Path(model.__file__).parents[1] / "examples"
 

@@ -26,6 +26,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner, Result
 
+from cases import shortly
 from controller.api.client import AsyncClient, Client
 from controller.api.methods import StateEvent
 from controller.api.schema import LearningSummary
@@ -36,10 +37,19 @@ from controller.learning import learning as learning_module
 from controller.learning.learned_table import load_learned
 from controller.learning.worker import Worker
 from controller.process.daemon_process import SocketLock
-from daemons import PATIENCE, daemon_at, far_end, ready
 from drivers.errors import CommandError, LinkError
 from examples.make_measured import record_responses, scanning_grid
-from gateway_bench import (
+from kit.clock import VirtualLoop, run_virtual
+from kit.plates import write_rig
+from kit.wires import WIRES, FarSide, far_side
+from model.errors import InputError
+from model.estimate.measurement import write_responses_csv, write_responses_uff
+from model.rig.rig import Rig
+from model.rig.rig_file import example_rig_path, load_rig
+from model.structure.plate import Plate
+from model.table.table_file import build_table
+from processes.daemons import PATIENCE, daemon_at, far_end, ready
+from processes.gateways import (
     TOKEN,
     Page,
     ScriptedDaemon,
@@ -49,19 +59,9 @@ from gateway_bench import (
     wait_for,
     wait_for_state,
 )
-from long_form import shortly
-from model.errors import InputError
-from model.estimate.measurement import write_responses_csv, write_responses_uff
-from model.rig.rig import Rig
-from model.rig.rig_file import example_rig_path, load_rig
-from model.structure.plate import Plate
-from model.table.table_file import build_table
-from plates import write_rig
-from real_wires import WIRES, FarSide, far_side
 from registry import threads
 from sim.amplifier.simulated_amplifier import SimulatedAmplifier
 from sim.plant.fingers import Accelerometer
-from virtual_lines import VirtualLoop, run_virtual
 
 Typed = Callable[..., Result]
 PORT = "serial:///dev/memory0?baud=921600"

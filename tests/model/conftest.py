@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from long_form import shortly
+from cases import shortly
 from model.compiled import kernels
 from model.errors import InputError
 

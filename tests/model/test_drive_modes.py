@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
+from kit.plates import by_hand, contact_sets, forms_of, smooth_table
 from model import drive_modes
 from model.answer.stimulus import Placement
 from model.arrays import NEARLY, Complex64Array
 from model.drive_modes import Forms, playable_drive_modes
 from model.finger import fingertip_points
 from model.rig.rig import Uncertainty
-from plates import by_hand, contact_sets, forms_of, smooth_table
 
 SIGMA = 0.1
 """Relative error of each ERA's contribution."""

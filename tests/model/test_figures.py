@@ -12,9 +12,10 @@ import numpy as np
 import pytest
 from tables import claims, stiffness_study, tables
 
+from cases import shortly
 from controller.cli.main import run
 from era_haptics.lab.paper_figures import SWEEP, PaperFigure, equal_area_points, paper_figures
-from long_form import shortly
+from kit.plates import make_paper_rig, small_table, with_strokes, write_rig
 from model.figures import Template, _pages, answer_figure, levels_figure, weak_cells_figure
 from model.finger import Grid
 from model.reduction.free_plate import solve_free_plate
@@ -22,7 +23,6 @@ from model.rig.rig import FOUR_ERA_LAYOUTS, alike
 from model.rig.rig_file import load_rig
 from model.spectral.modes import SpectralMesh
 from model.study.contrast_maps import WeakCells
-from plates import make_paper_rig, small_table, with_strokes, write_rig
 
 POINT = 25.4 / 72  # mm
 SVG = "{http://www.w3.org/2000/svg}"

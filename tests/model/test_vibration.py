@@ -12,8 +12,9 @@ import numpy as np
 import pytest
 from scipy.integrate import dblquad
 
+from cases import shortly
 from error_estimates import CASES, MAX_RATIO, judge
-from long_form import shortly
+from kit.plates import LENGTH, WIDTH, make_paper_rig
 from model.errors import InputError
 from model.fem import Mesh
 from model.finger import (
@@ -45,7 +46,6 @@ from model.vibration import (
     study_convergence,
     tone_fields,
 )
-from plates import LENGTH, WIDTH, make_paper_rig
 
 # On four corner springs: founding paper, in-house column of Table 2, and converged (NGSolve).
 PAPER = np.array([31.98, 68.50, 76.62, 107.84, 160.77])

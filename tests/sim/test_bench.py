@@ -21,16 +21,17 @@ import pytest
 from benchmarks.direct_plate import direct_acceleration
 from drivers.host.amplifier_sensors import measure_tones, read_sensors
 from drivers.playing import AmplifierTone, Voice, VoiceTransition
-from firmware_machine import SESSION as BENCH_SESSION
-from firmware_machine import arm_bench, keep_alive
-from firmware_machine import play as play_at_once
+from kit.clock import in_virtual_time
+from kit.plates import apart, lock_in
+from kit.wires import WIRES, layer, rig_on_wire
 from model.arrays import FloatArray
 from model.fem import assemble
 from model.finger import fingertip_points
 from model.rig.rig import Rig
 from model.structure.attachments import Fingertip, FingertipLoad
-from plates import apart, lock_in
-from real_wires import WIRES, layer, rig_on_wire
+from processes.firmware_machine import SESSION as BENCH_SESSION
+from processes.firmware_machine import arm_bench, keep_alive
+from processes.firmware_machine import play as play_at_once
 from registry import threads
 from registry.limits import HAND_LOAD
 from sim.amplifier.readings import AmplifierClock, Crystal
@@ -40,7 +41,6 @@ from sim.plant.fingers import Accelerometer
 from sim.plant.imperfections import Imperfections, PlateErrors, motion_of
 from sim.plant.plant import FingerPlacement
 from sim.sensors import Accelerometers
-from virtual_lines import in_virtual_time
 
 AT = (0.08, 0.06)
 

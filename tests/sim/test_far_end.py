@@ -20,10 +20,11 @@ import numpy as np
 import pytest
 
 from drivers.playing import AmplifierTone
-from firmware_machine import play
-from interrupted import full_disk
 from model.errors import InputError
 from model.rig.rig import Rig
+from processes.firmware_machine import play
+from processes.interrupted import full_disk
+from processes.sound_cards import read_recording
 from registry import threads
 from sim import simulation
 from sim.bench.bench import Bench
@@ -31,7 +32,6 @@ from sim.plant.fingers import Accelerometer, readings
 from sim.sensors import Recorder, Recording, write_recording
 from sim.transport.far_end import linked_urls, links_by_amplifier
 from sim.transport.simulated_line import LINE_KINDS, Latency, LineKind
-from sound_cards import read_recording
 
 RATE = 5000.0
 

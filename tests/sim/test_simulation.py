@@ -24,9 +24,7 @@ import pytest
 from rich.console import Console
 from typer.testing import CliRunner
 
-from courses import Taken
-from daemons import SESSION as DAEMONS_SESSION
-from daemons import FarEndProcess, far_end_process, playing
+from cases import read_yaml, shortly
 from drivers.by_hand.reaching import random_session
 from drivers.errors import CommandError, LinkError
 from drivers.opening import Lines
@@ -36,24 +34,25 @@ from era_haptics.lab.cli import app
 from era_haptics.lab.witness.capture import read_capture
 from era_haptics.lab.witness.relay import parse_endpoint, relays
 from era_haptics.lab.witness.witness import Witness
-from firmware_machine import play
-from long_form import shortly
+from kit.clock import in_virtual_time
+from kit.courses import Taken
+from kit.plates import write_rig
+from kit.wires import WIRES, far_side
+from kit.witness import witness_config
 from model.errors import InputError
 from model.rig.rig import Rig
 from model.rig.rig_file import example_rig_path
 from model.structure.attachments import PointLoad
-from plate_witness import witness_config
-from plates import write_rig
-from real_wires import WIRES, far_side
+from processes.daemons import SESSION as DAEMONS_SESSION
+from processes.daemons import FarEndProcess, far_end_process, playing
+from processes.firmware_machine import play
+from processes.sound_cards import read_recording
 from registry.limits import GuardLimits
 from sim.bench.bench import Bench
 from sim.control import LINE_MAX, SimulationContext, carry_out, control_socket
 from sim.far_ends.wire_assignment import SimulatedWire
 from sim.plant.imperfections import Imperfections, PlateErrors
 from sim.simulation import SimulationView, draw
-from sound_cards import read_recording
-from virtual_lines import in_virtual_time
-from yaml_files import read_yaml
 
 LIMITS = GuardLimits(40.0, 500.0, 1.0)
 TIMEOUT = 120  # s; for a loaded machine, not an expectation

@@ -24,7 +24,7 @@ from pathlib import Path
 import grimp
 import pytest
 
-from long_form import SLOWEST
+from cases import SLOWEST
 
 ROOT = Path(__file__).parents[2]
 PACKAGES = ("registry", "controller", "drivers", "era_haptics", "model", "sim", "benchmarks")
@@ -172,6 +172,8 @@ def _node(path: str) -> str:
     name = path.rpartition(".")[0].removesuffix("/__init__")
     if path.partition("/")[0] in PACKAGES:
         return name.replace("/", ".")
+    if path.startswith("tests/support/"):
+        return name.removeprefix("tests/support/").replace("/", ".")
     return path if path in _tests() else name.rpartition("/")[2]
 
 

@@ -15,11 +15,11 @@ from pathlib import Path
 
 import numpy as np
 
-import patient_daemon
 from controller.demo.demonstration import layout_of_people
-from gateway_bench import GatewayProcess, Page, gateway_process, open_browser, real_daemon
+from kit.plates import make_paper_rig
 from model.table.table_file import build_table
-from plates import make_paper_rig
+from processes import patient_daemon
+from processes.gateways import GatewayProcess, Page, gateway_process, open_browser, real_daemon
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
 
-from gateway_bench import (
+from processes.gateways import (
     ERA,
     TOKEN,
     GatewayProcess,

@@ -22,10 +22,7 @@ from pathlib import Path
 from typing import Any, Self
 
 import drivers
-import plate_witness
-import real_wires
 import sim
-from chain import Chain
 from drivers.by_hand import actions
 from drivers.errors import CommandRefused, DriverError, LinkError, Preempted
 from drivers.host.group import Group
@@ -34,13 +31,16 @@ from drivers.host.line import Priority
 from drivers.playing import AmplifierLayer, AmplifierTone
 from drivers.protocol.definition import BOOT_TIME, STATES
 from drivers.protocol.sets import Envelope
-from real_wires import after_each
+from kit import wires as real_wires
+from kit import witness as plate_witness
+from kit.chain import Chain
+from kit.clock import Stuck, VirtualLoop, run_virtual
+from kit.set_table import SetTable, make_rig
+from kit.wires import after_each
 from registry import threads
 from registry.limits import GuardLimits
-from set_table import SetTable, make_rig
 from sim.far_ends.wire_assignment import SimulatedWire
 from sim.faults import FaultKind, FaultWindow, Toward
-from virtual_lines import Stuck, VirtualLoop, run_virtual
 
 _CHANNELS, _LAYERS = 2, 4
 _PASSING = 50e-6, 350e-6  # s; through driver and adapter, that sets may be read back at any time

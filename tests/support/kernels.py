@@ -81,8 +81,8 @@ Answers = list[tuple[list[float], float | None]]
 
 def answers() -> Answers:
     """Answers to the fixed questions: one target, none to five quiet fingers, both drive modes."""
-    from plates import contact_sets, smooth_table
-    from set_table import only
+    from kit.plates import contact_sets, smooth_table
+    from kit.set_table import only
 
     found = []
     for quiet in (0, 1, 2, 3, 5):

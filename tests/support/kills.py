@@ -23,7 +23,10 @@ from pathlib import Path
 from controller.api.client import AsyncClient
 from controller.api.jsonrpc import RpcError
 from controller.api.link import Unreachable
-from daemons import (
+from kit.plates import TWO_AMPLIFIERS, write_rig
+from kit.wires import WIRES, far_side
+from model.rig.rig_file import load_rig
+from processes.daemons import (
     REACTION,
     STARTING,
     WATCHDOG,
@@ -37,9 +40,6 @@ from daemons import (
     until,
     until_state,
 )
-from model.rig.rig_file import load_rig
-from plates import TWO_AMPLIFIERS, write_rig
-from real_wires import WIRES, far_side
 from sim.far_ends.wire_assignment import SimulatedWire
 
 READY = "READY_TO_SWITCH_ON"

@@ -19,17 +19,17 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 
-from chain import Chain
 from controller.play.intent import HapticIntent, Pulse, Target
 from controller.sources.touch import Contact, ContactKey
 from drivers.errors import DriverError
+from kit.chain import Chain
+from kit.clock import run_virtual
+from kit.set_table import SetTable, make_rig
 from model.rig.rig import Channel
 from model.vibration import Tone
 from registry.limits import GuardLimits
-from set_table import SetTable, make_rig
 from sim.far_ends.wire_assignment import SimulatedWire
 from sim.faults import FaultWindow
-from virtual_lines import run_virtual
 
 WIRES: Mapping[str, SimulatedWire] = {
     "serial": SimulatedWire("serial", 921_600, shared=True),

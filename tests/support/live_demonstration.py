@@ -3,8 +3,8 @@
 import asyncio
 
 from controller.demo.demonstration import run_live
+from kit.plates import small_table
 from model.rig.rig_file import example_rig_path
-from plates import small_table
 
 if __name__ == "__main__":
     asyncio.run(run_live(example_rig_path(), small_table(), wire="serial", dashboard="127.0.0.1:0"))

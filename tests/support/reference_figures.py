@@ -12,6 +12,7 @@ import numpy as np
 
 from era_haptics.lab.design.problem import DesignProblem, anywhere, area_of, layouts_of
 from era_haptics.lab.design.score import LayoutSearch
+from kit.plates import make_paper_rig, small_problem
 from model.answer.answer_report import Timing
 from model.answer.answer_report import measures as measures_of
 from model.answer.plan import query
@@ -20,7 +21,6 @@ from model.caching import NUMERICS_VERSION
 from model.drive_modes import DRIVE_MODES
 from model.table.table_file import solve_table
 from model.vibration import natural_modes
-from plates import make_paper_rig, small_problem
 
 RECORD = Path(__file__).parents[1] / "model" / "reference_figures.json"
 

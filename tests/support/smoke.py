@@ -25,7 +25,7 @@ from pathlib import Path
 
 from packaging.requirements import Requirement
 
-from typed_page import (
+from processes.typed_page import (
     Failed,
     InstalledEra,
     try_demo,

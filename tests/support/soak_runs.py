@@ -19,7 +19,6 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from chain import Chain
 from controller.api.jsonrpc import RpcError
 from controller.content.pattern import Pattern, Transient
 from controller.effects.effect import Region
@@ -33,6 +32,11 @@ from controller.play.loop import PlayReport
 from controller.sources.touch import Touch, TouchFrame
 from drivers.errors import DriverError
 from era_haptics.lab.witness.capture import TimeLimits
+from kit.chain import Chain
+from kit.clock import START, Stuck, VirtualLoop, run_virtual
+from kit.plates import make_paper_rig, small_table
+from kit.wires import after_each, on_amplifiers
+from kit.witness import PlateTimes
 from model.answer.answer_report import Timing
 from model.config.fields import Rectangle
 from model.finger import STRONG_DB_SL, Grid
@@ -40,15 +44,11 @@ from model.rig.rig import Rig
 from model.rig.rig_file import load_rig
 from model.table.table import LocalizationTable
 from model.table.table_file import TableProblem, solve_table
-from plate_witness import PlateTimes
-from plates import make_paper_rig, small_table
-from real_wires import after_each, on_amplifiers
 from registry import threads
 from sim.far_ends.wire_assignment import SimulatedWire
 from sim.faults import FaultKind, FaultWindow
 from sim.plant.imperfections import Imperfections, draw_imperfections
 from sim.transport.simulated_line import LINE_KINDS, PROMPT
-from virtual_lines import START, Stuck, VirtualLoop, run_virtual
 
 KINDS: Mapping[str, Sequence[int | None]] = {
     "serial": (115_200, 921_600),

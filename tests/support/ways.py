@@ -26,13 +26,13 @@ import pytest
 from controller.api.server import Connection
 from controller.sources import udp_source
 from controller.sources.touch import Touch, TouchFrame
-from daemons import Wire, daemon_table, ready_daemon, request, until
 from era_haptics import query
 from examples.make_touches import tuio_datagram
+from kit.clock import VirtualLoop, run_virtual
 from model.rig.rig_file import load_rig
 from model.table.table_file import build_table
+from processes.daemons import Wire, daemon_table, ready_daemon, request, until
 from registry import threads
-from virtual_lines import VirtualLoop, run_virtual
 
 ROOT = Path(__file__).parents[2]
 _COUNTED = tuple(f"{ROOT / name}/" for name in ("controller", "drivers", "model", "registry"))

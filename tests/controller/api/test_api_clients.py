@@ -30,7 +30,9 @@ from controller.api.link import (
     find_socket,
 )
 from controller.api.methods import LogEvent
-from daemons import (
+from kit.clock import in_virtual_time
+from model.errors import InputError
+from processes.daemons import (
     PLACE,
     daemon_at,
     far_end,
@@ -40,8 +42,6 @@ from daemons import (
     running_daemon,
     until_state,
 )
-from model.errors import InputError
-from virtual_lines import in_virtual_time
 
 PAGE = Path(controller.__file__).parent.parent / "docs" / "reference" / "api.md"
 READY, ENABLED = "READY_TO_SWITCH_ON", "OPERATION_ENABLED"

@@ -48,8 +48,9 @@ from controller.api.methods import (
 from controller.api.schema import MAX_RATE, ApiMessage, Empty
 from controller.api.server import MAX_UNREAD_BYTES, ApiServer, Connection, Hub
 from controller.gateway.field import DrawnField
-from courses import Taken, courses, follow
-from daemons import (
+from kit.clock import feed, in_virtual_time
+from kit.courses import Taken, courses, follow
+from processes.daemons import (
     PATIENCE,
     PLACE,
     ServedApi,
@@ -62,7 +63,6 @@ from daemons import (
 )
 from registry import threads
 from registry.threads import no_long_collections
-from virtual_lines import feed, in_virtual_time
 
 PARAMS = {
     "arm": '{"owner":"me","lease_s":5}',

@@ -23,14 +23,14 @@ from controller.daemon.config import DAEMON, DaemonConfig, DaemonSection, load_d
 from controller.daemon.layouts import config_change
 from controller.process.child import child_command
 from controller.sources.touch import Touch
-from daemons import ENABLED, ready_daemon
+from kit.clock import in_virtual_time
+from kit.plates import TWO_AMPLIFIERS, write_rig
 from model.cli import config_app
 from model.config.document import ConfigError
 from model.errors import InputError
 from model.rig.rig_file import example_rig_path, load_rig
-from plates import TWO_AMPLIFIERS, write_rig
+from processes.daemons import ENABLED, ready_daemon
 from sim.memory_line import SimulationUrl
-from virtual_lines import in_virtual_time
 
 RUNNER = CliRunner()
 EXAMPLES = Path(__file__).parents[3] / "examples"

@@ -33,8 +33,16 @@ from controller.api.methods import ArmParams, StatusResult, TouchParams
 from controller.cli.status_text import show_status
 from controller.demo.demonstration import layout_of_people
 from controller.operation.operation_states import ENERGISED, Operation
-from courses import Planted, Step, Taken, courses, follow
-from daemons import (
+from drivers.protocol.definition import QUANTITIES
+from kit.clock import in_virtual_time
+from kit.courses import Planted, Step, Taken, courses, follow
+from kit.fingers import answers_take
+from kit.plates import TWO_AMPLIFIERS, make_paper_rig
+from model.arrays import FloatArray
+from model.errors import InputError
+from model.table.table import LocalizationTable
+from model.table.table_file import build_table
+from processes.daemons import (
     PATIENCE,
     READY,
     DaemonBench,
@@ -44,16 +52,8 @@ from daemons import (
     far_end,
     until_state,
 )
-from drivers.protocol.definition import QUANTITIES
-from model.arrays import FloatArray
-from model.errors import InputError
-from model.table.table import LocalizationTable
-from model.table.table_file import build_table
-from plates import TWO_AMPLIFIERS, make_paper_rig
 from registry import threads
-from several_fingers import answers_take
 from sim.faults import FaultWindow
-from virtual_lines import in_virtual_time
 
 PLACES = {
     "pad": (0.1, 0.1),

@@ -52,8 +52,13 @@ from controller.operation.operation_states import (
     step,
 )
 from controller.process.log import LogThread
-from courses import Planted
-from daemons import (
+from drivers.errors import CommandError
+from drivers.host.amplifier import WATCHDOG
+from kit.clock import in_virtual_time
+from kit.courses import Planted
+from kit.plates import TWO_AMPLIFIERS
+from model.errors import InputError
+from processes.daemons import (
     ENABLED,
     PATIENCE,
     PLACE,
@@ -73,14 +78,9 @@ from daemons import (
     until_state,
     write_daemon,
 )
-from drivers.errors import CommandError
-from drivers.host.amplifier import WATCHDOG
-from gateway_bench import UNCONFIRMED, ScriptedDaemon, real_daemon
-from model.errors import InputError
-from plates import TWO_AMPLIFIERS
+from processes.gateways import UNCONFIRMED, ScriptedDaemon, real_daemon
 from registry import threads
 from sim.faults import FaultWindow
-from virtual_lines import in_virtual_time
 
 
 def dumped(folder: Path, kind: str) -> list[str]:

@@ -44,15 +44,23 @@ from controller.sources.touch import (
     TouchSource,
     turned,
 )
-from daemons import ENABLED, DaemonBench, Journal, daemon_table, holding, ready_daemon, until
 from examples.make_touches import tuio_datagram
+from kit.clock import MemoryMachine, VirtualLoop, in_virtual_time
+from kit.fingers import bundle, frame, free_port, message, panel
+from kit.witness import tell_first
 from model.answer.answer_report import Timing
 from model.errors import InputError
-from plate_witness import tell_first
+from processes.daemons import (
+    ENABLED,
+    DaemonBench,
+    Journal,
+    daemon_table,
+    holding,
+    ready_daemon,
+    until,
+)
 from registry import threads
-from several_fingers import bundle, frame, free_port, message, panel
 from sim.transport.far_end import FarEnd
-from virtual_lines import MemoryMachine, VirtualLoop, in_virtual_time
 
 
 @in_virtual_time
@@ -610,7 +618,7 @@ async def test_content_rendered_amid_a_stop_is_not_played(
 
     steady = [(0.0, 1.0, 0.5), (1.0, 1.0, 0.5)]
     async with ready_daemon(tmp_path) as (bench, era), await bench.client("another") as other:
-        monkeypatch.setattr("virtual_lines._AWAITED", ())  # time goes on beside the thread
+        monkeypatch.setattr("kit.clock._AWAITED", ())  # time goes on beside the thread
         await other.arm("me", lease_s=60)
         async with holding(other, PLACE, far=bench.far):
             monkeypatch.setattr(File, "prepare", slow)
@@ -622,5 +630,5 @@ async def test_content_rendered_amid_a_stop_is_not_played(
             released.set()
             with pytest.raises(RpcError, match="stopped or disarmed meanwhile"):
                 await playing
-            monkeypatch.setattr("virtual_lines._AWAITED", ("content",))
+            monkeypatch.setattr("kit.clock._AWAITED", ("content",))
             await era.play(steady, PLACE)

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from gateway_bench import ScriptedDaemon
+from processes.gateways import ScriptedDaemon
 
 
 @pytest.fixture(scope="module")

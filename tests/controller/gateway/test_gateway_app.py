@@ -32,8 +32,10 @@ from controller.gateway.app import serve
 from controller.gateway.field import DrawnField, FieldSolver
 from controller.gateway.gateway_settings import GatewaySettings
 from controller.gateway.metrics import exposition
-from daemons import PATIENCE, ready_daemon, stated_readings, until
-from gateway_bench import (
+from model.arrays import ComplexArray
+from model.rig.rig_file import example_rig_path, load_rig
+from processes.daemons import PATIENCE, ready_daemon, stated_readings, until
+from processes.gateways import (
     TOKEN,
     UNCONFIRMED,
     GatewayProcess,
@@ -44,8 +46,6 @@ from gateway_bench import (
     wait_for,
     wait_for_daemon,
 )
-from model.arrays import ComplexArray
-from model.rig.rig_file import example_rig_path, load_rig
 
 
 def scraped(status: StatusResult | None) -> dict[tuple[str, str], float]:

@@ -12,7 +12,7 @@ from typing import Any, TypeAlias
 import httpx
 import pytest
 
-from gateway_bench import (
+from processes.gateways import (
     ARM,
     TOKEN,
     GatewayProcess,

@@ -34,9 +34,11 @@ from controller.demo.demonstration import check_page
 from controller.gateway import connections
 from controller.gateway.app import Gateway, listen, serve
 from controller.gateway.gateway_settings import GatewaySettings, read_token
-from daemons import PATIENCE, until
 from gateway_attacks import ATTACKS, LIMIT, attack
-from gateway_bench import (
+from kit.clock import in_virtual_time
+from model.errors import InputError
+from processes.daemons import PATIENCE, until
+from processes.gateways import (
     TOKEN,
     GatewayProcess,
     RawWebSocket,
@@ -49,9 +51,7 @@ from gateway_bench import (
     wait_for,
     wait_for_daemon,
 )
-from model.errors import InputError
-from typed_page import installed_program
-from virtual_lines import in_virtual_time
+from processes.typed_page import installed_program
 
 
 def test_gateway_exits_at_sigint_with_open_connections(

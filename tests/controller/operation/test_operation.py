@@ -14,6 +14,7 @@ from pathlib import Path
 
 import pytest
 
+from cases import shortly
 from controller.daemon.messages import amplifier_statuses
 from controller.operation import supervisor as supervisor_module
 from controller.operation.operation_states import (
@@ -29,16 +30,15 @@ from controller.operation.operation_states import (
     step,
 )
 from controller.operation.plate_controller import Controller
-from courses import Planted, Step, courses, follow
 from drivers.errors import CommandRefused, DriverError
 from drivers.host.ledger import StopOutcome
 from drivers.protocol.definition import FAULTS
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Command, LayerSet, pack_layers, parts, token_after
-from long_form import shortly
+from kit.clock import in_virtual_time, run_virtual
+from kit.courses import Planted, Step, courses, follow
+from kit.fingers import Watched, watched
 from registry import threads
-from several_fingers import Watched, watched
-from virtual_lines import in_virtual_time, run_virtual
 from ways import stop
 
 STEPS: Sequence[Step] = (

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from chain import FINGER, set_running
+from cases import read_yaml
 from controller.content.pattern import Pattern, Transient
 from controller.daemon.messages import PlateView
 from controller.effects.kinds import File
@@ -26,15 +26,10 @@ from controller.play.routing import PlaybackCapabilities
 from controller.play.selection import Chooser, Selector
 from controller.play.slots import Slot, Slots
 from controller.sources.touch import Contact, ContactKey
-from courses import Acted, courses, fits, follow
-from model.answer.answer import Layer
-from model.answer.answer_report import Timing
-from model.answer.stimulus import Course, Placement
-from model.config.document import data_text, parse_document
-from model.vibration import Tone
-from plates import smooth_rig
-from registry import threads
-from several_fingers import (
+from kit.chain import FINGER, set_running
+from kit.clock import in_virtual_time
+from kit.courses import Acted, courses, fits, follow
+from kit.fingers import (
     ABOVE,
     LAYOUT,
     LEFT,
@@ -46,8 +41,13 @@ from several_fingers import (
     playable,
     table,
 )
-from virtual_lines import in_virtual_time
-from yaml_files import read_yaml
+from kit.plates import smooth_rig
+from model.answer.answer import Layer
+from model.answer.answer_report import Timing
+from model.answer.stimulus import Course, Placement
+from model.config.document import data_text, parse_document
+from model.vibration import Tone
+from registry import threads
 
 FILE = read_yaml(Path(__file__).with_name("fingers.yaml"))
 LAYOUTS = {

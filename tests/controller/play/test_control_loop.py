@@ -21,7 +21,6 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 
-from chain import FINGER, OTHER, Chain, Sent, set_chain, set_running
 from controller.effects.effect import Region
 from controller.effects.kinds import Click
 from controller.effects.layout import SurfaceLayout, default_effects
@@ -32,12 +31,17 @@ from controller.play.loop import PlayReport
 from controller.play.routing import RAMPS_ONLY, PlaybackCapabilities
 from controller.play.selection import Chooser, Selector
 from controller.sources.touch import Change, Contact, ContactKey, ContactTracker, Touch, TouchFrame
-from courses import Acted, Planted, courses, follow
 from drivers.host.group import GroupState
 from drivers.opening import Lines
 from drivers.protocol.definition import QUANTITIES
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Command
+from kit.chain import FINGER, OTHER, Chain, Sent, set_chain, set_running
+from kit.clock import in_virtual_time
+from kit.courses import Acted, Planted, courses, follow
+from kit.fingers import LAYOUT, LEFT, RIGHT, fingers_on, playable, table
+from kit.plates import small_problem, small_table
+from kit.set_table import SetTiming, set_answer
 from model.answer.answer import Answer, Layer, Limits
 from model.answer.answer_report import Timing
 from model.answer.stimulus import Finger, Placement, Stimulus
@@ -48,13 +52,9 @@ from model.structure.material import Material
 from model.structure.plate import Plate
 from model.transients.base_motion import BaseEnvelope
 from model.vibration import Excitation, Tone
-from plates import small_problem, small_table
 from registry import threads
 from registry.limits import HAND_LOAD
-from set_table import SetTiming, set_answer
-from several_fingers import LAYOUT, LEFT, RIGHT, fingers_on, playable, table
 from sim.far_ends.wire_assignment import SimulatedWire
-from virtual_lines import in_virtual_time
 
 
 class Shapes(SetTiming):

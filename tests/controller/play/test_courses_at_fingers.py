@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from chain import Chain
+from cases import shortly
 from controller.content.pattern import Curve, Pattern, Transient, sharpness_of
 from controller.daemon.messages import PlateView
 from controller.effects.effect import Effect, Region
@@ -24,7 +24,10 @@ from controller.effects.layout import SurfaceLayout
 from controller.effects.player import EffectPlayer
 from controller.play.routing import RAMPS_ONLY, PlaybackCapabilities
 from controller.sources.touch import Contact, ContactKey
-from long_form import shortly
+from kit.chain import Chain
+from kit.clock import in_virtual_time, run_virtual
+from kit.fingers import ABOVE, LEFT, RIGHT, Fingers, fingers_on
+from kit.fingers import table as paper_table
 from model.answer.answer import Answer, Limits
 from model.answer.answer_report import Timing
 from model.answer.plan import answer
@@ -36,11 +39,8 @@ from model.rig.rig_file import load_rig, parse_rig
 from model.table.table import LocalizationTable
 from model.table.table_file import build_table
 from model.transients.base_motion import Envelopes
-from several_fingers import ABOVE, LEFT, RIGHT, Fingers, fingers_on
-from several_fingers import table as paper_table
+from processes.sound_cards import STEP, Magnets, Outputs
 from sim.far_ends.wire_assignment import SimulatedWire
-from sound_cards import STEP, Magnets, Outputs
-from virtual_lines import in_virtual_time, run_virtual
 
 SWELL = Pattern(1.5, ((0.0, 0.3), (0.7, 1.0), (1.5, 0.2)), ((0.0, 0.4),))
 SHARPER = Pattern(1.5, SWELL.intensity, ((0.0, 0.7),))

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from chain import Chain, Position
+from cases import shortly
 from controller.play.intent import HapticIntent, Target
 from controller.play.joint_answers import (
     Crossfades,
@@ -31,7 +31,12 @@ from controller.play.loop import PlayReport
 from controller.play.slots import CROSSFADE
 from controller.sources.touch import AT_REST, Contact, ContactKey, Motion
 from drivers.host.group import Group
-from long_form import shortly
+from kit.chain import Chain, Position
+from kit.clock import in_virtual_time, run_virtual
+from kit.fingers import LAYOUT, LEFT, RIGHT, Fingers, asked, chosen_for, fingers_on, playable
+from kit.fingers import table as paper_table
+from kit.plates import contact_sets, smooth_rig
+from kit.wires import on_two_amplifiers
 from model.answer.answer import Limits
 from model.answer.answer_report import Timing
 from model.answer.plan import answer
@@ -43,12 +48,7 @@ from model.study.contrast_maps import random_contacts
 from model.study.verification import draw_plates, harmonics_on, powers_on
 from model.table.table import LocalizationTable, read_fingertips
 from model.table.table_file import build_table
-from plates import contact_sets, smooth_rig
-from real_wires import on_two_amplifiers
-from several_fingers import LAYOUT, LEFT, RIGHT, Fingers, asked, chosen_for, fingers_on, playable
-from several_fingers import table as paper_table
 from sim.far_ends.wire_assignment import SimulatedWire
-from virtual_lines import in_virtual_time, run_virtual
 
 BUS = SimulatedWire("serial", speed=921_600, shared=True, line_kind="prompt")
 LINES = SimulatedWire("serial", speed=921_600, unpluggable=True)

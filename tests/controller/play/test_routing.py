@@ -16,7 +16,6 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 
-from chain import FarEnd
 from controller.effects.player import EffectPlayer
 from controller.play.intent import leaks_db_sl
 from controller.play.routing import (
@@ -37,6 +36,10 @@ from drivers.playing import AmplifierTone as Played
 from drivers.protocol.definition import CLOCK_UNKNOWN
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Command, Envelope, LayerSet
+from kit.chain import FarEnd
+from kit.clock import in_virtual_time
+from kit.fingers import LAYOUT, LEFT, RIGHT, Fingers
+from kit.plates import smooth_rig, smooth_table
 from model.answer.answer_report import Timing
 from model.ensemble.attached_plate import AttachedPlate, PlateOnEras
 from model.ensemble.draws import EXACT_CLOCKS
@@ -46,14 +49,11 @@ from model.table.table import LocalizationTable
 from model.table.table_file import build_table
 from model.transients.base_motion import BaseEnvelope
 from model.vibration import Excitation, Tone
-from plates import smooth_rig, smooth_table
 from registry import threads
 from registry.limits import GuardLimits
-from several_fingers import LAYOUT, LEFT, RIGHT, Fingers
 from sim.amplifier.readings import Crystal, capabilities
 from sim.far_ends.wire_assignment import SimulatedWire as WireAssignmentWire
 from sim.plant.imperfections import draw_imperfections
-from virtual_lines import in_virtual_time
 
 RIG = smooth_rig()
 HALVES = replace(

@@ -34,10 +34,10 @@ from controller.sources.tuio import (
 from controller.sources.udp_source import BACKLOG_THRESHOLD, Datagram, Datagrams, Peer, listen
 from drivers.errors import LinkError
 from examples.make_touches import tuio_datagram, write_capture
+from kit.clock import in_virtual_time
+from kit.fingers import bundle, cursor, frame, free_port, message
+from kit.plates import make_paper_rig
 from model.errors import InputError
-from plates import make_paper_rig
-from several_fingers import bundle, cursor, frame, free_port, message
-from virtual_lines import in_virtual_time
 
 PEER = ("192.0.2.7", 50000)
 

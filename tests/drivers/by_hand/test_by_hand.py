@@ -21,6 +21,7 @@ import pytest_asyncio
 from serial.tools.list_ports_common import ListPortInfo
 from typer.testing import CliRunner, Result
 
+from cases import shortly
 from drivers.by_hand import actions, reaching
 from drivers.by_hand.actions import BlockingAmplifier
 from drivers.by_hand.cli import app
@@ -41,9 +42,8 @@ from drivers.urls import CLOCK_ERRORS, SIMULATED, with_address
 from drivers.wires.can_frames import CanFrame
 from era_haptics.lab.cli import app as lab_app
 from era_haptics.lab.conformance.check import ConformanceReport
-from long_form import shortly
+from kit.wires import WORD_WIRES, WordFarSide, until
 from model.rig.rig_file import example_rig_path
-from real_wires import WORD_WIRES, WordFarSide, until
 from registry.limits import GuardLimits
 from sim.far_ends.can_amplifiers import CanBus, SlcanAdapter
 from sim.transport.far_end import make_terminal

@@ -13,6 +13,7 @@ from unittest.mock import AsyncMock, Mock
 
 import pytest
 
+from cases import shortly
 from drivers.errors import (
     CommandError,
     CommandRefused,
@@ -39,12 +40,11 @@ from drivers.wires.can_frames import unpack_frames
 from drivers.wires.serial_frames import REPLY_BIT, FrameReader, encode_frame
 from drivers.wires.serial_line import SerialWire
 from drivers.wires.wire import Reply
-from long_form import shortly
-from real_wires import WORD_WIRES
+from kit.clock import KINDS, MemoryLine, in_virtual_time
+from kit.wires import WORD_WIRES
 from registry.limits import GuardLimits
 from sim.amplifier.readings import capabilities
 from sim.amplifier.simulated_amplifier import SimulatedAmplifier
-from virtual_lines import KINDS, MemoryLine, in_virtual_time
 
 FREQUENCIES = [110.0, 173.5]
 ROW = {"unit": 1, "channel": 255, "x": 1000, "y": 2000, "range": 512.0, "frequency_max": 20_000}

@@ -14,8 +14,8 @@ from typing import Any
 
 import pytest
 
-from courses import Taken, courses, follow
 from drivers.host.clock import HeldClock
+from kit.courses import Taken, courses, follow
 
 ARMED, OFF = 4, 1
 STEP = 20 / 65536  # s; of shift: the clock goes round in 20 s

@@ -21,16 +21,16 @@ from drivers.playing import AmplifierLayer, AmplifierTone
 from drivers.protocol.definition import CLOCK_UNKNOWN, FEATURES, HELLO, HIGH_TIME, MESSAGES, SPAN
 from drivers.wires.can_frames import CanFrame, pack_frames
 from drivers.wires.serial_line import SerialWire
-from sim.amplifier.readings import AmplifierClock, Crystal
-from sim.far_ends import serial_amplifiers
-from sim.transport.simulated_line import LINE_KINDS, LineDelays
-from virtual_lines import (
+from kit.clock import (
     KINDS,
     MemoryLine,
     group_of,
     in_virtual_time,
     unaltered,
 )
+from sim.amplifier.readings import AmplifierClock, Crystal
+from sim.far_ends import serial_amplifiers
+from sim.transport.simulated_line import LINE_KINDS, LineDelays
 
 PACKED = len(pack_frames([CanFrame(0, b"")]))
 STATUS = {

@@ -19,7 +19,6 @@ from unittest.mock import Mock
 
 import pytest
 
-from courses import Taken, courses, follow
 from drivers.errors import LinkTimeout
 from drivers.host.amplifier_sensors import read_measured
 from drivers.host.group import Group
@@ -34,10 +33,11 @@ from drivers.wires.can_frames import CanFrame, pack_frames, segments
 from drivers.wires.serial_frames import REPLY_BIT, FrameReader, encode_frame, pack_words
 from drivers.wires.serial_line import SerialWire
 from drivers.wires.wire import BrokenReply
+from kit.clock import KINDS, MemoryLine, delayed, group_of, losing, of_parts, unaltered
+from kit.courses import Taken, courses, follow
 from registry import threads
 from sim.amplifier.readings import AmplifierClock, Crystal
 from sim.amplifier.simulated_amplifier import SimulatedAmplifier as FarEnd
-from virtual_lines import KINDS, MemoryLine, delayed, group_of, losing, of_parts, unaltered
 
 
 def altered(

@@ -23,8 +23,6 @@ from typing import Any
 import pytest
 
 import drivers
-from chain import set_running
-from courses import Acted
 from drivers.errors import DriverError, LinkTimeout
 from drivers.host.group import Group
 from drivers.playing import AmplifierLayer
@@ -38,11 +36,8 @@ from drivers.wires.wire import Wire
 from group_stops import LINES as STOPPED_LINES
 from group_stops import PER_CHAIN, PROGRAMMES, Tally
 from group_stops import play as play_stops
-from late_taps import AMPLIFIERS
-from late_taps import WIRES as LATE_WIRES
-from late_taps import play as play_late_taps
-from sim.amplifier.readings import AmplifierClock, Crystal
-from virtual_lines import (
+from kit.chain import set_running
+from kit.clock import (
     KINDS,
     MemoryLine,
     delayed,
@@ -54,6 +49,11 @@ from virtual_lines import (
     tone,
     unaltered,
 )
+from kit.courses import Acted
+from late_taps import AMPLIFIERS
+from late_taps import WIRES as LATE_WIRES
+from late_taps import play as play_late_taps
+from sim.amplifier.readings import AmplifierClock, Crystal
 
 
 class Paced:

@@ -23,9 +23,9 @@ from drivers.playing import AmplifierLayer, AmplifierTone, Playback
 from drivers.protocol.sets import Envelope
 from drivers.wires.can_frames import CanFrame, pack_frames
 from drivers.wires.serial_frames import Frame, encode_frame
+from kit.clock import MemoryLine, in_virtual_time, unaltered
 from registry.limits import GuardLimits
 from sim.amplifier.readings import capabilities
-from virtual_lines import MemoryLine, in_virtual_time, unaltered
 
 WIDE = GuardLimits(20.0, 1000.0, 1.0)
 CAN = capabilities(3)

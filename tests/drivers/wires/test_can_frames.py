@@ -17,7 +17,6 @@ from unittest.mock import AsyncMock, Mock
 import can
 import pytest
 
-from courses import Taken, courses, follow
 from drivers.errors import LinkError, WireCounters
 from drivers.opening import Lines
 from drivers.ports import PORT_OPENER
@@ -40,9 +39,10 @@ from drivers.wires.can_frames import (
     unpack_frames,
 )
 from drivers.wires.wire import address_of
-from real_wires import until
+from kit.clock import in_virtual_time
+from kit.courses import Taken, courses, follow
+from kit.wires import until
 from registry.limits import GuardLimits
-from virtual_lines import in_virtual_time
 
 FRAME = CanFrame(0x181, bytes.fromhex("0102030405060708"))
 LINES = {

@@ -16,7 +16,6 @@ from unittest.mock import Mock
 import pytest
 from scipy.stats import poisson
 
-from courses import Taken, courses, follow
 from drivers.protocol.definition import IDENTITY, MESSAGES, STATUS
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Command, Envelope, LayerSet, pack_layers, parts
@@ -33,10 +32,11 @@ from drivers.wires.wire import (
     Reply,
     Wire,
 )
-from real_wires import damage
+from kit.clock import KINDS, MemoryLine, in_virtual_time, unaltered
+from kit.courses import Taken, courses, follow
+from kit.wires import damage
 from sim.amplifier.simulated_amplifier import SimulatedAmplifier
 from sim.far_ends.modbus_amplifiers import ModbusAmplifiers
-from virtual_lines import KINDS, MemoryLine, in_virtual_time, unaltered
 
 PART: Values = {
     **{"session": 0x2A17, "token": 0x0102, "index": 0, "parts": 1, "now": 1},

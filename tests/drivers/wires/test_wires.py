@@ -27,7 +27,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pymodbus.logging import Log
 
-from courses import Taken, courses, follow
+from cases import in_turn, shortly
 from drivers import ports
 from drivers.errors import CommandError, LinkError
 from drivers.ports import Port
@@ -48,7 +48,7 @@ from drivers.wires.modbus_frames import (
 )
 from drivers.wires.serial_frames import PAYLOAD_MAX, Frame, FrameReader, encode_frame, frame_length
 from drivers.wires.wire import address_of
-from long_form import in_turn, shortly
+from kit.courses import Taken, courses, follow
 from registry import threads
 
 BYTE = 11 / 19_200  # s

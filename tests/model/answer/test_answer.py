@@ -7,6 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from kit.plates import SMALL_TABLE_HZ, contact_sets, realised, smooth_rig, smooth_table
+from kit.set_table import drives, only, wants
+from kit.set_table import phased as answer
 from model.answer.answer import NO_LIMITS, Limits
 from model.answer.answer_report import query_one
 from model.answer.plan import answer as answer_by_table
@@ -19,10 +22,7 @@ from model.finger import detection_threshold
 from model.structure.attachments import HAND_PATCHES, HAND_STD
 from model.study.verification import Plates, draw_plates
 from model.table.table_file import build_table
-from plates import SMALL_TABLE_HZ, contact_sets, realised, smooth_rig, smooth_table
 from registry.limits import HAND_LOAD
-from set_table import drives, only, wants
-from set_table import phased as answer
 
 NEAR, FAR, THIRD, FOURTH = (0.09, 0.07), (0.25, 0.18), (0.05, 0.19), (0.24, 0.06)
 QUIET = (0.16, 0.20)

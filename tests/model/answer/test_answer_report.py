@@ -10,6 +10,9 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 
+from kit.plates import make_paper_rig, smooth_rig, smooth_table
+from kit.set_table import only, wants
+from kit.set_table import phased as answer
 from model.answer.answer_report import (
     Timing,
     cell_centres,
@@ -31,9 +34,6 @@ from model.table.table_file import build_table, save_table
 from model.transients.base_motion import ramped_ending, ramped_onset, shaped
 from model.transients.shaping import Shaper, Transients
 from model.transients.time_response import plate_in_time
-from plates import make_paper_rig, smooth_rig, smooth_table
-from set_table import only, wants
-from set_table import phased as answer
 
 PUBLISHED = {
     6.3: 0.727, 8: 0.873, 10: 0.951, 12.5: 0.958, 16: 0.896, 20: 0.782, 25: 0.647, 31.5: 0.519,

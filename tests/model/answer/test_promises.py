@@ -17,6 +17,18 @@ import numpy as np
 import pytest
 
 from benchmarks.promise.clicks import clicks_on, given
+from cases import read_yaml
+from kit.plates import (
+    SMALL_TABLE_HZ,
+    Realised,
+    contact_sets,
+    realised,
+    small_table,
+    smooth_rig,
+    smooth_table,
+)
+from kit.set_table import drives, wants
+from kit.set_table import phased as set_answer
 from model.answer.answer import (
     MIN_CONTRAST_DB,
     MIXED,
@@ -51,18 +63,6 @@ from model.table.table_file import build_table
 from model.transients.base_motion import ramped_onset, ramped_pulse
 from model.transients.shaping import SAMPLE_RATE, Transients
 from model.vibration import Tone, base_amplitudes
-from plates import (
-    SMALL_TABLE_HZ,
-    Realised,
-    contact_sets,
-    realised,
-    small_table,
-    smooth_rig,
-    smooth_table,
-)
-from set_table import drives, wants
-from set_table import phased as set_answer
-from yaml_files import read_yaml
 
 WEEKEND = Path(__file__).parents[3] / "examples" / "weekend" / "rig.yaml"
 CASES: dict[str, dict[str, Any]] = {

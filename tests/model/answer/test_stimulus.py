@@ -13,7 +13,16 @@ import pytest
 from scipy.linalg import eigh
 
 from benchmarks.promise.clicks import given
-from long_form import shortly
+from cases import shortly
+from kit.plates import (
+    SMALL_TABLE_HZ,
+    contact_sets,
+    forms_of,
+    small_table,
+    smooth_rig,
+    smooth_table,
+)
+from kit.set_table import only, phased, wants
 from model.answer import tone_search
 from model.answer.answer import KEPT, MISSING, Contents, Limits, Stream
 from model.answer.plan import answer, query
@@ -40,16 +49,7 @@ from model.table.table_file import build_table
 from model.transients.base_motion import BaseEnvelope, rise, shaped
 from model.transients.shaping import SAMPLE_RATE, Transients
 from model.vibration import Tone, base_amplitudes
-from plates import (
-    SMALL_TABLE_HZ,
-    contact_sets,
-    forms_of,
-    small_table,
-    smooth_rig,
-    smooth_table,
-)
 from registry.limits import HAND_LOAD
-from set_table import only, phased, wants
 
 TARGET, QUIET, STROKE = (0.09, 0.07), (0.24, 0.17), 100e-6
 

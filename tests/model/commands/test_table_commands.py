@@ -23,9 +23,11 @@ from click.testing import Result
 from typer.testing import CliRunner
 
 import era_haptics as api
+from cases import read_yaml
 from controller.cli.main import run
 from era_haptics.lab.cli import app as lab_app
 from era_haptics.lab.design import problem, score
+from kit.plates import small_table, smooth_table, write_rig
 from model.cli import app
 from model.commands import options
 from model.commands.options import next_line, progress_bar
@@ -36,8 +38,6 @@ from model.rig.rig_file import example_rig_path, load_rig
 from model.study import overview
 from model.table.table_file import save_table
 from model.vibration import study_convergence
-from plates import small_table, smooth_table, write_rig
-from yaml_files import read_yaml
 
 RIG = str(example_rig_path())
 QUICK = ["--mesh", "12x9", "--frequencies", "60,110,250", "--grid", "4x3"]

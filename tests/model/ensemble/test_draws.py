@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from benchmarks.direct_plate import direct_acceleration
+from kit.plates import LENGTH, WIDTH, contact_sets, smooth_rig
 from model.answer.answer import Answer
 from model.answer.plan import answer
 from model.answer.promise import FingersOnPlate
@@ -38,7 +39,6 @@ from model.structure.attachments import FingertipLoad, PointLoad, footprints_of
 from model.structure.exciter import Exciter
 from model.table.table import LocalizationTable
 from model.table.table_file import build_table
-from plates import LENGTH, WIDTH, contact_sets, smooth_rig
 
 
 def test_common_gain_moves_all_channels_together():

@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 from scipy import optimize
 
-import plates as calibration_plates
 from benchmarks.calibration.hidden_plates import (
     FORM,
     SENSORS,
@@ -25,6 +24,10 @@ from benchmarks.calibration.hidden_plates import (
     true_values,
 )
 from benchmarks.weekend import chain
+from kit import plates as calibration_plates
+from kit.plates import NAMES as PLATES_NAMES
+from kit.plates import make_paper_rig, perturbed
+from kit.plates import measured as plates_measured
 from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError
 from model.estimate import plate_match
@@ -40,9 +43,6 @@ from model.rig.rig import Rig
 from model.rig.rig_file import example_rig_path, load_rig
 from model.spectral.modes import SpectralMesh, stretched
 from model.structure.attachments import PointLoad, footprints_of
-from plates import NAMES as PLATES_NAMES
-from plates import make_paper_rig, perturbed
-from plates import measured as plates_measured
 
 FREQUENCIES = np.arange(40.0, 321.0, 40.0)
 STIFF, SOFT = 30e3, 10.0  # N/m; the latter is 3e-4 of an ERA's

@@ -31,9 +31,10 @@ from benchmarks.identification.plates import (
     pattern_of_touches,
     table_of,
 )
+from cases import shortly
 from controller.learning import learned_table as learned_table_module
 from controller.learning.learned_table import LearnedTable, save_learned
-from long_form import shortly
+from kit.plates import SETTLED_PATTERNS_FREQUENCIES, played, settled_patterns
 from model.arrays import FloatArray
 from model.errors import InputError
 from model.estimate.fit import Fit
@@ -62,7 +63,6 @@ from model.reduction.free_plate import solve_free_plate
 from model.rig.rig import Rig, Uncertainty
 from model.table.table import LocalizationTable
 from model.table.table_file import build_table
-from plates import SETTLED_PATTERNS_FREQUENCIES, played, settled_patterns
 
 TONES = np.array([85.0, 150.0, 215.0, 330.0])
 POINTS = np.array([[0.06, 0.05], [0.15, 0.11], [0.26, 0.17], [0.22, 0.04]])

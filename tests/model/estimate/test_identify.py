@@ -16,6 +16,7 @@ import pytest
 
 from benchmarks.direct_plate import direct_acceleration
 from benchmarks.identification.plates import Hidden, draw, parameters_held
+from kit.plates import SETTLED_PATTERNS_FREQUENCIES, as_sold, exciter_rig, exciter_rig_text
 from model.arrays import ComplexArray, FloatArray
 from model.config.document import parse_document
 from model.errors import InputError
@@ -53,7 +54,6 @@ from model.structure.exciter import Exciter
 from model.structure.material import Material, Orthotropy
 from model.structure.plate import Bond, Laminate, LaminateLayer, equivalent_plate
 from model.study.verification import expected_contrast
-from plates import SETTLED_PATTERNS_FREQUENCIES, as_sold, exciter_rig, exciter_rig_text
 
 FREQUENCIES = np.linspace(40.0, 500.0, 21)
 ONE_ROUND = (np.arange(len(FREQUENCIES))[:, None] + np.arange(4)) % 4 == 0

@@ -22,9 +22,19 @@ from benchmarks.identification import causes
 from benchmarks.identification.mistakes import on_glue
 from benchmarks.identification.plates import draw
 from benchmarks.weekend.chain import FOLDER, BuiltBoard
+from cases import read_yaml, shortly
 from controller.cli.main import run
 from controller.plate_measurement import MeasuredPlate
-from long_form import shortly
+from kit.plates import (
+    DISTORTIONS,
+    as_sold,
+    exciter_rig,
+    make_paper_rig,
+    noise_like,
+    perturbed,
+    random_gains,
+)
+from kit.plates import measured as measured_by_plates
 from model.errors import InputError
 from model.estimate import plate_match
 from model.estimate.calibrate import MAX_OUTLIERS, calibrate, check_consistency
@@ -51,17 +61,6 @@ from model.rig.rig import Rig
 from model.rig.rig_file import load_rig, parse_rig
 from model.spectral.direct_solution import direct_spectral_acceleration
 from model.spectral.modes import SpectralMesh
-from plates import (
-    DISTORTIONS,
-    as_sold,
-    exciter_rig,
-    make_paper_rig,
-    noise_like,
-    perturbed,
-    random_gains,
-)
-from plates import measured as measured_by_plates
-from yaml_files import read_yaml
 
 TONES = np.arange(91.0, 300.0, 20.0)
 NAMES = ("NE", "NW", "SW", "SE")

@@ -14,7 +14,8 @@ from scipy import sparse
 from scipy.sparse.linalg import splu
 
 from benchmarks.direct_plate import direct_acceleration, direct_responder
-from long_form import shortly
+from cases import shortly
+from kit.plates import ALUMINIUM, LENGTH, WIDTH, make_paper_rig
 from model.arrays import FloatArray
 from model.errors import InputError
 from model.estimate.fit import sensed_plate
@@ -52,7 +53,6 @@ from model.structure.plate import (
 from model.study.verification import verify_table
 from model.table.table_file import TableProblem, build_table, table_following
 from model.vibration import natural_modes
-from plates import ALUMINIUM, LENGTH, WIDTH, make_paper_rig
 
 # Even and odd counts of elements, low and high order, with strips along the edges and without.
 MESHES = {

@@ -15,6 +15,8 @@ import pytest
 
 from benchmarks.direct_plate import direct_acceleration
 from controller.cli.main import run
+from kit.plates import exciter_rig, exciter_rig_text
+from kit.set_table import only
 from model.answer.stimulus import Placement
 from model.config.document import ConfigError, KeyPath, read_document
 from model.errors import InputError
@@ -36,8 +38,6 @@ from model.structure.attachments import Fingertip, PointLoad, footprints_of
 from model.table.table_file import build_table
 from model.transients.base_motion import BaseMotions, Term
 from model.transients.time_response import plate_in_time
-from plates import exciter_rig, exciter_rig_text
-from set_table import only
 
 # A line per value, so that every problem has a line of its own.
 GOOD = """\

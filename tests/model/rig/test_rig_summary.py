@@ -20,8 +20,9 @@ import yaml
 import era_haptics
 import model
 import rig_page
+from cases import shortly
 from key_tables import quantities
-from long_form import shortly
+from kit.plates import exciter_rig, exciter_rig_text
 from model.commands.plate_cli import show
 from model.config.document import ConfigError, data_text, parse_document
 from model.config.fields import Section
@@ -40,7 +41,6 @@ from model.structure.material import EXCITER_TYPES, KNOWN_MATERIALS, Material
 from model.structure.plate import FOLLOWED_FIELDS, AirGap, Laminate, Plate
 from model.table.table_file import build_table, table_following
 from model.vibration import natural_modes
-from plates import exciter_rig, exciter_rig_text
 
 ROOT = Path(model.__file__).parent.parent
 PAGE = (ROOT / "docs" / "reference" / "rig.md").read_text("utf-8")

@@ -16,7 +16,8 @@ from scipy.integrate import trapezoid
 from scipy.linalg import eigh
 
 from benchmarks.layers import air_pressure, cell_middles, strip_frequencies
-from long_form import in_turn
+from cases import in_turn
+from kit.plates import ALUMINIUM, LENGTH, WIDTH, make_paper_rig
 from model.arrays import FloatArray
 from model.errors import InputError
 from model.fem import (
@@ -50,7 +51,6 @@ from model.structure.plate import (
     equivalent_plate,
 )
 from model.vibration import natural_modes
-from plates import ALUMINIUM, LENGTH, WIDTH, make_paper_rig
 
 RIG = make_paper_rig(12, 9)
 PAPER = RIG.plate

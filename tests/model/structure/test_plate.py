@@ -16,7 +16,8 @@ from scipy import linalg
 
 from benchmarks.direct_plate import direct_acceleration
 from benchmarks.layers import wave_number
-from long_form import in_turn, shortly
+from cases import in_turn, shortly
+from kit.plates import ALUMINIUM, LENGTH, WIDTH, exciter_rig, make_paper_rig
 from model.arrays import ComplexArray, FloatArray, lattice
 from model.errors import InputError
 from model.fem import ELEMENTS, Mesh, assemble
@@ -55,7 +56,6 @@ from model.structure.plate import (
 )
 from model.table.table_file import build_table, table_following
 from model.vibration import natural_modes, reference_mesh
-from plates import ALUMINIUM, LENGTH, WIDTH, exciter_rig, make_paper_rig
 
 # DAEX25FHE-4 of its sheet with Qms 3, R_g 0.1 ohm, 1 W.
 BY_HAND = Exciter(

@@ -12,6 +12,7 @@ import pytest
 from benchmarks.contents import share_kept
 from benchmarks.setting import random_contacts
 from benchmarks.surface import exported_modes
+from cases import read_yaml
 from controller.cli.main import run
 from controller.sources.touch import ContactTracker, Touch, TouchFrame
 from era_haptics.lab.design.problem import area_of
@@ -27,7 +28,6 @@ from model.study.verification import amplitudes_on, draw_plates, verify_table
 from model.table.table import LocalizationTable
 from model.table.table_file import build_table, load_table, save_table
 from sim.plant.imperfections import draw_of_ensemble
-from yaml_files import read_yaml
 
 ERAS = """
 eras:

@@ -14,6 +14,8 @@ from typer.testing import CliRunner
 
 import era_haptics as era
 from drivers.urls import CLOCK_ERRORS
+from kit.plates import FREQUENCIES, make_paper_rig, small_table, smooth_rig, with_strokes
+from kit.set_table import only
 from model.answer.stimulus import Placement
 from model.cli import app
 from model.errors import InputError
@@ -44,8 +46,6 @@ from model.study.overview import (
     summarize,
 )
 from model.table.table_file import build_table, save_table
-from plates import FREQUENCIES, make_paper_rig, small_table, smooth_rig, with_strokes
-from set_table import only
 
 IDENTIFIED = Uncertainty(0.015, 1.5, 0.002, 0.01, 1.1, 0.5, modulus=0.0, place=0.0, harmonic=0.0)
 RIG = """

@@ -8,6 +8,16 @@ import numpy as np
 import pytest
 
 from benchmarks.direct_plate import direct_acceleration
+from kit.plates import (
+    FREQUENCIES,
+    SMALL_TABLE_HZ,
+    contact_sets,
+    make_paper_rig,
+    small_table,
+    smooth_rig,
+    smooth_table,
+)
+from kit.set_table import only
 from model.answer.stimulus import Placement
 from model.ensemble.draws import percentile
 from model.fem import assemble
@@ -18,16 +28,6 @@ from model.structure.attachments import FingertipLoad, PointLoad
 from model.study.verification import AnswerCheck, Plates, draw_plates, felt_on, verify_table
 from model.table.table_file import build_table, load_table, save_table
 from model.vibration import base_amplitudes, tone_fields
-from plates import (
-    FREQUENCIES,
-    SMALL_TABLE_HZ,
-    contact_sets,
-    make_paper_rig,
-    small_table,
-    smooth_rig,
-    smooth_table,
-)
-from set_table import only
 
 
 @pytest.fixture(scope="module")

@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 
 from benchmarks.direct_plate import direct_acceleration
+from kit.plates import contact_sets, make_paper_rig, smooth_rig, smooth_table
+from kit.set_table import only
 from model.answer.plan import query
 from model.answer.stimulus import Placement
 from model.drive_modes import highest_levels
@@ -22,9 +24,7 @@ from model.study.verification import Plates, felt_on
 from model.table.table import LocalizationTable, Raster, default_drive_frequencies, read_fingertips
 from model.table.table_file import TableProblem, build_table, table_following
 from model.vibration import Tone, tone_fields
-from plates import contact_sets, make_paper_rig, smooth_rig, smooth_table
 from registry.limits import GuardLimits
-from set_table import only
 
 
 def test_highest_level_is_that_of_the_best_pattern_tried_by_hand():

@@ -19,6 +19,7 @@ from pydantic.fields import FieldInfo
 
 import rig_page
 from key_tables import quantities
+from kit.plates import make_paper_rig, small_problem, small_table
 from model import caching
 from model.config.fields import Section
 from model.config.units import parse_frequencies
@@ -32,7 +33,6 @@ from model.rig.rig_file import parse_rig
 from model.table import table_file
 from model.table.table_file import TableProblem, cached_table, load_table, save_table, solve_table
 from model.vibration import study_convergence
-from plates import make_paper_rig, small_problem, small_table
 
 REMEDY = "era table build"
 

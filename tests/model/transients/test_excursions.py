@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 from scipy.signal import StateSpace, lsim
 
-from long_form import shortly
+from cases import shortly
+from kit.plates import exciter_rig, make_paper_rig
 from model.answer.stimulus import Course, swings_of_pulse
 from model.reduction.free_plate import solve_free_plate
 from model.reduction.reduced_plate import (
@@ -60,8 +61,7 @@ from model.transients.time_response import (
     plate_in_time,
 )
 from model.vibration import Tone
-from plates import exciter_rig, make_paper_rig
-from sound_cards import STEP, Magnets
+from processes.sound_cards import STEP, Magnets
 
 
 def test_magnets_on_a_board_as_light_as_they_are() -> None:

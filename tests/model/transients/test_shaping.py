@@ -9,6 +9,16 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
+from kit.plates import (
+    STILL,
+    faded_base,
+    make_paper_rig,
+    make_plate_in_time,
+    motion_of,
+    shaped_base,
+    stepped_acceleration,
+)
+from kit.set_table import only
 from model.answer.stimulus import Placement
 from model.arrays import lattice
 from model.errors import InputError
@@ -42,16 +52,6 @@ from model.transients.knots import (
 from model.transients.shaping import SAMPLE_RATE, Shaper, Transients, responses_at
 from model.transients.time_response import plate_in_time
 from model.vibration import Excitation, Tone
-from plates import (
-    STILL,
-    faded_base,
-    make_paper_rig,
-    make_plate_in_time,
-    motion_of,
-    shaped_base,
-    stepped_acceleration,
-)
-from set_table import only
 
 EXAMPLES = Path(__file__).parents[3] / "examples"
 VARIANCE = 0.05**2 + np.radians(5) ** 2

@@ -25,16 +25,16 @@ from typing import Any
 import can
 import pytest
 
-from courses import Step, Taken, courses, fits, follow
 from drivers.errors import LinkError
 from drivers.protocol.definition import FAULTS, READING_STATES, REFUSALS, STATES
 from drivers.protocol.records import Refusal, Values
 from drivers.protocol.sets import Command, LayerSet, pack_layers, parts
 from drivers.wires.can_frames import CanFrame, pack_frames
 from drivers.wires.serial_frames import Frame, FrameReader, encode_frame
+from kit.courses import Step, Taken, courses, fits, follow
+from kit.plates import make_paper_rig
+from kit.wires import MASTERS, drive, far_side, make_bench, on_amplifiers, until
 from model.rig.rig import Rig
-from plates import make_paper_rig
-from real_wires import MASTERS, drive, far_side, make_bench, on_amplifiers, until
 from sim.amplifier.readings import AmplifierClock, Crystal
 from sim.amplifier.simulated_amplifier import SimulatedAmplifier
 from sim.bench.bench import Bench

@@ -19,7 +19,7 @@ from typing import Any
 
 import pytest
 
-from courses import Taken, courses, follow
+from cases import shortly
 from drivers.errors import CommandError, CommandRefused, DriverError, LinkDegraded, LinkError
 from drivers.host.amplifier import Amplifier
 from drivers.host.group import Group
@@ -37,11 +37,10 @@ from drivers.protocol.definition import (
 from drivers.urls import ADDRESS
 from drivers.wires.serial_frames import Frame, encode_frame
 from drivers.wires.serial_line import SerialWire
-from long_form import shortly
-from model.rig.rig import Rig
-from model.rig.rig_file import example_rig_path
-from plates import TWO_AMPLIFIERS, make_paper_rig, write_rig
-from real_wires import (
+from kit.clock import VirtualLoop, in_virtual_time
+from kit.courses import Taken, courses, follow
+from kit.plates import TWO_AMPLIFIERS, make_paper_rig, write_rig
+from kit.wires import (
     LIMITS,
     SHARED_WIRES,
     WIRES,
@@ -54,6 +53,8 @@ from real_wires import (
     on_two_amplifiers,
     rig_on_wire,
 )
+from model.rig.rig import Rig
+from model.rig.rig_file import example_rig_path
 from registry import threads
 from registry.threads import no_long_collections
 from sim.bench.amplifier_device import AmplifierDevice
@@ -62,7 +63,6 @@ from sim.faults import FaultKind, Faults, FaultWindow, load_faults
 from sim.memory_line import MemoryPort
 from sim.simulation import STEP, SteppedLoop
 from sim.transport.simulated_line import SimulatedLine as MemoryLine
-from virtual_lines import VirtualLoop, in_virtual_time
 
 URLS = {
     "a": "serial:///dev/ttyUSB0?baud=115200&address=3",

@@ -16,7 +16,8 @@ from numpy.testing import assert_allclose
 from benchmarks.direct_plate import direct_acceleration
 from drivers.playing import AmplifierTone, Playback, Voice, VoiceTransition
 from drivers.protocol.sets import Command, Envelope, LayerSet
-from firmware_machine import arm_bench, keep_alive, play
+from kit.plates import FINGERTIP, lock_in
+from kit.plates import motion_of as sampled
 from model.answer.answer import Layer
 from model.answer.stimulus import Placement, Stimulus, together
 from model.arrays import FloatArray
@@ -36,8 +37,7 @@ from model.transients.base_motion import BaseEnvelope, shaped
 from model.transients.shaping import Transients
 from model.transients.time_response import plate_in_time
 from model.vibration import Tone as VibrationTone
-from plates import FINGERTIP, lock_in
-from plates import motion_of as sampled
+from processes.firmware_machine import arm_bench, keep_alive, play
 from sim.amplifier.readings import StraightClock
 from sim.bench.bench import Bench
 from sim.plant.excited_plate import PlatePlayback as TonePlayback

@@ -15,7 +15,20 @@ from scipy import linalg, sparse
 from scipy.signal import butter, lsim, sosfiltfilt
 
 from benchmarks.direct_plate import direct_acceleration
-from long_form import shortly
+from cases import shortly
+from kit.plates import BASES as MOVED_BASES
+from kit.plates import (
+    FINGERTIP,
+    apart,
+    exciter_rig,
+    faded_base,
+    lock_in,
+    make_paper_rig,
+    resting,
+    shaped_base,
+)
+from kit.plates import STROKE as BASE_STROKE
+from kit.set_table import only
 from model.answer.answer import Layer
 from model.answer.answer_report import Timing
 from model.answer.plan import query
@@ -32,19 +45,6 @@ from model.table.table_file import build_table
 from model.transients.base_motion import Term, raised_cosine
 from model.transients.shaping import ONSET_WINDOW
 from model.transients.time_response import from_rest
-from plates import BASES as MOVED_BASES
-from plates import (
-    FINGERTIP,
-    apart,
-    exciter_rig,
-    faded_base,
-    lock_in,
-    make_paper_rig,
-    resting,
-    shaped_base,
-)
-from plates import STROKE as BASE_STROKE
-from set_table import only
 from sim.plant.excited_plate import play
 from sim.plant.plant import Plant
 

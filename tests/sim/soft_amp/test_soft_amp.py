@@ -24,14 +24,19 @@ import numpy as np
 import pytest
 from cobs import cobs
 
-import hand_written as hand
 from benchmarks.desk.session import Capture
+from cases import shortly
 from drivers.host.amplifier import Amplifier
 from drivers.opening import Lines
 from drivers.protocol.definition import FAULTS, STATES
-from gateway_bench import wait_for
-from long_form import shortly
+from kit import conversation as hand
 from model.errors import InputError
+from processes.gateways import wait_for
+from processes.sound_cards import BLOCK as CARD_BLOCK
+from processes.sound_cards import RATE as CARD_RATE
+from processes.sound_cards import SoftAmp, capture_on, host, jack_server
+from processes.steady_host import WATCHDOG, linear_amplifier
+from processes.typed_page import ERA
 from sim.soft_amp.engine import (
     Counters,
     JackCalls,
@@ -49,11 +54,6 @@ from sim.soft_amp.settings import (
     SoftAmplifierSettings,
     terminal_place,
 )
-from sound_cards import BLOCK as CARD_BLOCK
-from sound_cards import RATE as CARD_RATE
-from sound_cards import SoftAmp, capture_on, host, jack_server
-from steady_host import WATCHDOG, linear_amplifier
-from typed_page import ERA
 
 CHANNELS = 2
 RATE = 96_000  # not the one that is assumed until the server says its own

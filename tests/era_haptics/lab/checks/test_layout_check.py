@@ -20,6 +20,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from cases import in_turn, shortly
 from controller.cli.main import run as run_era
 from controller.content.pattern import Pattern, Transient
 from controller.effects.effect import Effect, Region
@@ -38,7 +39,10 @@ from era_haptics.lab.checks.layout_check import (
 )
 from era_haptics.lab.checks.layout_picture import JointTouch, check_together, close_pairs, matrix_of
 from era_haptics.lab.cli import app
-from long_form import in_turn, shortly
+from kit.fingers import WIRES, Pressed, playable
+from kit.fingers import table as paper_table
+from kit.plates import smooth_rig
+from kit.set_table import phased, wants
 from model.config.fields import Circle, Rectangle
 from model.config.file_kinds import KINDS
 from model.errors import InputError
@@ -54,10 +58,6 @@ from model.table.table import LocalizationTable
 from model.table.table_file import build_table, save_table
 from model.transients.base_motion import along_lines, raised_cosine
 from model.transients.shaping import SAMPLE_RATE, Transients
-from plates import smooth_rig
-from set_table import phased, wants
-from several_fingers import WIRES, Pressed, playable
-from several_fingers import table as paper_table
 
 EXAMPLE = Path(__file__).parents[4] / "examples" / "panel_layout.yaml"
 BUTTON = Rectangle(0.05, 0.04, 0.012, 0.012)

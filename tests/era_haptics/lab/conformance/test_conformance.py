@@ -17,6 +17,7 @@ import pytest
 from cobs import cobs
 
 import era_haptics
+from cases import shortly
 from drivers.errors import CommandError
 from drivers.protocol.definition import MESSAGES, NAMES
 from drivers.protocol.records import Values
@@ -42,14 +43,7 @@ from era_haptics.lab.conformance.judge_client import (
     layer,
 )
 from era_haptics.lab.conformance.subject import Subject
-from long_form import shortly
-from model.rig.rig import Rig
-from registry import threads
-from sim.amplifier.readings import capabilities
-from sim.amplifier.simulated_amplifier import SimulatedAmplifier
-from sim.bench.bench import Bench, keep_time
-from sim.far_ends.serial_amplifiers import SerialAmplifiers
-from virtual_lines import (
+from kit.clock import (
     JUDGED_LINE_KINDS,
     JudgedLine,
     in_virtual_time,
@@ -59,6 +53,12 @@ from virtual_lines import (
     short_checks,
     varied,
 )
+from model.rig.rig import Rig
+from registry import threads
+from sim.amplifier.readings import capabilities
+from sim.amplifier.simulated_amplifier import SimulatedAmplifier
+from sim.bench.bench import Bench, keep_time
+from sim.far_ends.serial_amplifiers import SerialAmplifiers
 
 SKIPPED = {
     "serial": {"sensors", "steps_as_stated", "limited", "readings"},
@@ -335,7 +335,7 @@ async def test_machine_that_was_late_once_has_a_verdict_on_voices(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """By 1 s, beside replies of 9 ms and ramps of 0.7 s: what it leads by fits into these."""
-    monkeypatch.setattr("virtual_lines.DELAY", 0.0045)
+    monkeypatch.setattr("kit.clock.DELAY", 0.0045)
     far = varied()
     far.capabilities.update(ramp_max=700)
     chosen = [each for each in of_kind("tcp") if each[1].name == "voices"]
@@ -366,7 +366,7 @@ SLOW = {
 @pytest.mark.parametrize("kind", shortly(SLOW, ["tcp"]))
 def test_slow_line_has_its_verdicts(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """At 40 ms each way and back: times are long against it, and what comes late is heard."""
-    monkeypatch.setattr("virtual_lines.DELAY", 0.02)
+    monkeypatch.setattr("kit.clock.DELAY", 0.02)
     for found in judged(kind, SLOW[kind]):
         assert (found.result, found.attempts) == (Result.PASSED, 1), found
 
@@ -423,7 +423,7 @@ def test_amplifier_that_replies_just_in_time_passes(
     kind: str, names: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """After 9 ms, where 10 are allowed: every check has its verdict, or says what is not seen."""
-    monkeypatch.setattr("virtual_lines.DELAY", 0.0045)
+    monkeypatch.setattr("kit.clock.DELAY", 0.0045)
     skipped = set() if names else SKIPPED[kind]
     twice = kind == "tcp"  # each request that changes something is a write and a read
     expect_passed(judged(kind, names), skipped, within=(1.7 if twice else 1.4) * MINUTE)
@@ -491,7 +491,7 @@ def test_rate_of_a_clock_is_tried_on_a_slow_wire(
     kind: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Where a status takes 8 ms, as at 115 200 baud: 3.3 ms a second show within 6 s."""
-    monkeypatch.setattr("virtual_lines.DELAY", 0.004)
+    monkeypatch.setattr("kit.clock.DELAY", 0.004)
     found = [
         judged(kind, ["clock_rate"], far=each("steered", channels=4))
         for each in (SimulatedAmplifier, _Unsteered)

@@ -5,12 +5,12 @@ from functools import partial
 
 import pytest
 
+from cases import shortly
 from drivers.protocol.records import Values
 from drivers.wires.can_frames import unpack_frames
-from long_form import shortly
+from kit.clock import JUDGED_LINE_KINDS, JudgedLine, judged, varied
 from sim.amplifier.simulated_amplifier import SimulatedAmplifier
 from sim.far_ends.modbus_amplifiers import ModbusAmplifiers
-from virtual_lines import JUDGED_LINE_KINDS, JudgedLine, judged, varied
 
 SKIPPED = {"sensors", "steps_as_stated", "limited", "readings"}
 FOR_ALL = {

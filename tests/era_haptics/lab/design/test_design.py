@@ -29,6 +29,7 @@ from era_haptics.lab.design.problem import (
     shortfall,
 )
 from era_haptics.lab.design.score import LayoutSearch, Scorer
+from kit.plates import exciter_rig_text, make_paper_rig
 from model.arrays import ComplexArray, FloatArray
 from model.config.document import parse_document
 from model.errors import InputError
@@ -38,7 +39,6 @@ from model.reduction.free_plate import FreePlate, solve_free_plate
 from model.rig.rig import Rig, Uncertainty
 from model.rig.rig_file import example_rig_path, load_rig, parse_rig
 from model.structure.attachments import Era, attached_stiffness, drive_forces, static_loads
-from plates import exciter_rig_text, make_paper_rig
 
 
 @pytest.fixture(autouse=True)

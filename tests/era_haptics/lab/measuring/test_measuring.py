@@ -45,17 +45,17 @@ from era_haptics.lab.measuring.sound_card import (
     default_frequencies,
 )
 from examples.make_measured import record_responses
+from kit.plates import exciter_rig_text
 from model.arrays import Float32Array, FloatArray
 from model.errors import InputError
 from model.estimate.measurement import measurement_of, read_measured
 from model.rig.rig import Rig, Uncertainty
 from model.rig.rig_file import example_rig_path, load_rig, parse_rig
 from model.structure.attachments import PointLoad
-from plates import exciter_rig_text
+from processes.sound_cards import DeskCard, ExciterCircuit, jack_server
+from processes.typed_page import ERA
 from sim.plant.fingers import Accelerometer
 from sim.soft_amp.engine import address_of
-from sound_cards import DeskCard, ExciterCircuit, jack_server
-from typed_page import ERA
 
 PLACES = ((0.03, 0.05), (0.20, 0.11))
 FIXED = tuple(WiredSensor(f"P{n}", x, y, n, 1e-3) for n, (x, y) in enumerate(PLACES, start=1))

@@ -43,7 +43,7 @@ from era_haptics.lab.measuring.sound_card import (
     open_card,
     read_sensors,
 )
-from gateway_bench import wait_for
+from kit.plates import apart, lock_in
 from model.arrays import Float32Array, FloatArray
 from model.errors import InputError
 from model.estimate.identify import identify
@@ -52,11 +52,11 @@ from model.finger import fingertips_on
 from model.rig.rig import Rig
 from model.rig.rig_file import example_rig_path, parse_rig
 from model.structure.attachments import PointLoad, fingertip_loads
-from plates import apart, lock_in
+from processes.gateways import wait_for
+from processes.sound_cards import DeskCard, JackServer, capture_on, jack_server
+from processes.typed_page import ERA
 from sim.soft_amp.output import open_output
 from sim.soft_amp.settings import Protocol, SoftAmplifierSettings
-from sound_cards import DeskCard, JackServer, capture_on, jack_server
-from typed_page import ERA
 
 BOARD = """
 plate: {length: 300 mm, width: 230 mm, thickness: 5 mm, loss_factor: 0.01,

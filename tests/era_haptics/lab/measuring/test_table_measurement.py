@@ -19,6 +19,7 @@ from typer.testing import CliRunner
 
 from benchmarks.desk_plate.desk_plate import Actuator, Converters, DeskPlate, Truth, draw_truth
 from benchmarks.direct_plate import direct_responder
+from cases import shortly
 from drivers.by_hand.actions import BlockingAmplifier
 from drivers.errors import CommandRefused, LinkError
 from drivers.host.ledger import StagedSet
@@ -28,7 +29,7 @@ from era_haptics.lab.measuring import table_measurement
 from era_haptics.lab.measuring.other_sources import read_stepped
 from era_haptics.lab.measuring.outputs import OutputFinding, listen, matched, tone
 from era_haptics.lab.measuring.sound_card import Desk, SoundCard, WiredSensor, read_sensors
-from long_form import shortly
+from kit.plates import exciter_rig
 from model.arrays import ComplexArray, Float32Array, FloatArray
 from model.cli import app
 from model.errors import InputError
@@ -41,8 +42,7 @@ from model.study.promise_at_sensors import CheckSettings, Promise, promises
 from model.table.table import LocalizationTable
 from model.table.table_file import build_table, save_table
 from model.vibration import tone_fields
-from plates import exciter_rig
-from sound_cards import DeskCard
+from processes.sound_cards import DeskCard
 
 RATE = 8_000.0
 LEVEL = 0.5

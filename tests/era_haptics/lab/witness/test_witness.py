@@ -17,9 +17,8 @@ from typing import Any
 
 import pytest
 
-import hand_written as hand
+from cases import read_yaml, shortly
 from controller.sources.touch import Touch, TouchFrame
-from courses import Acted, courses, follow
 from drivers.host.amplifier import Amplifier
 from drivers.wires.modbus_frames import framed
 from era_haptics.lab.witness.capture import (
@@ -31,16 +30,16 @@ from era_haptics.lab.witness.capture import (
 )
 from era_haptics.lab.witness.witness import DECODERS, Witness
 from group_stops import RandomGroup
-from hand_written import HALF, Talk
-from long_form import shortly
+from kit import conversation as hand
+from kit.clock import run_virtual
+from kit.conversation import HALF, Talk
+from kit.courses import Acted, courses, follow
+from kit.set_table import STROKE, SetTable, make_rig
+from kit.witness import RULES
 from model.vibration import Excitation, Tone
-from plate_witness import RULES
 from registry import threads
 from registry.limits import GuardLimits
-from set_table import STROKE, SetTable, make_rig
 from sim.far_ends.wire_assignment import SimulatedWire
-from virtual_lines import run_virtual
-from yaml_files import read_yaml
 
 KINDS = {
     "can": SimulatedWire("slcan", 500_000),

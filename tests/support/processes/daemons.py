@@ -27,7 +27,6 @@ from typing import Any, cast
 
 import pytest
 
-from chain import Chain
 from controller.api.client import AsyncClient
 from controller.api.jsonrpc import ErrorCode, RpcError
 from controller.api.link import Notification
@@ -45,20 +44,21 @@ from drivers.playing import AmplifierLayer, AmplifierTone
 from drivers.protocol.definition import READINGS
 from drivers.protocol.records import Number, Refusal, Values
 from drivers.protocol.sets import unpack_layers
+from kit.chain import Chain
+from kit.clock import VirtualLoop, feed
+from kit.plates import small_table, write_rig
+from kit.wires import WIRES, FarSide, far_side
+from kit.witness import LoopWitness, PlateJudge, tell_first
 from model.arrays import FloatArray
 from model.rig.rig import Rig
 from model.rig.rig_file import example_rig_path, load_rig
 from model.table.table import LocalizationTable
 from model.table.table_file import save_table
-from patient_daemon import PROGRAM
-from plate_witness import LoopWitness, PlateJudge, tell_first
-from plates import small_table, write_rig
-from real_wires import WIRES, FarSide, far_side
+from processes.patient_daemon import PROGRAM
+from processes.typed_page import ERA
 from registry import threads
 from registry.limits import GuardLimits
 from sim.amplifier.simulated_amplifier import SimulatedAmplifier
-from typed_page import ERA
-from virtual_lines import VirtualLoop, feed
 
 PATIENCE = 180.0  # s; generous, for a loaded machine
 PLACE = (0.1, 0.1)

@@ -32,16 +32,17 @@ from drivers.protocol.records import Values
 from drivers.protocol.sets import LayerSet, is_vibrating, unpack_layers
 from era_haptics.lab.witness.capture import RuleViolation
 from era_haptics.lab.witness.relay import parse_endpoint
+from kit.clock import MemoryMachine, run_virtual
+from kit.set_table import SetTable, SetTiming, make_rig
+from kit.wires import FarSide, far_side
+from kit.witness import STEP, WATCHDOG, LoopWitness, OperatorCommand, PlateJudge
 from model.answer.answer_report import Timing
 from model.arrays import ComplexArray, FloatArray
 from model.rig.rig import Rig
 from model.table.table import LocalizationTable
 from model.vibration import Tone
-from plate_witness import STEP, WATCHDOG, LoopWitness, OperatorCommand, PlateJudge
-from real_wires import FarSide, far_side
 from registry import threads
 from registry.limits import GuardLimits
-from set_table import SetTable, SetTiming, make_rig
 from sim.amplifier.readings import AmplifierSummary
 from sim.amplifier.simulated_amplifier import SimulatedAmplifier
 from sim.far_ends.wire_assignment import SimulatedWire
@@ -49,7 +50,6 @@ from sim.faults import FaultKind, FaultWindow
 from sim.plant.fingers import Accelerometer, FeltVibration
 from sim.plant.imperfections import Imperfections, draw_imperfections
 from sim.sensors import Accelerometers, Recording
-from virtual_lines import MemoryMachine, run_virtual
 
 Position = tuple[float, float]
 Finger = tuple[int, float, float]

@@ -21,16 +21,16 @@ from unittest.mock import Mock
 
 import pytest
 
-from chain import FINGER, OTHER, Chain
+from cases import read_yaml
 from drivers import errors
 from drivers.errors import CommandError, CommandRefused
 from drivers.protocol.definition import FAULTS, STATES
 from drivers.protocol.records import Refusal, Values
+from kit.chain import FINGER, OTHER, Chain
+from kit.clock import run_virtual
 from model.vibration import Tone
 from registry import threads
 from sim.faults import FaultKind
-from virtual_lines import run_virtual
-from yaml_files import read_yaml
 
 Step = str | Mapping[str, Any]
 FINGERS = {

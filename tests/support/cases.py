@@ -1,14 +1,19 @@
-"""The short and the long form of the suite, and the files of tests that take longest.
+"""Cases of tests: those of the long form, which files take longest, and data in YAML.
 
 A test or a case with the mark `long` is left to `make test-long`, which `make nightly` runs;
 `make test` has a short case of the same.
+Data have words and numbers as the product's own files have them.
 """
 
 from collections.abc import Collection, Iterable, Sequence
 from itertools import cycle
-from typing import Any
+from pathlib import Path
+from typing import Any, ClassVar
 
 import pytest
+import yaml
+
+from model.config.document import plain_value
 
 
 def shortly(values: Iterable[Any], short: Collection[Any]) -> list[Any]:
@@ -66,3 +71,23 @@ SLOWEST = (
     "test_house.py",
 )
 """Run in this order before all others: one that started last would leave the other cores idle."""
+
+
+class _Loader(yaml.CSafeLoader):
+    """Leaves it to `plain_value` which unquoted texts are words and numbers; `<<` merges."""
+
+    yaml_implicit_resolvers: ClassVar[dict[str, Any]] = {
+        "<": yaml.CSafeLoader.yaml_implicit_resolvers["<"]
+    }
+
+    def scalar(self, node: yaml.ScalarNode) -> Any:
+        """The value of a text."""
+        return node.value if node.style else plain_value(node.value)
+
+
+_Loader.add_constructor("tag:yaml.org,2002:str", _Loader.scalar)
+
+
+def read_yaml(path: Path) -> Any:
+    """The data of a file."""
+    return yaml.load(path.read_text(encoding="utf-8"), Loader=_Loader)

@@ -22,7 +22,6 @@ from pythonosc.osc_bundle_builder import IMMEDIATELY, OscBundleBuilder
 from pythonosc.osc_message_builder import OscMessageBuilder
 from scipy.signal import hilbert
 
-from chain import Chain, Position, set_chain
 from controller.daemon.messages import PlateView
 from controller.effects.effect import Region
 from controller.effects.kinds import Buzz
@@ -37,11 +36,16 @@ from controller.play.routing import RAMPS_ONLY, PlaybackCapabilities
 from controller.play.slots import Sets, Slots
 from controller.sources.touch import Contact, ContactKey, Touch, TouchFrame
 from controller.sources.tuio import RecordedDatagram
-from courses import Acted, Planted, Step, fits
 from drivers.errors import CommandRefused, LinkError
 from drivers.playing import AmplifierLayer
 from drivers.protocol.sets import LayerSet
 from examples.make_touches import tuio_datagram, write_capture
+from kit.chain import Chain, Position, set_chain
+from kit.clock import run_virtual
+from kit.courses import Acted, Planted, Step, fits
+from kit.plates import smooth_rig
+from kit.set_table import SetTiming
+from kit.wires import after_each
 from model.answer.answer import Limits
 from model.answer.answer_report import Timing
 from model.arrays import FloatArray
@@ -51,12 +55,8 @@ from model.finger import detection_threshold
 from model.rig.rig import Channel, Rig
 from model.table.table import LocalizationTable
 from model.table.table_file import build_table
-from plates import smooth_rig
-from real_wires import after_each
 from registry import threads
-from set_table import SetTiming
 from sim.far_ends.wire_assignment import SimulatedWire
-from virtual_lines import run_virtual
 
 LEFT, RIGHT, ABOVE = (0.126, 0.081), (0.234, 0.049), (0.069, 0.208)
 """Places on the paper's plate, 11 to 23 cm apart."""

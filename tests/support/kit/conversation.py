@@ -18,7 +18,7 @@ from era_haptics.lab.witness.capture import (
     TimeLimits,
     WitnessConfig,
 )
-from plate_witness import PlateWitness
+from kit.witness import PlateWitness
 
 VERSION = 4
 REPLY = 0x80

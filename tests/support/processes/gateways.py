@@ -59,12 +59,12 @@ from controller.api.schema import (
     Topic,
 )
 from controller.api.server import ApiServer, Connection, Hub
-from daemons import PATIENCE, daemon_table, write_daemon
+from kit.plates import write_rig
 from model.rig.rig_file import parse_rig
 from model.table.table import LocalizationTable
 from model.table.table_file import save_table
-from plates import write_rig
-from typed_page import ERA, installed_program
+from processes.daemons import PATIENCE, daemon_table, write_daemon
+from processes.typed_page import ERA, installed_program
 
 T = TypeVar("T")
 TOKEN = "a-token-of-these-tests-only"

@@ -41,9 +41,9 @@ from model.rig.rig import Rig
 from model.rig.rig_summary import exciters_of
 from model.structure.attachments import footprints_of
 from model.transients.base_motion import Motion
+from processes.typed_page import ERA
 from sim.plant.plant import Plant
 from sim.sensors import Recording
-from typed_page import ERA
 
 RATE = 48_000
 BLOCK = 128

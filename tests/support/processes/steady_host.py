@@ -1,6 +1,6 @@
 """A host that plays 1 kHz at level 0.5 on every channel of a linear amplifier, until killed.
 
-    python tests/support/steady_host.py URL CHANNELS
+    python tests/support/processes/steady_host.py URL CHANNELS
 
 Each channel is 30 degrees ahead of the one before. It prints `armed`. The amplifier waits for it as
 long as the protocol allows, since a busy machine may hold it up.

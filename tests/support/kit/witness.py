@@ -42,11 +42,11 @@ from era_haptics.lab.witness.host_rules import (
 )
 from era_haptics.lab.witness.relay import parse_endpoint
 from era_haptics.lab.witness.witness import RECOVERY, Witness
-from real_wires import FarSide, after_each
+from kit.clock import START, VirtualLoop
+from kit.wires import FarSide, after_each
 from registry import threads
 from sim.amplifier.simulated_amplifier import SimulatedAmplifier
 from sim.faults import FaultWindow
-from virtual_lines import START, VirtualLoop
 
 RULES = {
     "justified": "no vibration is commanded without a contact",

@@ -1,4 +1,4 @@
-"""Floods of a daemon, each a process: `python tests/support/floods.py KIND ...`.
+"""Floods of a daemon, each a process: `python tests/support/processes/floods.py KIND ...`.
 
     idle SOCKET COUNT         silent connections
     unreading SOCKET COUNT    connections that subscribe to everything and read nothing

@@ -14,7 +14,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
 from pathlib import Path
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 PACKAGES = ("controller", "drivers", "era_haptics", "examples", "model", "registry", "sim")
 PAGES = ("README.md", "docs/how-to/*.md", "docs/reference/*.md", "docs/tutorials/*.md")
 """Whose programs users copy, as they copy the examples."""

@@ -1,6 +1,6 @@
 """Weight of every package beside its ceiling in pyproject.toml; `make lint` fails above one.
 
-    python tests/support/ceilings.py [--lower]
+    python tests/support/checks/ceilings.py [--lower]
 
 Counts statements, not lines: blank lines, comments, docstrings and line breaks are free, so that a
 clear layout costs nothing. `--lower` takes ceilings down to what stands, rounded up to 50
@@ -15,7 +15,7 @@ import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[3]
 STEP = 50
 _ROW = re.compile(r'^"(?P<folder>[\w/]+)" = \{ statements = (\d+), files = (\d+) \}$', re.MULTILINE)
 

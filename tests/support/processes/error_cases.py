@@ -24,16 +24,16 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+from cases import read_yaml
 from controller.api.client import Client
 from controller.api.jsonrpc import RpcError
 from controller.cli.main import run
-from gateway_bench import real_daemon, wait_for
+from kit.plates import DISTORTIONS, every
 from model.estimate.measurement import measurement_of, read_measured, write_responses_csv
 from model.rig.rig_file import example_rig_path, load_rig
-from plates import DISTORTIONS, every
-from yaml_files import read_yaml
+from processes.gateways import real_daemon, wait_for
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 PAGE = ROOT / "docs" / "reference" / "errors.md"
 HOME = "/home/you"
 """Stands on the page for the folder of a case, which is its home, too."""

@@ -34,10 +34,11 @@ from drivers.protocol.definition import STATUS as DEFINITION_STATUS
 from drivers.protocol.records import Record, Values
 from drivers.wires.can_frames import CanFrame, pack_frames, unpack_frames
 from drivers.wires.wire import reply_words
+from kit.clock import MemoryMachine, VirtualLoop, live_in_memory
+from kit.set_table import make_rig
 from model.rig.rig import Channel, Rig
 from registry import threads
 from registry.limits import GuardLimits
-from set_table import make_rig
 from sim.amplifier.readings import AmplifierSummary
 from sim.amplifier.simulated_amplifier import SimulatedAmplifier
 from sim.bench.amplifier_device import AmplifierDevice
@@ -55,7 +56,6 @@ from sim.far_ends.wire_assignment import SimulatedWire, open_wires
 from sim.faults import Faults
 from sim.plant.imperfections import Imperfections
 from sim.transport.far_end import TcpEnd, TerminalEnd
-from virtual_lines import MemoryMachine, VirtualLoop, live_in_memory
 
 
 @dataclass

@@ -16,7 +16,6 @@ from typing import NamedTuple
 import numpy as np
 from cobs import cobs
 
-import hand_written as hand
 from drivers.playing import AmplifierTone
 from drivers.protocol.definition import (
     BY_NUMBER,
@@ -31,13 +30,14 @@ from drivers.protocol.records import Record, Values
 from drivers.protocol.sets import Command, Envelope, LayerSet, pack_layers, parts, token_after
 from drivers.wires.can_frames import SLCAN, TextReader, pack_frames, unpack_frames
 from drivers.wires.serial_frames import Frame, FrameReader, encode_frame, pack_words, unpack_words
+from kit import conversation as hand
 from model.arrays import FloatArray
 from registry import threads
 from sim.amplifier.simulated_amplifier import SimulatedAmplifier
 from sim.bench.bench import Bench
 from sim.far_ends.serial_amplifiers import SerialAmplifiers
 
-FIRMWARE = Path(__file__).parents[2] / "firmware"
+FIRMWARE = Path(__file__).parents[3] / "firmware"
 
 
 def build_firmware(folder: Path, program: str, *options: str) -> Path:

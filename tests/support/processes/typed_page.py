@@ -49,7 +49,7 @@ from markdown_it import MarkdownIt
 from websockets.sync.client import connect
 from websockets.typing import Subprotocol
 
-from patient_daemon import RESTING
+from processes.patient_daemon import RESTING
 
 _COMMENT = re.compile(r"<!-- ([a-z ]+): (.+) -->")
 _OF_A_FENCE = {"terminal", "seen in", "status", "file", "edit", "not typed"}

@@ -620,12 +620,13 @@ class Browser:
     async def close(self, *, code: int = 1000, drain: bool = True) -> None:
         """Answer that it has left."""
 
-    async def bridged(self, path: Path) -> None:
-        """Be bridged to a daemon's socket, until it has left or is given up."""
+    async def bridged(self, path: Path, *read: "asyncio.Future[list[bytes]]") -> None:
+        """Be bridged to a daemon's socket, until it has left or is given up, and all is read."""
         opened = await link.DaemonLink.open(path, "browser")
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(link.DaemonLink, "open", AsyncMock(return_value=opened))
             await connections.bridge(self, "192.0.2.1:1", path, None)  # type: ignore[arg-type]
+        await asyncio.gather(*read)
         opened.abort()
         await asyncio.sleep(0)
 
@@ -666,10 +667,9 @@ async def test_stop_of_a_browser_that_is_given_up_is_passed_on(
     stop = '{"jsonrpc":"2.0","id":9,"method":"st\\u006fp"}'
     play = '{"jsonrpc":"2.0","id":8,"method":"play","params":{"effect":"stop","x_m":0,"y_m":0}}'
     async with asyncio.timeout(PATIENCE):
-        await Browser(*[touch] * 1000, stop, play).bridged(path)
-        lines = await read
-    assert len(lines) < 900
-    assert lines[-1] == stop.encode()
+        await Browser(*[touch] * 1000, stop, play).bridged(path, read)
+    assert len(read.result()) < 900
+    assert read.result()[-1] == stop.encode()
 
 
 async def test_others_have_a_turn_after_each_frame(
@@ -679,14 +679,13 @@ async def test_others_have_a_turn_after_each_frame(
     path, read = busy_daemon
     monkeypatch.setattr(connections, "SEND_TIMEOUT", 0.5)
     browser, turns = Browser(*["{}"] * 100), 0
-    bridging = asyncio.create_task(browser.bridged(path))
+    bridging = asyncio.create_task(browser.bridged(path, read))
     async with asyncio.timeout(PATIENCE):
         while not browser.frames.empty():
             await asyncio.sleep(0)
             turns += 1
         browser.frames.put_nowait(LEFT)
         await bridging
-        await read
     assert turns >= 100
 
 

@@ -178,6 +178,7 @@ def test_amplifiers_that_cannot_measure_are_named(
         check(PORT, on=PLATE)
 
 
+@pytest.mark.long
 def test_rig_is_written_with_the_plate_that_is_there(
     tmp_path: Path, typed: Typed, monkeypatch: pytest.MonkeyPatch
 ) -> None:

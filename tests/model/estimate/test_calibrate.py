@@ -196,6 +196,7 @@ def test_calibrate_finds_all_that_differs(coarse, truth):
     assert fitted.is_good
 
 
+@pytest.mark.long
 def test_calibrate_finds_a_dead_era_despite_gaps_and_outliers(coarse, truth):
     """An ERA that moves nothing is named; its spring is still found by the others' responses.
 
@@ -219,6 +220,7 @@ def test_calibrate_finds_a_dead_era_despite_gaps_and_outliers(coarse, truth):
     assert [one.value for one in found.parameters] == pytest.approx(true_values(truth), rel=0.02)
 
 
+@pytest.mark.long
 def test_calibrate_leaves_out_a_sensor_that_is_elsewhere(coarse: Rig, truth: Rig) -> None:
     """P6 stands beside P1, and reads what that one does with less noise: the others find the plate.
 
@@ -557,6 +559,7 @@ def test_a_fit_allows_for_what_plates_are_drawn_with() -> None:
     assert allowed == pytest.approx(FORM)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("sensors", "plates", "share"),
     [

@@ -221,6 +221,7 @@ def changed_to(
     return live, explanation
 
 
+@pytest.mark.long
 def test_loosened_mount_is_named_and_followed(hidden: Hidden, known: PlateEstimate) -> None:
     """A mount 20 % softer is named NE within 8 patterns."""
     factors = np.where(np.arange(4) == NE, 0.8, 1.0)

@@ -102,6 +102,7 @@ def test_identified_rig_states_less_uncertainty_but_for_fingers(
     assert again.thickness < 0.005
 
 
+@pytest.mark.long
 def test_the_same_data_again_tell_no_more_of_the_level(rig: Rig) -> None:
     """What is unknown of the level stays, and the level itself, since the sensors may be the same.
 
@@ -191,6 +192,7 @@ def test_contrast_is_promised_of_an_explained_plate(found: Identification) -> No
     assert not replace(found, fitted=far_off).can_promise
 
 
+@pytest.mark.long
 def test_uneven_plate_is_promised_less(rig: Rig, found: Identification) -> None:
     """A thickness that differs by 3 % over the plate is what no parameter explains: it is written.
 

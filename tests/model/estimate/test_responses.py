@@ -44,6 +44,7 @@ def rig_and_points() -> tuple[Rig, FloatArray]:
     return rig, shares * [rig.plate.length, rig.plate.width]
 
 
+@pytest.mark.long
 def test_loss_factor_of_a_plate_in_time_is_within_its_standard_error() -> None:
     """A plate whose losses are viscous has its loss factor at its resonances alone.
 
@@ -64,6 +65,7 @@ def test_loss_factor_of_a_plate_in_time_is_within_its_standard_error() -> None:
     assert off < loss.standard_error < 0.01 * loss.value
 
 
+@pytest.mark.long
 def test_viscous_plate_differs_as_its_model_in_time_does() -> None:
     """The difference of both laws, a few thousandths of the response, to a fifth of it.
 

@@ -313,6 +313,7 @@ def test_check_warns_near_the_resonance_of_the_magnets_and_of_one_that_is_misrea
     assert not [each for each in warned(f"{OWN}, stiffness: 3190", "[100, 300]") if "high" in each]
 
 
+@pytest.mark.long
 def test_check_says_at_which_frequencies_a_magnet_would_leave_its_excursion() -> None:
     """On a rigid heavy board a magnet moves as on one that is held, and furthest in an onset.
 

@@ -90,6 +90,7 @@ def test_magnets_on_a_board_as_light_as_they_are() -> None:
         assert found[:, number] == pytest.approx(expected, rel=0.01)
 
 
+@pytest.mark.long
 def test_excursion_within_the_frequencies_of_a_rig() -> None:
     """By its level: half of it is half as far, and from a frequency on all are within."""
     rig = exciter_rig("type: DAEX13-4SM, power: 1 W", frequency="[60, 300]")

@@ -33,7 +33,9 @@ OPERATIONAL, RESET_NODE = b"O\rt00020100\r", b"t00028100\r"
 TONE = hand.tone(0, 100, 0.5, 90)
 
 
-@pytest.fixture(params=[16_000, 48_000], ids=["16kHz", "48kHz"])
+@pytest.fixture(
+    params=[16_000, pytest.param(48_000, marks=pytest.mark.long)], ids=["16kHz", "48kHz"]
+)
 def rate(request: pytest.FixtureRequest) -> int:
     """Samples per second."""
     return int(request.param)

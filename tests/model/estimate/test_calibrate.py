@@ -117,6 +117,7 @@ def plates(seeds: range) -> Iterator[FloatArray]:
         yield off(calibrate(rig, responses).rig, hidden.rig)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("drawn", "by_one", "by_two"),
     [
@@ -325,8 +326,10 @@ def match_a_plate() -> None:
 
 @pytest.mark.parametrize(
     "searched",
-    [fit_a_rig, match_a_plate],
-    ids=["rig and all scales", "plate"],
+    [
+        pytest.param(fit_a_rig, id="rig and all scales", marks=pytest.mark.long),
+        pytest.param(match_a_plate, id="plate"),
+    ],
 )
 def test_jacobians_of_searches_are_exact(
     searched: Callable[[], None], monkeypatch: pytest.MonkeyPatch

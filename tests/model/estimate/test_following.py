@@ -294,7 +294,8 @@ def test_object_is_noticed_where_it_lies_until_it_is_gone(
     assert (live.known.change, live.known.lying) == ("", None)
 
 
-@pytest.mark.parametrize("hours", shortly([0.2, 1.0], [0.2]))
+@pytest.mark.long
+@pytest.mark.parametrize("hours", [0.2, 1.0])
 def test_fingers_are_no_change(hidden: Hidden, known: PlateEstimate, hours: float) -> None:
     """Nothing is accused of lying there in hours of a touch each 12 s.
 

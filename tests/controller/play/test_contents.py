@@ -82,7 +82,6 @@ async def hands(
         FILE["courses"].keys()
         - {
             "latency counts from the change that an answer is for",
-            "moving fingers with slow answers delay no heartbeat and no lift",
             "slide to another band keeps the beat",
         },
     ),

@@ -5,7 +5,7 @@ A test or a case with the mark `long` is left to `make test-long`, which `make n
 Data have words and numbers as the product's own files have them.
 """
 
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from itertools import cycle
 from pathlib import Path
 from typing import Any, ClassVar
@@ -74,7 +74,10 @@ SLOWEST = (
 
 
 class _Loader(yaml.CSafeLoader):
-    """Leaves it to `plain_value` which unquoted texts are words and numbers; `<<` merges."""
+    """Leaves it to `plain_value` which unquoted texts are words and numbers; `<<` merges.
+
+    A key that stands twice is an error: the first would never be tried.
+    """
 
     yaml_implicit_resolvers: ClassVar[dict[str, Any]] = {
         "<": yaml.CSafeLoader.yaml_implicit_resolvers["<"]
@@ -84,7 +87,16 @@ class _Loader(yaml.CSafeLoader):
         """The value of a text."""
         return node.value if node.style else plain_value(node.value)
 
+    def mapping(self, node: yaml.MappingNode) -> Iterator[dict[Any, Any]]:
+        """The values by their keys, once all are read."""
+        keys = [each.value for each, _ in node.value]
+        twice = [each for each in keys if keys.count(each) > 1 and isinstance(each, str)]
+        if twice:
+            raise ValueError(f"{twice[0]} must stand once{node.start_mark}")
+        return self.construct_yaml_map(node)
 
+
+_Loader.add_constructor("tag:yaml.org,2002:map", _Loader.mapping)
 _Loader.add_constructor("tag:yaml.org,2002:str", _Loader.scalar)
 
 

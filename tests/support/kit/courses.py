@@ -415,8 +415,11 @@ def follow(
             handler.emit = chain.log.append  # type: ignore[method-assign]
             logging.getLogger().addHandler(handler)
             try:
-                for step in steps:
+                for number, step in enumerate(steps, 1):  # noqa: B007  said where one fails
                     await chain.take(step)
+            except BaseException as error:
+                error.add_note(f"step {number} of {len(steps)}: {step}")
+                raise
             finally:
                 logging.getLogger().removeHandler(handler)
 

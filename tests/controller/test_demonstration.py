@@ -3,12 +3,13 @@
 import asyncio
 import re
 import shutil
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
+from unittest.mock import AsyncMock
 
 import numpy as np
 import pytest
@@ -227,7 +228,6 @@ def test_picture_shows_highest_contrasts_of_each_number_of_fingers():
     assert [len(each.collections) + len(each.images) > 0 for each in panels] == [True, False]
 
 
-FELT = vibration([[1.0], [1.0]])
 FAULT = "amplifier d: state must be OPERATION_ENABLED, got FAULT with fault WATCHDOG"
 
 
@@ -236,21 +236,12 @@ def contact(number: int) -> Contact:
     return Contact(ContactKey("test", number), 0.1, 0.1, threads.now())
 
 
-async def nothing(*_: object) -> dict[str, FingerVibration]:
-    """What a plate says that is not there."""
-    return {}
-
-
 @asynccontextmanager
-async def recorder_of(
-    rows: list[TouchRow],
-    vibration: Callable[[float, float], Awaitable[object]] = nothing,
-    place_fingers: Callable[[Any, Any], Awaitable[object]] = nothing,
-) -> AsyncIterator[TouchRecorder]:
-    """A recorder of a plate that is not there; its rows are made at the end."""
-    plate = cast(SimulatedPlate, SimpleNamespace(vibration=vibration, place_fingers=place_fingers))
+async def recorder_of(rows: list[TouchRow], **plate: AsyncMock) -> AsyncIterator[TouchRecorder]:
+    """A recorder of a plate that is not there, by what it replies; its rows are made at the end."""
+    asked = SimpleNamespace(**{"vibration": AsyncMock(), "place_fingers": AsyncMock(), **plate})
     async with asyncio.TaskGroup() as tasks:
-        yield TouchRecorder(plate, tasks, on_row=rows.append)
+        yield TouchRecorder(cast(SimulatedPlate, asked), tasks, on_row=rows.append)
 
 
 async def test_rows_after_a_fault_name_it_until_the_plate_is_armed_again() -> None:
@@ -291,18 +282,9 @@ async def test_pattern_is_measured_while_no_finger_moves_or_lands(
     contrast.
     """
     monkeypatch.setattr(threads, "now", asyncio.get_running_loop().time)
-    windows: list[tuple[float, float]] = []
-    placed: list[tuple[Any, Any]] = []
+    measure, place = AsyncMock(return_value={"test#1": vibration([[1.0], [1.0]])}), AsyncMock()
     rows: list[TouchRow] = []
-
-    async def vibration(since: float, until: float) -> dict[str, FingerVibration]:
-        windows.append((since, until))
-        return {"test#1": FELT}
-
-    async def place(positions: Any, loads: Any) -> None:
-        placed.append((positions, loads))
-
-    async with recorder_of(rows, vibration, place) as recorder:
+    async with recorder_of(rows, vibration=measure, place_fingers=place) as recorder:
         start, loop = threads.now(), Observers()
         recorder.observe(loop)
         (changed,), (applied_now,) = loop.contacts_changed, loop.reported
@@ -324,7 +306,7 @@ async def test_pattern_is_measured_while_no_finger_moves_or_lands(
             )
             applied_now(cast(PlayReport, applied))
             await asyncio.sleep(1.0)
-            if len(windows) == 2:
+            if measure.await_count == 2:
                 changed((finger, other), Change(down=(other,)))
                 await asyncio.sleep(0.8)
                 continue
@@ -336,12 +318,12 @@ async def test_pattern_is_measured_while_no_finger_moves_or_lands(
         changed((finger, other), Change(moved=(finger,)))
         changed((other,), Change(up=(finger,)))
         applied_now(PlayReport((other,), (), None, threads.now()))
-    assert windows == [
+    assert [each.args for each in measure.await_args_list] == [
         pytest.approx((start + since, start + until))
         for since, until in ((0.755, 0.995), (2.555, 2.795), (4.355, 4.595))
     ]
-    assert len(placed) == 1 + 16 + 1 + 1 + 1
-    assert [loads.get("test#1") for _, loads in placed[-2:]] == [2.0, None]
+    assert place.await_count == 1 + 16 + 1 + 1 + 1
+    assert [each.args[1].get("test#1") for each in place.await_args_list[-2:]] == [2.0, None]
     (row,) = rows
     assert (row.steady, row.measured_level_db_sl, row.measured_contrast_db) == (True, None, None)
 

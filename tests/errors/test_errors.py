@@ -95,9 +95,10 @@ def test_error_has_its_status_and_place(case: Case, shelf: Path, tmp_path: Path)
     assert outcome.status == case.status
     assert outcome.text.startswith("era: error: ")
     for place in case.at:
-        said = outcome.text.replace(", line ", ":")
         # As a whole: line 1 is not in line 11, nor a key in one below it.
-        assert re.search(rf"{re.escape(place)}((?<!\w)|(?!\w|\.\w))", said), said
+        assert re.search(
+            rf"{re.escape(place)}((?<!\w)|(?!\w|\.\w))", outcome.text.replace(", line ", ":")
+        ), outcome.text
     assert not INTERNALS.search(outcome.text)
     assert len(outcome.text) < 1500
     assert outcome.out == "" if not case.said else outcome.out.startswith(case.said)

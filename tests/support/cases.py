@@ -90,8 +90,7 @@ class _Loader(yaml.CSafeLoader):
     def mapping(self, node: yaml.MappingNode) -> Iterator[dict[Any, Any]]:
         """The values by their keys, once all are read."""
         keys = [each.value for each, _ in node.value]
-        twice = [each for each in keys if keys.count(each) > 1 and isinstance(each, str)]
-        if twice:
+        if twice := [each for each in keys if keys.count(each) > 1]:
             raise ValueError(f"{twice[0]} must stand once{node.start_mark}")
         return self.construct_yaml_map(node)
 

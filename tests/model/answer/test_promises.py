@@ -68,11 +68,6 @@ WEEKEND = Path(__file__).parents[3] / "examples" / "weekend" / "rig.yaml"
 CASES: dict[str, dict[str, Any]] = {
     case["promised"]: case for case in read_yaml(Path(__file__).with_name("promises.yaml"))
 }
-REQUIRED = {"kept", "tenth", "median"}
-KEYS = REQUIRED | {
-    *("promised", "plate", "rig", "by", "known", "believed", "hertz", "mode", "contents", "quiet"),
-    *("draws", "late", "judged", "numpy", "long"),
-}
 AMPLIFIERS = (0, 1, 0, 1)  # of the ERAs
 
 
@@ -134,8 +129,11 @@ def shares(found: Answer, by_set: Sequence[Realised]) -> dict[str, float]:
 def judge(name: str) -> None:
     """Answer each set of fingers, solve the plates drawn for it, and count what is kept."""
     case, table = CASES[name], table_of(name)
-    assert case.keys() <= KEYS
-    assert case.keys() & REQUIRED
+    assert case.keys() <= {
+        *("kept", "tenth", "median", "promised", "plate", "rig", "by", "known", "believed"),
+        *("hertz", "mode", "contents", "quiet", "draws", "late", "judged", "numpy", "long"),
+    }
+    assert case.keys() & {"kept", "tenth", "median"}
     asked, draws = believing(table, case), case["draws"]
     stimuli, quiet = [Stimulus(**keys) for keys in case["contents"]], case.get("quiet", [0])
     sets = contact_sets(

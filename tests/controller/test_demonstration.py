@@ -295,7 +295,7 @@ async def test_pattern_is_measured_while_no_finger_moves_or_lands(
             layer=SimpleNamespace(drive_mode="phased"),
             drive={},
         )
-        for quiet in ((), (contact(2),), (contact(2),)):
+        for quiet, lands in (((), False), ((contact(2),), False), ((contact(2),), True)):
             applied = SimpleNamespace(
                 time=threads.now(),
                 targets=(Prediction(finger, 20.0),),
@@ -306,14 +306,14 @@ async def test_pattern_is_measured_while_no_finger_moves_or_lands(
             )
             applied_now(cast(PlayReport, applied))
             await asyncio.sleep(1.0)
-            if measure.await_count == 2:
+            if lands:
                 changed((finger, other), Change(down=(other,)))
                 await asyncio.sleep(0.8)
-                continue
-            for _ in range(8):
-                finger = replace(finger, x=finger.x + 0.004)
-                changed((finger,), Change(moved=(finger,)))
-                await asyncio.sleep(0.1)
+            else:
+                for _ in range(8):
+                    finger = replace(finger, x=finger.x + 0.004)
+                    changed((finger,), Change(moved=(finger,)))
+                    await asyncio.sleep(0.1)
         finger = replace(finger, load=2.0)
         changed((finger, other), Change(moved=(finger,)))
         changed((other,), Change(up=(finger,)))

@@ -1,8 +1,8 @@
 """Cases of tests: those of the long form, which files take longest, and data in YAML.
 
 A test or a case with the mark `long` is left to `make test-long`, which `make nightly` runs;
-`make test` has a short case of the same.
-Data have words and numbers as the product's own files have them.
+`make test` has a short case of the same. Data have words and numbers as
+the product's own files have them.
 """
 
 from collections.abc import Collection, Iterable, Iterator, Sequence
@@ -90,8 +90,8 @@ class _Loader(yaml.CSafeLoader):
     def mapping(self, node: yaml.MappingNode) -> Iterator[dict[Any, Any]]:
         """The values by their keys, once all are read."""
         keys = [each.value for each, _ in node.value]
-        if twice := [each for each in keys if keys.count(each) > 1]:
-            raise ValueError(f"{twice[0]} must stand once{node.start_mark}")
+        if twice := [each for each, _ in node.value if keys.count(each.value) > 1]:
+            raise ValueError(f"{twice[-1].value} must stand once, got two{twice[-1].start_mark}")
         return self.construct_yaml_map(node)
 
 
@@ -101,4 +101,5 @@ _Loader.add_constructor("tag:yaml.org,2002:str", _Loader.scalar)
 
 def read_yaml(path: Path) -> Any:
     """The data of a file."""
-    return yaml.load(path.read_text(encoding="utf-8"), Loader=_Loader)
+    with path.open(encoding="utf-8") as file:
+        return yaml.load(file, Loader=_Loader)

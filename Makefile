@@ -10,7 +10,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet --editab
 # Hundreds of processes are started: what is compiled of us is kept, whatever the shell says.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo firmware firmware-test test test-changed test-long test-busy test-kernels test-pymodbus nightly lint pages format docs fuzz faults kill-test fault-test stop-test late-test desk-test qt-test estimate-test surface-test soak bench bench-latency \
+.PHONY: demo firmware firmware-test test test-changed test-long test-busy test-kernels test-pymodbus nightly lint weigh pages format docs fuzz faults kill-test fault-test stop-test late-test desk-test qt-test estimate-test surface-test soak bench bench-latency \
 	bench-plant bench-promise dist dist-platform smoke smoke-lowest sbom licences clean
 .NOTPARALLEL:
 
@@ -44,7 +44,7 @@ test-changed: .venv/installed-test
 
 # All that is long, one target after another, each within an hour; the rest goes on after a failure.
 # Two hours on two cores. Others: make nightly NIGHTLY='soak kill-test'
-NIGHTLY := test-long test-kernels test-pymodbus test-busy faults firmware-test fuzz stop-test late-test kill-test soak desk-test qt-test estimate-test surface-test smoke-lowest
+NIGHTLY := test-long test-kernels test-pymodbus test-busy faults firmware-test fuzz stop-test late-test kill-test soak desk-test qt-test estimate-test surface-test smoke-lowest weigh
 nightly: .venv/installed-test
 	@failed=; for target in $(NIGHTLY); do start=$$(date +%s); echo "nightly: $$target"; \
 		$(MAKE) $$target || failed="$$failed $$target"; \
@@ -92,8 +92,11 @@ lint: .venv/installed-test
 	$(BIN)/lint-imports
 	$(BIN)/mypy
 	$(BIN)/python tests/support/checks/vocabulary.py
-	$(BIN)/python tests/support/checks/ceilings.py
 	$(PAGES) --check
+
+# Weight and density of the tree, for reviewers; nothing fails on them. One folder: make weigh WEIGH=controller
+weigh: .venv/installed-test
+	$(BIN)/python tests/support/weigh.py $(WEIGH)
 
 # Every page, part of a page, client stub and C header that is written from the code.
 PAGES := OPENBLAS_NUM_THREADS=1 PYTHONPATH=tests/support $(BIN)/python docs/generators/pages.py

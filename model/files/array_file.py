@@ -9,13 +9,13 @@ import glob
 import hashlib
 import math
 import os
-import tokenize
+import struct
 import uuid
 import zipfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import IO, Any, TypeAlias
+from typing import IO, Any, BinaryIO, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +24,15 @@ from model.errors import shown
 from registry.files import open_regular
 
 Arrays: TypeAlias = Mapping[str, NDArray[Any]]
+
+Types: TypeAlias = Mapping[str, str | Collection[str]]
+"""By the name of an array its type (`dtype.str`), or the types that it may have."""
+
+WHOLE_NUMBERS = frozenset(np.dtype(order + code).str for order in "<>" for code in "bBhHiIqQ")
+"""Types of whole numbers of any size."""
+
+REAL_NUMBERS = WHOLE_NUMBERS | {np.dtype(order + code).str for order in "<>" for code in "efdg"}
+"""Types of real numbers of any size."""
 
 UNREADABLE = (
     OSError,
@@ -37,9 +46,11 @@ UNREADABLE = (
 
 _RANDOM = 12  # letters of a temporary name
 _ENCRYPTED = 0x1  # a flag of a zip member
-
-# numpy parses a header as Python text and does not turn all errors of that into ValueError.
-_NO_HEADER = (SyntaxError, tokenize.TokenError, TypeError, RecursionError, MemoryError)
+_END = struct.Struct("<4s6xHI4xH")  # mark, number of members, size of the directory and of a remark
+_END_MARK = b"PK\x05\x06"
+_END_64 = b"PK\x06\x07"  # before the end of a file of more than 2 GiB
+_END_64_SIZE = 20
+_MAX_DIRECTORY = 1 << 16  # bytes; an entry of 50 becomes an object of 700
 
 
 @contextmanager
@@ -75,27 +86,58 @@ def write_arrays(path: Path, arrays: Arrays) -> None:
         np.savez(stream, allow_pickle=False, **arrays)
 
 
-def read_arrays(path: Path, types: Mapping[str, str], *, max_bytes: int) -> dict[str, NDArray[Any]]:
-    """Read arrays of exactly these names and types (`dtype.str`); raises one of UNREADABLE."""
-    with open_regular(path, max_bytes) as file, zipfile.ZipFile(file) as archive:
-        members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
-        if sorted(members) != sorted(types) or len(archive.infolist()) != len(types):
+def read_arrays(path: Path, types: Types, *, max_bytes: int) -> dict[str, NDArray[Any]]:
+    """Read arrays of exactly these names and types; raises one of UNREADABLE."""
+    with open_regular(path, max_bytes) as file:
+        return arrays_in(file, types)
+
+
+def arrays_in(
+    file: BinaryIO, types: Types, *, optional: Collection[str] = ()
+) -> dict[str, NDArray[Any]]:
+    """Read the arrays of an open file; raises one of UNREADABLE.
+
+    types: of all arrays that the file may have; optional: names of arrays that may be missing.
+    """
+    file_bytes = file.seek(0, os.SEEK_END)
+    _check_end(file, file_bytes)
+    with zipfile.ZipFile(file) as archive:
+        entries = archive.infolist()
+        members = {entry.filename.removesuffix(".npy"): entry for entry in entries}
+        is_missing = types.keys() - members.keys() - set(optional)
+        if is_missing or members.keys() - types.keys() or len(members) < len(entries):
+            required = ", ".join(sorted(types.keys() - set(optional)))
+            further = f", optionally {', '.join(sorted(optional))}" if optional else ""
             given = shown(", ".join(sorted(members)))
-            raise ValueError(f"members must be {', '.join(sorted(types))}, got {given}")
-        if any(info.compress_type != zipfile.ZIP_STORED for info in members.values()):
-            raise ValueError("members must not be compressed")
-        if any(info.flag_bits & _ENCRYPTED for info in members.values()):
-            raise ValueError("members must not be encrypted")
-        declared = sum(info.file_size for info in members.values())
-        if declared > os.fstat(file.fileno()).st_size:
+            raise ValueError(f"members must be {required}{further}, got {given}")
+        for name, entry in members.items():
+            if entry.compress_type != zipfile.ZIP_STORED:
+                raise ValueError(f"{name}: must not be compressed; write it with numpy.savez")
+            if entry.flag_bits & _ENCRYPTED:
+                raise ValueError(f"{name}: must not be encrypted")
+        declared = sum(entry.file_size for entry in entries)
+        if declared > file_bytes:
             raise ValueError(f"size must be that of the file, got {declared} bytes")
         arrays = {}
-        for name, info in members.items():
-            with archive.open(info) as stream:
-                _check_npy_header(stream, name, types[name], member_bytes=info.file_size)
-            with archive.open(info) as stream:
+        for name, entry in members.items():
+            with archive.open(entry) as stream:
+                _check_npy_header(stream, name, types[name], member_bytes=entry.file_size)
+            with archive.open(entry) as stream:
                 arrays[name] = np.lib.format.read_array(stream, allow_pickle=False)
         return arrays
+
+
+def _check_end(file: BinaryIO, file_bytes: int) -> None:
+    """Raise an error of UNREADABLE for a directory too large to read, or without an end."""
+    file.seek(max(0, file_bytes - _END.size - _END_64_SIZE))
+    before, end = file.read(_END_64_SIZE), file.read()
+    if len(end) != _END.size:
+        raise zipfile.BadZipFile("the file is too short")
+    mark, _, directory_bytes, remark_bytes = _END.unpack(end)
+    if mark != _END_MARK or remark_bytes:
+        raise zipfile.BadZipFile("the file must end with the directory of an archive")
+    if before.startswith(_END_64) or directory_bytes > _MAX_DIRECTORY:
+        raise ValueError(f"the directory must be of up to {_MAX_DIRECTORY >> 10} KiB")
 
 
 def digest_of(text: str, arrays: Arrays) -> str:
@@ -107,19 +149,27 @@ def digest_of(text: str, arrays: Arrays) -> str:
     return digest.hexdigest()
 
 
-def _check_npy_header(stream: IO[bytes], name: str, kind: str, *, member_bytes: int) -> None:
-    """Raise ValueError unless the declared type is expected and the size is the member's."""
+def _check_npy_header(
+    stream: IO[bytes], name: str, accepted: str | Collection[str], *, member_bytes: int
+) -> None:
+    """Raise ValueError unless the declared type is accepted and the size is the member's."""
     version = np.lib.format.read_magic(stream)
     if version != (1, 0):
         raise ValueError(f"{name}: .npy version must be (1, 0), got {version}")
     try:
         shape, _, dtype = np.lib.format.read_array_header_1_0(stream)
-    except _NO_HEADER as error:
+    except Exception as error:  # numpy parses the header as Python text, which fails in many ways
         raise ValueError(f"{name}: unreadable header") from error
-    if dtype.str != kind:
-        raise ValueError(f"{name}: type must be {kind}, got {dtype.str}")
-    if any(type(count) is not int or count < 0 for count in shape):
-        raise ValueError(f"{name}: shape must be of whole numbers, got {shape}")
+    if isinstance(accepted, str):
+        is_accepted, expected = dtype.str == accepted, accepted
+    else:
+        is_accepted = dtype.str in accepted
+        expected = "real numbers" if "<f8" in accepted else "whole numbers"
+    if not is_accepted:
+        raise ValueError(f"{name}: type must be {expected}, got {shown(dtype.str)}")
+    # A dimension of an array without values could be any number.
+    if any(type(count) is not int or not 0 <= count <= member_bytes for count in shape):
+        raise ValueError(f"{name}: shape must be of whole numbers, got {shown(str(shape))}")
     size = dtype.itemsize * math.prod(shape)  # Python integers: no overflow
     if size + stream.tell() != member_bytes:
         raise ValueError(f"{name}: size must be that of the member, got {size} bytes")

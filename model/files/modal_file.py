@@ -10,7 +10,6 @@ of the nodes in coordinates of touches, and faces (k, 3 or more), rows of node n
 """
 
 import math
-import zipfile
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from io import BytesIO
@@ -19,7 +18,8 @@ from pathlib import Path
 import numpy as np
 
 from model.arrays import ComplexArray, FloatArray
-from model.errors import InputError
+from model.errors import MAX_VALUE, InputError
+from model.files.array_file import REAL_NUMBERS, UNREADABLE, WHOLE_NUMBERS, arrays_in
 from model.files.csv_file import read_lines
 from model.files.uff import DatasetBlock, blocks, numbers_in, read_nodes, rows_of, units_of
 
@@ -32,8 +32,11 @@ _VALUES_A_ROW = 6
 _HEAD = {55: (9, 6), 2414: (14, 9)}
 """Rows before the first node of a mode, and of these the row of its types, by dataset."""
 
-_ARRAYS = {"nodes", "frequencies", "shapes"}
-_FURTHER = {"damping_ratios", "places", "faces"}
+_OPTIONAL = {"damping_ratios", "places", "faces"}
+_ARRAYS = {
+    **dict.fromkeys(("nodes", "frequencies", "shapes", "damping_ratios", "places"), REAL_NUMBERS),
+    "faces": WHOLE_NUMBERS,
+}
 _COLUMNS = ("mode", "frequency_hz", "x_m", "y_m", "z_m", "shape_x", "shape_y", "shape_z")
 _BINARY_ZIP = b"PK\x03\x04"
 
@@ -63,51 +66,56 @@ class ModeShapes:
 
 def read_modes(path: Path, content: bytes) -> ModeShapes:
     """Read the modes of a file with this content; raises InputError with file and line."""
-    modes = (
-        _from_arrays(path, content)
-        if content.startswith(_BINARY_ZIP)
-        else _from_lines(path)
-        if path.suffix.lower() == ".csv"
-        else _from_universal(path, content)
-    )
+    ending = path.suffix.lower()
+    if ending == ".npz" or content.startswith(_BINARY_ZIP):
+        modes = _from_arrays(path, content)
+    elif ending == ".csv":
+        modes = _from_lines(path)
+    else:
+        modes = _from_universal(path, content)
     for name in ("nodes", "frequencies", "shapes"):
-        if not np.isfinite(getattr(modes, name)).all():
-            raise InputError(f"{path}: {name} of modes must be finite; export them again")
+        if not (np.abs(getattr(modes, name)) <= MAX_VALUE).all():
+            raise InputError(
+                f"{path}: {name} of modes must be finite numbers up to {MAX_VALUE:g}; export them "
+                "again"
+            )
     return modes
 
 
 def _from_arrays(path: Path, content: bytes) -> ModeShapes:
     try:
-        with np.load(BytesIO(content), allow_pickle=False) as file:
-            held = {name: file[name] for name in file.files}
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        arrays = arrays_in(BytesIO(content), _ARRAYS, optional=_OPTIONAL)
+    except UNREADABLE as error:
         raise InputError(
-            f"{path}: .npz of modes must be readable, got {error}; write it again"
+            f"{path}: .npz of modes must be readable, got: {error}; write it again with numpy.savez"
         ) from error
-    unknown = held.keys() - _ARRAYS - _FURTHER
-    if unknown or _ARRAYS - held.keys():
-        raise InputError(
-            f"{path}: .npz of modes must have {', '.join(sorted(_ARRAYS))} and may have "
-            f"{', '.join(sorted(_FURTHER))}, got {', '.join(sorted(held)) or 'none'}"
-        )
-    n, r = (held[name].shape[:1] or (0,) for name in ("nodes", "frequencies"))
+    nodes, frequencies, shapes = arrays["nodes"], arrays["frequencies"], arrays["shapes"]
+    n = nodes.shape[:1] or (0,)
+    r = frequencies.shape[:1] or (0,)
     expected = {"nodes": [(*n, 3)], "frequencies": [r], "shapes": [(*r, *n, 3), (*r, *n)]}
     expected |= {"damping_ratios": [r], "places": [(*n, 2)]}
-    for name, shapes in expected.items():
-        if name in held and (held[name].shape not in shapes or held[name].dtype.kind not in "fiu"):
+    for name, accepted in expected.items():
+        if name in arrays and arrays[name].shape not in accepted:
             raise InputError(
-                f"{path}: {name} must be real numbers of shape {' or '.join(map(str, shapes))}, "
-                f"got {held[name].dtype} of {held[name].shape}"
+                f"{path}: {name} must be of shape {' or '.join(map(str, accepted))}, got "
+                f"{arrays[name].shape}; write it again"
             )
-    faces = held.get("faces", np.empty((0, 3), dtype=int))
-    if faces.dtype.kind not in "iu" or faces.ndim != 2 or ((faces < 0) | (faces >= n[0])).any():
-        raise InputError(f"{path}: faces must be rows of node numbers from 0 to {n[0] - 1}")
-    places = held.get("places")
+    for name in ("places", "damping_ratios"):
+        if not np.isfinite(arrays.get(name, 0.0)).all():
+            raise InputError(f"{path}: {name} of modes must be finite; leave out the array")
+    faces = arrays.get("faces", np.empty((0, 3), dtype=int))
+    is_table = faces.ndim == 2 and faces.shape[1] >= 3
+    if not is_table or ((faces < 0) | (faces >= n[0])).any():
+        raise InputError(
+            f"{path}: faces must be rows of 3 or more node numbers from 0 to {n[0] - 1}; write "
+            "them again"
+        )
+    places = arrays.get("places")
     return ModeShapes(
-        held["nodes"].astype(float),
-        held["frequencies"].astype(float),
-        held["shapes"].astype(float),
-        held.get("damping_ratios", np.full(r, math.nan)).astype(float),
+        nodes.astype(float),
+        frequencies.astype(float),
+        shapes.astype(float),
+        arrays.get("damping_ratios", np.full(r, math.nan)).astype(float),
         faces.tolist(),
         None if places is None else places.astype(float),
     )
@@ -203,7 +211,8 @@ class _Mode:
 
 def _read_faces(path: Path, block: DatasetBlock) -> Iterator[list[int]]:
     """Yield the nodes of each shell element in turn."""
-    rows, at = [numbers_in(row) for row in block.rows[1:]], 0
+    lines = enumerate(block.rows[1:], start=block.line + 2)
+    rows, at = [numbers_in(row, f"{path}:{line}") for line, row in lines], 0
     while at < len(rows):
         if len(rows[at]) < 6:
             raise InputError(
@@ -226,10 +235,14 @@ def _read_mode(path: Path, block: DatasetBlock) -> _Mode | None:
     head, types = _HEAD[block.kind]
     if len(rows) <= head + 1:
         raise InputError(f"{place}: dataset {block.kind} must have a mode, got {len(rows)} rows")
+
+    def numbers(row: int) -> list[float]:
+        return numbers_in(rows[row], f"{path}:{block.line + 1 + row}")
+
     # The row of types is the sixth of a dataset 55 and the ninth of a dataset 2414.
-    kinds = [int(each) for each in numbers_in(rows[types])]
+    kinds = [int(number) for number in numbers(types)]
     if block.kind == 2414:
-        location = numbers_in(rows[3])
+        location = numbers(3)
         if location and int(location[0]) != 1:
             return None  # at elements
     if len(kinds) < 6 or kinds[1] not in (_NORMAL_MODES, *_COMPLEX_MODES):
@@ -244,17 +257,17 @@ def _read_mode(path: Path, block: DatasetBlock) -> _Mode | None:
             f"{place}: a mode must have 1, 3 or 6 values at each node, got {count}; export "
             "displacements"
         )
-    reals = [each for row in rows[types + 2 : head] for each in numbers_in(row)]
+    reals = [number for row in range(types + 2, head) for number in numbers(row)]
     if block.kind == 2414:
         reals = reals[2:]  # behind two counts
     frequency, mass, damping = _modal(place, block.kind, analysis, reals)
     is_complex = data in (5, 6)
-    numbers, values = _values(path, block, head, count * (1 + is_complex))
+    nodes, values = _values(path, block, head, count * (1 + is_complex))
     shape: FloatArray | ComplexArray = values
     if is_complex:
         shape = _real(place, values[:, ::2] + 1j * values[:, 1::2])
     shape = shape[:, 0] if count == 1 else shape[:, :3]
-    return _Mode(place, frequency, damping, numbers, np.asarray(shape / math.sqrt(mass)))
+    return _Mode(place, frequency, damping, nodes, np.asarray(shape / math.sqrt(mass)))
 
 
 def _modal(

@@ -271,6 +271,15 @@ def _header(place: str, block: DatasetBlock) -> dict[str, Any]:
             found[name] = text if read is str else read(text.upper().replace("D", "E") or "0")
     except (IndexError, ValueError) as error:
         raise InputError(f"{place}: dataset 58 cannot be read; export it again") from error
+    for name in ("abscissa_min", "abscissa_inc"):
+        if not math.isfinite(found[name]):
+            raise InputError(
+                f"{place}: {name} must be a finite number, got {found[name]:g}; export it again"
+            )
+    if found["num_pts"] < 1:
+        raise InputError(
+            f"{place}: number of values must be at least 1, got {found['num_pts']}; export it again"
+        )
     return found
 
 
@@ -342,21 +351,31 @@ def _numbers_of(
                 f"{path}:{line}: data must be numbers, {count} in all, got {shown!r}; export the "
                 "damaged file again"
             )
-        numbers += numbers_in(row)
+        numbers += numbers_in(row, f"{path}:{line}")
     return np.array(numbers[:count])
 
 
-def numbers_in(row: bytes) -> list[float]:
-    """All numbers of a row, in any spelling of Fortran."""
-    words = (each.upper().replace(b"D", b"E") for each in _NUMBER.findall(row))
-    return [float(_NO_LETTER.sub(b"E", word)) for word in words]
+def numbers_in(row: bytes, place: str) -> list[float]:
+    """All numbers of a row, in any spelling of Fortran.
+
+    place: file and line, for the error. Raises InputError for NaN and infinite numbers.
+    """
+    words = (word.upper().replace(b"D", b"E") for word in _NUMBER.findall(row))
+    numbers = [float(_NO_LETTER.sub(b"E", word)) for word in words]
+    for number in numbers:
+        if not math.isfinite(number):
+            raise InputError(f"{place}: numbers must be finite, got {number:g}; export them again")
+    return numbers
 
 
 def units_of(path: Path, block: DatasetBlock) -> tuple[float, float]:
     """By what lengths and forces of the file are divided to have metres and newtons."""
-    place, rows = f"{path}:{block.line}", block.rows[1:]
-    factors = [each for row in rows[1:] for each in numbers_in(row)]
-    code = numbers_in(rows[0][:10]) if rows else []
+    place = f"{path}:{block.line}"
+    rows = block.rows[1:]
+    code = numbers_in(rows[0][:10], f"{path}:{block.line + 2}") if rows else []
+    factors: list[float] = []
+    for line, row in enumerate(rows[1:], start=block.line + 3):
+        factors += numbers_in(row, f"{path}:{line}")
     if not code or len(factors) < 2:
         raise InputError(f"{place}: units (dataset 164) must have a code and factors; export again")
     label = rows[0][10:30].decode("ascii", "replace").strip()
@@ -381,8 +400,12 @@ def rows_of(
             f"{path}:{block.line + head + len(rows)}: dataset {block.kind} must have {size} rows "
             f"for each entry, got {len(rows)} in all; the file is damaged, export it again"
         )
-    for first in range(0, len(rows), size):
-        yield [numbers_in(row) for row in rows[first : first + size]]
+    record: list[list[float]] = []
+    for line, row in enumerate(rows, start=block.line + 1 + head):
+        record.append(numbers_in(row, f"{path}:{line}"))
+        if len(record) == size:
+            yield record
+            record = []
 
 
 def read_nodes(
@@ -394,11 +417,11 @@ def read_nodes(
     """Add the nodes of a dataset, and the numbers of those with local displacements."""
     size = 1 if block.kind == 15 else 2
     for count, record in enumerate(rows_of(path, block, size)):
-        numbers = [each for row in record for each in row]
-        if len(numbers) != 7 or not np.isfinite(numbers).all():
+        numbers = [number for row in record for number in row]
+        if len(numbers) != 7:
             raise InputError(
                 f"{path}:{block.line + 2 + size * count}: node must have a number, three codes and "
-                f"three finite coordinates, got {len(numbers)} numbers; export it again"
+                f"three coordinates, got {len(numbers)} numbers; export it again"
             )
         nodes[int(numbers[0])] = tuple(numbers[4:])
         if numbers[2]:

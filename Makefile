@@ -37,8 +37,8 @@ test: .venv/installed-test
 	$(BIN)/pytest $(ENDING) -m 'not real_time and not long' --numprocesses $(call MORE_THAN_PROCESSORS,1) --dist loadfile --no-loadscope-reorder
 	$(BIN)/pytest $(ENDING) -m 'real_time and not long' --numprocesses $(call MORE_THAN_PROCESSORS,3) --dist loadfile --no-loadscope-reorder $$(grep -rl real_time tests --include='test_*.py')
 
-# Of these for a minute those that are nearest to what differs from a commit, by default from where
-# this branch has left main. Others: make test-changed SINCE=HEAD~3
+# The tests nearest to what differs from main: about a minute, stopping at the first failure.
+# Since another commit: make test-changed SINCE=HEAD~3
 test-changed: .venv/installed-test
 	$(BIN)/python tests/support/changed_tests.py $(if $(SINCE),--since $(SINCE))
 

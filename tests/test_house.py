@@ -14,7 +14,6 @@ from pathlib import Path
 
 import pytest
 
-import changed_tests
 from changed_tests import ALSO, also, nearest
 from checks import vocabulary
 from checks.vocabulary import misleading_names, retired_identifiers
@@ -125,24 +124,46 @@ def test_rows_name_what_there_is() -> None:
     assert also(["drivers/wires/can_frames.py"]) == ["make pages", "make fuzz"]
 
 
-@pytest.mark.long
+RUN_WITH_TIME_LIMIT = """
+import sys
+import pytest
+from changed_tests import TimeLimit
+options = ["-q", "-x", "-p", "no:cacheprovider", "-p", "no:xdist"]
+sys.exit(pytest.main(options, plugins=[TimeLimit(float(sys.argv[1]))]))
+"""
+NUMBERED_TESTS = """
+import pytest
+
+@pytest.mark.parametrize("number", range(120))
+def test_number(number):
+    assert number != FAILING
+"""
+
+
 @pytest.mark.parametrize(
-    ("seconds", "status", "said"), [("0", 3, "No test had time"), ("300", 0, "Next: make test")]
+    ("seconds", "failing", "status", "expected"),
+    [
+        ("600", -1, 0, "120 passed"),
+        ("0", 99, 1, "1 failed, 99 passed"),
+        ("0", 100, 0, "100 passed"),
+    ],
 )
-def test_command_fails_where_no_test_had_time(
-    seconds: str,
-    status: int,
-    said: str,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+def test_time_limit_runs_the_nearest_hundred_tests_when_the_time_is_over(
+    seconds: str, failing: int, status: int, expected: str, tmp_path: Path
 ) -> None:
-    """And its last line says so, which nothing passed would not."""
-    monkeypatch.setattr(
-        changed_tests, "changed_since", lambda commit: ["tests/registry/test_threads.py"]
+    """The nearest 100 tests run even after the time is up; a failure among them fails the run."""
+    program = NUMBERED_TESTS.replace("FAILING", str(failing))
+    (tmp_path / "test_numbers.py").write_text(program, "utf-8")
+    done = subprocess.run(
+        [sys.executable, "-c", RUN_WITH_TIME_LIMIT, seconds],
+        cwd=tmp_path,
+        env=os.environ | {"PYTHONPATH": str(ROOT / "tests" / "support")},
+        capture_output=True,
+        text=True,
+        check=False,
     )
-    monkeypatch.setattr(sys, "argv", ["changed_tests", "--seconds", seconds])
-    assert changed_tests.main() == status
-    assert capsys.readouterr().out.splitlines()[-1].startswith(said)
+    assert done.returncode == status, done.stdout + done.stderr
+    assert f"{expected} in" in done.stdout
 
 
 def test_what_users_copy_keeps_the_rule(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

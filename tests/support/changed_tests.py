@@ -1,21 +1,22 @@
-"""The tests of what differs from a commit, the nearest first, for a minute: `make test-changed`.
+"""Run the tests nearest to what differs from a commit: `make test-changed`.
 
     python tests/support/changed_tests.py [--since COMMIT] [--seconds N] [--list]
 
-A test is near what has changed by its folder, then by the number of imports between both. A file
-that is no module has the tests that name it and those of its folder. What only `pyproject.toml` or
-an example leads to comes last. The first failure ends the run, and so does the end of the minute.
-What is left out is printed; exit status 3 where no test had time.
+Order: changed tests; tests in the folder of the changed file; tests that import the file, directly
+or through other modules. A file that is no module has the tests that name it. Files reached only
+from `pyproject.toml` or an example come last.
+
+The run ends with the first failure, or when the time is up. The time counts from the first test, so
+that a busy machine delays the run but does not empty it, and the nearest tests always run.
 """
 
 import argparse
 import ast
 import os
 import re
-import signal
 import subprocess
 import sys
-import threading
+import time
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import cache
@@ -66,100 +67,123 @@ ALSO: Sequence[tuple[Sequence[str], Sequence[str]]] = (
         ),
     ),
 )
-"""What else to run after a change of files that begin so."""
+"""Prefixes of changed paths, and the commands to run in addition to `make test`."""
 
-_MAX_FILES = 60  # collecting more leaves no time to run them
-_SECONDS = 45.0  # for tests, of a minute
-_NOTHING_RAN = 3
+_MAX_FILES = 24  # two processors do not finish more within the time, and each costs time to import
+_SECONDS = 45.0
+MIN_TESTS = 100
+"""Tests that always run, however slow the machine is."""
 _MODULES = (".py", ".pyi")
 _WRITER = re.compile(r"<!-- begin: written by \S*?(\w+)\.py")
 _LAST = ("pyproject.toml", "examples/")
-"""What many tests name or import that its change does not concern."""
+"""Paths that many tests name or import without depending on their content."""
 
 
 def table() -> str:
-    """The rows of ALSO, as Markdown."""
+    """Return the rows of ALSO as a Markdown table."""
     lines = ["| changed | run as well |", "|---|---|"]
     for paths, commands in ALSO:
-        cells = (", ".join(f"`{each}`" for each in row) for row in (paths, commands))
-        lines.append(f"| {' | '.join(cells)} |")
+        changed = ", ".join(f"`{path}`" for path in paths)
+        run = ", ".join(f"`{command}`" for command in commands)
+        lines.append(f"| {changed} | {run} |")
     return "\n".join(lines)
 
 
 def also(changed: Iterable[str]) -> list[str]:
-    """What else to run after changes of these files."""
-    rows = [
-        commands for paths, commands in ALSO if any(each.startswith((*paths,)) for each in changed)
-    ]
-    return [*dict.fromkeys(command for commands in rows for command in commands)]
+    """Return the commands to run in addition after a change of these files."""
+    files = tuple(changed)
+    selected: dict[str, None] = {}
+    for prefixes, commands in ALSO:
+        if any(path.startswith(tuple(prefixes)) for path in files):
+            selected.update(dict.fromkeys(commands))
+    return list(selected)
 
 
 def changed_since(commit: str) -> list[str]:
-    """The files that differ from a commit, with those that are not added yet."""
+    """Return the files that differ from a commit, including files that git does not track yet."""
     differing = _git("diff", "--name-only", commit).splitlines()
-    return [*differing, *_git("ls-files", "--others", "--exclude-standard").splitlines()]
+    untracked = _git("ls-files", "--others", "--exclude-standard").splitlines()
+    return differing + untracked
 
 
 def default_commit() -> str:
-    """Where this branch has left main; on main, or without it, the last commit."""
-    known = _git(
-        "for-each-ref", "--format=%(refname)", "refs/heads/main", "refs/remotes/origin/main"
-    )
-    return _git("merge-base", "HEAD", known.splitlines()[0]).strip() if known else "HEAD"
+    """Return the commit at which this branch left main; HEAD on main or without a main."""
+    branches = ("refs/heads/main", "refs/remotes/origin/main")
+    present = _git("for-each-ref", "--format=%(refname)", *branches).splitlines()
+    return _git("merge-base", "HEAD", present[0]).strip() if present else "HEAD"
 
 
 def _git(*arguments: str) -> str:
-    return subprocess.run(
-        ["git", *arguments], cwd=ROOT, capture_output=True, text=True, check=True
-    ).stdout
+    command = ["git", *arguments]
+    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout
 
 
 def nearest(changed: Sequence[str]) -> dict[str, int]:
-    """The files of tests that changed files reach, by path: 0 in their folder, then by imports.
+    """Return the test files that changed files reach, nearest first, with their distance.
 
-    Of a file that is no module those are 0 that name it, then come those of its folder. The order:
-    tests that are changed themselves; those of the folders of changed modules and of changed pages;
-    the nearest by imports, of as many those of a near folder first, and those that take long last;
-    what is reached from _LAST alone.
+    The distance is 0 in the folder of a changed module and for tests that name a changed page,
+    otherwise the number of imports in between.
     """
     last = [path for path in changed if path.startswith(_LAST)]
-    near = _reached([path for path in changed if path not in last])
+    first = [path for path in changed if path not in last]
+    near = _reached(first)
     distances = _reached(last) | near
-    modules = [each for each in {*changed} - {*last, *_tests()} if each.endswith(_MODULES)]
-    beside = {test for path in modules for test in _tests_beside(path)}
-    beside |= {test for path in changed if path.endswith(".md") for test in _tests_of_page(path)}
+    beside: set[str] = set()
+    for path in first:
+        if path.endswith(_MODULES) and path not in _tests():
+            beside.update(_tests_beside(path))
+        elif path.endswith(".md"):
+            beside.update(_tests_of_page(path))
 
-    def place(test: str) -> tuple[bool, bool, bool, int, int, bool, str]:
-        common = (os.path.commonpath([test, f"tests/{path}"]) for path in changed)
-        shared = max(len(Path(each).parts) for each in common)
+    def rank(test: str) -> tuple[bool, bool, bool, int, int, bool, str]:
+        common_paths = [os.path.commonpath([test, f"tests/{path}"]) for path in changed]
+        common_folders = max(len(Path(path).parts) for path in common_paths)
         return (
-            *(test not in changed, test not in near, test not in beside, distances[test]),
-            *(-shared, Path(test).name in SLOWEST, test),
+            test not in changed,
+            test not in near,
+            test not in beside,
+            distances[test],
+            -common_folders,
+            Path(test).name in SLOWEST,
+            test,
         )
 
-    order = sorted((path for path in _tests() if path in distances), key=place)
-    return {path: distances[path] for path in order}
+    reached = [test for test in _tests() if test in distances]
+    return {test: distances[test] for test in sorted(reached, key=rank)}
 
 
 def _reached(changed: Sequence[str]) -> dict[str, int]:
-    """The least number of imports from each module and test to one of the changed files."""
+    """Return the least number of imports from each module and test to one of the changed files."""
     distances: dict[str, int] = {}
     for path in changed:
-        first, second = [_node(path)], [] if path in _tests() else [*_tests_beside(path)]
+        direct = [_node(path)]
+        beside = [] if path in _tests() else list(_tests_beside(path))
         if path.endswith(_MODULES):
-            first, second = [*first, *second], []
+            direct += beside
+            beside = []
         else:
-            package = str(Path(path).parent).replace("/", ".")
-            first += [each for each in _importers() if each.rpartition(".")[0] == package]
-            first += _tests_of_page(path)
-        distances = dict.fromkeys(second, 1) | distances | dict.fromkeys(first, 0)
-    is_for_all, found = "conftest" in distances, sorted(distances, key=lambda one: distances[one])
-    for node in found:
+            direct += _modules_in(Path(path).parent)
+            direct += _tests_of_page(path)
+        for node in beside:
+            distances.setdefault(node, 1)
+        for node in direct:
+            distances[node] = 0
+    is_for_all_tests = "conftest" in distances
+    queue = sorted(distances, key=lambda node: distances[node])
+    for node in queue:  # grows while it is read: breadth first
         for importer in sorted(_importers().get(node, ())):
             if importer not in distances:
                 distances[importer] = distances[node] + 1
-                found.append(importer)
-    return dict.fromkeys(_tests(), 1) | distances if is_for_all else distances
+                queue.append(importer)
+    if is_for_all_tests:
+        return dict.fromkeys(_tests(), 1) | distances
+    return distances
+
+
+def _modules_in(folder: Path) -> list[str]:
+    """Return the imported modules in a folder, for a data file among them."""
+    package = str(folder).replace("/", ".")
+    return [module for module in _importers() if module.rpartition(".")[0] == package]
 
 
 @cache
@@ -168,7 +192,7 @@ def _tests() -> list[str]:
 
 
 def _node(path: str) -> str:
-    """The name of a module, in the graph of imports; that of a test is its path."""
+    """Return the name of a file in the graph of imports: that of its module; a test's path."""
     name = path.rpartition(".")[0].removesuffix("/__init__")
     if path.partition("/")[0] in PACKAGES:
         return name.replace("/", ".")
@@ -178,32 +202,38 @@ def _node(path: str) -> str:
 
 
 def _tests_beside(path: str) -> Iterator[str]:
-    """The tests of the folder in tests/ with the path of a file's folder, or of the one above."""
+    """Yield the tests in the folder of tests/ that corresponds to a file's, or in one above."""
     folder = Path("tests") / Path(path.removeprefix("tests/")).parent
     while folder != Path("tests"):
-        if found := [each for each in _tests() if each.startswith(f"{folder}/")]:
-            yield from found
+        tests = [test for test in _tests() if test.startswith(f"{folder}/")]
+        if tests:
+            yield from tests
             return
         folder = folder.parent
 
 
 def _tests_of_page(path: str) -> Iterator[str]:
-    """The tests that name a file, and those that import what writes parts of it, by its marks."""
-    yield from (test for test in _tests() if Path(path).name in (ROOT / test).read_text("utf-8"))
-    if path.endswith(".md") and (ROOT / path).exists():
-        for writer in {*_WRITER.findall((ROOT / path).read_text("utf-8"))}:
-            yield from _importers().get(writer, set()) & {*_tests()}
+    """Yield the tests that name a file, and those that import a generator of parts of it."""
+    name = Path(path).name
+    for test in _tests():
+        if name in (ROOT / test).read_text("utf-8"):
+            yield test
+    page = ROOT / path
+    if path.endswith(".md") and page.exists():
+        for generator in set(_WRITER.findall(page.read_text("utf-8"))):
+            yield from _importers().get(generator, set()) & set(_tests())
 
 
 @cache
 def _importers() -> Mapping[str, set[str]]:
-    """The modules and tests that import each module: of the packages by grimp, others by ast."""
+    """Return the importers of each module: packages according to grimp, other files to `ast`."""
     graph = grimp.build_graph(*PACKAGES, cache_dir=str(ROOT / ".import_linter_cache"))
     importers: dict[str, set[str]] = defaultdict(set)
     for module in graph.modules:
         importers[module] = graph.find_modules_that_directly_import(module)
     files = [ROOT / path for path in _tests()]
-    files += [path for folder in FLAT for path in (ROOT / folder).rglob("*.py")]
+    for folder in FLAT:
+        files += (ROOT / folder).rglob("*.py")
     for file in files:
         node = _node(file.relative_to(ROOT).as_posix())
         for name in _imports(file):
@@ -212,66 +242,81 @@ def _importers() -> Mapping[str, set[str]]:
 
 
 def _imports(file: Path) -> set[str]:
-    """The modules that a file imports, and the names that may be such."""
+    """Return the modules that a file imports, and imported names that may be modules."""
     names: set[str] = set()
     for node in ast.walk(ast.parse(file.read_text("utf-8"))):
         if isinstance(node, ast.Import):
-            names |= {alias.name for alias in node.names}
+            names.update(alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom) and node.module:
-            names |= {node.module, *(f"{node.module}.{alias.name}" for alias in node.names)}
+            names.add(node.module)
+            names.update(f"{node.module}.{alias.name}" for alias in node.names)
     return names
 
 
-def _run(files: Sequence[str], *, seconds: float) -> int:
-    """Run tests for some seconds, as if Ctrl-C ended them; return pytest's status, or another.
+class TimeLimit:
+    """A pytest plugin: end the run some seconds after the first test, but not before MIN_TESTS.
 
-    _NOTHING_RAN where no test had time; 0 where those that had time have passed.
+    It ends between two tests, so that a failure of the last one decides the exit status.
     """
+
+    def __init__(self, seconds: float) -> None:
+        self.seconds = seconds
+        self.started_tests = 0
+        self.ends_at = 0.0
+
+    def pytest_runtest_logstart(self) -> None:
+        """Count a test that is about to start, or end the run if the time is up."""
+        now = time.monotonic()
+        if self.started_tests == 0:
+            self.ends_at = now + self.seconds
+        if self.started_tests >= MIN_TESTS and now >= self.ends_at:
+            pytest.exit(f"{self.seconds:g} s after the first test: no failure so far", returncode=0)
+        self.started_tests += 1
+
+
+def _run(tests: Sequence[str], *, seconds: float) -> int:
+    """Run test files, nearest first, until a failure or until the time is up; return the status."""
     options = ["-q", "-r", "fE", "-x", "-m", "not long and not alone"]
-    spread = ["--numprocesses", "2", "--dist", "loadfile", "--no-loadscope-reorder"]
-    command = [sys.executable, "-m", "pytest", *options, *spread, *files]
-    said = ""
-    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True) as process:
-        timer = threading.Timer(seconds, process.send_signal, [signal.SIGINT])
-        timer.start()
-        for said in process.stdout or ():
-            sys.stdout.write(said)
-        timer.cancel()
-    if process.returncode not in (pytest.ExitCode.INTERRUPTED, -signal.SIGINT):
-        return process.returncode
-    return 0 if " passed" in said else _NOTHING_RAN
+    options += ["--numprocesses", str(_workers()), "--dist", "loadfile", "--no-loadscope-reorder"]
+    status = pytest.main([*options, *tests], plugins=[TimeLimit(seconds)])
+    return 0 if status == pytest.ExitCode.NO_TESTS_COLLECTED else int(status)
+
+
+def _workers() -> int:
+    """Return the number of worker processes; 0 on a busy machine, where each delays the start."""
+    processors = len(os.sched_getaffinity(0))
+    is_busy = os.getloadavg()[0] > processors
+    return 0 if is_busy else processors
 
 
 def main() -> int:
-    """The command."""
+    """Run the command."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--since", metavar="COMMIT", help="by default where this branch left main")
-    parser.add_argument("--seconds", type=float, default=_SECONDS, help="for tests")
-    parser.add_argument("--list", action="store_true", help="list the tests, and run none")
+    parser.add_argument("--since", metavar="COMMIT", help="default: where this branch left main")
+    parser.add_argument(
+        "--seconds", type=float, default=_SECONDS, help="time from the first test on"
+    )
+    parser.add_argument("--list", action="store_true", help="list the test files, and run none")
     options = parser.parse_args()
     since = options.since or default_commit()
     changed = changed_since(since)
     reached = nearest(changed)
-    chosen, status = [*reached][:_MAX_FILES], 0
     if options.list:
         sys.stdout.writelines(f"{distance} {path}\n" for path, distance in reached.items())
         return 0
-    sys.stdout.write(f"{len(changed)} files differ from {since}; tests in {len(chosen)} files\n")
+    selected = list(reached)[:_MAX_FILES]
+    sys.stdout.write(f"{len(changed)} files differ from {since}; tests in {len(selected)} files\n")
     sys.stdout.flush()
-    if chosen:
-        status = _run(chosen, seconds=options.seconds)
+    os.chdir(ROOT)
+    status = _run(selected, seconds=options.seconds) if selected else 0
+    farther = len(reached) - len(selected)
+    unreached = len(_tests()) - len(reached)
     sys.stdout.write(
-        f"Left out: tests in {len(reached) - len(chosen)} files that more imports lead to and in "
-        f"{len(_tests()) - len(reached)} that none do, and all that is long or loads the machine.\n"
+        f"Not run: {farther} test files farther away, {unreached} that do not depend on the "
+        "change, tests marked `long` or `alone`, and what the time did not allow.\n"
         f"Next: {', '.join([*also(changed), 'make test'])}\n"
     )
-    if status == _NOTHING_RAN:
-        sys.stdout.write(
-            f"No test had time within {options.seconds:g} s: nothing is tested. Run them without "
-            f"other load, or with more time: python {Path(__file__).relative_to(ROOT)} --seconds "
-            f"{4 * options.seconds:g}\n"
-        )
-    return 0 if status == pytest.ExitCode.NO_TESTS_COLLECTED else status
+    return status
 
 
 if __name__ == "__main__":

@@ -45,6 +45,7 @@ from model.rig.rig import Rig as Rig
 from model.rig.rig import Uncertainty as Uncertainty
 from model.rig.rig_file import example_rig_path as example_rig_path
 from model.rig.rig_file import load_rig as load_rig
+from model.rig.rig_writing import change_rig as change_rig
 from model.rig.rig_writing import rig as rig
 from model.rig.rig_writing import save_rig as save_rig
 from model.structure.attachments import Fingertip as Fingertip

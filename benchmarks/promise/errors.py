@@ -27,6 +27,7 @@ from model.answer.stimulus import Finger, Placement, Stimulus
 from model.arrays import FloatArray
 from model.rig.rig import Uncertainty
 from model.rig.rig_file import load_rig
+from model.rig.rig_writing import change_rig
 from model.study.contrast_maps import random_contacts
 from model.study.verification import Plates, draw_plates, harmonics_on, powers_on
 from model.table.table import LocalizationTable, read_fingertips
@@ -67,16 +68,18 @@ def with_errors(sets: int, count: int, place: float | None) -> Iterator[tuple[st
 
 def after_weather(sets: int, count: int) -> Iterator[tuple[str, list[str]]]:
     """Yield rows of plates that were measured, after the weather has changed."""
-    acrylic = load_rig(EXAMPLES / "paper_plate.yaml").replaced(
+    acrylic = change_rig(
+        load_rig(EXAMPLES / "paper_plate.yaml"),
         plate={
             "material": "acrylic",
             "thickness": 0.004,
             "temperature": ["23 degC", "38 degC"],
             "measured_temperature": "23 degC",
-        }
+        },
     )
-    birch = load_rig(EXAMPLES / "weekend" / "rig.yaml").replaced(
-        plate={"humidity": ["50 %", "61 %"], "measured_humidity": "50 %"}
+    birch = change_rig(
+        load_rig(EXAMPLES / "weekend" / "rig.yaml"),
+        plate={"humidity": ["50 %", "61 %"], "measured_humidity": "50 %"},
     )
     measured = Uncertainty(0.01, 0.6, stiffness=0.01, damping=1.02, place=0.0, supports=0.05)
     measured = replace(measured, **Uncertainty.of_frequency(0.01))

@@ -30,6 +30,7 @@ from model.arrays import ComplexArray, FloatArray
 from model.finger import decibels, detection_threshold, fingertips_on
 from model.rig.rig import Rig
 from model.rig.rig_file import load_rig
+from model.rig.rig_writing import change_rig
 from model.table.table import LocalizationTable
 from model.table.table_file import build_table
 from model.transients.excursions import excursions_of
@@ -71,16 +72,17 @@ class Board:
         """Its rig, from where magnets stay within their excursion; raises ConfigError."""
         rig = load_rig(ROOT / "examples" / "weekend" / "rig.yaml")
         data: Any = rig.document.data if rig.document else {}
-        made = rig.replaced(
+        made = change_rig(
+            rig,
             plate=self.plate,
             eras={name: {"type": self.exciter} for name in data["eras"]},
             limits={"frequency": [LOWEST, 300]},
         )
         data = made.document.data if made.document else {}
         feet = {name: {**keys, "kind": self.feet} for name, keys in data["supports"].items()}
-        made = made.replaced(supports=feet)
+        made = change_rig(made, supports=feet)
         lowest = STEP * math.ceil(excursions_of(made).allowed / STEP)
-        return made.replaced(limits={"frequency": [lowest, 300]})
+        return change_rig(made, limits={"frequency": [lowest, 300]})
 
 
 BOARDS = tuple(

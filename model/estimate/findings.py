@@ -39,6 +39,7 @@ from model.estimate.plate_match import (
 from model.quantities import counted, in_display_unit, percent
 from model.rig.rig import Rig
 from model.rig.rig_summary import exciters_of, sections_of
+from model.rig.rig_writing import change_rig
 from model.structure.attachments import FingertipLoad, PointLoad
 
 MAX_FORM_ERROR = 0.05
@@ -425,7 +426,7 @@ def misread_resonance(
         return None
     for which in dict.fromkeys(written.values()):
         meant = {name: _OTHER_MEANING[which] for name, own in written.items() if own == which}
-        other = rig.replaced(eras={name: {"resonance_is": each} for name, each in meant.items()})
+        other = change_rig(rig, eras={name: {"resonance_is": each} for name, each in meant.items()})
         sensed = plate_of(other, observation)
         found = _variation(sensed, match_shapes(sensed, values), values)
         if found < _CLEARLY_STEADIER * as_written:

@@ -15,7 +15,6 @@ from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from itertools import combinations
 from numbers import Real
-from pkgutil import resolve_name
 from typing import Any
 
 import numpy as np
@@ -180,9 +179,6 @@ class Uncertainty:
         return {"thickness": each, "modulus": each}
 
 
-_REPLACED = "model.rig.rig_writing:replaced"
-"""By name: it makes rigs, and so needs this file."""
-
 # m; two bolts cannot be closer
 SAME_POINT = 1e-6
 
@@ -272,21 +268,6 @@ class Rig:
     def full_levels(self) -> dict[str, float]:
         """Full level of each ERA, by its name: its stroke [m], or volts of an exciter."""
         return {era.name: era.full_level for era in self.eras}
-
-    def replaced(self, **changes: Any) -> "Rig":
-        """Make a rig with other keys, as thickness=0.002, plate={"thickness": 0.002}, or sections.
-
-        Of eras the keys given change, as eras={"SW": {"stiffness": 2e4}}. What follows from them
-        follows: damping by `damping_ratio`, a mesh `auto`, a laminate's equivalent plate; ERAs and
-        masses keep their share of the sides. None leaves a key, or an ERA, out: it has its default,
-        so a finger, which is weightless as fingertip="none". Raises ConfigError with all problems,
-        InputError for `modes` identified on another plate.
-
-        Example:
-            >>> thick = rig.replaced(thickness=0.002, eras={"SW": {"stiffness": 2e4}})
-        """
-        made: Rig = resolve_name(_REPLACED)(self, changes)
-        return made
 
     @property
     def exactly_known(self) -> tuple[str, ...]:

@@ -254,6 +254,9 @@ def _numbers(rig: Rig, section: RigSection) -> Iterator[float]:
 _SECTIONS = RigSection.model_fields.keys() - {"plate", "eras"}
 """Keys that are changed as a whole."""
 
+_CHANGED = "change_rig"
+"""Name of its document in errors."""
+
 _PLACED = {"eras", "masses", "supports"}
 """Those of what has a place on the plate."""
 
@@ -345,38 +348,66 @@ def save_rig(rig: Rig, path: Path | str) -> None:
         stream.write(written.text.encode())
 
 
-def replaced(rig: Rig, changes: Mapping[str, Any]) -> Rig:
-    """Make a rig with other keys, see `Rig.replaced`."""
-    check_is_plate(rig.plate, "rig.replaced")
+def change_rig(rig: Rig, **changes: Any) -> Rig:
+    """Make a rig with other keys: of the plate, as thickness=0.002, or of whole sections.
+
+    `plate` and `eras` change only the keys given: eras={"SW": {"stiffness": 2e4}}. Values that
+    depend on a changed key are computed again: damping from `damping_ratio`, a mesh `auto`, the
+    equivalent plate of a laminate. When a side changes, ERAs and masses keep their share of it.
+    None removes a key or an ERA. A key that is removed has its default, also `fingertip`; a finger
+    without load is fingertip="none". Raises ConfigError with all problems, InputError for `modes`
+    that were identified on another plate.
+
+    Example:
+        >>> thick = era.change_rig(rig, thickness=0.002, eras={"SW": {"stiffness": 2e4}})
+    """
+    expect(rig, Rig, what="rig", made_by='era.load_rig("rig.yaml")')
+    check_is_plate(rig.plate, _CHANGED)
+    for key in ("plate", "eras"):
+        if key in changes:
+            expect(changes[key], Mapping, what=key, made_by='{"thickness": 0.002} or era.Era')
     data: dict[str, Any] = {**stated(rig).data}
-    for key in {"plate", "eras"} & changes.keys():
-        expect(changes[key], Mapping, what=key, made_by='{"thickness": 0.002} or era.Era')
-    of_plate = {key: each for key, each in changes.items() if key not in RigSection.model_fields}
-    of_plate |= changes.get("plate", {})
-    data["plate"] = _given({**data["plate"], **of_plate})
-    if data["plate"].get("modes") and _OF_THEORY & of_plate.keys() and "modes" not in of_plate:
+    plate_changes = {
+        key: value for key, value in changes.items() if key not in RigSection.model_fields
+    }
+    plate_changes |= changes.get("plate", {})
+    data["plate"] = _given({**data["plate"], **plate_changes})
+    changes_modes = not _OF_THEORY.isdisjoint(plate_changes)
+    if data["plate"].get("modes") and changes_modes and "modes" not in plate_changes:
         raise InputError(
-            "rig.replaced: plate.modes must be given with another plate, got those identified on "
+            f"{_CHANGED}: plate.modes must be given with another plate, got those identified on "
             "this one; modes=None for the theory's"
         )
-    read = Validation(_document("rig.replaced", data), RigSection).field
-    factors = [
-        (read(("plate", key), PlateSection) or own) / own
-        for key, own in (("length", rig.plate.length), ("width", rig.plate.width))
+    sections = _with_shares_kept(rig, data)
+    for key in _SECTIONS & changes.keys():
+        sections[key] = changes[key]
+    sections["eras"] = _merged(sections["eras"], changes.get("eras", {}))
+    return rig_of(_document(_CHANGED, sections))
+
+
+def _with_shares_kept(rig: Rig, data: Mapping[str, Any]) -> dict[str, Any]:
+    """Sections of a rig with other sides, where all that stands on the plate keeps its share."""
+    read = Validation(_document(_CHANGED, data), RigSection).field
+    length = read(("plate", "length"), PlateSection) or rig.plate.length
+    width = read(("plate", "width"), PlateSection) or rig.plate.width
+    factors = (length / rig.plate.length, width / rig.plate.width)
+    sections = {**data}
+    if factors == (1, 1):
+        return sections
+    for kind in _PLACED & data.keys():
+        sections[kind] = {name: _moved(keys, factors) for name, keys in data[kind].items()}
+    return sections
+
+
+def _moved(keys: Mapping[str, Any], factors: tuple[float, float]) -> Mapping[str, Any]:
+    """Keys of a section with its position times factors, unchanged without a position."""
+    if "at" not in keys:
+        return keys
+    position = [
+        factor * quantity(coordinate, LENGTH)
+        for factor, coordinate in zip(factors, keys["at"], strict=True)
     ]
-    for kind in _PLACED & data.keys() if factors != [1, 1] else ():
-        data[kind] = {
-            name: {
-                **each,
-                "at": [f * quantity(x, LENGTH) for f, x in zip(factors, each["at"], strict=True)],
-            }
-            if "at" in each
-            else each
-            for name, each in data[kind].items()
-        }
-    eras = _merged(data["eras"], changes.get("eras", {}))
-    whole = {key: changes[key] for key in _SECTIONS & changes.keys()}
-    return rig_of(_document("rig.replaced", {**data, **whole, "eras": eras}))
+    return {**keys, "at": position}
 
 
 def _merged(own: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
@@ -406,7 +437,7 @@ def stated(rig: Rig) -> Document:
     if not is_same or replace(back, **{name: getattr(rig, name) for name in _REWRITTEN}) != rig:
         raise InputError(
             "rig must have other plate, ERAs, masses and uncertainty than its keys alone; change "
-            "others by rig.replaced"
+            "others by change_rig"
         )
     return found
 

@@ -33,6 +33,7 @@ from kit.clock import in_virtual_time
 from kit.plates import small_table
 from kit.wires import SHARED_WIRES, on_two_amplifiers, rig_on_wire
 from model.reduction.free_plate import solve_free_plate
+from model.rig.rig_writing import change_rig
 from model.table.table_file import build_table
 from python_page import named
 from registry import threads
@@ -488,6 +489,7 @@ GOOD: dict[Callable[..., Any], dict[str, Any]] = {
         "fingertip": era.Fingertip(), "threshold": "vibrotactile-probe",
         "promised_thresholds": ["pressing-fingertip"],
     },
+    era.change_rig: {"rig": COARSE_RIG, "changes": {}},
     era.save_rig: {"rig": COARSE_RIG, "path": "rig.yaml"},
     era.load_table: {"path": "t.npz", "rig": COARSE_RIG},
     era.save_table: {"table": None, "path": "t.npz"},
@@ -646,7 +648,7 @@ def test_thickness_takes_the_damping_the_mesh_and_the_frequencies_with_it() -> N
     Shear and rotary inertia lower those of 1 mm by 0.1 % more than those of 0.5 mm.
     """
     rig = era.rig(SHEET_OF_KEYS, SPRINGS, amplifiers=MAIN)
-    thin, thick = (rig.replaced(thickness=each) for each in ("0.5 mm", 0.001))
+    thin, thick = (change_rig(rig, thickness=each) for each in ("0.5 mm", 0.001))
     assert thin.mesh != thick.mesh
     mass = 2700 * 0.001 * 0.3048 * 0.2286
     assert thick.eras[0].damping == pytest.approx(2 * 0.05 * math.sqrt(17e3 * mass / 4))
@@ -665,20 +667,20 @@ def test_places_keep_their_share_of_the_plates_sides() -> None:
         amplifiers=MAIN,
         masses={"camera": {"at": (0.1, 0.05), "mass": 0.01}},
     )
-    wider = rig.replaced(length=0.4, width=np.float32(0.3))
+    wider = change_rig(rig, length=0.4, width=np.float32(0.3))
     assert np.allclose(
         [(each.x, each.y) for each in wider.eras], [(0, 0), (0.4, 0), (0.4, 0.3), (0, 0.3)]
     )
     camera = wider.masses[0]
     assert (camera.x, camera.y) == pytest.approx((0.1 * 0.4 / 0.3048, 0.05 * 0.3 / 0.2286))
-    assert wider.replaced(length="12 in", width="9 in").eras == rig.eras
-    assert rig.replaced(length=0.4, eras=SPRINGS).eras[1].x == 0.3048
+    assert change_rig(wider, length="12 in", width="9 in").eras == rig.eras
+    assert change_rig(rig, length=0.4, eras=SPRINGS).eras[1].x == 0.3048
 
 
 def test_keys_of_the_plate_and_of_single_eras_are_changed_alone() -> None:
     """The damping goes with the stiffness; an ERA is added, another left out; others stay."""
-    changed = KEYED.replaced(
-        plate={"thickness": "2 mm"}, length=0.4, eras={"SW": {"stiffness": 2e4}, "NW": None}
+    changed = change_rig(
+        KEYED, plate={"thickness": "2 mm"}, length=0.4, eras={"SW": {"stiffness": 2e4}, "NW": None}
     )
     assert changed.plate.thickness == 0.002
     assert [(each.name, each.x, each.stiffness) for each in changed.eras] == [
@@ -686,15 +688,15 @@ def test_keys_of_the_plate_and_of_single_eras_are_changed_alone() -> None:
     ]  # fmt: skip
     mass = 2700 * 0.002 * 0.4 * 0.2286
     assert changed.eras[0].damping == pytest.approx(2 * 0.05 * math.sqrt(2e4 * mass / 3))
-    assert changed.replaced(eras={"NW": SPRINGS["NW"]}).eras[3].stiffness == 17e3
-    assert KEYED.replaced(fingertip=None) == KEYED
-    assert KEYED.replaced(fingertip="none").fingertip is None
+    assert change_rig(changed, eras={"NW": SPRINGS["NW"]}).eras[3].stiffness == 17e3
+    assert change_rig(KEYED, fingertip=None) == KEYED
+    assert change_rig(KEYED, fingertip="none").fingertip is None
 
 
 def test_deviations_of_modes_stay_or_are_left_out() -> None:
     """With a change that leaves the modes as they were, or by None."""
-    assert WITH_MODES.replaced(thickness="2 mm", modes=None).plate.mode_deviations == ()
-    assert WITH_MODES.replaced(loss_factor=0.02).plate.mode_deviations != ()
+    assert change_rig(WITH_MODES, thickness="2 mm", modes=None).plate.mode_deviations == ()
+    assert change_rig(WITH_MODES, loss_factor=0.02).plate.mode_deviations != ()
 
 
 @pytest.mark.parametrize(
@@ -704,20 +706,20 @@ def test_deviations_of_modes_stay_or_are_left_out() -> None:
         (lambda: era.Era(at=(0, 0)), ["era.Era: stiffness: missing"]),
         (lambda: era.rig(SHEET_OF_KEYS, SPRINGS, amplifiers={}), ["eras.SW.amplifier: unknown"]),
         (lambda: era.rig(3, 4, amplifiers=5), ["plate: must be a map", "eras: must be a map"]),
-        (lambda: KEYED.replaced(thicknes=1), ["plate.thicknes: unknown key; did you mean"]),
-        (lambda: KEYED.replaced(plate={"thicknes": 1}), ["plate.thicknes: unknown key"]),
-        (lambda: KEYED.replaced(plate=3, length=2), ["plate must be a Mapping, got 3"]),
-        (lambda: KEYED.replaced(eras={"SW": 3}, length=2), ["eras.SW: must be a map"]),
+        (lambda: change_rig(KEYED, thicknes=1), ["plate.thicknes: unknown key; did you mean"]),
+        (lambda: change_rig(KEYED, plate={"thicknes": 1}), ["plate.thicknes: unknown key"]),
+        (lambda: change_rig(KEYED, plate=3, length=2), ["plate must be a Mapping, got 3"]),
+        (lambda: change_rig(KEYED, eras={"SW": 3}, length=2), ["eras.SW: must be a map"]),
         (lambda: era.rig(SHEET_OF_KEYS, 4), ["eras must be a Mapping, got 4"]),
         (lambda: era.rig(SHEET_OF_KEYS, {"SW": 4}), ["eras.SW: must be a map"]),
-        (lambda: KEYED.replaced(length="2 kg"), ["plate.length: '2 kg' is not a length"]),
-        (lambda: KEYED.replaced(mesh="2x2"), ["rig.replaced: mesh: 2x2 is too coarse"]),
+        (lambda: change_rig(KEYED, length="2 kg"), ["plate.length: '2 kg' is not a length"]),
+        (lambda: change_rig(KEYED, mesh="2x2"), ["change_rig: mesh: 2x2 is too coarse"]),
         (lambda: era.save_rig(KEYED, "rig.txt"), ["must end in .yaml"]),
         # Without the finger of its keys, or without them, a rig is another one.
         (lambda: era.save_rig(replace(KEYED, fingertip=None), "rig.yaml"), ["rig must"]),
         (lambda: era.save_rig(replace(KEYED, document=None), "rig.yaml"), ["rig must"]),
         # Deviations of modes were identified on the plate before.
-        (lambda: WITH_MODES.replaced(thickness="2 mm"), ["plate.modes must be given"]),
+        (lambda: change_rig(WITH_MODES, thickness="2 mm"), ["plate.modes must be given"]),
         # Drives have no fingers, and those of an answer have their loads; silence is not played.
         (lambda: SOLVED.play({"SW": 110}), ["target must be"]),
         (lambda: SOLVED.play(ANSWER, quiet=[QUIET]), ["target must be"]),
@@ -740,4 +742,4 @@ def test_fitted_rig_is_saved_and_changed(tmp_path: Path) -> None:
     back = era.load_rig(tmp_path / "rig.yaml")
     assert (back.plate, back.uncertainty) == (plate, fitted.uncertainty)
     assert back.eras[0].damping == pytest.approx(KEYED.eras[0].damping, rel=1e-5)
-    assert fitted.replaced(thickness=0.002).plate == replace(plate, thickness=0.002)
+    assert change_rig(fitted, thickness=0.002).plate == replace(plate, thickness=0.002)

@@ -57,6 +57,7 @@ from model.ensemble.draws import JUDGING_DRAWS, ClockErrors
 from model.finger import THRESHOLDS, detection_threshold, fingertip_points, fingertip_weights
 from model.rig.rig import Uncertainty
 from model.rig.rig_file import load_rig
+from model.rig.rig_writing import change_rig
 from model.study.verification import draw_plates
 from model.table.table import LocalizationTable
 from model.table.table_file import build_table
@@ -77,7 +78,7 @@ def table_of(name: str) -> LocalizationTable:
     case = CASES[name]
     rig = smooth_rig() if case["plate"] == "paper" else load_rig(WEEKEND)
     if "rig" in case:
-        rig = rig.replaced(**case["rig"])
+        rig = change_rig(rig, **case["rig"])
     if "known" in case:
         rig = replace(rig, uncertainty=replace(Uncertainty.none(), **case["known"]))
     rig = replace(rig, promised_thresholds=tuple(case.get("by", rig.promised_thresholds)))

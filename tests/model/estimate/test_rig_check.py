@@ -59,6 +59,7 @@ from model.estimate.rig_check import (
 from model.fem import Mesh
 from model.rig.rig import Rig
 from model.rig.rig_file import load_rig, parse_rig
+from model.rig.rig_writing import change_rig
 from model.spectral.direct_solution import direct_spectral_acceleration
 from model.spectral.modes import SpectralMesh
 
@@ -81,7 +82,7 @@ def given_as(which: str, resonance: float = 306.0) -> Rig:
 
 def of_keys(keys: Mapping[str, Any]) -> Rig:
     """The board of the page with other keys of each exciter."""
-    return WEEKEND.replaced(eras=dict.fromkeys(NAMES, keys))
+    return change_rig(WEEKEND, eras=dict.fromkeys(NAMES, keys))
 
 
 def measured(rig: Rig, seed: int) -> Measurement:
@@ -245,7 +246,7 @@ def planted(case: Mapping[str, Any]) -> tuple[Rig, Measurement]:
         case {"eras": keys}:
             rig = of_keys(keys)
         case {"plate": keys}:
-            rig = rig.replaced(plate=keys)
+            rig = change_rig(rig, plate=keys)
     return rig, found
 
 
@@ -344,7 +345,7 @@ def test_every_kind_of_finding_has_a_scenario_or_a_test() -> None:
             marks=pytest.mark.long,
         ),
         (
-            WEEKEND.replaced(plate={"grain": "width"}),
+            change_rig(WEEKEND, plate={"grain": "width"}),
             WEEKEND,
             r"^plate\.grain must be width, got length: ",
         ),
@@ -404,7 +405,7 @@ def test_commands_say_why_they_write_no_rig(
     to type instead.
     """
     is_dead = command.startswith("calibrate") and status == 1
-    true = given_as("free") if is_dead else WEEKEND.replaced(plate={"grain": "width"})
+    true = given_as("free") if is_dead else change_rig(WEEKEND, plate={"grain": "width"})
     found = measured(true, 1)
     found.values[..., 2] *= 1e-4 if is_dead else 1
     here = MeasuredPlate(found, None, None, (), (), {})

@@ -33,6 +33,7 @@ from model.rig.actuator_keys import KINDS
 from model.rig.rig import Rig, Uncertainty, differences
 from model.rig.rig_file import example_rig_path, load_rig, parse_rig, rig_of
 from model.rig.rig_summary import RIG, exciter_notes, excursion_notes, plate_summary
+from model.rig.rig_writing import change_rig
 from model.rig.rig_writing import stated as keys_of
 from model.rig.sections import PLAIN_KEYS, PlateSection
 from model.structure.attachments import rigid_body_frequencies
@@ -389,7 +390,7 @@ def test_a_fitted_exciter_is_written_and_reads_back() -> None:
 
 
 def test_programs_make_and_change_exciters(tmp_path: Path) -> None:
-    """`era.Exciter` beside `era.Era`, `Rig.replaced` and `save_rig`."""
+    """`era.Exciter` beside `era.Era`, `change_rig` and `save_rig`."""
     corners = {"a": (0, 0), "b": (0.3, 0), "c": (0.15, 0.23)}
     made = era_haptics.rig(
         era_haptics.Plate(length=0.3, width=0.23, thickness=0.005, material="acrylic"),
@@ -401,7 +402,7 @@ def test_programs_make_and_change_exciters(tmp_path: Path) -> None:
     )
     assert [era.name for era in made.eras] == ["x"]
     assert made.supports == ("a", "b", "c")
-    changed = made.replaced(eras={"x": {"type": "DAEX13-4SM"}}, thickness=0.006)
+    changed = change_rig(made, eras={"x": {"type": "DAEX13-4SM"}}, thickness=0.006)
     assert changed.eras[0].magnet_mass == pytest.approx(14.3e-3)
     era_haptics.save_rig(changed, tmp_path / "board.yaml")
     assert era_haptics.load_rig(tmp_path / "board.yaml") == changed

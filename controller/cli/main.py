@@ -28,6 +28,7 @@ from registry.wording import reworded
 
 COMMANDS = (
     "controller.cli.commands",
+    "controller.cli.config_cli",
     "drivers.by_hand.cli",
     "model.cli",
     "sim.cli",

@@ -13,6 +13,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import AfterValidator, Field, Strict
 
+from controller.config_kind import CheckedFile, ConfigKind
 from controller.effects.layout import (
     SurfaceLayout,
     default_effects,
@@ -23,12 +24,12 @@ from controller.effects.layout import (
 from controller.effects.strengths import read_strengths
 from controller.learning.learned_table import was_learned
 from controller.process.daemon_process import check_socket_path
+from controller.rig_file_check import clock_costs, whole_url
 from controller.sources.touch import TouchCalibration, TouchSource, fitted, open_source, turned
 from drivers.by_hand.reaching import check_links
 from model.arrays import FloatArray
 from model.config.document import ConfigError, Document, read_document
 from model.config.fields import Quantity, Section, Validation
-from model.config.file_kinds import CheckedFile, ConfigKind
 from model.config.units import LENGTH, LEVEL
 from model.drive_modes import DRIVE_MODES
 from model.errors import InputError
@@ -36,7 +37,7 @@ from model.finger import STRONG_DB_SL
 from model.rig.actuator_keys import Identifier
 from model.rig.rig import Rig
 from model.rig.rig_file import rig_of, with_base
-from model.rig.rig_summary import clock_costs, gain_notes, whole_url
+from model.rig.rig_summary import gain_notes
 from model.structure.attachments import check_supported
 from registry.limits import MAX_CONTACTS, MAX_FINGERS
 

@@ -13,6 +13,7 @@ from typing import Annotated, Any, Self
 
 from pydantic import Field
 
+from controller.config_kind import CheckedFile, ConfigKind
 from controller.effects.effect import (
     DEFAULT_MAX_DB_SL,
     ON_MOVE,
@@ -29,7 +30,6 @@ from model.answer.stimulus import MAX_LEVEL_DB_SL
 from model.arrays import FloatArray
 from model.config.document import Document, KeyPath, read_document
 from model.config.fields import Quantity, Section, ShapedSection, Validation
-from model.config.file_kinds import CheckedFile, ConfigKind
 from model.config.units import LEVEL
 from model.errors import InputError
 from model.finger import STRONG_DB_SL

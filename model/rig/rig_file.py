@@ -25,7 +25,6 @@ from model.config.document import (
     read_document,
 )
 from model.config.fields import Quantity, Section, Validation, section_by_kind
-from model.config.file_kinds import check_is_rig
 from model.config.units import LENGTH, RATIO, quantity
 from model.errors import InputError, expect_path, shown
 from model.fem import MITC4, Mesh, element_of
@@ -382,6 +381,10 @@ def _given(
 _BASE_KEYS = ("base", "base_fingerprint", "standard_errors")
 """Keys of a fitted rig beside those of a rig: they say what it differs from, and how surely."""
 
+_RIG_KEYS = {*RigSection.model_fields, *_BASE_KEYS}
+
+_MAX_KEYS_SHOWN = 3
+
 _NAMED = ("eras", "supports", "amplifiers")  # sections whose entries a fit takes from the base
 
 
@@ -483,6 +486,17 @@ def load_rig(path: Path | str, *, mesh: str | None = None) -> Rig:
     return rig_of(read_document(expect_path(path, what="path")), mesh=mesh)
 
 
+def check_is_rig(document: Document) -> None:
+    """Reject a file without any key of a rig as a whole, instead of reporting each unknown key."""
+    keys = [*document.data]
+    if keys and _RIG_KEYS.isdisjoint(keys):
+        first_keys = ", ".join(shown(key) for key in keys[:_MAX_KEYS_SHOWN])
+        raise InputError(
+            f"{document.source}: must be a rig, with plate or surface, got a file with "
+            f"{first_keys}; era config init rig.yaml  writes one"
+        )
+
+
 def parse_rig(source: str, text: str) -> Rig:
     """Read the text of a rig file that came from a source; raises ConfigError."""
     return rig_of(parse_document(source, text))
@@ -491,8 +505,7 @@ def parse_rig(source: str, text: str) -> Rig:
 def rig_of(document: Document, *, mesh: str | None = None) -> Rig:
     """Make the rig of a document, with another mesh if one is given; raises as `load_rig`."""
     document = with_base(document)
-    if not {"plate", "surface"} & document.data.keys():
-        check_is_rig(document)
+    check_is_rig(document)
     validation = Validation(document, RigSection)
     check_across(validation, mesh_given=mesh is not None)
     section = validation.finish()

@@ -1,36 +1,22 @@
 """Summary of a rig, and warnings about its file.
 
-Numbers of its plate and exciters: materials, rigidity, bending wavelengths, types; frequencies that
-its exciters can follow. Rig files as a kind of configuration for `era config`; warnings say what a
-rig does not know or leaves out. Its amplifiers are checked by the package that knows wires.
+Numbers of its plate and exciters: materials, rigidity, bending wavelengths, types. Warnings say
+what a rig does not know or leaves out, and which frequencies its exciters cannot follow. Warnings
+for which plates are solved, or wires are known, are in `controller.rig_file_check`.
 """
 
 import cmath
-import contextlib
 import math
-import os
-from collections import Counter
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, fields, replace
+from collections.abc import Iterator
+from dataclasses import fields
 from itertools import pairwise
 from pathlib import Path
-from pkgutil import resolve_name
 from typing import Any
-from urllib.parse import quote
 
-import numpy as np
-from numpy.typing import NDArray
-
-from model.arrays import FloatArray
-from model.config.document import ConfigError, ConfigProblem, Document
 from model.config.fields import quantities
-from model.config.file_kinds import CheckedFile, ConfigKind
-from model.errors import InputError
-from model.quantities import percent
 from model.rig.actuator_keys import STIFF_MOUNT, ExciterSection
 from model.rig.rig import Rig
-from model.rig.rig_file import example_rig_path, rig_of, with_base
-from model.rig.sections import PLAIN_KEYS, LimitsSection, RigSection
+from model.rig.sections import PLAIN_KEYS, RigSection
 from model.spectral.modes import KnownModes
 from model.structure.attachments import (
     DEFAULT_POINTS,
@@ -38,7 +24,6 @@ from model.structure.attachments import (
     Era,
     Source,
     least_points,
-    support_problem,
 )
 from model.structure.exciter import Exciter
 from model.structure.material import EXCITER_TYPES
@@ -55,29 +40,10 @@ from model.structure.plate import (
 from model.structure.surface import WELL_KNOWN
 from registry.limits import GuardLimits
 
-_EXCURSIONS = "model.transients.excursions:excursions_of"
-"""By name: it solves plates, which the packages above this one do."""
-
 _NEARLY = 1.001
 _LAG = 0.01  # (omega L / R)² from which time and frequency differ visibly
 _ABOVE = 1.3  # times the resonance of a magnet, where little depends on it
 _LIGHT, _HIGH = 0.3, 100.0  # share of the coil in the magnet's mass; Hz
-
-
-@dataclass(frozen=True, eq=False)
-class Excursions:
-    """Excursions [m] of each exciter at the rig's level, (n,).
-
-    at_lowest: settled at its lowest frequency; largest: in onsets within all that it allows, of
-    those that are limited; passed (n,): whether these are more than they may be; allowed: the
-    lowest frequency [Hz] from which all stay within up to the highest, infinite where they do not
-    there.
-    """
-
-    at_lowest: FloatArray
-    largest: FloatArray
-    passed: NDArray[np.bool_]
-    allowed: float
 
 
 def exciters_of(rig: Rig) -> list[Exciter]:
@@ -92,34 +58,8 @@ def sections_of(rig: Rig) -> dict[str, ExciterSection]:
     return {name: ExciterSection.model_validate(keys[name]) for name in names}
 
 
-def excursion_notes(rig: Rig) -> Iterator[str]:
-    """Yield a warning where full level would move magnets beyond their excursion."""
-    exciters, limits = exciters_of(rig), rig.limits
-    found: Excursions | None = resolve_name(_EXCURSIONS)(rig) if exciters else None
-    if found is None or not found.passed.any():
-        return
-    shares = found.largest / [one.excursion for one in exciters]
-    worst = int(shares.argmax())
-    names = [one.name for one, is_far in zip(exciters, found.passed, strict=True) if is_far]
-    lowest = (
-        f"within from {found.allowed:g} Hz on" if np.isfinite(found.allowed) else "nowhere within"
-    )
-    yield (
-        f"limits.frequency: from {limits.frequency_min:g} Hz on limits.level {limits.level:g} can "
-        f"move the magnets of {', '.join(names)} beyond their excursion, that of "
-        f"{exciters[worst].name} by {1e3 * found.largest[worst]:.2g} mm of "
-        f"{1e3 * exciters[worst].excursion:.2g} mm ({lowest}); answers play less there, tones by "
-        "hand do not: a level of at most "
-        f"{math.floor(1e3 * limits.level / shares[worst]) / 1e3:g} is safe"
-    )
-
-
 def exciter_notes(rig: Rig) -> Iterator[str]:
-    """Yield warnings: resonances that may be misread, and magnets that move too far or resonate.
-
-    Of a resonance that may be misread it is not said from where on to play.
-    """
-    low, high = rig.limits.frequency_min, rig.limits.frequency_max
+    """Yield warnings of resonances that may be misread, and of what may harm exciters."""
     sections = sections_of(rig)
     misread: dict[str, list[str]] = {}
     for name, section in sections.items():
@@ -128,8 +68,16 @@ def exciter_notes(rig: Rig) -> Iterator[str]:
     yield from (f"resonance_is of {', '.join(names)}: {said}" for said, names in misread.items())
     for one in exciters_of(rig):
         yield from (f"eras.{one.name}.{each}" for each in _hazards(one, sections[one.name], rig))
-    yield from excursion_notes(rig)
-    doubted = {name for names in misread.values() for name in names}
+
+
+def resonance_notes(rig: Rig) -> Iterator[str]:
+    """Yield a warning where a rig plays near the resonance of its magnets.
+
+    A resonance that may be misread does not count.
+    """
+    low, high = rig.limits.frequency_min, rig.limits.frequency_max
+    sections = sections_of(rig)
+    doubted = {name for name, section in sections.items() if _misread_resonance(section)}
     free = [one for one in exciters_of(rig) if not one.held and one.name not in doubted]
     near = {one.name: f for one in free if low < _ABOVE * (f := one.magnet_frequency)}
     if near:
@@ -344,41 +292,10 @@ def _types(rig: Rig) -> dict[str, dict[str, Any]]:
 _FAR_FROM_SLIDING = 2.0
 
 
-def _check(document: Document) -> CheckedFile:
-    """Check a rig and its amplifiers; return its values in a line, to show unlikely ones."""
-    document = with_base(document)
-    problems: list[ConfigProblem] = []
-    rig = None
-    try:
-        rig = rig_of(document)
-    except ConfigError as error:
-        problems += error.problems
-    urls = _urls(document)
-    counts = rig.channel_counts if rig else Counter[str]()
-    limits = rig.limits if rig else LimitsSection().made()
-    wrong, warnings = resolve_name(_CHECK)(urls, channels=counts, limits=limits)
-    if rig is not None:
-        support = support_problem(rig.plate, rig.eras, loads=rig.masses)
-        problems += [] if support is None else [document.problem(("eras",), support)]
-    known = {problem.key for problem in problems}
-    of_urls = [document.problem(("amplifiers", name, "url"), what) for name, what in wrong.items()]
-    problems += [problem for problem in of_urls if problem.key not in known]
-    if rig is None or problems:
-        raise ConfigError(document.source, problems)
-    note = rig.uncertainty_note
-    line, lost, more = clock_costs(rig, urls)
-    warnings = [*exciter_notes(rig), *warnings]
-    costs = [
-        *(*lost, *gain_notes(rig), *_plate_notes(rig), *_cost_notes(rig)),
-        *(*_mount_notes(rig), *_span_notes(rig)),
-    ]
-    return CheckedFile(_summary(rig) + line, [*warnings, *costs, *([note] if note else [])], more)
-
-
 _NEEDED = ("required", "oneOf", "dependentRequired", "minProperties")
 
 
-def _keys() -> dict[str, Any]:
+def rig_schema() -> dict[str, Any]:
     """The JSON schema of a whole rig, and of a fitted one, which has what differs from its base."""
     whole = RigSection.model_json_schema()
     fitted = _partial(whole)
@@ -404,19 +321,11 @@ def _partial(schema: Any) -> Any:
     return found
 
 
-RIG = ConfigKind(
-    "A rig of era-haptics",
-    recognises=lambda document: not {"plate", "surface"}.isdisjoint(document.data),
-    check=_check,
-    example_file=example_rig_path(),
-    keys=_keys,
-)
-
 _THICK = 0.02  # m; of one material
 _NEARLY_ALL = 0.9  # of the modes up to a frequency the highest may be so far below it
 
 
-def _plate_notes(rig: Rig) -> Iterator[str]:
+def plate_notes(rig: Rig) -> Iterator[str]:
     """Yield warnings of a plate in the wrong unit, and of what air and soft layers cost."""
     plate, low, high = rig.plate, rig.limits.frequency_min, rig.limits.frequency_max
     if isinstance(rig.mesh, KnownModes) and rig.mesh.frequency < _NEARLY_ALL * WELL_KNOWN * high:
@@ -444,70 +353,7 @@ def _plate_notes(rig: Rig) -> Iterator[str]:
         )
 
 
-def _cost_notes(rig: Rig) -> Iterator[str]:
-    """Yield what the weather of use and an object cost, if the rig states any."""
-    known = rig.uncertainty
-    notes = {
-        "foreign_mass": (
-            f"uncertainty.foreign_mass: with {1e3 * known.foreign_mass:.3g} g anywhere on the "
-            "plate",
-            "what always lies at one place belongs under masses",
-        ),
-        "weather": (
-            "plate: temperature and humidity change its modulus by "
-            f"{100 * known.weather:.2g} %, one standard deviation;",
-            "narrow the range, or measure anew when the season has changed",
-        ),
-    }
-    for key, (what, remedy) in notes.items():
-        if getattr(known, key):
-            with contextlib.suppress(InputError):  # no place for two fingers
-                cost = resolve_name(_UNCERTAINTY_COST)(rig, key)
-                yield (
-                    f"{what} two contents keep {cost.kept_db:.1f} of {cost.exact_db:.1f} dB; "
-                    f"{remedy}"
-                )
-    if known.weather:
-        return
-    plate: Any = rig.document.data.get("plate", {}) if rig.document else {}
-    if any(key in plate for key in _WEATHER):
-        yield (
-            f"plate.{' and plate.'.join(_WEATHER)}: nothing is known of how "
-            f"{rig.plate.material.name} changes, so that promises do not count it; state "
-            "uncertainty.weather, or give the material the name of a known one"
-        )
-
-
-_WEATHER = ("temperature", "humidity")
-_SMALL_SPAN = 1 / 3  # of the plate
-
-
-def _span_notes(rig: Rig) -> Iterator[str]:
-    """Yield a warning where ERAs span a small part of the plate, with what its corners promise.
-
-    None for ERAs in one line along a side.
-    """
-    places = np.array([[era.x, era.y] for era in rig.eras])
-    sides = np.array([rig.plate.length, rig.plate.width])
-    span = np.ptp(places, axis=0)
-    share = float((span / sides).prod())
-    if not 0 < share < _SMALL_SPAN:
-        return
-    apart = (sides * (places - places.min(axis=0)) / span).tolist()
-    eras = tuple(replace(era, x=x, y=y) for era, (x, y) in zip(rig.eras, apart, strict=True))
-    exact = dict.fromkeys(rig.channel_counts, 0.0)
-    with contextlib.suppress(InputError):  # no place for two fingers
-        here, there = (
-            resolve_name(_COST)(each, exact).exact_db for each in (rig, replace(rig, eras=eras))
-        )
-        yield (
-            f"eras: they span {percent(share)} of the plate; two contents are promised {here:.1f} "
-            f"dB, with ERAs spread to its corners {there:.1f} dB: check `at` of each after a "
-            "change of plate.length or plate.width"
-        )
-
-
-def _mount_notes(rig: Rig) -> Iterator[str]:
+def mount_notes(rig: Rig) -> Iterator[str]:
     """Yield what stiff mounts cost that are points, and few points of an edge with many waves."""
     decade = math.log(10) / (2 * math.pi * rig.plate.shear_rigidity)
     mounts = {era.name: era.support for era in rig.eras} | dict(
@@ -531,7 +377,8 @@ def _mount_notes(rig: Rig) -> Iterator[str]:
                 )
 
 
-def _summary(rig: Rig) -> str:
+def summary_line(rig: Rig) -> str:
+    """One line about the plate and its ERAs."""
     plate, laminate = rig.plate, rig.laminate
     thickness = plate.thickness if laminate is None else laminate.thickness
     sizes = " x ".join(f"{1e3 * size:g}" for size in (plate.length, plate.width, thickness))
@@ -599,73 +446,3 @@ def _notes(era: Source, low: float, high: float) -> list[str]:
         f"eras.{era.name}.gains: phases differ by {math.degrees(angle):.0f} degrees between "
         f"{first:g} and {last:g} Hz, at most 20 are interpolated well; measure between them"
     ]
-
-
-_ARRANGEMENT = "drivers.by_hand.reaching:arrangement_of"
-_COST = "model.study.overview:clock_cost"
-_UNCERTAINTY_COST = "model.study.overview:uncertainty_cost"
-_LOST_DB = 0.1  # contrast that is worth a warning
-
-
-def clock_costs(rig: Rig, urls: Mapping[str, str]) -> tuple[str, list[str], dict[str, Any]]:
-    """What the clocks of several amplifiers leave: to the line of a good rig, warnings, and data.
-
-    urls: by the amplifier's name. Nothing of one alone.
-    """
-    arrangement = resolve_name(_ARRANGEMENT)(
-        urls, channels=rig.channel_counts, stated=rig.clock_errors
-    )
-    if arrangement is None:
-        return "", [], {}
-    errors = dict.fromkeys(rig.channel_counts, 0.0) | arrangement.errors
-    try:
-        cost = resolve_name(_COST)(rig, errors)
-    except InputError:  # no place for two fingers
-        return "", [], {}
-    alone = [name for name, each in errors.items() if math.isinf(each)]
-    us = 1e6 * max((each for each in errors.values() if math.isfinite(each)), default=0.0)
-    said = (
-        f"{len(rig.eras)} ERAs on {len(errors)} amplifiers over {arrangement.lines}: clocks held "
-        f"together to {us:.0f} us; two contents keep {cost.kept_db:.1f} of {cost.exact_db:.1f} dB"
-    )
-    data = {
-        "lines": arrangement.lines,
-        "error_us": {
-            name: None if name in alone else round(1e6 * each, 1) for name, each in errors.items()
-        },
-        "exact_contrast_db": cost.exact_db,
-        "kept_contrast_db": cost.kept_db,
-    }
-    if cost.exact_db - cost.kept_db < _LOST_DB:
-        return f"; {said}", [], {"clocks": data}
-    remedy = f"; {arrangement.remedy} gives all of it" if arrangement.remedy and not alone else ""
-    unsteered = [
-        f"amplifier {name} has no clock that can be steered: its ERAs play contents of their own"
-        for name in alone
-    ]
-    return "", [said + remedy, *unsteered], {"clocks": data}
-
-
-_CHECK = "drivers.by_hand.reaching:check_links"
-"""By name: this package does not import the one beside it.
-
-Of URLs by the amplifier's name, numbers of channels that are wired, and the rig's limits; it gives
-errors by the amplifier's name, and warnings, and opens none.
-"""
-
-
-def _urls(document: Document) -> dict[str, str]:
-    """All URLs that are text."""
-    amplifiers = document.data.get("amplifiers")
-    return {
-        name: whole_url(url, document.source, str(name))
-        for name, amplifier in (amplifiers.items() if isinstance(amplifiers, dict) else ())
-        if isinstance(amplifier, dict) and isinstance(url := amplifier.get("url"), str)
-    }
-
-
-def whole_url(url: str, rig_file: str | Path, amplifier: str) -> str:
-    """The URL of an amplifier; `sim://` alone becomes a simulated one over this rig's plate."""
-    if url != "sim://":
-        return url
-    return f"sim://{quote(os.fsencode(rig_file))}?amplifier={quote(amplifier)}"

@@ -26,6 +26,7 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from model.arrays import ComplexArray, FloatArray, lattice
 from model.errors import InputError
@@ -33,7 +34,7 @@ from model.finger import FIVE_POINTS, STRONG_DB_SL, decibels, detection_threshol
 from model.reduction.free_plate import FreePlate, solve_free_plate
 from model.reduction.reduced_plate import reduce_free_plate
 from model.rig.rig import Rig, Uncertainty
-from model.rig.rig_summary import Excursions, exciters_of
+from model.rig.rig_summary import exciters_of
 from model.structure.attachments import PointLoad, footprints_of
 from model.transients.base_motion import KNOT_STEP, rise
 from model.transients.knots import RISE, SAMPLES
@@ -48,6 +49,22 @@ CLICKS_APART = 0.060
 _SWING_STEP = 0.002  # s; between samples: the beat with a magnet's own vibration takes 5 ms or more
 _PACES = 0.060  # s; from the shortest to the longest pause between repetitions
 _NEAR, _BESIDE = 1.5, 50.0  # near eigenvectors are below this multiple of a drive's, plus this [Hz]
+
+
+@dataclass(frozen=True, eq=False)
+class Excursions:
+    """Excursions [m] of each exciter at the rig's level, (n,).
+
+    at_lowest: settled at its lowest frequency; largest: in onsets within all that it allows, of
+    those that are limited; passed (n,): whether these are more than they may be; allowed: the
+    lowest frequency [Hz] from which all stay within up to the highest, infinite where they do not
+    there.
+    """
+
+    at_lowest: FloatArray
+    largest: FloatArray
+    passed: NDArray[np.bool_]
+    allowed: float
 
 
 @dataclass(frozen=True)
@@ -397,3 +414,25 @@ def _held(rig: Rig, free: FreePlate, places: FloatArray, frequencies: FloatArray
     stiffness = rig.fingertip.dynamic_stiffness(2 * np.pi * frequencies)
     own = np.diagonal(between, axis1=-2, axis2=-1)
     return np.abs(1 + stiffness[:, None] * own)
+
+
+def excursion_notes(rig: Rig) -> Iterator[str]:
+    """Yield a warning where full level would move magnets beyond their excursion."""
+    exciters, limits = exciters_of(rig), rig.limits
+    found = excursions_of(rig) if exciters else None
+    if found is None or not found.passed.any():
+        return
+    shares = found.largest / [one.excursion for one in exciters]
+    worst = int(shares.argmax())
+    names = [one.name for one, is_far in zip(exciters, found.passed, strict=True) if is_far]
+    lowest = (
+        f"within from {found.allowed:g} Hz on" if np.isfinite(found.allowed) else "nowhere within"
+    )
+    yield (
+        f"limits.frequency: from {limits.frequency_min:g} Hz on limits.level {limits.level:g} can "
+        f"move the magnets of {', '.join(names)} beyond their excursion, that of "
+        f"{exciters[worst].name} by {1e3 * found.largest[worst]:.2g} mm of "
+        f"{1e3 * exciters[worst].excursion:.2g} mm ({lowest}); answers play less there, tones by "
+        "hand do not: a level of at most "
+        f"{math.floor(1e3 * limits.level / shares[worst]) / 1e3:g} is safe"
+    )

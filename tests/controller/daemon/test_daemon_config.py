@@ -18,6 +18,7 @@ import pytest
 from typer.testing import CliRunner
 
 from controller.api.link import default_socket
+from controller.cli.config_cli import config_app
 from controller.daemon.children import read_in_child
 from controller.daemon.config import DAEMON, DaemonConfig, DaemonSection, load_daemon_config
 from controller.daemon.layouts import config_change
@@ -25,7 +26,6 @@ from controller.process.child import child_command
 from controller.sources.touch import Touch
 from kit.clock import in_virtual_time
 from kit.plates import TWO_AMPLIFIERS, write_rig
-from model.cli import config_app
 from model.config.document import ConfigError
 from model.errors import InputError
 from model.rig.rig_file import example_rig_path, load_rig

@@ -24,6 +24,7 @@ from typer.testing import CliRunner
 
 import era_haptics as api
 from cases import read_yaml
+from controller.cli.config_cli import app as config_commands
 from controller.cli.main import run
 from era_haptics.lab.cli import app as lab_app
 from era_haptics.lab.design import problem, score
@@ -96,7 +97,7 @@ def test_commands_say_that_there_is_no_compiler(
     """`era table build` and `era config check`, with how much longer answers take."""
     without_kernels()
     built = era("table", "build", RIG, "-o", tmp_path / "t.npz", *QUICK)
-    checked = CliRunner().invoke(app, ["config", "check", RIG, "--json"])
+    checked = CliRunner().invoke(config_commands, ["config", "check", RIG, "--json"])
     assert (built.exit_code, checked.exit_code) == (0, 0)
     assert WITHOUT_KERNELS in built.stderr
     (warning,) = json.loads(checked.stdout)["warnings"]

@@ -21,6 +21,7 @@ import era_haptics
 import model
 import rig_page
 from cases import shortly
+from controller.rig_file_check import RIG
 from key_tables import quantities
 from kit.plates import exciter_rig, exciter_rig_text
 from model.commands.plate_cli import show
@@ -32,7 +33,7 @@ from model.rig import sections
 from model.rig.actuator_keys import KINDS
 from model.rig.rig import Rig, Uncertainty, differences
 from model.rig.rig_file import example_rig_path, load_rig, parse_rig, rig_of
-from model.rig.rig_summary import RIG, exciter_notes, excursion_notes, plate_summary
+from model.rig.rig_summary import exciter_notes, plate_summary, resonance_notes
 from model.rig.rig_writing import change_rig
 from model.rig.rig_writing import stated as keys_of
 from model.rig.sections import PLAIN_KEYS, PlateSection
@@ -41,6 +42,7 @@ from model.structure.exciter import Exciter
 from model.structure.material import EXCITER_TYPES, KNOWN_MATERIALS, Material
 from model.structure.plate import FOLLOWED_FIELDS, AirGap, Laminate, Plate
 from model.table.table_file import build_table, table_following
+from model.transients.excursions import excursion_notes
 from model.vibration import natural_modes
 
 ROOT = Path(model.__file__).parent.parent
@@ -296,7 +298,8 @@ def test_a_wrong_exciter_is_found_in_its_line(right: str, wrong: str, key: str, 
 
 def warned(keys: str, frequency: str) -> list[str]:
     """Warnings of a board."""
-    return [*exciter_notes(exciter_rig(keys, frequency=frequency))]
+    rig = exciter_rig(keys, frequency=frequency)
+    return [*exciter_notes(rig), *excursion_notes(rig), *resonance_notes(rig)]
 
 
 def test_check_warns_near_the_resonance_of_the_magnets_and_of_one_that_is_misread() -> None:

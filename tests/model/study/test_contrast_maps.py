@@ -13,6 +13,7 @@ from scipy.io import loadmat
 from typer.testing import CliRunner
 
 import era_haptics as era
+from controller.cli.config_cli import app as config_commands
 from drivers.urls import CLOCK_ERRORS
 from kit.plates import FREQUENCIES, make_paper_rig, small_table, smooth_rig, with_strokes
 from kit.set_table import only
@@ -87,7 +88,9 @@ def test_config_check_tells_what_clocks_cost(
 ) -> None:
     """Over USB: that of the line, and 5 us / sqrt(3) of the amplifier; and which plays alone."""
     (tmp_path / "rig.yaml").write_text(RIG % more)
-    ran = CliRunner().invoke(app, ["config", "check", str(tmp_path / "rig.yaml"), "--json"])
+    ran = CliRunner().invoke(
+        config_commands, ["config", "check", str(tmp_path / "rig.yaml"), "--json"]
+    )
     found = json.loads(ran.output)
     assert found["ok"]
     clocks = found["clocks"]

@@ -21,6 +21,7 @@ import pytest
 from typer.testing import CliRunner
 
 from cases import in_turn, shortly
+from controller.cli.config_cli import config_kinds
 from controller.cli.main import run as run_era
 from controller.content.pattern import Pattern, Transient
 from controller.effects.effect import Effect, Region
@@ -44,7 +45,6 @@ from kit.fingers import table as paper_table
 from kit.plates import smooth_rig
 from kit.set_table import phased, wants
 from model.config.fields import Circle, Rectangle
-from model.config.file_kinds import KINDS
 from model.errors import InputError
 from model.finger import (
     decibels,
@@ -261,7 +261,7 @@ def test_command_prints_one_object_and_writes_a_picture(tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("plain_pictures")
-@pytest.mark.parametrize("kind", shortly(KINDS, {*KINDS} - {"layout"}))
+@pytest.mark.parametrize("kind", shortly([*config_kinds()], {*config_kinds()} - {"layout"}))
 def test_files_that_config_init_writes_fit_each_other(
     kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

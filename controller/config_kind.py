@@ -1,0 +1,47 @@
+"""`ConfigKind`: how `era config` recognises, checks and writes one kind of configuration file."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from model.config.document import Document
+
+
+@dataclass(frozen=True)
+class CheckedFile:
+    """A valid configuration file."""
+
+    line: str
+    """One line about it."""
+
+    warnings: Sequence[str] = ()
+    more: Mapping[str, Any] = field(default_factory=dict)
+    """Further entries of its report as data."""
+
+
+@dataclass(frozen=True)
+class ConfigKind:
+    """One kind of configuration file."""
+
+    title: str
+    recognises: Callable[[Document], bool]
+    """Whether a document is of this kind."""
+
+    check: Callable[[Document], CheckedFile]
+    """Check a file and the files that it names; raises ConfigError."""
+
+    example_file: Path
+    """A commented file to start from."""
+
+    keys: Callable[[], dict[str, Any]]
+    """JSON schema of its keys, without the title."""
+
+    def example(self) -> str:
+        """A commented file to start from."""
+        return self.example_file.read_text(encoding="utf-8")
+
+    def schema(self) -> dict[str, Any]:
+        """The JSON schema for editors."""
+        draft = "https://json-schema.org/draft/2020-12/schema"
+        return {"$schema": draft, **self.keys(), "title": self.title}

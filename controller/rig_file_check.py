@@ -1,0 +1,229 @@
+"""Check of a rig file: errors with their keys, and warnings of lost contrast or risk to exciters.
+
+These checks need the wires (`drivers`) and solved plates (`model.study`, `model.transients`).
+Checks that need the values of the rig alone are in `model.rig.rig_summary`.
+"""
+
+import contextlib
+import math
+import os
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+import numpy as np
+
+from controller.config_kind import CheckedFile, ConfigKind
+from drivers.by_hand.reaching import arrangement_of, check_links
+from model.config.document import ConfigError, ConfigProblem, Document
+from model.errors import InputError
+from model.quantities import percent
+from model.rig.rig import Rig
+from model.rig.rig_file import example_rig_path, rig_of, with_base
+from model.rig.rig_summary import (
+    exciter_notes,
+    gain_notes,
+    mount_notes,
+    plate_notes,
+    resonance_notes,
+    rig_schema,
+    summary_line,
+)
+from model.rig.sections import LimitsSection
+from model.structure.attachments import support_problem
+from model.study.overview import clock_cost, uncertainty_cost
+from model.transients.excursions import excursion_notes
+
+_LOST_DB = 0.1
+"""Loss of contrast that is worth a warning."""
+
+_SMALL_SPAN = 1 / 3
+"""Share of the plate between ERAs below which there is a warning."""
+
+_WEATHER_KEYS = ("temperature", "humidity")
+
+
+def check_rig(document: Document) -> CheckedFile:
+    """Check a rig and its amplifiers; raises ConfigError with all problems."""
+    document = with_base(document)
+    problems: list[ConfigProblem] = []
+    rig = None
+    try:
+        rig = rig_of(document)
+    except ConfigError as error:
+        problems += error.problems
+    urls = _urls(document)
+    link_errors, link_warnings = check_links(
+        urls,
+        channels=rig.channel_counts if rig else Counter[str](),
+        limits=rig.limits if rig else LimitsSection().made(),
+    )
+    if rig is not None:
+        problems += _support_problems(document, rig)
+    reported = {problem.key for problem in problems}
+    for name, message in link_errors.items():
+        problem = document.problem(("amplifiers", name, "url"), message)
+        if problem.key not in reported:
+            problems.append(problem)
+    if rig is None or problems:
+        raise ConfigError(document.source, problems)
+    clock_line, clock_warnings, clock_data = clock_costs(rig, urls)
+    warnings = [
+        *exciter_notes(rig),
+        *excursion_notes(rig),
+        *resonance_notes(rig),
+        *link_warnings,
+        *clock_warnings,
+        *gain_notes(rig),
+        *plate_notes(rig),
+        *_cost_notes(rig),
+        *mount_notes(rig),
+        *_span_notes(rig),
+    ]
+    if rig.uncertainty_note:
+        warnings.append(rig.uncertainty_note)
+    return CheckedFile(summary_line(rig) + clock_line, warnings, clock_data)
+
+
+def _support_problems(document: Document, rig: Rig) -> list[ConfigProblem]:
+    """Problems of ERAs and feet that let the plate tip over."""
+    message = support_problem(rig.plate, rig.eras, loads=rig.masses)
+    return [] if message is None else [document.problem(("eras",), message)]
+
+
+def _cost_notes(rig: Rig) -> Iterator[str]:
+    """Yield what objects on the plate and the weather cost, where the rig states them."""
+    known = rig.uncertainty
+    if known.foreign_mass:
+        yield from _uncertainty_note(
+            rig,
+            "foreign_mass",
+            what=f"uncertainty.foreign_mass: with {1e3 * known.foreign_mass:.3g} g anywhere on the "
+            "plate",
+            remedy="what always lies at one place belongs under masses",
+        )
+    if known.weather:
+        yield from _uncertainty_note(
+            rig,
+            "weather",
+            what="plate: temperature and humidity change its modulus by "
+            f"{100 * known.weather:.2g} %, one standard deviation;",
+            remedy="narrow the range, or measure anew when the season has changed",
+        )
+        return
+    plate_keys: Any = rig.document.data.get("plate", {}) if rig.document else {}
+    if not plate_keys.keys().isdisjoint(_WEATHER_KEYS):
+        yield (
+            f"plate.{' and plate.'.join(_WEATHER_KEYS)}: nothing is known of how "
+            f"{rig.plate.material.name} changes, so that promises do not count it; state "
+            "uncertainty.weather, or give the material the name of a known one"
+        )
+
+
+def _uncertainty_note(rig: Rig, key: str, *, what: str, remedy: str) -> Iterator[str]:
+    """Yield the contrast that is left with one uncertainty of a rig."""
+    with contextlib.suppress(InputError):  # no place for two fingers
+        cost = uncertainty_cost(rig, key)
+        yield f"{what} two contents keep {cost.kept_db:.1f} of {cost.exact_db:.1f} dB; {remedy}"
+
+
+def _span_notes(rig: Rig) -> Iterator[str]:
+    """Yield a warning where ERAs span a small part of the plate.
+
+    It compares the promised contrast with that of ERAs in the corners. None for ERAs in one line
+    along a side.
+    """
+    positions = np.array([[era.x, era.y] for era in rig.eras])
+    sides = np.array([rig.plate.length, rig.plate.width])
+    span = np.ptp(positions, axis=0)
+    share = float((span / sides).prod())
+    if not 0 < share < _SMALL_SPAN:
+        return
+    in_corners = (sides * (positions - positions.min(axis=0)) / span).tolist()
+    corner_eras = tuple(
+        replace(era, x=x, y=y) for era, (x, y) in zip(rig.eras, in_corners, strict=True)
+    )
+    exact_clocks = dict.fromkeys(rig.channel_counts, 0.0)
+    with contextlib.suppress(InputError):  # no place for two fingers
+        contrast_db = clock_cost(rig, exact_clocks).exact_db
+        corner_db = clock_cost(replace(rig, eras=corner_eras), exact_clocks).exact_db
+        yield (
+            f"eras: they span {percent(share)} of the plate; two contents are promised "
+            f"{contrast_db:.1f} dB, with ERAs spread to its corners {corner_db:.1f} dB: check `at` "
+            "of each after a change of plate.length or plate.width"
+        )
+
+
+def clock_costs(rig: Rig, urls: Mapping[str, str]) -> tuple[str, list[str], dict[str, Any]]:
+    """Contrast that is left with the clocks of several amplifiers: summary, warnings and data.
+
+    urls: by the amplifier's name. All three are empty for one amplifier, and for a plate without
+    room for two fingers. The summary is empty where contrast is lost.
+    """
+    arrangement = arrangement_of(urls, channels=rig.channel_counts, stated=rig.clock_errors)
+    if arrangement is None:
+        return "", [], {}
+    errors = {**dict.fromkeys(rig.channel_counts, 0.0), **arrangement.errors}
+    try:
+        cost = clock_cost(rig, errors)
+    except InputError:  # no place for two fingers
+        return "", [], {}
+    unsteered = [name for name, error in errors.items() if math.isinf(error)]
+    largest_us = 1e6 * max((e for e in errors.values() if math.isfinite(e)), default=0.0)
+    summary = (
+        f"{len(rig.eras)} ERAs on {len(errors)} amplifiers over {arrangement.lines}: clocks held "
+        f"together to {largest_us:.0f} us; two contents keep {cost.kept_db:.1f} of "
+        f"{cost.exact_db:.1f} dB"
+    )
+    error_us: dict[str, float | None] = {}
+    for name, error in errors.items():
+        error_us[name] = None if name in unsteered else round(1e6 * error, 1)
+    data = {
+        "lines": arrangement.lines,
+        "error_us": error_us,
+        "exact_contrast_db": cost.exact_db,
+        "kept_contrast_db": cost.kept_db,
+    }
+    if cost.exact_db - cost.kept_db < _LOST_DB:
+        return f"; {summary}", [], {"clocks": data}
+    if arrangement.remedy and not unsteered:
+        summary += f"; {arrangement.remedy} gives all of it"
+    warnings = [summary]
+    for name in unsteered:
+        warnings.append(
+            f"amplifier {name} has no clock that can be steered: its ERAs play contents of their "
+            "own"
+        )
+    return "", warnings, {"clocks": data}
+
+
+def _urls(document: Document) -> dict[str, str]:
+    """URLs of amplifiers by name; those that are no text are reported with the rig's keys."""
+    amplifiers = document.data.get("amplifiers")
+    if not isinstance(amplifiers, dict):
+        return {}
+    urls = {}
+    for name, amplifier in amplifiers.items():
+        url = amplifier.get("url") if isinstance(amplifier, dict) else None
+        if isinstance(url, str):
+            urls[name] = whole_url(url, document.source, str(name))
+    return urls
+
+
+def whole_url(url: str, rig_file: str | Path, amplifier: str) -> str:
+    """The URL of an amplifier; `sim://` alone becomes a simulated one over this rig's plate."""
+    if url != "sim://":
+        return url
+    return f"sim://{quote(os.fsencode(rig_file))}?amplifier={quote(amplifier)}"
+
+
+RIG = ConfigKind(
+    "A rig of era-haptics",
+    recognises=lambda document: not {"plate", "surface"}.isdisjoint(document.data),
+    check=check_rig,
+    example_file=example_rig_path(),
+    keys=rig_schema,
+)

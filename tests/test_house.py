@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from changed_tests import ALSO, also, nearest
+from changed_tests import ALSO, OPTIONS, also, nearest
 from checks import vocabulary
 from checks.vocabulary import misleading_names, retired_identifiers
 
@@ -122,6 +122,15 @@ def test_rows_name_what_there_is() -> None:
         named = [command.split()[1] for command in commands if command.startswith("make ")]
         assert set(named) <= set(targets)
     assert also(["drivers/wires/can_frames.py"]) == ["make pages", "make fuzz"]
+
+
+def test_nearest_files_run_first_even_if_others_are_slower() -> None:
+    """Only `make test` begins with the slowest files; `make test-changed` keeps its own order."""
+    files = ["tests/registry/test_threads.py", "tests/drivers/host/test_ledger.py"]
+    command = [sys.executable, "-m", "pytest", *OPTIONS, "--collect-only", *files]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
+    collected = [line.partition("::")[0] for line in done.stdout.splitlines() if "::" in line]
+    assert list(dict.fromkeys(collected)) == files
 
 
 RUN_WITH_TIME_LIMIT = """

@@ -71,6 +71,8 @@ ALSO: Sequence[tuple[Sequence[str], Sequence[str]]] = (
 
 _MAX_FILES = 24  # two processors do not finish more within the time, and each costs time to import
 _SECONDS = 45.0
+OPTIONS = ("-q", "-r", "fE", "-x", "--in-order", "-m", "not long and not alone")
+"""Options of pytest."""
 MIN_TESTS = 100
 """Tests that always run, however slow the machine is."""
 _MODULES = (".py", ".pyi")
@@ -276,9 +278,8 @@ class TimeLimit:
 
 def _run(tests: Sequence[str], *, seconds: float) -> int:
     """Run test files, nearest first, until a failure or until the time is up; return the status."""
-    options = ["-q", "-r", "fE", "-x", "-m", "not long and not alone"]
-    options += ["--numprocesses", str(_workers()), "--dist", "loadfile", "--no-loadscope-reorder"]
-    status = pytest.main([*options, *tests], plugins=[TimeLimit(seconds)])
+    workers = ["--numprocesses", str(_workers()), "--dist", "loadfile", "--no-loadscope-reorder"]
+    status = pytest.main([*OPTIONS, *workers, *tests], plugins=[TimeLimit(seconds)])
     return 0 if status == pytest.ExitCode.NO_TESTS_COLLECTED else int(status)
 
 

@@ -4,6 +4,8 @@ import math
 
 _DISPLAY_UNITS = {"m": (1e3, "mm"), "Pa": (1e-9, "GPa"), "N/m": (1e-3, "kN/m"), "kg": (1e3, "g")}
 
+_ROUNDING = 1e-9  # of a percentage: 100 * 0.29 is 28.999999999999996
+
 
 def in_display_unit(value: float, unit: str, *, digits: int = 3) -> str:
     """Format a value of an SI unit, or of none, in the unit usual for plates: `17 kN/m`."""
@@ -31,6 +33,11 @@ def with_error(value: float, error: float, unit: str = "", *, sign: str = "") ->
 def percent(share: float) -> str:
     """Format a share as `12 %`; below a tenth with two digits, `1.2 %`."""
     return f"{100 * share:.0f} %" if share > 0.1 else f"{100 * share:.2g} %"
+
+
+def percent_down(share: float) -> str:
+    """Format a share as `79 %`, rounded down: one below a limit never reads as the limit."""
+    return f"{math.floor(100 * share + _ROUNDING)} %"
 
 
 def counted(number: int, thing: str, *, plural: str | None = None) -> str:

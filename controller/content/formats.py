@@ -50,6 +50,7 @@ from controller.content.reading import (
     between,
     course_of,
     mixed,
+    names_remark,
     read_json,
     refusal,
     too_much,
@@ -79,8 +80,11 @@ _CONTROL = {
 }
 """Lowest, highest and default value of each parameter."""
 
+_PARAMETERS = (*_EVENT, *_CONTROL)
 _PHASES = ("AttackTime", "DecayTime", "ReleaseTime")
 _LASTING = (*_PHASES, "Sustained")  # without effect on a transient
+
+_AUDIO = "Audio"  # what the names of parameters and events of sound begin with
 
 _MAX_TIME = 1e6  # s; of a parameter that comes after all events
 
@@ -163,6 +167,8 @@ class _AhapReading:
         self._events: list[tuple[_Event, dict[str, float]]] = []
         self._controls: dict[str, list[Curve]] = {name: [] for name in _CONTROL}
         self._skipped: Counter[tuple[str, str]] = Counter()
+        self._audio_parameters: Counter[str] = Counter()
+        self._unknown_parameters: Counter[str] = Counter()
         self._clamped: dict[str, list[float]] = {}
 
     def add(self, entry: _Entry) -> None:
@@ -180,13 +186,13 @@ class _AhapReading:
 
     def _add_event(self, event: _Event) -> None:
         self.count += 1
-        if event.EventType.startswith("Audio"):
+        if event.EventType.startswith(_AUDIO):
             self._skipped["audio event", "audio events"] += 1
             return
         values = {name: default for name, (_, _, default) in _EVENT.items()}
         for each in event.EventParameters:
             if each.ParameterID not in _EVENT:
-                self._skipped["unknown parameter", "unknown parameters"] += 1
+                self._leave_out(each.ParameterID)
             elif each.ParameterValue is not None:
                 low, high, _ = _EVENT[each.ParameterID]
                 value = self._in_range(each.ParameterID, each.ParameterValue, low, high)
@@ -207,7 +213,7 @@ class _AhapReading:
     ) -> None:
         self.count += len(points)
         if name not in _CONTROL:
-            self._skipped["unknown parameter", "unknown parameters"] += 1
+            self._leave_out(name)
             return
         low, high, default = _CONTROL[name]
         curve = [
@@ -223,6 +229,12 @@ class _AhapReading:
             self._controls[name].append(tuple(sorted(curve, key=itemgetter(0))))
         else:
             self._skipped["curve without points", "curves without points"] += 1
+
+    def _leave_out(self, parameter: str) -> None:
+        """Count a parameter that has no effect on vibration."""
+        is_audio = parameter.startswith(_AUDIO)
+        names = self._audio_parameters if is_audio else self._unknown_parameters
+        names[parameter] += 1
 
     def _in_range(self, name: str, value: float, low: float, high: float) -> float:
         if low <= value <= high:
@@ -256,6 +268,10 @@ class _AhapReading:
 
     def remarks(self) -> tuple[str, ...]:
         """Return a remark for each kind of entry that was left out or clamped."""
+        parameters = (
+            *names_remark("unknown parameter", self._unknown_parameters, known=_PARAMETERS),
+            *names_remark("audio parameter", self._audio_parameters),
+        )
         lasts = any(event.EventType == "HapticContinuous" for event, _ in self._events)
         for name in [] if lasts else [f"Haptic{each}Control" for each in _PHASES]:
             self._skipped[name, f"{name}s"] += len(self._controls[name])
@@ -269,7 +285,7 @@ class _AhapReading:
             f"from {min(values):g} to {max(values):g}"
             for name, values in self._clamped.items()
         ]
-        return (*skipped, *clamped)
+        return (*parameters, *skipped, *clamped)
 
 
 def _segments(values: dict[str, float], controls: dict[str, _Control]) -> list[Segment]:
@@ -666,13 +682,13 @@ class _HjifReading:
             if band.curve_type == "Linear"
             else CubicHermiteSpline(knots, given, np.zeros(len(knots)))(at)
         )
-        intensity, sharpness, remarks = course_of(wave * self._gain, _RATE)
-        knots = np.unique([time for curve in (intensity, sharpness) for time, _ in curve])
-        levels = between(intensity, knots).tolist()
-        sharps = between(sharpness or ((0.0, 0.0),), knots).tolist()
+        course = course_of(wave * self._gain, _RATE)
+        knots = np.unique([time for time, _ in (*course.intensity, *course.sharpness)])
+        levels = between(course.intensity, knots).tolist()
+        sharps = between(course.sharpness or ((0.0, 0.0),), knots).tolist()
         shifted = (knots + at[0]).tolist()
         self._segments += zip(shifted[:-1], shifted[1:], *levels, *sharps, strict=True)
-        self._remarks += tuple(f"curve: {each}" for each in remarks)
+        self._remarks += tuple(f"curve: {remark}" for remark in course.remarks)
 
     def _sharpness(self, hertz: FloatArray) -> Any:
         self._moved += int(((hertz < MIN_HZ) | (hertz > MAX_HZ)).sum())

@@ -44,6 +44,8 @@ class Pattern:
     """Ascending in time."""
     remarks: tuple[str, ...] = ()
     """What was changed or left out of the file."""
+    out_of_band_share: float = 0.0
+    """Share of the energy of a sampled signal that was left out, 0 to 1."""
 
 
 def misfit(pattern: Pattern) -> str:

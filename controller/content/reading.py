@@ -16,7 +16,7 @@ from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Collection, Iterator
 from functools import partial
-from typing import Annotated, Any, ClassVar, TypeAlias, TypeVar
+from typing import Annotated, Any, ClassVar, NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
 from pydantic import ConfigDict, GetCoreSchemaHandler
@@ -27,7 +27,8 @@ from model.config.document import ConfigError, ConfigProblem, Document, KeyPath,
 from model.config.fields import Section
 from model.errors import InputError
 from model.files.wav_file import samples_of
-from model.quantities import counted
+from model.quantities import counted, percent
+from registry.plugins import did_you_mean
 
 MAX_SIZE = 4 << 20
 """Largest file [bytes]."""
@@ -70,7 +71,8 @@ class ContentFormat(ABC):
 _MAX_SIZE = 2 << 20  # bytes
 _MAX_LEVELS = 20
 _MAX_VALUES = 5 * MAX_POINTS  # a keyframe of HJIF is four, an event of AHAP thirteen
-_MAX_NAMED = 5  # unknown keys in remarks
+_MAX_NAMED = 5  # unknown names in a remark
+_MAX_NAME = 40  # characters of a name that is compared with known ones
 _EMPTY: tuple[object, ...] = (None, "", [], {})
 
 _STRING = r'"[^"\\]*+(?:\\.?+[^"\\]*+)*+"?'  # one without an end, too: no text is read twice
@@ -138,12 +140,30 @@ def unknown_keys(section: ContentSection, but: Collection[str] = ()) -> tuple[st
 
     but: keys without an effect on what is felt; empty ones do not count either.
     """
-    found = Counter(name for name in _extra(section) if name not in but)
-    if not found:
+    names = Counter(name for name in _extra(section) if name not in but)
+    return names_remark("unknown key", names, verb="ignored")
+
+
+def names_remark(
+    thing: str, names: Counter[str], *, verb: str = "left out", known: Collection[str] = ()
+) -> tuple[str, ...]:
+    """Return a remark on names in a file that have no effect, the first ones by name, if any.
+
+    known: names that may have been meant.
+    """
+    if not names:
         return ()
-    names = [key_name((name,)) for name in list(found)[:_MAX_NAMED]]
-    more = " and others" * (len(found) > _MAX_NAMED)
-    return (f"{counted(found.total(), 'unknown key')} ignored: {', '.join(names)}{more}",)
+    listed = [_suggested(name, known) for name in list(names)[:_MAX_NAMED]]
+    if len(names) > _MAX_NAMED:
+        listed.append(f"and {len(names) - _MAX_NAMED} others")
+    return (f"{counted(names.total(), thing)} {verb}: {', '.join(listed)}",)
+
+
+def _suggested(name: str, known: Collection[str]) -> str:
+    """Format a name of a file, with the known name that it resembles."""
+    shown = key_name((name,))
+    suggestion = did_you_mean(name[:_MAX_NAME], known).strip()
+    return f"{shown} ({suggestion})" if suggestion else shown
 
 
 def _extra(value: Any) -> Iterator[str]:
@@ -318,14 +338,31 @@ class Wav(ContentFormat):
         if channel > count:
             raise refusal(source, f"channel must be 1 to {count}, got {channel}")
         signal = samples[:, channel - 1]
-        intensity, sharpness, remarks = course_of(signal, rate)
+        course = course_of(signal, rate)
+        remarks = course.remarks
         if count == 2:
             remarks = (f"channel {channel} of 2 read", *remarks)
-        return Pattern(len(signal) / rate, intensity, sharpness, (), remarks)
+        return Pattern(
+            len(signal) / rate,
+            course.intensity,
+            course.sharpness,
+            remarks=remarks,
+            out_of_band_share=course.out_of_band_share,
+        )
 
 
-def course_of(signal: FloatArray, rate: int) -> tuple[Curve, Curve, tuple[str, ...]]:
-    """Return intensity and sharpness of a signal at a rate [Hz], and remarks on what is lost."""
+class SignalCourse(NamedTuple):
+    """A sampled signal as intensity and sharpness over time."""
+
+    intensity: Curve
+    sharpness: Curve
+    out_of_band_share: float
+    """Share of the signal's energy outside the frequencies of sharpness, 0 to 1."""
+    remarks: tuple[str, ...]
+
+
+def course_of(signal: FloatArray, rate: int) -> SignalCourse:
+    """Return intensity and sharpness of a signal at a rate [Hz]."""
     import scipy.fft
 
     duration = len(signal) / rate
@@ -355,26 +392,36 @@ def course_of(signal: FloatArray, rate: int) -> tuple[Curve, Curve, tuple[str, .
     is_felt = intensity > 0
     given = np.concatenate([[0], times, [duration]])
     course = np.concatenate([intensity[:1], np.minimum(intensity, 1), intensity[-1:]]).clip(0, 1)
-    return (
+    out_of_band_share = _out_of_band_share(spectrum, outer)
+    return SignalCourse(
         thinned(given, course),
         thinned(times[is_felt], sharpness[is_felt]),
-        _remarks(spectrum, outer, intensity),
+        out_of_band_share,
+        tuple(_signal_remarks(out_of_band_share, intensity)),
     )
 
 
-def _remarks(spectrum: Any, outer: FloatArray, intensity: FloatArray) -> tuple[str, ...]:
+def _out_of_band_share(spectrum: Any, outer: FloatArray) -> float:
+    """Return the share of a spectrum's energy that a filter of its lowest lines removes."""
     power = abs(spectrum) ** 2
     total = float(power.sum())
-    lost = 1 - float((power[: len(outer)] * outer**2).sum()) / total if total else 0.0
-    remarks = []
-    if lost > _MIN_LOST:
-        remarks.append(
-            f"{lost:.0%} of its energy ({10 * math.log10(lost):.1f} dB) lies outside "
-            f"{MIN_HZ:g} to {MAX_HZ:g} Hz and is left out"
+    if not total:
+        return 0.0
+    kept = float((power[: len(outer)] * outer**2).sum())
+    return 1 - kept / total
+
+
+def _signal_remarks(out_of_band_share: float, intensity: FloatArray) -> Iterator[str]:
+    """Yield a remark for each way in which the course of a signal differs from it."""
+    if out_of_band_share > _MIN_LOST:
+        level_db = 10 * math.log10(out_of_band_share)
+        yield (
+            f"{percent(out_of_band_share)} of its energy ({level_db:.1f} dB) "
+            f"lies outside {MIN_HZ:g} to {MAX_HZ:g} Hz and is left out"
         )
-    if (intensity > 1).any():
-        remarks.append(f"{(intensity > 1).mean():.1%} of the time above full scale, clamped")
-    return tuple(remarks)
+    is_clamped = intensity > 1
+    if is_clamped.any():
+        yield f"{percent(is_clamped.mean())} of the time above full scale, clamped"
 
 
 def _band(spectrum: Any, points: int, step: float, count: int) -> tuple[FloatArray, FloatArray]:

@@ -14,6 +14,7 @@ from controller.content.pattern import MAX_HZ, MIN_HZ, Pattern, Transient, along
 from model.answer.stimulus import MAX_MODULATION, MIN_MODULATION, Course
 from model.arrays import FloatArray, best_of
 from model.finger import decibels
+from model.quantities import percent
 from model.transients.base_motion import KNOT_STEP, rise
 from model.transients.excursions import CLICKS_APART
 
@@ -67,6 +68,8 @@ class Rendition:
     """Ascending in time, at least 60 ms apart."""
     remarks: tuple[str, ...]
     """What was changed or lost."""
+    sharpness_kept: float = 1.0
+    """Share of what lasts, by its energy, whose frequency is in the band of the carrier."""
 
     def smoothed(self) -> "Rendition":
         """Return the rendition beside other fingers: its course averaged over 20 ms.
@@ -130,18 +133,23 @@ def rendered(pattern: Pattern, level_db_sl: float, frequencies: FloatArray) -> R
     if close:
         remarks.append(
             f"{len(close)} of {len(close) + len(taps)} taps, less than {1000 * CLICKS_APART:.0f} "
-            "ms from a stronger one: left to what lasts"
+            "ms from a stronger one: moved into the continuous part"
         )
     course, band, modulation = None, _band(MIN_HZ, frequencies), None
+    sharpness_kept = 1.0
     if highest := float(shares.max()):
         course = Course(tuple(times.tolist()), tuple((shares / highest).tolist()))
         of_taps = tuple((each.time, each.sharpness) for each in pattern.transients)
         hertz = hertz_of(along(pattern.sharpness or of_taps, times))
         band = _band(_carrier(hertz, shares**2), frequencies)
         modulation = _modulation(times, shares)
-        remarks += _lost(hertz, shares, band, clicks)
+        is_off_band = (hertz < band[0]) | (hertz > band[1])
+        sharpness_kept = 1 - float(np.average(is_off_band, weights=shares**2))
+        remarks += _lost(hertz[shares > 0], sharpness_kept, clicks)
         level_db_sl = float(level.max() + decibels(highest))
-    return Rendition(duration, course, level_db_sl, band, modulation, clicks, tuple(remarks))
+    return Rendition(
+        duration, course, level_db_sl, band, modulation, clicks, tuple(remarks), sharpness_kept
+    )
 
 
 def _level_of(intensity: FloatArray, level_db_sl: float) -> FloatArray:
@@ -233,19 +241,19 @@ def _carrier(hertz: FloatArray, energy: FloatArray) -> float:
     return float(np.average(hertz[near], weights=energy[near]))
 
 
-def _lost(
-    hertz: FloatArray, shares: FloatArray, band: Band, clicks: Sequence[Tap]
-) -> Iterator[str]:
-    """Yield a remark for each way in which what lasts differs from the file."""
-    away = (hertz < band[0]) | (hertz > band[1])
-    if (lost := np.average(away, weights=shares**2)) > _MENTIONED:
-        of_file = hertz[shares > 0]
+def _lost(hertz: FloatArray, sharpness_kept: float, clicks: Sequence[Tap]) -> Iterator[str]:
+    """Yield a remark for each way in which what lasts differs from the file.
+
+    hertz: its frequencies [Hz] wherever it is felt.
+    """
+    lost = 1 - sharpness_kept
+    if lost > _MENTIONED:
         yield (
-            f"sharpness of {100 * lost:.0f} % of what lasts: {of_file.min():.0f} to "
-            f"{of_file.max():.0f} Hz in the file, one frequency here"
+            f"sharpness of {percent(lost)} of the continuous part: {hertz.min():.0f} to "
+            f"{hertz.max():.0f} Hz in the file, one frequency here"
         )
     if clicks:
-        yield f"what lasts, {1000 * DUCKING:.0f} ms before and after each tap"
+        yield f"the continuous part, {1000 * DUCKING:.0f} ms before and after each tap"
 
 
 def _modulation(times: FloatArray, shares: FloatArray) -> float | None:

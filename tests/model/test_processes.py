@@ -33,7 +33,7 @@ from model.compiled.kernels import (
 )
 from model.errors import InputError
 from model.processes import on_cluster, on_processes
-from model.quantities import in_display_unit, percent, with_error
+from model.quantities import in_display_unit, percent, percent_down, with_error
 from reference_figures import RECORD, reference_figures
 
 
@@ -229,6 +229,10 @@ def test_the_first_of_the_nearly_equal_best_is_chosen(choose, scores, expected):
         *((lambda by=by: percent(by), f"{said} %") for by, said in ((1.43, 143), (0.124, 12))),
         *((lambda by=by: percent(by), f"{said} %") for by, said in ((0.0999, 10), (0.0123, 1.2))),
         (lambda: percent(0.0), "0 %"),
+        *(
+            (lambda share=share: percent_down(share), text)
+            for share, text in ((0.7959, "79 %"), (0.9999, "99 %"), (0.29, "29 %"), (1.0, "100 %"))
+        ),
         (lambda: with_error(74.0241e9, 0.8712e9, "Pa"), "74.02 ± 0.87 GPa"),
         (lambda: with_error(0.0130284, 2.72e-5, ""), "0.013028 ± 0.000027"),
         (lambda: with_error(0.0119941, 0.000996, "kg"), "12.0 ± 1.0 g"),

@@ -1,5 +1,6 @@
 """How much of a content file a finger will feel, simulated in time on the plate of a table."""
 
+import math
 from bisect import bisect_left
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -8,6 +9,7 @@ from itertools import product
 from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from controller.content.pattern import Pattern, along, hertz_of
@@ -26,7 +28,8 @@ from model.answer.stimulus import Finger, Stimulus, check_level
 from model.arrays import FloatArray, best_of
 from model.drive_modes import DRIVE_MODES
 from model.finger import decibels, fingertip_points, fingertip_weights, over_threshold
-from model.quantities import percent
+from model.quantities import percent, percent_down
+from model.structure.plate import Plate
 from model.table.table import LocalizationTable
 from model.transients.base_motion import KNOT_STEP, rise
 from model.transients.time_response import from_rest
@@ -36,7 +39,14 @@ TOLERANCE_DB, RANGE_DB, MAX_DELAY = 3.0, 20.0, 0.010
 """What is within so many dB of what is expected is kept; that counts within so many dB of
 its highest; a plate may be late by so long [s], the same for all of a file."""
 
-_MENTIONED = 0.05  # share of the time off its level that is lost without a word
+DEFAULT_POSITIONS = (0.5, 0.5), (0.2, 0.3), (0.35, 0.75), (0.65, 0.2), (0.8, 0.6)
+"""Positions of a finger as shares of the plate's sides: the middle, often on a nodal line, and four
+that no symmetry of a plate relates."""
+
+MIN_DISTANCE = 0.04
+"""Distance [m] from a quiet finger to the default positions."""
+
+_MENTIONED = 0.05  # share of the time off its level, or of energy, that is lost without a word
 _AFTER = 0.1  # s; followed after the end
 _MIN_RATE, _RATE = 1250.0, 3.5  # Hz; and by the highest frequency that plays
 # Odd numbers of samples whose Fourier transforms are fast.
@@ -59,20 +69,37 @@ class Part:
 
 @dataclass(frozen=True, eq=False)
 class CheckedContent:
-    """Content at a finger as it will be felt.
+    """Content at a finger as it will be felt."""
 
-    duration [s]; parts: what lasts, if anything does, and the taps; lost: what was changed or left
-    out, in words; expected, given (n,) [dB SL]: levels every `step` [s], root mean squares over
-    20 ms; kept: shares of the time in which they agree, for delays of 0, 1, 2 ... steps.
-    """
-
+    at: Position
+    """Of the finger [m]."""
     duration: float
+    """[s]"""
     parts: tuple[Part, ...]
+    """The continuous part, if there is one, and the taps."""
     lost: tuple[str, ...]
+    """What was changed or left out, in words."""
     step: float
+    """Time [s] between two levels."""
     expected: FloatArray
+    """Levels (n,) [dB SL] that the file asks for, root mean squares over 20 ms."""
     given: FloatArray
+    """Levels (n,) [dB SL] that the finger feels."""
     kept: FloatArray
+    """Shares of the time in which both agree, for delays of 0, 1, 2 ... steps."""
+    sharpness_kept: float = 1.0
+    """Share of the continuous part, by its energy, that plays at about the file's frequency."""
+    out_of_band_share: float = 0.0
+    """Share of a sampled signal's energy that was left out, 0 to 1."""
+
+    @property
+    def headline(self) -> str:
+        """The kept shares in words, rounded down, and what was left out of a signal."""
+        level = f"level {percent_down(self.kept_share)} kept"
+        sharpness = f"sharpness {percent_down(self.sharpness_kept)} kept"
+        if self.out_of_band_share < _MENTIONED:
+            return f"{level}, {sharpness}"
+        return f"{level}, {sharpness}, {percent(self.out_of_band_share)} of the energy left out"
 
     @property
     def delay(self) -> float:
@@ -92,7 +119,10 @@ class CheckedContent:
             for levels in (self.expected, self.given)
         )
         return {
+            "at_m": [*self.at],
             "kept_share": self.kept_share,
+            "sharpness_kept_share": self.sharpness_kept,
+            "out_of_band_share": self.out_of_band_share,
             "delay_s": self.delay,
             "lost": [*self.lost],
             "level_db_sl": {"requested": expected, "given": given, "step_s": every * self.step},
@@ -154,7 +184,28 @@ def check_content(
     kept = kept_shares(expected, given, int(MAX_DELAY * rate) + 1)
     deviations = _deviations(expected, given, best_of(kept))
     lost = (*rendition.remarks, *_weaker(parts), *_off_level(deviations))
-    return CheckedContent(rendition.duration, parts, lost, 1 / rate, expected, given, kept)
+    return CheckedContent(
+        at=at,
+        duration=rendition.duration,
+        parts=parts,
+        lost=lost,
+        step=1 / rate,
+        expected=expected,
+        given=given,
+        kept=kept,
+        sharpness_kept=rendition.sharpness_kept,
+        out_of_band_share=pattern.out_of_band_share,
+    )
+
+
+def default_positions(plate: Plate, quiet: Sequence[Position] = ()) -> list[Position]:
+    """Return the default positions of a finger [m] that are not next to a quiet one [m]."""
+    positions = [(u * plate.length, v * plate.width) for u, v in DEFAULT_POSITIONS]
+    return [
+        position
+        for position in positions
+        if all(math.dist(position, other) > MIN_DISTANCE for other in quiet)
+    ]
 
 
 def play_content(
@@ -229,17 +280,18 @@ def _off_level(deviations: FloatArray) -> Iterator[str]:
 
 def _weaker(parts: Sequence[Part]) -> Iterator[str]:
     """What is weaker than asked, in words."""
-    for what, some in (
-        ("what lasts", [each for each in parts if each.stimulus.course]),
-        ("taps", [each for each in parts if not each.stimulus.course]),
-    ):
-        lowered = [each.answer.fingers[0].lowered_db for each in some]
-        if count := np.count_nonzero(lowered):
-            who = what if len(some) == 1 else f"{count} of {len(some)} {what}"
-            yield f"{who} up to {max(lowered):.1f} dB weaker: all that the plate allows here"
+    continuous = [part for part in parts if part.stimulus.course]
+    taps = [part for part in parts if not part.stimulus.course]
+    for kind, of_kind in (("continuous part", continuous), ("taps", taps)):
+        lowered = [part.answer.fingers[0].lowered_db for part in of_kind]
+        count = np.count_nonzero(lowered)
+        if count:
+            subject = kind if len(of_kind) == 1 else f"{count} of {len(of_kind)} {kind}"
+            yield f"{subject} up to {max(lowered):.1f} dB weaker: all that the plate allows here"
 
 
 _REQUESTED, _FELT = "#888888", "#0b5cad"
+_FAINT = 0.1  # share of the highest amplitude below which no frequency is drawn
 
 
 def content_figure(pattern: Pattern, checked: CheckedContent) -> Figure:
@@ -255,20 +307,35 @@ def content_figure(pattern: Pattern, checked: CheckedContent) -> Figure:
     levels.plot(times - checked.delay, checked.given, color=_FELT, lw=1.2, label="felt")
     levels.set_ylim(top - RANGE_DB, top + 2 * TOLERANCE_DB)
     levels.set_ylabel("level / dB SL")
-    levels.set_title(
-        f"{100 * checked.kept_share:.0f} % kept, felt {1000 * checked.delay:.0f} ms later",
-        fontsize=10,
-    )
-    tones.plot(times, hertz_of(along(pattern.sharpness, times)), color=_REQUESTED, lw=1)
-    sharpness = np.array([each.sharpness for each in pattern.transients])
-    starts = [each.time for each in pattern.transients]
-    tones.plot(starts, hertz_of(sharpness), "x", color=_REQUESTED)
-    for part in checked.parts:
-        if part.frequency is not None:
-            until = part.start + (part.stimulus.duration or 0.0)
-            tones.plot([part.start, until], [part.frequency] * 2, color=_FELT, lw=2)
+    late = f"felt {1000 * checked.delay:.0f} ms later"
+    levels.set_title(f"{checked.headline}, {late}", fontsize=10)
+    levels.legend(loc="best", fontsize=8)
+    _draw_frequencies(tones, pattern, checked, times)
     tones.set_xlim(0, checked.duration)
     tones.set_xlabel("time / s")
     tones.set_ylabel("frequency / Hz")
-    levels.legend(loc="lower right", fontsize=8)
     return figure
+
+
+def _draw_frequencies(
+    axes: Axes, pattern: Pattern, checked: CheckedContent, times: FloatArray
+) -> None:
+    """Draw frequencies at times [s] (n,) wherever something plays: of the file, and felt."""
+    if pattern.intensity:
+        hertz = hertz_of(along(pattern.sharpness, times))
+        is_silent = along(pattern.intensity, times, beyond=0.0) <= 0
+        axes.plot(times, np.where(is_silent, np.nan, hertz), color=_REQUESTED, lw=1)
+    starts = [tap.time for tap in pattern.transients]
+    sharpness = np.array([tap.sharpness for tap in pattern.transients])
+    axes.plot(starts, hertz_of(sharpness), "x", color=_REQUESTED)
+    for part in checked.parts:
+        if part.frequency is None:
+            continue
+        course = part.stimulus.course
+        if course is None:
+            end = part.start + (part.stimulus.duration or 0.0)
+            axes.plot([part.start, end], [part.frequency] * 2, color=_FELT, lw=2)
+        else:
+            is_faint = course.at(times - part.start) < _FAINT
+            hertz = np.where(is_faint, np.nan, part.frequency)
+            axes.plot(times, hertz, color=_FELT, lw=2)

@@ -1,27 +1,35 @@
 """`era content check` and `era play`: content on a simulated plate, or at a finger of a daemon."""
 
-import math
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from controller.cli.daemon_cli import Socket, connected
-from model.commands.options import JsonOption, QuietOption, print_report
+from model.commands.options import (
+    JsonOption,
+    QuietOption,
+    Stopwatch,
+    print_report,
+    progress_bar,
+)
 from model.config.units import parse_point
 from model.errors import InputError
-from model.quantities import counted, percent
+from model.quantities import counted, percent, percent_down
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from controller.content.pattern import Pattern
     from era_haptics.lab.checks.content_check import CheckedContent, Part
+    from era_haptics.lab.checks.layout_check import Position
+    from model.table.table import LocalizationTable
 
 _RATE = 48000  # Hz; with 16 bits what all players of sound take
-_FULL = 1 << 15  # of samples of 16 bits
-_PEAK = 0.9  # of full scale
+_MAX_SAMPLE = (1 << 15) - 1  # of 16 bits
+_FULL_SCALE = 20.0  # m/s²; contents of 20 dB SL reach 3 to 5
 
 
 def play(
@@ -48,13 +56,20 @@ def play(
         Path | None,
         typer.Option("--output", "-o", metavar="WAV", help="With --simulate: what is felt."),
     ] = None,
+    full_scale: Annotated[
+        float,
+        typer.Option(
+            metavar="M_S2", help="With --simulate: acceleration at full scale, m/s².", min=1e-3
+        ),
+    ] = _FULL_SCALE,
     socket: Socket = None,
     as_json: JsonOption = False,
 ) -> None:
     """Play content once at a finger that is on the plate, within 20 mm of a position.
 
     With --simulate write the acceleration at a finger that is alone there as sound, to listen to
-    and to look at: 16 bits at 48 kHz, scaled so that its loudest moment is 90 % of full scale.
+    and to look at: 16 bits at 48 kHz. All sounds have the same full scale, so their loudness can be
+    compared by ear.
     """
     place = parse_point(at, what="--at")
     if (simulate is None) != (output is None):
@@ -63,7 +78,16 @@ def play(
         if loop:
             raise InputError("--loop must be left out with --simulate")
         pattern = pattern_of(file, channel)
-        _simulate(file, pattern, simulate, output, place, level=level, as_json=as_json)
+        _simulate(
+            file,
+            pattern,
+            simulate,
+            output,
+            place,
+            level=level,
+            full_scale=full_scale,
+            as_json=as_json,
+        )
         return
     with connected(socket) as era:
         if file.suffix:
@@ -95,9 +119,10 @@ def _simulate(
     place: tuple[float, float],
     *,
     level: float | None,
+    full_scale: float,
     as_json: bool,
 ) -> None:
-    """Write what a finger feels as a WAV file."""
+    """Write what a finger feels as a WAV file; raises InputError above full scale [m/s²]."""
     import numpy as np
     from scipy.io import wavfile
     from scipy.signal import resample
@@ -115,18 +140,26 @@ def _simulate(
     _, _, rate, accelerations = play_content(pattern, table, given, at=place)
     felt = accelerations @ fingertip_weights(*place, table.plate)
     sound = resample(felt, round(len(felt) * _RATE / rate))
-    full_scale = float(np.abs(sound).max()) / _PEAK or 1.0
-    wavfile.write(output, _RATE, np.rint(_FULL / full_scale * sound).astype(np.int16))
+    peak = float(np.abs(sound).max())
+    if peak > full_scale:
+        raise InputError(
+            f"--full-scale must be at least the highest acceleration of {file}, {peak:.3g} m/s², "
+            f"got {full_scale:g}; give the same value for all sounds that you compare, or lower "
+            "--level"
+        )
+    samples = np.rint(_MAX_SAMPLE / full_scale * sound).astype(np.int16)
+    wavfile.write(output, _RATE, samples)
     print_report(
         [
-            f"scaled: the loudest moment is {percent(_PEAK)} of full scale, which is "
-            f"{full_scale:.3g} m/s²",
+            f"peak: {peak:.3g} m/s², {percent(peak / full_scale)} of full scale, "
+            f"{full_scale:g} m/s²",
             f"wrote {output}: 16 bits, {_RATE / 1000:g} kHz",
         ],
         {
             "file": str(file),
             "at_m": [*place],
             "full_scale_m_s2": full_scale,
+            "peak_m_s2": peak,
             "sample_rate_hz": _RATE,
             "duration_s": len(sound) / _RATE,
             "files": [str(output)],
@@ -142,13 +175,18 @@ FAILED = 1
 
 @content_app.command()
 def check(
-    file: Annotated[
-        Path,
-        typer.Argument(metavar="FILE", help="A file of content, or the name of one that is known."),
+    files: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="FILE...", help="Files of content, folders of them, or names of known contents."
+        ),
     ],
     table_file: Annotated[
-        Path, typer.Option("--table", metavar="TABLE", help="Table file, e.g. T.npz.")
-    ],
+        Path | None,
+        typer.Option(
+            "--table", metavar="TABLE", help="Table file, e.g. T.npz; default: the paper's plate."
+        ),
+    ] = None,
     at: Annotated[
         str | None,
         typer.Option(
@@ -163,7 +201,8 @@ def check(
         int | None, typer.Option(metavar="N", help="Channel of a file that has several.", min=1)
     ] = None,
     least: Annotated[
-        float, typer.Option(metavar="SHARE", help="Least share that must be kept.", min=0, max=1)
+        float,
+        typer.Option(metavar="SHARE", help="Least share of the level to keep.", min=0, max=1),
     ] = 0.8,
     picture: Annotated[
         Path | None,
@@ -171,96 +210,273 @@ def check(
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Simulate in time what of a file a finger will feel, alone or beside quiet ones.
+    """Simulate in time what a finger will feel of content, alone or next to quiet fingers.
 
-    The kept share is that of the time in which the level at the skin is within 3 dB of what the
-    file asks, where that is within 20 dB of its highest: 1 says that all rises, taps and pauses are
-    felt as they were made. Levels are means over 20 ms; taps that are left out are lost, lost
-    sharpness is only mentioned. Amplifiers are taken as phased, whichever mode the table was built
-    for. Exit status 1 if less than --least is kept. Without --at five
-    places are tried, the middle among them, and the one that keeps the third most is shown.
+    The kept share of the level is the share of the time in which the level at the skin is within
+    3 dB of the file's, counted where the file is within 20 dB of its highest level. Levels are
+    means over 20 ms. The kept share of the sharpness is the share of the continuous part that plays
+    at about the frequency in the file. Shares are rounded down. Amplifiers are taken as phased,
+    whichever mode the table was built for. Without --table the plate is that of the founding paper.
+    Without --at five positions are tried, the middle among them, and the one with the median share
+    is shown. Several files, or a folder with its subfolders, are listed with one line each. Exit
+    status 1 if a file keeps less of its level than --least, or one of several cannot be read;
+    sharpness has no limit.
     """
-    from era_haptics.lab.checks.content_check import check_content, least_promise
-    from model.answer.answer import MIN_CONTRAST_DB
-    from model.commands.options import Stopwatch
     from model.files.output_paths import check_picture
+
+    contents = _content_files(files)
+    is_list = len(contents) != 1 or files[0].is_dir()
+    if picture is not None:
+        if is_list:
+            raise InputError("--output must be left out for several files, got a picture's name")
+        check_picture(picture)
+    setting = _setting(table_file, at, quiet or [], level=level, channel=channel, least=least)
+    if is_list:
+        is_kept = _check_list(contents, setting, as_json=as_json)
+    else:
+        is_kept = _check_one(contents[0], setting, picture, as_json=as_json)
+    if not is_kept:
+        raise typer.Exit(FAILED)
+
+
+@dataclass(frozen=True)
+class _Setting:
+    """Where and how strongly contents are checked."""
+
+    table: "LocalizationTable"
+    table_file: Path | None
+    """None for the built-in plate."""
+    positions: "Sequence[Position]"
+    """Positions of the finger [m] to try."""
+    quiet: "Sequence[Position]"
+    level_db_sl: float
+    channel: int | None
+    least_share: float
+
+    def check(self, file: Path) -> "tuple[Pattern, list[CheckedContent]]":
+        """Check a file at every position; return it with the results, the least kept first.
+
+        Raises InputError for a file that cannot be read or is silent.
+        """
+        from era_haptics.lab.checks.content_check import check_content
+
+        pattern = pattern_of(file, self.channel)
+        has_level = any(intensity > 0 for _, intensity in pattern.intensity)
+        if not has_level and not pattern.transients:
+            raise InputError(f"{file}: is silent; there is nothing to check")
+        results = [
+            check_content(pattern, self.table, self.level_db_sl, at=position, quiet=self.quiet)
+            for position in self.positions
+        ]
+        results.sort(key=lambda checked: checked.kept_share)
+        return pattern, results
+
+    def has_enough(self, checked: "CheckedContent") -> bool:
+        """Return whether enough of the level is kept."""
+        return checked.kept_share >= self.least_share
+
+    @property
+    def plate_row(self) -> str | None:
+        """A line about the built-in plate; None if a table was given."""
+        if self.table_file is not None:
+            return None
+        plate = self.table.plate
+        size = f"{1000 * plate.length:.0f} x {1000 * plate.width:.0f} mm"
+        return (
+            f"plate: the founding paper's, {size} with {len(self.table.eras)} ERAs; "
+            "give --table for another one"
+        )
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the part of the report that all files share."""
+        return {
+            "table": None if self.table_file is None else str(self.table_file),
+            "quiet_m": [[*position] for position in self.quiet],
+            "least_share": self.least_share,
+        }
+
+
+def _setting(
+    table_file: Path | None,
+    at: str | None,
+    quiet: "Sequence[str]",
+    *,
+    level: float,
+    channel: int | None,
+    least: float,
+) -> _Setting:
+    """Read the options of a check; raises InputError for invalid ones."""
+    from era_haptics.lab.checks.content_check import default_positions
     from model.table.table_file import load_table
 
-    if picture is not None:
-        check_picture(picture)
-    table = load_table(table_file)
-    others = [parse_point(each, what="--quiet") for each in quiet or []]
-    places = [(u * table.plate.length, v * table.plate.width) for u, v in _TRIED]
-    places = [each for each in places if all(math.dist(each, other) > _BESIDE for other in others)]
-    if at is not None or not places:
-        places = [parse_point(at or "", what="--at")]
-    pattern = pattern_of(file, channel)
-    if not (any(each for _, each in pattern.intensity) or pattern.transients):
-        raise InputError(f"{file}: is silent; there is nothing to check")
-    with Stopwatch() as watch:
-        tried = [
-            (place, check_content(pattern, table, level, at=place, quiet=others))
-            for place in places
+    table = _built_in_table() if table_file is None else load_table(table_file)
+    quiet_positions = [parse_point(text, what="--quiet") for text in quiet]
+    if at is not None:
+        positions = [parse_point(at, what="--at")]
+    else:
+        positions = default_positions(table.plate, quiet_positions)
+    if not positions:
+        raise InputError("--at must be given: every default position is next to a quiet finger")
+    return _Setting(
+        table=table,
+        table_file=table_file,
+        positions=positions,
+        quiet=quiet_positions,
+        level_db_sl=level,
+        channel=channel,
+        least_share=least,
+    )
+
+
+def _built_in_table() -> "LocalizationTable":
+    """Return the table of the founding paper's plate, from the user's cache if it is there."""
+    from model.drive_modes import DRIVE_MODES
+    from model.rig.rig_file import example_rig_path, load_rig
+    from model.table.table_file import cached_table
+
+    rig = load_rig(example_rig_path())
+    table, _ = cached_table(rig, drive_mode=DRIVE_MODES[-1])
+    return table
+
+
+def _content_files(paths: "Sequence[Path]") -> list[Path]:
+    """Return files and names as they are, and the contents of folders in order of their names.
+
+    Raises InputError for a folder without content.
+    """
+    from controller.content.formats import content_formats
+
+    endings = tuple(f".{name}" for name in content_formats())
+    files: list[Path] = []
+    for path in paths:
+        if not path.is_dir():
+            files.append(path)
+            continue
+        in_folder = [
+            file
+            for file in sorted(path.rglob("*"))
+            if file.name.lower().endswith(endings) and file.is_file()
         ]
-    tried.sort(key=lambda each: each[1].kept_share)
-    place, checked = tried[len(tried) // 2]
-    files = []
+        if not in_folder:
+            raise InputError(
+                f"{path}: must contain files of content ({', '.join(endings)}), got none"
+            )
+        files += in_folder
+    return files
+
+
+def _check_one(file: Path, setting: _Setting, picture: Path | None, *, as_json: bool) -> bool:
+    """Report on one file in detail; return whether enough of its level is kept."""
+    with Stopwatch() as watch:
+        pattern, results = setting.check(file)
+    checked = results[len(results) // 2]
+    pictures = []
     if picture is not None:
         from era_haptics.lab.checks.content_check import content_figure
         from model.figures import save_figure
 
         save_figure(content_figure(pattern, checked), picture)
-        files = [str(picture)]
-    is_kept, verdict = checked.kept_share >= least, "good"
-    promised = least_promise(checked.parts)
-    if not is_kept:
-        verdict = f"lost too much, at least {percent(least)} must be; {_REMEDY}"
-    elif promised is not None and promised < MIN_CONTRAST_DB:
-        verdict = (
-            f"good, but other fingers feel much of it: {promised:.1f} dB promised above them, "
-            f"{MIN_CONTRAST_DB:g} dB or more are felt apart"
-        )
+        pictures = [str(picture)]
     rows = [
+        setting.plate_row,
         *_lines(checked),
-        *_along(tried, least),
-        f"{file}: {percent(checked.kept_share)} kept, {verdict}; "
+        *_position_row(results, setting),
+        f"{file}: {checked.headline}: {_verdict(checked, setting)}; "
         f"{pattern.duration:.2f} s of content in {watch.elapsed:.1f} s",
-        *(f"wrote {name}" for name in files),
+        *(f"wrote {name}" for name in pictures),
     ]
-    answer = checked.as_json() | {
-        "at_m": [*place],
-        "quiet_m": [[*each] for each in others],
-        "least_share": least,
-        "files": files,
+    answer = {
+        **checked.as_json(),
+        **setting.as_json(),
+        "files": pictures,
         "check_time_s": watch.elapsed,
     }
     print_report(rows, answer, as_json=as_json)
-    if not is_kept:
-        raise typer.Exit(FAILED)
+    return setting.has_enough(checked)
+
+
+def _check_list(files: "Sequence[Path]", setting: _Setting, *, as_json: bool) -> bool:
+    """Report on files, a line each; return whether enough of the level of all is kept."""
+    rows = [setting.plate_row, "level  sharpness  at [m]        file"]
+    contents: list[dict[str, Any]] = []
+    failures = 0
+    with Stopwatch() as watch, progress_bar("files") as progress:
+        for number, file in enumerate(files, start=1):
+            try:
+                _, results = setting.check(file)
+            except (InputError, OSError) as error:
+                failures += 1
+                problem = str(error).splitlines()[0]
+                rows.append(f"{'-':>5}  {'-':>9}  {'-':12}  {problem}")
+                contents.append({"file": str(file), "error": problem})
+            else:
+                checked = results[len(results) // 2]
+                failures += not setting.has_enough(checked)
+                rows.append(_list_row(file, checked, setting))
+                contents.append({"file": str(file), **checked.as_json()})
+            progress(number, len(files))
+    good = f"{len(files) - failures} of {len(files)} files"
+    rows.append(f"{good} keep at least {_exact_percent(setting.least_share)} of their level")
+    answer = {**setting.as_json(), "contents": contents, "check_time_s": watch.elapsed}
+    print_report(rows, answer, as_json=as_json)
+    return failures == 0
+
+
+def _list_row(file: Path, checked: "CheckedContent", setting: _Setting) -> str:
+    """Format a file of several."""
+    level = percent_down(checked.kept_share)
+    sharpness = percent_down(checked.sharpness_kept)
+    verdict, _, _ = _verdict(checked, setting).partition(";")
+    x, y = checked.at
+    return f"{level:>5}  {sharpness:>9}  {f'{x:.3f},{y:.3f}':12}  {file}: {verdict}"
 
 
 _ROWS = 12
-_TRIED = (0.5, 0.5), (0.2, 0.3), (0.35, 0.75), (0.65, 0.2), (0.8, 0.6)
-"""Shares of the plate's sides: the middle, often on a nodal line, and four that no symmetry of a
-plate relates."""
-_BESIDE = 0.04  # m; from a quiet finger to a place that is tried
 _REMEDY = "try --at another place, another sharpness, slower rises or a lower --level"
 
 
-def _along(
-    tried: "Sequence[tuple[tuple[float, float], CheckedContent]]", least: float
-) -> Iterator[str]:
-    """Format how much is kept along several places, and which of them is shown."""
-    if len(tried) > 1:
-        worst, (shown, _), best = tried[0], tried[len(tried) // 2], tried[-1]
-        enough = sum(each.kept_share >= least for _, each in tried)
-        yield (
-            f"of {len(tried)} places {enough} keep at least {percent(least)}: "
-            + ", ".join(
-                f"{percent(each.kept_share)} at {x:.3f},{y:.3f}" for (x, y), each in (worst, best)
-            )
-            + f"; above is {shown[0]:.3f},{shown[1]:.3f}"
+def _verdict(checked: "CheckedContent", setting: _Setting) -> str:
+    """Judge content in words: the first loss that counts, then its details after a semicolon."""
+    from era_haptics.lab.checks.content_check import least_promise
+    from model.answer.answer import MIN_CONTRAST_DB
+
+    least = _exact_percent(setting.least_share)
+    if not setting.has_enough(checked):
+        return f"lost too much; at least {least} of the level must be kept, {_REMEDY}"
+    losses = []
+    if checked.sharpness_kept < setting.least_share:
+        losses.append("its sharpness is lost")
+    if 1 - checked.out_of_band_share < setting.least_share:
+        losses.append("part of it is left out")
+    promised = least_promise(checked.parts)
+    if promised is not None and promised < MIN_CONTRAST_DB:
+        losses.append(
+            f"other fingers feel much of it; {promised:.1f} dB promised above them, "
+            f"{MIN_CONTRAST_DB:g} dB or more are felt apart"
         )
+    return f"level good, but {', '.join(losses)}" if losses else "good"
+
+
+def _exact_percent(share: float) -> str:
+    """Format a limit with all its digits."""
+    return f"{100 * share:.10g} %"
+
+
+def _position_row(results: "Sequence[CheckedContent]", setting: _Setting) -> Iterator[str]:
+    """Format how much is kept at several positions, and which of them is shown."""
+    if len(results) == 1:
+        return
+    worst, shown, best = results[0], results[len(results) // 2], results[-1]
+    enough = sum(setting.has_enough(checked) for checked in results)
+    extremes = ", ".join(
+        f"{percent_down(checked.kept_share)} at {checked.at[0]:.3f},{checked.at[1]:.3f}"
+        for checked in (worst, best)
+    )
+    yield (
+        f"{enough} of {len(results)} positions keep at least "
+        f"{_exact_percent(setting.least_share)}: {extremes}; "
+        f"above is {shown.at[0]:.3f},{shown.at[1]:.3f}"
+    )
 
 
 def _lines(checked: "CheckedContent") -> Iterator[str]:
@@ -275,13 +491,13 @@ def _lines(checked: "CheckedContent") -> Iterator[str]:
         since, until = checked.step * some[0], checked.step * (some[-1] + 1)
         yield f"{since:6.2f} {until:6.2f} {_level(expected)} {_level(felt)}"
     yield f"felt {1000 * checked.delay:.0f} ms later"
-    lasting = [each for each in checked.parts if each.stimulus.course is not None]
-    taps = [each for each in checked.parts if each.stimulus.course is None]
-    for what, parts in (("what lasts", lasting), (counted(len(taps), "tap"), taps)):
+    lasting = [part for part in checked.parts if part.stimulus.course is not None]
+    taps = [part for part in checked.parts if part.stimulus.course is None]
+    for title, parts in (("continuous", lasting), (counted(len(taps), "tap"), taps)):
         if parts:
-            yield f"{what}: {_played(parts)}"
-    for each in checked.lost:
-        yield f"lost: {each}"
+            yield f"{title}: {_played(parts)}"
+    for remark in checked.lost:
+        yield f"lost: {remark}"
 
 
 def _level(db_sl: float) -> str:
@@ -293,8 +509,8 @@ def _played(parts: "Sequence[Part]") -> str:
     """Format frequencies, levels, and the least promise."""
     from era_haptics.lab.checks.content_check import least_promise
 
-    tones = [each.frequency for each in parts if each.frequency is not None]
-    levels = [each.answer.fingers[0].level_db_sl for each in parts]
+    tones = [part.frequency for part in parts if part.frequency is not None]
+    levels = [part.answer.fingers[0].level_db_sl for part in parts]
     promised = least_promise(parts)
     beside = "" if promised is None else f", promised {promised:.1f} dB above quiet fingers"
     return f"{_span(tones)} Hz, up to {max(levels):.1f} dB SL{beside}"

@@ -295,7 +295,7 @@ def test_what_lasts_has_one_band_where_most_of_its_energy_is() -> None:
     found = rendered(pattern, 20.0, EVERY_10_HZ)
     assert found.band == pytest.approx((0.9 * 206, 1.1 * 206))
     assert found.remarks == (
-        "sharpness of 30 % of what lasts: 206 to 253 Hz in the file, one frequency here",
+        "sharpness of 30 % of the continuous part: 206 to 253 Hz in the file, one frequency here",
     )
 
 
@@ -305,7 +305,7 @@ def test_what_lasts_fades_for_30_ms_around_a_tap_of_40_ms() -> None:
     found = rendered(pattern, 20.0, EVERY_10_HZ)
     shares = found.course.at(np.array([0.46, 0.485, 0.5, 0.54, 0.555, 0.58]))
     assert shares == pytest.approx([1.0, 0.5, 0.0, 0.0, 0.5, 1.0])
-    assert found.remarks == ("what lasts, 30 ms before and after each tap",)
+    assert found.remarks == ("the continuous part, 30 ms before and after each tap",)
 
 
 def test_of_taps_closer_than_60_ms_the_strongest_stay() -> None:
@@ -314,7 +314,7 @@ def test_of_taps_closer_than_60_ms_the_strongest_stay() -> None:
     found = rendered(Pattern(1.0, transients=tuple(row)), 20.0, EVERY_10_HZ)
     assert [each.time for each in found.clicks] == pytest.approx([0.1, 0.2])
     assert found.remarks[0] == (
-        "2 of 4 taps, less than 60 ms from a stronger one: left to what lasts"
+        "2 of 4 taps, less than 60 ms from a stronger one: moved into the continuous part"
     )
     assert found.level_db_sl == pytest.approx(16.0)
     shares = found.course.at(np.array([0.07, 0.155, 0.17, 0.3]))
@@ -485,13 +485,17 @@ def test_what_apple_ignores_passes_and_is_said(read: Read) -> None:
           {"Event": {"EventType": "HapticTransient", "Colour": "blue, ]", "EventParameters": [
             {"ParameterID": "HapticIntensity", "ParameterValue": 1.5},
             {"ParameterID": "HapticSharpness"},
+            {"ParameterID": "HapticIntensty", "ParameterValue": 1},
             {"ParameterID": "AudioPan", "ParameterValue": 9}, ]}},
+          {"Parameter": {"ParameterID": "Flavour\\u001b", "Time": 0, "ParameterValue": 1}},
           {"Event": {"EventType": "AudioCustom", "EventWaveformPath": "/etc/passwd"}},
         ],}""",
     )
     assert pattern.transients == (Transient(0.0, 1.0, 0.5),)
     assert pattern.remarks == (
-        "1 unknown parameter left out",
+        "2 unknown parameters left out: HapticIntensty (did you mean HapticIntensity?), "
+        "'Flavour\\x1b'",
+        "1 audio parameter left out: AudioPan",
         "1 audio event left out",
         "HapticIntensity: 1 value out of range clamped, from 1.5 to 1.5",
         "1 unknown key ignored: Colour",

@@ -23,6 +23,7 @@ from typer.testing import CliRunner
 from cases import in_turn, shortly
 from controller.cli.config_cli import config_kinds
 from controller.cli.main import run as run_era
+from controller.content.formats import named_content, read_content
 from controller.content.pattern import Pattern, Transient
 from controller.effects.effect import Effect, Region
 from controller.effects.kinds import BUILT_IN, Buzz, Click, Detents, Dial, File, Ramp, Texture
@@ -31,7 +32,7 @@ from controller.effects.player import EffectPlayer
 from controller.play.selection import Chooser, Selector
 from controller.sources.touch import Contact, ContactKey
 from era_haptics.lab.checks import layout_check, layout_picture
-from era_haptics.lab.checks.content_check import check_content, kept_shares
+from era_haptics.lab.checks.content_check import check_content, content_figure, kept_shares
 from era_haptics.lab.checks.layout_check import (
     CheckedEffect,
     check_layout,
@@ -629,7 +630,7 @@ def test_command_says_what_is_kept_and_fails_below_the_least(tmp_path: Path) -> 
     assert picture.stat().st_size > 0
     result = CliRunner().invoke(app, [*arguments, "--least", "1", "--quiet", "0.21,0.06"])
     assert result.exit_code == 1
-    assert "lost too much, at least 100 % must be" in result.stdout
+    assert "lost too much; at least 100 % of the level must be kept" in result.stdout
     assert "dB above quiet fingers" in result.stdout
 
 
@@ -648,10 +649,10 @@ def test_command_tries_several_places_and_says_what_a_tap_loses(tmp_path: Path) 
         shares.append(found["kept_share"])
     assert shares[0] == np.median(shares[1:])
     (told,) = re.findall(
-        r"of 5 places (\d) keep at least 80 %: (\d+) % at \S+, (\d+) % at ",
+        r"(\d) of 5 positions keep at least 80 %: (\d+) % at \S+, (\d+) % at ",
         CliRunner().invoke(app, arguments).stdout,
     )
-    worst, *_, best = (round(100 * each) for each in sorted(shares[1:]))
+    worst, *_, best = (math.floor(100 * each) for each in sorted(shares[1:]))
     assert [*map(int, told)] == [sum(each >= 0.8 for each in shares[1:]), worst, best]
 
 
@@ -663,26 +664,90 @@ def test_level_beyond_all_is_refused_as_it_was_given() -> None:
 
 
 @pytest.mark.usefixtures("plain_pictures")
-def test_what_is_felt_is_written_as_sound(tmp_path: Path) -> None:
-    """Intensity 1 for a second at 20 dB SL: ten times the threshold at its frequency, sampled.
+def test_sound_has_the_felt_level_at_one_scale(tmp_path: Path) -> None:
+    """Intensity 1 for a second at 20 and 14 dB SL: so many decibels above the threshold, sampled.
 
-    In 16 bits at 48 kHz, which Python's own module reads, of which full scale is as printed.
+    Both with the same full scale, 20 m/s², in 16 bits at 48 kHz, which Python's own module reads.
+    Content at 50 dB SL exceeds that scale and is rejected.
     """
     save_table(content_check_table(), tmp_path / "table.npz")
-    envelope = {"amplitude": [{"time": 0, "amplitude": 1}, {"time": 1, "amplitude": 1}]}
-    content = {"version": {"major": 1, "minor": 0, "patch": 0}, "metadata": {}}
-    signals = {"signals": {"continuous": {"envelopes": envelope}}}
-    (tmp_path / "even.haptic").write_text(json.dumps(content | signals))
+    even = [{"time": 0, "amplitude": 1}, {"time": 1, "amplitude": 1}]
+    write_haptic(tmp_path / "even.haptic", amplitude=even)
     arguments = ["play", str(tmp_path / "even.haptic"), "--at", "0.11,0.13", "--json", "--simulate"]
     sound = tmp_path / "felt.wav"
-    result = CliRunner().invoke(app, [*arguments, str(tmp_path / "table.npz"), "-o", str(sound)])
+    arguments += [str(tmp_path / "table.npz"), "-o", str(sound), "--level"]
+    for level in (20.0, 14.0):
+        result = CliRunner().invoke(app, [*arguments, str(level)])
+        assert result.exit_code == 0
+        with wave.open(str(sound)) as file:
+            assert (file.getsampwidth(), file.getnchannels(), file.getframerate()) == (2, 1, 48000)
+            rate, samples = 48000, np.frombuffer(file.readframes(file.getnframes()), "<i2")
+        acceleration = 20.0 * samples / 32768
+        assert json.loads(result.stdout)["peak_m_s2"] == pytest.approx(acceleration.max(), rel=0.01)
+        middle = acceleration[int(0.3 * rate) : int(0.7 * rate)]
+        frequency = np.fft.rfftfreq(len(middle), 1 / rate)[np.abs(np.fft.rfft(middle)).argmax()]
+        threshold = float(detection_threshold(np.array(frequency), content_check_table().threshold))
+        felt = decibels(math.sqrt(2) * middle.std() / threshold)
+        assert felt == pytest.approx(level, abs=1.0)
+    result = CliRunner().invoke(app, [*arguments, "50"])
+    assert isinstance(result.exception, InputError)
+    assert str(result.exception).startswith("--full-scale must be at least the highest")
+
+
+def write_haptic(path: Path, **envelopes: list[dict[str, float]]) -> None:
+    """Write a .haptic file with these envelopes."""
+    content = {"version": {"major": 1, "minor": 0, "patch": 0}, "metadata": {}}
+    signals = {"signals": {"continuous": {"envelopes": envelopes}}}
+    path.write_text(json.dumps(content | signals))
+
+
+@pytest.mark.usefixtures("plain_pictures")
+def test_sweep_keeps_its_level_but_not_its_sharpness(tmp_path: Path) -> None:
+    """A sweep of 65 to 300 Hz in a second becomes one tone, on the built-in plate, without a table.
+
+    Its best band, 245 to 300 Hz, is 23 % of the sweep: the frequency is linear over time.
+    """
+    even = [{"time": 0, "amplitude": 1}, {"time": 1, "amplitude": 1}]
+    rise = [{"time": share, "frequency": share**2} for share in np.linspace(0, 1, 101).tolist()]
+    write_haptic(tmp_path / "sweep.haptic", amplitude=even, frequency=rise)
+    arguments = ["content", "check", str(tmp_path / "sweep.haptic"), "--at", "0.11,0.13"]
+    found = json.loads(CliRunner().invoke(app, [*arguments, "--json"]).stdout)
+    assert found["table"] is None
+    assert found["kept_share"] > 0.9
+    assert found["sharpness_kept_share"] == pytest.approx(0.23, abs=0.02)
+    result = CliRunner().invoke(app, arguments)
     assert result.exit_code == 0
-    with wave.open(str(sound)) as file:
-        assert (file.getsampwidth(), file.getnchannels(), file.getframerate()) == (2, 1, 48000)
-        rate, samples = 48000, np.frombuffer(file.readframes(file.getnframes()), "<i2")
-    assert np.abs(samples).max() == pytest.approx(0.9 * 32768, abs=1)
-    middle = samples[int(0.3 * rate) : int(0.7 * rate)] / 32768
-    middle *= json.loads(result.stdout)["full_scale_m_s2"]
-    frequency = np.fft.rfftfreq(len(middle), 1 / rate)[np.abs(np.fft.rfft(middle)).argmax()]
-    threshold = float(detection_threshold(np.array(frequency), content_check_table().threshold))
-    assert decibels(math.sqrt(2) * middle.std() / threshold) == pytest.approx(20.0, abs=1.0)
+    assert result.stdout.startswith("plate: the founding paper's, 305 x 229 mm with 4 ERAs; ")
+    share = math.floor(100 * found["sharpness_kept_share"])
+    headline = f"sharpness {share} % kept: level good, but its sharpness is lost;"
+    assert headline in result.stdout
+    pattern = read_content(tmp_path / "sweep.haptic")
+    checked = check_content(pattern, content_check_table(), 20.0, at=AT)
+    title = content_figure(pattern, checked).axes[0].get_title()
+    assert title.startswith(checked.headline)
+    assert "sharpness 2" in title
+
+
+@pytest.mark.usefixtures("plain_pictures")
+def test_folder_is_listed_with_a_line_for_each_file(tmp_path: Path) -> None:
+    """Files of its subfolders, too; not files of other kinds. One that cannot be read fails it."""
+    save_table(content_check_table(), tmp_path / "table.npz")
+    folder = tmp_path / "contents"
+    (folder / "taps").mkdir(parents=True)
+    tick = folder / "taps" / "tick.ahap"
+    tick.write_bytes(named_content("tick").read_bytes())
+    (folder / "notes.txt").write_text("not a content")
+    arguments = ["content", "check", str(folder), "--table", str(tmp_path / "table.npz")]
+    arguments += ["--at", "0.11,0.13", "--least", "0.1"]
+    result = CliRunner().invoke(app, arguments)
+    assert result.exit_code == 0
+    _, row, last = result.stdout.splitlines()
+    assert re.fullmatch(rf" *\d+ % +100 % +0.110,0.130 +{re.escape(str(tick))}: good", row)
+    assert last == "1 of 1 files keep at least 10 % of their level"
+    (folder / "broken.haptic").write_text("{}")
+    result = CliRunner().invoke(app, [*arguments, "--json"])
+    assert result.exit_code == 1
+    broken, kept = json.loads(result.stdout)["contents"]
+    assert broken["error"].startswith(str(folder / "broken.haptic"))
+    assert kept["file"] == str(tick)
+    assert kept["kept_share"] >= 0.1

@@ -37,6 +37,8 @@ def did_you_mean(name: str, known: Iterable[str], *, ending: str = "") -> str:
 _T = TypeVar("_T")
 _Made = TypeVar("_Made")
 
+EXAMPLE_PREFIX = "example"
+"""Names of the example plug-ins begin with it, names of this project never do."""
 _OURS = "era-haptics"
 _GROUP_PREFIX = "era_haptics."
 _REMEDY = "repair or remove that package"
@@ -65,6 +67,15 @@ class PluginRegistry(Generic[_T]):
     hint: str = ""
     ending: str = ""
     example: str = ""
+
+    def __post_init__(self) -> None:
+        """Keep the names of the examples free; raises ValueError."""
+        for name in self.own:
+            if name.startswith(EXAMPLE_PREFIX):
+                raise ValueError(
+                    f"name of a built-in {self.what} must not begin with {EXAMPLE_PREFIX!r}, "
+                    f"got {name!r}: such names belong to the examples"
+                )
 
     def names(self) -> tuple[str, ...]:
         """All names, our own first; no plug-in is loaded."""

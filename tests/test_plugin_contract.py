@@ -1,6 +1,8 @@
 """Plug-ins of every kind: found by name, and attributed to their package when they fail."""
 
 import asyncio
+import inspect
+import pkgutil
 import re
 import sys
 import tempfile
@@ -10,10 +12,12 @@ from dataclasses import dataclass
 from importlib import import_module
 from inspect import isabstract
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import pytest
 
+import era_haptics.plugins
 from controller.cli.main import run
 from controller.content.formats import Ahap, content_format, content_formats, read_content
 from controller.content.reading import ContentFormat
@@ -28,7 +32,7 @@ from drivers.wires.serial_line import SerialAddress
 from drivers.wires.wire import address_of
 from model.errors import InputError
 from model.structure.material import KNOWN_MATERIALS, known_material, material_names
-from registry.plugins import failure_text
+from registry.plugins import EXAMPLE_PREFIX, PluginRegistry, failure_text
 
 URL_CLASS = """\
     def __init__(self, url):
@@ -322,18 +326,17 @@ def test_layout_names_the_packages_that_claim_a_kind(install: Install, tmp_path:
 
 
 @of_every_kind
-def test_example_has_a_name_that_the_project_does_not_have(kind: Kind, install: Install) -> None:
-    """Or the how-to page that installs it would be refused."""
+def test_example_name_cannot_collide_with_a_built_in_one(kind: Kind) -> None:
+    """Names of example plug-ins have a prefix, which a registry rejects for names of its own."""
+    names: list[str] = []
     for file in (Path(__file__).parents[1] / "examples" / "plugins").glob("*/pyproject.toml"):
         points = tomllib.loads(file.read_text("utf-8"))["project"]["entry-points"]
-        for name in points.get(f"era_haptics.{kind.group}", ()):
-            install(f"{file.parent.name}_{name}", kind, name, None)
-            with pytest.raises(kind.error) as caught:
-                kind.look_up(name)
-            assert "(era-haptics," not in str(caught.value), (
-                f"{kind.what} {name} is built in: rename that in {file.parent}, on its how-to page "
-                "in docs/how-to, and in its test in tests/examples"
-            )
+        names += points.get(f"era_haptics.{kind.group}", ())
+    assert names
+    assert [name for name in names if not name.startswith(EXAMPLE_PREFIX)] == []
+    for name in names:
+        with pytest.raises(ValueError, match=rf"must not begin with 'example', got '{name}'"):
+            PluginRegistry(kind.what, kind.group, object, error=InputError, own={name: object()})
 
 
 @of_every_kind
@@ -376,6 +379,29 @@ def test_every_touch_source_of_the_project_is_registered() -> None:
         if base.__module__.startswith("controller.sources") and not isabstract(base):
             sources.append(f"{base.__module__}:{base.__name__}")
     assert sorted(sources) == sorted(_SOURCES.own.values()), "add it to controller/sources/touch.py"
+
+
+INTERFACES = [
+    import_module(f"era_haptics.plugins.{module.name}")
+    for module in pkgutil.iter_modules(era_haptics.plugins.__path__)
+]
+
+
+@pytest.mark.parametrize("interface", INTERFACES, ids=lambda module: module.__name__)
+def test_docstrings_of_an_interface_name_only_what_it_exports(interface: ModuleType) -> None:
+    """A name in backticks that its module defines, or a constant, can be imported by a plug-in."""
+    missing: list[str] = []
+    for exported in interface.__all__:
+        thing = getattr(interface, exported)
+        if not (inspect.isclass(thing) or inspect.isfunction(thing)):
+            continue
+        home = sys.modules[thing.__module__]
+        members = {*dir(thing), *inspect.get_annotations(thing)}
+        for name in re.findall(r"`(\w+)[`.]", inspect.getsource(thing)):
+            is_a_name = name.isupper() or hasattr(home, name)
+            if is_a_name and name not in {*interface.__all__, *members}:
+                missing.append(f"{exported} names {name}")
+    assert missing == [], f"export it from {interface.__name__}, or describe it in words"
 
 
 @of_every_kind

@@ -478,12 +478,13 @@ class Change:
 class ContactTracker:
     """Follows the contacts on one plate; times are arguments.
 
-    x = X L and y = (1 - Y) W, since touch sensors count Y downwards. A touch at most `RIM` outside
-    the plate (0..1) is at its edge. Touches that are farther off, have non-finite coordinates or
-    repeat an id within a frame (the last one counts) are rejected; a contact whose touch is
-    rejected is lifted. Beyond the maximum number of contacts one is evicted (`to_evict`), or the
-    touch is rejected. Of fewer, those that come after max_fingers fingers are surplus until one of
-    these lifts, or turns out to be a hand.
+    x = X L and y = (1 - Y) W, since touch sensors count Y downwards. A touch outside the plate
+    (0..1) by up to the radius of a fingertip is moved to the edge. Touches that are farther off,
+    have non-finite coordinates or repeat an id within a frame (the last one counts) are rejected; a
+    contact whose touch is rejected is lifted. Beyond the maximum number of contacts, the newest
+    contact of the source with the most contacts is lifted for the new one, or the new one is
+    rejected. Contacts beyond max_fingers are surplus until a finger lifts or turns out to be a
+    hand.
     """
 
     def __init__(self, plate: "Plate", *, max_fingers: int = MAX_FINGERS) -> None:

@@ -6,16 +6,19 @@ them.
 """
 
 from drivers.errors import CommandError, LinkError, WireCounters
-from drivers.ports import Port
+from drivers.ports import NETWORK_DELAY, Port
 from drivers.protocol.definition import REQUESTS
+from drivers.protocol.records import Values
 from drivers.wires.can_bus import CanWire
 from drivers.wires.can_frames import CanFrame, pack_frames, unpack_frames
 from drivers.wires.modbus import ModbusWire
 from drivers.wires.serial_line import SerialWire
-from drivers.wires.wire import Wire, WireAddress, read_event, read_reply
+from drivers.wires.wire import Arrival, Wire, WireAddress, read_event, read_reply
 
 __all__ = [
+    "NETWORK_DELAY",
     "REQUESTS",
+    "Arrival",
     "CanFrame",
     "CanWire",
     "CommandError",
@@ -23,6 +26,7 @@ __all__ = [
     "ModbusWire",
     "Port",
     "SerialWire",
+    "Values",
     "Wire",
     "WireAddress",
     "WireCounters",

@@ -367,7 +367,7 @@ async def test_group_plays_behind_a_socket_until_it_is_closed(address: Any, tmp_
         lines = Lines()
         amplifiers = {
             str(number): await lines.amplifier(
-                f"serial+unix://{path}#{number}", LIMITS, name=str(number)
+                f"example-unix://{path}#{number}", LIMITS, name=str(number)
             )
             for number in (1, 2)
         }
@@ -394,11 +394,11 @@ async def read_for_ever(amplifier: Any) -> None:
 
 async def test_url_and_socket_must_be_there(address: Any, tmp_path: Path) -> None:
     """An address that cannot be, a path that is none."""
-    for url in ("serial+unix://host/x", "serial+unix:///x#300", "serial+unix:///", "x:///y?z"):
+    for url in ("example-unix://host/x", "example-unix:///x#300", "example-unix:///", "x:///y?z"):
         with pytest.raises(CommandError):
             address(url)
     with pytest.raises(LinkError, match="no connection"):
-        await Lines().amplifier(f"serial+unix://{tmp_path / 'none'}", LIMITS, name="a")
+        await Lines().amplifier(f"example-unix://{tmp_path / 'none'}", LIMITS, name="a")
 
 
 SOURCE = ROOT / "examples" / "smallest_amplifier" / "amplifier.c"

@@ -24,7 +24,7 @@ class EnvelopeFile(ContentSection):
 class AmplitudeEnvelope(ContentFormat):
     """One amplitude after another, each as long as the others."""
 
-    ending = "envelope.json"
+    ending = "example.json"
 
     def read(self, content: bytes, source: str, channel: int) -> Pattern:
         """Return a pattern whose intensity is each amplitude in the middle of its time."""

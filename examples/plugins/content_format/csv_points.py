@@ -11,7 +11,7 @@ from era_haptics.plugins.content_formats import (
 class CsvPoints(ContentFormat):
     """Points with commas between their values."""
 
-    ending = "csv"
+    ending = "example.csv"
 
     def read(self, content: bytes, source: str, channel: int) -> Pattern:
         """Return a pattern of all lines; those that are empty are skipped."""

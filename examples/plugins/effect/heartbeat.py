@@ -45,7 +45,7 @@ class Beating(EffectRun):
 class Heartbeat(Effect):
     """The effect; its fields are its parameters in a layout, beside `level`."""
 
-    kind: ClassVar[str] = "heartbeat"
+    kind: ClassVar[str] = "example-heartbeat"
     is_for_motion: ClassVar[bool] = False  # for on_press
 
     period: Annotated[float, Quantity(TIME, at_least=0.4, at_most=5.0)] = 0.9

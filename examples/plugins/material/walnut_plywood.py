@@ -3,7 +3,7 @@
 from era_haptics.plugins.materials import KnownMaterial, Material
 
 WALNUT_PLYWOOD = KnownMaterial(
-    Material("walnut-plywood", E=9.5e9, rho=620.0, nu=0.3),
+    Material("example-walnut-plywood", E=9.5e9, rho=620.0, nu=0.3),
     source="bending test of three strips 300 mm long, weighed; nu assumed",
     variation="E 8.7 to 10.2 GPa over the strips, stiffer along the grain of the faces",
     loss_factor="0.01 to 0.02",

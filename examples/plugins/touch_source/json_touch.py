@@ -10,7 +10,7 @@ from era_haptics.plugins.touch_sources import Touch, TouchFrame, UdpSource
 
 
 class JsonTouch(UdpSource):
-    """A source that listens at jsontouch:HOST:PORT."""
+    """A source that listens at example-json:HOST:PORT."""
 
     max_size = 4096  # bytes of a datagram; ten fingers need 400
 

@@ -1,6 +1,6 @@
 """A wire for amplifiers behind a Unix socket, with the frames of a serial line.
 
-serial+unix:///run/amplifier.sock#ADDRESS, as a program serves that has the real line.
+example-unix:///run/amplifier.sock#ADDRESS, as a program serves that has the real line.
 """
 
 import asyncio
@@ -23,7 +23,7 @@ class UnixAddress(WireAddress):
         number = parts.fragment or "1"
         is_number = number.isascii() and number.isdigit() and int(number) in ADDRESSES
         if not parts.path.strip("/") or parts.netloc or parts.query or not is_number:
-            raise CommandError(f"URL must be serial+unix:///PATH#ADDRESS, got {url!r}")
+            raise CommandError(f"URL must be example-unix:///PATH#ADDRESS, got {url!r}")
         self.line, self.number = unquote(parts.path), int(number)
         self.settings = {"protocol": "serial"}
 

@@ -65,12 +65,9 @@ def _named(text: str) -> str:
 
 
 def _leave_out(app: Sphinx, doctree: object) -> None:
-    """Keep what has an index page out of the side bar, and decisions out of the search."""
-    metadata = app.env.metadata[app.env.docname]
-    if app.env.docname.startswith(("decisions/", "gallery/", "measured/")):
-        metadata["orphan"] = True
-    if app.env.docname.startswith("decisions/"):
-        metadata["nosearch"] = True
+    """Keep pages that an index page lists out of the side bar."""
+    if app.env.docname.startswith(("gallery/", "measured/")):
+        app.env.metadata[app.env.docname]["orphan"] = True
 
 
 class Notebook(SphinxDirective):

@@ -37,7 +37,7 @@ _HEAD = """\
 // SPDX-License-Identifier: MIT
 //
 // Protocol 4 in numbers, made by docs/generators/firmware_header.py: do not edit it. A message is a
-// row of 16-bit words (docs/decisions/0088-protocol-4.md). REQUEST_FIELD is the place of a field in
+// row of 16-bit words (docs/reference/protocol.md). REQUEST_FIELD is the place of a field in
 // the words of a request; small fields share a word, out of which FIELD_OF takes one. Ranges of
 // quantities are those of the wire. Replies are in records.h.
 

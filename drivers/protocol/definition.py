@@ -1,7 +1,7 @@
 """Protocol 4 as data: quantities, messages, clock and times, each once, for every wire and end.
 
-`records` turns messages into 16-bit words and back; a wire adds its frame. What the messages mean
-is written in docs/decisions/0088-protocol-4.md.
+`records` turns messages into 16-bit words and back; a wire adds its frame. The meaning of messages
+is defined in docs/reference/protocol.md.
 
 The clock of an amplifier has 32 bits, which go round once in 20 s. A voice of frequency word n has
 the angle n times clock modulo 2^32, in turns of 2^-32. Times are in s.

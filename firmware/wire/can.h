@@ -1,7 +1,6 @@
 // SPDX-License-Identifier: MIT
 //
-// A CANopen node (docs/decisions/0088-protocol-4.md, Wires): frames in, frames out, whatever carries
-// them.
+// A CANopen node (docs/reference/can.md): frames in, frames out, whatever carries them.
 //
 //     can_node.c      network management, heartbeats, events, emergencies
 //     can_segments.c  messages in frames of three words

@@ -70,7 +70,7 @@ SIDE_BANDS = 0.02
 """Share of a content's power, for one ERA, in side bands at other fingers while weights change.
 
 Of n ERAs it is an n-th: their changes have no common phase, while their fields at their own finger
-have. It is what promises on ways need for nine of ten to be kept (decision 0112).
+have. The value is fitted to plates solved in time, so that 90 % of the promises on a path are kept.
 """
 
 

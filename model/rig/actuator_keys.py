@@ -203,7 +203,7 @@ STIFF_MOUNT = 1e6
 """Stiffness [N/m] from which the dent of a point force in the plate counts beside the mount's own.
 
 On the paper's plate a radius of 5 mm in place of a point changes the response by 2 % at 400 Hz and
-16 % near a resonance (`docs/decisions/0049-stiff-mounts-have-a-size.md`).
+16 % near a resonance.
 """
 
 _SAME = {each.name for each in fields(Era)} - {"damping", "gains"}

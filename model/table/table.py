@@ -229,7 +229,7 @@ EDGE = 0.05
 DEFAULT_FREQUENCIES = np.arange(40.0, 501.0, 10.0)
 """Drive frequencies [Hz] of a table by default, the paper's among them.
 
-Steps of 2 Hz would promise 0.1 to 0.2 dB more and take twice as long (docs/decisions, 0037).
+Steps of 2 Hz would promise 0.1 to 0.2 dB more and take twice as long.
 """
 
 PAPER_GRID = Grid(12, 9)

@@ -13,8 +13,6 @@ import doctest
 import json
 import re
 import shutil
-import subprocess
-import sys
 import tempfile
 from collections.abc import Iterator
 from importlib.metadata import requires
@@ -422,18 +420,17 @@ def test_page_states_how_many_fingers_kept_the_promise(page: str) -> None:
 
 
 def test_files_that_pages_name_are_there() -> None:
-    """In any folder, and tests by their bare names; decisions name what was there at the time."""
+    """Every file named on a page exists; tests are named without their folder."""
     tests = {path.name for path in (ROOT / "tests").rglob("test_*.py")}
     folders = "|".join(path.name for path in ROOT.iterdir() if path.is_dir())
     named = re.compile(rf"`((?:{folders})/[\w./-]+\.(?:py|md|yaml|c|h|js|toml|json|html))`")
     gone = {
         name
         for page in FACT_PAGES
-        if "decisions" not in page.parts
         for name in named.findall(page.read_text("utf-8"))
         if not (ROOT / name).exists() and not name.startswith(("dist/", "tests/faults/AREA"))
     }
-    pages = [page.read_text("utf-8") for page in FACT_PAGES if "decisions" not in page.parts]
+    pages = [page.read_text("utf-8") for page in FACT_PAGES]
     assert gone == set()
     assert {name for page in pages for name in re.findall(r"`(test_\w+\.py)`", page)} <= tests
 
@@ -482,34 +479,13 @@ def test_every_page_can_be_found() -> None:
     docs = ROOT / "docs"
     index = (docs / "index.md").read_text("utf-8")
     listed = set(re.findall(r"^(?:.* <)?([a-z-]+(?:/[\w-]+)?)>?$", index, re.MULTILINE))
-    for name in ("decisions/README", "measured/figures", "gallery"):
+    for name in ("measured/figures", "gallery"):
         assert name in listed
         folder, links = Path(name).parent, (docs / f"{name}.md").read_text("utf-8")
         listed |= {str(folder / page) for page in re.findall(r"\(([\w/-]+)\.md\)", links)}
     pages = {path.relative_to(docs) for path in docs.rglob("*.md")}
     names = {page.with_suffix("").as_posix() for page in pages if page.parts[0] != "_build"}
     assert names - listed == {"index"}
-
-
-@pytest.mark.long
-def test_the_search_finds_pages_and_no_decision(tmp_path: Path) -> None:
-    """A word of a page is in the index of the built pages, one of a decision is not."""
-    pytest.importorskip("sphinx", reason="`make docs` installs what builds the pages")
-    for name, text in {
-        "index": "# Pages\n\n```{toctree}\nwire\ndecisions/README\n```\n",
-        "wire": "# A wire\n\nserendipity\n",
-        "decisions/README": "# Decisions\n\n[one](0001-one.md)\n",
-        "decisions/0001-one": "# Juxtaposed\n\nbamboozle\n",
-    }.items():
-        (tmp_path / name).parent.mkdir(exist_ok=True)
-        (tmp_path / f"{name}.md").write_text(text, "utf-8")
-    built = tmp_path / "_build"
-    command = [sys.executable, "-m", "sphinx", "-q", "-b", "html", "-c", ROOT / "docs"]
-    subprocess.run([*command, tmp_path, built], check=True, capture_output=True)
-    index = (built / "searchindex.js").read_text("utf-8").lower()
-    assert "serendip" in index
-    assert "juxtapos" not in index
-    assert "bamboozl" not in index
 
 
 def test_the_version_is_the_same_wherever_it_is_stated() -> None:
@@ -552,24 +528,6 @@ def test_pages_that_are_named_in_code_are_there() -> None:
     }
     assert len(named) > 10
     assert {(page, path) for page, path in named if not (ROOT / page).is_file()} == set()
-
-
-def test_decisions_that_are_named_are_there() -> None:
-    """A record that was folded into a later one is named nowhere, in code, tests or pages."""
-    folders = ["controller", "docs", "drivers", "firmware", "model", "sim", "tests"]
-    suffixes = {".py", ".c", ".h", ".md", ".yaml"}
-    files = [path for name in folders for path in (ROOT / name).rglob("*.*")]
-    named = {
-        (number, path.name)
-        for path in files
-        if path.suffix in suffixes and "_build" not in path.parts
-        for number in re.findall(
-            r"(?:\bdecisions?/|\bdecisions? |\[)(0\d{3})\b", path.read_text("utf-8")
-        )
-    }
-    assert len(named) > 50
-    there = {path.name[:4] for path in (ROOT / "docs" / "decisions").glob("0*.md")}
-    assert {(number, name) for number, name in named if number not in there} == set()
 
 
 PYTHON_EXAMPLES_PAGE = (ROOT / "docs" / "reference" / "python-api.md").read_text("utf-8")

@@ -46,7 +46,7 @@ from sim.far_ends.can_amplifiers import ObjectServer
 
 DOCS = Path(__file__).parents[2] / "docs" / "reference"
 
-# Worked out from docs/decisions/0088-protocol-4.md and the standards, not by our codecs.
+# Worked out from docs/reference/protocol.md and the standards, not by our codecs.
 BY_HAND = {
     ("serial", "Set, part 0 of 2, without a reply"): """
 > 00 05 05 04 01 08 06 17 2A 02 01 04 02 02 02 14 04 F4 01 08 05 98 08 D0 07 01 02 18 0B 98 08 4C

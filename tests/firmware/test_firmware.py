@@ -1,7 +1,7 @@
 """The firmware in C: its sources, its samples, and its programs with the host of protocol 4.
 
 Structs go by the names of their fields and files have no circle; samples follow the formulas of
-docs/decisions/0088-protocol-4.md; the firmware is compared with the simulated amplifier, judged by
+docs/reference/protocol.md; the firmware is compared with the simulated amplifier, judged by
 conformance, and run as a program on terminals and TCP. Damaged frames meet it under sanitizers:
 `make firmware-test` has 20 000 for each line, under the sanitizer of addresses as well, and
 200 000 with --long.

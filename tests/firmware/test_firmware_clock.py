@@ -1,4 +1,4 @@
-"""The firmware's clock and what counts on it, against docs/decisions/0088, at two sample rates.
+"""The firmware's clock and what counts on it, against the protocol page, at two sample rates.
 
 Sample k since power-up has the clock k / rate [s], and is put out when it is due, a sample later:
 so a reading is that much behind the time since then, and the same for all that run it.

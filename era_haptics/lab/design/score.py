@@ -16,8 +16,8 @@ half, dc by the ERAs' damping, s_j of each ERA's stiffness and the finger's load
 the plate without fingers, as `LocalizationTable.error_power`. The score of a set is |h_t w|² /
 max_q w^H R_q w of the best weights w at the best frequency, less a tenth of what they miss the
 wanted level by: an answer that has to reach it loses little. For several contents it is the worst
-one's, with all other fingers quiet: their foreign levels add to little more than the highest
-(docs/decisions, 0067). Each is searched at as many times the level, since they share the stroke.
+one's, with all other fingers quiet: their foreign levels add to little more than the highest.
+Each is searched at as many times the level, since they share the stroke.
 
 The search adds the candidate that raises the score most, one ERA after the other; then exchanges
 move one ERA at a time to the best candidate until none gains; then every ERA is moved by ever

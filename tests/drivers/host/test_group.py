@@ -66,7 +66,7 @@ class Paced:
     def __init__(self, end: MemoryLine, character: float, gap: float) -> None:
         self._end, self._character, self._gap = end, character, gap
         self._free = self._reply_until = 0.0
-        self.reaction = 0.0099  # s; a reply may begin 10 ms after its request (decision 0088)
+        self.reaction = 0.0099  # s; a reply may begin 10 ms after its request (protocol page)
         self.collisions = 0
         end.inward, end.outward = self._inward, self._outward
 

@@ -1,6 +1,6 @@
 """Messages of protocol 4 in CAN frames, and the buses and adapters that carry these.
 
-Bytes are worked out by hand from the decision. Frames as text of adapters, the greeting of
+Bytes are worked out by hand from the protocol page. Frames as text of adapters, the greeting of
 socketcand and the commands of slcan, a transmit queue of python-can that is full, error frames,
 losses.
 """
@@ -113,7 +113,7 @@ REQUESTS: dict[str, tuple[int, Values, tuple[str, ...]]] = {
 
 
 @pytest.mark.parametrize("name", REQUESTS)
-def test_requests_have_the_bytes_of_the_decision(name: str) -> None:
+def test_requests_have_the_bytes_of_the_protocol_page(name: str) -> None:
     """Number, index, type, count and two words, then three words each, low byte first."""
     number, values, expected = REQUESTS[name]
     message = MESSAGES[name]

@@ -1,4 +1,4 @@
-"""The simulated amplifier of protocol 4 against decision 0088, its clock, and its far ends.
+"""The simulated amplifier of protocol 4 against the protocol page, its clock, and its far ends.
 
 2^32 steps of the clock in 20 s are 214 748 364.8 a second; a step of the high word is 20 s / 65536
 = 305.18 us. Far ends are on real ports: CAN, its adapters, and Modbus with masters of others. Bytes

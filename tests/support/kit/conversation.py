@@ -1,6 +1,6 @@
 """A host and an amplifier on a serial line, whose frames of protocol 4 are written by hand.
 
-By docs/decisions/0088-protocol-4.md, with none of the product's codecs: a frame is 00, COBS of
+According to docs/reference/protocol.md, with none of the product's codecs: a frame is 00, COBS of
 (type, version, address, sequence as u16, payload, CRC-32), 00; words are little-endian. What a host
 or an amplifier must not do is a conversation each, by docs/reference/witness.md.
 """

@@ -79,7 +79,7 @@ def test_witness_finds_nothing_in_random_days(kind: str, lines: str, seed: int) 
 @pytest.mark.parametrize("lines", shortly(LINES, ["shared"]))
 @pytest.mark.parametrize("kind", shortly(KINDS, ["serial", "tcp"]))
 def test_witness_excuses_lost_and_doubled_frames(kind: str, lines: str, seed: int) -> None:
-    """Both sides bear them as the decision says, and half a second later all rules hold again."""
+    """Host and amplifiers recover, and half a second later all rules hold again."""
     live(kind, lines, seed, lossy_steps=25)
 
 

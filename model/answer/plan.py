@@ -17,9 +17,9 @@ three together, near the best steady one.
 
 import math
 from bisect import bisect_left, bisect_right
-from collections import defaultdict
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
 from typing import Any
 
@@ -110,15 +110,40 @@ def answer(
     """
     if not 0 <= apart_hz < math.inf:  # False for NaN
         raise InputError(f"apart_hz must be a distance of frequencies in Hz, got {apart_hz}")
-    every = (*fingers, *[each if isinstance(each, Finger) else Finger(each) for each in quiet])
-    check_fingers(every, table.plate)
-    mode = checked_mode(drive_mode or table.drive_mode)
-    near = [np.abs(table.frequencies - each) < apart_hz - SAME_FREQUENCY for each in avoided_hz]
-    avoided = frozenset(np.flatnonzero(np.any(near, axis=0)).tolist() if near else ())
-    answering = _Answering(table, every, mode, shaped, apart_hz, avoided, bands_may_swap, limits)
-    found = answering.within_limits(answering.solve(min_contrast_db), min_contrast_db)
-    changed = _changed(found)
-    return replace(found, applied=(*found.applied, *changed)) if changed else found
+    every_finger = (*fingers, *map(_quiet_finger, quiet))
+    check_fingers(every_finger, table.plate)
+    search = _Search(
+        table,
+        every_finger,
+        drive_mode=checked_mode(drive_mode or table.drive_mode),
+        is_shaped=shaped,
+        apart_hz=apart_hz,
+        avoided=_rows_near(table, avoided_hz, apart_hz),
+        bands_may_swap=bands_may_swap,
+        limits=limits,
+        min_contrast_db=min_contrast_db,
+    )
+    result = search.within_limits(search.solve())
+    notes = (*_steady_notes(result), *_level_notes(result))
+    if not notes:
+        return result  # a copy would lose what it has computed
+    return replace(result, applied=(*result.applied, *notes))
+
+
+def _quiet_finger(position: Point | Finger) -> Finger:
+    """A finger that is to feel nothing."""
+    return position if isinstance(position, Finger) else Finger(position)
+
+
+def _rows_near(
+    table: LocalizationTable, frequencies: Sequence[float], apart_hz: float
+) -> frozenset[int]:
+    """Rows of the table that are too near to frequencies [Hz]."""
+    rows: set[int] = set()
+    for frequency in frequencies:
+        distance = np.abs(table.frequencies - frequency)
+        rows.update(np.flatnonzero(distance < apart_hz - SAME_FREQUENCY).tolist())
+    return frozenset(rows)
 
 
 def query(
@@ -142,27 +167,31 @@ def prepare_answers(table: LocalizationTable, drive_mode: str | None = None) -> 
         query(table, placed, MIN_LEVEL_DB_SL, drive_mode=drive_mode)
 
 
-def _changed(found: Answer) -> list[str]:
-    """List in words which vibrations are steady or lowered against what was asked."""
-    steady, lowered = [], []
-    for number, stream in enumerate(found.contents.streams):
+def _steady_notes(result: Answer) -> Iterator[str]:
+    """Yield notes of vibrations that are steady although their stimulus is modulated."""
+    tones_of = Counter(result.tones.owners)
+    for number, stream in enumerate(result.contents.streams):
+        finger = result.asked[stream.targets[0]]
+        is_modulated = finger.stimulus is not None and finger.stimulus.modulation_hz is not None
+        if is_modulated and tones_of[number] == 1:
+            yield f"vibration of {_at(finger)} is steady"
+
+
+def _level_notes(result: Answer) -> Iterator[str]:
+    """Yield notes of vibrations that are weaker than requested, with the reason."""
+    for stream in result.contents.streams:
         first = stream.targets[0]
-        stimulus = found.asked[first].stimulus
-        is_modulated = stimulus is not None and stimulus.modulation_hz is not None
-        if is_modulated and list(found.tones.owners).count(number) == 1:
-            steady.append(f"vibration of {_at(found.asked[first])} is steady")
         lasts = stream.duration is None
-        is_reached = found.tones.level_db_sl[first][lasts] >= stream.level_db_sl - SAME_LEVEL
-        if stream.limit_db_sl is None and not is_reached:
-            level = found.tones.level_db_sl[first][lasts]
-            why = (
-                "all that the ERAs' stroke and the amplifiers allow"
-                if found.stroke_factor < 1 - NEARLY or lasts
-                else "so that quiet fingers feel half of it at most"
-            )
-            at = _at(found.asked[first])
-            lowered.append(f"vibration of {at} is lowered to {level:.1f} dB SL, {why}")
-    return [*steady, *lowered]
+        level = result.tones.level_db_sl[first][lasts]
+        is_reached = level >= stream.level_db_sl - SAME_LEVEL
+        if stream.limit_db_sl is not None or is_reached:
+            continue
+        if result.stroke_factor < 1 - NEARLY or lasts:
+            reason = "all that the ERAs' stroke and the amplifiers allow"
+        else:
+            reason = "so that quiet fingers feel half of it at most"
+        at = _at(result.asked[first])
+        yield f"vibration of {at} is lowered to {level:.1f} dB SL, {reason}"
 
 
 @dataclass(frozen=True)
@@ -175,89 +204,114 @@ class _Plan:
     """What was changed, in words."""
 
 
-@dataclass(frozen=True)
-class _Answering:
-    """Fingers on a table's plate, numbered in their order."""
+@dataclass(frozen=True, kw_only=True)
+class _Search:
+    """The search for an answer; fingers are numbered in their order."""
 
-    table: LocalizationTable
-    fingers: tuple[Finger, ...]
+    table: LocalizationTable = field(kw_only=False)
+    fingers: tuple[Finger, ...] = field(kw_only=False)
     drive_mode: str
     is_shaped: bool
     apart_hz: float
     avoided: frozenset[int]
+    """Rows of the table's frequencies that play already, or are too near to these."""
     bands_may_swap: bool
     limits: Limits
+    min_contrast_db: float
 
-    def solve(self, min_contrast_db: float) -> Answer:
-        """Let fingers share, then serve in turn, until the worst finger has the contrast.
+    def solve(self) -> Answer:
+        """Find who feels which vibration, then set modulation and levels.
 
-        Otherwise return the best answer that was tried.
+        First each finger has its own vibration. Until all have enough contrast, fingers share, and
+        then are served in turn. Otherwise the best answer that was tried is returned.
         """
-        plan = _Plan(self._first_contents)
-        if len(plan.contents) > MAX_SEPARATE:
-            plan = self._many_joined(plan)
+        plan = self._first_plan()
+        self._check_drive_mode(plan)
+        plan, tried = self._share_until_served(plan)
+        result = tried[-1]
+        if self._fails(result):
+            result = self._serve_in_turn(plan, tried)
+        if result.tones.worst_db < self.min_contrast_db:  # NaN for a finger alone
+            note = f"nothing reaches {self.min_contrast_db:g} dB: the best that was tried is served"
+            result = replace(result, applied=(*result.applied, note))
+        if self.drive_mode == UNRESTRICTED and not self.table.clocks.groups:
+            result = with_modulation(self.table, result, playable=self.limits.frequencies)
+        if any(stream.limit_db_sl is not None for stream in result.contents.streams):
+            result = as_quiet_fingers_allow(self.table, result)
+        return result
+
+    def within_limits(self, result: Answer) -> Answer:
+        """Lower the answer to what the amplifiers' limits allow.
+
+        If a finger would no longer be served, all are answered again at the lower levels.
+        """
+        result = as_ramps_allow(self.table, result, self.limits)
+        factor = self.limits.factor_within(result.layers, self.table)
+        if factor >= 1 - NEARLY:
+            return result
+        if len(result.contents.streams) > 1:
+            result = self._lowered_by_priority(result)
+            factor = self.limits.factor_within(result.layers, self.table)
+        return scaled(result, float(decibels(factor))) if factor < 1 else result
+
+    def _lowered_by_priority(self, result: Answer) -> Answer:
+        """Lower the vibrations, those of low priority first, so that limits hold."""
+        gains = gains_within(self.table, result, self.limits)
+        lowered = with_gains(self.table, result, gains)
+        if is_served(lowered, result):
+            return lowered
+        softer = replace(self, fingers=_softer(result, gains.tolist()))
+        return replace(softer.solve(), asked=self.fingers)
+
+    def _check_drive_mode(self, plan: _Plan) -> None:
+        """Raise InputError for several vibrations in a drive mode that plays one."""
         if len(plan.contents) > 1 and self.drive_mode != UNRESTRICTED:
             raise InputError(
                 f"drive mode must be {UNRESTRICTED} for a vibration of each of several fingers, "
                 f"got {self.drive_mode}, which plays one; where the amplifiers play it give "
                 f"drive_mode={UNRESTRICTED!r}, or --mode {UNRESTRICTED} to era table query or build"
             )
-        tried = [found := self._measure(plan)]
-        while (
-            _fails(found, min_contrast_db)
-            and (shared := self._with_more_shared(plan, min_contrast_db)) != plan
-        ):
-            tried.append(found := self._measure(plan := shared))
-        if _fails(found, min_contrast_db):
-            found = self._in_turn(plan, tried, min_contrast_db)
-        if found.tones.worst_db < min_contrast_db:  # NaN for a finger alone
-            below = f"nothing reaches {min_contrast_db:g} dB: the best that was tried is served"
-            found = replace(found, applied=(*found.applied, below))
-        if self.drive_mode == UNRESTRICTED and not self.table.clocks.groups:
-            found = with_modulation(self.table, found, playable=self.limits.frequencies)
-        is_limited = any(stream.limit_db_sl is not None for stream in found.contents.streams)
-        return as_quiet_fingers_allow(self.table, found) if is_limited else found
 
-    def within_limits(self, found: Answer, min_contrast_db: float) -> Answer:
-        """Lower the answer to what the amplifiers' limits allow.
+    def _fails(self, result: Answer) -> bool:
+        """Whether a finger has less contrast than all must have, or than it asks for."""
+        return _is_out_of_bounds(result) or result.tones.worst_db < self.min_contrast_db
 
-        If a finger would no longer be served, all are answered again at the lower levels.
-        """
-        found = as_ramps_allow(self.table, found, self.limits)
-        if (factor := self.limits.factor_within(found.layers, self.table)) >= 1 - NEARLY:
-            return found
-        if len(found.contents.streams) > 1:
-            gains = gains_within(self.table, found, self.limits)
-            lowered = with_gains(self.table, found, gains)
-            if not is_served(lowered, found):
-                lowered = replace(self, fingers=_softer(found, gains.tolist())).solve(
-                    min_contrast_db
-                )
-                lowered = replace(lowered, asked=self.fingers)
-            found = lowered
-            factor = self.limits.factor_within(found.layers, self.table)
-        return scaled(found, float(decibels(factor))) if factor < 1 else found
+    def _share_until_served(self, plan: _Plan) -> tuple[_Plan, list[Answer]]:
+        """Let fingers share until all are served; return the last plan, and all answers tried."""
+        tried = [self._measure(plan)]
+        while self._fails(tried[-1]):
+            shared = self._with_more_shared(plan)
+            if shared == plan:
+                break
+            plan = shared
+            tried.append(self._measure(plan))
+        return plan, tried
+
+    def _first_plan(self) -> _Plan:
+        """A vibration of its own for each finger, except for those that must or may share."""
+        plan = _Plan(self._first_contents)
+        return self._many_joined(plan) if len(plan.contents) > MAX_SEPARATE else plan
 
     @cached_property
     def _first_contents(self) -> tuple[tuple[int, ...], ...]:
         """The fingers of each vibration at first: together if they must feel one."""
-        found: list[list[int]] = []
+        groups: list[list[int]] = []
         for number, finger in enumerate(self.fingers):
             if finger.stimulus is None:
                 continue
-            for content in found:
-                if finger.must_feel_one_with(self.fingers[content[0]]):
-                    content.append(number)
+            for group in groups:
+                if finger.must_feel_one_with(self.fingers[group[0]]):
+                    group.append(number)
                     break
             else:
-                found.append([number])
-        return tuple(map(tuple, found))
+                groups.append([number])
+        return tuple(map(tuple, groups))
 
-    def _with_more_shared(self, plan: _Plan, min_contrast_db: float) -> _Plan:
+    def _with_more_shared(self, plan: _Plan) -> _Plan:
         """Let the nearest two fingers share that cannot be apart, else the nearest that may."""
         for _ in range(max(1, len(plan.contents) // CONTENTS_A_STEP)):
             pair = self._nearest(plan, are_apart=False)
-            if not pair or self._contrast_alone(*pair) >= min_contrast_db:
+            if not pair or self._contrast_alone(*pair) >= self.min_contrast_db:
                 pair = self._nearest(plan)
             if not pair:
                 break
@@ -265,17 +319,19 @@ class _Answering:
         return plan
 
     def _nearest(self, plan: _Plan, *, are_apart: bool = True) -> tuple[tuple[int, ...], ...]:
-        """Return the nearest two contents that may be one, empty if there are none.
+        """The nearest two contents that may be one, empty if there are none.
 
         are_apart: whether each finger could be served with a vibration of its own.
         """
-        fingers, pairs = self.fingers, dict[tuple[tuple[int, ...], ...], float]()
-        for number, one in enumerate(plan.contents):
-            for other in plan.contents[:number]:
-                both = [(fingers[a], fingers[b]) for a in one for b in other]
-                if all(a.may_feel_one_with(b, are_apart=are_apart) for a, b in both):
-                    pairs[other, one] = -min(math.dist(a.at, b.at) for a, b in both)
-        return best_by([*pairs], pairs.__getitem__) if pairs else ()
+        distances: dict[tuple[tuple[int, ...], ...], float] = {}
+        for number, second in enumerate(plan.contents):
+            for first in plan.contents[:number]:
+                pairs = [(self.fingers[a], self.fingers[b]) for a in second for b in first]
+                if all(a.may_feel_one_with(b, are_apart=are_apart) for a, b in pairs):
+                    distances[first, second] = min(math.dist(a.at, b.at) for a, b in pairs)
+        if not distances:
+            return ()
+        return best_by([*distances], lambda contents: -distances[contents])
 
     def _contrast_alone(self, own: Sequence[int], others: Sequence[int]) -> float:
         """Contrast [dB] of the nearest two of own and other fingers, if only these were touching.
@@ -285,89 +341,95 @@ class _Answering:
         pairs = [(self.fingers[a], self.fingers[b]) for a in own for b in others]
         if not pairs:
             return math.inf
-        one, other = best_by(pairs, lambda each: -math.dist(each[0].at, each[1].at))
+        felt, quiet = best_by(pairs, lambda pair: -math.dist(pair[0].at, pair[1].at))
         both = (
-            replace(one, stimulus=Stimulus()),
-            replace(other, stimulus=None, is_protected=True),
+            replace(felt, stimulus=Stimulus()),
+            replace(quiet, stimulus=None, is_protected=True),
         )
         alone = replace(self, fingers=both, avoided=frozenset())
         return alone._measure(_Plan(((0,),))).tones.worst_db
 
     def _quiet_beside(self, felt: Sequence[int]) -> list[int]:
-        """Return the fingers that must not feel the vibration of these fingers."""
+        """The fingers that must not feel the vibration of these fingers."""
         return [
             number
-            for number, each in enumerate(self.fingers)
-            if number not in felt and each.is_protected and not each.is_load
+            for number, finger in enumerate(self.fingers)
+            if number not in felt and finger.is_protected and not finger.is_load
         ]
 
-    def _in_turn(self, plan: _Plan, tried: Sequence[Answer], min_contrast_db: float) -> Answer:
-        """Serve contents one after the other, each if all served so far still have what they need.
+    def _serve_in_turn(self, plan: _Plan, tried: Sequence[Answer]) -> Answer:
+        """Serve contents one after another, each if all served so far still have what they need.
 
-        First come fingers that others disturb, then higher priorities, then protected fingers, then
-        earlier ones; last come contents that could not even be kept from the finger beside their
-        own. If the first cannot be served, the best of tried is returned.
+        If not even the first can be served, the best of the answers tried is returned.
         """
-        every, served = tried[-1], list[tuple[int, ...]]()
-        order = sorted(
-            plan.contents,
-            key=lambda each: (
-                self._contrast_alone(each, self._quiet_beside(each)) < min_contrast_db,
-                {*each}.isdisjoint(every.disturbed),
-                -self.fingers[each[0]].priority,
-                not self.fingers[each[0]].is_protected,
-            ),
-        )
-        found, without = self._measure(replace(plan, contents=())), dict.fromkeys(order, every)
+        order = sorted(plan.contents, key=lambda content: self._order_key(content, tried[-1]))
+        served: list[tuple[int, ...]] = []
+        result = self._measure(replace(plan, contents=()))
+        with_content = dict.fromkeys(order, tried[-1])
         for content in order:
-            more, chosen = every, [*served, content]
-            if len(chosen) < len(order):
-                contents = tuple([each for each in plan.contents if each in chosen])
-                more = self._measure(replace(plan, contents=contents))
-            without[content] = more
-            if not _fails(more, min_contrast_db):
-                found, served = more, chosen
-            elif content == order[0] and not _is_out_of_bounds(more):
-                allowed = [each for each in (*tried, more) if not _is_out_of_bounds(each)]
-                found = best_by(allowed, worst_of)
+            attempt = tried[-1]
+            if len(served) + 1 < len(order):
+                chosen = {*served, content}
+                contents = tuple(each for each in plan.contents if each in chosen)
+                attempt = self._measure(replace(plan, contents=contents))
+            with_content[content] = attempt
+            if not self._fails(attempt):
+                result = attempt
+                served.append(content)
+            elif content == order[0] and not _is_out_of_bounds(attempt):
+                allowed = [each for each in (*tried, attempt) if not _is_out_of_bounds(each)]
+                result = best_by(allowed, worst_of)
                 break
-        felt = {finger for stream in found.contents.streams for finger in stream.targets}
-        held = [each for each in order if felt.isdisjoint(each)]
-        return replace(
-            found,
-            held=tuple(
-                (finger, without[each].tones.contrast_db[finger][2], bool(without[each].disturbed))
-                for each in held
-                for finger in each
-            ),
-            applied=(
-                *found.applied,
-                *(
-                    f"vibration of {_at(first)} is "
-                    f"{'held back' if first.is_protected else 'neither served nor protected'}"
-                    for first in [self.fingers[each[0]] for each in held]
-                ),
-            ),
+        return self._with_held_back(result, with_content)
+
+    def _order_key(self, content: Sequence[int], together: Answer) -> tuple[bool, bool, int, bool]:
+        """Sort key of a content that is served in turn; together: the answer with all of them.
+
+        First come fingers that others disturb, then higher priorities, then protected fingers. Last
+        come contents that could not even be kept from the finger next to their own.
+        """
+        first = self.fingers[content[0]]
+        return (
+            self._contrast_alone(content, self._quiet_beside(content)) < self.min_contrast_db,
+            {*content}.isdisjoint(together.disturbed),
+            -first.priority,
+            not first.is_protected,
         )
+
+    def _with_held_back(
+        self, result: Answer, with_content: Mapping[tuple[int, ...], Answer]
+    ) -> Answer:
+        """Note the contents that are held back, with what each would have been promised."""
+        felt = {finger for stream in result.contents.streams for finger in stream.targets}
+        held: list[tuple[int, float, bool]] = []
+        notes: list[str] = []
+        for content, attempt in with_content.items():
+            if not felt.isdisjoint(content):
+                continue
+            for finger in content:
+                contrast = attempt.tones.contrast_db[finger][2]
+                held.append((finger, contrast, bool(attempt.disturbed)))
+            first = self.fingers[content[0]]
+            what = "held back" if first.is_protected else "neither served nor protected"
+            notes.append(f"vibration of {_at(first)} is {what}")
+        return replace(result, held=tuple(held), applied=(*result.applied, *notes))
 
     def _joined(self, plan: _Plan, contents: Sequence[tuple[int, ...]]) -> _Plan:
-        """Return the plan with some of its contents joined to that of the highest priority."""
-        one, *others = sorted(contents, key=lambda each: -self.fingers[each[0]].priority)
-        fingers = sum(others, one)
-        at = _at(self.fingers[one[0]])
-        return replace(
-            plan,
-            contents=tuple(
-                fingers if each == one else each for each in plan.contents if each not in others
-            ),
-            applied=(
-                *plan.applied,
-                *(f"{_at(self.fingers[each[0]])} shares the vibration of {at}" for each in others),
-            ),
-        )
+        """The plan with some of its contents joined to the one of the highest priority."""
+        by_priority = sorted(contents, key=lambda content: -self.fingers[content[0]].priority)
+        host, guests = by_priority[0], by_priority[1:]
+        joined = sum(guests, host)
+        plan_contents = [
+            joined if content == host else content
+            for content in plan.contents
+            if content not in guests
+        ]
+        at = _at(self.fingers[host[0]])
+        notes = [f"{_at(self.fingers[guest[0]])} shares the vibration of {at}" for guest in guests]
+        return replace(plan, contents=tuple(plan_contents), applied=(*plan.applied, *notes))
 
     def _many_joined(self, plan: _Plan) -> _Plan:
-        """Return the plan with one content for more than MAX_SEPARATE fingers that may share."""
+        """The plan with one content for more than MAX_SEPARATE fingers that may share."""
         groups = defaultdict[str | bool, list[tuple[int, ...]]](list)
         for content in plan.contents:
             finger = self.fingers[content[0]]
@@ -380,15 +442,16 @@ class _Answering:
 
     @cached_property
     def _bands(self) -> dict[int, tuple[int, int]]:
-        """First row that each finger may have of the table's frequencies, and one past the last."""
-        frequencies, bands = self.table.frequencies.tolist(), {}
+        """First row of the table's frequencies that each finger may have, and one past the last."""
+        frequencies = self.table.frequencies.tolist()
+        bands: dict[int, tuple[int, int]] = {}
         for number, finger in enumerate(self.fingers):
             if finger.stimulus is None:
                 continue
             low, high = finger.stimulus.band_hz
             first, end = bisect_left(frequencies, low), bisect_right(frequencies, high)
             if first == end:
-                nearest = min(frequencies, key=lambda each: abs(each - low))
+                nearest = min(frequencies, key=lambda frequency: abs(frequency - low))
                 raise InputError(
                     f"band of {_at(finger)} must be LOW-HIGH in Hz and hold a frequency of the "
                     f"table, {frequencies[0]:g} to {frequencies[-1]:g} Hz, of which {nearest:g} Hz "
@@ -399,38 +462,26 @@ class _Answering:
         return bands
 
     def _contents(self, plan: _Plan) -> Contents:
-        """Return the contents of a plan."""
-        bands, streams, background = self._bands, [], None
-        for fingers in plan.contents:
-            own = tuple(bands.values()) if self.bands_may_swap else (bands[fingers[0]],)
-            first = self.fingers[fingers[0]]
-            stimulus, priority, level = first.stimulus, first.priority, -math.inf
-            for finger in fingers:
-                other = self.fingers[finger]
-                level = max(level, other.stimulus.level_db_sl if other.stimulus else level)
-                priority = max(priority, other.priority)
-            duration, limit, course = None, None, None
-            if stimulus is not None:
-                duration, course = stimulus.duration, stimulus.course
-                if course is not None:
-                    level += course.strongest_db
-                if stimulus.is_limit:
-                    level, limit = min(level, FELT_DB_SL), level
-            of_stimulus = duration, limit, course
-            streams.append(Stream(fingers, float(level), own, priority, *of_stimulus))
+        """The contents of a plan, as the search for tones takes them."""
+        streams = tuple(self._stream(content) for content in plan.contents)
         quiet = tuple(self._quiet_beside(sum(plan.contents, ())))
+        background = None
         if len(streams) == 1 and not quiet:
-            places = [self.fingers[finger].at for finger in streams[0].targets]
-            background = self.table.background(places)
-        rows = [{*range(*band)} for stream in streams for band in stream.bands]
-        leaves_none = any(each <= self.avoided for each in rows)
-        places, loads = [each.at for each in self.fingers], [each.load for each in self.fingers]
-        size = self.table.plate.length, self.table.plate.width
-        places, loads = with_patches(places, loads, size)
+            targets = [self.fingers[finger].at for finger in streams[0].targets]
+            background = self.table.background(targets)
+        leaves_none = False
+        for stream in streams:
+            for band in stream.bands:
+                leaves_none = leaves_none or self.avoided.issuperset(range(*band))
+        positions, loads = with_patches(
+            [finger.at for finger in self.fingers],
+            [finger.load for finger in self.fingers],
+            (self.table.plate.length, self.table.plate.width),
+        )
         return Contents(
-            tuple(places),
+            tuple(positions),
             tuple(loads),
-            tuple(streams),
+            streams,
             quiet,
             self.apart_hz,
             background=background,
@@ -439,17 +490,46 @@ class _Answering:
             avoided=() if leaves_none else tuple(self.avoided),
         )
 
+    def _stream(self, content: Sequence[int]) -> Stream:
+        """The stream of a content: its first finger's stimulus at the highest requested level."""
+        fingers = [self.fingers[number] for number in content]
+        bands = tuple(self._bands.values()) if self.bands_may_swap else (self._bands[content[0]],)
+        levels = [finger.stimulus.level_db_sl for finger in fingers if finger.stimulus]
+        level = max(levels, default=-math.inf)
+        priority = max(finger.priority for finger in fingers)
+        duration, limit, course = None, None, None
+        stimulus = fingers[0].stimulus
+        if stimulus is not None:
+            duration, course = stimulus.duration, stimulus.course
+            if course is not None:
+                level += course.strongest_db
+            if stimulus.is_limit:
+                limit = level
+                level = min(level, FELT_DB_SL)
+        return Stream(tuple(content), float(level), bands, priority, duration, limit, course)
+
     def _measure(self, plan: _Plan) -> Answer:
-        """Choose the tones of a plan's contents and compute what fingers feel of them."""
-        table, contents, applied = self.table, self._contents(plan), plan.applied
+        """Choose the tones of a plan and compute the sensations of all fingers."""
+        table, contents = self.table, self._contents(plan)
         if contents.streams:
             tones = choose_tones(table, contents)
         else:
             tones = Tones.none(len(contents.places), len(table.threshold_sets))
-        if not tones.is_apart or len(contents.avoided) < len(self.avoided):
-            applied += (f"frequencies are nearer than {self.apart_hz:g} Hz",)
-        given = self.fingers, contents, tones, (), applied
-        return Answer(*given, table.eras, table.frequencies, table.highest_drives, table.thresholds)
+        notes = plan.applied
+        ignores_avoided = len(contents.avoided) < len(self.avoided)
+        if not tones.is_apart or ignores_avoided:
+            notes = (*notes, f"frequencies are nearer than {self.apart_hz:g} Hz")
+        return Answer(
+            asked=self.fingers,
+            contents=contents,
+            tones=tones,
+            held=(),
+            applied=notes,
+            eras=table.eras,
+            frequencies=table.frequencies,
+            highest_drives=table.highest_drives,
+            thresholds=table.thresholds,
+        )
 
 
 def _softer(found: Answer, gains_db: Sequence[float]) -> tuple[Finger, ...]:
@@ -464,11 +544,6 @@ def _softer(found: Answer, gains_db: Sequence[float]) -> tuple[Finger, ...]:
                 stimulus = replace(finger.stimulus, level_db_sl=level, band_hz=band)
                 softer[number] = replace(finger, stimulus=stimulus)
     return tuple(softer)
-
-
-def _fails(found: Answer, min_contrast_db: float) -> bool:
-    """Whether a finger has less contrast than all must have, or than it asks for."""
-    return _is_out_of_bounds(found) or found.tones.worst_db < min_contrast_db
 
 
 def _is_out_of_bounds(found: Answer) -> bool:

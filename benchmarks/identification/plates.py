@@ -29,7 +29,7 @@ from model.estimate.following import SettledPattern
 from model.estimate.forward import RestingFinger, Sensor, jacobian
 from model.estimate.identify import Identification, identify, model_of, relevant
 from model.estimate.measurement import Measurement
-from model.estimate.space import KINDS
+from model.estimate.parameters import KINDS
 from model.finger import fingertip_points, fingertip_weights
 from model.rig.rig import Rig, Uncertainty
 from model.structure.attachments import Era, Fingertip, PointLoad

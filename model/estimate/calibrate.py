@@ -45,9 +45,9 @@ from model.estimate.measurement import (
     Measurement,
     check_enough_sensors,
 )
+from model.estimate.parameters import FORM_ERRORS, KINDS
 from model.estimate.plate_match import MAX_FIT_ERROR
 from model.estimate.rig_check import diagnose
-from model.estimate.space import FORM, KINDS
 from model.files.csv_file import as_frame
 from model.processes import Progress, unseen
 from model.quantities import in_display_unit
@@ -418,7 +418,7 @@ class Calibration:
         """
         space, x = self.plate.model.space, self.fit.x.copy()
         mine = space.of("modulus", "loss_added", "sensor_scale", "sensor_place")
-        form = space.of(*FORM, "mode_shifts") & ~mine
+        form = space.of(*FORM_ERRORS, "mode_shifts") & ~mine
         x[form | (space.of("place") & ~self.is_clear)] = 0.0
         searched, measurement = self.fit.searched & mine, self.measurement
         return fit(self.plate.model, measurement, searched=searched, start=x, prior=self.prior)

@@ -36,7 +36,8 @@ from model.estimate.forward import (
     jacobian,
 )
 from model.estimate.measurement import Measurement
-from model.estimate.space import KINDS, MAX_GUESSED, VALUE_UNITS, rig_with, space_by_sheets
+from model.estimate.parameters import KINDS
+from model.estimate.space import MAX_GUESSED, VALUE_UNITS, rig_with, space_from_datasheets
 from model.reduction.free_plate import solve_free_plate
 from model.reduction.reduced_plate import reduced_modes
 from model.rig.actuator_keys import KINDS as ACTUATOR_KEYS
@@ -597,7 +598,7 @@ class SensedPlate:
             lowest = _LOWEST * rig.plate.lowest_bending_frequency
             shifting = int(((natural > lowest) & (natural < highest)).sum())
         names = [sensor.name for sensor in self.model.sensors]
-        space = space_by_sheets(rig, names, shifting)
+        space = space_from_datasheets(rig, names, shifting)
         eras = tuple(replace(era, gains=()) for era in rig.eras)
         return SensedPlate(rig, replace(self.model, rig=replace(rig, eras=eras), space=space))
 
@@ -676,7 +677,7 @@ def sensed_plate(
     if has_form:
         supports = footprints_of(rig.eras, rig.masses)
         form = reduced_modes(free, supports, MASS_CELLS.centres(rig.plate))
-    space = space_by_sheets(rig, (), None)
+    space = space_from_datasheets(rig, (), None)
     return SensedPlate(rig, ForwardModel(rig, sensors, frequencies, space, free, form=form)).of(rig)
 
 

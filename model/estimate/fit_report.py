@@ -15,7 +15,8 @@ from model.arrays import FloatArray, Point
 from model.estimate.calibrate import Calibration
 from model.estimate.fit import Parameter
 from model.estimate.identify import MAX_CHI2, MAX_MODE_SHIFT, Identification, clock_estimates
-from model.estimate.space import KINDS, MAX_GUESSED, UNIT_KEYS
+from model.estimate.parameters import KINDS
+from model.estimate.space import MAX_GUESSED, UNIT_KEYS
 from model.quantities import counted, in_display_unit, percent, with_error
 from model.rig.rig import Rig, Uncertainty
 from model.study.verification import ExpectedContrast

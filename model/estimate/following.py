@@ -40,6 +40,7 @@ from model.estimate.forward import (
     FINGER_PARTS,
     MODE_SHIFTS,
     ForwardModel,
+    Prior,
     RestingFinger,
     Sensor,
     Values,
@@ -47,6 +48,7 @@ from model.estimate.forward import (
 )
 from model.estimate.identify import solved_for
 from model.estimate.measurement import Measurement
+from model.estimate.parameters import KINDS
 from model.estimate.space import rig_with, space_of
 from model.finger import Grid
 from model.rig.rig import BOUNDS, Rig, Uncertainty
@@ -314,7 +316,7 @@ def update(
         model,
         frequencies=np.concatenate([each.frequencies for each in patterns]),
         fingers=fingers,
-        space=model.space.and_further("fingers", names),
+        space=model.space.extended(KINDS["fingers"], names, Prior(KINDS["fingers"].std)),
         last_places={},
     )
     measurement = Measurement(

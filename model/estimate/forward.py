@@ -22,9 +22,9 @@ attachment that is a change of rank one or two. A sensor of mass m that is on th
 measures adds l² w² m T_sj dT_ss to l dT_sj.
 
 A vector x has one number for each parameter, in standard deviations of what is known beforehand.
-`Kind` says of all parameters of a kind how they change the plate and its responses; which there are
-is in `model.estimate.space`. `Space` names the parameters of a rig, `Values` has what they stand
-for.
+`ParameterKind` defines how all parameters of a kind change the plate and its responses;
+`model.estimate.parameters` has one class for each kind. `Space` names the parameters of a rig,
+`Values` has the values that they represent.
 
 A plate may also have form errors, which a rig file does not describe: a cable glued to it, sides
 that are not cut to size. Left out, they bias fitted values by far more than noise does, and no
@@ -32,10 +32,11 @@ residual shows by how much. They change stiffness and mass between the modes of 
 so its mode shapes (`ReducedModes` of `model.reduction`).
 """
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -84,8 +85,16 @@ AnyArray: TypeAlias = NDArray[np.floating[Any]] | NDArray[np.complexfloating[Any
 Number: TypeAlias = float | NDArray[np.floating[Any]]
 """One number for all parameters of a kind, or one for each."""
 
-Range: TypeAlias = tuple[Number, Number, Number]
-"""Standard deviation, lowest and highest deviation of parameters, in the unit of `Values`."""
+
+class Prior(NamedTuple):
+    """Prior distribution of the parameters of a kind, in the unit of `Values`."""
+
+    std: Number
+    """Standard deviation, 0 if a parameter is known exactly."""
+    lower: Number = -np.inf
+    """Lower bound."""
+    upper: Number = np.inf
+    """Upper bound."""
 
 
 @dataclass(frozen=True)
@@ -116,7 +125,7 @@ class RestingFinger:
 
 @dataclass(frozen=True, eq=False)
 class SearchScope:
-    """What may differ of a rig with sensors; each `Kind` derives its parameters from it."""
+    """Parts of a rig with sensors that can differ; each `ParameterKind` takes its names from it."""
 
     rig: Rig
     sensors: Sequence[str]
@@ -132,7 +141,12 @@ class SearchScope:
     mode_count: int = MODE_SHIFTS
     """Number of elastic modes that may shift."""
     form_of: int | None = None
-    """Number of sensors beside ERAs of a plate with form errors, None without these."""
+    """Number of sensors of a plate with form errors, None for a plate without form errors."""
+
+    @property
+    def has_form_errors(self) -> bool:
+        """Whether the plate may have form errors."""
+        return self.form_of is not None
 
     @cached_property
     def eras(self) -> list[str]:
@@ -155,38 +169,51 @@ def values_of_eras(rig: Rig, kind: str) -> FloatArray:
     return np.array([getattr(era, era.fields.get(kind, ""), 0.0) for era in rig.eras])
 
 
-@dataclass(frozen=True, eq=False)
-class Kind:
-    """Parameters of a kind: names, prior, what they change of a rig and of its responses."""
+class ParameterKind(ABC):
+    """Parameters of one kind, such as the stiffness of each ERA; see `model.estimate.parameters`.
 
+    Parameters are deviations from the rig, most of them logarithms of factors.
+    """
+
+    name: str
+    """Key of the kind in `Space` and `Values`."""
     std: float
     """Standard deviation for a plate that was not measured, in the unit of `Values`."""
-    names: Callable[[SearchScope], Sequence[str]]
-    """Names of all parameters."""
-    slope: Callable[["PlateAt"], ComplexArray]
-    """Derivatives of the responses by all parameters, in the unit of `Values` (f, s, n, m)."""
-    value: Callable[["Values"], Any] | None = None
-    """What the parameters stand for, by default their deviations alone."""
-    stated: Callable[[SearchScope, float], Number] | None = None
-    """Standard deviations where a rig states them, from `std`; by default that of all."""
-    limits: Callable[[SearchScope], tuple[Number, Number]] | None = None
-    """Lowest and highest deviations where a rig is measured in place, by default any."""
-    by_sheet: Callable[[SearchScope, float], Range] | None = None
-    """Range of a rig that data sheets alone describe, from `std`; by default exactly known."""
-    unit: str = "%"
-    """Unit in reports for people; logarithms of factors are written as per cent."""
-    per_unit: float = 100.0
+    unit = "%"
+    """Unit in reports for people; logarithms of factors are written in per cent."""
+    per_unit = 100.0
     """Number of report units in one unit of `Values`."""
-    drift: float = 0.0
-    """Standard deviation by which it walks in an hour of service."""
-    drifts_to: float = 0.0
-    """Largest standard deviation by drift, 0 for `std`."""
-    theory: float = 0.0
-    """Change of the fitted value by another theory of the plate."""
-    stage: int = 2
-    """When an identification searches it: 0 at first, 1 with the places of masses, 2 with all."""
-    is_listed: bool = False
-    """Whether the report of an identification always has it."""
+    drift = 0.0
+    """Standard deviation of the random walk in an hour of service."""
+    drifts_to = 0.0
+    """Largest standard deviation that drift leads to, 0 for `std`."""
+    theory = 0.0
+    """Error of a fitted value because of the plate theory: its change with viscous losses and
+    without shear deformation, for plates of 1.5 mm (docs/measured/identification.md)."""
+    stage = 2
+    """When an identification searches it: 0 at first, 1 with the positions of masses, 2 last."""
+    is_listed = False
+    """Whether the report of an identification always lists it."""
+
+    @abstractmethod
+    def names(self, scope: SearchScope) -> Sequence[str]:
+        """Names of all parameters; empty if the rig has no such value."""
+
+    @abstractmethod
+    def derivative(self, plate: "PlateAt") -> ComplexArray:
+        """Derivatives of the responses by all m parameters (f, s, n, m)."""
+
+    def prior(self, scope: SearchScope) -> Prior:
+        """Prior for a rig that is measured in place."""
+        return Prior(self.std)
+
+    def datasheet_prior(self, scope: SearchScope) -> Prior:
+        """Prior for a rig described by data sheets only; by default known exactly."""
+        return Prior(0.0)
+
+    def value(self, values: "Values") -> Any:
+        """The value of the rig that the parameters represent, by default their deviations."""
+        return values.deviations(self.name)
 
     @property
     def widest(self) -> float:
@@ -207,8 +234,14 @@ class Space:
     """Upper bounds of x (p,)."""
     groups: dict[str, slice]
     """Slice of the parameters of each kind."""
-    kinds: Mapping[str, Kind]
+    kinds: Mapping[str, ParameterKind]
     """All kinds by their names."""
+
+    @classmethod
+    def empty(cls, kinds: Mapping[str, ParameterKind]) -> "Space":
+        """A space without parameters."""
+        none = np.zeros(0)
+        return cls((), none, none, none, {}, kinds)
 
     @property
     def size(self) -> int:
@@ -232,26 +265,25 @@ class Space:
             chosen[self.groups[kind]] = True
         return chosen & self.uncertain
 
-    def and_further(self, kind: str, names: Sequence[str], known: Range | None = None) -> "Space":
-        """Append parameters of a kind; known: by default with the kind's deviation, unbounded."""
-        own = (self.kinds[kind].std, -np.inf, np.inf) if known is None else known
-        std, lower, upper = (np.broadcast_to(each, len(names)) for each in own)
-        unit = np.where(std > 0, std, 1.0)
+    def extended(self, kind: ParameterKind, names: Sequence[str], prior: Prior) -> "Space":
+        """Append parameters of a kind."""
+        std, lower, upper = (np.broadcast_to(each, len(names)) for each in prior)
+        scale = np.where(std > 0, std, 1.0)
         return replace(
             self,
             names=(*self.names, *names),
             std=np.append(self.std, std),
-            lower=np.append(self.lower, lower / unit),
-            upper=np.append(self.upper, upper / unit),
-            groups=self.groups | {kind: slice(self.size, self.size + len(names))},
+            lower=np.append(self.lower, lower / scale),
+            upper=np.append(self.upper, upper / scale),
+            groups=self.groups | {kind.name: slice(self.size, self.size + len(names))},
         )
 
-    def of_kinds(self, known: Callable[[Kind], float]) -> FloatArray:
+    def of_kinds(self, get: Callable[[ParameterKind], float]) -> FloatArray:
         """A property of the kind of each parameter, in its unit (p,), 0 for known ones."""
-        found = np.zeros(self.size)
+        properties = np.zeros(self.size)
         for kind, part in self.groups.items():
-            found[part] = known(self.kinds[kind])
-        return np.where(self.uncertain, found, 0.0)
+            properties[part] = get(self.kinds[kind])
+        return np.where(self.uncertain, properties, 0.0)
 
     @cached_property
     def as_built(self) -> "Space":
@@ -275,24 +307,28 @@ class Space:
 class Values:
     """Values of a rig's plate by the kinds of parameters x (p,) that change them.
 
-    As each `Kind.value` says; of n ERAs, m additional masses, k fingers and s sensors.
+    `ParameterKind.value` defines each of them. Arrays have n ERAs, m additional masses, k fingers
+    or s sensors.
     """
 
     def __init__(self, rig: Rig, space: Space, x: FloatArray) -> None:
         self.rig, self.space, self.x = rig, space, x
 
-    def own(self, kind: str) -> FloatArray:
-        """Deviations of all parameters of a kind."""
+    def deviations(self, kind: str) -> FloatArray:
+        """Deviations of all parameters of a kind from the rig, in their unit."""
         return self.space.values(self.x, kind)
+
+    def factor(self, kind: str) -> float:
+        """Factor whose logarithm is the one parameter of a kind."""
+        return float(np.exp(self.deviations(kind)[0]))
 
     def __getitem__(self, kind: str) -> Any:
         """The values of a kind, without the deviations of others that add to it elsewhere."""
-        value = self.space.kinds[kind].value
-        return self.own(kind) if value is None else value(self)
+        return self.space.kinds[kind].value(self)
 
     def sources(self) -> tuple[Actuator, ...]:
         """The rig's ERAs with their values, without gains."""
-        found: list[Actuator] = []
+        sources: list[Actuator] = []
         for number, era in enumerate(self.rig.eras):
             fields: dict[str, Any] = {
                 name: float(self[kind][number]) for kind, name in era.fields.items()
@@ -300,8 +336,8 @@ class Values:
             if isinstance(era, Exciter):
                 largest = era.largest_force_factor(fields["magnet_mass"])
                 fields["force_factor"] = min(fields["force_factor"], largest)
-            found.append(replace(era, gains=(), **fields))
-        return tuple(found)
+            sources.append(replace(era, gains=(), **fields))
+        return tuple(sources)
 
     def lag(self, frequencies: FloatArray) -> ComplexArray:
         """Motion of each drive at frequencies (f,) [Hz] relative to a slow one, (f, n).
@@ -860,7 +896,7 @@ def jacobian(plate: PlateAt, searched: NDArray[np.bool_] | None = None) -> Compl
     found = np.zeros((*plate.responses.shape, space.size), dtype=complex)
     for kind, part in space.groups.items():
         if wanted[part].any():
-            found[..., part] = space.kinds[kind].slope(plate) * space.std[part]
+            found[..., part] = space.kinds[kind].derivative(plate) * space.std[part]
     return found
 
 

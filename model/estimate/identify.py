@@ -48,7 +48,8 @@ from model.estimate.fit import (
 )
 from model.estimate.forward import MODE_SHIFTS, ForwardModel, Sensor, Space, Values, jacobian
 from model.estimate.measurement import Measurement
-from model.estimate.space import KINDS, inwards, plate_with, rig_with, space_of
+from model.estimate.parameters import KINDS
+from model.estimate.space import inwards, plate_with, rig_with, space_of
 from model.finger import Grid
 from model.processes import Progress, unseen
 from model.reduction.free_plate import FreePlate, solve_free_plate

@@ -36,7 +36,7 @@ from model.estimate.fit import SensedPlate, fit, sensed_plate
 from model.estimate.fit_report import calibration_json, change_rows, finding_rows
 from model.estimate.forward import MASS_CELLS
 from model.estimate.measurement import Measurement, sensors_at
-from model.estimate.space import KINDS
+from model.estimate.parameters import KINDS
 from model.reduction.free_plate import solve_free_plate
 from model.reduction.reduced_plate import reduced_modes
 from model.rig.rig import Rig

@@ -25,6 +25,7 @@ from model.estimate.forward import (
     FINGER_PARTS,
     SENSOR_FOOT,
     ForwardModel,
+    Prior,
     RestingFinger,
     Sensor,
     Space,
@@ -41,7 +42,8 @@ from model.estimate.identify import (
     standard_errors,
 )
 from model.estimate.measurement import Measurement, Repeat
-from model.estimate.space import inwards, rig_with, space_by_sheets, space_of
+from model.estimate.parameters import KINDS
+from model.estimate.space import inwards, rig_with, space_from_datasheets, space_of
 from model.fem import ELEMENTS, Mesh, assemble
 from model.reduction.free_plate import solve_free_plate
 from model.rig.rig import Channel, Rig
@@ -447,7 +449,8 @@ def model(rig: Rig) -> ForwardModel:
     sensors = [*(Sensor(era.name, era.name) for era in rig.eras), PAD]
     names = [sensor.name for sensor in sensors]
     space = space_of(rig, names, rig.uncertainty, drives_lag=True, masses=1)
-    space = space.and_further("fingers", [f"{part} of finger" for part in FINGER_PARTS])
+    names = [f"{part} of finger" for part in FINGER_PARTS]
+    space = space.extended(KINDS["fingers"], names, Prior(KINDS["fingers"].std))
     free = solve_free_plate(rig.plate, rig.mesh, frequency_max=500.0)
     return ForwardModel(rig, sensors, FORWARD_FREQUENCIES, space, free, [FINGER])
 
@@ -576,7 +579,11 @@ def test_values_that_a_search_tries_are_those_of_a_rig(name: str, of: str) -> No
     rig = load_rig(example_rig_path().parent / f"{name}.yaml")
     rig = replace(rig, plate=replace(rig.plate, loss_factor=0.6))
     known = rig.uncertainty
-    space = space_of(rig, ["P"], known, masses=1) if of == "fit" else space_by_sheets(rig, ["P"], 3)
+    space = (
+        space_of(rig, ["P"], known, masses=1)
+        if of == "fit"
+        else space_from_datasheets(rig, ["P"], 3)
+    )
     rng = np.random.default_rng(0)
     for size in (1, 10):
         for x in rng.normal(0, size, (50, space.size)).clip(space.lower, space.upper):

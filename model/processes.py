@@ -11,7 +11,8 @@ import threading
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from multiprocessing.connection import Connection
 from typing import Any, TypeAlias, TypeVar
 
 from model.caching import code_version
@@ -35,30 +36,39 @@ def on_processes(
     """Yield numbers of tasks with their results in the order in which they are done.
 
     count: of processes, 1 for this one; solve: a function of a module; shared: its first argument,
-    sent to each process once. Raises InputError if a process dies.
+    sent to each process once. The processes end at once if the caller stops early, as on Ctrl-C.
+    Raises InputError if a process dies.
     """
     if count == 1:
         yield from ((number, solve(shared, task)) for number, task in tasks.items())
         return
     for variable in _THREAD_COUNTS:
         os.environ.setdefault(variable, "1")  # read by numpy when a new process loads it
+    context = multiprocessing.get_context("spawn")
+    stop, stopper = context.Pipe(duplex=False)
     pool = ProcessPoolExecutor(
         min(count, len(tasks)) or 1,
-        mp_context=multiprocessing.get_context("spawn"),
+        mp_context=context,
         initializer=_start_worker,
-        initargs=(solve, shared),
+        initargs=(solve, shared, stop),
     )
+    is_done = False
     try:
         with _interrupts_blocked():
             numbers = {pool.submit(_run, task): number for number, task in tasks.items()}
         for future in as_completed(numbers):
             yield numbers[future], future.result()
+        is_done = True
     except BrokenProcessPool:
         raise InputError(
             "a worker process died, perhaps short of memory; use fewer of them (--workers)"
         ) from None
     finally:
+        if not is_done:
+            stopper.send_bytes(b"stop")  # read by none, so that all see it
         pool.shutdown(wait=True, cancel_futures=True)
+        stopper.close()
+        stop.close()
 
 
 @contextmanager
@@ -77,12 +87,20 @@ def _interrupts_blocked() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def _start_worker(solve: Callable[[Any, Any], Any], shared: Any) -> None:
+def _start_worker(solve: Callable[[Any, Any], Any], shared: Any, stop: Connection) -> None:
     """Keep what all tasks need; ignore Ctrl-C, which the parent process handles; end with it."""
     global _in_worker
     _in_worker = solve, shared
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
+    threading.Thread(target=_end_on, args=(stop,), daemon=True).start()
+
+
+def _end_on(stop: Connection) -> None:
+    """End this process in the middle of its task when the parent stops the work."""
+    with suppress(OSError):
+        stop.poll(None)
+    os._exit(1)
 
 
 def _end_with_parent() -> None:

@@ -62,6 +62,7 @@ SeedOption = Annotated[
 ]
 
 _LINE_INTERVAL = 2.0  # s
+_MINUTES_FROM = 100.0  # s; longer times are given in minutes
 
 
 class Stopwatch:
@@ -85,25 +86,52 @@ def progress_bar(unit: str) -> "Iterator[Progress]":
     Yields update(done, total). unit: plural of the things counted.
     """
     from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, TimeRemainingColumn
+    from rich.progress import BarColumn, MofNCompleteColumn, TimeElapsedColumn, TimeRemainingColumn
     from rich.progress import Progress as Bars
 
     console = Console(stderr=True)
     if not console.is_terminal:
-        printed = time.monotonic()
-
-        def update(done: int, total: int) -> None:
-            nonlocal printed
-            if time.monotonic() - printed >= _LINE_INTERVAL:
-                printed = time.monotonic()
-                sys.stderr.write(f"{done} of {total} {unit}\n")
-
-        yield update
+        yield _ProgressLines(unit).update
         return
-    columns = (BarColumn(), MofNCompleteColumn(), unit, TimeRemainingColumn())
+    columns = (BarColumn(), MofNCompleteColumn(), unit, TimeElapsedColumn(), TimeRemainingColumn())
     with Bars(*columns, console=console) as bar:
         task = bar.add_task("", total=None)
         yield lambda done, total: bar.update(task, completed=done, total=total)
+
+
+class _ProgressLines:
+    """Progress as lines of text on standard error, at most one every two seconds.
+
+    The remaining time is that of the stage: a new one starts where the total changes or the count
+    starts again.
+    """
+
+    def __init__(self, unit: str) -> None:
+        self._unit = unit
+        self._done = self._total = 0
+        self._updated = self._printed = self._started = time.monotonic()
+
+    def update(self, done: int, total: int) -> None:
+        """Print what is done if the last line is old enough."""
+        now = time.monotonic()
+        if total != self._total or done <= self._done:
+            self._started = self._updated
+        self._done = done
+        self._total = total
+        self._updated = now
+        if now - self._printed < _LINE_INTERVAL:
+            return
+        self._printed = now
+        sys.stderr.write(f"{done} of {total} {self._unit}{self._remaining(now)}\n")
+
+    def _remaining(self, now: float) -> str:
+        """Format the remaining time of the stage, if it can be estimated."""
+        if not 0 < self._done < self._total:
+            return ""
+        seconds = (now - self._started) / self._done * (self._total - self._done)
+        if seconds < _MINUTES_FROM:
+            return f", about {seconds:.0f} s left"
+        return f", about {seconds / 60:.0f} min left"
 
 
 def print_report(rows: Iterable[str | None], answer: Mapping[str, Any], *, as_json: bool) -> None:

@@ -247,7 +247,7 @@ def test_design_ranks_given_layouts_by_contrast(monkeypatch: pytest.MonkeyPatch)
     contrasts = [each.contrast for each in found]
     assert contrasts[2:] == [None] * 6
     assert contrasts[0] >= contrasts[1]
-    scores = [each.expected_contrast for each in found[2:] if each.expected_contrast is not None]
+    scores = [each.score for each in found[2:] if each.score is not None]
     assert scores == sorted(scores, reverse=True)
     assert all(len(each.eras) == 4 for each in found)
     best = f"{found[0].name}, 4 ERAs, {contrasts[0]:.1f} dB"

@@ -11,8 +11,10 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -46,6 +48,23 @@ def test_a_process_that_dies_is_an_error() -> None:
     """With a remedy."""
     with pytest.raises(InputError, match=r"died.*--workers"):
         list(on_processes(2, die, 1, {0: 8}))
+
+
+def wait_a_minute(shared: int, task: int) -> int:
+    """Return the first task's number; others take a minute."""
+    if task:
+        time.sleep(60)
+    return task
+
+
+def test_workers_end_amid_their_tasks_when_the_caller_stops() -> None:
+    """As on Ctrl-C: the second task would take a minute."""
+    results = on_processes(2, wait_a_minute, 1, {0: 0, 1: 1})
+    assert next(results) == (0, 0)
+    stopped = time.monotonic()
+    with suppress(KeyboardInterrupt):
+        results.throw(KeyboardInterrupt)
+    assert time.monotonic() - stopped < 40
 
 
 def die_with_the_program(shared: int, task: int) -> None:
@@ -272,6 +291,7 @@ def test_knots_are_within_the_stroke_and_their_memory(version: Version, tmp_path
 
 _PROGRAM = """
 import sys
+import time
 from pathlib import Path
 from model.compiled.kernels import kept_library
 found = kept_library("seven", [Path(sys.argv[1])], flags=(), what="seven")

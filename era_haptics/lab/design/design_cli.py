@@ -2,7 +2,8 @@
 
 import time
 from collections.abc import Iterator, Sequence
-from typing import Annotated, Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -22,6 +23,9 @@ from model.config.units import LENGTH, STIFFNESS, Dimension, quantity
 from model.errors import InputError
 from model.quantities import counted
 from registry.limits import MAX_CONTENTS
+
+if TYPE_CHECKING:
+    from era_haptics.lab.design.design_run import UnfinishedDesign
 
 design_app = typer.Typer()
 
@@ -85,9 +89,12 @@ def design(
     mesh: MeshOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Find or rank places of ERAs for the best promised contrast."""
+    """Find or rank places of ERAs for the best promised contrast.
+
+    Ctrl-C prints the layouts that were found so far and writes them as a file for --layouts.
+    """
+    from era_haptics.lab.design.design_run import UnfinishedDesign, summary, write_design
     from era_haptics.lab.design.design_run import design as find
-    from era_haptics.lab.design.design_run import summary, write_design
     from model.config.document import read_document
     from model.rig.rig_file import rig_of
 
@@ -98,25 +105,31 @@ def design(
     springs = [_quantity(each, STIFFNESS, "--stiffness") for each in _listed(stiffness)]
     output.mkdir(parents=True, exist_ok=True)
     started = time.perf_counter()
-    with progress_bar("tasks") as progress:
-        found = find(
-            rig,
-            counts,
-            layouts=layouts or None,
-            keep=_listed(keep),
-            where=where,
-            contacts=contacts,
-            contents=contents,
-            apart=distance,
-            lowest=lowest,
-            stiffness=springs,
-            finalists=finalists,
-            starts=starts,
-            seed=seed,
-            workers=workers or (None if cluster else 2),
-            cluster=cluster,
-            progress=progress,
-        )
+    unfinished = UnfinishedDesign()
+    try:
+        with progress_bar("tasks") as progress:
+            found = find(
+                rig,
+                counts,
+                layouts=layouts or None,
+                keep=_listed(keep),
+                where=where,
+                contacts=contacts,
+                contents=contents,
+                apart=distance,
+                lowest=lowest,
+                stiffness=springs,
+                finalists=finalists,
+                starts=starts,
+                seed=seed,
+                workers=workers or (None if cluster else 2),
+                cluster=cluster,
+                progress=progress,
+                on_layout=unfinished.add,
+            )
+    except KeyboardInterrupt:
+        _report_unfinished(unfinished, rig_file, output, as_json=as_json)
+        raise
     files = [str(path) for path in write_design(output, found, document.data)]
     result = {**summary(found), "time_s": time.perf_counter() - started, "files": files}
     _warn_of_light(result["eras"])
@@ -130,13 +143,39 @@ def design(
     print_report(rows, result, as_json=as_json)
 
 
+def _report_unfinished(
+    unfinished: "UnfinishedDesign", rig_file: Path, output: Path, *, as_json: bool
+) -> None:
+    """Print what an interrupted design has found, and write its layouts, if there are any."""
+    result = unfinished.summary()
+    files: list[str] = []
+    rows = ["interrupted: this design is incomplete; no layout was found so far"]
+    if result["layouts"]:
+        file = output / "unfinished.yaml"
+        unfinished.write(file)
+        files = [str(file)]
+        counts = f"{result['layout_count']} layouts were found so far, {result['judged']} judged"
+        rows = [
+            f"interrupted: this design is incomplete; {counts}",
+            *_rows_of_layouts(result["layouts"]),
+            f"wrote {file}, to judge these layouts; give the other options as before",
+            next_line("era", "design", rig_file, "--layouts", file, "-o", output),
+        ]
+    print_report(rows, {**result, "files": files}, as_json=as_json)
+
+
 def _counts(text: str) -> Sequence[int]:
     """Numbers of ERAs of N or LO-HI."""
     low, _, high = text.partition("-")
-    ends = [each.strip() for each in (low, high or low)]
-    if not all(each.isdecimal() for each in ends):
+    ends = [end.strip() for end in (low, high or low)]
+    if not all(end.isdecimal() for end in ends):
         raise InputError(f"--eras must be a number, or LO-HI such as 3-6, got {text!r}")
-    return range(int(ends[0]), int(ends[1]) + 1) or [int(ends[0])]
+    first, last = map(int, ends)
+    if first > last:
+        raise InputError(
+            f"--eras must be LO-HI with LO at most HI, got {text!r}; write {last}-{first}"
+        )
+    return range(first, last + 1)
 
 
 def _listed(text: str) -> list[str]:
@@ -209,11 +248,11 @@ def _rows(result: dict[str, Any], *, own_count: int) -> Iterator[str]:
 
 def _rows_of_layouts(layouts: list[dict[str, Any]]) -> Iterator[str]:
     """Yield the first of given layouts."""
-    yield "rank  layout                          stiffness  contrast  expected"
-    for each in layouts:
-        contrast = f"{each['contrast_db']['mean']:.1f} dB" if each["contrast_db"] else "-"
-        expected = f"{each['expected_contrast_db']:.1f} dB" if each["supported"] else "-"
+    yield "rank  layout                          stiffness  contrast  score"
+    for layout in layouts:
+        contrast = f"{layout['contrast_db']['mean']:.1f} dB" if layout["contrast_db"] else "-"
+        score = f"{layout['score']:.1f}" if layout["supported"] else "-"
         yield (
-            f"{each['rank']:4d}  {each['layout']:28s}  {each['stiffness_n_m'] / 1000:6.4g} kN/m  "
-            f"{contrast:>8s}  {expected:>8s}"
+            f"{layout['rank']:4d}  {layout['layout']:28s}  "
+            f"{layout['stiffness_n_m'] / 1000:6.4g} kN/m  {contrast:>8s}  {score:>5s}"
         )

@@ -49,6 +49,7 @@ from model.files.array_file import whole_or_nothing
 from model.files.csv_file import write_columns
 from model.finger import STRONG_DB_SL
 from model.processes import Progress, check_progress, on_cluster, on_processes, unseen
+from model.quantities import counted
 from model.rig.actuator_keys import KINDS
 from model.rig.rig import Channel, Rig
 from model.rig.rig_file import rig_of
@@ -169,9 +170,17 @@ class RankedLayout:
         return None if self.judged is None else self.mean_db
 
     @property
-    def expected_contrast(self) -> float | None:
-        """The score [dB] that ranks others, None where it does not support the plate."""
+    def score(self) -> float | None:
+        """A number that ranks layouts before they are judged; None if the plate is not supported.
+
+        It has no unit and cannot be compared with a contrast.
+        """
         return self.found.score_db if self.found.is_supported else None
+
+    @property
+    def expected_contrast(self) -> float | None:
+        """The score, under its former name."""
+        return self.score
 
     @property
     def rig(self) -> Rig:
@@ -219,22 +228,62 @@ class Design:
         return max((self.best.mean_db - each.mean_db for each in self.starts), default=0.0)
 
 
+LayoutListener: TypeAlias = Callable[[RankedLayout], None]
+"""Is called with every layout as soon as it is scored, and again once it is judged."""
+
+
+def ignore_layout(layout: RankedLayout) -> None:
+    """Ignore a layout that was scored or judged."""
+
+
 @dataclass(frozen=True)
 class Runner:
-    """Solves tasks on machines; progress: of one stage after the other."""
+    """Solves tasks on machines."""
 
     machines: Machines = _HERE
     progress: Progress = unseen
+    """Of one stage after the other."""
+    on_layout: LayoutListener = ignore_layout
 
     def run(
-        self, solve: Callable[[Any, Any], Any], shared: object, tasks: Sequence[Any]
+        self,
+        solve: Callable[[Any, Any], Any],
+        shared: object,
+        tasks: Sequence[Any],
+        on_result: Callable[[int, Any], None] = lambda number, result: None,
     ) -> list[Any]:
-        """Results of tasks, in their order."""
-        done: dict[int, Any] = {}
+        """Return the results of tasks, in their order.
+
+        on_result: called with the number of each task and its result as soon as it is done.
+        """
+        results: dict[int, Any] = {}
         for number, result in self.machines(solve, shared, dict(enumerate(tasks))):
-            done[number] = result
-            self.progress(len(done), len(tasks))
-        return [done[number] for number in range(len(tasks))]
+            results[number] = result
+            on_result(number, result)
+            self.progress(len(results), len(tasks))
+        return [results[number] for number in range(len(tasks))]
+
+    def run_layouts(
+        self,
+        solve: Callable[[Any, Any], Any],
+        shared: object,
+        tasks: Sequence[Any],
+        layouts_of_result: Callable[[int, Any], list[RankedLayout]],
+    ) -> list[RankedLayout]:
+        """Return the layouts of all results, in the order of their tasks; tell the listener.
+
+        layouts_of_result: the layouts of a task's number and result.
+        """
+
+        def tell(number: int, result: Any) -> None:
+            for layout in layouts_of_result(number, result):
+                self.on_layout(layout)
+
+        results = self.run(solve, shared, tasks, tell)
+        layouts: list[RankedLayout] = []
+        for number, result in enumerate(results):
+            layouts += layouts_of_result(number, result)
+        return layouts
 
 
 def design(
@@ -255,6 +304,7 @@ def design(
     workers: int | None = None,
     cluster: str | None = None,
     progress: Progress = unseen,
+    on_layout: LayoutListener = ignore_layout,
 ) -> Design:
     """Find or compare layouts of ERAs, the best promised felt contrast first, as `era design` does.
 
@@ -265,7 +315,8 @@ def design(
     plate; stiffness [N/m]: of which new ERAs get the best, that of the rig's for none; finalists:
     given layouts that are judged by their tables' answers; starts: of a search; workers: processes,
     one for None; cluster: address of a Dask scheduler in their place; progress: called with the
-    tasks done and all, of one stage after the other. Raises InputError.
+    tasks done and all, of one stage after the other; on_layout: called with every layout as soon as
+    it is scored, and again once it is judged. Raises InputError.
 
     Example:
         >>> designed = era.design(rig, 4, layouts="random:6", finalists=2)
@@ -329,12 +380,13 @@ def design(
     machines: Machines = (
         partial(on_processes, workers or 1) if cluster is None else partial(on_cluster, cluster)
     )
+    runner = Runner(machines, progress, on_layout)
     if layouts is None:
-        return search_layouts(problems, starts=starts, runner=Runner(machines, progress))
+        return search_layouts(problems, starts=starts, runner=runner)
     return rank_layouts(
         supported_layouts(str(expect_path(layouts, what="layouts")), problems),
         finalists=finalists,
-        runner=Runner(machines, progress),
+        runner=runner,
     )
 
 
@@ -346,11 +398,12 @@ def search_layouts(problems: Sequence[DesignProblem], *, starts: int, runner: Ru
     plate.
     """
     tasks = [(number, start) for number in range(len(problems)) for start in range(starts)]
-    layouts = [
-        RankedLayout(problems[number], f"start {start}", each)
-        for (number, start), found in zip(tasks, runner.run(_start, problems, tasks), strict=True)
-        for each in found
-    ]
+
+    def layouts_of_start(task: int, found: list[ScoredLayout]) -> list[RankedLayout]:
+        number, start = tasks[task]
+        return [RankedLayout(problems[number], f"start {start}", scored) for scored in found]
+
+    layouts = runner.run_layouts(_start, problems, tasks, layouts_of_start)
     for problem in problems:
         ends = [each for each in layouts if each.problem is problem and each.count == problem.count]
         if len(ends) < starts:
@@ -379,12 +432,15 @@ def rank_layouts(
         for at in range(0, len(given[problem]), CHUNK)
     ]
     tasks = [(number, list(chunk.values())) for number, chunk in chunks]
-    scored = runner.run(_score, problems, tasks)
-    layouts = [
-        RankedLayout(problems[number], name, each)
-        for (number, chunk), found in zip(chunks, scored, strict=True)
-        for name, each in zip(chunk, found, strict=True)
-    ]
+
+    def layouts_of_chunk(task: int, found: list[ScoredLayout]) -> list[RankedLayout]:
+        number, chunk = chunks[task]
+        return [
+            RankedLayout(problems[number], name, scored)
+            for name, scored in zip(chunk, found, strict=True)
+        ]
+
+    layouts = runner.run_layouts(_score, problems, tasks, layouts_of_chunk)
     order = best_first([each.found.score_db for each in layouts]).tolist()
     ranked = [layouts[each] for each in order]
     supported = [each for each in ranked if each.found.is_supported]
@@ -432,8 +488,14 @@ def _judged(layouts: Sequence[RankedLayout], runner: Runner) -> list[RankedLayou
     problems = list(dict.fromkeys(each.problem for each in layouts))
     keys = [(problems.index(each.problem), each.found.positions.tobytes()) for each in layouts]
     different = dict(zip(keys, layouts, strict=True))
+    distinct = list(different.values())
     tasks = [(number, each.found.positions) for (number, _), each in different.items()]
-    answers = dict(zip(different, runner.run(_answers, problems, tasks), strict=True))
+
+    def judged_layout(task: int, assessment: Assessment) -> list[RankedLayout]:
+        return [replace(distinct[task], judged=assessment)]
+
+    judged = runner.run_layouts(_answers, problems, tasks, judged_layout)
+    answers = {key: layout.judged for key, layout in zip(different, judged, strict=True)}
     return [replace(each, judged=answers[key]) for key, each in zip(keys, layouts, strict=True)]
 
 
@@ -519,7 +581,7 @@ def rig_text(design: Design, data: Mapping[str, Value]) -> str:
     keys = layout_keys(design.problem, design.best.found.positions, data)
     added = [name for name in keys["amplifiers"] if name not in design.problem.rig.amplifiers]
     comment = (
-        f"# Designed for contrast: {design.problem.count} ERAs, "
+        f"# Designed for contrast: {design.best.count} ERAs, "
         f"{design.best.mean_db:.1f} dB over fresh contact sets.\n"
     )
     if added:
@@ -536,7 +598,7 @@ def layout_keys(
     """
     rig = problem.rig
     before, amplifiers = data["eras"], data["amplifiers"]
-    channels = iter(_free_channels(rig, problem.kept, count=problem.count))
+    channels = iter(_free_channels(rig, problem.kept, count=len(positions)))
     eras: dict[str, Any] = {}
     mounts = rig.masses[len(rig.masses) - len(rig.supports) :]
     for name, mount in zip(rig.supports, mounts, strict=True):
@@ -627,6 +689,62 @@ def summary(design: Design) -> dict[str, Any]:
     }
 
 
+class UnfinishedDesign:
+    """The layouts of a design that was interrupted, as far as they were scored or judged."""
+
+    def __init__(self) -> None:
+        self._layouts: dict[tuple[DesignProblem, bytes], RankedLayout] = {}
+
+    def add(self, layout: RankedLayout) -> None:
+        """Add a layout that was scored, or replace it once it is judged."""
+        key = layout.problem, layout.found.positions.tobytes()
+        self._layouts[key] = layout
+
+    @property
+    def layouts(self) -> list[RankedLayout]:
+        """Layouts that support the plate: judged ones by their contrast, then others by score."""
+        supported = [layout for layout in self._layouts.values() if layout.found.is_supported]
+        return sorted(supported, key=_rank)
+
+    def summary(self) -> dict[str, Any]:
+        """The layouts for JSON."""
+        layouts = self.layouts
+        return {
+            "incomplete": True,
+            "layout_count": len(layouts),
+            "judged": sum(layout.judged is not None for layout in layouts),
+            "layouts": [
+                {"rank": rank, **_row(layout), "layout": _name(layout)}
+                for rank, layout in enumerate(layouts[:MAX_SHOWN], start=1)
+            ],
+        }
+
+    def write(self, path: Path) -> None:
+        """Write the first layouts as a file that `design` takes as `layouts`.
+
+        Raises OSError if it cannot be written.
+        """
+        positions = {}
+        for rank, layout in enumerate(self.layouts[:MAX_SHOWN], start=1):
+            added = layout.found.positions[len(layout.problem.kept) :]
+            positions[f"{rank}: {_name(layout)}"] = added.tolist()
+        comment = "# Layouts of a design that was interrupted, the best first.\n"
+        with whole_or_nothing(path) as stream:
+            stream.write((comment + data_text({"layouts": positions})).encode())
+
+
+def _name(layout: RankedLayout) -> str:
+    """The name of a layout among those of several numbers of ERAs."""
+    return f"{layout.name}, {counted(layout.count, 'ERA')}"
+
+
+def _rank(layout: RankedLayout) -> tuple[bool, float]:
+    """A key that sorts judged layouts by their contrast, then others by their score."""
+    if layout.judged is None:
+        return True, -layout.found.score_db
+    return False, -layout.mean_db
+
+
 def _row(layout: RankedLayout) -> dict[str, Any]:
     """A layout for JSON."""
     eras = layout.eras
@@ -635,7 +753,8 @@ def _row(layout: RankedLayout) -> dict[str, Any]:
         "at_m": {era.name: [era.x, era.y] for era in eras},
         "stiffness_n_m": eras[-1].in_time.stiffness,
         "supported": layout.found.is_supported,
-        "expected_contrast_db": layout.expected_contrast,
+        "score": layout.score,
+        "expected_contrast_db": layout.score,  # its former name, for one release
         "contrast_db": layout.judged.summary if layout.judged else None,
     }
 

@@ -27,7 +27,7 @@ from cases import read_yaml
 from controller.cli.config_cli import app as config_commands
 from controller.cli.main import run
 from era_haptics.lab.cli import app as lab_app
-from era_haptics.lab.design import problem, score
+from era_haptics.lab.design import design_run, problem, score
 from kit.plates import small_table, smooth_table, write_rig
 from model.cli import app
 from model.commands import options
@@ -174,7 +174,7 @@ def test_given_layouts_are_ranked_and_the_best_written(small, tmp_path: Path) ->
     assert len(judged) == 4
     assert judged == sorted(judged, reverse=True)
     assert [row["contrast_db"] != "" for row in rows] == [True] * 4 + [False] * (len(rows) - 4)
-    scores = [float(row["expected_contrast_db"]) for row in rows[4:] if row["supported"] == "True"]
+    scores = [float(row["score"]) for row in rows[4:] if row["supported"] == "True"]
     assert scores == sorted(scores, reverse=True)
     assert sum(row["supported"] == "False" for row in rows) == found["unsupported"] > 0
     assert found["contrast_db"] == found["layouts"][0]["contrast_db"]
@@ -192,6 +192,46 @@ def test_design_warns_of_a_plate_that_nearly_tips(small, tmp_path: Path, depth, 
     (tmp_path / "layouts.yaml").write_text(layout)
     found = design("--layouts", tmp_path / "layouts.yaml", "-o", tmp_path)
     assert sum(name in found["stderr"] for name in found["eras"]) == 2 * is_light
+
+
+@pytest.mark.usefixtures("plain_pictures")
+def test_interrupted_design_keeps_its_layouts(
+    small,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """Ctrl-C while the third of its layouts is judged: two are printed with a contrast.
+
+    The file of layouts has all that were found, of three to five ERAs, and finishes the design,
+    with the same contrast.
+    """
+    judged = []
+
+    def interrupted_judge(*arguments: Any, **options: Any) -> Any:
+        if len(judged) == 2:
+            raise KeyboardInterrupt
+        judged.append(judge(*arguments, **options))
+        return judged[-1]
+
+    judge = design_run.judge
+    typed = ["design", RIG, "--workers", "1", "--eras", "5", "--starts", "1", "-o", str(tmp_path)]
+    with monkeypatch.context() as patch:
+        patch.setattr(design_run, "judge", interrupted_judge)
+        assert run([*typed, "--json"]) == 130
+    unfinished = json.loads(capsys.readouterr().out)
+    assert unfinished["incomplete"] is True
+    assert (unfinished["layout_count"], unfinished["judged"]) == (3, 2)
+    contrasts = [layout["contrast_db"] for layout in unfinished["layouts"]]
+    assert [contrast is None for contrast in contrasts] == [False, False, True]
+    assert unfinished["files"] == [str(tmp_path / "unfinished.yaml")]
+    assert [path.name for path in tmp_path.iterdir()] == ["unfinished.yaml"]
+    finished = design("--layouts", tmp_path / "unfinished.yaml", "-o", tmp_path)
+    by_name = {layout["layout"][3:]: layout for layout in finished["layouts"]}
+    for layout in unfinished["layouts"]:
+        again = by_name[layout["layout"]]
+        assert list(again["at_m"].values()) == list(layout["at_m"].values())
+        assert layout["contrast_db"] in (None, again["contrast_db"])
 
 
 LAYOUTS = """layouts:
@@ -327,14 +367,28 @@ def test_convergence_lists_errors_of_finer_and_finer_meshes(monkeypatch, tmp_pat
 def test_log_gets_a_line_every_two_seconds(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Of ten steps of half a second those at 2 and 4 s are printed, without a bar."""
+    """Of ten steps of half a second those at 2 and 4 s are printed, without a bar.
+
+    With the time that the rest takes at the same pace; a second stage has its own pace.
+    """
     now = [0.0]
     monkeypatch.setattr(options.time, "monotonic", lambda: now[0])
     with progress_bar("cells") as update:
         for done in range(1, 11):
             now[0] = 0.5 * done
             update(done, 10)
-    assert capsys.readouterr().err.splitlines() == ["4 of 10 cells", "8 of 10 cells"]
+        for done in (1, 2):
+            now[0] += 90.0
+            update(done, 3)
+        now[0] += 90.0
+        update(3, 3)
+    assert capsys.readouterr().err.splitlines() == [
+        "4 of 10 cells, about 3 s left",
+        "8 of 10 cells, about 1 s left",
+        "1 of 3 cells, about 3 min left",
+        "2 of 3 cells, about 90 s left",
+        "3 of 3 cells",
+    ]
 
 
 @pytest.mark.usefixtures("plain_pictures")

@@ -196,7 +196,7 @@ async def _run(pattern: Pattern, level_db_sl: float, pair: int, seed: int) -> tu
             owners = {number: owner_of(one) for number, one in applied.contents.items()}
             log.own(owners, applied.time - EARLY)
             for one in applied.contents.values():
-                contrast = one.content.predictions[0].promised_contrast_db
+                contrast = one.content.sensations[0].promised_contrast_db
                 promises.setdefault(one.content.key[1], contrast)
         on.far.bench.advance(threads.now())
         voice = 0 if 0 in promises else CLICK

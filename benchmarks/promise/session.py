@@ -36,7 +36,7 @@ from benchmarks.promise.cases import (
 )
 from benchmarks.setting import random_contacts, support
 from controller.effects.player import CLICK_ABOVE_DB
-from controller.play.intent import CLICK, HapticIntent, Prediction, Pulse, Target
+from controller.play.intent import CLICK, FingerSensation, HapticIntent, Pulse, Target
 from controller.play.loop import PlayReport
 from controller.play.slots import CROSSFADE, FALL_AFTER
 from controller.sources.touch import ContactKey
@@ -244,7 +244,7 @@ def measured(
             Heard(other, click, click).foreign_db_sl(after, strongest=True) for other in others
         ]
         foreign = every[id].foreign_db_sl(during)
-        contrast = promised[id].promised_contrast_db
+        contrast = promised[id].sensation.promised_contrast_db
         if contrast is not None:
             loudest = np.max([*leaks, foreign], axis=0)
             found.contrasts.append((contrast, float((own - loudest).min())))
@@ -259,7 +259,7 @@ def _note(
     found: Clicked,
     id: int,
     report: PlayReport,
-    promised: Prediction | None,
+    promised: FingerSensation | None,
     heard: Heard,
 ) -> None:
     """Note what another finger felt of a click."""
@@ -269,11 +269,11 @@ def _note(
         (levels,) = [each for key, each in report.quiet_levels.items() if key.id == id]
         found.foreign.append((-max(levels), -float(foreign.max())))
         return
-    if promised.foreign_level_db_sl is not None:
-        found.foreign.append((-promised.foreign_level_db_sl, -float(foreign.max())))
-    if promised.promised_contrast_db is not None:
+    if promised.sensation.foreign_level_db_sl is not None:
+        found.foreign.append((-promised.sensation.foreign_level_db_sl, -float(foreign.max())))
+    if promised.sensation.promised_contrast_db is not None:
         contrast = float((heard.own_db_sl(during) - foreign).min())
-        found.restated.append((promised.promised_contrast_db, contrast))
+        found.restated.append((promised.sensation.promised_contrast_db, contrast))
 
 
 def _spans(since: float) -> tuple[Span, Span]:
@@ -333,12 +333,14 @@ class _Steady:
         return self.until - STEADY, self.until
 
     @property
-    def promised(self) -> Mapping[int, Prediction]:
+    def promised(self) -> Mapping[int, FingerSensation]:
         return _promises(self.applied)
 
     @property
     def served(self) -> list[int]:
-        return [id for id, each in self.promised.items() if each.verdict in ("own", "mixed")]
+        return [
+            id for id, each in self.promised.items() if each.sensation.verdict in ("own", "mixed")
+        ]
 
 
 @dataclass(frozen=True)
@@ -555,12 +557,13 @@ def _measured(
 
     def pairs(steady: _Steady) -> list[tuple[float, float]]:
         both = [
-            (steady.promised[id].promised_contrast_db, felt(steady, id)) for id in steady.served
+            (steady.promised[id].sensation.promised_contrast_db, felt(steady, id))
+            for id in steady.served
         ]
         return [(a, b) for a, b in both if a is not None and b is not None]
 
     start = pairs(first)
-    promises = [each.promised_contrast_db for each in first.promised.values()]
+    promises = [each.sensation.promised_contrast_db for each in first.promised.values()]
     found = Outcome(
         (min(each for each in promises if each is not None), min((b for _, b in start), default=0)),
         len(first.served) / (last + 1),
@@ -583,10 +586,10 @@ def _measured(
             found.events[MOVES].append(mover.contrast_db(*event.path) - float(np.mean(resting)))
             for each in event.answers:
                 promised = _promises(each)[last]
-                if promised.promised_contrast_db is not None:
+                if promised.sensation.promised_contrast_db is not None:
                     until = each.time + NEXT
                     spans = [one for one in event.path if each.time <= one[0] < one[1] <= until]
-                    above = mover.contrast_db(*spans) - promised.promised_contrast_db
+                    above = mover.contrast_db(*spans) - promised.sensation.promised_contrast_db
                     found.events[ANSWERS].append(above)
         else:
             _noted(event, found, heard, timing, case)
@@ -609,7 +612,7 @@ def _beside_step(
 
 def _above(
     ids: Iterable[int],
-    promises: Sequence[Mapping[int, Prediction]],
+    promises: Sequence[Mapping[int, FingerSensation]],
     heard: Mapping[int, Heard],
     span: Span,
 ) -> list[float]:
@@ -620,13 +623,13 @@ def _above(
     ]
 
 
-def _promises(report: PlayReport) -> dict[int, Prediction]:
+def _promises(report: PlayReport) -> dict[int, FingerSensation]:
     return {each.contact.key.id: each for each in report.targets}
 
 
-def _most(id: int, *promises: Mapping[int, Prediction]) -> float:
+def _most(id: int, *promises: Mapping[int, FingerSensation]) -> float:
     """The foreign level at a finger by the one of several promises that says most."""
-    levels = [each[id].foreign_level_db_sl for each in promises]
+    levels = [each[id].sensation.foreign_level_db_sl for each in promises]
     return max([each for each in levels if each is not None], default=-math.inf)
 
 
@@ -650,7 +653,7 @@ def _noted(
                 onset = float(case.table.levels_by_set(level, one.layer.excitation).max())
     for id in event.after.served:
         foreign = float(heard[id].foreign_db_sl(span, strongest=True).max())
-        promised = after[id].promised_contrast_db
+        promised = after[id].sensation.promised_contrast_db
         contrast = heard[id].contrast_db(span, strongest=True)
         if event.name == JOINS and promised is not None:
             kind = "first 100 ms, joining" if id == last else "first 100 ms, beside"

@@ -59,7 +59,7 @@ from controller.effects.strengths import UNNAMED
 from controller.learning.learning import Learning
 from controller.operation.operation_states import DaemonState, Loss, Operation
 from controller.operation.supervisor import LinkChange
-from controller.play.intent import BEING_CHOSEN, NO_CONTACTS, leaks_db_sl
+from controller.play.intent import BEING_CHOSEN, NO_CONTACTS, FingerSensation, leaks_db_sl
 from controller.play.loop import Observers, PlayReport
 from controller.play.routing import Drive
 from controller.sources.touch import Change, Contact, ContactKey
@@ -222,13 +222,14 @@ class EventPublisher:
         self.hub.publish("contacts", self.view.contacts_event)
 
     def _reported(self, report: PlayReport) -> None:
-        """Publish what plays or that nothing does, and count its latency.
+        """Publish the contents that play, or silence, and count the latency.
 
-        Latencies of touches are counted apart from all others.
+        Latencies of touches are counted separately.
         """
         self.view.report = report
         topic: Topic = "pattern" if report.contents else "silence"
-        self._noted({"time_s": report.time, topic: report.targets, "reason": report.reason})
+        targets = [_noted_sensation(felt) for felt in report.targets]
+        self._noted({"time_s": report.time, topic: targets, "reason": report.reason})
         if report.latency is not None:
             latencies = self.latencies if report.is_touch else self.lift_latencies
             latencies.add(report.latency)
@@ -359,18 +360,7 @@ def _contact_status(
         for felt in report.targets:
             # A report may be older than a finger of the same number.
             if (felt.contact.key, felt.contact.since) == (contact.key, contact.since):
-                status |= {
-                    "role": "target",
-                    "feels": felt.content,
-                    "level_db_sl": _finite(felt.level_db_sl),
-                    "promised_contrast_db": _finite(felt.promised_contrast_db),
-                    "contrast_db": _finite(felt.contrast_db),
-                    "verdict": felt.verdict,
-                    "frequency_hz": felt.frequency,
-                    "foreign_level_db_sl": _finite(felt.foreign_level_db_sl),
-                    "is_foreign_felt": felt.is_foreign_felt,
-                    "held_back": felt.held_back,
-                }
+                status |= {"role": "target", **_figures(felt)}
     if report and any(each.key == contact.key for each in report.quiet):
         highest = max(report.quiet_levels.get(contact.key, ()), default=None)
         status |= {
@@ -384,17 +374,47 @@ def _contact_status(
     return ContactStatus.model_validate(status)
 
 
+def _figures(felt: FingerSensation) -> dict[str, object]:
+    """Return the figures of a target's sensation, by the keys of its status."""
+    sensation = felt.sensation
+    return {
+        "feels": felt.content_name,
+        "level_db_sl": _finite(felt.level_db_sl),
+        "promised_contrast_db": _finite(sensation.promised_contrast_db),
+        "contrast_db": _finite(sensation.contrast_db),
+        "verdict": sensation.verdict,
+        "frequency_hz": felt.frequency,
+        "foreign_level_db_sl": _finite(sensation.foreign_level_db_sl),
+        "is_foreign_felt": sensation.is_foreign_felt,
+        "held_back": felt.held_back,
+    }
+
+
+def _noted_sensation(felt: FingerSensation) -> dict[str, object]:
+    """Return the sensation of a finger, for a dump."""
+    return {"contact": felt.contact, **_figures(felt)}
+
+
 def playing_of(applied: PlayReport | None) -> dict[str, Any]:
     """Return the values of `PatternFields`: the tones of a pattern and its figures."""
-    felt = None if applied is None else applied.felt
-    contents = {} if applied is None else applied.contents
-    return {
-        "drive": {} if applied is None else _played_tones(applied.drive),
-        "layers": {str(number): _played_tones(each.drive) for number, each in contents.items()},
-        "promised_contrast_db": felt and _finite(felt.promised_contrast_db),
-        "predicted_contrast_db": felt and _finite(felt.contrast_db),
-        "predicted_level_db_sl": felt and _finite(felt.nominal_db_sl),
-    }
+    drive = dict[str, PlayedTone]()
+    layers = dict[str, dict[str, PlayedTone]]()
+    felt: FingerSensation | None = None
+    if applied is not None:
+        drive = _played_tones(applied.drive)
+        felt = applied.felt
+        for number, slot in applied.contents.items():
+            layers[str(number)] = _played_tones(slot.drive)
+    figures: dict[str, float | None] = dict.fromkeys(
+        ("promised_contrast_db", "predicted_contrast_db", "predicted_level_db_sl")
+    )
+    if felt is not None:
+        figures = {
+            "promised_contrast_db": _finite(felt.sensation.promised_contrast_db),
+            "predicted_contrast_db": _finite(felt.sensation.contrast_db),
+            "predicted_level_db_sl": _finite(felt.sensation.level_db_sl),
+        }
+    return {"drive": drive, "layers": layers, **figures}
 
 
 def _played_tones(drive: Drive) -> dict[str, PlayedTone]:

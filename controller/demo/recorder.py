@@ -24,7 +24,7 @@ from urllib.parse import quote
 import numpy as np
 from pydantic import BaseModel, ValidationError
 
-from controller.play.intent import Prediction
+from controller.play.intent import FingerSensation
 from controller.play.loop import Observers, PlayReport
 from controller.process.child import ended
 from controller.sources.touch import Change, Contact, ContactKey
@@ -439,7 +439,7 @@ class TouchRecorder:
         touches = []
         for felt in applied.targets:
             touch = self.touches.get(felt.contact.key)
-            if touch is not None and felt.verdict == HELD_BACK:
+            if touch is not None and felt.sensation.verdict == HELD_BACK:
                 touch.reason = applied.reason or felt.held_back
             elif touch is not None:  # not lifted meanwhile
                 touches.append(touch)
@@ -533,8 +533,8 @@ async def _played(touch: _Touch, row: TouchRow) -> TouchRow:
         latency_ms=None if first.applied.latency is None else 1000 * first.applied.latency,
         played_s=main_part.duration,
         steady=main_part.duration >= STEADY_DURATION,
-        predicted_contrast_db=predicted.contrast_db,
-        promised_contrast_db=predicted.promised_contrast_db,
+        predicted_contrast_db=predicted.sensation.contrast_db,
+        promised_contrast_db=predicted.sensation.promised_contrast_db,
         predicted_level_db_sl=predicted.level_db_sl,
         pattern=pattern,
         levels_db_sl={
@@ -565,7 +565,7 @@ def _significance(pattern: _PlayedPattern) -> tuple[int, float, float]:
     return len(applied.contents), min(pattern.duration, STEADY_DURATION), applied.time
 
 
-def _finger_row(felt: Prediction, vibration: Mapping[str, FingerVibration]) -> FingerRow:
+def _finger_row(felt: FingerSensation, vibration: Mapping[str, FingerVibration]) -> FingerRow:
     """What a finger feels among several contents."""
     level = contrast = None
     measured = vibration.get(_id(felt.contact))
@@ -577,15 +577,15 @@ def _finger_row(felt: Prediction, vibration: Mapping[str, FingerVibration]) -> F
     return FingerRow(
         at_m=_place(felt.contact),
         frequency_hz=felt.frequency,
-        verdict=felt.verdict,
-        promised_contrast_db=felt.promised_contrast_db,
+        verdict=felt.sensation.verdict,
+        promised_contrast_db=felt.sensation.promised_contrast_db,
         measured_contrast_db=contrast if contrast != math.inf else None,
         measured_level_db_sl=level,
     )
 
 
 def _fingers(
-    vibration: Mapping[str, FingerVibration], felt: Prediction, others: Sequence[Contact]
+    vibration: Mapping[str, FingerVibration], felt: FingerSensation, others: Sequence[Contact]
 ) -> tuple[FingerVibration | None, list[FingerVibration]]:
     """Vibration of the target and of the quiet fingers; no target unless all were measured."""
     target = vibration.get(_id(felt.contact))

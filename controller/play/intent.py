@@ -1,13 +1,13 @@
-"""Haptic intents, and the contents of layers that are chosen for them.
+"""Haptic intents, and the contents that are selected for them.
 
-An intent says which contacts shall feel something, how strongly, and until when: it is the
-interface between effects and playback. All other contacts are kept quiet. A content is what a layer
-plays, for its own finger and those that share it; predictions say what fingers feel of it, and a
-selection has the contents of all fingers. A question asks for the contents of some.
+An intent states which contacts get a vibration, how strong it is and until when it plays. It is the
+interface between effects and playback; all other contacts are kept quiet. A content is a layer of
+the model's answer, the contacts it is played for, and the model's sensation for each contact. A
+selection holds the contents of all contacts; a question asks for the contents of some contacts.
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Protocol, TypeAlias
@@ -15,8 +15,8 @@ from typing import Protocol, TypeAlias
 import numpy as np
 
 from controller.sources.touch import Contact, ContactKey
-from model.answer.answer import HELD_BACK, MIXED, OWN, Layer, is_felt, verdict_of
-from model.answer.stimulus import SHAPED_FROM, Course, Placement
+from model.answer.answer import HELD_BACK, MIXED, OWN, SHARED, Layer, Sensation, verdict_of
+from model.answer.stimulus import SHAPED_FROM, Course, Finger, Placement
 from model.arrays import FloatArray, best_of
 from model.finger import STRONG_DB_SL, detection_threshold, fingertips_on
 from model.structure.attachments import with_patches
@@ -28,7 +28,7 @@ _MIN_WAIT = 0.001  # s
 _MAX_DELAY = 0.1
 
 FADED_AFTER = 0.05
-"""Time [s] after the end of a pulse or layer when none of it is left on any amplifier."""
+"""Time [s] from the end of a pulse or layer until it has faded on every amplifier."""
 
 MAX_DB_SL = 26.0
 """Upper bound of `as strongly as the neighbours allow`: twice a strong vibration."""
@@ -36,23 +36,24 @@ MAX_DB_SL = 26.0
 NO_CONTACTS = "no contact on the plate"
 
 Band: TypeAlias = tuple[float, float]
-"""Lowest and highest frequency [Hz]; equal ones stand for the nearest that a table has."""
+"""Lowest and highest frequency [Hz]; if they are equal, the nearest frequency of the table."""
 
 Gains = Mapping[tuple[ContactKey, bool], float]
-"""Strengths [dB], 0 at most, by contact, and by whether a short pulse or what lasts is meant."""
+"""Strengths [dB], 0 at most, by contact and by whether they apply to its short pulses or to its
+lasting content."""
 
 CLICK = -1
-"""Voice of a short pulse; those of what lasts at the same finger begin with 0."""
+"""Voice of a short pulse; the voices of the same finger's lasting content begin with 0."""
 
-_TOLERANCE = 0.05  # of a frequency; less than anyone tells apart
+_TOLERANCE = 0.05  # relative; smaller differences of frequency are not felt
 
 
 @dataclass(slots=True, unsafe_hash=True)
 class Pulse:
     """A vibration of limited duration; pulses requested at different times differ.
 
-    A pulse that is not started ends 0.1 s after it is due, or after its duration where that is
-    more.
+    A pulse that has not started ends 0.1 s after it is due, or after its duration if that is
+    longer.
     """
 
     duration: float
@@ -60,12 +61,12 @@ class Pulse:
     requested_at: float
     """[s]"""
     is_raised: bool = True
-    """Whether the drive is raised so that the level is felt over the duration, onset included; else
-    the level is the steady one."""
+    """Whether the drive is raised to reach the level over the duration, onset included; otherwise
+    the level is that of the steady vibration."""
     due_at: float = field(default=-math.inf, init=False, compare=False)
-    """When [s] it is due, where it waits its turn; else it is due when it is requested."""
+    """When [s] a pulse that waits its turn is due; other pulses are due when requested."""
     started_at: float | None = field(default=None, init=False, compare=False)
-    """When [s] the amplifiers were sent its commit; None before."""
+    """When [s] its commit was sent to the amplifiers; None before."""
 
     @property
     def start(self) -> float:
@@ -89,38 +90,39 @@ class Pulse:
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """A contact that shall feel something of its own."""
+    """A contact with the vibration intended for it."""
 
     key: ContactKey
     level_db_sl: float | None = STRONG_DB_SL
-    """Level where the plate allows it; None for as strong as the neighbours allow."""
+    """Level if the plate allows it; None for as strong as the neighbours allow."""
     pulse: Pulse | None = None
-    """None without an end of its own."""
+    """Limits its duration; None for a vibration without an end of its own."""
     band: Band | None = None
     priority: int = 0
     """Targets of lower priority give way first."""
     content: str | None = None
-    """Name of the content. Fingers of one name may share a vibration where the plate cannot give
-    each its own; without a name the content is this finger's alone."""
+    """Name of the content. If the plate cannot give each finger a vibration, fingers with contents
+    of the same name can share one; a content without a name is never shared."""
     is_own: bool = False
     """Whether it feels its own content or none."""
     may_share: bool = False
-    """Whether it may also feel the content of any other finger that may share."""
+    """Whether it can also feel the content of any other finger that may share."""
     modulation_hz: float | None = None
-    """Frequency [Hz] at which the strength of what lasts comes and goes."""
+    """Frequency [Hz] at which the strength of a lasting content is modulated."""
     above_db: float | None = None
-    """Least level [dB] of a short pulse above what lasts at its finger; None for its own level."""
-    course: Course | None = field(default=None, hash=False, repr=False)  # of thousands of points
-    """Course from the start of the pulse on, again and again until that ends; None if steady."""
+    """Minimum level [dB] of a short pulse above the lasting content of its finger; None for no
+    minimum."""
+    course: Course | None = field(default=None, hash=False, repr=False)  # thousands of points
+    """Course from the start of the pulse, repeated until the pulse ends; None if steady."""
 
     @property
     def voice(self) -> int:
-        """Its first voice; voices tell the contents of one finger apart."""
+        """Its first voice; voices distinguish the contents of one finger."""
         return CLICK if self.is_short else 0
 
     @property
     def shared_as(self) -> str | bool | None:
-        """A value that targets have in common if they may share a vibration; None if it may not."""
+        """A value that is equal for targets that may share a vibration; None if it may not."""
         if self.is_short or self.is_own or self.course:
             return None
         return self.may_share or self.content
@@ -136,12 +138,12 @@ class HapticIntent:
     """Targets and their levels at one moment."""
 
     targets: tuple[Target, ...]
-    """For each contact one that lasts, a short pulse, or both; contacts that are not on the plate
-    are ignored."""
+    """For each contact a lasting content, a short pulse, or both; contacts that are not on the
+    plate are ignored."""
     reason: str = "no target"
     """Why there are no targets."""
     until: float = math.inf
-    """When [s] the intent may change though no contact does."""
+    """When [s] the intent can change without a change of contacts."""
     protected: frozenset[ContactKey] = frozenset()
     """Contacts that must not notice the contents of others."""
     gains_db: Gains = field(default_factory=dict)
@@ -163,7 +165,7 @@ class IntentSource(Protocol):
 
 
 def band_of_table(band: Band, frequencies: FloatArray) -> Band:
-    """Return a band [Hz] that has frequencies of a table: itself, or the nearest of them alone."""
+    """Return a band [Hz] with frequencies of a table: the band itself, or the nearest frequency."""
     low, high = band
     if low < high and ((frequencies >= low) & (frequencies <= high)).any():
         return band
@@ -173,13 +175,13 @@ def band_of_table(band: Band, frequencies: FloatArray) -> Band:
 
 
 def band_problem(band: Band, frequencies: FloatArray) -> str | None:
-    """Return a warning if a table of frequencies [Hz] has none in or near a band."""
+    """Return a warning unless one of a table's frequencies [Hz] is in or near a band."""
     low, high = band
     nearest = band_of_table(band, frequencies)[0]
     if low * (1 - _TOLERANCE) <= nearest <= high * (1 + _TOLERANCE):
         return None
-    given = f"{low:g} Hz" if low == high else f"{low:g} to {high:g} Hz"
-    return f"frequency {given} is not in the table, which plays {nearest:g} Hz instead"
+    band_text = f"{low:g} Hz" if low == high else f"{low:g} to {high:g} Hz"
+    return f"frequency {band_text} is not in the table, which plays {nearest:g} Hz instead"
 
 
 Targets = tuple[tuple[Contact, Target], ...]
@@ -187,96 +189,88 @@ Targets = tuple[tuple[Contact, Target], ...]
 BEING_CHOSEN = "what it shall feel is being chosen; wait a moment"
 
 
-@dataclass(frozen=True)
-class Prediction:
-    """The predicted sensation of a finger that is to feel something.
+def own_level_db_sl(sensation: Sensation) -> float:
+    """Return the level [dB SL] of a finger's content: promised if it lasts, otherwise nominal.
 
-    Contrasts and foreign levels are None where there is nothing to compare with.
+    The nominal level is the level over the duration, onset included.
     """
+    stimulus = sensation.finger.stimulus
+    if stimulus is None or stimulus.duration is None:
+        return sensation.promised_level_db_sl
+    return sensation.level_db_sl
 
-    contact: Contact
-    """As it was when the content was chosen."""
-    level_db_sl: float | None
-    """Over the duration of the effect, onset included, or the steady level where it has none."""
-    contrast_db: float | None = None
-    """Nominal contrast to the loudest quiet finger, or to the contents of others here."""
-    verdict: str = OWN
-    """Whether the finger feels its own content, that mixed, that of another finger, or none."""
-    held_back: str | None = None
-    """Why it does not feel its own content; None if it does."""
-    promised_contrast_db: float | None = None
-    """The contrast that nine of ten plates reach."""
-    foreign_level_db_sl: float | None = None
-    """Level of others' contents here that nine of ten plates do not exceed."""
-    frequency: float | None = None
-    """[Hz]; None where several or none play."""
-    content: str | None = None
-    """Name of what the finger feels."""
-    nominal_db_sl: float | None = None
-    """Level of that on the plate as modelled."""
-    pauses: bool = False
-    """Whether the content ends, or comes and goes."""
-    is_apart: bool = True
-    """Whether all that others feel is at least 30 Hz away."""
 
-    @property
-    def is_foreign_felt(self) -> bool:
-        """Whether others' contents may be felt here."""
-        return is_felt(self.foreign_level_db_sl)
+def judged(sensation: Sensation, *, is_apart: bool) -> Sensation:
+    """Return a sensation with the verdict that its figures give, if the finger has its own content.
 
-    def judged(self) -> "Prediction":
-        """Return the prediction with its verdict by its figures, if it has a content of its own."""
-        if self.verdict not in (OWN, MIXED):
-            return self
-        verdict = verdict_of(
-            self.promised_contrast_db, self.foreign_level_db_sl, pauses=self.pauses
-        )
-        return replace(self, verdict=verdict if self.is_apart else MIXED)
+    is_apart: whether all other contents are at least 30 Hz away; otherwise they mix.
+    """
+    if sensation.verdict not in (OWN, MIXED):
+        return sensation
+    if not is_apart:
+        return replace(sensation, verdict=MIXED)
+    verdict = verdict_of(
+        sensation.promised_contrast_db,
+        sensation.foreign_level_db_sl,
+        pauses=sensation.pauses,
+    )
+    return replace(sensation, verdict=verdict)
 
-    def beside(
-        self, others: Sequence[float], total: Sequence[float], above: Sequence[float] = (0.0,)
-    ) -> "Prediction":
-        """Return the prediction with other contents besides, whose powers add.
 
-        The worst set of thresholds counts. others: levels [dB SL] of these contents by set; total:
-        levels of all that is foreign here; above: own level by set [dB], relative to the rig's set.
-        """
-        level, contrast = self.level_db_sl, self.promised_contrast_db
-        found = replace(self, foreign_level_db_sl=max(total))
-        if level is None:
-            return found
-        own = [level + each for each in above]
-        least, background = math.inf if contrast is None else contrast, total
-        if contrast is not None and self.foreign_level_db_sl is not None:  # else to quiet fingers
-            background = sums_db([[each - contrast for each in own], others])
-        contrasts = [one - each for one, each in zip(own, background, strict=True)]
-        return replace(found, promised_contrast_db=min(least, *contrasts)).judged()
+def beside_others(
+    sensation: Sensation,
+    other_levels: Sequence[float],
+    foreign_levels: Sequence[float],
+    offsets_db: Sequence[float] = (0.0,),
+) -> Sensation:
+    """Return a sensation while other contents play; powers add, and the worst threshold set counts.
 
-    def weakened(self, gain_db: float, others_db: float) -> "Prediction":
-        """Return the prediction with a gain [dB]; others_db: the highest on others' contents.
+    other_levels: levels of these contents at the finger [dB SL] by threshold set; foreign_levels:
+    levels of all foreign contents there, these included; offsets_db: the finger's own level by set,
+    relative to the rig's set.
+    """
+    foreign_level = max(foreign_levels)
+    if sensation.layer is None:
+        return replace(sensation, foreign_level_db_sl=foreign_level)
+    nominal_level = own_level_db_sl(sensation)
+    own_levels = [nominal_level + offset for offset in offsets_db]
+    promised = sensation.promised_contrast_db
+    masking_levels = foreign_levels
+    if promised is not None and sensation.foreign_level_db_sl is not None:
+        # The promised contrast is to foreign contents here, not to quiet fingers.
+        promised_background = [level - promised for level in own_levels]
+        masking_levels = sums_db([promised_background, other_levels])
+    level_pairs = zip(own_levels, masking_levels, strict=True)
+    contrasts = [own - masking for own, masking in level_pairs]
+    if promised is not None:
+        contrasts.append(promised)
+    return replace(
+        sensation, promised_contrast_db=min(contrasts), foreign_level_db_sl=foreign_level
+    )
 
-        Contrasts are lower bounds.
-        """
-        gains = {
-            **dict.fromkeys(("level_db_sl", "nominal_db_sl"), gain_db),
-            **dict.fromkeys(("contrast_db", "promised_contrast_db"), min(gain_db - others_db, 0.0)),
-            "foreign_level_db_sl": others_db,
-        }
-        found: Prediction = replace(
-            self,
-            **{
-                key: level + gains[key]
-                for key in gains
-                if (level := getattr(self, key)) is not None
-            },
-        )
-        if (found.level_db_sl or 0.0) < 0 <= (self.level_db_sl or 0.0):
-            return replace(
-                found,
-                verdict=HELD_BACK,
-                held_back=f"a strength of {gain_db:g} dB leaves it below the threshold; raise it",
-            )
-        return found.judged()
+
+def weakened(sensation: Sensation, gain_db: float, others_gain_db: float) -> Sensation:
+    """Return a sensation with a gain [dB]; others_gain_db: the largest gain of other contents.
+
+    Contrasts become lower bounds. A sensation that falls below the threshold is held back.
+    """
+    contrast_gain = min(gain_db - others_gain_db, 0.0)
+    weaker = replace(
+        sensation,
+        level_db_sl=sensation.level_db_sl + gain_db,
+        promised_level_db_sl=sensation.promised_level_db_sl + gain_db,
+        contrast_db=_amplified(sensation.contrast_db, contrast_gain),
+        median_contrast_db=_amplified(sensation.median_contrast_db, contrast_gain),
+        promised_contrast_db=_amplified(sensation.promised_contrast_db, contrast_gain),
+        foreign_level_db_sl=_amplified(sensation.foreign_level_db_sl, others_gain_db),
+    )
+    if own_level_db_sl(weaker) < 0 <= own_level_db_sl(sensation):
+        return replace(weaker, verdict=HELD_BACK)
+    return weaker
+
+
+def _amplified(level: float | None, gain_db: float) -> float | None:
+    return None if level is None else level + gain_db
 
 
 @dataclass(frozen=True)
@@ -284,32 +278,120 @@ class Content:
     """The content of one layer, with the contacts as they were when it was chosen."""
 
     key: tuple[ContactKey, int]
-    """Its finger, and its voice: CLICK for a short pulse, 0 for a content that lasts, or the number
-    of a side band of that, which has no predictions."""
+    """Its contact and its voice: CLICK for a short pulse, 0 for a lasting content, or the number of
+    a side band of a lasting content."""
     targets: Targets
-    """Its finger, then those that share it."""
+    """The finger that owns it, followed by the fingers that share it."""
     placement: Placement
-    """Where these fingers are, and all others."""
+    """Positions of these fingers and of all other fingers."""
     layer: Layer
-    predictions: tuple[Prediction, ...] = field(default=(), compare=False)
-    """One for each target; they also depend on other contents."""
+    """The layer of the model's answer, in phase with the content that it continues, with its
+    gain."""
+    sensations: tuple[Sensation, ...] = field(default=(), compare=False)
+    """One for each target, while all other contents play; empty for a side band."""
+    is_apart: bool = field(default=True, compare=False)
+    """Whether all other contents are at least 30 Hz away."""
     gain_db: float = 0.0
     """Strength of its fingers, included in the layer."""
     is_led: bool = field(default=False, compare=False)
-    """Whether it takes the place of another content of its finger along a cross-fade."""
+    """Whether it replaces another content of its finger in a cross-fade."""
+
+    @property
+    def contact(self) -> Contact:
+        """The contact that owns it."""
+        return self.targets[0][0]
+
+    @property
+    def target(self) -> Target:
+        """The target of the contact that owns it."""
+        return self.targets[0][1]
+
+    @property
+    def contact_keys(self) -> list[ContactKey]:
+        """Keys of all contacts that feel it."""
+        return [contact.key for contact, _ in self.targets]
 
     @property
     def frequency(self) -> float | None:
-        """Its frequency [Hz]; None where there are several."""
+        """Its frequency [Hz]; None if it has several."""
         return self.layer.frequency
+
+    @property
+    def pulses(self) -> list[Pulse]:
+        """The pulses of its targets."""
+        return [target.pulse for _, target in self.targets if target.pulse is not None]
 
     @property
     def course(self) -> tuple[Course, Pulse] | None:
         """Its course and pulse; None for a steady content."""
-        target = self.targets[0][1]
+        target = self.target
         if target.course is None or target.pulse is None:
             return None
         return target.course, target.pulse
+
+    @property
+    def finger_sensations(self) -> list["FingerSensation"]:
+        """The sensation of each of its fingers; none for a side band."""
+        if not self.sensations:
+            return []
+        contacts = [contact for contact, _ in self.targets]
+        return [
+            FingerSensation(contact, sensation, self, self._why_held_back(contact, sensation))
+            for contact, sensation in zip(contacts, self.sensations, strict=True)
+        ]
+
+    def _why_held_back(self, contact: Contact, sensation: Sensation) -> str | None:
+        """Return why a finger does not feel a content of its own; None if it does."""
+        if sensation.verdict == HELD_BACK:
+            return f"a strength of {self.gain_db:g} dB leaves it below the threshold; raise it"
+        if sensation.verdict == SHARED and contact is not self.contact:
+            owner = self.contact.key
+            return (
+                f"shares the vibration of finger {owner.source} {owner.id}; lift one, or move "
+                "them apart"
+            )
+        return None
+
+    def with_sensations(self, sensations: Iterable[Sensation]) -> "Content":
+        """Return the content with other figures for its fingers, and the verdicts they give."""
+        verdicts = [judged(sensation, is_apart=self.is_apart) for sensation in sensations]
+        return replace(self, sensations=tuple(verdicts))
+
+    def weakened(self, gain_db: float, others_gain_db: float) -> "Content":
+        """Return the content with a gain [dB]; others_gain_db: the largest gain of the others."""
+        quieter = replace(self, layer=self.layer.scaled(gain_db), gain_db=gain_db)
+        return quieter.with_sensations(
+            [weakened(sensation, gain_db, others_gain_db) for sensation in self.sensations]
+        )
+
+
+@dataclass(frozen=True)
+class FingerSensation:
+    """The model's sensation of a finger, its contact, and the content that it feels."""
+
+    contact: Contact
+    """As it was when the content was chosen."""
+    sensation: Sensation
+    """While all other contents play."""
+    content: Content | None = None
+    """The content it feels; None if it feels nothing of its own."""
+    held_back: str | None = None
+    """Why it does not feel a content of its own; None if it does."""
+
+    @property
+    def level_db_sl(self) -> float | None:
+        """Level of the content: promised if it lasts, otherwise nominal; None without a content."""
+        return None if self.content is None else own_level_db_sl(self.sensation)
+
+    @property
+    def frequency(self) -> float | None:
+        """Frequency of the content [Hz]; None if it has several, or without a content."""
+        return None if self.content is None else self.content.frequency
+
+    @property
+    def content_name(self) -> str | None:
+        """Name of the content."""
+        return None if self.content is None else self.content.target.content
 
 
 @dataclass(frozen=True)
@@ -317,35 +399,35 @@ class Selection:
     """The contents of some contacts, or the reason for silence."""
 
     targets: Targets
-    """Contacts that are to feel something, as they were when the contents were chosen."""
+    """Contacts with a target, as they were when the contents were chosen."""
     quiet: tuple[Contact, ...]
     """The other contacts, as they were then."""
     contents: tuple[Content, ...] = ()
     reason: str | None = None
     """Why there are no contents."""
-    not_served: tuple[Prediction, ...] = ()
-    """Predictions for targets that feel nothing, with the reasons."""
+    unserved: tuple[FingerSensation, ...] = ()
+    """Targets that feel nothing, with the reasons."""
     is_pending: bool = False
     """Whether the contents of some targets are still being chosen."""
     foreign_levels: Mapping[ContactKey, Sequence[float]] = field(default_factory=dict)
-    """Levels [dB SL] of others' contents at contacts, by set of thresholds; nine of ten plates do
-    not exceed them."""
+    """Levels [dB SL] of other contents at each contact, by threshold set, which 90 % of plates do
+    not exceed."""
     protected: frozenset[ContactKey] = frozenset()
     """Contacts that must not notice the contents of others."""
     is_limited: bool = field(default=False, compare=False)
-    """Whether it has only the limits that pulses leave which play beside it."""
+    """Whether it is confined to the limits that active pulses leave."""
 
     @cached_property
     def contacts(self) -> dict[ContactKey, Contact]:
         """All contacts as they were then."""
-        found = {each.key: each for each in self.quiet}
+        contacts = {contact.key: contact for contact in self.quiet}
         for contact, _ in self.targets:
-            found[contact.key] = contact
-        return found
+            contacts[contact.key] = contact
+        return contacts
 
     @cached_property
     def target_keys(self) -> set[ContactKey]:
-        """Contacts of the targets."""
+        """Keys of the contacts with a target."""
         return {contact.key for contact, _ in self.targets}
 
     @property
@@ -355,94 +437,106 @@ class Selection:
 
     @cached_property
     def is_whole(self) -> bool:
-        """Whether every target feels its own, so that others gain nothing when one leaves."""
-        is_each_alone = all(len(content.targets) == 1 for content in self.contents)
-        return bool(self.contents) and is_each_alone and not self.not_served
+        """Whether every target feels its own content, so that none gains when another leaves."""
+        if not self.contents or self.unserved:
+            return False
+        return all(len(content.targets) == 1 for content in self.contents)
+
+    @property
+    def finger_sensations(self) -> tuple[FingerSensation, ...]:
+        """The sensation of each target; targets without a content come last.
+
+        A finger with two contents has the sensation of its short pulse. If one content could not be
+        served, the finger has the sensation of the other content, and the reason.
+        """
+        sensations = dict[ContactKey, FingerSensation]()
+        for content in self.contents:
+            for felt in content.finger_sensations:
+                sensations[felt.contact.key] = felt
+        for unserved in self.unserved:
+            key = unserved.contact.key
+            if key in sensations:
+                sensations[key] = replace(sensations[key], held_back=unserved.held_back)
+            else:
+                sensations[key] = unserved
+        return tuple(sensations.values())
 
     def weakened(self, gains_db: Gains) -> "Selection":
-        """Return the selection with the strengths of fingers; a shared content has the lowest."""
-        if not (self.contents and any(gains_db.values())):
+        """Return the selection with the strengths of its fingers.
+
+        A shared content has the lowest strength of its fingers.
+        """
+        if not self.contents or not any(gains_db.values()):
             return self
         gains = {
-            each.targets: min(
-                0.0,
-                *[gains_db.get((at.key, to.is_short), 0.0) for at, to in each.targets],
-            )
-            for each in self.contents
+            content.targets: _lowest_gain(content.targets, gains_db) for content in self.contents
         }
-        contents = []
-        for each in self.contents:
-            gain = gains[each.targets]
-            others = [other for targets, other in gains.items() if targets != each.targets]
-            loudest = max(others, default=gain)
-            felt = tuple([one.weakened(gain, loudest) for one in each.predictions])
-            scaled = each.layer.scaled(gain)
-            contents.append(replace(each, layer=scaled, predictions=felt, gain_db=gain))
-        loudest = max(gains.values())
-        levels = {
-            key: [level + loudest for level in by_set]
-            for key, by_set in self.foreign_levels.items()
-        }
-        return replace(self, contents=tuple(contents), foreign_levels=levels)
+        contents = list[Content]()
+        for content in self.contents:
+            gain = gains[content.targets]
+            others_gains = [gains[targets] for targets in gains if targets != content.targets]
+            contents.append(content.weakened(gain, max(others_gains, default=gain)))
+        largest_gain = max(gains.values())
+        foreign_levels = dict[ContactKey, Sequence[float]]()
+        for key, levels in self.foreign_levels.items():
+            foreign_levels[key] = [level + largest_gain for level in levels]
+        return replace(self, contents=tuple(contents), foreign_levels=foreign_levels)
 
-    def without(self, contents: Sequence["Content"], reason: str) -> "Selection":
+    def without(self, contents: Collection[Content], reason: str) -> "Selection":
         """Return the selection without some contents, whose targets feel nothing for a reason."""
-        held_back = dict.fromkeys(contact for each in contents for contact, _ in each.targets)
-        left = tuple(each for each in self.contents if each not in contents)
+        remaining = tuple([content for content in self.contents if content not in contents])
+        unserved = dict[ContactKey, FingerSensation]()
+        for content in contents:
+            for contact, _ in content.targets:
+                unserved[contact.key] = not_served(contact, reason)
         return replace(
             self,
-            contents=left,
-            reason=self.reason if left else reason,
-            not_served=(
-                *self.not_served,
-                *[not_served(contact, reason) for contact in held_back],
-            ),
+            contents=remaining,
+            reason=self.reason if remaining else reason,
+            unserved=(*self.unserved, *unserved.values()),
         )
 
     def beside(self, others: Sequence["Selection"], table: LocalizationTable) -> "Selection":
-        """Return the selection with the foreign levels of others that play beside it.
+        """Return the selection while other selections play, too, with their foreign levels.
 
-        table: has the sets of thresholds.
+        table: has the threshold sets.
         """
-        levels = {key: foreign_at(key, others) for key in self.target_keys}
-        levels = {
-            key: each for key, each in levels.items() if max(each, default=-math.inf) > -math.inf
-        }
-        if not levels:
+        other_levels = dict[ContactKey, Sequence[float]]()
+        for key in self.target_keys:
+            levels = foreign_at(key, others)
+            if max(levels, default=-math.inf) > -math.inf:
+                other_levels[key] = levels
+        if not other_levels:
             return self
-        total = {**self.foreign_levels}
-        total |= {key: foreign_at(key, (self, *others)) for key in levels}
+        foreign_levels = {**self.foreign_levels}
+        for key in other_levels:
+            foreign_levels[key] = foreign_at(key, (self, *others))
 
-        def together(each: Prediction, above: Sequence[float] = (0.0,)) -> Prediction:
-            key = each.contact.key
-            return each.beside(levels[key], total[key], above) if key in levels else each
+        def restated(finger: FingerSensation, offsets: Sequence[float] = (0.0,)) -> Sensation:
+            key = finger.contact.key
+            if key not in other_levels:
+                return finger.sensation
+            return beside_others(finger.sensation, other_levels[key], foreign_levels[key], offsets)
 
-        contents = []
-        for one in self.contents:
-            above = [*map(float, table.levels_by_set(0.0, one.layer.excitation))]
-            felt = [together(each, above) for each in one.predictions]
-            contents.append(replace(one, predictions=tuple(felt)))
+        contents = list[Content]()
+        for content in self.contents:
+            levels_by_set = table.levels_by_set(0.0, content.layer.excitation)
+            offsets = [float(level) for level in levels_by_set]
+            sensations = [restated(finger, offsets) for finger in content.finger_sensations]
+            contents.append(content.with_sensations(sensations))
+        unserved = [replace(finger, sensation=restated(finger)) for finger in self.unserved]
         return replace(
             self,
             contents=tuple(contents),
-            not_served=tuple(map(together, self.not_served)),
-            foreign_levels=total,
+            unserved=tuple(unserved),
+            foreign_levels=foreign_levels,
         )
 
-    @property
-    def predictions(self) -> tuple[Prediction, ...]:
-        """A prediction for each target, those that feel nothing at the end.
 
-        A finger with two contents has that of its short pulse; if one is not served, that of the
-        other with the reason.
-        """
-        found = {each.contact.key: each for one in self.contents for each in one.predictions}
-        for each in self.not_served:
-            felt = found.get(each.contact.key)
-            found[each.contact.key] = (
-                each if felt is None else replace(felt, held_back=each.held_back)
-            )
-        return tuple(found.values())
+def _lowest_gain(targets: Targets, gains_db: Gains) -> float:
+    """Return the lowest gain [dB] of some targets, 0 at most."""
+    gains = [gains_db.get((contact.key, target.is_short), 0.0) for contact, target in targets]
+    return min(0.0, *gains)
 
 
 NOTHING = Selection((), ())
@@ -453,30 +547,30 @@ _SOON = 5.0  # s; longer courses take longer to answer than the control loop may
 
 @dataclass(frozen=True)
 class Question:
-    """The targets that contents are to be chosen for, among all contacts, and what plays."""
+    """The targets to choose contents for, all contacts, and the contents that play."""
 
     contacts: tuple[Contact, ...]
-    """All on the plate."""
+    """All contacts on the plate."""
     lasting: Targets
-    """Targets of contents that last."""
+    """Targets of lasting contents."""
     short: Targets
     """Targets of short pulses."""
     protected: frozenset[ContactKey] = frozenset()
     """Contacts that must not notice the contents of others."""
-    before: Mapping[tuple[ContactKey, int], Content] = field(default_factory=dict)
+    playing: Mapping[tuple[ContactKey, int], Content] = field(default_factory=dict)
     """Contents that are felt now, by finger and voice."""
     kept: tuple[Selection, ...] = ()
-    """Selections that play on beside the new ones."""
+    """Selections that continue to play next to the new ones."""
     is_rested: bool = False
-    """Whether what plays would do, too, but may be led to what promises more."""
+    """Whether all fingers rest and are served, so that only a better answer is of interest."""
     now: float = math.inf
     """[s]"""
     fading: Selection = NOTHING
-    """What played before a cross-fade that goes on."""
+    """Contents that fade in a cross-fade."""
 
     @cached_property
     def is_alone(self) -> bool:
-        """Whether what lasts is one, steady, beside no other finger that is protected."""
+        """Whether there is one lasting, steady target and no other finger is protected."""
         if len(self.lasting) != 1:
             return False
         ((contact, target),) = self.lasting
@@ -484,11 +578,11 @@ class Question:
 
     @cached_property
     def takes_long(self) -> bool:
-        """Whether what lasts takes longer than the control loop may wait."""
+        """Whether the answer for lasting targets takes longer than the control loop can wait."""
         if self.lasting and not self.is_alone:
             return True
-        courses = [each.course for _, each in self.lasting if each.course is not None]
-        return bool(courses) and max([each.duration for each in courses]) > _SOON
+        courses = [target.course for _, target in self.lasting if target.course is not None]
+        return any(course.duration > _SOON for course in courses)
 
     def quiet_beside(self, targets: Targets) -> tuple[Contact, ...]:
         """Return the contacts that are not among some targets."""
@@ -499,61 +593,79 @@ class Question:
 
     def silent(self, targets: Targets, reason: str) -> Selection:
         """Return the selection of targets that feel nothing, for a reason."""
-        skipped = tuple(not_served(contact, reason) for contact, _ in targets)
-        quiet = self.quiet_beside(targets)
-        return Selection(targets, quiet, (), reason, skipped, protected=self.protected)
+        return Selection(
+            targets,
+            self.quiet_beside(targets),
+            reason=reason,
+            unserved=tuple([not_served(contact, reason) for contact, _ in targets]),
+            protected=self.protected,
+        )
 
     def unanswered(self, reason: str) -> tuple[Selection, ...]:
-        """Return selections in place of those not made: silence, unless what plays would do."""
-        each = () if self.is_rested else (self.lasting, *[(one,) for one in self.short])
-        return tuple([self.silent(targets, reason) for targets in each])
+        """Return silence in place of the missing selections; nothing if all fingers are served."""
+        if self.is_rested:
+            return ()
+        parts = [self.lasting, *[(pair,) for pair in self.short]]
+        return tuple([self.silent(targets, reason) for targets in parts])
 
 
-def foreign_at(key: ContactKey, parts: Sequence[Selection]) -> list[float]:
-    """Return the foreign levels [dB SL] of several selections at a contact, by set."""
-    return sums_db([known for part in parts if (known := part.foreign_levels.get(key))])
+def foreign_at(key: ContactKey, selections: Sequence[Selection]) -> list[float]:
+    """Return the foreign levels [dB SL] of several selections at a contact, by threshold set."""
+    levels = [selection.foreign_levels.get(key) for selection in selections]
+    return sums_db([levels_by_set for levels_by_set in levels if levels_by_set])
 
 
 def sums_db(levels: Sequence[Sequence[float]]) -> list[float]:
-    """Return the levels of powers that add up [dB], by set of thresholds."""
-    powers = [sum([10 ** (level / 10) for level in each]) for each in zip(*levels, strict=True)]
-    return [10 * math.log10(power) if power else -math.inf for power in powers]
+    """Return the levels [dB] of the sums of powers, by threshold set."""
+    powers = list[float]()
+    for levels_of_set in zip(*levels, strict=True):
+        powers.append(sum([10 ** (level / 10) for level in levels_of_set]))
+    return [_power_db(power) for power in powers]
+
+
+def _power_db(power: float) -> float:
+    return 10 * math.log10(power) if power else -math.inf
 
 
 def no_layer_free(count: int) -> str:
-    """Return why a content is held back where the layers of the amplifiers are all taken."""
+    """Return why a content is held back when all layers of the amplifiers are in use."""
     return f"no layer is free: the amplifiers play {count} contents at once; lift a finger"
 
 
-def not_served(contact: Contact, reason: str) -> Prediction:
-    """Return the prediction for a target that feels nothing of its own."""
-    return Prediction(contact, None, verdict=HELD_BACK, held_back=reason)
+def not_served(contact: Contact, reason: str) -> FingerSensation:
+    """Return the sensation of a target that feels nothing of its own."""
+    finger = Finger((contact.x, contact.y), load=contact.load)
+    return FingerSensation(contact, Sensation(finger, HELD_BACK), held_back=reason)
 
 
 def leaks_db_sl(
     table: LocalizationTable, contents: Sequence[Content], contacts: Sequence[Contact]
 ) -> dict[ContactKey, float]:
-    """Return what each contact feels of contents that are not for it, at its loudest point [dB SL].
+    """Return the level of foreign contents at each contact, at its loudest point [dB SL].
 
-    On the nominal plate with the contacts where they are, since weights follow them late: until a
-    finger has moved by 8 mm, and while the next answer is computed and fades in. Takes a few
-    milliseconds.
+    The level is computed on the nominal plate for the present positions of the contacts. Weights
+    lag behind a moving finger: they change after 8 mm, once the next answer has been computed and
+    has faded in. Takes a few milliseconds.
     """
-    if not contacts:  # lifted, while what plays is not known to have ended
+    if not contacts:  # lifted, while layers are not known to have ended
         return {}
-    places = [(each.x, each.y) for each in contacts]
-    length, width = table.plate.length, table.plate.width
-    resting = with_patches(places, [each.load for each in contacts], (length, width))
-    points, _ = fingertips_on(np.array(places), length=length, width=width)
-    power = np.zeros(points.shape[:2])  # by contact and point
-    fields = table.unit_fields(points.reshape(-1, 2), contacts=resting[0], loads=resting[1])
+    positions = [(contact.x, contact.y) for contact in contacts]
+    loads = [contact.load for contact in contacts]
+    plate = table.plate
+    patches, patch_loads = with_patches(positions, loads, (plate.length, plate.width))
+    points, _ = fingertips_on(np.array(positions), length=plate.length, width=plate.width)
+    fields = table.unit_fields(points.reshape(-1, 2), contacts=patches, loads=patch_loads)
+    foreign_power = np.zeros(points.shape[:2])  # by contact and point
     for content in contents:
-        frequencies, felt = table.driven(content.layer.excitation, fields)
-        sensed = np.abs(felt) / detection_threshold(frequencies, table.threshold)[:, None]
-        own = {contact.key for contact, _ in content.targets}
-        is_foreign = np.array([each.key not in own for each in contacts])
-        power += (sensed**2).sum(axis=0).reshape(power.shape) * is_foreign[:, None]
+        frequencies, accelerations = table.driven(content.layer.excitation, fields)
+        thresholds = detection_threshold(frequencies, table.threshold)
+        relative = np.abs(accelerations) / thresholds[:, None]
+        power = (relative**2).sum(axis=0).reshape(foreign_power.shape)
+        own_keys = content.contact_keys
+        is_foreign = np.array([contact.key not in own_keys for contact in contacts])
+        foreign_power += power * is_foreign[:, None]
+    loudest_powers = foreign_power.max(axis=1).tolist()
     return {
-        each.key: 10 * math.log10(loudest) if loudest else -math.inf
-        for each, loudest in zip(contacts, power.max(axis=1).tolist(), strict=True)
+        contact.key: _power_db(power)
+        for contact, power in zip(contacts, loudest_powers, strict=True)
     }

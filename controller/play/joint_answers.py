@@ -1,39 +1,42 @@
-"""Joint answers: from targets to contents by one answer of the table, and ways to better answers.
+"""Joint answers: choose the contents of all targets with one query of the table, and improve them.
 
-A frequency that a finger feels is content: it is kept, and its phase at that finger, unless another
-one serves more fingers.
+The frequency that a finger already feels is part of its content. It is kept, as is its phase at
+that finger, unless another frequency serves more fingers.
 
-Moving fingers are answered for 16 mm of their way, at three places at once, with their own content
-and as quiet for all others: around the middle of the 8 mm from where a finger is once the weights
-have half changed, to where they do again. What is promised is the mean power there on drawn plates,
-with a share of others' contents for the side bands of weights that change (`model.answer.promise`).
+Moving fingers are solved for a 16 mm stretch of their path, at three points simultaneously: each
+with its own content and quiet for all others. The stretch is centred on the 8 mm between two
+positions: where the change of weights to this answer is half complete, and where the change to the
+next answer will be. The promise is the mean power there over sampled plates, plus an allowance for
+side bands that changing weights cause in other fingers' contents (`model.answer.promise`).
 
-What fingers feel depends on the order of their arrival, since frequencies are kept. Once all rest,
-the answer with none kept is led to along cross-fades (`Crossfades`), one content after the other,
-so that others feel little of it; where only weights change, as after a finger has left, along the
-same ramp within the layer. Each step keeps 30 Hz between all that sounds at once, the old tone
-included; where no order of the contents does, what plays is left. Between the steps the promise is
-that of what plays then.
+Because frequencies are kept, the result depends on the order of arrival. Once all fingers rest,
+playback cross-fades (`Crossfades`) to the answer without kept frequencies. One content changes at a
+time, so that other fingers feel little of the change. If only weights change, for instance after a
+finger has left, the layer itself follows the same ramp. Every step keeps all sounding frequencies,
+including the outgoing one, 30 Hz apart; if no order of steps can, playback does not change. Between
+steps the promise is computed for the contents that play at the time.
 """
 
 import cmath
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 
 import numpy as np
 
 from controller.play.intent import (
     MAX_DB_SL,
     Content,
-    Prediction,
+    FingerSensation,
     Question,
     Selection,
     Target,
     Targets,
     band_of_table,
+    judged,
     not_served,
+    own_level_db_sl,
 )
 from controller.play.routing import PlaybackCapabilities
 from controller.sources.touch import Contact, ContactKey
@@ -44,7 +47,6 @@ from model.answer.answer import (
     MIN_CONTRAST_DB,
     OWN_CONTRAST_DB,
     SAME_LEVEL,
-    SHARED,
     Answer,
     Layer,
     Sensation,
@@ -62,13 +64,13 @@ from model.vibration import Excitation, base_amplitudes
 from registry.limits import MAX_CONTACTS
 
 STRETCH = 0.008
-"""Way [m] after which a moving finger is asked anew; it is answered for twice as much of it."""
+"""Distance [m] after which a moving finger gets a new answer, which covers twice that distance."""
 
 WORTH = 2.0
-"""How much more [dB] the worst finger must be promised for other frequencies."""
+"""Gain in promised contrast [dB] of the worst finger that justifies other frequencies."""
 
 WORTH_OF_WEIGHTS = 0.5
-"""How much more [dB] it must be promised for other weights alone."""
+"""Gain in promised contrast [dB] of the worst finger that justifies other weights alone."""
 
 LIMITS_LEAVE_NOTHING = "the limits of the amplifiers allow nothing that is felt; raise them"
 
@@ -77,16 +79,16 @@ NEIGHBOURS_LEAVE_NOTHING = (
     "not; lift or move that finger away"
 )
 
-_ANSWER_TIME = 0.020  # s; until what is asked now has begun to play
-_SHORT_OF = 1.0  # dB; by which what keeps its frequency may be weaker than asked
+_ANSWER_TIME = 0.020  # s; from a question until its answer begins to play
+_SHORT_OF = 1.0  # dB; tolerated loss of level for a kept frequency
 _SIDE_BANDS = 2
-_SAME = 0.01  # of the largest amplitude of two drives: a difference that is not felt
+_SAME = 0.01  # difference between two drives that is not felt, relative to the largest amplitude
 
 Shape = Callable[[Placement, Layer, bool], Layer]
-"""Adds the envelopes of a layer; without an onset where the last argument is true."""
+"""Adds the envelopes of a layer, without an onset if the last argument is true."""
 
 _Voices = Mapping[ContactKey, tuple[Content, ...]]
-"""A content and its side bands, by the finger whose content it is."""
+"""A content and its side bands, by the finger that owns it."""
 
 
 def answered(
@@ -99,37 +101,49 @@ def answered(
     now: float = math.inf,
     avoided_hz: Sequence[float] = (),
 ) -> Answer:
-    """Answer the fingers of some targets, moving ones on their ways; all others are quiet.
+    """Choose vibrations for some targets of a question; all other contacts are quiet.
 
-    keeps: whether frequencies that are felt now are kept, unless others serve more fingers, or more
-    strongly. now [s]: infinite where all rest; avoided_hz: frequencies that play beside the answer.
-    Raises InputError for fingers that are too close.
+    Moving fingers are solved along their paths. keeps: whether present frequencies are kept, unless
+    others serve more fingers, or serve them more strongly; now [s]: infinite if all fingers rest;
+    avoided_hz: frequencies that play at the same time. Raises InputError for fingers that are too
+    close.
     """
     quiet = question.quiet_beside(targets)
-    is_shaped = capabilities.envelope_support.onset_knots > 0
+    first_target = targets[0][1]
     fingers = fingers_of(table, targets, quiet, capabilities, question.protected)
-    if len(targets) > 1 or targets[0][1].modulation_hz is not None:
+    if len(targets) > 1 or first_target.modulation_hz is not None:
         fingers = _as_layers_allow(fingers, len(targets), capabilities)
     contacts = [*[contact for contact, _ in targets], *quiet]
-    fingers = with_ways(fingers, contacts, now, table.plate)
+    fingers = with_paths(fingers, contacts, now, table.plate)
+    has_onsets = capabilities.envelope_support.onset_knots > 0
     request = partial(
         answer,
         table,
         drive_mode=capabilities.drive_mode,
-        shaped=is_shaped and not targets[0][1].is_short,  # all or none
+        shaped=has_onsets and not first_target.is_short,  # either all targets are short or none
         limits=capabilities.limits,
         avoided_hz=avoided_hz,
     )
-    kept = _kept(fingers, targets, question.before) if keeps else fingers
-    found = request(kept)
-    served, lowered = len(found.layers), _lowered_db(found)
-    is_loud = lowered < _SHORT_OF
-    if kept != fingers and not (is_loud and served == len(targets)):
-        other = request(fingers)
-        is_better = not is_loud and _lowered_db(other) < lowered
-        if (len(other.layers), is_better) > (served, False):
-            found = other
-    return _on_ways(table, found, len(contacts))
+    tuned_fingers = _tuned_as_played(fingers, targets, question.playing) if keeps else fingers
+    solution = request(tuned_fingers)
+    if tuned_fingers != fingers and _may_be_improved(solution, len(targets)):
+        free_solution = request(fingers)
+        if _serves_better(free_solution, solution):
+            solution = free_solution
+    return _on_paths(table, solution, len(contacts))
+
+
+def _may_be_improved(solution: Answer, count: int) -> bool:
+    """Whether an answer leaves out a target, or is weaker than requested."""
+    return len(solution.layers) < count or _lowered_db(solution) >= _SHORT_OF
+
+
+def _serves_better(solution: Answer, kept: Answer) -> bool:
+    """Whether an answer has more layers than the one of kept frequencies, or is clearly louder."""
+    if len(solution.layers) != len(kept.layers):
+        return len(solution.layers) > len(kept.layers)
+    shortfall = _lowered_db(kept)
+    return shortfall >= _SHORT_OF and _lowered_db(solution) < shortfall
 
 
 def fingers_of(
@@ -139,50 +153,63 @@ def fingers_of(
     capabilities: PlaybackCapabilities,
     protected: frozenset[ContactKey] = frozenset(),
 ) -> list[Finger]:
-    """Return the fingers of targets, then the quiet ones.
+    """Return the fingers of targets, followed by the quiet fingers.
 
-    protected: contacts that must not notice the vibrations of others. A duration is asked for only
-    with a single target, and with pulses that end before an onset would have settled.
+    protected: contacts that must not notice the vibrations of others. A duration is requested only
+    for a single target, and for pulses that end before an onset would have settled.
     """
-    found = []
+    fingers = list[Finger]()
     for contact, target in targets:
-        is_over = target.course is None and (len(targets) == 1 or target.is_short)
-        duration = None
-        if is_over and target.pulse is not None and target.pulse.is_raised:
-            duration = target.pulse.duration
-        stimulus = Stimulus(
-            MAX_DB_SL if target.level_db_sl is None else target.level_db_sl,
-            playable_band(target.band, table.frequencies, capabilities.limits.frequencies),
-            duration,
-            None if duration is not None else target.modulation_hz,
-            is_limit=target.level_db_sl is None,
-            name=target.content,
-            course=target.course,
+        band = playable_band(target.band, table.frequencies, capabilities.limits.frequencies)
+        finger = Finger(
+            (contact.x, contact.y),
+            _stimulus_of(target, band, is_single=len(targets) == 1),
+            contact.load,
+            target.priority,
+            _sharing_of(target),
+            min_contrast_db=OWN_CONTRAST_DB if target.is_own else -math.inf,
+            max_foreign_db_sl=_max_foreign_db_sl(contact, protected),
         )
-        never = target.is_own or target.course is not None  # each has begun at its own time
-        sharing = NEVER if never else ANY if target.may_share else BY_NAME
-        found.append(
-            Finger(
-                (contact.x, contact.y),
-                stimulus,
-                contact.load,
-                target.priority,
-                sharing,
-                min_contrast_db=OWN_CONTRAST_DB if target.is_own else -math.inf,
-                max_foreign_db_sl=IMPERCEPTIBLE_DB_SL if contact.key in protected else math.inf,
-            )
-        )
+        fingers.append(finger)
     for contact in quiet:
-        bound = IMPERCEPTIBLE_DB_SL if contact.key in protected else math.inf
-        found.append(
-            Finger(
-                (contact.x, contact.y),
-                load=contact.load,
-                is_protected=not contact.is_surplus,
-                max_foreign_db_sl=bound,
-            )
+        finger = Finger(
+            (contact.x, contact.y),
+            load=contact.load,
+            is_protected=not contact.is_surplus,
+            max_foreign_db_sl=_max_foreign_db_sl(contact, protected),
         )
-    return found
+        fingers.append(finger)
+    return fingers
+
+
+def _stimulus_of(target: Target, band: tuple[float, float], *, is_single: bool) -> Stimulus:
+    """Return the stimulus of a target within a playable band [Hz]."""
+    has_duration = target.course is None and (is_single or target.is_short)
+    duration = None
+    if has_duration and target.pulse is not None and target.pulse.is_raised:
+        duration = target.pulse.duration
+    is_limit = target.level_db_sl is None
+    return Stimulus(
+        MAX_DB_SL if target.level_db_sl is None else target.level_db_sl,
+        band,
+        duration,
+        target.modulation_hz if duration is None else None,
+        is_limit=is_limit,
+        name=target.content,
+        course=target.course,
+    )
+
+
+def _sharing_of(target: Target) -> str:
+    """Return which vibrations of other fingers a target can share."""
+    if target.is_own or target.course is not None:  # courses begin at different times
+        return NEVER
+    return ANY if target.may_share else BY_NAME
+
+
+def _max_foreign_db_sl(contact: Contact, protected: frozenset[ContactKey]) -> float:
+    """Return the largest level [dB SL] of foreign vibrations that a contact may feel."""
+    return IMPERCEPTIBLE_DB_SL if contact.key in protected else math.inf
 
 
 def playable_band(
@@ -190,64 +217,68 @@ def playable_band(
 ) -> tuple[float, float]:
     """Return the lowest and highest frequency [Hz] of a band that can be played.
 
-    A band that shares no frequency of a table with what is playable is ignored.
+    A band without a playable frequency of the table is ignored.
     """
-    low, high = playable
-    if band is not None:
-        of_table = band_of_table(band, frequencies)
-        together = max(low, of_table[0]), min(high, of_table[1])
-        if ((frequencies >= together[0]) & (frequencies <= together[1])).any():
-            low, high = together
-    return low, high
+    if band is None:
+        return playable
+    table_low, table_high = band_of_table(band, frequencies)
+    low = max(playable[0], table_low)
+    high = min(playable[1], table_high)
+    is_in_band = (frequencies >= low) & (frequencies <= high)
+    return (low, high) if is_in_band.any() else playable
 
 
 def _as_layers_allow(
-    fingers: Sequence[Finger], targets: int, capabilities: PlaybackCapabilities
+    fingers: Sequence[Finger], target_count: int, capabilities: PlaybackCapabilities
 ) -> list[Finger]:
-    """Return fingers, those of low priority steady where no layers are left for side bands.
+    """Return fingers, of which those with low priority are steady if side bands have no layer left.
 
     One layer is left free for a click.
     """
-    found, spare = [*fingers], capabilities.layers - targets - 1
-    for number in sorted(range(targets), key=lambda each: -found[each].priority):
-        stimulus = found[number].stimulus
-        if stimulus is not None and stimulus.modulation_hz is not None:
-            if spare >= _SIDE_BANDS:
-                spare -= _SIDE_BANDS
-            else:
-                steady = replace(stimulus, modulation_hz=None)
-                found[number] = replace(found[number], stimulus=steady)
-    return found
-
-
-def _kept(
-    fingers: Sequence[Finger],
-    targets: Sequence[tuple[Contact, Target]],
-    before: Mapping[tuple[ContactKey, int], Content],
-) -> list[Finger]:
-    """Return fingers tuned to the frequencies that they feel now, where their bands allow it."""
-    kept = [*fingers]
-    for number, (contact, target) in enumerate(targets):
-        then, stimulus = before.get((contact.key, target.voice)), fingers[number].stimulus
-        frequency = None if then is None else then.frequency
-        if stimulus is None or frequency is None:
+    allowed = [*fingers]
+    spare_layers = capabilities.layers - target_count - 1
+    by_priority = sorted(range(target_count), key=lambda number: -fingers[number].priority)
+    for number in by_priority:
+        stimulus = fingers[number].stimulus
+        if stimulus is None or stimulus.modulation_hz is None:
             continue
+        if spare_layers >= _SIDE_BANDS:
+            spare_layers -= _SIDE_BANDS
+        else:
+            steady = replace(stimulus, modulation_hz=None)
+            allowed[number] = replace(fingers[number], stimulus=steady)
+    return allowed
+
+
+def _tuned_as_played(
+    fingers: Sequence[Finger],
+    targets: Targets,
+    playing: Mapping[tuple[ContactKey, int], Content],
+) -> list[Finger]:
+    """Return fingers tuned to the frequencies that they feel now, if their bands allow it."""
+    tuned_fingers = [*fingers]
+    for number, (contact, target) in enumerate(targets):
+        content = playing.get((contact.key, target.voice))
+        stimulus = fingers[number].stimulus
+        if content is None or stimulus is None:
+            continue
+        frequency = content.frequency
         low, high = stimulus.band_hz
-        if low <= frequency <= high:
+        if frequency is not None and low <= frequency <= high:
             tuned = replace(stimulus, band_hz=(frequency, frequency))
-            kept[number] = replace(fingers[number], stimulus=tuned)
-    return kept
+            tuned_fingers[number] = replace(fingers[number], stimulus=tuned)
+    return tuned_fingers
 
 
-def _lowered_db(found: Answer) -> float:
-    """Return by how many dB the weakest finger is weaker than asked."""
-    return max([each.lowered_db for each in found.fingers], default=0.0)
+def _lowered_db(solution: Answer) -> float:
+    """Return the largest difference [dB] between a requested level and the level of the answer."""
+    return max([sensation.lowered_db for sensation in solution.fingers], default=0.0)
 
 
 def selection_of(
     table: LocalizationTable,
     question: Question,
-    found: Answer,
+    solution: Answer,
     targets: Targets,
     *,
     shape: Shape | None = None,
@@ -257,241 +288,297 @@ def selection_of(
 
     The phases of contents that play are kept if is_in_phase; shape: adds envelopes.
     """
-    before, quiet = question.before, question.quiet_beside(targets)
-    fields: Complex64Array | None = None  # seldom needed
-    contents: list[Content] = []
-    skipped: list[Prediction] = []
-    felt, unfelt = [*zip(targets, found.fingers, strict=False)], set[ContactKey]()
-    for (contact, _), each in felt:
-        if each.verdict == HELD_BACK:
-            skipped.append(_held_back(contact, each))
-        elif (reason := _why_unfelt(each)) is not None:
-            unfelt.add(contact.key)
-            skipped.append(not_served(contact, reason))
-    for layer in found.layers:
-        own, sensations = list[tuple[Contact, Target]](), list[Sensation]()
+    quiet = question.quiet_beside(targets)
+    unserved = _unserved(targets, solution)
+    unserved_keys = {finger.contact.key for finger in unserved}
+    phases = _Phases(table, tuple([finger.at for finger in solution.asked[: len(targets)]]))
+    contents = list[Content]()
+    for layer in solution.layers:
+        own_targets = list[tuple[Contact, Target]]()
+        sensations = list[Sensation]()
         for number in layer.fingers:
-            finger, sensation = felt[number]
-            if finger[0].key not in unfelt:
-                own.append(finger)
-                sensations.append(sensation)
-        if not own:
+            contact, target = targets[number]
+            if contact.key not in unserved_keys:
+                own_targets.append((contact, target))
+                sensations.append(_within_pulse(solution.fingers[number], target))
+        if not own_targets:
             continue
-        (contact, target), placed, voices = own[0], found.placement(layer), layer.voices
-        carrier = before.get((contact.key, target.voice))
-        is_continued = carrier is not None and all(
-            (then := before.get((contact.key, voice))) is not None
-            and then.frequency == played.frequency
-            for voice, played in enumerate(voices)
+        first_contact, first_target = own_targets[0]
+        carrier = Content(
+            key=(first_contact.key, first_target.voice),
+            targets=tuple(own_targets),
+            placement=solution.placement(layer),
+            layer=layer,
+            sensations=tuple(sensations),
         )
-        for voice, played in enumerate(voices):
-            if layer.side_bands or (is_in_phase and carrier is not None):
-                if fields is None:
-                    places = [each.at for each in found.asked[: len(targets)]]
-                    fields = table.unit_fields(np.array(places), contacts=places)
-                then = carrier if is_continued else None
-                played = _in_phase(played, then, fields, layer.fingers[0], table)
-            contents.append(
-                Content(
-                    (contact.key, target.voice + voice),
-                    tuple(own),
-                    placed,
-                    shape(placed, played, is_continued) if shape and not target.course else played,
-                    () if voice else _predictions(own, sensations, layer),
-                )
-            )
+        contents += _voices_of(carrier, question.playing, phases, shape, is_in_phase=is_in_phase)
     contacts = [*[contact for contact, _ in targets], *quiet]
-    heard = np.array(found.tones.foreign_db_sl)
-    levels = zip(contacts, np.where(np.isnan(heard), -math.inf, heard).tolist(), strict=False)
     return Selection(
         targets,
         quiet,
         tuple(contents),
-        None if contents else skipped[0].held_back,
-        tuple(skipped),
-        foreign_levels={contact.key: by_set for contact, by_set in levels},
+        None if contents else unserved[0].held_back,
+        tuple(unserved),
+        foreign_levels=_foreign_levels(solution, contacts),
         protected=question.protected,
     )
 
 
-def _why_unfelt(felt: Sensation) -> str | None:
-    """Return why a finger would not feel its own layer; None if it does."""
-    stimulus = felt.finger.stimulus
-    if felt.layer is None or stimulus is None:
+def _unserved(targets: Targets, solution: Answer) -> list[FingerSensation]:
+    """Return the targets without a content, with the reasons."""
+    unserved = list[FingerSensation]()
+    for (contact, _), sensation in zip(targets, solution.fingers, strict=False):
+        if sensation.verdict == HELD_BACK:
+            why_held_back = _why_held_back(sensation)
+            unserved.append(FingerSensation(contact, sensation, held_back=why_held_back))
+            continue
+        why_unfelt = _why_unfelt(sensation)
+        if why_unfelt is not None:
+            unserved.append(not_served(contact, why_unfelt))
+    return unserved
+
+
+def _within_pulse(sensation: Sensation, target: Target) -> Sensation:
+    """Return the sensation of a target; a pulse no longer masks other vibrations when it ends."""
+    if target.pulse is None or sensation.pauses:
+        return sensation
+    return judged(replace(sensation, pauses=True), is_apart=True)
+
+
+def _voices_of(
+    carrier: Content,
+    playing: Mapping[tuple[ContactKey, int], Content],
+    phases: "_Phases",
+    shape: Shape | None,
+    *,
+    is_in_phase: bool,
+) -> list[Content]:
+    """Return a content and its side bands, each in a layer of its own.
+
+    playing: contents that are felt now; a content that continues keeps its phase if is_in_phase;
+    shape: adds envelopes.
+    """
+    layers = carrier.layer.voices
+    contact_key, first_voice = carrier.key
+    felt_now = playing.get(carrier.key)
+    is_continued = felt_now is not None and _are_played(layers, contact_key, playing)
+    is_turned = len(layers) > 1 or (is_in_phase and felt_now is not None)
+    reference = felt_now if is_continued else None
+    owner = carrier.layer.fingers[0]
+    voices = list[Content]()
+    for voice, layer in enumerate(layers):
+        if is_turned:
+            layer = phases.turned(layer, reference, owner)
+        if shape is not None and carrier.target.course is None:
+            layer = shape(carrier.placement, layer, is_continued)
+        key = (contact_key, first_voice + voice)
+        sensations = () if voice else carrier.sensations
+        voices.append(replace(carrier, key=key, layer=layer, sensations=sensations))
+    return voices
+
+
+def _are_played(
+    layers: Sequence[Layer], key: ContactKey, playing: Mapping[tuple[ContactKey, int], Content]
+) -> bool:
+    """Whether a finger feels the frequencies of all these layers now."""
+    for voice, layer in enumerate(layers):
+        content = playing.get((key, voice))
+        if content is None or content.frequency != layer.frequency:
+            return False
+    return True
+
+
+def _foreign_levels(
+    solution: Answer, contacts: Sequence[Contact]
+) -> dict[ContactKey, Sequence[float]]:
+    """Return the levels [dB SL] of other contents at contacts, by threshold set."""
+    levels = np.array(solution.tones.foreign_db_sl)
+    levels[np.isnan(levels)] = -math.inf  # at fingers that are neither targets nor quiet
+    keys = [contact.key for contact in contacts]
+    return dict(zip(keys, levels.tolist(), strict=False))
+
+
+def _why_unfelt(sensation: Sensation) -> str | None:
+    """Return why a finger would not feel its own layer; None if it would."""
+    stimulus = sensation.finger.stimulus
+    if sensation.layer is None or stimulus is None:
         return None
-    if stimulus.is_limit and felt.level_db_sl <= 0:
+    if stimulus.is_limit and sensation.level_db_sl <= 0:
         return NEIGHBOURS_LEAVE_NOTHING
-    return LIMITS_LEAVE_NOTHING if felt_db_sl(felt) < 0 <= stimulus.level_db_sl else None
+    if own_level_db_sl(sensation) < 0 <= stimulus.level_db_sl:
+        return LIMITS_LEAVE_NOTHING
+    return None
 
 
-def felt_db_sl(felt: Sensation) -> float:
-    """Return the level [dB SL] of a finger: promised if it lasts, else nominal over its time."""
-    stimulus = felt.finger.stimulus
-    lasts = stimulus is None or stimulus.duration is None
-    return felt.promised_level_db_sl if lasts else felt.level_db_sl
-
-
-def _predictions(
-    targets: Sequence[tuple[Contact, Target]],
-    sensations: Sequence[Sensation],
-    layer: Layer,
-) -> tuple[Prediction, ...]:
-    """Return the predictions for a layer's finger, and for those that share it."""
-    first, own = targets[0]
-    shares = (
-        f"shares the vibration of finger {first.key.source} {first.key.id}; lift one, or move them "
-        "apart"
-    )
-    predictions: list[Prediction] = []
-    for (contact, target), felt in zip(targets, sensations, strict=True):
-        predictions.append(
-            Prediction(
-                contact,
-                felt_db_sl(felt),
-                felt.contrast_db,
-                felt.verdict,
-                shares if felt.verdict == SHARED and contact is not first else None,
-                felt.promised_contrast_db,
-                felt.foreign_level_db_sl,
-                layer.frequency,
-                own.content,
-                felt.level_db_sl,
-                pauses=felt.pauses or target.pulse is not None,
-            ).judged()
-        )
-    return tuple(predictions)
-
-
-def _held_back(contact: Contact, felt: Sensation) -> Prediction:
-    """Return the prediction for a finger whose vibration is held back, with the reason."""
-    had = felt.promised_contrast_db
-    least = max(MIN_CONTRAST_DB, felt.finger.min_contrast_db)
-    if felt.is_disturbing:
-        reason = "a protected finger would notice it; lower its level, or lift that finger"
-    elif had is not None and had >= least:
-        reason = (
+def _why_held_back(sensation: Sensation) -> str:
+    """Return why the model holds back the vibration of a finger."""
+    if sensation.is_disturbing:
+        return "a protected finger would notice it; lower its level, or lift that finger"
+    contrast = sensation.promised_contrast_db
+    required = max(MIN_CONTRAST_DB, sensation.finger.min_contrast_db)
+    if contrast is not None and contrast >= required:
+        return (
             "too many contents for this plate: beside it another finger would not have had the "
             f"{MIN_CONTRAST_DB:g} dB of contrast, or more, that it requires; lift a finger, move "
             "it away, or widen its band"
         )
-    else:
-        figure = "" if had is None or not math.isfinite(had) else f", only {had:.1f} dB"
-        reason = (
-            f"too many contents for this plate: beside the others it would not have had {least:g} "
-            f"dB of contrast{figure}; lift a finger, move it away, or widen its band"
-        )
-    return replace(
-        not_served(contact, reason),
-        promised_contrast_db=had,
-        foreign_level_db_sl=felt.foreign_level_db_sl,
+    figure = ""
+    if contrast is not None and math.isfinite(contrast):
+        figure = f", only {contrast:.1f} dB"
+    return (
+        f"too many contents for this plate: beside the others it would not have had {required:g} "
+        f"dB of contrast{figure}; lift a finger, move it away, or widen its band"
     )
 
 
-def _in_phase(
-    layer: Layer,
-    before: Content | None,
-    fields: Complex64Array,
-    number: int,
-    table: LocalizationTable,
-) -> Layer:
-    """Turn a layer so that its finger feels it in the phase of the tone before, 0 without any.
+@dataclass(frozen=True)
+class _Phases:
+    """Phases of layers at the fingers that feel them.
 
-    Side bands in phase with their carrier modulate its amplitude, not its frequency: all have the
-    phase of the carrier before. fields (f, eras, fingers): of each ERA at full stroke; number: of
-    the finger.
+    positions: of the fingers of an answer [m].
     """
-    fields = fields[:, :, [number]]
-    felt = _felt(layer.excitation, fields, table)
-    felt_before = {} if before is None else _felt(before.layer.excitation, fields, table)
-    (then,) = felt_before.values() if len(felt_before) == 1 else (1.0,)
-    turned = {}
-    for name, tone in layer.excitation.items():
-        now = felt[tone.frequency]
-        change = cmath.phase(then / now) if now and then else 0.0
-        turned[name] = replace(tone, phase=tone.phase + change)
-    return replace(layer, excitation=turned)
+
+    table: LocalizationTable
+    positions: tuple[Point, ...]
+
+    @cached_property
+    def _fields(self) -> Complex64Array:
+        """Acceleration per ERA at full stroke (f, eras, fingers); computed on first use."""
+        positions = [*self.positions]
+        return self.table.unit_fields(np.array(positions), contacts=positions)
+
+    def turned(self, layer: Layer, content: Content | None, finger: int) -> Layer:
+        """Return a layer turned so that its finger feels it in the phase of a content, 0 for None.
+
+        Side bands in phase with their carrier modulate its amplitude, not its frequency, so all
+        layers are turned to the phase of the former carrier.
+        """
+        reference: complex = 1.0
+        if content is not None:
+            accelerations = self._accelerations(content.layer.excitation, finger)
+            if len(accelerations) == 1:
+                (reference,) = accelerations.values()
+        accelerations = self._accelerations(layer.excitation, finger)
+        tones = {}
+        for name, tone in layer.excitation.items():
+            acceleration = accelerations[tone.frequency]
+            change = 0.0
+            if acceleration and reference:
+                change = cmath.phase(reference / acceleration)
+            tones[name] = replace(tone, phase=tone.phase + change)
+        return replace(layer, excitation=tones)
+
+    def _accelerations(self, excitation: Excitation, finger: int) -> dict[float, complex]:
+        """Return the complex acceleration at a finger, by frequency [Hz]."""
+        frequencies, accelerations = self.table.driven(excitation, self._fields[:, :, [finger]])
+        at_finger = accelerations[:, 0].tolist()
+        return dict(zip(frequencies.tolist(), at_finger, strict=True))
 
 
-def _felt(
-    excitation: Excitation, fields: Complex64Array, table: LocalizationTable
-) -> dict[float, complex]:
-    """Return the complex acceleration at a finger, by frequency [Hz]."""
-    frequencies, felt = table.driven(excitation, fields)
-    return dict(zip(frequencies.tolist(), felt[:, 0].tolist(), strict=True))
-
-
-def with_ways(
+def with_paths(
     fingers: Sequence[Finger], contacts: Sequence[Contact], now: float, plate: Plate
 ) -> list[Finger]:
-    """Return the fingers of contacts at a time [s], moving ones at the middle of their ways.
+    """Return the fingers of contacts at a time [s], moving ones at the middle of their paths.
 
-    Two places as far before and after it as each way is long follow all of them, as fingers of the
-    same stimulus that share its load: weights for these change more slowly. Fingers that may share
-    with others, whose strength comes and goes, or that come too near another are only moved.
+    The start and the end of each path are appended as fingers with the same stimulus, which share
+    its load: weights for three points change more slowly. A finger that may share with others, is
+    modulated, or comes too near another finger is only moved to the middle.
     """
-    found, ends = [*fingers], list[Finger]()
+    moved = [*fingers]
+    ends = list[Finger]()
     for number, (finger, contact) in enumerate(zip(fingers, contacts, strict=True)):
-        vx, vy = contact.motion.velocity(now)
-        if not (speed := math.hypot(vx, vy)):
+        path = _path_of(contact, now, plate)
+        if path is None:
             continue
-        since = now - contact.motion.places[-1][0] + _ANSWER_TIME + ONSET_RAMP / 2
-        reach = STRETCH / speed
-        way = [
-            _on_plate((contact.x + vx * each, contact.y + vy * each), plate)
-            for each in (since - reach / 2, since + reach / 2, since + 3 * reach / 2)
-        ]
-        others = [each for each in (*found, *ends) if each is not finger]
-        if any(math.dist(at, each.at) < FINGERTIP_RADIUS for at in way for each in others):
+        start, middle, end = path
+        others = [other for other in (*moved, *ends) if other is not finger]
+        if _comes_near(path, others):
             continue
-        found[number] = replace(finger, at=way[1])
-        is_one = len({*way}) == len(way) and len(found) + len(ends) + 2 <= MAX_CONTACTS
-        if is_one and _is_steady_and_alone(finger, others):
-            name = finger.name or f"finger {number}"
-            stimulus = finger.stimulus and replace(finger.stimulus, name=name)
-            one = replace(finger, stimulus=stimulus, load=MIN_LOAD, sharing=MUST)
-            ends += [replace(one, at=at) for at in (way[0], way[2])]
-            found[number] = replace(one, at=way[1], load=finger.load - 2 * MIN_LOAD)
-    return [*found, *ends]
+        moved[number] = replace(finger, at=middle)
+        has_room = len(moved) + len(ends) + 2 <= MAX_CONTACTS
+        if has_room and len(set(path)) == len(path) and _is_steady_and_alone(finger, others):
+            at_end = replace(finger, load=MIN_LOAD, sharing=MUST, stimulus=_named(finger, number))
+            ends += [replace(at_end, at=start), replace(at_end, at=end)]
+            moved[number] = replace(at_end, at=middle, load=finger.load - 2 * MIN_LOAD)
+    return [*moved, *ends]
 
 
-def _on_plate(at: Point, plate: Plate) -> Point:
-    x, y = at
+def _path_of(contact: Contact, now: float, plate: Plate) -> tuple[Point, Point, Point] | None:
+    """Return start, middle and end of the path to solve for; None if the contact rests."""
+    vx, vy = contact.motion.velocity(now)
+    speed = math.hypot(vx, vy)
+    if not speed:
+        return None
+    last_seen = contact.motion.places[-1][0]
+    answer_delay = now - last_seen + _ANSWER_TIME + ONSET_RAMP / 2
+    stretch_time = STRETCH / speed
+
+    def position_after(delay: float) -> Point:
+        return _on_plate((contact.x + vx * delay, contact.y + vy * delay), plate)
+
+    start = position_after(answer_delay - stretch_time / 2)
+    middle = position_after(answer_delay + stretch_time / 2)
+    end = position_after(answer_delay + 3 * stretch_time / 2)
+    return start, middle, end
+
+
+def _on_plate(position: Point, plate: Plate) -> Point:
+    x, y = position
     return min(max(x, 0.0), plate.length), min(max(y, 0.0), plate.width)
+
+
+def _comes_near(path: Sequence[Point], others: Sequence[Finger]) -> bool:
+    """Whether a path comes within a fingertip's radius of another finger."""
+    for point in path:
+        if any(math.dist(point, other.at) < FINGERTIP_RADIUS for other in others):
+            return True
+    return False
+
+
+def _named(finger: Finger, number: int) -> Stimulus | None:
+    """Return the stimulus of a finger; a stimulus without a name gets a unique one."""
+    if finger.stimulus is None:
+        return None
+    return replace(finger.stimulus, name=finger.name or f"finger {number}")
 
 
 def _is_steady_and_alone(finger: Finger, others: Sequence[Finger]) -> bool:
     """Whether a finger feels nothing, or a steady content that no other finger may share."""
     if finger.stimulus is None:
         return True
-    may_share = any(finger.may_feel_one_with(each) for each in others)
-    return finger.stimulus.modulation_hz is None and not may_share
+    if finger.stimulus.modulation_hz is not None:
+        return False
+    return not any(finger.may_feel_one_with(other) for other in others)
 
 
-def _on_ways(table: LocalizationTable, found: Answer, count: int) -> Answer:
-    """Return the answer for the first fingers; the others are ends of their ways."""
-    if len(found.asked) == count:
-        return found
-    ways, places = [[number] for number in range(count)], [each.at for each in found.asked]
-    for end in range(count, len(places)):
-        near = [math.dist(at, places[end]) for at in places[:count]]
-        ways[near.index(min(near))].append(end)
-    if found.layers:
-        tones = found.tones
-        of_tones = np.array(tones.rows), tones.weights, np.array(tones.owners)
-        found = with_tones(table, found, *of_tones, np.array(tones.gains), ways)
+def _on_paths(table: LocalizationTable, solution: Answer, count: int) -> Answer:
+    """Return the answer for the first fingers; the others are the ends of their paths."""
+    if len(solution.asked) == count:
+        return solution
+    positions = [finger.at for finger in solution.asked]
+    paths = [[number] for number in range(count)]
+    for end in range(count, len(positions)):
+        distances = [math.dist(middle, positions[end]) for middle in positions[:count]]
+        paths[distances.index(min(distances))].append(end)
+    if solution.layers:
+        tones = solution.tones
+        rows = np.array(tones.rows)
+        owners = np.array(tones.owners)
+        gains = np.array(tones.gains)
+        solution = with_tones(table, solution, rows, tones.weights, owners, gains, paths)
     return replace(
-        found,
-        asked=found.asked[:count],
-        contents=found.contents.of_first(count),
-        held=tuple([each for each in found.held if each[0] < count]),
+        solution,
+        asked=solution.asked[:count],
+        contents=solution.contents.of_first(count),
+        held=tuple([vibration for vibration in solution.held if vibration[0] < count]),
     )
 
 
 @dataclass(frozen=True)
 class Crossfades:
-    """Finds the way from what plays to a better answer for the same fingers.
+    """Finds the way from the contents that play to a better answer for the same fingers.
 
-    question: what lasts, where its fingers rest; shape: adds envelopes.
+    question: has the lasting targets, whose fingers rest; shape: adds envelopes.
     """
 
     table: LocalizationTable
@@ -500,153 +587,192 @@ class Crossfades:
     shape: Shape | None = None
 
     def steps(self) -> tuple[Selection, ...]:
-        """Return the selection after each step; contents that are led to are marked.
+        """Return the selection after each step; new contents are marked as cross-faded (`is_led`).
 
-        Other frequencies must promise 2 dB more to the worst finger, other weights alone 0.5 dB;
-        either to the same fingers, and not more weakly. The way ends where a step promises no more.
-        Where nothing is better, the only step is what plays, if its promised contrast differs by
-        0.5 dB from what was promised while fingers moved. No step where nothing plays.
+        Other frequencies must promise the worst finger 2 dB more, other weights alone 0.5 dB more,
+        in both cases to the same fingers and at no lower level. The way ends with the last step
+        that promises more. Without a better answer the only step is the present selection, if its
+        promised contrast differs by 0.5 dB from the promise made while fingers moved. There is no
+        step if no content plays.
         """
-        if self.capabilities.drive_mode != UNRESTRICTED or not self.question.before:
+        if self.capabilities.drive_mode != UNRESTRICTED or not self.question.playing:
             return ()
-        question, same = self.question, tuple[Selection, ...]()
-        playing = _by_finger(question.before.values())
+        playing = _by_finger(self.question.playing.values())
+        restated = tuple[Selection, ...]()
         for keeps in (False, True):
-            goal = answered(self.table, question, question.lasting, self.capabilities, keeps=keeps)
-            found = _by_finger(self._selection(goal, shape=self.shape).contents)
-            if _served(found) != _served(playing) or len(goal.layers) != len(playing):
+            goal = answered(
+                self.table, self.question, self.question.lasting, self.capabilities, keeps=keeps
+            )
+            goal_voices = _by_finger(self._selection(goal, shape=self.shape).contents)
+            is_same_service = _served(goal_voices) == _served(playing)
+            if not is_same_service or len(goal.layers) != len(playing):
                 continue
-            now = self._mixed(goal, playing)
-            same = self._restated(now, playing)
-            led = {key: each for key, each in found.items() if _differ(each, playing[key])}
-            is_tuned = any(_is_tuned(playing[key], each) for key, each in led.items())
-            gain = worst_of(goal) - worst_of(now)
-            if gain < (WORTH if is_tuned else WORTH_OF_WEIGHTS) or _is_weaker(goal, now):
+            present = self._answer_of(goal, playing)
+            restated = self._restated(present, playing)
+            changes = {
+                key: voices for key, voices in goal_voices.items() if _differ(voices, playing[key])
+            }
+            if not _is_worth_it(goal, present, playing, changes):
                 continue
-            if steps := self._in_order(goal, playing, led):
+            steps = self._in_order(goal, playing, changes)
+            if steps:
                 return steps
-        return same
+        return restated
 
-    def _restated(self, now: Answer, playing: _Voices) -> tuple[Selection, ...]:
-        """Return what plays with its present promises; nothing if they are known."""
-        found, said = self._felt(now, playing), dict[ContactKey, float]()
-        for content in self.question.before.values():
-            for each in content.predictions:
-                said[each.contact.key] = each.promised_contrast_db or 0.0
-        for each in found.predictions:
-            promised = each.promised_contrast_db or 0.0
-            if abs(promised - said.get(each.contact.key, promised)) >= WORTH_OF_WEIGHTS:
-                return (found,)
+    def _restated(self, present: Answer, playing: _Voices) -> tuple[Selection, ...]:
+        """Return the present selection with its present promises; nothing if they are known."""
+        known_promises = dict[ContactKey, float]()
+        for content in self.question.playing.values():
+            for felt in content.finger_sensations:
+                known_promises[felt.contact.key] = felt.sensation.promised_contrast_db or 0.0
+        selection = self._selection_of_playing(present, playing)
+        for felt in selection.finger_sensations:
+            promise = felt.sensation.promised_contrast_db or 0.0
+            known_promise = known_promises.get(felt.contact.key, promise)
+            if abs(promise - known_promise) >= WORTH_OF_WEIGHTS:
+                return (selection,)
         return ()
 
-    def _in_order(self, goal: Answer, playing: _Voices, led: _Voices) -> tuple[Selection, ...]:
-        """Return the selection after each step, the best content first; none if none may follow.
+    def _in_order(self, goal: Answer, playing: _Voices, changes: _Voices) -> tuple[Selection, ...]:
+        """Return the selection after each step, the best content first; empty without an order.
 
-        A content that may follow hinders none later, so no other order goes on where this ends.
+        A content that can follow now never prevents a later one, so no other order gets further
+        than this one.
         """
-        left, steps, before = {**led}, list[Selection](), -math.inf
-        while left:
-            options = []
-            for key, voices in left.items():
+        remaining = {**changes}
+        steps = list[Selection]()
+        promised_worst = -math.inf
+        while remaining:
+            options = list[tuple[float, ContactKey]]()
+            answers = dict[ContactKey, Answer]()
+            for key, voices in remaining.items():
                 if self._may_follow(playing, key, voices):
-                    after = {**playing, key: voices}
-                    options.append((self._mixed(goal, after), key, after))
+                    answers[key] = self._answer_of(goal, {**playing, key: voices})
+                    options.append((worst_of(answers[key]), key))
             if not options:
                 return ()
-            mixed, key, playing = max(options, key=lambda each: worst_of(each[0]))
-            del left[key]
-            if left or not steps or worst_of(mixed) >= before + SAME_LEVEL:
-                steps.append(self._felt(mixed, playing))
-            before = worst_of(mixed)
+            worst, best_key = max(options, key=lambda option: option[0])
+            playing = {**playing, best_key: remaining.pop(best_key)}
+            if remaining or not steps or worst >= promised_worst + SAME_LEVEL:
+                steps.append(self._selection_of_playing(answers[best_key], playing))
+            promised_worst = worst
         return tuple(steps)
 
     def _may_follow(self, playing: _Voices, key: ContactKey, voices: tuple[Content, ...]) -> bool:
-        """Whether a finger's content may be led to another beside all that plays.
+        """Whether a finger's content can be cross-faded to another one while all contents play.
 
-        While both sound they are 30 Hz from all others and each other, and within the limits of the
-        amplifiers.
+        While both sound, they must be 30 Hz from all other contents and from each other, and within
+        the limits of the amplifiers.
         """
-        beside = [one for each in playing.values() for one in each]
         if not _is_tuned(playing[key], voices):
-            beside = [one for one in beside if one not in playing[key]]
-        elif any(
-            abs((voices[0].frequency or 0.0) - (each[0].frequency or 0.0)) < APART_HZ
-            for each in playing.values()
-        ):
+            contents = _all_of({**playing, key: voices})
+        elif _is_apart(voices[0], [contents[0] for contents in playing.values()]):
+            contents = [*_all_of(playing), *voices]
+        else:
             return False
-        total = [one.layer for one in (*beside, *voices)]
-        return self.capabilities.limits.factor_within(total, self.table) >= 1 - NEARLY
+        layers = [content.layer for content in contents]
+        return self.capabilities.limits.factor_within(layers, self.table) >= 1 - NEARLY
 
-    def _mixed(self, goal: Answer, voices: _Voices) -> Answer:
-        """Return an answer with the tones of contents that are felt together, and its promises."""
-        drives, owners = [], list[int]()
-        rows, table = list[int](), self.table
+    def _answer_of(self, goal: Answer, voices: _Voices) -> Answer:
+        """Return an answer with the tones of contents that play together, and its promises."""
+        rows = list[int]()
+        drives = list[list[complex]]()
+        owners = list[int]()
         for number, stream in enumerate(goal.contents.streams):
-            for one in voices[self.question.lasting[stream.targets[0]][0].key]:
-                frequencies, bases = base_amplitudes(one.layer.excitation, table.eras)
-                at = table.rows_of(frequencies)
-                rows += at.tolist()
-                drives += (bases / table.highest_drives[at]).tolist()
+            owner, _ = self.question.lasting[stream.targets[0]]
+            for content in voices[owner.key]:
+                frequencies, bases = base_amplitudes(content.layer.excitation, self.table.eras)
+                content_rows = self.table.rows_of(frequencies)
+                rows += content_rows.tolist()
+                drives += (bases / self.table.highest_drives[content_rows]).tolist()
                 owners += [number] * len(frequencies)
-        every = np.array(rows), drives, np.array(owners), np.ones(len(rows))
-        return with_tones(table, goal, *every)
+        gains = np.ones(len(rows))
+        return with_tones(self.table, goal, np.array(rows), drives, np.array(owners), gains)
 
-    def _felt(self, mixed: Answer, voices: _Voices) -> Selection:
-        """Return the selection of contents that are felt together, with their predictions."""
-        found = self._selection(mixed)
-        contents = [
-            replace(one, predictions=predicted.predictions)
-            for key, each in _by_finger(found.contents).items()
-            for one, predicted in zip(voices[key], each, strict=True)
-        ]
-        return replace(found, contents=tuple(contents))
+    def _selection_of_playing(self, present: Answer, voices: _Voices) -> Selection:
+        """Return the selection of contents that play together, with their sensations."""
+        selection = self._selection(present)
+        contents = list[Content]()
+        for key, answered_voices in _by_finger(selection.contents).items():
+            for content, answered_voice in zip(voices[key], answered_voices, strict=True):
+                contents.append(replace(content, sensations=answered_voice.sensations))
+        return replace(selection, contents=tuple(contents))
 
-    def _selection(self, found: Answer, *, shape: Shape | None = None) -> Selection:
+    def _selection(self, solution: Answer, *, shape: Shape | None = None) -> Selection:
+        """Return the selection of an answer; its contents are marked as cross-faded."""
         targets = self.question.lasting
-        chosen = selection_of(self.table, self.question, found, targets, shape=shape)
-        led = [replace(each, is_led=True) for each in chosen.contents]
-        return replace(chosen, contents=tuple(led))
+        selection = selection_of(self.table, self.question, solution, targets, shape=shape)
+        contents = [replace(content, is_led=True) for content in selection.contents]
+        return replace(selection, contents=tuple(contents))
 
 
 def _by_finger(contents: Iterable[Content]) -> _Voices:
-    found: dict[ContactKey, tuple[Content, ...]] = {}
-    for each in sorted(contents, key=lambda one: one.key[1]):
-        found[each.key[0]] = (*found.get(each.key[0], ()), each)
-    return found
+    """Return contents by finger, each followed by its side bands."""
+    voices = dict[ContactKey, tuple[Content, ...]]()
+    for content in sorted(contents, key=lambda content: content.key[1]):
+        key = content.key[0]
+        voices[key] = (*voices.get(key, ()), content)
+    return voices
+
+
+def _all_of(voices: _Voices) -> list[Content]:
+    """Return all contents and side bands."""
+    return [content for contents in voices.values() for content in contents]
 
 
 def _served(voices: _Voices) -> dict[ContactKey, tuple[int, set[ContactKey]]]:
     """Return the number of voices and the contacts of each finger's content."""
-    return {
-        key: (len(each), {contact.key for contact, _ in each[0].targets})
-        for key, each in voices.items()
-    }
+    served = {}
+    for key, contents in voices.items():
+        served[key] = (len(contents), {*contents[0].contact_keys})
+    return served
 
 
-def _is_tuned(then: Sequence[Content], now: Sequence[Content]) -> bool:
-    """Whether frequencies differ."""
-    return [each.frequency for each in then] != [each.frequency for each in now]
+def _is_worth_it(goal: Answer, present: Answer, playing: _Voices, changes: _Voices) -> bool:
+    """Whether an answer promises the worst finger clearly more, and no finger a lower level."""
+    is_tuned = any(_is_tuned(playing[key], voices) for key, voices in changes.items())
+    gain = worst_of(goal) - worst_of(present)
+    required_gain = WORTH if is_tuned else WORTH_OF_WEIGHTS
+    return gain >= required_gain and not _is_weaker(goal, present)
 
 
-def _differ(now: Sequence[Content], then: Sequence[Content]) -> bool:
-    """Whether any finger feels a difference between two contents of one."""
-    if _is_tuned(then, now):
+def _is_apart(content: Content, others: Iterable[Content]) -> bool:
+    """Whether a content is at least 30 Hz from all others."""
+    frequency = content.frequency or 0.0
+    return all(abs(frequency - (other.frequency or 0.0)) >= APART_HZ for other in others)
+
+
+def _is_tuned(playing: Sequence[Content], goal: Sequence[Content]) -> bool:
+    """Whether the frequencies of two contents and their side bands differ."""
+    playing_frequencies = [content.frequency for content in playing]
+    return playing_frequencies != [content.frequency for content in goal]
+
+
+def _differ(goal: Sequence[Content], playing: Sequence[Content]) -> bool:
+    """Whether a finger feels a difference between two contents and their side bands."""
+    if _is_tuned(playing, goal):
         return True
-    for one, other in zip(now, then, strict=True):
-        new, old = (
-            {name: tone.phasor for name, tone in each.layer.excitation.items()}
-            for each in (one, other)
-        )
-        least = _SAME * max(map(abs, (*new.values(), *old.values())))
-        if any(abs(new.get(name, 0) - old.get(name, 0)) > least for name in {*new, *old}):
-            return True
+    for new_content, old_content in zip(goal, playing, strict=True):
+        new_phasors = _phasors(new_content)
+        old_phasors = _phasors(old_content)
+        amplitudes = [abs(phasor) for phasor in (*new_phasors.values(), *old_phasors.values())]
+        tolerance = _SAME * max(amplitudes)
+        for name in {*new_phasors, *old_phasors}:
+            change = new_phasors.get(name, 0) - old_phasors.get(name, 0)
+            if abs(change) > tolerance:
+                return True
     return False
 
 
-def _is_weaker(goal: Answer, now: Answer) -> bool:
-    """Whether a finger feels clearly less of its own."""
-    return any(
-        new.promised_level_db_sl < old.promised_level_db_sl - _SHORT_OF
-        for new, old in zip(goal.fingers, now.fingers, strict=True)
-        if new.layer is not None
-    )
+def _phasors(content: Content) -> dict[str, complex]:
+    """Return the complex amplitude of each ERA [m]."""
+    return {name: tone.phasor for name, tone in content.layer.excitation.items()}
+
+
+def _is_weaker(goal: Answer, present: Answer) -> bool:
+    """Whether a finger with a content feels a clearly lower level."""
+    for new, old in zip(goal.fingers, present.fingers, strict=True):
+        loss = old.promised_level_db_sl - new.promised_level_db_sl
+        if new.layer is not None and loss > _SHORT_OF:
+            return True
+    return False

@@ -1,9 +1,9 @@
-"""The control loop of a plate: a cycle plans, sends what changes, then feeds the watchdogs.
+"""Control loop of a plate: each cycle plans, sends the changes and feeds the watchdogs.
 
 plan(now):  fingers -> intent -> contents -> the layers that change, on every amplifier
 
-The planner never waits, and reads no clock; the cycle waits and sends. Reports say what a plan
-plays or silences; observers of the control loop get them.
+The planner never waits and reads no clock; the cycle waits and sends. Observers of the loop get a
+report whenever a plan changes the contents that play.
 """
 
 import asyncio
@@ -16,15 +16,16 @@ from functools import partial
 from typing import ParamSpec
 
 from controller.play.intent import (
+    Content,
+    FingerSensation,
     IntentSource,
-    Prediction,
     Pulse,
     Selection,
     no_layer_free,
     not_served,
 )
 from controller.play.routing import CountedClocks, Drive, PlaybackCapabilities
-from controller.play.selection import Chooser, Selector
+from controller.play.selection import Chooser, PendingChoice, Selector
 from controller.play.slots import RELEASE_RAMP, RETRY, Check, Sets, Slot, Slots
 from controller.sources.touch import (
     Change,
@@ -62,44 +63,47 @@ ENDED = (
     "there again"
 )
 
-_CLOCKS_INTERVAL = 2 * HEARTBEAT  # s; after which clocks are counted though fingers change
+_CLOCKS_INTERVAL = 2 * HEARTBEAT  # s; longest time without counting clocks while fingers change
+
+ChangeTimes = Mapping[ContactKey | None, float]
+"""When [s] fingers changed, by contact; the key None is for the first finger that lifted."""
 
 _logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What contacts feel from a moment on, and the sets for it."""
+    """The contents that play from a moment on, and the sets that start them."""
 
     contacts: tuple[Contact, ...]
     selection: Selection
     made_at: float
     """[s]"""
-    answered: Mapping[ContactKey | None, float]
-    """When [s] the fingers changed that the plan answers; None: the first that lifted."""
+    answered: ChangeTimes
+    """Changes of fingers that the plan responds to."""
     sets: Sets = field(default_factory=Sets)
-    """Empty where nothing changes."""
+    """Empty if no layer changes."""
     is_reported: bool = True
-    """Whether what is felt changes."""
-    before: Mapping[int, Slot] = field(default_factory=dict)
-    """What played before, by layer."""
+    """Whether observers get a report, because a finger feels a difference."""
+    former_slots: Mapping[int, Slot] = field(default_factory=dict)
+    """Slots before the plan, by layer."""
 
     @property
     def since(self) -> float:
-        """When [s] the first finger changed that it answers; when it was made, if none did."""
+        """When [s] the first of the fingers changed; when the plan was made, if none did."""
         return min([self.made_at, *self.answered.values()])
 
     @property
     def is_touch(self) -> bool:
-        """Whether it answers a finger that came, moved or pressed, not lifts alone."""
-        return len(self.answered) > (None in self.answered)
+        """Whether it responds to a finger that came, moved or pressed, not to lifts alone."""
+        return any(key is not None for key in self.answered)
 
 
 class Planner:
-    """Plans what the contacts on one plate feel; synchronous, times are arguments.
+    """Plans the vibrations for the contacts on one plate; synchronous, times are arguments.
 
-    A plan never raises: it falls back to silence on any exception. check: asks the ledgers;
-    arrived: called when contents have been chosen in the thread; it calls `look_again` and plans.
+    A plan never raises: it falls back to silence on any exception. check: queries the ledgers;
+    arrived: called when contents have been chosen in the thread; it calls `look_again` and plans;
     too_late: called with the number of clicks that came too late to be felt; clock_errors: returns
     the clock errors of the amplifiers by name, rms [s].
     """
@@ -120,92 +124,97 @@ class Planner:
     ) -> None:
         self.capabilities = capabilities
         """The capabilities of the amplifiers together."""
-        self._tracker, self._intent_source = tracker, intent_source
+        self._tracker = tracker
+        self._intent_source = intent_source
+        self._count_too_late = too_late
         self.slots = Slots(rig, capabilities, timing, check=check, expiry_of=tracker.expiry_of)
-        """What each layer plays."""
+        """The contents of all layers."""
         self.clocks = CountedClocks(rig, clock_errors)
-        """The clock errors of the amplifiers, as answers count them."""
+        """Clock errors of the amplifiers, as the table includes them."""
         self._selector = Selector(
-            self._chooser_of(table),
-            arrived=arrived,
-            may_lead=self.slots.may_lead,
+            self._chooser_of(table), arrived=arrived, may_lead=self.slots.may_lead
         )
-        self._selected: Selection | None = None  # the last, before limits left contents out of it
-        self._unplayed: Mapping[ContactKey | None, float] = {}  # answered by what was refused
-        self._plan: Plan | None = None  # the last, None where what plays is unknown
         self._intent_due = math.inf  # s; when the intent may change without a touch
-        self._retry_at = math.inf  # s; when a ledger may admit what it refused
-        self._clocks_due = -math.inf  # s; though fingers change
-        self._too_late = too_late
-        self._seen: Sequence[Contact] = ()  # by the last plan
-        self._awaited: dict[int, Pulse] = {}  # by identity: planned, and not known to have started
-        self._pending: object = None  # the last question in the thread
-        self._waiting: dict[ContactKey | None, float] = {}  # fingers that the last is for
+        self._retry_at = math.inf  # s; when a ledger may admit a refused set
+        self._clocks_due = -math.inf  # s; when clocks are counted even if fingers have changed
+        self._last_plan: Plan | None = None  # None if it is unknown which contents play
+        self._last_selection: Selection | None = None  # including contents that limits left out
+        self._planned_contacts: Sequence[Contact] = ()
+        self._unstarted_pulses: dict[int, Pulse] = {}  # planned, but not started; by identity
+        self._refused_changes: ChangeTimes = {}  # of a plan that amplifiers refused
+        self._last_choice: PendingChoice | None = None
+        self._waiting_changes: dict[ContactKey | None, float] = {}  # wait for that choice
 
     def replace_answers(self, table: LocalizationTable, timing: Timing) -> None:
-        """Answer by another table of this plate from now on; what plays is kept until all rest."""
+        """Use another table of this plate; present contents continue until all fingers rest."""
         self.slots.timing = timing
-        self._answer_by(self._chooser_of(self.clocks.counted_by(table)))
+        self._use(self._chooser_of(self.clocks.counted_by(table)))
 
     def replace_limits(self, limits: Limits) -> None:
-        """Answer within other limits from now on: an amplifier was identified again."""
+        """Use other limits, because an amplifier was identified again."""
         if limits != self.capabilities.limits:
             self.capabilities = replace(self.capabilities, limits=limits)
-            self._answer_by(self._selector.chooser)
+            self._use(self._selector.chooser)
 
     def _count_clocks(self) -> None:
-        """Answer by the clocks as they are now; what plays is kept until all rest.
+        """Update the table to the present clock errors; contents continue until all fingers rest.
 
-        It is chosen anew at once if a clock is no longer held.
+        If a clock is no longer held, contents are chosen again immediately.
         """
-        chooser, known = self._selector.chooser, self.clocks.known
-        is_one_lost = self.clocks.is_one_lost(known)
-        counted = self.clocks.counted_by(chooser.table, known)
-        if counted is not chooser.table:
-            self._answer_by(replace(chooser, table=counted), at_once=is_one_lost)
+        chooser = self._selector.chooser
+        errors = self.clocks.known
+        is_clock_lost = self.clocks.is_one_lost(errors)
+        table = self.clocks.counted_by(chooser.table, errors)
+        if table is not chooser.table:
+            self._use(replace(chooser, table=table), immediately=is_clock_lost)
 
     def _chooser_of(self, table: LocalizationTable) -> Chooser:
-        """Make a chooser by a table, whose envelopes are of the timing in use."""
+        """Make a chooser with a table, whose envelopes follow the timing in use."""
         shape = partial(self.capabilities.envelope_support.shape, self.slots.timing)
         return Chooser(table, shape)
 
-    def _answer_by(self, chooser: Chooser, *, at_once: bool = False) -> None:
-        """Answer by another chooser once all rest, or at once; at once where nothing plays, too."""
+    def _use(self, chooser: Chooser, *, immediately: bool = False) -> None:
+        """Use another chooser: immediately, if nothing plays or so requested, or once all rest."""
         selector = self._selector
         selector.chooser = chooser
-        if at_once or not (self.slots.may_play or selector.pending):
-            selector.choose_anew()
+        is_idle = not self.slots.may_play and selector.pending is None
+        if immediately or is_idle:
+            selector.choose_again()
         self.look_again()
 
     def prepare(self) -> None:
-        """Precompute what the first touch would have to wait for; seconds, of a large rig.
+        """Compute in advance everything the first touch would wait for; seconds for a large rig.
 
-        The table without clock errors, by which statuses say what leaks, shares all of that with
-        the one with them. Raises InputError for a table without a pattern for these amplifiers.
+        The table without clock errors, from which statuses compute foreign levels, shares these
+        results. Raises InputError for a table without a pattern for these amplifiers.
         """
-        mode, timing = self.capabilities.drive_mode, self.slots.timing
-        prepare_answers(self._selector.chooser.table, mode)
+        drive_mode = self.capabilities.drive_mode
+        prepare_answers(self._selector.chooser.table, drive_mode)
         self._count_clocks()
         table = self._selector.chooser.table
+        timing = self.slots.timing
         timing.prepare(table.frequencies.tolist())
-        plate, support = table.plate, self.capabilities.envelope_support
-        placed = Placement(((plate.length / 2, plate.width / 2),), ((0.0, 0.0),))
+        centre = (table.plate.length / 2, table.plate.width / 2)
+        placement = Placement((centre,), ((0.0, 0.0),))
         band = self.capabilities.limits.frequencies
-        (layer,) = query(table, placed, MIN_LEVEL_DB_SL, drive_mode=mode, band_hz=band).layers
-        onset, ending = support.onset_knots > 0, support.ending_knots > 0
-        timing.with_envelopes(layer, placed, onset=onset, ending=ending)
+        pattern = query(table, placement, MIN_LEVEL_DB_SL, drive_mode=drive_mode, band_hz=band)
+        (layer,) = pattern.layers
+        support = self.capabilities.envelope_support
+        timing.with_envelopes(
+            layer, placement, onset=support.onset_knots > 0, ending=support.ending_knots > 0
+        )
 
     @property
     def due(self) -> float:
         """When [s] to plan next even if nothing arrives.
 
-        Then an intent expires, a ledger may admit what it refused, or a finger that moved rests.
+        The intent expires then, a ledger may admit a refused set, or a finger that moved rests.
         """
         return min(self._intent_due, self._retry_at, self._selector.due)
 
     @property
     def is_waiting(self) -> bool:
-        """Whether a change of fingers is not answered yet, or contents are being chosen."""
+        """Whether a change of fingers is not planned yet, or contents are being chosen."""
         return bool(self._tracker.changed) or self._selector.pending is not None
 
     @property
@@ -215,192 +224,295 @@ class Planner:
 
     def note_lifts(self, up: Sequence[Contact]) -> None:
         """Note that contacts have lifted."""
-        seen = {each.key for each in self._seen}
-        if unseen := sum(each.key not in seen for each in up):
-            self._too_late(unseen)
+        planned_keys = {contact.key for contact in self._planned_contacts}
+        unplanned = [contact for contact in up if contact.key not in planned_keys]
+        if unplanned:
+            self._count_too_late(len(unplanned))
 
     def look_again(self) -> None:
-        """Note that the next plan may differ though no contact has changed."""
+        """Note that the next plan can differ even if no contact changes."""
         self._intent_due = -math.inf
 
     def forget(self) -> None:
-        """Discard the known playback: the next plan has a set; fingers keep their layers."""
-        self._plan, self._retry_at = None, math.inf
+        """Discard the known playback; the next plan has a set, and fingers keep their layers."""
+        self._last_plan = None
+        self._retry_at = math.inf
         self.slots.forget()
 
     def not_played(self, plan: Plan, *, is_known: bool) -> None:
-        """Have the fingers of a plan that was not played wait for the next one.
+        """Let the fingers of a plan that was not played wait for the next plan.
 
-        What plays is discarded, unless it is known to be what played before; what the plan ends may
-        play, and is ended by the next.
+        The known playback is discarded. If is_known, the former contents still play, except that
+        layers ended by the plan may be silent or not; the next plan ends these again.
         """
         if plan.is_reported or not is_known:
             self.forget()
-        if plan.is_reported:
-            self._tracker.wait_again(plan.answered)
-            sets = plan.sets
-            left = plan.before.keys() - (sets.layers.keys() - sets.started) if is_known else ()
-            self.slots.contents = {number: plan.before[number] for number in left}
+        if not plan.is_reported:
+            return
+        self._tracker.wait_again(plan.answered)
+        self.slots.by_layer = {}
+        if is_known:
+            ended_layers = plan.sets.layers.keys() - plan.sets.started
+            for number, slot in plan.former_slots.items():
+                if number not in ended_layers:
+                    self.slots.by_layer[number] = slot
 
     def only_ends(self, plan: Plan) -> Plan:
-        """Return a plan that starts and prolongs nothing; what it would start is planned again."""
+        """Return a plan that starts and prolongs nothing; contents to be started wait again."""
         if not plan.is_reported:
             return replace(plan, sets=Sets())
-        if not plan.sets.started:
+        started = plan.sets.started
+        if not started:
             return plan
         self.not_played(plan, is_known=True)
-        ends = {n: each for n, each in plan.sets.layers.items() if n not in plan.sets.started}
-        return replace(plan, sets=Sets(ends), is_reported=False)
+        endings = {
+            number: layer for number, layer in plan.sets.layers.items() if number not in started
+        }
+        return replace(plan, sets=Sets(endings), is_reported=False)
 
     def confirm(self, sets: Sets, played: PlayedSet, *, now: float) -> None:
-        """Note what the amplifiers play of sets by now [s].
+        """Note how the amplifiers play sets by now [s].
 
-        Pulses start where the last amplifier does.
+        Pulses start when the last amplifier starts.
         """
-        for pulse in self._pulses(sets.started):
-            if pulse.started_at is None:
-                if played.starts_at > pulse.end:
-                    self._too_late(1)
-                pulse.started_at = played.starts_at
-                self._intent_due = min(self._intent_due, pulse.end)
+        for pulse in self._pulses_in(sets.started):
+            if pulse.started_at is not None:
+                continue
+            if played.starts_at > pulse.end:
+                self._count_too_late(1)
+            pulse.started_at = played.starts_at
+            self._intent_due = min(self._intent_due, pulse.end)
         self.slots.confirm(sets, played, now)
 
     def refused(self, plan: Plan, refusal: CommandRefused, *, now: float) -> Plan:
-        """Return silence in place of a plan that amplifiers refused though the ledgers admit it.
+        """Return silence in place of a plan that amplifiers refused although the ledgers admit it.
 
-        It is planned again when the refusal ends, or after RETRY where that is unknown.
+        The contents are planned again when the refusal ends, or after RETRY if that is unknown.
         """
-        if not plan.is_reported and self.slots.contents:
+        if not plan.is_reported and self.slots.by_layer:
             self.slots.not_renewed(plan.sets, refusal)
             return replace(plan, sets=Sets())
-        if refusal.until is None or refusal.until > now:  # not of a wire that is too slow or busy
-            self._awaited.clear()
-        until = now + RETRY if refusal.until is None else refusal.until
-        self._retry_at = max(until, now + HEARTBEAT)
-        self._unplayed = plan.answered
-        silence = replace(self.slots.silence(FADE_RAMP, now), reason=str(refusal))
-        return replace(plan, sets=silence, is_reported=True)
+        is_by_limit = refusal.until is None or refusal.until > now
+        if is_by_limit:  # otherwise the wire is too slow or busy, and a pulse is too late
+            self._unstarted_pulses.clear()
+        retry_at = now + RETRY if refusal.until is None else refusal.until
+        self._retry_at = max(retry_at, now + HEARTBEAT)
+        self._refused_changes = plan.answered
+        silence = self.slots.silence(FADE_RAMP, now)
+        return replace(plan, sets=replace(silence, reason=str(refusal)), is_reported=True)
 
     def plan(self, now: float) -> Plan | None:
         """Plan at a time [s], for the contacts as of `expire`; None if nothing changes."""
-        for number, pulse in [*self._awaited.items()]:
-            if pulse.started_at is not None or now >= pulse.end:
-                del self._awaited[number]
-                if pulse.started_at is None:
-                    self._too_late(1)
-        before, contacts, has_failed = self._plan, self._tracker.contacts, False
-        playing = self.slots.contents
+        self._drop_ended_pulses(now)
+        contacts = self._tracker.contacts
+        last_plan = self._last_plan
+        former_slots = self.slots.by_layer
         try:
-            # Where fingers change only if none was counted for long: their answer waits for it.
-            if now >= self._clocks_due or not self._tracker.changed:
-                self._clocks_due = now + _CLOCKS_INTERVAL
-                self._count_clocks()
-            if before is not None and not (self._tracker.changed or now >= self.due):
-                return self._go_on(before, now)
-            self._seen = contacts
-            self._intent_due = math.inf
-            fingers = tuple([each for each in contacts if not each.why_load_alone])
-            intent = self._intent_source.intent(fingers, now)
-            self._intent_due = intent.due(now)
-            chosen = self._selector.select(contacts, intent, self.capabilities, now=now)
-            selected = chosen.weakened(intent.gains_db)
-            if before is not None and selected == self._selected and now < self._retry_at:
-                self._answered(())
-                return self._go_on(before, now)
-            if self._unplayed:
-                down = {each.key for each in contacts}
-                self._tracker.wait_again({k: at for k, at in self._unplayed.items() if k in down})
-                self._unplayed = {}
-            selection, sets = self._playable(selected), Sets()
-            if is_felt := len(selection.contents) > 0:
-                sets = self.slots.plan(selection.contents, now)
-                if sets.skipped:
-                    selection = selection.without(sets.skipped, sets.reason)
+            self._count_clocks_if_due(now)
+            if last_plan is not None and not self._is_due(now):
+                return self._prolonged(last_plan, now)
+            selected = self._select(contacts, now)
+            if last_plan is not None and self._is_planned(selected, now):
+                self._take_answered_changes(())
+                return self._prolonged(last_plan, now)
+            self._wait_again_after_refusal(contacts)
+            selection, sets = self._playback_of(selected, now)
         except Exception as error:
-            has_failed, is_felt, sets = True, False, Sets(retry_at=now + HEARTBEAT)
-            self._selector.due, self._retry_at = math.inf, sets.retry_at
-            selected = selection = Selection((), contacts, (), failure_text(error))
-            if before is not None and selected == self._selected:
-                return None
-            _logger.exception("loop: plan failed, silencing all channels")
-        self._retry_at, self._selected = sets.retry_at, selected
-        is_awaited = not is_felt and selected.is_pending and not self.slots.may_play
-        if not (is_felt or is_awaited):
-            sets = self._end(contacts, now, has_failed=has_failed)
-        for pulse in self._pulses(sets.started):
-            self._awaited[id(pulse)] = pulse
-        answered = self._answered(sets.started)
-        self._plan = plan = Plan(contacts, selection, now, answered, sets, before=playing)
-        if sets or not (is_felt or is_awaited):
-            return plan
-        said = () if before is None else before.selection.predictions
-        return self._go_on(plan, now) if is_awaited or selection.predictions == said else plan
+            return self._plan_silence(error, contacts, former_slots, now)
+        self._last_selection = selected
+        if sets is None:  # no content
+            self._retry_at = math.inf
+            is_awaited = selected.is_pending and not self.slots.may_play
+            if is_awaited:
+                plan = self._adopt(contacts, selection, Sets(), former_slots, now)
+                return self._prolonged(plan, now)
+            sets = self._end(contacts, now)
+            return self._adopt(contacts, selection, sets, former_slots, now)
+        self._retry_at = sets.retry_at
+        plan = self._adopt(contacts, selection, sets, former_slots, now)
+        changes_nothing = not sets and _is_felt_alike(plan, last_plan)
+        return self._prolonged(plan, now) if changes_nothing else plan
 
-    def _go_on(self, plan: Plan, now: float) -> Plan | None:
-        """Plan what is due where nothing changes: contents have ended or are to be prolonged."""
+    def _plan_silence(
+        self,
+        error: Exception,
+        contacts: tuple[Contact, ...],
+        former_slots: Mapping[int, Slot],
+        now: float,
+    ) -> Plan | None:
+        """Plan silence after a failure; None if the last plan is silence for the same reason."""
+        self._selector.due = math.inf
+        self._retry_at = now + HEARTBEAT
+        failure = Selection((), contacts, reason=failure_text(error))
+        if self._last_plan is not None and failure == self._last_selection:
+            return None
+        _logger.error("loop: plan failed, silencing all channels", exc_info=error)
+        self._last_selection = failure
+        sets = self._end(contacts, now, has_failed=True)
+        return self._adopt(contacts, failure, sets, former_slots, now)
+
+    def _adopt(
+        self,
+        contacts: tuple[Contact, ...],
+        selection: Selection,
+        sets: Sets,
+        former_slots: Mapping[int, Slot],
+        now: float,
+    ) -> Plan:
+        """Return the plan for a selection and its sets, and keep it as the last plan."""
+        for pulse in self._pulses_in(sets.started):
+            self._unstarted_pulses[id(pulse)] = pulse
+        answered = self._take_answered_changes(sets.started)
+        plan = Plan(contacts, selection, now, answered, sets, former_slots=former_slots)
+        self._last_plan = plan
+        return plan
+
+    def _is_planned(self, selected: Selection, now: float) -> bool:
+        """Whether the last plan is for the same selection and no refused set is due again."""
+        return selected == self._last_selection and now < self._retry_at
+
+    def _drop_ended_pulses(self, now: float) -> None:
+        """Count pulses that ended before the amplifiers started them."""
+        for number, pulse in [*self._unstarted_pulses.items()]:
+            if pulse.started_at is not None:
+                del self._unstarted_pulses[number]
+            elif now >= pulse.end:
+                del self._unstarted_pulses[number]
+                self._count_too_late(1)
+
+    def _count_clocks_if_due(self, now: float) -> None:
+        """Count the clocks; while fingers wait for a plan, at most every other heartbeat."""
+        if now >= self._clocks_due or not self._tracker.changed:
+            self._clocks_due = now + _CLOCKS_INTERVAL
+            self._count_clocks()
+
+    def _is_due(self, now: float) -> bool:
+        """Whether fingers have changed, or the time for a new plan [s] has come."""
+        return bool(self._tracker.changed) or now >= self.due
+
+    def _select(self, contacts: tuple[Contact, ...], now: float) -> Selection:
+        """Return the selection for contacts by the present intent, with its strengths."""
+        self._planned_contacts = contacts
+        self._intent_due = math.inf
+        fingers = tuple([contact for contact in contacts if not contact.why_load_alone])
+        intent = self._intent_source.intent(fingers, now)
+        self._intent_due = intent.due(now)
+        selection = self._selector.select(contacts, intent, self.capabilities, now=now)
+        return selection.weakened(intent.gains_db)
+
+    def _wait_again_after_refusal(self, contacts: Sequence[Contact]) -> None:
+        """Let fingers wait again whose plan was refused, unless they have lifted."""
+        if not self._refused_changes:
+            return
+        contact_keys = {contact.key for contact in contacts}
+        changes: ChangeTimes = {
+            key: changed_at
+            for key, changed_at in self._refused_changes.items()
+            if key in contact_keys
+        }
+        self._tracker.wait_again(changes)
+        self._refused_changes = {}
+
+    def _playback_of(self, selected: Selection, now: float) -> tuple[Selection, Sets | None]:
+        """Return the playable part of a selection, and its sets; None if it has no contents."""
+        playable = self._playable(selected)
+        if not playable.contents:
+            return playable, None
+        sets = self.slots.plan(playable.contents, now)
+        if sets.skipped:
+            playable = playable.without(sets.skipped, sets.reason)
+        return playable, sets
+
+    def _prolonged(self, plan: Plan, now: float) -> Plan | None:
+        """Return a due change while a plan continues: contents have ended, or must be prolonged."""
         if now < self.slots.due:
             return None
-        if contents := self.slots.ended(now):
-            selection = plan.selection.without(contents, ENDED)
-            self._plan = replace(plan, selection=selection, sets=Sets(), made_at=now, answered={})
-            return self._plan
+        ended_contents = self.slots.ended(now)
+        if ended_contents:
+            selection = plan.selection.without(ended_contents, ENDED)
+            self._last_plan = replace(
+                plan, selection=selection, sets=Sets(), made_at=now, answered={}
+            )
+            return self._last_plan
         renewal = self.slots.renewal(now)
         return replace(plan, sets=renewal, is_reported=False) if renewal else None
 
     def _playable(self, selection: Selection) -> Selection:
-        """Return a selection without what has ended by itself, and what has no layer."""
-        if over := self.slots.over_of(selection.contents):
-            selection = selection.without(over, ENDED)
-        count = self.capabilities.layers
-        if len(selection.contents) > count:  # of each content all voices have one, or none
-            served = [*self.slots.numbered(selection.contents).values()]
-            lacking = [each.targets for each in selection.contents if each not in served]
-            left = [each for each in selection.contents if each.targets in lacking]
-            selection = selection.without(left, no_layer_free(count))
-        return selection
+        """Return a selection without contents that have ended by themselves or have no layer."""
+        ended_contents = self.slots.over_of(selection.contents)
+        if ended_contents:
+            selection = selection.without(ended_contents, ENDED)
+        layer_count = self.capabilities.layers
+        if len(selection.contents) <= layer_count:
+            return selection
+        # All voices of a content have a layer, or none has.
+        numbered = [*self.slots.numbered(selection.contents).values()]
+        lacking = [content.targets for content in selection.contents if content not in numbered]
+        skipped = [content for content in selection.contents if content.targets in lacking]
+        return selection.without(skipped, no_layer_free(layer_count))
 
-    def _end(self, contacts: tuple[Contact, ...], now: float, *, has_failed: bool) -> Sets:
-        """Return the sets that end all that plays; along endings only under fingers that stay."""
+    def _end(self, contacts: tuple[Contact, ...], now: float, *, has_failed: bool = False) -> Sets:
+        """Return the sets that end all contents; along their endings if fingers remain."""
         if not contacts:
             return self.slots.silence(RELEASE_RAMP, now)
         if has_failed or not self.slots.have_settled(now):
             return self.slots.silence(FADE_RAMP, now)
         return self.slots.plan((), now)
 
-    def _answered(self, started: Collection[int]) -> dict[ContactKey | None, float]:
-        """Return when [s] the fingers changed that are answered; None: the first that lifted.
+    def _take_answered_changes(self, started: Collection[int]) -> dict[ContactKey | None, float]:
+        """Return the changes of fingers that a plan with starting layers responds to.
 
-        While contents are being chosen, only lifts and pulses that start are answered, and with a
-        content that lasts also the fingers of the choice before.
+        These changes no longer wait. While contents are being chosen in the thread, the plan
+        responds only to lifts and to fingers whose pulses start. A lasting content that starts
+        comes from the previous choice, and responds to the changes that waited for that choice.
         """
-        changed, pending = self._tracker.changed, self._selector.pending
-        before, waiting = self._waiting, dict[ContactKey | None, float]()
-        answered = {**changed, **before}
-        if pending is not None:
-            contents = [self.slots.contents[number].content for number in started]
-            short = [each for each in contents if each.targets[0][1].is_short]
-            keys = {None, *[contact.key for each in short for contact, _ in each.targets]}
-            answered = {key: at for key, at in answered.items() if key in keys}
-            if pending is self._pending:
-                changed.pop(None, None)
-                return answered
-            waiting = {key: at for key, at in changed.items() if key not in keys}
-            if len(short) < len(contents):
-                answered |= before
-            else:
-                waiting |= before
-        changed.clear()
-        self._pending, self._waiting = pending, waiting
+        changes = self._tracker.changed
+        choice = self._selector.pending
+        waiting_changes = self._waiting_changes
+        if choice is None:
+            answered = {**changes, **waiting_changes}
+            changes.clear()
+            self._last_choice = None
+            self._waiting_changes = {}
+            return answered
+        contents = [self.slots.by_layer[number].content for number in started]
+        answered_keys: set[ContactKey | None] = {None, *_contact_keys_of_pulses(contents)}
+        answered = {
+            key: at for key, at in {**changes, **waiting_changes}.items() if key in answered_keys
+        }
+        if choice is self._last_choice:
+            changes.pop(None, None)
+            return answered
+        new_changes = {key: at for key, at in changes.items() if key not in answered_keys}
+        changes.clear()
+        has_lasting_start = any(not content.target.is_short for content in contents)
+        if has_lasting_start:
+            answered |= waiting_changes
+        else:
+            new_changes |= waiting_changes
+        self._last_choice = choice
+        self._waiting_changes = new_changes
         return answered
 
-    def _pulses(self, numbers: Iterable[int]) -> list[Pulse]:
+    def _pulses_in(self, numbers: Iterable[int]) -> list[Pulse]:
         """Return the pulses that play in layers."""
-        return [
-            target.pulse
-            for number in numbers
-            for _, target in self.slots.contents[number].content.targets
-            if target.pulse is not None
-        ]
+        contents = [self.slots.by_layer[number].content for number in numbers]
+        return [pulse for content in contents for pulse in content.pulses]
+
+
+def _is_felt_alike(plan: Plan, last_plan: Plan | None) -> bool:
+    """Whether the sensations of two plans are equal."""
+    last_sensations = () if last_plan is None else last_plan.selection.finger_sensations
+    return plan.selection.finger_sensations == last_sensations
+
+
+def _contact_keys_of_pulses(contents: Iterable[Content]) -> set[ContactKey]:
+    """Return the contacts that feel the short pulses among contents."""
+    keys = set[ContactKey]()
+    for content in contents:
+        if content.target.is_short:
+            keys.update(content.contact_keys)
+    return keys
 
 
 @dataclass(frozen=True)
@@ -409,20 +521,20 @@ class PlayReport:
 
     contacts: tuple[Contact, ...]
     """All contacts, in order of arrival."""
-    targets: tuple[Prediction, ...]
-    """A prediction for each contact that is to feel something; of silence with the reason."""
+    targets: tuple[FingerSensation, ...]
+    """The sensation of each contact with a target; without a content it has the reason."""
     latency: float | None
     """Time [s] from the touch frame to the last byte of the command; None if none was needed."""
     time: float
     """When [s] that byte was sent, or the report made."""
     is_touch: bool = False
-    """As of the plan."""
+    """As in the plan."""
     reason: str = ""
     """Why all channels are silent."""
     contents: Mapping[int, Slot] = field(default_factory=dict)
-    """Copies of the slots as they are played, by layer, the newest one last; none in silence."""
+    """Copies of the slots as they are played, by layer, the newest one last; empty in silence."""
     quiet: tuple[Contact, ...] = ()
-    """Contacts that are to feel nothing of what plays."""
+    """Contacts without a target, which are kept quiet."""
     quiet_levels: Mapping[ContactKey, Sequence[float]] = field(default_factory=dict)
     """Foreign levels at quiet contacts (`Selection.foreign_levels`)."""
     settled_after: float = 0.0
@@ -446,53 +558,65 @@ class PlayReport:
         return self.newest.drive
 
     @property
-    def felt(self) -> Prediction | None:
-        """The prediction for the finger of the newest content; None where none plays."""
-        every = [each for one in self.contents.values() for each in one.content.predictions[:1]]
-        return every[-1] if every else None
+    def felt(self) -> FingerSensation | None:
+        """The sensation of the newest content's finger; None without a content."""
+        for slot in reversed([*self.contents.values()]):
+            if slot.content.sensations:  # not a side band
+                return slot.content.finger_sensations[0]
+        return None
 
 
 def play_report(
     plan: Plan, playing: Mapping[int, Slot], *, sent_at: float | None, now: float
 ) -> PlayReport:
-    """Report what plays after a plan, by layer; sent_at [s]: when it starts, None if before."""
+    """Report the contents that play after a plan.
+
+    playing: slots by layer; sent_at [s]: when the sets start, None if there are no sets.
+    """
+    latency = None if sent_at is None else sent_at - plan.since
+    is_silent = plan.sets.silence is not None or not plan.selection.contents
+    if is_silent:
+        reason = plan.sets.reason or plan.selection.reason or ""
+        return PlayReport(
+            plan.contacts,
+            _silent_targets(plan.selection, reason),
+            latency=latency,
+            time=now,
+            is_touch=plan.is_touch,
+            reason=reason,
+        )
     selection = plan.selection
-    known = partial(
-        PlayReport,
+    numbers = [number for number, slot in playing.items() if slot.content in selection.contents]
+    numbers.sort(key=plan.sets.started.__contains__)
+    return PlayReport(
         plan.contacts,
-        latency=None if sent_at is None else sent_at - plan.since,
-        is_touch=plan.is_touch,
-    )
-    if plan.sets.silence is not None or not selection.contents:
-        reason = plan.sets.reason or selection.reason or ""
-        said = {each.contact.key: each for each in selection.not_served}
-        targets = dict.fromkeys([contact for contact, _ in selection.targets])
-        silent = tuple([said.get(each.key) or not_served(each, reason) for each in targets])
-        return known(silent, time=now, reason=reason)
-    order = sorted(
-        [number for number, one in playing.items() if one.content in selection.contents],
-        key=plan.sets.started.__contains__,
-    )
-    return known(
-        selection.predictions,
+        selection.finger_sensations,
+        latency=latency,
         time=now if sent_at is None else sent_at,
-        contents={number: replace(playing[number]) for number in order},
+        is_touch=plan.is_touch,
+        contents={number: replace(playing[number]) for number in numbers},
         quiet=selection.quiet,
         quiet_levels={
-            each.key: selection.foreign_levels.get(each.key, ()) for each in selection.quiet
+            contact.key: selection.foreign_levels.get(contact.key, ())
+            for contact in selection.quiet
         },
         settled_after=plan.sets.settled_after,
-        lasts=all(
-            target.pulse is None for each in selection.contents for _, target in each.targets
-        ),
+        lasts=not any(content.pulses for content in selection.contents),
     )
+
+
+def _silent_targets(selection: Selection, reason: str) -> tuple[FingerSensation, ...]:
+    """Return the targets of a selection that is not played, with their own reasons or this one."""
+    unserved = {finger.contact.key: finger for finger in selection.unserved}
+    contacts = dict.fromkeys([contact for contact, _ in selection.targets])
+    return tuple([unserved.get(contact.key) or not_served(contact, reason) for contact in contacts])
 
 
 @dataclass(frozen=True)
 class Observers:
-    """Callbacks of the control loop by event, called within it in order: they must return at once.
+    """Callbacks of the control loop by event, called within it in order; they must not wait.
 
-    Their exceptions are logged and go no further.
+    Their exceptions are only logged.
     """
 
     contacts_changed: list[Callable[[tuple[Contact, ...], Change], object]] = field(
@@ -537,10 +661,10 @@ class Cycle:
         They were over, or had lost their touch, before the amplifiers could play them, as under
         fingers that came and left within a cycle. Refusals by a ledger do not count.
         """
-        self._plan: Plan | None = None  # that is on its way to the amplifiers
+        self._plan: Plan | None = None  # being sent to the amplifiers
         self._wake = asyncio.Event()
         self._heartbeat_due = 0.0
-        self._is_armed_anew = False  # until the next turn, which sends again what is to play
+        self._is_newly_armed = False  # until the next turn, which sends all contents again
         self._expiry: asyncio.TimerHandle | None = None
 
     @property
@@ -568,34 +692,39 @@ class Cycle:
         self._wake.clear()
         if planner is None:
             return
-        if self._is_armed_anew:  # not amid a turn, whose set may be on the wire
-            self._is_armed_anew = False
+        if self._is_newly_armed:  # not during a turn, whose set may be on the wire
+            self._is_newly_armed = False
             planner.forget()
         plan = planner.plan(now)
         try:
             async with self.sending:
-                with suppress(LinkDegraded):  # what plays is unknown, and planned anew; others feed
+                with suppress(LinkDegraded):  # the next plan starts afresh; feed the others
                     if plan is not None and self.group.is_armed:
                         await self._send(planner, plan)
                 # Not after a set that was given up: the next cycle silences it first.
                 if self._is_heartbeat_due(planner):
-                    # From its beginning: the watchdog has run since its request was sent.
-                    due = self._heartbeat_due = threads.now() + HEARTBEAT
-                    try:
-                        await self.group.beat()
-                    finally:
-                        if self._heartbeat_due == due:  # none replies again since
-                            rest = HEARTBEAT / 2  # on a slow wire
-                            self._heartbeat_due = max(due, threads.now() + rest)
+                    await self._beat()
         except (Preempted, LinkDegraded):
-            pass  # what plays is unknown, and planned anew
+            pass  # the playback is unknown; the next plan starts afresh
         except LinkError as error:
             _report(self.observers.link_lost, str(error))
         except DriverError as error:
             _report(self.observers.refused, str(error))
 
+    async def _beat(self) -> None:
+        """Feed the watchdogs, and note when that is due next."""
+        # Counted from the request: the watchdog has run since that was sent.
+        due = threads.now() + HEARTBEAT
+        self._heartbeat_due = due
+        try:
+            await self.group.beat()
+        finally:
+            if self._heartbeat_due == due:  # not hastened meanwhile (`feed_at_once`)
+                pause = HEARTBEAT / 2  # for a slow wire
+                self._heartbeat_due = max(due, threads.now() + pause)
+
     async def _send(self, planner: Planner, plan: Plan) -> None:
-        """Send what a plan changes, and report the outcome; raises DriverError.
+        """Send the changes of a plan, and report the outcome; raises DriverError.
 
         While an amplifier is degraded nothing starts or is prolonged.
         """
@@ -609,21 +738,27 @@ class Cycle:
                 outcome = await self._play(planner, plan)
         finally:
             self._plan = None
-        if reason := plan.sets.reason:
-            _report(self.observers.refused, reason)
-        if plan.is_reported:
-            sent_at = outcome if isinstance(outcome, float) else None
-            applied = play_report(plan, planner.slots.contents, sent_at=sent_at, now=threads.now())
-            _report(self.observers.reported, applied)
+        if plan.sets.reason:
+            _report(self.observers.refused, plan.sets.reason)
+        if not plan.is_reported:
+            return
+        sent_at = outcome if isinstance(outcome, float) else None
+        report = play_report(plan, planner.slots.by_layer, sent_at=sent_at, now=threads.now())
+        _report(self.observers.reported, report)
 
     async def _play(self, planner: Planner, plan: Plan) -> float | CommandRefused | None:
         """Play the sets of a plan on all amplifiers, from one moment on.
 
-        Returns when [s] they start, None where nothing is sent, or the refusal. It is unknown what
-        plays if anything is raised.
+        Returns when [s] they start, None if nothing is sent, or the refusal. After an exception it
+        is unknown which contents play.
         """
-        if not (sets := plan.sets):
+        sets = plan.sets
+        if not sets:
             return None
+
+        def is_overtaken_by_touch() -> bool:
+            return self._wake.is_set() and threads.now() < sets.preempted_until
+
         try:
             if sets.silence is not None:
                 sent_at = await self.group.silence(sets.silence)
@@ -631,13 +766,9 @@ class Cycle:
                 return sent_at
             if self.group.sets.is_in_doubt:
                 await self.group.silence(RELEASE_RAMP)  # before the next pattern
-            played = await self.group.apply(
-                sets.by_amplifier,
-                (lambda: self._wake.is_set() and threads.now() < sets.preempted_until)
-                if sets.endings
-                else None,
-            )
-        except Overtaken:  # endings, by what has come since: they follow it
+            is_preempted = is_overtaken_by_touch if sets.endings else None
+            played = await self.group.apply(sets.by_amplifier, is_preempted)
+        except Overtaken:  # the endings follow the sets of the next plan
             return None
         except BaseException as error:
             is_overtaken = isinstance(error, Preempted) or not self.group.is_armed
@@ -658,23 +789,24 @@ class Cycle:
             )
 
     def wake(self) -> None:
-        """Begin the next cycle at once."""
+        """Begin the next cycle immediately."""
         self._wake.set()
 
     def feed_at_once(self) -> None:
-        """Begin the next cycle at once, and feed the watchdogs in it."""
+        """Begin the next cycle immediately, and feed the watchdogs in it."""
         self._heartbeat_due = threads.now()
         self._wake.set()
 
     def note_armed(self, limits: Limits, *, was_armed: bool) -> None:
-        """Note that the amplifiers have been armed: the next cycle sends all and feeds watchdogs.
+        """Note that the amplifiers have been armed.
 
-        limits: of the amplifiers as they are now; was_armed: also before, so that what plays goes
-        on. Raises CommandError without a planner.
+        The next cycle sends all contents and feeds the watchdogs. limits: present limits of the
+        amplifiers; was_armed: whether they were armed before, so that contents continue. Raises
+        CommandError without a planner.
         """
         if self.planner is None:
             raise CommandError("controller must be open; call open() first")
-        self._is_armed_anew = True
+        self._is_newly_armed = True
         if not was_armed:
             self.planner.slots.may_play = frozenset()
         self.planner.replace_limits(limits)
@@ -682,8 +814,8 @@ class Cycle:
         self.feed_at_once()
 
     def deliver(self, frame: TouchFrame) -> None:
-        """Process a touch frame; to be called in the loop's thread."""
-        # Contacts that came since the last cycle have not been decided yet.
+        """Process a touch frame; call it in the loop's thread."""
+        # No plan includes the contacts that came since the last cycle.
         is_undecided = self._wake.is_set() and self.group.is_armed
         change = self.tracker.update(frame, keeps_taps=is_undecided)
         if change:
@@ -701,7 +833,7 @@ class Cycle:
                 _logger.exception("loop: fingers of %s not lifted", source)
 
     def request_update(self) -> None:
-        """Query the intent source again, because its intent changed without a touch."""
+        """Query the intent source again, because its intent has changed without a touch."""
         if self.planner is not None:
             self.planner.look_again()
         self._wake.set()
@@ -713,7 +845,7 @@ class Cycle:
         return threads.now() >= min(self._heartbeat_due, self.group.members.lost_from)
 
     def _follow(self, change: Change) -> None:
-        """Act on a change of contacts, also while amplifiers are being awaited."""
+        """Act on a change of contacts, also while the loop waits for amplifiers."""
         planner = self.planner
         self._wake.set()
         if change.up and planner is not None:  # else the amplifiers were never open
@@ -725,7 +857,7 @@ class Cycle:
     def _schedule_expiry(self) -> None:
         """Check for expired sources when the next one times out.
 
-        A timer that is due before stays: nothing is set anew for every frame of a source.
+        An earlier timer is kept, so that not every frame of a source sets a new one.
         """
         due = self.tracker.next_expiry
         if self._expiry is not None:
@@ -744,7 +876,8 @@ class Cycle:
 
     def _expire(self, now: float) -> None:
         """Lift contacts that no source has confirmed in time; called before every plan."""
-        if (change := self.tracker.expire(now)).up:
+        change = self.tracker.expire(now)
+        if change.up:
             self._follow(change)
 
     async def _wait_for_event(self) -> None:
@@ -757,8 +890,8 @@ class Cycle:
             until = min(until, self.planner.due)
         if self.group.is_armed:
             until = min(until, self._heartbeat_due, self.group.members.lost_from)
-            if self.planner is not None and now < (due := self.planner.slots.ending_due):
-                until = min(until, due)
+            if self.planner is not None and now < self.planner.slots.ending_due:
+                until = min(until, self.planner.slots.ending_due)
         pause = max(0.0, until - now)
         timer = asyncio.get_running_loop().call_later(pause, self._wake.set)
         try:

@@ -1,31 +1,30 @@
-"""Selection: from a haptic intent to the contents of a table that realise it, and when to ask anew.
+"""Selection: choose the contents that realise a haptic intent, and decide when to choose again.
 
-All contents that last are chosen together, by one answer of the table; each short pulse is chosen
-alone, beside what lasts: with the stroke and the power that this leaves, all other fingers quiet,
-30 Hz from all that plays where its band allows it. What lasts at its own finger goes on. A pulse is
-over before an answer for all would help, so it is never changed. Contents that last and do not fit
-beside a pulse that plays get what it leaves, until it has ended.
+All lasting contents are chosen together by one answer of the table. Each short pulse is chosen
+alone, with the stroke and the power that the lasting contents leave: all other fingers are quiet,
+and its frequency is 30 Hz from all sounding frequencies if its band allows it. The lasting content
+of its own finger continues. A pulse would be over before a joint answer could help, so it is never
+changed. While a pulse plays, lasting contents are confined to the stroke and power that it leaves.
 
-One choice is made at a time, for the fingers as they are when the one before was made.
+One choice is made at a time, for the fingers as they are once the previous choice has been made.
 """
 
 import asyncio
 import logging
 import math
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
+from collections.abc import Callable, Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass, replace
 from functools import partial
-from operator import itemgetter
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 from controller.play.intent import (
     BEING_CHOSEN,
     FADED_AFTER,
     NOTHING,
     Content,
+    FingerSensation,
     HapticIntent,
-    Prediction,
     Question,
     Selection,
     Target,
@@ -61,7 +60,7 @@ _logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Chooser:
-    """Chooses contents by a table; shape: adds envelopes to those of a joint answer."""
+    """Chooses contents from a table; shape: adds envelopes to the contents of joint answers."""
 
     table: LocalizationTable
     shape: Shape | None = None
@@ -69,173 +68,204 @@ class Chooser:
     def choose(
         self, question: Question, capabilities: PlaybackCapabilities
     ) -> tuple[Selection, ...]:
-        """Return the selection of what lasts, then one for each short pulse of a question.
+        """Return the selection of the lasting targets of a question, then one for each short pulse.
 
-        Where all rest, return the selections on the way from what plays to what promises more, one
-        after the other; none on any failure.
+        For fingers at rest, return the selections on the way from the present contents to a better
+        answer, step by step; nothing on any failure.
         """
         if question.is_rested:
             try:
                 return Crossfades(self.table, question, capabilities, self.shape).steps()
             except Exception as error:
-                _logger.error("loop: table failed, keeping what plays", exc_info=error)
+                _logger.error("loop: table failed, contents continue", exc_info=error)
                 return ()
-        found = [self._lasting(question, capabilities)] if question.lasting else []
-        kept = [*question.kept, *found]
-        for each in question.short:
-            beside = [*kept, question.fading]
-            left = self._left_by(_contents(beside), capabilities)
-            kept.append(self._chosen(question, (each,), left, beside))
-            found.append(kept[-1].beside([question.fading], self.table))
-        return tuple(found)
+        selections = list[Selection]()
+        active = [*question.kept]
+        if question.lasting:
+            lasting = self._choose_lasting(question, capabilities)
+            selections.append(lasting)
+            active.append(lasting)
+        for contact, target in question.short:
+            pulse = self._choose_pulse(question, contact, target, capabilities, active)
+            active.append(pulse)
+            selections.append(pulse.beside([question.fading], self.table))
+        return tuple(selections)
 
-    def _lasting(self, question: Question, capabilities: PlaybackCapabilities) -> Selection:
-        """Choose what lasts; it is limited by pulses that play.
+    def _choose_lasting(self, question: Question, capabilities: PlaybackCapabilities) -> Selection:
+        """Choose lasting contents, within the limits that active pulses leave.
 
-        Beside these what it replaces fades, too.
+        Contents that they replace fade at the same time, and use the limits like the pulses.
         """
-        targets = question.lasting
-        free = self._chosen(question, targets, capabilities)
-        pulses = _contents(question.kept) if question.kept else []
+        unlimited = self._choose(question, question.lasting, capabilities)
+        pulses = _contents_of(question.kept)
         if not pulses:
-            return free
+            return unlimited
         fading = [
-            one
-            for (finger, _), one in question.before.items()
-            if finger in free.target_keys and one not in pulses
+            content
+            for (key, _), content in question.playing.items()
+            if key in unlimited.target_keys and content not in pulses
         ]
-        left = self._left_by([*pulses, *fading], capabilities)
-        total = [each.layer for each in free.contents]
-        if left.limits.factor_within(total, self.table) >= 1 - NEARLY:
-            return free
-        limited = self._chosen(question, targets, left)
+        remaining = self._left_by([*pulses, *fading], capabilities)
+        layers = [content.layer for content in unlimited.contents]
+        if remaining.limits.factor_within(layers, self.table) >= 1 - NEARLY:
+            return unlimited
+        limited = self._choose(question, question.lasting, remaining)
         if not limited.contents:
-            limited = question.silent(targets, _USED_UP)
+            limited = question.silent(question.lasting, _USED_UP)
         return replace(limited, is_limited=True)
+
+    def _choose_pulse(
+        self,
+        question: Question,
+        contact: Contact,
+        target: Target,
+        capabilities: PlaybackCapabilities,
+        active: Sequence[Selection],
+    ) -> Selection:
+        """Choose for a short pulse, while active selections play and other contents fade."""
+        others = _contents_of([*active, question.fading])
+        remaining = self._left_by(others, capabilities)
+        raised = ((contact, _raised(target, contact, others)),)
+        frequencies = set[float]()
+        for content in others:
+            frequencies.update([tone.frequency for tone in content.layer.excitation.values()])
+        return self._choose(
+            question, ((contact, target),), remaining, raised=raised, avoided_hz=[*frequencies]
+        )
 
     def _left_by(
         self, contents: Sequence[Content], capabilities: PlaybackCapabilities
     ) -> PlaybackCapabilities:
-        """Return what contents leave of the amplifiers' limits."""
+        """Return the amplifiers' capabilities with the limits that contents leave."""
         if not contents:
             return capabilities
-        return capabilities.left_by([each.layer for each in contents], self.table)
+        return capabilities.left_by([content.layer for content in contents], self.table)
 
-    def _chosen(
+    def _choose(
         self,
         question: Question,
         targets: Targets,
         capabilities: PlaybackCapabilities,
-        beside: Sequence[Selection] = (),
+        *,
+        raised: Targets | None = None,
+        avoided_hz: Sequence[float] = (),
     ) -> Selection:
         """Choose for targets within capabilities; any failure is their reason for silence.
 
-        beside: selections that a pulse is felt beside.
+        raised: the targets with the levels to request, if these differ; avoided_hz: frequencies
+        that play at the same time.
         """
-        raised, avoided = targets, list[float]()
-        if beside:
-            raised = tuple([(contact, _over(to, contact, beside)) for contact, to in targets])
-            excitations = [content.layer.excitation.values() for content in _contents(beside)]
-            avoided = [*{tone.frequency for tones in excitations for tone in tones}]
-        is_long = question.takes_long and not targets[0][1].is_short
         try:
-            answer = answered(
-                self.table,
-                question,
-                raised,
-                capabilities,
-                keeps=is_long or _is_step(targets, question.before),
-                now=question.now if is_long else math.inf,
-                avoided_hz=avoided,
-            )
-            if not is_long:
-                answer = _alike(answer, raised[0][1])
-            found = selection_of(
-                self.table,
-                question,
-                answer,
-                targets,
-                shape=self.shape if is_long else None,
-                is_in_phase=is_long,
-            )
-            if avoided:
-                found = _among(question, found, avoided)
+            return self._solve(question, targets, raised or targets, capabilities, avoided_hz)
+        except InputError as error:
+            reason = str(error)
         except Exception as error:
-            if isinstance(error, InputError):
-                reason = str(error)
-            else:
-                _logger.error("loop: table failed, silencing its targets", exc_info=error)
-                reason = failure_text(error)
-            found = question.silent(targets, reason)
-        return found
+            _logger.error("loop: table failed, silencing its targets", exc_info=error)
+            reason = failure_text(error)
+        return question.silent(targets, reason)
+
+    def _solve(
+        self,
+        question: Question,
+        targets: Targets,
+        requested: Targets,
+        capabilities: PlaybackCapabilities,
+        avoided_hz: Sequence[float],
+    ) -> Selection:
+        """Return the contents for targets, of the table's answer to their requested levels."""
+        is_joint = question.takes_long and not targets[0][1].is_short
+        solution = answered(
+            self.table,
+            question,
+            requested,
+            capabilities,
+            keeps=is_joint or _is_level_change(targets, question.playing),
+            now=question.now if is_joint else math.inf,
+            avoided_hz=avoided_hz,
+        )
+        if not is_joint:
+            solution = _even_level(solution, requested[0][1])
+        selection = selection_of(
+            self.table,
+            question,
+            solution,
+            targets,
+            shape=self.shape if is_joint else None,
+            is_in_phase=is_joint,
+        )
+        return _among(question, selection, avoided_hz) if avoided_hz else selection
 
 
-def _is_step(targets: Targets, before: Mapping[tuple[ContactKey, int], Content]) -> bool:
-    """Whether all that changes is the level of a single target that is not raised."""
-    ((contact, new),) = targets
-    then = before.get((contact.key, new.voice))
-    if then is None or new.level_db_sl is None or (new.pulse and new.pulse.is_raised):
+def _is_level_change(targets: Targets, playing: Mapping[tuple[ContactKey, int], Content]) -> bool:
+    """Whether only the level of a single target changes, and that level is not raised."""
+    ((contact, target),) = targets
+    content = playing.get((contact.key, target.voice))
+    if content is None or target.level_db_sl is None:
         return False
-    old = then.targets[0][1]
-    return new != old and new == replace(old, level_db_sl=new.level_db_sl)
+    if target.pulse is not None and target.pulse.is_raised:
+        return False
+    former_target = content.target
+    with_new_level = replace(former_target, level_db_sl=target.level_db_sl)
+    return target == with_new_level and target != former_target
 
 
-def _alike(found: Answer, target: Target) -> Answer:
-    """Return an answer whose level in a band is the same wherever the finger is.
+def _even_level(solution: Answer, target: Target) -> Answer:
+    """Return an answer whose level within a band is the same at every position of the finger.
 
-    The margin for other plates, by which the level exceeds the promise, differs between places.
+    The level exceeds the promise by a margin for other plates, which differs between positions.
     """
-    is_level = target.level_db_sl is not None and not (target.pulse and target.pulse.is_raised)
-    if not (is_level and target.band and found.layers):
-        return found
-    excess = found.fingers[0].level_db_sl - (target.level_db_sl or 0.0)
-    return scaled(found, -excess) if excess > 0 else found
+    is_raised = target.pulse is not None and target.pulse.is_raised
+    if target.level_db_sl is None or target.band is None or is_raised or not solution.layers:
+        return solution
+    excess = solution.fingers[0].level_db_sl - target.level_db_sl
+    return scaled(solution, -excess) if excess > 0 else solution
 
 
-def _over(target: Target, contact: Contact, beside: Sequence[Selection]) -> Target:
-    """Return the target of a short pulse, raised as far as it must be above what lasts there."""
-    level, above = target.level_db_sl, target.above_db
-    if level is None or above is None:
+def _raised(target: Target, contact: Contact, others: Iterable[Content]) -> Target:
+    """Return the target of a short pulse, raised to its minimum above other contents there."""
+    level = target.level_db_sl
+    if level is None or target.above_db is None:
         return target
-    for each in _contents(beside):
-        for felt in each.predictions:
-            if felt.contact.key == contact.key and felt.nominal_db_sl is not None:
-                level = max(level, felt.nominal_db_sl + above)
+    for content in others:
+        for felt in content.finger_sensations:
+            if felt.contact.key == contact.key:
+                level = max(level, felt.sensation.level_db_sl + target.above_db)
     return replace(target, level_db_sl=level)
 
 
-def _among(question: Question, found: Selection, frequencies: Sequence[float]) -> Selection:
+def _among(question: Question, selection: Selection, frequencies: Sequence[float]) -> Selection:
     """Return the selection for a pulse among vibrations of some frequencies [Hz].
 
-    It is mixed where it is nearer than 30 Hz to one of them.
+    The pulse is mixed if it is nearer than 30 Hz to one of them.
     """
-    if not found.contents:
-        is_used_up = found.reason == LIMITS_LEAVE_NOTHING
-        return question.silent(found.targets, _USED_UP) if is_used_up else found
-    (content,) = found.contents
-    gap = min([abs((content.frequency or 0.0) - each) for each in frequencies])
-    if gap >= APART_HZ - SAME_FREQUENCY:
-        return found
-    mixed = tuple([replace(each, is_apart=False).judged() for each in content.predictions])
-    return replace(found, contents=(replace(content, predictions=mixed),))
+    if not selection.contents:
+        if selection.reason == LIMITS_LEAVE_NOTHING:
+            return question.silent(selection.targets, _USED_UP)
+        return selection
+    (content,) = selection.contents
+    distances = [abs((content.frequency or 0.0) - frequency) for frequency in frequencies]
+    if min(distances) >= APART_HZ - SAME_FREQUENCY:
+        return selection
+    mixed = replace(content, is_apart=False).with_sensations(content.sensations)
+    return replace(selection, contents=(mixed,))
 
 
-def _contents(parts: Iterable[Selection]) -> list[Content]:
-    return [content for part in parts for content in part.contents]
+def _contents_of(selections: Iterable[Selection]) -> list[Content]:
+    return [content for selection in selections for content in selection.contents]
 
 
 TIME_LIMIT = 1.0
 """Time [s] after which a choice is given up; it takes some tens of milliseconds."""
 
 MAX_LATE = 2
-"""Choices that may still be computed after they were given up; until one ends none is begun."""
+"""Number of given-up choices that can still run; while so many run, no other choice begins."""
 
-# Bending wavelengths are 17 cm and more below 500 Hz; a fingertip that has moved by about its own
-# radius is still within the disc that the pattern was chosen for. One that moves is answered for
-# this way ahead.
+# Bending wavelengths are at least 17 cm below 500 Hz, so a fingertip that has moved by about its
+# own radius is still within the disc that the pattern was chosen for. The answer for a moving
+# finger covers this distance ahead.
 MOVE_TOLERANCE = STRETCH
 
-# s; fingers of which none has come, left or moved further for so long rest.
+# s; fingers rest if no finger has come, left or moved further for this long.
 _RESTS_AFTER = 0.1
 
 CROSSFADE_INTERVAL = 0.4
@@ -252,68 +282,106 @@ BLOCKED = (
 
 _UNANSWERED = (GIVEN_UP, BLOCKED)
 
-_FADES_FOR = FALL_AFTER + CROSSFADE + FADED_AFTER  # s; what a step leads away from
+_FADES_FOR = FALL_AFTER + CROSSFADE + FADED_AFTER  # s; contents that a step replaces
 
 
 def _is_met_by(intended: Question, chosen: Selection) -> bool:
-    """Whether what was chosen also serves what lasts of what is intended now."""
-    is_whole, then = chosen.is_whole, chosen.contacts
-    requested, had = _targets_of(intended.lasting), _targets_of(chosen.targets)
-    # Others would gain from the end of one only where fingers share or are not served.
-    if not (had and (requested == had or (requested < had and is_whole))):
+    """Whether a selection also serves the lasting targets that are intended now."""
+    requested = _targets_of(intended.lasting)
+    served = _targets_of(chosen.targets)
+    if not served or not requested <= served:
         return False
-    now = {each.key: each for each in intended.contacts}
-    hands = {key for key, contact in then.items() if contact.is_hand}
-    same = hands <= now.keys() <= then.keys() if is_whole else now.keys() == then.keys()
-    follows = not intended.is_alone
-    return same and all(
-        math.dist((contact.x, contact.y), (then[key].x, then[key].y)) <= MOVE_TOLERANCE
-        and (contact.load, contact.is_surplus) == (then[key].load, then[key].is_surplus)
-        and (key in intended.protected) == (key in chosen.protected)
-        and not (follows and _has_set_out(contact, then[key]))
-        for key, contact in now.items()
-    )
+    # If a target ends, the others gain only if fingers share or are not served.
+    if requested != served and not chosen.is_whole:
+        return False
+    present_contacts = {contact.key: contact for contact in intended.contacts}
+    if not _are_same_fingers(present_contacts, chosen):
+        return False
+    for key, contact in present_contacts.items():
+        former_contact = chosen.contacts[key]
+        if not _feels_alike(contact, former_contact):
+            return False
+        if (key in intended.protected) != (key in chosen.protected):
+            return False
+        if not intended.is_alone and _has_set_out(contact, former_contact):
+            return False
+    return True
 
 
-def _has_set_out(now: Contact, then: Contact) -> bool:
-    """Whether a contact that rested then is under way, and to be answered for the way ahead."""
-    has_moved = (now.x, now.y) != (then.x, then.y)
-    return has_moved and now.motion.is_under_way and not then.motion.is_under_way
+def _are_same_fingers(contacts: Mapping[ContactKey, Contact], chosen: Selection) -> bool:
+    """Whether contacts are the same as in a selection; fingers may have left a whole one."""
+    former_contacts = chosen.contacts
+    if not chosen.is_whole:
+        return contacts.keys() == former_contacts.keys()
+    hands = {key for key, contact in former_contacts.items() if contact.is_hand}
+    return hands <= contacts.keys() <= former_contacts.keys()
 
 
-def _targets_of(targets: Targets) -> set[Target]:
-    return set(map(itemgetter(1), targets))
+def _feels_alike(contact: Contact, former: Contact) -> bool:
+    """Whether an answer still serves a contact: near its former position, with the same load."""
+    distance = math.dist((contact.x, contact.y), (former.x, former.y))
+    is_as_heavy = contact.load == former.load and contact.is_surplus == former.is_surplus
+    return distance <= MOVE_TOLERANCE and is_as_heavy
 
 
-def _of_any_course(targets: Targets) -> set[Target]:
-    """Return targets without what may differ in a late choice: level, pulse, course."""
+def _has_set_out(contact: Contact, former: Contact) -> bool:
+    """Whether a contact that rested is moving now, and needs an answer for the path ahead."""
+    has_moved = (contact.x, contact.y) != (former.x, former.y)
+    return has_moved and contact.motion.is_under_way and not former.motion.is_under_way
+
+
+def _targets_of(targets: Targets) -> frozenset[Target]:
+    return frozenset([target for _, target in targets])
+
+
+def _at_any_level(targets: Targets) -> set[Target]:
+    """Return targets without the values that may differ in a late choice."""
     return {
         replace(target, level_db_sl=None, pulse=None, modulation_hz=None, course=None)
         for _, target in targets
     }
 
 
-_Choosing: TypeAlias = "asyncio.Future[tuple[Selection, ...]]"
-"""The selections of a question, made in the thread."""
+_Future: TypeAlias = "asyncio.Future[tuple[Selection, ...]]"
+
+
+@dataclass(frozen=True, eq=False)
+class PendingChoice:
+    """A question that the thread works on, or whose answer has not been taken yet."""
+
+    question: Question
+    future: _Future
+
+
+class _Situation(NamedTuple):
+    """Everything a joint answer depends on except the positions of fingers."""
+
+    fingers: frozenset[tuple[ContactKey, float, float]]
+    """Key, time of arrival [s] and load of each contact."""
+    lasting_targets: frozenset[Target]
+    protected: frozenset[ContactKey]
+    table: LocalizationTable
+    capabilities: PlaybackCapabilities
 
 
 class Selector:
-    """Keeps a selection for the contacts on a plate, and chooses anew where it no longer serves.
+    """Keeps a selection for the contacts on a plate, and chooses again when it no longer serves.
 
-    Each target has contents of its own: all that last are chosen together, in a thread where they
-    are several; a short pulse is chosen alone beside them, and never changed. What lasts is kept as
-    long as its targets and their levels are the same, no contact has moved more than 8 mm, none of
-    several has set out, and none has another load, which changes by a factor of 1.5 or more. A
-    contact that lifts, or whose effect ends, leaves the others as they are.
+    All lasting contents are chosen together, in a thread if there are several. Each short pulse is
+    chosen alone and never changed. Lasting contents are kept while their targets and levels are the
+    same, no contact has moved more than 8 mm, none of several has set out, and no load has changed
+    (loads change in steps of a factor of 1.5 or more). A contact that lifts, or whose effect ends,
+    does not change the others.
 
-    Once all rest, contents are led to a better answer, if there is one, a step after the other,
-    until anything changes: fingers, the table with its clocks, or the limits of the amplifiers.
-    Where a finger was held back before that, all are chosen anew. A choice that takes too long is
-    given up: all that lasts is silent until its fingers change, or until that choice has ended.
+    Once all fingers rest, contents are cross-faded to a better answer, if there is one, step by
+    step until anything changes: fingers, the table with its clocks, or the limits of the
+    amplifiers. If a finger was held back before that change, all contents are chosen again. A
+    choice that takes too long is given up: all lasting contents are silent until their fingers
+    change or that choice has ended.
 
-    chooser: makes the next choice; a choice in the thread goes on by the former one. arrived:
-    called when the thread is done; may_lead: whether contents may be led to from what plays at a
-    time [s].
+    chooser: makes the next choice, while the thread finishes with the former chooser; arrived:
+    called when the thread is done; may_lead: whether present contents can be cross-faded to these
+    at a time [s].
     """
 
     def __init__(
@@ -323,21 +391,25 @@ class Selector:
         arrived: Callable[[], None] = lambda: None,
         may_lead: Callable[[Sequence[Content], float], bool] = lambda contents, now: True,
     ) -> None:
-        self.chooser, self._arrived, self._may_lead = chooser, arrived, may_lead
+        self.chooser = chooser
+        self._arrived = arrived
+        self._may_lead = may_lead
         self._threads = DaemonThreads()
-        self.pending: tuple[Question, _Choosing] | None = None
-        """What is chosen in the thread, or not taken yet: one question at a time."""
-        self._late = set[_Choosing]()  # given up, and still computed
-        self._lasting = NOTHING  # as it was chosen, for fingers that have left it, too
-        self._short: dict[ContactKey, Selection] = {}
-        self._fingers: dict[ContactKey, float] = {}  # of what lasts, down since [s]
-        self._situation: object = None
-        self._requested: object = None  # the situation in which what lasts was requested last
+        self.pending: PendingChoice | None = None
+        """The choice in the thread; there is one at a time."""
+        self._given_up = set[_Future]()  # still computed
+        self._lasting = NOTHING  # as chosen, also for fingers that have left
+        self._pulses: dict[ContactKey, Selection] = {}  # active, or not started yet
+        self._lasting_fingers: dict[ContactKey, float] = {}  # of lasting targets, down since [s]
+        self._situation: _Situation | None = None
+        self._requested_situation: _Situation | None = (
+            None  # of the last question with lasting targets
+        )
         self._steps: Sequence[Selection] = ()  # to a better answer
-        self._led_at = -math.inf  # s; by the last step
-        self._fading = NOTHING  # what plays until that has been taken
+        self._led_at = -math.inf  # s; time of the last step
+        self._fading = NOTHING  # contents that the last step replaced
         self.due = math.inf
-        """Time [s] to select anew though no contact changes: all rest, or pulses have ended."""
+        """Time [s] of the next selection if no contact changes: all rest, or pulses have ended."""
 
     def select(
         self,
@@ -347,97 +419,232 @@ class Selector:
         *,
         now: float = math.inf,
     ) -> Selection:
-        """Return the selection for contacts in their order of arrival; an equal one if it is kept.
+        """Return the selection for contacts in order of arrival; an equal one if contents are kept.
 
-        While the thread computes, contents that play and are still wanted stay. now [s]: infinite
-        where fingers do not move.
+        While the thread computes, contents that play and are still wanted continue. now [s]:
+        infinite if fingers do not move.
         """
-        by_key = defaultdict[ContactKey, list[Target]](list)
-        for target in intent.targets:
-            by_key[target.key].append(target)
-        # Lists: a generator would be a call for each.
-        targets = tuple([(one, each) for one in contacts for each in by_key.get(one.key, ())])
+        targets = _targets_on_plate(contacts, intent)
         served, skipped = _within_layers(targets, capabilities)
-        short = tuple([each for each in served if each[1].is_short])
-        lasting = tuple([each for each in served if each not in short]) if short else served
+        short = tuple([pair for pair in served if pair[1].is_short])
+        lasting = tuple([pair for pair in served if not pair[1].is_short])
         intended = Question(tuple(contacts), lasting, short, intent.protected)
-        before, self._fingers = self._fingers, {one.key: one.since for one, _ in lasting}
-        back = dict(self._fingers.items() - before.items()).keys() & self._lasting.target_keys
-        if back and not _is_met_by(intended, self._lasting):  # who has come back may be elsewhere
-            self._lasting = _felt(self._lasting, self._lasting.target_keys - back)
-        fingers = frozenset([(each.key, each.since, each.load) for each in contacts])  # not places
-        requested = _targets_of(lasting), intent.protected
-        situation = fingers, *requested, self.chooser.table, capabilities
-        if situation != self._situation:
-            self._situation = situation
-            self._rest_again(now)
-        has_arrived = self.pending is not None and self.pending[1].done()
-        if self.pending is not None and has_arrived:
-            (question, choosing), self.pending = self.pending, None
-            arrived = choosing.result()
-            is_late = self._requested is None or not self._is_intended(arrived, intended)
-            self._take(question, arrived, now, is_late=is_late)
-        pulses, self._short = self._short, {}
-        for contact, target in short:
-            pulse = pulses.get(contact.key)
-            if pulse is not None and pulse.targets[0][1] == target:
-                self._short[contact.key] = pulse
+        self._follow_fingers(intended)
+        self._follow_situation(intended, capabilities, now)
+        has_arrived = self._take_arrived(intended, now)
+        former_pulses = self._pulses
+        self._pulses = _still_requested(former_pulses, short)
         if not contacts:
             self._lasting = NOTHING
         if self.pending is None:
-            for question in self._questions(intended, pulses, now, has_waited=has_arrived):
-                if question.lasting:
-                    self._requested = situation
-                self._answer(question, capabilities, now)
+            self._choose_if_due(intended, former_pulses, capabilities, now, has_waited=has_arrived)
         elif self.due <= now:
             self.due = now + _RESTS_AFTER
-        parts = [_felt(self._lasting, self._fingers.keys()), *self._short.values()]
-        found = _together(contacts, targets, parts, skipped, intent.reason, self.chooser.table)
-        if self.pending is not None and len(found.predictions) < len(by_key):
-            reason = found.reason or (None if found.contents else BEING_CHOSEN)
-            found = replace(found, is_pending=True, reason=reason)
-        return found
+        parts = [self._felt_lasting(), *self._pulses.values()]
+        selection = _joined(contacts, targets, parts, skipped, intent.reason, self.chooser.table)
+        target_keys = {target.key for target in intent.targets}
+        if self.pending is None or len(selection.finger_sensations) >= len(target_keys):
+            return selection
+        reason = selection.reason
+        if reason is None and not selection.contents:
+            reason = BEING_CHOSEN
+        return replace(selection, is_pending=True, reason=reason)
 
-    def _answer(self, question: Question, capabilities: PlaybackCapabilities, now: float) -> None:
-        """Have a question answered at a time [s]: at once, or in the thread where it takes long.
+    def _follow_fingers(self, intended: Question) -> None:
+        """Drop the lasting content of fingers that have left and come back elsewhere."""
+        former_fingers = self._lasting_fingers
+        self._lasting_fingers = {contact.key: contact.since for contact, _ in intended.lasting}
+        new_fingers = dict(self._lasting_fingers.items() - former_fingers.items())
+        returned = new_fingers.keys() & self._lasting.target_keys
+        if returned and not _is_met_by(intended, self._lasting):
+            self._lasting = _restricted(self._lasting, self._lasting.target_keys - returned)
 
-        A choice in the thread that hangs cannot be ended, only given up: its thread holds up
-        neither the next choice nor the end of the process, and what it returns is dropped.
+    def _follow_situation(
+        self, intended: Question, capabilities: PlaybackCapabilities, now: float
+    ) -> None:
+        """Leave the way to a better answer if the situation has changed."""
+        fingers = [(contact.key, contact.since, contact.load) for contact in intended.contacts]
+        situation = _Situation(
+            frozenset(fingers),
+            _targets_of(intended.lasting),
+            intended.protected,
+            self.chooser.table,
+            capabilities,
+        )
+        if situation != self._situation:
+            self._situation = situation
+            self._rest_again(now)
+
+    def _take_arrived(self, intended: Question, now: float) -> bool:
+        """Take the choice of the thread if it is done; return whether it was."""
+        choice = self.pending
+        if choice is None or not choice.future.done():
+            return False
+        self.pending = None
+        selections = choice.future.result()
+        is_outdated = self._requested_situation is None or not self._still_serves(
+            selections, intended
+        )
+        self._take(choice.question, selections, now, is_outdated=is_outdated)
+        return True
+
+    def _felt_lasting(self) -> Selection:
+        """Return the lasting contents of the fingers that still want them."""
+        return _restricted(self._lasting, self._lasting_fingers.keys())
+
+    def _choose_if_due(
+        self,
+        intended: Question,
+        former_pulses: Mapping[ContactKey, Selection],
+        capabilities: PlaybackCapabilities,
+        now: float,
+        *,
+        has_waited: bool,
+    ) -> None:
+        """Choose contents that are due: for new pulses, and for lasting targets.
+
+        former_pulses: selections of pulses until now; has_waited: whether the thread was busy. A
+        pulse that has waited for the thread is chosen before lasting contents, after which it would
+        be late.
+        """
+        is_served = not intended.lasting or _is_met_by(intended, self._lasting)
+        new_pulses = tuple([pair for pair in intended.short if pair[0].key not in self._pulses])
+        is_rested = False
+        if self.due < math.inf and self.due <= now:
+            self.due = math.inf
+            if intended.lasting and self._would_gain():
+                is_served = False
+            if is_served and _may_crossfade(intended):
+                is_rested = not new_pulses and self._is_at_rest(intended, now)
+                if not is_rested:
+                    self._rest_again(now)
+        if is_rested and self._steps:
+            self._lead(now)
+        elif is_rested:
+            question = self._question_of_lasting(intended, {}, now)
+            self._choose_lasting(replace(question, is_rested=True), capabilities, now)
+        else:
+            pulses_first = has_waited or is_served
+            if new_pulses and pulses_first:
+                question = self._question_of_pulses(intended, new_pulses, former_pulses, now)
+                self._choose(question, capabilities, now)
+                new_pulses = ()
+            if not is_served:
+                self._rest_again(now)
+                question = self._question_of_lasting(intended, former_pulses, now)
+                self._choose_lasting(replace(question, short=new_pulses), capabilities, now)
+
+    def _is_at_rest(self, intended: Question, now: float) -> bool:
+        """Whether no pulse is active and no contact moves at a time [s]."""
+        if self._active_pulses(now):
+            return False
+        return not any(any(contact.motion.velocity(now)) for contact in intended.contacts)
+
+    def _question_of_pulses(
+        self,
+        intended: Question,
+        new_pulses: Targets,
+        former_pulses: Mapping[ContactKey, Selection],
+        now: float,
+    ) -> Question:
+        """Return the question for new pulses, while all other contents continue."""
+        is_fading = now < self._led_at + _FADES_FOR
+        return replace(
+            intended,
+            lasting=(),
+            short=new_pulses,
+            playing=self._felt_contents(former_pulses),
+            kept=(self._felt_lasting(), *self._active_pulses(now)),
+            fading=self._fading if is_fading else NOTHING,
+        )
+
+    def _question_of_lasting(
+        self, intended: Question, former_pulses: Mapping[ContactKey, Selection], now: float
+    ) -> Question:
+        """Return the question for lasting targets, without pulses."""
+        return replace(
+            intended,
+            short=(),
+            playing=self._felt_contents(former_pulses),
+            kept=self._active_pulses(now),
+            now=now,
+        )
+
+    def _felt_contents(
+        self, pulses: Mapping[ContactKey, Selection]
+    ) -> dict[tuple[ContactKey, int], Content]:
+        """Return the lasting contents and those of some pulses, by finger and voice."""
+        selections = [self._felt_lasting(), *pulses.values()]
+        return {content.key: content for content in _contents_of(selections)}
+
+    def _choose_lasting(
+        self, question: Question, capabilities: PlaybackCapabilities, now: float
+    ) -> None:
+        """Choose for a question with lasting targets, and note its situation."""
+        self._requested_situation = self._situation
+        self._choose(question, capabilities, now)
+
+    def _would_gain(self) -> bool:
+        """Whether another choice may give lasting targets more than the present one.
+
+        It may if pulses have ended that limited them, or if one is held back and the situation has
+        changed.
+        """
+        if self._lasting.is_limited:
+            return True
+        if self._requested_situation == self._situation:
+            return False
+        unserved_keys = [finger.contact.key for finger in self._lasting.unserved]
+        return any(key in self._lasting_fingers for key in unserved_keys)
+
+    def _choose(self, question: Question, capabilities: PlaybackCapabilities, now: float) -> None:
+        """Choose for a question at a time [s]: immediately, or in the thread if it takes long.
+
+        A choice in the thread that hangs cannot be ended, only given up. Its thread delays neither
+        the next choice nor the end of the process, and its result is dropped.
         """
         if not question.takes_long:
             self._take(question, self.chooser.choose(question, capabilities), now)
-        elif len(self._late) >= MAX_LATE:
+        elif len(self._given_up) >= MAX_LATE:
             self._take(question, question.unanswered(BLOCKED), now)
         else:
-            loop, choose = asyncio.get_running_loop(), self.chooser.choose
-            choosing = loop.run_in_executor(self._threads, partial(choose, question, capabilities))
-            self.pending = question, choosing
-            choosing.add_done_callback(self._note)
-            loop.call_later(TIME_LIMIT, self._give_up, question, choosing)
+            loop = asyncio.get_running_loop()
+            choose = partial(self.chooser.choose, question, capabilities)
+            future = loop.run_in_executor(self._threads, choose)
+            self.pending = PendingChoice(question, future)
+            future.add_done_callback(self._note_done)
+            loop.call_later(TIME_LIMIT, self._give_up, question, future)
 
-    def _give_up(self, question: Question, choosing: _Choosing) -> None:
-        if not choosing.done():
-            _logger.warning("loop: answer given up, still computed after %g s", TIME_LIMIT)
-            self._late.add(choosing)
-            self.pending = question, asyncio.get_running_loop().create_future()
-            self.pending[1].set_result(question.unanswered(GIVEN_UP))
-            self._arrived()
+    def _give_up(self, question: Question, future: _Future) -> None:
+        """Give up a choice that is not done: lasting contents fall silent."""
+        if future.done():
+            return
+        _logger.warning("loop: answer given up, still computed after %g s", TIME_LIMIT)
+        self._given_up.add(future)
+        silence: _Future = asyncio.get_running_loop().create_future()
+        silence.set_result(question.unanswered(GIVEN_UP))
+        self.pending = PendingChoice(question, silence)
+        self._arrived()
 
-    def _note(self, choosing: _Choosing) -> None:
-        if choosing in self._late:
-            self._late.remove(choosing)
-            choosing.exception()  # of no interest any more
-            if self._lasting.reason in _UNANSWERED:  # asked again
+    def _note_done(self, future: _Future) -> None:
+        """Note that the thread is done with a choice."""
+        if future in self._given_up:
+            self._given_up.remove(future)
+            future.exception()  # retrieved, so that asyncio does not log it
+            if self._lasting.reason in _UNANSWERED:  # so that the next cycle chooses again
                 self._lasting = NOTHING
         self._arrived()
 
-    def choose_anew(self) -> None:
-        """Choose anew what lasts: silent until then, and not by a choice that is under way."""
-        self._lasting, self._steps, self._requested = NOTHING, (), None
+    def choose_again(self) -> None:
+        """Drop lasting contents and the choice under way, so that the next cycle chooses again."""
+        self._lasting = NOTHING
+        self._steps = ()
+        self._requested_situation = None
 
     def _rest_again(self, now: float) -> None:
-        """Leave the way to a better answer, if any, until all have rested."""
-        self._steps, self.due = (), max(now + _RESTS_AFTER, self._led_at + MIN_INTERVAL)
+        """Leave the way to a better answer, if any, until all fingers have rested."""
+        self._steps = ()
+        self.due = max(now + _RESTS_AFTER, self._led_at + MIN_INTERVAL)
 
     def _lead(self, now: float) -> None:
         """Take the next step to a better answer at a time [s], if the amplifiers can."""
@@ -445,198 +652,205 @@ class Selector:
         if not self._may_lead(step.contents, now):
             self._steps = ()
             return
-        new = {(each.key, each.frequency) for each in step.contents}
-        old = [each for each in self._lasting.contents if (each.key, each.frequency) not in new]
         if step.contents != self._lasting.contents:
-            self._fading, self._led_at = replace(self._lasting, contents=tuple(old)), now
+            step_tones = {(content.key, content.frequency) for content in step.contents}
+            fading = [
+                content
+                for content in self._lasting.contents
+                if (content.key, content.frequency) not in step_tones
+            ]
+            self._fading = replace(self._lasting, contents=tuple(fading))
+            self._led_at = now
         self._lasting = step
         self.due = now + CROSSFADE_INTERVAL if self._steps else math.inf
 
-    def _questions(
-        self,
-        intended: Question,
-        pulses: Mapping[ContactKey, Selection],
-        now: float,
-        *,
-        has_waited: bool,
-    ) -> Iterator[Question]:
-        """Yield the questions that are due, one after the other.
-
-        pulses: selections of pulses until now. A pulse that has waited for the thread goes before
-        what lasts, after which it would be late.
-        """
-        lasting, playing, is_rested = intended.lasting, self._playing(now), False
-        is_kept = not lasting or _is_met_by(intended, self._lasting)
-        new = tuple([each for each in intended.short if each[0].key not in self._short])
-        if self.due < math.inf and self.due <= now:
-            self.due = math.inf
-            held_back = [each.contact.key in self._fingers for each in self._lasting.not_served]
-            if self._lasting.is_limited or (self._requested != self._situation and any(held_back)):
-                is_kept = is_kept and not lasting  # by pulses that have ended, or limits of before
-            # No cross-fade follows a course.
-            is_rested = is_kept and intended.takes_long and not any(to.course for _, to in lasting)
-            velocities = [each.motion.velocity(now) for each in intended.contacts]
-            if is_rested and (new or playing or any(map(any, velocities))):
-                self._rest_again(now)
-                is_rested = False
-        if is_rested and self._steps:
-            self._lead(now)
-            return
-        if is_kept and not (is_rested or new):
-            return
-        felt = _felt(self._lasting, self._fingers.keys())
-        parts = [felt] if is_rested else [felt, *pulses.values()]
-        before = {each.key: each for part in parts for each in part.contents}
-        if new and (has_waited or is_kept):
-            fading = self._fading if now < self._led_at + _FADES_FOR else NOTHING
-            kept = felt, *playing
-            yield replace(intended, lasting=(), short=new, before=before, kept=kept, fading=fading)
-            new, playing = (), self._playing(now)
-        if is_kept and not is_rested:
-            return
-        if not is_rested:
-            self._rest_again(now)
-        yield replace(
-            intended, short=new, before=before, kept=playing, is_rested=is_rested, now=now
-        )
-
-    def _playing(self, now: float) -> tuple[Selection, ...]:
+    def _active_pulses(self, now: float) -> tuple[Selection, ...]:
         """Return the short pulses that have not ended at a time [s]."""
-        parts = self._short.values()
-        return tuple([part for part in parts if any(now < each.end for each in part.pulses)])
-
-    def _is_intended(self, chosen: Sequence[Selection], intended: Question) -> bool:
-        """Whether a late choice of what lasts still serves the contacts on the plate.
-
-        All must have been there when it was chosen, and not have lifted since. Places, levels and
-        courses may have changed, or such a finger would get nothing; the layout may not. It is
-        dropped if what plays will do again, since a finger that came has lifted meanwhile.
-        """
-        found = next(iter(chosen), NOTHING)
-        if found.reason in _UNANSWERED:
-            return True  # in doubt nothing plays
-        return (
-            (
-                self._lasting.is_limited
-                or self._requested == self._situation
-                or not _is_met_by(intended, self._lasting)
-            )
-            and {(each.key, each.since) for each in intended.contacts}
-            <= {(each.key, each.since) for each in found.contacts.values()}
-            and intended.protected <= found.protected
-            and _of_any_course(intended.lasting) <= _of_any_course(found.targets)
+        return tuple(
+            [
+                selection
+                for selection in self._pulses.values()
+                if any(now < pulse.end for pulse in selection.pulses)
+            ]
         )
+
+    def _still_serves(self, selections: Sequence[Selection], intended: Question) -> bool:
+        """Whether a late choice of lasting contents still serves the contacts on the plate.
+
+        All contacts must have been present when it was made, without lifting since. Positions,
+        levels and courses may have changed, since a finger that keeps moving would get nothing
+        otherwise; the layout may not. The choice is dropped if present contents serve again,
+        because a finger that came has lifted.
+        """
+        selection = selections[0] if selections else NOTHING
+        if selection.reason in _UNANSWERED:
+            return True  # it silences
+        may_improve = self._lasting.is_limited or self._requested_situation == self._situation
+        if not may_improve and _is_met_by(intended, self._lasting):
+            return False
+        present = {(contact.key, contact.since) for contact in intended.contacts}
+        answered_for = {(contact.key, contact.since) for contact in selection.contacts.values()}
+        if not present <= answered_for or not intended.protected <= selection.protected:
+            return False
+        return _at_any_level(intended.lasting) <= _at_any_level(selection.targets)
 
     def _take(
         self,
         question: Question,
-        chosen: Sequence[Selection],
+        selections: Sequence[Selection],
         now: float,
         *,
-        is_late: bool = False,
+        is_outdated: bool = False,
     ) -> None:
-        """Take what was chosen for a question at a time [s]; is_late: without what lasts."""
+        """Take the selections for a question at a time [s]; only pulses of an outdated choice."""
         if question.is_rested:
-            if chosen and self._requested == self._situation:
-                self._steps, self.due = chosen, now
+            if selections and self._requested_situation == self._situation:
+                self._steps = selections
+                self.due = now
             return
-        for each in chosen:
-            contact, target = each.targets[0]
+        for selection in selections:
+            contact, target = selection.targets[0]
             if target.is_short:
-                self._short[contact.key] = each
-            elif not is_late:
-                self._lasting = each
-                if each.reason in _UNANSWERED:
-                    self.due = math.inf
-                if each.is_limited:
-                    ends = [pulse.end for part in question.kept for pulse in part.pulses]
-                    self.due = max(ends) + FADED_AFTER
+                self._pulses[contact.key] = selection
+            elif not is_outdated:
+                self._take_lasting(question, selection)
+
+    def _take_lasting(self, question: Question, selection: Selection) -> None:
+        """Take the lasting contents chosen for a question."""
+        self._lasting = selection
+        if selection.reason in _UNANSWERED:
+            self.due = math.inf
+        if selection.is_limited:
+            pulses = [pulse for kept in question.kept for pulse in kept.pulses]
+            self.due = max([pulse.end for pulse in pulses]) + FADED_AFTER
 
 
-def _together(
+def _targets_on_plate(contacts: Sequence[Contact], intent: HapticIntent) -> Targets:
+    """Return the targets of an intent with their contacts, in order of arrival."""
+    by_key = defaultdict[ContactKey, list[Target]](list)
+    for target in intent.targets:
+        by_key[target.key].append(target)
+    return tuple(
+        [(contact, target) for contact in contacts for target in by_key.get(contact.key, ())]
+    )
+
+
+def _still_requested(
+    pulses: Mapping[ContactKey, Selection], short: Targets
+) -> dict[ContactKey, Selection]:
+    """Return the selections of pulses that are still targets."""
+    requested = dict[ContactKey, Selection]()
+    for contact, target in short:
+        selection = pulses.get(contact.key)
+        if selection is not None and selection.targets[0][1] == target:
+            requested[contact.key] = selection
+    return requested
+
+
+def _may_crossfade(intended: Question) -> bool:
+    """Whether lasting contents can cross-fade to a better answer; courses have no cross-fades."""
+    has_course = any(target.course is not None for _, target in intended.lasting)
+    return intended.takes_long and not has_course
+
+
+def _joined(
     contacts: Sequence[Contact],
     targets: Targets,
     parts: Sequence[Selection],
-    skipped: tuple[Prediction, ...],
+    skipped: tuple[FingerSensation, ...],
     reason: str,
     table: LocalizationTable,
 ) -> Selection:
-    """Join selections made apart, contacts as they were then; reason: why there are no targets."""
+    """Join selections that were chosen separately, with the contacts as they were then.
+
+    reason: why there are no targets.
+    """
     chosen = [part for part in parts if part.targets]
     if len(chosen) == 1 and len(chosen[0].targets) == len(targets):
         return chosen[0]
     restated = [
-        part.beside([each for each in chosen if each is not part], table) for part in chosen
+        part.beside([other for other in chosen if other is not part], table) for part in chosen
     ]
-    then = {key: each for part in chosen for key, each in part.contacts.items()}
-    keys = {contact.key for contact, _ in targets}
-    quiet = [then.get(each.key, each) for each in contacts if each.key not in keys]
+    former_contacts = dict[ContactKey, Contact]()
+    for part in chosen:
+        former_contacts |= part.contacts
+    former_targets = [
+        (former_contacts.get(contact.key, contact), target) for contact, target in targets
+    ]
+    target_keys = {contact.key for contact, _ in targets}
+    quiet = [contact for contact in contacts if contact.key not in target_keys]
+    unserved = [finger for part in restated for finger in part.unserved]
     reasons = [part.reason for part in chosen if part.reason is not None]
+    first_reason = reasons[0] if reasons else None
     return Selection(
-        tuple([(then.get(contact.key, contact), target) for contact, target in targets]),
-        tuple(quiet),
-        tuple([content for part in restated for content in part.contents]),
-        next(iter(reasons), None) if targets else reason,
-        (*[each for part in restated for each in part.not_served], *skipped),
-        foreign_levels={each.key: foreign_at(each.key, chosen) for each in contacts},
+        tuple(former_targets),
+        tuple([former_contacts.get(contact.key, contact) for contact in quiet]),
+        tuple(_contents_of(restated)),
+        first_reason if targets else reason,
+        (*unserved, *skipped),
+        foreign_levels={contact.key: foreign_at(contact.key, chosen) for contact in contacts},
     )
 
 
-def _felt(chosen: Selection, keys: Set[ContactKey]) -> Selection:
-    """Return a selection with the contents of some fingers alone, by key."""
-    if chosen.target_keys <= keys:
-        return chosen
-    targets = tuple([each for each in chosen.targets if each[0].key in keys])
+def _restricted(selection: Selection, keys: Set[ContactKey]) -> Selection:
+    """Return a selection with the contents of some fingers alone, by key; the others are quiet."""
+    if selection.target_keys <= keys:
+        return selection
+    targets = [(contact, target) for contact, target in selection.targets if contact.key in keys]
+    other_contacts = [contact for contact, _ in selection.targets if contact.key not in keys]
+    contents = [
+        content for content in selection.contents if not keys.isdisjoint(content.contact_keys)
+    ]
+    unserved = [finger for finger in selection.unserved if finger.contact.key in keys]
     return replace(
-        chosen,
-        targets=targets,
-        quiet=(*chosen.quiet, *[one for one, _ in chosen.targets if one.key not in keys]),
-        contents=tuple(
-            [
-                content
-                for content in chosen.contents
-                if not keys.isdisjoint([contact.key for contact, _ in content.targets])
-            ]
-        ),
-        not_served=tuple([each for each in chosen.not_served if each.contact.key in keys]),
+        selection,
+        targets=tuple(targets),
+        quiet=(*selection.quiet, *other_contacts),
+        contents=tuple(contents),
+        unserved=tuple(unserved),
     )
 
 
 def _within_layers(
     targets: Targets, capabilities: PlaybackCapabilities
-) -> tuple[Targets, tuple[Prediction, ...]]:
-    """Split targets into those that have a layer, and predictions for the others.
+) -> tuple[Targets, tuple[FingerSensation, ...]]:
+    """Split targets into targets with a layer, and sensations of fingers that feel nothing.
 
-    Short pulses of fingers that feel what lasts are left out first, then the targets of lowest
-    priority, the earliest first. Many that may share have one layer together.
+    Short pulses of fingers with a lasting content are left out first, then the targets of lowest
+    priority, the earliest first. Many targets that may share have one layer together.
     """
     mode = capabilities.drive_mode
-    count = capabilities.layers if mode == UNRESTRICTED else 1
-    if len(targets) <= count:
+    has_layers = mode == UNRESTRICTED
+    layer_count = capabilities.layers if has_layers else 1
+    if len(targets) <= layer_count:
         return targets, ()
     reason = f"the drive mode {mode} plays 1 content at once; lift a finger"
-    if mode == UNRESTRICTED:
-        reason = no_layer_free(count)
-    sharing = Counter([target.shared_as for _, target in targets])
-    layers: list[str | bool | None] = []
-    served, lasting = set[int](), {target.key for _, target in targets if not target.is_short}
-    ranks = [
-        (not (target.is_short and target.key in lasting), target.priority, number)
-        for number, (_, target) in enumerate(targets)
+    if has_layers:
+        reason = no_layer_free(layer_count)
+    group_sizes = Counter([target.shared_as for _, target in targets])
+    layer_groups = list[str | bool | None]()  # of each layer, what its targets share
+    served = set[int]()
+    for number in _by_rank(targets):
+        group = targets[number][1].shared_as
+        is_joint = has_layers and group is not None and group_sizes[group] > MAX_SEPARATE
+        if is_joint and group in layer_groups:
+            served.add(number)
+        elif len(layer_groups) < layer_count:
+            layer_groups.append(group)
+            served.add(number)
+    skipped = [
+        not_served(contact, reason)
+        for number, (contact, _) in enumerate(targets)
+        if number not in served
     ]
-    for _, _, at in sorted(ranks, reverse=True):
-        name = targets[at][1].shared_as
-        is_one = name is not None and sharing[name] > MAX_SEPARATE and mode == UNRESTRICTED
-        if is_one and name in layers:
-            served.add(at)
-        elif len(layers) < count:
-            layers.append(name)
-            served.add(at)
-    return (
-        tuple(each for at, each in enumerate(targets) if at in served),
-        tuple(
-            not_served(contact, reason)
-            for at, (contact, _) in enumerate(targets)
-            if at not in served
-        ),
-    )
+    return tuple([targets[number] for number in sorted(served)]), tuple(skipped)
+
+
+def _by_rank(targets: Targets) -> list[int]:
+    """Return the numbers of targets, in the order in which they get a layer."""
+    lasting_keys = {target.key for _, target in targets if not target.is_short}
+    ranks = list[tuple[bool, int, int]]()
+    for number, (_, target) in enumerate(targets):
+        is_extra = target.is_short and target.key in lasting_keys
+        ranks.append((not is_extra, target.priority, number))
+    return [number for _, _, number in sorted(ranks, reverse=True)]

@@ -1,14 +1,14 @@
-"""The slots of a plate: contents in, sets out; what each layer plays, and until when.
+"""Slots: which content each layer plays, until when, and the sets for it.
 
-The ledgers are asked before a set is made: what they do not admit is played along plain ramps, then
-without the newest content, and nothing is played where none is left. A vibration ends by itself if
-the host or a touch source falls silent, so it is renewed only while sources confirm its contacts.
-A layer with a course gets a set for each piece, half a piece ahead.
+The ledgers are queried before a set is made. Contents that they refuse are played along plain
+ramps, then without the newest content; if no content is left, nothing plays. A vibration ends by
+itself if the host or a touch source falls silent, so it is renewed only while sources confirm its
+contacts. A layer with a course gets a set for each piece, half a piece ahead.
 """
 
 import logging
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence, Set
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -35,10 +35,9 @@ from drivers.protocol.definition import QUANTITIES
 from drivers.protocol.sets import is_vibrating
 from model.answer import answer
 from model.answer.answer_report import Timing
-from model.answer.stimulus import FADE_RAMP, Course
+from model.answer.stimulus import FADE_RAMP
 from model.rig.rig import Rig
 from model.transients.base_motion import BaseEnvelope
-from model.vibration import Tone
 
 MIN_LEFT = 0.001
 """Shortest remaining time [s] of a pulse."""
@@ -47,44 +46,44 @@ MIN_LEFT = 0.001
 RELEASE_RAMP = 0.010
 
 STRENGTH_FADE = 0.100
-"""Time [s] of the raised cosine along which a content is led to another strength."""
+"""Time [s] of the raised cosine along which a content changes its strength."""
 
 CROSSFADE = 0.300
-"""Time [s] of the raised cosines along which one content takes the place of another.
+"""Time [s] of the raised cosines along which one content replaces another.
 
-Shorter ones are felt by fingers that are on nulls.
+Fingers on nulls feel shorter ones.
 """
 
 FALL_AFTER = 0.27 * CROSSFADE
-"""Delay [s] of the fall of the other content, so that its finger feels no dip between."""
+"""Delay [s] after which the replaced content falls, so that its finger feels no dip."""
 
 RETRY = 1.0
-"""Time [s] after which a set is planned again that was refused for an unknown time."""
+"""Time [s] after which a set that was refused for an unknown time is planned again."""
 
 # Shortest time [s] until a vibration ends by itself on the amplifier, so that a slow wire or a rate
 # limit of one set a second does not interrupt it. It is renewed at half its time.
 _MIN_VALID_FOR = 2.0
 _MARGIN = 0.2  # s; after the contact is lifted, for late frames
-_SURELY_SETTLED = 0.005  # s; by which a set starts later than its last reply, and clocks differ
-_MIN_RATE = 10.0  # sets/s; a lower limit leaves no turn to an ending: a touch would wait for it
+_SURELY_SETTLED = 0.005  # s; covers the delay from a set's last reply to its start, and clocks
+_MIN_RATE = 10.0  # sets/s; with a lower limit, touches would have to wait for endings
 _VALID_FOR, _LEVEL = QUANTITIES["valid_for"], QUANTITIES["level"]
 
 Check = Callable[[Mapping[str, Sequence[AmplifierLayer]]], CommandRefused | None]
-"""Returns why the ledgers would refuse layers, by amplifier, now; None if they would admit them."""
+"""Returns why the ledgers would refuse layers (by amplifier) now; None if they would admit them."""
 
 _logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
 class Sets:
-    """The sets of all amplifiers for one moment; without layers and silence nothing is sent."""
+    """The sets of all amplifiers for one moment; nothing is sent without layers and silence."""
 
     layers: Mapping[int, PlateLayer] = field(default_factory=dict)
     """Layers that change, by number."""
     started: frozenset[int] = frozenset()
-    """Of these, the layers that play another content."""
+    """Changing layers that start another content."""
     endings: Mapping[int, answer.Layer] = field(default_factory=dict)
-    """Of the others, those that get an ending, or the next piece of a course."""
+    """Changing layers that get an ending, or the next piece of a course."""
     silence: float | None = None
     """Ramp [s] along which all layers fall silent instead."""
     settled_after: float = 0.0
@@ -92,23 +91,23 @@ class Sets:
     skipped: Sequence[Content] = ()
     """Contents that a ledger does not admit."""
     reason: str = ""
-    """Why it does not."""
+    """Why the ledger does not admit them."""
     retry_at: float = math.inf
-    """When [s] it may."""
+    """When [s] the ledger may admit them."""
     preempted_until: float = math.inf
-    """When [s] a touch no longer preempts endings, pieces of courses among them."""
+    """When [s] a touch no longer preempts endings and pieces of courses."""
 
     @cached_property
     def by_amplifier(self) -> dict[str, list[AmplifierLayer]]:
         """The layers of each amplifier, by name."""
-        of_each: dict[str, list[AmplifierLayer]] = {}
-        for layers in self.layers.values():
-            for name, layer in layers.items():
-                of_each.setdefault(name, []).append(layer)
-        return of_each
+        by_amplifier: dict[str, list[AmplifierLayer]] = {}
+        for plate_layer in self.layers.values():
+            for name, layer in plate_layer.items():
+                by_amplifier.setdefault(name, []).append(layer)
+        return by_amplifier
 
     def __bool__(self) -> bool:
-        """Whether anything is to be sent."""
+        """Whether there is anything to send."""
         return bool(self.layers) or self.silence is not None
 
 
@@ -116,7 +115,7 @@ class Sets:
 class Slot:
     """A content in its layer; it starts, plays, gets its ending or pieces, is renewed, falls, ends.
 
-    What is due at one is due at `due`. `replace` makes a copy that does not change.
+    `due` is the time of the next of these events. `replace` makes a copy that does not change.
     """
 
     content: Content
@@ -127,32 +126,33 @@ class Slot:
     settled_at: float = math.inf
     """When [s] its onset has ended."""
     is_shaped: bool = False
-    """Whether it may have an ending; until it has one, it fades."""
+    """Whether it can have a shaped ending; until it has got that, it would end along a ramp."""
     ending_due: float = math.inf
-    """When [s] its ending is sent, once the onset has ended, or the next piece of its course, or
-    when it falls."""
+    """When [s] to send its ending (once the onset has ended), the next piece of its course, or its
+    fall."""
     confirmed_until: float = math.inf
-    """When [s] its first target would have been lifted, as known when it was sent."""
+    """When [s] its first target would have been lifted, as known when its set was sent."""
     renewal_due: float = math.inf
-    """When [s] it is renewed, if all targets have been confirmed since it was sent, and a margin is
-    left until its end."""
+    """When [s] to renew it, if all targets have been confirmed since its set was sent and a margin
+    is left until it ends."""
     ends_at: float = math.inf
-    """When [s] it has ended by itself unless it was renewed."""
+    """When [s] it ends by itself unless it is renewed."""
     is_falling: bool = False
-    """Whether another content takes its place along a cross-fade; it is not renewed."""
+    """Whether another content replaces it in a cross-fade, so that it is not renewed."""
     course_until: float = -math.inf
-    """When [s] what has been sent of its course ends."""
+    """When [s] the last piece of its course that was sent ends."""
 
     @property
     def due(self) -> float:
         """When [s] its ending, its renewal or its end is due."""
-        return min(self.ending_due, self.renewal_due, self.ends_at if self.drive else math.inf)
+        ends_at = self.ends_at if self.drive else math.inf
+        return min(self.ending_due, self.renewal_due, ends_at)
 
 
 class Slots:
     """The slots of all layers of a rig; times are arguments.
 
-    timing: shapes patterns; check: asks the ledgers; expiry_of: returns when [s] a contact is
+    timing: shapes patterns; check: queries the ledgers; expiry_of: returns when [s] a contact is
     lifted unless a frame arrives.
     """
 
@@ -165,315 +165,401 @@ class Slots:
         check: Check = lambda layers: None,
         expiry_of: Callable[[ContactKey], float],
     ) -> None:
-        self._rig, self._count, self.timing = rig, capabilities.layers, timing
-        self.check, self._expiry_of = check, expiry_of
-        self._support, self._ramp_max = capabilities.envelope_support, capabilities.ramp_max
-        self._may_follow = self._support.ending_knots > 0 and rig.limits.rate >= _MIN_RATE
-        # A limit of slew lengthens ramps.
-        knots = capabilities.course_knots if math.isinf(rig.limits.slew) else 0
-        self._course_knots = knots  # of a piece, 0 for ramps
-        if not knots:
-            why = "without envelopes" if math.isinf(rig.limits.slew) else "with a limit of slew"
-            _logger.debug("loop: files follow in ramps of %g s, %s", PLAIN_STEP, why)
-        self.contents: dict[int, Slot] = {}
-        """What plays, by layer."""
+        self.timing = timing
+        self.check = check
+        self._rig = rig
+        self._layer_count = capabilities.layers
+        self._ramp_max = capabilities.ramp_max
+        self._support = capabilities.envelope_support
+        self._expiry_of = expiry_of
+        has_endings = self._support.ending_knots > 0
+        self._may_follow = has_endings and rig.limits.rate >= _MIN_RATE
+        has_slew_limit = not math.isinf(rig.limits.slew)  # which lengthens ramps
+        self._course_knots = 0 if has_slew_limit else capabilities.course_knots  # 0 for ramps
+        if not self._course_knots:
+            cause = "with a limit of slew" if has_slew_limit else "without envelopes"
+            _logger.debug("loop: files follow in ramps of %g s, %s", PLAIN_STEP, cause)
+        self.by_layer: dict[int, Slot] = {}
+        """Slots by layer."""
         self.may_play: frozenset[int] = frozenset()
         """Layers that may play; empty once all are silent for certain."""
         self.is_silent = False
         """Whether all layers are silent, for certain."""
-        self._fades_until = -math.inf  # s; what was ended or replaced
-        self._over: tuple[Content, ...] = ()  # ended by themselves
-        # By finger and voice, also where what plays is unknown.
+        self._fades_until = -math.inf  # s; for contents that were ended or replaced
+        self._ended_contents: tuple[Content, ...] = ()  # by themselves
+        # By finger and voice, also while the playback is unknown.
         self._layer_of: Mapping[tuple[ContactKey, int], int] = {}
 
     @property
     def due(self) -> float:
         """When [s] the next content is renewed, gets its ending, or has ended by itself."""
-        return min([one.due for one in self.contents.values()], default=math.inf)
+        return min([slot.due for slot in self.by_layer.values()], default=math.inf)
 
     @property
     def ending_due(self) -> float:
         """When [s] the next content gets its ending, or the next piece of its course."""
-        return min([one.ending_due for one in self.contents.values()], default=math.inf)
+        return min([slot.ending_due for slot in self.by_layer.values()], default=math.inf)
 
     def plan(self, contents: Sequence[Content], now: float) -> Sets:
         """Return the sets by which layers play these contents and no others from a time [s] on.
 
-        Contents that play already stay as they are.
+        Contents that play already do not change. If the ledgers refuse the sets, the contents are
+        played along plain ramps; if they refuse these, too, without the newest content.
         """
-        left, skipped = [*contents], list[Content]()
-        reason, retry_at = "", math.inf
+        remaining = [*contents]
+        skipped = list[Content]()
+        reason = ""
+        retry_at = math.inf
         while True:
-            for is_shaped in (True, False):
-                sets, playing = self._sets(left, now, is_shaped=is_shaped)
-                driven = [number for number, one in self.contents.items() if one.drive]
-                if len(sets.layers) > len(sets.started) or not sets.started.isdisjoint(driven):
-                    self._fades_until = now + FADED_AFTER
-                refusal = self.check(sets.by_amplifier) if sets.started else None
-                if refusal is None:
-                    if sets.layers:
-                        self.contents, self.is_silent = playing, False
-                        self._layer_of = {
-                            one.content.key: number
-                            for number, one in playing.items()
-                            if not one.is_falling
-                        }
-                        self.may_play |= sets.started
-                    if skipped:
-                        sets = replace(sets, skipped=skipped, reason=reason, retry_at=retry_at)
-                    return sets
-                _logger.info("loop: a ledger refuses what plays shaped, then plain: %s", refusal)
-                reason, until = str(refusal), refusal.until
-            retry_at = self._faded_by(contents, now) if until is None else until
-            newest = max([playing[number] for number in sets.started], key=_requested_at).content
-            voices = [each for each in left if each.targets == newest.targets]
-            skipped, left = skipped + voices, [each for each in left if each not in voices]
+            sets, slots, refusal = self._admissible(remaining, now)
+            if refusal is None:
+                break
+            reason = str(refusal)
+            retry_at = self._faded_by(contents, now) if refusal.until is None else refusal.until
+            newest = max([slots[number] for number in sets.started], key=_requested_at)
+            voices = [content for content in remaining if content.targets == newest.content.targets]
+            skipped += voices
+            remaining = [content for content in remaining if content not in voices]
+        if sets.layers:
+            self._take(slots, sets.started)
+        if skipped:
+            sets = replace(sets, skipped=skipped, reason=reason, retry_at=retry_at)
+        return sets
+
+    def _admissible(
+        self, contents: Sequence[Content], now: float
+    ) -> tuple[Sets, dict[int, Slot], CommandRefused | None]:
+        """Return sets for contents with their slots, shaped or otherwise plain, and any refusal."""
+        for is_shaped in (True, False):
+            sets, slots = self._sets(contents, now, is_shaped=is_shaped)
+            self._note_ends(sets, now)
+            refusal = self.check(sets.by_amplifier) if sets.started else None
+            if refusal is None:
+                break
+            form = "shaped" if is_shaped else "plain"
+            _logger.info("loop: ledger refused %s contents: %s", form, refusal)
+        return sets, slots, refusal
+
+    def _note_ends(self, sets: Sets, now: float) -> None:
+        """Note until when contents fade that are ended or replaced by sets."""
+        has_endings = len(sets.layers) > len(sets.started)
+        driven = [number for number, slot in self.by_layer.items() if slot.drive]
+        if has_endings or not sets.started.isdisjoint(driven):
+            self._fades_until = now + FADED_AFTER
+
+    def _take(self, slots: dict[int, Slot], started: frozenset[int]) -> None:
+        """Take these slots as the playback from now on."""
+        self.by_layer = slots
+        self.is_silent = False
+        self._layer_of = {
+            slot.content.key: number for number, slot in slots.items() if not slot.is_falling
+        }
+        self.may_play |= started
 
     def may_lead(self, contents: Sequence[Content], now: float) -> bool:
-        """Whether contents may be led to from what plays at a time [s].
+        """Whether the present contents can be cross-faded to these at a time [s].
 
-        Each must take the place of one that plays. Each other frequency needs a free layer, and
-        the ledgers must admit both together.
+        Each content must replace one that plays. If its frequency differs it needs a free layer,
+        and the ledgers must admit both contents together.
         """
-        if {each.key for each in contents} - {one.content.key for one in self.contents.values()}:
+        playing_keys = {slot.content.key for slot in self.by_layer.values()}
+        if not {content.key for content in contents} <= playing_keys:
             return False
-        before = [(self._led_from(each), each.frequency) for each in contents]
-        tuned = [each for each, new in before if each and each.content.frequency != new]
-        if len(self.may_play) + len(tuned) > self._count:
+        tuned_count = 0
+        for content in contents:
+            slot = self._led_from(content)
+            if slot is not None and slot.content.frequency != content.frequency:
+                tuned_count += 1
+        if len(self.may_play) + tuned_count > self._layer_count:
             return False
-        return self.check(self._sets(contents, now, is_shaped=True)[0].by_amplifier) is None
+        sets, _ = self._sets(contents, now, is_shaped=True)
+        return self.check(sets.by_amplifier) is None
 
     def silence(self, ramp: float, now: float) -> Sets:
         """Return the sets that silence all layers along a ramp [s]; empty if they are silent."""
         if self.is_silent:
             return Sets()
-        self.contents = {}
-        self.is_silent, self._layer_of, self._fades_until = True, {}, now + FADED_AFTER
+        self.by_layer = {}
+        self.is_silent = True
+        self._layer_of = {}
+        self._fades_until = now + FADED_AFTER
         return Sets(silence=ramp)
 
     def endings(self, now: float) -> Sets:
-        """Return the sets that give endings to what plays, where that is due at a time [s].
+        """Return the sets with the endings, falls and pieces of courses due at a time [s].
 
-        They are sets of their own, so that no touch waits for endings. A content whose ending a
-        ledger refuses fades later; one that gives way to another falls. The next pieces of courses
-        are among them, while sources confirm the contacts.
+        Endings have sets of their own, so that no touch waits for them. If a ledger refuses the
+        ending of a content, the content will end along a plain ramp. The next piece of a course is
+        sent while sources confirm its contacts.
         """
-        layers, endings = dict[int, PlateLayer](), dict[int, answer.Layer]()
-        due = {number: one for number, one in self.contents.items() if one.ending_due <= now}
-        urgent = min(
-            [one.course_until for one in due.values() if one.content.course], default=math.inf
-        )
-        for number, one in due.items():
-            if (led := one.content.course) is None:
-                build = self._fall if one.is_falling else self._ending
-                layers[number], endings[number] = build(number, one, now)
-            elif now < self._confirmed_until(one.content):
-                layers[number], endings[number] = self._piece(
-                    number, one.content, *led, now, among=len(due), before=one
-                )
-        return self._admitted(Sets(layers, endings=endings, preempted_until=urgent - HELD / 2))
+        due_slots = {
+            number: slot for number, slot in self.by_layer.items() if slot.ending_due <= now
+        }
+        layers = dict[int, PlateLayer]()
+        endings = dict[int, answer.Layer]()
+        first_piece_end = math.inf
+        for number, slot in due_slots.items():
+            if slot.content.course is not None:
+                first_piece_end = min(first_piece_end, slot.course_until)
+                if now < self._confirmed_until(slot.content):
+                    layers[number], endings[number] = self._piece(
+                        number, slot.content, now, among=len(due_slots), slot=slot
+                    )
+            elif slot.is_falling:
+                layers[number], endings[number] = self._fall(number, slot)
+            else:
+                layers[number], endings[number] = self._ending(number, slot, now)
+        preempted_until = first_piece_end - HELD / 2
+        return self._admitted(Sets(layers, endings=endings, preempted_until=preempted_until))
 
     def renewal(self, now: float) -> Sets:
-        """Return the sets that prolong what plays, where that is due at a time [s].
+        """Return the sets that prolong contents, or their endings, if due at a time [s].
 
-        A content that a ledger refuses for good ends by itself.
+        A content whose renewal a ledger refuses for good ends by itself.
         """
-        if endings := self.endings(now):
+        endings = self.endings(now)
+        if endings:
             return endings
-        sets = dict[int, PlateLayer]()
-        for number, one in self.contents.items():
-            is_due = one.renewal_due <= now < one.ends_at - _MARGIN / 2
-            if is_due and self._confirmed_until(one.content) > one.confirmed_until:
-                lasts = self._lasts(one.content, now)
-                layer = AmplifierLayer(number, ramp=one.layer.ramp, valid_for=lasts, renew=True)
-                sets[number] = dict.fromkeys(self._rig.amplifiers, layer)
-        return self._admitted(Sets(sets))
+        layers = dict[int, PlateLayer]()
+        for number, slot in self.by_layer.items():
+            is_due = slot.renewal_due <= now < slot.ends_at - _MARGIN / 2
+            if is_due and self._confirmed_until(slot.content) > slot.confirmed_until:
+                layer = AmplifierLayer(
+                    number,
+                    ramp=slot.layer.ramp,
+                    valid_for=self._valid_for(slot.content, now),
+                    renew=True,
+                )
+                layers[number] = dict.fromkeys(self._rig.amplifiers, layer)
+        return self._admitted(Sets(layers))
 
     def _admitted(self, sets: Sets) -> Sets:
-        """Return sets by which nothing starts, or none if a ledger refuses them."""
-        if sets.layers and (refusal := self.check(sets.by_amplifier)) is not None:
-            self.not_renewed(sets, refusal)
-            return Sets()
-        return sets
+        """Return sets that start nothing, or empty sets if a ledger refuses them."""
+        refusal = self.check(sets.by_amplifier) if sets.layers else None
+        if refusal is None:
+            return sets
+        self.not_renewed(sets, refusal)
+        return Sets()
 
     def not_renewed(self, renewal: Sets, refusal: CommandRefused) -> None:
-        """Note that layers are not prolonged; after a refusal for good they end."""
-        due = math.inf if refusal.until is None else refusal.until
+        """Note that layers are not prolonged; after a final refusal they end."""
+        retry_at = math.inf if refusal.until is None else refusal.until
         for number in renewal.layers:
-            one = self.contents[number]
+            slot = self.by_layer[number]
             if number not in renewal.endings:
-                one.renewal_due = due
+                slot.renewal_due = retry_at
+            elif slot.content.course is None:
+                slot.ending_due = math.inf
             else:
-                one.ending_due = math.inf if one.content.course is None else due
+                slot.ending_due = retry_at
 
     def have_settled(self, now: float) -> bool:
-        """Whether all that may play has settled, so that endings lead from there."""
-        return bool(self.may_play) and all(self._may_end_shaped(n, now) for n in self.may_play)
+        """Whether all layers that may play have settled, so that their endings fit."""
+        if not self.may_play:
+            return False
+        return all(self._may_end_shaped(number, now) for number in self.may_play)
 
     def confirm(self, sets: Sets, played: PlayedSet, now: float) -> None:
-        """Note what the amplifiers play of sets that were committed by now [s].
+        """Note how the amplifiers play sets that were committed by now [s].
 
-        A content that a ledger has shortened is not renewed: that would circumvent its limit. The
-        second piece of a course is sent at once, each later one when half of that before has been
-        played.
+        A content that a ledger has shortened is not renewed, which would circumvent its limit. The
+        second piece of a course is sent immediately, each later piece when half of the previous one
+        has been played.
         """
-        going_on = sets.layers.keys() & self.contents.keys()
-        self.may_play = self.may_play.difference(sets.layers).union(going_on)
-        for number in going_on:
-            one, lasts = self.contents[number], _shortest(played, number)
-            since = max(now, one.course_until)  # a piece waits for the one before
-            if (led := one.content.course) is not None:
-                piece = sets.endings.get(number, one.layer)
-                starts = max(played.starts_at, one.course_until)
-                until = one.course_until = starts + _settled_after(piece)
-                due = now + MIN_LEFT if number in sets.started else (starts + until) / 2
-                is_over = until > led[1].end - MIN_LEFT
-                one.ending_due = math.inf if is_over else due if piece.onset else until
-                one.drive = full_drive(one.content.layer.excitation, self._rig)
+        continuing = sets.layers.keys() & self.by_layer.keys()
+        self.may_play = self.may_play.difference(sets.layers).union(continuing)
+        for number in continuing:
+            slot = self.by_layer[number]
+            valid_for = _shortest(played, number)
+            sent_from = max(now, slot.course_until)  # a piece waits for the previous one
+            if slot.content.course is not None:
+                piece = sets.endings.get(number, slot.layer)
+                is_first = number in sets.started
+                self._confirm_piece(slot, piece, played.starts_at, now, is_first=is_first)
             elif number in sets.started:
-                one.drive = tones_by_era(played.layers, self._rig, number)
-                one.settled_at = now + _settled_after(one.layer)
-                due = one.settled_at + _SURELY_SETTLED
-                has_ending = one.is_shaped and due < now + lasts and self._may_follow
-                one.ending_due = due if has_ending else math.inf
+                slot.drive = tones_by_era(played.layers, self._rig, number)
+                slot.settled_at = now + _settled_after(slot.layer)
+                slot.ending_due = self._first_ending_due(slot, now + valid_for)
             elif number in sets.endings:
-                one.layer = replace(one.layer, ending=sets.endings[number].ending)
-                one.ending_due = math.inf
-            one.confirmed_until = self._confirmed_until(one.content)
-            one.renewal_due = math.inf if lasts < _MIN_VALID_FOR else now + lasts / 2
-            one.ends_at = since + lasts
+                slot.layer = replace(slot.layer, ending=sets.endings[number].ending)
+                slot.ending_due = math.inf
+            is_renewable = valid_for >= _MIN_VALID_FOR
+            slot.renewal_due = now + valid_for / 2 if is_renewable else math.inf
+            slot.confirmed_until = self._confirmed_until(slot.content)
+            slot.ends_at = sent_from + valid_for
+
+    def _first_ending_due(self, slot: Slot, ends_at: float) -> float:
+        """Return when [s] a slot gets its ending once its onset has ended; infinite for never."""
+        due = slot.settled_at + _SURELY_SETTLED
+        has_ending = self._may_follow and slot.is_shaped and due < ends_at
+        return due if has_ending else math.inf
+
+    def _confirm_piece(
+        self, slot: Slot, piece: answer.Layer, starts_at: float, now: float, *, is_first: bool
+    ) -> None:
+        """Note that a piece of a course plays from a time [s] on, and when the next one is due."""
+        starts_at = max(starts_at, slot.course_until)
+        ends_at = starts_at + _settled_after(piece)
+        slot.course_until = ends_at
+        slot.drive = full_drive(slot.content.layer.excitation, self._rig)
+        pulse = slot.content.pulses[0]
+        if ends_at > pulse.end - MIN_LEFT:  # the last piece
+            slot.ending_due = math.inf
+        elif not piece.onset:  # a ramp, which the next one follows
+            slot.ending_due = ends_at
+        elif is_first:
+            slot.ending_due = now + MIN_LEFT
+        else:
+            slot.ending_due = (starts_at + ends_at) / 2
 
     def forget(self) -> None:
-        """Discard what plays, which is unknown; fingers keep their layers."""
-        self.contents = {}
-        self.is_silent, self._over = False, ()
+        """Discard the playback, which is unknown; fingers keep their layers."""
+        self.by_layer = {}
+        self.is_silent = False
+        self._ended_contents = ()
 
     def ended(self, now: float) -> tuple[Content, ...]:
         """Return the contents that have ended by themselves by a time [s], each once.
 
-        Those of which a piece is due, for which the host was late, go on.
+        A course with a piece due, for which the host was late, continues.
         """
-        over = list[Content]()
-        for number, one in [*self.contents.items()]:
-            if not one.drive or now < one.ends_at:
+        newly_ended = list[Content]()
+        for number, slot in [*self.by_layer.items()]:
+            has_ended = bool(slot.drive) and now >= slot.ends_at
+            if not has_ended or self._has_piece_due(slot, now):
                 continue
-            is_due = one.content.course is not None and one.ending_due <= now
-            if is_due and now < self._confirmed_until(one.content):
-                continue
-            if one.is_falling:
+            if slot.is_falling:
                 self.may_play -= {number}
-                del self.contents[number]
+                del self.by_layer[number]
             else:
-                one.drive, one.ending_due = {}, math.inf
-                over.append(one.content)
-        self._over = (*self._over, *over)
-        return tuple(over)
+                slot.drive = {}
+                slot.ending_due = math.inf
+                newly_ended.append(slot.content)
+        self._ended_contents = (*self._ended_contents, *newly_ended)
+        return tuple(newly_ended)
+
+    def _has_piece_due(self, slot: Slot, now: float) -> bool:
+        """Whether the next piece of a slot's course is due, and its contacts are confirmed."""
+        is_due = slot.content.course is not None and slot.ending_due <= now
+        return is_due and now < self._confirmed_until(slot.content)
 
     def over_of(self, contents: Sequence[Content]) -> tuple[Content, ...]:
-        """Return which of the wanted contents have ended by themselves."""
-        over = [(each.key, each.targets, each.placement) for each in self._over]
-        self._over = tuple(
-            [one for one in contents if (one.key, one.targets, one.placement) in over]
-        )
-        return self._over
+        """Return the requested contents that have ended by themselves; forget all others."""
+        ended_identities = [_identity(content) for content in self._ended_contents]
+        requested = [content for content in contents if _identity(content) in ended_identities]
+        self._ended_contents = tuple(requested)
+        return self._ended_contents
 
     def numbered(self, contents: Sequence[Content]) -> dict[int, Content]:
-        """Return contents by layer: the own one, or that of the finger, or one that ends.
+        """Return contents by layer: a content's present layer, its finger's, a free or ending one.
 
-        A content that another gives way to gets a free layer. So does a short pulse if it can,
-        since what ends in its layer would fade along its short ramp.
+        A content that replaces one of another frequency gets a free layer. So does a short pulse if
+        possible, since a content that ends in its layer would fade along its short ramp.
         """
         numbers = {
-            number: contents[contents.index(one.content)]  # what is predicted of it may differ
-            for number, one in self.contents.items()
-            if one.content in contents
+            number: contents[contents.index(slot.content)]  # equal, but its sensations may differ
+            for number, slot in self.by_layer.items()
+            if slot.content in contents
         }
-        kept, new = [*numbers.values()], list[Content]()
+        continuing = [*numbers.values()]
+        without_layer = list[Content]()
         for content in contents:
-            if content in kept:
+            if content in continuing:
                 continue
-            known = self._layer_of.get(content.key)
-            before = self._led_from(content)
-            if before is not None and before.content.frequency != content.frequency:
-                free = [n for n in range(self._count) if n not in self.may_play | numbers.keys()]
-                known = next(iter(free), known)
-            if known is None:
-                new.append(content)
+            number = self._layer_of.get(content.key)
+            if self._needs_second_layer(content):
+                free = self._layers_not_in(self.may_play | numbers.keys())
+                number = free[0] if free else number
+            if number is None:
+                without_layer.append(content)
             else:
-                numbers[known] = content
-        falls = {number for number, one in self.contents.items() if one.is_falling}
-        falling = sorted(falls & self.may_play - numbers.keys())
-        ending = sorted(self.may_play - numbers.keys() - falls)
-        free = [n for n in range(self._count) if n not in self.may_play and n not in numbers]
-        for content in new:
-            first, second = (free, ending) if content.key[1] == CLICK else (ending, free)
-            if some := first or second or falling:
-                numbers[some.pop(0)] = content
+                numbers[number] = content
+        falling_layers = {number for number, slot in self.by_layer.items() if slot.is_falling}
+        falling = sorted(falling_layers & self.may_play - numbers.keys())
+        ending = sorted(self.may_play - numbers.keys() - falling_layers)
+        free = self._layers_not_in(self.may_play | numbers.keys())
+        for content in without_layer:
+            is_click = content.key[1] == CLICK
+            candidates = (free or ending) if is_click else (ending or free)
+            candidates = candidates or falling
+            if candidates:
+                numbers[candidates.pop(0)] = content
         return numbers
+
+    def _needs_second_layer(self, content: Content) -> bool:
+        """Whether a content replaces one of another frequency, so that both sound for a while."""
+        slot = self._led_from(content)
+        return slot is not None and slot.content.frequency != content.frequency
+
+    def _layers_not_in(self, numbers: Set[int]) -> list[int]:
+        """Return all layers except these."""
+        return [number for number in range(self._layer_count) if number not in numbers]
 
     def _sets(
         self, contents: Sequence[Content], now: float, *, is_shaped: bool
     ) -> tuple[Sets, dict[int, Slot]]:
-        """Return the sets for these contents, and what all layers play then."""
+        """Return the sets for these contents, and the slots of all layers then."""
         numbers = self.numbered(contents)
-        starting = [  # side bands join a carrier that plays: all count their phases on one clock
-            number
-            for number, content in numbers.items()
-            if number not in self.contents or self.contents[number].content != content
-        ]
+        slots = dict[int, Slot]()
+        for number, slot in self.by_layer.items():
+            if number in numbers and slot.content == numbers[number]:
+                slots[number] = replace(slot, content=numbers[number])
+        # Side bands can start while their carrier plays: phases count on one clock.
+        starting = [number for number in numbers if number not in slots]
         layers = dict[int, PlateLayer]()
-        playing = {
-            number: replace(one, content=numbers[number])
-            for number, one in self.contents.items()
-            if number in numbers and number not in starting
-        }
-        settled, among = [0.0], len(starting)
+        settling_times = [0.0]
         for number in starting:
             content = numbers[number]
-            led = content.course
-            is_long = is_shaped and led is None and not content.targets[0][1].is_short
-            if led is not None:
-                layers[number], played = self._piece(number, content, *led, now, among=among)
+            has_course = content.course is not None
+            has_envelopes = is_shaped and not has_course and not content.target.is_short
+            if has_course:
+                layers[number], layer = self._piece(number, content, now, among=len(starting))
             else:
-                layers[number], played = self._pattern(
-                    number, content, now, among=among, is_shaped=is_long
+                layers[number], layer = self._pattern(
+                    number, content, now, among=len(starting), is_shaped=has_envelopes
                 )
-            playing[number] = Slot(content, played, is_shaped=is_long)
-            settled.append(_settled_after(played))
-        is_clicking = any(content.targets[0][1].is_short for content in contents)
-        ramp = min(BESIDE_CLICK if is_clicking else FADE_RAMP, self._ramp_max)
+            slots[number] = Slot(content, layer, is_shaped=has_envelopes)
+            settling_times.append(_settled_after(layer))
+        has_click = any(content.target.is_short for content in contents)
+        ramp = min(BESIDE_CLICK if has_click else FADE_RAMP, self._ramp_max)
         for number in self.may_play - numbers.keys():
-            if is_shaped and (falling := self._falling(number, contents, now)) is not None:
-                playing[number] = falling
+            falling = self._falling(number, contents, now) if is_shaped else None
+            if falling is not None:
+                slots[number] = falling
                 continue
             if is_shaped and self._may_end_shaped(number, now):
                 end = AmplifierLayer(number, ramp=ramp)
                 layers[number] = dict.fromkeys(self._rig.amplifiers, end)
             else:
                 layers[number] = route({}, self._rig, ramp=ramp, number=number)
-            settled.append(ramp)
-        return Sets(layers, frozenset(starting), settled_after=max(settled)), playing
+            settling_times.append(ramp)
+        sets = Sets(layers, frozenset(starting), settled_after=max(settling_times))
+        return sets, slots
 
     def _pattern(
         self, number: int, content: Content, now: float, *, among: int, is_shaped: bool
     ) -> tuple[PlateLayer, answer.Layer]:
         """Return the set of a pattern in a layer, and the pattern as it is played.
 
-        A tone that continues needs no onset, nor does one that is led along its ramp, though an ERA
-        joins it. among: layers that change at once, which share the time on the wires; is_shaped:
-        whether it may have an onset; its ending follows (`_ending`).
+        A tone that continues or cross-fades needs no onset, even if an ERA joins it. among: number
+        of layers that change simultaneously, which share the time on the wires; is_shaped: whether
+        it can have an onset; its ending follows (`_ending`).
         """
-        fade, layer = self._fade_of(number, content), content.layer
-        tones, playing, onset = layer.excitation, self._drive_of(number), None
+        layer = content.layer
+        tones = layer.excitation
+        fade = self._fade_of(number, content)
+        playing = self._drive_of(number)
         restarted = restarted_by(tones, playing)
+        onset = None
         if is_shaped:
             frequencies = [tone.frequency for tone in tones.values()]
             is_continued = fade > 0 or not restarted.issuperset(frequencies)
             shaped = self._support.shape(
                 self.timing, content.placement, layer, is_continued, adds_ending=False
             )
-            if onset := shaped.onset:
-                onset = thinned(onset, knots=max(1, self._support.onset_knots // among))
+            if shaped.onset:
+                knots = max(1, self._support.onset_knots // among)
+                onset = thinned(shaped.onset, knots=knots)
         layers = route(
             tones,
             self._rig,
@@ -481,16 +567,16 @@ class Slots:
             number=number,
             playing=playing,
             restarted=restarted,
-            valid_for=self._lasts(content, now),
+            valid_for=self._valid_for(content, now),
             onset=onset,
         )
         ramp = next(iter(layers.values())).ramp
         return layers, replace(layer, ramp=ramp, onset=onset, ending=None)
 
-    def _ending(self, number: int, one: Slot, now: float) -> tuple[PlateLayer, answer.Layer]:
-        """Return the set that gives an ending to a pattern, which plays on as it is, and both."""
-        content = one.content
-        layer = replace(content.layer, ramp=one.layer.ramp)
+    def _ending(self, number: int, slot: Slot, now: float) -> tuple[PlateLayer, answer.Layer]:
+        """Return the set that adds an ending to a pattern that continues, and that pattern."""
+        content = slot.content
+        layer = replace(content.layer, ramp=slot.layer.ramp)
         layer = self._support.shape(self.timing, content.placement, layer, is_continued=True)
         layers = route(
             layer.excitation,
@@ -499,21 +585,22 @@ class Slots:
             number=number,
             playing=self._drive_of(number),
             restarted=frozenset(),
-            valid_for=self._lasts(content, now),
+            valid_for=self._valid_for(content, now),
             ending=layer.ending,
         )
         return layers, layer
 
-    def _fall(self, number: int, one: Slot, now: float) -> tuple[PlateLayer, answer.Layer]:
-        """Return the set by which a layer falls to below any threshold, and ends; and its layer.
+    def _fall(self, number: int, slot: Slot) -> tuple[PlateLayer, answer.Layer]:
+        """Return the set that lets a layer fall below any threshold and end, and its layer.
 
-        It does not fall to silence, since no later set could end that sooner, as where a finger
-        lifts.
+        It does not fall to silence, since no later set could end that sooner, for instance when its
+        finger lifts.
         """
-        least, ramp = _LEVEL.from_wire(1), min(CROSSFADE, self._ramp_max)
+        lowest_level = _LEVEL.from_wire(1)
+        ramp = min(CROSSFADE, self._ramp_max)
         faint = {
-            name: replace(tone, amplitude=least * self._rig.full_levels[name])
-            for name, tone in one.layer.excitation.items()
+            name: replace(tone, amplitude=lowest_level * self._rig.full_levels[name])
+            for name, tone in slot.layer.excitation.items()
         }
         layers = route(
             faint,
@@ -524,90 +611,94 @@ class Slots:
             restarted=frozenset(),
             valid_for=ramp,
         )
-        return layers, one.layer
+        return layers, slot.layer
 
     def _piece(
         self,
         number: int,
         content: Content,
-        course: Course,
-        pulse: Pulse,
         now: float,
         *,
         among: int,
-        before: Slot | None = None,
+        slot: Slot | None = None,
     ) -> tuple[PlateLayer, answer.Layer]:
-        """Return the set of the next piece of a content's course in a layer, and what is played.
+        """Return the set of the next piece of a content's course in a layer, and the piece.
 
-        The piece starts where the pulse is at a time [s], or when the piece before ends if that has
-        not ended yet, and from wherever its tones are. among: pieces that are sent together;
-        before: the slot with the piece before, None for the first.
+        The piece starts at the pulse's position in the course at a time [s], or when the previous
+        piece ends if that still plays, and from the present tones. among: number of pieces that are
+        sent together; slot: has played the previous piece, None for the first piece.
         """
-        is_after, starts, playing = False, now, self._drive_of(number)
+        if content.course is None:
+            raise ValueError("content must have a course")
+        course, pulse = content.course
+        playing = self._drive_of(number)
         knots = self._course_knots
-        if before is None:
+        starts_at = now
+        follows_piece = False
+        if slot is None:
             knots = min(knots, self._support.onset_knots)
         else:
-            is_after, starts = now < before.course_until, max(now, before.course_until)
-            playing = {} if now >= before.ends_at else playing
-        since = 0.0 if pulse.started_at is None else starts - pulse.started_at
+            follows_piece = now < slot.course_until
+            starts_at = max(now, slot.course_until)
+            if now >= slot.ends_at:
+                playing = {}
         knots = max(knots // among, 1) if knots else 0
-        step, shares = piece_of(course, pulse, since, knots=knots, is_first=before is None)
-        onset: dict[str, BaseEnvelope] = {}
-        last, tones = dict[str, Tone](), content.layer.excitation
-        for name, tone in tones.items():
-            last[name] = replace(tone, amplitude=shares[-1] * tone.amplitude)
-            if len(shares) > 1:  # else a ramp
-                motions = tuple([share * tone.phasor for share in shares])
-                onset[name] = BaseEnvelope(tone.frequency, 0.0, motions, step)
+        elapsed = 0.0 if pulse.started_at is None else starts_at - pulse.started_at
+        step, shares = piece_of(course, pulse, elapsed, knots=knots, is_first=slot is None)
+        onset = _course_onset(content.layer, shares, step)
+        last_tones = {
+            name: replace(tone, amplitude=shares[-1] * tone.amplitude)
+            for name, tone in content.layer.excitation.items()
+        }
         layers = route(
-            last,
+            last_tones,
             self._rig,
             ramp=min(FADE_RAMP if onset else step, self._ramp_max),
             number=number,
             playing=playing,
             restarted=frozenset(),
             valid_for=step * len(shares) + HELD,
-            onset=onset or None,
+            onset=onset,
         )
-        ramp, is_after = next(iter(layers.values())).ramp, is_after and bool(onset)
-        after = {name: replace(each, after=is_after) for name, each in layers.items()}
-        return after, replace(content.layer, ramp=ramp, onset=onset or None, ending=None)
+        ramp = next(iter(layers.values())).ramp
+        waits = follows_piece and onset is not None
+        scheduled = {name: replace(layer, after=waits) for name, layer in layers.items()}
+        return scheduled, replace(content.layer, ramp=ramp, onset=onset, ending=None)
 
     def _fade_of(self, number: int, content: Content) -> float:
-        """Return the time [s] in which a content takes the place of another; 0 where it begins."""
-        before = self.contents[number].content if number in self.contents else None
-        same = [
-            (one.key, one.frequency, one.targets[0][1].pulse) for one in (before, content) if one
-        ]
-        if before is not None and before.gain_db != content.gain_db:
-            return STRENGTH_FADE if same[0] == same[1] else 0.0
-        is_led = self._led_from(content) is not None and same[0] == same[-1]
-        return CROSSFADE if is_led else 0.0
+        """Return the time [s] in which a content replaces another; 0 if it starts from silence."""
+        slot = self.by_layer.get(number)
+        is_same_voice = slot is None or _voice_of(slot.content) == _voice_of(content)
+        if slot is not None and slot.content.gain_db != content.gain_db:
+            return STRENGTH_FADE if is_same_voice else 0.0
+        is_led = self._led_from(content) is not None
+        return CROSSFADE if is_led and is_same_voice else 0.0
 
     def _led_from(self, content: Content) -> Slot | None:
-        """Return what a content that is led to takes the place of, if anything."""
-        one = self.contents.get(self._layer_of.get(content.key, -1))
-        if one is None or not content.is_led or one.content == content:
+        """Return the slot that a content replaces in a cross-fade, if any."""
+        number = self._layer_of.get(content.key)
+        slot = None if number is None else self.by_layer.get(number)
+        if slot is None or not content.is_led or slot.content == content:
             return None
-        return None if one.content.targets[0][1].is_short else one
+        return None if slot.content.target.is_short else slot
 
     def _falling(self, number: int, contents: Sequence[Content], now: float) -> Slot | None:
-        """Return a layer as it gives way to one of these contents; None if it ends at once."""
-        if (one := self.contents.get(number)) is None:
+        """Return a layer's slot while one of these contents replaces it; None if it just ends."""
+        slot = self.by_layer.get(number)
+        if slot is None:
             return None
         for content in contents:
-            if one.is_falling and content.is_led and content.key == one.content.key:
-                return one
-            if self._led_from(content) is one:
-                due = now + FALL_AFTER
-                return replace(one, is_falling=True, ending_due=due, renewal_due=math.inf)
+            if slot.is_falling and content.is_led and content.key == slot.content.key:
+                return slot
+            if self._led_from(content) is slot:
+                fall_due = now + FALL_AFTER
+                return replace(slot, is_falling=True, ending_due=fall_due, renewal_due=math.inf)
         return None
 
     def _faded_by(self, contents: Sequence[Content], now: float) -> float:
-        """Return when [s] pulses that play, or what was ended, have faded; after RETRY if none."""
-        pulses = [to.pulse for one in contents for _, to in one.targets if to.pulse is not None]
-        ends = [each.end for each in pulses if each.started_at is not None and each.end > now]
+        """Return when [s] active pulses and ended contents have faded; without any, after RETRY."""
+        pulses = [pulse for content in contents for pulse in content.pulses]
+        ends = [pulse.end for pulse in pulses if pulse.started_at is not None and pulse.end > now]
         if now < self._fades_until:
             ends.append(now)
         return max(ends, default=now + RETRY) + FADED_AFTER
@@ -616,40 +707,67 @@ class Slots:
         """Return when [s] the first target of a content is lifted unless a frame arrives."""
         return min([self._expiry_of(contact.key) for contact, _ in content.targets])
 
-    def _lasts(self, content: Content, now: float) -> float:
-        """Return for how long [s] a content may last by itself from a time [s] on.
+    def _valid_for(self, content: Content, now: float) -> float:
+        """Return how long [s] a content can last from a time [s] on without a renewal.
 
-        The amplifiers end the content with the last pulse.
+        The amplifiers end the content with its last pulse.
         """
-        until = self._confirmed_until(content)
-        unlimited = min(max(until - now + _MARGIN, _MIN_VALID_FOR), MAX_CONTACT_TIMEOUT)
-        return min(unlimited, max([_left(target.pulse, now) for _, target in content.targets]))
+        unconfirmed_in = self._confirmed_until(content) - now + _MARGIN
+        without_pulse = min(max(unconfirmed_in, _MIN_VALID_FOR), MAX_CONTACT_TIMEOUT)
+        pulse_times = [_remaining(target.pulse, now) for _, target in content.targets]
+        return min(without_pulse, max(pulse_times))
 
     def _may_end_shaped(self, number: int, now: float) -> bool:
-        """Whether a layer has settled, so that its endings lead from what plays."""
-        one = self.contents.get(number)
-        return one is not None and bool(one.layer.ending) and now >= one.settled_at
+        """Whether a layer has settled, so that its endings start from its present tones."""
+        slot = self.by_layer.get(number)
+        if slot is None or not slot.layer.ending:
+            return False
+        return now >= slot.settled_at
 
     def _drive_of(self, number: int) -> Drive:
-        """Return what plays in a layer, at frequencies not rounded by wire and amplifier."""
-        if (one := self.contents.get(number)) is None:
+        """Return the tones in a layer, at frequencies not rounded by wire and amplifier."""
+        slot = self.by_layer.get(number)
+        if slot is None:
             return {}
-        tones = one.layer.excitation
+        tones = slot.layer.excitation
         return {
             name: replace(tone, frequency=tones[name].frequency)
-            for name, tone in one.drive.items()
+            for name, tone in slot.drive.items()
             if name in tones
         }
 
 
-def _requested_at(one: Slot) -> float:
+def _identity(content: Content) -> tuple[object, ...]:
+    """Return values that identify a content independently of its strength."""
+    return content.key, content.targets, content.placement
+
+
+def _voice_of(content: Content) -> tuple[object, ...]:
+    """Return values that are equal for contents that can fade from one to the other."""
+    return content.key, content.frequency, content.target.pulse
+
+
+def _course_onset(
+    layer: answer.Layer, shares: Sequence[float], step: float
+) -> dict[str, BaseEnvelope] | None:
+    """Return the onset of a piece by ERA, whose shares are a step [s] apart; None for a ramp."""
+    if len(shares) < 2:
+        return None
+    onset = dict[str, BaseEnvelope]()
+    for name, tone in layer.excitation.items():
+        motions = tuple([share * tone.phasor for share in shares])
+        onset[name] = BaseEnvelope(tone.frequency, 0.0, motions, step)
+    return onset or None
+
+
+def _requested_at(slot: Slot) -> float:
     """When [s] a content was requested, by its pulse or its contact."""
-    contact, target = one.content.targets[0]
-    return contact.since if target.pulse is None else target.pulse.requested_at
+    pulse = slot.content.target.pulse
+    return slot.content.contact.since if pulse is None else pulse.requested_at
 
 
-def _left(pulse: Pulse | None, now: float) -> float:
-    """Return how long [s] a target is driven from a time [s]; infinite without a pulse."""
+def _remaining(pulse: Pulse | None, now: float) -> float:
+    """Return how long [s] a target is driven after a time [s]; infinite without a pulse."""
     if pulse is None:
         return math.inf
     return pulse.duration if pulse.started_at is None else max(pulse.end - now, MIN_LEFT)
@@ -657,19 +775,21 @@ def _left(pulse: Pulse | None, now: float) -> float:
 
 def _settled_after(layer: answer.Layer) -> float:
     """Return how long [s] after the commit the ramp or onset of a layer has ended."""
-    last = next(iter(layer.onset.values())).duration if layer.onset else 0.0
-    return max(layer.ramp, last)
+    if not layer.onset:
+        return layer.ramp
+    envelope = next(iter(layer.onset.values()))
+    return max(layer.ramp, envelope.duration)
 
 
 def _shortest(played: PlayedSet, number: int) -> float:
     """Return the time [s] after the commit when the first amplifier ends a layer by itself.
 
-    Infinite where none does.
+    Infinite if none does.
     """
     times = [
-        _VALID_FOR.from_wire(one.valid_for)
+        _VALID_FOR.from_wire(layer.valid_for)
         for layers in played.layers.values()
-        for one in layers
-        if one.layer == number and one.valid_for and is_vibrating(one)
+        for layer in layers
+        if layer.layer == number and layer.valid_for and is_vibrating(layer)
     ]
     return min(times, default=math.inf)

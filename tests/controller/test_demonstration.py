@@ -27,14 +27,15 @@ from controller.demo.recorder import (
     simulated_plate,
     steady_contrast_db,
 )
-from controller.play.intent import Prediction, not_served
+from controller.play.intent import FingerSensation, not_served
 from controller.play.loop import Observers, PlayReport
 from controller.sources.touch import Change, Contact, ContactKey
 from drivers.errors import LinkError
 from kit.clock import in_virtual_time
 from kit.plates import small_table
+from model.answer.answer import OWN, Sensation
 from model.answer.plan import query
-from model.answer.stimulus import Placement
+from model.answer.stimulus import Finger, Placement
 from model.finger import detection_threshold
 from model.rig.rig_file import example_rig_path
 from model.table import table_file
@@ -44,6 +45,7 @@ from sim.faults import FaultWindow
 
 FIGURES = ("contrast_db", "level_db_sl")
 PROMISED = ("promised_contrast_db",)
+FELT = Sensation(Finger((0.1, 0.1)), OWN, layer=0, promised_level_db_sl=20.0)
 KEYS = (
     *("time_s", "until_s", "targets_m", "quiet_m", "reason", "drive", "mode", "latency_ms"),
     *("played_s", "steady"),
@@ -298,7 +300,7 @@ async def test_pattern_is_measured_while_no_finger_moves_or_lands(
         for quiet, lands in (((), False), ((contact(2),), False), ((contact(2),), True)):
             applied = SimpleNamespace(
                 time=threads.now(),
-                targets=(Prediction(finger, 20.0),),
+                targets=(FingerSensation(finger, FELT),),
                 layer=SimpleNamespace(ramp=0.04),
                 quiet=quiet,
                 contents={1: played},

@@ -248,8 +248,8 @@ def _felt(
         key = one[0].key
         question = Question(contacts, (), (one,), protected or frozenset(), kept=tuple(beside))
         (chosen,) = simulator.chooser.choose(question, simulator.capabilities)
-        (predicted,) = chosen.beside(beside, simulator.table).predictions
-        found[key] = predicted.promised_contrast_db or 0.0, predicted.verdict
+        (felt,) = chosen.beside(beside, simulator.table).finger_sensations
+        found[key] = felt.sensation.promised_contrast_db or 0.0, felt.sensation.verdict
         worst = min(worst, found[key][0])
     return worst, [found[contact.key] for contact, _ in fingers]
 

@@ -447,9 +447,9 @@ async def test_gain_of_a_source_is_felt_at_its_finger_alone_along_a_fade() -> No
         tones = {each.effect: each.frequency_hz for each in (await era.status()).contacts}
         planner = bench.daemon._controller.cycle.planner
         (sent,) = [
-            n for n, one in planner.slots.contents.items() if "right" in one.content.key[0].source
+            n for n, one in planner.slots.by_layer.items() if "right" in one.content.key[0].source
         ]
-        settled_at = planner.slots.contents[sent].settled_at
+        settled_at = planner.slots.by_layer[sent].settled_at
         for gain, first, last in ((-6.0, 1.0, LOWER), (0.0, LOWER, 1.0)):
             set_at = threads.now()
             await era.strength(name="left", gain_db=gain)
@@ -472,7 +472,7 @@ async def test_gain_of_a_source_is_felt_at_its_finger_alone_along_a_fade() -> No
                     assert 20 * np.log10(found[-1] / found[0]) == pytest.approx(gain or 6, abs=0.05)
                 else:
                     assert 20 * np.log10(found / found[0]) == pytest.approx(0.0, abs=0.1)
-            assert planner.slots.contents[sent].settled_at == settled_at  # not sent again
+            assert planner.slots.by_layer[sent].settled_at == settled_at  # not sent again
             assert len(moving) == 5
             for course in moving:
                 changes = np.diff(course / course[-1] * last) * math.copysign(1, last - first)

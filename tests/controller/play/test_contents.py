@@ -99,7 +99,7 @@ def test_a_shared_content_that_changes_beside_a_click_of_its_finger_keeps_its_la
     lasting = Content((shared[0][0].key, 0), shared, Placement((LEFT,)), pattern)
     clicking = Content((CONTACTS[0].key, 0), ((CONTACTS[0], click),), Placement((LEFT,)), pattern)
     playing = Slots(smooth_rig(), playable(4), Timing(table()), expiry_of=lambda key: 0.0)
-    playing.contents = {
+    playing.by_layer = {
         number: Slot(one, pattern, drive={}) for number, one in ((1, clicking), (0, lasting))
     }
     playing.may_play = frozenset({0})
@@ -162,12 +162,12 @@ def test_a_higher_priority_keeps_its_level_within_a_limit(
     free = chosen(FREE, first, second)
     capabilities = limited(free, what)
     found = chosen(capabilities, first, second)
-    kept, lowered = found.predictions
+    kept, lowered = found.finger_sensations
     assert kept.level_db_sl == pytest.approx(14.0, abs=0.2)
     assert lowered.level_db_sl < 13.0
     assert is_used(found, capabilities)
-    before = free.predictions[1].promised_contrast_db
-    change = lowered.promised_contrast_db - before
+    before = free.finger_sensations[1].sensation.promised_contrast_db
+    change = lowered.sensation.promised_contrast_db - before
     assert change == pytest.approx(lowered.level_db_sl - 14.0, abs=1.0)
 
 
@@ -177,9 +177,9 @@ def test_who_is_lowered_too_far_is_held_back_by_the_rule() -> None:
     content, _ = chosen(FREE, first, second).contents
     most = max(content.layer.excitation[each.name].amplitude / each.stroke for each in table().eras)
     found = chosen(within(most=1.02 * most), first, second)
-    kept, held_back = found.predictions
+    kept, held_back = found.finger_sensations
     assert kept.level_db_sl == pytest.approx(14.0, abs=0.3)
-    assert held_back.verdict == "held back"
+    assert held_back.sensation.verdict == "held back"
     assert held_back.held_back
 
 
@@ -189,10 +189,8 @@ def test_contents_that_a_limit_leaves_unfelt_are_held_back() -> None:
     most = 0.01 * sums(chosen(FREE, *wanted)).max()
     found = chosen(within(most=most), *wanted)
     assert found.contents == ()
-    assert all(
-        "the limits of the amplifiers" in (each.held_back or "") for each in found.not_served
-    )
-    assert len(found.not_served) == 2
+    assert all("the limits of the amplifiers" in (each.held_back or "") for each in found.unserved)
+    assert len(found.unserved) == 2
     quiet = chosen(FREE, *(replace(each, level_db_sl=-10.0) for each in wanted))
     assert len(quiet.contents) == 2
 
@@ -203,7 +201,7 @@ def test_of_equal_priority_the_louder_content_is_lowered(what: str) -> None:
     targets = Target(CONTACTS[0].key, 14.0), Target(CONTACTS[1].key, 8.0)
     capabilities = limited(chosen(FREE, *targets), what)
     found = chosen(capabilities, *targets)
-    louder, softer = (each.level_db_sl for each in found.predictions)
+    louder, softer = (each.level_db_sl for each in found.finger_sensations)
     assert softer == pytest.approx(8.0, abs=0.2)
     assert 8.0 < louder < 13.5
     assert is_used(found, capabilities)
@@ -222,7 +220,7 @@ def test_a_click_is_within_the_power_that_what_lasts_leaves() -> None:
         assert (
             np.linalg.norm(sums(found)) <= share * lasting * (1 + 1e-6) < np.linalg.norm(sums(free))
         )
-    (held_back,) = found.not_served
+    (held_back,) = found.unserved
     assert "lift a finger" in str(held_back.held_back)
 
 
@@ -235,12 +233,12 @@ def test_what_a_click_leaves_nothing_for_says_so_and_is_felt_after_it() -> None:
     selector = Selector(Chooser(table()))
     selector.select(CONTACTS, HapticIntent((click,)), hardly, now=0.0)
     both = HapticIntent((lasting, click))
-    (held_back,) = selector.select(CONTACTS, both, hardly, now=0.01).not_served
+    (held_back,) = selector.select(CONTACTS, both, hardly, now=0.01).unserved
     assert held_back.contact == CONTACTS[0]
     assert "contents of other fingers" in str(held_back.held_back)
     after = HapticIntent((lasting,))
     found = selector.select(CONTACTS, after, hardly, now=selector.due)
-    assert (found.not_served, len(found.contents)) == ((), 1)
+    assert (found.unserved, len(found.contents)) == ((), 1)
 
 
 @pytest.mark.parametrize("what", ["level", "power"])
@@ -254,9 +252,10 @@ def test_a_lone_steady_content_is_within_a_limit(what: str) -> None:
         capabilities = within(most=most)
     found = Selector(Chooser(table())).select(CONTACTS, intent, capabilities)
     assert sums(found) == pytest.approx(0.8 * sums(free), rel=1e-6)
-    (before,), (after,) = free.predictions, found.predictions
+    (before,), (after,) = free.finger_sensations, found.finger_sensations
     assert after.level_db_sl == pytest.approx(before.level_db_sl + 20 * np.log10(0.8))
-    assert after.promised_contrast_db == pytest.approx(before.promised_contrast_db)
+    contrast = before.sensation.promised_contrast_db
+    assert after.sensation.promised_contrast_db == pytest.approx(contrast)
 
 
 FULL = 0.2  # the level that the table's pattern has
@@ -471,8 +470,8 @@ def test_a_content_whose_own_contrast_is_not_why_it_is_held_back_says_so() -> No
     places = (0.06, 0.06), (0.2, 0.1)
     contacts = [Contact(ContactKey("a", n), *at, since=0.0) for n, at in enumerate(places)]
     targets = [(each, Target(each.key, 20.0, band=(99.0, 101.0))) for each in contacts]
-    (held_back,) = chosen_for(targets, playable(4)).not_served
-    assert (held_back.promised_contrast_db or 0.0) > 12
+    (held_back,) = chosen_for(targets, playable(4)).unserved
+    assert (held_back.sensation.promised_contrast_db or 0.0) > 12
     assert "another finger" in (held_back.held_back or "")
 
 

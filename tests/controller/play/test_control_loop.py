@@ -26,7 +26,15 @@ from controller.effects.kinds import Click
 from controller.effects.layout import SurfaceLayout, default_effects
 from controller.effects.player import EffectPlayer
 from controller.operation.plate_controller import Controller
-from controller.play.intent import HapticIntent, Prediction, Pulse, Selection, Target, sums_db
+from controller.play.intent import (
+    HapticIntent,
+    Pulse,
+    Selection,
+    Target,
+    beside_others,
+    judged,
+    sums_db,
+)
 from controller.play.loop import PlayReport
 from controller.play.routing import RAMPS_ONLY, PlaybackCapabilities
 from controller.play.selection import Chooser, Selector
@@ -42,7 +50,7 @@ from kit.courses import Acted, Planted, courses, follow
 from kit.fingers import LAYOUT, LEFT, RIGHT, fingers_on, playable, table
 from kit.plates import small_problem, small_table
 from kit.set_table import SetTiming, set_answer
-from model.answer.answer import Answer, Layer, Limits
+from model.answer.answer import Answer, Layer, Limits, Sensation
 from model.answer.answer_report import Timing
 from model.answer.stimulus import Finger, Placement, Stimulus
 from model.config.fields import Circle
@@ -283,13 +291,14 @@ async def test_a_click_restates_what_its_neighbour_feels_and_only_meanwhile() ->
             for report in fingers.applied[before - 1 :]
         ]
         assert again == old
-        figures = old.level_db_sl, old.promised_contrast_db, old.foreign_level_db_sl
+        then, now = old.sensation, new.sensation
+        figures = old.level_db_sl, then.promised_contrast_db, then.foreign_level_db_sl
         level, contrast, foreign = (10 ** ((each or 0.0) / 10) for each in figures)
-        total = 10 ** ((new.foreign_level_db_sl or 0.0) / 10)
+        total = 10 ** ((now.foreign_level_db_sl or 0.0) / 10)
         assert total > 2 * foreign
         expected = level / (level / contrast + total - foreign)
-        assert new.promised_contrast_db == pytest.approx(10 * math.log10(expected), abs=1e-6)
-        assert new.verdict == ("own" if new.promised_contrast_db >= 12 else "mixed")
+        assert now.promised_contrast_db == pytest.approx(10 * math.log10(expected), abs=1e-6)
+        assert now.verdict == ("own" if now.promised_contrast_db >= 12 else "mixed")
         assert (new.level_db_sl, new.frequency) == (old.level_db_sl, old.frequency)
 
 
@@ -305,11 +314,16 @@ def test_powers_of_contents_add(
     contrast: float | None, foreign: float | None, expected: float, total: float, verdict: str
 ) -> None:
     """6 dB SL beside 20: on 6 dB SL that its contrast of 14 dB is to, on 5 dB SL, on nothing."""
-    contact = Contact(ContactKey("a", 1), 0.1, 0.1, 0.0)
-    was = "mixed" if contrast == 11 else "own"
-    felt = Prediction(
-        contact, 20.0, None, was, promised_contrast_db=contrast, foreign_level_db_sl=foreign
-    ).beside([6.0], sums_db([[6.0], [-math.inf if foreign is None else foreign]]))
+    alone = Sensation(
+        Finger((0.1, 0.1), Stimulus(20.0)),
+        "mixed" if contrast == 11 else "own",
+        layer=0,
+        promised_level_db_sl=20.0,
+        promised_contrast_db=contrast,
+        foreign_level_db_sl=foreign,
+    )
+    foreign_levels = sums_db([[6.0], [-math.inf if foreign is None else foreign]])
+    felt = judged(beside_others(alone, [6.0], foreign_levels), is_apart=True)
     assert felt.promised_contrast_db == pytest.approx(expected, abs=1e-3)
     assert felt.foreign_level_db_sl == pytest.approx(total, abs=1e-3)
     assert felt.verdict == verdict
@@ -327,7 +341,7 @@ async def test_a_click_without_a_free_layer_is_refused_and_the_buzz_plays_on() -
         found.append(selector.select(contacts, intent, playable(2), now=1.0))
         await asyncio.sleep(0.1)
     assert found[2].contents == found[1].contents
-    old, new = (each.predictions[0] for each in found[1:])
+    old, new = (each.finger_sensations[0] for each in found[1:])
     assert replace(new, held_back=None) == old
     assert "no layer is free" in (new.held_back or "")
 
@@ -489,7 +503,7 @@ def test_selector_keeps_other_contacts_quiet(recorder: Any) -> None:
     target, *quiet = recorder.asked[1]
     assert (target.at, [each.at for each in quiet]) == ((0.25, 0.1), [(0.1, 0.1), (0.2, 0.1)])
     assert target.stimulus == Stimulus(17.0, (45.0, 300.0))
-    (predicted,) = selection.predictions
+    (predicted,) = selection.finger_sensations
     assert (predicted.contact.key.id, predicted.level_db_sl) == (3, 17.0)
 
 
@@ -536,7 +550,7 @@ def test_selector_saturates_at_full_stroke_on_a_plate() -> None:
     )
     selection = Selector(Chooser(table)).select((at(1, 0.1),), wanting(c1=60.0), capabilities)
     (content,) = selection.contents
-    assert 12 < selection.predictions[0].level_db_sl < 60
+    assert 12 < selection.finger_sensations[0].level_db_sl < 60
     loudest = max(tone.amplitude for tone in content.layer.excitation.values())
     assert loudest == pytest.approx(1e-4)
 
@@ -670,7 +684,7 @@ def test_a_pulse_is_held_back_where_others_use_the_whole_stroke(recorder: Any) -
     full = replace(CAPABILITIES, limits=Limits((45.0, 300.0), {"SW": 1e-6}), layers=2)
     selection = Selector(Chooser(recorder)).select((at(1, 0.1), at(2, 0.2)), intent, full)
     assert [each.targets[0][0].key.id for each in selection.contents] == [1]
-    (held,) = selection.not_served
+    (held,) = selection.unserved
     assert held.held_back == "the contents of other fingers use the whole stroke; lift a finger"
 
 
@@ -691,7 +705,9 @@ def test_a_click_leaves_what_another_drives_until_that_has_ended(
     selection = selector.select(contacts, both, limits, now=since)
     amplitudes = [each.layer.excitation["SW"].amplitude for each in selection.contents]
     assert amplitudes == pytest.approx([1e-6, left])
-    assert selection.predictions[1].level_db_sl == pytest.approx(12 + 20 * math.log10(left / 1e-6))
+    assert selection.finger_sensations[1].level_db_sl == pytest.approx(
+        12 + 20 * math.log10(left / 1e-6)
+    )
 
 
 @pytest.mark.parametrize(

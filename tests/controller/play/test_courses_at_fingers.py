@@ -64,7 +64,7 @@ async def test_of_a_buzz_and_a_file_the_later_is_felt_then_what_is_left_of_the_o
 
         def felt() -> tuple[str | None, float]:
             (target,) = fingers.applied[-1].targets
-            return target.content, 20 * np.log10(max(fingers.far_end.levels))
+            return target.content_name, 20 * np.log10(max(fingers.far_end.levels))
 
         fingers.play("it")
         await fingers.hold(0.41)
@@ -133,7 +133,7 @@ async def test_three_fingers_feel_three_files_apart() -> None:
                 loudest = (others**2).sum(axis=0).max(initial=0)
                 foreign[id - 1] = max(foreign[id - 1], loudest)
         targets = sorted(fingers.applied[-1].targets, key=lambda each: each.contact.key.id)
-        promised = np.array([each.promised_contrast_db for each in targets])
+        promised = np.array([each.sensation.promised_contrast_db for each in targets])
         assert len({each.frequency for each in targets}) == len(targets) == 3
         assert (10 * np.log10(own / foreign) > promised).all()
         assert not fingers.refused

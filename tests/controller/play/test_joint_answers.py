@@ -25,7 +25,7 @@ from controller.play.joint_answers import (
     Crossfades,
     answered,
     selection_of,
-    with_ways,
+    with_paths,
 )
 from controller.play.loop import PlayReport
 from controller.play.slots import CROSSFADE
@@ -236,7 +236,7 @@ def test_a_moving_finger_is_answered_around_the_next_8_mm() -> None:
     Its three places are 8 mm apart, the middle one in the middle of that way.
     """
     contacts = [contact(1, MOVER, vx=0.2), contact(2, OTHER)]
-    middle, other, first, last = with_ways(fingers(contacts), contacts, NOW, paper_table().plate)
+    middle, other, first, last = with_paths(fingers(contacts), contacts, NOW, paper_table().plate)
     assert [each.at[0] - MOVER[0] for each in (first, middle, last)] == pytest.approx(
         [0.004, 0.012, 0.020]
     )
@@ -269,10 +269,10 @@ def test_ends_of_ways_are_fingers_where_they_can_be(
     """
     contacts = [contact(1, at, vx=vx), replace(contact(2, OTHER), motion=Motion())]
     given = [Finger(at, stimulus), fingers(contacts)[1]]
-    found = with_ways(given, contacts, NOW, paper_table().plate)
+    found = with_paths(given, contacts, NOW, paper_table().plate)
     assert len(found) == count
     assert len(answer(paper_table(), found, drive_mode="phased").fingers) == count
-    assert with_ways(given, contacts, NOW + 0.06, paper_table().plate) == given
+    assert with_paths(given, contacts, NOW + 0.06, paper_table().plate) == given
 
 
 def test_what_is_felt_on_a_way_is_the_mean_power_there_and_a_share_for_side_bands() -> None:
@@ -287,7 +287,7 @@ def test_what_is_felt_on_a_way_is_the_mean_power_there_and_a_share_for_side_band
         [(each, Target(each.key, 14.0, content=str(each.key.id))) for each in contacts]
     )
     found = answered(table, question, question.lasting, playable(), now=NOW)
-    middle, other, first, last = with_ways(fingers(contacts), contacts, NOW, table.plate)
+    middle, other, first, last = with_paths(fingers(contacts), contacts, NOW, table.plate)
     at = (middle, first, last, other)
     placed = Placement(
         tuple([each.at for each in at[:3]]), (other.at,), tuple([each.load for each in at])
@@ -327,7 +327,7 @@ def test_a_promise_for_a_way_holds_at_places_between() -> None:
         [(each, Target(each.key, 14.0, content=str(each.key.id))) for each in contacts]
     )
     found = answered(paper_table(), question, question.lasting, playable(), now=NOW)
-    moving, _ = selection_of(paper_table(), question, found, question.lasting).predictions
+    moving, _ = selection_of(paper_table(), question, found, question.lasting).finger_sensations
     least = []
     for way in [*(0.008 + 0.001 * step for step in range(9)), -0.022]:
         at = (MOVER[0] + way, MOVER[1])
@@ -343,7 +343,7 @@ def test_a_promise_for_a_way_holds_at_places_between() -> None:
             for number, layer in enumerate(found.layers)
         )
         least.append(20 * math.log10(own / foreign))
-    assert min(least[:-1]) >= (moving.promised_contrast_db or 0.0)
+    assert min(least[:-1]) >= (moving.sensation.promised_contrast_db or 0.0)
     assert least[-1] < min(least[:-1])
 
 
@@ -352,7 +352,7 @@ FIRST, SECOND = (0.2133, 0.0366), (0.1206, 0.1132)
 
 def worst(applied: PlayReport) -> float:
     """Promise of the worst finger."""
-    return min(each.promised_contrast_db or 0.0 for each in applied.targets)
+    return min(each.sensation.promised_contrast_db or 0.0 for each in applied.targets)
 
 
 def frequencies(applied: PlayReport) -> dict[int, float]:
@@ -392,7 +392,9 @@ async def test_fingers_that_land_apart_come_to_the_promise_of_those_that_land_to
     """
     targets = tuple((each, Target(each.key, 14.0)) for each in contacts_at(FIRST, SECOND))
     together = chosen_for(targets, playable())
-    promised = min(each.promised_contrast_db or 0.0 for each in together.predictions)
+    promised = min(
+        each.sensation.promised_contrast_db or 0.0 for each in together.finger_sensations
+    )
     async with fingers_on(paper_table(), WHOLE) as fingers:
         count = await apart(fingers, then=0.6)
         fades = [each for each in fingers.committed[count:] if each[2][0].ramp == 300]
@@ -443,10 +445,10 @@ def test_every_step_keeps_30_hz_between_all_that_sounds() -> None:
         felt = {each.key: each for each in landed.contents if each.key[0] in keys}
         if {key for key, _ in felt} != keys:
             continue
-        beside = {each.contact.key: each.frequency or 0.0 for each in landed.predictions}
+        beside = {each.contact.key: each.frequency or 0.0 for each in landed.finger_sensations}
         beside = {key: beside[key] for key in keys}
         for step in Crossfades(paper_table(), asked(resting, felt), playable()).steps():
-            after = {each.contact.key: each.frequency or 0.0 for each in step.predictions}
+            after = {each.contact.key: each.frequency or 0.0 for each in step.finger_sensations}
             changed = [key for key in keys if after[key] != beside[key]]
             assert len(changed) <= 1
             for key in changed:
@@ -475,13 +477,14 @@ def test_what_does_not_fit_beside_what_plays_is_not_led_to() -> None:
     moving = {
         key: [
             replace(one, promised_contrast_db=one.promised_contrast_db - 2.0)
-            for one in each.predictions
+            for one in each.sensations
             if one.promised_contrast_db is not None
         ]
         for key, each in felt.items()
     }
-    felt = {key: replace(each, predictions=tuple(moving[key])) for key, each in felt.items()}
+    felt = {key: replace(each, sensations=tuple(moving[key])) for key, each in felt.items()}
     (rested,) = Crossfades(paper_table(), asked(targets, felt), limited).steps()
     assert rested.contents == landed.contents
-    for one, other in zip(rested.predictions, landed.predictions, strict=True):
-        assert one.promised_contrast_db == pytest.approx(other.promised_contrast_db, abs=0.1)
+    for one, other in zip(rested.finger_sensations, landed.finger_sensations, strict=True):
+        contrast = other.sensation.promised_contrast_db
+        assert one.sensation.promised_contrast_db == pytest.approx(contrast, abs=0.1)

@@ -174,7 +174,8 @@ async def beyond_the_promise() -> dict[int, float]:
     async with two_fingers() as fingers:
         await fingers.hold(10.0)
         promised = {
-            each.contact.key.id: each.promised_contrast_db for each in fingers.applied[-1].targets
+            each.contact.key.id: each.sensation.promised_contrast_db
+            for each in fingers.applied[-1].targets
         }
         return {id: felt - promised[id] for id, felt in fingers.contrasts().items()}
 

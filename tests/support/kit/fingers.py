@@ -29,7 +29,7 @@ from controller.effects.layout import SurfaceLayout
 from controller.effects.player import EffectPlayer
 from controller.operation.operation_states import DaemonEvent, DaemonState, Lease, Trigger
 from controller.operation.supervisor import Supervisor
-from controller.play.intent import CLICK, Content, Question, Selection, Target
+from controller.play.intent import CLICK, Content, FingerSensation, Question, Selection, Target
 from controller.play.joint_answers import answered, selection_of
 from controller.play.loop import PlayReport
 from controller.play.routing import RAMPS_ONLY, PlaybackCapabilities
@@ -77,7 +77,7 @@ def asked(
     before: Mapping[tuple[ContactKey, int], Content] = MappingProxyType({}),
 ) -> Question:
     """A question for fingers that feel what lasts, among no others."""
-    return Question(tuple([contact for contact, _ in targets]), tuple(targets), (), before=before)
+    return Question(tuple([contact for contact, _ in targets]), tuple(targets), (), playing=before)
 
 
 def chosen_for(
@@ -466,9 +466,12 @@ class Hands(Acted, Fingers):
     @property
     def keeps_frequencies(self) -> bool:
         """Whether fingers keep, in new reports, the frequencies that they had at the mark."""
-        had = felt(self.before, "frequency")
-        found = [felt(each, "frequency") for each in self.new]
-        return all(had[id] == each[id] for each in found for id in had.keys() & each.keys())
+        had = felt(self.before)
+        for report in self.new:
+            for id, target in felt(report).items():
+                if id in had and target.frequency != had[id].frequency:
+                    return False
+        return True
 
     @property
     def gained_db(self) -> float:
@@ -478,14 +481,14 @@ class Hands(Acted, Fingers):
     @property
     def gained_nominal_db(self) -> float:
         """How much more the first finger feels now than at the mark, as modelled [dB]."""
-        return float(
-            felt(self.applied[-1], "nominal_db_sl")[1] - felt(self.before, "nominal_db_sl")[1]
-        )
+        now, before = felt(self.applied[-1])[1], felt(self.before)[1]
+        return now.sensation.level_db_sl - before.sensation.level_db_sl
 
     @property
     def gained_since_db(self) -> float:
         """How much more the first finger is to feel by the last new report than by the first."""
-        return float(felt(self.new[-1], "level_db_sl")[1] - felt(self.new[0], "level_db_sl")[1])
+        last, first = felt(self.new[-1])[1], felt(self.new[0])[1]
+        return (last.level_db_sl or 0.0) - (first.level_db_sl or 0.0)
 
     @property
     def most_of_a_stroke(self) -> float:
@@ -498,23 +501,23 @@ class Hands(Acted, Fingers):
     @property
     def held_back(self) -> dict[int, str | None]:
         """Why fingers feel nothing of their own, as is reported."""
-        return felt(self.applied[-1], "held_back")
+        return {id: target.held_back for id, target in felt(self.applied[-1]).items()}
 
     @property
     def told(self) -> list[list[tuple[int, str]]]:
         """Verdicts of each new report, by finger."""
-        return [sorted(felt(each, "verdict").items()) for each in self.new]
+        return [sorted(verdicts(report).items()) for report in self.new]
 
     @property
     def verdicts(self) -> list[str]:
         """All verdicts."""
-        return sorted({*felt(self.applied[-1], "verdict").values()})
+        return sorted({*verdicts(self.applied[-1]).values()})
 
     @property
     def beyond_nominal_db(self) -> dict[int, float]:
         """By how much contrasts at fingertips are beyond those of contents, as modelled [dB]."""
         contents = [one.content for one in self.applied[-1].contents.values()]
-        said = {each.key[0].id: each.predictions[0].contrast_db or 0.0 for each in contents}
+        said = {each.key[0].id: each.sensations[0].contrast_db or 0.0 for each in contents}
         return {id: contrast - said[id] for id, contrast in self.contrasts().items()}
 
     @property
@@ -557,9 +560,15 @@ def places_of(fingers: Mapping[int, str | Position]) -> dict[int, Position]:
     return {id: named[at] if isinstance(at, str) else (at[0], at[1]) for id, at in fingers.items()}
 
 
-def felt(report: PlayReport | None, what: str) -> dict[int, Any]:
-    """What is predicted of each finger that is to feel something."""
-    return {each.contact.key.id: getattr(each, what) for each in (report.targets if report else ())}
+def felt(report: PlayReport | None) -> dict[int, FingerSensation]:
+    """The predicted sensation of each target, by the number of its finger."""
+    targets = report.targets if report else ()
+    return {target.contact.key.id: target for target in targets}
+
+
+def verdicts(report: PlayReport) -> dict[int, str]:
+    """The verdict on each target, by the number of its finger."""
+    return {id: target.sensation.verdict for id, target in felt(report).items()}
 
 
 def _lasting(report: PlayReport | None) -> dict[int, Content]:
@@ -568,7 +577,7 @@ def _lasting(report: PlayReport | None) -> dict[int, Content]:
 
 
 def _worst(report: PlayReport | None) -> float:
-    return min(each or 0.0 for each in felt(report, "promised_contrast_db").values())
+    return min(each.sensation.promised_contrast_db or 0.0 for each in felt(report).values())
 
 
 WIRES = {

@@ -454,10 +454,12 @@ async def test_what_comes_and_goes_is_promised_as_the_daemon_promises_it(effect:
     selector.select(contacts, intent, playable())
     if selector.pending is not None:
         await arrived.wait()
-    predicted = selector.select(contacts, intent, playable()).predictions
+    predicted = selector.select(contacts, intent, playable()).finger_sensations
     west, north = sorted(predicted, key=lambda each: each.contact.key.id)
-    assert found.contrasts[0] == pytest.approx(west.promised_contrast_db, abs=0.3)
-    assert north.promised_contrast_db <= found.contrasts[1] + 0.3  # less while a click plays
+    assert found.contrasts[0] == pytest.approx(west.sensation.promised_contrast_db, abs=0.3)
+    assert (
+        north.sensation.promised_contrast_db <= found.contrasts[1] + 0.3
+    )  # less while a click plays
 
 
 def test_matrix_has_two_below_and_three_above_the_diagonal() -> None:

@@ -123,6 +123,11 @@ class FarEndKind:
     bits: int = 0
 
     @property
+    def scheme(self) -> str:
+        """The scheme of its URLs."""
+        return self.url.partition("://")[0]
+
+    @property
     def is_ported(self) -> bool:
         """Whether it is a TCP port."""
         return "{host}" in self.url
@@ -165,7 +170,7 @@ FAR_ENDS: Mapping[str, FarEndKind] = {
     ),
 }
 """By the names of `era sim --wire`."""
-_KIND_OF_SCHEME = {kind.url.partition("://")[0]: name for name, kind in FAR_ENDS.items()}
+_KIND_OF_SCHEME = {kind.scheme: name for name, kind in FAR_ENDS.items()}
 _EXAMPLE = "; as in --wire main=serial"
 
 

@@ -175,6 +175,11 @@ DECODERS: Mapping[str, Callable[[bytes], Iterator[Message]]] = {
 """What decodes the bytes of each wire; of python-can the messages are noted as candump does."""
 
 
+def test_every_wire_has_a_decoder_of_its_bytes() -> None:
+    """A new wire needs one here, made from its page and not from its code."""
+    assert DECODERS.keys() == {*WIRES, PYTHON_CAN}
+
+
 def tones_in(stream: tuple[int, ...]) -> Tones:
     """Decode the stream of a set: layers of commands, with onsets and endings behind each."""
     tones: dict[tuple[int, int], Tone] = {}

@@ -52,7 +52,7 @@ from sim.far_ends.can_amplifiers import (
 )
 from sim.far_ends.modbus_amplifiers import ModbusAmplifiers
 from sim.far_ends.serial_amplifiers import SerialAmplifiers
-from sim.far_ends.wire_assignment import SimulatedWire, open_wires
+from sim.far_ends.wire_assignment import FAR_ENDS, SimulatedWire, open_wires
 from sim.faults import Faults
 from sim.plant.imperfections import Imperfections
 from sim.transport.far_end import TcpEnd, TerminalEnd
@@ -149,22 +149,14 @@ def make_bench(
 
 
 WIRES: Mapping[str, SimulatedWire] = {
-    "serial": SimulatedWire("serial", unpluggable=True),
-    "modbus+tcp": SimulatedWire("modbus-tcp", unpluggable=True),
-    "modbus+rtu": SimulatedWire("modbus-rtu", unpluggable=True),
-    "can+socketcand": SimulatedWire("socketcand", unpluggable=True),
-    "can+slcan": SimulatedWire("slcan", unpluggable=True),
+    far_end.scheme: SimulatedWire(kind, unpluggable=True) for kind, far_end in FAR_ENDS.items()
 }
-"""Each is far end and host by one scheme; see `sim.far_ends.wire_assignment`."""
+"""A wire with a far end of each kind, by the scheme of its URLs."""
 
 SHARED_WIRES: Mapping[str, SimulatedWire] = {
-    "serial": SimulatedWire("serial", shared=True),
-    "modbus+tcp": SimulatedWire("modbus-tcp", shared=True),
-    "modbus+rtu": SimulatedWire("modbus-rtu", shared=True),
-    "can+socketcand": SimulatedWire("socketcand", shared=True),
-    "can+slcan": SimulatedWire("slcan", shared=True),
+    far_end.scheme: SimulatedWire(kind, shared=True) for kind, far_end in FAR_ENDS.items()
 }
-"""Those on which several amplifiers hear one broadcast."""
+"""The same with several amplifiers on one line, where they hear one broadcast."""
 
 
 def on_amplifiers(rig: Rig, names: Sequence[str]) -> Rig:

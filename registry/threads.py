@@ -43,7 +43,13 @@ async def in_thread(
     opened.
     """
     done: Future[_T] = Future()
-    threading.Thread(target=_run, args=(work, done, undo), name=name, daemon=True).start()
+    thread = threading.Thread(target=_run, args=(work, done, undo), name=name, daemon=True)
+    _at_work.add(done)
+    try:
+        thread.start()
+    except RuntimeError:  # the system has no more threads
+        _at_work.discard(done)
+        raise
     try:
         return await asyncio.wrap_future(done)
     except asyncio.CancelledError:
@@ -56,21 +62,34 @@ async def in_thread(
 def _run(
     work: Callable[[], _T], done: "Future[_T]", undo: Callable[[_T], object] | None = None
 ) -> None:
-    """Note the result of work, or its error; undo: called with that of work that was cancelled."""
+    """Do work and note its result or error; it counts as at work until that is noted."""
     _at_work.add(done)
+    try:
+        _note_result(work, done, undo)
+    finally:
+        _at_work.discard(done)
+
+
+def _note_result(
+    work: Callable[[], _T], done: "Future[_T]", undo: Callable[[_T], object] | None
+) -> None:
+    """Note the result of work, or its error; undo: called with that of work that was cancelled."""
     try:
         result = work()
     except Exception as error:
         with suppress(InvalidStateError):  # cancelled
             done.set_exception(error)
         return
-    finally:
-        _at_work.discard(done)
     try:
         done.set_result(result)
     except InvalidStateError:
         if undo is not None:
             undo(result)
+
+
+def are_at_work() -> bool:
+    """Whether a thread is at work for `in_thread`, or its result is not noted yet."""
+    return bool(_at_work)
 
 
 def leave_work() -> None:

@@ -34,11 +34,12 @@ from drivers.protocol.sets import Envelope
 from kit import wires as real_wires
 from kit import witness as plate_witness
 from kit.chain import Chain
-from kit.clock import Stuck, VirtualLoop, run_virtual
+from kit.clock import VirtualLoop, run_virtual
 from kit.set_table import SetTable, make_rig
 from kit.wires import after_each
 from registry import threads
 from registry.limits import GuardLimits
+from registry.virtual_time import Stuck
 from sim.far_ends.wire_assignment import SimulatedWire
 from sim.faults import FaultKind, FaultWindow, Toward
 

@@ -33,7 +33,7 @@ from controller.sources.touch import Touch, TouchFrame
 from drivers.errors import DriverError
 from era_haptics.lab.witness.capture import TimeLimits
 from kit.chain import Chain
-from kit.clock import START, Stuck, VirtualLoop, run_virtual
+from kit.clock import VirtualLoop, run_virtual
 from kit.plates import make_paper_rig, small_table
 from kit.wires import after_each, on_amplifiers
 from kit.witness import PlateTimes
@@ -45,6 +45,7 @@ from model.rig.rig_file import load_rig
 from model.table.table import LocalizationTable
 from model.table.table_file import TableProblem, solve_table
 from registry import threads
+from registry.virtual_time import START, Stuck
 from sim.far_ends.wire_assignment import SimulatedWire
 from sim.faults import FaultKind, FaultWindow
 from sim.plant.imperfections import Imperfections, draw_imperfections

@@ -10,9 +10,7 @@ protocol 4, simulated, of the firmware or of an example, can be judged by confor
 import asyncio
 import functools
 import inspect
-import math
 import random
-import selectors
 import threading
 from collections import Counter
 from collections.abc import Callable, Coroutine, Mapping, Sequence
@@ -39,6 +37,7 @@ from era_haptics.lab.conformance.contract import CHECKS, LEVEL, CheckResult, of_
 from era_haptics.lab.conformance.contract import CLIENTS as BY_PROTOCOL
 from registry import threads
 from registry.limits import GuardLimits
+from registry.virtual_time import VirtualTimeLoop
 from sim.amplifier.simulated_amplifier import SimulatedAmplifier
 from sim.far_ends.can_amplifiers import CanAmplifiers
 from sim.far_ends.modbus_amplifiers import ModbusAmplifiers
@@ -48,10 +47,7 @@ from sim.transport.far_end import TERMINAL_MAKER, PseudoTerminal
 P = ParamSpec("P")
 T = TypeVar("T")
 
-START = 1000.0  # s; not zero, which code could take for "never"
 _FIRST_PORT = 20_000
-_TURNS_MAX = 20_000  # at one moment; more are an endless loop
-_REAL_WAIT = 0.001  # s; for a thread that works
 _AWAITED = ("reload", "dump", "content")  # names of threads for which time stands still
 _LATENCY = (50e-6, 400e-6)  # s; of a loopback connection
 
@@ -59,81 +55,24 @@ Seen = Callable[[str, str, bytes], None]
 """Called with a link, the direction (amplifier or host) and the bytes, as they are sent."""
 
 
-class Stuck(Exception):
-    """Deadlock: no timer and no ready task, or no progress of time."""
-
-
-class _Selector(selectors.DefaultSelector):
-    """Waiting for a timer costs no time, waiting for the machine does: the clock jumps.
-
-    It stands still while a daemon's threads work with files.
-    """
-
-    def __init__(self, loop: "VirtualLoop") -> None:
-        super().__init__()
-        self._loop = loop
-        self._turns = 0
-
-    def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
-        self._turns += 1
-        if self._turns > _TURNS_MAX:
-            self._turns = 0
-            raise Stuck(f"{_TURNS_MAX} turns at one moment: a task reschedules itself endlessly")
-        is_alone = (
-            len(self.get_map()) == 1 == threading.active_count()
-        )  # nothing but the loop's own
-        ready = [] if is_alone else super().select(0)
-        if ready or timeout == 0:
-            return ready
-        self._turns = 0
-        if timeout is None:
-            if is_alone:
-                raise Stuck("deadlock: no timer and no ready task")
-            return super().select(timeout)
-        if not is_alone and any(each.name in _AWAITED for each in threading.enumerate()):
-            return super().select(_REAL_WAIT)
-        self._loop.now = max(self._loop.now, self._loop._scheduled[0].when())
-        return ready
-
-
-class VirtualLoop(asyncio.SelectorEventLoop):
+class VirtualLoop(VirtualTimeLoop):
     """The loop; rng: of the latencies of connections; seen: observer of their bytes.
 
     latency [s]: shortest and longest of a connection.
     """
 
     def __init__(self, rng: random.Random | None = None, seen: Seen | None = None) -> None:
-        self.now = START
         self.latency = _LATENCY
-        super().__init__(_Selector(self))
+        super().__init__()
         self.rng = rng or random.Random(0)
         self.seen: Seen = seen or (lambda link, toward, data: None)
         self._servers: dict[int, _Server] = {}
         self._hosts: list[MemoryTransport] = []
 
-    def time(self) -> float:
-        """Virtual seconds."""
-        return self.now
-
     @property
-    def _clock_resolution(self) -> float:
-        """The smallest step: no timer fires early."""
-        return math.ulp(self.now)
-
-    @_clock_resolution.setter
-    def _clock_resolution(self, of_the_machine: float) -> None:
-        """Ignore the resolution of the machine's clock."""
-
-    def run_in_executor(  # type: ignore[override]
-        self, executor: Any, func: Callable[..., T], *args: Any
-    ) -> "asyncio.Future[T]":
-        """Run at once: there are no threads."""
-        future: asyncio.Future[T] = self.create_future()
-        try:
-            future.set_result(func(*args))
-        except Exception as error:
-            future.set_exception(error)
-        return future
+    def waits_for_threads(self) -> bool:
+        """Whether a daemon's threads work with files; other threads may hang, as in some tests."""
+        return any(thread.name in _AWAITED for thread in threading.enumerate())
 
     async def create_server(self, factory: Any, host: Any = None, port: Any = 0, **_: Any) -> Any:
         """Listen on a port; OSError where it is taken."""

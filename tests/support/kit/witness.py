@@ -42,9 +42,10 @@ from era_haptics.lab.witness.host_rules import (
 )
 from era_haptics.lab.witness.relay import parse_endpoint
 from era_haptics.lab.witness.witness import RECOVERY, Witness
-from kit.clock import START, VirtualLoop
+from kit.clock import VirtualLoop
 from kit.wires import FarSide, after_each
 from registry import threads
+from registry.virtual_time import START
 from sim.amplifier.simulated_amplifier import SimulatedAmplifier
 from sim.faults import FaultWindow
 

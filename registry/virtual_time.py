@@ -92,6 +92,6 @@ class _JumpingSelector(selectors.DefaultSelector):
             return super().select(timeout)
         if is_held:
             return super().select(_THREAD_WAIT)
-        next_timer = self._loop._scheduled[0].when()
+        next_timer = self._loop._scheduled[0].when()  # type: ignore[attr-defined]
         self._loop.now = max(self._loop.now, next_timer)
         return ready

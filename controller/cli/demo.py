@@ -10,15 +10,20 @@ from model.commands.options import (
     ExactOption,
     JsonOption,
     SeedOption,
+    Stopwatch,
     next_line,
     print_report,
+    progress_bar,
     seed_of_plate,
 )
 from model.errors import InputError
 from model.quantities import counted
 
 if TYPE_CHECKING:
+    from controller.demo.demonstration import DemoRun, Scene
     from controller.demo.recorder import TouchRow
+    from model.rig.rig import Rig
+    from model.table.table import LocalizationTable
 
 
 def demo(
@@ -30,13 +35,23 @@ def demo(
     ] = None,
     *,
     wire: Annotated[
-        str,
+        str | None,
         typer.Option(
-            help="Wire: serial (a pseudo-terminal), modbus (TCP), can (socketcand), firmware (the "
-            "amplifier in C on serial, after `make firmware`, whose plate does not move) or sim "
-            "(none)."
+            help="Wire to the amplifiers: sim (none, they are in this process), or in real time "
+            "serial (a pseudo-terminal), modbus (TCP), can (socketcand) or firmware (the amplifier "
+            "in C on serial, after `make firmware`, whose plate does not move). Default: sim; in "
+            "real time serial.",
+            show_default=False,
         ),
-    ] = "serial",
+    ] = None,
+    real_time: Annotated[
+        bool,
+        typer.Option(
+            "--real-time",
+            help="Play in real time, with the amplifiers in a process of their own, and measure "
+            "latency.",
+        ),
+    ] = False,
     touches: Annotated[
         Path | None,
         typer.Option(metavar="FILE", help="TUIO capture."),
@@ -58,94 +73,155 @@ def demo(
     """Play recorded touches on a simulated plate; measure contrast.
 
     First one person, of whose fingers one feels it; then two, or on eight ERAs and more three, who
-    each feel a vibration of their own. The plate deviates from the table's within the rig's
-    uncertainty, the same for the same --seed; recorded places are shares of its size.
+    each feel a vibration of their own. The plate differs from the table's within the rig's
+    uncertainty, the same for the same --seed; recorded places are shares of its size. Time is
+    virtual, so figures do not depend on the machine. With --real-time, another wire than sim, or
+    --dashboard it is real: a machine that is too slow makes the run void, with exit status 1.
     """
-    import asyncio
-    import time
-
-    from controller.demo.demonstration import (
-        WIRES,
-        Scene,
-        check_page,
-        example_scenes,
-        run_demo,
-        run_live,
-        write_pictures,
-    )
-    from controller.sources.tuio import read_capture
+    from controller.demo.demonstration import SIM, WIRES, check_page, write_pictures
     from model.rig.rig_file import example_rig_path, load_rig
-    from model.table.table_file import cached_table
 
-    if wire not in WIRES:
+    if wire is not None and wire not in WIRES:
         raise InputError(f"--wire must be one of {', '.join(WIRES)}, got {wire}")
     if dashboard is not None and (touches is not None or as_json):
         raise InputError("--dashboard takes its touches from the page; omit --touches and --json")
+    is_real_time = real_time or dashboard is not None or wire not in (None, SIM)
+    wire = wire or ("serial" if is_real_time else SIM)
     drawn = seed_of_plate(exact=exact, seed=seed)
-    recorded = None if touches is None else Scene(read_capture(touches))
+    recording = None if touches is None else _read_touches(touches)
     own_rig, rig_file = rig_file, (rig_file or example_rig_path()).absolute()
     rig = load_rig(rig_file)
-    started = time.perf_counter()
-    table, _ = cached_table(rig)
+    table = _table_of(rig, rig_file, is_quiet=as_json or dashboard is not None)
     if dashboard is not None:
         from controller.gateway.gateway_settings import require_gateway
 
         require_gateway()
         check_page(dashboard)
-        print("Open the URL below, press Arm, and touch the plate; Ctrl-C ends it.", flush=True)
-        asyncio.run(run_live(rig_file, table, wire=wire, dashboard=dashboard, seed=drawn))
+        _serve_page(rig_file, table, wire, dashboard, drawn)
         return
-    if not as_json:
-        print(
-            f"{rig_file.name}: table of {counted(len(rig.eras), 'ERA')} "
-            f"{'on a mesh of' if rig.plate.surface is None else 'by'} {table.mesh}, "
-            f"ready in {time.perf_counter() - started:.1f} s"
-        )
-        print(_HEADING, end="")
-    rows = asyncio.run(
-        run_demo(
-            rig_file,
-            table,
-            wire=wire,
-            scenes=example_scenes(rig) if recorded is None else [recorded],
-            on_row=lambda row: None if as_json else print(_line(row), flush=True),
-            seed=drawn,
-        )
+    run = _play(
+        rig_file,
+        table,
+        wire,
+        recording,
+        seed=drawn,
+        is_real_time=is_real_time,
+        is_quiet=as_json,
     )
-    files = write_pictures(table, rows, out)
+    pictures = None if run.why_void is not None else write_pictures(table, run.rows, out)
+    answer = {
+        "wire": wire,
+        "clock": "real" if is_real_time else "virtual",
+        "void": run.why_void,
+        "touches": [row.as_json() for row in run.rows],
+        "files": [] if pictures is None else [str(file) for file in pictures.files],
+    }
+    if pictures is None:
+        print_report(_void_report(run), answer, as_json=as_json)
+        raise typer.Exit(1)
     further: tuple[str | Path, ...] = ("config", "init", "my_rig.yaml")
     if own_rig is not None:
         further = ("table", "build", own_rig, "-o", "table.npz")
-    answer = {
-        "wire": wire,
-        "touches": [row.as_json() for row in rows],
-        "files": [str(file) for file in files],
-    }
     lines = [
-        _summary(rows),
-        _NO_BUS if wire == "sim" and len(rig.amplifiers) > 1 else None,
-        *(f"wrote {file}" for file in files),
+        _summary(run.rows),
+        *pictures.omitted,
+        *(f"wrote {file}" for file in pictures.files),
         next_line("era", *further),
     ]
     print_report(lines, answer, as_json=as_json)
 
 
-_NO_BUS = (
-    "the amplifiers of wire sim have no bus and start one after the other, which costs contrast; "
-    "on --wire serial or can they start together"
-)
+def _read_touches(file: Path) -> "Scene":
+    from controller.demo.demonstration import Scene
+    from controller.sources.tuio import read_capture
 
-_HEADING = (
-    f"{'':51}{'felt contrast':^13}  {'level':^13} {'latency':>7}\n"
-    f"{'':51}{'/ dB':^13}  {'/ dB SL':^13} {'/ ms':>7}\n"
-    f" time  target / cm  others  {'ERAs':22} "
-    f"{'prom.':>6} {'meas.':>6}  {'prom.':>6} {'meas.':>6}\n"
-)
+    return Scene(read_capture(file))
+
+
+def _table_of(rig: "Rig", rig_file: Path, *, is_quiet: bool) -> "LocalizationTable":
+    """Return the table of a rig from the cache, or build it; print how long it took."""
+    from model.table.table_file import cached_table
+
+    with (
+        Stopwatch() as timed,
+        progress_bar("parts of the table", is_transient=True) as progress,
+    ):
+        table, _ = cached_table(rig, progress=progress)
+    if not is_quiet:
+        print(
+            f"{rig_file.name}: table of {counted(len(rig.eras), 'ERA')} "
+            f"{'on a mesh of' if rig.plate.surface is None else 'by'} {table.mesh}, "
+            f"ready in {timed.elapsed:.1f} s"
+        )
+    return table
+
+
+def _serve_page(
+    rig_file: Path, table: "LocalizationTable", wire: str, address: str, seed: int | None
+) -> None:
+    import asyncio
+
+    from controller.demo.demonstration import run_live
+
+    print("Open the URL below, press Arm, and touch the plate; Ctrl-C ends it.", flush=True)
+    asyncio.run(run_live(rig_file, table, wire=wire, dashboard=address, seed=seed))
+
+
+def _play(
+    rig_file: Path,
+    table: "LocalizationTable",
+    wire: str,
+    recording: "Scene | None",
+    *,
+    seed: int | None,
+    is_real_time: bool,
+    is_quiet: bool,
+) -> "DemoRun":
+    """Play a recording, or those that come with the package; print a line for each touch."""
+    import asyncio
+
+    from controller.demo.demonstration import example_scenes, run_demo
+    from model.rig.rig_file import load_rig
+    from registry.virtual_time import VirtualTimeLoop
+
+    rig = load_rig(rig_file)
+    if not is_quiet:
+        print(_heading(rig.threshold, has_latency=is_real_time), end="", flush=True)
+
+    def print_row(row: "TouchRow") -> None:
+        if not is_quiet:
+            print(_line(row, has_latency=is_real_time), flush=True)
+
+    playing = run_demo(
+        rig_file,
+        table,
+        wire=wire,
+        scenes=example_scenes(rig) if recording is None else [recording],
+        on_row=print_row,
+        seed=seed,
+    )
+    make_loop = None if is_real_time else VirtualTimeLoop
+    with asyncio.Runner(loop_factory=make_loop) as runner:
+        return runner.run(playing)
+
+
+def _heading(threshold: str, *, has_latency: bool) -> str:
+    """Return the heading of the rows: groups, units and columns."""
+    pair = f"{'prom.':>6} {'meas.':>6}"
+    columns = f" time  target / cm  others  {'ERAs':22} {pair}  {pair}"
+    groups = f"{'':51}{'felt contrast':^13}  {'level':^13}"
+    units = f"{'':51}{'/ dB':^13}  {'/ dB SL':^13}"
+    if has_latency:
+        groups += f" {'latency':>7}"
+        units += f" {'/ ms':>7}"
+    scale = f"Levels are relative to the thresholds of the rig, {threshold}."
+    return "\n".join([scale, groups.rstrip(), units.rstrip(), columns, ""])
+
 
 _MAX_NAMES = 4  # of ERAs in a row
 
 
-def _line(row: "TouchRow") -> str:
+def _line(row: "TouchRow", *, has_latency: bool) -> str:
     x, y = (100 * value for value in row.targets_m[0])
     others = len(row.fingers) - 1 if row.fingers else len(row.quiet)
     start = f"{row.time_s:5.1f}  {x:5.1f},{y:5.1f}  {others:6d}  "
@@ -167,7 +243,8 @@ def _line(row: "TouchRow") -> str:
     for finger in row.fingers:
         if finger.at_m == row.targets_m[0]:
             note += f"  {finger.verdict}, of {counted(len(row.contents), 'content')}"
-    return f"{start}{eras:22s} {figures} {_number(row.latency_ms):>7s}{note}"
+    latency = f" {_number(row.latency_ms):>7s}" if has_latency else ""
+    return f"{start}{eras:22s} {figures}{latency}{note}"
 
 
 def _named(eras: list[str]) -> str:
@@ -187,5 +264,15 @@ def _summary(rows: "list[TouchRow]") -> str:
     return (
         f"{touches}; of {len(kept)} with other fingers on the plate {sum(kept)} "
         f"({sum(kept) / len(kept):.0%}) felt at least the contrast promised\n"
-        "(nine of ten plates within the rig's uncertainty keep a promise; --seed draws another one)"
+        "(a promise is what 90 % of plates within the rig's uncertainty reach; --seed draws "
+        "another plate)"
     )
+
+
+def _void_report(run: "DemoRun") -> list[str]:
+    """Report that the figures of a run do not count, and why."""
+    touches = counted(len(run.rows), "touch", plural="touches")
+    return [
+        f"{touches}; no pictures were drawn; try again on a less busy machine or in virtual time",
+        f"void: this machine was too slow ({run.why_void}): the figures do not count",
+    ]

@@ -2,16 +2,20 @@
 
 `run_demo` plays scenes and returns a row per touch, `run_live` serves the page instead.
 `write_pictures` draws some of the touches, and where each of several contents is felt.
+
+In a `VirtualTimeLoop`, with the amplifiers in this process (wire `sim`), every machine gives the
+same figures. In real time a machine that is too slow spoils them, and the run is void.
 """
 
 import asyncio
 import contextlib
 import json
+import logging
 import math
 import os
 import socket
 import tempfile
-from collections.abc import AsyncIterator, Callable, Mapping, Sequence
+from collections.abc import AsyncIterator, Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import zip_longest
 from pathlib import Path
@@ -23,7 +27,7 @@ from matplotlib.figure import Figure
 from controller.api.client import AsyncClient
 from controller.api.jsonrpc import RpcError
 from controller.api.schema import MAX_LEASE
-from controller.daemon.config import DaemonConfig, load_daemon_config
+from controller.daemon.config import DaemonConfig, TouchInput, load_daemon_config
 from controller.daemon.daemon import Daemon, page_address
 from controller.demo.recorder import (
     SIM_OPTIONS,
@@ -37,7 +41,8 @@ from controller.effects.layout import BUZZ
 from controller.operation.operation_states import DaemonState
 from controller.process.daemon_process import ServiceManager, SocketLock
 from controller.process.log import LogThread, start_log
-from controller.sources.tuio import RESTART_PAUSE, RecordedDatagram, read_capture, replay_capture
+from controller.sources.touch import ALIGNED, TouchFrame, TouchSource
+from controller.sources.tuio import RecordedDatagram, TuioSource, read_capture
 from drivers.errors import LinkError
 from model.answer.answer import Sensation
 from model.answer.stimulus import Finger
@@ -55,6 +60,7 @@ from model.rig.rig_file import load_rig
 from model.structure.plate import Plate
 from model.table.table import LocalizationTable
 from registry import threads
+from registry.virtual_time import VirtualTimeLoop
 
 MIN_ERAS_FOR_THREE = 8
 """Number of ERAs from which three people have contents of their own, else two."""
@@ -125,7 +131,9 @@ def example_touches_path(name: str) -> Path:
     return installed if installed.exists() else package.parent / "examples" / file
 
 
-WIRES = (*SIM_OPTIONS, "sim")
+SIM = "sim"
+"""The wire to amplifiers in this process, the only one that virtual time has."""
+WIRES = (SIM, *SIM_OPTIONS)
 
 CONTACT_TIMEOUT = 2.0
 """Time [s] after which a recorded finger without news is lifted, for a machine that is busy."""
@@ -137,10 +145,56 @@ RECOVERY = 30.0
 """Time [s] within which the daemon must be armed, also anew after a fault."""
 
 _RIG_FILE = "rig.yaml"
-_HOST = "127.0.0.1"
+_RECORDER = ("127.0.0.1", 3333)  # host and port of the sender of recorded touches
 _ARMED = DaemonState.OPERATION_ENABLED
 _TIMEOUT = 60.0  # s; of a request to the daemon, on a machine that is busy
 _PAUSE = 0.05  # s; between attempts to arm
+
+
+class RecordedTouches(TouchSource):
+    """Recorded datagrams, read as if they came over the network, one recording after the other."""
+
+    def __init__(self) -> None:
+        self._opened: asyncio.Future[Callable[[TouchFrame], None]]
+        self._opened = asyncio.get_running_loop().create_future()
+
+    async def run(self, deliver: Callable[[TouchFrame], None]) -> None:
+        """Deliver the frames of `play` until cancelled."""
+        self._opened.set_result(deliver)
+        await asyncio.get_running_loop().create_future()
+
+    async def play(self, recording: Sequence[RecordedDatagram]) -> None:
+        """Play a recording at its pace, as a new sender; wait until the source runs."""
+        deliver = await self._opened
+        reader = TuioSource(f"tuio:?timeout={CONTACT_TIMEOUT:g}")
+        reader.rejects = self.rejects
+        start = threads.now()
+        for datagram in recording:
+            await asyncio.sleep(max(0.0, start + datagram.time - threads.now()))
+            frame = reader.read(datagram.payload, _RECORDER, threads.now())
+            if frame is not None:
+                deliver(frame)
+
+
+@dataclass(frozen=True)
+class _RecordedInput(TouchInput):
+    """The touch input of a daemon that plays recorded touches."""
+
+    source: RecordedTouches
+
+    def make(self) -> TouchSource:
+        return self.source
+
+
+@dataclass(frozen=True)
+class DemoRun:
+    """The rows of a demonstration, in order of time.
+
+    why_void: why the figures do not count, because the machine was too slow; None if they do.
+    """
+
+    rows: list[TouchRow]
+    why_void: str | None
 
 
 async def run_demo(
@@ -151,42 +205,49 @@ async def run_demo(
     scenes: Sequence[Scene],
     on_row: Callable[[TouchRow], None],
     seed: int | None = 0,
-) -> list[TouchRow]:
+) -> DemoRun:
     """Play scenes one after another to a daemon, over a wire, onto a simulated plate.
 
     rig_file: an absolute path; wire: one of WIRES; on_row: called with each row when complete;
     seed: of the plate within the rig's uncertainty, None for the rig's own. Each scene has a layout
-    of its own. Return all rows in order of time. Raises LinkError if the far end is lost.
+    of its own. Raises LinkError if the far end is lost.
     """
-    port = _free_port()
-    url = f"tuio:{_HOST}:{port}?timeout={CONTACT_TIMEOUT:g}"
-    more = {"socket": "era.sock", "touch": [{"name": "recorded", "url": url}]}
-    async with _on_simulated_plate(
-        rig_file, more, layouts=[scene.layout for scene in scenes], wire=wire, seed=seed
-    ) as (config, lock, plate):
-        try:
-            async with asyncio.TaskGroup() as tasks:
-                recorder = TouchRecorder(plate, tasks, on_row=on_row)
-                daemon = Daemon(
-                    config,
-                    table,
-                    log=LogThread(None),  # nothing is logged: rows and causes tell it
-                    manager=ServiceManager({}),
-                    dashboard=None,
-                    observe=recorder.observe,
-                    watchdog=WATCHDOG,
-                )
-                serving = tasks.create_task(daemon.run(lock))
-                arming = tasks.create_task(_keep_armed(daemon, config.socket, recorder))
-                playing = tasks.create_task(_play(scenes, port, recorder, config.socket))
-                await asyncio.wait({serving, playing}, return_when=asyncio.FIRST_COMPLETED)
-                if not playing.done():  # a signal has ended the daemon
-                    raise KeyboardInterrupt
-                arming.cancel()
-                daemon.shut_down("the demonstration is over")
-        except BaseExceptionGroup as failures:
-            raise failures.exceptions[0] from None
-    return sorted(recorder.rows, key=lambda row: row.time_s)
+    is_real_time = not isinstance(asyncio.get_running_loop(), VirtualTimeLoop)
+    touches = RecordedTouches()
+    recorded = _RecordedInput("recorded", "recorded:", ALIGNED, touches)
+    simulated = _on_simulated_plate(
+        rig_file,
+        {"socket": "era.sock"},
+        layouts=[scene.layout for scene in scenes],
+        wire=wire,
+        seed=seed,
+    )
+    with _log_errors_only():
+        async with simulated as (config, lock, plate):
+            try:
+                async with asyncio.TaskGroup() as tasks:
+                    recorder = TouchRecorder(plate, tasks, on_row=on_row)
+                    daemon = Daemon(
+                        replace(config, touch=(recorded,)),
+                        table,
+                        log=LogThread(None),
+                        manager=ServiceManager({}),
+                        dashboard=None,
+                        observe=recorder.observe,
+                        watchdog=WATCHDOG,
+                    )
+                    serving = tasks.create_task(daemon.run(lock))
+                    arming = tasks.create_task(_keep_armed(daemon, config.socket, recorder))
+                    playing = tasks.create_task(_play(scenes, touches, recorder, config.socket))
+                    await asyncio.wait({serving, playing}, return_when=asyncio.FIRST_COMPLETED)
+                    if not playing.done():  # a signal has ended the daemon
+                        raise KeyboardInterrupt
+                    arming.cancel()
+                    daemon.shut_down("the demonstration is over")
+            except BaseExceptionGroup as failures:
+                raise failures.exceptions[0] from None
+    rows = sorted(recorder.rows, key=lambda row: row.time_s)
+    return DemoRun(rows, recorder.why_void() if is_real_time else None)
 
 
 async def run_live(
@@ -225,6 +286,19 @@ async def run_live(
         log.close()
 
 
+@contextlib.contextmanager
+def _log_errors_only() -> Iterator[None]:
+    """Log errors to standard error and no warnings, which rows and causes report."""
+    handler = logging.StreamHandler()
+    handler.setLevel(logging.ERROR)
+    root = logging.getLogger()
+    root.addHandler(handler)
+    try:
+        yield
+    finally:
+        root.removeHandler(handler)
+
+
 @contextlib.asynccontextmanager
 async def _on_simulated_plate(
     rig_file: Path,
@@ -244,8 +318,9 @@ async def _on_simulated_plate(
         lock = SocketLock(config.socket)
         stack.callback(lock.release)
         rig = config.rig
+        thresholds = tuple(dict.fromkeys((rig.threshold, *rig.promised_thresholds)))
         plate = await stack.enter_async_context(
-            simulated_plate(rig_file, rig.amplifiers, wire=wire, seed=seed, threshold=rig.threshold)
+            simulated_plate(rig_file, rig.amplifiers, wire=wire, seed=seed, thresholds=thresholds)
         )
         yield replace(config, urls=plate.urls), lock, plate
 
@@ -279,13 +354,6 @@ def check_page(address: str) -> None:
             "other program or give another address, such as --dashboard 127.0.0.1:0 for any free "
             "port"
         ) from error
-
-
-def _free_port() -> int:
-    """A UDP port that is free now."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind((_HOST, 0))
-        return int(probe.getsockname()[1])
 
 
 async def _keep_armed(daemon: Daemon, path: Path, recorder: TouchRecorder) -> None:
@@ -323,7 +391,7 @@ async def _armed(era: AsyncClient) -> str:
 
 async def _play(
     scenes: Sequence[Scene],
-    port: int,
+    touches: RecordedTouches,
     recorder: TouchRecorder,
     path: Path,
 ) -> None:
@@ -335,8 +403,7 @@ async def _play(
     for number, scene in enumerate(scenes):
         async with await AsyncClient.connect(path, name="era demo", timeout=_TIMEOUT) as era:
             await era.layout(_layout_name(number))
-        await replay_capture(scene.touches, _HOST, port)
-        await asyncio.sleep(RESTART_PAUSE)  # or the next scene's sender would be a second one
+        await touches.play(scene.touches)
         while recorder.touches:  # noqa: ASYNC110  nobody else waits for this
             await asyncio.sleep(DECAY)
     await asyncio.sleep(DECAY)
@@ -352,31 +419,57 @@ def _layout_name(number: int) -> str:
 MAX_PANELS = 6
 
 
-def write_pictures(table: LocalizationTable, rows: list[TouchRow], folder: Path) -> list[Path]:
-    """Draw some of the touches into a folder, and several contents; return what was written."""
-    figures = {}
-    if chosen := choose_rows([row for row in rows if not row.fingers]):
+@dataclass(frozen=True)
+class Pictures:
+    """Files that were written; omitted: for each other picture, why there is none."""
+
+    files: list[Path]
+    omitted: list[str]
+
+
+def write_pictures(table: LocalizationTable, rows: list[TouchRow], folder: Path) -> Pictures:
+    """Draw some of the touches into a folder, and several contents that played together."""
+    figures: dict[str, Figure] = {}
+    omitted = []
+    chosen = choose_rows([row for row in rows if not row.fingers])
+    if chosen:
         figures["touches"] = touches_figure(table, chosen)
-    several = [row for row in rows if row.measured_level_db_sl is not None and row.fingers]
-    if several:
-        row = max(several, key=lambda row: len(row.contents))
-        frequencies = [layer.frequency for layer in row.contents]
-        fingers = [
-            Sensation(
-                Finger(each.at_m),
-                each.verdict,
-                frequencies.index(each.frequency_hz) if each.frequency_hz in frequencies else None,
-                -math.inf if each.measured_level_db_sl is None else each.measured_level_db_sl,
-                contrast_db=each.measured_contrast_db,
-            )
-            for each in row.fingers
-        ]
-        figures["contents"] = contents_figure(table, row.contents, fingers)
+    else:
+        omitted.append("no touches.png: no touch with a vibration of one frequency was measured")
+    with_several = [row for row in rows if row.fingers]
+    measured = [row for row in with_several if row.measured_level_db_sl is not None]
+    if measured:
+        figures["contents"] = _several_contents_figure(table, measured)
+    elif with_several:
+        omitted.append("no contents.png: no touch with several contents was measured")
+    else:
+        omitted.append("no contents.png: no two fingers had vibrations of their own at one time")
     folder.mkdir(parents=True, exist_ok=True)
-    paths = [folder / f"{name}.png" for name in figures]
-    for path, figure in zip(paths, figures.values(), strict=True):
-        save_figure(figure, path)
-    return paths
+    files = []
+    for name, figure in figures.items():
+        file = folder / f"{name}.png"
+        save_figure(figure, file)
+        files.append(file)
+    return Pictures(files, omitted)
+
+
+def _several_contents_figure(table: LocalizationTable, rows: Sequence[TouchRow]) -> Figure:
+    """Draw the row of most contents, with what was measured at its fingers."""
+    row = max(rows, key=lambda row: len(row.contents))
+    frequencies = [layer.frequency for layer in row.contents]
+    sensations = []
+    for finger in row.fingers:
+        frequency = finger.frequency_hz
+        level = finger.measured_level_db_sl
+        sensation = Sensation(
+            Finger(finger.at_m),
+            finger.verdict,
+            layer=frequencies.index(frequency) if frequency in frequencies else None,
+            level_db_sl=-math.inf if level is None else level,
+            contrast_db=finger.measured_contrast_db,
+        )
+        sensations.append(sensation)
+    return contents_figure(table, row.contents, sensations)
 
 
 def choose_rows(rows: Sequence[TouchRow]) -> list[TouchRow]:

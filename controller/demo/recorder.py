@@ -32,7 +32,9 @@ from drivers.errors import LinkError
 from model.answer.answer import HELD_BACK, Layer
 from model.arrays import FloatArray
 from model.finger import DEFAULT_THRESHOLD, mean_level_db_sl, sensation_level
+from model.quantities import counted
 from registry import threads
+from registry.virtual_time import VirtualTimeLoop
 from registry.wording import first_problem
 
 Position: TypeAlias = tuple[float, float]
@@ -51,18 +53,26 @@ class FingerVibration:
     """Amplitudes (f, p) [m/s²] of the steady part."""
     weights: FloatArray
     """Weights (p,) of the points in the mean over the tip."""
-    threshold: str = DEFAULT_THRESHOLD
-    """Name of the set of thresholds that levels refer to."""
+    thresholds: tuple[str, ...] = (DEFAULT_THRESHOLD,)
+    """Names of threshold sets: levels are relative to the first, contrasts the least over all."""
 
     @property
     def level_db_sl(self) -> float:
         """Sensation level, mean over the tip; -inf without vibration."""
-        return mean_level_db_sl(self.frequencies, self.amplitudes, self.weights, self.threshold)
+        return self.level_by(self.thresholds[0])
 
     @property
     def loudest_db_sl(self) -> float:
         """Sensation level at the loudest point of the tip; -inf without vibration."""
-        return float(sensation_level(self.frequencies, self.amplitudes, self.threshold).max())
+        return self.loudest_by(self.thresholds[0])
+
+    def level_by(self, threshold: str) -> float:
+        """Sensation level relative to a threshold set by name, mean over the tip."""
+        return mean_level_db_sl(self.frequencies, self.amplitudes, self.weights, threshold)
+
+    def loudest_by(self, threshold: str) -> float:
+        """Sensation level relative to a threshold set by name, at the loudest point of the tip."""
+        return float(sensation_level(self.frequencies, self.amplitudes, threshold).max())
 
     def parted(self, frequency: float) -> tuple["FingerVibration", "FingerVibration"]:
         """Return the part of a content's frequency [Hz], and that of all others."""
@@ -100,8 +110,9 @@ class TouchRow:
     a finger alone, and measured ones if the pattern was too short: predicted ones are of the
     table's plate, promised ones what nine of ten plates within the uncertainty give, in levels.
     drive: as the amplifiers achieved it, by ERA; latency_ms: from touch frame to last byte on the
-    wire; reason: why nothing played, if so. fingers: of several contents, each; contrasts are then
-    to the contents of others at this finger; contents: their patterns, in the order of layers.
+    wire, None in virtual time, in which computing takes none; reason: why nothing played, if so.
+    fingers: of several contents, each; contrasts are then to the contents of others at this finger;
+    contents: their patterns, in the order of layers.
     """
 
     target_id: str
@@ -146,11 +157,18 @@ class TouchRow:
 _OWN = ("target_id", "quiet", "pattern", "levels_db_sl", "fingers", "contents")
 
 
-def steady_contrast_db(target: FingerVibration, quiet: Sequence[FingerVibration]) -> float | None:
-    """Level of the target above that of the loudest quiet point [dB], steady; None if alone."""
-    if not quiet:
+def steady_contrast_db(target: FingerVibration, others: Sequence[FingerVibration]) -> float | None:
+    """Level of the target above the loudest point of others [dB], steady; None without others.
+
+    As promised contrasts, the least over the threshold sets of the target.
+    """
+    if not others:
         return None
-    return target.level_db_sl - max(finger.loudest_db_sl for finger in quiet)
+    contrasts = []
+    for threshold in target.thresholds:
+        loudest = max(other.loudest_by(threshold) for other in others)
+        contrasts.append(target.level_by(threshold) - loudest)
+    return min(contrasts)
 
 
 WATCHDOG = 2.0
@@ -179,11 +197,15 @@ class SimulatedPlate:
     """
 
     def __init__(
-        self, control: Path, urls: Mapping[str, str], *, threshold: str = DEFAULT_THRESHOLD
+        self,
+        control: Path,
+        urls: Mapping[str, str],
+        *,
+        thresholds: Sequence[str] = (DEFAULT_THRESHOLD,),
     ) -> None:
         self.urls = urls
         self._control = control
-        self._threshold = threshold
+        self._thresholds = tuple(thresholds)
         self._placing = asyncio.Lock()  # fingers are placed in order
 
     async def place_fingers(
@@ -203,7 +225,7 @@ class SimulatedPlate:
                     len(felt.frequencies_hz), len(felt.weights)
                 ),
                 weights=np.array(felt.weights),
-                threshold=self._threshold,
+                thresholds=self._thresholds,
             )
             for id, felt in reply.fingers.items()
         }
@@ -251,13 +273,13 @@ async def simulated_plate(
     *,
     wire: str,
     seed: int | None = 0,
-    threshold: str = DEFAULT_THRESHOLD,
+    thresholds: Sequence[str] = (DEFAULT_THRESHOLD,),
 ) -> AsyncIterator[SimulatedPlate]:
     """Simulate the amplifiers of a rig file for the duration of the context.
 
     wire: a key of `SIM_OPTIONS` for a process of their own, "sim" for a plate in this process;
-    seed: of the plate within the rig's uncertainty, None for the rig's own; threshold: name of the
-    set for levels. Raises LinkError if the process does not start.
+    seed: of the plate within the rig's uncertainty, None for the rig's own; thresholds: see
+    `FingerVibration`. Raises LinkError if the process does not start.
     """
     with tempfile.TemporaryDirectory(prefix="era-") as folder:
         path = Path(folder) / "control"
@@ -270,7 +292,7 @@ async def simulated_plate(
                 process = await _start(rig_file, wire=wire, control=path, seed=seed)
                 stack.push_async_callback(_terminate, process)
                 urls = await _read_urls(process, count=len(amplifiers))
-            yield SimulatedPlate(path, urls, threshold=threshold)
+            yield SimulatedPlate(path, urls, thresholds=thresholds)
 
 
 async def _start(
@@ -330,6 +352,9 @@ MARGIN = 0.005
 STEADY_DURATION = 0.4
 """Shortest pattern [s] that counts as steady; the plate rings for 50 ms to 1 s."""
 
+MAX_DELAY = STEADY_DURATION - STEADY_WINDOW
+"""Delay [s] of a pattern or of a finger's sensor from which a steady window may contain it."""
+
 Measured: TypeAlias = asyncio.Task[dict[str, FingerVibration]]
 
 _NOT_THE_TARGET = "another finger came down at the same moment and was the target"
@@ -385,6 +410,12 @@ class TouchRecorder:
         """Those that are down."""
         self.fault: str | None = None
         """Why the plate is armed no longer; None while it is, and before."""
+        self.faults: list[str] = []
+        """Every cause so far for which the plate was armed no longer."""
+        self.rejected_sets = 0
+        """Number of sets that an amplifier or its ledger has rejected."""
+        self.worst_delay = 0.0
+        """Longest time [s] from a touch to its pattern, or for the plate's sensors to follow."""
         self._is_armed = asyncio.Event()
         self._plate = plate
         self._tasks = tasks
@@ -399,6 +430,18 @@ class TouchRecorder:
         """Observe what the control loop reports."""
         loop.contacts_changed.append(self._contacts_changed)
         loop.reported.append(self._reported)
+        loop.refused.append(self._set_rejected)
+
+    def why_void(self) -> str | None:
+        """Return why the figures of a run in real time do not count; None if they do."""
+        if self.faults:
+            return f"the amplifiers stopped ({self.faults[0]})"
+        if self.worst_delay > MAX_DELAY:
+            delay_ms = 1000 * self.worst_delay
+            return f"a reaction took {delay_ms:.0f} ms, more than {1000 * MAX_DELAY:.0f} ms"
+        if self.rejected_sets:
+            return f"amplifiers rejected {counted(self.rejected_sets, 'set')}"
+        return None
 
     async def start(self) -> None:
         """Wait until the plate is armed, and set the start of the recording to then."""
@@ -413,6 +456,7 @@ class TouchRecorder:
     def failed(self, cause: str) -> None:
         """Note that the plate is armed no longer; rows of touches that this spoils say so."""
         self.fault = cause.partition("; ")[0]  # without its remedy
+        self.faults.append(self.fault)
         since = -math.inf if self._playing is None else self._playing.applied.time
         self._end_pattern(threads.now(), is_measured=False)  # silent since a time that is not known
         for touch in self.touches.values():
@@ -445,6 +489,7 @@ class TouchRecorder:
                 touches.append(touch)
         if touches:
             self._playing = _PlayedPattern(applied, touches)
+            self._note_delay(applied.latency or 0.0)
         for touch in touches:
             touch.patterns.append(cast(_PlayedPattern, self._playing))
 
@@ -484,7 +529,21 @@ class TouchRecorder:
         loads = {_id(contact): contact.load for contact in contacts}
         if sensors != self._sensors or loads != self._loads:
             self._sensors, self._loads = sensors, loads
-            self._tasks.create_task(self._plate.place_fingers(sensors, loads))
+            self._tasks.create_task(self._place_sensors(sensors, loads))
+
+    async def _place_sensors(
+        self, sensors: Mapping[str, Position], loads: Mapping[str, float]
+    ) -> None:
+        """Place the plate's sensors and note how long that took."""
+        started_at = threads.now()
+        await self._plate.place_fingers(sensors, loads)
+        self._note_delay(threads.now() - started_at)
+
+    def _note_delay(self, delay: float) -> None:
+        self.worst_delay = max(self.worst_delay, delay)
+
+    def _set_rejected(self, reason: str) -> None:
+        self.rejected_sets += 1
 
     async def _add_row(self, touch: _Touch) -> None:
         """Make the row of a lifted touch."""
@@ -509,7 +568,10 @@ async def _played(touch: _Touch, row: TouchRow) -> TouchRow:
     It is the same pattern for all fingers that it serves, so that their rows are of one moment.
     Latency is of the touch's first pattern.
     """
-    first, main_part = touch.patterns[0], max(touch.patterns, key=_significance)
+    main_part = max(touch.patterns, key=_significance)
+    latency = touch.patterns[0].applied.latency
+    if isinstance(asyncio.get_running_loop(), VirtualTimeLoop):
+        latency = None
     key = touch.contact.key
     applied = main_part.applied
     predicted = next(felt for felt in applied.targets if felt.contact.key == key)
@@ -530,7 +592,7 @@ async def _played(touch: _Touch, row: TouchRow) -> TouchRow:
             for era, each in played.drive.items()
         },
         mode=pattern.drive_mode,
-        latency_ms=None if first.applied.latency is None else 1000 * first.applied.latency,
+        latency_ms=None if latency is None else 1000 * latency,
         played_s=main_part.duration,
         steady=main_part.duration >= STEADY_DURATION,
         predicted_contrast_db=predicted.sensation.contrast_db,
@@ -573,7 +635,7 @@ def _finger_row(felt: FingerSensation, vibration: Mapping[str, FingerVibration])
         own, others = measured.parted(felt.frequency)
         if math.isfinite(own.level_db_sl):
             level = own.level_db_sl
-            contrast = level - others.loudest_db_sl
+            contrast = steady_contrast_db(own, [others])
     return FingerRow(
         at_m=_place(felt.contact),
         frequency_hz=felt.frequency,

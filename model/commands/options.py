@@ -80,10 +80,11 @@ class Stopwatch:
 
 
 @contextmanager
-def progress_bar(unit: str) -> "Iterator[Progress]":
+def progress_bar(unit: str, *, is_transient: bool = False) -> "Iterator[Progress]":
     """Show a progress bar on standard error, or lines of text if that is not a terminal.
 
-    Yields update(done, total). unit: plural of the things counted.
+    Yields update(done, total). unit: plural of the things counted; is_transient: whether the bar
+    disappears at the end.
     """
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, TimeElapsedColumn, TimeRemainingColumn
@@ -94,7 +95,7 @@ def progress_bar(unit: str) -> "Iterator[Progress]":
         yield _ProgressLines(unit).update
         return
     columns = (BarColumn(), MofNCompleteColumn(), unit, TimeElapsedColumn(), TimeRemainingColumn())
-    with Bars(*columns, console=console) as bar:
+    with Bars(*columns, console=console, transient=is_transient) as bar:
         task = bar.add_task("", total=None)
         yield lambda done, total: bar.update(task, completed=done, total=total)
 

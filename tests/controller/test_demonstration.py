@@ -3,7 +3,8 @@
 import asyncio
 import re
 import shutil
-from collections.abc import AsyncIterator
+import time
+from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -17,7 +18,14 @@ import pytest
 from controller.cli.main import run
 from controller.demo import demonstration
 from controller.demo import recorder as far_end
-from controller.demo.demonstration import choose_rows
+from controller.demo.demonstration import (
+    DemoRun,
+    Pictures,
+    Scene,
+    choose_rows,
+    example_scenes,
+    run_demo,
+)
 from controller.demo.recorder import (
     FingerRow,
     FingerVibration,
@@ -29,18 +37,21 @@ from controller.demo.recorder import (
 )
 from controller.play.intent import FingerSensation, not_served
 from controller.play.loop import Observers, PlayReport
-from controller.sources.touch import Change, Contact, ContactKey
+from controller.sources.touch import Change, Contact, ContactKey, TouchFrame
+from controller.sources.tuio import TuioSource
 from drivers.errors import LinkError
-from kit.clock import in_virtual_time
+from kit.clock import in_virtual_time, run_virtual
 from kit.plates import small_table
 from model.answer.answer import OWN, Sensation
 from model.answer.plan import query
 from model.answer.stimulus import Finger, Placement
 from model.finger import detection_threshold
-from model.rig.rig_file import example_rig_path
+from model.rig.rig_file import example_rig_path, load_rig
 from model.table import table_file
+from model.table.table_file import build_table
 from processes.daemons import ENABLED, ready_daemon, until, until_state
 from registry import threads
+from registry.virtual_time import VirtualTimeLoop
 from sim.faults import FaultWindow
 
 FIGURES = ("contrast_db", "level_db_sl")
@@ -100,6 +111,20 @@ def test_felt_contrast_relates_levels_not_accelerations():
     )
 
 
+def test_felt_contrast_is_the_least_over_the_threshold_sets():
+    """A target at 250 Hz beside 100 Hz, each at the same level by the first set.
+
+    By hand, of the thresholds on the page about people: by the second set the target is higher by
+    28 dB and the other by 31, so that the contrast is 3 dB less.
+    """
+    low, high = detection_threshold(np.array([100.0, 250.0]))
+    sets = ("vibrotactile-probe", "pressing-fingertip")
+    target = replace(vibration([[0.0], [10 * high]]), thresholds=sets)
+    other = vibration([[10 * low], [0.0]])
+    assert target.level_db_sl == pytest.approx(other.loudest_db_sl)
+    assert steady_contrast_db(target, [other]) == pytest.approx(-3.0, abs=0.2)
+
+
 def test_contents_are_told_apart_by_their_frequencies():
     """By hand: 10 times threshold of its own, 0.3 and 0.4 of others: 26 dB above their power."""
     thresholds = detection_threshold(np.array([90.0, 170.0, 260.0]))
@@ -154,6 +179,7 @@ ROWS = (
     ),
 )
 DRIVEN = {"SW": {"frequency_hz": 50.0}, "SE": {"frequency_hz": 50.0}, "NE": {"frequency_hz": 120.0}}
+SCALE = "Levels are relative to the thresholds of the rig, vibrotactile-probe.\n"
 LINES = """\
   0.3   19.8,  5.9       0  SW SE 50 Hz, NE 120 Hz      -      -    20.0   19.0     9.6
   1.0    5.0,  5.0       2  SW SE 50 Hz, NE 120 Hz   12.2   14.0    20.0   19.0     9.6
@@ -169,42 +195,96 @@ LINES = """\
 """
 
 
+Demo = Callable[..., tuple[int, list[str]]]
+
+
+@pytest.fixture
+def demo(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> Demo:
+    """Run `era demo` in an empty folder, with the rows above; returns status and lines printed.
+
+    why_void: that of the run.
+    """
+    rows = [
+        replace(each, drive=DRIVEN, latency_ms=9.62, predicted_level_db_sl=20.0) for each in ROWS
+    ]
+
+    def run_era(*arguments: str, why_void: str | None = None) -> tuple[int, list[str]]:
+        async def run_demo(file: Path, table: object, *, on_row: Any, **more: Any) -> DemoRun:
+            assert file.name == ("mine.yaml" if "mine.yaml" in arguments else "paper_plate.yaml")
+            assert len(more["scenes"]) == 2
+            for each in rows:
+                on_row(each)
+            return DemoRun(rows, why_void)
+
+        monkeypatch.setattr(demonstration, "run_demo", run_demo)
+        status = run(["demo", *arguments, "--out", "drawn"])
+        return status, capsys.readouterr().out.splitlines(keepends=True)
+
+    def write_pictures(table: object, rows: object, out: Path) -> Pictures:
+        return Pictures([out / "t.png"], ["no contents.png: WHY"])
+
+    monkeypatch.setattr(demonstration, "write_pictures", write_pictures)
+    monkeypatch.setattr(table_file, "cached_table", lambda rig, **more: (small_table(), None))
+    monkeypatch.chdir(tmp_path)
+    shutil.copy(example_rig_path(), "mine.yaml")
+    return run_era
+
+
 @pytest.mark.parametrize(
     ("given", "then"),
     [((), "era config init my_rig.yaml"), (("mine.yaml",), "era table build mine.yaml")],
 )
 def test_lines_say_of_each_touch_what_was_promised_and_felt(
-    given: tuple[str, ...],
-    then: str,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    given: tuple[str, ...], then: str, demo: Demo
 ) -> None:
     """By hand, of touches alone, kept, missed, silent, too short, still ringing, and of two people.
 
     With a rig of one's own its table comes next. Without a capture the scenes are the examples'.
     """
-    played = [
-        replace(each, drive=DRIVEN, latency_ms=9.62, predicted_level_db_sl=20.0) for each in ROWS
-    ]
-
-    async def run_demo(file: Path, table: object, *, on_row: Any, **more: Any) -> list[TouchRow]:
-        assert file.name == (given[0] if given else "paper_plate.yaml")
-        assert len(more["scenes"]) == 2
-        for each in played:
-            on_row(each)
-        return played
-
-    monkeypatch.setattr(demonstration, "run_demo", run_demo)
-    monkeypatch.setattr(demonstration, "write_pictures", lambda table, rows, out: [out / "t.png"])
-    monkeypatch.setattr(table_file, "cached_table", lambda rig: (small_table(), None))
-    monkeypatch.chdir(tmp_path)
-    shutil.copy(example_rig_path(), "mine.yaml")
-    assert run(["demo", *given, "--out", "drawn"]) == 0
-    head, _, _, _, *lines = capsys.readouterr().out.splitlines(keepends=True)
+    status, (head, scale, _, _, _, *lines) = demo(*given, "--real-time")
+    assert status == 0
     assert re.search(r"\.yaml: table of 4 ERAs on a mesh of 12x9, ready in [0-9]\.\d s$", head)
+    assert scale == SCALE
     assert "".join(lines).startswith(LINES)
-    assert lines[-2:] == ["wrote drawn/t.png\n", f"Next: {then}{lines[-1].partition(then)[2]}"]
+    assert lines[-3:-1] == ["no contents.png: WHY\n", "wrote drawn/t.png\n"]
+    assert lines[-1].startswith(f"Next: {then}")
+
+
+def test_demo_prints_no_latency_in_virtual_time(demo: Demo) -> None:
+    """The same lines without their last number, 9.6 ms, and without its column."""
+    _, (_, _, groups, _, _, *lines) = demo()
+    assert "latency" not in groups
+    assert "".join(lines).startswith(LINES.replace("     9.6", ""))
+
+
+def test_void_run_prints_no_share_and_draws_nothing(demo: Demo) -> None:
+    """Its last line says that the machine was too slow, and why; the exit status is 1."""
+    status, lines = demo("--real-time", why_void="a reaction took 400 ms")
+    assert status == 1
+    assert "%" not in "".join(lines)
+    assert not any(line.startswith("wrote") for line in lines)
+    assert lines[-1].startswith("void: this machine was too slow (a reaction took 400 ms)")
+
+
+@pytest.mark.parametrize(
+    ("rows", "omitted"),
+    [
+        ([replace(ROWS[3], measured_level_db_sl=None)], ["touches.png", "contents.png"]),
+        ([replace(ROWS[6], measured_level_db_sl=None)], ["touches.png", "contents.png"]),
+        ([ROWS[0]], ["contents.png"]),
+    ],
+    ids=["one that was silent", "two contents, not measured", "one finger alone"],
+)
+def test_each_picture_that_is_not_drawn_has_a_reason(
+    rows: list[TouchRow], omitted: list[str], tmp_path: Path
+) -> None:
+    """By name; the others are written."""
+    pictures = demonstration.write_pictures(small_table(), rows, tmp_path)
+    assert [reason.removeprefix("no ").partition(":")[0] for reason in pictures.omitted] == omitted
+    assert {file.name for file in pictures.files} == {"touches.png", "contents.png"} - {*omitted}
+    assert {*tmp_path.iterdir()} == {*pictures.files}
 
 
 def test_picture_shows_highest_contrasts_of_each_number_of_fingers():
@@ -330,6 +410,64 @@ async def test_pattern_is_measured_while_no_finger_moves_or_lands(
     assert (row.steady, row.measured_level_db_sl, row.measured_contrast_db) == (True, None, None)
 
 
+@pytest.mark.parametrize(
+    ("delay", "is_void"), [(0.149, False), (0.151, True)], ids=["short enough", "too long"]
+)
+def test_run_is_void_when_sensors_follow_a_finger_too_late(delay: float, is_void: bool) -> None:
+    """After 150 ms a window of 250 ms at the end of a pattern of 400 ms may contain the move."""
+
+    async def place_slowly(*given: object) -> None:
+        await asyncio.sleep(delay)
+
+    async def play() -> str | None:
+        place = AsyncMock(side_effect=place_slowly)
+        async with recorder_of([], place_fingers=place) as recorder:
+            loop = Observers()
+            recorder.observe(loop)
+            finger = contact(1)
+            loop.contacts_changed[0]((finger,), Change(down=(finger,)))
+        return recorder.why_void()
+
+    why_void = run_virtual(play())
+    assert (why_void is not None and "151 ms" in why_void) == is_void
+
+
+async def test_run_is_void_after_a_rejected_set_and_after_a_fault() -> None:
+    """Also once the plate is armed again; not before."""
+    async with recorder_of([]) as recorder:
+        loop = Observers()
+        recorder.observe(loop)
+        assert recorder.why_void() is None
+        loop.refused[0]("too late")
+        assert "rejected 1 set" in str(recorder.why_void())
+        recorder.failed(FAULT)
+        recorder.armed()
+        assert FAULT in str(recorder.why_void())
+
+
+def test_demo_gives_the_same_rows_on_a_slow_machine(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In virtual time, to the last digit, with each frame of touches read 20 ms later."""
+    file = example_rig_path()
+    table = build_table(load_rig(file), frequencies=np.array([120.0, 160.0, 200.0]))
+    scene = Scene(example_scenes(load_rig(file))[0].touches[:100])
+
+    def rows() -> list[dict[str, Any]]:
+        with asyncio.Runner(loop_factory=VirtualTimeLoop) as runner:
+            playing = run_demo(file, table, wire="sim", scenes=[scene], on_row=lambda row: None)
+            return [row.as_json() for row in runner.run(playing).rows]
+
+    prompt = rows()
+    read = TuioSource.read
+
+    def read_slowly(self: TuioSource, *given: Any) -> TouchFrame | None:
+        time.sleep(0.02)
+        return read(self, *given)
+
+    monkeypatch.setattr(TuioSource, "read", read_slowly)
+    assert rows() == prompt
+    assert any(row["measured_level_db_sl"] is not None for row in prompt)
+
+
 @in_virtual_time
 async def test_plate_is_armed_again_after_a_fault_but_not_after_a_stop(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -363,7 +501,7 @@ async def test_fault_that_lasts_aborts_the_demonstration() -> None:
         recorder.failed(f"{FAULT}; once the cause is gone, clear and arm again")
         nothing = cast(Any, None)
         with pytest.raises(LinkError, match=f"aborted: {FAULT}$"):
-            await demonstration._play([], 0, recorder, nothing)
+            await demonstration._play([], nothing, recorder, nothing)
 
 
 async def test_far_end_terminates_process_when_not_ready_in_time(

@@ -427,7 +427,7 @@ def test_finger_feels_what_many_eras_promise(name: str, tmp_path: Path) -> None:
     capture = read_capture(write_schedule(tmp_path / "touches.tuio", SCHEDULE, 1.0))
     scenes = [Scene(capture)]
     demo = run_demo(file, table, wire="sim", scenes=scenes, on_row=lambda row: None)
-    *_, row = run_virtual(demo)
+    *_, row = run_virtual(demo).rows
     assert row.drive.keys() == {era.name for era in rig.eras}
     x, y = SCHEDULE[1][3:]
     assert row.targets_m == [pytest.approx((x * rig.plate.length, (1 - y) * rig.plate.width))]
@@ -449,7 +449,8 @@ def test_three_people_each_feel_their_own_content_while_one_slides_and_one_leave
     rig = load_rig(file)
     table = build_table(rig, frequencies=np.arange(70.0, 301.0, 10.0), drive_mode="phased")
     scene = example_scenes(rig)[-1]
-    rows = run_virtual(run_demo(file, table, wire="sim", scenes=[scene], on_row=lambda row: None))
+    demo = run_demo(file, table, wire="sim", scenes=[scene], on_row=lambda row: None)
+    rows = run_virtual(demo).rows
     slid, stayed, left = rows
     assert len(slid.fingers) == 3
     assert slid.fingers == stayed.fingers == left.fingers

@@ -36,8 +36,14 @@ from registry import threads
 
 ROOT = Path(__file__).parents[2]
 _COUNTED = tuple(f"{ROOT / name}/" for name in ("controller", "drivers", "model", "registry"))
+_CLOCK = str(ROOT / "registry" / "virtual_time.py")  # of this run, and not of a daemon
 _CALLBACK = str(Path("asyncio", "events.py"))  # what calls what the event loop runs
 _BESIDE = tuple(f"{ROOT / name}/" for name in ("sim", "era_haptics/lab"))
+
+
+def _is_counted(file: str) -> bool:
+    """Whether a file belongs to the way that a daemon takes."""
+    return file.startswith(_COUNTED) and file != _CLOCK
 
 
 @dataclass
@@ -86,7 +92,7 @@ class Recorder:
         return way
 
     def _called(self, frame: types.FrameType, event: str, _: object) -> None:
-        if event != "call" or not frame.f_code.co_filename.startswith(_COUNTED):
+        if event != "call" or not _is_counted(frame.f_code.co_filename):
             return
         outer: types.FrameType | None = frame
         while outer is not None and not outer.f_code.co_filename.endswith(_CALLBACK):
@@ -176,7 +182,7 @@ class Scheduled:
         found: list[tuple[str, str]] = []
         while frame is not None:
             code = frame.f_code
-            if code.co_filename.startswith(_COUNTED):
+            if _is_counted(code.co_filename):
                 file = Path(code.co_filename).relative_to(ROOT).as_posix()
                 found.append((file, code.co_qualname))
             frame = frame.f_back

@@ -4,6 +4,7 @@ A drive is given in hertz, fractions of full stroke and degrees, and converted t
 """
 
 import math
+import warnings
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -41,6 +42,12 @@ _UNITS_OF_A_TONE = {
 def expect_rig(value: object) -> None:
     """Raise InputError for anything but a rig, such as the name of its file."""
     expect(value, Rig, what="rig", made_by='era.load_rig("rig.yaml")')
+
+
+def warn_of_surface(rig: Rig) -> None:
+    """Warn of suspicious modes of a rig's surface, at the line that called the public function."""
+    for note in rig.surface_notes:
+        warnings.warn(note, stacklevel=3)
 
 
 def as_frequencies(given: object) -> FloatArray:

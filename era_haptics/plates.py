@@ -23,6 +23,7 @@ from era_haptics.drive import (
     as_signals,
     expect_rig,
     layers_of,
+    warn_of_surface,
 )
 from model.answer.answer import Answer
 from model.answer.stimulus import Placement, Stimulus, check_on_plate, together
@@ -62,6 +63,7 @@ class SolvedPlate:
 
     def __init__(self, rig: Rig, *, seed: int | None = None) -> None:
         expect_rig(rig)
+        warn_of_surface(rig)
         self.rig = rig
         self._drawn = Imperfections()
         if seed is not None:

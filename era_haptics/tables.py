@@ -10,6 +10,7 @@ from era_haptics.drive import (
     as_frequencies,
     as_points,
     expect_rig,
+    warn_of_surface,
 )
 from model.answer.answer import APART_HZ, Answer
 from model.answer.answer_report import Measures, Timing
@@ -45,6 +46,7 @@ def table(
         >>> table = era.table(rig, drive_mode="phased")
     """
     expect_rig(rig)
+    warn_of_surface(rig)
     expect(grid, Grid, what="grid", made_by="era.Grid(12, 9)")
     _expect_mode(drive_mode)
     chosen = None if frequencies is None else as_frequencies(frequencies)

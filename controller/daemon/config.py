@@ -432,7 +432,7 @@ def _checked(document: Document) -> CheckedFile:
     )
     note = rig.uncertainty_note
     held, lost, more = clock_costs(rig, config.urls)
-    notes = [*lost, *gain_notes(rig), *([note] if note else [])]
+    notes = [*lost, *gain_notes(rig), *rig.surface_notes, *([note] if note else [])]
     return CheckedFile(line + held, [*warnings, *notes], more)
 
 

@@ -415,6 +415,8 @@ def show(rig_file: RigArgument, as_json: JsonOption = False) -> None:
         *_type_rows(summary["exciter_types"]),
     ]
     print_report(rows, summary, as_json=as_json)
+    for note in rig.surface_notes:
+        typer.echo(f"era: warning: {note}", err=True)
 
 
 def _laminate_rows(laminate: dict[str, Any] | None) -> Iterator[str]:

@@ -125,7 +125,8 @@ def build(
             "this error into account and is lower for it; export modes up to "
             f"{max(WELL_KNOWN * chosen[-1], 2 * table.mesh.highest_frequency(rig.plate)):.0f} Hz"
         )
-    for warning in (coarse if error >= _COARSE_ERROR else None, why_slow()):
+    shown_if_coarse = coarse if error >= _COARSE_ERROR else None
+    for warning in (*rig.surface_notes, shown_if_coarse, why_slow()):
         if warning:
             typer.echo(f"era: warning: {warning}", err=True)
 

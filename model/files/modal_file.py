@@ -9,6 +9,7 @@ of the nodes in coordinates of touches, and faces (k, 3 or more), rows of node n
 .csv has a line for each node of each mode, with the columns of `_COLUMNS` and damping_ratio.
 """
 
+import cmath
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -25,10 +26,13 @@ from model.files.uff import DatasetBlock, blocks, numbers_in, read_nodes, rows_o
 
 _SHELLS = frozenset(range(40, 100)) | {171, 172}  # plane stress, plates, membranes, thin shells
 _BEAMS = frozenset(range(11, 38))  # whose elements have a further row
-_NORMAL_MODES, _COMPLEX_MODES = 2, (3, 7)  # types of analysis
+# Types of analysis. Complex ones of the first order have a modal A, those of the second a mass.
+_NORMAL_MODES, _FIRST_ORDER, _SECOND_ORDER = 2, 3, 7
+_MODES = (_NORMAL_MODES, _FIRST_ORDER, _SECOND_ORDER)
 _DISPLACEMENT = (0, 8)  # unknown, displacement
 _MAX_COMPLEX = 0.3  # imaginary part that a turned shape may have, relative to its real part
 _VALUES_A_ROW = 6
+_MOST_REALS = 14  # numbers of a mode before its shape; those that are left out are 0
 _HEAD = {55: (9, 6), 2414: (14, 9)}
 """Rows before the first node of a mode, and of these the row of its types, by dataset."""
 
@@ -168,6 +172,8 @@ def _from_universal(path: Path, content: bytes) -> ModeShapes:
             f"{path}: must have normal modes (dataset 55 or 2414), got datasets {sorted(kinds)}; "
             "export shapes of modes, not records"
         )
+    # A pole and its conjugate are one mode.
+    modes = [mode for mode in modes if not mode.is_conjugate] or modes
     numbers = modes[0].nodes
     for mode in modes:
         if mode.nodes != numbers:
@@ -207,6 +213,8 @@ class _Mode:
     damping_ratio: float
     nodes: list[int]
     shape: FloatArray
+    is_conjugate: bool
+    """Whether the imaginary part of its pole is negative."""
 
 
 def _read_faces(path: Path, block: DatasetBlock) -> Iterator[list[int]]:
@@ -245,7 +253,7 @@ def _read_mode(path: Path, block: DatasetBlock) -> _Mode | None:
         location = numbers(3)
         if location and int(location[0]) != 1:
             return None  # at elements
-    if len(kinds) < 6 or kinds[1] not in (_NORMAL_MODES, *_COMPLEX_MODES):
+    if len(kinds) < 6 or kinds[1] not in _MODES:
         return None
     _, analysis, _, result, data, count = kinds[:6]
     if result not in _DISPLACEMENT:
@@ -258,36 +266,87 @@ def _read_mode(path: Path, block: DatasetBlock) -> _Mode | None:
             "displacements"
         )
     reals = [number for row in range(types + 2, head) for number in numbers(row)]
-    if block.kind == 2414:
-        reals = reals[2:]  # behind two counts
-    frequency, mass, damping = _modal(place, block.kind, analysis, reals)
+    reals += [0.0] * _MOST_REALS
+    if analysis == _NORMAL_MODES:
+        modal = _normal_mode(place, block.kind, reals)
+    else:
+        modal = _complex_mode(place, block.kind, analysis, reals)
     is_complex = data in (5, 6)
     nodes, values = _values(path, block, head, count * (1 + is_complex))
     shape: FloatArray | ComplexArray = values
     if is_complex:
-        shape = _real(place, values[:, ::2] + 1j * values[:, 1::2])
+        shape = values[:, ::2] + 1j * values[:, 1::2]
     shape = shape[:, 0] if count == 1 else shape[:, :3]
-    return _Mode(place, frequency, damping, nodes, np.asarray(shape / math.sqrt(mass)))
-
-
-def _modal(
-    place: str, kind: int, analysis: int, reals: Sequence[float]
-) -> tuple[float, float, float]:
-    """Frequency [Hz], modal mass and damping ratio of a mode, NaN for none."""
-    found: Sequence[float] = [*reals, *[0.0] * 8]
-    if kind == 55 and analysis == _NORMAL_MODES:
-        frequency, mass, viscous, hysteretic = found[:4]
-    elif kind == 55:
-        pole, mass, hysteretic = complex(found[0], found[1]), 0.0, 0.0
-        frequency, viscous = abs(pole) / (2 * math.pi), -pole.real / max(abs(pole), 1e-30)
+    if is_complex or analysis != _NORMAL_MODES:
+        shape = _real(place, np.asarray(shape / cmath.sqrt(modal.mass), dtype=complex))
     else:
-        _, frequency, _, mass, viscous, hysteretic = found[:6]
-    if not (math.isfinite(frequency) and frequency >= 0 and mass >= 0):
+        shape = shape / math.sqrt(modal.mass.real)
+    return _Mode(
+        place, modal.frequency, modal.damping_ratio, nodes, np.asarray(shape), modal.is_conjugate
+    )
+
+
+@dataclass(frozen=True)
+class _Modal:
+    """Modal parameters of one dataset."""
+
+    frequency: float
+    """Natural frequency [Hz]."""
+
+    mass: complex
+    """Modal mass; a shape divided by its root is of unit modal mass."""
+
+    damping_ratio: float
+    """Share of critical damping, NaN without one."""
+
+    is_conjugate: bool = False
+    """Whether the imaginary part of the pole is negative."""
+
+
+def _normal_mode(place: str, kind: int, reals: Sequence[float]) -> _Modal:
+    """Parameters of a normal mode; its mass is 1 where the file has none."""
+    if kind == 55:
+        frequency, mass, viscous, hysteretic = reals[:4]
+    else:
+        # Two counts; time, frequency, eigenvalue, mass and damping.
+        frequency, _, mass, viscous, hysteretic = reals[3:8]
+    if frequency < 0 or mass < 0:
         raise InputError(
-            f"{place}: frequency and modal mass must be finite and at least 0, got {frequency:g} "
-            f"Hz and {mass:g}; export it again"
+            f"{place}: frequency and modal mass must be at least 0, got {frequency:g} Hz and "
+            f"{mass:g}; export it again"
         )
-    return frequency, mass or 1.0, viscous or hysteretic / 2 or math.nan
+    return _Modal(frequency, mass or 1.0, viscous or hysteretic / 2 or math.nan)
+
+
+def _complex_mode(place: str, kind: int, analysis: int, reals: Sequence[float]) -> _Modal:
+    """Parameters of a complex mode by its pole and its modal A, or its modal mass.
+
+    A of a shape psi at a pole is psi' (2 pole M + C) psi. With proportional damping this is
+    2j Im(pole) times the modal mass. Units of A are those of mass over time.
+    """
+    if kind == 55 and analysis == _SECOND_ORDER:
+        raise InputError(
+            f"{place}: analysis type of a mode must be 2 or 3, got 7, for which dataset 55 defines "
+            "no scale; export normal modes (2), or complex ones with their modal A (3)"
+        )
+    # Behind two counts dataset 2414 has a row for normal modes, then one for complex ones.
+    pole_real, pole_imaginary, *scale = reals[:4] if kind == 55 else reals[8:12]
+    pole = complex(pole_real, pole_imaginary)
+    stated = complex(*scale)
+    name = "modal mass" if analysis == _SECOND_ORDER else "modal A"
+    if not stated or not pole.imag:
+        raise InputError(
+            f"{place}: {name} and the imaginary part of the pole must not be 0 in a complex mode, "
+            f"got {stated:g} and {pole.imag:g}, which leaves its scale unknown; export normal "
+            "modes of unit modal mass"
+        )
+    mass = stated if analysis == _SECOND_ORDER else stated / (2j * pole.imag)
+    return _Modal(
+        abs(pole) / (2 * math.pi),
+        mass,
+        -pole.real / abs(pole) or math.nan,
+        is_conjugate=pole.imag < 0,
+    )
 
 
 def _values(path: Path, block: DatasetBlock, head: int, count: int) -> tuple[list[int], FloatArray]:

@@ -29,7 +29,7 @@ from model.arrays import FloatArray
 from model.structure.attachments import check_on_plate, mean_over
 from model.structure.modal_elasticity import Dispersion
 from model.structure.plate import Plate
-from model.structure.surface import LEAST_KNOWN, THICKNESS, Surface, surface_shapes
+from model.structure.surface import LEAST_KNOWN, THICKNESS, Surface, surface_shapes, thinned
 
 RESIDUAL_ORDER = 4
 """Residual vectors of each point.
@@ -54,19 +54,6 @@ def _correlations() -> tuple[FloatArray, FloatArray]:
     t, weights = (t + 1) / 2, weights / 2
     orders = np.arange(1, 2 * RESIDUAL_ORDER + 1)
     return r, 2 * (weights * t ** (4 * orders[:, None] - 3)) @ j0(r / t[:, None])
-
-
-def thinned(points: FloatArray, count: int) -> FloatArray:
-    """Numbers of at most so many points (n, 2), evenly over the surface; equal places once."""
-    _, first = np.unique(np.round(points / (1e-6 * np.ptp(points))), axis=0, return_index=True)
-    size = math.sqrt(float(np.prod(np.ptp(points, axis=0))) / count)
-    while len(first) > count:
-        cells = np.floor(points[first] / size).astype(int)
-        _, own = np.unique(cells, axis=0, return_index=True)
-        if len(own) <= count:
-            first = first[own]
-        size *= 1.05
-    return np.sort(first)
 
 
 class SurfaceModes:

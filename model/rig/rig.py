@@ -289,6 +289,11 @@ class Rig:
             f"for these known exactly, the rest: {self.uncertainty}"
         )
 
+    @property
+    def surface_notes(self) -> tuple[str, ...]:
+        """Suspicious properties of its surface's modes, a line each; none of a plate."""
+        return () if self.plate.surface is None else self.plate.surface.notes
+
     @cached_property
     def feet(self) -> tuple[int, ...]:
         """Numbers of the masses that are feet, in the order of their file."""
@@ -329,6 +334,7 @@ MAY_DIFFER = {
     "Rig.laminate": "all that is solved of it is in the plate",
     "Material.name": "displayed only",
     "Surface.file": "its content is known by its digest",
+    "Surface.notes": "they follow from its modes",
 }
 """What a table's rig may have otherwise, by class and field, each with the reason.
 

@@ -328,6 +328,7 @@ _NEARLY_ALL = 0.9  # of the modes up to a frequency the highest may be so far be
 def plate_notes(rig: Rig) -> Iterator[str]:
     """Yield warnings of a plate in the wrong unit, and of what air and soft layers cost."""
     plate, low, high = rig.plate, rig.limits.frequency_min, rig.limits.frequency_max
+    yield from rig.surface_notes
     if isinstance(rig.mesh, KnownModes) and rig.mesh.frequency < _NEARLY_ALL * WELL_KNOWN * high:
         yield (
             f"surface: {rig.mesh} leave fields uncertain at {high:g} Hz (limits.frequency); export "

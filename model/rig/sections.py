@@ -98,6 +98,7 @@ from model.structure.surface import (
     homogeneous,
     surface_shapes,
 )
+from model.structure.surface_check import check_surface
 from registry.limits import GuardLimits
 
 
@@ -498,6 +499,7 @@ class SurfaceSection(Section):
         """Make the plate of the modes of a file; raises InputError for what are none."""
         digest = digest_of_file(path)
         shapes = surface_shapes(str(path), digest, self.normal)
+        notes = check_surface(str(path), digest, self.normal, self.mass)
         modulus, density, loss = homogeneous(shapes, self.mass)
         rings = shapes.outline if self.outline is None else self.outline
         surface = Surface(
@@ -509,6 +511,7 @@ class SurfaceSection(Section):
             frequency=float(shapes.frequencies[-1]),
             modulus=modulus,
             outline=tuple(tuple((float(x), float(y)) for x, y in ring) for ring in rings),
+            notes=notes,
         )
         length, width = shapes.size.tolist()
         return Plate(

@@ -19,13 +19,16 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import TypeAlias
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from model.arrays import FloatArray, Point
 from model.errors import InputError
+
+if TYPE_CHECKING:  # only a surface needs it
+    from model.files.modal_file import ModeShapes
 
 Rings: TypeAlias = tuple[tuple[Point, ...], ...]
 
@@ -42,7 +45,7 @@ fields were wrong by a fifth; with those up to three times by 3 %."""
 MAX_DEVIATING = 64
 """Number of the lowest elastic modes that may differ from those of a file."""
 
-_RIGID_FREQUENCY = 1.0  # Hz; below it a mode is of the rigid body
+RIGID_FREQUENCY = 1.0  # Hz; below it a mode is of the rigid body
 _HELD = 0.2  # motion along the normal of a rigid mode, to that of the one with most
 _SEEN = 1e-3  # the same of elastic modes, to their median; others move within the surface
 _FEWEST = 6  # nodes, and elastic modes
@@ -81,6 +84,9 @@ class Surface:
     sizes: tuple[float, ...] = ()
     """Factors of the shapes of the lowest elastic modes, on one that differs from the file's."""
 
+    notes: tuple[str, ...] = ()
+    """Suspicious properties of the modes, as warnings show them."""
+
     def frequency_factor(self, thickness: float, modulus: float) -> float:
         """Return the factor of its natural frequencies for a homogeneous plate that deviates.
 
@@ -117,6 +123,12 @@ class SurfaceShapes:
     outline: Rings
     """Edges of its faces, none where the file has no faces."""
 
+    motions: FloatArray
+    """Rigid-body motion along the normal at the nodes (n, 3): translation and two rotations."""
+
+    modes: "ModeShapes"
+    """All modes in the order of the file."""
+
 
 def digest_of_file(path: Path) -> str:
     """Return the SHA-256 of a file's content; raises InputError if it cannot be read."""
@@ -139,12 +151,13 @@ def surface_shapes(file: str, digest: str, normal: str) -> SurfaceShapes:
     upwards = -1.0 if "-" in normal else 1.0
     along = (read.shapes if read.shapes.ndim == 2 else upwards * read.shapes[:, :, axis]).T
     w = along
+    normals = upwards * np.eye(3)[[axis] * len(read.nodes)]
     if normal.startswith("local") and read.shapes.ndim == 3:
         normals = upwards * _normals(read.nodes, axis)
         w = np.einsum("rnk,nk->nr", read.shapes, normals)
     order = np.argsort(read.frequencies, kind="stable")
     frequencies, w, along = read.frequencies[order], w[:, order], along[:, order]
-    is_rigid = frequencies < _RIGID_FREQUENCY
+    is_rigid = frequencies < RIGID_FREQUENCY
     elastic, ratios = w[:, ~is_rigid], read.damping_ratios[order][~is_rigid]
     size = np.sqrt((elastic**2).mean(axis=0))
     seen = size > _SEEN * np.median(size) if len(size) else np.empty(0, dtype=bool)
@@ -174,7 +187,34 @@ def surface_shapes(file: str, digest: str, normal: str) -> SurfaceShapes:
         _mass(along[:, is_rigid]),
         np.ptp(points, axis=0),
         rings_of(read.faces, points),
+        _rigid_motions(read.nodes, normals, axis),
+        read,
     )
+
+
+def _rigid_motions(nodes: FloatArray, normals: FloatArray, axis: int) -> FloatArray:
+    """Motion along normals (n, 3) by a translation along an axis and rotations about the others."""
+    translation = normals[:, axis]
+    arms = nodes - nodes.mean(axis=0)
+    rotations = [
+        (np.cross(direction, arms) * normals).sum(axis=1)
+        for other, direction in enumerate(np.eye(3))
+        if other != axis
+    ]
+    return np.column_stack([translation, *rotations])
+
+
+def thinned(points: FloatArray, count: int) -> FloatArray:
+    """Numbers of at most so many points (n, 2), evenly over the surface; equal places once."""
+    _, first = np.unique(np.round(points / (1e-6 * np.ptp(points))), axis=0, return_index=True)
+    size = math.sqrt(float(np.prod(np.ptp(points, axis=0))) / count)
+    while len(first) > count:
+        cells = np.floor(points[first] / size).astype(int)
+        _, own = np.unique(cells, axis=0, return_index=True)
+        if len(own) <= count:
+            first = first[own]
+        size *= 1.05
+    return np.sort(first)
 
 
 def _normals(nodes: FloatArray, axis: int) -> FloatArray:

@@ -37,13 +37,13 @@ class CurvedGlass:
         for model in ("glass", "full"):
             subprocess.run(["ccx", model], cwd=folder, check=True, stdout=subprocess.DEVNULL)
         self.modes_file = from_calculix.convert(folder / "glass", unroll=True)
-        _, _, modes = from_calculix.read_frd(folder / "glass.frd")
+        modes = from_calculix.read_frd(folder / "glass.frd").modes
         dof = [each.split(".") for each in (folder / "full.dof").read_text().split()]
         self._column = {(int(node), int(axis)): n for n, (node, axis) in enumerate(dof)}
         self._stiffness, self._mass = (_matrix(folder / f"full.{each}") for each in ("sti", "mas"))
-        self.eigenvalues = (2 * np.pi * np.array([f for f, _ in modes])) ** 2
+        self.eigenvalues = (2 * np.pi * np.array([mode.frequency for mode in modes])) ** 2
         self._shapes = np.array(
-            [[shape[int(node)][int(axis) - 1] for node, axis in dof] for _, shape in modes]
+            [[mode.shape[int(node)][int(axis) - 1] for node, axis in dof] for mode in modes]
         ).T
 
     def rows(self, places: FloatArray, layer: int) -> sparse.csr_array:

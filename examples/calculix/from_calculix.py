@@ -2,13 +2,17 @@
 
     python examples/calculix/from_calculix.py MODEL [--set TOUCH] [--unroll]
 
-MODEL.inp has the nodes that fingers touch as a set (*NSET), MODEL.frd the results of *FREQUENCY
-with *NODE FILE and U in ASCII, both in m, kg and s. Of elements whose faces have all of their
+MODEL.inp has the nodes that fingers touch as a set (*NSET), MODEL.frd the results of one *FREQUENCY
+step with *NODE FILE and U in ASCII, both in m, kg and s. Of elements whose faces have all of their
 corners in the set the outline is taken. With --unroll places count along the arc of a surface that
 is bent about y, as those of a touch panel.
 """
 
 import argparse
+import re
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -30,48 +34,263 @@ FACES = {
 }
 """Corners of each face of an element by its type in a .frd."""
 
+# A value has 12 characters (E12.5). With three digits in the exponent, as on Windows, it has up to
+# 13 and touches the next one. Fortran leaves out the letter of such an exponent.
+_NUMBER = re.compile(r"[-+]?\d+\.\d*(?:[ED][-+]?\d{2,3}|[-+]\d{3})?")
+_NO_LETTER = re.compile(r"(?<=[\d.])(?=[-+])")
+_NODE_NUMBER = {0: 5, 1: 10}
+"""Characters of a node number, by the format of a block: short or long ASCII."""
+
+_MODAL = 2  # type of analysis of a block of results
+_MAX_INCLUDES = 10
+
+
+@dataclass(frozen=True)
+class Mode:
+    """A mode of a .frd."""
+
+    frequency: float
+    """Natural frequency [Hz]."""
+
+    shape: dict[int, list[float]] = field(default_factory=dict)
+    """Displacement of each node."""
+
+
+@dataclass(frozen=True)
+class Results:
+    """Mesh and modes of a .frd."""
+
+    nodes: dict[int, list[float]]
+    """Positions by node number."""
+
+    elements: list[tuple[int, list[int]]]
+    """Type and nodes of each element."""
+
+    modes: list[Mode]
+
 
 def read_set(path: Path, name: str) -> list[int]:
-    """Return the nodes of a set of an input file; raises ValueError without it."""
-    nodes: list[int] = []
-    is_own = False
-    for line in path.read_text(encoding="utf-8").upper().splitlines():
+    """Return the nodes of a set of an input file; raises ValueError with the line at fault."""
+    sets: dict[str, dict[int, None]] = {}
+    instances: dict[str, set[str]] = {}
+    target: dict[int, None] | None = None
+    parameters: dict[str, str] = {}
+    keyword = ""
+    for place, line in _input_lines(path):
         if line.startswith("*"):
-            is_own = line.replace(" ", "") == f"*NSET,NSET={name.upper()}"
-        elif is_own:
-            nodes += [int(each) for each in line.split(",") if each.strip()]
-    if not nodes:
-        raise ValueError(f"{path}: no node set {name}, written as *NSET, NSET={name}")
-    return nodes
+            keyword, parameters = _keyword(line)
+            own_name = parameters.get("NSET", "") if keyword in ("NSET", "NODE") else ""
+            target = sets.setdefault(own_name, {}) if own_name else None
+            if keyword == "NSET" and "INSTANCE" in parameters:
+                instances.setdefault(own_name, set()).add(parameters["INSTANCE"])
+        elif target is not None:
+            entries = [entry.strip().upper() for entry in line.split(",") if entry.strip()]
+            if keyword == "NODE":
+                entries = entries[:1]
+            target.update(dict.fromkeys(_numbers_of(entries, parameters, sets, place)))
+    wanted = name.upper()
+    if len(instances.get(wanted, ())) > 1:
+        raise ValueError(
+            f"{path}: node set {name} must be of one instance, got "
+            f"{', '.join(sorted(instances[wanted]))}; CalculiX ignores instance=, so write a model "
+            "without instances, whose node numbers are unique"
+        )
+    if not sets.get(wanted):
+        known = ", ".join(sorted(sets)) or "no sets"
+        raise ValueError(
+            f"{path}: must have the node set {name}, got {known}; add a line *NSET, NSET={name}, "
+            "or name another set with --set"
+        )
+    return list(sets[wanted])
 
 
-def read_frd(
-    path: Path,
-) -> tuple[dict[int, list[float]], list[tuple[int, list[int]]], list[tuple[float, dict]]]:
-    """Return nodes by number, elements with their types, and modes: frequency [Hz] and shape."""
-    nodes: dict[int, list[float]] = {}
+def _input_lines(path: Path, depth: int = 0) -> Iterator[tuple[str, str]]:
+    """Yield the lines of an input file and of those that it includes, with their places."""
+    text = path.read_text(encoding="utf-8", errors="replace")
+    for number, line in enumerate(text.splitlines(), start=1):
+        stripped = line.strip()
+        if not stripped or stripped.startswith("**"):
+            continue
+        if _keyword(stripped)[0] == "INCLUDE":
+            file = stripped.partition("=")[2].strip().strip('"')
+            if depth == _MAX_INCLUDES:
+                raise ValueError(f"{path}:{number}: *INCLUDE must not be nested this deeply")
+            yield from _input_lines(path.parent / file, depth + 1)
+        else:
+            yield f"{path}:{number}", stripped
+
+
+def _keyword(line: str) -> tuple[str, dict[str, str]]:
+    """Return the keyword of a line, without asterisk, and its parameters in capitals."""
+    keyword, *rest = (word.strip() for word in line.upper().lstrip("*").split(","))
+    parameters = {}
+    for word in rest:
+        key, _, value = word.partition("=")
+        parameters[key.strip()] = value.strip().strip('"')
+    return keyword.replace(" ", ""), parameters
+
+
+def _numbers_of(
+    entries: list[str], parameters: dict[str, str], sets: dict[str, dict[int, None]], place: str
+) -> list[int]:
+    """Return the node numbers of a data line: numbers, a range (GENERATE), or names of sets."""
+    if "GENERATE" in parameters:
+        try:
+            first, last, *step = (int(entry) for entry in entries)
+            return list(range(first, last + 1, step[0] if step else 1))
+        except ValueError:
+            raise ValueError(
+                f"{place}: line of GENERATE must have a first and a last number and perhaps a "
+                f"step, got {', '.join(entries)}"
+            ) from None
+    numbers: list[int] = []
+    for entry in entries:
+        if entry in sets:
+            numbers.extend(sets[entry])
+            continue
+        try:
+            numbers.append(int(entry))
+        except ValueError:
+            raise ValueError(
+                f"{place}: node set must have whole numbers or names of sets above it, got {entry}"
+            ) from None
+    return numbers
+
+
+@dataclass(frozen=True)
+class _Block:
+    """A block of a .frd: nodes (2C), elements (3C) or results (100C)."""
+
+    kind: str
+    place: str
+    """File and line of its header."""
+
+    header: str
+    step: int
+    """Number of the step that computed it."""
+
+    rows: list[tuple[str, str]] = field(default_factory=list)
+    """Further lines, each with its place."""
+
+    @property
+    def width(self) -> int:
+        """Characters of a node number; raises ValueError for binary blocks."""
+        code = _whole(self.header[73:75], self.place)
+        if code not in _NODE_NUMBER:
+            raise ValueError(f"{self.place}: .frd must be in ASCII, got a binary one")
+        return _NODE_NUMBER[code]
+
+
+def read_frd(path: Path) -> Results:
+    """Return mesh and modes of a file; raises ValueError with the line at fault."""
+    results = Results({}, [], [])
+    steps: set[int] = set()
+    for block in _blocks(path):
+        if block.kind == "2C":
+            results.nodes.update(_values(block))
+        elif block.kind == "3C":
+            results.elements.extend(_elements(block))
+        elif _is_mode(block):
+            steps.add(block.step)
+            (frequency,) = _numbers(block.header[12:24], 1, block.place)
+            results.modes.append(Mode(frequency, _values(block)))
+    if not results.modes:
+        raise ValueError(
+            f"{path}: must have modes, got none; write *FREQUENCY and *NODE FILE with U in one step"
+        )
+    if len(steps) > 1:
+        raise ValueError(
+            f"{path}: modes must be of one *FREQUENCY step, got those of steps "
+            f"{', '.join(map(str, sorted(steps)))}; remove *NODE FILE from all others"
+        )
+    return results
+
+
+def _blocks(path: Path) -> Iterator[_Block]:
+    """Yield the blocks of nodes, elements and results of a file."""
+    block: _Block | None = None
+    step = 0
+    lines = path.read_text(encoding="ascii", errors="replace").splitlines()
+    for number, line in enumerate(lines, start=1):
+        place = f"{path}:{number}"
+        kind = line[:6].strip()
+        if line.startswith("    1PSTEP"):
+            step = _whole(line.split()[-1], place)
+        elif kind in ("2C", "3C", "100C"):
+            block = _Block(kind, place, line, step)
+        elif line.startswith(" -3") and block is not None:
+            yield block
+            block = None
+        elif block is not None:
+            block.rows.append((place, line))
+    if block is not None:
+        raise ValueError(f"{block.place}: block must end with -3, got the end of the file")
+
+
+def _is_mode(block: _Block) -> bool:
+    """Whether results are the displacements of a mode; raises ValueError for complex ones."""
+    names = [line.split()[1:2] for _, line in block.rows if line.startswith(" -4")]
+    if names == [["DISPI"]]:
+        raise ValueError(
+            f"{block.place}: modes must be real, got complex or cyclic ones; use *FREQUENCY alone"
+        )
+    return names == [["DISP"]] and _whole(block.header[56:58], block.place) == _MODAL
+
+
+def _values(block: _Block) -> dict[int, list[float]]:
+    """Return the three numbers of each node of a block."""
+    end = 3 + block.width
+    return {
+        _whole(line[3:end], place): _numbers(line[end:], 3, place)
+        for place, line in block.rows
+        if line.startswith(" -1")
+    }
+
+
+def _elements(block: _Block) -> list[tuple[int, list[int]]]:
+    """Return the type and the nodes of each element of a block."""
+    width = block.width
     elements: list[tuple[int, list[int]]] = []
-    modes: list[tuple[float, dict[int, list[float]]]] = []
-    frequency, values = 0.0, None
-    for line in path.read_text(encoding="ascii", errors="replace").splitlines():
-        block, row = line[:6].strip(), line[:3].strip()
-        if block == "2C":
-            values = nodes
-        elif block == "100C":
-            frequency = float(line[12:24])
-        elif row == "-4":
-            values = {}
-            if line.split()[1] == "DISP":
-                modes.append((frequency, values))
-        elif row == "-3":
-            values = None
-        elif row == "-1" and values is not None:
-            values[int(line[3:13])] = [float(line[13 + 12 * n : 25 + 12 * n]) for n in range(3)]
-        elif row == "-1":
-            elements.append((int(line.split()[2]), []))
-        elif row == "-2":
-            elements[-1][1].extend(int(each) for each in line[3:].split())
-    return nodes, elements, modes
+    for place, line in block.rows:
+        if line.startswith(" -1"):
+            elements.append((_whole(line[3 + width : 8 + width], place), []))
+        elif line.startswith(" -2") and elements:
+            text = line[3:].rstrip()
+            cuts = range(0, len(text), width)
+            elements[-1][1].extend(_whole(text[cut : cut + width], place) for cut in cuts)
+    return elements
+
+
+def _whole(text: str, place: str) -> int:
+    """Return a whole number; raises ValueError for other text."""
+    try:
+        return int(text)
+    except ValueError:
+        raise ValueError(
+            f"{place}: line must have a whole number, got {text.strip()!r}; run CalculiX again"
+        ) from None
+
+
+def _numbers(text: str, count: int, place: str) -> list[float]:
+    """Return so many numbers of a line; raises ValueError for other text."""
+    words = _NUMBER.findall(text)
+    if "," in text:
+        raise ValueError(
+            f"{place}: numbers must have decimal points, got {text.strip()!r} with commas; run "
+            "CalculiX with the locale C"
+        )
+    if len(words) != count or _NUMBER.sub("", text).strip():
+        raise ValueError(
+            f"{place}: line must have {count} numbers such as -1.23456E-01, got {text.strip()!r}; "
+            "run CalculiX again"
+        )
+    numbers = []
+    for word in words:
+        with_letter = word.replace("D", "E")
+        if "E" not in word:
+            with_letter = _NO_LETTER.sub("E", word)
+        numbers.append(float(with_letter))
+    return numbers
 
 
 def unrolled(nodes: np.ndarray) -> np.ndarray:
@@ -83,37 +302,57 @@ def unrolled(nodes: np.ndarray) -> np.ndarray:
 
 
 def convert(model: Path, name: str = "TOUCH", *, unroll: bool = False) -> Path:
-    """Write MODEL.npz; return its path."""
+    """Write MODEL.npz; return its path. Raises ValueError and OSError."""
+    results_file = model.with_suffix(".frd")
     touch = read_set(model.with_suffix(".inp"), name)
-    positions, elements, modes = read_frd(model.with_suffix(".frd"))
+    results = read_frd(results_file)
+    for what, known in (("mesh", results.nodes), *(("mode", mode.shape) for mode in results.modes)):
+        missing = [number for number in touch if number not in known]
+        if missing:
+            raise ValueError(
+                f"{results_file}: {what} must have all nodes of {name}, got none with number "
+                f"{missing[0]} and {len(missing) - 1} others; of shells write *NODE FILE, "
+                "OUTPUT=2D"
+            )
     row = {number: at for at, number in enumerate(touch)}
     faces = [
-        [row[nodes[corner]] for corner in face]
-        for kind, nodes in elements
+        [row[corners[corner]] for corner in face]
+        for kind, corners in results.elements
         for face in FACES.get(kind, [])
-        if all(nodes[corner] in row for corner in face)
+        if all(corners[corner] in row for corner in face)
     ]
-    corners = max(map(len, faces), default=3)
-    nodes = np.array([positions[each] for each in touch])
+    most_corners = max(map(len, faces), default=3)
+    nodes = np.array([results.nodes[number] for number in touch])
     arrays = {
         "nodes": nodes,
-        "frequencies": np.array([frequency for frequency, _ in modes]),
-        "shapes": np.array([[shape[each] for each in touch] for _, shape in modes]),
-        # A triangle among quadrilaterals has its last corner twice.
-        "faces": np.array([[*f, *f[-1:] * (corners - len(f))] for f in faces], dtype=int),
+        "frequencies": np.array([mode.frequency for mode in results.modes]),
+        "shapes": np.array([[mode.shape[number] for number in touch] for mode in results.modes]),
     }
+    if faces:
+        # A triangle among quadrilaterals has its last corner twice.
+        padded = [[*face, *face[-1:] * (most_corners - len(face))] for face in faces]
+        arrays["faces"] = np.array(padded, dtype=int)
     if unroll:
         arrays["places"] = unrolled(nodes)
-    if not faces:
-        del arrays["faces"]
     np.savez(model.with_suffix(".npz"), **arrays)
     return model.with_suffix(".npz")
 
 
-if __name__ == "__main__":
+def main() -> None:
+    """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("model", type=Path)
     parser.add_argument("--set", default="TOUCH")
     parser.add_argument("--unroll", action="store_true")
     options = parser.parse_args()
-    print("wrote", convert(options.model, options.set, unroll=options.unroll))
+    try:
+        written = convert(options.model, options.set, unroll=options.unroll)
+    except OSError as error:
+        sys.exit(f"from_calculix: {error.filename or options.model}: {error.strerror}")
+    except ValueError as error:
+        sys.exit(f"from_calculix: {error}")
+    print("wrote", written)
+
+
+if __name__ == "__main__":
+    main()

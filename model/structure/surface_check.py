@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from model.arrays import FloatArray, lattice
 from model.errors import InputError
 from model.files.modal_file import ModeShapes
+from model.quantities import counted
 from model.structure.surface import (
     RIGID_FREQUENCY,
     SurfaceShapes,
@@ -126,17 +127,18 @@ def _check_pairs(modes: ModeShapes) -> Iterator[str]:
         return
     are_many = len(close) > _MANY_PAIRS * len(modes.frequencies)
     has_nodes = len(modes.nodes) >= _MIN_NODES
+    pairs = counted(len(close), "pair")
     if is_equal.any() or (are_many and has_nodes):
         first = np.argwhere(is_equal)[0] if is_equal.any() else close[0]
         raise InputError(
             f"modes must differ, got {_named(modes, first)} with the same frequency and shape, "
-            f"{len(close)} such pairs in all; keep one export, one *FREQUENCY step and one of "
+            f"{pairs} in all; keep one export, one *FREQUENCY step and one of "
             "the equal modes"
         )
     if has_nodes:
         yield (
-            f"{_named(modes, close[0])} have nearly the same shape, {len(close)} such pairs in "
-            "all; if a pair is one mode that was identified twice, remove one of the two"
+            f"{_named(modes, close[0])} have nearly the same shape, {pairs} in all; if a pair is "
+            "one mode that was identified twice, remove one of the two"
         )
 
 
@@ -334,9 +336,9 @@ def _check_rigid_motion(shapes: SurfaceShapes, motion: _Motion) -> Iterator[str]
     if 0 < shapes.rigid < 3 and len(shapes.points) >= _NODES_FOR_ROTATIONS:
         carried = min(carried, float(np.linalg.eigvalsh(shares)[0]))
     missing = (
-        f"modes must include rigid-body motion, of which they express {100 * carried:.0f} %: "
-        f"{shapes.rigid} of the modes at 0 Hz move along the normal, and in the elastic modes the "
-        "surface does not move as a whole, as in those of a free part"
+        f"modes must include rigid-body motion, got {100 * carried:.0f} % of it: {shapes.rigid} "
+        f"modes below {RIGID_FREQUENCY:g} Hz move along the normal, and in the others the surface "
+        "does not move as a whole, as in elastic modes of a free part"
     )
     remedy = (
         "export all rigid-body modes with them, or the modes of the part as it is held, from the "
@@ -349,9 +351,11 @@ def _check_rigid_motion(shapes: SurfaceShapes, motion: _Motion) -> Iterator[str]
             f"modes express little rigid-body motion, {100 * carried:.0f} %; if the part is free, "
             f"{remedy}"
         )
-    is_even = _is_near_one(_squares_of(motion.rigid, shapes.mass), 1 + _EVEN_MASS)
+    if shapes.rigid < 3 or math.isnan(shapes.mass):
+        return
+    has_even_mass = _is_near_one(_squares_of(motion.rigid, shapes.mass), 1 + _EVEN_MASS)
     mixed = float(np.linalg.eigvalsh(in_elastic @ in_elastic.T)[-1])
-    if shapes.rigid == 3 and is_even and mixed > _MAX_MIXED:
+    if has_even_mass and mixed > _MAX_MIXED:
         raise InputError(
             "elastic modes of a free part must be orthogonal to rigid-body motion, got modes that "
             f"move as a whole ({100 * mixed:.0f} % of a rigid-body motion); export free modes or "

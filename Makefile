@@ -55,7 +55,7 @@ nightly: .venv/installed-test
 # empty folder, conformance of the examples, an identified plate; and those
 # cases of heavy tests that `make test` leaves out.
 test-long: .venv/installed-test
-	.ci/install caddy:caddy nginx:nginx openssl:openssl
+	.ci/install caddy:caddy nginx:nginx openssl:openssl calculix-ccx:ccx
 	$(BIN)/pytest -m 'long and not alone' --numprocesses auto
 	$(BIN)/pytest -m 'long and alone'
 

@@ -35,9 +35,10 @@ FACES = {
 """Corners of each face of an element by its type in a .frd."""
 
 # A value has 12 characters (E12.5). With three digits in the exponent, as on Windows, it has up to
-# 13 and touches the next one. Fortran leaves out the letter of such an exponent.
-_NUMBER = re.compile(r"[-+]?\d+\.\d*(?:[ED][-+]?\d{2,3}|[-+]\d{3})?")
-_NO_LETTER = re.compile(r"(?<=[\d.])(?=[-+])")
+# 13 and touches the next one. Fortran leaves out the letter of such an exponent. One digit before
+# the point shows where the next number begins.
+_NUMBER = r"\s*([-+]?(?:\d\.\d+(?:[ED][-+]?\d{2,3}|[-+]\d{3})|\d+\.\d*))"
+_NO_LETTER = re.compile(r"(?<=\d)(?=[-+])")
 _NODE_NUMBER = {0: 5, 1: 10}
 """Characters of a node number, by the format of a block: short or long ASCII."""
 
@@ -88,20 +89,20 @@ def read_set(path: Path, name: str) -> list[int]:
             if keyword == "NODE":
                 entries = entries[:1]
             target.update(dict.fromkeys(_numbers_of(entries, parameters, sets, place)))
-    wanted = name.upper()
-    if len(instances.get(wanted, ())) > 1:
+    requested = name.upper()
+    of_set = sorted(instances.get(requested, ()))
+    if len(of_set) > 1:
         raise ValueError(
-            f"{path}: node set {name} must be of one instance, got "
-            f"{', '.join(sorted(instances[wanted]))}; CalculiX ignores instance=, so write a model "
-            "without instances, whose node numbers are unique"
+            f"{path}: node set {name} must be of one instance, got {', '.join(of_set)}; CalculiX "
+            "ignores instance=, so write a model without instances, whose node numbers are unique"
         )
-    if not sets.get(wanted):
+    if not sets.get(requested):
         known = ", ".join(sorted(sets)) or "no sets"
         raise ValueError(
             f"{path}: must have the node set {name}, got {known}; add a line *NSET, NSET={name}, "
             "or name another set with --set"
         )
-    return list(sets[wanted])
+    return list(sets[requested])
 
 
 def _input_lines(path: Path, depth: int = 0) -> Iterator[tuple[str, str]]:
@@ -273,21 +274,21 @@ def _whole(text: str, place: str) -> int:
 
 def _numbers(text: str, count: int, place: str) -> list[float]:
     """Return so many numbers of a line; raises ValueError for other text."""
-    words = _NUMBER.findall(text)
     if "," in text:
         raise ValueError(
             f"{place}: numbers must have decimal points, got {text.strip()!r} with commas; run "
             "CalculiX with the locale C"
         )
-    if len(words) != count or _NUMBER.sub("", text).strip():
+    match = re.fullmatch(_NUMBER * count + r"\s*", text)
+    if match is None:
         raise ValueError(
             f"{place}: line must have {count} numbers such as -1.23456E-01, got {text.strip()!r}; "
             "run CalculiX again"
         )
     numbers = []
-    for word in words:
+    for word in match.groups():
         with_letter = word.replace("D", "E")
-        if "E" not in word:
+        if "E" not in with_letter:
             with_letter = _NO_LETTER.sub("E", word)
         numbers.append(float(with_letter))
     return numbers
@@ -321,7 +322,7 @@ def convert(model: Path, name: str = "TOUCH", *, unroll: bool = False) -> Path:
         for face in FACES.get(kind, [])
         if all(corners[corner] in row for corner in face)
     ]
-    most_corners = max(map(len, faces), default=3)
+    corner_count = max(map(len, faces), default=3)
     nodes = np.array([results.nodes[number] for number in touch])
     arrays = {
         "nodes": nodes,
@@ -330,7 +331,7 @@ def convert(model: Path, name: str = "TOUCH", *, unroll: bool = False) -> Path:
     }
     if faces:
         # A triangle among quadrilaterals has its last corner twice.
-        padded = [[*face, *face[-1:] * (most_corners - len(face))] for face in faces]
+        padded = [[*face, *face[-1:] * (corner_count - len(face))] for face in faces]
         arrays["faces"] = np.array(padded, dtype=int)
     if unroll:
         arrays["places"] = unrolled(nodes)

@@ -32,7 +32,7 @@ _MODES = (_NORMAL_MODES, _FIRST_ORDER, _SECOND_ORDER)
 _DISPLACEMENT = (0, 8)  # unknown, displacement
 _MAX_COMPLEX = 0.3  # imaginary part that a turned shape may have, relative to its real part
 _VALUES_A_ROW = 6
-_MOST_REALS = 14  # numbers of a mode before its shape; those that are left out are 0
+_MAX_REALS = 14  # numbers of a mode before its shape; those that are left out are 0
 _HEAD = {55: (9, 6), 2414: (14, 9)}
 """Rows before the first node of a mode, and of these the row of its types, by dataset."""
 
@@ -266,7 +266,7 @@ def _read_mode(path: Path, block: DatasetBlock) -> _Mode | None:
             "displacements"
         )
     reals = [number for row in range(types + 2, head) for number in numbers(row)]
-    reals += [0.0] * _MOST_REALS
+    reals += [0.0] * _MAX_REALS
     if analysis == _NORMAL_MODES:
         modal = _normal_mode(place, block.kind, reals)
     else:

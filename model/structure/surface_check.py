@@ -35,16 +35,16 @@ from model.structure.surface import (
 
 _UNITS = {"mm": 1e-3, "cm": 1e-2, "inches": 0.0254}
 _MIN_SIDE, _MAX_SIDE = 0.01, 10.0  # m, of the longer side
-_USUAL_MIN_SIDE, _USUAL_MAX_SIDE = 0.03, 3.0
+_MIN_EXPECTED_SIDE, _MAX_EXPECTED_SIDE = 0.03, 3.0
 _MIN_DENSITY, _MAX_DENSITY = 0.02, 2000.0  # kg/m²; paper has 0.08, 25 cm of steel 2000
-_USUAL_MIN_DENSITY, _USUAL_MAX_DENSITY = 0.1, 300.0
+_MIN_EXPECTED_DENSITY, _MAX_EXPECTED_DENSITY = 0.1, 300.0
 
 _EQUAL_FREQUENCY, _EQUAL_SHAPE = 1e-3, 0.999  # relative difference, and MAC
 _CLOSE_FREQUENCY, _CLOSE_SHAPE = 0.01, 0.98
 _SEEN = 1e-3  # size of a shape that is more than rounding, relative to the median
-_MANY_PAIRS = 0.25  # close pairs by modes, as of two steps with another preload
+_MANY_IN_PAIRS = 0.4  # share of modes in close pairs, as of two steps with different preloads
 
-_SCALE_LIMIT, _USUAL_SCALE = 10.0, 3.0
+_SCALE_LIMIT, _EXPECTED_SCALE = 10.0, 3.0
 """Factors by which the median integral of phi² may differ from 1: measured 0.43 to 2.7."""
 
 _RIGID_SCALE_LIMIT = 50.0
@@ -56,7 +56,7 @@ _NORMALISED_SCALE = 1.4
 _SAME_VALUE = 5e-4  # relative difference, as of files with four digits
 _MIN_TIES, _TIES, _NEARLY_ALL = 3, 0.2, 0.9  # modes with the same value; shares of all modes
 
-_MIN_CARRIED, _USUAL_CARRIED = 0.3, 0.45
+_MIN_CARRIED, _EXPECTED_CARRIED = 0.3, 0.45
 """Share of rigid-body translation in the modes: 0.61 to 1 for held panels; 0 for the elastic modes
 of an even free panel, 0.26 with a rib of half its mass."""
 
@@ -68,8 +68,8 @@ _MIN_NODES = 12
 """At six random nodes the median integral of even plates was from 0.4 to 3.5."""
 _NODES_FOR_ROTATIONS = 30
 _NODES_PER_MODE = 3
-_MAX_NODES, _LINES = 300, 28  # interpolated nodes; lines of the raster a side
-_MAX_RIGID = 6
+_MAX_NODES, _LINES, _MIN_RASTER = 300, 28, 50
+"""Interpolated nodes; lines of the raster a side, and its points within the surface."""
 
 
 @lru_cache(maxsize=8)
@@ -100,17 +100,17 @@ def _check_sides(shapes: SurfaceShapes) -> Iterator[str]:
     units = [
         f"{_sides(shapes.size * factor)} m if they are in {unit}"
         for unit, factor in _UNITS.items()
-        if _USUAL_MIN_SIDE <= longer * factor <= _USUAL_MAX_SIDE
+        if _MIN_EXPECTED_SIDE <= longer * factor <= _MAX_EXPECTED_SIDE
     ]
-    likely = f" ({', '.join(units)})" if units else ""
+    guess = f" ({', '.join(units)})" if units else ""
     remedy = (
         "convert nodes and places to metres, and shapes with them; a universal file states its "
         "units in dataset 164"
     )
     if not _MIN_SIDE <= longer <= _MAX_SIDE:
-        raise InputError(f"{what}{likely}; {remedy}")
-    if not _USUAL_MIN_SIDE <= longer <= _USUAL_MAX_SIDE:
-        yield f"sides of {_sides(shapes.size)} m are unusual{likely}; {remedy}"
+        raise InputError(f"{what}{guess}; {remedy}")
+    if not _MIN_EXPECTED_SIDE <= longer <= _MAX_EXPECTED_SIDE:
+        yield f"sides of {_sides(shapes.size)} m are unusual{guess}; {remedy}"
 
 
 def _sides(size: FloatArray) -> str:
@@ -125,15 +125,14 @@ def _check_pairs(modes: ModeShapes) -> Iterator[str]:
     close = np.argwhere(is_close)
     if not len(close):
         return
-    are_many = len(close) > _MANY_PAIRS * len(modes.frequencies)
+    are_many = len(np.unique(close)) > _MANY_IN_PAIRS * len(modes.frequencies)
     has_nodes = len(modes.nodes) >= _MIN_NODES
     pairs = counted(len(close), "pair")
     if is_equal.any() or (are_many and has_nodes):
         first = np.argwhere(is_equal)[0] if is_equal.any() else close[0]
         raise InputError(
             f"modes must differ, got {_named(modes, first)} with the same frequency and shape, "
-            f"{pairs} in all; keep one export, one *FREQUENCY step and one of "
-            "the equal modes"
+            f"{pairs} in all; keep one export, one *FREQUENCY step and one of the equal modes"
         )
     if has_nodes:
         yield (
@@ -173,7 +172,7 @@ class _Motion:
     """Motion along the normal on an even raster of p points within the surface."""
 
     area: float
-    """Area of the surface [m²]."""
+    """Area of the surface [m²], NaN if it is unknown."""
 
     rigid: FloatArray
     """Shapes of rigid-body modes (p, a) [1/sqrt(kg)]."""
@@ -203,16 +202,19 @@ def _on_raster(shapes: SurfaceShapes) -> _Motion:
     is_inside = Delaunay(nodes).find_simplex(raster) >= 0
     if shapes.outline:
         is_inside &= is_within(shapes.outline, raster)
+    area = float(np.prod(shapes.size)) * is_inside.mean()
     raster = raster[is_inside]
+    if len(raster) < _MIN_RASTER:  # a surface that is narrower than the raster
+        area, raster = math.nan, nodes
     resolved = shapes.rigid + max(_NODES_PER_MODE, len(nodes) // _NODES_PER_MODE)
     values = np.hstack([shapes.shapes[chosen, :resolved], shapes.motions[chosen]])
     spline = RBFInterpolator(nodes, values, kernel="cubic", degree=2)
-    found = np.asarray(spline(raster))
-    bodies, _ = np.linalg.qr(found[:, -3:])
+    interpolated = np.asarray(spline(raster))
+    bodies, _ = np.linalg.qr(interpolated[:, -3:])
     return _Motion(
-        float(np.prod(shapes.size)) * len(raster) / _LINES**2,
-        found[:, : shapes.rigid],
-        found[:, shapes.rigid : -3],
+        area,
+        interpolated[:, : shapes.rigid],
+        interpolated[:, shapes.rigid : -3],
         bodies * math.sqrt(len(raster)),
     )
 
@@ -224,8 +226,8 @@ def _check_density(motion: _Motion, mass: float) -> Iterator[str]:
     remedy = "check surface.mass, and the units of modal masses and shapes (kg, not t or g)"
     if density < _MIN_DENSITY or density > _MAX_DENSITY:
         raise InputError(f"mass must be plausible, got {what}; {remedy}")
-    if density < _USUAL_MIN_DENSITY or density > _USUAL_MAX_DENSITY:
-        yield f"mass of {what}, is unusual; {remedy}"
+    if density < _MIN_EXPECTED_DENSITY or density > _MAX_EXPECTED_DENSITY:
+        yield f"unusual mass: {what}; {remedy}"
 
 
 def _check_scale(shapes: SurfaceShapes, motion: _Motion, mass: float) -> Iterator[str]:
@@ -262,7 +264,7 @@ def _check_scale(shapes: SurfaceShapes, motion: _Motion, mass: float) -> Iterato
             f"{len(shapes.points)} nodes are too few to check scale and rigid-body motion of the "
             f"modes; export or measure {_MIN_NODES} or more"
         )
-    elif not _is_near_one([typical], _USUAL_SCALE):
+    elif not _is_near_one([typical], _EXPECTED_SCALE):
         yield f"shapes may not be of unit modal mass: {integral}; {remedy}"
 
 
@@ -346,7 +348,7 @@ def _check_rigid_motion(shapes: SurfaceShapes, motion: _Motion) -> Iterator[str]
     )
     if carried < _MIN_CARRIED:
         raise InputError(f"{missing}; {remedy}")
-    if carried < _USUAL_CARRIED:
+    if carried < _EXPECTED_CARRIED:
         yield (
             f"modes express little rigid-body motion, {100 * carried:.0f} %; if the part is free, "
             f"{remedy}"

@@ -30,20 +30,21 @@ from model.table.table_file import cached_table
 def table(
     rig: Rig,
     *,
-    drive_mode: str = "switched",
+    drive_mode: str = "phased",
     frequencies: Sequence[float] | FloatArray | None = None,
     grid: Grid = PAPER_GRID,
     progress: Progress = unseen,
 ) -> LocalizationTable:
     """Load the rig's localization table from the user's cache, or build it in a second or two.
 
-    drive_mode: its default, `switched` or `phased`; frequencies (f,) [Hz]:
-    ascending, within the rig's limits, by default 40 to 500 in steps of 10 within these; grid:
-    target cells; progress: called with the parts built and all. The table of `era table build`;
-    `load_table` and `save_table` are for files. Raises InputError.
+    drive_mode: default of later queries, `phased` (any levels and phases) or, for amplifiers that
+    cannot set phases, `switched` (one or two ERAs without phases, one vibration at a time);
+    frequencies (f,) [Hz]: ascending, within the rig's limits, by default 40 to 500 in steps of 10
+    within these; grid: target cells; progress: called with the parts built and all. The table of
+    `era table build`; `load_table` and `save_table` are for files. Raises InputError.
 
     Example:
-        >>> table = era.table(rig, drive_mode="phased")
+        >>> table = era.table(rig)
     """
     expect_rig(rig)
     warn_of_surface(rig)

@@ -69,7 +69,7 @@ from these it picks amplitudes and phases for the fingers.
 """
 
 # %%
-table = era.table(rig, drive_mode="phased")
+table = era.table(rig)
 target, quiet = (0.08, 0.06), [(0.22, 0.16)]
 only = era.query(table, target, quiet=quiet)
 for name, tone in table.drive_of(only.layers[0].excitation).items():

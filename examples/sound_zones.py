@@ -114,7 +114,7 @@ def by_method(fields, thresholds):
 def compare(pairs):
     """Contrast [dB] that nine of ten judging plates give at each pair of fingers, by method."""
     rig = era.load_rig(era.example_rig_path())
-    table, plates, found = era.table(rig, drive_mode="phased"), plates_of(rig, FEW, MANY), {}
+    table, plates, found = era.table(rig), plates_of(rig, FEW, MANY), {}
     judges = [era.SolvedPlate(rig, seed=seed) for seed in JUDGES]
     for fingers in pairs:
         judged = fields_of(judges, fingers)
@@ -141,7 +141,7 @@ def write_entries(folder):
     document, patterns = json.loads((folder / "localization-1.json").read_text("utf-8")), {}
     for plate, content in document["plates"].items():
         rig = era.load_rig(folder / f"{plate}.yaml")
-        table, plates = era.table(rig, drive_mode="phased"), plates_of(rig, FEW)
+        table, plates = era.table(rig), plates_of(rig, FEW)
         for place, fingers in content["sets"].items():
             fields = {of: fields_of(some, fingers) for of, some in plates.items()}
             for name, (row, weights) in by_method(fields, table.thresholds).items():

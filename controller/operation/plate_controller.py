@@ -14,7 +14,7 @@ from drivers.host.ledger import UNREACHED, StopOutcome
 from drivers.opening import Lines
 from drivers.protocol.definition import REPLY_TIMEOUT
 from model.answer.answer_report import Timing
-from model.drive_modes import DRIVE_MODES
+from model.drive_modes import UNRESTRICTED
 from model.errors import InputError
 from model.rig.rig import Rig
 from model.table.table import LocalizationTable
@@ -87,7 +87,7 @@ class Controller:
         """The drive mode of questions to the table; the best possible one until `open`."""
         if self.cycle.planner is not None:
             return self.cycle.planner.capabilities.drive_mode
-        return self._drive_mode or DRIVE_MODES[-1]
+        return self._drive_mode or UNRESTRICTED
 
     def replace_answers(self, table: LocalizationTable, timing: Timing) -> None:
         """Answer touches by another table of this plate from now on, in one step.

@@ -58,7 +58,7 @@ from drivers.protocol.definition import (
     has_feature,
     name_of,
 )
-from drivers.protocol.records import bits_of
+from drivers.protocol.records import Values, bits_of
 from drivers.protocol.sets import token_after
 from drivers.urls import with_address
 from registry import threads
@@ -70,6 +70,7 @@ _STOP_TIMEOUT = 2.0  # s
 _STOP_INTERVAL = 1.0  # s; of stops while it is identified, which they cut short
 _RAMP = 0.05  # s; neither start nor end of a drive clicks
 _TOKEN = 1
+_MAX_PHASE_ERROR = 5.0  # degrees, between channels that play one frequency together
 _UNKNOWN = "it is unknown when its watchdog was fed last: switch it off"
 _SENSOR_UNITS = {
     "ACCELERATION": "m/s²",
@@ -382,7 +383,11 @@ class BlockingAmplifier:
         return self._wait(self._measured(frequencies, window))
 
     def apply(self, layers: Sequence[AmplifierLayer]) -> StagedSet:
-        """Play these layers from now on, all else silent; returns them as on the wire."""
+        """Play these layers from now on, all else silent; returns them as on the wire.
+
+        Raises CommandError for levels or phases between the amplifier's steps where these are
+        coarse: full level or nothing, or phases that would be off by more than 5 degrees.
+        """
         return self._wait(self._applied(layers))
 
     def play(self, layers: Sequence[AmplifierLayer], *, duration: float) -> StagedSet:
@@ -397,6 +402,8 @@ class BlockingAmplifier:
 
     async def _applied(self, layers: Sequence[AmplifierLayer]) -> StagedSet:
         _require_layers(layers)
+        for layer in layers:
+            _check_steps(layer, self._amplifier.capabilities)
         self._token = token_after(self._token)
         every, given = range(self._amplifier.capabilities["layers"]), [n.number for n in layers]
         ended = [AmplifierLayer(number) for number in every if number not in given]
@@ -421,6 +428,32 @@ class BlockingAmplifier:
             self._wait(self._opened.aclose())
         finally:
             self._loop.close()
+
+
+def _check_steps(layer: AmplifierLayer, capabilities: Values) -> None:
+    """Raise CommandError for levels and phases that the amplifier would round away.
+
+    Answers of the drive mode `switched` need no phases.
+    """
+    level_step = QUANTITIES["level"].from_wire(capabilities["level_step"])
+    phase_step = QUANTITIES["phase_step"].from_wire(capabilities["phase_step"])
+    first_at: dict[float, AmplifierTone] = {}
+    for tone in layer.tones:
+        where = f"of channel {tone.channel} in layer {layer.number}"
+        if level_step >= 1 and 0 < tone.level < 1:
+            raise CommandError(
+                f"level {where} must be 0 or 1, got {tone.level:.3g}: this amplifier plays full "
+                "level or nothing"
+            )
+        first = first_at.setdefault(tone.frequency, tone)
+        difference = tone.phase - first.phase
+        rounded_away = abs(math.remainder(difference, phase_step)) if phase_step else 0.0
+        if tone.level and rounded_away > _MAX_PHASE_ERROR:
+            raise CommandError(
+                f"phase {where} must differ from that of channel {first.channel} by a multiple of "
+                f"{phase_step:g} degrees, the amplifier's step, got {difference:.0f}; compute "
+                "answers with drive_mode='switched', which needs no phases"
+            )
 
 
 def _require_layers(layers: object) -> None:

@@ -57,8 +57,13 @@ def build(
         ),
     ] = None,
     drive_mode: Annotated[
-        str, typer.Option("--mode", help="Default drive mode: switched or phased.")
-    ] = "switched",
+        str,
+        typer.Option(
+            "--mode",
+            help="Default drive mode of queries: phased (any levels and phases), or switched (one "
+            "or two ERAs without phases, one vibration at a time).",
+        ),
+    ] = "phased",
     grid: Annotated[
         str, typer.Option(metavar="NXxNY", help="Target cells along x and y.")
     ] = "12x9",
@@ -152,7 +157,7 @@ def query(
     ] = False,
     drive_mode: Annotated[
         str | None,
-        typer.Option("--mode", help="switched or phased; default: the table's."),
+        typer.Option("--mode", help="phased or switched; default: the table's."),
     ] = None,
     level: Annotated[
         float, typer.Option(metavar="DB_SL", help="Level at the target, dB SL.")

@@ -32,7 +32,7 @@ from pydantic_core import to_jsonable_python
 
 from model.arrays import FloatArray
 from model.caching import NUMERICS_VERSION, cache_folder, code_version
-from model.drive_modes import checked_mode
+from model.drive_modes import UNRESTRICTED, checked_mode
 from model.errors import InputError, expect, expect_path
 from model.files.array_file import UNREADABLE, Arrays, digest_of, read_arrays, write_arrays
 from model.files.output_paths import begins_with
@@ -344,7 +344,7 @@ def build_table(
     *,
     frequencies: FloatArray | None = None,
     grid: Grid = PAPER_GRID,
-    drive_mode: str = "switched",
+    drive_mode: str = UNRESTRICTED,
     progress: Progress = unseen,
 ) -> LocalizationTable:
     """Build the localization table of a rig.
@@ -442,7 +442,7 @@ def cached_table(
     *,
     frequencies: FloatArray | None = None,
     grid: Grid = PAPER_GRID,
-    drive_mode: str = "switched",
+    drive_mode: str = UNRESTRICTED,
     progress: Progress = unseen,
 ) -> tuple[LocalizationTable, Path | None]:
     """Return a rig's table from the user's cache folder, built if it is not there, and its file.

@@ -23,6 +23,7 @@ from era_haptics.lab.design import problem
 from kit.plates import make_paper_rig
 from model.answer.answer import Layer
 from model.cli import app
+from model.drive_modes import playable_drive_modes
 from model.rig.rig import Channel
 from model.structure.attachments import PointLoad
 from model.table.table_file import build_table
@@ -273,6 +274,19 @@ def test_design_refuses(wrong: dict[str, object]) -> None:
     with pytest.raises(era.InputError) as refused:
         era.design(make_paper_rig(12, 9), **wrong)  # type: ignore[arg-type]
     assert "--" not in str(refused.value)
+
+
+def test_defaults_give_two_fingers_a_vibration_each(tmp_path: Path) -> None:
+    """Tables by `era.table` and `era table build` have the drive mode that a daemon chooses."""
+    table = era.table(RIG, frequencies=np.arange(60, 301, 20), grid=era.Grid(4, 3))
+    fingers = [era.Finger(at, era.Stimulus()) for at in (TARGET, QUIET[0])]
+    assert len(era.answer(table, fingers).layers) == 2
+    file = str(tmp_path / "table.npz")
+    build = ["table", "build", str(era.example_rig_path()), "-o", file, "--grid", "4x3"]
+    result = CliRunner().invoke(app, [*build, "--frequencies", "60:120:30"])
+    assert result.exit_code == 0, result.output
+    of_daemon = playable_drive_modes(level_step=0.001, phase_step=0.01)[-1]
+    assert era.load_table(file).drive_mode == table.drive_mode == of_daemon
 
 
 @pytest.mark.parametrize("envelopes", [False, True])

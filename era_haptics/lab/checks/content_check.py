@@ -26,7 +26,7 @@ from model.answer.answer import Answer
 from model.answer.plan import answer
 from model.answer.stimulus import Finger, Stimulus, check_level
 from model.arrays import FloatArray, best_of
-from model.drive_modes import DRIVE_MODES
+from model.drive_modes import UNRESTRICTED
 from model.finger import decibels, fingertip_points, fingertip_weights, over_threshold
 from model.quantities import percent, percent_down
 from model.structure.plate import Plate
@@ -232,7 +232,7 @@ def play_content(
     if rendition.course is not None:
         lasting = Stimulus(rendition.level_db_sl, rendition.band, course=rendition.course)
         stimuli.insert(0, (0.0, lasting))
-    answered = partial(answer, table, quiet=quiet, drive_mode=DRIVE_MODES[-1])
+    answered = partial(answer, table, quiet=quiet, drive_mode=UNRESTRICTED)
     found = {stimulus: answered([Finger(at, stimulus)]) for _, stimulus in stimuli}
     parts = tuple(Part(start, each, found[each]) for start, each in stimuli)
     highest = max((each.frequency or 0.0 for each in parts), default=0.0)

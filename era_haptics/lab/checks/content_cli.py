@@ -330,12 +330,11 @@ def _setting(
 
 def _built_in_table() -> "LocalizationTable":
     """Return the table of the founding paper's plate, from the user's cache if it is there."""
-    from model.drive_modes import DRIVE_MODES
     from model.rig.rig_file import example_rig_path, load_rig
     from model.table.table_file import cached_table
 
     rig = load_rig(example_rig_path())
-    table, _ = cached_table(rig, drive_mode=DRIVE_MODES[-1])
+    table, _ = cached_table(rig)
     return table
 
 

@@ -18,7 +18,7 @@ from controller.sources.touch import Contact, ContactKey
 from model.answer.answer import Answer, Limits
 from model.answer.answer_report import exposures
 from model.arrays import NEARLY, FloatArray
-from model.drive_modes import DRIVE_MODES
+from model.drive_modes import DRIVE_MODES, UNRESTRICTED
 from model.errors import InputError
 from model.finger import decibels, fingertip_points, fingertip_weights, over_threshold
 from model.processes import Progress, unseen
@@ -78,7 +78,7 @@ class TouchSimulator:
         self.chooser = Chooser(table)
         """Chooses what is played beside other contents."""
         self.capabilities = PlaybackCapabilities(
-            drive_mode=DRIVE_MODES[-1],
+            drive_mode=UNRESTRICTED,
             playable=DRIVE_MODES,
             limits=Limits((float(table.frequencies[0]), float(table.frequencies[-1]))),
             envelope_support=RAMPS_ONLY,

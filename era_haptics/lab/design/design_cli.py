@@ -138,7 +138,7 @@ def design(
         *_rows(result, own_count=len(rig.eras)),
         "wrote",
         *(f"  {name}" for name in files),
-        next_line("era", "table", "build", files[0], "-o", table, "--mode", "phased"),
+        next_line("era", "table", "build", files[0], "-o", table),
     ]
     print_report(rows, result, as_json=as_json)
 

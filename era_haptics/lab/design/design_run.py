@@ -33,7 +33,6 @@ from model.answer.stimulus import Finger, Stimulus
 from model.arrays import FloatArray, IntArray, best_by, best_first
 from model.config.document import Document, Value, data_text
 from model.config.fields import section_by_kind
-from model.drive_modes import UNRESTRICTED
 from model.errors import (
     MAX_VALUE,
     InputError,
@@ -532,7 +531,7 @@ def judge(rig: Rig, sets: Sequence[FloatArray], *, contents: int = 1) -> Assessm
     For contents of STRONG_DB_SL, where it cannot be reached for the highest found, none of which is
     shared or held back. Raises InputError for ERAs that do not support the plate.
     """
-    table = build_table(rig, drive_mode="phased")
+    table = build_table(rig)
     contrast, level = np.array([_answer(table, contacts, contents) for contacts in sets]).T
     quiet = np.array([len(contacts) - contents for contacts in sets])
     return Assessment(quiet, contrast, level)
@@ -545,7 +544,6 @@ def _answer(table: LocalizationTable, contacts: FloatArray, contents: int) -> tu
         table,
         fingers,
         quiet=places[contents:],
-        drive_mode=UNRESTRICTED,
         min_contrast_db=-math.inf,
     )
     assert found.promised_worst_db is not None  # noqa: S101  a set has two fingers

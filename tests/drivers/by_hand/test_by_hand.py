@@ -45,6 +45,8 @@ from era_haptics.lab.conformance.check import ConformanceReport
 from kit.wires import WORD_WIRES, WordFarSide, until
 from model.rig.rig_file import example_rig_path
 from registry.limits import GuardLimits
+from sim.amplifier import simulated_amplifier
+from sim.amplifier.readings import capabilities
 from sim.far_ends.can_amplifiers import CanBus, SlcanAdapter
 from sim.transport.far_end import make_terminal
 from sim.transport.simulated_line import LINE_KINDS, PROMPT
@@ -286,6 +288,38 @@ def test_blocking_amplifier_plays_and_ends_disarmed() -> None:
         assert amplifier.clear()["state"] == "SWITCH_ON_DISABLED"
         assert amplifier.faults() == []
     assert loop_threads() == []
+
+
+@pytest.mark.parametrize(
+    ("steps", "tones", "rejected"),
+    [
+        ({"phase_step": 9000}, [(0, 110.0, 0.3, 0.0), (1, 110.0, 0.3, 40.0)], "phase of channel 1"),
+        ({"phase_step": 9000}, [(0, 110.0, 0.3, 30.0), (1, 110.0, 0.3, 118.0)], ""),
+        ({"phase_step": 9000}, [(0, 110.0, 0.3, 0.0), (1, 150.0, 0.3, 40.0)], ""),
+        ({"phase_step": 900}, [(0, 110.0, 0.3, 0.0), (1, 110.0, 0.3, 40.0)], ""),
+        ({"level_step": 10_000}, [(0, 110.0, 0.3, 0.0)], "level of channel 0"),
+    ],
+    ids=["between steps", "a step apart", "other frequency", "fine steps", "on or off"],
+)
+def test_blocking_amplifier_rejects_what_its_steps_round_away(
+    steps: dict[str, int],
+    tones: list[tuple[int, float, float, float]],
+    rejected: str,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Steps of 90 degrees put 40 degrees at 0 or 90: 40 or 50 off, and 118 - 30 only 2 off."""
+    monkeypatch.setattr(
+        simulated_amplifier, "capabilities", lambda *n, **k: capabilities(*n, **k) | steps
+    )
+    made = AmplifierLayer(0, tuple(AmplifierTone(*tone) for tone in tones), ramp=0.0)
+    with BlockingAmplifier(DRAWN, limits=WIDE_LIMITS) as amplifier:
+        amplifier.arm(2.0)
+        if rejected:
+            with pytest.raises(CommandError, match=rejected):
+                amplifier.play([made], duration=0.03)
+            assert amplifier.status()["levels"] == [0.0] * 4
+        else:
+            amplifier.play([made], duration=0.03)
 
 
 def test_blocking_amplifier_measures_while_it_feeds_the_watchdog() -> None:

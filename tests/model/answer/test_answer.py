@@ -103,8 +103,7 @@ def test_a_hand_that_rests_is_counted_and_not_protected():
 
 def test_drive_mode_of_the_table_is_obeyed():
     """Amplifiers that only switch get ERAs at full stroke, as one finger's query; or a refusal."""
-    table = smooth_table()
-    assert table.drive_mode == "switched"
+    table = replace(smooth_table(), drive_mode="switched")
     requests, others = [wants(NEAR, level_db_sl=15.0)], [Finger(FAR)]
     (layer,) = answer_by_table(table, requests, quiet=others).layers
     (phased,) = answer(table, requests, others).layers

@@ -582,40 +582,57 @@ def with_modulation(
     """Modulate an answer as its fingers ask, where that leaves all fingers served.
 
     playable: lowest and highest frequency [Hz] of side bands. These are equally far below and above
-    the carrier, at the table's frequencies nearest to the modulation, and APART_HZ from all tones
-    of other contents. A shared content is steady. Levels are lowered to what the stroke allows.
+    the carrier, at the table's frequencies nearest to the modulation, APART_HZ from all tones of
+    other contents, and not among the avoided frequencies. A shared content is steady. Levels are
+    lowered to what the stroke allows.
     """
+    lowest = max(playable[0], table.frequencies[0])
+    highest = min(playable[1], table.frequencies[-1])
     for number, stream in enumerate(found.contents.streams):
-        stimulus, tones = found.asked[stream.targets[0]].stimulus, found.tones
+        stimulus = found.asked[stream.targets[0]].stimulus
         modulation = None if stimulus is None else stimulus.modulation_hz
         if stimulus is None or modulation is None or len(stream.targets) > 1:
             continue
-        alone = cache(_alone_at(table, found, number))
-        limits = max(playable[0], table.frequencies[0]), min(playable[1], table.frequencies[-1])
-        owners, rows = np.array(tones.owners), np.array(tones.rows)
-        taken = table.frequencies[rows[owners != number]]
-        tried = [
-            each
-            for each in _carriers(table, int(rows[owners == number][0]), modulation)
-            if _fits(table.frequencies[each], modulation, stimulus.band_hz, limits, taken)
+        owners, rows = np.array(found.tones.owners), np.array(found.tones.rows)
+        others = table.frequencies[rows[owners != number]]
+        steady = int(rows[owners == number][0])
+        candidates = [
+            tones
+            for tones in _carriers(table, steady, modulation)
+            if not {*tones} & {*found.contents.avoided}
+            and _fits(
+                table.frequencies[tones], modulation, stimulus.band_hz, (lowest, highest), others
+            )
         ]
-        if not tried:
+        if not candidates:
             continue
-        best = tried[best_of([_contrast_db([alone(row) for row in each]) for each in tried])]
-        own, kept = [alone(row) for row in best], np.flatnonzero(owners != number)
-        shares = _SHARES * 10 ** (-_ALL_DB / 20) * [each.gains[0] for each in own]
-        modulated = with_tones(
-            table,
-            found,
-            np.append(rows[kept], best),
-            [*(tones.weights[each] for each in kept.tolist()), *(each.weights[0] for each in own)],
-            np.append(owners[kept], [number] * len(own)),
-            np.append(np.array(tones.gains)[kept], shares),
-        )
-        modulated = _within_stroke(table, modulated)
+        modulated = _with_tones_of(table, found, number, candidates)
         if is_served(modulated, found):
             found = modulated
     return found
+
+
+def _with_tones_of(
+    table: LocalizationTable, found: Answer, number: int, candidates: Sequence[Sequence[int]]
+) -> Answer:
+    """Give a content the carrier and side bands of the best contrast, within the stroke."""
+    tones = found.tones
+    owners, rows, gains = np.array(tones.owners), np.array(tones.rows), np.array(tones.gains)
+    tone_at = cache(_alone_at(table, found, number))
+    contrasts = [_contrast_db([tone_at(row) for row in candidate]) for candidate in candidates]
+    best = candidates[best_of(contrasts)]
+    own = [tone_at(row) for row in best]
+    own_gains = _SHARES * 10 ** (-_ALL_DB / 20) * [tone.gains[0] for tone in own]
+    kept = np.flatnonzero(owners != number)
+    modulated = with_tones(
+        table,
+        found,
+        np.append(rows[kept], best),
+        [*(tones.weights[tone] for tone in kept.tolist()), *(tone.weights[0] for tone in own)],
+        np.append(owners[kept], [number] * len(own)),
+        np.append(gains[kept], own_gains),
+    )
+    return _within_stroke(table, modulated)
 
 
 def _carriers(table: LocalizationTable, steady: int, modulation: float) -> Iterator[list[int]]:

@@ -535,6 +535,19 @@ def test_a_modulation_between_two_steps_of_the_table_plays_the_nearest(table):
         assert len(layer.side_bands) == count
 
 
+def test_side_bands_keep_apart_from_what_plays_already(table):
+    """Whichever frequency plays, each of the three tones is 30 Hz from it; some sets have three."""
+    counts = []
+    for playing in (80.0, 120.0, 160.0, 200.0, 240.0):
+        request = wants((0.09, 0.07), level_db_sl=12.0, modulation_hz=20.0)
+        found = answer(table, [request], [Finger(FAR)], avoided_hz=[playing])
+        (layer,) = found.layers
+        tones = [tone.frequency for each, _ in layer.drives for tone in each.values()]
+        assert min(abs(frequency - playing) for frequency in tones) >= 30.0
+        counts.append(len({*tones}))
+    assert {*counts} >= {3}
+
+
 @pytest.mark.parametrize("modulation", [20.0, 30.0])
 def test_all_tones_of_two_contents_are_apart(table, modulation):
     """By 30 Hz, side bands of one and carrier and side bands of the other, where any is."""

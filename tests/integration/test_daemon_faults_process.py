@@ -80,6 +80,7 @@ from processes.daemons import (
     until_state,
     write_daemon,
 )
+from sim.far_ends.wire_assignment import FAR_ENDS
 from sim.faults import FaultWindow
 from sim.plant import imperfections
 from sim.plant.imperfections import Imperfections, draw_imperfections, realised
@@ -643,7 +644,7 @@ TURNS = Stream(
 # channels with an onset need 30 words (3 of the head, 3 of the layer, 6 of each), and 8 more for
 # each knot: an ending follows in a set of its own.
 KNOTS = {"modbus-rtu": 2, "slcan": 9, "socketcand": 9}
-WIRES = ("serial", "modbus-tcp", "modbus-rtu", "slcan", "socketcand")
+WIRES = tuple(FAR_ENDS)
 SHORTLY = ("serial", "modbus-rtu")
 
 

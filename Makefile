@@ -162,8 +162,9 @@ surface-test: .venv/installed-test
 	$(BIN)/python -m benchmarks.surface --solver calculix --sets 30 $(SURFACE)
 
 format: .venv/installed-test
-	$(BIN)/ruff check --fix .
+	$(BIN)/ruff check --fix --exit-zero --quiet .
 	$(BIN)/ruff format .
+	$(BIN)/ruff check .
 
 # Five minutes. Programs take turns, so that other load affects all of them.
 bench: .venv/installed-peers

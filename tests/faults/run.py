@@ -1,14 +1,25 @@
 """Judge the tests by planted faults: plant each in a copy of the tree, run the tests that find it.
 
-    python tests/faults/run.py [--only PATTERN] [--nightly] [--workers N] [--json FILE]
+    python tests/faults/run.py [--only PATTERN] [--workers N] [--json FILE]
+    python tests/faults/run.py --check [FILE ...]      list faults that cannot be planted any more
+    python tests/faults/run.py --nightly               list faults that `make test` does not find
 
-Faults are data, in the files `AREA.yaml` beside this one; CONTRIBUTING.md has their format. A fault
-is found if every test named by it fails and shows what it must, missed if one of them does not or
-takes too long, stale if a text to change does not occur exactly once in its file, no test can be
-run with it, or one ends by a name or module that is not there. Those of `missed.yaml` are not found
-by any test of today, with the reason: a line to fall behind never. --nightly lists, in place of
-judging, the faults that `make test` does not find, since all their tests are long.
-Exit status 1 for anything missed or stale that is not among them, or found though it is.
+Faults are data, in the files `AREA.yaml` beside this one:
+
+    - fault: a name that occurs once in the area
+      behaviour: What the product then does, in words that do not depend on the code.
+      change:                   # edits; each text to find occurs once in its file
+        - {file: drivers/wires/modbus.py, find: "text", replace: "other text"}
+      found_by: ["tests/drivers/test_a.py::test_b[{where}]"]   # the quickest; each must fail
+      where: [serial, modbus]   # optional: what stands for {where}
+      shows: text               # optional: in the first line of each failure
+      missed: reason            # only in missed.yaml: why no test finds it yet
+
+A fault is *found* if each of its tests fails and shows what it must, *missed* if one of them passes
+or takes too long, and *stale* if it cannot be planted: a text to find does not occur once in its
+file, or a test cannot be run. Who rewrites a text or renames a test does so in the fault, too, and
+never drops the fault. Exit status 1 for a fault that is missed or stale, and for one of missed.yaml
+that is found.
 """
 
 import argparse
@@ -63,11 +74,12 @@ _BROKEN = "cannot be run", "ImportError", "ModuleNotFoundError", "NameError", ' 
 class PlantedFault:
     """A fault in words of behaviour, the edits (file, find, replace) that plant it, and its tests.
 
-    name: AREA/NAME; shows: what the first line of each failure must contain; missed: why no test of
-    today finds it, empty for all others.
+    name: AREA/NAME; source: the file that describes it; shows: what the first line of each failure
+    must contain; missed: why no test finds it yet, empty for all others.
     """
 
     name: str
+    source: str
     behaviour: str
     edits: tuple[tuple[str, str, str], ...]
     tests: tuple[str, ...]
@@ -85,10 +97,10 @@ class Judgement:
     tests: Mapping[str, str]
 
     def __str__(self) -> str:
-        passed = (
-            [] if self.result == "found" else [f"\n    {t}: {w}" for t, w in self.tests.items()]
-        )
-        return f"{self.result:6} {self.seconds:5.1f} s  {self.fault}{''.join(passed)}"
+        lines = [f"{self.result:6} {self.seconds:5.1f} s  {self.fault}"]
+        if self.result != "found":
+            lines += [f"    {subject}: {outcome}" for subject, outcome in self.tests.items()]
+        return "\n".join(lines)
 
 
 class _Outcomes:
@@ -108,27 +120,29 @@ class _Outcomes:
 
 def load_faults() -> list[PlantedFault]:
     """Return the faults of all areas; ValueError for a name that occurs twice."""
-    faults = [
-        _fault_of(path.stem, row)
-        for path in sorted(HERE.glob("*.yaml"))
-        for row in yaml.load(path.read_text("utf-8"), Loader=yaml.CSafeLoader) or ()
-    ]
-    twice = [name for name, count in Counter(one.name for one in faults).items() if count > 1]
+    faults: list[PlantedFault] = []
+    for path in sorted(HERE.glob("*.yaml")):
+        rows = yaml.load(path.read_text("utf-8"), Loader=yaml.CSafeLoader) or ()
+        faults += [_fault_of(path, row) for row in rows]
+    counts = Counter(fault.name for fault in faults)
+    twice = [name for name, count in counts.items() if count > 1]
     if twice:
         raise ValueError(f"names of faults must be unique, got {', '.join(twice)} twice")
     return faults
 
 
-def _fault_of(area: str, row: dict[str, Any]) -> PlantedFault:
+def _fault_of(path: Path, row: dict[str, Any]) -> PlantedFault:
     wires = row.get("where", [""])
-    tests = [each.replace("{where}", wire) for each in row["found_by"] for wire in wires]
+    tests = [test.replace("{where}", wire) for test in row["found_by"] for wire in wires]
+    edits = [(edit["file"], edit["find"], edit["replace"]) for edit in row["change"]]
     return PlantedFault(
-        f"{area}/{row['fault']}",
-        row["behaviour"],
-        tuple((edit["file"], edit["find"], edit["replace"]) for edit in row["change"]),
-        tuple(dict.fromkeys(tests)),
-        row.get("shows", ""),
-        row.get("missed", ""),
+        name=f"{path.stem}/{row['fault']}",
+        source=path.relative_to(ROOT).as_posix(),
+        behaviour=row["behaviour"],
+        edits=tuple(edits),
+        tests=tuple(dict.fromkeys(tests)),
+        shows=row.get("shows", ""),
+        missed=row.get("missed", ""),
     )
 
 
@@ -165,22 +179,46 @@ def _run_pytest(folder: Path, tests: Sequence[str], sending: Connection) -> None
 
 
 def stale_edits(fault: PlantedFault, tree: Path) -> dict[str, str]:
-    """Return what is wrong with the files of a tree in which a fault cannot be planted.
+    """Return why a fault cannot be planted in a tree, by file; empty if it can.
 
     A text must occur once; a module in which several lines replace it must still be Python.
     """
-    stale, planted = dict[str, str](), dict[str, str]()
+    stale: dict[str, str] = {}
+    planted: dict[str, str] = {}
     for file, find, replace in fault.edits:
-        text = planted.get(file) or (_text(tree / file) if (tree / file).is_file() else "")
-        planted[file] = text.replace(find, replace)
-        if text.count(find) != 1:
-            stale[file] = "must contain the text to change once"
+        if file not in planted:
+            planted[file] = _text(tree / file) if (tree / file).is_file() else ""
+        count = planted[file].count(find)
+        planted[file] = planted[file].replace(find, replace)
+        if count != 1:
+            stale[file] = f"must contain once, got {count} times: {find.strip()}"
         elif file.endswith(".py") and "\n" in replace:
             try:
                 ast.parse(planted[file])
             except SyntaxError as error:
                 stale[file] = f"must be Python once it is changed, got {error}"
     return stale
+
+
+def stale_report(faults: Iterable[PlantedFault], tree: Path) -> list[str]:
+    """Describe each fault that cannot be planted in a tree: where, why, and what to do."""
+    reports = []
+    for fault in faults:
+        for file, reason in stale_edits(fault, tree).items():
+            reports.append(
+                f"{fault.source}: fault {fault.name.partition('/')[2]} cannot be planted:\n"
+                f"    {file} {reason}\n"
+                f"    Change `find` and `replace` there to the present code, so that again:\n"
+                f"    {fault.behaviour}\n"
+                f"    Then: python tests/faults/run.py --only {fault.name}"
+            )
+    return reports
+
+
+def _concerns(fault: PlantedFault, files: Sequence[str]) -> bool:
+    """Whether a fault is described in, or planted in, one of these files; in any without files."""
+    places = {fault.source, *(file for file, _, _ in fault.edits)}
+    return not files or not places.isdisjoint(files)
 
 
 def collected(*arguments: str) -> set[str]:
@@ -269,6 +307,9 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--only", default="", help="part of AREA/NAME of faults")
     parser.add_argument("--nightly", action="store_true", help="list what `make test` leaves")
+    parser.add_argument(
+        "--check", nargs="*", metavar="FILE", help="list faults of these files that are stale"
+    )
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--json", type=Path, help="file for the judgements")
     asked = parser.parse_args()
@@ -278,6 +319,10 @@ def main() -> int:
     if asked.nightly:
         _list_nightly(faults)
         return 0
+    if asked.check is not None:
+        reports = stale_report([one for one in faults if _concerns(one, asked.check)], ROOT)
+        sys.stdout.writelines(f"{report}\n" for report in reports)
+        return 1 if reports else 0
     for module in (*_PRELOADED, *(_PRELOADED_FOR_MANY if len(faults) > _MANY else ())):
         import_module(module)
     known = {one.name for one in faults if one.missed}

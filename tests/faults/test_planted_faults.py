@@ -38,21 +38,41 @@ def judged(run: Path, *options: str) -> tuple[int, dict[str, str]]:
 
 
 def test_no_fault_is_stale(request: pytest.FixtureRequest) -> None:
-    """A text to change occurs once in its file; what is imported and all tests are there.
-
-    Who rewrites a text or renames a test does so in the fault, too.
-    """
+    """A text to change occurs once in its file; what is imported and all tests are there."""
     judge = runpy.run_path(str(RUN))
     faults = judge["load_faults"]()
-    stale = {one.name: judge["stale_edits"](one, judge["ROOT"]) for one in faults}
-    assert {name: files for name, files in stale.items() if files} == {}
+    reports = judge["stale_report"](faults, judge["ROOT"])
+    assert not reports, "\n".join(reports)
     lines = {line.strip() for one in faults for edit in one.edits for line in edit[2].split("\n")}
     exec("\n".join(line for line in lines if re.fullmatch(r"(from [\w.]+ )?import [\w, ]+", line)))
     folder = request.node.getparent(pytest.Dir)
     beside = pytest.Module.from_parent(folder, path=RUN.with_name("one_conformance.py"))
     known = request.config.stash[COLLECTED] | {test.nodeid for test in beside.collect()}
     others = {test for one in faults for test in one.tests} - known
-    assert not others or others <= judge["collected"](*sorted(others))  # of files not asked for
+    missing = others - judge["collected"](*sorted(others)) if others else set()
+    assert not missing, "tests of faults must exist: correct `found_by` in tests/faults"
+
+
+def test_stale_fault_is_reported_with_its_file_and_the_remedy(tmp_path: Path) -> None:
+    """The report of a fault whose text is gone names both files, the text and the behaviour."""
+    folder = tmp_path / "tests" / "faults"
+    folder.mkdir(parents=True)
+    shutil.copy(RUN, folder)
+    (tmp_path / "sums.py").write_text("SUM = 2 + 2\n")
+    faults = [("sound", "2 + 2"), ("gone", "2 + 1")]
+    texts = [FAULT.format(name=name, find=find, result="5") for name, find in faults]
+    (folder / "sums.yaml").write_text("".join(texts))
+    command = [sys.executable, folder / "run.py", "--check"]
+    done = subprocess.run(command, stdout=subprocess.PIPE, text=True)
+    assert done.returncode == 1
+    assert done.stdout.splitlines() == [
+        "tests/faults/sums.yaml: fault gone cannot be planted:",
+        "    sums.py must contain once, got 0 times: 2 + 1",
+        "    Change `find` and `replace` there to the present code, so that again:",
+        "    Two and two are 5.",
+        "    Then: python tests/faults/run.py --only sums/gone",
+    ]
+    assert subprocess.run([*command, "other.py"]).returncode == 0
 
 
 @pytest.mark.long

@@ -290,6 +290,12 @@ def _workers() -> int:
     return 0 if is_busy else processors
 
 
+def _check_planted_faults(changed: Sequence[str]) -> int:
+    """List the planted faults that changed files have made stale; return 1 for any."""
+    command = [sys.executable, "tests/faults/run.py", "--check", *changed]
+    return subprocess.run(command, cwd=ROOT, check=False).returncode
+
+
 def main() -> int:
     """Run the command."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
@@ -310,6 +316,8 @@ def main() -> int:
     sys.stdout.flush()
     os.chdir(ROOT)
     status = _run(selected, seconds=options.seconds) if selected else 0
+    if changed:
+        status = max(status, _check_planted_faults(changed))
     farther = len(reached) - len(selected)
     unreached = len(_tests()) - len(reached)
     sys.stdout.write(

@@ -516,14 +516,14 @@ def write_responses_uff(
 
 def _read_csv(path: Path) -> list[MeasuredValue]:
     found = []
-    header = text_of(path, read_bytes(path)).lstrip().partition("\n")[0]
-    is_per_volt = _PER_VOLT[0] in header
-    columns = (*COLUMNS[:-2], *(_PER_VOLT if is_per_volt else COLUMNS[-2:]))
-    for line in read_lines(path, columns, optional=(*ERA_COLUMNS, MASS, SETTING)):
+    optional = (*ERA_COLUMNS, MASS, SETTING)
+    for line in read_lines(path, COLUMNS, optional=optional, instead=_PER_VOLT):
+        is_per_volt = _PER_VOLT[0] in line.cells
         at_era = [line.number(name) for name in ERA_COLUMNS if name in line.cells]
         if len(at_era) == 1:
             raise InputError(f"{path}:1: {' and '.join(ERA_COLUMNS)} must be given together")
-        x, y, frequency, real, imaginary = map(line.number, columns[2:])
+        parts = _PER_VOLT if is_per_volt else COLUMNS[-2:]
+        x, y, frequency, real, imaginary = map(line.number, (*COLUMNS[2:-2], *parts))
         era, sensor = line.cells["era"], line.cells["sensor"]
         if not (era and sensor):
             raise InputError(f"{line.place}: era and sensor must have names")

@@ -6,8 +6,10 @@ import io
 import logging
 import math
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections import deque
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from importlib import import_module
 from itertools import chain
 from pathlib import Path
@@ -18,10 +20,13 @@ from numpy.typing import NDArray
 
 from model.errors import MAX_VALUE, InputError
 from model.files.array_file import whole_or_nothing
-from model.files.uff import read_bytes, text_of
+from model.files.uff import open_measured, text_stream
 from registry.plugins import did_you_mean
 
 _MAX_NAMED = 3  # unknown columns in an error
+_MAX_COLUMNS = 1000
+_MAX_LINE = 1 << 16  # characters
+_MAX_ABOVE = 100  # lines above numbers, of which one may name their columns
 _POINT = re.compile(r'[;\t"\n][-+]?\d+\.\d+(?:[eE][-+]?\d+)?[;\t"\n]')  # a number with one
 _BLANK = "\n ,;\t"  # of lines without content
 _MAX_DB = 200.0
@@ -153,54 +158,47 @@ def read_lines(
     columns: Sequence[str],
     *,
     optional: Sequence[str] = (),
+    instead: Sequence[str] = (),
     unnamed: Sequence[str] = (),
-) -> list[CsvLine]:
-    """Read a file whose first line names its columns, in any order.
+) -> Iterator[CsvLine]:
+    """Yield the lines of a file whose first line names its columns, in any order.
 
     Columns are separated by commas, semicolons, tabs or spaces; but for commas a decimal comma is
     read as well, unless another number has a decimal point: it may separate thousands. Empty lines,
     remarks above the names (with *, #, ! or // before them), empty cells behind the last column and
-    further columns are skipped. unnamed: columns of a file that has numbers alone, as programs that
-    measure write it; then names of quantities and units are read by their meaning, also from a
-    remark. Raises InputError with file and line for missing and repeated columns, names that may be
+    further columns are skipped. instead: columns in place of the last ones, of a file that has the
+    first of them. unnamed: columns of a file that has numbers alone, as programs that measure write
+    it; then names of quantities and units are read by their meaning, also from a remark.
+
+    The file is read line by line: one that is damaged takes no more memory than its first lines.
+    Raises InputError with file and line for missing and repeated columns, names that may be
     misspelt, lines of another length, and a file without any.
     """
-    text = text_of(path, read_bytes(path)).replace("\r\n", "\n").replace("\r", "\n")
-    given, begin = text.split("\n"), 0
-    if given[0].lower().startswith("sep="):  # of a spreadsheet program
-        given[0] = ""
-    # Below names a line may begin with the name of a sensor, such as #1.
-    above = next((n for n, row in enumerate(given) if row and not _REMARK.match(row)), 0)
-    marked = given if unnamed else given[:above]
-    plain = ["" if _REMARK.match(row) else row for row in marked] + given[len(marked) :]
-    first = next((row for row in plain if row.strip(_BLANK)), "")
-    if unnamed:
-        begin = next((number for number, row in enumerate(plain) if _NUMERIC.match(row)), 0)
-        first = plain[begin] if begin else first
-    if is_spaced := _SPACED.search(first) is not None and not (";" in first or "\t" in first):
-        plain = ["\t".join(row.split()) for row in plain]
-    separator = "\t" if is_spaced else next((each for each in "\t;" if each in first), ",")
-    names: list[str] = []
-    if unnamed and _NUMERIC.match(first):
-        count = len([cell for cell in plain[begin].split(separator) if cell.strip()])
-        heads = [_REMARK.sub("", row).strip(_BLANK) for row in given[:begin]]
-        split = [_columns(row, separator, count) for row in heads if row]
-        names = [*unnamed] if count == len(unnamed) else [f"column {n + 1}" for n in range(count)]
-        names = next((row for row in reversed(split) if len(row) == count), names)
-        plain[:begin] = [""] * begin
+    head = _head_of(path, unnamed)
+    has_decimal_comma = head.separator != "," and not _has_points(path, head)
     rows = csv.reader(
-        io.StringIO("\n".join(plain)), strict=True, skipinitialspace=True, delimiter=separator
+        (f"{row}\n" for row in _plain_rows(path, head)),
+        strict=True,
+        skipinitialspace=True,
+        delimiter=head.separator,
     )
-    has_decimal_comma = separator != "," and _POINT.search("\n".join(["", *plain, ""])) is None
     filled = (row for row in rows if any(map(str.strip, row)))
-    lines = []
+    count = 0
     try:
-        header = names or [name.strip() for name in next(filled, ())]
-        place, factors = f"{path}:{rows.line_num or 1}", dict[str, float]()
+        header = list(head.names) or [name.strip() for name in next(filled, ())]
+        place = f"{path}:{rows.line_num or 1}"
         while header and not header[-1]:
             del header[-1]
+        if len(header) > _MAX_COLUMNS:
+            raise InputError(
+                f"{place}: line must have up to {_MAX_COLUMNS} columns, got {len(header)}; give a "
+                "CSV file"
+            )
+        factors: Mapping[str, float] = {}
         if unnamed:
             header, factors = _meant(header, (*columns, *optional))
+        if instead and instead[0] in header:
+            columns = (*columns[: -len(instead)], *instead)
         _check_header(place, header, columns, optional)
         for row in filled:
             place = f"{path}:{rows.line_num}"
@@ -212,14 +210,108 @@ def read_lines(
                     f"{len(row)}; the file is damaged"
                 )
             cells = dict(zip(header, map(str.strip, row), strict=True))
-            lines.append(CsvLine(place, cells, has_decimal_comma, factors))
+            count += 1
+            yield CsvLine(place, cells, has_decimal_comma, factors)
     except csv.Error as error:
         raise InputError(
             f"{path}:{rows.line_num}: invalid CSV ({error}); check quotes and the end of the file"
         ) from error
-    if not lines:
+    if count == 0:
         raise InputError(f"{path}:1: at least one line of values must follow, got none")
-    return lines
+
+
+@dataclass(frozen=True)
+class _Head:
+    """How the rows of a file are read."""
+
+    skipped: int
+    """Number of rows before the first that is read."""
+
+    separator: str
+    is_spaced: bool
+    """Whether spaces separate its columns."""
+
+    has_remarks: bool
+    """Whether remarks may stand between its rows."""
+
+    names: Sequence[str]
+    """Columns; empty if the first row that is read names them."""
+
+
+def _head_of(path: Path, unnamed: Sequence[str]) -> _Head:
+    """Find where a file begins, and how its columns are separated; raises InputError."""
+    above: deque[str] = deque(maxlen=_MAX_ABOVE)
+    first_row = first_filled = ""
+    is_empty = True
+    skipped = 0
+    for number, row in enumerate(_text_rows(path)):
+        is_empty = is_empty and not row.strip()
+        is_remark = _REMARK.match(row) is not None
+        if unnamed and not is_remark and _NUMERIC.match(row):
+            first_row, skipped = row, number
+            break
+        if not first_filled and not is_remark and row.strip(_BLANK):
+            first_filled = row
+        # Below names a line may begin with the name of a sensor, such as #1.
+        if not unnamed and row and not is_remark:
+            skipped = number
+            if first_filled:
+                break
+        above.append(row)
+    if is_empty:
+        raise InputError(f"{path}: file is empty; export the measurement again")
+    first = first_row or first_filled
+    is_spaced = _SPACED.search(first) is not None and not (";" in first or "\t" in first)
+    plain = "\t".join(first.split()) if is_spaced else first
+    separator = "\t" if is_spaced else next((sign for sign in "\t;" if sign in first), ",")
+    names: Sequence[str] = ()
+    if first_row:
+        count = len([cell for cell in plain.split(separator) if cell.strip()])
+        heads = [_REMARK.sub("", row).strip(_BLANK) for row in above]
+        split = [_columns(row, separator, count) for row in heads if row]
+        default = [f"column {number + 1}" for number in range(count)]
+        names = unnamed if count == len(unnamed) else default
+        names = next((row for row in reversed(split) if len(row) == count), names)
+    return _Head(skipped, separator, is_spaced, bool(unnamed), names)
+
+
+def _has_points(path: Path, head: _Head) -> bool:
+    """Whether a number of a file has a decimal point."""
+    return any(_POINT.search(f"\n{row}\n") for row in _plain_rows(path, head))
+
+
+def _plain_rows(path: Path, head: _Head) -> Iterator[str]:
+    """All rows of a file in turn: skipped ones and remarks as empty ones."""
+    for number, row in enumerate(_text_rows(path)):
+        if number < head.skipped or (head.has_remarks and _REMARK.match(row)):
+            yield ""
+        elif head.is_spaced:
+            yield "\t".join(row.split())
+        else:
+            yield row
+
+
+def _text_rows(path: Path) -> Iterator[str]:
+    """All rows of a file without their ends; raises InputError for what is no text."""
+    with open_measured(path) as file, text_stream(file) as stream:
+        number = 0
+        try:
+            for row in iter(partial(stream.readline, _MAX_LINE), ""):
+                number += 1
+                if "\0" in row:
+                    raise InputError(
+                        f"{path}: file must be text in UTF-8, got zero bytes; export it as such"
+                    )
+                if len(row) == _MAX_LINE and not row.endswith("\n"):
+                    raise InputError(
+                        f"{path}:{number}: line must have less than {_MAX_LINE} characters; give a "
+                        "CSV file"
+                    )
+                # Spreadsheet programs state the separator in the first row.
+                is_separator = number == 1 and row.lower().startswith("sep=")
+                yield "" if is_separator else row.removesuffix("\n")
+        except UnicodeDecodeError as error:
+            raise InputError(f"{path}: text must be UTF-8; save it as such") from error
 
 
 def _columns(row: str, separator: str, count: int) -> list[str]:

@@ -7,9 +7,11 @@ writes files. It skips over damage and knows one spelling of numbers, so files a
 import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
+from io import TextIOWrapper
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +19,7 @@ from numpy.typing import NDArray
 from model.arrays import FloatArray
 from model.errors import MAX_VALUE, InputError
 from model.files.array_file import whole_or_nothing
-from registry.files import read_regular
+from registry.files import open_regular
 
 TIME_RESPONSE, FREQUENCY_RESPONSE = 1, 4  # function types
 DISPLACEMENT, ACCELERATION, TIME, FREQUENCY = 8, 12, 17, 18  # data types
@@ -158,7 +160,7 @@ def read_universal(path: Path) -> Universal:
 def text_of(path: Path, content: bytes) -> str:
     """The text of a measured file in UTF-8, or UTF-16 with a mark; raises InputError."""
     try:
-        text = content.decode("utf-16" if content.startswith(_UTF_16) else "utf-8-sig")
+        text = content.decode(_encoding(content))
     except UnicodeDecodeError as error:
         raise InputError(f"{path}: text must be UTF-8; save it as such") from error
     if "\0" in text:
@@ -166,15 +168,34 @@ def text_of(path: Path, content: bytes) -> str:
     return text
 
 
+def text_stream(file: BinaryIO) -> TextIOWrapper:
+    """The text of an open file in UTF-8, or UTF-16 with a mark, with any line ends."""
+    start = file.read(2)
+    file.seek(0)
+    return TextIOWrapper(file, _encoding(start), newline=None)
+
+
+def _encoding(start: bytes) -> str:
+    return "utf-16" if start.startswith(_UTF_16) else "utf-8-sig"
+
+
 def read_bytes(path: Path) -> bytes:
     """Read a measured file; raises InputError if it is missing, empty or too large."""
-    try:
-        content = read_regular(path, _MAX_BYTES)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}") from error
+    with open_measured(path) as file:
+        content = file.read()
     if not content.strip():
         raise InputError(f"{path}: file is empty; export the measurement again")
     return content
+
+
+@contextmanager
+def open_measured(path: Path) -> Iterator[BinaryIO]:
+    """Open a measured file; raises InputError if it is missing or too large."""
+    try:
+        with open_regular(path, _MAX_BYTES) as file:
+            yield file
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}") from error
 
 
 @dataclass(frozen=True)

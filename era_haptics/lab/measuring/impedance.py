@@ -302,8 +302,11 @@ def read_impedance(path: Path) -> tuple[FloatArray, ComplexArray]:
     That may have magnitude and phase (ZMA, LIMP, REW) or real and imaginary part, in other words
     and units (`model.files.csv_file.read_lines`). Raises InputError.
     """
-    lines = read_lines(path, _READ[:1], optional=_READ[1:], unnamed=_UNNAMED)
-    frequencies = np.array([line.number("frequency_hz") for line in lines])
-    if frequencies.min() <= 0:
-        raise InputError(f"{path}: frequency_hz must be above 0, got {frequencies.min():g}")
-    return frequencies, np.array([line.complex_number() for line in lines])
+    frequencies = []
+    impedance = []
+    for line in read_lines(path, _READ[:1], optional=_READ[1:], unnamed=_UNNAMED):
+        frequencies.append(line.number("frequency_hz"))
+        impedance.append(line.complex_number())
+    if min(frequencies) <= 0:
+        raise InputError(f"{path}: frequency_hz must be above 0, got {min(frequencies):g}")
+    return np.array(frequencies), np.array(impedance)

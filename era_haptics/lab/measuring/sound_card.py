@@ -428,7 +428,7 @@ def read_sensors(
     """
     sensors: list[WiredSensor] = []
     columns = (*PLACE_COLUMNS, *INPUT_COLUMNS[:2])
-    lines = read_lines(path, columns, optional=tuple(_OPTIONAL))
+    lines = [*read_lines(path, columns, optional=tuple(_OPTIONAL))]
     moves = may_move and len(lines) > 1 and len({line.number("input") for line in lines}) == 1
     for line in lines:
         sensors.append(_sensor(line, sensors, plate, mass=mass, moves=moves))

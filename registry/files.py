@@ -7,8 +7,10 @@ tables, answers and designs do not, and a missing module is explained (`posix_ne
 import errno
 import os
 import stat
+from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
-from typing import IO, Any, BinaryIO
+from typing import IO, Any, BinaryIO, TextIO
 
 
 def regular_file(name: str, flags: int) -> int:
@@ -44,6 +46,25 @@ def read_regular(path: Path, max_bytes: int) -> bytes:
     if len(content) > max_bytes:  # of a length that no system states
         raise _too_long(path, max_bytes)
     return content
+
+
+class LineTooLong(ValueError):
+    """A line of text that is longer than expected; its number is in `line`."""
+
+    def __init__(self, line: int, max_length: int) -> None:
+        self.line = line
+        super().__init__(f"line must have less than {max_length} characters")
+
+
+def lines_of(stream: TextIO, max_length: int) -> Iterator[str]:
+    """Yield the lines of a text without their ends; raises LineTooLong.
+
+    A line of a binary or hostile file may be as long as the file.
+    """
+    for number, line in enumerate(iter(partial(stream.readline, max_length), ""), start=1):
+        if len(line) == max_length and not line.endswith("\n"):
+            raise LineTooLong(number, max_length)
+        yield line.removesuffix("\n")
 
 
 def _too_long(path: Path, max_bytes: int) -> OSError:

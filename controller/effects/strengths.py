@@ -99,6 +99,8 @@ def read_strengths(file: Path | None) -> Mapping[str, float]:
         # A number of many digits becomes infinite, and is refused as such.
         gains = json.loads(text, object_pairs_hook=_unique, parse_int=float)
         return _GAINS.validate_python(gains, strict=True)
+    except InputError as error:
+        raise InputError(f"{file}: {error}; correct or remove it") from error
     except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
         raise InputError(f"{file}: is not JSON ({error}); correct or remove it") from error
     except ValidationError as error:

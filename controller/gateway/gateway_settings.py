@@ -20,6 +20,10 @@ _DEVIATING = re.compile("[\xdf\u03c2\u200c\u200d]")  # which Python's IDNA maps 
 _ORIGIN = re.compile(r"(https?)://([^/?#@:\s\[\]]+|\[[^]]*\])(?::([0-9]{1,5}))?", re.IGNORECASE)
 _DEFAULT_PORTS = {"http": 80, "https": 443}
 _LOOPBACK_NAMES = ("localhost", "127.0.0.1", "[::1]")
+_RULE = (
+    "token must have 22 to 128 letters, digits, - or _; make one with "
+    "python -c 'import secrets; print(secrets.token_urlsafe(32))'"
+)
 _MAX_TOKEN_FILE = 4096  # bytes
 
 
@@ -53,8 +57,7 @@ class GatewaySettings:
             (not 0 <= self.port < 65536, f"port must be 0 to 65535, got {self.port}"),
             (
                 not _TOKEN.fullmatch(self.token),
-                "token must have 22 to 128 letters, digits, - or _; make one with "
-                "python -c 'import secrets; print(secrets.token_urlsafe(32))'",
+                _RULE,
             ),
             (
                 not is_loopback and not self.is_token_user_supplied,
@@ -151,7 +154,7 @@ def read_token(path: Path) -> str:
             "token that only you may read"
         ) from error
     for is_wrong, text in (
-        (not content.isascii(), "not a text file; --token-file must be a file with the token"),
+        (not _TOKEN.fullmatch(content.decode("ascii", "replace").strip()), _RULE),
         (status.st_mode & 0o077, f"readable by other users; restrict it with chmod 600 {path}"),
         (
             status.st_uid not in (0, os.geteuid()),

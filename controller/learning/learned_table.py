@@ -6,7 +6,6 @@ what was learned. It works in the process of the estimator.
 
 import json
 import time as clock
-import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -19,7 +18,13 @@ from model.arrays import FloatArray
 from model.errors import InputError
 from model.estimate.following import BY_MASS, LivePlate, PlateEstimate, SettledPattern
 from model.estimate.forward import Sensor
-from model.files.array_file import UNREADABLE, read_arrays, remove_partial, write_arrays
+from model.files.array_file import (
+    UNREADABLE,
+    array_names,
+    read_arrays,
+    remove_partial,
+    write_arrays,
+)
 from model.files.output_paths import begins_with
 from model.rig.rig import Rig, Uncertainty
 from model.table.table import LocalizationTable
@@ -241,6 +246,8 @@ def load_learned(file: Path, *, table: str) -> tuple[dict[str, Any], FloatArray,
         ) from error
     if version != _VERSION or x.shape != (p,) or covariance.shape != (p, p):
         raise InputError(f"{file}: version must be {_VERSION}; remove the file to learn anew")
+    if not (np.isfinite(x).all() and np.isfinite(covariance).all()):
+        raise InputError(f"{file}: numbers must be finite; remove the file to learn anew")
     if of != table:
         raise InputError(
             f"{file}: must be learned for this table, got one of another rig; remove the file to "
@@ -251,10 +258,9 @@ def load_learned(file: Path, *, table: str) -> tuple[dict[str, Any], FloatArray,
 
 def was_learned(file: Path) -> bool:
     """Whether a file is a learned plate of any version, or may have been before it was damaged."""
-    if not begins_with(file, b"PK"):
+    if not begins_with(file, b"PK") or file.stat().st_size > _MAX_BYTES:
         return False
     try:
-        with zipfile.ZipFile(file) as members:
-            return "covariance.npy" in members.namelist()
-    except zipfile.BadZipFile:
+        return "covariance" in array_names(file, max_bytes=_MAX_BYTES)
+    except UNREADABLE:
         return True

@@ -27,16 +27,17 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
+from io import TextIOWrapper
 from itertools import islice, product
 from pathlib import Path
-from typing import TypeAlias
+from typing import TextIO, TypeAlias
 
 from controller.sources.touch import Touch, TouchFrame
 from controller.sources.udp_source import MAX_DATAGRAM, Datagram, Peer, UdpSource
 from drivers.errors import LinkError, system_message
 from model.errors import InputError
 from registry import threads
-from registry.files import read_regular
+from registry.files import LineTooLong, lines_of, open_regular
 from registry.limits import MAX_CONTACTS
 
 Argument: TypeAlias = str | int | float | None
@@ -474,6 +475,7 @@ def _whole(value: Argument) -> int:
 
 HEADER = "# era-haptics TUIO capture 1"
 _LINE = re.compile(r"(\d{1,9}(?:\.\d{1,9})?) ((?:[0-9a-f]{2})+)", re.ASCII | re.IGNORECASE)
+_MAX_LINE = 1 << 18  # characters; a datagram is of up to 64 KiB, two digits a byte
 MAX_BYTES = 16 << 20  # 100 s of ten fingers at 100 Hz; of one finger a quarter of an hour
 
 
@@ -490,8 +492,11 @@ def read_capture(path: Path | str) -> list[RecordedDatagram]:
     """Read a capture; raises InputError with file and line."""
     path = Path(path)
     try:
-        content = read_regular(path, MAX_BYTES)
-        lines = content.decode("utf-8-sig").replace("\r\n", "\n").removesuffix("\n").split("\n")
+        with (
+            open_regular(path, MAX_BYTES) as file,
+            TextIOWrapper(file, "utf-8-sig", newline=None) as stream,
+        ):
+            return _datagrams_in(path, stream)
     except OSError as error:
         raise InputError(
             f"{path}: cannot be read ({error.strerror}); check the path, which is relative to the "
@@ -499,10 +504,16 @@ def read_capture(path: Path | str) -> list[RecordedDatagram]:
         ) from error
     except UnicodeDecodeError as error:
         raise InputError(f"{path}: must be a TUIO capture, got a binary file") from error
-    if lines[0] != HEADER:
+    except LineTooLong as error:
+        raise InputError(f"{path}, line {error.line}: {error} of a TUIO capture") from error
+
+
+def _datagrams_in(path: Path, stream: TextIO) -> list[RecordedDatagram]:
+    lines = lines_of(stream, _MAX_LINE)
+    if next(lines, "") != HEADER:
         raise InputError(f"{path}, line 1: must be {HEADER!r} for a TUIO capture")
     datagrams: list[RecordedDatagram] = []
-    for number, line in enumerate(lines[1:], start=2):
+    for number, line in enumerate(lines, start=2):
         if line.startswith("#") or not line.strip():
             continue
         match = _LINE.fullmatch(line)

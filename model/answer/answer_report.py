@@ -303,7 +303,7 @@ _Place = Annotated[list[float], Field(min_length=2, max_length=2)]
 class _Own(BaseModel):
     """Schema of a finger with a vibration of its own, by the fields of `Stimulus` and `Finger`."""
 
-    model_config = ConfigDict(extra="forbid")
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
 
     at: _Place
     level_db_sl: float | None = None
@@ -331,7 +331,7 @@ class _Own(BaseModel):
 class _Line(BaseModel):
     """Schema of a line of a batch."""
 
-    model_config = ConfigDict(extra="forbid")
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
 
     target: _Place | None = None
     targets: list[_Place] = []

@@ -5,6 +5,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import nullcontext
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -39,6 +40,7 @@ if TYPE_CHECKING:
     from model.study.contrast_maps import ContrastMap
 
 _MAX_LINE = 1 << 20  # characters of a question in a batch
+_MAX_EMPTY = 1000  # lines before the first question
 
 _COARSE_ERROR = 5.0  # % of the fields, as large as the error of a gain
 
@@ -335,6 +337,8 @@ def _query_batch(table_file: Path, batch: Path, defaults: dict[str, Any]) -> Non
             else open(batch, encoding="utf-8", opener=regular_file)
         ) as lines:
             bounded = iter(partial(lines.readline, _MAX_LINE), "")
+            if not is_piped:
+                bounded = _questions_of(batch, bounded)
             for answer in query_batch(table, bounded, defaults):
                 has_failed = has_failed or "error" in answer
                 print(json.dumps(answer), flush=is_piped)
@@ -348,6 +352,26 @@ def _query_batch(table_file: Path, batch: Path, defaults: dict[str, Any]) -> Non
         raise InputError(f"--batch {batch} must be UTF-8; save it as UTF-8") from error
     if has_failed:
         raise typer.Exit(1)
+
+
+def _questions_of(batch: Path, lines: Iterator[str]) -> Iterator[str]:
+    """Lines of a file, once the first that is not empty looks like a question.
+
+    Raises InputError for another kind of file, which would have an error for each line.
+    """
+    empty_lines: list[str] = []
+    got = "none"
+    for line in lines:
+        if line.lstrip().startswith("{"):
+            return chain(empty_lines, [line], lines)
+        if line.strip() or len(empty_lines) > _MAX_EMPTY:
+            got = "another kind of file"
+            break
+        empty_lines.append(line)
+    raise InputError(
+        f'--batch {batch}: must have a question on each line, such as {{"target": [0.08, 0.06]}}, '
+        f"got {got}; give a file of JSON lines"
+    )
 
 
 def contrast_map(

@@ -37,9 +37,7 @@ from model.files.uff import (
     FREQUENCY_RESPONSE,
     Function,
     Universal,
-    read_bytes,
     read_universal,
-    text_of,
     write_universal,
 )
 from model.rig.rig import Rig

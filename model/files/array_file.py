@@ -127,6 +127,14 @@ def arrays_in(
         return arrays
 
 
+def array_names(path: Path, *, max_bytes: int) -> list[str]:
+    """Names of the arrays that a file may hold; raises one of UNREADABLE."""
+    with open_regular(path, max_bytes) as file:
+        _check_end(file, file.seek(0, os.SEEK_END))
+        with zipfile.ZipFile(file) as archive:
+            return [name.removesuffix(".npy") for name in archive.namelist()]
+
+
 def _check_end(file: BinaryIO, file_bytes: int) -> None:
     """Raise an error of UNREADABLE for a directory too large to read, or without an end."""
     file.seek(max(0, file_bytes - _END.size - _END_64_SIZE))

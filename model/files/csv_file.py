@@ -6,10 +6,8 @@ import io
 import logging
 import math
 import re
-from collections import deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import partial
 from importlib import import_module
 from itertools import chain
 from pathlib import Path
@@ -21,12 +19,13 @@ from numpy.typing import NDArray
 from model.errors import MAX_VALUE, InputError
 from model.files.array_file import whole_or_nothing
 from model.files.uff import open_measured, text_stream
+from registry.files import LineTooLong, lines_of
 from registry.plugins import did_you_mean
 
 _MAX_NAMED = 3  # unknown columns in an error
 _MAX_COLUMNS = 1000
 _MAX_LINE = 1 << 16  # characters
-_MAX_ABOVE = 100  # lines above numbers, of which one may name their columns
+_MAX_ABOVE = 1000  # lines above the first of values
 _POINT = re.compile(r'[;\t"\n][-+]?\d+\.\d+(?:[eE][-+]?\d+)?[;\t"\n]')  # a number with one
 _BLANK = "\n ,;\t"  # of lines without content
 _MAX_DB = 200.0
@@ -240,11 +239,18 @@ class _Head:
 
 def _head_of(path: Path, unnamed: Sequence[str]) -> _Head:
     """Find where a file begins, and how its columns are separated; raises InputError."""
-    above: deque[str] = deque(maxlen=_MAX_ABOVE)
+    above: list[str] = []
     first_row = first_filled = ""
     is_empty = True
     skipped = 0
     for number, row in enumerate(_text_rows(path)):
+        if number > _MAX_ABOVE and not first_filled:
+            raise InputError(
+                f"{path}: columns must be named in the first {_MAX_ABOVE} lines, got none; give a "
+                "CSV file"
+            )
+        if number > _MAX_ABOVE:
+            break
         is_empty = is_empty and not row.strip()
         is_remark = _REMARK.match(row) is not None
         if unnamed and not is_remark and _NUMERIC.match(row):
@@ -294,24 +300,19 @@ def _plain_rows(path: Path, head: _Head) -> Iterator[str]:
 def _text_rows(path: Path) -> Iterator[str]:
     """All rows of a file without their ends; raises InputError for what is no text."""
     with open_measured(path) as file, text_stream(file) as stream:
-        number = 0
         try:
-            for row in iter(partial(stream.readline, _MAX_LINE), ""):
-                number += 1
+            for number, row in enumerate(lines_of(stream, _MAX_LINE)):
                 if "\0" in row:
                     raise InputError(
                         f"{path}: file must be text in UTF-8, got zero bytes; export it as such"
                     )
-                if len(row) == _MAX_LINE and not row.endswith("\n"):
-                    raise InputError(
-                        f"{path}:{number}: line must have less than {_MAX_LINE} characters; give a "
-                        "CSV file"
-                    )
                 # Spreadsheet programs state the separator in the first row.
-                is_separator = number == 1 and row.lower().startswith("sep=")
-                yield "" if is_separator else row.removesuffix("\n")
+                is_separator = number == 0 and row.lower().startswith("sep=")
+                yield "" if is_separator else row
         except UnicodeDecodeError as error:
             raise InputError(f"{path}: text must be UTF-8; save it as such") from error
+        except LineTooLong as error:
+            raise InputError(f"{path}:{error.line}: {error}; give a CSV file") from error
 
 
 def _columns(row: str, separator: str, count: int) -> list[str]:

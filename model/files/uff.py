@@ -61,7 +61,7 @@ _HEADER = re.compile(
 )
 # As Fortran writes them: they may touch, with D for E, or without a letter.
 _NUMBER = re.compile(
-    rb"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eEdD][-+]?\d+|[-+]\d{2,3}(?![\d.]))?|[-+]?\b(?:[nN]a[nN]|[iI]nf\w*)\b"
+    rb"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eEdD][-+]?\d+|[-+]\d{2,3}(?![\d.]))?|[-+]?\b(?i:nan|inf\w*)\b"
 )
 _NO_LETTER = re.compile(rb"(?<=[\d.])(?=[-+])")
 
@@ -228,8 +228,10 @@ def blocks(path: Path, content: bytes) -> Iterator[DatasetBlock]:
             f"{path}: a universal file must have lines of `    -1` alone, got none; export the "
             "measurement as UFF, datasets 58 with 15 or 2411"
         )
+    line, counted = 1, 0
     while start is not None:
-        line = content.count(b"\n", 0, start.start()) + 1
+        line += content.count(b"\n", counted, start.start())
+        counted = start.start()
         begin = start.end()
         head = _HEADER.match(content, begin)
         if head is None:
@@ -367,10 +369,9 @@ def _numbers_of(
     numbers: list[float] = []
     for line, row in enumerate(block.rows[_HEADER_LINES:], start=block.line + 1 + _HEADER_LINES):
         if _NUMBER.sub(b"", row).strip() or (len(numbers) >= count and row.strip()):
-            shown = row.decode("ascii", "backslashreplace").strip()[:40]
             raise InputError(
-                f"{path}:{line}: data must be numbers, {count} in all, got {shown!r}; export the "
-                "damaged file again"
+                f"{path}:{line}: data must be numbers, {count} in all, got {_quoted(row)}; export "
+                "the damaged file again"
             )
         numbers += numbers_in(row, f"{path}:{line}")
     return np.array(numbers[:count])
@@ -379,14 +380,21 @@ def _numbers_of(
 def numbers_in(row: bytes, place: str) -> list[float]:
     """All numbers of a row, in any spelling of Fortran.
 
-    place: file and line, for the error. Raises InputError for NaN and infinite numbers.
+    place: file and line, for the error. Raises InputError for anything else, and for NaN and
+    infinite numbers.
     """
+    if _NUMBER.sub(b"", row).strip():
+        raise InputError(f"{place}: line must be of numbers, got {_quoted(row)}; export it again")
     words = (word.upper().replace(b"D", b"E") for word in _NUMBER.findall(row))
     numbers = [float(_NO_LETTER.sub(b"E", word)) for word in words]
     for number in numbers:
         if not math.isfinite(number):
             raise InputError(f"{place}: numbers must be finite, got {number:g}; export them again")
     return numbers
+
+
+def _quoted(row: bytes) -> str:
+    return repr(row.decode("ascii", "backslashreplace").strip()[:40])
 
 
 def units_of(path: Path, block: DatasetBlock) -> tuple[float, float]:

@@ -40,7 +40,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.arrays import ComplexArray, FloatArray
-from model.errors import InputError, expect_between, expect_values
+from model.errors import MAX_VALUE, InputError, expect_between, expect_values
 from model.structure.material import Material
 from model.structure.surface import EDGES, Surface, is_within
 
@@ -116,14 +116,25 @@ class LaminateLayer(Sheet):
     """
 
     def __post_init__(self) -> None:
-        """Refuse a thickness that is not above zero."""
+        """Refuse a thickness that is not above zero, and rows that state no modulus."""
         expect_values(self, "layer", above="thickness")
+        previous = 0.0
+        for frequency, factor, loss in self.by_frequency:
+            if not (previous < frequency <= MAX_VALUE and 0 < factor <= MAX_VALUE and 0 <= loss):
+                raise InputError(
+                    "layer: by_frequency must have rows of ascending frequencies above 0 Hz, "
+                    f"factors above 0 and loss factors, got ({frequency}, {factor}, {loss})"
+                )
+            previous = frequency
 
     def modulus(self, frequency: float) -> complex:
         """E (1 + i eta) [Pa] at a frequency [Hz]."""
         if not self.by_frequency:
             return self.material.E * (1 + 1j * self.loss_factor)
         rows = self.by_frequency
+        if len(rows) == 1:
+            ((_, factor, loss),) = rows
+            return self.material.E * factor * (1 + 1j * loss)
         after = min(max(bisect_left(rows, (frequency,)), 1), len(rows) - 1)
         (f0, factor0, loss0), (f1, factor1, loss1) = rows[after - 1], rows[after]
         share = min(max(math.log(frequency / f0) / math.log(f1 / f0), 0.0), 1.0)

@@ -1,11 +1,10 @@
 """Errors as a user meets them: commands, files that are no such file, interruptions, a full disk.
 
-Each reader refuses each file in words.
+Each reader refuses what is wrong in words; hostile files are in test_hostile_files.py.
 """
 
 import contextlib
 import io
-import os
 import re
 import resource
 import shlex
@@ -15,7 +14,6 @@ import sys
 import time
 import zipfile
 from collections.abc import Callable, Iterator
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -23,50 +21,37 @@ import pytest
 
 from cases import read_yaml, shortly
 from controller.cli.main import run
-from controller.content.formats import read_content
-from controller.effects.layout import load_layout
-from controller.effects.strengths import read_strengths
-from controller.gateway.gateway_settings import read_token
-from controller.learning.learned_table import load_learned
 from controller.sources.touch import open_source
-from controller.sources.tuio import read_capture
 from drivers.errors import CommandError
 from drivers.wires.wire import address_of
 from era_haptics.lab.design.problem import (
-    DesignProblem,
-    anywhere,
     area_of,
-    contact_rule,
-    layouts_of,
 )
-from era_haptics.lab.measuring.impedance import read_impedance
-from era_haptics.lab.measuring.other_sources import read_stepped
-from era_haptics.lab.measuring.sound_card import Desk, WiredSensor, read_sensors
 from era_haptics.lab.paper_figures import paper_figures
-from era_haptics.lab.witness import capture
 from era_haptics.lab.witness.relay import parse_endpoint
+from kit.outside_files import READERS, RIG
 from model.config.document import read_document
 from model.config.units import parse_frequencies
 from model.errors import InputError
 from model.estimate import calibrate
-from model.estimate.measurement import read_measured, read_places
 from model.files.array_file import UNREADABLE, read_arrays
 from model.processes import on_cluster
-from model.rig.rig_file import example_rig_path, load_rig, mesh_of
+from model.rig.rig_file import mesh_of
 from model.structure.material import material
 from model.structure.plate import Plate
-from model.table.table_file import load_table
-from processes.error_cases import PAGE, Case, Quotation, cases, filled, provoke, quotations
+from processes.error_cases import (
+    INTERNALS,
+    PAGE,
+    Case,
+    Quotation,
+    cases,
+    filled,
+    provoke,
+    quotations,
+)
 from processes.error_cases import RIG as CASE_RIG
 from processes.interrupted import full_disk, interrupted
 from sim.far_ends.wire_assignment import SimulatedWire, assign_wires, choose_lines
-from sim.faults import load_faults
-
-INTERNALS = re.compile(
-    r"Traceback|File \"|<class |object at 0x|np\.\w+\(|PosixPath\(|\[Errno|Field required|"
-    r"(Input|String|List) should"
-)
-"""Words of Python and of libraries, which help no user."""
 
 REMEDY = re.compile(
     r";|must|expected|did you mean|see |try|give|use|write|check|known|add|first|make|install", re.I
@@ -282,40 +267,6 @@ def test_recording_fails_without_a_file_when_the_disk_is_full(home: Path) -> Non
     assert not list(home.glob("*run*"))
 
 
-RIG = load_rig(example_rig_path())
-DESIGN = DesignProblem(RIG, 4, area_of("edge", RIG.plate), anywhere(RIG.plate))
-DESK = Desk(RIG, (WiredSensor("P1", 0.1, 0.1, 1, 1.0),))
-
-READERS: dict[str, Callable[[Path], object]] = {
-    "rig.yaml": load_rig,
-    "layout.yaml": lambda path: load_layout(path, None),
-    "polygons.yaml": lambda path: area_of(str(path), RIG.plate),
-    "mask.png": lambda path: area_of(str(path), RIG.plate),
-    "mask.jpg": lambda path: area_of(str(path), RIG.plate),
-    "strengths.json": read_strengths,
-    "token.txt": read_token,
-    "taps.tuio": read_capture,
-    "wires.txt": lambda path: [*capture.read_capture(path, wires=["wire1"])],
-    "tap.ahap": read_content,
-    "tap.haptic": read_content,
-    "tap.hjif": read_content,
-    "tap.wav": read_content,
-    "measured.csv": read_measured,
-    "measured.uff": read_measured,
-    "places.csv": lambda path: read_places(path, RIG.plate),
-    "sensors.csv": lambda path: read_sensors(path, RIG.plate),
-    "moved.csv": lambda path: read_sensors(path, RIG.plate, may_move=True),
-    "contacts.yaml": lambda path: contact_rule(path, RIG.plate),
-    "faults.yaml": lambda path: load_faults(path, amplifiers=["main"]),
-    "layouts.yaml": lambda path: layouts_of(str(path), DESIGN),
-    "free.zma": read_impedance,
-    "P1-1.wav": lambda path: read_stepped(path, DESK),
-    "P1-1.csv": lambda path: read_stepped(path, DESK),
-    "table.npz": load_table,
-    "learned.npz": lambda path: load_learned(path, table=""),
-}
-"""By a name of a file, what reads it."""
-
 TEN_METRES, URL = Plate(10.0, 10.0, 0.002, material("float-glass")), "sim://"
 
 
@@ -357,61 +308,9 @@ def test_what_is_wrong_is_said(
     """Of a file with its name, line and key; nothing that a text asks for is opened."""
     text = re.sub(r"<(\d+) (.+?)>", lambda found: int(found[1]) * found[2], text)
     (tmp_path / named).write_text(text, "utf-8")
-    files = READERS | {"document.yaml": read_document}  # which may hold any plain data
+    files = {**READERS, "document.yaml": read_document}  # which may hold any plain data
     with pytest.raises((InputError, CommandError), match=pattern):
         files[read](tmp_path / named) if read in files else PARSERS[read](text)
-
-
-_DIGITS = b"9" * 100_000
-
-
-HOSTILE: dict[str, Callable[[Path], object]] = {
-    "pipe": os.mkfifo,
-    "device": lambda path: path.symlink_to("/dev/zero"),
-    "folder": Path.mkdir,
-    "missing": lambda path: None,
-    "sparse": lambda path: [path.touch(), os.truncate(path, 1 << 40)],
-    "zeros": lambda path: path.write_bytes(bytes(1 << 16)),
-    "digits": lambda path: path.write_bytes(_DIGITS),
-    "digits in JSON": lambda path: path.write_bytes(b'{"a": %s}' % _DIGITS),
-    "digits in a list": lambda path: path.write_bytes(b"[%s, 1]" % _DIGITS),
-    "digits of a dataset": lambda path: path.write_bytes(b"    -1\n%s\n 1\n    -1\n" % _DIGITS),
-    "digits of a binary dataset": lambda path: path.write_bytes(
-        b"    -1\n    58b 1 2 11 %s 0 0\n 1\n    -1\n" % _DIGITS
-    ),
-    "brackets": lambda path: path.write_bytes(b"[" * 100_000),
-    "no UTF-8": lambda path: path.write_bytes(b'{"a": "\xfc\xff\xfe"}\n1,\xe9,3\n'),
-    "lines": lambda path: path.write_bytes(b"\n\r\n" * 100_000),
-    "chunks": lambda path: path.write_bytes(b"RIFF\0\0\0\0WAVEdata\0\0\0\0" + bytes(999)),
-    "archive": lambda path: path.write_bytes(b"PK\x05\x06" + b"\xff" * 18),
-}
-"""By what it is, how it is made."""
-
-
-@pytest.mark.parametrize("kind", HOSTILE)
-@pytest.mark.parametrize("name", READERS)
-def test_reader_refuses_in_words_what_is_no_such_file(tmp_path: Path, name: str, kind: str) -> None:
-    """At once, without waiting for a writer or the end; with the file's name, and none of Python's.
-
-    Strengths that were never set have no file, wires may be still, and a token may be any text.
-    """
-    path = tmp_path / name
-    HOSTILE[kind](path)
-    if path.is_file():
-        path.chmod(0o600)
-    if (name, kind) in (("strengths.json", "missing"), ("wires.txt", "lines")):
-        READERS[name](path)
-        return
-    if name == "token.txt" and path.is_file():
-        with suppress(InputError):
-            READERS[name](path)
-        return
-    with pytest.raises((InputError, CommandError), match=re.escape(name)) as caught:
-        READERS[name](path)
-    assert not re.search(r"Errno|Error\(|object at|local variable", str(caught.value))
-    assert len(str(caught.value)) < 2000 + len(str(path))
-    if kind == "sparse" and name != "wires.txt":  # which is read line by line
-        assert "must be up to" in str(caught.value)
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,6 +44,9 @@ from model.structure.plate import Plate
 from model.table.table import default_drive_frequencies
 from registry.limits import MAX_CONTACTS, MAX_CONTENTS
 
+if TYPE_CHECKING:  # only pictures need it
+    from PIL import Image
+
 EDGE, ANYWHERE = "edge", "anywhere"
 """Names of the areas that need no file."""
 
@@ -54,6 +57,7 @@ PROPORTION_TOLERANCE = 0.02
 
 _PICTURE_SIDE = 1000  # pixels of the longer side of the picture proposed
 _MAX_BYTES = 16 << 20
+_MAX_PIXELS = 4_000_000
 _ON_EDGE = 1e-9  # m
 _MAX_CANDIDATES = 2000
 
@@ -232,17 +236,26 @@ def _white(path: Path, content: bytes, plate: Plate) -> NDArray[np.bool_]:
 
     To PROPORTION_TOLERANCE, or half a pixel.
     """
-    from matplotlib.image import imread
+    from PIL import Image
 
     try:
-        with warnings.catch_warnings(action="error"):  # of one that takes more memory than it may
-            pixels = np.asarray(imread(io.BytesIO(content), path.suffix[1:].lower()), dtype=float)
+        # Of what decodes to more than it may Pillow warns.
+        with (
+            warnings.catch_warnings(action="error"),
+            Image.open(io.BytesIO(content), formats=("PNG", "JPEG")) as picture,
+        ):
+            columns, rows = picture.size
+            is_white = _bright_pixels(picture) if columns * rows <= _MAX_PIXELS else None
     except Exception as error:  # of a damaged file anything
         raise InputError(
             f"{path}: cannot be read as a picture; save it as PNG or JPEG, of {_PICTURE_SIDE} "
             "pixels a side or less"
         ) from error
-    rows, columns = pixels.shape[:2]
+    if is_white is None:
+        raise InputError(
+            f"{path}: picture must have up to {_MAX_PIXELS / 1e6:g} megapixels, got {columns} by "
+            f"{rows} pixels; {_PICTURE_SIDE} pixels a side are enough"
+        )
     expected = columns * plate.width / plate.length
     if abs(rows - expected) > max(PROPORTION_TOLERANCE * expected, 0.5):
         scale = _PICTURE_SIDE / max(plate.length, plate.width)
@@ -252,8 +265,15 @@ def _white(path: Path, content: bytes, plate: Plate) -> NDArray[np.bool_]:
             f"{plate.width:g} m, got {columns} by {rows} pixels; draw the whole plate, without a "
             f"margin, for example on {across} by {up} pixels"
         )
-    grey = pixels if pixels.ndim == 2 else pixels[..., :3].mean(axis=-1)
-    return np.asarray(grey > (127.5 if grey.max() > 1 else 0.5))
+    return is_white
+
+
+def _bright_pixels(picture: "Image.Image") -> NDArray[np.bool_]:
+    """Whether the mean of red, green and blue is above half, (rows, columns)."""
+    if picture.mode.startswith("I"):  # grey of 16 bits
+        return np.asarray(picture) > 0x7FFF
+    colours = np.asarray(picture.convert("RGB"))
+    return np.asarray(colours.sum(axis=-1, dtype=np.uint16) > 3 * 0xFF // 2)
 
 
 @dataclass(frozen=True, eq=False)

@@ -411,6 +411,29 @@ def test_modulus_by_frequency_is_a_power_law_between_rows():
     assert layer.modulus(5e3) == pytest.approx(4 * 70e6 * (1 + 0.6j))
 
 
+def test_modulus_of_one_row_is_the_same_at_every_frequency():
+    """A single row states a modulus that frequency does not change."""
+    layer = LaminateLayer(FOAM, 1e-3, by_frequency=((100.0, 0.5, 0.2),))
+    moduli = [layer.modulus(frequency) for frequency in (1.0, 100.0, 5e3)]
+    assert moduli == pytest.approx([35e6 * (1 + 0.2j)] * 3)
+
+
+@pytest.mark.parametrize(
+    "rows",
+    [
+        [(0.0, 1.0, 0.1)],
+        [(100.0, 0.0, 0.1)],
+        [(100.0, 1.0, math.nan)],
+        [(100.0, 1.0, 0.1), (100.0, 2.0, 0.1)],
+    ],
+    ids=["zero frequency", "zero factor", "loss that is no number", "equal frequencies"],
+)
+def test_layer_refuses_rows_without_a_modulus(rows):
+    """The logarithm of zero and the ratio of equal frequencies have no value."""
+    with pytest.raises(InputError, match="by_frequency must have rows"):
+        LaminateLayer(FOAM, 1e-3, by_frequency=tuple(rows))
+
+
 def test_sliding_layers_add_their_rigidities():
     """Two equal layers are twice one, a quarter of the bonded pair; others add up by hand."""
     two = [LaminateLayer(GLASS, 1e-3)] * 2

@@ -6,11 +6,9 @@ A reader that is missing here is not tested against hostile files (`processes.ho
 import contextlib
 import io
 import json
-import os
 import struct
 import tempfile
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
 
@@ -230,9 +228,13 @@ SAMPLES: Mapping[str, Callable[[], bytes]] = {
     "polygons.yaml": lambda: b"polygons:\n  left: [[0.0, 0.0], [0.1, 0.0], [0.1, 0.2]]\n",
     "mask.png": partial(_picture, "png"),
     "mask.jpg": partial(_picture, "jpg"),
-    "contacts.yaml": lambda: b"quiet: [3, 6]\nregions: {a: {circle: {at: [0.1, 0.1], radius: 0.05}}}\n",
+    "contacts.yaml": lambda: (
+        b"quiet: [3, 6]\nregions: {a: {circle: {at: [0.1, 0.1], radius: 0.05}}}\n"
+    ),
     "layouts.yaml": lambda: b"layouts: {two: [[0.0, 0.0], [0.3, 0.0], [0.3, 0.2], [0.0, 0.2]]}\n",
-    "faults.yaml": lambda: b"seed: 7\nfaults:\n  - {fault: drop, at: 2.0, lasts: 10.0, share: 0.2}\n",
+    "faults.yaml": lambda: (
+        b"seed: 7\nfaults:\n  - {fault: drop, at: 2.0, lasts: 10.0, share: 0.2}\n"
+    ),
     "strengths.json": lambda: b'{"table": -3.5}',
     "token.txt": lambda: b"0123456789abcdef0123456789abcdef\n",
     "taps.tuio": (EXAMPLES / "touches.tuio").read_bytes,
@@ -267,5 +269,5 @@ def write_sample(folder: Path, name: str) -> Path:
     """Write a valid file of a name into a folder."""
     path = folder / name
     path.write_bytes(SAMPLES[name]())
-    os.chmod(path, 0o600)
+    path.chmod(0o600)
     return path

@@ -52,6 +52,12 @@ limits:
   frequency: [40, 300]
 """
 
+INTERNALS = re.compile(
+    r"Traceback|File \"|<class |object at 0x|np\.\w+\(|PosixPath\(|\[Errno|Field required|"
+    r"(Input|String|List) should|Error\(|local variable"
+)
+"""Words of Python and of libraries, which help no user."""
+
 _PREPARED = {
     "rig.yaml": RIG,
     "daemon.yaml": "rig: rig.yaml\n",

@@ -38,7 +38,7 @@ import numpy as np
 
 MIB = 1 << 20
 LONG = 8 * MIB  # bytes of long lines and of many short ones
-_BOMB = 1 << 28  # bytes of zeros, as deflate 260 kB
+_BOMB = 1 << 28  # bytes of zeros, deflated to 260 kB
 _MAX_DATA = 2 << 30  # bytes; a reader that wants more fails, and the machine goes on
 _SILENCE = 120.0  # s until a variant counts as one that waits for ever
 _DIGITS = b"9" * 100_000
@@ -144,7 +144,9 @@ def _object_array() -> bytes:
 
 def _many_members() -> bytes:
     """An archive of 60 000 empty members: 3 MB, of which 40 MB of objects are made."""
-    entry = b"PK\x01\x02" + struct.pack("<6H3I5H2I", *[20, 20, 0, 0, 0, 0x21], *[0] * 3, 1, *[0] * 6)
+    entry = b"PK\x01\x02" + struct.pack(
+        "<6H3I5H2I", *[20, 20, 0, 0, 0, 0x21], *[0] * 3, 1, *[0] * 6
+    )
     directory = (entry + b"x") * 60_000
     return directory + struct.pack(
         "<4s4H2IH", b"PK\x05\x06", 0, 0, 60_000, 60_000, len(directory), 0, 0
@@ -291,7 +293,7 @@ CONTENTS: Mapping[str, Content] = {
     "sound of infinity": lambda _: _wav(np.full(9999, np.inf, "<f4").tobytes(), code=3, bits=32),
     "sound of 4 GHz": lambda _: _wav(bytes(999), rate=4_000_000_000),
 }
-"""By what a variant is, its content, made of that of a valid file; one that is equal is left out."""
+"""By what a variant is, its content, made of that of a valid file; an equal one is left out."""
 
 
 def _socket(path: Path) -> None:
@@ -394,7 +396,8 @@ def main() -> None:
 
 
 def _print(answer: Any) -> None:
-    print(json.dumps(answer), flush=True)
+    sys.stdout.write(f"{json.dumps(answer)}\n")
+    sys.stdout.flush()
 
 
 def _written(path: Path, content: bytes) -> Path:
@@ -433,6 +436,8 @@ def _read(
         text, outcome = f"{type(error).__name__}: {error}", "bug"
     seconds = time.process_time() - started
     memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 - before
+    if path.is_file() and not path.is_symlink():
+        path.unlink()
     return Report(variant, outcome, text, size, memory, seconds)
 
 

@@ -1,0 +1,107 @@
+"""Every reader of files from outside, fed the same hostile files."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from cases import shortly
+from kit.outside_files import READERS, SAMPLES, write_sample
+from processes.error_cases import INTERNALS
+from processes.hostile_files import MIB, VARIANTS, HostileReading, Report
+
+MAX_MEMORY = 64 * MIB
+"""Most memory of a reader above the size of the file [bytes]."""
+
+MAX_SECONDS = 5.0
+"""Most time of the processor for a hostile file of 8 MiB."""
+
+_IN_UTF_16 = {"UTF-16"}
+_BETWEEN_DATASETS = {"UTF-16", "surrogates as UTF-8"}
+
+READ: dict[str, set[str]] = {
+    # Strengths that were never set have no file.
+    "strengths.json": {"missing", "UTF-16", "UTF-32"},
+    "wires.txt": {"empty", "blanks", "cut in half", "many empty lines"},
+    "measured.csv": {"UTF-16", "cut in half"},
+    "measured.uff": {*_BETWEEN_DATASETS, "zero bytes inside"},  # in a description
+    "modes.uff": _BETWEEN_DATASETS,
+    **dict.fromkeys(
+        ("places.csv", "sensors.csv", "moved.csv", "free.zma", "P1-1.csv", "modes.csv"), _IN_UTF_16
+    ),
+}
+"""By the name of a file the variants that its reader may read."""
+
+
+SHORT = (
+    "daemon.yaml",
+    "mask.png",
+    "tap.ahap",
+    "measured.csv",
+    "modes.npz",
+    "modes.uff",
+    "table.npz",
+    "questions.jsonl",
+)
+"""Those of each format that `make test` takes."""
+
+
+@pytest.fixture(scope="module")
+def hostile() -> Iterator[HostileReading]:
+    """A process in which all readers are loaded."""
+    with HostileReading() as reading:
+        yield reading
+
+
+@pytest.mark.parametrize("name", READERS)
+def test_reader_reads_a_valid_file(name: str, tmp_path: Path) -> None:
+    """What hostile files are made of is valid, so that only their harm is refused."""
+    READERS[name](write_sample(tmp_path, name))
+
+
+@pytest.mark.parametrize("name", shortly(READERS, SHORT))
+def test_reader_refuses_hostile_files_within_bounds(
+    name: str, hostile: HostileReading, tmp_path: Path
+) -> None:
+    """One message that names the file, within 64 MiB above its size and in time; no bug."""
+    reports = [*hostile.reports(name, tmp_path)]
+    assert len(reports) > 0.8 * len(VARIANTS)
+    assert {report.variant for report in reports if report.outcome == "read"} == READ.get(
+        name, set()
+    )
+    faults = {report.variant: fault for report in reports if (fault := _fault_of(report, name))}
+    assert not faults
+
+
+def _fault_of(report: Report, name: str) -> str:
+    """What is wrong with a report, "" if nothing is."""
+    if report.outcome == "bug":
+        return report.text
+    if report.memory - report.size > MAX_MEMORY:
+        return f"{report.memory / MIB:.0f} MiB for a file of {report.size / MIB:.0f} MiB"
+    if report.seconds > MAX_SECONDS:
+        return f"{report.seconds:.1f} s"
+    if report.outcome == "read":
+        return ""
+    return _fault_of_message(report, name)
+
+
+def _fault_of_message(report: Report, name: str) -> str:
+    message = report.text
+    first, *others = message.splitlines()
+    if name == "questions.jsonl" and first.startswith("{"):
+        return "" if '"line": 1' in message else message  # an answer to the line
+    if name not in first:
+        return f"does not name the file: {message}"
+    if others and not first.endswith(":"):  # problems of a file, or of one that it names, follow
+        return f"more than one message: {message}"
+    if INTERNALS.search(message) or not first.isprintable():
+        return f"words of Python, or control characters: {message}"
+    if report.variant.startswith("sparse") and "must be up to" not in message:
+        return "" if name in ("wires.txt", "token.txt") else f"reads on: {message}"
+    return ""
+
+
+def test_every_reader_has_a_valid_file() -> None:
+    """A reader without one would not be tested."""
+    assert SAMPLES.keys() == READERS.keys()

@@ -120,7 +120,7 @@ class LaminateLayer(Sheet):
         expect_values(self, "layer", above="thickness")
         previous = 0.0
         for frequency, factor, loss in self.by_frequency:
-            if not (previous < frequency <= MAX_VALUE and 0 < factor <= MAX_VALUE and 0 <= loss):
+            if not (previous < frequency <= MAX_VALUE and 0 < factor <= MAX_VALUE and loss >= 0):
                 raise InputError(
                     "layer: by_frequency must have rows of ascending frequencies above 0 Hz, "
                     f"factors above 0 and loss factors, got ({frequency}, {factor}, {loss})"

@@ -154,14 +154,14 @@ def read_token(path: Path) -> str:
             "token that only you may read"
         ) from error
     for is_wrong, text in (
-        (
-            not _TOKEN.fullmatch(content.decode("ascii", "replace").strip()),
-            f"--token-file must be a file with the token; {_RULE}",
-        ),
         (status.st_mode & 0o077, f"readable by other users; restrict it with chmod 600 {path}"),
         (
             status.st_uid not in (0, os.geteuid()),
             "belongs to another user; give a file of your own",
+        ),
+        (
+            not _TOKEN.fullmatch(content.decode("ascii", "replace").strip()),
+            f"--token-file must be a file with the token; {_RULE}",
         ),
     ):
         if is_wrong:

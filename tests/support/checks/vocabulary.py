@@ -1,6 +1,6 @@
 """Retired words in identifiers, and names that mislead: `make lint` lists them and fails.
 
-The glossary of CONTRIBUTING.md defines the words that are used in place of retired ones. A public
+docs/reference/glossary.md defines the words that are used in place of retired ones. A public
 class is defined once. A module has a name of its own, but for those that a package may have by
 custom. A class is a noun of the field, no bare participle; only an error may be named by what
 happened.

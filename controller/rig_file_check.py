@@ -22,6 +22,7 @@ from model.config.document import ConfigError, ConfigProblem, Document
 from model.errors import InputError
 from model.quantities import percent
 from model.rig.rig import Rig
+from model.rig.rig_balance import RigBalance
 from model.rig.rig_file import example_rig_path, rig_of, with_base
 from model.rig.rig_summary import (
     exciter_notes,
@@ -34,6 +35,7 @@ from model.rig.rig_summary import (
 )
 from model.rig.sections import LimitsSection
 from model.structure.attachments import support_problem
+from model.structure.surface import centre_of_surface
 from model.study.overview import clock_cost, uncertainty_cost
 from model.transients.excursions import excursion_notes
 
@@ -70,6 +72,7 @@ def check_rig(document: Document) -> CheckedFile:
             problems.append(problem)
     if rig is None or problems:
         raise ConfigError(document.source, problems)
+    balance = _balance(rig)
     clock_line, clock_warnings, clock_data = clock_costs(rig, urls)
     warnings = [
         *exciter_notes(rig),
@@ -81,11 +84,27 @@ def check_rig(document: Document) -> CheckedFile:
         *plate_notes(rig),
         *_cost_notes(rig),
         *mount_notes(rig),
+        *(() if balance is None else balance.notes()),
         *_span_notes(rig),
     ]
     if rig.uncertainty_note:
         warnings.append(rig.uncertainty_note)
-    return CheckedFile(summary_line(rig) + clock_line, warnings, clock_data)
+    if balance is None:
+        return CheckedFile(summary_line(rig) + clock_line, warnings, clock_data)
+    if balance.tips_over:
+        summary = summary_line(rig, verdict="tips over")
+    else:
+        summary = f"{summary_line(rig)}, {balance.phrase}"
+    data = {"balance": balance.as_json(), **clock_data}
+    return CheckedFile(summary + clock_line, warnings, data)
+
+
+def _balance(rig: Rig) -> RigBalance | None:
+    """How the plate rests on its supports; None for a surface that its modes hold."""
+    surface = rig.plate.surface
+    if surface is not None and centre_of_surface(surface) is None:
+        return None
+    return RigBalance(rig)
 
 
 def _support_problems(document: Document, rig: Rig) -> list[ConfigProblem]:

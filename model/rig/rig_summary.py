@@ -378,8 +378,8 @@ def mount_notes(rig: Rig) -> Iterator[str]:
                 )
 
 
-def summary_line(rig: Rig) -> str:
-    """One line about the plate and its ERAs."""
+def summary_line(rig: Rig, *, verdict: str = "good") -> str:
+    """One line about the plate and its ERAs; verdict: its first words."""
     plate, laminate = rig.plate, rig.laminate
     thickness = plate.thickness if laminate is None else laminate.thickness
     sizes = " x ".join(f"{1e3 * size:g}" for size in (plate.length, plate.width, thickness))
@@ -403,7 +403,7 @@ def summary_line(rig: Rig) -> str:
         parts.append(f"supported without being driven by {', '.join(feet)}")
     if carried := sum(mass.mass for mass in rig.masses):
         parts.append(f"carries {1e3 * carried:g} g")
-    return f"good: {', '.join(parts)}"
+    return f"{verdict}: {', '.join(parts)}"
 
 
 def _attached(rig: Rig, kind: str) -> dict[str, Any]:

@@ -36,6 +36,7 @@ from scipy import sparse
 from model.arrays import ComplexArray, FloatArray, Point
 from model.errors import InputError, expect_values
 from model.structure.plate import Plate
+from model.structure.surface import centre_of_surface
 from registry.limits import HAND_LOAD, MAX_FINGER_LOAD
 
 Gain: TypeAlias = tuple[float, float, float]
@@ -663,9 +664,20 @@ def static_loads(
     At least three springs are not in one line. K q = sum of weights p, reactions k p' q.
     """
     p, stiffness, mass = _attached(plate, eras, loads)
-    weight = GRAVITY * (p @ mass + [plate.mass, 0, 0])
+    x, y = centre_of_mass(plate)
+    plate_moments = plate.mass * np.array([1.0, x / plate.length - 0.5, y / plate.width - 0.5])
+    weight = GRAVITY * (p @ mass + plate_moments)
     q = np.linalg.solve((p * stiffness) @ p.T, weight)
     return np.asarray((stiffness * (q @ p))[stiffness > 0])
+
+
+def centre_of_mass(plate: Plate) -> Point:
+    """Return the centre of mass [m] of the bare plate: its middle, or that of a surface's modes."""
+    if plate.surface is not None:
+        centre = centre_of_surface(plate.surface)
+        if centre is not None:
+            return centre
+    return plate.length / 2, plate.width / 2
 
 
 def _attached(

@@ -48,6 +48,7 @@ MAX_DEVIATING = 64
 RIGID_FREQUENCY = 1.0  # Hz; below it a mode is of the rigid body
 _HELD = 0.2  # motion along the normal of a rigid mode, to that of the one with most
 _SEEN = 1e-3  # the same of elastic modes, to their median; others move within the surface
+_TILTING = 3  # rigid modes of a surface that is free: it moves along the normal and tilts
 _FEWEST = 6  # nodes, and elastic modes
 _BESIDE = 9  # nodes beside each other, whose plane has the normal
 _ON_OUTLINE = 1e-3  # m; a place so near to it is on the surface
@@ -135,6 +136,30 @@ def digest_of_file(path: Path) -> str:
     from model.files.uff import read_bytes  # only a surface needs it
 
     return hashlib.sha256(read_bytes(path)).hexdigest()
+
+
+def centre_of_surface(surface: Surface) -> Point | None:
+    """Return the centre of mass [m] of a surface; None unless its rigid body is free to tilt."""
+    if surface.rigid < _TILTING:
+        return None
+    return _centre(surface.file, surface.digest, surface.normal)
+
+
+@lru_cache(maxsize=4)
+def _centre(file: str, digest: str, normal: str) -> Point | None:
+    """Compute the centre of mass [m] of a free surface from its rigid modes.
+
+    Modes of unit modal mass are P T, where P has a row (1, x, y) for each node: then the mass and
+    the first and second moments of the surface are (T T')^-1.
+    """
+    shapes = surface_shapes(file, digest, normal)
+    motions = np.column_stack([np.ones(len(shapes.points)), shapes.points])
+    factors, _, rank, _ = np.linalg.lstsq(motions, shapes.shapes[:, : shapes.rigid])
+    if rank < _TILTING or np.linalg.matrix_rank(factors) < _TILTING:
+        return None
+    moments = np.linalg.inv(factors @ factors.T)
+    x, y = (moments[0, 1:] / moments[0, 0]).tolist()
+    return x, y
 
 
 @lru_cache(maxsize=4)

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import scipy.linalg
 
 from benchmarks.contents import share_kept
 from benchmarks.setting import random_contacts
@@ -23,6 +24,7 @@ from model.errors import InputError
 from model.rig.rig import Rig, Uncertainty
 from model.rig.rig_file import load_rig, parse_rig
 from model.rig.rig_writing import save_rig
+from model.structure.attachments import GRAVITY, centre_of_mass, static_loads
 from model.structure.surface import is_within, rings_of
 from model.study.verification import amplitudes_on, draw_plates, verify_table
 from model.table.table import LocalizationTable
@@ -128,6 +130,34 @@ def test_plate_by_its_own_modes_has_the_fields_of_its_table(
     (tmp_path / name).write_text(text + text.splitlines()[-1] + "\n")
     with pytest.raises(InputError, match=rf"{name}:\d+: (modes must follow|dataset must begin)"):
         load_rig(tmp_path / "rig.yaml")
+
+
+def test_surface_has_the_centre_of_mass_of_its_modes(
+    modes: Mapping[str, FloatArray], tmp_path: Path
+) -> None:
+    """Of the paper's plate with 50 g at a node, solved from its own modes; in the middle without.
+
+    The modal masses with m at a node of shapes phi are I + m phi phi'.
+    """
+    mass, node = 0.05, 40
+    at = modes["shapes"][:, node]
+    eigenvalues = (2 * np.pi * modes["frequencies"]) ** 2
+    loaded = np.eye(len(at)) + mass * np.outer(at, at)
+    solved, vectors = scipy.linalg.eigh(np.diag(eigenvalues), loaded)
+    frequencies = np.sqrt(solved.clip(0)) / (2 * np.pi)
+    rig = load_rig(
+        _write(tmp_path, modes, frequencies=frequencies, shapes=vectors.T @ modes["shapes"])
+    )
+    whole = PAPER.plate.mass + mass
+    middle = np.array([PAPER.plate.length, PAPER.plate.width]) / 2
+    expected = (PAPER.plate.mass * middle + mass * modes["nodes"][node, :2]) / whole
+    assert rig.plate.mass == pytest.approx(whole, rel=1e-3)
+    assert centre_of_mass(rig.plate) == pytest.approx(expected, abs=1e-5)
+    assert GRAVITY * whole == pytest.approx(static_loads(rig.plate, rig.eras).sum(), rel=1e-3)
+    moments = static_loads(rig.plate, rig.eras) @ [(era.x, era.y) for era in rig.eras]
+    assert moments / (GRAVITY * whole) == pytest.approx(expected, rel=1e-3)
+    plain = load_rig(_write(tmp_path, modes))
+    assert centre_of_mass(plain.plate) == pytest.approx(middle, abs=1e-5)
 
 
 def test_few_modes_are_off_as_much_as_stated(

@@ -1,0 +1,101 @@
+"""How a rigid plate rests on its supports: its centre of mass, their static loads, and tipping.
+
+Supports are springs to the ground: ERAs, held exciters and feet. A foot only pushes; what is bolted
+or glued can also pull. The plate tips where its centre of mass lies outside the convex hull of the
+supports, and a finger that presses outside of it tips the plate over an edge of the hull.
+"""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import ConvexHull
+
+from model.arrays import FloatArray, Point
+from model.structure.attachments import (
+    GRAVITY,
+    PointLoad,
+    Source,
+    centre_of_mass,
+    static_loads,
+)
+from model.structure.plate import Plate
+
+
+@dataclass(frozen=True, eq=False)
+class Balance:
+    """A plate at rest on n supports, which are not in one line."""
+
+    weight: float
+    """Of the plate and all that moves with it [N]."""
+    centre: Point
+    """Centre of mass [m]."""
+    supports: FloatArray
+    """Positions of the supports (n, 2) [m]."""
+    loads: FloatArray
+    """Static load of each support (n,) [N]; one that is pulled upwards has a negative load."""
+
+    @property
+    def edges(self) -> FloatArray:
+        """Edges of the supports' convex hull (e, 3): unit normal outwards, and offset [m].
+
+        normal · point + offset is the distance of a point to the edge, positive outside.
+        """
+        return np.asarray(ConvexHull(self.supports).equations)
+
+    @property
+    def inside(self) -> float:
+        """Distance of the centre of mass to the nearest edge [m], negative outside the hull."""
+        return float(np.min(-_distances(self.edges, self.centre)))
+
+    @property
+    def inside_share(self) -> float:
+        """The least distance to an edge, as a share of the hull's depth behind that edge.
+
+        On three supports it is the least share of the weight that one of them carries.
+        """
+        edges = self.edges
+        depths = np.max(-(self.supports @ edges[:, :2].T + edges[:, 2]), axis=0)
+        return float(np.min(-_distances(edges, self.centre) / depths))
+
+    def tipping_force(self, points: Iterable[Point]) -> tuple[float, Point] | None:
+        """Return the least force [N] on one of these points [m] that tips the plate, and the point.
+
+        None if no point lies outside the hull. The centre of mass must lie within it.
+        """
+        edges = self.edges
+        holding = -self.weight * _distances(edges, self.centre)  # N m, about each edge
+        least: tuple[float, Point] | None = None
+        for point in points:
+            levers = _distances(edges, point)
+            is_outside = levers > 0
+            if not is_outside.any():
+                continue
+            force = float(np.min(holding[is_outside] / levers[is_outside]))
+            if least is None or force < least[0]:
+                least = force, point
+        return least
+
+
+def balance_of(plate: Plate, sources: Sequence[Source], loads: Sequence[PointLoad] = ()) -> Balance:
+    """Return how a plate rests on its sources and loads, which support it.
+
+    The static loads are those of a rigid plate on springs; of three supports they follow from the
+    positions alone.
+    """
+    attached = [*(source.support for source in sources), *loads]
+    springs = [support for support in attached if support.stiffness > 0]
+    masses = np.array([plate.mass, *(load.mass for load in attached)])
+    positions = np.array([centre_of_mass(plate), *((load.x, load.y) for load in attached)])
+    x, y = (masses @ positions / masses.sum()).tolist()
+    return Balance(
+        weight=GRAVITY * float(masses.sum()),
+        centre=(x, y),
+        supports=np.array([(support.x, support.y) for support in springs]),
+        loads=static_loads(plate, sources, loads=loads),
+    )
+
+
+def _distances(edges: FloatArray, point: Point) -> FloatArray:
+    """Distances [m] of a point to edges (e, 3), positive outside."""
+    return np.asarray(edges[:, :2] @ point + edges[:, 2])

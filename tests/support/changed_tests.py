@@ -35,14 +35,12 @@ FLAT = ("tests/support", "docs/generators", "examples")
 ALSO: Sequence[tuple[Sequence[str], Sequence[str]]] = (
     (
         (
-            *("drivers/protocol/", "controller/api/", "controller/cli/", "drivers/by_hand/cli.py"),
-            *("controller/effects/", "model/cli.py", "model/commands/"),
-            *("model/rig/sections.py", "sim/cli.py"),
-            *("era_haptics/", "docs/generators/"),
+            *("controller/", "drivers/", "era_haptics/", "model/", "registry/", "sim/"),
+            *("docs/generators/", "tests/errors/cases/"),
         ),
         ("make pages",),
     ),
-    (("drivers/wires/",), ("make pages", "make fuzz")),
+    (("drivers/wires/",), ("make fuzz",)),
     (("drivers/host/",), ("make fuzz", "make stop-test", "make late-test")),
     (("era_haptics/lab/conformance/", "docs/how-to/", "docs/tutorials/"), ("make test-long",)),
     (("controller/daemon/", "controller/operation/"), ("make fault-test", "make kill-test")),
@@ -51,13 +49,7 @@ ALSO: Sequence[tuple[Sequence[str], Sequence[str]]] = (
     (("sim/soft_amp/", "era_haptics/lab/measuring/"), ("make desk-test",)),
     (("firmware/",), ("make firmware-test",)),
     (("examples/application/",), ("make qt-test",)),
-    (
-        ("controller/gateway/",),
-        (
-            "make pages",
-            "pytest tests/integration/test_dashboard*.py",
-        ),
-    ),
+    (("controller/gateway/",), ("pytest tests/integration/test_dashboard*.py",)),
     (("docs/",), ("make docs",)),
     (
         ("pyproject.toml",),
@@ -323,7 +315,7 @@ def main() -> int:
     sys.stdout.write(
         f"Not run: {farther} test files farther away, {unreached} that do not depend on the "
         "change, tests marked `long` or `alone`, and what the time did not allow.\n"
-        f"Next: {', '.join([*also(changed), 'make test'])}\n"
+        f"Next: {', '.join([*also(changed), 'make lint', 'make test'])}\n"
     )
     return status
 

@@ -65,7 +65,7 @@ _MAX_FILES = 24  # two processors do not finish more within the time, and each c
 _SECONDS = 45.0
 OPTIONS = ("-q", "-r", "fE", "-x", "--in-order", "-m", "not long and not alone")
 """Options of pytest."""
-MIN_TESTS = 100
+MIN_TESTS = 50
 """Tests that always run, however slow the machine is."""
 _MODULES = (".py", ".pyi")
 _WRITER = re.compile(r"<!-- begin: written by \S*?(\w+)\.py")

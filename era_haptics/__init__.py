@@ -7,10 +7,10 @@ Invalid input raises InputError, a ValueError.
 
 These names are stable; the packages behind them (`model`, `sim`, `drivers`, `controller`) change
 without notice. A name is loaded at its first use, so that a client of the daemon does not wait for
-linear algebra; `__init__.pyi` says from where, also to type checkers.
+linear algebra; `__init__.pyi` defines from where, also for type checkers.
 """
 
-import re
+import ast
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -20,14 +20,29 @@ from era_haptics.packages import check_packages, drop_foreign_backend
 check_packages()
 drop_foreign_backend()
 
-_IMPORT = re.compile(r"^from (\S+) import (\w+(?:, \w+)*)", re.MULTILINE)
-_NAME = re.compile(r"^from \S+ import (\w+) as (\w+)$|^(\w+) = (\w+)$", re.MULTILINE)
-_STUB = Path(__file__).with_suffix(".pyi").read_text(encoding="utf-8")
-_MODULES = {own: module for module, names in _IMPORT.findall(_STUB) for own in names.split(", ")}
-_OWN = {name or alias: own or known for own, name, alias, known in _NAME.findall(_STUB)}
-_HOMES = {name: (_MODULES[own], own) for name, own in _OWN.items()}
-"""The module that defines each name, and the name that it has there."""
 
+def _homes() -> dict[str, tuple[str, str]]:
+    """The module that defines each public name, and its name there, from the stub.
+
+    Public are `from MODULE import NAME as NAME` and `NAME = IMPORTED`, as for type checkers.
+    `lazy_loader.attach_stub` does the same for modules within one package only.
+    """
+    stub = Path(__file__).with_suffix(".pyi").read_text(encoding="utf-8")
+    imported: dict[str, tuple[str, str]] = {}
+    homes: dict[str, tuple[str, str]] = {}
+    for statement in ast.parse(stub).body:
+        match statement:
+            case ast.ImportFrom(module=str(module), names=aliases):
+                for alias in aliases:
+                    imported[alias.name] = (module, alias.name)
+                    if alias.asname:
+                        homes[alias.asname] = imported[alias.name]
+            case ast.Assign(targets=[ast.Name(id=public)], value=ast.Name(id=name)):
+                homes[public] = imported[name]
+    return homes
+
+
+_HOMES = _homes()
 __all__ = sorted(_HOMES)
 
 
@@ -38,14 +53,14 @@ def __getattr__(name: str) -> Any:
     if name not in _HOMES:
         raise AttributeError(f"unknown name era_haptics.{name}; known are {', '.join(__all__)}")
     try:
-        module, own = _HOMES[name]
-        found = getattr(import_module(module), own)
+        module, name_there = _HOMES[name]
+        value = getattr(import_module(module), name_there)
     except ModuleNotFoundError as error:
         if needed := posix_needed(error):
             raise ImportError(needed, name=error.name) from error
         raise
-    globals()[name] = found
-    return found
+    globals()[name] = value
+    return value
 
 
 def __dir__() -> list[str]:

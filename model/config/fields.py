@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from functools import cache, cached_property, partial
 from types import UnionType
 from typing import (
-    TYPE_CHECKING,
     Annotated,
     Any,
     Generic,
@@ -41,9 +40,6 @@ from model.config.units import LENGTH, Dimension, quantity, shown
 from model.quantities import counted
 from registry.plugins import did_you_mean
 from registry.wording import reworded
-
-if TYPE_CHECKING:
-    pass
 
 
 class Section(BaseModel):

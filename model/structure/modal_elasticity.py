@@ -134,18 +134,18 @@ def check_scales(
     """Raise InputError for factors on thickness or modulus of a plate with a part that stays.
 
     What is solved of a plate then serves for others by `modal_receptance`, unless it has parts
-    whose mass or stiffness does not go with them: fields of `Plate` without a law of scale. remedy:
+    whose mass or stiffness does not scale: fields of `Plate` without the metadata `scales`. remedy:
     the end of the message.
     """
-    stays = [
-        each.name
-        for each in fields(plate)
-        if not each.metadata.get("scaling") and getattr(plate, each.name) != each.default
+    fixed_parts = [
+        part.name
+        for part in fields(plate)
+        if not part.metadata.get("scales") and getattr(plate, part.name) != part.default
     ]
-    if stays and any(np.any(np.asarray(factor) != 1) for factor in factors):
+    if fixed_parts and any(np.any(np.asarray(factor) != 1) for factor in factors):
         raise InputError(
-            f"plate.{stays[0]}: thickness and modulus must be those that were solved, since this "
-            f"part does not scale with them; {remedy}"
+            f"plate.{fixed_parts[0]}: thickness and modulus must be those that were solved, since "
+            f"this part does not scale with them; {remedy}"
         )
 
 

@@ -250,78 +250,72 @@ LOSS_FREQUENCY = 150.0
 """Frequency [Hz] at which a plate has its loss factor, where that varies."""
 
 
-def _meaning(
-    scaling: str, *, is_of_theory: bool = True, has_own_row: bool = False
-) -> dict[str, str | bool]:
-    """What a field of `Plate` means to code that treats all fields alike, as its metadata.
+def _scales(*, is_of_theory: bool = True, has_own_row: bool = False) -> dict[str, bool]:
+    """Metadata of a field of `Plate` whose mass and stiffness scale with those of the plate.
 
-    A field without it has parts of another law, which stay as they are, and is of the theory.
+    The plate's mass scales with its thickness h, its bending stiffness with E h³. While all parts
+    scale like that, or are a share of it, one solution serves for other thicknesses and moduli.
+    A field without this metadata does not scale (`check_scales`), so a plate that has it must be
+    solved for each thickness.
 
-    scaling: how its mass and stiffness go with thickness h and modulus E. All go as those of the
-    plate, h and E h³, or are a share of them: so one solution serves for other thicknesses and
-    moduli, where two plates are told apart within a fifth of their difference. A plate with a field
-    of another law must be solved for each thickness.
-    is_of_theory: whether it decides the modes of the plate's theory. If not, a table of the plate
-    follows a change of it, and identified modes remain those of the changed plate.
+    is_of_theory: whether the field decides the modes of the plate's theory. If not, a table of the
+    plate follows a change of it, and identified modes remain those of the changed plate.
     has_own_row: whether a summary shows it in a row of its own, not among the further quantities.
     """
-    return {"scaling": scaling, "is_of_theory": is_of_theory, "has_own_row": has_own_row}
+    return {"scales": True, "is_of_theory": is_of_theory, "has_own_row": has_own_row}
 
 
 @dataclass(frozen=True)
 class Plate(Sheet):
     """A rectangular plate of constant thickness with its corner at the origin."""
 
-    length: float = field(metadata=_meaning("no mass or stiffness by itself", has_own_row=True))
+    length: float = field(metadata=_scales(has_own_row=True))
     """Along x [m]."""
 
-    width: float = field(metadata=_meaning("no mass or stiffness by itself", has_own_row=True))
+    width: float = field(metadata=_scales(has_own_row=True))
     """Along y [m]."""
 
-    thickness: float = field(metadata=_meaning("mass as h, bending stiffness as h³"))
+    thickness: float = field(metadata=_scales())
     """Thickness [m]; for a laminate that of the equivalent homogeneous plate."""
 
-    material: Material = field(metadata=_meaning("stiffness as E"))
+    material: Material = field(metadata=_scales())
     """Material; for a laminate that of the equivalent homogeneous plate."""
 
-    loss_factor: float = field(
-        default=0.01, metadata=_meaning("a share of the stiffness", is_of_theory=False)
-    )
+    loss_factor: float = field(default=0.01, metadata=_scales(is_of_theory=False))
     """Structural loss factor eta of a hysteretic stiffness (1 + i eta) K, at LOSS_FREQUENCY.
 
     The paper does not print it; 1 % is the usual order for a metal or glass panel with its bonded
     layers.
     """
 
-    loss_exponent: float = field(
-        default=0.0, metadata=_meaning("a share of the stiffness", is_of_theory=False)
-    )
+    loss_exponent: float = field(default=0.0, metadata=_scales(is_of_theory=False))
     """The loss factor varies as this power of the frequency."""
 
     mode_deviations: tuple[tuple[float, float], ...] = field(
-        default=(), metadata=_meaning("factors of the stiffness", is_of_theory=False)
+        default=(), metadata=_scales(is_of_theory=False)
     )
     """Logarithms of eigenvalue and loss factor of the lowest elastic modes, relative to those of
     the theory, in ascending order, as `era rig identify` finds them (see
     `model.structure.modal_elasticity`).
     """
 
-    laminate: Laminate | None = field(
-        default=None,
-        metadata=_meaning("as the homogeneous plate; a soft adhesive makes it up to a fifth less"),
-    )
-    """Layers that are solved as they are; None for a homogeneous plate."""
+    laminate: Laminate | None = field(default=None, metadata=_scales())
+    """Layers that are solved as they are; None for a homogeneous plate.
 
-    air_gap: AirGap | None = field(
-        default=None,
-        metadata=_meaning("as the homogeneous plate; air of 0.5 mm or more makes it a fifth less"),
-    )
-    """Air between the plate and a rigid wall; None for a plate in the open."""
+    Scaled like the homogeneous plate, which is up to a fifth too much for a soft adhesive.
+    """
 
-    surface: Surface | None = field(
-        default=None, metadata=_meaning("all natural frequencies as h, all modal masses as h")
-    )
-    """Modes of another program that take the place of its own; the plate is like them."""
+    air_gap: AirGap | None = field(default=None, metadata=_scales())
+    """Air between the plate and a rigid wall; None for a plate in the open.
+
+    Scaled like the homogeneous plate, which is a fifth too much for air of 0.5 mm or more.
+    """
+
+    surface: Surface | None = field(default=None, metadata=_scales())
+    """Modes of another program that take the place of its own; the plate is like them.
+
+    Natural frequencies and modal masses scale with the thickness.
+    """
 
     def __post_init__(self) -> None:
         """Refuse dimensions out of range."""
@@ -421,7 +415,9 @@ class Plate(Sheet):
 
 
 FOLLOWED_FIELDS = tuple(
-    each.name for each in fields(Plate) if not each.metadata.get("is_of_theory", True)
+    plate_field.name
+    for plate_field in fields(Plate)
+    if not plate_field.metadata.get("is_of_theory", True)
 )
 """Fields of a plate that a table follows, and that leave the modes of the plate's theory alone."""
 

@@ -18,7 +18,6 @@ from typing import Any
 import pytest
 
 import era_haptics.plugins
-from controller.cli.main import run
 from controller.content.formats import Ahap, content_format, content_formats, read_content
 from controller.content.reading import ContentFormat
 from controller.effects.effect import Effect
@@ -30,6 +29,7 @@ from controller.sources.tuio import TuioSource
 from drivers.errors import CommandError
 from drivers.wires.serial_line import SerialAddress
 from drivers.wires.wire import address_of
+from era_haptics.command import run
 from model.errors import InputError
 from model.structure.material import KNOWN_MATERIALS, known_material, material_names
 from registry.plugins import EXAMPLE_PREFIX, PluginRegistry, failure_text

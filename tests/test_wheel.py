@@ -249,7 +249,7 @@ for module, names in {
         delattr(module, name)
 OURS = r"(controller|drivers|era_haptics|model|registry|sim)\\."
 warnings.filterwarnings("error", category=EncodingWarning, module=OURS)
-from controller.cli.main import main
+from era_haptics.command import main
 
 def era(*arguments):
     """Run a command; its exit status."""

@@ -284,7 +284,7 @@ _PLANTED = (sys.executable, "-m", "benchmarks.latency.planted", PLANTED)
 _WITHOUT_KERNELS = (
     *(sys.executable, "-c"),
     "import model.compiled.kernels as compiled\ncompiled.kernels = lambda: None\n"
-    "from controller.cli.main import main\nmain()",
+    "from era_haptics.command import main\nmain()",
     "daemon",
 )
 _EXAMPLES = ("paper_plate", "tutorial_rig", "eight_eras", "car_display", "glass_panel", "table")

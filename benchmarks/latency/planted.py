@@ -6,10 +6,10 @@ The proof of the benchmark: just that time must appear in its figures.
 import sys
 import time
 
-from controller.cli.main import main
 from controller.sources.touch import TouchFrame
 from controller.sources.tuio import TuioSource
 from controller.sources.udp_source import Peer
+from era_haptics.command import main
 
 if __name__ == "__main__":
     delay, read = float(sys.argv[1]), TuioSource.read

@@ -1,8 +1,6 @@
-"""The `era` command: assembles the commands of all packages and maps errors to exit statuses.
+"""How commands run: one group for the commands of several modules, and an exit status per error.
 
-A package provides commands by a module with `app`, a typer application whose commands appear under
-`era`, those of a group beside others of the same group, and `EXIT_STATUS`, the exit status by error
-class.
+`era_haptics.command` lists the modules of `era`, `controller.cli.__main__` those of this package.
 """
 
 import errno
@@ -13,10 +11,9 @@ import sys
 import traceback
 from collections.abc import Callable, Iterable, Sequence
 from functools import cache
-from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
-from typing import Annotated, Any, TypeAlias
+from typing import Annotated, Any, Protocol, TypeAlias
 
 import typer
 from typer.core import TyperGroup
@@ -25,16 +22,6 @@ from typer.main import get_group
 from registry.files import posix_needed
 from registry.plugins import failed_plugin, failure_text
 from registry.wording import reworded
-
-COMMANDS = (
-    "controller.cli.commands",
-    "controller.cli.config_cli",
-    "drivers.by_hand.cli",
-    "model.cli",
-    "sim.cli",
-    "era_haptics.lab.cli",
-)
-"""Modules with commands, by name: packages beside this one do not import each other."""
 
 SECTIONS = {
     "Try": ("demo", "sim", "figure"),
@@ -74,12 +61,28 @@ BROKEN_PIPE = 141  # as a shell reports SIGPIPE
 
 ExitStatus: TypeAlias = dict[type[BaseException], int]
 
+
+class CommandModule(Protocol):
+    """A module that provides commands."""
+
+    app: typer.Typer
+    """Its commands appear under `era`; those of a group join the group of that name."""
+    EXIT_STATUS: ExitStatus
+    """Exit status for each class of error that its commands raise on purpose."""
+
+
+LoadModules: TypeAlias = Callable[[], Sequence[CommandModule]]
+"""Imports modules with commands, which takes a second."""
+
 # With two threads the small systems here take up to three times as long, and vary widely.
 _THREAD_COUNTS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 
 
-def main() -> int:
-    """Run the command line of the process; return the exit status."""
+def main(load: LoadModules) -> int:
+    """Run the command line of the process; return the exit status.
+
+    load: called once signals end the process.
+    """
     for variable in _THREAD_COUNTS:
         os.environ.setdefault(variable, "1")
     # Pictures go to files; a notebook hands its own backend to what it starts, also with `!era`.
@@ -90,7 +93,7 @@ def main() -> int:
     # While modules load nothing is armed, and a KeyboardInterrupt could be swallowed.
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: os._exit(INTERRUPTED))
-    return run(sys.argv[1:], COMMANDS, on_loaded=_interrupt_on_signals)
+    return run(sys.argv[1:], load, on_loaded=_interrupt_on_signals)
 
 
 def _interrupt_on_signals() -> None:
@@ -101,18 +104,18 @@ def _interrupt_on_signals() -> None:
 
 def run(
     arguments: Sequence[str],
-    modules: Iterable[str] = COMMANDS,
+    load: LoadModules,
     *,
     on_loaded: Callable[[], None] = lambda: None,
 ) -> int:
-    """Run one command line with the commands of these modules; return the exit status.
+    """Run one command line with the commands of some modules; return the exit status.
 
     on_loaded: called once the modules are loaded.
     """
     end = arguments.index("--") if "--" in arguments else len(arguments)
     kept = [argument for argument in arguments[:end] if argument != "--debug"]
     debug, arguments = len(kept) < end, [*kept, *arguments[end:]]
-    group, statuses = load_commands(modules)
+    group, statuses = join_commands(load())
     try:
         on_loaded()
         status = _invoke(group, arguments)
@@ -166,14 +169,13 @@ class _Commands(TyperGroup):
                     formatter.write_dl(rows)
 
 
-def load_commands(modules: Iterable[str] = COMMANDS) -> tuple[TyperGroup, ExitStatus]:
+def join_commands(modules: Iterable[CommandModule]) -> tuple[TyperGroup, ExitStatus]:
     """Return one group with the commands of all modules, and the exit status by error class."""
     app = typer.Typer(cls=_Commands, no_args_is_help=True)
     app.callback()(_root)
     group = _group(app)
     statuses: ExitStatus = {}
-    for name in modules:
-        module = import_module(name)
+    for module in modules:
         statuses.update(module.EXIT_STATUS)
         for word, command in _group(module.app).commands.items():
             known = group.commands.setdefault(word, command)

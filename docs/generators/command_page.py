@@ -10,7 +10,8 @@ from typing import Any
 import typer
 from typer.core import TyperGroup
 
-from controller.cli.main import load_commands
+from controller.cli.main import join_commands
+from era_haptics.command import command_modules
 
 _MANY = 6
 """So many commands with the same argument or option: it is a common one."""
@@ -20,7 +21,7 @@ _Records = list[tuple[str, str]]
 
 def command_reference() -> str:
     """All commands in the order of `era --help`, as Markdown."""
-    group, _ = load_commands()
+    group, _ = join_commands(command_modules())
     commands = list(_commands(group, typer.Context(group, info_name="era")))
     counts = Counter(record for *_, records in commands for record in records)
     common: dict[str, str] = {}

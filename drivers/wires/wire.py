@@ -306,6 +306,7 @@ _WIRES: PluginRegistry[Callable[[str], WireAddress]] = PluginRegistry(
         "modbus+tcp": "drivers.wires.modbus:ModbusAddress",
         "serial": "drivers.wires.serial_line:SerialAddress",
         "serial+tcp": "drivers.wires.serial_line:SerialAddress",
+        # A plug-in of the package `sim`, which imports this one; hosts of hardware never load it.
         "sim": "sim.memory_line:SimulatedAddress",
     },
     ending="://",

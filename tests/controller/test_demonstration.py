@@ -15,7 +15,6 @@ from unittest.mock import AsyncMock
 import numpy as np
 import pytest
 
-from controller.cli.main import run
 from controller.demo import demonstration
 from controller.demo import recorder as far_end
 from controller.demo.demonstration import (
@@ -40,6 +39,7 @@ from controller.play.loop import Observers, PlayReport
 from controller.sources.touch import Change, Contact, ContactKey, TouchFrame
 from controller.sources.tuio import TuioSource
 from drivers.errors import LinkError
+from era_haptics.command import run
 from kit.clock import in_virtual_time, run_virtual
 from kit.plates import small_table
 from model.answer.answer import OWN, Sensation

@@ -16,6 +16,7 @@ import sys
 import threading
 from collections.abc import Iterator, Mapping
 from contextlib import closing, contextmanager
+from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
 from textwrap import dedent
@@ -23,7 +24,7 @@ from unittest.mock import Mock
 
 import pytest
 
-from controller.cli.main import main, run
+from controller.cli.main import LoadModules, run
 from controller.daemon.children import gateway_options
 from controller.daemon.messages import LatencyStatistics
 from controller.operation.fault_dumps import DUMP_PATTERN, MAX_DUMPS, FaultDumps, write_dump
@@ -31,6 +32,7 @@ from controller.operation.operation_states import DaemonState, Operation
 from controller.process.daemon_process import ServiceManager, SocketLock
 from controller.process.log import LogFormatter, LogThread, RateLimitFilter
 from drivers.wires.wire import Reply
+from era_haptics.command import main
 from kit.chain import set_chain
 from kit.clock import in_virtual_time
 from model.errors import InputError
@@ -244,19 +246,20 @@ COMMANDS = """
 
 
 @pytest.fixture
-def entries(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
+def entries(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> LoadModules:
     """A module with commands, which is forgotten after the test."""
     (tmp_path / f"{MODULE}.py").write_text(dedent(COMMANDS), encoding="utf-8")
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.delitem(sys.modules, MODULE, raising=False)
-    return [MODULE]
+    return lambda: [import_module(MODULE)]
 
 
 def run_typed(folder: Path, *arguments: str, **environment: str) -> "subprocess.Popen[str]":
     """A process that runs the test commands, which are written to a folder."""
     (folder / f"{MODULE}.py").write_text(dedent(COMMANDS), encoding="utf-8")
     script = (
-        f"import controller.cli.main as m; m.COMMANDS = [{MODULE!r}]; raise SystemExit(m.main())"
+        "import importlib, controller.cli.main as m\n"
+        f"raise SystemExit(m.main(lambda: [importlib.import_module({MODULE!r})]))"
     )
     return subprocess.Popen(
         [sys.executable, "-c", script, *arguments],
@@ -268,7 +271,7 @@ def run_typed(folder: Path, *arguments: str, **environment: str) -> "subprocess.
 
 
 def test_run_runs_a_command_and_returns_zero(
-    entries: list[str], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    entries: LoadModules, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Commands and groups of a package are at the root, with their options; so are help, version.
 
@@ -316,7 +319,7 @@ def test_run_runs_a_command_and_returns_zero(
     ],
 )
 def test_run_reports_an_error_in_one_line_with_its_status(
-    entries: list[str],
+    entries: LoadModules,
     capsys: pytest.CaptureFixture[str],
     arguments: list[str],
     status: int,
@@ -336,7 +339,7 @@ def test_run_reports_an_error_in_one_line_with_its_status(
     [["--debug", "ends", "bug"], ["ends", "--debug", "bug"], ["ends", "bug", "--debug"]],
 )
 def test_run_shows_the_traceback_with_debug(
-    entries: list[str], capsys: pytest.CaptureFixture[str], arguments: list[str]
+    entries: LoadModules, capsys: pytest.CaptureFixture[str], arguments: list[str]
 ) -> None:
     """The option is accepted anywhere; the traceback has no colour."""
     assert run(arguments, entries) == 70
@@ -372,15 +375,15 @@ def test_main_ends_quietly_and_prints_what_its_output_cannot_encode(
 LOADED = """
 import contextlib, io, sys
 from importlib.metadata import packages_distributions
-from controller.cli.main import load_commands
-from controller.cli.main import run
+from controller.cli.main import join_commands
+from era_haptics.command import command_modules, run
 
 if "all" in sys.argv:
     def help_of(command, path):
         yield path
         for name, part in getattr(command, "commands", {}).items():
             yield from help_of(part, [*path, name])
-    paths = list(help_of(load_commands()[0], []))
+    paths = list(help_of(join_commands(command_modules())[0], []))
 else:
     paths = [[]]
 with contextlib.redirect_stdout(io.StringIO()):

@@ -31,7 +31,7 @@ import pages
 from controller.api.methods import StateEvent
 from controller.api.schema import headline
 from controller.cli.config_cli import app as config_commands
-from controller.cli.main import load_commands
+from controller.cli.main import join_commands
 from controller.daemon.config import DaemonSection, DumpSection, LogSection, TouchSection
 from controller.operation.operation_states import DaemonState
 from controller.sources.touch import CONTACT_TIMEOUT
@@ -40,6 +40,7 @@ from drivers.by_hand.reaching import check_links
 from drivers.errors import CommandError
 from drivers.protocol.definition import BOOT_TIME, REACTION
 from drivers.wires.wire import address_of
+from era_haptics.command import command_modules
 from model.answer.answer import MIN_CONTRAST_DB, OWN_CONTRAST_DB
 from model.answer.promise import MIN_RAISED_CONTRAST_DB
 from model.cli import app
@@ -271,7 +272,7 @@ def test_page_lists_every_command_with_its_options() -> None:
     """The names on the page are those of the program; what it says once, it says above them."""
     parts = re.split(r"^### ", PAGE, flags=re.MULTILINE)[1:]
     listed = {part.splitlines()[0]: part for part in parts}
-    known = dict(commands(load_commands()[0]))
+    known = dict(commands(join_commands(command_modules())[0]))
     common = set(re.findall(r"^- `(--[a-z-]+)", parts[0], re.MULTILINE))
     assert {name for name in listed if name.startswith("era ")} == set(known)
     for name, command in known.items():

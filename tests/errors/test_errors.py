@@ -20,10 +20,10 @@ from typing import Any
 import pytest
 
 from cases import read_yaml, shortly
-from controller.cli.main import run
 from controller.sources.touch import open_source
 from drivers.errors import CommandError
 from drivers.wires.wire import address_of
+from era_haptics.command import run
 from era_haptics.lab.design.problem import (
     area_of,
 )

@@ -30,7 +30,6 @@ import pytest
 import yaml
 
 from benchmarks.weekend.chain import BuiltBoard
-from controller.cli.main import run
 from drivers import opening
 from drivers.by_hand.actions import identify
 from drivers.errors import CommandError, LinkError
@@ -38,6 +37,7 @@ from drivers.host.group import Group
 from drivers.opening import Lines
 from drivers.playing import AmplifierLayer, AmplifierTone
 from drivers.wires.serial_frames import Frame, encode_frame
+from era_haptics.command import run
 from era_haptics.lab.conformance.contract import judge, of_kind
 from kit.clock import judged
 from model.caching import cache_folder

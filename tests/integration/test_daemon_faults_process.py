@@ -91,7 +91,7 @@ from sim.plant.plant import SAMPLE_RATE, Plant
 async def test_start_that_is_stuck_ends_by_sigterm(tmp_path: Path) -> None:
     """In a library that looks at no signal, as one that waits for memory."""
     stuck = (
-        "import ctypes, controller.daemon.daemon as daemon\nfrom controller.cli.main import main\n"
+        "import ctypes, controller.daemon.daemon as daemon\nfrom era_haptics.command import main\n"
         "def table(config):\n"
         "    lock, mutex = ctypes.CDLL(None).pthread_mutex_lock, ctypes.create_string_buffer(64)\n"
         "    print(flush=True)\n"

@@ -40,7 +40,6 @@ from controller.api.jsonrpc import ErrorCode, RpcError
 from controller.api.methods import LayoutEvent, PatternEvent, StateEvent
 from controller.api.schema import ContactStatus, DaemonStateName
 from controller.api.server import Hub
-from controller.cli.main import run
 from controller.demo.demonstration import Scene, layout_of_people
 from controller.demo.recorder import TouchRecorder
 from controller.gateway.app import MAX_SESSIONS
@@ -51,6 +50,7 @@ from drivers.by_hand import actions
 from drivers.errors import LinkError, LinkTimeout
 from drivers.host.group import GroupState
 from drivers.opening import Lines
+from era_haptics.command import run
 from era_haptics.lab.conformance.contract import opened
 from era_haptics.lab.witness.capture import TimeLimits
 from kit.chain import Chain
@@ -557,7 +557,7 @@ ENABLED = "OPERATION_ENABLED"
 
 IMPATIENT = """
 import sys
-from controller.cli.main import main
+from era_haptics.command import main
 from controller.gateway import app, connections
 app.CLIENT_TIMEOUT = connections.CLIENT_TIMEOUT = connections.SEND_TIMEOUT = 1.0
 sys.exit(main())

@@ -13,7 +13,7 @@ import pytest
 from tables import claims, stiffness_study, tables
 
 from cases import shortly
-from controller.cli.main import run
+from era_haptics.command import run
 from era_haptics.lab.paper_figures import SWEEP, PaperFigure, equal_area_points, paper_figures
 from kit.plates import make_paper_rig, small_table, with_strokes, write_rig
 from model.figures import Template, _pages, answer_figure, levels_figure, weak_cells_figure

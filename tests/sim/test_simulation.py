@@ -205,7 +205,7 @@ async def test_simulation_writes_its_recording_on_a_signal(
 @pytest.mark.parametrize("after", [0.1, 0.4])
 async def test_simulation_exits_on_a_signal_while_it_starts(tmp_path: Path, after: float) -> None:
     """It exits without a traceback."""
-    for command in (["-m", "sim"], ["-c", "from controller.cli.main import main; main()", "sim"]):
+    for command in (["-m", "sim"], ["-c", "from era_haptics.command import main; main()", "sim"]):
         process = await asyncio.create_subprocess_exec(
             *(sys.executable, "-P", *command, str(write_rig(tmp_path / "rig.yaml")), "--serial"),
             stdout=asyncio.subprocess.PIPE,
@@ -493,7 +493,7 @@ async def test_witness_relays_a_wire_until_interrupted(
     capture = tmp_path / "capture.txt"
     async with far_side(SimulatedWire("serial"), coarse_rig) as far:
         options = ("--slack", "5000", "--record", str(capture))
-        code = "import sys; from controller.cli.main import main; sys.exit(main())"
+        code = "import sys; from era_haptics.command import main; sys.exit(main())"
         process = await asyncio.create_subprocess_exec(
             # -B: bytecode would be cut off, too, and Python does not notice
             *(sys.executable, "-B", "-P", "-c", code, "witness", far.url, *options),

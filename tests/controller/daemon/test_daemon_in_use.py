@@ -34,7 +34,7 @@ from controller.api.jsonrpc import ErrorCode, RpcError
 from controller.api.link import Notification
 from controller.api.methods import TOPICS
 from controller.cli.commands import app
-from controller.cli.main import BAD_INPUT, run
+from controller.cli.main import BAD_INPUT
 from controller.cli.status_text import show_event, show_status
 from controller.daemon.children import gateway_options
 from controller.daemon.daemon import run_daemon
@@ -54,6 +54,7 @@ from controller.operation.operation_states import (
 from controller.process.log import LogThread
 from drivers.errors import CommandError
 from drivers.host.amplifier import WATCHDOG
+from era_haptics.command import run
 from kit.clock import in_virtual_time
 from kit.courses import Planted
 from kit.plates import TWO_AMPLIFIERS
@@ -178,7 +179,7 @@ def test_commands_choose_a_layout_and_reload(
     write_layouts(tmp_path)
 
     def era(*line: str) -> tuple[int, str]:
-        status = run([*line, "--socket", str(tmp_path / "era.sock")], ["controller.cli.commands"])
+        status = run([*line, "--socket", str(tmp_path / "era.sock")])
         return status, "".join(capsys.readouterr())
 
     with real_daemon(tmp_path, LAYOUTS) as socket, Client.connect(socket) as client:
@@ -577,16 +578,15 @@ def test_stop_exits_with_3_and_names_amplifiers_unless_all_are_silent(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Success only if every amplifier is confirmed silent, or else the unconfirmed ones."""
-    modules = ["controller.cli.commands"]
     with ScriptedDaemon(tmp_path) as daemon:
         command = ["stop", "--socket", str(daemon.socket)]
-        assert run(command, modules) == 0
+        assert run(command) == 0
         daemon.silence = UNCONFIRMED
-        assert run(command, modules) == 3
+        assert run(command) == 3
         errors = capsys.readouterr().err
         assert re.search(r"side .*0\.20 s.*rear", errors)
         assert "main" not in errors
-    assert run(command, modules) == 3
+    assert run(command) == 3
 
 
 def test_help_of_watch_names_every_topic() -> None:

@@ -21,7 +21,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pythonosc.osc_message_builder import OscMessageBuilder
 
-from controller.cli.main import run
 from controller.sources.touch import ContactTracker, Touch, TouchFrame
 from controller.sources.tuio import (
     HEADER,
@@ -33,6 +32,7 @@ from controller.sources.tuio import (
 )
 from controller.sources.udp_source import BACKLOG_THRESHOLD, Datagram, Datagrams, Peer, listen
 from drivers.errors import LinkError
+from era_haptics.command import run
 from examples.make_touches import tuio_datagram, write_capture
 from kit.clock import in_virtual_time
 from kit.fingers import bundle, cursor, frame, free_port, message
@@ -825,14 +825,13 @@ async def test_replay_capture_raises_when_a_port_is_closed_or_the_system_refuses
 
 def test_era_touch_sends_a_capture(tmp_path: Path) -> None:
     """To the UDP port of the daemon's source; fingers and a capture exclude each other."""
-    commands = ["controller.cli.commands"]
     path = tmp_path / "taps.tuio"
     write_capture(path, [RecordedDatagram(0.0, b"one"), RecordedDatagram(0.0, b"two")])
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
         receiver.bind(("127.0.0.1", 0))
         receiver.settimeout(10)
         options = ["--replay", str(path), "--port", str(receiver.getsockname()[1])]
-        assert run(["touch", *options], commands) == 0
+        assert run(["touch", *options]) == 0
         assert [receiver.recv(100) for _ in range(2)] == [b"one", b"two"]
-        assert run(["touch", "0.1,0.1", *options], commands) == 2
-    assert run(["touch"], commands) == 2
+        assert run(["touch", "0.1,0.1", *options]) == 2
+    assert run(["touch"]) == 2

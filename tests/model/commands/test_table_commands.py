@@ -25,7 +25,7 @@ from typer.testing import CliRunner
 import era_haptics as api
 from cases import read_yaml
 from controller.cli.config_cli import app as config_commands
-from controller.cli.main import run
+from era_haptics.command import run
 from era_haptics.lab.cli import app as lab_app
 from era_haptics.lab.design import design_run, problem, score
 from kit.plates import small_table, smooth_table, write_rig

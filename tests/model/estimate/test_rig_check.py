@@ -23,8 +23,8 @@ from benchmarks.identification.mistakes import on_glue
 from benchmarks.identification.plates import draw
 from benchmarks.weekend.chain import FOLDER, BuiltBoard
 from cases import read_yaml, shortly
-from controller.cli.main import run
 from controller.plate_measurement import MeasuredPlate
+from era_haptics.command import run
 from kit.plates import (
     DISTORTIONS,
     as_sold,

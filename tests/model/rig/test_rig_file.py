@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 
 from benchmarks.direct_plate import direct_acceleration
-from controller.cli.main import run
 from controller.rig_file_check import check_rig
+from era_haptics.command import run
 from kit.plates import exciter_rig, exciter_rig_text
 from kit.set_table import only
 from model.answer.stimulus import Placement

@@ -14,8 +14,8 @@ from benchmarks.contents import share_kept
 from benchmarks.setting import random_contacts
 from benchmarks.surface import exported_modes
 from cases import read_yaml
-from controller.cli.main import run
 from controller.sources.touch import ContactTracker, Touch, TouchFrame
+from era_haptics.command import run
 from era_haptics.lab.design.problem import area_of
 from model.answer.plan import answer
 from model.answer.stimulus import Finger, Stimulus, check_on_plate

@@ -9,7 +9,7 @@ import pytest
 
 import era_haptics as era
 from benchmarks.surface import exported_modes
-from controller.cli.main import run
+from era_haptics.command import run
 from model.arrays import FloatArray, lattice
 from model.errors import InputError
 from model.files.modal_file import read_modes

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.image import imsave
 
-from controller.cli.main import BUG, run
+from controller.cli.main import BUG
 from controller.content.formats import named_content, read_content
 from controller.daemon.config import load_daemon_config
 from controller.effects.layout import load_layout
@@ -23,6 +23,7 @@ from controller.effects.strengths import read_strengths
 from controller.gateway.gateway_settings import read_token
 from controller.learning.learned_table import load_learned
 from controller.sources.tuio import read_capture
+from era_haptics.command import run
 from era_haptics.lab.design.problem import (
     DesignProblem,
     anywhere,

@@ -27,7 +27,7 @@ from typing import Any
 from cases import read_yaml
 from controller.api.client import Client
 from controller.api.jsonrpc import RpcError
-from controller.cli.main import run
+from era_haptics.command import run
 from kit.plates import DISTORTIONS, every
 from model.estimate.measurement import measurement_of, read_measured, write_responses_csv
 from model.rig.rig_file import example_rig_path, load_rig

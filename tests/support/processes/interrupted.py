@@ -91,7 +91,7 @@ def _waiting(command: str, inside: str, writing: int) -> int:
 
 
 if __name__ == "__main__":
-    from controller.cli.main import main
+    from era_haptics.command import main
 
     asked = json.loads(sys.stdin.read())
     for module in {at.rpartition(".")[0] for at in asked.values()}:

@@ -33,8 +33,8 @@ def wait_long(patch: pytest.MonkeyPatch) -> None:
 
 
 if __name__ == "__main__":
-    from controller.cli.main import main
     from controller.sources import touch
+    from era_haptics.command import main
 
     patch = pytest.MonkeyPatch()
     wait_long(patch)

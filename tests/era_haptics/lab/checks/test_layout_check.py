@@ -22,7 +22,6 @@ from typer.testing import CliRunner
 
 from cases import in_turn, shortly
 from controller.cli.config_cli import config_kinds
-from controller.cli.main import run as run_era
 from controller.content.formats import named_content, read_content
 from controller.content.pattern import Pattern, Transient
 from controller.effects.effect import Effect, Region
@@ -31,6 +30,7 @@ from controller.effects.layout import SurfaceLayout, load_layout
 from controller.effects.player import EffectPlayer
 from controller.play.selection import Chooser, Selector
 from controller.sources.touch import Contact, ContactKey
+from era_haptics.command import run as run_era
 from era_haptics.lab.checks import layout_check, layout_picture
 from era_haptics.lab.checks.content_check import check_content, content_figure, kept_shares
 from era_haptics.lab.checks.layout_check import (

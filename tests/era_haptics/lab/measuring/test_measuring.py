@@ -20,8 +20,8 @@ from typer.testing import CliRunner
 
 from benchmarks.desk.session import open_client
 from benchmarks.desk_plate.desk_plate import Converters, DeskModel, DeskPlate, JackPlate, Truth
-from controller.cli.main import run as run_era
 from drivers.errors import LinkError
+from era_haptics.command import run as run_era
 from era_haptics.lab.measuring import other_sources
 from era_haptics.lab.measuring.impedance import (
     ImpedanceSetup,

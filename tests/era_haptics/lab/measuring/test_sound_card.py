@@ -30,9 +30,9 @@ from benchmarks.desk_plate.desk_plate import (
     sampled,
 )
 from benchmarks.direct_plate import direct_responder
-from controller.cli.main import run
 from controller.plate_measurement import MeasuredPlate
 from drivers.errors import LinkError
+from era_haptics.command import run
 from era_haptics.lab.measuring.measure import measure_through
 from era_haptics.lab.measuring.sound_card import (
     Desk,

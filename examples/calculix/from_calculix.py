@@ -71,7 +71,7 @@ class Results:
 
 
 def read_set(path: Path, name: str) -> list[int]:
-    """Return the nodes of a set of an input file; raises ValueError with the line at fault."""
+    """Return the nodes of a set in an input file; raises ValueError with file and line."""
     sets: dict[str, dict[int, None]] = {}
     instances: dict[str, set[str]] = {}
     target: dict[int, None] | None = None
@@ -106,7 +106,7 @@ def read_set(path: Path, name: str) -> list[int]:
 
 
 def _input_lines(path: Path, depth: int = 0) -> Iterator[tuple[str, str]]:
-    """Yield the lines of an input file and of those that it includes, with their places."""
+    """Yield the lines of an input file and its included files, with file and line number."""
     text = path.read_text(encoding="utf-8", errors="replace")
     for number, line in enumerate(text.splitlines(), start=1):
         stripped = line.strip()
@@ -122,7 +122,7 @@ def _input_lines(path: Path, depth: int = 0) -> Iterator[tuple[str, str]]:
 
 
 def _keyword(line: str) -> tuple[str, dict[str, str]]:
-    """Return the keyword of a line, without asterisk, and its parameters in capitals."""
+    """Return keyword and parameters of a line in capitals, without the asterisk."""
     keyword, *rest = (word.strip() for word in line.upper().lstrip("*").split(","))
     parameters = {}
     for word in rest:
@@ -134,7 +134,7 @@ def _keyword(line: str) -> tuple[str, dict[str, str]]:
 def _numbers_of(
     entries: list[str], parameters: dict[str, str], sets: dict[str, dict[int, None]], place: str
 ) -> list[int]:
-    """Return the node numbers of a data line: numbers, a range (GENERATE), or names of sets."""
+    """Return the node numbers of a data line with numbers, set names or a range (GENERATE)."""
     if "GENERATE" in parameters:
         try:
             first, last, *step = (int(entry) for entry in entries)
@@ -168,10 +168,10 @@ class _Block:
 
     header: str
     step: int
-    """Number of the step that computed it."""
+    """Step number of the analysis."""
 
     rows: list[tuple[str, str]] = field(default_factory=list)
-    """Further lines, each with its place."""
+    """Lines after the header: file with line number, and text."""
 
     @property
     def width(self) -> int:
@@ -183,7 +183,7 @@ class _Block:
 
 
 def read_frd(path: Path) -> Results:
-    """Return mesh and modes of a file; raises ValueError with the line at fault."""
+    """Return mesh and modes of a file; raises ValueError with file and line."""
     results = Results({}, [], [])
     steps: set[int] = set()
     for block in _blocks(path):

@@ -4,12 +4,12 @@ In a mode phi of unit modal mass, the integral of phi² over the mass of the par
 are orthogonal to rigid-body motion. A free part has that motion in its rigid-body modes, a held
 part in its lowest elastic modes.
 
-The distribution of the mass is unknown, and taken as even. Ribs, frames and lumped masses change
-the figures, as do few nodes that do not reach the edges. All limits leave room for that: the
-measured ranges are stated beside them, from plates with frames of up to three times and lumped
-masses of 1.7 times their own mass, free and held in ten ways, at 12 to 180 nodes.
+The mass distribution is unknown and assumed to be even. Ribs, frames and lumped masses change the
+results, and so do few nodes that do not reach the edges. The limits leave room for both. The
+comments state the ranges measured on plates with frames of up to three times and lumped masses of
+1.7 times their own mass, free and held in ten ways, at 12 to 180 nodes.
 
-What cannot be true raises InputError. What is unlikely gives a note, for a warning.
+Impossible modes raise InputError. Suspicious modes give a note, which is shown as a warning.
 """
 
 import math
@@ -42,30 +42,30 @@ _MIN_EXPECTED_DENSITY, _MAX_EXPECTED_DENSITY = 0.1, 300.0
 _EQUAL_FREQUENCY, _EQUAL_SHAPE = 1e-3, 0.999  # relative difference, and MAC
 _CLOSE_FREQUENCY, _CLOSE_SHAPE = 0.01, 0.98
 _SEEN = 1e-3  # size of a shape that is more than rounding, relative to the median
-_MANY_IN_PAIRS = 0.4  # share of modes in close pairs, as of two steps with different preloads
+_MANY_IN_PAIRS = 0.4  # share of modes in close pairs, for example of two preloaded steps
 
 _SCALE_LIMIT, _EXPECTED_SCALE = 10.0, 3.0
-"""Factors by which the median integral of phi² may differ from 1: measured 0.43 to 2.7."""
+"""Limits for the factor between the median integral of phi² and 1; measured: 0.43 to 2.7."""
 
 _RIGID_SCALE_LIMIT = 50.0
-"""The same of rigid-body modes: 0.09 to 2.7 where the nodes cover a quarter of the part."""
+"""Limit for rigid-body modes; measured: 0.09 to 2.7 if the nodes cover a quarter of the part."""
 
 _NORMALISED_SCALE = 1.4
-"""The same of shapes that look normalised otherwise: 0.97 to 1.03 for even plates."""
+"""Limit for shapes that look normalised in another way; measured: 0.97 to 1.03 on even plates."""
 
-_SAME_VALUE = 5e-4  # relative difference, as of files with four digits
+_SAME_VALUE = 5e-4  # relative difference after rounding to four digits
 _MIN_TIES, _TIES, _NEARLY_ALL = 3, 0.2, 0.9  # modes with the same value; shares of all modes
 
 _MIN_CARRIED, _EXPECTED_CARRIED = 0.3, 0.45
-"""Share of rigid-body translation in the modes: 0.61 to 1 for held panels; 0 for the elastic modes
-of an even free panel, 0.26 with a rib of half its mass."""
+"""Share of rigid-body translation in the modes. Measured: 0.61 to 1 on held panels; in the elastic
+modes of free panels 0, and 0.26 with a rib of half the panel's mass."""
 
-_EVEN_MASS = 0.15  # relative difference of the moments of the mass from those of an even one
+_EVEN_MASS = 0.15  # relative difference of the moments of inertia from an even distribution
 _MAX_MIXED = 0.6
 """Share of rigid-body motion in elastic modes of a free part with even mass; 0 in theory."""
 
 _MIN_NODES = 12
-"""At six random nodes the median integral of even plates was from 0.4 to 3.5."""
+"""With six random nodes the median integral of phi² on even plates was 0.4 to 3.5."""
 _NODES_FOR_ROTATIONS = 30
 _NODES_PER_MODE = 3
 _MAX_NODES, _LINES, _MIN_RASTER = 300, 28, 50
@@ -74,9 +74,9 @@ _MAX_NODES, _LINES, _MIN_RASTER = 300, 28, 50
 
 @lru_cache(maxsize=8)
 def check_surface(file: str, digest: str, normal: str, mass: float | None) -> tuple[str, ...]:
-    """Return notes on suspicious modes of a file; raises InputError for impossible ones.
+    """Return notes on suspicious modes in a file; raises InputError for impossible modes.
 
-    mass: stated [kg]; None for that of the rigid-body modes.
+    mass: stated mass [kg]; None to take the mass from the rigid-body modes.
     """
     shapes = surface_shapes(file, digest, normal)
     known_mass = shapes.mass if mass is None else mass
@@ -147,11 +147,11 @@ def _pairs(modes: ModeShapes) -> tuple[FloatArray, FloatArray]:
     products = shapes @ shapes.T
     squares = np.diag(products)
     sizes = np.outer(squares, squares)
-    # Modes within the surface have no shape along the normal but rounding.
+    # Modes within the surface have rounding errors instead of a shape along the normal.
     is_seen = squares > _SEEN**2 * np.median(squares)
     both = np.outer(is_seen, is_seen) & (sizes > 0)
     alike = np.divide(products**2, sizes, out=np.zeros_like(sizes), where=both)
-    # All modes of the rigid body have the same frequency but for rounding.
+    # Rigid-body modes have the same frequency apart from rounding.
     frequencies = np.where(modes.frequencies < RIGID_FREQUENCY, 0.0, modes.frequencies)
     higher = np.maximum.outer(frequencies, frequencies)
     apart = np.abs(np.subtract.outer(frequencies, frequencies)) / np.maximum(higher, 1.0)
@@ -178,14 +178,14 @@ class _Motion:
     """Shapes of rigid-body modes (p, a) [1/sqrt(kg)]."""
 
     elastic: FloatArray
-    """Shapes of the lowest elastic modes (p, r), as many as the nodes resolve [1/sqrt(kg)]."""
+    """Shapes (p, r) of the lowest elastic modes, as many as the nodes resolve [1/sqrt(kg)]."""
 
     bodies: FloatArray
     """Translation and rotations (p, 3), orthogonal, with a mean square of 1."""
 
 
 def _on_raster(shapes: SurfaceShapes) -> _Motion:
-    """Interpolate shapes as the table does, by a spline; raises InputError for nodes in rows."""
+    """Interpolate shapes with the spline that tables use; raises InputError for too few rows."""
     from scipy.interpolate import RBFInterpolator  # slow to import
     from scipy.spatial import Delaunay
 
@@ -220,7 +220,7 @@ def _on_raster(shapes: SurfaceShapes) -> _Motion:
 
 
 def _check_density(motion: _Motion, mass: float) -> Iterator[str]:
-    """Check that a mass [kg] is plausible for the area; NaN is no mass."""
+    """Check that a mass [kg] is plausible for the area; NaN for an unknown mass."""
     density = mass / motion.area
     what = f"{mass:.3g} kg on {motion.area:.3g} m², {density:.3g} kg/m²"
     remedy = "check surface.mass, and the units of modal masses and shapes (kg, not t or g)"
@@ -231,7 +231,7 @@ def _check_density(motion: _Motion, mass: float) -> Iterator[str]:
 
 
 def _check_scale(shapes: SurfaceShapes, motion: _Motion, mass: float) -> Iterator[str]:
-    """Check that shapes are of unit modal mass, for a mass [kg]; NaN is no mass."""
+    """Check that shapes are of unit modal mass; mass [kg]: NaN for an unknown mass."""
     if math.isnan(mass):
         return
     typical = float(np.median(mass * (motion.elastic**2).mean(axis=0)))
@@ -269,7 +269,7 @@ def _check_scale(shapes: SurfaceShapes, motion: _Motion, mass: float) -> Iterato
 
 
 def _squares_of(shapes: FloatArray, mass: float) -> list[float]:
-    """Integrals of the squared shapes (p, r) over a mass [kg], of mixtures that are orthogonal."""
+    """Integrals of squared orthogonal mixtures of shapes (p, r) over a mass [kg]."""
     products = mass * shapes.T @ shapes / len(shapes)
     return [float(square) for square in np.linalg.eigvalsh(products)]
 
@@ -280,9 +280,9 @@ def _is_near_one(values: Sequence[float], factor: float) -> bool:
 
 
 def _normalisation(modes: ModeShapes) -> str:
-    """How shapes that are not of unit modal mass look normalised; empty if nothing is found.
+    """Describe a normalisation other than to unit modal mass; empty if there is no sign of one.
 
-    Their common value is then a power of ten, or its root where units of mass were converted.
+    The common value of all modes is a power of ten, or its root if units of mass were converted.
     """
     shapes = modes.shapes.reshape(len(modes.frequencies), len(modes.nodes), -1)
     lengths = [np.linalg.norm(shape, axis=1) for shape in shapes]
@@ -291,7 +291,7 @@ def _normalisation(modes: ModeShapes) -> str:
     sizes = np.array([np.linalg.norm(length) for length in lengths])
     count = len(shapes)
     for largest in (largest_values, largest_lengths):
-        # Nodes that are left out may have had the largest value of some modes.
+        # The largest value of some modes may be at nodes that were not exported.
         ties = int(_is_same(largest, largest.max()).sum())
         if ties >= max(_MIN_TIES, _TIES * count) and _is_round(float(largest.max())):
             return f"normalised to their largest value ({ties} of {count} modes have the same)"
@@ -313,12 +313,12 @@ def _normalisation(modes: ModeShapes) -> str:
 
 
 def _is_same(values: FloatArray, value: FloatArray | float) -> NDArray[np.bool_]:
-    """Whether positive values are the same but for rounding."""
+    """Whether positive values are the same apart from rounding."""
     return np.asarray((np.abs(values - value) <= _SAME_VALUE * value) & (values > 0))
 
 
 def _is_round(value: float) -> bool:
-    """Whether a value is a power of ten or the root of one, but for rounding."""
+    """Whether a value is a power of ten or its square root, apart from rounding."""
     if value <= 0:
         return False
     half_decades = 2 * math.log10(value)
@@ -326,7 +326,7 @@ def _is_round(value: float) -> bool:
 
 
 def _check_rigid_motion(shapes: SurfaceShapes, motion: _Motion) -> Iterator[str]:
-    """Check that modes express rigid-body motion, and elastic modes of a free part none of it."""
+    """Check that the modes express rigid-body motion, and the elastic modes of a free part none."""
     bodies, elastic = motion.bodies, motion.elastic
     count = len(bodies)
     # Cosines between bodies and modes.

@@ -128,9 +128,12 @@ def test_measured_free_panel_passes_without_notes(free: Modes, nodes: int, tmp_p
         chosen = np.append(corners, rng.choice(others, nodes - 4, replace=False))
         shapes = free["shapes"][:, chosen]
         scatter = rng.normal(1, 0.1, (len(shapes), 1)) * rng.normal(1, 0.1, shapes.shape)
-        scatter[:3] = 1.0  # a person states the rigid-body modes from the mass
         measured["nodes"] = free["nodes"][chosen]
         measured["shapes"] = np.round(shapes * scatter, 3)
+        # Rigid-body modes of a suspended panel from its mass and sides, as the page recommends.
+        x, y, _ = (measured["nodes"] - (LENGTH / 2, WIDTH / 2, 0)).T
+        tilts = x * math.sqrt(12) / LENGTH, y * math.sqrt(12) / WIDTH
+        measured["shapes"][:3] = np.array([x**0, *tilts]) / math.sqrt(MASS)
         measured["frequencies"] = np.round(free["frequencies"], 1)
     rig = load_rig(_write(tmp_path, measured))
     assert rig.surface_notes == ()

@@ -95,7 +95,7 @@ def answer(
 ) -> Answer:
     """Answer several fingers at once, each with a vibration of its own.
 
-    quiet: the others, which are to feel nothing, as positions [m] or as fingers; drive_mode: the
+    quiet: the others, which are to be kept quiet, as positions [m] or as fingers; drive_mode: the
     table's own if None, which must be `phased` for more than one vibration; shaped: for amplifiers
     that play shaped onsets and endings; apart_hz: distance of the frequencies; bands_may_swap:
     whether a finger may have another one's band. Where the worst finger would have less than 6 dB,

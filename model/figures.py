@@ -38,7 +38,13 @@ from model.errors import InputError
 from model.estimate.calibrate import Calibration
 from model.files.array_file import whole_or_nothing
 from model.files.output_paths import check_picture_name
-from model.finger import FELT_DB_SL, FINGERTIP_RADIUS, Grid, sensation_level
+from model.finger import (
+    FELT_DB_SL,
+    FINGERTIP_RADIUS,
+    Grid,
+    scale_in_words,
+    sensation_level,
+)
 from model.rig.rig import Rig
 from model.structure.attachments import Source
 from model.structure.plate import Plate
@@ -557,7 +563,8 @@ def levels_figure(table: LocalizationTable) -> Figure:
         "dB SL)"
     )
     dead = levels < FELT_DB_SL
-    return _cells_figure(table, table.grid, {title: levels}, label="level / dB SL", crossed=(dead,))
+    label = f"{scale_in_words(table.threshold)} / dB SL"
+    return _cells_figure(table, table.grid, {title: levels}, label=label, crossed=(dead,))
 
 
 def contrast_figure(table: LocalizationTable, overview: Overview) -> Figure:
@@ -663,7 +670,7 @@ def layer_figure(table: LocalizationTable, answer: Answer, number: int) -> Figur
         axes.set_title(
             f"contrast at least {promised:.0f} dB on nine of ten plates", fontsize=11, pad=20
         )
-    draw_level_scale(figure, [axes], shrink=0.8)
+    draw_level_scale(figure, [axes], table.threshold, shrink=0.8)
     return figure
 
 
@@ -715,12 +722,17 @@ def draw_levels(axes: Axes, table: LocalizationTable, excitation: Excitation) ->
         )
 
 
-def draw_level_scale(figure: Figure, axes: Iterable[Axes], *, shrink: float) -> None:
-    """Draw the colour scale of `draw_levels` beside axes, shrunk to a share of their height."""
+def draw_level_scale(
+    figure: Figure, axes: Iterable[Axes], threshold: str, *, shrink: float
+) -> None:
+    """Draw the colour scale of `draw_levels` next to axes, shrunk to a share of their height.
+
+    threshold: name of the set that levels are relative to.
+    """
     figure.colorbar(
         ScalarMappable(_SCALE, _LEVEL_COLORS),
         ax=list(axes),
-        label="level above detection threshold / dB SL",
+        label=f"{scale_in_words(threshold)} / dB SL",
         extend="both",
         shrink=shrink,
     )

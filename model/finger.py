@@ -277,6 +277,11 @@ def sensation_level(
     return decibels(np.sqrt((above**2).sum(axis=0)))
 
 
+def scale_in_words(threshold: str) -> str:
+    """Name the threshold set that levels in dB SL are relative to, for reports and labels."""
+    return f"levels above the thresholds of {threshold}"
+
+
 def decibels(ratio: FloatArray | float) -> FloatArray:
     """Return 20 log10 of amplitude ratios, of the same shape; -inf for zero."""
     with np.errstate(divide="ignore"):

@@ -126,6 +126,9 @@ class StatusResult(StrengthResult, PatternFields, CauseAndRemedy):
     layout: str | None = Field(None, description="name of the layout in use; null without any")
     layouts: list[str] = Field(default=[], description="names that `layout` accepts")
     slow_reason: str | None = Field(None, description="why answers take longer than they need")
+    threshold: str | None = Field(
+        None, description="name of the rig's threshold set, to which levels in dB SL are relative"
+    )
     uptime_s: float
 
 

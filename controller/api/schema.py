@@ -181,7 +181,9 @@ class ContactStatus(ApiMessage):
         "rests, or of a finger beyond max_fingers; null before the first decision",
     )
     level_db_sl: float | None = Field(
-        None, description="predicted sensation level of a target; null if unknown"
+        None,
+        description="predicted level of a target relative to the rig's threshold set (`threshold` "
+        "of `status`); null if unknown",
     )
     promised_contrast_db: float | None = Field(None, description=PROMISED)
     contrast_db: float | None = Field(
@@ -204,7 +206,12 @@ class ContactStatus(ApiMessage):
     foreign_level_db_sl: float | None = Field(
         None,
         description="of the contents of others there, which nine of ten plates do not exceed, by "
-        "the most sensitive thresholds; null where there are none",
+        "the most sensitive thresholds: not to be compared with level_db_sl; null where there are "
+        "none",
+    )
+    rig_foreign_level_db_sl: float | None = Field(
+        None,
+        description="the same level relative to the rig's threshold set, as level_db_sl is",
     )
     is_foreign_felt: bool = Field(
         False,
@@ -213,8 +220,9 @@ class ContactStatus(ApiMessage):
     )
     leak_db_sl: float | None = Field(
         None,
-        description="of the contents of others where it is now, on the nominal plate: more "
-        "than promised while it moves; in the status only, null where there are none",
+        description="of the contents of others where it is now, on the nominal plate, relative "
+        "to the rig's threshold set: more than promised while it moves; in the status only, null "
+        "where there are none",
     )
     held_back: str | None = Field(
         None,

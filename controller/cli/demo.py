@@ -207,6 +207,8 @@ def _play(
 
 def _heading(threshold: str, *, has_latency: bool) -> str:
     """Return the heading of the rows: groups, units and columns."""
+    from model.finger import scale_in_words
+
     pair = f"{'prom.':>6} {'meas.':>6}"
     columns = f" time  target / cm  others  {'ERAs':22} {pair}  {pair}"
     groups = f"{'':51}{'felt contrast':^13}  {'level':^13}"
@@ -214,7 +216,7 @@ def _heading(threshold: str, *, has_latency: bool) -> str:
     if has_latency:
         groups += f" {'latency':>7}"
         units += f" {'/ ms':>7}"
-    scale = f"Levels are relative to the thresholds of the rig, {threshold}."
+    scale = f"{scale_in_words(threshold)}, contrasts the least over all sets"
     return "\n".join([scale, groups.rstrip(), units.rstrip(), columns, ""])
 
 

@@ -38,6 +38,7 @@ def show_status(status: StatusResult) -> str:
         *_given(("  slow: {}", status.slow_reason)),
         *_given(("  armed by {}", armed)),
         *_given(("  layout {}", status.layout and _layout(status))),
+        *_given(("  {}", _scale(status))),
         *map(_contact, status.contacts),
         *[f"  strength {name}: {gain:g} dB" for name, gain in status.strengths.items() if gain],
         *_given(("  silent: {}", status.silence_reason if status.contacts else None)),
@@ -67,6 +68,18 @@ def show_status(status: StatusResult) -> str:
         ("  lost events: {}", sum(status.lost_events.values()) or None),
     )
     return "\n".join([*lines, f"  state {status.state}, up for {status.uptime_s:.0f} s"])
+
+
+def _scale(status: StatusResult) -> str | None:
+    """Name the threshold set of the levels that are shown; None if none is."""
+    from model.finger import scale_in_words
+
+    if status.threshold is None:  # a daemon of an earlier version
+        return None
+    for contact in status.contacts:
+        if contact.level_db_sl is not None or contact.rig_foreign_level_db_sl is not None:
+            return scale_in_words(status.threshold)
+    return None
 
 
 def _layout(status: StatusResult) -> str:
@@ -104,7 +117,7 @@ def _contact(contact: ContactStatus) -> str:
         (", {:g} Hz", contact.frequency_hz),
         (", effect {}", contact.effect),
         (", feels {}", None if contact.feels == contact.effect else contact.feels),
-        (", others at most {:.1f} dB SL", contact.foreign_level_db_sl),
+        (", others at most {:.1f} dB SL", contact.rig_foreign_level_db_sl),
         (", {}", None if verdict == OWN else verdict),
         (": {}", contact.held_back),
         (", load {:.1f}", None if contact.load == 1 else contact.load),

@@ -172,6 +172,7 @@ class ApiService:
             layouts=self._layouts.names,
             strengths=self._publisher.strengths().strengths,
             slow_reason=why_slow(),
+            threshold=self._config.rig.threshold,
             uptime_s=now - self._started,
         )
 

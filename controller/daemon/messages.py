@@ -362,10 +362,12 @@ def _contact_status(
             if (felt.contact.key, felt.contact.since) == (contact.key, contact.since):
                 status |= {"role": "target", **_figures(felt)}
     if report and any(each.key == contact.key for each in report.quiet):
-        highest = max(report.quiet_levels.get(contact.key, ()), default=None)
+        levels = report.quiet_levels.get(contact.key, ())
+        highest = max(levels, default=None)
         status |= {
             "role": "quiet",
             "foreign_level_db_sl": _finite(highest),
+            "rig_foreign_level_db_sl": _finite(levels[0]) if levels else None,
             "is_foreign_felt": is_felt(highest),
         }
     if contact.why_load_alone:
@@ -385,6 +387,7 @@ def _figures(felt: FingerSensation) -> dict[str, object]:
         "verdict": sensation.verdict,
         "frequency_hz": felt.frequency,
         "foreign_level_db_sl": _finite(sensation.foreign_level_db_sl),
+        "rig_foreign_level_db_sl": _finite(sensation.rig_foreign_level_db_sl),
         "is_foreign_felt": sensation.is_foreign_felt,
         "held_back": felt.held_back,
     }

@@ -498,7 +498,7 @@ def touches_figure(table: LocalizationTable, rows: Sequence[TouchRow]) -> Figure
         axes.set_axis_off()
     for axes, row in zip(panels, rows, strict=False):
         _draw_touch(axes, table, row)
-    draw_level_scale(figure, panels, shrink=0.7)
+    draw_level_scale(figure, panels, table.threshold, shrink=0.7)
     figure.supxlabel(
         "felt: mean over the fingertip; quiet: its loudest point; "
         "felt contrast: the first less the loudest of the second",

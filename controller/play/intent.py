@@ -226,12 +226,16 @@ def beside_others(
     """Return a sensation while other contents play; powers add, and the worst threshold set counts.
 
     other_levels: levels of these contents at the finger [dB SL] by threshold set; foreign_levels:
-    levels of all foreign contents there, these included; offsets_db: the finger's own level by set,
-    relative to the rig's set.
+    levels of all foreign contents there, these included, relative to the rig's own set first;
+    offsets_db: the finger's own level by set, relative to the rig's set.
     """
-    foreign_level = max(foreign_levels)
+    beside = replace(
+        sensation,
+        foreign_level_db_sl=max(foreign_levels),
+        rig_foreign_level_db_sl=foreign_levels[0],
+    )
     if sensation.layer is None:
-        return replace(sensation, foreign_level_db_sl=foreign_level)
+        return beside
     nominal_level = own_level_db_sl(sensation)
     own_levels = [nominal_level + offset for offset in offsets_db]
     promised = sensation.promised_contrast_db
@@ -244,9 +248,7 @@ def beside_others(
     contrasts = [own - masking for own, masking in level_pairs]
     if promised is not None:
         contrasts.append(promised)
-    return replace(
-        sensation, promised_contrast_db=min(contrasts), foreign_level_db_sl=foreign_level
-    )
+    return replace(beside, promised_contrast_db=min(contrasts))
 
 
 def weakened(sensation: Sensation, gain_db: float, others_gain_db: float) -> Sensation:
@@ -263,6 +265,7 @@ def weakened(sensation: Sensation, gain_db: float, others_gain_db: float) -> Sen
         median_contrast_db=_amplified(sensation.median_contrast_db, contrast_gain),
         promised_contrast_db=_amplified(sensation.promised_contrast_db, contrast_gain),
         foreign_level_db_sl=_amplified(sensation.foreign_level_db_sl, others_gain_db),
+        rig_foreign_level_db_sl=_amplified(sensation.rig_foreign_level_db_sl, others_gain_db),
     )
     if own_level_db_sl(weaker) < 0 <= own_level_db_sl(sensation):
         return replace(weaker, verdict=HELD_BACK)

@@ -536,7 +536,7 @@ class PlayReport:
     quiet: tuple[Contact, ...] = ()
     """Contacts without a target, which are kept quiet."""
     quiet_levels: Mapping[ContactKey, Sequence[float]] = field(default_factory=dict)
-    """Foreign levels at quiet contacts (`Selection.foreign_levels`)."""
+    """Foreign levels at quiet contacts (`Selection.foreign_levels`), by the rig's set first."""
     settled_after: float = 0.0
     """Time [s] until the last fade or envelope has ended."""
     lasts: bool = True

@@ -161,6 +161,8 @@ export interface StatusResult {
   layouts?: Array<string>;
   /** why answers take longer than they need */
   slow_reason?: string | null;
+  /** name of the rig's threshold set, to which levels in dB SL are relative */
+  threshold?: string | null;
   uptime_s: number;
 }
 
@@ -419,7 +421,7 @@ export interface ContactStatus {
   y_m: number;
   /** whether it is to feel the pattern, or only its load counts: of a hand that rests, or of a finger beyond max_fingers; null before the first decision */
   role?: "target" | "quiet" | "hand" | "surplus" | null;
-  /** predicted sensation level of a target; null if unknown */
+  /** predicted level of a target relative to the rig's threshold set (`threshold` of `status`); null if unknown */
   level_db_sl?: number | null;
   /** felt contrast, target over loudest quiet finger, that nine of ten plates within the rig's uncertainty give; null for a single finger */
   promised_contrast_db?: number | null;
@@ -433,11 +435,13 @@ export interface ContactStatus {
   verdict?: "own" | "mixed" | "shared" | "held back" | null;
   /** of what it feels, as asked for, which amplifiers may round; null for several */
   frequency_hz?: number | null;
-  /** of the contents of others there, which nine of ten plates do not exceed, by the most sensitive thresholds; null where there are none */
+  /** of the contents of others there, which nine of ten plates do not exceed, by the most sensitive thresholds: not to be compared with level_db_sl; null where there are none */
   foreign_level_db_sl?: number | null;
+  /** the same level relative to the rig's threshold set, as level_db_sl is */
+  rig_foreign_level_db_sl?: number | null;
   /** whether the contents of others may be felt there: foreign_level_db_sl is above 0; beside a verdict own these are weaker by 12 dB or more */
   is_foreign_felt?: boolean;
-  /** of the contents of others where it is now, on the nominal plate: more than promised while it moves; in the status only, null where there are none */
+  /** of the contents of others where it is now, on the nominal plate, relative to the rig's threshold set: more than promised while it moves; in the status only, null where there are none */
   leak_db_sl?: number | null;
   /** why it does not feel an effect of its own, or not its click over what lasts; null if it does */
   held_back?: string | null;

@@ -272,8 +272,9 @@ OWN, MIXED, SHARED, HELD_BACK, QUIET = "own", "mixed", "shared", "held back", "q
 class Sensation:
     """What a finger gets.
 
-    Promised measures are those that nine of ten plates within the rig's uncertainty reach, or do
-    not exceed; the others are nominal, those of the modelled plate with the fingers on it.
+    Promised measures are those that 90 % of plates within the rig's uncertainty reach, or do not
+    exceed; the others are nominal, those of the modelled plate with the fingers on it. Levels are
+    relative to the rig's own threshold set, except for `foreign_level_db_sl`.
     """
 
     finger: Finger
@@ -299,7 +300,13 @@ class Sensation:
     """The same contrast, on half of the plates."""
     promised_contrast_db: float | None = None
     foreign_level_db_sl: float | None = None
-    """Promised level of all other vibrations here, the greatest over the sets of thresholds."""
+    """Promised level of all other vibrations at the loudest point here, above the lowest threshold.
+
+    It is the greatest over the rig's threshold sets, up to 30 dB above `rig_foreign_level_db_sl`,
+    and decides whether others may be felt. Do not compare it with this finger's level.
+    """
+    rig_foreign_level_db_sl: float | None = None
+    """The same level relative to the rig's own threshold set, as the levels of the finger are."""
     lowered_db: float = 0.0
     """By how much it is weaker than its stimulus asks [dB]."""
     is_disturbing: bool = False
@@ -441,51 +448,64 @@ class Answer:
     @cached_property
     def fingers(self) -> tuple[Sensation, ...]:
         """What each finger gets, in the order of `asked`."""
-        found, tones = dict[int, Sensation](), self.tones
-        known = [  # None in place of NaN
-            [None if each != each else each for each in (*contrasts, max(of_others))]
-            for contrasts, of_others in zip(tones.contrast_db, tones.foreign_db_sl, strict=True)
-        ]
+        sensations: dict[int, Sensation] = {}
         for number, stream in enumerate(self.contents.streams):
-            lowered, pauses = self.lowered_db(number), self.pauses(number)
             for finger in stream.targets:
-                contrast, median, promised, of_others = known[finger]
-                level, promised_level = self.levels_db_sl(number, finger)
-                found[finger] = Sensation(
-                    self.asked[finger],
-                    SHARED
-                    if finger != stream.targets[0]
-                    else verdict_of(promised, of_others, pauses=pauses),
-                    number,
-                    level,
-                    promised_level,
-                    contrast,
-                    median,
-                    promised,
-                    of_others,
-                    lowered,
-                    pauses=pauses,
-                )
-        for finger, had, is_disturbing in self.held:
-            found[finger] = Sensation(
+                sensations[finger] = self._sensation_of_content(number, finger)
+        for finger, contrast, is_disturbing in self.held:
+            worst_level, rig_level = self._foreign_levels(finger)
+            sensations[finger] = Sensation(
                 self.asked[finger],
                 HELD_BACK,
-                promised_contrast_db=had,
-                foreign_level_db_sl=known[finger][-1],
+                promised_contrast_db=contrast,
+                foreign_level_db_sl=worst_level,
+                rig_foreign_level_db_sl=rig_level,
                 is_disturbing=is_disturbing,
             )
-        for finger, each in enumerate(self.asked):
-            if each.stimulus is None:
-                contrast, median, promised, of_others = known[finger]
-                found[finger] = Sensation(
-                    each,
-                    QUIET,
-                    contrast_db=contrast,
-                    median_contrast_db=median,
-                    promised_contrast_db=promised,
-                    foreign_level_db_sl=of_others,
-                )
-        return tuple([found[number] for number in range(len(self.asked))])
+        for number, finger_asked in enumerate(self.asked):
+            if finger_asked.stimulus is None:
+                sensations[number] = self._sensation_beside(number, QUIET)
+        return tuple([sensations[number] for number in range(len(self.asked))])
+
+    def _sensation_of_content(self, number: int, finger: int) -> Sensation:
+        """Return what a finger feels of a content for it, both by number."""
+        stream = self.contents.streams[number]
+        pauses = self.pauses(number)
+        level, promised_level = self.levels_db_sl(number, finger)
+        verdict = SHARED
+        sensation = self._sensation_beside(finger, verdict)
+        if finger == stream.targets[0]:
+            verdict = verdict_of(
+                sensation.promised_contrast_db, sensation.foreign_level_db_sl, pauses=pauses
+            )
+        return replace(
+            sensation,
+            verdict=verdict,
+            layer=number,
+            level_db_sl=level,
+            promised_level_db_sl=promised_level,
+            lowered_db=self.lowered_db(number),
+            pauses=pauses,
+        )
+
+    def _sensation_beside(self, finger: int, verdict: str) -> Sensation:
+        """Return a finger's contrasts and the level of others there, without its own content."""
+        contrast, median, promised = map(_known, self.tones.contrast_db[finger])
+        worst_level, rig_level = self._foreign_levels(finger)
+        return Sensation(
+            self.asked[finger],
+            verdict,
+            contrast_db=contrast,
+            median_contrast_db=median,
+            promised_contrast_db=promised,
+            foreign_level_db_sl=worst_level,
+            rig_foreign_level_db_sl=rig_level,
+        )
+
+    def _foreign_levels(self, finger: int) -> tuple[float | None, float | None]:
+        """Return the level of others at a finger: the greatest over all sets, and by the rig's."""
+        levels = self.tones.foreign_db_sl[finger]
+        return _known(max(levels)), _known(levels[0])
 
     @cached_property
     def layers(self) -> tuple[Layer, ...]:
@@ -628,11 +648,9 @@ class Answer:
     def to_frame(self) -> Any:
         """Return what each finger feels as a pandas DataFrame, a row per finger; needs pandas.
 
-        worst_foreign_level_db_sl is `Sensation.foreign_level_db_sl`: the level of others'
-        vibrations at the loudest point of the fingertip, which nine of ten plates do not exceed,
-        above the lowest thresholds known. The finger's own level is above the rig's thresholds,
-        which are up to 30 dB higher, so 20 dB SL of its own beside 34 dB SL of others' is no
-        contradiction; compare by the contrast.
+        Levels are relative to the rig's own threshold set, those of others at the loudest point of
+        the fingertip. worst_foreign_level_db_sl alone is above the lowest thresholds known
+        (`Sensation.foreign_level_db_sl`), up to 30 dB higher: not to be compared with the others.
         """
         at, found = np.array([each.at for each in self.asked]), self.fingers
         frequencies = [layer.frequency or math.nan for layer in self.layers]
@@ -647,9 +665,15 @@ class Answer:
                 ],
                 "promised_level_db_sl": [each.promised_level_db_sl for each in found],
                 "promised_contrast_db": [each.promised_contrast_db for each in found],
+                "rig_foreign_level_db_sl": [each.rig_foreign_level_db_sl for each in found],
                 "worst_foreign_level_db_sl": [each.foreign_level_db_sl for each in found],
             }
         )
+
+
+def _known(value: float) -> float | None:
+    """Return a number, None in place of NaN."""
+    return None if math.isnan(value) else value
 
 
 def verdict_of(

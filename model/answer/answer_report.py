@@ -429,6 +429,7 @@ def _shown(table: LocalizationTable, found: Answer, more: Measures | None) -> di
                 "median_contrast_db": nullable(each.median_contrast_db),
                 "promised_contrast_db": nullable(each.promised_contrast_db),
                 "foreign_level_db_sl": nullable(each.foreign_level_db_sl),
+                "rig_foreign_level_db_sl": nullable(each.rig_foreign_level_db_sl),
                 "lowered_db": each.lowered_db,
                 "exposure_m_s2": exposure,
             }

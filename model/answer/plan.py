@@ -91,7 +91,7 @@ def answer(
     Args:
         table: of the plate on which the fingers are.
         fingers: with the stimulus that each is to feel.
-        quiet: more fingers, which are to feel nothing.
+        quiet: more fingers, which are to be kept quiet.
         drive_mode: the table's own if None; must be `phased` for more than one vibration.
         shaped: whether the amplifiers play shaped onsets and endings, which `Timing` adds.
         apart_hz: least distance of the vibrations' frequencies from each other and from avoided_hz,
@@ -131,7 +131,7 @@ def answer(
 
 
 def _quiet_finger(position: Point | Finger) -> Finger:
-    """A finger that is to feel nothing."""
+    """A finger that is to be kept quiet."""
     return position if isinstance(position, Finger) else Finger(position)
 
 

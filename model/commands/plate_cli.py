@@ -411,7 +411,7 @@ def show(rig_file: RigArgument, as_json: JsonOption = False) -> None:
             for key, wavelength in summary["bending_wavelength_m"].items()
         ),
         *_attached_rows(summary),
-        *_exciter_rows(summary["exciters"], summary.get("reach")),
+        *_exciter_rows(summary["exciters"], summary.get("reach"), rig.threshold),
         *_type_rows(summary["exciter_types"]),
     ]
     print_report(rows, summary, as_json=as_json)
@@ -493,8 +493,13 @@ def _attached_rows(summary: dict[str, Any]) -> Iterator[str]:
             )
 
 
-def _exciter_rows(exciters: list[dict[str, Any]], reach: dict[str, Any] | None) -> Iterator[str]:
-    """Yield each exciter, and the frequency from which all together reach a level."""
+def _exciter_rows(
+    exciters: list[dict[str, Any]], reach: dict[str, Any] | None, threshold: str
+) -> Iterator[str]:
+    """Yield each exciter, and the frequency from which all together reach a level.
+
+    threshold: name of the set that the level is relative to.
+    """
     if reach is None:
         return
     lowest = f"{reach['frequencies_hz'][0]:g} Hz"
@@ -509,7 +514,7 @@ def _exciter_rows(exciters: list[dict[str, Any]], reach: dict[str, Any] | None) 
             f"{each['full_level_force_n']:.2f} N at full level, {each['full_level_v']:.3g} V; "
             f"{1e3 * each['excursion_at_lowest_m']:.2g}{of} mm"
         )
-    level, start = f"{reach['level_db_sl']:g} dB SL", reach["from_hz"]
+    level, start = f"{reach['level_db_sl']:g} dB SL ({threshold})", reach["from_hz"]
     everywhere = "everywhere but 2 cm at the edges, under a finger, by the board of the file"
     from_where = "at no frequency" if start is None else f"from {start:g} Hz"
     yield f"    {level} {everywhere}: {from_where}"

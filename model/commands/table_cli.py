@@ -2,7 +2,7 @@
 
 import json
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import nullcontext
 from functools import partial
 from itertools import chain
@@ -221,10 +221,9 @@ def query(
     answer = query_one(table, line)
     rows = [
         *_rows_of_layers(answer),
-        *_rows_of_fingers(answer),
+        *_rows_of_fingers(answer, table.threshold_sets),
         *_rows_of_measures(answer),
-        "promised: what nine of ten plates within the rig's uncertainty give "
-        f"({table.uncertainty})",
+        f"promised: what 90 % of plates within the rig's uncertainty give ({table.uncertainty})",
         f"solved in {1000 * answer['solve_time_s']:.1f} ms",
     ]
     print_report(rows, answer, as_json=as_json)
@@ -263,10 +262,15 @@ def _rows_of_layers(found: dict[str, Any]) -> Iterator[str]:
         yield "level: the threshold is extrapolated at this frequency"
 
 
-def _rows_of_fingers(found: dict[str, Any]) -> Iterator[str]:
-    """Yield a line for each finger with its vibration and verdict, then the changes made."""
-    from model.answer.answer import verdict_shown
+def _rows_of_fingers(found: dict[str, Any], threshold_sets: Sequence[str]) -> Iterator[str]:
+    """Yield a line for each finger with its vibration and verdict, then the changes made.
 
+    threshold_sets: names, that of the rig first.
+    """
+    from model.answer.answer import verdict_shown
+    from model.finger import scale_in_words
+
+    yield f"{scale_in_words(threshold_sets[0])}, contrasts the least over all sets"
     yield "finger [m]         frequency       level    contrast  nominal  foreign level    exposure"
     for finger in found["fingers"]:
         layer = finger["layer"]
@@ -276,7 +280,7 @@ def _rows_of_fingers(found: dict[str, Any]) -> Iterator[str]:
             f"{_cell(finger['promised_level_db_sl'], 'dB SL'):>11s} "
             f"{_cell(finger['promised_contrast_db'], 'dB'):>11s} "
             f"{_cell(finger['contrast_db'], 'dB'):>8s} "
-            f"{_cell(finger['foreign_level_db_sl'], 'dB SL'):>14s} "
+            f"{_cell(finger['rig_foreign_level_db_sl'], 'dB SL'):>14s} "
             f"{finger['exposure_m_s2']:6.2f} m/s²  "
             f"{verdict_shown(finger['verdict'], is_foreign_felt=finger['is_foreign_felt'])}"
         )
@@ -291,9 +295,11 @@ def _rows_of_measures(found: dict[str, Any]) -> Iterator[str]:
     if "residual_db" not in found:
         return
     rows = [("residual after the end", found["residual_db"], "dB nominal")]
-    if (awareness := found["is_imperceptible_to_quiet"]) is not None:
+    is_imperceptible = found["is_imperceptible_to_quiet"]
+    if is_imperceptible is not None:
         rows.append(("contrast in the first 100 ms", found["transient_contrast_db"], "dB nominal"))
-        yield f"quiet fingers: {'feel nothing' if awareness else 'may feel it'}"
+        is_felt = "not felt, 10 dB below all threshold sets" if is_imperceptible else "may feel it"
+        yield f"quiet fingers: {is_felt}"
     else:
         rows += [
             (

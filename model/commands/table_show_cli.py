@@ -221,7 +221,7 @@ def _verify_by_solving(
         found = verify_table(table, rig, samples=samples, seed=seed, progress=progress)
     count = len(found.checks)
     rows = [
-        *_verification_rows(found),
+        *_verification_rows(found, table.threshold),
         f"{count - found.failed_count} of {count} passed (seed {seed}) in {timed.elapsed:.1f} s",
         next_line("era", "table", "build", rig_file, "-o", table_file)
         if found.failed_count
@@ -233,14 +233,17 @@ def _verify_by_solving(
         raise typer.Exit(1)
 
 
-def _verification_rows(found: "Verification") -> Iterator[str]:
-    """Yield the checks of a table by solving, and their outcomes."""
+def _verification_rows(found: "Verification", threshold: str) -> Iterator[str]:
+    """Yield the checks of a table by solving, and their outcomes; threshold: set of all levels."""
+    from model.finger import scale_in_words
+
     for check in found.content:
         yield (
             f"{check.name:24s} {check.error:8.1e} relative L2 to the reference  "
             f"{'passed' if check.is_passed else 'FAILED'}"
         )
-    yield "\n                       level, dB SL         felt contrast, dB"
+    yield f"\n{scale_in_words(threshold)}"
+    yield "                       level, dB SL         felt contrast, dB"
     yield "target, m        quiet  predicted  direct  predicted  direct  in time   tolerances"
     for answer in found.answer_checks:
         x, y = answer.placed.targets[0]
@@ -295,7 +298,7 @@ def _verify_by_measuring(
         save_figure(promise_figure(found), picture)
         files.append(str(picture))
     rows = [
-        *_measured_rows(found),
+        *_measured_rows(found, table.threshold),
         f"{counted(len(found.measured), 'pattern')} measured in {timed.elapsed:.1f} s "
         f"(seed {settings.seed})",
         f"wrote {', '.join(files)}" if files else None,
@@ -306,8 +309,11 @@ def _verify_by_measuring(
         raise typer.Exit(1)
 
 
-def _measured_rows(found: "MeasuredVerification") -> Iterator[str]:
-    """Yield what was promised and measured of each pattern."""
+def _measured_rows(found: "MeasuredVerification", threshold: str) -> Iterator[str]:
+    """Yield what was promised and measured of each pattern; threshold: set of all levels."""
+    from model.finger import scale_in_words
+
+    yield scale_in_words(threshold)
     yield "                                    felt contrast, dB            level, dB SL"
     yield "target  quiet                  promised   median  measured  promised  measured"
     for each in found.measured:

@@ -65,7 +65,9 @@ class FeltFinger:
 
     level_db_sl: of its own layers, mean over the fingertip; foreign_level_db_sl: of all others at
     its loudest point; both -inf without one. times (w,) [s], and at these levels_db_sl and
-    foreign_levels_db_sl (w,): root mean square under a Hann window of 30 ms.
+    foreign_levels_db_sl (w,): root mean square under a Hann window of 30 ms. All levels are
+    relative to one threshold set, that of the playback. An answer's foreign_level_db_sl is the
+    greatest over several sets: compare this one with its rig_foreign_level_db_sl.
     """
 
     level_db_sl: float

@@ -357,6 +357,7 @@ def test_results_become_frames(table: era.LocalizationTable) -> None:
     assert list(frame["verdict"]) == [each.verdict for each in answer.fingers]
     assert frame.loc[1, "x_m"] == BOTH[0][0]
     assert frame["worst_foreign_level_db_sl"][1] == answer.fingers[1].foreign_level_db_sl
+    assert frame["rig_foreign_level_db_sl"][1] == answer.fingers[1].rig_foreign_level_db_sl
     modes = PLATE.modes.to_frame()
     assert modes["frequency_hz"].tolist() == PLATE.modes.natural_frequencies.tolist()
     assert modes["damping_ratio"].between(0, 1).all()

@@ -366,6 +366,8 @@ def _content_files(paths: "Sequence[Path]") -> list[Path]:
 
 def _check_one(file: Path, setting: _Setting, picture: Path | None, *, as_json: bool) -> bool:
     """Report on one file in detail; return whether enough of its level is kept."""
+    from model.finger import scale_in_words
+
     with Stopwatch() as watch:
         pattern, results = setting.check(file)
     checked = results[len(results) // 2]
@@ -378,6 +380,7 @@ def _check_one(file: Path, setting: _Setting, picture: Path | None, *, as_json: 
         pictures = [str(picture)]
     rows = [
         setting.plate_row,
+        scale_in_words(setting.table.threshold),
         *_lines(checked),
         *_position_row(results, setting),
         f"{file}: {checked.headline}: {_verdict(checked, setting)}; "

@@ -44,6 +44,7 @@ def check(
     from era_haptics.lab.checks.layout_picture import check_together, close_pairs, matrix_of
     from model.commands.options import progress_bar
     from model.files.output_paths import check_picture_name
+    from model.finger import scale_in_words
     from model.table.table_file import load_table
 
     if picture is not None:
@@ -67,6 +68,7 @@ def check(
     touches = sum(len(each.touches) for each in checked)
     outcome = counted(problems, "problem") if problems else "good"
     rows = [
+        scale_in_words(table.threshold),
         *(line for each in checked for line in _lines(each)),
         *(_matrix(*matrix_of(together)) if together else ()),
         f"{layout_file}: {outcome}{close_pairs(together)}; "

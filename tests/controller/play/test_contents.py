@@ -443,6 +443,7 @@ async def test_status_says_what_each_finger_feels() -> None:
             assert contact.verdict == ("own" if promised >= 12 else "mixed")
             assert contact.level_db_sl == pytest.approx(14.0, abs=0.5)
             assert contact.foreign_level_db_sl == pytest.approx(14.0 - promised, abs=2.0)
+            assert contact.rig_foreign_level_db_sl == contact.foreign_level_db_sl  # of one set
             assert contact.frequency_hz == one.content.frequency
             tones = event.layers[str(number)].values()
             assert {tone.frequency_hz for tone in tones} == {contact.frequency_hz}

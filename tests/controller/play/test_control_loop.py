@@ -34,6 +34,7 @@ from controller.play.intent import (
     beside_others,
     judged,
     sums_db,
+    weakened,
 )
 from controller.play.loop import PlayReport
 from controller.play.routing import RAMPS_ONLY, PlaybackCapabilities
@@ -327,6 +328,15 @@ def test_powers_of_contents_add(
     assert felt.promised_contrast_db == pytest.approx(expected, abs=1e-3)
     assert felt.foreign_level_db_sl == pytest.approx(total, abs=1e-3)
     assert felt.verdict == verdict
+
+
+def test_level_of_others_is_the_greatest_and_that_by_the_rigs_set() -> None:
+    """Of 5 dB SL by the rig's set and 33 by another; 6 dB weaker, both are 6 dB less."""
+    alone = Sensation(Finger((0.1, 0.1), Stimulus(20.0)), "own", layer=0, promised_level_db_sl=20.0)
+    felt = beside_others(alone, [5.0, 33.0], [5.0, 33.0], [0.0, 28.0])
+    assert (felt.rig_foreign_level_db_sl, felt.foreign_level_db_sl) == (5.0, 33.0)
+    weaker = weakened(felt, -6.0, -6.0)
+    assert (weaker.rig_foreign_level_db_sl, weaker.foreign_level_db_sl) == (-1.0, 27.0)
 
 
 @in_virtual_time

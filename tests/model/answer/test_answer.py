@@ -19,6 +19,7 @@ from model.answer.stimulus import NEVER, Finger, Placement, Stimulus
 from model.answer.tone_search import choose_tones
 from model.errors import InputError
 from model.finger import detection_threshold
+from model.rig.rig_file import example_rig_path, load_rig
 from model.structure.attachments import HAND_PATCHES, HAND_STD
 from model.study.verification import Plates, draw_plates
 from model.table.table_file import build_table
@@ -68,6 +69,23 @@ def test_figures_as_modelled_are_those_of_the_exact_plate(contents, other):
     assert [each.level_db_sl for each in found.fingers[:contents]] == pytest.approx(
         levels, abs=0.02
     )
+
+
+def test_level_of_others_is_stated_by_the_rigs_set_too() -> None:
+    """28 dB less than by the most sensitive set at 250 Hz, as the page about people has it.
+
+    A quiet finger and one with a content of its own, of which the other plays at 100 Hz: 31 dB.
+    """
+    table = build_table(load_rig(example_rig_path()), frequencies=np.array([100.0, 250.0]))
+    assert len(table.threshold_sets) == 2
+    requests = [wants(NEAR, (250.0, 250.0)), wants(FAR, (100.0, 100.0))]
+    (_, quiet), (_, other) = (
+        answer(table, requests[:1], [Finger(FAR)]).fingers,
+        answer(table, [requests[1], requests[0]], min_contrast_db=-99).fingers,
+    )
+    for sensation, difference in ((quiet, 28.0), (other, 31.0)):
+        found = sensation.foreign_level_db_sl - sensation.rig_foreign_level_db_sl
+        assert found == pytest.approx(difference, abs=0.5)
 
 
 HAND = (0.17, 0.13)

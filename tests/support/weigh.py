@@ -109,16 +109,26 @@ def row(folder: str, counts: Counter[str]) -> str:
     )
 
 
-def main() -> None:
-    """Print the table, or the rows of one folder."""
+def main() -> int:
+    """Print the table, or the rows of one folder; return 2 for a folder without any."""
     prefix = sys.argv[1] if len(sys.argv) > 1 else None
+    totals = sorted(weights(ROOT).items())
+    shown = [(folder, counts) for folder, counts in totals if _is_shown(folder, prefix)]
+    if not shown:
+        sys.stderr.write(f"folder must be one with Python of the first two levels, got {prefix}\n")
+        return 2
     header = f"{'folder':26}{'files':>6}{'lines':>8}{'statements':>12}{'knodes':>8}"
     sys.stdout.write(f"{header}{'expr':>6}{'comp':>6}{'pron':>6}{'words':>8}\n")
-    for folder, counts in sorted(weights(ROOT).items()):
-        is_shown = "/" not in folder if prefix is None else folder.startswith(prefix)
-        if is_shown:
-            sys.stdout.write(f"{row(folder, counts)}\n")
+    for folder, counts in shown:
+        sys.stdout.write(f"{row(folder, counts)}\n")
+    return 0
+
+
+def _is_shown(folder: str, prefix: str | None) -> bool:
+    if prefix is None:
+        return "/" not in folder
+    return f"{folder}/".startswith(f"{prefix.rstrip('/')}/")
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

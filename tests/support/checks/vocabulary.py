@@ -222,5 +222,23 @@ def _is_error(name: str, bases: Mapping[str, Sequence[str]]) -> bool:
     return name.endswith("Error") or any(_is_error(base, bases) for base in bases.get(name, ()))
 
 
+_REMEDY = """\
+Rename these. A retired word had several meanings here; docs/reference/glossary.md has the words in
+use. If an identifier needs the word in its ordinary meaning, add it to ALLOWED in
+tests/support/checks/vocabulary.py with the reason.
+"""
+
+
+def main() -> int:
+    """Print each identifier with a retired word and each misleading name; return 1 for any."""
+    retired = list(retired_identifiers())
+    misleading = list(misleading_names(ROOT))
+    problems = [*retired, *misleading]
+    sys.stderr.writelines(f"{problem}\n" for problem in problems)
+    if retired:
+        sys.stderr.write(_REMEDY)
+    return 1 if problems else 0
+
+
 if __name__ == "__main__":
-    sys.exit("\n".join([*retired_identifiers(), *misleading_names(ROOT)]) or None)
+    sys.exit(main())

@@ -4,9 +4,17 @@ import os
 from numbers import Integral, Real
 from pathlib import Path
 
+from registry.streams import printable
+
 
 class InputError(ValueError):
-    """Invalid input; the message says what, where and the remedy."""
+    """Invalid input; the message says what, where and the remedy.
+
+    Control characters of what it quotes are escaped.
+    """
+
+    def __init__(self, message: object = "") -> None:
+        super().__init__(printable(str(message)))
 
 
 _MAX_LENGTH = 40

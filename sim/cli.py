@@ -10,6 +10,7 @@ import typer
 from drivers.errors import LinkError
 from model.commands.options import ExactOption, SeedOption, seed_of_plate
 from model.errors import InputError
+from registry.streams import drawing_on
 from sim.soft_amp.soft_amp_cli import port_option, soft_amp
 
 if TYPE_CHECKING:
@@ -246,9 +247,10 @@ class _LiveView:
     """The live view, redrawn in place at each call."""
 
     def __init__(self) -> None:
+        from rich.console import Console
         from rich.live import Live
 
-        self._live = Live(auto_refresh=False)
+        self._live = Live(console=Console(file=drawing_on(sys.stdout)), auto_refresh=False)
         self._plate: SimulationView | None = None
 
     def __call__(self, context: "SimulationContext") -> None:

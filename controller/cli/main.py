@@ -4,7 +4,6 @@
 """
 
 import errno
-import io
 import os
 import signal
 import sys
@@ -21,6 +20,7 @@ from typer.main import get_group
 
 from registry.files import posix_needed
 from registry.plugins import failed_plugin, failure_text
+from registry.streams import protect_streams
 from registry.wording import reworded
 
 SECTIONS = {
@@ -87,9 +87,7 @@ def main(load: LoadModules) -> int:
         os.environ.setdefault(variable, "1")
     # Pictures go to files; a notebook hands its own backend to what it starts, also with `!era`.
     os.environ["MPLBACKEND"] = "agg"
-    for stream in (sys.stdout, sys.stderr):  # of any encoding, and file names are any bytes
-        if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="backslashreplace")
+    protect_streams()
     # While modules load nothing is armed, and a KeyboardInterrupt could be swallowed.
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: os._exit(INTERRUPTED))
@@ -232,6 +230,9 @@ def _report(error: Exception, statuses: ExitStatus) -> int:
     if isinstance(error, OSError) and error.filename is not None:
         _print_error(f"error: {error.filename}: {_file_error(error)}")
         return BAD_INPUT
+    if isinstance(error, OSError) and error.errno in _NO_OUTPUT:
+        _print_error("error: standard output cannot be written; redirect it to a file")
+        return BAD_INPUT
     if isinstance(error, OSError) and error.errno in _DISK_FULL:
         _print_error("error: disk full; free some space, or write elsewhere")
         return BAD_INPUT
@@ -247,6 +248,9 @@ def _report(error: Exception, statuses: ExitStatus) -> int:
     )
     return BUG
 
+
+_NO_OUTPUT = (errno.EBADF, errno.EIO)
+"""Errors of writing to a stream that is open for reading, or whose terminal has gone."""
 
 _DISK_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 """Errors of writing, which have no file name."""

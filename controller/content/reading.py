@@ -25,7 +25,7 @@ from controller.content.pattern import MAX_DURATION, MAX_HZ, MIN_HZ, Curve, Patt
 from model.arrays import FloatArray
 from model.config.document import ConfigError, ConfigProblem, Document, KeyPath, decoded, key_name
 from model.config.fields import Section
-from model.errors import InputError
+from model.errors import InputError, shown
 from model.files.wav_file import samples_of
 from model.quantities import counted, percent
 from registry.plugins import did_you_mean
@@ -71,6 +71,7 @@ class ContentFormat(ABC):
 _MAX_SIZE = 2 << 20  # bytes
 _MAX_LEVELS = 20
 _MAX_VALUES = 5 * MAX_POINTS  # a keyframe of HJIF is four, an event of AHAP thirteen
+_MAX_QUOTED = 50  # characters in errors
 _MAX_NAMED = 5  # unknown names in a remark
 _MAX_NAME = 40  # characters of a name that is compared with known ones
 _EMPTY: tuple[object, ...] = (None, "", [], {})
@@ -124,15 +125,24 @@ def read_json(content: bytes, source: str, *, has_trailing_commas: bool = False)
         # Whole numbers become floats: those of many digits are refused by their size, as 1e999 is.
         data = json.loads(text, parse_int=float, object_pairs_hook=unique)
     except json.JSONDecodeError as error:
-        is_cut = not text.rstrip().endswith("}")
-        remedy = "its end is missing: export it again" if is_cut else "correct it there"
-        message = f"is not valid JSON: {error.msg} in column {error.colno}; {remedy}"
-        raise refusal(source, message, line=error.lineno) from error
+        raise refusal(source, _why_unparsed(text, error), line=error.lineno) from error
     if not isinstance(data, dict):
         raise refusal(source, "must be an object in braces, got another value", line=1)
     if with_repeats:
         find_lines()  # raises
     return Document(source, text, data, find_lines)
+
+
+def _why_unparsed(text: str, error: json.JSONDecodeError) -> str:
+    if error.msg == "Extra data":
+        surplus = shown(text[error.pos : error.pos + _MAX_QUOTED])
+        return (
+            f"nothing may stand behind the end of the content, got {surplus} in column "
+            f"{error.colno}; remove it"
+        )
+    is_cut = not text.rstrip().endswith("}")
+    remedy = "its end is missing: export it again" if is_cut else "correct it there"
+    return f"is not valid JSON: {error.msg} in column {error.colno}; {remedy}"
 
 
 def unknown_keys(section: ContentSection, but: Collection[str] = ()) -> tuple[str, ...]:
@@ -161,9 +171,9 @@ def names_remark(
 
 def _suggested(name: str, known: Collection[str]) -> str:
     """Format a name of a file, with the known name that it resembles."""
-    shown = key_name((name,))
+    named = key_name((name,))
     suggestion = did_you_mean(name[:_MAX_NAME], known).strip()
-    return f"{shown} ({suggestion})" if suggestion else shown
+    return f"{named} ({suggestion})" if suggestion else named
 
 
 def _extra(value: Any) -> Iterator[str]:

@@ -28,8 +28,8 @@ from controller.rig_file_check import clock_costs, whole_url
 from controller.sources.touch import TouchCalibration, TouchSource, fitted, open_source, turned
 from drivers.by_hand.reaching import check_links
 from model.arrays import FloatArray
-from model.config.document import ConfigError, Document, read_document
-from model.config.fields import Quantity, Section, Validation
+from model.config.document import ConfigError, Document, is_file_name, read_document
+from model.config.fields import FileName, Quantity, Section, Validation
 from model.config.units import LENGTH, LEVEL
 from model.drive_modes import DRIVE_MODES
 from model.errors import InputError
@@ -53,12 +53,6 @@ def _mode(text: str) -> str:
     return text
 
 
-def _file(text: str) -> str:
-    if "\0" in text:
-        raise ValueError(f"file name must not contain a zero byte, got {text[:40]!r}")
-    return text
-
-
 def loopback_address(text: str) -> str:
     """Return HOST:PORT on the loopback interface unchanged; raises ValueError otherwise."""
     match = re.fullmatch(r"(127\.0\.0\.1|localhost|\[::1\]):(\d{1,5})", text)
@@ -70,7 +64,6 @@ def loopback_address(text: str) -> str:
     return text
 
 
-File = Annotated[str, Field(min_length=1, max_length=4096), AfterValidator(_file)]
 LevelDbSl = Annotated[float, Quantity(LEVEL, at_least=-20, at_most=60)]
 
 
@@ -101,29 +94,31 @@ class LogSection(Section):
     """The log: JSON, one object a line, to standard error or a file."""
 
     level: Literal["debug", "info", "warning", "error"] = "info"
-    file: File | None = None
+    file: FileName | None = None
 
 
 class DumpSection(Section):
     """Folder of fault dumps."""
 
-    folder: File
+    folder: FileName
 
 
 class DaemonSection(Section):
     """The daemon's configuration; paths are relative to its folder."""
 
-    rig: File
-    table: File | None = None
+    rig: FileName
+    table: FileName | None = None
     mode: Annotated[str, AfterValidator(_mode)] | None = None
-    learn: File | None = None
+    learn: FileName | None = None
     level_db_sl: LevelDbSl = STRONG_DB_SL
-    layouts: Annotated[dict[Identifier, File], Field(max_length=MAX_LAYOUTS, default_factory=dict)]
-    strengths: File | None = None
+    layouts: Annotated[
+        dict[Identifier, FileName], Field(max_length=MAX_LAYOUTS, default_factory=dict)
+    ]
+    strengths: FileName | None = None
     touch: Annotated[list[TouchSection], Field(max_length=16, default_factory=list)]
     max_fingers: Annotated[int, Field(ge=1, le=MAX_CONTACTS)] = MAX_FINGERS
     serial_numbers: Annotated[dict[Identifier, str], Field(max_length=64, default_factory=dict)]
-    socket: File | None = None
+    socket: FileName | None = None
     log: LogSection = LogSection()
     dumps: DumpSection | None = None
     dashboard: Annotated[str, AfterValidator(loopback_address)] | None = None
@@ -258,9 +253,7 @@ def file_of(document: Document, *keys: str) -> Path | None:
     value: object = document.data
     for key in keys:
         value = value.get(key) if isinstance(value, dict) else None
-    if not isinstance(value, str) or "\0" in value:
-        return None
-    return document.beside(value)
+    return document.beside(value) if is_file_name(value) else None
 
 
 def _rig(validation: Validation[DaemonSection], file: Path | None) -> tuple[Rig | None, str]:

@@ -11,7 +11,7 @@ from itertools import islice
 from pathlib import Path
 from typing import Annotated, Any, Self
 
-from pydantic import Field
+from pydantic import BeforeValidator, Field
 
 from controller.config_kind import CheckedFile, ConfigKind
 from controller.effects.effect import (
@@ -28,7 +28,7 @@ from controller.effects.kinds import BUILT_IN, effect_kind, effect_kinds, named_
 from controller.play.intent import band_problem
 from model.answer.stimulus import MAX_LEVEL_DB_SL
 from model.arrays import FloatArray
-from model.config.document import Document, KeyPath, read_document
+from model.config.document import Document, KeyPath, is_null_word, read_document
 from model.config.fields import Quantity, Section, ShapedSection, Validation
 from model.config.units import LEVEL
 from model.errors import InputError
@@ -130,12 +130,18 @@ _HighestLevel = Annotated[
 ]
 
 
+EffectName = Annotated[
+    Identifier | None, BeforeValidator(lambda value: None if is_null_word(value) else value)
+]
+"""Type of the name of an effect, null or `none` for no effect."""
+
+
 class RegionSection(ShapedSection, TunedSection):
     """A region of the plate and its effects."""
 
-    on_press: Identifier | None = None
-    on_move: Identifier | None = None
-    on_release: Identifier | None = None
+    on_press: EffectName = None
+    on_move: EffectName = None
+    on_release: EffectName = None
     level: Level | None = None
     priority: Annotated[int, Field(ge=0, le=100)] = 0
     own: bool = False
@@ -152,7 +158,7 @@ class LayoutSection(Section):
     regions: Annotated[
         dict[Identifier, RegionSection], Field(max_length=_MAX_REGIONS, default_factory=dict)
     ]
-    elsewhere: Identifier | None = BUZZ
+    elsewhere: EffectName = BUZZ
     max_level_db_sl: _HighestLevel = DEFAULT_MAX_DB_SL
 
 
@@ -226,6 +232,9 @@ def _effects(
         path = ("effects", name)
         if not isinstance(parameters, dict):
             continue  # reported with the section of the layout
+        if is_null_word(name):
+            validation.add(path, "means no effect where an effect is named; choose another name")
+            continue
         kind = parameters.get("kind", name)
         try:
             section = effect_kind(kind if isinstance(kind, str) else repr(kind))

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from model.errors import InputError
+from registry.streams import drawing_on
 
 if TYPE_CHECKING:
     from model.processes import Progress
@@ -90,7 +91,7 @@ def progress_bar(unit: str, *, is_transient: bool = False) -> "Iterator[Progress
     from rich.progress import BarColumn, MofNCompleteColumn, TimeElapsedColumn, TimeRemainingColumn
     from rich.progress import Progress as Bars
 
-    console = Console(stderr=True)
+    console = Console(file=drawing_on(sys.stderr))
     if not console.is_terminal:
         yield _ProgressLines(unit).update
         return

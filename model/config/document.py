@@ -12,8 +12,8 @@ import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from pathlib import Path
-from typing import Any, TypeAlias
+from pathlib import Path, PurePath
+from typing import Any, TypeAlias, TypeGuard
 
 import yaml
 
@@ -112,6 +112,30 @@ class Document:
     def problem(self, path: KeyPath, message: str) -> ConfigProblem:
         """A problem at a key."""
         return ConfigProblem(self.line_of(path), key_name(path), message)
+
+
+MAX_FILE_NAME = 1000
+"""Most characters of the name of a file in a configuration."""
+
+_MAX_PART = 255  # bytes, on all usual file systems
+
+
+_NULL_WORDS = frozenset(("none", "None", "NONE", "nil", "Nil", "NIL"))
+
+
+def is_null_word(value: object) -> bool:
+    """Whether a value is a word that other languages have for null, which YAML takes as text."""
+    return isinstance(value, str) and value in _NULL_WORDS
+
+
+def is_file_name(value: object) -> TypeGuard[str]:
+    """Whether a value can be the name of a file: text that every system takes as one."""
+    if not isinstance(value, str) or not 0 < len(value) <= MAX_FILE_NAME:
+        return False
+    if "\0" in value or is_null_word(value):
+        return False
+    parts = [part.encode("utf-8", "surrogatepass") for part in PurePath(value).parts]
+    return all(len(part) <= _MAX_PART for part in parts)
 
 
 def key_name(path: KeyPath) -> str:

@@ -23,6 +23,7 @@ from typing import (
 )
 
 from pydantic import (
+    AfterValidator,
     BaseModel,
     ConfigDict,
     Field,
@@ -35,7 +36,17 @@ from pydantic import (
 from pydantic.fields import FieldInfo
 from pydantic_core import CoreSchema, ErrorDetails, InitErrorDetails, core_schema
 
-from model.config.document import MAX_PROBLEMS, ConfigError, ConfigProblem, Document, KeyPath, Value
+from model.config.document import (
+    MAX_FILE_NAME,
+    MAX_PROBLEMS,
+    ConfigError,
+    ConfigProblem,
+    Document,
+    KeyPath,
+    Value,
+    is_file_name,
+    is_null_word,
+)
 from model.config.units import LENGTH, Dimension, quantity, shown
 from model.quantities import counted
 from registry.plugins import did_you_mean
@@ -104,6 +115,23 @@ class Quantity:
         unit = self.dimension.unit or "no unit"
         description = f"{self.dimension.name} [{unit}], for example {self.dimension.example}"
         return {"type": ["number", "string"], "description": description}
+
+
+_WRITE_NULL = "; for none write null, or leave the key out"
+
+
+def _file_name(text: str) -> str:
+    if is_null_word(text):
+        raise ValueError(f"must be the name of a file, got {text}{_WRITE_NULL}; or write ./{text}")
+    if not is_file_name(text):
+        raise ValueError(
+            f"must be the name of a file, up to {MAX_FILE_NAME} characters, got {shown(text)[:40]}"
+        )
+    return text
+
+
+FileName = Annotated[str, AfterValidator(_file_name)]
+"""Type of the name of a file; relative ones count from the folder of the file that has it."""
 
 
 def quantities(field: FieldInfo) -> list[Quantity]:
@@ -257,7 +285,19 @@ def _problem(
             )
         case _:
             message = f"{reworded(details['msg'])}, got {_shown(details)}"
+    if is_null_word(given) and _WRITE_NULL not in message:
+        message += _without_value(root, path, document)
     return document.problem((*below, *path), message)
+
+
+def _without_value(root: type[Section], path: KeyPath, document: Document) -> str:
+    """What to write at a key for no value, "" where there must be one."""
+    section = _section_at(root, path[:-1], document)  # or the type of a list or mapping
+    field = getattr(section, "model_fields", {}).get(path[-1])
+    if field is None or field.is_required():
+        return ""
+    is_nullable = type(None) in get_args(field.annotation)
+    return _WRITE_NULL if is_nullable else "; for none leave the key out"
 
 
 _WHOLE, _LIST = "must be a whole number, got {got}", "must be a list in brackets, got {got}"

@@ -20,6 +20,7 @@ from model.config.document import (
     Document,
     KeyPath,
     Value,
+    is_file_name,
     key_name,
     parse_document,
     read_document,
@@ -402,22 +403,23 @@ def with_base(document: Document) -> Document:
         raise ConfigError(document.source, [document.problem(path or ("base",), message)])
 
     name = document.data["base"]
-    if not isinstance(name, str) or not name:
+    if not is_file_name(name):
         refuse(f"must be the name of a rig file, got {shown(name)}")
+    named = shown(name)
     if PurePath(name).is_absolute() or ".." in PurePath(name).parts:
-        refuse(f"must be in the folder of this file or below it, got {name}; put both together")
+        refuse(f"must be in the folder of this file or below it, got {named}; put both together")
     path = base_path(document)
     if not path.is_file():
-        refuse(f"must be a rig file beside this one, got {name}, which is not there; put it back")
+        refuse(f"must be a rig file beside this one, got {named}, which is not there; put it back")
     if path.resolve() == Path(document.source).resolve():
-        refuse(f"must be the rig file that was fitted, got {name}, this file; name the other one")
+        refuse(f"must be the rig file that was fitted, got {named}, this file; name the other one")
     base = read_document(path)
     check_is_rig(base)
     if "base" in base.data:
-        refuse(f"must be a whole rig, got {name}, which has a base of its own; name that one")
+        refuse(f"must be a whole rig, got {named}, which has a base of its own; name that one")
     if document.data.get("base_fingerprint") != base_fingerprint(base):
         refuse(
-            f"{name} must have the plate, ERAs, masses and supports, as written, that it had when "
+            f"{named} must have the plate, ERAs, masses and supports, as written, that it had when "
             "they were fitted; undo what was changed there, or fit anew"
         )
     over = own_keys(document)
@@ -425,7 +427,7 @@ def with_base(document: Document) -> Document:
         known, given = (each.get(kind) for each in (base.data, over))
         for each in given if isinstance(given, dict) else ():
             if not isinstance(known, dict) or each not in known:
-                refuse(f"must be in {name}, which has none of this name; remove it", kind, each)
+                refuse(f"must be in {named}, which has none of this name; remove it", kind, each)
     data = merged_keys(base.data, over)
     return Document(document.source, "", data, document.find_lines, over=document)
 

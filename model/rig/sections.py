@@ -25,7 +25,7 @@ from pydantic import (
 from pydantic_core import CoreSchema, core_schema
 
 from model.config.document import KeyPath
-from model.config.fields import Quantity, Section
+from model.config.fields import FileName, Quantity, Section
 from model.config.units import (
     DAMPING,
     DENSITY,
@@ -466,7 +466,7 @@ Ring = Annotated[list[Corner], Field(min_length=3, max_length=1000)]
 class SurfaceSection(Section):
     """A surface by the modes of another program, in place of a plate."""
 
-    modes: Annotated[str, Field(min_length=1, max_length=1000)]
+    modes: FileName
     """File of its modes beside the rig file: universal, .npz or .csv; see [surfaces](#surface).
 
     Limits: a file

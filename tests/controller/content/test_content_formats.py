@@ -574,6 +574,16 @@ def test_named_contents_are_felt(tmp_path: Path) -> None:
             '{\n"Pattern": [1 2]}',
             ":2: is not valid JSON: Expecting ',' delimiter in column 15; correct it there",
         ),
+        (
+            "ahap",
+            '{"Pattern": []}\0\0',
+            r":1: nothing may stand behind the end .* got '\\x00\\x00'",
+        ),
+        (
+            "hjif",
+            '{"a": 1}\n# end\n',
+            r":2: nothing may stand behind the end .* got '# end\\n' in column 1; remove it",
+        ),
         ("ahap", '{"Pattern": [', ":1: is not valid JSON: .*; its end is missing: export it again"),
         ("haptic", b" " * (2 << 20) + b"{}", "is larger than 2 MiB; shorten the content"),
         ("haptic", '{"a": [1,]}', "is not valid JSON"),

@@ -455,3 +455,14 @@ def test_a_file_that_cannot_be_played_is_a_problem_of_its_layout(
     (problem,) = caught.value.problems
     assert (problem.line, problem.key) == (2, "effects.it.file")
     assert words in problem.message
+
+
+@pytest.mark.parametrize("word", ["null", "~", "none", "None", "nil"])
+def test_layout_takes_words_for_no_effect(tmp_path: Path, word: str) -> None:
+    """Nothing is felt elsewhere, nor in a region; YAML takes all but the first two as text."""
+    path = tmp_path / "layout.yaml"
+    region = f"{{circle: {{at: [0.1, 0.1], radius: 0.02}}, on_press: {word}, on_move: {word}}}"
+    path.write_text(f"elsewhere: {word}\nregions: {{button: {region}}}\n", "utf-8")
+    layout = load_layout(path, None)
+    assert layout.elsewhere is None
+    assert list(layout.uses()) == []

@@ -32,10 +32,11 @@ from controller.sources.evdev import (
     parse_events,
 )
 from controller.sources.touch import TouchFrame
-from kit.clock import START, run_virtual
+from kit.clock import run_virtual
 from model.errors import InputError
 from registry import threads
 from registry.limits import HAND_LOAD
+from registry.virtual_time import START
 
 EMPTY = SlotState(-1, 0, 0)
 KINDS = {

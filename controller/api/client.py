@@ -188,7 +188,10 @@ class AsyncClient(AbstractAsyncContextManager["AsyncClient"]):
         return await self._call(LayoutResult, "layout", name=name)
 
     async def reload(self) -> ReloadResult:
-        """Read the daemon's files again, and apply their layouts if nothing else has changed."""
+        """Read the daemon's files again and apply their layouts.
+
+        Any other change is refused, and needs a restart.
+        """
         return await self._call(ReloadResult, "reload")
 
     async def effects(self) -> EffectsResult:
@@ -196,9 +199,10 @@ class AsyncClient(AbstractAsyncContextManager["AsyncClient"]):
         return await self._call(EffectsResult, "effects")
 
     async def strength(self, name: str, gain_db: float | None = None) -> StrengthResult:
-        """Set the strength of a touch source, client or region, or show it; the status shows all.
+        """Set or show the strength of a source, client or region.
 
-        What plays is led there within 100 ms.
+        The name is that of a touch source, a client or a region; the status shows all strengths.
+        Active effects are faded to it within 100 ms.
         """
         return await self._call(StrengthResult, "strength", name=name, gain_db=gain_db)
 

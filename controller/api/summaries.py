@@ -16,10 +16,10 @@ SUMMARIES = {
     "forget": "Discard what was learned of the plate, and learn anew. Answers are those of the table at once.",
     "touch": "Report all fingers of a touch source of this client.",
     "layout": "Use one of the daemon's layouts. Of resting fingers, what ends by itself and what a program plays goes on to its end; what lasts follows the new layout at once.",
-    "reload": "Read the daemon's files again, and apply their layouts if nothing else has changed.",
+    "reload": "Read the daemon's files again and apply their layouts. Any other change is refused, and needs a restart.",
     "effects": "List the effects.",
     "play": "Play an effect, or points, at a finger; only while armed.",
-    "strength": "Set the strength of a touch source, client or region, or show it; the status shows all. What plays is led there within 100 ms.",
+    "strength": "Set or show the strength of a source, client or region. The name is that of a touch source, a client or a region; the status shows all strengths. Active effects are faded to it within 100 ms.",
     "subscribe": "Receive notifications of topics.",
     "unsubscribe": "Receive no more notifications of topics.",
 }

@@ -316,7 +316,10 @@ def use(
     socket: Socket = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Use one of the daemon's layouts; what lasts at resting fingers follows it at once."""
+    """Switch to another one of the daemon's layouts.
+
+    Continuous effects under resting fingers change immediately.
+    """
     with connected(socket) as era:
         used = era.layout(name)
     names = ", ".join(used.layouts)

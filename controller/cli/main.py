@@ -16,7 +16,7 @@ from typing import Annotated, Any, Protocol, TypeAlias
 
 import typer
 from typer.core import TyperGroup
-from typer.main import get_group
+from typer.main import get_group, get_install_completion_arguments
 
 from registry.files import posix_needed
 from registry.plugins import failed_plugin, failure_text
@@ -33,6 +33,7 @@ SECTIONS = {
         "calibrate",
         "rig",
         "design",
+        "content",
         "outputs",
         "measure",
     ),
@@ -44,6 +45,8 @@ SECTIONS = {
         "stop",
         "clear",
         "touch",
+        "play",
+        "strength",
         "watch",
         "gateway",
         "forget",
@@ -91,7 +94,22 @@ def main(load: LoadModules) -> int:
     # While modules load nothing is armed, and a KeyboardInterrupt could be swallowed.
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: os._exit(INTERRUPTED))
+    instruction = os.environ.get(COMPLETE)
+    if instruction:
+        return _complete(instruction, load)
     return run(sys.argv[1:], load, on_loaded=_interrupt_on_signals)
+
+
+COMPLETE = "_ERA_COMPLETE"
+"""Variable by which the scripts of `era --install-completion` request words at a tab."""
+
+
+def _complete(instruction: str, load: LoadModules) -> int:
+    """Print words for the command line that is being typed in a shell; return the exit status."""
+    from typer.completion import shell_complete
+
+    group, _ = join_commands(load())  # also registers typer's shells
+    return shell_complete(group, {}, "era", COMPLETE, instruction)
 
 
 def _interrupt_on_signals() -> None:
@@ -172,6 +190,7 @@ def join_commands(modules: Iterable[CommandModule]) -> tuple[TyperGroup, ExitSta
     app = typer.Typer(cls=_Commands, no_args_is_help=True)
     app.callback()(_root)
     group = _group(app)
+    group.params += get_install_completion_arguments()
     statuses: ExitStatus = {}
     for module in modules:
         statuses.update(module.EXIT_STATUS)

@@ -361,9 +361,10 @@ def show(
     fitted: Annotated[Path, typer.Argument(metavar="FITTED", help="File of a fitted rig.")],
     as_json: JsonOption = False,
 ) -> None:
-    """Show what a fit found beside the rig file that it began with, with standard errors.
+    """Show the values of a fit next to those of its base.
 
-    Values are in SI units, as the rig file states them.
+    The base is the rig file that the fit began with. Values are in SI units, as the rig file states
+    them, and those of the fit have standard errors.
     """
     from model.rig.rig_file import load_rig
     from model.rig.rig_writing import fitted_rows
@@ -412,9 +413,10 @@ def merge(
         Path, typer.Option("--output", "-o", metavar="RIG.yaml", help="Rig file to write.")
     ],
 ) -> None:
-    """Write one rig file with what a fit found and all else of the file that it began with.
+    """Write one rig file from a fitted rig and its base.
 
-    Comments of that file are not in it. The table of the fitted rig serves it, too.
+    It has the values of the fit and all other keys of the rig file that the fit began with, without
+    its comments. The table of the fitted rig serves it, too.
     """
     from model.files.array_file import whole_or_nothing
     from model.rig.rig_file import load_rig

@@ -313,7 +313,10 @@ class ApiService:
 
     @api_method()
     def reload(self, client: Connection, params: Empty) -> Awaitable[ReloadResult]:
-        """Read the daemon's files again, and apply their layouts if nothing else has changed."""
+        """Read the daemon's files again and apply their layouts.
+
+        Any other change is refused, and needs a restart.
+        """
         return self._reload()
 
     @api_method()
@@ -423,9 +426,10 @@ class ApiService:
 
     @api_method()
     def strength(self, client: Connection, params: StrengthParams) -> StrengthResult:
-        """Set the strength of a touch source, client or region, or show it; the status shows all.
+        """Set or show the strength of a source, client or region.
 
-        What plays is led there within 100 ms.
+        The name is that of a touch source, a client or a region; the status shows all strengths.
+        Active effects are faded to it within 100 ms.
         """
         known, name = self._publisher.strengths().strengths, params.name
         if name not in known:

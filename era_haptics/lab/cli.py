@@ -41,8 +41,9 @@ def report(
         Path | None, typer.Option("--socket", help="Socket of the daemon; default: the usual path.")
     ] = None,
 ) -> None:
-    """Collect versions, files, daemon state and the end of its log in a folder for a bug report.
+    """Collect files for a bug report in a folder.
 
+    They have versions, configuration files, the daemon's state and the end of its log.
     Values of unknown keys, hosts, serial numbers and comments are hidden; look before you send it.
     """
 

@@ -22,13 +22,13 @@ export interface Methods {
   touch: { params: TouchParams; result: Empty };
   /** Use one of the daemon's layouts. Of resting fingers, what ends by itself and what a program plays goes on to its end; what lasts follows the new layout at once. */
   layout: { params: LayoutParams; result: LayoutResult };
-  /** Read the daemon's files again, and apply their layouts if nothing else has changed. */
+  /** Read the daemon's files again and apply their layouts. Any other change is refused, and needs a restart. */
   reload: { params: Empty; result: ReloadResult };
   /** List the effects. */
   effects: { params: Empty; result: EffectsResult };
   /** Play an effect, or points, at a finger; only while armed. */
   play: { params: PlayParams; result: Empty };
-  /** Set the strength of a touch source, client or region, or show it; the status shows all. What plays is led there within 100 ms. */
+  /** Set or show the strength of a source, client or region. The name is that of a touch source, a client or a region; the status shows all strengths. Active effects are faded to it within 100 ms. */
   strength: { params: StrengthParams; result: StrengthResult };
   /** Receive notifications of topics. */
   subscribe: { params: SubscribeParams; result: Empty };

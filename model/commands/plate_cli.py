@@ -361,9 +361,10 @@ def materials(as_json: JsonOption = False) -> None:
 
 @plate_app.command()
 def show(rig_file: RigArgument, as_json: JsonOption = False) -> None:
-    """Show material and rigidity of a rig's plate, and what its exciters reach.
+    """Show material, rigidity and exciters of a rig's plate.
 
-    Reached is by the board of the file; one whose parts deviate reaches more or less.
+    The levels that the exciters reach are those of the plate in the file; a plate whose parts
+    deviate reaches more or less.
     """
     from model.quantities import in_display_unit
     from model.rig.rig_file import load_rig
@@ -556,9 +557,10 @@ def template(
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Draw the board in real size with the places of all that is glued to it.
+    """Draw a full-scale template with all positions.
 
-    Print at 100 %: the ruler on it must measure 100 mm.
+    It is the board with the positions of everything that is glued to it. Print at 100 %: the ruler
+    on it must measure 100 mm.
     """
     from model.estimate.measurement import read_places
     from model.figures import Template, write_template

@@ -23,8 +23,10 @@ from textwrap import dedent
 from unittest.mock import Mock
 
 import pytest
+import typer
+from typer.core import TyperGroup
 
-from controller.cli.main import LoadModules, run
+from controller.cli.main import LoadModules, join_commands, run
 from controller.daemon.children import gateway_options
 from controller.daemon.messages import LatencyStatistics
 from controller.operation.fault_dumps import DUMP_PATTERN, MAX_DUMPS, FaultDumps, write_dump
@@ -416,6 +418,43 @@ def test_help_loads_commands_and_typer_alone(which: str, others: set[str]) -> No
     typers = {"typer", "annotated_doc", "shellingham", "typing_extensions", "typing_inspection"}
     of_the_environment = {"_distutils_hack"}  # of setuptools
     assert set(loaded) - ours - typers - of_the_environment - others == set()
+
+
+def test_summaries_of_commands_fit_in_80_columns() -> None:
+    """Help lists each command with the whole first sentence of its own help."""
+    group, _ = join_commands(command_modules())
+    groups = [(group, typer.Context(group, info_name="era", terminal_width=80))]
+    for name, command in group.commands.items():
+        if isinstance(command, TyperGroup):
+            groups.append((command, typer.Context(command, info_name=name, terminal_width=80)))
+    assert len(groups) > 5
+    for listed, context in groups:
+        lines = listed.get_help(context).splitlines()
+        assert [line for line in lines if line.endswith("...") and "Usage" not in line] == []
+
+
+@pytest.mark.parametrize(
+    ("typed", "words"),
+    [("era con", {"config", "content"}), ("era content check tick --qu", {"--quiet"})],
+)
+def test_bash_completes_commands_and_options(typed: str, words: set[str]) -> None:
+    """By the script that `era --show-completion` prints for the shell that runs it."""
+    *before, last = typed.split()
+    script = (
+        'script=$(era --show-completion) && eval "$script" && '
+        f"COMP_WORDS=({typed}) COMP_CWORD={len(before)} && _era_completion era {last} {before[-1]} "
+        '&& echo "${COMPREPLY[@]}"'
+    )
+    path = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
+    done = subprocess.run(
+        ["bash", "--norc", "-c", script],
+        capture_output=True,
+        text=True,
+        env=os.environ | {"PATH": path},
+        timeout=60,
+    )
+    assert done.stderr == ""
+    assert {*done.stdout.split()} == words
 
 
 def test_main_loads_every_package_of_the_project(

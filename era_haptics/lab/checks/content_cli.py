@@ -65,11 +65,11 @@ def play(
     socket: Socket = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Play content once at a finger that is on the plate, within 20 mm of a position.
+    """Play content at a finger, or write it as sound.
 
-    With --simulate write the acceleration at a finger that is alone there as sound, to listen to
-    and to look at: 16 bits at 48 kHz. All sounds have the same full scale, so their loudness can be
-    compared by ear.
+    It plays once, at a finger that is on the plate within 20 mm of a position. With --simulate
+    write the acceleration at a finger that is alone there as sound, to listen to and to look at: 16
+    bits at 48 kHz. All sounds have the same full scale, so their loudness can be compared by ear.
     """
     place = parse_point(at, what="--at")
     if (simulate is None) != (output is None):
@@ -210,17 +210,18 @@ def check(
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Simulate in time what a finger will feel of content, alone or next to quiet fingers.
+    """Simulate what a finger will feel of content.
 
-    The kept share of the level is the share of the time in which the level at the skin is within
-    3 dB of the file's, counted where the file is within 20 dB of its highest level. Levels are
-    means over 20 ms. The kept share of the sharpness is the share of the continuous part that plays
-    at about the frequency in the file. Shares are rounded down. Amplifiers are taken as phased,
-    whichever mode the table was built for. Without --table the plate is that of the founding paper.
-    Without --at five positions are tried, the middle among them, and the one with the median share
-    is shown. Several files, or a folder with its subfolders, are listed with one line each. Exit
-    status 1 if a file keeps less of its level than --least, or one of several cannot be read;
-    sharpness has no limit.
+    It is simulated in time, for a finger alone or next to quiet fingers. The kept share of the
+    level is the share of the time in which the level at the skin is within 3 dB of the file's,
+    counted where the file is within 20 dB of its highest level. Levels are means over 20 ms. The
+    kept share of the sharpness is the share of the continuous part that plays at about the
+    frequency in the file. Shares are rounded down. Amplifiers are taken as phased, whichever mode
+    the table was built for. Without --table the plate is that of the founding paper. Without --at
+    five positions are tried, the middle among them, and the one with the median share is shown.
+    Several files, or a folder with its subfolders, are listed with one line each. Exit status 1 if
+    a file keeps less of its level than --least, or one of several cannot be read; sharpness has no
+    limit.
     """
     from model.files.output_paths import check_picture
 

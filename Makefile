@@ -213,7 +213,7 @@ smoke-lowest: dist
 sbom: dist
 	for extras in '' '-extras'; do \
 		rm -rf out/clean && $(PYTHON) -m venv out/clean && \
-		out/clean/bin/python -m pip install -qq "$$(ls dist/*.whl)$${extras:+[gateway,cluster,sound]}" && \
+		out/clean/bin/python -m pip install -qq "$$(ls dist/*.whl)$${extras:+[gateway,cluster,sound,frames]}" && \
 		out/clean/bin/python -m pip uninstall -qq --yes pip setuptools && \
 		$(BIN)/cyclonedx-py environment --output-reproducible --validate \
 			-o dist/sbom$$extras.json out/clean || exit 1; \

@@ -35,14 +35,14 @@ _GATEWAY = ("controller.cli", "gateway")
 _logger = logging.getLogger(__name__)
 
 
-def gateway_options(address: str, socket: Path) -> list[str]:
+def gateway_options(address: str, socket: Path, *, shows_token: bool = False) -> list[str]:
     """Return options of a gateway that serves the page at HOST:PORT, with a new token.
 
     Where the gateway would print its token into a log, the token is in a file that only its owner
-    may read. Raises InputError if that cannot be written.
+    may read, unless shows_token is true. Raises InputError if that cannot be written.
     """
     options = ["--socket", str(socket), "--listen", address]
-    if sys.stdout.isatty():
+    if shows_token or sys.stdout.isatty():
         return options
     file = socket.with_name("dashboard-token")
     try:

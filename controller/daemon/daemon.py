@@ -62,6 +62,7 @@ class Daemon:
     """A daemon; create it within the event loop that runs it.
 
     dashboard: HOST:PORT at which the gateway serves the page, or None.
+    shows_token: whether the page's token is printed where it may be logged, too.
     observe: adds observers of the control loop.
     lines: makes the lines to the amplifiers.
     watchdog [s]: of the amplifiers; longer for simulated ones on a busy machine.
@@ -75,6 +76,7 @@ class Daemon:
         log: LogThread,
         manager: ServiceManager,
         dashboard: str | None,
+        shows_token: bool = False,
         observe: Callable[[Observers], None] = lambda loop: None,
         lines: Callable[[Lines | None], Lines] = Lines,
         watchdog: float = WATCHDOG,
@@ -84,6 +86,7 @@ class Daemon:
         self._log = log
         self._manager = manager
         self._dashboard = dashboard
+        self._shows_token = shows_token
         self._reload_requested = asyncio.Event()
         self._next_reload = asyncio.get_running_loop().create_future()
         self._shutdown = asyncio.Event()
@@ -195,7 +198,9 @@ class Daemon:
             running = asyncio.create_task(self._supervisor.run(), name="control loop")
             self._inputs.start(self._config.touch)
             if self._dashboard is not None:
-                options = gateway_options(self._dashboard, self._config.socket)
+                options = gateway_options(
+                    self._dashboard, self._config.socket, shows_token=self._shows_token
+                )
                 self._gateway = asyncio.create_task(keep_gateway(options), name="gateway")
             shutdown = asyncio.create_task(self._shutdown.wait())
             started = asyncio.create_task(self.started.wait())

@@ -279,6 +279,7 @@ async def run_live(
                 log=log,
                 manager=ServiceManager(),
                 dashboard=dashboard,
+                shows_token=True,  # its output is for a person, also through a pipe
                 watchdog=WATCHDOG,
             )
             await daemon.run(lock)

@@ -11,7 +11,7 @@ from importlib.metadata import PackageNotFoundError, requires, version
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
-EXTRAS = ("gateway", "cluster", "sound")
+EXTRAS = ("gateway", "cluster", "sound", "frames")
 
 
 def closure(name: str, *extras: str) -> dict[str, str]:

@@ -81,7 +81,9 @@ def as_frame(columns: Columns) -> Any:
     try:
         pandas = import_module("pandas")
     except ModuleNotFoundError as error:
-        raise InputError("pandas must be installed for to_frame: pip install pandas") from error
+        raise InputError(
+            "to_frame needs pandas, which is not installed; install it with  pip install pandas"
+        ) from error
     return pandas.DataFrame(dict(columns))
 
 

@@ -34,7 +34,7 @@ from controller.operation.operation_states import DaemonState, Operation
 from controller.process.daemon_process import ServiceManager, SocketLock
 from controller.process.log import LogFormatter, LogThread, RateLimitFilter
 from drivers.wires.wire import Reply
-from era_haptics.command import main
+from era_haptics.command import command_modules, main
 from kit.chain import set_chain
 from kit.clock import in_virtual_time
 from model.errors import InputError

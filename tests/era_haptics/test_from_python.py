@@ -6,6 +6,7 @@ against the commands; and what is refused, with its words.
 
 import json
 import math
+import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -367,6 +368,13 @@ def test_results_become_frames(table: era.LocalizationTable) -> None:
     felt = PLATE.play({"SW": 110}, TARGET, quiet=BOTH).to_frame()
     assert felt["time_s"].iloc[-1] == pytest.approx(1.0, abs=0.001)
     assert list(felt.columns[1:]) == ["target_1_m_s2", "quiet_1_m_s2", "quiet_2_m_s2"]
+
+
+def test_frames_need_pandas(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without it the error names it and how to install it."""
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    with pytest.raises(era.InputError, match=r"to_frame needs pandas.*pip install pandas"):
+        PLATE.modes.to_frame()
 
 
 def test_draw_map_marks_driven_eras() -> None:

@@ -631,7 +631,13 @@ async def test_status_shows_levels_of_one_threshold_set_and_names_it(tmp_path: P
 
 
 def test_gateway_keeps_its_token_out_of_a_log(tmp_path: Path) -> None:
-    """Not on a terminal, it reads it from a file of the owner instead of printing it."""
+    """Not on a terminal, it reads it from a file of the owner instead of printing it.
+
+    A demonstration prints it all the same.
+    """
+    assert "--token-file" not in gateway_options(
+        "127.0.0.1:0", tmp_path / "era.sock", shows_token=True
+    )
     *_, option, file = gateway_options("127.0.0.1:0", tmp_path / "era.sock")
     assert option == "--token-file"
     assert len(read_token(Path(file))) >= 32  # which refuses a file that others may read

@@ -5,7 +5,7 @@ import re
 import sys
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 import typer
 
@@ -28,7 +28,7 @@ from registry.plugins import did_you_mean
 
 if TYPE_CHECKING:
     from model.rig.rig import Rig
-    from model.vibration import Excitation
+    from model.vibration import Excitation, PlateMap
 
 plate_app = typer.Typer(help="Compute modes and vibration maps of a plate.")
 
@@ -134,11 +134,19 @@ def plate_map(
         figure = map_figure(rig, solved, active=excitation.keys(), title=title)
         save_figure(figure, output, inches=inches)
     row, column = divmod(best_of(solved.peak.ravel()), len(solved.x))
-    rows = [
+    levels = _levels_over(solved, rig.threshold)
+    level_row = None
+    if levels is not None:
+        level_row = (
+            f"level    {levels.median:8.1f} dB SL in the median, "
+            f"{levels.on_99_percent:.1f} or more on 99 % of the points ({rig.threshold})"
+        )
+    rows: list[str | None] = [
         f"{rig_file}: {', '.join(drive)}, mesh {rig.mesh}, solved in {timed.elapsed:.2f} s",
         f"largest  {solved.peak.max() / G:8.2f} g  ({solved.peak.max():.1f} m/s²) "
         f"at ({solved.x[column]:.4f}, {solved.y[row]:.4f}) m",
         f"median   {float(np.median(solved.peak)) / G:8.2f} g",
+        level_row,
         f"nulls    {len(solved.nulls):5d}",
     ]
     if output is not None:
@@ -151,12 +159,34 @@ def plate_map(
         "max_m_s2": float(solved.peak.max()),
         "max_at_m": [float(solved.x[column]), float(solved.y[row])],
         "nulls_m": solved.nulls.tolist(),
+        "median_level_db_sl": None if levels is None else levels.median,
+        "level_on_99_percent_db_sl": None if levels is None else levels.on_99_percent,
         "is_supported": unsupported is None,
         "mesh": [rig.mesh.nx, rig.mesh.ny],
         "solve_time_s": timed.elapsed,
         "files": [str(output)] if output else [],
     }
     print_report(rows, answer, as_json=as_json)
+
+
+class _Levels(NamedTuple):
+    """Levels over a plate [dB SL]: the median, and that which 99 % of the points reach."""
+
+    median: float
+    on_99_percent: float
+
+
+def _levels_over(solved: "PlateMap", threshold: str) -> _Levels | None:
+    """Return levels over a plate relative to a threshold set; None beyond the data of the set."""
+    import numpy as np
+
+    from model.finger import sensation_level
+
+    try:
+        levels = sensation_level(solved.frequencies, np.abs(solved.field), threshold)
+    except InputError:
+        return None
+    return _Levels(float(np.median(levels)), float(np.percentile(levels, 1)))
 
 
 _NUMBER = r"[-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d{1,2})?"

@@ -336,6 +336,15 @@ def test_map_has_its_maximum_and_is_in_proportion_to_the_level():
 
 @pytest.mark.usefixtures("plain_pictures")
 @pytest.mark.long
+def test_map_states_levels_above_the_threshold_of_the_frequency() -> None:
+    """By hand, of 0.249 m/s² at 100 Hz on the page about people; unknown below 10 Hz."""
+    drawn = as_json("plate", "map", RIG, "--drive", "SW=100", "--points", "31x23")
+    levels = 20 * np.log10(np.array(drawn["peak_acceleration_m_s2"]) / 0.249)
+    assert drawn["median_level_db_sl"] == pytest.approx(np.median(levels), abs=0.02)
+    assert drawn["level_on_99_percent_db_sl"] == pytest.approx(np.percentile(levels, 1), abs=0.02)
+    assert as_json("plate", "map", RIG, "--drive", "SW=9")["median_level_db_sl"] is None
+
+
 def test_convergence_lists_errors_of_finer_and_finer_meshes(monkeypatch, tmp_path):
     """Errors fall from mesh to mesh, and the rig's own is marked; text and JSON agree."""
     studied = []

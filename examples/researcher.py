@@ -64,8 +64,8 @@ show(era.draw_map(plate, drive, title="SW 110 Hz, NE half of it, 90° ahead"), "
 # %% [markdown]
 """
 ## Felt here, not there
-One finger shall feel 20 dB SL, the other nothing. The table has each ERA's field at each frequency;
-from these it picks amplitudes and phases for the fingers.
+One finger shall feel 20 dB SL, the other as little as possible. The table has each ERA's field at
+each frequency; from these it picks amplitudes and phases for the fingers.
 """
 
 # %%

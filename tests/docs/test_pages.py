@@ -14,6 +14,7 @@ import json
 import re
 import shutil
 import tempfile
+import textwrap
 from collections.abc import Iterator
 from importlib.metadata import requires
 from pathlib import Path
@@ -40,7 +41,7 @@ from drivers.by_hand.reaching import check_links
 from drivers.errors import CommandError
 from drivers.protocol.definition import BOOT_TIME, REACTION
 from drivers.wires.wire import address_of
-from era_haptics.command import command_modules
+from era_haptics.command import command_modules, run
 from model.answer.answer import MIN_CONTRAST_DB, OWN_CONTRAST_DB
 from model.answer.promise import MIN_RAISED_CONTRAST_DB
 from model.cli import app
@@ -344,6 +345,22 @@ def test_the_keys_are_those_that_are_printed(
     for key in [key for key in keys if "_N_" in key]:
         keys = keys - {key} | {key.replace("N", number) for number in "123"}
     assert keys == set(json.loads(result.stdout))
+
+
+@pytest.mark.long
+def test_readme_shows_what_the_demonstration_prints(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Its scale, the rows of three people and the summary, which virtual time makes repeatable."""
+    readme = text_of("README.md")
+    ((command, shown),) = re.findall(
+        r"^    \$ \.venv/bin/era (demo .*)\n((?:    .*\n)+)", readme, re.MULTILINE
+    )
+    assert shown.count("of 3 contents") == 3
+    monkeypatch.chdir(ROOT)
+    assert run([*command.split(), "--out", str(tmp_path)]) == 0
+    what = difference(textwrap.dedent(shown), capsys.readouterr().out)
+    assert what is None, what
 
 
 FACT_PAGES = [

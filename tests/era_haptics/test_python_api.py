@@ -332,7 +332,7 @@ def test_page_example_feels_what_was_predicted(tmp_path: Path) -> None:
 def test_readme_program_prints_what_is_said_of_each_finger(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """As the README shows it, a line a finger; the quiet one has no contrast of its own."""
+    """As the README shows it, a line a finger below the scale; a quiet one has no contrast."""
     readme = (EXAMPLES.parent / "README.md").read_text("utf-8")
     (lines,) = re.findall(r"^```python\n(.*?)^```$", readme, re.MULTILINE | re.DOTALL)
     (shown,) = re.findall(r"^```text\n(.*?)^```$", readme, re.MULTILINE | re.DOTALL)
@@ -340,7 +340,7 @@ def test_readme_program_prints_what_is_said_of_each_finger(
     runpy.run_path("readme.py")
     printed = capsys.readouterr().out
     assert printed == shown
-    assert ["contrast" in line for line in printed.splitlines()] == [True, True, True, False]
+    assert ["contrast" in line for line in printed.splitlines()] == [False, True, True, True, False]
 
 
 def test_page_rig_needs_no_file(

@@ -36,6 +36,7 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass
+from difflib import get_close_matches
 from functools import cache, partial
 from importlib import import_module
 from multiprocessing import get_context
@@ -212,6 +213,22 @@ def stale_report(faults: Iterable[PlantedFault], tree: Path) -> list[str]:
                 f"    {fault.behaviour}\n"
                 f"    Then: python tests/faults/run.py --only {fault.name}"
             )
+    return reports
+
+
+def missing_tests_report(faults: Iterable[PlantedFault], existing: set[str]) -> list[str]:
+    """Describe each test that a fault names and that does not exist, with the nearest one."""
+    reports = []
+    for fault in faults:
+        for test in fault.tests:
+            if test in existing:
+                continue
+            file = test.partition("::")[0]
+            candidates = [name for name in existing if name.startswith(f"{file}::")]
+            similar = get_close_matches(test, candidates, n=1)
+            hint = f"\n    Did you mean {similar[0]}?" if similar else ""
+            name = fault.name.partition("/")[2]
+            reports.append(f"{fault.source}: fault {name} names no existing test: {test}{hint}")
     return reports
 
 

@@ -47,10 +47,15 @@ def test_no_fault_is_stale(request: pytest.FixtureRequest) -> None:
     exec("\n".join(line for line in lines if re.fullmatch(r"(from [\w.]+ )?import [\w, ]+", line)))
     folder = request.node.getparent(pytest.Dir)
     beside = pytest.Module.from_parent(folder, path=RUN.with_name("one_conformance.py"))
-    known = request.config.stash[COLLECTED] | {test.nodeid for test in beside.collect()}
-    others = {test for one in faults for test in one.tests} - known
-    missing = others - judge["collected"](*sorted(others)) if others else set()
-    assert not missing, "tests of faults must exist: correct `found_by` in tests/faults"
+    existing = request.config.stash[COLLECTED] | {test.nodeid for test in beside.collect()}
+    root = RUN.parents[2]
+    unknown = {test for one in faults for test in one.tests} - existing
+    others = {test.partition("::")[0] for test in unknown}
+    files = [file for file in sorted(others) if (root / file).is_file()]
+    if files:  # of tests that were not asked for
+        existing |= judge["collected"](*files)
+    missing = judge["missing_tests_report"](faults, existing)
+    assert not missing, "\n".join(missing)
 
 
 def test_stale_fault_is_reported_with_its_file_and_the_remedy(tmp_path: Path) -> None:
@@ -73,6 +78,26 @@ def test_stale_fault_is_reported_with_its_file_and_the_remedy(tmp_path: Path) ->
         "    Then: python tests/faults/run.py --only sums/gone",
     ]
     assert subprocess.run([*command, "other.py"]).returncode == 0
+
+
+def test_fault_without_its_test_is_reported_with_the_nearest_name() -> None:
+    """A renamed test is named with the fault, its file and the test that comes closest."""
+    judge = runpy.run_path(str(RUN))
+    fault = judge["PlantedFault"](
+        name="sums/gone",
+        source="tests/faults/sums.yaml",
+        behaviour="Two and two are 5.",
+        edits=(),
+        tests=("tests/test_sums.py::test_sum[four]",),
+        shows="",
+        missed="",
+    )
+    existing = {"tests/test_sums.py::test_sum[for]", "tests/test_other.py::test_sum[four]"}
+    assert judge["missing_tests_report"]([fault], existing) == [
+        "tests/faults/sums.yaml: fault gone names no existing test: "
+        "tests/test_sums.py::test_sum[four]\n"
+        "    Did you mean tests/test_sums.py::test_sum[for]?"
+    ]
 
 
 @pytest.mark.long

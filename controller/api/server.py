@@ -10,6 +10,9 @@ There are places for a bounded number of clients. Further ones are in reserve, w
 that silence are served, so that another client can always connect and `stop`. What takes longer,
 such as arming, runs as a task of its own. How often a topic is sent is a row of `TOPICS`
 (`controller/api/methods.py`).
+
+A request that silences is carried out before anything else of it is checked, and counts in no
+bound (`controller/api/silencing.py`). Its errors are reported afterwards.
 """
 
 import asyncio
@@ -43,6 +46,7 @@ from controller.api.schema import (
     Empty,
     Topic,
 )
+from controller.api.silencing import read_silencing
 from controller.process.log import RateLimiter
 from controller.sources.touch import CONTACT_TIMEOUT
 from drivers.errors import CommandRefused, DriverError, LinkError
@@ -54,7 +58,7 @@ _MAX_READ = 1 << 14  # bytes in an iteration of the event loop
 _MAX_READ_AHEAD = 1 << 16  # bytes that wait to be served
 UNREAD_TIMEOUT = 5.0  # s; for losing notifications before the connection is closed
 MAX_REQUEST_RATE = 2000.0  # 1/s, and as many in a burst
-MAX_PENDING = 8  # requests of one client that take long; stop is not counted
+MAX_PENDING = 8  # requests of one client that take long; those that silence are always accepted
 MAX_PENDING_STOPS = 64  # requests without responses, above which no further line is taken
 STOP = b'"stop"'
 
@@ -83,7 +87,7 @@ class Connection(asyncio.BufferedProtocol):
         self.process = 0  # its id; 0 if unknown
         self.received_at = server.clock()  # s; when the last bytes arrived
         self.is_reserve = False  # whether it is in reserve
-        self.is_at_end = False  # whether it has closed its side
+        self.is_at_end = False  # whether it sends, or is served, no further line
         self.pending: set[asyncio.Task[None]] = set()
         self.silenced = 0  # its stops and disarms
         self.touched_at = -math.inf  # s; when it sent fingers, unless it has lifted them since
@@ -106,7 +110,7 @@ class Connection(asyncio.BufferedProtocol):
 
     @property
     def has_left(self) -> bool:
-        """Whether the client has closed its side, or the connection is lost."""
+        """Whether the client has closed its side or is to be closed, or the connection is lost."""
         return self.is_at_end or not self.is_open
 
     @property
@@ -148,6 +152,11 @@ class Connection(asyncio.BufferedProtocol):
     def eof_received(self) -> bool:
         """Finish what the client requested before it closed its side, then close."""
         self.is_at_end = True
+        if self._input and not self._input.endswith(b"\n"):  # the last line may lack its line feed
+            self._input += b"\n"
+            if self._line_end < 0:
+                self._line_end = len(self._input) - 1
+            self._server.add(self)
         self.close_if_finished()
         return True
 
@@ -155,11 +164,9 @@ class Connection(asyncio.BufferedProtocol):
         """Report the end; pending requests are carried out all the same."""
         self._server.forget(self)
 
-    def next_line(self) -> bytes | None:
-        """Take the next line; None if it is too long."""
-        end = self._line_end
-        if not 0 <= end < MAX_LINE_LENGTH:
-            return None
+    def next_line(self) -> bytes:
+        """Take the next line, or all that has come of one that is too long."""
+        end = self._line_end if self._line_end >= 0 else len(self._input)
         line = bytes(memoryview(self._input)[:end])
         del self._input[: end + 1]
         self._stop_at = max(self._stop_at - end - 1, -1)
@@ -168,8 +175,16 @@ class Connection(asyncio.BufferedProtocol):
             self._transport.resume_reading()
         return line
 
+    def take_rest(self) -> bytes:
+        """Take all lines that wait to be served, and read no more."""
+        rest = bytes(self._input)
+        self._input.clear()
+        self._line_end = self._stop_at = -1
+        self._transport.pause_reading()
+        return rest
+
     def close_if_finished(self) -> None:
-        """Close after the last response, if the client has closed its side."""
+        """Close after the last response, if no further line is taken from the client."""
         if self.is_at_end and not self.has_lines and not self.pending:
             self.close()
 
@@ -198,11 +213,6 @@ class Connection(asyncio.BufferedProtocol):
             self.abort()
         return True
 
-    def refuse(self, error: RpcError) -> None:
-        """Send an error and close."""
-        self.respond(error_line(None, error))
-        self.close()
-
     def close(self) -> None:
         """Close after all output is sent."""
         self._transport.close()
@@ -216,7 +226,10 @@ Handler: TypeAlias = Callable[[Connection, Any], ApiMessage | Awaitable[ApiMessa
 
 
 class _Call:
-    """A line as read: a method with its parameters, or an error."""
+    """A line as read: a method with its parameters, and what is wrong with the line, if anything.
+
+    A method that silences is identified before anything else is read.
+    """
 
     def __init__(self, line: bytes) -> None:
         self.id: Id = None
@@ -225,17 +238,36 @@ class _Call:
         self.params: ApiMessage | None = None
         self.error: Exception | None = None
         self.record: dict[str, Any] = {}  # for dumps, with the outcome
+        silencing = read_silencing(line)
+        self.silences = silencing is not None
+        if silencing is not None:
+            self.method = silencing.method
+            self.params = silencing.params
         try:
-            request = read_request(line)
-            self.id, self.expects_response = request.id, request.expects_response
-            if request.method not in METHODS:
-                raise unknown_method(request.method, METHODS)
-            self.params = read_params(METHODS[request.method].params, request)
-            self.method = request.method
+            self._read(line)
         except InvalidRequest as error:
             self.id, self.error = error.id, error
         except Exception as error:  # of the parameters, or a bug
             self.error = error
+
+    def _read(self, line: bytes) -> None:
+        """Read the line strictly; raises RpcError."""
+        if len(line) >= MAX_LINE_LENGTH:
+            what = f"line longer than {MAX_LINE_LENGTH} bytes"
+            raise InvalidRequest(ErrorCode.PARSE, what, remedy="send less")
+        request = read_request(line)
+        self.id, self.expects_response = request.id, request.expects_response
+        if request.method not in METHODS:
+            raise unknown_method(request.method, METHODS)
+        self.params = read_params(METHODS[request.method].params, request)
+        self.method = request.method
+
+    @property
+    def is_limited(self) -> bool:
+        """Whether it counts in the rate of requests."""
+        if self.silences:
+            return False
+        return self.error is not None or METHODS[self.method].is_limited
 
 
 class ApiServer:
@@ -325,6 +357,7 @@ class ApiServer:
 
     def forget(self, client: Connection) -> None:
         """Forget a client that has disconnected."""
+        self._end_input(client)
         self.clients.pop(client, None)
         self._waiting.pop(client, None)
         self._on_disconnect(client)
@@ -394,35 +427,37 @@ class ApiServer:
     def _serve(self, client: Connection) -> None:
         """Serve the next line of a client, or start to."""
         line = client.next_line()
-        if line is None:
-            what = f"line longer than {MAX_LINE_LENGTH} bytes"
-            client.refuse(RpcError(ErrorCode.PARSE, what, remedy="send less"))
-            return
         call = _Call(line)
-        if (call.error or METHODS[call.method].is_limited) and not client.rate.take():
-            if call.error is not None:
-                client.refuse(_busy())
-                return
+        is_over_rate = call.is_limited and not client.rate.take()
+        if is_over_rate and call.error is not None:
+            client.respond(error_line(None, _busy()))
+            self._end_input(client)
+            return
+        if is_over_rate:
             call.error = _busy()
+        self._begin(client, call)
+        if len(line) >= MAX_LINE_LENGTH:
+            self._end_input(client)
+
+    def _end_input(self, client: Connection) -> None:
+        """Serve no further line of a client, except for what silences in the rest of its input."""
+        rest = client.take_rest()
+        client.is_at_end = True
+        if read_silencing(rest) is not None:
+            self._begin(client, _Call(rest))
+
+    def _begin(self, client: Connection, call: _Call) -> None:
+        """Carry out a call, or start to; respond if it has ended."""
         try:
             call.record = self._requested(client.name, call.method, client.received_at)
-            self._check(client, call)
-            method = METHODS[call.method]
-            client.silenced += method.silences
-            if isinstance(call.params, TouchParams):
-                client.touched_at = self.clock() if call.params.touches else -math.inf
-            handle = partial(self._handlers[call.method], client, call.params)
-            result: ApiMessage | Awaitable[ApiMessage] = Empty()
-            if not method.needs_reply:
-                result = handle()
-            elif call.expects_response:
-                result = _for_one_who_stays(client, client.silenced, handle)
+            if not call.silences:
+                self._check(client, call)
+            result = self._handle(client, call)
             if isinstance(result, ApiMessage):
                 self._respond(client, call, result)
                 return
         except Exception as error:
-            # A bug in reading the line: what may be a stop is one.
-            if call.method == "stop" or (STOP in line and not isinstance(error, RpcError)):
+            if call.silences:
                 self._stop_all()
             self._respond(client, call, error)
             return
@@ -430,8 +465,21 @@ class ApiServer:
         client.pending.add(task)
         task.add_done_callback(lambda task: self._finished(client, task))
 
+    def _handle(self, client: Connection, call: _Call) -> ApiMessage | Awaitable[ApiMessage]:
+        """Call the handler of a method; arming waits until the client's input is read."""
+        method = METHODS[call.method]
+        client.silenced += method.silences
+        if isinstance(call.params, TouchParams):
+            client.touched_at = self.clock() if call.params.touches else -math.inf
+        handle = partial(self._handlers[call.method], client, call.params)
+        if not method.needs_reply:
+            return handle()
+        if not call.expects_response:
+            return Empty()
+        return _for_one_who_stays(client, client.silenced, handle)
+
     def _check(self, client: Connection, call: _Call) -> None:
-        """Raise why a call is not carried out."""
+        """Raise why a call is not carried out; one that silences always is."""
         if call.error is not None:
             raise call.error
         if client.is_reserve and not METHODS[call.method].in_reserve:
@@ -442,7 +490,7 @@ class ApiServer:
                     f"too many clients; only {', '.join(_RESERVE_METHODS)} are served here",
                     remedy="try again later",
                 )
-        if call.method != "stop" and len(client.pending) >= MAX_PENDING:
+        if len(client.pending) >= MAX_PENDING:
             raise RpcError(ErrorCode.BUSY, "too many pending requests", remedy="await responses")
 
     async def _finish(self, client: Connection, call: _Call, result: Awaitable[ApiMessage]) -> None:
@@ -457,13 +505,18 @@ class ApiServer:
         client.close_if_finished()
 
     def _respond(self, client: Connection, call: _Call, outcome: ApiMessage | Exception) -> None:
-        if isinstance(outcome, ApiMessage):
-            response = result_line(call.id, outcome.model_dump_json())
-            call.record["outcome"] = "done"
-        else:
+        """Send the response to a call, and note its outcome."""
+        if isinstance(outcome, Exception):
             error = _rpc_error(outcome)
             response = error_line(call.id, error)
             call.record["outcome"] = call.record["refused"] = str(error)
+        elif call.error is not None:
+            error = _carried_out_despite(_rpc_error(call.error), call.method)
+            response = error_line(call.id, error)
+            call.record["outcome"] = f"done, but {error}"
+        else:
+            response = result_line(call.id, outcome.model_dump_json())
+            call.record["outcome"] = "done"
         if call.expects_response:
             client.respond(response)
 
@@ -504,6 +557,13 @@ def _rpc_error(error: Exception) -> RpcError:
         f"a bug in the daemon ({type(error).__name__})",
         remedy="report it with the daemon's log",
     )
+
+
+def _carried_out_despite(error: RpcError, method: str) -> RpcError:
+    """The error of a request that silences, which was carried out."""
+    data = error.data
+    what = f"{data.what} ({method} was carried out all the same)"
+    return RpcError(error.code, what, where=data.where, remedy=data.remedy)
 
 
 DEFAULT_RATE = 10.0  # Hz

@@ -210,7 +210,7 @@ class ApiService:
         client.lease = lease.token
         return RenewResult(lease_s=lease.duration)
 
-    @api_method(silences=True, in_reserve=True)
+    @api_method(is_limited=False, silences=True, in_reserve=True)
     async def disarm(self, client: Connection, params: DisarmParams) -> Empty:
         """Ramp to silence, then switch the high voltage off.
 

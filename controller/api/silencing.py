@@ -1,0 +1,67 @@
+"""Requests that silence the plate, `stop` and `disarm`, read leniently.
+
+A newer client must be able to stop an older daemon, and a client with a mistake must be able to
+stop at all. So a request that silences is identified by its method alone, and is carried out
+whatever else is wrong with it; the error is reported afterwards.
+"""
+
+import re
+from collections.abc import Mapping
+from contextlib import suppress
+from typing import Any, NamedTuple
+
+from controller.api.jsonrpc import parse_json
+from controller.api.methods import METHODS
+from controller.api.schema import ApiMessage
+
+_PRECEDENCE = ("stop", "disarm")  # of the methods that silence, where a line names both
+_MARKS = (*(name.encode() for name in _PRECEDENCE), b"\\u")  # any line that silences has one
+_NAMED = re.compile(rb'"method"\s*:\s*"(%s)"' % "|".join(_PRECEDENCE).encode())
+
+
+class SilencingRequest(NamedTuple):
+    """A method that silences, with those of its parameters that can be read."""
+
+    method: str
+    params: ApiMessage
+
+
+def read_silencing(line: bytes) -> SilencingRequest | None:
+    """Identify a request that silences; None if the line names no such method. Never fails.
+
+    The method is looked up where a request has it, in a batch in each of its requests. A line that
+    is not JSON, repeats a key or exceeds a bound is searched as text, at any depth.
+    """
+    if not any(mark in line for mark in _MARKS):
+        return None
+    try:
+        document = parse_json(line)
+    except Exception:  # also of a bug: the text decides
+        return _search(line)
+    batch = document if isinstance(document, list) else [document]
+    requests = [request for request in batch if isinstance(request, dict)]
+    for method in _PRECEDENCE:
+        for request in requests:
+            if request.get("method") == method:
+                return SilencingRequest(method, readable_params(method, request.get("params")))
+    return None
+
+
+def _search(text: bytes) -> SilencingRequest | None:
+    """Search text for a method that silences; its parameters cannot be read."""
+    named = _NAMED.findall(text)
+    for method in _PRECEDENCE:
+        if method.encode() in named:
+            return SilencingRequest(method, readable_params(method, {}))
+    return None
+
+
+def readable_params(method: str, given: object) -> ApiMessage:
+    """The parameters of a method that silences: each one that is valid, defaults for all others."""
+    model = METHODS[method].params
+    params: dict[str, Any] = {}
+    if isinstance(given, Mapping):
+        for name in model.model_fields.keys() & given.keys():
+            with suppress(Exception):  # whatever is wrong with it
+                params[name] = getattr(model(**{name: given[name]}), name)
+    return model(**params)

@@ -16,9 +16,18 @@ each are written by `make pages` from their registration in `controller/daemon/h
 
 import asyncio
 import functools
+import inspect
 import itertools
 from collections import deque
-from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Iterator, Sequence
+from collections.abc import (
+    AsyncIterator,
+    Awaitable,
+    Callable,
+    Coroutine,
+    Iterator,
+    Mapping,
+    Sequence,
+)
 from contextlib import (
     AbstractAsyncContextManager,
     AbstractContextManager,
@@ -29,7 +38,7 @@ from contextlib import (
 )
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Concatenate, ParamSpec, Self, TypeVar
+from typing import Any, Concatenate, ParamSpec, Self, TypeVar, cast
 
 from controller.api.jsonrpc import ErrorCode, RpcError, request_line
 from controller.api.link import (
@@ -62,6 +71,8 @@ from controller.api.methods import (
     StrengthResult,
 )
 from controller.api.schema import ApiMessage, Empty, Topic, headline
+from controller.api.silencing import readable_params
+from model.errors import InputError
 from registry.threads import LoopThread, pauses
 
 MAX_QUEUED_EVENTS = 1000  # not yet taken; the oldest is dropped
@@ -70,6 +81,27 @@ _RENEWAL_INTERVAL = 0.25  # s; within it a lost lease is noticed, however long i
 
 _T = TypeVar("_T")
 _ResultT = TypeVar("_ResultT", bound=ApiMessage)
+_MethodT = TypeVar("_MethodT", bound=Callable[..., Coroutine[Any, Any, Any]])
+
+
+def _lenient(method: _MethodT) -> _MethodT:
+    """A method that is carried out without those of its arguments that it does not take.
+
+    Raises their TypeError afterwards.
+    """
+    signature = inspect.signature(method)
+
+    @functools.wraps(method)
+    async def call(client: "AsyncClient", *args: Any, **options: Any) -> Any:
+        try:
+            signature.bind(client, *args, **options)
+        except TypeError:
+            known = {name: options[name] for name in options if name in signature.parameters}
+            await method(client, **known)
+            raise
+        return await method(client, *args, **options)
+
+    return cast(_MethodT, call)
 
 
 class AsyncClient(AbstractAsyncContextManager["AsyncClient"]):
@@ -80,20 +112,26 @@ class AsyncClient(AbstractAsyncContextManager["AsyncClient"]):
     method returns within the timeout and raises RpcError for an error of the daemon, Unreachable
     (a LinkError) without a response, and LeaseLost, except for `stop` and `disarm`, once the lease
     of `armed` is lost.
+
+    `stop` and `disarm` are sent whatever is wrong with their arguments; InputError or TypeError is
+    raised afterwards.
     """
 
     def __init__(self, path: Path, *, name: str, timeout: float) -> None:
+        make_params("hello", client=name)  # a wrong name would keep a stop from being sent
         self.path = path
         self._name = name
         self._timeout = timeout
         self._is_closed = False
-        self._connecting = asyncio.Lock()
+        self._opening = asyncio.Lock()
+        self._restoring = asyncio.Lock()
         self._connections = 0
         self._link: DaemonLink | None = None
         self._reading: asyncio.Task[None] | None = None
         self._pending: dict[int, asyncio.Future[Any]] = {}  # of the present connection, by id
         self._ids = itertools.count(1)
         self._rates: dict[Topic, float | None] = {}  # of the subscriptions
+        self._restored: DaemonLink | None = None  # the connection that has all subscriptions
         self._events: deque[tuple[int, Notification]] = deque()  # with the number of its connection
         self._lost = 0  # events that were dropped here before the next one
         self._changed = asyncio.Event()  # an event arrived, or connection or lease was lost
@@ -150,6 +188,7 @@ class AsyncClient(AbstractAsyncContextManager["AsyncClient"]):
         """Extend the lease."""
         return await self._call(RenewResult, "renew", lease=lease)
 
+    @_lenient
     async def disarm(self, *, client: str | None = None, lease: str | None = None) -> None:
         """Ramp to silence, then switch the high voltage off.
 
@@ -157,6 +196,7 @@ class AsyncClient(AbstractAsyncContextManager["AsyncClient"]):
         """
         await self._call(Empty, "disarm", client=client, lease=lease)
 
+    @_lenient
     async def stop(self, *, client: str | None = None) -> StopResult:
         """Quick-stop all amplifiers, latched until clear.
 
@@ -300,31 +340,49 @@ class AsyncClient(AbstractAsyncContextManager["AsyncClient"]):
         """Call a method with these parameters and return its result.
 
         What `clear` acknowledges is what this client has seen, in its last `status`, `stop` or
-        state event. From a stop on no lease is renewed, even if no daemon responds.
+        state event.
         """
-        if method not in SILENCING:
-            self._check_lease()
+        if method in SILENCING:
+            return await self._silence(result, method, values)
+        self._check_lease()
         if method == "clear" and values["epoch"] is None and self._seen is not None:
             values["epoch"] = self._seen[1]
         params = make_params(method, **values)
-        if method == "stop":
-            self._end_renewal()
         read = read_result(await self.request(method, params), result)
-        if method == "disarm":
-            self._end_renewal()
-        elif method == "hello":
+        if method == "hello":
             self._name = values["client"]
         self._see(self._connections, getattr(read, "epoch", None))
+        return read
+
+    async def _silence(
+        self, result: type[_ResultT], method: str, values: Mapping[str, object]
+    ) -> _ResultT:
+        """Call a method that silences, and raise what is wrong with its arguments afterwards.
+
+        From a stop on no lease is renewed, even if no daemon responds.
+        """
+        if method == "stop":
+            self._end_renewal()
+        params = readable_params(method, values)
+        read = read_result(await self.request(method, params), result)
+        self._end_renewal()
+        self._see(self._connections, getattr(read, "epoch", None))
+        try:
+            make_params(method, **values)
+        except InputError as error:
+            raise InputError(f"{error} ({method} was carried out all the same)") from None
         return read
 
     async def request(self, method: str, params: ApiMessage) -> Any:
         """Send a request, again over new connections if that is harmless.
 
-        Returns its result as parsed JSON, with the keys of a later daemon.
+        Returns its result as parsed JSON, with the keys of a later daemon. What silences is sent
+        before subscriptions are restored.
         """
+        connected = self._opened if method in SILENCING else self._connected
 
         async def attempt() -> Any:
-            return await self._exchange(await self._repeated(self._connected), method, params)
+            return await self._exchange(await self._repeated(connected), method, params)
 
         again = Unreachable if method == "stop" else ConnectionLost
         return await self._repeated(attempt, again if METHODS[method].is_repeated else ())
@@ -370,8 +428,16 @@ class AsyncClient(AbstractAsyncContextManager["AsyncClient"]):
             raise Unreachable.at(self.path, error) from error
 
     async def _connected(self) -> DaemonLink:
+        """The connection with all subscriptions; raises RpcError and Unreachable."""
+        async with self._restoring:
+            link = await self._opened()
+            if link is not self._restored:
+                await self._restore(link)
+            return link
+
+    async def _opened(self) -> DaemonLink:
         """The connection, made again if it was lost; raises RpcError and Unreachable."""
-        async with self._connecting:
+        async with self._opening:
             if self._is_closed:
                 raise Unreachable(f"this client of the daemon at {self.path} is closed")
             if self._link is None or not self._link.is_open:
@@ -380,14 +446,18 @@ class AsyncClient(AbstractAsyncContextManager["AsyncClient"]):
                 self._connections += 1
                 reading = self._read(link, self._pending, self._connections)
                 self._reading = asyncio.create_task(reading, name="API")
-                try:
-                    for topic, rate in list(self._rates.items()):
-                        params = make_params("subscribe", topics=[topic], rate_hz=rate)
-                        await self._exchange(link, "subscribe", params)
-                except BaseException:
-                    link.abort()
-                    raise
             return self._link
+
+    async def _restore(self, link: DaemonLink) -> None:
+        """Subscribe again over a new connection, which is closed if that fails."""
+        try:
+            for topic, rate in list(self._rates.items()):
+                params = make_params("subscribe", topics=[topic], rate_hz=rate)
+                await self._exchange(link, "subscribe", params)
+            self._restored = link
+        except BaseException:
+            link.abort()
+            raise
 
     async def _read(
         self, link: DaemonLink, pending: dict[int, asyncio.Future[Any]], connection: int

@@ -440,7 +440,7 @@ METHODS: dict[str, Method] = {
     "status": Method(Empty, StatusResult, in_reserve=True),
     "arm": Method(ArmParams, ArmResult, needs_reply=True, is_repeated=False),
     "renew": Method(RenewParams, RenewResult),
-    "disarm": Method(DisarmParams, Empty, silences=True, in_reserve=True),
+    "disarm": Method(DisarmParams, Empty, is_limited=False, silences=True, in_reserve=True),
     "stop": Method(RequestedBy, StopResult, is_limited=False, silences=True, in_reserve=True),
     "clear": Method(ClearParams, Empty, is_repeated=False),
     "forget": Method(RequestedBy, Empty),

@@ -51,44 +51,46 @@ class Access:
 
     def __init__(self, settings: GatewaySettings) -> None:
         self._settings = settings
+        self._names = settings.allowed_names
         self._origins = settings.allowed_origins
 
     def check(self, request: web.Request) -> None:
-        """Check a request or WebSocket before anything of its body; raises web.HTTPException."""
+        """Check who requests, before anything of the body; raises web.HTTPException."""
         headers = request.headers
-        host, origin = (", ".join(headers.getall(name, [])) for name in ("Host", "Origin"))
-        own = sent_origin(f"http://{host}")
+        # Routes would take an escaped line feed for another path, and ignore the host in a URL.
+        if _CONTROL.search(request.path) or not request.raw_path.startswith("/"):
+            text = "the target must be a path without control characters"
+            raise web.HTTPBadRequest(text=text)
+        host = ", ".join(headers.getall("Host", []))
+        name = _PORT.sub("", host).lower()
+        if name not in self._names:  # with any port
+            raise web.HTTPMisdirectedRequest(text="this Host is not allowed; see --allow-host")
+        origin = ", ".join(headers.getall("Origin", []))
+        allowed_origins = {sent_origin(f"http://{host}"), *self._origins} - {""}
+        if "Origin" in headers and origin.lower() not in allowed_origins:
+            raise web.HTTPForbidden(text="this Origin is not allowed; see --allow-origin")
         is_link = headers.get("Sec-Fetch-Mode") == "navigate"  # which the user followed
-        is_embedded = headers.get("Sec-Fetch-Site") == "cross-site" and not (origin or is_link)
-        for is_refused, error, text in (
-            (request.version not in VERSIONS, web.HTTPVersionNotSupported, "use HTTP/1.1"),
-            # Small chunks would take the time of others.
-            ("Transfer-Encoding" in headers, web.HTTPLengthRequired, "send a Content-Length"),
-            # Routes would take an escaped line feed for another path, and ignore the host in a URL.
-            (
-                _CONTROL.search(request.path) or not request.raw_path.startswith("/"),
-                web.HTTPBadRequest,
-                "the target must be a path without control characters",
-            ),
-            (
-                _PORT.sub("", host).lower() not in self._settings.allowed_names,  # with any port
-                web.HTTPMisdirectedRequest,
-                "this Host is not allowed; see --allow-host",
-            ),
-            (
-                "Origin" in headers and origin.lower() not in {own, *self._origins} - {""},
-                web.HTTPForbidden,
-                "this Origin is not allowed; see --allow-origin",
-            ),
-            (is_embedded, web.HTTPForbidden, "cross-site requests are not allowed"),
-            (
-                self._needs_token(request) and not self._has_token(request),
-                web.HTTPUnauthorized,
-                "the token is missing or wrong; open the URL that the gateway printed",
-            ),
-        ):
-            if is_refused:
-                raise error(text=text)
+        is_cross_site = headers.get("Sec-Fetch-Site") == "cross-site"
+        if is_cross_site and not origin and not is_link:
+            raise web.HTTPForbidden(text="cross-site requests are not allowed")
+        if self._needs_token(request) and not self._has_token(request):
+            text = "the token is missing or wrong; open the URL that the gateway printed"
+            raise web.HTTPUnauthorized(text=text)
+
+    def allows(self, request: web.Request) -> bool:
+        """Whether `check` passes."""
+        try:
+            self.check(request)
+        except web.HTTPException:
+            return False
+        return True
+
+    def check_form(self, request: web.Request) -> None:
+        """Check how a request is sent, before anything of the body; raises web.HTTPException."""
+        if request.version not in VERSIONS:
+            raise web.HTTPVersionNotSupported(text="use HTTP/1.1")
+        if "Transfer-Encoding" in request.headers:  # small chunks would take the time of others
+            raise web.HTTPLengthRequired(text="send a Content-Length")
 
     async def preflight(self, _: web.Request) -> web.Response:
         """Answer what a page of another, allowed origin may do (CORS): what `protect` adds."""

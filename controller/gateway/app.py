@@ -15,7 +15,7 @@ import socket
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 from aiohttp import HttpVersion11, WSCloseCode, web
 from aiohttp.http import HttpProcessingError
@@ -38,9 +38,18 @@ from controller.api.jsonrpc import (
 from controller.api.link import RESPONSE_TIMEOUT, Unreachable
 from controller.api.methods import METHODS, SILENCING, Method
 from controller.api.schema import API_VERSION, ApiMessage
+from controller.api.silencing import readable_params
 from controller.api.summaries import SUMMARIES
 from controller.gateway.access import SUBPROTOCOL, Access
-from controller.gateway.connections import CLIENT_TIMEOUT, CONNECTION, ClientConnection, bridge
+from controller.gateway.connections import (
+    CLIENT_TIMEOUT,
+    CONNECTION,
+    MAX_READ_FRAME,
+    BrowserSocket,
+    ClientConnection,
+    Connections,
+    bridge,
+)
 from controller.gateway.field import DrawnField
 from controller.gateway.gateway_settings import GatewaySettings
 from controller.gateway.metrics import exposition
@@ -140,11 +149,12 @@ def _operation(name: str, method: Method, references: Any) -> dict[str, Any]:
     }
 
 
-MAX_BODY = 1 << 16  # bytes; of a message as well
+MAX_BODY = 1 << 16  # bytes
 MAX_REQUESTS = 256  # to the daemon at once
 MAX_SESSIONS = 24  # WebSockets; the daemon has 32 connections, and some for stops
 _METRICS_TIME = 0.5  # s; for which the same metrics are given
-_MAX_DISARMS = 8  # at once; the daemon carries out as many of one client
+_MAX_DISARMS = 8  # at once, so that the daemon always reads a stop that comes behind them
+_STOP_DELAY = 0.01  # s; at most, in which a body may name the client that stops
 _HEARTBEAT = 10.0  # s; without a frame of a browser, after which it is asked for one
 _CLOSE_TIMEOUT = 0.3  # s; for a browser to close its side
 _PAGE = Path(__file__).parent / "page"
@@ -157,10 +167,9 @@ class Gateway:
         self.field = DrawnField(settings.socket)
         self._access = Access(settings)
         self._daemon = settings.socket
-        self._sessions: set[web.WebSocketResponse] = set()
+        self._sessions: set[BrowserSocket] = set()
         self._places = asyncio.Semaphore(MAX_REQUESTS)
-        self._waiting: dict[ClientConnection, asyncio.TimerHandle] = {}
-        self._kept: dict[ClientConnection, AsyncClient] = {}
+        self._connections = Connections(settings.socket)
         # For what must not wait for a new connection, which the daemon may refuse.
         self._own = AsyncClient(settings.socket, name="gateway", timeout=RESPONSE_TIMEOUT)
         self._disarms = asyncio.Semaphore(_MAX_DISARMS)
@@ -184,9 +193,9 @@ class Gateway:
         self.app.on_response_prepare.append(self._access.protect)
         self.app.on_shutdown.append(self._end_sessions)
 
-    def connection(self, server: asyncio.Protocol) -> ClientConnection:
+    def connection(self, make_server: Callable[[], web.RequestHandler]) -> ClientConnection:
         """A connection that is served by the web server's protocol for it."""
-        return ClientConnection(server, self._daemon, self._waiting, self._kept)
+        return ClientConnection(make_server, self._connections)
 
     async def keep_connected(self) -> None:
         """Connect to the daemon again after every loss, so that no stop has to wait for it."""
@@ -196,13 +205,18 @@ class Gateway:
 
     @web.middleware
     async def _answer(self, request: web.Request, handler: Handler) -> web.StreamResponse:
-        """Check a request and answer it; its client has the time of the next one to read that.
-
-        A client may have left meanwhile: its stop is carried out all the same.
-        """
+        """Check a request and answer it. Its client may have left: its stop is carried out."""
         connection = CONNECTION.get()
-        connection.stop_waiting()
+        connection.begin(request)
         try:
+            method = _method_that_silences(request)
+            if method is not None and self._access.allows(request):
+                connection.admit()
+                return await self._silence(request, method)
+            if method is not None:
+                await connection.wait_for_turn()
+            connection.admit()
+            self._access.check_form(request)
             self._access.check(request)
             return await handler(request)
         except web.HTTPException as error:
@@ -212,9 +226,7 @@ class Gateway:
                 headers=[each for each in error.headers.items() if each[0] == "Allow"],
             )
         finally:
-            if not request.content.is_eof():
-                connection.refuse_rest()
-            connection.wait()
+            connection.finish()
 
     async def _file(self, request: web.Request) -> web.Response:
         """A file of the page, or the description."""
@@ -245,42 +257,56 @@ class Gateway:
             if self._places.locked():
                 raise web.HTTPServiceUnavailable(text="too many requests at once; try again later")
             async with self._places:
-                result = await self._request(method, await _body(request))
+                _check_media(request)
+                params = _read_params(method, await _read_body(request))
+                result = await CONNECTION.get().request(method, params)
             return web.json_response(result)
-        except (RpcError, Unreachable) as problem:
-            error = (
-                RpcError(ErrorCode.LINK, str(problem))
-                if isinstance(problem, Unreachable)
-                else problem
-            )
-            failed = json.loads(error_line(None, error))["error"]
-            return web.json_response(
-                {"error": failed["message"], "code": failed["code"], "data": failed["data"]},
-                status=HTTP_STATUS[error.code],
-            )
+        except (RpcError, Unreachable) as error:
+            return _failure(error)
 
-    async def _request(self, method: str, body: object) -> Any:
-        """The daemon's result, over the connection that the client's keeps; body: as parsed.
+    async def _silence(self, request: web.Request, method: str) -> web.Response:
+        """Call a method that silences, then report what is wrong with the request.
 
-        What silences goes over the own one, from any client. Raises RpcError and Unreachable.
+        Over the own connection to the daemon. Only who may request it was checked before.
         """
-        connection = CONNECTION.get()
-        request = request_of({"jsonrpc": "2.0", "method": method, "params": body})
-        params = read_params(METHODS[method].params, request)
-        if method not in SILENCING:
-            return await connection.request(method, params)
-        caller = request.params.get("client") or f"http {connection.address}"
-        async with contextlib.nullcontext() if method == "stop" else self._disarms:
-            return await self._own.request(method, params.model_copy(update={"client": caller}))
+        reading = asyncio.create_task(self._read(request))
+        try:
+            # A stop does not wait for its body, which only names the client. That of a disarm may
+            # restrict it to a lease.
+            await asyncio.wait({reading}, timeout=_STOP_DELAY if method == "stop" else None)
+            result = await self._request_silence(method, _given(reading))
+            if request.method != "POST":
+                raise web.HTTPMethodNotAllowed(request.method, ["POST"])
+            _check_media(request)
+            _read_params(method, await reading)
+            return web.json_response(result)
+        except (RpcError, Unreachable) as error:
+            return _failure(error)
+        finally:
+            reading.cancel()
+            await asyncio.gather(reading, return_exceptions=True)
 
-    async def _serve(self, request: web.Request) -> web.WebSocketResponse:
+    async def _read(self, request: web.Request) -> bytes:
+        self._access.check_form(request)
+        return await _read_body(request)
+
+    async def _request_silence(self, method: str, given: object) -> Any:
+        """The daemon's result, by the parameters that can be read of those given."""
+        params = readable_params(method, given)
+        if getattr(params, "client", None) is None:
+            params = params.model_copy(update={"client": f"http {CONNECTION.get().address}"})
+        async with contextlib.nullcontext() if method == "stop" else self._disarms:
+            return await self._own.request(method, params)
+
+    async def _serve(self, request: web.Request) -> BrowserSocket:
         """Serve one browser."""
         connection = CONNECTION.get()
-        socket = web.WebSocketResponse(
+        socket: BrowserSocket = web.WebSocketResponse(
             protocols=[SUBPROTOCOL],
             compress=False,  # no decompression bombs
             heartbeat=_HEARTBEAT,
-            max_msg_size=MAX_BODY + 1,  # the first that is refused
+            max_msg_size=MAX_READ_FRAME,
+            decode_text=False,  # invalid text is refused after it was searched for what silences
             timeout=_CLOSE_TIMEOUT,
             autoclose=False,  # by the bridge
         )
@@ -296,6 +322,7 @@ class Gateway:
         ):
             raise web.HTTPForbidden(text=f"it must be a WebSocket of {SUBPROTOCOL}")
         self._sessions.add(socket)  # before the first await, so that the limit holds
+        connection.upgrade()
         try:
             await socket.prepare(request)
             await bridge(
@@ -303,6 +330,7 @@ class Gateway:
                 connection.address,
                 self._daemon,
                 field=self.field if "field" in request.query else None,
+                turns=self._connections.turns,
             )
         finally:
             self._sessions.discard(socket)
@@ -321,11 +349,21 @@ async def _continue_later(_: web.Request) -> None:
     """Leave 100 Continue to `_body`: aiohttp would send it before the token is checked."""
 
 
-async def _body(request: web.Request) -> Any:
-    """A request's body, by default an empty object; raises RpcError, web.HTTPException."""
+def _method_that_silences(request: web.Request) -> str | None:
+    """The method that a request names in its path, if that silences."""
+    name = request.path.removeprefix("/api/v1/")
+    return name if name in SILENCING and request.method != "OPTIONS" else None
+
+
+def _check_media(request: web.Request) -> None:
+    """Check the content type; raises web.HTTPException."""
     media = request.headers.get("Content-Type", "").partition(";")[0].strip().lower()
     if media != "application/json" and (media or request.can_read_body):
         raise web.HTTPUnsupportedMediaType(text="the content type must be application/json")
+
+
+async def _read_body(request: web.Request) -> bytes:
+    """Read a request's body; raises web.HTTPException."""
     if (request.content_length or 0) > MAX_BODY:
         raise web.HTTPRequestEntityTooLarge(MAX_BODY)
     if request.headers.get("Expect", "").lower() == "100-continue":
@@ -333,15 +371,41 @@ async def _body(request: web.Request) -> Any:
         request.writer.output_size = 0
     try:
         async with asyncio.timeout(CLIENT_TIMEOUT):
-            body = await request.read()
-    except TimeoutError as error:
+            return await request.read()
+    except (TimeoutError, ConnectionError) as error:
         raise web.HTTPRequestTimeout(text="the body is not complete") from error
-    return parse_json(body or b"{}")
+
+
+def _read_params(method: str, body: bytes) -> ApiMessage:
+    """The parameters of a method from a body, by default an empty object; raises RpcError."""
+    document = {"jsonrpc": "2.0", "method": method, "params": parse_json(body or b"{}")}
+    return read_params(METHODS[method].params, request_of(document))
+
+
+def _given(reading: "asyncio.Task[bytes]") -> object:
+    """The parameters in a body, as JSON; None if it was not read."""
+    if not reading.done():
+        return None
+    try:
+        return parse_json(reading.result())
+    except Exception:  # not read, or not JSON; it is reported later
+        return None
+
+
+def _failure(problem: RpcError | Unreachable) -> web.Response:
+    """The response for a request that failed."""
+    error = RpcError(ErrorCode.LINK, str(problem)) if isinstance(problem, Unreachable) else problem
+    failed = json.loads(error_line(None, error))["error"]
+    return web.json_response(
+        {"error": failed["message"], "code": failed["code"], "data": failed["data"]},
+        status=HTTP_STATUS[error.code],
+    )
 
 
 _MAX_LINE = 1 << 13  # bytes; of the head of a request
 _MAX_LINES = 64
 _QUEUE = 512  # connections that wait to be accepted
+_ACCEPTED = 4  # of them in an iteration of the event loop
 _NICENESS = 10  # added, so that the daemon's control loop has priority
 _SHUTDOWN_TIMEOUT = 0.3  # s; for requests to end by themselves
 
@@ -377,9 +441,11 @@ async def serve(settings: GatewaySettings, *, announce: Callable[[int], None]) -
     own = asyncio.gather(gateway.field.run(), gateway.keep_connected())
     own.add_done_callback(lambda _: over.set())
     make_server = runner.server
+    # asyncio accepts as many in an iteration as it lets wait.
     serving = await asyncio.get_running_loop().create_server(
-        lambda: cast(asyncio.Protocol, gateway.connection(make_server())), sock=listening
+        lambda: gateway.connection(make_server), sock=listening, backlog=_ACCEPTED
     )
+    listening.listen(_QUEUE)
     announce(listening.getsockname()[1])
     with no_long_collections():  # of connections that a storm leaves, nothing else is visited
         await over.wait()

@@ -89,6 +89,8 @@ def _method(name: str, method: Method, summary: str) -> Iterator[str]:
     head = f"    async def {name}({', '.join(['self', *parameters])}) -> {result}:"
     if len(head) > _WIDTH:
         head = head.replace("(", "(\n        ").replace(") ->", "\n    ) ->")
+    if method.silences:
+        yield "    @_lenient"
     yield head
     first, dot, rest = summary.partition(". ")
     wrapped = textwrap.wrap(rest, _WIDTH - 8)

@@ -120,6 +120,23 @@ class Attacker:
         writer.transport.abort()
         return f"{received[9:].decode()} {outcome}".strip()
 
+    async def pipeline(self, requests: bytes) -> str:
+        """Send requests at once and read nothing; again over a new connection every half second."""
+        refused = 0
+        end = time.monotonic() + self.seconds
+        while time.monotonic() < end:
+            try:
+                async with asyncio.timeout(_CONNECTING):
+                    _, writer = await asyncio.open_connection("127.0.0.1", self._port)
+            except OSError:
+                refused += 1
+                continue
+            writer.transport.pause_reading()  # type: ignore[attr-defined]
+            writer.write(requests)
+            await asyncio.sleep(0.5)
+            writer.transport.abort()
+        return "refused at times" if refused else "sent all the while"
+
     def frames(self, data: bytes, *, reads: bool = False) -> Callable[[int], Awaitable[str]]:
         """Frames without pause over a WebSocket, whose own frames are read or not."""
         return lambda _: self.send(self._upgrade, itertools.repeat(data), reads=reads)
@@ -152,6 +169,7 @@ def _large_body(number: int) -> list[bytes]:
 
 _GET = b"GET / HTTP/1.1\r\nHost: localhost\r\n"
 _PAGE = b"GET /app.js HTTP/1.1\r\nHost: localhost\r\n\r\n"
+_PAGE_BY_TOKEN = _PAGE[:-2] + f"Authorization: Bearer {TOKEN}\r\n\r\n".encode()
 _ARM = b"POST /api/v1/arm HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\n"
 ATTACKS: dict[str, Callable[[Attacker], Awaitable[str]]] = {
     "none": Attacker.none,
@@ -173,6 +191,12 @@ ATTACKS: dict[str, Callable[[Attacker], Awaitable[str]]] = {
     ),
     "200 connections, 200 pages each unread": lambda a: a.many(
         200, lambda _: a.send(_PAGE * 200, itertools.repeat(b"\r\n"), every=0.2, reads=False)
+    ),
+    "120 clients, 60 pages at once, unread": lambda a: a.many(
+        120, lambda _: a.pipeline(_PAGE * 60)
+    ),
+    "120 clients with the token, 60 pages at once, unread": lambda a: a.many(
+        120, lambda _: a.pipeline(_PAGE_BY_TOKEN * 60)
     ),
     "20 WebSockets, replies unread": lambda a: a.many(20, a.frames(frame(_HELLO) * 500)),
     "8 WebSockets, texts of 2 bytes": lambda a: a.many(

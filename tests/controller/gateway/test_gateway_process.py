@@ -8,6 +8,7 @@ Stops through the gateway are passed on or answered, whatever other clients do.
 import asyncio
 import contextlib
 import errno
+import json
 import os
 import re
 import signal
@@ -525,16 +526,16 @@ async def test_clients_that_leave_while_the_daemon_hangs_keep_their_places(
 ) -> None:
     """Until their connections have failed: else any number of them would wait for the daemon."""
     monkeypatch.setattr(connections, "RESPONSE_TIMEOUT", 0.3)
-    kept: dict[connections.ClientConnection, AsyncClient] = {}
+    shared = connections.Connections(full_queue)
 
     def request(*, leaves: bool = True) -> "asyncio.Task[object]":
-        made = connections.ClientConnection(Mock(), full_queue, {}, kept)
+        made = connections.ClientConnection(Mock(), shared)
         transport = Mock(is_closing=lambda: False, get_extra_info=lambda _: ("192.0.2.1", 1))
         made.connection_made(transport)
         task = asyncio.create_task(made.request("status", Empty()))
         if leaves:
             asyncio.get_running_loop().call_soon(made.connection_lost, None)
-        made.stop_waiting()
+        made.admit()
         return task
 
     waiting = [request() for _ in range(connections.MAX_KEPT)]
@@ -543,7 +544,7 @@ async def test_clients_that_leave_while_the_daemon_hangs_keep_their_places(
         await request(leaves=False)
     with pytest.raises(Unreachable):
         await asyncio.gather(*waiting)
-    await until(lambda: not kept)
+    await until(lambda: not shared.kept)
 
 
 @in_virtual_time
@@ -552,10 +553,9 @@ async def test_connection_that_waits_is_closed(tmp_path: Path) -> None:
 
     None before what has come of it is read, and those that had an answer before new ones.
     """
-    waiting: dict[connections.ClientConnection, asyncio.TimerHandle] = {}
+    shared = connections.Connections(tmp_path)
     made = [
-        connections.ClientConnection(Mock(), tmp_path, waiting, {})
-        for _ in range(connections.MAX_WAITING + 3)
+        connections.ClientConnection(Mock(), shared) for _ in range(connections.MAX_WAITING + 3)
     ]
     wires = [Mock(is_closing=lambda: False) for _ in made]
     for each, wire in zip(made, wires, strict=True):
@@ -564,17 +564,23 @@ async def test_connection_that_waits_is_closed(tmp_path: Path) -> None:
     def closed() -> list[int]:
         return [number for number, wire in enumerate(wires) if wire.abort.called]
 
-    made[4].stop_waiting()
-    made[4].wait()  # answered
+    made[4].admit()
+    made[4].finish()  # answered
     assert closed() == []
     await asyncio.sleep(0.01)
     assert closed() == [0, 1, 4]
-    made[-2].stop_waiting()  # its request has come
+    made[-2].admit()  # its request has come
     await asyncio.sleep(4.9)
-    made[-1].data_received(b"G")
+    received(made[-1], b"G")
     assert closed() == [0, 1, 4]
     await asyncio.sleep(0.2)
     assert closed() == [each for each in range(len(made)) if each != len(made) - 2]
+
+
+def received(connection: connections.ClientConnection, data: bytes) -> None:
+    """Let a connection receive bytes."""
+    connection.get_buffer(-1)[: len(data)] = data
+    connection.buffer_updated(len(data))
 
 
 LEFT = WSMessage(WSMsgType.CLOSED, None, None)
@@ -594,7 +600,7 @@ class Browser:
         self.leaves = leaves
         self.sent = 0
         for text in texts:
-            self.frames.put_nowait(WSMessage(WSMsgType.TEXT, text, ""))
+            self.frames.put_nowait(WSMessage(WSMsgType.TEXT, text.encode(), ""))
 
     def __aiter__(self) -> "Browser":
         return self
@@ -625,7 +631,13 @@ class Browser:
         opened = await link.DaemonLink.open(path, "browser")
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(link.DaemonLink, "open", AsyncMock(return_value=opened))
-            await connections.bridge(self, "192.0.2.1:1", path, None)  # type: ignore[arg-type]
+            await connections.bridge(
+                cast(connections.BrowserSocket, self),
+                "192.0.2.1:1",
+                path,
+                None,
+                connections.Turns(),
+            )
         await asyncio.gather(*read)
         opened.abort()
         await asyncio.sleep(0)
@@ -669,7 +681,7 @@ async def test_stop_of_a_browser_that_is_given_up_is_passed_on(
     async with asyncio.timeout(PATIENCE):
         await Browser(*[touch] * 1000, stop, play).bridged(path, read)
     assert len(read.result()) < 900
-    assert read.result()[-1] == stop.encode()
+    assert json.loads(read.result()[-1])["method"] == "stop"
 
 
 async def test_others_have_a_turn_after_each_frame(

@@ -92,14 +92,14 @@ def _lenient(method: _MethodT) -> _MethodT:
     signature = inspect.signature(method)
 
     @functools.wraps(method)
-    async def call(client: "AsyncClient", *args: Any, **options: Any) -> Any:
+    async def call(self: "AsyncClient", /, *args: Any, **options: Any) -> Any:
         try:
-            signature.bind(client, *args, **options)
+            signature.bind(self, *args, **options)
         except TypeError:
             known = {name: options[name] for name in options if name in signature.parameters}
-            await method(client, **known)
+            await method(self, **known)
             raise
-        return await method(client, *args, **options)
+        return await method(self, *args, **options)
 
     return cast(_MethodT, call)
 

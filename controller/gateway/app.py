@@ -358,7 +358,7 @@ def _method_that_silences(request: web.Request) -> str | None:
 def _check_media(request: web.Request) -> None:
     """Check the content type; raises web.HTTPException."""
     media = request.headers.get("Content-Type", "").partition(";")[0].strip().lower()
-    if media != "application/json" and (media or request.can_read_body):
+    if media != "application/json" and (media or request.body_exists):
         raise web.HTTPUnsupportedMediaType(text="the content type must be application/json")
 
 

@@ -250,7 +250,7 @@ class ClientConnection(asyncio.BufferedProtocol):
 
     def eof_received(self) -> bool:
         """Answer what a client requested before it closed its side; a WebSocket is closed."""
-        if self._is_upgraded or not (self._is_serving or self._turn):
+        if self._is_upgraded or not self._has_request:
             return False
         self._is_at_end = True
         self._end_body()
@@ -311,12 +311,17 @@ class ClientConnection(asyncio.BufferedProtocol):
         self._wait()
         self._transport.resume_reading()
         self._request_turn()
-        if self._is_at_end and not self._input and self._server is not None:
+        if self._is_at_end and not self._has_request and self._server is not None:
             self._server.close()  # after the response
+
+    @property
+    def _has_request(self) -> bool:
+        """Whether a request is being served, or waits for its turn."""
+        return self._is_serving or self._turn is not None
 
     def _request_turn(self) -> None:
         """Hand the next request on in its turn; one that may silence at once."""
-        if self._is_serving or self._turn is not None:
+        if self._has_request:
             return
         if not self._head:
             self._input = self._input.lstrip(b"\r\n")  # as HTTP allows before a request

@@ -317,6 +317,19 @@ def test_request_is_repeated_when_the_connection_is_lost_if_that_is_harmless(
     assert (sent.count(method) > 1) is is_repeated
 
 
+def test_stop_is_sent_before_subscriptions_are_restored(tmp_path: Path) -> None:
+    """A daemon with many clients would refuse these, and the stop with them."""
+    done = b'{"jsonrpc":"2.0","id":1,"result":{"epoch":1}}\n'
+    with (
+        responding(tmp_path / "s", HELLO, done) as received,
+        Client.connect(tmp_path / "s") as era,
+    ):
+        era.subscribe("state")
+        assert era.stop().epoch == 1
+    methods = [json.loads(line)["method"] for line in received if line]
+    assert methods == ["hello", "subscribe", "hello", "stop"]
+
+
 @in_virtual_time
 async def test_stop_is_repeated_while_no_daemon_runs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -364,6 +377,7 @@ def test_client_refuses_invalid_arguments(tmp_path: Path) -> None:
             (lambda: era.play("tap", (0.1, 0.1, 0.1)), "position "),  # type: ignore[arg-type]
             (lambda: era.subscribe("weather"), "subscribe: topics.0"),  # type: ignore[arg-type]
             (lambda: Client.connect(tmp_path / "s", name="a\nb"), r"client .*got 'a\\nb'$"),
+            (lambda: AsyncClient(tmp_path, name="", timeout=1.0), "hello: client .*got ''$"),
         ]:
             with pytest.raises(InputError, match=words):
                 call()

@@ -142,6 +142,21 @@ ATTACKS: dict[str, tuple[dict[str, Any], set[int]]] = {
     "path in capitals, no token": ({"token": [], "target": "/API/v1/arm"}, {404, 405}),
     "two slashes, no token": ({"token": [], "target": "//api/v1/arm"}, {404, 405}),
     "path with dots, no token": ({"token": [], "target": "/x/../api/v1/arm"}, {404, 405}),
+    # stops, which are carried out before anything but these is checked
+    "stop without a token": ({"target": "/api/v1/stop", "token": []}, {401}),
+    "stop with a wrong token": ({"target": "/api/v1/stop", "token": ["x" * len(TOKEN)]}, {401}),
+    "stop of a foreign origin": (
+        origin("http://evil.example") | {"target": "/api/v1/stop"},
+        {403},
+    ),
+    "stop of a foreign host": ({"target": "/api/v1/stop", "host": ["evil.example"]}, {421}),
+    "stop of a foreign page without an origin": (
+        {"target": "/api/v1/stop", "more": ["Sec-Fetch-Site: cross-site"]},
+        {403},
+    ),
+    "stop by an absolute target": ({"target": "http://evil.example/api/v1/stop"}, {400}),
+    "disarm without a token": ({"target": "/api/v1/disarm", "token": []}, {401}),
+    "preflight of a stop": (get("/api/v1/stop", "OPTIONS"), {200}),
     # files other than the page's
     "file outside": (get("/../../../../etc/passwd"), {400, 404}),
     "file outside, escaped": (get("/%2e%2e/settings.py"), {400, 404}),

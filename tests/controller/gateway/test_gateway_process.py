@@ -23,16 +23,16 @@ from typing import cast
 from unittest.mock import AsyncMock, Mock
 
 import pytest
-from aiohttp import WSMessage, WSMsgType
+from aiohttp import WSMessage, WSMsgType, web
 
 import controller
 from controller.api import link
 from controller.api.client import AsyncClient
 from controller.api.jsonrpc import RpcError
 from controller.api.link import Unreachable
-from controller.api.schema import API_VERSION, Empty
+from controller.api.schema import API_VERSION, ApiMessage, Empty
 from controller.demo.demonstration import check_page
-from controller.gateway import connections
+from controller.gateway import app, connections
 from controller.gateway.app import Gateway, listen, serve
 from controller.gateway.gateway_settings import GatewaySettings, read_token
 from gateway_attacks import ATTACKS, LIMIT, attack
@@ -487,6 +487,127 @@ def test_stops_are_passed_on_although_other_hosts_connect_often(
         asked += [sent("disarm", "127.0.0.4") for _ in range(20)]
         assert {each.recv(1 << 16)[9:12] for each in asked} == {b"200"}
         assert (daemon.methods.count("stop"), daemon.methods.count("disarm")) == (70, 20)
+
+
+@contextlib.asynccontextmanager
+async def serving(daemon: Path) -> AsyncIterator[int]:
+    """The port of a gateway in this event loop."""
+    port: asyncio.Future[int] = asyncio.get_running_loop().create_future()
+    settings = GatewaySettings(socket=daemon, token=TOKEN)
+    running = asyncio.create_task(serve(settings, announce=port.set_result))
+    try:
+        yield await port
+    finally:
+        signal.raise_signal(signal.SIGTERM)
+        await running
+
+
+def head_of(method: str, target: str, *more: str) -> bytes:
+    """A request of a client that has the token, without a body."""
+    lines = [f"{method} {target} HTTP/1.1", "Host: localhost", *more]
+    return "\r\n".join([*lines, f"Authorization: Bearer {TOKEN}", "", ""]).encode()
+
+
+async def answer(port: int, request: bytes) -> bytes:
+    """The status with which a request of a new client is answered."""
+    reader, writer = await asyncio.open_connection("127.0.0.1", port)
+    writer.write(request)
+    line = await reader.readline()
+    writer.close()
+    return line.split()[1]
+
+
+async def test_what_silences_is_passed_on_while_all_places_for_requests_are_taken(
+    daemon: ScriptedDaemon, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Other methods are refused meanwhile."""
+    monkeypatch.setattr("os.nice", lambda _: 0)
+    monkeypatch.setattr(app, "MAX_REQUESTS", 0)
+    async with serving(daemon.socket) as port:
+        daemon.calls.clear()
+        for method, status in (("status", b"503"), ("stop", b"200"), ("disarm", b"200")):
+            assert await answer(port, head_of("POST", f"/api/v1/{method}")) == status
+    assert daemon.methods == ["stop", "disarm"]
+
+
+PAGE_WITHOUT_TOKEN = b"GET /app.js HTTP/1.1\r\nHost: localhost\r\n\r\n"
+FLOODS = {
+    "pages": PAGE_WITHOUT_TOKEN,
+    "pages with the token": head_of("GET", "/app.js"),
+    "methods": head_of("POST", "/api/v1/effects"),
+    "stops without the token": PAGE_WITHOUT_TOKEN.replace(b"GET /app.js", b"POST /api/v1/stop"),
+}
+
+
+@pytest.mark.parametrize("name", FLOODS)
+async def test_stop_waits_for_few_requests_of_clients_that_do_not_read(
+    daemon: ScriptedDaemon, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    """Of 120 clients, each with sixty requests at once: some tens are begun before it is passed on.
+
+    In time of the processor that is a few milliseconds; all of them would take a second.
+    """
+    begun = 0
+    begun_before_stops: list[int] = []
+    begin = connections.ClientConnection.begin
+    send = AsyncClient.request
+
+    def count(connection: connections.ClientConnection, request: web.Request) -> None:
+        nonlocal begun
+        begun += 1
+        begin(connection, request)
+
+    async def note(client: AsyncClient, method: str, params: ApiMessage) -> object:
+        if method == "stop":
+            begun_before_stops.append(begun)
+        return await send(client, method, params)
+
+    monkeypatch.setattr("os.nice", lambda _: 0)
+    monkeypatch.setattr(connections.ClientConnection, "begin", count)
+    monkeypatch.setattr(AsyncClient, "request", note)
+    async with serving(daemon.socket) as port, contextlib.AsyncExitStack() as opened:
+        flooding = []
+        for _ in range(120):
+            _, writer = await asyncio.open_connection("127.0.0.1", port)
+            writer.transport.pause_reading()  # type: ignore[attr-defined]
+            opened.callback(writer.transport.abort)
+            flooding.append(writer)
+        assert await answer(port, head_of("POST", "/api/v1/stop")) == b"200"
+        begun = 0
+        for writer in flooding:
+            writer.write(FLOODS[name] * 60)
+        assert await answer(port, head_of("POST", "/api/v1/stop")) == b"200"
+    # A request without the token that looks like a stop is begun before that is seen, one of each.
+    assert begun_before_stops[-1] < (40 if name != "stops without the token" else 160)
+
+
+async def test_requests_that_came_at_once_are_answered_in_their_order(
+    daemon: ScriptedDaemon, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each whole: a page, a body, line feeds before a head, as HTTP allows, and a stop.
+
+    The client has closed its side, and the gateway closes after the last of them.
+    """
+    monkeypatch.setattr("os.nice", lambda _: 0)
+    body = b'{"client": "GET / HTTP/1.1\\r\\n\\r\\n"}'
+    media = "Content-Type: application/json"
+    requests = [
+        head_of("GET", "/icon.svg"),
+        head_of("POST", "/api/v1/forget", media, f"Content-Length: {len(body)}") + body,
+        b"\r\n\r\n" + head_of("GET", "/nothing"),
+        head_of("POST", "/api/v1/stop"),
+    ]
+    async with serving(daemon.socket) as port:
+        daemon.calls.clear()
+        reader, writer = await asyncio.open_connection("127.0.0.1", port)
+        writer.write(b"".join(requests))
+        writer.write_eof()
+        async with asyncio.timeout(PATIENCE / 6):
+            received = await reader.read()
+        writer.close()
+    statuses = re.findall(rb"HTTP/1.1 (\d+) ", received)
+    assert statuses == [b"200", b"422", b"404", b"200"]
+    assert daemon.methods == ["stop"]
 
 
 @pytest.fixture

@@ -31,6 +31,7 @@ from processes.gateways import (
     wait_for_daemon,
 )
 
+PROMPT = 20.0  # s; within which a request is carried out, on a busy machine
 LONG_TEXTS = {
     "DIGITS": "9" * 5000,
     "KEYS": ",".join(f'"{number}":1' for number in range(3000)),
@@ -212,7 +213,7 @@ def test_request_that_silences_is_carried_out_whatever_is_wrong_with_it(
             continue
         place.daemon.calls.clear()
         error = TRANSPORTS[transport](place, form, method)
-        wait_for(lambda: place.daemon.calls, timeout=PATIENCE / 6)
+        wait_for(lambda: place.daemon.calls, timeout=PROMPT)
         ((called, params),) = place.daemon.calls
         assert isinstance(params, RequestedBy)
         client = form.client
@@ -269,7 +270,7 @@ def test_stop_does_not_wait_for_its_body(place: Place) -> None:
     with place.gateway.connect() as connection:
         connection.sendall(f"{head}Authorization: Bearer {TOKEN}\r\n".encode())
         connection.sendall(b"Content-Length: 17\r\n\r\n{")
-        wait_for(lambda: place.daemon.methods == ["stop"])
+        wait_for(lambda: place.daemon.methods == ["stop"], timeout=PROMPT)
         connection.sendall(b'"client": "hmi"}')
         assert connection.recv(1 << 16)[9:12] == b"200"
     assert place.daemon.methods == ["stop"]
@@ -299,7 +300,7 @@ def test_frame_that_silences_is_carried_out_before_it_is_refused(
     with RawWebSocket(place.gateway) as browser:
         browser.send(frame.replace(b"METHOD", method.encode()), first=first)
         assert browser.close_code() == code
-    wait_for(lambda: place.daemon.methods == [method])
+    wait_for(lambda: place.daemon.methods == [method], timeout=PROMPT)
 
 
 @pytest.mark.parametrize(

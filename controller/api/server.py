@@ -435,7 +435,7 @@ class ApiServer:
             return
         if is_over_rate:
             call.error = _busy()
-        self._begin(client, call)
+        self._start_call(client, call)
         if len(line) >= MAX_LINE_LENGTH:
             self._end_input(client)
 
@@ -444,9 +444,9 @@ class ApiServer:
         rest = client.take_rest()
         client.is_at_end = True
         if read_silencing(rest) is not None:
-            self._begin(client, _Call(rest))
+            self._start_call(client, _Call(rest))
 
-    def _begin(self, client: Connection, call: _Call) -> None:
+    def _start_call(self, client: Connection, call: _Call) -> None:
         """Carry out a call, or start to; respond if it has ended."""
         try:
             call.record = self._requested(client.name, call.method, client.received_at)

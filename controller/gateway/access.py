@@ -70,8 +70,8 @@ class Access:
         if "Origin" in headers and origin.lower() not in allowed_origins:
             raise web.HTTPForbidden(text="this Origin is not allowed; see --allow-origin")
         is_link = headers.get("Sec-Fetch-Mode") == "navigate"  # which the user followed
-        is_cross_site = headers.get("Sec-Fetch-Site") == "cross-site"
-        if is_cross_site and not origin and not is_link:
+        is_from_elsewhere = headers.get("Sec-Fetch-Site") == "cross-site"
+        if is_from_elsewhere and not origin and not is_link:
             raise web.HTTPForbidden(text="cross-site requests are not allowed")
         if self._needs_token(request) and not self._has_token(request):
             text = "the token is missing or wrong; open the URL that the gateway printed"

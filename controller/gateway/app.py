@@ -207,7 +207,7 @@ class Gateway:
     async def _answer(self, request: web.Request, handler: Handler) -> web.StreamResponse:
         """Check a request and answer it. Its client may have left: its stop is carried out."""
         connection = CONNECTION.get()
-        connection.begin(request)
+        connection.start_request(request)
         try:
             method = _method_that_silences(request)
             if method is not None and self._access.allows(request):

@@ -42,17 +42,17 @@ class Turns:
     def take(self) -> "asyncio.Future[None]":
         """A turn; to be cancelled if its connection is lost."""
         loop = asyncio.get_running_loop()
-        turn = loop.create_future()
-        self._waiting.append(turn)
+        permit = loop.create_future()
+        self._waiting.append(permit)
         if len(self._waiting) == 1:
             loop.call_soon(self._admit_next)
-        return turn
+        return permit
 
     def _admit_next(self) -> None:
         while self._waiting:
-            turn = self._waiting.popleft()
-            if not turn.done():
-                turn.set_result(None)
+            permit = self._waiting.popleft()
+            if not permit.done():
+                permit.set_result(None)
                 break
         if self._waiting:
             asyncio.get_running_loop().call_soon(self._admit_next)
@@ -212,7 +212,7 @@ class ClientConnection(asyncio.BufferedProtocol):
         self._head = b""  # end of an incomplete head that was handed on
         self._body_left = 0  # bytes of the present request's body that have not come
         self._body: StreamReader | None = None  # of the present request
-        self._turn: asyncio.Future[None] | None = None  # that a request waits for
+        self._permit: asyncio.Future[None] | None = None  # that a request waits for
         self._is_urgent = False  # whether the next request may silence
         self._is_serving = False  # from the end of a request's head to its response
         self._has_requested = False  # whether a request was admitted
@@ -259,8 +259,8 @@ class ClientConnection(asyncio.BufferedProtocol):
     def connection_lost(self, error: Exception | None) -> None:
         """Close the client of the daemon, once it has carried out what it was sent."""
         self._stop_waiting()
-        if self._turn is not None:
-            self._turn.cancel()
+        if self._permit is not None:
+            self._permit.cancel()
         if self._server is not None:
             # Later, as aiohttp fails where a request was handed on that it has not begun.
             asyncio.get_running_loop().call_soon(self._server.connection_lost, error)
@@ -279,7 +279,7 @@ class ClientConnection(asyncio.BufferedProtocol):
 
     # Called as a request is served:
 
-    def begin(self, request: web.Request) -> None:
+    def start_request(self, request: web.Request) -> None:
         """Begin to serve a request, of whose body the rest is handed on as it comes."""
         self._body = request.content
         self._body_left = request.content_length or 0
@@ -289,9 +289,9 @@ class ClientConnection(asyncio.BufferedProtocol):
 
     async def wait_for_turn(self) -> None:
         """Wait for a turn of the present request, which was handed on without one."""
-        self._turn = self._shared.turns.take()
-        await self._turn
-        self._turn = None
+        self._permit = self._shared.turns.take()
+        await self._permit
+        self._permit = None
 
     def admit(self) -> None:
         """Let the present request take as much time as it needs."""
@@ -317,7 +317,7 @@ class ClientConnection(asyncio.BufferedProtocol):
     @property
     def _has_request(self) -> bool:
         """Whether a request is being served, or waits for its turn."""
-        return self._is_serving or self._turn is not None
+        return self._is_serving or self._permit is not None
 
     def _request_turn(self) -> None:
         """Hand the next request on in its turn; one that may silence at once."""
@@ -329,12 +329,12 @@ class ClientConnection(asyncio.BufferedProtocol):
         if self._input and self._is_urgent:
             self._hand_on_head()
         elif self._input:
-            self._turn = self._shared.turns.take()
-            self._turn.add_done_callback(self._take_turn)
+            self._permit = self._shared.turns.take()
+            self._permit.add_done_callback(self._take_turn)
 
-    def _take_turn(self, turn: "asyncio.Future[None]") -> None:
-        self._turn = None
-        if not turn.cancelled():
+    def _take_turn(self, permit: "asyncio.Future[None]") -> None:
+        self._permit = None
+        if not permit.cancelled():
             self._hand_on_head()
 
     def _hand_on_head(self) -> None:

@@ -3,6 +3,7 @@
 The reasons are in docs/how-to/play-content.md.
 """
 
+from array import array
 from bisect import bisect_left
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -89,7 +90,7 @@ class Rendition:
             texture = np.fft.irfft(spectrum * (away <= _TEXTURE), len(shares))
         shares = averaged(shares - texture, times[1], SMOOTHING) + texture
         shares *= rise(times, SMOOTHING) * rise(times[-1] - times, SMOOTHING)
-        course = Course(self.course.times, tuple(np.clip(shares, 0, 1).tolist()))
+        course = Course(self.course.times, array("d", np.clip(shares, 0, 1)))
         return replace(among, course=course)
 
 
@@ -138,7 +139,7 @@ def rendered(pattern: Pattern, level_db_sl: float, frequencies: FloatArray) -> R
     course, band, modulation = None, _band(MIN_HZ, frequencies), None
     sharpness_kept = 1.0
     if highest := float(shares.max()):
-        course = Course(tuple(times.tolist()), tuple((shares / highest).tolist()))
+        course = Course(array("d", times), array("d", shares / highest))
         of_taps = tuple((each.time, each.sharpness) for each in pattern.transients)
         hertz = hertz_of(along(pattern.sharpness or of_taps, times))
         band = _band(_carrier(hertz, shares**2), frequencies)

@@ -12,14 +12,15 @@ heartbeats would wait for it.
 
 import asyncio
 import contextlib
-import io
 import logging
 import os
 import pickle
 import secrets
 import subprocess
 import sys
+import threading
 from pathlib import Path
+from typing import IO, cast
 
 from controller.daemon.config import DaemonConfig, load_daemon_config
 from controller.process.child import child_command, ended
@@ -84,42 +85,60 @@ _TIMEOUT = 60.0  # s; a plug-in or a file on a lost network folder may hang
 _NICE = 10  # above that of the daemon, whose loop comes first
 
 
-class _Pieces(io.BytesIO):
-    """Bytes that take a call for each 64 KiB: in it other threads get the interpreter's lock."""
-
-    def read(self, size: int | None = -1, /) -> bytes:
-        return super().read(size)
-
-
 def read_in_child(file: Path, frequencies: FloatArray) -> DaemonConfig:
     """Read a configuration in a child process, for the frequencies of a table [Hz]; blocks.
 
-    Raises InputError with all problems, of which a plug-in that was installed or changed after
-    this process started is one, and OSError if the child cannot be started or fails.
+    Raises InputError with all problems, also for a plug-in that was installed or changed after this
+    process started, and OSError if the child cannot be started or fails.
     """
-    try:
-        done = subprocess.run(  # noqa: S603  our own module
-            child_command("controller.daemon.children", str(file)),
-            input=pickle.dumps(frequencies),
-            stdout=subprocess.PIPE,
-            start_new_session=True,  # Ctrl-C is handled by the daemon
-            timeout=_TIMEOUT,
-            check=False,
-        )
-    except subprocess.TimeoutExpired as error:
-        raise TimeoutError(f"reading {file} took longer than {_TIMEOUT:g} s") from error
-    if done.returncode != 0:
-        raise OSError(f"reading {file} failed with status {done.returncode}")
-    try:
-        read = pickle.load(_Pieces(done.stdout))  # noqa: S301  of our own process
-    except (ImportError, AttributeError, TypeError) as error:
-        raise InputError(
-            f"{file} uses a plug-in that was installed or changed after the daemon started "
-            f"({error}); restart the daemon"
-        ) from error
-    if isinstance(read, DaemonConfig):
-        return read
-    raise InputError(str(read))
+    expired = threading.Event()
+
+    def expire() -> None:
+        expired.set()
+        process.kill()
+
+    config: object = None
+    with subprocess.Popen(  # noqa: S603  our own module
+        child_command("controller.daemon.children", str(file)),
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        start_new_session=True,  # Ctrl-C is handled by the daemon
+    ) as process:
+        timer = threading.Timer(_TIMEOUT, expire)
+        timer.start()
+        try:
+            config = _exchanged(process, frequencies)
+        except (EOFError, OSError, pickle.UnpicklingError) as error:
+            _logger.debug("config: child ended early: %s", error)
+        except (ImportError, AttributeError, TypeError) as error:
+            process.kill()  # it would wait for the rest to be read
+            raise InputError(
+                f"{file} uses a plug-in that was installed or changed after the daemon started "
+                f"({error}); restart the daemon"
+            ) from error
+        finally:
+            status = process.wait()
+            timer.cancel()
+    if expired.is_set():
+        raise TimeoutError(f"reading {file} took longer than {_TIMEOUT:g} s")
+    if status != 0:
+        raise OSError(f"reading {file} failed with status {status}")
+    if isinstance(config, DaemonConfig):
+        return config
+    raise InputError(str(config))
+
+
+def _exchanged(process: "subprocess.Popen[bytes]", frequencies: FloatArray) -> object:
+    """Send the frequencies to the child, and return the object that it sends back.
+
+    The object is loaded as it arrives, and each read of the pipe lets other threads run. Joining
+    the bytes of many files first, hundreds of megabytes, would hold the interpreter for too long.
+    """
+    stdin = cast(IO[bytes], process.stdin)
+    with stdin:
+        pickle.dump(frequencies, stdin)
+    config: object = pickle.load(cast(IO[bytes], process.stdout))  # noqa: S301  of our own process
+    return config
 
 
 def _main() -> None:

@@ -14,7 +14,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
-from functools import partial
+from dataclasses import replace
 from pathlib import Path
 
 from controller.api.methods import ReloadResult
@@ -23,8 +23,9 @@ from controller.api.server import ApiServer
 from controller.daemon.children import gateway_options, keep_gateway
 from controller.daemon.config import DaemonConfig, load_daemon_config, loopback_address
 from controller.daemon.handlers import ApiService
-from controller.daemon.layouts import LayoutChoice, TouchInputs, read_again
+from controller.daemon.layouts import ConfigChange, LayoutChoice, TouchInputs, read_again, release
 from controller.daemon.messages import EventPublisher, amplifier_statuses
+from controller.effects.effect import Effect
 from controller.gateway.gateway_settings import require_gateway
 from controller.learning.learning import Learning
 from controller.operation.fault_dumps import FaultDumps
@@ -81,8 +82,9 @@ class Daemon:
         lines: Callable[[Lines | None], Lines] = Lines,
         watchdog: float = WATCHDOG,
     ) -> None:
-        self._config = config = config.for_table(table.frequencies)
+        self._config = config.for_table(table.frequencies)
         self._frequencies = table.frequencies
+        self._released: list[Effect] = []  # of replaced layouts, not freed yet
         self._log = log
         self._manager = manager
         self._dashboard = dashboard
@@ -104,7 +106,9 @@ class Daemon:
         )
         self.started = self._supervisor.started
         """Set once it serves, and its amplifiers are open or searched for."""
-        self._layouts = LayoutChoice(config, table.frequencies, changed=self._layout_changed)
+        self._layouts = LayoutChoice(self._config, table.frequencies, changed=self._layout_changed)
+        # All others get no layouts, so that these can be freed once they are replaced.
+        config = replace(config, layouts={})
         self._publisher = EventPublisher(
             operation=lambda: self._supervisor.operation,
             amplifiers=lambda: amplifier_statuses(
@@ -249,23 +253,34 @@ class Daemon:
     async def _reload_now(self) -> ReloadResult:
         is_done = False
         try:
-            read = partial(read_again, self._config, self._frequencies)
-            change = await in_thread(read, name="reload")
+            change = await self._read_again()
             is_armed = self._supervisor.operation.state in ENERGISED
-            if reasons := change.refusals(is_armed=is_armed):
-                reasons += [f"{each}, but not applied" for each in change.changes]
-                unused = [change.config]
+            reasons = change.refusals(is_armed=is_armed)
+            if reasons:
+                reasons += [f"{text}, but not applied" for text in change.changes]
             else:
                 reasons = [*change.changes, *self._layouts.apply(change)] or ["nothing has changed"]
-                unused, self._config, is_done = [self._config], change.config, True
+                self._config = change.config
+                is_done = True
+            self._released = change.effects
             del change
-            await in_thread(unused.clear, name="reload")  # to free many objects takes as long
+            await release(self._released)
         except (InputError, OSError) as error:
             reasons = [line.strip() for line in str(error).splitlines()]
         except Exception as error:  # systemd and clients wait for the end of the reload
             _logger.exception("config: reload failed")
             reasons = [f"a bug in the daemon ({type(error).__name__}); its log has the details"]
         return ReloadResult(reloaded=is_done, reasons=reasons)
+
+    async def _read_again(self) -> ConfigChange:
+        """Read the configuration again in a thread, which keeps no reference to either one."""
+        changes: list[ConfigChange] = []
+
+        def read() -> None:
+            changes.append(read_again(self._config, self._frequencies))
+
+        await in_thread(read, name="reload")
+        return changes.pop()
 
     def _layout_changed(self) -> None:
         self._publisher.hub.publish("layout", self._layouts.event)

@@ -17,6 +17,7 @@ from controller.api.methods import InputsEvent, LayoutEvent
 from controller.api.schema import TouchInputStatus
 from controller.daemon.children import read_in_child
 from controller.daemon.config import DaemonConfig, TouchInput
+from controller.effects.effect import Effect
 from controller.effects.layout import SurfaceLayout
 from controller.effects.player import EffectPlayer
 from controller.effects.strengths import Strengths, read_strengths
@@ -46,6 +47,8 @@ class ConfigChange:
     old_max_db_sl: float
     max_db_sl: float
     """Highest level of all layouts, before and after [dB SL]."""
+    effects: list[Effect]
+    """All effects of both configurations, in use or not; see `release`."""
 
     def refusals(self, *, is_armed: bool) -> list[str]:
         """Return the reasons why the configuration must not be applied; empty if it may be."""
@@ -96,9 +99,31 @@ def config_change(old: DaemonConfig, new: DaemonConfig) -> ConfigChange:
     if before["level_db_sl"] != after["level_db_sl"]:
         changes.append(f"level_db_sl: from {before['level_db_sl']:g} to {after['level_db_sl']:g}")
     kept = {name: now[name] if name in differ else was[name] for name in now}
-    highest = [max(each.max_db_sl for each in layouts.values()) for layouts in (was, now)]
-    new = replace(new, layouts=kept)
-    return ConfigChange(new, restart, changes, frozenset(differ), *highest)
+    return ConfigChange(
+        config=replace(new, layouts=kept),
+        restart=restart,
+        changes=changes,
+        layouts=frozenset(differ),
+        old_max_db_sl=max([layout.max_db_sl for layout in was.values()]),
+        max_db_sl=max([layout.max_db_sl for layout in now.values()]),
+        effects=[*_effects_of(old), *_effects_of(new)],
+    )
+
+
+def _effects_of(config: DaemonConfig) -> list[Effect]:
+    """Return the effects of all layouts."""
+    return [effect for layout in config.layouts.values() for effect in layout.effects.values()]
+
+
+async def release(effects: list[Effect]) -> None:
+    """Free the effects of replaced layouts, one in each turn of the event loop.
+
+    The caller has no other reference to these layouts. The interpreter is held while an object is
+    freed with all that it refers to, so layouts of many files must not be freed as a whole.
+    """
+    while effects:
+        effects.pop()
+        await asyncio.sleep(0)
 
 
 class LayoutChoice:

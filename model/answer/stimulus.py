@@ -331,9 +331,9 @@ SILENCE = 1e-6
 class Course:
     """Shares of the highest amplitude of a stimulus over its duration."""
 
-    times: tuple[float, ...]
+    times: Sequence[float]
     """Times [s], ascending from 0 to the duration."""
-    shares: tuple[float, ...]
+    shares: Sequence[float]
     """Share at each time, 0 to 1; linear in between."""
 
     def __post_init__(self) -> None:

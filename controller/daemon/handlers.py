@@ -103,7 +103,6 @@ class ApiService:
         self._started = threads.now()
         self._clients = set[Connection]()  # that are connected and have said or done something
         self._strengths = layouts.player.strengths
-        self._strengths.clients = lambda: [(_origin(each), each.name) for each in self._clients]
         self._saving: asyncio.Task[None] | None = None
         self._save_problem = ""  # of the last attempt
         self._preparing = asyncio.Lock()  # of what is played, for which clients wait
@@ -118,6 +117,12 @@ class ApiService:
         if client.number is not None:
             self._controller.cycle.lift(f"{_origin(client)}:")
         self._clients.discard(client)
+        self._clients_changed()
+
+    def _clients_changed(self) -> None:
+        """Pass the names of all clients on to the strengths, which the control loop reads."""
+        names = [(_origin(client), client.name) for client in self._clients]
+        self._strengths.clients = tuple(names)
 
     def holds_lease(self, client: Connection) -> bool:
         """Whether a client armed or renewed the current lease: it is never evicted."""
@@ -129,6 +134,7 @@ class ApiService:
         """Introduce the client; returns what the daemon drives."""
         client.name = params.client
         self._clients.add(client)
+        self._clients_changed()
         if self._strengths.gains_db:  # its fingers may rest
             self._controller.cycle.request_update()
         return hello_result(
@@ -284,6 +290,7 @@ class ApiService:
         if client.number is None:
             client.number = next(self._next_number)
             self._clients.add(client)
+            self._clients_changed()
         plate, origin = self._config.rig.plate, _origin(client)
         touches = tuple(
             Touch(

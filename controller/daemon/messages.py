@@ -202,7 +202,7 @@ class EventPublisher:
     def strengths(self) -> StrengthResult:
         """Return the strengths of all known touch sources, clients and regions."""
         known, inputs = self._player.strengths, [each.name for each in self.inputs().inputs]
-        clients = [name for _, name in known.clients() if not UNNAMED.fullmatch(name)]
+        clients = [name for _, name in known.clients if not UNNAMED.fullmatch(name)]
         regions = [each.name for each in self._player.layout.regions]
         names = sorted({*inputs, *known.sources, *clients, *regions})
         return StrengthResult(strengths={**dict.fromkeys(names, 0.0), **known.gains_db})

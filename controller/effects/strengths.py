@@ -6,7 +6,7 @@ The types of names and gains bound them, over the API as in the file that keeps 
 import json
 import os
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, TypeAlias
 
@@ -45,8 +45,11 @@ class Strengths:
     def __init__(self, gains_db: Mapping[str, float] | None = None) -> None:
         self.gains_db = gains_db or {}
         """Gains that were set, by name; also to 0."""
-        self.clients: Callable[[], Sequence[tuple[str, str]]] = tuple
-        """Returns, for each client, the beginning of the keys of its sources, and its name."""
+        self.clients: Sequence[tuple[str, str]] = ()
+        """For each client, the prefix of its sources' keys, and its name.
+
+        The API sets this value whenever it changes, so the control loop calls no code of the API.
+        """
         self.sources: Sequence[str] = ()
         """Names of touch sources that had fingers."""
 
@@ -86,7 +89,7 @@ class Strengths:
     def _names_of(self, source: str) -> tuple[str, str]:
         """Return the two names of a source, its own first."""
         first, second, *rest = f"{source}::".split(":", 2)
-        client = dict(self.clients()).get(f"{first}:{second}")
+        client = dict(self.clients).get(f"{first}:{second}")
         return (source, first) if client is None else (rest[0][:-2], client)
 
 

@@ -396,7 +396,9 @@ FILES, LAYOUTS = 50, 6  # effects of files in a layout, and layouts
 
 def write_layouts_of_files(folder: Path, *, level: int) -> None:
     """Layouts of many files, all at one level [dB SL]."""
-    effects = [f"  f{number}: {{kind: file, file: tick, level: {level}}}" for number in range(FILES)]
+    effects = [
+        f"  f{number}: {{kind: file, file: tick, level: {level}}}" for number in range(FILES)
+    ]
     text = "\n".join(["effects:", *effects, "elsewhere: null", ""])
     for number in range(LAYOUTS):
         (folder / f"layout{number}.yaml").write_text(text, encoding="utf-8")

@@ -30,9 +30,11 @@ from controller.api.client import AsyncClient
 from controller.api.jsonrpc import ErrorCode, RpcError
 from controller.api.link import Notification
 from controller.api.methods import ArmParams, StatusResult, TouchParams
+from controller.api.server import Connection
 from controller.cli.status_text import show_status
 from controller.demo.demonstration import layout_of_people
 from controller.operation.operation_states import ENERGISED, Operation
+from controller.sources.touch import Touch, TouchFrame
 from drivers.protocol.definition import QUANTITIES
 from kit.clock import in_virtual_time
 from kit.courses import Planted, Step, Taken, courses, follow
@@ -430,6 +432,42 @@ def envelope(bench: DaemonBench, finger: str, frequency: float, at: FloatArray) 
     turned = np.exp(-2j * np.pi * frequency * felt.times) * (felt.accelerations @ felt.weights)
     weights = np.cos(np.pi * np.clip((felt.times - at[:, None]) / WINDOW, -0.5, 0.5)) ** 2
     return np.asarray(np.abs(weights @ turned) / weights.sum(axis=1))
+
+
+@in_virtual_time
+async def test_plate_plays_on_when_the_name_of_a_client_cannot_be_read(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The control loop reads strengths that the API has set, and calls no code of the API."""
+
+    def fail(client: Connection) -> str:
+        raise AssertionError("name of a client read in the control loop")
+
+    async with served(seats=True) as daemon:
+        era, controller = daemon.era, daemon.bench.daemon._controller
+
+        async def hold(*places: str) -> None:
+            """Hold fingers of a touch source of the daemon for 0.4 s."""
+            plate = daemon.bench.daemon._config.rig.plate
+            touches = []
+            for number, place in enumerate(places):
+                x, y = PLACES[place]
+                touches.append(Touch(number, x / plate.length, 1 - y / plate.width))
+            for _ in range(20):
+                controller.cycle.deliver(TouchFrame("panel", threads.now(), tuple(touches)))
+                await asyncio.sleep(0.02)
+
+        await era.arm("test", lease_s=60)
+        await hold("left")
+        await era.strength(name="left", gain_db=-6)
+        await hold("left")
+        alone = [contact.level_db_sl for contact in (await era.status()).contacts]
+        with monkeypatch.context() as broken:
+            broken.setattr(Connection, "name", property(fail), raising=False)
+            await hold("left", "right")
+        both = [contact.level_db_sl for contact in (await era.status()).contacts]
+        assert alone == pytest.approx([14.0], abs=0.2)
+        assert both == pytest.approx([14.0, 20.0], abs=0.2)
 
 
 @in_virtual_time

@@ -1,9 +1,9 @@
 """Ports: serial devices of this machine and TCP connections that carry the bytes of a line.
 
-The event loop reads each device that it can watch; a thread reads any other. A serial port never
-blocks the loop: bytes that it does not take at once are sent as soon as it does, unless a newer
-frame replaces them, because late bytes must not delay a stop. `PORT_OPENER` replaces serial ports,
-for example by a simulation in virtual time.
+The event loop reads each device that it can watch; a thread reads any other, and threads make all
+calls that may block. A serial port never blocks the loop: bytes that it does not take immediately
+are sent as soon as it does, unless a newer frame replaces them, because late bytes must not delay a
+stop. `PORT_OPENER` replaces serial ports, for example by a simulation in virtual time.
 """
 
 import asyncio
@@ -96,12 +96,20 @@ class DevicePort(ABC):
         self.closing = threading.Event()
         self.descriptor = descriptor
         self._on_data, self._on_loss, self._shut = on_data, on_loss, shut
-        self._thread: threading.Thread | None = None
+        self._threads: list[threading.Thread] = []
         if descriptor is not None:
             self.loop.add_reader(descriptor, self.poll)
-            return
-        self._thread = threading.Thread(target=self._run, name=f"era-read {name}", daemon=True)
-        self._thread.start()
+        else:
+            self.start_thread(self._read, name=f"era-read {name}")
+
+    def start_thread(self, work: Callable[[], None], *, name: str) -> None:
+        """Start a thread for calls that may block; it ends once `closing` is set.
+
+        An exception in it is a loss of the device.
+        """
+        thread = threading.Thread(target=self._run, args=(work,), name=name, daemon=True)
+        self._threads.append(thread)
+        thread.start()
 
     @abstractmethod
     def read_watched(self) -> bytes:
@@ -154,21 +162,25 @@ class DevicePort(ABC):
         await close_in_thread(self._close_device, name=f"era-close {self.name}")
 
     def _close_device(self) -> None:
-        if self._thread is not None:
-            self._thread.join()
+        for thread in self._threads:
+            thread.join()
         with contextlib.suppress(*self.failures):
             self._shut()
 
-    def _run(self) -> None:
-        """Read until the port is closed or lost; this is the reader thread."""
-        post = self.loop.call_soon_threadsafe
+    def _run(self, work: Callable[[], None]) -> None:
+        """Do the work of a thread, and report its failure as a loss."""
         with contextlib.suppress(RuntimeError):  # a closed loop raises it
             try:
-                while not self.closing.is_set():
-                    if data := self.read_waiting():
-                        post(self.received, data)
-            except Exception as error:  # whatever has failed, nothing more is read
-                post(self.lose, error)
+                work()
+            except Exception as error:  # after any failure the device is of no use
+                self.loop.call_soon_threadsafe(self.lose, error)
+
+    def _read(self) -> None:
+        """Read until the port is closed or lost; this is the reader thread."""
+        while not self.closing.is_set():
+            data = self.read_waiting()
+            if data:
+                self.loop.call_soon_threadsafe(self.received, data)
 
 
 NETWORK_DELAY = 1.0

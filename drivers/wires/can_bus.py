@@ -17,9 +17,10 @@ import logging
 import math
 import random
 import re
+import threading
 import time
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any, final
 
 import can
@@ -213,6 +214,9 @@ class CanWire(Wire):
 _WATCHED = ("socketcan", "udp_multicast")
 """Interfaces whose file descriptor the event loop watches: `recv` of the others may block."""
 
+_SENDS_AT_ONCE = ("socketcan",)
+"""Interfaces whose `send` never blocks without a timeout."""
+
 _READ_TIMEOUT = 0.05  # s; interval in which a reader thread notices its end
 _READS = 64  # frames at once, so that a flood does not keep the event loop
 _BUS_OFF = 0x40  # error class of SocketCAN
@@ -245,16 +249,71 @@ async def open_bus(
             f"CAN bus {name} cannot be opened: {remedy} (the system says: "
             f"{system_message(problem)})"
         ) from problem
-    return BusPort(opened, bus["interface"] in _WATCHED, name, on_data, on_loss)
+    interface = bus["interface"]
+    return BusPort(
+        opened,
+        name,
+        on_data,
+        on_loss,
+        is_watched=interface in _WATCHED,
+        sends_at_once=interface in _SENDS_AT_ONCE,
+    )
+
+
+class Outbox:
+    """Frames that an adapter has not taken yet; times [s] are arguments.
+
+    Newer frames replace older ones, whose request was given up. Broadcasts, which have no reply to
+    wait for, stay for as long as a request would. Frames that make no progress for 30 ms are
+    dropped as too old.
+    """
+
+    def __init__(self) -> None:
+        self._frames: deque[tuple[CanFrame, float]] = deque()  # with the expiry [s] of a broadcast
+        self._given_up_at = 0.0
+
+    def __len__(self) -> int:
+        """Return the number of frames."""
+        return len(self._frames)
+
+    def put(self, frames: Iterable[CanFrame], now: float) -> None:
+        """Add the frames of a request in place of all others but broadcasts."""
+        self._given_up_at = now + _FULL_TIMEOUT
+        broadcasts = [entry for entry in self._frames if entry[0].id == REQUEST]
+        added = [(frame, self._given_up_at) for frame in frames]
+        self._frames = deque([*broadcasts, *added])
+
+    def first(self, now: float) -> CanFrame | None:
+        """Return the next frame to send, without frames that are too old; None without any."""
+        if now > self._given_up_at:
+            self._frames.clear()
+        while self._frames:
+            frame, expires_at = self._frames[0]
+            if frame.id != REQUEST or now <= expires_at:
+                return frame
+            self._frames.popleft()
+        return None
+
+    def taken(self, frame: CanFrame, now: float) -> None:
+        """Note that the adapter has taken a frame, unless a newer request has replaced it."""
+        if self._frames and self._frames[0][0] is frame:
+            self._frames.popleft()
+            if now <= self._given_up_at:
+                self._given_up_at = now + _FULL_TIMEOUT
+
+    def clear(self) -> None:
+        """Drop all frames."""
+        self._frames.clear()
 
 
 @final
 class BusPort(DevicePort):
-    """A bus of python-can, read by the event loop where it is watched, or by a thread.
+    """A bus of python-can; implements `Port`.
 
-    on_data: called with packed frames. Implements `Port`. Of frames that the adapter has not taken
-    yet newer ones replace the older, whose request was given up; broadcasts, which have no
-    reply to wait for, stay for as long as a request would.
+    is_watched: whether the event loop watches the bus for frames, otherwise a thread reads it;
+    sends_at_once: whether `send` of the interface never blocks, otherwise a thread calls it, so
+    that an adapter that hangs delays neither a stop on another line nor a heartbeat. on_data:
+    called with packed frames.
     """
 
     kind = "CAN bus"
@@ -263,29 +322,37 @@ class BusPort(DevicePort):
     def __init__(
         self,
         bus: can.BusABC,
-        is_watched: bool,
         name: str,
         on_data: Callable[[bytes], None],
         on_loss: Callable[[str], None],
+        *,
+        is_watched: bool,
+        sends_at_once: bool,
     ) -> None:
         self._bus = bus
-        self._unsent: list[tuple[CanFrame, float]] = []  # until when [s] a broadcast may be sent
-        self._given_up_at = 0.0
-        self._is_full = False
+        self._outbox = Outbox()
+        self._outbox_changed = threading.Condition()  # its lock guards the outbox
+        self._sends_at_once = sends_at_once
+        self._is_blocked = False
         self._timer: asyncio.TimerHandle | None = None
         super().__init__(name, bus.fileno() if is_watched else None, on_data, on_loss, bus.shutdown)
+        if not sends_at_once:
+            self.start_thread(self._send_in_thread, name=f"era-send {name}")
 
     @property
     def is_blocked(self) -> bool:
-        """Whether the adapter has not taken all frames yet."""
-        return self._is_full
+        """Whether the adapter has not taken the frame that was given to it last."""
+        return self._is_blocked
 
     def write(self, data: bytes) -> None:
         """Send frames, as soon as the adapter takes them; raises LinkError."""
-        kept = [each for each in self._unsent if each[0].id == REQUEST]
-        self._given_up_at = until = self.loop.time() + _FULL_TIMEOUT
-        self._unsent = [*kept, *[(frame, until) for frame in unpack_frames(data)]]
-        self._send()
+        if self.closing.is_set():
+            raise self.lose(OSError("it is closed"))
+        with self._outbox_changed:
+            self._outbox.put(unpack_frames(data), self.loop.time())
+            self._outbox_changed.notify()
+        if self._sends_at_once:
+            self._send()
 
     def read_watched(self) -> bytes:
         """Return the frames that have come."""
@@ -308,29 +375,47 @@ class BusPort(DevicePort):
 
     def close(self) -> None:
         """Stop reading and writing; `wait_closed` closes the bus."""
-        self._unsent.clear()
-        super().close()
+        with self._outbox_changed:
+            self._outbox.clear()
+            super().close()
+            self._outbox_changed.notify()
 
     def _send(self) -> None:
         """Send frames until the adapter takes no more, then again after a pause."""
-        now = self.loop.time()
-        self._unsent = [each for each in self._unsent if each[0].id != REQUEST or now <= each[1]]
         try:
-            while self._unsent:
-                self._is_full = not self._take(self._unsent[0][0])
-                if self._is_full:
-                    break
-                del self._unsent[0]
-                self._given_up_at = self.loop.time() + _FULL_TIMEOUT
+            while (frame := self._outbox.first(self.loop.time())) and self._take(frame):
+                self._outbox.taken(frame, self.loop.time())
         except self.failures as error:
             raise self.lose(error) from error
-        if self.loop.time() > self._given_up_at:
-            self._unsent.clear()
-        if self._unsent and self._timer is None:
+        if self._outbox and self._timer is None:
             self._timer = self.loop.call_later(_FULL_PAUSE, self._send_again)
 
+    def _send_again(self) -> None:
+        self._timer = None
+        if not self.closing.is_set():
+            with contextlib.suppress(LinkError):  # reported as a loss
+                self._send()
+
+    def _send_in_thread(self) -> None:
+        """Send frames as they come, each as soon as the adapter has taken the last one."""
+        while True:
+            with self._outbox_changed:
+                frame = self._outbox.first(self.loop.time())
+                while frame is None and not self.closing.is_set():
+                    self._outbox_changed.wait()
+                    frame = self._outbox.first(self.loop.time())
+                if frame is None or self.closing.is_set():
+                    return
+            is_taken = self._take(frame)  # without the lock: it may block
+            with self._outbox_changed:
+                if is_taken:
+                    self._outbox.taken(frame, self.loop.time())
+                else:
+                    self._outbox_changed.wait(_FULL_PAUSE)
+
     def _take(self, frame: CanFrame) -> bool:
-        """Send a frame; returns whether the adapter has taken it."""
+        """Give a frame to the adapter; returns whether it has taken it."""
+        self._is_blocked = True
         message = can.Message(
             arbitration_id=frame.id,
             is_extended_id=False,
@@ -343,13 +428,8 @@ class BusPort(DevicePort):
             if error.error_code == errno.ENOBUFS or _FULL in str(error):
                 return False
             raise
+        self._is_blocked = False
         return True
-
-    def _send_again(self) -> None:
-        self._timer = None
-        if not self.closing.is_set():
-            with contextlib.suppress(LinkError):  # reported as a loss
-                self._send()
 
 
 def _frames(message: can.Message) -> list[CanFrame]:

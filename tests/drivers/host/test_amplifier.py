@@ -41,7 +41,7 @@ from drivers.wires.serial_frames import REPLY_BIT, FrameReader, encode_frame
 from drivers.wires.serial_line import SerialWire
 from drivers.wires.wire import Reply
 from kit.clock import KINDS, MemoryLine, in_virtual_time
-from kit.wires import WORD_WIRES
+from kit.wires import WORD_WIRES, hanging_interface, until
 from registry.limits import GuardLimits
 from sim.amplifier.readings import capabilities
 from sim.amplifier.simulated_amplifier import SimulatedAmplifier
@@ -331,6 +331,43 @@ async def test_group_plays_over_a_wire_and_stops(
         with pytest.raises(LinkTimeout):
             await nobody.read_status()
         await group.amplifiers["1"].read_status()
+
+
+@pytest.mark.real_time
+async def test_stop_of_another_line_is_sent_while_a_can_adapter_hangs(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The other amplifier replies and falls silent during the call that hangs.
+
+    Once the call returns, the amplifier behind the adapter is stopped, too.
+    """
+    monkeypatch.setattr("drivers.host.amplifier.COMMIT_DELAY", 10.0)
+    async with (
+        WORD_WIRES["can+python-can virtual"](1) as behind_adapter,
+        WORD_WIRES["serial"](1) as other,
+        opened_lines() as lines,
+    ):
+        with hanging_interface() as adapter:
+            url = behind_adapter.url(1).replace("virtual", "hanging")
+            amplifiers = {
+                "adapter": await lines.amplifier(url, LIMITS, name="adapter"),
+                "other": await lines.amplifier(other.url(1), LIMITS, name="other"),
+            }
+            group = Group(amplifiers, watchdog=2.0)
+            await group.open()
+            await group.arm()
+            layers = [AmplifierLayer(0, (AmplifierTone(0, 100.0, 0.5),), 0.0)]
+            await group.apply(dict.fromkeys(amplifiers, layers))
+            await until(lambda: behind_adapter.level(1) == pytest.approx(0.5))
+            adapter.hangs = True
+            stopping = asyncio.create_task(group.stop())
+            await until(lambda: other.level(1) == 0.0)
+            await amplifiers["other"].read_status()
+            assert adapter.sending == 1
+            adapter.resume()
+            stopped = await stopping
+            assert stopped["other"].is_confirmed
+            await until(lambda: behind_adapter.level(1) == 0.0)
 
 
 @pytest.mark.real_time

@@ -286,7 +286,7 @@ async def group_behind_python_can(sent: bytearray) -> AsyncIterator[Group]:
         loop.call_soon(far_end.receive, frames, loop.time())
 
     bus = Mock(send=send, recv=lambda timeout: None, fileno=lambda: read_end)
-    port = BusPort(bus, True, "can0", line.received, pytest.fail)
+    port = BusPort(bus, "can0", line.received, pytest.fail, is_watched=True, sends_at_once=True)
     line.open(port)
     group = Group({"main": Amplifier(line, 1, LIMITS, name="main")})
     try:

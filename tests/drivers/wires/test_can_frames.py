@@ -24,7 +24,7 @@ from drivers.protocol.definition import MESSAGES
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Command, LayerSet, pack_layers
 from drivers.wires import can_bus
-from drivers.wires.can_bus import BusPort, SlcanAddress, TextPort
+from drivers.wires.can_bus import BusPort, Outbox, SlcanAddress, TextPort
 from drivers.wires.can_frames import (
     SLCAN,
     SOCKETCAND,
@@ -41,7 +41,7 @@ from drivers.wires.can_frames import (
 from drivers.wires.wire import address_of
 from kit.clock import in_virtual_time
 from kit.courses import Taken, courses, follow
-from kit.wires import until
+from kit.wires import hanging_interface, until
 from registry.limits import GuardLimits
 
 FRAME = CanFrame(0x181, bytes.fromhex("0102030405060708"))
@@ -223,7 +223,9 @@ async def opened(
 ) -> AsyncIterator[tuple[BusPort, Adapter, list[str]]]:
     """A port, its adapter, and its losses; heard: called with what it receives."""
     adapter, losses = Adapter(), list[str]()
-    port = BusPort(adapter, is_watched, "can0", heard, losses.append)
+    port = BusPort(
+        adapter, "can0", heard, losses.append, is_watched=is_watched, sends_at_once=is_watched
+    )
     try:
         yield port, adapter, losses
     finally:
@@ -288,9 +290,53 @@ async def test_reader_thread_hands_over_frames_in_order_until_the_adapter_is_gon
         ]
         await until(lambda: bool(losses))
         assert heard == [pack_frames([frame]) for frame in frames]
-        port._thread.join(10.0)
-        assert not port._thread.is_alive()
+        reader, _ = port._threads
+        reader.join(10.0)
+        assert not reader.is_alive()
     assert len(losses) == 1
+
+
+async def test_thread_sends_a_stop_next_after_a_call_that_hangs(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """On a real interface only the broadcast stays ahead of it; the rest of the set is dropped."""
+    monkeypatch.setattr(can_bus, "_FULL_TIMEOUT", 60.0)
+    bus = {"interface": "hanging", "channel": "stop first"}
+    with (
+        hanging_interface() as adapter,
+        can.Bus(interface="virtual", channel="stop first") as other,
+    ):
+        port = await can_bus.open_bus("can0", bus, lambda data: None, pytest.fail)
+        adapter.hangs = True
+        for name in ("burst", "commit", "burst"):
+            port.write(pack_frames(FRAMES[name]))
+            await until(lambda: adapter.sending == 1)
+        port.write(pack_frames(FRAMES["stop"]))
+        assert port.is_blocked
+        adapter.resume()
+        heard = [await asyncio.to_thread(other.recv, 60.0) for _ in range(3)]
+        assert [bytes(message.data) for message in heard] == [b"\0", b"commit", b"stop"]
+        await until(lambda: not port.is_blocked)
+        port.close()
+        await port.wait_closed()
+        assert other.recv(0.0) is None
+
+
+@pytest.mark.parametrize(
+    ("taken_at", "following"), [(0.02, BURST[1]), (0.05, None)], ids=["soon", "late"]
+)
+def test_rest_of_a_set_is_dropped_if_the_adapter_took_too_long_for_a_frame(
+    taken_at: float, following: CanFrame | None
+) -> None:
+    """A request is given up after 30 ms without progress; a newer one is sent however late."""
+    outbox = Outbox()
+    outbox.put(BURST, 0.0)
+    first = outbox.first(0.001)
+    assert first is BURST[0]
+    outbox.taken(first, taken_at)
+    assert outbox.first(taken_at) is following
+    outbox.put(FRAMES["stop"], taken_at)
+    assert outbox.first(taken_at) is FRAMES["stop"][0]
 
 
 FRAME_AS_TEXT = CanFrame(0x185, bytes.fromhex("0102030405060708"))

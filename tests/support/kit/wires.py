@@ -15,12 +15,13 @@ from collections.abc import AsyncIterator, Callable, Iterator, Mapping, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, TypeAlias, cast
+from typing import Any, ClassVar, TypeAlias, cast
 from urllib.parse import urlsplit
 
 import can
 import minimalmodbus
 import pytest
+from can.interfaces.virtual import VirtualBus
 from pymodbus.client import ModbusSerialClient, ModbusTcpClient
 from pymodbus.pdu import ModbusPDU
 
@@ -354,6 +355,41 @@ async def _python_can(
         ending.set()
         thread.join()
         adapter.shutdown()
+
+
+class HangingBus(VirtualBus):
+    """python-can's virtual bus, whose `send` hangs while `hangs`, for ten seconds at most."""
+
+    hangs: ClassVar[bool] = False
+    resumed: ClassVar[threading.Condition] = threading.Condition()
+    sending: ClassVar[int] = 0
+    """Number of calls that hang now."""
+
+    def send(self, msg: can.Message, timeout: float | None = None) -> None:
+        kind = type(self)
+        with kind.resumed:
+            kind.sending += 1
+            kind.resumed.wait_for(lambda: not kind.hangs, 10.0)
+            kind.sending -= 1
+        super().send(msg, timeout)
+
+    @classmethod
+    def resume(cls) -> None:
+        """Let all calls go on."""
+        with cls.resumed:
+            cls.hangs = False
+            cls.resumed.notify_all()
+
+
+@contextlib.contextmanager
+def hanging_interface() -> Iterator[type[HangingBus]]:
+    """Make python-can know the interface `hanging`, as it would from a package."""
+    can.interfaces.BACKENDS["hanging"] = (__name__, HangingBus.__name__)
+    try:
+        yield HangingBus
+    finally:
+        HangingBus.resume()
+        del can.interfaces.BACKENDS["hanging"]
 
 
 def _free_port() -> int:

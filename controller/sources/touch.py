@@ -176,6 +176,11 @@ _SOURCES: PluginRegistry[Callable[[str], TouchSource]] = PluginRegistry(
 )
 
 
+def source_schemes() -> tuple[str, ...]:
+    """Schemes of the URLs of touch sources, those of plug-ins last."""
+    return _SOURCES.names()
+
+
 def open_source(url: str) -> TouchSource:
     """Create the touch source of a URL such as `tuio:127.0.0.1:3333` or `evdev:/dev/input/event5`.
 

@@ -314,6 +314,11 @@ _WIRES: PluginRegistry[Callable[[str], WireAddress]] = PluginRegistry(
 )
 
 
+def schemes() -> tuple[str, ...]:
+    """Schemes of the URLs of amplifiers, those of plug-ins last."""
+    return _WIRES.names()
+
+
 def address_of(url: str) -> WireAddress:
     """Parse the URL of an amplifier; CommandError for an unknown or invalid one."""
     return _WIRES.make(url)

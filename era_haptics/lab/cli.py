@@ -4,7 +4,6 @@
 figures.
 """
 
-import os
 from pathlib import Path
 from typing import Annotated
 
@@ -43,23 +42,22 @@ def report(
 ) -> None:
     """Collect files for a bug report in a folder.
 
-    They have versions, configuration files, the daemon's state and the end of its log.
-    Values of unknown keys, hosts, serial numbers and comments are hidden; look before you send it.
+    They have versions, configuration files, the daemon's state and the end of its log: values of
+    known, harmless keys. Texts, names, hosts and all that is unknown are hidden.
     """
-
     from era_haptics.lab.report import collect, write_report
 
     for path in configs or ():
         if not path.exists():
             raise InputError(f"{path}: no such file; check its name and folder")
-    home = Path(os.path.expanduser("~"))  # noqa: PTH111  Path.home raises where there is none
-    files, missing = collect(configs or [], socket=socket, home=home)
-    write_report(output, files, missing)
-    for name, text in files.items():
-        print(f"  {name}: {len(text)} characters")
-    for what in missing:
+    collected = collect(configs or [], socket=socket)
+    write_report(output, collected)
+    for name, file in collected.files.items():
+        source = "" if file.source is None else f" of {file.source}"
+        print(f"  {name}: {len(file.text)} characters{source}")
+    for what in collected.missing:
         print(f"  skipped: {what}")
-    print(f"wrote {output}\nNext: look before you send: names and causes are not hidden")
+    print(f"wrote {output}\nNext: read the files, and send the folder")
 
 
 figure_app = typer.Typer()

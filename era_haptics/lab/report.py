@@ -1,88 +1,176 @@
 """`era report`: collect what a bug report needs in one folder.
 
 The folder has versions, configuration, the daemon's status, the end of its log and its fault dumps.
-Values of keys of a configuration that this program does not know are hidden, and everywhere those
-of keys that name a secret. Free text, as in causes and names, is not searched: look at the files
-before you send them.
+`era_haptics.lab.harmless` decides what of these is shown: values of known keys that are harmless.
 """
 
 import json
+import os
 import platform
-import re
 import shutil
 import sys
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from functools import cache
 from importlib.metadata import distributions, entry_points, version
 from pathlib import Path
 from typing import Any
 
-from pydantic.json_schema import models_json_schema
-
 from controller.api.client import Client
 from controller.api.jsonrpc import RpcError
-from controller.api.methods import StatusResult
-from controller.daemon.config import DaemonSection, file_of, is_daemon_document
-from controller.effects.layout import LayoutSection
+from controller.daemon.config import file_of, is_daemon_document
+from controller.effects.layout import is_layout_document
 from controller.operation.fault_dumps import DUMP_PATTERN
 from drivers.errors import LinkError
-from model.config.document import read_document
+from era_haptics.lab.harmless import (
+    Names,
+    declare_names,
+    harmless_configuration,
+    harmless_json,
+    harmless_records,
+)
+from model.config.document import ConfigError, Document, is_file_name, read_document
 from model.errors import InputError
-from model.rig.sections import RigSection
 from registry.files import regular_file
 from registry.plugins import plugins_of
 
 MAX_FILE_SIZE = 1 << 20  # bytes; of a larger file only the end is included
 MAX_DUMPS = 5
 _GROUPS = "era_haptics."  # prefix of our entry point groups
-_COMMENT = re.compile(r"(?m)(?:^|(?<=\s))#.*$")
-_HOST = re.compile(r"(?<=://)[^/?#\s\"']+")
-_PARAMETER = re.compile(r"""(?<![\w-])([\w-]++)(=)([^\s,&#}"']+)""")  # of a URL
-_ENTRY = re.compile(
-    r"""(?<![\w-])([\w-]++)(["']?[ \t]*:[ \t]*)(?!//)"""
-    r"""("[^"\n]*"|'[^'\n]*'|[^\s,{}\[\]"'][^\n,{}\[\]"']*)"""
-)  # of YAML or JSON
-_SECRET = re.compile(r"(?i)key|\blease\b|pass|\bpin\b|secret|serial_number|token|user")
-
-_HIDDEN = "hidden"
-
-_OF_FILES = (RigSection, DaemonSection, LayoutSection, StatusResult)
-_OTHERS = ("baud", "bitrate", "timeout")
 
 
-def collect(
-    configs: Iterable[Path], *, socket: Path | None, home: Path
-) -> tuple[dict[str, str], list[str]]:
-    """Collect the files of a report, by name, and descriptions of what is missing.
+@dataclass(frozen=True)
+class CollectedFile:
+    """One file of a report."""
+
+    text: str
+    source: Path | None = None
+    """Where it comes from, for the user alone; None for what the report itself finds out."""
+
+
+@dataclass(frozen=True)
+class Collected:
+    """What a report has: files by name, and what is missing, in words without any of the user's."""
+
+    files: Mapping[str, CollectedFile]
+    missing: list[str]
+
+
+class _Report:
+    """Files under the names of their kinds, so that no name of the user's is in the report."""
+
+    def __init__(self) -> None:
+        self.files: dict[str, CollectedFile] = {}
+        self.missing: list[str] = []
+        self.names = Names()
+        self._seen: set[str] = set()
+        self._documents: list[tuple[str, Path, Document]] = []
+
+    def add_configuration(self, path: Path) -> None:
+        """Read a configuration file and those that it names; `collected` shows them."""
+        if not self._is_new(path):
+            return
+        try:
+            document = read_document(path)
+        except ConfigError as error:
+            self._add_unreadable(path, [problem.line for problem in error.problems])
+            return
+        declare_names(document, self.names)
+        name = self._new_name(_kind_of(document), ".yaml")
+        self._documents.append((name, path, document))
+        self._add(name, "", path)
+        for named in _named_by(document):
+            self.add_configuration(named)
+        if is_daemon_document(document):
+            self._add_records(document)
+
+    def _add_unreadable(self, path: Path, lines: Sequence[int | None]) -> None:
+        """Add a file of which nothing but the place of its error is shown."""
+        name = self._new_name("unreadable", ".yaml")
+        if not path.exists():
+            self.missing.append(f"{name}: no such file")
+            return
+        numbers = ", ".join(str(line) for line in lines if line is not None)
+        place = f" at line {numbers}" if numbers else ""
+        self._add(name, f"# not valid YAML{place}; hidden\n", path)
+        self.missing.append(f"{name}: not valid YAML{place}; files that it names are left out")
+
+    def _add_records(self, daemon: Document) -> None:
+        """Add the log of a daemon and its last dumps."""
+        log = file_of(daemon, "log", "file")
+        folder = file_of(daemon, "dumps", "folder")
+        dumps = sorted(folder.glob(DUMP_PATTERN)) if folder is not None else []
+        records = [("log", log)] if log is not None else []
+        records += [("fault", dump) for dump in dumps[-MAX_DUMPS:]]
+        for kind, path in records:
+            if self._is_new(path):
+                self._add_record(self._new_name(kind, ".jsonl"), path)
+
+    def _add_record(self, name: str, path: Path) -> None:
+        try:
+            self._add(name, _end_of(path), path)
+        except OSError as error:
+            self.missing.append(f"{name}: {error.strerror}")
+
+    def add_status(self, socket: Path | None) -> None:
+        """Add the status of the daemon that runs."""
+        try:
+            with Client.connect(socket, name="era report") as daemon:
+                status = daemon.status().model_dump_json()
+        except (LinkError, RpcError) as error:
+            self.missing.append(f"status of a daemon ({type(error).__name__})")
+            return
+        self._add("status.json", harmless_json(status, self.names))
+
+    def collected(self) -> Collected:
+        """All files, shown once the names of all of them are known."""
+        shown = dict(self.files)
+        for name, path, document in self._documents:
+            text = harmless_configuration(document, self.names)
+            shown[name] = CollectedFile(text, path)
+        for name, file in self.files.items():
+            if name.endswith(".jsonl"):
+                text = harmless_records(file.text, self.names)
+                shown[name] = CollectedFile(text, file.source)
+        shown["versions.json"] = CollectedFile(json.dumps(versions(), indent=2))
+        return Collected(shown, self.missing)
+
+    def _is_new(self, path: Path) -> bool:
+        """Whether a file was not met before, under this path or another."""
+        place = os.path.realpath(path)
+        is_new = place not in self._seen
+        self._seen.add(place)
+        return is_new
+
+    def _add(self, name: str, text: str, source: Path | None = None) -> None:
+        self.files[name] = CollectedFile(text, source)
+        if source is not None:
+            self.names.files[os.path.realpath(source)] = name
+
+    def _new_name(self, kind: str, ending: str) -> str:
+        name, number = f"{kind}{ending}", 1
+        taken = {*self.files, *(line.partition(":")[0] for line in self.missing)}
+        while name in taken:
+            number += 1
+            name = f"{kind}-{number}{ending}"
+        return name
+
+
+def collect(configs: Iterable[Path], *, socket: Path | None) -> Collected:
+    """Collect the files of a report.
 
     configs: rig, layout and daemon files, with the files, the log and the dumps that a daemon's
-    file names; socket: the daemon's, the default if None; home: the folder that is replaced by ~.
+    file names; socket: the daemon's, the default if None.
     """
-    files: dict[str, str] = {}
-    missing: list[str] = []
-    found = [each for path in configs for each in _with_named(path, missing)]
-    for path, is_recorded in {path.resolve(): (path, is_own) for path, is_own in found}.values():
-        try:
-            text = _end_of(path)
-        except OSError as error:
-            missing.append(f"{path.name}: {error.strerror}")
-            continue
-        name = path.name
-        while name in files:
-            name = f"another-{name}"
-        files[name] = shown(text, home=home, is_recorded=is_recorded)
-    try:
-        with Client.connect(socket, name="era report") as daemon:
-            status = daemon.status().model_dump_json(indent=2)
-        files["status.json"] = shown(status, home=home)
-    except (LinkError, RpcError) as error:
-        missing.append(f"status of a daemon ({type(error).__name__})")
-    files["versions.json"] = json.dumps(versions(), indent=2)
-    return files, missing
+    report = _Report()
+    for path in configs:
+        report.add_configuration(path)
+    report.add_status(socket)
+    return report.collected()
 
 
-def write_report(folder: Path, files: Mapping[str, str], missing: Iterable[str]) -> None:
-    """Write a new folder of mode 0700, completely or not at all; arguments as `collect` returns.
+def write_report(folder: Path, report: Collected) -> None:
+    """Write a new folder of mode 0700, completely or not at all.
 
     Raises InputError if it exists already or cannot be created, OSError if writing fails.
     """
@@ -92,10 +180,10 @@ def write_report(folder: Path, files: Mapping[str, str], missing: Iterable[str])
         raise InputError(f"{folder}: exists already; choose another with -o") from error
     except OSError as error:
         raise InputError(f"{folder}: cannot write: {error.strerror}") from error
-    lines = "".join(f"{line}\n" for line in missing)
+    missing = CollectedFile("".join(f"{line}\n" for line in report.missing))
     try:
-        for name, text in {**files, "missing.txt": lines}.items():
-            (folder / name).write_text(text, "utf-8")
+        for name, file in {**report.files, "missing.txt": missing}.items():
+            (folder / name).write_text(file.text, "utf-8")
     except BaseException:
         shutil.rmtree(folder, ignore_errors=True)
         raise
@@ -116,44 +204,45 @@ def versions() -> dict[str, Any]:
         "python": sys.version,
         "system": platform.platform(),
         "machine": platform.machine(),
-        "packages": dict(sorted((each.name, each.version) for each in distributions())),
+        "packages": dict(_packages(tuple(sys.path))),
         "plug-ins": plug_ins,
     }
+
+
+@cache
+def _packages(path: tuple[str, ...]) -> Sequence[tuple[str, str]]:
+    """Name and version of each installed package, in order; path: of modules."""
+    return sorted((each.name, each.version) for each in distributions(path=[*path]))
 
 
 def _package(dist: Any) -> str:
     return f"{dist.name} {dist.version}" if dist is not None else "unknown"
 
 
-def _with_named(path: Path, missing: list[str]) -> Iterator[tuple[Path, bool]]:
-    """Yield a configuration file, and the files that it names: for a daemon log and last dumps too.
+def _kind_of(document: Document) -> str:
+    if is_daemon_document(document):
+        return "daemon"
+    return "layout" if is_layout_document(document) else "rig"
 
-    Each with whether this program recorded it.
+
+def _named_by(document: Document) -> Iterator[Path]:
+    """Configuration files that a file names: its base, and a daemon's rig and layouts.
+
+    A table is large and can be built again.
     """
-    yield path, False
-    try:
-        document = read_document(path)
-    except InputError as error:
-        if path.is_file():  # a missing file is reported when it is read
-            missing.append(f"files that {path.name} names ({type(error).__name__})")
-        return
     base = document.data.get("base")
-    if isinstance(base, str) and "\0" not in base:
-        yield document.beside(base), False
+    if is_file_name(base):
+        yield document.beside(base)
     if not is_daemon_document(document):
         return
+    rig = file_of(document, "rig")
+    if rig is not None:
+        yield rig
     layouts = document.data.get("layouts")
-    # A table is large and can be built again.
-    if (rig := file_of(document, "rig")) is not None:
-        yield from _with_named(rig, missing)
     for name in layouts if isinstance(layouts, dict) else ():
-        if (layout := file_of(document, "layouts", name)) is not None:
-            yield layout, False
-    if (log := file_of(document, "log", "file")) is not None:
-        yield log, True
-    if (folder := file_of(document, "dumps", "folder")) is not None:
-        dumps = sorted(folder.glob(DUMP_PATTERN), key=lambda file: file.name)
-        yield from ((each, True) for each in dumps[-MAX_DUMPS:])
+        layout = file_of(document, "layouts", name)
+        if layout is not None:
+            yield layout
 
 
 def _end_of(path: Path) -> str:
@@ -161,37 +250,3 @@ def _end_of(path: Path) -> str:
     with open(path, "rb", opener=regular_file) as stream:
         stream.seek(max(0, path.stat().st_size - MAX_FILE_SIZE))
         return stream.read(MAX_FILE_SIZE).decode("utf-8", errors="replace")
-
-
-def shown(text: str, *, home: Path, is_recorded: bool = False) -> str:
-    """Hide in a text the values of unknown keys, hosts and comments.
-
-    home: the folder that is replaced by ~; is_recorded: of a log or a dump, whose keys are this
-    program's own: only those that name a secret are hidden.
-    """
-
-    def entry(found: re.Match[str]) -> str:
-        key, separator, value = found.groups()
-        is_hidden = _SECRET.search(key) or not (is_recorded or key in _known_keys())
-        return f"{key}{separator}{_HIDDEN if is_hidden else value}"
-
-    if home != home.parent:  # the home "/" of system users is part of every path
-        text = text.replace(str(home), "~")
-    text = _HOST.sub(_HIDDEN, text if is_recorded else _COMMENT.sub("", text))
-    return _ENTRY.sub(entry, _PARAMETER.sub(entry, text))
-
-
-@cache
-def _known_keys() -> frozenset[str]:
-    """Every key of the files and of the status at any depth, and of URLs."""
-    _, schema = models_json_schema([(each, "validation") for each in _OF_FILES])
-    return frozenset(_OTHERS).union(_properties(schema))
-
-
-def _properties(schema: dict[str, Any] | list[Any]) -> Iterator[str]:
-    """Names of properties at any depth of a schema: one of several kinds has its own inside."""
-    if isinstance(schema, dict):
-        yield from schema.get("properties", ())
-    for each in schema.values() if isinstance(schema, dict) else schema:
-        if isinstance(each, dict | list):
-            yield from _properties(each)

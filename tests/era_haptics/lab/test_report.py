@@ -1,65 +1,208 @@
-"""Contents of a bug report, and what is removed from them."""
+"""Contents of a bug report: harmless values of known keys, and nothing else of a user's."""
 
 import json
 import os
+import re
 import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
 import yaml
 
-from era_haptics.lab.report import MAX_DUMPS, MAX_FILE_SIZE, collect, shown, versions
+from cases import read_yaml
+from era_haptics.lab.harmless import Names, harmless_records
+from era_haptics.lab.report import (
+    MAX_DUMPS,
+    MAX_FILE_SIZE,
+    Collected,
+    collect,
+    versions,
+    write_report,
+)
 from model.rig.rig_file import example_rig_path
 
-HOME = Path("/home/user")
+SECRET, NUMBER = "swordfish", "4077361"
+LEAKS = read_yaml(Path(__file__).with_name("leaks.yaml"))
+BEFORE = {
+    "rig.yaml": example_rig_path().read_text("utf-8"),
+    "daemon.yaml": "rig: rig.yaml\ntable: table.npz\n",
+    "layout.yaml": "effects:\n  tick: {kind: click}\nmax_level_db_sl: 30\n",
+    "alone.yaml": "",
+}
+"""Valid files, at whose end a shape stands."""
+
+
+def report_of(folder: Path, *names: str) -> Collected:
+    """The report of files in a folder, where no daemon runs."""
+    return collect([folder / name for name in names], socket=folder / "no.sock")
+
+
+def written(folder: Path, report: Collected) -> str:
+    """All that is in a report's folder: names and content of its files."""
+    write_report(folder, report)
+    return "".join(f"{path.name}\n{path.read_text('utf-8')}\n" for path in folder.iterdir())
+
+
+@pytest.mark.parametrize("shape", LEAKS)
+def test_report_has_nothing_of_a_secret_in_a_configuration(tmp_path: Path, shape: str) -> None:
+    """In no file and no name of a file, wherever it stands; the rest of a valid file is shown."""
+    text = shape.replace("CANARY", SECRET).replace("NUMBER", NUMBER)
+    for name, before in BEFORE.items():
+        folder = tmp_path / name.removesuffix(".yaml")
+        folder.mkdir()
+        (folder / name).write_text(before + text, "utf-8")
+        content = written(folder / "report", report_of(folder, name))
+        assert not re.search(f"{SECRET}|{NUMBER}", content, re.IGNORECASE)
+
+
+@pytest.mark.parametrize("name", ["paper_plate", "car_display", "eight_eras", "weekend/rig"])
+def test_report_shows_the_numbers_of_an_example(tmp_path: Path, name: str) -> None:
+    """All values of plate, ERAs and limits; only names of ERAs and amplifiers may differ."""
+    text = (Path(__file__).parents[3] / "examples" / f"{name}.yaml").read_text("utf-8")
+    (tmp_path / "rig.yaml").write_text(text, "utf-8")
+    shown = yaml.safe_load(report_of(tmp_path, "rig.yaml").files["rig.yaml"].text)
+    given = yaml.safe_load(text)
+    assert shown.keys() == given.keys()
+    for key in given.keys() - {"eras", "supports", "masses", "amplifiers"}:
+        assert shown[key] == given[key]
+    for key in given.keys() & {"eras", "supports", "masses"}:
+        assert [_numbers(part) for part in shown[key].values()] == [
+            _numbers(part) for part in given[key].values()
+        ]
+
+
+def _numbers(part: dict[str, object]) -> dict[str, object]:
+    return {key: value for key, value in part.items() if key != "amplifier"}
 
 
 @pytest.mark.parametrize(
-    ("text", "expected", "is_recorded"),
+    ("given", "expected"),
     [
-        *(
-            (text, expected, False)
-            for text, expected in (
-                ("thickness: 1.5mm, mesh: auto 1 %", "thickness: 1.5mm, mesh: auto 1 %"),
-                (
-                    "url: serial:///dev/ttyUSB0?baud=921600",
-                    "url: serial:///dev/ttyUSB0?baud=921600",
-                ),
-                ("url: 'socket://me:1234@amp:4000'", "url: 'socket://hidden'"),
-                ("url: modbus+tcp://plc.example/7", "url: modbus+tcp://hidden/7"),
-                ("url: socket:///x?pin=1234&baud=9600", "url: socket:///x?pin=hidden&baud=9600"),
-                ("token: 123456  # my bank's", "token: hidden"),
-                ('{"access_key": 1234, "stroke": 1}', '{"access_key": hidden, "stroke": 1}'),
-                ('serial_numbers: {main: "A1234"}', "serial_numbers: {main: hidden}"),
-                ('{"serial_number": "A1234"}', '{"serial_number": hidden}'),
-                ("rig: /home/user/rig.yaml", "rig: ~/rig.yaml"),
-            )
-        ),
-        (  # of a record: state, fault and message, neither a host nor a home in free text
-            '"state": 7, "serial_number": "A-17", "access_token": 4, '
-            '"cause": "no tcp://me:1@amp # /home/user/x"',
-            '"state": 7, "serial_number": hidden, "access_token": hidden, '
-            '"cause": "no tcp://hidden # ~/x"',
-            True,
+        ("level_db_sl: 14 dB", {"level_db_sl": "14 dB"}),
+        ("lvel_db_sl: 14", {"hidden": "unknown keys at line 2; similar to level_db_sl"}),
+        ("password: 14\nuser: me", {"hidden": "unknown keys at line 2, line 3"}),
+        ("log: {level: debug, file: /var/me.txt}", {"log": {"level": "debug", "file": "hidden"}}),
+        (
+            "touch: [{name: panel, url: 'tuio:127.0.0.1:3333?timeout=3'}]",
+            {"touch": [{"name": "hidden", "url": "tuio:hidden?timeout=3"}]},
         ),
     ],
 )
-def test_report_hides_values_of_unknown_keys(text: str, expected: str, is_recorded: bool) -> None:
-    """And hosts, serial numbers, comments and the home folder."""
-    assert shown(text, home=HOME, is_recorded=is_recorded).rstrip() == expected
+def test_report_says_what_it_hides(tmp_path: Path, given: str, expected: dict[str, object]) -> None:
+    """Unknown keys by their lines and the known keys that they are like; schemes and options."""
+    (tmp_path / "rig.yaml").write_text(BEFORE["rig.yaml"], "utf-8")
+    (tmp_path / "daemon.yaml").write_text(f"rig: rig.yaml\n{given}\n", "utf-8")
+    shown = report_of(tmp_path, "daemon.yaml").files["daemon.yaml"].text
+    assert yaml.safe_load(shown) == {"rig": "rig.yaml", **expected}
 
 
-def test_example_rig_is_shown_without_its_comments() -> None:
-    """All values of plate, ERAs, amplifier and limits."""
-    text = example_rig_path().read_text("utf-8")
-    assert yaml.safe_load(shown(text, home=HOME)) == yaml.safe_load(text)
+@pytest.mark.parametrize(
+    ("url", "shown"),
+    [
+        ("sim://", "sim://"),
+        ("serial:///dev/ttyUSB0?baud=921600", "serial:///dev/ttyUSB0?baud=921600"),
+        ("serial:///dev/serial/by-id/usb-A17?baud=9600", "serial://hidden?baud=9600"),
+        ("modbus+tcp://plc.example/7", "modbus+tcp://hidden"),
+        ("can+socketcan://can0#7", "can+socketcan://hidden#7"),
+        ("serial+tcp://me:1@amp:4001?pin=1", "serial+tcp://hidden"),
+        ("ftp://amp/x?baud=1", "hidden"),
+    ],
+)
+def test_report_shows_the_kind_of_a_line(tmp_path: Path, url: str, shown: str) -> None:
+    """Scheme, usual device, options and number of a valid URL, without host, user or path."""
+    rig = BEFORE["rig.yaml"].replace("sim://", url)
+    (tmp_path / "rig.yaml").write_text(rig, "utf-8")
+    report = yaml.safe_load(report_of(tmp_path, "rig.yaml").files["rig.yaml"].text)
+    assert report["amplifiers"]["main"]["url"] == shown
+
+
+def test_report_gives_a_name_one_replacement_in_all_files(tmp_path: Path) -> None:
+    """An amplifier of the rig, and of an ERA, is the same in the daemon's file and its log."""
+    rig = re.sub(r"\bmain\b", "left-panel", BEFORE["rig.yaml"])
+    (tmp_path / "rig.yaml").write_text(rig, "utf-8")
+    (tmp_path / "daemon.yaml").write_text(
+        "rig: rig.yaml\nserial_numbers: {left-panel: A17}\nlog: {file: log.txt}\n", "utf-8"
+    )
+    (tmp_path / "log.txt").write_text('{"message": "link left-panel: lost"}\n', "utf-8")
+    files = report_of(tmp_path, "daemon.yaml").files
+    daemon, rig = (yaml.safe_load(files[name].text) for name in ("daemon.yaml", "rig.yaml"))
+    (name,) = daemon["serial_numbers"]
+    assert daemon["serial_numbers"][name] == "hidden"
+    assert [*rig["amplifiers"]] == [name]
+    assert {era["amplifier"] for era in rig["eras"].values()} == {name}
+    assert json.loads(files["log.jsonl"].text) == {"message": f"link {name}: lost"}
+    assert "left" not in "".join(file.text for file in files.values())
+
+
+RECORDS = [
+    (
+        {
+            "time": "2026-01-02T03:04:05.123Z",
+            "level": "warning",
+            "message": "no reply within 30 ms",
+        },
+        {
+            "time": "2026-01-02T03:04:05.123Z",
+            "level": "warning",
+            "message": "no reply within 30 ms",
+        },
+    ),
+    (
+        {"message": "link main: no tcp://me:1@amp:4001 of swordfish, 10.0.0.2:4001 -> lost"},
+        {"message": "link main: no … of … … -> lost"},
+    ),
+    (
+        {"url": "serial:///dev/ttyUSB0?baud=9600", "cause": "at serial+tcp://me:1@amp:4001, lost"},
+        {"url": "serial:///dev/ttyUSB0?baud=9600", "cause": "at serial+tcp://hidden, lost"},
+    ),
+    (
+        {"message": "wrote /home/swordfish/era.log for swordfish@example.com, attempts=3"},
+        {"message": "wrote … for … attempts=3"},
+    ),
+    (
+        {"serial_number": "A17", "access_token": 4},
+        {"serial_number": "hidden", "hidden-2": "hidden"},
+    ),
+    ({"time_s": 1.5, "swordfish": 4077361}, {"time_s": 1.5, "hidden-2": "hidden"}),
+    (
+        {"content": {"state": 7, "channels": [1, None, True], "swordfish": {"state": 1}}},
+        {"content": {"state": 7, "channels": [1, None, True], "hidden-3": "hidden"}},
+    ),
+    (
+        {
+            "traceback": 'Traceback:\n  File "/home/swordfish/x.py", line 3, in f\n'
+            '  File "/opt/era/controller/cli/main.py", line 12, in run\nValueError: swordfish'
+        },
+        {
+            "traceback": "Traceback\n  File hidden, line 3\n"
+            "  File controller/cli/main.py, line 12\nValueError: …"
+        },
+    ),
+]
+
+
+@pytest.mark.parametrize(("record", "expected"), RECORDS)
+def test_record_is_shown_in_the_programs_own_words(
+    record: dict[str, object], expected: dict[str, object]
+) -> None:
+    """Numbers and the words of the program stay; names, hosts, paths and other words do not."""
+    assert json.loads(harmless_records(json.dumps(record), Names())) == expected
+
+
+@pytest.mark.parametrize(
+    "line", ["swordfish", '{"message": "swordf', "[" * 5000, "\0", '{"a": 1} swordfish']
+)
+def test_line_that_is_no_record_is_hidden(line: str) -> None:
+    """As the first of a long log, which is cut off, or what a library printed."""
+    assert harmless_records(line, Names()) == '"hidden: a line that is no record"\n'
 
 
 @pytest.mark.parametrize("given", [["d.yaml"], ["rig.yaml", "d.yaml"]])
-def test_report_includes_files_of_daemon(tmp_path: Path, given: list[str]) -> None:
+def test_report_includes_files_of_daemon(tmp_path: Path, given: Sequence[str]) -> None:
     """Its rig, layout, log and last dumps once, and no table; missing files are listed."""
-    (tmp_path / "rig.yaml").write_text(example_rig_path().read_text("utf-8"), "utf-8")
+    (tmp_path / "rig.yaml").write_text(BEFORE["rig.yaml"], "utf-8")
     (tmp_path / "d.yaml").write_text(
         "rig: rig.yaml\nlayouts: {panel: none.yaml}\ntable: t.npz\ndumps: {folder: dumps}\n"
         "log: {file: era.out}\n",
@@ -70,20 +213,20 @@ def test_report_includes_files_of_daemon(tmp_path: Path, given: list[str]) -> No
     (tmp_path / "t.npz").write_bytes(b"x" * 100)
     (tmp_path / "dumps").mkdir()
     for number in range(MAX_DUMPS + 2):
-        (tmp_path / "dumps" / f"era-fault-2026-{number}.jsonl").write_text(str(number), "utf-8")
+        dump = tmp_path / "dumps" / f"era-fault-2026-{number}.jsonl"
+        dump.write_text(f'{{"time_s": {number}}}\n', "utf-8")
     (tmp_path / "dumps" / "other.txt").write_text("x", "utf-8")
-    files, missing = collect(
-        [tmp_path / name for name in given], socket=tmp_path / "no.sock", home=HOME
-    )
-    dumps = [f"era-fault-2026-{number}.jsonl" for number in range(2, MAX_DUMPS + 2)]
-    assert set(files) == {"d.yaml", "rig.yaml", "era.out", *dumps, "versions.json"}
-    log = files["era.out"]
-    assert len(log) == MAX_FILE_SIZE
-    assert log.endswith('x\n{"message": "link main: lost"}\n')
-    layout, daemon = missing
-    assert "none.yaml" in layout
-    assert "daemon" in daemon
-    found = json.loads(files["versions.json"])
+    report = report_of(tmp_path, *given)
+    dumps = ["fault.jsonl", *(f"fault-{number}.jsonl" for number in range(2, MAX_DUMPS + 1))]
+    assert {*report.files} == {"daemon.yaml", "rig.yaml", "log.jsonl", *dumps, "versions.json"}
+    assert report.files["log.jsonl"].text.splitlines() == [
+        '"hidden: a line that is no record"',
+        '{"message": "link main: lost"}',
+    ]
+    shown = [json.loads(report.files[name].text)["time_s"] for name in dumps]
+    assert shown == [*range(2, MAX_DUMPS + 2)]
+    assert [line.partition(" ")[0] for line in report.missing] == ["unreadable.yaml:", "status"]
+    found = json.loads(report.files["versions.json"].text)
     assert found["packages"]["numpy"][0].isdigit()
     assert set(found) >= {"packages", "plug-ins"}
 
@@ -107,15 +250,16 @@ def test_versions_list_packages_of_plug_ins(
     }
 
 
-def test_report_includes_invalid_files(tmp_path: Path) -> None:
-    """An invalid file may be the subject: it is included, shown like any other, and listed once."""
+def test_report_has_the_place_of_what_is_invalid(tmp_path: Path) -> None:
+    """Of a file that is no YAML only the line of its error is shown."""
     (tmp_path / "broken.yaml").write_text("rig: [\napi_token: abc\n\tx", "utf-8")
-    (tmp_path / "bytes.yaml").write_bytes(b"\xff\x00: \x80")
-    files = [tmp_path / name for name in ("broken.yaml", "bytes.yaml", "none.yaml")]
-    found, missing = collect(files, socket=tmp_path / "no.sock", home=HOME)
-    assert set(found) == {"broken.yaml", "bytes.yaml", "versions.json"}
-    assert found["broken.yaml"] == "rig: [\napi_token: hidden\n\tx"
-    assert [sum(path.name in each for each in missing) for path in files] == [1, 1, 1]
+    (tmp_path / "bytes.yaml").write_bytes(b"\n\xff\x00: \x80")
+    report = report_of(tmp_path, "broken.yaml", "bytes.yaml", "none.yaml")
+    assert {*report.files} == {"unreadable.yaml", "unreadable-2.yaml", "versions.json"}
+    assert report.files["unreadable.yaml"].text == "# not valid YAML at line 3; hidden\n"
+    assert report.files["unreadable-2.yaml"].text == "# not valid YAML at line 2; hidden\n"
+    assert len(report.missing) == 4
+    assert report.missing[2] == "unreadable-3.yaml: no such file"
 
 
 def test_report_command_writes_new_folder_for_owner_only(tmp_path: Path) -> None:

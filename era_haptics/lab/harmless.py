@@ -1,0 +1,444 @@
+"""What files and records of users may show to others: harmless values of known keys, and no more.
+
+Of a configuration these are, as its schema declares them, numbers, quantities, choices, and words
+that are public: materials, effects, elements, schemes of URLs. Names that users gave become
+`name-1`, `name-2` ..., the same in all files of a report. Everything else is hidden: free text,
+names of files and hosts, and all that stands under an unknown key, with the name of the key.
+
+Of a record that this program wrote, a line of a log or a dump, these are numbers and the words that
+stand in the program itself, under keys that stand there, too.
+"""
+
+import builtins
+import json
+import os
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from difflib import get_close_matches
+from functools import cache
+from importlib.machinery import SourceFileLoader
+from pathlib import Path
+from types import CodeType
+from typing import Any, TypeAlias
+from urllib.parse import parse_qsl
+
+from pydantic import BaseModel
+from pydantic.json_schema import models_json_schema
+
+from controller.content.formats import named_contents
+from controller.daemon.config import DaemonSection, is_daemon_document
+from controller.effects.kinds import BUILT_IN as EFFECTS
+from controller.effects.layout import LayoutSection, is_layout_document
+from controller.sources.touch import open_source, source_schemes
+from drivers.errors import CommandError
+from drivers.urls import CLOCK_ERRORS, KIND_OF_PORT
+from drivers.wires.wire import address_of, schemes
+from model.config import units
+from model.config.document import Document, Value, data_text, is_file_name, read_document
+from model.drive_modes import DRIVE_MODES
+from model.errors import InputError
+from model.fem import ELEMENTS
+from model.finger import THRESHOLDS
+from model.rig.rig_file import example_rig_path
+from model.rig.sections import RigSection
+from model.spectral.modes import POLYNOMIALS
+from model.structure.material import EXCITER_TYPES, KNOWN_MATERIALS
+
+HIDDEN = "hidden"
+
+Schema: TypeAlias = Mapping[str, Any]
+"""A JSON schema, or a part of one."""
+
+_ROOT = Path(__file__).parents[2]
+_PACKAGES = ("registry", "drivers", "model", "controller", "sim", "era_haptics")
+_FILE_ENDINGS = (".yaml", ".yml", ".npz", ".json", ".csv", ".uff", ".wav", ".ahap", ".haptic")
+
+_SECRET = re.compile(r"(?i)key|\blease\b|pass|\bpin\b|secret|serial_number|token|user")
+_NUMBER = r"[-+]?\d{1,6}(?:\.\d{1,12})?(?:[eE][-+]?\d{1,3})?"
+_QUANTITY = re.compile(rf"({_NUMBER})\s*(.*)")
+_SIZES = re.compile(r"\d{1,4}[x×]\d{1,4}")
+_IDENTIFIER = re.compile(r"[A-Za-z][A-Za-z0-9_-]{0,31}")
+_DEVICE = re.compile(rf"/dev/(?:{'|'.join(KIND_OF_PORT)}|input/event)\d{{1,3}}")
+_SHORT = re.compile(r"\d{1,3}")  # the address of an amplifier
+_OPTION = re.compile(rf"{_NUMBER}|yes|[NEO]")
+_TIME = re.compile(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d(?:\.\d{1,6})?Z?")
+_WORD = re.compile(r"[^\W\d_]+")
+_FRAME = re.compile(r'\s*File "([^"]*)", line (\d{1,6})')
+
+
+class Names:
+    """Replacements of the names that users gave, in the order in which they come."""
+
+    def __init__(self) -> None:
+        self._replacements: dict[str, str] = {}
+        self.files: dict[str, str] = {}
+        """Names of files in the report, by the real path of each."""
+
+    def declared(self, name: str) -> str:
+        """The replacement of a name that a mapping declares; public names stay."""
+        if name in public_words() or not _IDENTIFIER.fullmatch(name):
+            return name if name in public_words() else HIDDEN
+        return self._replacements.setdefault(name, f"name-{len(self._replacements) + 1}")
+
+    def known(self, name: str) -> str | None:
+        """The replacement of a name that was declared; None for another text."""
+        return self._replacements.get(name)
+
+
+def harmless_configuration(document: Document, names: Names) -> str:
+    """The text of a rig, daemon or layout file with its harmless values; names: of all files."""
+    schema, definitions = _schema_of(document)
+    reader = _Configuration(document, definitions, names)
+    reader.declare(document.data, schema)
+    return data_text(reader.mapping((), document.data, schema))
+
+
+def declare_names(document: Document, names: Names) -> None:
+    """Note the names of a file, before any file that may refer to them is shown."""
+    schema, definitions = _schema_of(document)
+    _Configuration(document, definitions, names).declare(document.data, schema)
+
+
+class _Configuration:
+    """Goes through a document along its schema."""
+
+    def __init__(self, document: Document, definitions: Schema, names: Names) -> None:
+        self._document = document
+        self._definitions = definitions
+        self._names = names
+
+    def declare(self, value: Value, schema: Schema) -> None:
+        """Note the names that mappings of users' names have."""
+        if isinstance(value, list):
+            items = self._of_kind(schema, "array")
+            for number, entry in enumerate(value):
+                self.declare(entry, _item_schema(items, number))
+        if not isinstance(value, dict):
+            return
+        best = self._mapping_schema(value, schema)
+        for key, entry in value.items():
+            inner = best.get("properties", {}).get(key)
+            if inner is None and isinstance(best.get("additionalProperties"), dict):
+                inner = best["additionalProperties"]
+                self._names.declared(key)
+            if inner is not None:
+                self.declare(entry, inner)
+
+    def mapping(
+        self, path: tuple[str | int, ...], value: Mapping[str, Value], schema: Schema
+    ) -> dict[str, Value]:
+        """The harmless part of a mapping; its unknown keys are counted."""
+        best = self._mapping_schema(value, schema)
+        properties = best.get("properties", {})
+        further = best.get("additionalProperties")
+        shown: dict[str, Value] = {}
+        unknown: list[str] = []
+        for key, entry in value.items():
+            inner = (*path, key)
+            if key in properties:
+                shown[key] = self._shown(inner, entry, properties[key])
+            elif isinstance(further, dict) and (name := self._names.declared(key)) != HIDDEN:
+                shown[name] = self._shown(inner, entry, further)
+            else:
+                unknown.append(key)
+        if unknown:
+            shown[HIDDEN] = self._described(path, unknown, [*properties])
+        return shown
+
+    def _described(
+        self, path: tuple[str | int, ...], unknown: Sequence[str], known: Sequence[str]
+    ) -> str:
+        """Unknown keys in words that have nothing of them: their lines, and keys they are like."""
+        lines = [self._document.line_of((*path, key)) for key in unknown]
+        places = ", ".join(f"line {line}" for line in lines if line)
+        meant = sorted({word for key in unknown for word in get_close_matches(key[:40], known, 1)})
+        similar = f"; similar to {', '.join(meant)}" if meant else ""
+        return f"unknown keys at {places or 'no line'}{similar}"
+
+    def _shown(self, path: tuple[str | int, ...], value: Value, schema: Schema) -> Value:
+        if value is None or isinstance(value, bool):
+            return value
+        if isinstance(value, dict):
+            return self.mapping(path, value, schema) if self._of_kind(schema, "object") else HIDDEN
+        if isinstance(value, list):
+            items = self._of_kind(schema, "array")
+            return [
+                self._shown((*path, number), entry, _item_schema(items, number))
+                for number, entry in enumerate(value)
+            ]
+        choices = [*self._alternatives(schema)]
+        if isinstance(value, str):
+            return self._text(value, choices)
+        is_number = any({"number", "integer"} & _types_of(choice) for choice in choices)
+        return value if is_number else HIDDEN
+
+    def _text(self, text: str, choices: Sequence[Schema]) -> str:
+        for choice in choices:
+            if text == choice.get("const") or text in choice.get("enum", ()):
+                return text
+            if {"number", "string"} <= _types_of(choice) and is_quantity(text):
+                return text
+        if is_file_name(text):
+            place = os.path.realpath(self._document.beside(text))
+            if place in self._names.files:
+                return self._names.files[place]
+        return public_text(text, self._names) or self._names.known(text) or HIDDEN
+
+    def _mapping_schema(self, value: Mapping[str, Value], schema: Schema) -> Schema:
+        """The alternative that a mapping fits best: by its kind, then by its known keys."""
+
+        def fit(choice: Schema) -> tuple[bool, int]:
+            properties = choice.get("properties", {})
+            kind = properties.get("kind", {})
+            kinds = {kind.get("const"), *kind.get("enum", ())}
+            return value.get("kind") in kinds, len(properties.keys() & value.keys())
+
+        return max(self._of_kind(schema, "object"), key=fit, default={})
+
+    def _of_kind(self, schema: Schema, kind: str) -> list[Schema]:
+        return [choice for choice in self._alternatives(schema) if kind in _types_of(choice)]
+
+    def _alternatives(self, schema: Schema) -> Iterator[Schema]:
+        if "$ref" in schema:
+            name = schema["$ref"].rpartition("/")[2]
+            yield from self._alternatives(self._definitions[name])
+            return
+        parts = (
+            [] if "properties" in schema else [*schema.get("anyOf", ()), *schema.get("oneOf", ())]
+        )
+        if not parts:
+            yield schema
+        for part in parts:
+            yield from self._alternatives(part)
+
+
+def _types_of(schema: Schema) -> set[str]:
+    kinds = schema.get("type", ())
+    return {kinds} if isinstance(kinds, str) else set(kinds)
+
+
+def _item_schema(arrays: Sequence[Schema], number: int) -> Schema:
+    """The schema of an entry of a list; {} if none is declared."""
+    for array in arrays:
+        entries: Sequence[Schema] = array.get("prefixItems", ())
+        if number < len(entries):
+            return entries[number]
+        further: Schema = array.get("items", {})
+        return further
+    return {}
+
+
+def _schema_of(document: Document) -> tuple[Schema, Schema]:
+    """The schema of a document's kind and its definitions; one without keys for another file."""
+    schemas, definitions = _schemas()
+    if is_daemon_document(document):
+        return schemas["daemon"], definitions
+    if is_layout_document(document):
+        return schemas["layout"], definitions
+    return schemas["rig"], definitions
+
+
+@cache
+def _schemas() -> tuple[dict[str, Schema], Schema]:
+    """Schemas of the kinds of files, and their common definitions."""
+    sections: list[type[BaseModel]] = [RigSection, DaemonSection, LayoutSection, *EFFECTS]
+    by_model, whole = models_json_schema([(section, "validation") for section in sections])
+    definitions = whole["$defs"]
+    rig, daemon, layout, *effects = (
+        dict(definitions[by_model[section, "validation"]["$ref"].rpartition("/")[2]])
+        for section in sections
+    )
+    # A fitted rig is beside its base. Effects are under the names of users, with a kind.
+    errors = {"type": "object", "additionalProperties": {"type": "number"}}
+    beside = {"base": {"type": "string"}, "base_fingerprint": {"type": "string"}}
+    rig["properties"] = rig["properties"] | beside | {"standard_errors": errors}
+    kinds = [
+        effect | {"properties": effect["properties"] | {"kind": {"const": section.kind}}}
+        for section, effect in zip(EFFECTS, effects, strict=True)
+    ]
+    of_users = {"type": "object", "additionalProperties": {"anyOf": kinds}}
+    layout["properties"] = layout["properties"] | {"effects": of_users}
+    return {"rig": rig, "daemon": daemon, "layout": layout}, definitions
+
+
+@cache
+def public_words() -> frozenset[str]:
+    """Words that everybody may read in this program: choices, and names of its own example."""
+    example = read_document(example_rig_path()).data
+    names = [name for key in ("eras", "amplifiers") for name in _keys_of(example[key])]
+    kinds = [effect.kind for effect in EFFECTS]
+    public = [*KNOWN_MATERIALS, *EXCITER_TYPES, *THRESHOLDS, *DRIVE_MODES, *ELEMENTS]
+    return frozenset([*names, *kinds, *named_contents(), *public, POLYNOMIALS, "auto"])
+
+
+def _keys_of(value: Value) -> list[str]:
+    return [*value] if isinstance(value, dict) else []
+
+
+@cache
+def _public_units() -> frozenset[str]:
+    """Units that the messages of this program use."""
+    dimensions = [each for each in vars(units).values() if isinstance(each, units.Dimension)]
+    examples = [dimension.example.partition(" ")[2] for dimension in dimensions]
+    return frozenset([*(unit for each in dimensions for unit in each.factors), *examples, ""])
+
+
+def is_quantity(text: str) -> bool:
+    """Whether a text is a number with a common unit."""
+    match = _QUANTITY.fullmatch(text.strip())
+    return match is not None and match[2].strip() in _public_units()
+
+
+def public_text(text: str, names: Names) -> str:
+    """A text of public words and sizes of a mesh, or the public part of a URL; "" for another."""
+    if text in public_words():
+        return text
+    parts = text.split()
+    is_mesh = bool(parts) and (parts[0] == "auto" or _SIZES.fullmatch(parts[0]) is not None)
+    if is_mesh and all(part in public_words() or is_quantity(part) for part in parts[1:]):
+        return text
+    scheme = text.partition(":")[0].lower()
+    if scheme in (*schemes(), *source_schemes()):
+        return _public_url(scheme, text.partition(":")[2], names)
+    ending = next((each for each in _FILE_ENDINGS if text.lower().endswith(each)), "")
+    return f"{HIDDEN}{ending}" if ending else ""
+
+
+def _public_url(scheme: str, rest: str, names: Names) -> str:
+    """A URL with its scheme and a usual device; of a valid one its options and number as well."""
+    slashes = "//" if rest.startswith("//") else ""
+    place, _, options = rest.removeprefix("//").partition("?")
+    options, _, number = options.partition("#")
+    if not options:
+        place, _, number = place.partition("#")
+    shown = place if place in ("", "/") or _DEVICE.fullmatch(place) else HIDDEN
+    try:
+        (address_of if scheme in schemes() else open_source)(f"{scheme}:{rest}")
+    except (CommandError, InputError):
+        return f"{scheme}:{slashes}{shown}"
+    pairs = [
+        f"{name}={_public_option(value, names)}"
+        for name, value in parse_qsl(options, keep_blank_values=True)
+    ]
+    query = f"?{'&'.join(pairs)}" if pairs else ""
+    return f"{scheme}:{slashes}{shown}{query}{f'#{number}' if _SHORT.fullmatch(number) else ''}"
+
+
+def _public_option(value: str, names: Names) -> str:
+    is_public = value in CLOCK_ERRORS or _OPTION.fullmatch(value) is not None
+    return value if is_public else names.known(value) or HIDDEN
+
+
+def harmless_records(text: str, names: Names) -> str:
+    """Lines of JSON that this program wrote, with what is harmless of each."""
+    return "".join(f"{_harmless_line(line, names)}\n" for line in text.splitlines())
+
+
+def harmless_json(text: str, names: Names) -> str:
+    """One value of JSON that this program wrote, with what is harmless of it."""
+    return json.dumps(_recorded(json.loads(text), names), indent=2)
+
+
+def _harmless_line(line: str, names: Names) -> str:
+    try:
+        record = json.loads(line)
+    except (ValueError, RecursionError):
+        return f'"{HIDDEN}: a line that is no record"'
+    return json.dumps(_recorded(record, names))
+
+
+def _recorded(value: Any, names: Names) -> Any:
+    if isinstance(value, list):
+        return [_recorded(entry, names) for entry in value]
+    if isinstance(value, str):
+        return harmless_words(value, names)
+    if not isinstance(value, dict):
+        return value
+    shown: dict[str, Any] = {}
+    for key, entry in value.items():
+        is_own = key in own_words() or key in public_words()
+        name = key if is_own else names.known(key) or f"{HIDDEN}-{len(shown) + 1}"
+        is_secret = _SECRET.search(key) is not None
+        is_nested = isinstance(entry, dict | list | bool | None)
+        if name.startswith(HIDDEN) or (is_secret and not is_nested):
+            shown[name] = HIDDEN
+        elif key == "traceback" and isinstance(entry, str):
+            shown[name] = _harmless_traceback(entry, names)
+        else:
+            shown[name] = _recorded(entry, names)
+    return shown
+
+
+def harmless_words(text: str, names: Names) -> str:
+    """A text with an ellipsis for all but numbers, the program's own words and known names."""
+
+    def shown(found: re.Match[str]) -> str:
+        token = found[0]
+        core = token.strip(".,;:()[]'\"")
+        name = names.known(core)
+        if name is not None:
+            return token.replace(core, name)
+        if not any(sign.isalnum() for sign in core) or _is_own(core):
+            return token
+        scheme, colon, rest = core.partition(":")
+        if colon and scheme in (*schemes(), *source_schemes()):
+            return token.replace(core, _public_url(scheme, rest, names))
+        return "…"
+
+    return re.sub(r"\S+", shown, text)
+
+
+def _is_own(core: str) -> bool:
+    if core in public_words() or is_quantity(core) or _TIME.fullmatch(core):
+        return True
+    name, equals, value = core.partition("=")
+    if equals:
+        return name in own_words() and not _SECRET.search(name) and is_quantity(value)
+    parts = re.split(r"[-_/]", core)
+    return core in _own_modules() or all(
+        _WORD.fullmatch(part) and part in own_words() for part in parts
+    )
+
+
+def _harmless_traceback(text: str, names: Names) -> str:
+    """A traceback with the files of this program, and the words of its other lines."""
+    lines = ["Traceback"]
+    for line in text.splitlines()[1:]:
+        frame = _FRAME.match(line)
+        if frame is None:
+            lines.append(harmless_words(line, names))
+            continue
+        own = next((file for file in _own_files() if frame[1].endswith(f"/{file}")), HIDDEN)
+        lines.append(f"  File {own}, line {frame[2]}")
+    return "\n".join(lines)
+
+
+@cache
+def _own_files() -> tuple[str, ...]:
+    files = (path for package in _PACKAGES for path in (_ROOT / package).rglob("*.py"))
+    return tuple(str(path.relative_to(_ROOT)) for path in files)
+
+
+@cache
+def _own_modules() -> frozenset[str]:
+    return frozenset(file.removesuffix(".py").replace("/", ".") for file in _own_files())
+
+
+@cache
+def own_words() -> frozenset[str]:
+    """Words and identifiers in the program: of its texts, its keys and its names."""
+    words = set(dir(builtins))  # classes of errors, in tracebacks
+    pending: list[object] = [
+        SourceFileLoader("own", str(_ROOT / file)).get_code("own") for file in _own_files()
+    ]
+    while pending:
+        constant = pending.pop()
+        if isinstance(constant, CodeType):
+            pending += constant.co_consts
+            words.update(constant.co_names)
+        elif isinstance(constant, tuple | frozenset):
+            pending += constant
+        elif isinstance(constant, str):
+            words.update(re.findall(r"[^\W\d]\w*", constant))
+            words.update(_WORD.findall(constant))
+    return frozenset(words)

@@ -49,7 +49,7 @@ class CollectedFile:
 
 
 @dataclass(frozen=True)
-class Collected:
+class ReportContents:
     """What a report has: files by name, and what is missing, in words without any of the user's."""
 
     files: Mapping[str, CollectedFile]
@@ -122,7 +122,7 @@ class _Report:
             return
         self._add("status.json", harmless_json(status, self.names))
 
-    def collected(self) -> Collected:
+    def collected(self) -> ReportContents:
         """All files, shown once the names of all of them are known."""
         shown = dict(self.files)
         for name, path, document in self._documents:
@@ -133,7 +133,7 @@ class _Report:
                 text = harmless_records(file.text, self.names)
                 shown[name] = CollectedFile(text, file.source)
         shown["versions.json"] = CollectedFile(json.dumps(versions(), indent=2))
-        return Collected(shown, self.missing)
+        return ReportContents(shown, self.missing)
 
     def _is_new(self, path: Path) -> bool:
         """Whether a file was not met before, under this path or another."""
@@ -156,7 +156,7 @@ class _Report:
         return name
 
 
-def collect(configs: Iterable[Path], *, socket: Path | None) -> Collected:
+def collect(configs: Iterable[Path], *, socket: Path | None) -> ReportContents:
     """Collect the files of a report.
 
     configs: rig, layout and daemon files, with the files, the log and the dumps that a daemon's
@@ -169,7 +169,7 @@ def collect(configs: Iterable[Path], *, socket: Path | None) -> Collected:
     return report.collected()
 
 
-def write_report(folder: Path, report: Collected) -> None:
+def write_report(folder: Path, report: ReportContents) -> None:
     """Write a new folder of mode 0700, completely or not at all.
 
     Raises InputError if it exists already or cannot be created, OSError if writing fails.

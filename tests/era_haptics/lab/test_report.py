@@ -16,7 +16,7 @@ from era_haptics.lab.harmless import Names, harmless_records
 from era_haptics.lab.report import (
     MAX_DUMPS,
     MAX_FILE_SIZE,
-    Collected,
+    ReportContents,
     collect,
     versions,
     write_report,
@@ -34,12 +34,12 @@ BEFORE = {
 """Valid files, at whose end a shape stands."""
 
 
-def report_of(folder: Path, *names: str) -> Collected:
+def report_of(folder: Path, *names: str) -> ReportContents:
     """The report of files in a folder, where no daemon runs."""
     return collect([folder / name for name in names], socket=folder / "no.sock")
 
 
-def written(folder: Path, report: Collected) -> str:
+def written(folder: Path, report: ReportContents) -> str:
     """All that is in a report's folder: names and content of its files."""
     write_report(folder, report)
     return "".join(f"{path.name}\n{path.read_text('utf-8')}\n" for path in folder.iterdir())

@@ -52,11 +52,12 @@ from model.study.contrast_maps import WANTED_CONTRAST_DB, ContrastMap, WeakCells
 from model.study.overview import Overview
 from model.study.promise_at_sensors import MeasuredVerification
 from model.table.table import LocalizationTable
-from model.vibration import Excitation, G, PlateMap
+from model.vibration import NULL_SHARE, Excitation, G, PlateMap
 
 COLORS = "viridis"
-ACTIVE_COLOR = "#d62728"
-RESTING_COLOR = "#2ca02c"
+ACTIVE_COLOR = "#d55e00"
+RESTING_COLOR = "white"
+"""Colours of ERAs that are driven and of others, which differ in brightness, too."""
 
 POINTS_ALONG = 97
 """Points of a raster along the longer side: on the paper's plate 60 per shortest wave."""
@@ -71,11 +72,16 @@ def raster(plate: Plate) -> tuple[int, int]:
 def draw_eras(
     axes: Axes, eras: Sequence[Source], *, active: Collection[str], size: float = 9
 ) -> None:
-    """Mark ERAs, red if driven and green if not; axes in centimetres, size in points."""
+    """Mark ERAs: orange with a white rim if driven, white with a black rim if not.
+
+    The axes are in centimetres, the size is in points.
+    """
     for era in eras:
-        color = ACTIVE_COLOR if era.name in active else RESTING_COLOR
-        place = (100 * era.x, 100 * era.y)
-        axes.plot(*place, "o", ms=size, color=color, mec="white", mew=1.5, clip_on=False)
+        is_active = era.name in active
+        color = ACTIVE_COLOR if is_active else RESTING_COLOR
+        rim = "white" if is_active else "black"
+        position = (100 * era.x, 100 * era.y)
+        axes.plot(*position, "o", ms=size, color=color, mec=rim, mew=1.5, clip_on=False)
 
 
 @dataclass(frozen=True)
@@ -89,7 +95,10 @@ class MapPanel:
 
 
 def maps_figure(panels: Sequence[MapPanel], *, columns: int, caption: str | None = None) -> Figure:
-    """Draw maps side by side on one colour scale in g (1 g = 9.8 m/s²), with ERAs and nulls."""
+    """Draw maps side by side on one colour scale in g (1 g = 9.8 m/s²), with ERAs.
+
+    White lines surround nulls: there the plate moves a tenth of the map's maximum.
+    """
     rows = -(-len(panels) // columns)
     width = 7.0 if columns == 1 else 3.6 * columns + 1
     ratio = panels[0].plate_map.y[-1] / panels[0].plate_map.x[-1]
@@ -103,18 +112,29 @@ def maps_figure(panels: Sequence[MapPanel], *, columns: int, caption: str | None
         colours = {"cmap": COLORS, "shading": "gouraud", "vmin": 0, "vmax": maximum}
         image = axes.pcolormesh(100 * solved.x, 100 * solved.y, solved.peak / G, **colours)
         label_plate(axes)
-        axes.plot(*(100 * solved.nulls.T), "x", color="red", ms=5, mew=1.2, clip_on=False)
+        _draw_nulls(axes, solved)
         draw_eras(axes, panel.eras, active=panel.active)
         axes.set_title(panel.title)
         axes.label_outer()
-    figure.colorbar(image, ax=grid, label="peak acceleration / g")
+    label = "peak acceleration / g\nwhite lines: a tenth of the map's maximum"
+    figure.colorbar(image, ax=grid, label=label)
     if caption:
         figure.suptitle(caption)
     return figure
 
 
+def _draw_nulls(axes: Axes, solved: PlateMap) -> None:
+    """Draw a white contour around the nulls, where the plate moves a tenth of its maximum."""
+    level = NULL_SHARE * float(solved.peak.max())
+    if not float(solved.peak.min()) < level:
+        return
+    axes.contour(
+        100 * solved.x, 100 * solved.y, solved.peak, levels=[level], colors="white", linewidths=1
+    )
+
+
 def map_figure(rig: Rig, plate_map: PlateMap, *, active: Collection[str], title: str) -> Figure:
-    """Draw one map with its ERAs, nulls as red crosses and a colour bar in g."""
+    """Draw one map with its ERAs, a white contour around nulls and a colour bar in g."""
     return maps_figure([MapPanel(title, plate_map, rig.eras, active)], columns=1)
 
 

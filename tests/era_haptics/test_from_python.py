@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 from matplotlib.colors import to_hex
+from matplotlib.contour import QuadContourSet
 from matplotlib.patches import Circle
 from typer.testing import CliRunner
 
@@ -378,18 +379,26 @@ def test_frames_need_pandas(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_draw_map_marks_driven_eras() -> None:
-    """Red where driven, green elsewhere, by place in cm; the scale ends at the largest value."""
+    """Orange where driven, white elsewhere, by place in cm; the scale ends at the largest value.
+
+    One colour is dark and the other bright, so that they differ for those who see no red or green.
+    """
     drive = {"SW": 110, "NE": era.Drive(110, level=0.5)}
     axes, scale = era.draw_map(PLATE, drive, title="a diagonal").axes
-    red, green = "#d62728", "#2ca02c"
+    orange, white = "#d55e00", "#ffffff"
     colours = {
         tuple(np.round(line.get_xydata()[0]).tolist()): to_hex(line.get_color())
         for line in axes.lines
         if line.get_marker() == "o"
     }
-    assert colours == {(0, 0): red, (30, 0): green, (30, 23): red, (0, 23): green}
+    assert colours == {(0, 0): orange, (30, 0): white, (30, 23): orange, (0, 23): white}
     assert axes.get_title() == "a diagonal"
-    assert scale.get_ylim()[1] == pytest.approx(PLATE.map(drive).peak.max() / 9.8)
+    field = PLATE.map(drive)
+    assert scale.get_ylim()[1] == pytest.approx(field.peak.max() / 9.8)
+    (contour,) = [one for one in axes.collections if isinstance(one, QuadContourSet)]
+    assert contour.levels == pytest.approx([field.peak.max() / 10])
+    inside = [path for path in contour.get_paths() if len(path.vertices)]
+    assert inside  # around the nulls, all of which are below a tenth
 
 
 def test_draw_answer_shows_fingers_and_levels(table: era.LocalizationTable) -> None:

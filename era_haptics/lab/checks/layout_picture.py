@@ -275,10 +275,52 @@ def _answered(
 
 _LEVEL_EDGES = [-12.0, -6.0, -4.0, -2.0, 2.0, 4.0, 6.0, 12.0]  # dB
 _MAX_CONTRAST = 30.0  # dB
+_FREQUENCY_TICKS = (40, 60, 100, 150, 250, 400, 600)  # Hz
 _NO_PROMISE = "#bbbbbb"
 _MAX_JOINED = 12  # fingers at once that are drawn joined, of each count
 _BRIGHT = 0.6  # of a scale of colours, from which black is read better than white
 _SIZES = (90.0, 36.0, 10.0)  # of marks; those of a region's further effects lie within
+
+
+@dataclass(frozen=True)
+class _TouchPanel:
+    """A panel with one mark for each touch."""
+
+    title: str
+    label: str
+    """Of the colour bar."""
+    value: Callable[[CheckedEffect, SimulatedTouch], float | None]
+    """What a mark's colour stands for; None without a value."""
+    norm: Normalize
+    colors: str
+
+
+def _touch_panels(frequencies: FloatArray) -> list[_TouchPanel]:
+    """Return the panels of a table with these frequencies [Hz]."""
+    low, high = float(frequencies[0]), float(frequencies[-1])
+    return [
+        _TouchPanel(
+            "level: felt compared with promised",
+            "felt minus promised / dB",
+            _off_level,
+            BoundaryNorm(_LEVEL_EDGES, 256, extend="both"),
+            "RdBu_r",
+        ),
+        _TouchPanel(
+            "frequency that plays",
+            "frequency / Hz",
+            lambda _, touch: touch.frequencies[0] if touch.frequencies else None,
+            LogNorm(low, max(high, 1.01 * low)),
+            "viridis",
+        ),
+        _TouchPanel(
+            "promised contrast to a resting second finger",
+            "above a resting second finger\npromised / dB",
+            lambda _, touch: touch.promised_contrast_db,
+            Normalize(0.0, _MAX_CONTRAST),
+            "viridis",
+        ),
+    ]
 
 
 def check_figure(
@@ -296,30 +338,20 @@ def check_figure(
     ratio = table.plate.width / table.plate.length
     rows = 2 if together else 1
     figure = Figure(figsize=(18.0, rows * (5.0 * ratio + 1.6)), layout="constrained")
-    panels: list[tuple[str, Callable[[CheckedEffect, SimulatedTouch], float | None]]] = [
-        ("felt minus promised / dB", _off_level),
-        ("frequency / Hz", lambda _, touch: touch.frequencies[0] if touch.frequencies else None),
-        (
-            "above a resting second finger\npromised / dB",
-            lambda _, touch: touch.promised_contrast_db,
-        ),
-    ]
-    low, high = float(table.frequencies[0]), float(table.frequencies[-1])
-    scales: list[tuple[Normalize, str]] = [
-        (BoundaryNorm(_LEVEL_EDGES, 256, extend="both"), "RdBu_r"),
-        (LogNorm(low, max(high, 1.01 * low)), "viridis"),
-        (Normalize(0.0, _MAX_CONTRAST), "viridis"),
-    ]
+    panels = _touch_panels(table.frequencies)
     subplots = figure.subplots(rows, len(panels), squeeze=False)
     if together:
         _draw_together(figure, [*subplots[1]], layout, table, together)
-    for axes, (label, value), (norm, colors) in zip(subplots[0], panels, scales, strict=True):
+    for axes, panel in zip(subplots[0], panels, strict=True):
+        axes.set_title(panel.title, fontsize=9)
         _draw_layout(axes, layout, table)
-        _draw_touches(axes, checked, value, norm, colors)
-        bar = figure.colorbar(ScalarMappable(norm, colors), ax=axes, label=label, shrink=0.85)
-        if isinstance(norm, LogNorm):
-            ticks = [each for each in (40, 60, 100, 150, 250, 400, 600) if low <= each <= high]
-            bar.set_ticks(ticks, labels=[str(each) for each in ticks], minor=False)
+        _draw_touches(axes, checked, panel.value, panel.norm, panel.colors)
+        scale = ScalarMappable(panel.norm, panel.colors)
+        bar = figure.colorbar(scale, ax=axes, label=panel.label, shrink=0.85)
+        if isinstance(panel.norm, LogNorm):
+            low, high = panel.norm.vmin or 0.0, panel.norm.vmax or 0.0
+            ticks = [hertz for hertz in _FREQUENCY_TICKS if low <= hertz <= high]
+            bar.set_ticks(ticks, labels=[str(hertz) for hertz in ticks], minor=False)
             bar.minorticks_off()
     return figure
 

@@ -486,6 +486,8 @@ def test_picture_has_the_plate_in_centimetres_and_the_names_of_its_regions() -> 
     found = check_together(shown, paper_table())
     figure = layout_picture.check_figure(shown, paper_table(), (), found)
     plate, *_, matrix = [each for each in figure.axes if each.get_title()]
+    panels = [axes for axes in figure.axes if axes.get_label() != "<colorbar>"]
+    assert [axes.get_title() for axes in panels if not axes.get_title()] == []
     named = {each.get_text(): each.get_rotation() for each in plate.texts}
     assert (named["tall"], named["flat"]) == (90, 0)
     outline = plate.patches[0].get_path().vertices[2]

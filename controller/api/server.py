@@ -165,13 +165,16 @@ class Connection(asyncio.BufferedProtocol):
         self._server.forget(self)
 
     def next_line(self) -> bytes:
-        """Take the next line, or all that has come of one that is too long."""
+        """Take the next line, or all that has come of one that is too long; then read no more."""
         end = self._line_end if self._line_end >= 0 else len(self._input)
         line = bytes(memoryview(self._input)[:end])
         del self._input[: end + 1]
         self._stop_at = max(self._stop_at - end - 1, -1)
         self._line_end = self._input.find(b"\n")
-        if len(self._input) <= _MAX_READ_AHEAD:
+        if end >= MAX_LINE_LENGTH:
+            self.is_at_end = True
+            self._transport.pause_reading()
+        elif len(self._input) <= _MAX_READ_AHEAD and not self.is_at_end:
             self._transport.resume_reading()
         return line
 
@@ -180,6 +183,7 @@ class Connection(asyncio.BufferedProtocol):
         rest = bytes(self._input)
         self._input.clear()
         self._line_end = self._stop_at = -1
+        self.is_at_end = True
         self._transport.pause_reading()
         return rest
 
@@ -226,9 +230,10 @@ Handler: TypeAlias = Callable[[Connection, Any], ApiMessage | Awaitable[ApiMessa
 
 
 class _Call:
-    """A line as read: a method with its parameters, and what is wrong with the line, if anything.
+    """A line of a client: a method with its parameters, and what is wrong with it, if anything.
 
-    A method that silences is identified before anything else is read.
+    A line that silences is only identified, so that nothing delays what it does; `read` then finds
+    out what is wrong with it.
     """
 
     def __init__(self, line: bytes) -> None:
@@ -238,24 +243,29 @@ class _Call:
         self.params: ApiMessage | None = None
         self.error: Exception | None = None
         self.record: dict[str, Any] = {}  # for dumps, with the outcome
+        self._line = line
         silencing = read_silencing(line)
         self.silences = silencing is not None
-        if silencing is not None:
+        if silencing is None:
+            self.read()
+        else:
             self.method = silencing.method
             self.params = silencing.params
+
+    def read(self) -> None:
+        """Read the line strictly."""
         try:
-            self._read(line)
+            self._read()
         except InvalidRequest as error:
             self.id, self.error = error.id, error
         except Exception as error:  # of the parameters, or a bug
             self.error = error
 
-    def _read(self, line: bytes) -> None:
-        """Read the line strictly; raises RpcError."""
-        if len(line) >= MAX_LINE_LENGTH:
+    def _read(self) -> None:
+        if len(self._line) >= MAX_LINE_LENGTH:
             what = f"line longer than {MAX_LINE_LENGTH} bytes"
             raise InvalidRequest(ErrorCode.PARSE, what, remedy="send less")
-        request = read_request(line)
+        request = read_request(self._line)
         self.id, self.expects_response = request.id, request.expects_response
         if request.method not in METHODS:
             raise unknown_method(request.method, METHODS)
@@ -396,7 +406,7 @@ class ApiServer:
                     client = clients.popleft()
                     self._waiting.pop(client, None)
                     if client.has_lines:
-                        self._serve(client)
+                        self._serve(client, client.next_line())
                     if client.has_lines:  # behind the others
                         self._waiting[client] = None
                         clients.append(client)
@@ -424,35 +434,22 @@ class ApiServer:
         touches = self.clock() - client.touched_at <= CONTACT_TIMEOUT
         return 0 if client.is_urgent else 1 if touches or self._holds_lease(client) else 2
 
-    def _serve(self, client: Connection) -> None:
-        """Serve the next line of a client, or start to."""
-        line = client.next_line()
+    def _serve(self, client: Connection, line: bytes) -> None:
+        """Carry out a line of a client, or start to; respond if it has ended."""
         call = _Call(line)
-        is_over_rate = call.is_limited and not client.rate.take()
-        if is_over_rate and call.error is not None:
-            client.respond(error_line(None, _busy()))
-            self._end_input(client)
-            return
-        if is_over_rate:
+        if call.is_limited and not client.rate.take():
+            if call.error is not None:
+                client.respond(error_line(None, _busy()))
+                self._end_input(client)
+                return
             call.error = _busy()
-        self._start_call(client, call)
-        if len(line) >= MAX_LINE_LENGTH:
-            self._end_input(client)
-
-    def _end_input(self, client: Connection) -> None:
-        """Serve no further line of a client, except for what silences in the rest of its input."""
-        rest = client.take_rest()
-        client.is_at_end = True
-        if read_silencing(rest) is not None:
-            self._start_call(client, _Call(rest))
-
-    def _start_call(self, client: Connection, call: _Call) -> None:
-        """Carry out a call, or start to; respond if it has ended."""
         try:
             call.record = self._requested(client.name, call.method, client.received_at)
             if not call.silences:
                 self._check(client, call)
-            result = self._handle(client, call)
+            self._note(client, call)
+            handle = self._handler(client, call)
+            result = handle()
             if isinstance(result, ApiMessage):
                 self._respond(client, call, result)
                 return
@@ -465,18 +462,29 @@ class ApiServer:
         client.pending.add(task)
         task.add_done_callback(lambda task: self._finished(client, task))
 
-    def _handle(self, client: Connection, call: _Call) -> ApiMessage | Awaitable[ApiMessage]:
-        """Call the handler of a method; arming waits until the client's input is read."""
-        method = METHODS[call.method]
-        client.silenced += method.silences
+    def _end_input(self, client: Connection) -> None:
+        """Serve no further line of a client, but for what silences in the rest of its input."""
+        rest = client.take_rest()
+        if read_silencing(rest) is not None:
+            self._serve(client, rest)
+
+    def _note(self, client: Connection, call: _Call) -> None:
+        """Note that a client silences or touches."""
+        client.silenced += METHODS[call.method].silences
         if isinstance(call.params, TouchParams):
             client.touched_at = self.clock() if call.params.touches else -math.inf
+
+    def _handler(
+        self, client: Connection, call: _Call
+    ) -> Callable[[], ApiMessage | Awaitable[ApiMessage]]:
+        """The handler of a call; that of an arm waits until more of the input is read."""
+        method = METHODS[call.method]
         handle = partial(self._handlers[call.method], client, call.params)
         if not method.needs_reply:
-            return handle()
+            return handle
         if not call.expects_response:
-            return Empty()
-        return _for_one_who_stays(client, client.silenced, handle)
+            return Empty
+        return partial(_for_one_who_stays, client, client.silenced, handle)
 
     def _check(self, client: Connection, call: _Call) -> None:
         """Raise why a call is not carried out; one that silences always is."""
@@ -506,6 +514,8 @@ class ApiServer:
 
     def _respond(self, client: Connection, call: _Call, outcome: ApiMessage | Exception) -> None:
         """Send the response to a call, and note its outcome."""
+        if call.silences:
+            call.read()
         if isinstance(outcome, Exception):
             error = _rpc_error(outcome)
             response = error_line(call.id, error)

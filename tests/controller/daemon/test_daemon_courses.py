@@ -30,6 +30,7 @@ from controller.api.client import AsyncClient
 from controller.api.jsonrpc import ErrorCode, RpcError
 from controller.api.link import Notification
 from controller.api.methods import ArmParams, StatusResult, TouchParams
+from controller.api.schema import ApiMessage
 from controller.api.server import Connection
 from controller.cli.status_text import show_status
 from controller.demo.demonstration import layout_of_people
@@ -255,6 +256,11 @@ class Served(Taken):
         """Require that a step is refused by the daemon, or by its client, with this text."""
         with pytest.raises((RpcError, InputError), match=text):
             await self.take(step)
+
+    async def requests(self, method: str, params: Mapping[str, object]) -> None:
+        """Let era request a method with any parameters."""
+        unchecked = SimpleNamespace(model_dump_json=lambda **_: json.dumps(params))
+        await self.era.request(method, cast(ApiMessage, unchecked))
 
     async def renews(self) -> None:
         """Renew the lease, as its client does."""

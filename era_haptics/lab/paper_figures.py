@@ -145,8 +145,8 @@ def _box_plots(rig: Rig, free: FreePlate, *, name: str, active_count: int) -> Pa
     axes.set_ylabel("cumulative peak acceleration / g")
     axes.set_ylim(bottom=0)
     axes.set_title("boxes: quartiles over the plate; whiskers: minimum and maximum", fontsize=10)
-    active = "One active ERA" if active_count == 1 else "Two active ERAs"
-    figure.suptitle(f"{active} (orange): peak accelerations added up over {len(SWEEP)} frequencies")
+    drive = "One active ERA" if active_count == 1 else "Two active ERAs"
+    figure.suptitle(f"{drive} (orange): peak accelerations added up over {len(SWEEP)} frequencies")
     headers = ("layout", "active_eras", "era_fractions", *(f"{key}_m_s2" for key in STATISTICS))
     table: Columns = dict(zip(headers, zip(*rows, strict=True), strict=True))
     return PaperFigure(name, figure, {"": table})

@@ -5,6 +5,7 @@ One browser and one daemon for all tests, and one tab for those that load nothin
 
 import asyncio
 import logging
+import math
 import re
 from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import suppress
@@ -623,15 +624,15 @@ async def test_texts_on_the_plate_do_not_overlap(page: Page) -> None:
         assert await page.evaluate(covered % width) == []
 
 
-async def test_effect_button_plays_at_the_newest_finger(page: Page, era: Client) -> None:
-    """Only while armed, and with a finger on the plate.
+async def test_effect_button_always_finds_a_finger_of_its_page(page: Page, era: Client) -> None:
+    """It plays at the newest finger, or puts one where the last one was lifted; only while armed.
 
     A slider sets the strength of its fingers, and a page of its own that by its name, if a number.
     """
     assert await page.until("document.querySelector('#effects button:disabled') !== null")
     await arm(page, era)
     async with fingers_down(page, PLACES[0]):
-        await contacts(era, 1)
+        (pressed,) = await contacts(era, 1)
         await page.until("document.querySelectorAll('.contact').length")
         await page.until("document.querySelector('[data-name=page] output')?.value === '0 dB'")
         await page.evaluate(
@@ -655,8 +656,13 @@ async def test_effect_button_plays_at_the_newest_finger(page: Page, era: Client)
         await page.until("document.querySelectorAll('.contact.target').length")
         assert await page.evaluate("document.querySelector('#problem').innerText") == ""
     await contacts(era, 0)
-    await page.click("#effects button")
-    await page.until("document.querySelector('#problem').innerText")
+    for _ in range(3):
+        await page.click("#effects button")
+        await page.until("document.querySelectorAll('.contact.target').length")
+    assert await page.evaluate("document.querySelector('#problem').innerText") == ""
+    (finger,) = await contacts(era, 1)
+    assert math.dist(finger, pressed) < 0.001
+    await contacts(era, 0)
 
 
 async def test_effects_and_events_are_seen_on_a_laptop(page: Page, era: Client) -> None:

@@ -62,6 +62,8 @@ async function attempt(called) {
 }
 
 const NOT_SILENT = 1006;
+const SAME_PLACE_M = 0.01;  // half the radius within which the daemon looks for a finger
+const CONTACT_WAIT_MS = 5000;  // of a busy machine
 
 async function stop() {
   try {
@@ -296,11 +298,23 @@ const HANDLERS = {
   },
 };
 
-// Play an effect at the keyboard's finger, or at the newest one.
+// Wait until the daemon reports a contact at a finger of this page.
+async function contactAt({ x_m, y_m }) {
+  const isThere = (contact) => Math.hypot(contact.x_m - x_m, contact.y_m - y_m) < SAME_PLACE_M;
+  const deadline = performance.now() + CONTACT_WAIT_MS;
+  while (!overlay.contacts.some(isThere)) {
+    if (performance.now() > deadline) throw new Error("the daemon has not reported the finger; press the button again");
+    await new Promise((resolve) => setTimeout(resolve, 10));
+  }
+}
+
+// Play an effect at a finger of this page.
 async function play(effect) {
-  const { rig, cursor, contacts } = overlay;
-  const { x_m, y_m } = cursor ?? contacts.at(-1) ?? { x_m: rig.length_m / 2, y_m: rig.width_m / 2 };
-  await attempt(() => connection.call("play", { effect, x_m, y_m }));
+  await attempt(async () => {
+    const finger = fingers.forButton();
+    await contactAt(finger);
+    await connection.call("play", { effect, x_m: finger.x_m, y_m: finger.y_m });
+  });
 }
 
 // What came since the state was shown is not acknowledged, but shown.

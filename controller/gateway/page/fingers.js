@@ -1,9 +1,12 @@
-// Fingers on the plate's picture: pointers of every kind, one moved by the keyboard, and those that rest
-// where a pointer was pressed with the shift key, until they are pressed so again or Escape lifts all.
+// Fingers on the plate's picture: pointers of every kind, one moved by the keyboard, and resting ones. A press with
+// the shift key lets a finger rest until it is pressed the same way again, or Escape lifts all. An effect button
+// whose page holds no finger down puts one where the last one was, for as long as the effect may last.
 
 const STEP_M = 0.005;
 const KEYBOARD = -1;  // an id that no pointer has
-const RESTING = -2;  // the first of those that rest; the next ones are lower
+const BUTTON = -2;  // the finger that an effect button puts on the plate
+const RESTING = -3;  // the first of those that rest; the next ones are lower
+const BUTTON_MS = 2000;  // after which the finger of an effect button is lifted
 const NEAR_PX = 24;  // of a resting finger
 const PX_M = 0.0254 / 96;  // of a CSS pixel: a finger has its size whatever that of the picture
 const LEAST_M = 0.001;  // radius; a pointer of unknown size has sides of one or two pixels
@@ -14,6 +17,8 @@ export class Fingers {
     this.overlay = overlay;
     this.send = send;
     this.positions = new Map();  // by id, of the fingers that are down
+    this.last = null;  // position of the finger that moved last, also after it was lifted
+    this.buttonTimer = null;  // lifts the finger of an effect button
     this.isMoveScheduled = false;
     plate.addEventListener("pointerdown", (event) => this.press(event, plate));
     plate.addEventListener("pointermove", (event) => this.move(event));
@@ -22,7 +27,9 @@ export class Fingers {
     }
     plate.addEventListener("contextmenu", (event) => event.preventDefault());
     plate.addEventListener("keydown", (event) => this.key(event));
-    plate.addEventListener("blur", () => this.removeCursor());
+    plate.addEventListener("blur", ({ relatedTarget }) => {
+      if (!relatedTarget?.closest("#effects")) this.removeCursor();
+    });
   }
 
   press(event, plate) {
@@ -47,6 +54,7 @@ export class Fingers {
   move(event) {
     if (!this.positions.has(event.pointerId)) return;
     this.positions.set(event.pointerId, this.contact(event));
+    this.last = this.positions.get(event.pointerId);
     if (this.isMoveScheduled) return;
     this.isMoveScheduled = true;
     requestAnimationFrame(() => {
@@ -67,7 +75,19 @@ export class Fingers {
 
   put(id, position) {
     this.positions.set(id, position);
+    this.last = position;
     this.report();
+  }
+
+  // Position for an effect button: of the newest finger that is down, or of one that is put where the last one was.
+  forButton() {
+    const newest = [...this.positions.keys()].filter((id) => id !== BUTTON).at(-1);
+    if (newest !== undefined) return this.positions.get(newest);
+    const { rig } = this.overlay;
+    this.put(BUTTON, this.last ?? { x_m: rig.length_m / 2, y_m: rig.width_m / 2 });
+    clearTimeout(this.buttonTimer);
+    this.buttonTimer = setTimeout(() => this.lift(BUTTON), BUTTON_MS);
+    return this.last;
   }
 
   lift(id) {

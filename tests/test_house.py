@@ -16,6 +16,7 @@ import pytest
 
 from changed_tests import ALSO, OPTIONS, also, nearest
 from checks import vocabulary
+from checks.unique_names import repeated_names
 from checks.vocabulary import misleading_names, retired_identifiers
 
 ROOT = Path(__file__).parents[1]
@@ -53,16 +54,44 @@ PRODUCT = {
 
 
 def test_names_that_mislead_are_listed_with_their_places(tmp_path: Path) -> None:
-    """Classes and modules of one name, and participles; errors and private classes are free."""
+    """Modules of one name, and participles; errors and names of command modules are free."""
     for name, text in PRODUCT.items():
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_text(text, "utf-8")
     found = [re.findall(r"^\w+ \w+|\w+/\S+\d", line) for line in misleading_names(tmp_path)]
     assert found == [
         ["module line"],
-        ["class Line", "model/line.py:2", "sim/line.py:1"],
         ["class Felt", "sim/cli.py:1"],
         ["class _Chosen", "sim/line.py:2"],
+    ]
+
+
+REPEATED = {
+    "model/plate.py": "LIMIT, _OWN = 1, 2\nclass Plate: ...\ndef shown(): ...\nRow = int",
+    "sim/plant.py": "if True:\n    LIMIT = 3\n_OWN = 4\nfrom model.plate import shown as shown",
+    "drivers/wire.py": "class Wire:\n    class Plate: ...\nRow: TypeAlias = list[int]",
+    "model/cli.py": "app = 1\nEXIT_STATUS = {}\ngroup = typer.Typer()\ndef show(): ...",
+    "sim/cli.py": "app = 2\nEXIT_STATUS = {}\ngroup = typer.Typer()\ndef show(): ...",
+    "era_haptics/lab/conformance/checks/one.py": "@reading('x')\nasync def stop(): ...",
+    "era_haptics/lab/conformance/checks/two.py": "@driving('x')\nasync def stop(): ...",
+    "era_haptics/tables.py": "def answer(): ...\ndef helper(): ...",
+    "era_haptics/__init__.pyi": "from era_haptics.tables import answer as answer",
+    "model/plan.py": "def answer(): ...\ndef helper(): ...",
+    "tests/plate.py": "LIMIT = 5",
+}
+
+
+def test_names_that_two_modules_define_are_listed_with_their_places(tmp_path: Path) -> None:
+    """Constants, classes, aliases, functions; re-exports, commands, checks and the API are free."""
+    for name, text in REPEATED.items():
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text(text, "utf-8")
+    found = [re.findall(r"^\w+|[\w/]+\.py:\d+", line) for line in repeated_names(tmp_path)]
+    assert found == [
+        ["LIMIT", "model/plate.py:1", "sim/plant.py:2"],
+        ["Plate", "drivers/wire.py:2", "model/plate.py:2"],
+        ["Row", "drivers/wire.py:3", "model/plate.py:4"],
+        ["helper", "era_haptics/tables.py:2", "model/plan.py:2"],
     ]
 
 

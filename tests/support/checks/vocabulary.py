@@ -1,9 +1,8 @@
 """Retired words in identifiers, and names that mislead: `make lint` lists them and fails.
 
-docs/reference/glossary.md defines the words that are used in place of retired ones. A public
-class is defined once. A module has a name of its own, but for those that a package may have by
-custom. A class is a noun of the field, no bare participle; only an error may be named by what
-happened.
+docs/reference/glossary.md defines the words that are used in place of retired ones. A module has a
+name of its own, but for those that a package may have by custom. A class is a noun of the field, no
+bare participle; only an error may be named by what happened.
 """
 
 import ast
@@ -205,8 +204,6 @@ def misleading_names(root: Path) -> Iterator[str]:
         if len(files) > 1 and name not in SHARED_MODULES:
             yield f"module {name} must have a name of its own, got {', '.join(files)}"
     for name, places in classes.items():
-        if len(places) > 1 and not name.startswith("_"):
-            yield f"class {name} must be defined once, got {', '.join(places)}"
         if is_participle(name) and not _is_error(name, bases):
             yield f"class {name} must be a noun, got a bare participle in {places[0]}"
 

@@ -23,7 +23,7 @@ from model.arrays import ComplexArray, FloatArray
 from model.reduction.free_plate import solve_free_plate
 from model.rig.rig import Rig
 from model.rig.rig_file import load_rig
-from model.spectral.modes import Band, SpectralPlate
+from model.spectral.modes import MaterialBand, SpectralPlate
 from model.spectral.polynomials import CLASSES
 from model.structure.material import Material
 from model.structure.plate import (
@@ -223,7 +223,7 @@ def _strip(layers: tuple[LaminateLayer, ...]) -> FloatArray:
     """Natural frequencies [Hz] of a strip of infinite width."""
     solved = SpectralPlate(_plate(layers, width=1.0), (16, 0), AT)
     found = [
-        solved.modes(each, shift=1e4, cut=1e10, band=Band(AT, AT)).eigenvalues
+        solved.modes(each, shift=1e4, cut=1e10, band=MaterialBand(AT, AT)).eigenvalues
         for each in CLASSES
         if each[1] == 1
     ]

@@ -26,7 +26,12 @@ from controller.play.routing import (
 )
 from drivers.errors import CommandError, CommandRefused
 from drivers.host.amplifier import Amplifier
-from drivers.host.amplifier_sensors import AmplifierSensor, Reading, measure_tones, read_sensors
+from drivers.host.amplifier_sensors import (
+    AmplifierSensor,
+    Reading,
+    measure_tones,
+    read_amplifier_sensors,
+)
 from drivers.host.clock import CLOCK_SETTLING
 from drivers.host.group import Group
 from drivers.opening import Lines
@@ -44,7 +49,7 @@ from model.transients.time_response import plate_in_time
 from model.vibration import Excitation, Tone
 from registry import threads
 
-WINDOW = 0.2  # s; of a reading: 1 % of noise is enough, and shorter ones hear more of it
+_WINDOW = 0.2  # s; of a reading: 1 % of noise is enough, and shorter ones hear more of it
 _TONES = 28  # over the range; theory in doubt asks for more, gains and springs for ten
 _PER_BAND = 2  # at least
 _AT_ONCE = 16  # tones of a reading
@@ -96,7 +101,7 @@ def interleaved(
         own, apart = _rounds(group, low, high, count=1 if is_quick else len(group))
         steps += own
         closest = min(closest, apart)
-    window = max(WINDOW, _MARGIN / closest, _MARGIN / low)
+    window = max(_WINDOW, _MARGIN / closest, _MARGIN / low)
     return ToneSchedule(tuple(steps), settling(rig, frequency_range), window)
 
 
@@ -163,7 +168,7 @@ async def plate_sensors(
     used: list[PlateSensor] = []
     unused: list[str] = []
     for name, amplifier in amplifiers.items():
-        reported = await read_sensors(amplifier)
+        reported = await read_amplifier_sensors(amplifier)
         if not reported:
             raise CommandError(
                 f"amplifier {name} must measure the plate (feature sensors of the wire protocol), "
@@ -292,7 +297,7 @@ class TonePlayer:
             await self._lines.close()
 
 
-LEVEL = 0.1
+_LEVEL = 0.1
 """Usual level of every tone, 20 dB below full stroke."""
 
 HIGHEST = 10**-0.5
@@ -562,7 +567,7 @@ def checked_level(rig: Rig, level: float | None) -> float:
     allowed = min(limits.level, math.sqrt(limits.power / len(rig.eras)), 1.0)
     highest = HIGHEST * allowed
     if level is None:
-        return min(LEVEL, highest)
+        return min(_LEVEL, highest)
     if not 0 < level <= highest:
         raise InputError(
             f"--level must be above 0 and at most {highest:.3g}, 10 dB below what the rig allows, "

@@ -41,7 +41,7 @@ def amplitude_of(level: int, phase: int) -> complex:
 
 
 @lru_cache(maxsize=256)  # a set names an envelope several times, and its commit does again
-def amplitudes_of(envelope: Envelope | None) -> tuple[complex, ...]:
+def _amplitudes_of(envelope: Envelope | None) -> tuple[complex, ...]:
     """Return the complex amplitudes of the knots of an envelope in full levels, if any."""
     return () if envelope is None else _amplitudes_at(envelope.knots)
 
@@ -135,7 +135,7 @@ def along(
         return VoiceTransition(time, ramp, first, last, time + ramp)
     step = envelope.step / _PER_STEP
     end = time + step * (len(envelope.knots) + 1)
-    return VoiceTransition(time, step, first, last, end, amplitudes_of(envelope))
+    return VoiceTransition(time, step, first, last, end, _amplitudes_of(envelope))
 
 
 def steepest(

@@ -25,6 +25,6 @@ def main() -> int:
     return command_line.main(command_modules)
 
 
-def run(arguments: Sequence[str]) -> int:
+def run_era(arguments: Sequence[str]) -> int:
     """Run one command line; return the exit status."""
     return command_line.run(arguments, command_modules)

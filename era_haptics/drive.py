@@ -16,7 +16,7 @@ import numpy as np
 from model.answer.answer import Answer, Layer
 from model.answer.stimulus import Finger
 from model.arrays import FloatArray, Point
-from model.errors import InputError, expect, expect_number, is_whole, shown
+from model.errors import InputError, expect_instance, expect_number, is_whole, shown
 from model.rig.rig import Rig
 from model.vibration import Tone
 
@@ -41,7 +41,7 @@ _UNITS_OF_A_TONE = {
 
 def expect_rig(value: object) -> None:
     """Raise InputError for anything but a rig, such as the name of its file."""
-    expect(value, Rig, what="rig", made_by='era.load_rig("rig.yaml")')
+    expect_instance(value, Rig, what="rig", made_by='era.load_rig("rig.yaml")')
 
 
 def warn_of_surface(rig: Rig) -> None:
@@ -181,7 +181,7 @@ Played: TypeAlias = Answer | Layer | Drives
 """What ERAs are to play: an answer with all its layers, one layer, or drives."""
 
 
-def layers_of(drive: Played, rig: Rig) -> tuple[Layer, ...]:
+def playable_layers(drive: Played, rig: Rig) -> tuple[Layer, ...]:
     """The layers of an answer, or one; raises InputError for silence, and what the rig cannot play.
 
     That is an unknown ERA, a frequency beyond the rig's limits, and more than full stroke of all

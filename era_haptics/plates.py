@@ -22,13 +22,13 @@ from era_haptics.drive import (
     as_points,
     as_signals,
     expect_rig,
-    layers_of,
+    playable_layers,
     warn_of_surface,
 )
 from model.answer.answer import Answer
 from model.answer.stimulus import Placement, Stimulus, check_on_plate, together
 from model.arrays import ComplexArray, FloatArray
-from model.errors import InputError, expect, expect_number, is_whole, shown
+from model.errors import InputError, expect_instance, expect_number, is_whole, shown
 from model.reduction.free_plate import FreePlate, solve_free_plate
 from model.reduction.reduced_plate import (
     ReducedPlate,
@@ -152,7 +152,7 @@ class SolvedPlate:
                 name: Tone.from_phasor(tone.frequency, factors[name] * tone.phasor)
                 for name, tone in each.items()
             }
-            for layer in layers_of(drive, self.rig)
+            for layer in playable_layers(drive, self.rig)
             for each in layer.excitations
         ]
         return plate_map(self._real, *excitations, raster=points, free=self._free)
@@ -204,7 +204,7 @@ class SolvedPlate:
                 sample_rate=cast(float, sample_rate),
                 imperfections=self._drawn,
             )
-        layers = layers_of(drive, self.rig)
+        layers = playable_layers(drive, self.rig)
         if placed is not None:
             own = tuple(range(len(placed)))
             layers = tuple([replace(each, fingers=own) for each in layers])
@@ -238,8 +238,8 @@ def draw_map(plate: SolvedPlate, drive: Played, *, title: str = "") -> "Figure":
     """
     from model.figures import map_figure
 
-    expect(plate, SolvedPlate, what="plate", made_by="era.SolvedPlate(rig)")
-    layers = layers_of(drive, plate.rig)
+    expect_instance(plate, SolvedPlate, what="plate", made_by="era.SolvedPlate(rig)")
+    layers = playable_layers(drive, plate.rig)
     active = {name for layer in layers for each in layer.excitations for name in each}
     return map_figure(plate.rig, plate.map(drive), active=active, title=title)
 
@@ -254,8 +254,8 @@ def draw_answer(table: LocalizationTable, answer: Answer, *, layer: int = 0) -> 
     """
     from model.figures import layer_figure
 
-    expect(table, LocalizationTable, what="table", made_by="era.table(rig)")
-    expect(answer, Answer, what="answer", made_by="era.query(table, target)")
+    expect_instance(table, LocalizationTable, what="table", made_by="era.table(rig)")
+    expect_instance(answer, Answer, what="answer", made_by="era.query(table, target)")
     if not is_whole(layer) or not 0 <= layer < len(answer.layers):
         raise InputError(
             f"layer must be the number of one of the answer's {len(answer.layers)}, from 0, got "
@@ -275,8 +275,8 @@ def draw_contents(table: LocalizationTable, answer: Answer) -> "Figure":
     """
     from model.figures import contents_figure
 
-    expect(table, LocalizationTable, what="table", made_by="era.table(rig)")
-    expect(answer, Answer, what="answer", made_by="era.answer(table, fingers)")
+    expect_instance(table, LocalizationTable, what="table", made_by="era.table(rig)")
+    expect_instance(answer, Answer, what="answer", made_by="era.answer(table, fingers)")
     if not answer.layers:
         raise InputError("an answer must have a layer to be drawn, got one of quiet fingers")
     return contents_figure(
@@ -301,8 +301,8 @@ def draw_contrast_map(table: LocalizationTable, found: ContrastMap) -> "Figure":
     """
     from model.figures import contrast_map_figure
 
-    expect(table, LocalizationTable, what="table", made_by="era.table(rig)")
-    expect(found, ContrastMap, what="found", made_by="era.contrast_map(table, quiet)")
+    expect_instance(table, LocalizationTable, what="table", made_by="era.table(rig)")
+    expect_instance(found, ContrastMap, what="found", made_by="era.contrast_map(table, quiet)")
     return contrast_map_figure(table, found)
 
 
@@ -318,7 +318,7 @@ def draw_playback(playback: PlatePlayback) -> "Figure":
     from matplotlib.figure import Figure
     from matplotlib.ticker import LogLocator, NullLocator
 
-    expect(playback, PlatePlayback, what="playback", made_by="plate.play(pattern, target)")
+    expect_instance(playback, PlatePlayback, what="playback", made_by="plate.play(pattern, target)")
     figure = Figure(figsize=(6.4, 3.8), layout="constrained")
     axes = figure.subplots()
     period = 1 / min(playback.frequencies, default=1 / LEVEL_WINDOW)

@@ -7,7 +7,7 @@ from typing import Any
 from controller.play.routing import route
 from drivers.by_hand.actions import BlockingAmplifier
 from drivers.playing import AmplifierLayer
-from era_haptics.drive import Played, expect_rig, layers_of
+from era_haptics.drive import Played, expect_rig, playable_layers
 from model.errors import InputError, expect_path, shown
 from model.estimate.calibrate import Calibration
 from model.estimate.calibrate import calibrate as fit
@@ -89,7 +89,7 @@ def commands_for(rig: Rig, drive: Played) -> dict[str, tuple[AmplifierLayer, ...
         [(0, 0.027), (1, 0.038), (2, 0.005), (3, 0.008)]
     """
     expect_rig(rig)
-    voices = [voice for layer in layers_of(drive, rig) for voice in layer.voices]
+    voices = [voice for layer in playable_layers(drive, rig) for voice in layer.voices]
     routed = [
         route(
             each.excitation,

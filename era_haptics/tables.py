@@ -18,7 +18,7 @@ from model.answer.answer_report import measures as _measures
 from model.answer.plan import answer as _answer
 from model.answer.stimulus import MUST, Finger, Stimulus
 from model.arrays import FloatArray
-from model.errors import InputError, expect, expect_number, shown
+from model.errors import InputError, expect_instance, expect_number, shown
 from model.finger import STRONG_DB_SL, Grid
 from model.processes import Progress, check_progress, unseen
 from model.rig.rig import Rig
@@ -48,7 +48,7 @@ def table(
     """
     expect_rig(rig)
     warn_of_surface(rig)
-    expect(grid, Grid, what="grid", made_by="era.Grid(12, 9)")
+    expect_instance(grid, Grid, what="grid", made_by="era.Grid(12, 9)")
     _expect_mode(drive_mode)
     chosen = None if frequencies is None else as_frequencies(frequencies)
     check_progress(progress)
@@ -109,11 +109,13 @@ def answer(
         >>> [(each.verdict, f"{each.promised_contrast_db:.0f} dB") for each in both.fingers]
         [('own', '15 dB'), ('own', '15 dB')]
     """
-    expect(table, LocalizationTable, what="table", made_by="era.table(rig)")
-    expect(fingers, Sequence, what="fingers", made_by="[era.Finger((0.08, 0.06), era.Stimulus())]")
+    expect_instance(table, LocalizationTable, what="table", made_by="era.table(rig)")
+    expect_instance(
+        fingers, Sequence, what="fingers", made_by="[era.Finger((0.08, 0.06), era.Stimulus())]"
+    )
     for finger in fingers:
         made_by = "era.Finger((0.08, 0.06), era.Stimulus())"
-        expect(finger, Finger, what="a finger", made_by=made_by)
+        expect_instance(finger, Finger, what="a finger", made_by=made_by)
     expect_number(apart_hz, what="apart_hz", unit="hertz")
     if drive_mode is not None:
         _expect_mode(drive_mode)
@@ -138,8 +140,8 @@ def measures(table: LocalizationTable, answer: Answer) -> Measures:
         >>> f"{era.measures(table, only).transient_contrast_db:.0f} dB in the first 100 ms"
         '23 dB in the first 100 ms'
     """
-    expect(table, LocalizationTable, what="table", made_by="era.table(rig)")
-    expect(answer, Answer, what="answer", made_by="era.query(table, target)")
+    expect_instance(table, LocalizationTable, what="table", made_by="era.table(rig)")
+    expect_instance(answer, Answer, what="answer", made_by="era.query(table, target)")
     return _measures(table, answer, timing=_timing(table))
 
 
@@ -163,11 +165,11 @@ def contrast_map(
         >>> found.promised_db["phased"].shape
         (4, 6)
     """
-    expect(table, LocalizationTable, what="table", made_by="era.table(rig)")
-    expect(drive_modes, Sequence, what="drive_modes", made_by="['switched', 'phased']")
+    expect_instance(table, LocalizationTable, what="table", made_by="era.table(rig)")
+    expect_instance(drive_modes, Sequence, what="drive_modes", made_by="['switched', 'phased']")
     expect_number(level_db_sl, what="level_db_sl", unit="decibels above the threshold")
     if grid is not None:
-        expect(grid, Grid, what="grid", made_by="era.Grid(12, 9)")
+        expect_instance(grid, Grid, what="grid", made_by="era.Grid(12, 9)")
     for mode in drive_modes:
         _expect_mode(mode)
     check_progress(progress)

@@ -72,7 +72,7 @@ def playable_drive_modes(*, level_step: float, phase_step: float) -> tuple[str, 
     return DRIVE_MODES if level_step < 1 and phase_step <= MAX_PHASE_STEP else DRIVE_MODES[:1]
 
 
-Drive: TypeAlias = list[tuple[int, Complex64Array]]
+WeightedTones: TypeAlias = list[tuple[int, Complex64Array]]
 """Tones: the index of a frequency, and the weights (eras,) at it in full strokes."""
 
 LEVEL_MARGIN = 1.0
@@ -169,7 +169,7 @@ class Forms:
 
     def quiet_power(self, weights: Complex64Array) -> Float32Array:
         """Expected power [m²/s⁴] at each quiet fingertip of weights (f, eras), (f, q)."""
-        power = expected_power(self.quiet.swapaxes(0, 1), weights).T
+        power = _expected_power(self.quiet.swapaxes(0, 1), weights).T
         if self.few is None or self.fine is None:
             return power
         mean = np.add.reduce(_powers(self.few, weights), axis=2)
@@ -185,7 +185,7 @@ class Forms:
         """Amplitudes (..., t, f) minus the margin."""
         if not self.level_margin:
             return amplitudes
-        variance = expected_power(self.target_power, weights) - amplitudes * amplitudes
+        variance = _expected_power(self.target_power, weights) - amplitudes * amplitudes
         deviation = np.sqrt(np.maximum(variance, 0))
         return np.asarray(amplitudes - np.float32(self.level_margin) * deviation)
 
@@ -196,7 +196,7 @@ def _powers(fields: Complex64Array, weights: Complex64Array) -> Float32Array:
     return np.asarray(found.real * found.real + found.imag * found.imag)
 
 
-def expected_power(forms: Complex64Array, weights: Complex64Array) -> Float32Array:
+def _expected_power(forms: Complex64Array, weights: Complex64Array) -> Float32Array:
     """w^H R w of forms (q, f, eras, eras) and weights (..., f, eras): (..., q, f)."""
     each = weights[..., None, :, :]
     moved = np.matvec(forms, each)
@@ -440,7 +440,7 @@ BATCH = 512
 """Number of patterns that are computed exactly at first, those of the highest bounds."""
 
 
-def find_switched(forms: Forms) -> list[tuple[float, Drive]]:
+def find_switched(forms: Forms) -> list[tuple[float, WeightedTones]]:
     """Find the switched patterns of the best scores that reach the level, best first.
 
     Empty if none does. Exact: patterns are excluded by bounds only.
@@ -525,7 +525,7 @@ def _sums_of_pairs(powers: Float32Array) -> Float32Array:
     return np.asarray(sums)
 
 
-def _drive(tones: list[list[int]], eras: int) -> Drive:
+def _drive(tones: list[list[int]], eras: int) -> WeightedTones:
     """Make a drive of ERAs at full stroke, from pairs of frequency, counted from 1, and ERA."""
     found: dict[int, Complex64Array] = {}
     for row, era in sorted(tones):

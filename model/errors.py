@@ -20,7 +20,7 @@ class InputError(ValueError):
 _MAX_LENGTH = 40
 
 
-def expect(value: object, cls: type, *, what: str, made_by: str) -> None:
+def expect_instance(value: object, cls: type, *, what: str, made_by: str) -> None:
     """Raise InputError for a value of another class; made_by: code that makes one."""
     if not isinstance(value, cls):
         raise InputError(

@@ -25,7 +25,12 @@ from scipy.sparse.linalg import LinearOperator, SuperLU, eigsh, splu
 
 from model.arrays import FloatArray, IntArray, lattice
 from model.errors import InputError
-from model.structure.attachments import PointLoad, check_on_plate, footprints_of, mean_over
+from model.structure.attachments import (
+    PointLoad,
+    check_footprints_on_plate,
+    footprints_of,
+    mean_over,
+)
 from model.structure.modal_elasticity import Discretisation
 from model.structure.plate import SHEAR_CORRECTION, Plate
 
@@ -278,7 +283,7 @@ class Mesh(Discretisation):
         points = np.atleast_2d(np.asarray(points, dtype=float))
         if points.shape[1] == 3:
             return mean_over(self.interpolation, points, length=self.length, width=self.width)
-        check_on_plate(points, length=self.length, width=self.width)
+        check_footprints_on_plate(points, length=self.length, width=self.width)
         of_x, weight_x = self.along[0].at(points[:, 0])
         of_y, weight_y = self.along[1].at(points[:, 1])
         columns = of_y[:, :, None] * self.columns + of_x[:, None]

@@ -22,17 +22,17 @@ _THREAD_COUNTS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 
 Shared = TypeVar("Shared")
 Task = TypeVar("Task")
-Result = TypeVar("Result")
+_Result = TypeVar("_Result")
 
 _in_worker: tuple[Callable[[Any, Any], Any], Any]  # set by _start_worker
 
 
 def on_processes(
     count: int,
-    solve: Callable[[Shared, Task], Result],
+    solve: Callable[[Shared, Task], _Result],
     shared: Shared,
     tasks: Mapping[int, Task],
-) -> Iterator[tuple[int, Result]]:
+) -> Iterator[tuple[int, _Result]]:
     """Yield numbers of tasks with their results in the order in which they are done.
 
     count: of processes, 1 for this one; solve: a function of a module; shared: its first argument,
@@ -138,10 +138,10 @@ _ADDRESS = re.compile(r"(tcp|tls)://[\w.\-\[\]:]+:\d{1,5}")
 
 def on_cluster(
     address: str,
-    solve: Callable[[Shared, Task], Result],
+    solve: Callable[[Shared, Task], _Result],
     shared: Shared,
     tasks: Mapping[int, Task],
-) -> Iterator[tuple[int, Result]]:
+) -> Iterator[tuple[int, _Result]]:
     """Yield numbers of tasks with their results in the order in which they are done.
 
     address: of a scheduler, for example tcp://192.168.1.5:8786; solve: a function of a module;
@@ -182,7 +182,7 @@ def on_cluster(
         }
         try:
             for future in as_completed(numbers, loop=client.loop):  # type: ignore[no-untyped-call]
-                result: Result = future.result()
+                result: _Result = future.result()
                 yield numbers.pop(future), result
         except KilledWorker as error:
             raise InputError(

@@ -122,7 +122,7 @@ def find_nulls(x: FloatArray, y: FloatArray, peak: FloatArray) -> FloatArray:
     return np.column_stack([x[columns], y[rows]])
 
 
-MAX_POINTS = 1_000_000
+_MAX_POINTS = 1_000_000
 """Most points of a map: more are finer than any screen, and take some hundred bytes each."""
 
 _BATCH = 10_000  # points that are solved together, at some kilobytes each
@@ -172,9 +172,9 @@ def plate_map(
     columns, rows = raster or mesh.raster
     if columns < 2 or rows < 2:
         raise InputError(f"map: points must be 2x2 or more, got {columns}x{rows}")
-    if columns * rows > MAX_POINTS:
+    if columns * rows > _MAX_POINTS:
         raise InputError(
-            f"map: points must be at most {MAX_POINTS}, got {columns}x{rows}; take a coarser one"
+            f"map: points must be at most {_MAX_POINTS}, got {columns}x{rows}; take a coarser one"
         )
     x = np.linspace(0, rig.plate.length, columns)
     y = np.linspace(0, rig.plate.width, rows)

@@ -254,13 +254,13 @@ class _LiveView:
         self._plate: SimulationView | None = None
 
     def __call__(self, context: "SimulationContext") -> None:
-        from sim.simulation import SimulationView, draw
+        from sim.simulation import SimulationView, render_simulation
 
         if self._plate is None:
             self._plate = SimulationView(context.bench)
             context.bench.probes.append(self._plate)
             self._live.start()
-        self._live.update(draw(context, self._plate), refresh=True)
+        self._live.update(render_simulation(context, self._plate), refresh=True)
 
     def close(self) -> None:
         self._live.stop()

@@ -75,6 +75,7 @@ from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError
 
 from drivers.errors import LinkError
 from model.answer.stimulus import check_on_plate
+from model.arrays import Point
 from model.errors import InputError
 from model.structure.attachments import PointLoad
 from registry import threads
@@ -82,7 +83,7 @@ from registry.wording import first_problem
 from sim.bench.amplifier_device import AmplifierDevice
 from sim.bench.bench import Bench
 from sim.faults import parse_fault
-from sim.plant.fingers import Accelerometer, Position, measure_vibration
+from sim.plant.fingers import Accelerometer, measure_vibration
 from sim.plant.imperfections import PlateErrors
 from sim.sensors import Accelerometers, Recorder, Recording
 
@@ -188,8 +189,8 @@ class SimulationContext:
         return f"wrote {recorder.path}: {recorder.seconds:.1f} s{full}"
 
 
-Response: TypeAlias = dict[str, Any]
-_Function: TypeAlias = Callable[..., Awaitable[Response]]
+_Response: TypeAlias = dict[str, Any]
+_Function: TypeAlias = Callable[..., Awaitable[_Response]]
 
 OPERATIONS: dict[str, tuple[type[BaseModel], _Function]] = {}
 """The operations by name, in the order of `hello`: keys of a request, and what carries it out."""
@@ -224,14 +225,14 @@ def _check_window(since_s: float, until_s: float) -> None:
         raise InputError("since_s must be less than until_s")
 
 
-VERSION = 3
+_VERSION = 3
 
 
 @operation("hello")
-async def _hello(context: SimulationContext, now: float) -> Response:
+async def _hello(context: SimulationContext, now: float) -> _Response:
     return {
         "protocol": "era-sim-control",
-        "version": VERSION,
+        "version": _VERSION,
         "clock": "wall" if context.step is None else "virtual",
         "ops": list(OPERATIONS),
         "urls": dict(context.urls),
@@ -239,7 +240,7 @@ async def _hello(context: SimulationContext, now: float) -> Response:
 
 
 @operation("state")
-async def _state(context: SimulationContext, now: float) -> Response:
+async def _state(context: SimulationContext, now: float) -> _Response:
     bench = context.bench
     bench.advance(now)
     amplifiers = {}
@@ -264,7 +265,7 @@ async def _fingers(
     fingers: dict[str, _At],
     observers: Annotated[list[str], Field(default_factory=list)],
     loads: Annotated[dict[str, FiniteFloat], Field(default_factory=dict)],
-) -> Response:
+) -> _Response:
     if not {*observers, *loads} <= fingers.keys():
         raise InputError("observers and loads must be of these fingers")
     return _placed(context, fingers, now, observers=observers, loads=loads)
@@ -279,7 +280,7 @@ async def _touch_or_move(
     finger: _Finger,
     at_m: _At | None = None,
     load: FiniteFloat | None = None,
-) -> Response:
+) -> _Response:
     bench = context.bench
     if (finger in bench.positions) != (op == "move"):
         state = "already" if finger in bench.positions else "not"
@@ -294,7 +295,7 @@ async def _touch_or_move(
 
 
 @operation("lift")
-async def _lift(context: SimulationContext, now: float, *, finger: _Finger) -> Response:
+async def _lift(context: SimulationContext, now: float, *, finger: _Finger) -> _Response:
     present = context.bench.positions
     if finger not in present:
         raise InputError(f"finger {finger!r} is not on the plate")
@@ -304,12 +305,12 @@ async def _lift(context: SimulationContext, now: float, *, finger: _Finger) -> R
 
 def _placed(
     context: SimulationContext,
-    positions: Mapping[str, Position],
+    positions: Mapping[str, Point],
     now: float,
     *,
     observers: Collection[str],
     loads: Mapping[str, float],
-) -> Response:
+) -> _Response:
     context.bench.begin_placing(positions, now=now, observers=observers, loads=loads)
     context.start_solving()
     return {"ok": True, "time_s": context.bench.time}
@@ -318,7 +319,7 @@ def _placed(
 @operation("felt")
 async def _felt(
     context: SimulationContext, now: float, *, since_s: FiniteFloat, until_s: FiniteFloat
-) -> Response:
+) -> _Response:
     _check_window(since_s, until_s)
     # In a thread, as the fits below: amplifiers must go on replying.
     await context.solved(until_s)
@@ -345,7 +346,7 @@ async def _felt(
 @operation("sensors")
 async def _sensors(
     context: SimulationContext, now: float, *, sensors: dict[str, SensorPlacement]
-) -> Response:
+) -> _Response:
     placed = [
         Accelerometer(name, *each.at_m, **each.model_dump(exclude={"at_m"}, exclude_unset=True))
         for name, each in sensors.items()
@@ -358,7 +359,7 @@ async def _sensors(
 @operation("signals")
 async def _signals(
     context: SimulationContext, now: float, *, since_s: FiniteFloat, until_s: FiniteFloat
-) -> Response:
+) -> _Response:
     recording = _recorded(context, now, since_s, until_s)
     columns = zip(
         recording.names, recording.points.tolist(), recording.samples.T.tolist(), strict=True
@@ -378,7 +379,7 @@ async def _tones(
     since_s: FiniteFloat,
     until_s: FiniteFloat,
     frequencies_hz: Annotated[list[_Positive], Field(min_length=1, max_length=_MAX_TONES)],
-) -> Response:
+) -> _Response:
     _check_window(since_s, until_s)
     nyquist = context.bench.sample_rate / 2
     if len(set(frequencies_hz)) < len(frequencies_hz) or max(frequencies_hz) >= nyquist:
@@ -404,14 +405,14 @@ def _recorded(context: SimulationContext, now: float, since_s: float, until_s: f
 @operation("record")
 async def _record(
     context: SimulationContext, now: float, *, file: Annotated[str, Field(min_length=1)]
-) -> Response:
+) -> _Response:
     context.bench.advance(now)
     context.record(Path(file))
     return {"ok": True, "time_s": context.bench.time}
 
 
 @operation("finish")
-async def _finish(context: SimulationContext, now: float) -> Response:
+async def _finish(context: SimulationContext, now: float) -> _Response:
     context.bench.advance(now)
     recorder = context.stop_recording()
     await asyncio.to_thread(recorder.finish)
@@ -431,7 +432,7 @@ async def _plate(
     modulus: _Positive = 1.0,
     stiffness: Annotated[dict[str, _Positive], Field(default_factory=dict)],
     masses: Annotated[list[_Mass], Field(default_factory=list)],
-) -> Response:
+) -> _Response:
     first, rig = context.first_plate, context.bench.rig
     names = [era.name for era in rig.eras]
     if not stiffness.keys() <= set(names):
@@ -452,7 +453,7 @@ async def _plate(
 @operation("inject_fault", extra="allow")
 async def _inject_fault(
     context: SimulationContext, now: float, *, op: str, **given: Any
-) -> Response:
+) -> _Response:
     window = parse_fault(given)
     for device in context.devices_of(window.amplifier):
         device.inject_fault(window)
@@ -460,7 +461,7 @@ async def _inject_fault(
 
 
 @operation("faults")
-async def _faults(context: SimulationContext, now: float) -> Response:
+async def _faults(context: SimulationContext, now: float) -> _Response:
     listed = {}
     for name, device in context.devices.items():
         begin = device.faults.begin
@@ -477,7 +478,7 @@ async def _faults(context: SimulationContext, now: float) -> Response:
 
 
 @operation("recover")
-async def _recover(context: SimulationContext, now: float, *, amplifier: Any = None) -> Response:
+async def _recover(context: SimulationContext, now: float, *, amplifier: Any = None) -> _Response:
     for device in context.devices_of(amplifier):
         device.recover()
     return {"ok": True, "time_s": now}
@@ -486,7 +487,7 @@ async def _recover(context: SimulationContext, now: float, *, amplifier: Any = N
 @operation("step")
 async def _step(
     context: SimulationContext, now: float, *, seconds: Annotated[_Positive, Field(le=_MAX_STEP)]
-) -> Response:
+) -> _Response:
     if context.step is None:
         raise InputError("step needs virtual time: start era sim with --virtual-time")
     await context.step(seconds)
@@ -494,7 +495,7 @@ async def _step(
     return {"ok": True, "time_s": context.bench.time}
 
 
-async def carry_out(context: SimulationContext, line: bytes, *, now: float) -> Response:
+async def execute(context: SimulationContext, line: bytes, *, now: float) -> _Response:
     """Execute one request line at a time [s]."""
     try:
         request = json.loads(line)
@@ -576,7 +577,7 @@ async def _serve_client(context: SimulationContext, connection: socket.socket) -
         while data := await loop.sock_recv(connection, LINE_MAX):
             *lines, rest = (rest + data).split(b"\n")
             for line in lines:
-                response = await carry_out(context, line, now=threads.now())
+                response = await execute(context, line, now=threads.now())
                 await loop.sock_sendall(connection, await asyncio.to_thread(_encode, response))
             if len(rest) > LINE_MAX:  # the next line cannot be found
                 error = {"error": f"line must be at most {LINE_MAX} bytes"}

@@ -75,7 +75,7 @@ class SimulationUrl:
 
 
 @asynccontextmanager
-async def opened(url: SimulationUrl) -> AsyncIterator[tuple[SimulationContext, str]]:
+async def _opened(url: SimulationUrl) -> AsyncIterator[tuple[SimulationContext, str]]:
     """The simulation of a URL while this lasts, and the name of its amplifier.
 
     Raises CommandError, LinkError.
@@ -236,7 +236,7 @@ class SimulatedAddress(WireAddress):
         The last port of a rig that is closed ends its simulation.
         """
         async with contextlib.AsyncExitStack() as stack:
-            context, name = await stack.enter_async_context(opened(self._url))
+            context, name = await stack.enter_async_context(_opened(self._url))
             device = context.devices.get(name)
             if not isinstance(device, AmplifierDevice):
                 device = AmplifierDevice(context.bench, name)

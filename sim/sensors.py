@@ -20,10 +20,17 @@ from model.answer.stimulus import check_on_plate
 from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError
 from model.files.output_paths import begins_with
-from model.files.uff import ACCELERATION, TIME, TIME_RESPONSE, Function, Universal, write_universal
+from model.files.uff import (
+    ACCELERATION,
+    TIME_RESPONSE,
+    UFF_TIME,
+    Function,
+    Universal,
+    write_universal,
+)
 from registry.files import regular_file
 from sim.bench.bench import Bench
-from sim.plant.fingers import KEPT, Accelerometer, fit_tones, positions, readings
+from sim.plant.fingers import HISTORY_DURATION, Accelerometer, fit_tones, positions, readings
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,7 +163,7 @@ def _write_uff(path: Path, recording: Recording) -> None:
             (_UP, 0),
             recording.times,
             recording.samples[:, number - 1],
-            (TIME, ACCELERATION, 0),
+            (UFF_TIME, ACCELERATION, 0),
             ("m/s^2", ""),
         )
         for number, name in enumerate(recording.names, start=1)
@@ -271,7 +278,7 @@ class Accelerometers:
         rate = self._bench.sample_rate
         read = readings(self.sensors, accelerations, sample_rate=rate, rng=self._rng)
         self._pieces.append((times, read))
-        while self._pieces[0][0][-1] < times[-1] - KEPT:
+        while self._pieces[0][0][-1] < times[-1] - HISTORY_DURATION:
             self._pieces.popleft()
 
     def read(self, since: float, until: float) -> Recording:
@@ -280,7 +287,7 @@ class Accelerometers:
         if not pieces:
             raise InputError(
                 f"no readings from {since:g} to {until:g} s; place sensors first, and ask for the "
-                f"last {KEPT:g} s at most"
+                f"last {HISTORY_DURATION:g} s at most"
             )
         return Recording(
             tuple(sensor.name for sensor in self.sensors),

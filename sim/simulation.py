@@ -25,7 +25,7 @@ from rich.table import Table
 from rich.text import Text
 
 from drivers.errors import LinkError
-from model.arrays import FloatArray, lattice
+from model.arrays import FloatArray, Point, lattice
 from model.errors import InputError
 from model.rig.rig import Rig
 from model.vibration import G
@@ -36,9 +36,9 @@ from sim.bench.bench import Bench, keep_time
 from sim.control import SimulationContext, control_socket, in_background
 from sim.far_ends.wire_assignment import SimulatedWire, open_wires
 from sim.faults import FaultFile
-from sim.plant.fingers import Accelerometer, Position
+from sim.plant.fingers import Accelerometer
 from sim.plant.imperfections import Imperfections
-from sim.plant.plant import SAMPLE_RATE
+from sim.plant.plant import PLANT_SAMPLE_RATE
 from sim.transport.far_end import linked_urls
 
 FIRMWARE_FOLDER = Path(__file__).parents[1] / "out" / "firmware"
@@ -130,10 +130,10 @@ class Simulation:
     rig: Rig
     wires: Mapping[str, SimulatedWire]
     faults: FaultFile = field(default_factory=lambda: FaultFile(faults=[]))
-    fingers: Mapping[str, Position] = field(default_factory=dict)
+    fingers: Mapping[str, Point] = field(default_factory=dict)
     imperfections: Imperfections = field(default_factory=Imperfections)
     sensors: Sequence[Accelerometer] = ()
-    sample_rate: float = SAMPLE_RATE
+    sample_rate: float = PLANT_SAMPLE_RATE
     control: Path | None = None
     record: Path | None = None
     until_eof: bool = False
@@ -252,7 +252,7 @@ async def _keep_viewing(
         await asyncio.sleep(_VIEW_INTERVAL)
 
 
-WINDOW = 0.2  # s; of the peaks shown for fingers
+_WINDOW = 0.2  # s; of the peaks shown for fingers
 _SHADES = " ·-+*#@"
 _FULL = 5.0  # g; the last shade
 _THRESHOLD = 0.002  # of _FULL; smaller values are not drawn
@@ -288,7 +288,7 @@ class SimulationView:
         return peaks.reshape(_ROWS, _COLUMNS)
 
 
-def draw(context: SimulationContext, plate: SimulationView) -> RenderableType:
+def render_simulation(context: SimulationContext, plate: SimulationView) -> RenderableType:
     """Render the present state; without fingers it fits on 24 lines of 80 columns."""
     bench = context.bench
     amplifiers = Table("amplifier", "state", "fault", "set", "level of each channel")
@@ -297,7 +297,7 @@ def draw(context: SimulationContext, plate: SimulationView) -> RenderableType:
         levels = "  ".join(f"{level:4.0%}" for level in summary.levels)
         amplifiers.add_row(name, summary.state, summary.fault, str(summary.token), levels)
     fingers = Table("finger", "at", "peak acceleration")
-    felt = bench.felt(bench.time - WINDOW, bench.time)
+    felt = bench.felt(bench.time - _WINDOW, bench.time)
     for name, (x, y) in bench.positions.items():
         peak = f"{felt[name].peak.max() / G:.2f} g" if name in felt else ""
         fingers.add_row(name, f"{x * 1000:.0f}, {y * 1000:.0f} mm", peak)

@@ -29,7 +29,7 @@ from controller.sources.tuio import TuioSource
 from drivers.errors import CommandError
 from drivers.wires.serial_line import SerialAddress
 from drivers.wires.wire import address_of
-from era_haptics.command import run
+from era_haptics.command import run_era
 from model.errors import InputError
 from model.structure.material import KNOWN_MATERIALS, known_material, material_names
 from registry.plugins import EXAMPLE_PREFIX, PluginRegistry, failure_text
@@ -295,7 +295,7 @@ def test_command_attributes_the_failure_of_a_plugin(
     """Bad input (2), not a bug of this project (70)."""
     kind = next(kind for kind in KINDS if kind.group == "wires")
     module = install("bad", kind, "fine", kind.fails)
-    assert run(["amp", "stop", "fine://a:1"]) == 2
+    assert run_era(["amp", "stop", "fine://a:1"]) == 2
     error = capsys.readouterr().err
     assert f"plug-in {module}:THING of package bad" in error
     assert "bug" not in error

@@ -29,7 +29,7 @@ from model.estimate.following import SettledPattern
 from model.estimate.forward import RestingFinger, Sensor, jacobian
 from model.estimate.identify import Identification, identify, model_of, relevant
 from model.estimate.measurement import Measurement
-from model.estimate.parameters import KINDS
+from model.estimate.parameters import PARAMETER_KINDS
 from model.finger import fingertip_points, fingertip_weights
 from model.rig.rig import Rig, Uncertainty
 from model.structure.attachments import Era, Fingertip, PointLoad
@@ -539,7 +539,7 @@ def parameters_held(found: Identification, own: Mounted) -> dict[str, Reals]:
         x, y, weight = own.masses[0]
         at = space.groups["masses"].start
         off = found.values["masses"][0] - [weight, x, y]
-        std = np.hypot(found.std[at : at + 3], [0.0, *[KINDS["place"].theory] * 2])
+        std = np.hypot(found.std[at : at + 3], [0.0, *[PARAMETER_KINDS["place"].theory] * 2])
         errors["mass"] = off / std
     return errors
 

@@ -24,7 +24,7 @@ import numpy as np
 from controller.api.client import AsyncClient
 from controller.api.link import LeaseLost, Unreachable
 from controller.sources.touch import Touch, TouchFrame
-from drivers.protocol.definition import MESSAGES, read_request
+from drivers.protocol.definition import MESSAGES, decode_request
 from drivers.protocol.sets import Assembly, is_last, unpack_layers
 from drivers.wires.serial_frames import Frame, FrameReader, frame_length, unpack_words
 from examples.make_touches import tuio_datagram
@@ -149,7 +149,7 @@ class _Device:
 
     def _note(self, frame: Frame, now: float) -> None:
         """Note the layers that a set drives, once it plays."""
-        _, values = read_request(frame.kind, unpack_words(frame.payload))
+        _, values = decode_request(frame.kind, unpack_words(frame.payload))
         token = values["token"]
         if frame.kind == _SET:
             if not is_last(values):

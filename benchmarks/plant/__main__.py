@@ -29,7 +29,7 @@ from model.structure.attachments import Fingertip, FingertipLoad, footprints_of
 from model.structure.exciter import Actuator
 from model.transients.base_motion import raised_cosine
 from sim.bench.bench import Bench
-from sim.plant.plant import SAMPLE_RATE, Plant
+from sim.plant.plant import PLANT_SAMPLE_RATE, Plant
 
 STEP = 0.01  # s
 FINGERS = ((0.10, 0.08), (0.25, 0.17), (0.05, 0.19), (0.18, 0.03), (0.28, 0.05),
@@ -185,7 +185,7 @@ class Rigs:
                     taps += 1
                     plant.set_contacts(_resting([FINGERS[taps % 10]]))
                     shapes = plant.reduced.at(points)
-                plant.advance(now + case.step, sample_rate=SAMPLE_RATE, shapes=shapes)
+                plant.advance(now + case.step, sample_rate=PLANT_SAMPLE_RATE, shapes=shapes)
 
         go_on(0.5)
         return go_on

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated, cast
 import typer
 
 from model.commands.calibrate_cli import NO_FIT, check_rig_output, finish, write_fitted_rig
-from model.commands.options import JsonOption, print_report, progress_bar
+from model.commands.options import FAILED, JsonOption, print_report, progress_bar
 from model.errors import InputError
 from model.quantities import counted
 
@@ -135,8 +135,8 @@ def identify(
     from controller.plate_measurement import observation_of
     from model.config.units import parse_frequencies
     from model.estimate import fit_report
+    from model.estimate.identify import identification_errors
     from model.estimate.identify import identify as fit
-    from model.estimate.identify import standard_errors
     from model.estimate.rig_check import check_meaning
     from model.structure.modal_elasticity import check_measurable
     from model.study.verification import expected_contrast
@@ -198,7 +198,7 @@ def identify(
     ]
     made = f"{source.name} identified in place by `era rig identify`:"
     files = (
-        write_fitted_rig(output, (rig, found.rig), [made, *rows], standard_errors(found))
+        write_fitted_rig(output, (rig, found.rig), [made, *rows], identification_errors(found))
         if found.is_explained
         else []
     )
@@ -349,8 +349,6 @@ def measured_json(measured: "MeasuredPlate") -> dict[str, object]:
 
 
 rig_app = typer.Typer(no_args_is_help=True, help="Check and identify a rig.")
-
-FAILED = 1
 
 
 rig_app.command()(identify)

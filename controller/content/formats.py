@@ -47,12 +47,12 @@ from controller.content.reading import (
     Entries,
     Segment,
     Wav,
-    between,
     course_of,
     mixed,
     names_remark,
     read_json,
     refusal,
+    stretches_between,
     too_much,
     unknown_keys,
 )
@@ -684,8 +684,8 @@ class _HjifReading:
         )
         course = course_of(wave * self._gain, _RATE)
         knots = np.unique([time for time, _ in (*course.intensity, *course.sharpness)])
-        levels = between(course.intensity, knots).tolist()
-        sharps = between(course.sharpness or ((0.0, 0.0),), knots).tolist()
+        levels = stretches_between(course.intensity, knots).tolist()
+        sharps = stretches_between(course.sharpness or ((0.0, 0.0),), knots).tolist()
         shifted = (knots + at[0]).tolist()
         self._segments += zip(shifted[:-1], shifted[1:], *levels, *sharps, strict=True)
         self._remarks += tuple(f"curve: {remark}" for remark in course.remarks)
@@ -714,10 +714,10 @@ def _course(
     """Return a modulation (2, n) at both ends of each stretch between knots."""
     values: list[Any] = [getattr(each, name) for each in effect.keyframes]
     curve = [(t, v) for t, v in zip(times, values, strict=True) if v is not None]
-    return between(tuple(curve) or ((0.0, default),), knots)
+    return stretches_between(tuple(curve) or ((0.0, default),), knots)
 
 
-BUILT_IN: tuple[type[ContentFormat], ...] = (Ahap, Haptic, Hjif, Wav)
+BUILT_IN_FORMATS: tuple[type[ContentFormat], ...] = (Ahap, Haptic, Hjif, Wav)
 """Formats of the project itself."""
 
 _FORMATS: PluginRegistry[type[ContentFormat]] = PluginRegistry(
@@ -725,7 +725,7 @@ _FORMATS: PluginRegistry[type[ContentFormat]] = PluginRegistry(
     "era_haptics.content_formats",
     ContentFormat,
     error=InputError,
-    own={each.ending: each for each in BUILT_IN},
+    own={each.ending: each for each in BUILT_IN_FORMATS},
     called=attrgetter("ending"),
 )
 

@@ -14,7 +14,7 @@ import numpy as np
 from model.arrays import FloatArray
 from model.errors import InputError
 
-MAX_DURATION = 60.0
+MAX_CONTENT_DURATION = 60.0
 """Longest content [s]."""
 
 _Point: TypeAlias = tuple[float, float]
@@ -114,8 +114,8 @@ def misfit(pattern: Pattern) -> str:
     ):
         before = 0.0
         for index, (time, value) in enumerate(curve):
-            if not before <= time <= MAX_DURATION:
-                bounds = f"{before:g} to {MAX_DURATION:g} s"
+            if not before <= time <= MAX_CONTENT_DURATION:
+                bounds = f"{before:g} to {MAX_CONTENT_DURATION:g} s"
                 return f"time of {name}[{index}] must be {bounds}, got {time:g} s"
             if not 0 <= value <= 1:
                 return f"{name}[{index}] must be 0 to 1, got {value:g} at {time:g} s"
@@ -123,7 +123,7 @@ def misfit(pattern: Pattern) -> str:
     return ""
 
 
-def along(curve: Curve, times: FloatArray, *, beyond: float | None = None) -> FloatArray:
+def curve_at(curve: Curve, times: FloatArray, *, beyond: float | None = None) -> FloatArray:
     """Return a curve at times [s]; beyond: its value outside, by default that of its ends."""
     moments, values = np.array(curve or ((0.0, 0.0),)).T
     return np.asarray(np.interp(times, moments, values, left=beyond, right=beyond))
@@ -184,12 +184,12 @@ def points_of(pattern: Pattern) -> tuple[list[_Row], list[_Row]]:
     between = between[(between > times[0]) & (between < times[-1])]
     moments = np.append(times, between)
     order = np.argsort(moments, kind="stable")
-    levels = np.append(levels, along(pattern.intensity, between))[order]
+    levels = np.append(levels, curve_at(pattern.intensity, between))[order]
     moments = moments[order]
     if len(moments) > room:
         moments = np.linspace(times[0], times[-1], room)
-        levels = along(pattern.intensity, moments)
-    sharpness = along(pattern.sharpness, moments)
+        levels = curve_at(pattern.intensity, moments)
+    sharpness = curve_at(pattern.sharpness, moments)
     return [*zip(moments.tolist(), levels.tolist(), sharpness.tolist(), strict=True)], taps
 
 
@@ -202,9 +202,10 @@ def _checked(what: str, given: Given) -> Iterator[_Row]:
                 f"{what}[{index}] must be [time_s, intensity, sharpness], got {len(each)} values"
             )
         time, intensity, sharpness = each
-        if not before <= time <= MAX_DURATION:
+        if not before <= time <= MAX_CONTENT_DURATION:
             raise InputError(
-                f"{what}[{index}] time_s must be {before:g} to {MAX_DURATION:g}, got {time:g}"
+                f"{what}[{index}] time_s must be {before:g} to {MAX_CONTENT_DURATION:g}, "
+                f"got {time:g}"
             )
         for name, value in (("intensity", intensity), ("sharpness", sharpness)):
             if not 0 <= value <= 1:

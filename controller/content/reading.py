@@ -21,7 +21,14 @@ from typing import Annotated, Any, ClassVar, NamedTuple, TypeAlias, TypeVar
 import numpy as np
 from pydantic import ConfigDict, GetCoreSchemaHandler
 
-from controller.content.pattern import MAX_DURATION, MAX_HZ, MIN_HZ, Curve, Pattern, sharpness_of
+from controller.content.pattern import (
+    MAX_CONTENT_DURATION,
+    MAX_HZ,
+    MIN_HZ,
+    Curve,
+    Pattern,
+    sharpness_of,
+)
 from model.arrays import FloatArray
 from model.config.document import ConfigError, ConfigProblem, Document, KeyPath, decoded, key_name
 from model.config.fields import Section
@@ -33,7 +40,7 @@ from registry.plugins import did_you_mean
 MAX_SIZE = 4 << 20
 """Largest file [bytes]."""
 
-MAX_POINTS = 20_000
+_MAX_POINTS = 20_000
 """Most points of a file: breakpoints, keyframes, events, or what one of them is made of."""
 
 
@@ -44,9 +51,9 @@ def refusal(source: str, message: str, *, line: int | None = None, key: str = ""
 
 def too_much(end: float, count: int) -> str:
     """Return why content with an end [s] and a number of points is too much, or ""."""
-    if end > MAX_DURATION:
-        return f"must end within {MAX_DURATION:g} s, got {end:g} s; shorten it"
-    return f"has more than {MAX_POINTS} points; leave some out" if count > MAX_POINTS else ""
+    if end > MAX_CONTENT_DURATION:
+        return f"must end within {MAX_CONTENT_DURATION:g} s, got {end:g} s; shorten it"
+    return f"has more than {_MAX_POINTS} points; leave some out" if count > _MAX_POINTS else ""
 
 
 class ContentFormat(ABC):
@@ -70,7 +77,7 @@ class ContentFormat(ABC):
 
 _MAX_SIZE = 2 << 20  # bytes
 _MAX_LEVELS = 20
-_MAX_VALUES = 5 * MAX_POINTS  # a keyframe of HJIF is four, an event of AHAP thirteen
+_MAX_VALUES = 5 * _MAX_POINTS  # a keyframe of HJIF is four, an event of AHAP thirteen
 _MAX_QUOTED = 50  # characters in errors
 _MAX_NAMED = 5  # unknown names in a remark
 _MAX_NAME = 40  # characters of a name that is compared with known ones
@@ -91,7 +98,7 @@ class _FirstOfMany:
     """
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> Any:
-        return {**handler(source), "fail_fast": True, "max_length": MAX_POINTS}
+        return {**handler(source), "fail_fast": True, "max_length": _MAX_POINTS}
 
 
 Entries: TypeAlias = Annotated[list[_T], _FirstOfMany()]
@@ -278,12 +285,12 @@ def mixed(
     order = np.argsort(levels.sum(axis=0), kind="stable")
     sharpness = np.full((2, count), np.nan)
     sharpness[:, at[order]] = sharps[:, order]  # of equal places the last, the strongest, stays
-    intensity = np.sqrt(power) * between(factor, knots)
-    sharpness += between(addend, knots)
+    intensity = np.sqrt(power) * stretches_between(factor, knots)
+    sharpness += stretches_between(addend, knots)
     return _curve(knots, np.clip(intensity, 0, 1)), _curve(knots, np.clip(sharpness, 0, 1))
 
 
-def between(curve: Curve, knots: FloatArray) -> FloatArray:
+def stretches_between(curve: Curve, knots: FloatArray) -> FloatArray:
     """Return a curve (2, n) after and before the ends of each stretch between knots."""
     times, values = np.array(curve).T
     times = times.round(_DIGITS)
@@ -297,10 +304,10 @@ def _curve(knots: FloatArray, values: FloatArray) -> Curve:
     times = np.stack([knots[:-1], knots[1:]], axis=1).ravel()
     course = values.T.ravel()
     is_given = ~np.isnan(course)
-    return thinned(times[is_given], course[is_given])
+    return _thinned(times[is_given], course[is_given])
 
 
-def thinned(times: FloatArray, values: FloatArray) -> Curve:
+def _thinned(times: FloatArray, values: FloatArray) -> Curve:
     """Return a curve without the points that repeat another or lie on the line between two."""
     is_new = np.ones(len(times), bool)
     is_new[1:] = (np.diff(times) > 0) | (abs(np.diff(values)) > 1e-12)
@@ -404,8 +411,8 @@ def course_of(signal: FloatArray, rate: int) -> SignalCourse:
     course = np.concatenate([intensity[:1], np.minimum(intensity, 1), intensity[-1:]]).clip(0, 1)
     out_of_band_share = _out_of_band_share(spectrum, outer)
     return SignalCourse(
-        thinned(given, course),
-        thinned(times[is_felt], sharpness[is_felt]),
+        _thinned(given, course),
+        _thinned(times[is_felt], sharpness[is_felt]),
         out_of_band_share,
         tuple(_signal_remarks(out_of_band_share, intensity)),
     )

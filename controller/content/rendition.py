@@ -7,20 +7,17 @@ from array import array
 from bisect import bisect_left
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import TypeAlias
 
 import numpy as np
 
-from controller.content.pattern import MAX_HZ, MIN_HZ, Pattern, Transient, along, hertz_of
+from controller.content.pattern import MAX_HZ, MIN_HZ, Pattern, Transient, curve_at, hertz_of
+from controller.play.intent import Band
 from model.answer.stimulus import MAX_MODULATION, MIN_MODULATION, Course
 from model.arrays import FloatArray, best_of
 from model.finger import decibels
 from model.quantities import percent
 from model.transients.base_motion import KNOT_STEP, rise
 from model.transients.excursions import CLICKS_APART
-
-Band: TypeAlias = tuple[float, float]
-"""Lowest and highest frequency [Hz]."""
 
 LEAST_DB_SL = 10.0
 """Level [dB SL] of the faintest intensity: the lowest that envelopes of Android guarantee."""
@@ -141,7 +138,7 @@ def rendered(pattern: Pattern, level_db_sl: float, frequencies: FloatArray) -> R
     if highest := float(shares.max()):
         course = Course(array("d", times), array("d", shares / highest))
         of_taps = tuple((each.time, each.sharpness) for each in pattern.transients)
-        hertz = hertz_of(along(pattern.sharpness or of_taps, times))
+        hertz = hertz_of(curve_at(pattern.sharpness or of_taps, times))
         band = _band(_carrier(hertz, shares**2), frequencies)
         modulation = _modulation(times, shares)
         is_off_band = (hertz < band[0]) | (hertz > band[1])
@@ -161,7 +158,7 @@ def _level_of(intensity: FloatArray, level_db_sl: float) -> FloatArray:
 
 def _lasting(pattern: Pattern, level_db_sl: float, times: FloatArray) -> FloatArray:
     """Return the levels [dB SL] of what lasts at times [s]."""
-    return _level_of(along(pattern.intensity, times, beyond=0.0), level_db_sl)
+    return _level_of(curve_at(pattern.intensity, times, beyond=0.0), level_db_sl)
 
 
 def _with_taps(
@@ -199,7 +196,7 @@ def _as_tap(pattern: Pattern) -> Pattern:
     if pattern.transients or not values.any() or length >= CLICK_DURATION:
         return pattern
     start = float(moments[np.flatnonzero(values)[0]])
-    sharpness = float(along(pattern.sharpness, np.array([start]))[0])
+    sharpness = float(curve_at(pattern.sharpness, np.array([start]))[0])
     lost = f"{1000 * length:.0f} ms, less than a plate follows: played as a tap"
     return replace(
         pattern,

@@ -25,7 +25,13 @@ from controller.effects.strengths import read_strengths
 from controller.learning.learned_table import was_learned
 from controller.process.daemon_process import check_socket_path
 from controller.rig_file_check import clock_costs, whole_url
-from controller.sources.touch import TouchCalibration, TouchSource, fitted, open_source, turned
+from controller.sources.touch import (
+    TouchCalibration,
+    TouchSource,
+    fit_touch_calibration,
+    open_source,
+    turned,
+)
 from drivers.by_hand.reaching import check_links
 from model.arrays import FloatArray
 from model.config.document import ConfigError, Document, is_file_name, read_document
@@ -350,7 +356,7 @@ def _calibration(section: CalibrationSection, rig: Rig | None) -> TouchCalibrati
     if section.points is None or rig is None:  # an invalid rig is reported already
         return turned(section.turned, mirror=section.mirror)
     plate = rig.plate
-    return fitted(
+    return fit_touch_calibration(
         [
             (x / plate.length, 1 - y / plate.width)
             for x, y in (each.shown for each in section.points)

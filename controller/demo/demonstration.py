@@ -31,7 +31,7 @@ from controller.daemon.config import DaemonConfig, TouchInput, load_daemon_confi
 from controller.daemon.daemon import Daemon, page_address
 from controller.demo.recorder import (
     SIM_OPTIONS,
-    WATCHDOG,
+    SIMULATED_WATCHDOG,
     SimulatedPlate,
     TouchRecorder,
     TouchRow,
@@ -135,13 +135,13 @@ SIM = "sim"
 """The wire to amplifiers in this process, the only one that virtual time has."""
 WIRES = (SIM, *SIM_OPTIONS)
 
-CONTACT_TIMEOUT = 2.0
+_CONTACT_TIMEOUT = 2.0
 """Time [s] after which a recorded finger without news is lifted, for a machine that is busy."""
 
 DECAY = 0.1
 """Time [s] for the plate to ring down after the last touch."""
 
-RECOVERY = 30.0
+_RECOVERY = 30.0
 """Time [s] within which the daemon must be armed, also anew after a fault."""
 
 _RIG_FILE = "rig.yaml"
@@ -166,7 +166,7 @@ class RecordedTouches(TouchSource):
     async def play(self, recording: Sequence[RecordedDatagram]) -> None:
         """Play a recording at its pace, as a new sender; wait until the source runs."""
         deliver = await self._opened
-        reader = TuioSource(f"tuio:?timeout={CONTACT_TIMEOUT:g}")
+        reader = TuioSource(f"tuio:?timeout={_CONTACT_TIMEOUT:g}")
         reader.rejects = self.rejects
         start = threads.now()
         for datagram in recording:
@@ -234,7 +234,7 @@ async def run_demo(
                         manager=ServiceManager({}),
                         dashboard=None,
                         observe=recorder.observe,
-                        watchdog=WATCHDOG,
+                        watchdog=SIMULATED_WATCHDOG,
                     )
                     serving = tasks.create_task(daemon.run(lock))
                     arming = tasks.create_task(_keep_armed(daemon, config.socket, recorder))
@@ -280,7 +280,7 @@ async def run_live(
                 manager=ServiceManager(),
                 dashboard=dashboard,
                 shows_token=True,  # its output is for a person, also through a pipe
-                watchdog=WATCHDOG,
+                watchdog=SIMULATED_WATCHDOG,
             )
             await daemon.run(lock)
     finally:
@@ -376,8 +376,8 @@ async def _keep_armed(daemon: Daemon, path: Path, recorder: TouchRecorder) -> No
 
 
 async def _armed(era: AsyncClient) -> str:
-    """Clear a fault, but no stop, and arm; return the lease. Raises LinkError after `RECOVERY`."""
-    end = threads.now() + RECOVERY
+    """Clear a fault, but no stop, and arm; return the lease. Raises LinkError after `_RECOVERY`."""
+    end = threads.now() + _RECOVERY
     while True:
         status = await era.status()
         if status.state == DaemonState.QUICK_STOP_ACTIVE or threads.now() > end:

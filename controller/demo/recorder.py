@@ -37,9 +37,9 @@ from registry import threads
 from registry.virtual_time import VirtualTimeLoop
 from registry.wording import first_problem
 
-Position: TypeAlias = tuple[float, float]
+_Position: TypeAlias = tuple[float, float]
 
-SAME_FREQUENCY = 1.0
+_SAME_FREQUENCY = 1.0
 """Difference [Hz] within which a tone is that of a content, as its amplifier has rounded it."""
 
 
@@ -76,7 +76,7 @@ class FingerVibration:
 
     def parted(self, frequency: float) -> tuple["FingerVibration", "FingerVibration"]:
         """Return the part of a content's frequency [Hz], and that of all others."""
-        is_own = np.abs(self.frequencies - frequency) < SAME_FREQUENCY
+        is_own = np.abs(self.frequencies - frequency) < _SAME_FREQUENCY
         own, others = (
             replace(self, frequencies=self.frequencies[some], amplitudes=self.amplitudes[some])
             for some in (is_own, ~is_own)
@@ -92,7 +92,7 @@ class FingerRow:
     Measured ones are None where nothing of its own, or nothing else, was measured.
     """
 
-    at_m: Position
+    at_m: _Position
     frequency_hz: float | None
     verdict: str
     promised_contrast_db: float | None
@@ -118,8 +118,8 @@ class TouchRow:
     target_id: str
     time_s: float
     until_s: float
-    targets_m: Sequence[Position]
-    quiet: Mapping[str, Position]
+    targets_m: Sequence[_Position]
+    quiet: Mapping[str, _Position]
     reason: str | None = None
     drive: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     mode: str | None = None
@@ -171,7 +171,7 @@ def steady_contrast_db(target: FingerVibration, others: Sequence[FingerVibration
     return min(contrasts)
 
 
-WATCHDOG = 2.0
+SIMULATED_WATCHDOG = 2.0
 """Watchdog [s] of simulated amplifiers, the longest of the protocol: their machine may be busy."""
 
 STARTUP_TIMEOUT = 120.0  # s; solving the plate takes long on a busy machine
@@ -209,7 +209,7 @@ class SimulatedPlate:
         self._placing = asyncio.Lock()  # fingers are placed in order
 
     async def place_fingers(
-        self, positions: Mapping[str, Position], loads: Mapping[str, float] = MappingProxyType({})
+        self, positions: Mapping[str, _Position], loads: Mapping[str, float] = MappingProxyType({})
     ) -> None:
         """Place fingers at positions [m] by id, loads by id, too; all others are removed."""
         async with self._placing:
@@ -346,13 +346,13 @@ STEADY_WINDOW = 0.25
 It is the end of the longest time in which no finger lands, moves or lifts.
 """
 
-MARGIN = 0.005
+_MARGIN = 0.005
 """Time [s] from the last byte on the wire to the plate, and before the next command."""
 
 STEADY_DURATION = 0.4
 """Shortest pattern [s] that counts as steady; the plate rings for 50 ms to 1 s."""
 
-MAX_DELAY = STEADY_DURATION - STEADY_WINDOW
+_MAX_DELAY = STEADY_DURATION - STEADY_WINDOW
 """Delay [s] of a pattern or of a finger's sensor from which a steady window may contain it."""
 
 Measured: TypeAlias = asyncio.Task[dict[str, FingerVibration]]
@@ -368,7 +368,7 @@ class _Touch:
     """A touch and the patterns that were played for it."""
 
     contact: Contact
-    quiet: Mapping[str, Position]
+    quiet: Mapping[str, _Position]
     until: float = math.inf
     patterns: list["_PlayedPattern"] = field(default_factory=list)
     reason: str | None = None
@@ -423,7 +423,7 @@ class TouchRecorder:
         self._start = threads.now()
         self._playing: _PlayedPattern | None = None
         self._changes: list[float] = []  # when fingers landed, moved or lifted
-        self._sensors: dict[str, Position] = {}
+        self._sensors: dict[str, _Position] = {}
         self._loads: dict[str, float] = {}
 
     def observe(self, loop: Observers) -> None:
@@ -436,9 +436,9 @@ class TouchRecorder:
         """Return why the figures of a run in real time do not count; None if they do."""
         if self.faults:
             return f"the amplifiers stopped ({self.faults[0]})"
-        if self.worst_delay > MAX_DELAY:
+        if self.worst_delay > _MAX_DELAY:
             delay_ms = 1000 * self.worst_delay
-            return f"a reaction took {delay_ms:.0f} ms, more than {1000 * MAX_DELAY:.0f} ms"
+            return f"a reaction took {delay_ms:.0f} ms, more than {1000 * _MAX_DELAY:.0f} ms"
         if self.rejected_sets:
             return f"amplifiers rejected {counted(self.rejected_sets, 'set')}"
         return None
@@ -503,7 +503,7 @@ class TouchRecorder:
         settled = ended.applied.time + ended.applied.layer.ramp
         changes = [each for each in self._changes if settled < each < now]
         start, end = max(pairwise([settled, *changes, now]), key=lambda rest: rest[1] - rest[0])
-        since, until = max(start, end - STEADY_WINDOW) + MARGIN, end - MARGIN
+        since, until = max(start, end - STEADY_WINDOW) + _MARGIN, end - _MARGIN
         self._changes = changes
         if is_measured and since < until:
             ended.steady = self._tasks.create_task(self._plate.vibration(since, until))
@@ -532,7 +532,7 @@ class TouchRecorder:
             self._tasks.create_task(self._place_sensors(sensors, loads))
 
     async def _place_sensors(
-        self, sensors: Mapping[str, Position], loads: Mapping[str, float]
+        self, sensors: Mapping[str, _Position], loads: Mapping[str, float]
     ) -> None:
         """Place the plate's sensors and note how long that took."""
         started_at = threads.now()
@@ -657,7 +657,7 @@ def _fingers(
     return target, quiet
 
 
-def _place(contact: Contact) -> Position:
+def _place(contact: Contact) -> _Position:
     return contact.x, contact.y
 
 

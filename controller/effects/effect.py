@@ -12,7 +12,7 @@ from controller.play.intent import Band, Pulse, Target
 from controller.sources.touch import Contact, ContactKey
 from model.answer.stimulus import MAX_LEVEL_DB_SL, MAX_MODULATION, MIN_MODULATION, Course
 from model.arrays import FloatArray
-from model.config.fields import Quantity, Section, Shape
+from model.config.fields import Quantity, RegionShape, Section
 from model.config.units import FREQUENCY, LEVEL
 from model.finger import STRONG_DB_SL
 
@@ -25,7 +25,7 @@ class Region:
     """A region of the plate and the names of its effects; a finger that lifts feels none."""
 
     name: str
-    shape: Shape
+    shape: RegionShape
     on_press: str | None = None
     """Effect when a finger comes down or slides in."""
     on_move: str | None = None
@@ -71,10 +71,10 @@ MIN_DB_SL, DEFAULT_MAX_DB_SL = -20.0, 40.0
 DB_SL = Quantity(LEVEL, at_least=MIN_DB_SL, at_most=MAX_LEVEL_DB_SL)
 """A level of an effect."""
 
-MIN_DURATION = 0.020
+MIN_EFFECT_DURATION = 0.020
 """The plate needs about 20 ms to respond (docs/concepts/transients.md); less is not felt [s]."""
 
-MAX_DURATION = 10.0
+MAX_EFFECT_DURATION = 10.0
 
 Modulation: TypeAlias = (
     Annotated[float, Quantity(FREQUENCY, at_least=MIN_MODULATION, at_most=MAX_MODULATION)] | None

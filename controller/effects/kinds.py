@@ -1,4 +1,4 @@
-"""Kinds of effects by name: those of the project (`BUILT_IN`), and those of installed packages.
+"""Kinds of effects by name: `BUILT_IN_EFFECTS`, and those of installed packages.
 
 Each kind is a section of a layout with its parameters, and a run that follows one finger.
 """
@@ -21,8 +21,8 @@ from controller.content.pattern import Pattern
 from controller.content.rendition import CLICK_DURATION, Rendition, Tap, rendered
 from controller.effects.effect import (
     DB_SL,
-    MAX_DURATION,
-    MIN_DURATION,
+    MAX_EFFECT_DURATION,
+    MIN_EFFECT_DURATION,
     Effect,
     EffectRun,
     EffectStimulus,
@@ -49,7 +49,8 @@ class Buzz(Effect):
     needs_entry: ClassVar[bool] = False
 
     duration: (
-        Annotated[float, Quantity(TIME, at_least=MIN_DURATION, at_most=MAX_DURATION)] | None
+        Annotated[float, Quantity(TIME, at_least=MIN_EFFECT_DURATION, at_most=MAX_EFFECT_DURATION)]
+        | None
     ) = None
     """None: as long as the finger stays."""
 
@@ -74,7 +75,7 @@ class Click(Effect):
     is_for_motion: ClassVar[bool] = False
     needs_entry: ClassVar[bool] = False
 
-    duration: Annotated[float, Quantity(TIME, at_least=MIN_DURATION, at_most=0.5)] = 0.040
+    duration: Annotated[float, Quantity(TIME, at_least=MIN_EFFECT_DURATION, at_most=0.5)] = 0.040
     """The plate needs 20 ms to follow."""
 
     def start(self, contact: Contact, now: float, *, level_db_sl: float | None) -> EffectRun:
@@ -140,7 +141,7 @@ class Detents(Effect):
     along: Literal["x", "y"] = "x"
     """Direction in which they are spaced."""
 
-    duration: Annotated[float, Quantity(TIME, at_least=MIN_DURATION, at_most=0.2)] = 0.030
+    duration: Annotated[float, Quantity(TIME, at_least=MIN_EFFECT_DURATION, at_most=0.2)] = 0.030
     """Duration of each click."""
 
     def start(self, contact: Contact, now: float, *, level_db_sl: float | None) -> EffectRun:
@@ -173,7 +174,7 @@ class Dial(Effect):
     spacing: Annotated[float, Quantity(ANGLE, at_least=0.05, at_most=3.2)] = _DEGREES_15
     """Angle between detents."""
 
-    duration: Annotated[float, Quantity(TIME, at_least=MIN_DURATION, at_most=0.2)] = 0.030
+    duration: Annotated[float, Quantity(TIME, at_least=MIN_EFFECT_DURATION, at_most=0.2)] = 0.030
     """Duration of each click."""
 
     def start(self, contact: Contact, now: float, *, level_db_sl: float | None) -> EffectRun:
@@ -238,7 +239,7 @@ class Ramp(Effect):
     start_level: Annotated[float, DB_SL] = 6.0
     """First level, in dB SL; the last is `level`."""
 
-    duration: Annotated[float, Quantity(TIME, at_least=0.1, at_most=MAX_DURATION)] = 1.0
+    duration: Annotated[float, Quantity(TIME, at_least=0.1, at_most=MAX_EFFECT_DURATION)] = 1.0
     """From the first level to the last."""
 
     hold: bool = False
@@ -248,7 +249,9 @@ class Ramp(Effect):
         """Start at the first level, in steps of 2 dB, or larger ones where these are too short."""
         end = STRONG_DB_SL if level_db_sl is None else level_db_sl
         span = end - self.start_level
-        count = max(1, min(round(abs(span) / RAMP_STEP_DB), int(self.duration / MIN_DURATION) - 1))
+        count = max(
+            1, min(round(abs(span) / RAMP_STEP_DB), int(self.duration / MIN_EFFECT_DURATION) - 1)
+        )
         rise = [self.start_level + span * index / count for index in range(count)]
         levels = (*rise, level_db_sl)
         pulse = Pulse(self.duration, now, is_raised=False)
@@ -536,7 +539,7 @@ class _FileRun(EffectRun):
         return self._pulse.start + turns * found.duration + found.clicks[number].time
 
 
-BUILT_IN: tuple[type[Effect], ...] = (Buzz, Click, Detents, Dial, File, Ramp, Texture)
+BUILT_IN_EFFECTS: tuple[type[Effect], ...] = (Buzz, Click, Detents, Dial, File, Ramp, Texture)
 """The kinds of the project itself."""
 
 _KINDS: PluginRegistry[type[Effect]] = PluginRegistry(
@@ -544,7 +547,7 @@ _KINDS: PluginRegistry[type[Effect]] = PluginRegistry(
     "era_haptics.effects",
     Effect,
     error=InputError,
-    own={each.kind: each for each in BUILT_IN},
+    own={each.kind: each for each in BUILT_IN_EFFECTS},
     called=attrgetter("kind"),
 )
 

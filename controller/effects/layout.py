@@ -24,7 +24,7 @@ from controller.effects.effect import (
     Region,
     TunedSection,
 )
-from controller.effects.kinds import BUILT_IN, effect_kind, effect_kinds, named_effects
+from controller.effects.kinds import BUILT_IN_EFFECTS, effect_kind, effect_kinds, named_effects
 from controller.play.intent import band_problem
 from model.answer.stimulus import MAX_LEVEL_DB_SL
 from model.arrays import FloatArray
@@ -46,7 +46,7 @@ ELSEWHERE = "elsewhere"
 
 def default_effects(level_db_sl: float = STRONG_DB_SL) -> dict[str, Effect]:
     """Return the effects that every layout has without defining them, at a level."""
-    effects = [each for each in BUILT_IN if not each.needs_entry]
+    effects = [each for each in BUILT_IN_EFFECTS if not each.needs_entry]
     plain = {each.kind: each.model_construct(set(), level=level_db_sl) for each in effects}
     return {**named_effects(level_db_sl), **plain}
 

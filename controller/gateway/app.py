@@ -416,7 +416,7 @@ async def serve(settings: GatewaySettings, *, announce: Callable[[int], None]) -
         os.nice(_NICENESS)
     allow_many_descriptors()
     gateway = Gateway(settings)
-    listening = listen(settings)
+    listening = listening_socket(settings)
     failures = logging.getLogger(f"{__name__}.requests")
     failures.addFilter(_is_own_failure)
     runner = web.AppRunner(
@@ -462,7 +462,7 @@ def _is_own_failure(record: logging.LogRecord) -> bool:
     return not isinstance(error, OSError | HttpProcessingError)
 
 
-def listen(settings: GatewaySettings) -> socket.socket:
+def listening_socket(settings: GatewaySettings) -> socket.socket:
     """Listen on a socket of its own; raises InputError."""
     family = socket.AF_INET6 if ":" in settings.host else socket.AF_INET
     try:

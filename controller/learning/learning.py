@@ -63,14 +63,14 @@ ESTIMATE_LIMIT = 30.0
 MAX_FAILURES = 8
 """Failures in a row after which an estimator is not replaced any more."""
 
-MAX_WAITING = 16
+_MAX_WAITING = 16
 """Patterns that wait for the estimator; newer ones are dropped."""
 
 CAUTIOUS_AFTER = 60.0
 """Time [s] without an estimator after which answers no longer trust what was learned."""
 
-WINDOW = 0.2  # s; of a reading, as in an identification
-READINGS = 4  # of one pattern, at most, where others are disturbed
+_WINDOW = 0.2  # s; of a reading, as in an identification
+_READINGS = 4  # of one pattern, at most, where others are disturbed
 _MOVED = 0.003  # m; a finger that has moved by less loads the plate as before
 _MARGIN = 0.002  # s; of the amplifiers' clocks
 _PERIODS = 1.01  # of a tone within a window, for frequencies as amplifiers round them
@@ -127,7 +127,7 @@ class SettledReadings:
             return
         highest = min((each.frequency_max for each in self.sensors), default=0.0)
         frequencies, _ = self._tones(applied)
-        is_apart = np.diff(frequencies, prepend=0.0).min() * WINDOW >= 1
+        is_apart = np.diff(frequencies, prepend=0.0).min() * _WINDOW >= 1
         is_read = applied.lasts and len(applied.contents) == len(frequencies) and is_apart
         self._playing = applied if is_read and frequencies[-1] <= highest else None
         self._contacts = applied.contacts
@@ -180,7 +180,7 @@ class SettledReadings:
         Without the phase of its drives: outputs follow their clocks by a delay that is not known.
         """
         frequencies, bases = self._tones(applied)
-        for _ in range(READINGS):
+        for _ in range(_READINGS):
             readings, ended_at = await self._measure(frequencies)
             if self._change.is_set():
                 return None
@@ -204,7 +204,7 @@ class SettledReadings:
             else (RestingFinger(each.x, each.y, tip.scaled(each.load)) for each in contacts)
         )
         # Not where the second harmonic of another tone is heard as well.
-        is_own = np.abs(frequencies[:, None] - 2 * frequencies).min(axis=1) * WINDOW >= 1
+        is_own = np.abs(frequencies[:, None] - 2 * frequencies).min(axis=1) * _WINDOW >= 1
         return SettledPattern(
             ended_at,
             frequencies[is_own],
@@ -236,7 +236,7 @@ class SettledReadings:
         """
         names = sorted({sensor.amplifier for sensor in self.sensors})
         amplifiers = {name: self._controller.amplifiers[name] for name in names}
-        window = max(WINDOW, _PERIODS / float(np.diff(frequencies, prepend=0.0).min()))
+        window = max(_WINDOW, _PERIODS / float(np.diff(frequencies, prepend=0.0).min()))
         started = {
             name: await start_reading(each, frequencies.tolist(), window)
             for name, each in amplifiers.items()
@@ -303,7 +303,7 @@ class Learning:
         self._estimated_at: float | None = None  # s
         self._is_shaped = True
         self._in_hand = 0  # pattern that is being estimated
-        self._waiting: asyncio.Queue[SettledPattern] = asyncio.Queue(MAX_WAITING)
+        self._waiting: asyncio.Queue[SettledPattern] = asyncio.Queue(_MAX_WAITING)
         self._task: asyncio.Task[None] | None = None
         self._outage: asyncio.TimerHandle | None = None
 
@@ -369,7 +369,7 @@ class Learning:
             _logger.exception("plate: learning failed")
             self._fail(failure_text(error))
         finally:
-            self._waiting = asyncio.Queue(MAX_WAITING)
+            self._waiting = asyncio.Queue(_MAX_WAITING)
 
     async def _has_sensors(self) -> bool:
         """Ask the amplifiers for their sensors until they tell; whether they have some of use."""

@@ -391,7 +391,7 @@ def piece_of(
     if not knots:
         step, count = PLAIN_STEP, 1
     else:
-        least = _AMID if is_first and since > 0 else stimulus.KNOT_STEP
+        least = _AMID if is_first and since > 0 else stimulus.COURSE_KNOT_STEP
         count = min(knots + 1, round((_FIRST if is_first else _NEXT) / least))
         step = max(least, _SHORTEST / count)
         left = min((pulse.duration - since) / step, count)

@@ -27,7 +27,7 @@ from controller.sources.touch import (
     Touch,
     TouchFrame,
     TouchSource,
-    moment_of,
+    frame_moment,
     number_option,
 )
 from model.errors import InputError
@@ -446,7 +446,7 @@ class EvdevSource(TouchSource):
         happened: float = -math.inf,
     ) -> None:
         """Deliver a frame of what happened at a time [s], now if that is not of this clock."""
-        at = moment_of(happened, asyncio.get_running_loop().time())
+        at = frame_moment(happened, asyncio.get_running_loop().time())
         deliver(TouchFrame(self._name, at, touches))
 
 

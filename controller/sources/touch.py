@@ -122,7 +122,7 @@ MAX_FRAME_AGE = 1.0
 """Age [s] beyond which the time of a frame is that of another clock, or of one that was set."""
 
 
-def moment_of(stated: float, now: float) -> float:
+def frame_moment(stated: float, now: float) -> float:
     """Return when [s] a frame happened: as stated, or now where that is of another clock."""
     return stated if now - MAX_FRAME_AGE <= stated <= now else now
 
@@ -189,8 +189,8 @@ def open_source(url: str) -> TouchSource:
     return _SOURCES.make(url)
 
 
-Row: TypeAlias = tuple[float, float, float]
-Point: TypeAlias = tuple[float, float]
+_Row: TypeAlias = tuple[float, float, float]
+_Point: TypeAlias = tuple[float, float]
 
 MAX_RESIDUAL = 0.005
 """Largest residual [m] of a point that was touched where it should be: less than the radius of a
@@ -198,7 +198,7 @@ fingertip, 6.5 mm."""
 
 _MIN_DETERMINANT = 1e-3  # below it the points on the plate lie nearly on a line
 
-_ROTATIONS: dict[int, tuple[Row, Row]] = {
+_ROTATIONS: dict[int, tuple[_Row, _Row]] = {
     0: ((1, 0, 0), (0, 1, 0)),
     90: ((0, -1, 1), (1, 0, 0)),
     180: ((-1, 0, 1), (0, -1, 1)),
@@ -210,7 +210,7 @@ _ROTATIONS: dict[int, tuple[Row, Row]] = {
 class TouchCalibration:
     """Map from sensor to plate: the rows of x' and y'."""
 
-    matrix: tuple[Row, Row] = _ROTATIONS[0]
+    matrix: tuple[_Row, _Row] = _ROTATIONS[0]
 
     def apply(self, touch: Touch) -> Touch:
         """Map a touch to coordinates 0..1 across the plate; NaN stays NaN."""
@@ -240,8 +240,8 @@ def turned(degrees: int = 0, *, mirror: str | None = None) -> TouchCalibration:
     return TouchCalibration((x_row, y_row))
 
 
-def fitted(
-    touched: Sequence[Point], positions: Sequence[Point], plate: "Plate"
+def fit_touch_calibration(
+    touched: Sequence[_Point], positions: Sequence[_Point], plate: "Plate"
 ) -> TouchCalibration:
     """Fit a calibration by least squares to at least three points.
 
@@ -340,16 +340,18 @@ _LEAST_TIME, _LEAST_WAY = 0.020, 0.003  # s, m; of a velocity
 
 
 @dataclass(frozen=True, slots=True)
-class Motion:
+class FingerMotion:
     """The recent way of a finger."""
 
     places: tuple[tuple[float, float, float], ...] = ()
     """Time [s], x and y [m] of each place; the last one is where the finger is."""
 
-    def followed(self, time: float, x: float, y: float) -> "Motion":
+    def followed(self, time: float, x: float, y: float) -> "FingerMotion":
         """Return the way with another place at a time [s]."""
         since = time - OVER
-        return Motion((*[each for each in self.places if since < each[0] < time], (time, x, y)))
+        return FingerMotion(
+            (*[each for each in self.places if since < each[0] < time], (time, x, y))
+        )
 
     def velocity(self, now: float) -> tuple[float, float]:
         """Return the velocity [m/s] at a time [s]; zero for a finger that rests."""
@@ -369,7 +371,7 @@ class Motion:
         return len(self.places) > 0 and any(self.velocity(self.places[-1][0]))
 
 
-AT_REST = Motion()
+AT_REST = FingerMotion()
 """Of a finger whose way is unknown."""
 
 
@@ -447,7 +449,7 @@ class Contact:
     """When [s] it came down."""
     load: float = 1.0
     """Relative to the rig's fingertip, bounded and in steps; 1 where nothing is reported."""
-    motion: Motion = field(default=AT_REST, compare=False)
+    motion: FingerMotion = field(default=AT_REST, compare=False)
     """Its recent way."""
     is_surplus: bool = False
     """Whether as many fingers as may feel effects came before it."""

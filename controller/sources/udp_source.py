@@ -24,7 +24,7 @@ from controller.sources.touch import (
     MAX_CONTACT_TIMEOUT,
     TouchFrame,
     TouchSource,
-    moment_of,
+    frame_moment,
     number_option,
 )
 from model.errors import InputError
@@ -127,7 +127,7 @@ class Datagrams:
             if (level, kind) == (socket.SOL_SOCKET, _TIMESTAMPS) and len(content) == _TIMESPEC.size:
                 seconds, nanoseconds = _TIMESPEC.unpack(content)
                 arrived = seconds + nanoseconds * 1e-9 + offset
-        self._latest = max(self._latest, moment_of(arrived, now))
+        self._latest = max(self._latest, frame_moment(arrived, now))
         return self._latest
 
 

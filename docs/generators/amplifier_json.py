@@ -49,7 +49,7 @@ from drivers.wires.modbus_frames import (
     WRITE,
 )
 from drivers.wires.serial_frames import PAYLOAD_MAX
-from sim.amplifier.simulated_amplifier import TRANSITIONS
+from sim.amplifier.simulated_amplifier import AMPLIFIER_TRANSITIONS
 
 _SERIAL: Mapping[str, Any] = {
     "line": {"baud": 921_600, "data_bits": 8, "parity": "none", "stop_bits": 1},
@@ -106,7 +106,7 @@ def _protocol() -> dict[str, Any]:
                     **{"reply": _fields(each.reply)},
                     "states": {
                         f"{STATES[state]}": STATES[after]
-                        for (state, name), after in TRANSITIONS.items()
+                        for (state, name), after in AMPLIFIER_TRANSITIONS.items()
                         if name == each.name
                     },
                 }

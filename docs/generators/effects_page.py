@@ -7,7 +7,7 @@ import inspect
 from collections.abc import Callable, Mapping
 
 from controller.effects.effect import Effect
-from controller.effects.kinds import BUILT_IN
+from controller.effects.kinds import BUILT_IN_EFFECTS
 from key_tables import HEAD, in_cell, rows_of
 
 
@@ -16,14 +16,16 @@ def kinds() -> str:
     rows = [
         f"| `{each.kind}` | {_finger(each)} | {'yes' if each.needs_entry else ''} | "
         f"{in_cell(inspect.getdoc(each) or '')} |"
-        for each in BUILT_IN
+        for each in BUILT_IN_EFFECTS
     ]
     return "\n".join(["| kind | for | needs an entry | what is felt |", "|---|---|---|---|", *rows])
 
 
 def keys() -> str:
     """A row for each key that a kind has by itself."""
-    return "\n".join([HEAD, *(row for each in BUILT_IN for row in rows_of(each, above=Effect))])
+    return "\n".join(
+        [HEAD, *(row for each in BUILT_IN_EFFECTS for row in rows_of(each, above=Effect))]
+    )
 
 
 PARTS: Mapping[str, Callable[[], str]] = {"kinds": kinds, "keys": keys}

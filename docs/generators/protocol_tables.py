@@ -39,7 +39,7 @@ from drivers.protocol.records import (
     View,
 )
 from drivers.wires.can_frames import CANOPEN
-from sim.amplifier.simulated_amplifier import TRANSITIONS
+from sim.amplifier.simulated_amplifier import AMPLIFIER_TRANSITIONS
 from word_names import word_names
 
 _REPLIES: Mapping[str, Record] = {
@@ -195,7 +195,9 @@ def transitions() -> str:
     groups: dict[tuple[str, ...], list[str]] = {}
     for name in MESSAGES:
         row = tuple(
-            "–" if (after := TRANSITIONS.get((state, name))) is None else str(STATES[after])
+            "–"
+            if (after := AMPLIFIER_TRANSITIONS.get((state, name))) is None
+            else str(STATES[after])
             for state in STATES
         )
         groups.setdefault(row, []).append(name)

@@ -38,8 +38,8 @@ from drivers.host.amplifier_sensors import (
     Reading,
     check_tones,
     measure_tones,
-    read_measured,
-    read_sensors,
+    read_amplifier_sensors,
+    read_electrical,
 )
 from drivers.host.ledger import StagedSet, StopOutcome
 from drivers.host.line import Priority
@@ -81,7 +81,7 @@ _SENSOR_UNITS = {
 }
 
 
-async def identify(url: str) -> dict[str, Any]:
+async def identify_amplifier(url: str) -> dict[str, Any]:
     """Read identity, capabilities and wire times."""
     async with identified(url) as amplifier:
         identity = {**amplifier.identity}
@@ -102,7 +102,7 @@ async def status(url: str) -> dict[str, Any]:
         faults = await amplifier.request("GetFaults", {})
         measured = [
             {"voltage_v": voltage, "current_a": current}
-            for voltage, current in await read_measured(amplifier)
+            for voltage, current in await read_electrical(amplifier)
         ]
         return {
             "url": url,
@@ -117,7 +117,7 @@ async def status(url: str) -> dict[str, Any]:
 async def sensors(url: str) -> dict[str, Any]:
     """Read what the sensors measure, and where."""
     async with identified(url) as amplifier:
-        found = await read_sensors(amplifier)
+        found = await read_amplifier_sensors(amplifier)
     return {
         "url": url,
         "sensors": [
@@ -136,11 +136,11 @@ async def sensors(url: str) -> dict[str, Any]:
     }
 
 
-async def measure(url: str, frequencies: Sequence[float], window: float) -> dict[str, Any]:
+async def measure_sensors(url: str, frequencies: Sequence[float], window: float) -> dict[str, Any]:
     """Measure tones [Hz] at every sensor over a window [s]; what plays goes on."""
     check_tones(frequencies, window)
     async with identified(url) as amplifier:
-        described = await read_sensors(amplifier)
+        described = await read_amplifier_sensors(amplifier)
         if not described:
             raise CommandError("the amplifier has no sensors")
         reading = await measure_tones(amplifier, frequencies, window)
@@ -373,7 +373,7 @@ class BlockingAmplifier:
 
     def sensors(self) -> tuple[AmplifierSensor, ...]:
         """Read what its sensors measure, and where; empty if it has none."""
-        return self._wait(read_sensors(self._amplifier))
+        return self._wait(read_amplifier_sensors(self._amplifier))
 
     def measure(self, frequencies: Sequence[float], window: float) -> Reading:
         """Measure tones [Hz] at all sensors over a window [s], feeding the watchdog meanwhile.

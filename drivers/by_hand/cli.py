@@ -118,16 +118,20 @@ def _show_discovered(result: dict[str, Any], problems: dict[str, DriverError]) -
     print(f"Next: era amp identify {shlex.quote(reached[0])}" if reached else "no amplifier found")
 
 
-def _add_plain(name: str, about: str) -> None:
-    """Add a command that has no options of its own: an action of that name."""
+@amp.command()
+def identify(url: Url, trace: Trace = None, json_: Json = False) -> None:
+    """Show identity, capabilities and wire times."""
+    from drivers.by_hand.actions import identify_amplifier
 
-    @amp.command(name, help=about)
-    def run(url: Url, trace: Trace = None, json_: Json = False) -> None:
-        _act(name, url, trace=trace, json_=json_)
+    _act(identify_amplifier(url), trace=trace, json_=json_)
 
 
-_add_plain("identify", "Show identity, capabilities and wire times.")
-_add_plain("status", "Show state, levels and faults.")
+@amp.command()
+def status(url: Url, trace: Trace = None, json_: Json = False) -> None:
+    """Show state, levels and faults."""
+    from drivers.by_hand import actions
+
+    _act(actions.status(url), trace=trace, json_=json_)
 
 
 @amp.command()
@@ -141,10 +145,18 @@ def drive(
     json_: Json = False,
 ) -> None:
     """Drive one channel, then disarm."""
-    _act("drive", url, channel, frequency, level, duration, trace=trace, json_=json_)
+    from drivers.by_hand import actions
+
+    work = actions.drive(url, channel, frequency, level, duration)
+    _act(work, trace=trace, json_=json_)
 
 
-_add_plain("sensors", "Show what the sensors measure, and where.")
+@amp.command()
+def sensors(url: Url, trace: Trace = None, json_: Json = False) -> None:
+    """Show what the sensors measure, and where."""
+    from drivers.by_hand import actions
+
+    _act(actions.sensors(url), trace=trace, json_=json_)
 
 
 @amp.command()
@@ -159,7 +171,9 @@ def measure(
     json_: Json = False,
 ) -> None:
     """Measure amplitude and phase of tones at every sensor. Changes nothing that plays."""
-    _act("measure", url, frequency, window, trace=trace, json_=json_)
+    from drivers.by_hand.actions import measure_sensors
+
+    _act(measure_sensors(url, frequency, window), trace=trace, json_=json_)
 
 
 @amp.command()
@@ -168,7 +182,9 @@ def stop(url: Url, trace: Trace = None, json_: Json = False) -> None:
 
     Exit status 0 only if the amplifier confirms that it is silent, else 3.
     """
-    result = _act("stop", url, trace=trace, json_=json_, needs_trace=False)
+    from drivers.by_hand import actions
+
+    result = _act(actions.stop(url), trace=trace, json_=json_, needs_trace=False)
     if result["silence"] != "confirmed_silent":
         raise typer.Exit(EXIT_STATUS[LinkError])
     if not json_:
@@ -189,10 +205,17 @@ def address(
     json_: Json = False,
 ) -> None:
     """Change the address, unit or node of an amplifier."""
-    _act("set_address", url, new, serial_number, trace=trace, json_=json_)
+    from drivers.by_hand.actions import set_address
+
+    _act(set_address(url, new, serial_number), trace=trace, json_=json_)
 
 
-_add_plain("clear", "Acknowledge a stop or fault. Leaves the amplifier disarmed.")
+@amp.command()
+def clear(url: Url, trace: Trace = None, json_: Json = False) -> None:
+    """Acknowledge a stop or fault. Leaves the amplifier disarmed."""
+    from drivers.by_hand import actions
+
+    _act(actions.clear(url), trace=trace, json_=json_)
 
 
 def run(work: Coroutine[Any, Any, _T], trace: Path | None, *, needs_trace: bool = True) -> _T:
@@ -214,13 +237,14 @@ def run(work: Coroutine[Any, Any, _T], trace: Path | None, *, needs_trace: bool 
 
 
 def _act(
-    action: str, *arguments: object, trace: Path | None, json_: bool, needs_trace: bool = True
+    action: Coroutine[Any, Any, dict[str, Any]],
+    *,
+    trace: Path | None,
+    json_: bool,
+    needs_trace: bool = True,
 ) -> dict[str, Any]:
     """Run an action and show its result: as rows, then a line for each sensor."""
-    from drivers.by_hand import actions
-
-    work = getattr(actions, action)(*arguments)
-    result: dict[str, Any] = run(work, trace, needs_trace=needs_trace)
+    result = run(action, trace, needs_trace=needs_trace)
     if json_:
         print(json.dumps(result))
         return result

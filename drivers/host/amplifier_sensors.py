@@ -84,7 +84,7 @@ class Reading:
     """Empty until the reading is complete."""
 
 
-async def read_sensors(amplifier: Amplifier) -> tuple[AmplifierSensor, ...]:
+async def read_amplifier_sensors(amplifier: Amplifier) -> tuple[AmplifierSensor, ...]:
     """Read the descriptions of an amplifier's sensors; empty if it has none."""
     if not has_feature(amplifier.ledger.capabilities, "sensors"):
         return ()
@@ -99,7 +99,7 @@ async def read_sensors(amplifier: Amplifier) -> tuple[AmplifierSensor, ...]:
             return tuple(found)
 
 
-async def read_measured(amplifier: Amplifier) -> list[tuple[float, float]]:
+async def read_electrical(amplifier: Amplifier) -> list[tuple[float, float]]:
     """Read voltage [V] and current [A] of each channel; empty if it does not measure them."""
     if not has_feature(amplifier.ledger.capabilities, "electrical"):
         return []

@@ -224,7 +224,7 @@ COMMIT_DELAY = 0.1
 _RATE_WINDOW = 1.0  # s
 _SLACK = 1e-6  # of a step, for sums of floats
 
-Vibration: TypeAlias = tuple[float | None, float]
+VibrationSpan: TypeAlias = tuple[float | None, float]
 """Earliest start [s] of a vibration, None without a vibration, and its latest end [s]."""
 
 
@@ -471,7 +471,7 @@ class Budget:
         used = max(self._used(now) - self._duty_time, now - self._start - self._limits.on_time)
         return max(0.0, -used - COMMIT_DELAY)
 
-    def sent(self, now: float, *, lasts: float) -> Vibration | None:
+    def sent(self, now: float, *, lasts: float) -> VibrationSpan | None:
         """Note a set that vibrates for `lasts` [s] at most; returns the vibration before it."""
         self._sent.append(now)
         if self.is_unlimited:
@@ -483,7 +483,7 @@ class Budget:
         self._end = max(self._end, now + COMMIT_DELAY + lasts)
         return before
 
-    def restore(self, before: Vibration | None) -> None:
+    def restore(self, before: VibrationSpan | None) -> None:
         """Note that the set that was sent last was refused; before: what `sent` returned."""
         if before is not None:
             self._start, self._end = before

@@ -119,7 +119,7 @@ def armed_problem(status: Values, latch: int | None) -> str | None:
     return None
 
 
-WINDOW = 8.0
+_WINDOW = 8.0
 """Readings count for so long [s]: fewer are noisier, and over longer a warming crystal bends."""
 _PARTS, _MIN_PART = 32, 2.0**-8
 """Parts of that time, of each of which the lowest reading is kept; shortest length of one [s]."""
@@ -436,7 +436,7 @@ class HeldClock:
         # It may be late by as much as its exchange took longer than the shortest one.
         self._all.append((time, lead + off - max(later - self._promptest - self._bits, 0.0)))
         part = _MIN_PART
-        self._lowest = [each for each in self._lowest if time - each[0] <= WINDOW]
+        self._lowest = [each for each in self._lowest if time - each[0] <= _WINDOW]
         while self._lowest and time - self._lowest[0][0] > _PARTS * part:
             part *= 2
         kept, self._lowest = (*self._lowest, (time, lead + off, later)), []

@@ -221,7 +221,7 @@ def is_lost(amplifier: Amplifier) -> bool:
 _STEP = AHEAD_MAX // 2  # between two high words that are tried
 
 
-def words_of(moment: float, amplifiers: Sequence[Amplifier]) -> dict[Amplifier, int]:
+def _words_of(moment: float, amplifiers: Sequence[Amplifier]) -> dict[Amplifier, int]:
     """Return the nearest high word of the clock of each amplifier at a moment [s]."""
     word = high_word(clock_at(moment + HIGH_TIME / 2))
     return {
@@ -405,7 +405,7 @@ class JointSets:
         if moment is None:
             words = dict.fromkeys(staged, word_passed_by_all(threads.now(), [*staged]))
         else:
-            words = words_of(moment, [*staged])
+            words = _words_of(moment, [*staged])
         requests: dict[Amplifier, Awaitable[Values]] = {}
         broadcasts: list[Awaitable[Values]] = []
         for line, sharing in by_line.items():

@@ -22,7 +22,7 @@ from drivers.host.bounds import (
     Bounds,
     Budget,
     Rounding,
-    Vibration,
+    VibrationSpan,
     refused,
     wire_limits,
 )
@@ -47,7 +47,7 @@ _MEASURING_ERROR = 0.002  # of full level, if the amplifier measures its levels
 _WEAK = 0.25  # largest measuring error, as a share of a weak level
 _logger = logging.getLogger(__name__)
 
-SILENCING = 0.005 + REACTION
+SILENCING_TIME = 0.005 + REACTION
 """Longest time from the expiry of a watchdog until the outputs are silent [s]."""
 _FULL_LEVEL = ("motion of a stiff source", "output of a linear amplifier")
 
@@ -87,7 +87,7 @@ class Feeding:
         """
         is_confirmed = self.plays <= self.since
         arrival = self.confirmed_at if is_confirmed else self.arrives + self.delay
-        return arrival + self.watchdog + self.fade + SILENCING
+        return arrival + self.watchdog + self.fade + SILENCING_TIME
 
     @property
     def may_play_until(self) -> float:
@@ -230,7 +230,7 @@ class Doubt(NamedTuple):
     layers: tuple[LayerSet, ...]
     sent_at: float
     """When it may have begun to play [s]."""
-    before: Vibration | None
+    before: VibrationSpan | None
     """The vibration that the budget counted before it."""
 
 
@@ -331,7 +331,7 @@ class Ledger:
         if self._first_sent[0] != token:
             self._first_sent = token, now if starts is None else starts
             self._starts, self._start_error = -math.inf if starts is None else starts, error
-        before: Vibration | None = None
+        before: VibrationSpan | None = None
         if is_vibrating(*layers):
             lasts = 0.0 if self._budget.is_unlimited else max(map(_lasts, layers))
             before = self._budget.sent(now, lasts=lasts + self._waits(layers, now))

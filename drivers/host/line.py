@@ -310,7 +310,7 @@ _AHEAD = 0.005  # s; the next part of a set is written so early; a stop waits fo
 _FULL_PAUSE = 0.0005  # s; before a blocked port is looked at again
 _LOOK_INTERVAL = 0.01  # s; between two looks, each of which would notice a delay of this process
 _LATE = 0.005  # s; if a timer fires later than this, this process was delayed
-MAX_LATE = 0.032
+_MAX_LATE = 0.032
 """How much longer [s] a reply is awaited at most where replies have come late.
 
 An adapter may hold what passes for 16 ms, each way.
@@ -356,7 +356,7 @@ class Line:
         self._sent_until = 0.0  # s; until then what was sent is still under way
         self._free_at = 0.0  # s; until then a reply may still occupy the line
         self.late = 0.0
-        """How much later replies have come [s] than the wire alone explains, at most `MAX_LATE`."""
+        """Delay of replies [s] beyond what the wire alone explains, at most `_MAX_LATE`."""
 
     def open(self, port: OpenPort) -> None:
         """Use this open port from now on."""
@@ -426,7 +426,7 @@ class Line:
                 continue
             self._sent_until = 0.0  # a request that has a reply has arrived
             if isinstance(arrival, Continuation):
-                self.late = max(self.late, min(self.time() - self._free_at, MAX_LATE))
+                self.late = max(self.late, min(self.time() - self._free_at, _MAX_LATE))
                 if self._queue and self._must_yield(job):
                     self._not_answered(job)
                 else:
@@ -437,7 +437,7 @@ class Line:
                 self._go_on(job)
                 continue
             late = self.time() - job.started_at - job.takes
-            self.late = min(max(late, self.late * _LATE_DECAY), MAX_LATE)
+            self.late = min(max(late, self.late * _LATE_DECAY), _MAX_LATE)
             if self.seen is not None:
                 self.seen("in", member.address, type(arrival).__name__, arrival)
             if not isinstance(arrival, Reply):

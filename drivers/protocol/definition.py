@@ -186,7 +186,7 @@ def _numbers(*names: str) -> tuple[Number, ...]:
     return tuple(Number(name, QUANTITIES[quantity or name]) for name, _, quantity in split)
 
 
-def reading(
+def status_reading(
     name: str,
     meaning: str,
     low: int,
@@ -227,8 +227,8 @@ LAYER = Record(
 _LIMITS = Record(*_numbers("frequency_min:frequency", "frequency_max:frequency", "level_max:level"))
 STATUS = Record(
     *_numbers("state:code", "fault:code", "flags", "latch", "watchdog_left"),
-    reading("temperature", "of the amplifier", -1000, 2000, 10, "°C", "status", "page"),
-    reading("high_voltage", "of the supply; 0: not measured", 0, 65535, 1, "V", "page"),
+    status_reading("temperature", "of the amplifier", -1000, 2000, 10, "°C", "status", "page"),
+    status_reading("high_voltage", "of the supply; 0: not measured", 0, 65535, 1, "V", "page"),
     *_numbers("clock", "token:played_token"),
     Bits((("channels", 8), ("layers", 8))),
     Numbers("levels", "channels", QUANTITIES["level"]),
@@ -370,11 +370,11 @@ MESSAGES: Mapping[str, Message] = {message.name: message for message in _MESSAGE
 BY_NUMBER: Mapping[int, Message] = {message.number: message for message in _MESSAGES}
 REQUESTS: Mapping[str, Message] = {"Hello": Message("Hello", HELLO, Record(), IDENTITY), **MESSAGES}
 """Requests by name: Hello, which every version has, and those of this version."""
-NAMES: Mapping[int, str] = {each.number: name for name, each in REQUESTS.items()}
+REQUEST_NAMES: Mapping[int, str] = {each.number: name for name, each in REQUESTS.items()}
 """Names of requests by number."""
 
 
-def read_request(number: int, words: Sequence[int]) -> tuple[str, Values]:
+def decode_request(number: int, words: Sequence[int]) -> tuple[str, Values]:
     """Read the name and the values of a request with a message's number; raises Refusal."""
     message = BY_NUMBER.get(number)
     if message is None:

@@ -127,7 +127,7 @@ def write_pdu(address: int, registers: Sequence[int]) -> bytes:
     return pdu_of(Write(address=address, registers=[*registers]))
 
 
-def answer(request: Pdu, registers: Sequence[int] = ()) -> bytes:
+def response_pdu(request: Pdu, registers: Sequence[int] = ()) -> bytes:
     """Return the PDU of the response to a request; registers: that were read."""
     if request.function_code == WRITE:
         return pdu_of(WriteMultipleRegistersResponse(address=request.address, count=request.count))
@@ -181,7 +181,7 @@ def response_to(request: Pdu | None, adu: Adu) -> Response | None:
     if pdu[0] == function | EXCEPTION:
         return Response(exception=pdu[1]) if len(pdu) == 2 and pdu[1] else None
     if function == WRITE:
-        return Response() if pdu == answer(request) else None
+        return Response() if pdu == response_pdu(request) else None
     if pdu[:2] != bytes((function, 2 * count)) or len(pdu) != 2 + 2 * count:
         return None
     return Response(struct.unpack(f">{count}H", pdu[2:]))

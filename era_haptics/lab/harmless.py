@@ -27,7 +27,7 @@ from pydantic.json_schema import models_json_schema
 
 from controller.content.formats import named_contents
 from controller.daemon.config import DaemonSection, is_daemon_document
-from controller.effects.kinds import BUILT_IN as EFFECTS
+from controller.effects.kinds import BUILT_IN_EFFECTS as EFFECTS
 from controller.effects.layout import LayoutSection, is_layout_document
 from controller.sources.touch import open_source, source_schemes
 from drivers.errors import CommandError

@@ -35,7 +35,7 @@ from registry.files import regular_file
 from registry.plugins import plugins_of
 
 MAX_FILE_SIZE = 1 << 20  # bytes; of a larger file only the end is included
-MAX_DUMPS = 5
+MAX_REPORTED_DUMPS = 5
 _GROUPS = "era_haptics."  # prefix of our entry point groups
 
 
@@ -101,7 +101,7 @@ class _Report:
         folder = file_of(daemon, "dumps", "folder")
         dumps = sorted(folder.glob(DUMP_PATTERN)) if folder is not None else []
         records = [("log", log)] if log is not None else []
-        records += [("fault", dump) for dump in dumps[-MAX_DUMPS:]]
+        records += [("fault", dump) for dump in dumps[-MAX_REPORTED_DUMPS:]]
         for kind, path in records:
             if self._is_new(path):
                 self._add_record(self._new_name(kind, ".jsonl"), path)
@@ -132,7 +132,7 @@ class _Report:
             if name.endswith(".jsonl"):
                 text = harmless_records(file.text, self.names)
                 shown[name] = CollectedFile(text, file.source)
-        shown["versions.json"] = CollectedFile(json.dumps(versions(), indent=2))
+        shown["versions.json"] = CollectedFile(json.dumps(installed_versions(), indent=2))
         return ReportContents(shown, self.missing)
 
     def _is_new(self, path: Path) -> bool:
@@ -189,7 +189,7 @@ def write_report(folder: Path, report: ReportContents) -> None:
         raise
 
 
-def versions() -> dict[str, Any]:
+def installed_versions() -> dict[str, Any]:
     """Versions of Python, the system, era-haptics and all installed packages, and all plug-ins."""
     plug_ins = {
         group.removeprefix(_GROUPS): {

@@ -28,7 +28,7 @@ from pymodbus.pdu.register_message import (
 from pymodbus.server import ModbusSerialServer, ModbusTcpServer
 from pymodbus.simulator import DataType, SimData, SimDevice
 
-from drivers.protocol.definition import BY_NUMBER, MAX_WORDS, Message, nak_of, read_request
+from drivers.protocol.definition import BY_NUMBER, MAX_WORDS, Message, decode_request, nak_of
 from drivers.protocol.records import Refusal
 from drivers.protocol.sets import is_earlier_part
 from drivers.wires.modbus_frames import (
@@ -99,7 +99,7 @@ class Unit:
     def _carry_out(self, message: Message, words: list[int]) -> tuple[int, list[int]]:
         """Return the result of a message and the words of its reply."""
         try:
-            name, values = read_request(message.number, words)
+            name, values = decode_request(message.number, words)
             done = self.amplifier.handle(name, values, threads.now())
         except Refusal as refusal:
             if is_earlier_part(message.number, words):

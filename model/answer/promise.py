@@ -31,7 +31,7 @@ from model.arrays import (
     IntArray,
     Point,
 )
-from model.drive_modes import Drive, Forms
+from model.drive_modes import Forms, WeightedTones
 from model.ensemble.attached_plate import PlateOnEras
 from model.ensemble.draws import PROMISED_DRAWS, Drawing, over_fingertips, percentile
 from model.ensemble.touched_plate import (
@@ -286,7 +286,7 @@ class RingingUnderFingers:
         found[found < _LEAST_SHARE * strongest] = 0.0
         return found
 
-    def spectrum(self, drive: Drive) -> Drive:
+    def spectrum(self, drive: WeightedTones) -> WeightedTones:
         """Return steady tones with the energy of a drive along the envelope, on any plate.
 
         By Parseval's theorem, except for what the drive excites far beside its frequencies.
@@ -327,7 +327,7 @@ class RingingUnderFingers:
         )
         return long if len(long) else some
 
-    def over_drive(self, drive: Drive) -> OverDuration:
+    def over_drive(self, drive: WeightedTones) -> OverDuration:
         """Return what fingers feel of a drive; each is solved once."""
         hertz, drives = self.table.frequencies, self.table.highest_drives
         key = tuple([(row, weights.tobytes()) for row, weights in drive])

@@ -35,7 +35,7 @@ The lower one is below the smallest amplitude of a channel. The exposure at the 
 discussed in docs/concepts/people.md.
 """
 
-MIN_DURATION, MAX_DURATION = 0.001, 1e6
+_MIN_DURATION, _MAX_DURATION = 0.001, 1e6
 """Bounds of a stimulus's duration [s]: no time step of a plate is nearly as short or as long."""
 
 MIN_MODULATION, MAX_MODULATION = 10.0, 30.0
@@ -112,9 +112,9 @@ class Stimulus:
             object.__setattr__(self, "duration", self.course.duration)
         if self.duration is not None:
             expect_number(self.duration, what="duration", unit="seconds")
-            if not MIN_DURATION <= self.duration <= MAX_DURATION:  # False for NaN
+            if not _MIN_DURATION <= self.duration <= _MAX_DURATION:  # False for NaN
                 raise InputError(
-                    f"duration must be from {MIN_DURATION:g} to {MAX_DURATION:g} s, got "
+                    f"duration must be from {_MIN_DURATION:g} to {_MAX_DURATION:g} s, got "
                     f"{self.duration:g}; leave it out of a stimulus that lasts"
                 )
         if self.modulation_hz is not None:
@@ -312,10 +312,10 @@ def _check_pair(given: object, *, what: str, such_as: str) -> None:
         raise InputError(f"{what} must be two numbers such as {such_as}, got {shown(given)}")
 
 
-MAX_POINTS = 20_000
+_MAX_POINTS = 20_000
 """Most times of a course."""
 
-KNOT_STEP = 0.010
+COURSE_KNOT_STEP = 0.010
 """Time [s] between the knots along which amplifiers play a course, if the wires carry so many."""
 
 STRONGEST = 0.040
@@ -338,9 +338,9 @@ class Course:
 
     def __post_init__(self) -> None:
         """Check times and shares; raises InputError."""
-        if not 2 <= len(self.times) == len(self.shares) <= MAX_POINTS:
+        if not 2 <= len(self.times) == len(self.shares) <= _MAX_POINTS:
             raise InputError(
-                f"a course must have 2 to {MAX_POINTS} times and as many shares, got "
+                f"a course must have 2 to {_MAX_POINTS} times and as many shares, got "
                 f"{len(self.times)} and {len(self.shares)}"
             )
         if self.times[0] != 0 or not (np.diff(self.times) > 0).all():
@@ -376,7 +376,7 @@ class Course:
         One for each distance of the knots: wires that carry fewer have them further apart.
         """
         found = []
-        for step in (KNOT_STEP, 2 * KNOT_STEP, 4 * KNOT_STEP):
+        for step in (COURSE_KNOT_STEP, 2 * COURSE_KNOT_STEP, 4 * COURSE_KNOT_STEP):
             count, rest = (math.ceil(each / step) for each in (self.duration, DECAYED))
             times = np.asarray(step * np.arange(1, count + rest + 1), dtype=float)
             once = np.where(times < self.duration, self.at(times), 0.0)
@@ -404,7 +404,7 @@ at 20 dB SL the target still feels it after a fifth of it (docs/concepts/transie
 FADE_RAMP = 0.020
 """Duration of the fade [s] under fingers that stay on the plate; a shorter one feels like a tap."""
 
-RINGING = 0.100
+_RINGING = 0.100
 """Time [s] after a short effect over which the ringing at other fingers counts.
 
 Weights keep it down for that time and no longer: with 20 ms it was up to 7 dB stronger afterwards
@@ -469,7 +469,7 @@ class OverDuration:
 
 @dataclass(frozen=True, eq=False)
 class DriveEnvelope:
-    """Envelope of a drive, up to RINGING after its end or until it is steady."""
+    """Envelope of a drive, up to _RINGING after its end or until it is steady."""
 
     values: FloatArray
     """Envelope (n,) at even steps."""
@@ -490,7 +490,7 @@ class DriveEnvelope:
         length = min(duration, SHAPED_FROM)  # the rest is steady
         count = min(_MAX_PULSE_STEPS, max(1, math.ceil(length / _PULSE_STEP)))
         step = length / count
-        every = count + math.ceil(RINGING / step)
+        every = count + math.ceil(_RINGING / step)
         times = np.asarray(step * (np.arange(every) + 0.5), dtype=float)
         values = rise(times, ramp) - rise(np.asarray(times - length), ramp)
         return cls(np.asarray(values), step, count, length / duration)
@@ -498,7 +498,7 @@ class DriveEnvelope:
     @classmethod
     def of_course(cls, course: Course) -> "DriveEnvelope":
         """Make the envelope along a course, with a plain ramp where it starts or ends above 0."""
-        count = math.ceil((course.duration + RINGING) / course.step)
+        count = math.ceil((course.duration + _RINGING) / course.step)
         times = np.asarray(course.step * np.arange(count), dtype=float)
         after, (first, *_, last) = np.asarray(times - course.duration), course.shares
         values = course.at(times) - first * (1 - rise(times, ONSET_RAMP))

@@ -57,14 +57,14 @@ from model.compiled.kernels import (
     TouchedPlates,
     WeightSearch,
     kernels,
-    run,
+    run_kernel,
 )
 from model.drive_modes import (
     LEVEL_MARGIN,
     NEARLY_HIGHEST,
     UNRESTRICTED,
-    Drive,
     Forms,
+    WeightedTones,
     find_switched,
     max_sensation_switched,
     search,
@@ -137,7 +137,7 @@ def choose_tones(table: LocalizationTable, contents: Contents) -> Tones:
     rows = array("i", bytes(4 * count))
     figures = array("f", bytes(4 * (size + count + of_fingers + 2)))
     to = FoundTones(0, rows.buffer_info()[0], figures.buffer_info()[0])
-    status = run(by.library.answer, to, plates, raster, rules, given)
+    status = run_kernel(by.library.answer, to, plates, raster, rules, given)
     if status != FOUND:
         raise AssertionError("contents must have tones")
     found = figures.tolist()
@@ -255,7 +255,7 @@ class Candidates:
     bands: IntArray
     """Band of each (m,), by number within its content."""
     scores: FloatArray
-    drives: Sequence[Drive]
+    drives: Sequence[WeightedTones]
 
     @property
     def rows(self) -> IntArray:
@@ -334,7 +334,7 @@ def _candidates(
     every = np.arange(len(hertz)) if any(ringing) else rows
     formed = fingers.forms(every, with_fine=True)
     apart_hz = contents.apart_hz if count > 1 else 0.0
-    found: list[tuple[int, int, float, Drive]] = []
+    found: list[tuple[int, int, float, WeightedTones]] = []
     is_limited = False
     for number, stream in enumerate(contents.streams):
         others = contents.others(number)
@@ -475,7 +475,7 @@ def _judged(
     return least, own[:, 1:], loudest[:, :, 1:]
 
 
-def tones_of(drives: Sequence[Drive]) -> tuple[IntArray, Complex64Array, IntArray]:
+def tones_of(drives: Sequence[WeightedTones]) -> tuple[IntArray, Complex64Array, IntArray]:
     """Return rows (m,) and weights (m, n) of the tones of drives, and each one's drive (m,)."""
     tones = [(row, weights, number) for number, each in enumerate(drives) for row, weights in each]
     rows, weights, owners = (np.array(each) for each in zip(*tones, strict=True))

@@ -136,7 +136,7 @@ def calibrate(
     Write what was found beside the rig's file, and print its values with their uncertainties.
     """
     from model.estimate.calibrate import calibrate as fit
-    from model.estimate.calibrate import standard_errors
+    from model.estimate.calibrate import calibration_errors
     from model.estimate.fit_report import (
         calibration_json,
         change_rows,
@@ -164,7 +164,7 @@ def calibrate(
     made = f"{rig_file.name} calibrated with {measured_file.name} by `era calibrate`:"
     files = (
         write_fitted_rig(
-            output, (rig, calibration.rig), [made, *rows, *notes], standard_errors(calibration)
+            output, (rig, calibration.rig), [made, *rows, *notes], calibration_errors(calibration)
         )
         if refusal is None
         else []

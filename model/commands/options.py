@@ -18,6 +18,9 @@ from registry.streams import drawing_on
 if TYPE_CHECKING:
     from model.processes import Progress
 
+FAILED = 1
+"""Exit status of a check whose object does not pass."""
+
 RigArgument = Annotated[Path, typer.Argument(metavar="RIG", help="Rig file, e.g. RIG.yaml.")]
 TableArgument = Annotated[Path, typer.Argument(metavar="TABLE", help="Table file, e.g. T.npz.")]
 MeshOption = Annotated[

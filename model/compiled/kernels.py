@@ -438,7 +438,7 @@ def why_slow() -> str | None:
     return None if kernels() else f"{WITHOUT_KERNELS}; install a C compiler, such as gcc or clang"
 
 
-def run(kernel: Callable[..., int], *given: Any) -> int:
+def run_kernel(kernel: Callable[..., int], *given: Any) -> int:
     """Run a kernel on structures and other arguments and return its status; raises MemoryError."""
     status = kernel(
         *[ctypes.byref(each) if isinstance(each, ctypes.Structure) else each for each in given]

@@ -20,7 +20,7 @@ import yaml
 from model.errors import InputError
 from registry.files import read_regular
 
-MAX_SIZE = 1 << 20  # bytes
+_MAX_SIZE = 1 << 20  # bytes
 MAX_PROBLEMS = 50
 """Number of problems of one file that are reported; with more it is the wrong kind of file."""
 
@@ -157,7 +157,7 @@ def read_document(path: Path, *, if_empty: str = IF_EMPTY) -> Document:
     """
     source = str(path)
     content = read_bytes(
-        path, MAX_SIZE, is_for="a configuration has a few lines", give="a YAML file"
+        path, _MAX_SIZE, is_for="a configuration has a few lines", give="a YAML file"
     )
     if content.startswith(_ZIP):
         raise _whole(

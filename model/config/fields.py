@@ -47,7 +47,7 @@ from model.config.document import (
     is_file_name,
     is_null_word,
 )
-from model.config.units import LENGTH, Dimension, quantity, shown
+from model.config.units import LENGTH, Dimension, as_written, quantity
 from model.quantities import counted
 from registry.plugins import did_you_mean
 from registry.wording import reworded
@@ -125,7 +125,8 @@ def _file_name(text: str) -> str:
         raise ValueError(f"must be the name of a file, got {text}{_WRITE_NULL}; or write ./{text}")
     if not is_file_name(text):
         raise ValueError(
-            f"must be the name of a file, up to {MAX_FILE_NAME} characters, got {shown(text)[:40]}"
+            f"must be the name of a file, up to {MAX_FILE_NAME} characters, "
+            f"got {as_written(text)[:40]}"
         )
     return text
 
@@ -333,7 +334,7 @@ def _no_choice(details: ErrorDetails, expected: str) -> str:
 
 
 def _shown(details: ErrorDetails) -> str:
-    text = shown(details["input"])
+    text = as_written(details["input"])
     return text if len(text) <= 40 else f"{text[:40]}..."
 
 
@@ -354,7 +355,7 @@ def _section_at(root: type[Section], path: KeyPath, document: Document) -> type[
     return section
 
 
-Point: TypeAlias = tuple[float, float]
+_Point: TypeAlias = tuple[float, float]
 
 _CIRCLE_CORNERS = 60  # a multiple of 4
 _TOLERANCE = 1e-9  # m; a point this close to a side lies on it
@@ -374,11 +375,11 @@ class Rectangle:
         return self.x <= x <= self.x + self.width and self.y <= y <= self.y + self.height
 
     @property
-    def centre(self) -> Point:
+    def centre(self) -> _Point:
         """The centre of area."""
         return (self.x + self.width / 2, self.y + self.height / 2)
 
-    def corners(self) -> Sequence[Point]:
+    def corners(self) -> Sequence[_Point]:
         """Return all four."""
         east, north = self.x + self.width, self.y + self.height
         return ((self.x, self.y), (east, self.y), (east, north), (self.x, north))
@@ -407,11 +408,11 @@ class Circle:
         return math.dist((x, y), (self.x, self.y)) <= self.radius
 
     @property
-    def centre(self) -> Point:
+    def centre(self) -> _Point:
         """The centre."""
         return (self.x, self.y)
 
-    def corners(self) -> Sequence[Point]:
+    def corners(self) -> Sequence[_Point]:
         """Return points around it, among them those farthest along x and y."""
         angles = [2 * math.pi * number / _CIRCLE_CORNERS for number in range(_CIRCLE_CORNERS)]
         return [
@@ -428,7 +429,7 @@ class Circle:
 class Polygon:
     """A polygon by its corners; crossing sides follow the even-odd rule."""
 
-    points: tuple[Point, ...]
+    points: tuple[_Point, ...]
 
     def contains(self, x: float, y: float) -> bool:
         """Whether a ray to the east crosses the sides an odd number of times."""
@@ -454,7 +455,7 @@ class Polygon:
         )
 
     @property
-    def centre(self) -> Point:
+    def centre(self) -> _Point:
         """The centre of area, or the mean of the corners where sides cross out the area."""
         following = (*self.points[1:], self.points[0])
         cross = [
@@ -470,7 +471,7 @@ class Polygon:
             sum((one[1] + other[1]) * each for one, other, each in pairs) / (6 * area),
         )
 
-    def corners(self) -> Sequence[Point]:
+    def corners(self) -> Sequence[_Point]:
         """Return all corners."""
         return self.points
 
@@ -479,11 +480,11 @@ class Polygon:
         return {"shape": "polygon", "points_m": [list(point) for point in self.points]}
 
 
-Shape: TypeAlias = Rectangle | Circle | Polygon
+RegionShape: TypeAlias = Rectangle | Circle | Polygon
 """A part of the plate; lengths in metres, from the plate's south-west corner."""
 
 
-def _is_on_side(x: float, y: float, start: Point, end: Point) -> bool:
+def _is_on_side(x: float, y: float, start: _Point, end: _Point) -> bool:
     """Whether a point lies on a side, within a nanometre."""
     length = math.dist(start, end)
     if length == 0:
@@ -520,7 +521,7 @@ class ShapedSection(Section):
     polygon: PolygonSection | None = None
 
     @property
-    def shape(self) -> Shape:
+    def shape(self) -> RegionShape:
         """That shape."""
         if self.rectangle is not None:
             (x0, y0), (x1, y1) = self.rectangle.start, self.rectangle.end
@@ -529,7 +530,7 @@ class ShapedSection(Section):
             return Circle(*self.circle.at, self.circle.radius)
         return Polygon(tuple(self.polygon or ()))
 
-    def shape_problem(self, sides: Point | None) -> tuple[tuple[str, ...], str] | None:
+    def shape_problem(self, sides: _Point | None) -> tuple[tuple[str, ...], str] | None:
         """Where and why it has not one shape, on a plate of these sides [m]; None if it has.
 
         sides: None for any plate.
@@ -549,7 +550,7 @@ class ShapedSection(Section):
         )
 
 
-def box_of(shape: Shape) -> tuple[Point, Point]:
+def box_of(shape: RegionShape) -> tuple[_Point, _Point]:
     """South-west and north-east corner of the box around a shape."""
     xs, ys = zip(*shape.corners(), strict=True)
     return (min(xs), min(ys)), (max(xs), max(ys))

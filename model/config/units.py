@@ -193,13 +193,13 @@ def _to_float(value: float | str | Decimal, dimension: Dimension) -> float:
 
 def _refusal(value: object, dimension: Dimension, why: str) -> InputError:
     """The error for a value, with what to write instead."""
-    text = shown(value)
+    text = as_written(value)
     text = text if len(text) <= _MAX_LENGTH else f"{text[:_MAX_LENGTH]}..."
     bare = f"a bare number in {dimension.unit}" if dimension.unit else "a bare number"
     return InputError(f"{text} {why}; write {bare}, or for example {dimension.example}")
 
 
-def shown(value: object) -> str:
+def as_written(value: object) -> str:
     """A value as it is written in a file."""
     if value is None:
         return "nothing"

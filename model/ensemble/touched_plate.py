@@ -40,7 +40,7 @@ from model.compiled.kernels import (
     TouchedPlates,
     as_given,
     kernels,
-    run,
+    run_kernel,
 )
 from model.ensemble.attached_plate import MODELLED, THICKER, THINNER, PlateOnEras
 from model.ensemble.draws import (
@@ -382,7 +382,7 @@ class TouchedByKernel(TouchedPlate):
         sizes = ((f, g, p, n), (f, g, fine_count, n), (f, g, n, n), (f, g, n, n))
         found = [np.empty(size, dtype=np.complex64) for size in sizes]
         to, at = (ctypes.c_void_p * 4)(*(each.ctypes.data for each in found)), as_given(rows)
-        run(self.kernels.library.forms_stage, self.structure, of, at.ctypes, f, to)
+        run_kernel(self.kernels.library.forms_stage, self.structure, of, at.ctypes, f, to)
         return LoadedContacts(found[0], None if fine is None else found[1], found[2], found[3])
 
     def drawn(
@@ -409,7 +409,7 @@ class TouchedByKernel(TouchedPlate):
         )
         draws = draws_structure(self.on, self.clocks, k, by)
         stage = self.kernels.library.tones_stage
-        run(stage, self.structure, draws, at, at_rows.ctypes, m, of_weights.ctypes, to)
+        run_kernel(stage, self.structure, draws, at, at_rows.ctypes, m, of_weights.ctypes, to)
         return FingertipAmplitudes(means, loudest, powers if with_powers else None)
 
 
@@ -530,7 +530,7 @@ def plates_structure(on: PlateOnEras) -> TouchedPlates:
         room = np.empty(2 * (f + by.lanes) * kept * b * r + _MAX_LANES, dtype=np.float32)
         found.arrays.append(room)
         found.of_blocks = room.ctypes.data + -room.ctypes.data % (4 * _MAX_LANES)  # whole registers
-        run(by.library.blocks_stage, found)
+        run_kernel(by.library.blocks_stage, found)
     return _kept.setdefault(on, found)  # concurrent threads all take the first one
 
 

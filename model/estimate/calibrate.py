@@ -45,7 +45,7 @@ from model.estimate.measurement import (
     Measurement,
     check_enough_sensors,
 )
-from model.estimate.parameters import FORM_ERRORS, KINDS
+from model.estimate.parameters import FORM_ERRORS, PARAMETER_KINDS
 from model.estimate.plate_match import MAX_FIT_ERROR
 from model.estimate.rig_check import diagnose
 from model.files.csv_file import as_frame
@@ -66,7 +66,9 @@ _LEAST = 1e-4  # of an uncertainty; no fit is exact
 # what form errors leave unexplained widens resonances by 0.4 % (root mean square over plates
 # without noise).
 _MODEL_ERROR, _LOSS_ERROR = 2e-3, 4e-3
-_FOREIGN_MASS = KINDS["foreign_mass"].std * math.sqrt(MASS_CELLS.cell_count)  # of the plate's
+_FOREIGN_MASS = PARAMETER_KINDS["foreign_mass"].std * math.sqrt(
+    MASS_CELLS.cell_count
+)  # of the plate's
 
 _UNKNOWN = 100.0  # standard deviations of what no prior holds
 _AT_BOUND = 1e-6  # standard deviations
@@ -222,7 +224,9 @@ class Calibration:
         All that is fitted but losses scales with the whole mass, which no response tells.
         """
         plate, x, space = self.plate, self.fit.x, self.plate.model.space
-        sides = KINDS["side"].std / np.array([plate.rig.plate.length, plate.rig.plate.width])
+        sides = PARAMETER_KINDS["side"].std / np.array(
+            [plate.rig.plate.length, plate.rig.plate.width]
+        )
         of_mass = math.hypot(_FOREIGN_MASS, *sides)
         distance = np.abs(np.array([space.lower, space.upper]) - x).min(axis=0)
         found = []
@@ -578,7 +582,7 @@ class Calibration:
         Where the fit does not clearly have another place, the error of the kept one counts; the
         error of the rig before counts where the data determine a place less than its prior does.
         """
-        space, kind = self.plate.model.space, KINDS["place"]
+        space, kind = self.plate.model.space, PARAMETER_KINDS["place"]
         kept, error = (
             space.values(each, "place")
             for each in (np.where(self.is_clear, 0.0, self.fit.x), self.fit.errors)
@@ -647,7 +651,7 @@ def _fitted_with_scales(rig: Rig, measured: Measurement, screened: Screening) ->
         dead[~dead] = ~heard  # elsewhere, or loose
         screened = replace(screened, dead_sensors=dead)
     measurement = replace(measurement, errors=std)
-    start[space.groups["sensor_scale"]] = (scales - 1) / KINDS["sensor_scale"].std
+    start[space.groups["sensor_scale"]] = (scales - 1) / PARAMETER_KINDS["sensor_scale"].std
     prior = _prior(plate, start, np.ones(len(scales), dtype=bool))
     searched = space.uncertain & ~space.of("gain")
     for _ in range(2):  # the effect of viscous losses changes little with the parameters
@@ -707,7 +711,7 @@ def _check_sides(found: Calibration) -> None:
     plate, space = found.plate.rig.plate, found.plate.model.space
     offs = space.values(found.fit.x, "side").tolist()
     for key, side, off in zip(("length", "width"), (plate.length, plate.width), offs, strict=True):
-        if abs(off) > _MAX_SIDE * KINDS["side"].std:
+        if abs(off) > _MAX_SIDE * PARAMETER_KINDS["side"].std:
             raise _wrong_size(f"plate.{key}", side, side + off)
 
 
@@ -772,7 +776,7 @@ def _variances(
     return np.asarray(((slopes @ own) * slopes).sum(axis=-1))
 
 
-def standard_errors(calibration: Calibration) -> dict[KeyPath, float]:
+def calibration_errors(calibration: Calibration) -> dict[KeyPath, float]:
     """Standard errors of the values that a rig's file states, by the path of their key."""
     found = calibration.parameters
     return errors_by_key(calibration.rig, ((each, each.standard_error) for each in found))

@@ -1,14 +1,14 @@
 """What a rig check finds: kinds of finding with their texts, and what judges each of them.
 
-A kind is an entry of `KINDS`, by which `docs/how-to/rig-check.md` is written, too, and a function
-here. What a file says the wrong way round (places, grain, resonances) is another plate, for which
-no fit of values makes up: functions of a plate and its shapes find it, and put it right. Shapes
-show it: those of boards as bought leave a quarter of the response unexplained with the right side,
-half to nine tenths with the other. All else follows from a `Verdict` whose plate and channels are
-matched.
+A kind is an entry of `FINDING_KINDS`, from which `docs/how-to/rig-check.md` is written, too, and a
+function here. What a file says the wrong way round (places, grain, resonances) is another plate,
+for which no fit of values makes up: functions of a plate and its shapes find it, and put it right.
+Shapes show it: those of boards as bought leave a quarter of the response unexplained with the right
+side, half to nine tenths with the other. All else follows from a `Verdict` whose plate and channels
+are matched.
 
-A new kind of fault is an entry of `KINDS`, and a function that yields findings of a verdict, which
-`judged` calls.
+A new kind of fault is an entry of `FINDING_KINDS`, and a function that yields findings of a verdict
+and is called by `with_findings`.
 """
 
 import math
@@ -85,7 +85,7 @@ class FindingKind:
     """Whether it fails the check."""
 
 
-KINDS = {
+FINDING_KINDS = {
     "mirrored": FindingKind(
         "PLACES: places of sensors must be from the corner from which those of ERAs are, "
         "got ones mirrored in {of}: {coarse}; correct the positions of all{or_plugs}",
@@ -270,7 +270,7 @@ class Finding:
     """Something that a check found."""
 
     kind: str
-    """Key of `KINDS`."""
+    """Key of `FINDING_KINDS`."""
     of: str
     """What it is of, by name."""
     value: float = 0.0
@@ -288,18 +288,18 @@ class Finding:
     @property
     def about(self) -> str:
         """What it is about, as `FindingKind.about`."""
-        return KINDS[self.kind].about
+        return FINDING_KINDS[self.kind].about
 
     @property
     def rows(self) -> list[str]:
         """Lines for people: what is wrong, and what to do."""
         own = {"of": self.of, "value": self.value, "confidence": self.confidence}
-        return KINDS[self.kind].text.format(**{**self.details, **own}).splitlines()
+        return FINDING_KINDS[self.kind].text.format(**{**self.details, **own}).splitlines()
 
     @property
     def is_fault(self) -> bool:
         """Whether it fails the check."""
-        return KINDS[self.kind].is_fault
+        return FINDING_KINDS[self.kind].is_fault
 
 
 Correction: TypeAlias = tuple[Finding, Rig, Measurement]
@@ -531,7 +531,7 @@ class Verdict:
         return float(np.mean(np.array(self.promise_margins) >= 0)) if self.promise_margins else None
 
 
-def judged(verdict: Verdict) -> Verdict:
+def with_findings(verdict: Verdict) -> Verdict:
     """The verdict with the findings that follow from it, besides those that it has."""
     mounts = [  # an ERA that hardly holds the plate
         Finding("detached", each.era, each.value / each.expected)

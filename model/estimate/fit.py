@@ -29,18 +29,18 @@ from model.estimate.forward import (
     MASS_CELLS,
     ForwardModel,
     PlateAt,
+    PlateValues,
     Sensor,
     Space,
-    Values,
     by_mass_at,
     jacobian,
 )
 from model.estimate.measurement import Measurement
-from model.estimate.parameters import KINDS
+from model.estimate.parameters import PARAMETER_KINDS
 from model.estimate.space import MAX_GUESSED, VALUE_UNITS, rig_with, space_from_datasheets
 from model.reduction.free_plate import solve_free_plate
 from model.reduction.reduced_plate import reduced_modes
-from model.rig.actuator_keys import KINDS as ACTUATOR_KEYS
+from model.rig.actuator_keys import ACTUATOR_KINDS as ACTUATOR_KEYS
 from model.rig.rig import Rig
 from model.structure.attachments import footprints_of
 from model.structure.modal_elasticity import check_is_plate
@@ -430,7 +430,7 @@ def noise_of(values: ComplexArray, residuals: FloatArray, left: FloatArray) -> F
     return np.asarray(np.sqrt(a2 + b2 * size**2 + floor**2))
 
 
-def likeliest(found: Sequence[Fit]) -> Fit:
+def likeliest_fit(found: Sequence[Fit]) -> Fit:
     """The fit of least cost, the first of those that are nearly equal."""
     return best_by(found, lambda each: -each.cost)
 
@@ -614,7 +614,7 @@ class SensedPlate:
         # A force factor is found with the damping beside it.
         own = self.model.space.of("force_factor", *beside)
         own[self.numbers] = True
-        values = Values(self.rig, self.model.space, np.where(own, z, 0.0))
+        values = PlateValues(self.rig, self.model.space, np.where(own, z, 0.0))
         return rig_with(self.rig, values, self.rig.uncertainty)
 
     def values(self, z: FloatArray) -> FloatArray:
@@ -635,7 +635,7 @@ class SensedPlate:
             "loss_factor": factor,
             "stiffness": math.hypot(stated.stiffness, stated.thickness),
             "magnet_mass": math.hypot(stated.stiffness, stated.thickness),
-            "damping": math.hypot(factor, KINDS["damping_each"].std),
+            "damping": math.hypot(factor, PARAMETER_KINDS["damping_each"].std),
             "supports": stated.supports,
         }
         own = np.array([row.before for row in self.rows])

@@ -15,7 +15,7 @@ from model.arrays import FloatArray, Point
 from model.estimate.calibrate import Calibration
 from model.estimate.fit import Parameter
 from model.estimate.identify import MAX_CHI2, MAX_MODE_SHIFT, Identification, clock_estimates
-from model.estimate.parameters import KINDS
+from model.estimate.parameters import PARAMETER_KINDS
 from model.estimate.space import MAX_GUESSED, UNIT_KEYS
 from model.quantities import counted, in_display_unit, percent, with_error
 from model.rig.rig import Rig, Uncertainty
@@ -287,7 +287,10 @@ def parameter_rows(found: Identification) -> list[str]:
     rows = []
     for each in identified_parameters(found):
         assert each.standard_error is not None  # noqa: S101  all were searched
-        if KINDS[each.kind].is_listed or abs(each.value) > _LISTED_STDS * each.standard_error:
+        if (
+            PARAMETER_KINDS[each.kind].is_listed
+            or abs(each.value) > _LISTED_STDS * each.standard_error
+        ):
             unit = each.unit if each.unit in ("", "°") else f" {each.unit}"
             value, _, error = with_error(each.value, each.standard_error, sign="+").partition(" ± ")
             other = confused[each.name]

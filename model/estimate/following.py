@@ -40,15 +40,15 @@ from model.estimate.forward import (
     FINGER_PARTS,
     MODE_SHIFTS,
     ForwardModel,
+    PlateValues,
     Prior,
     RestingFinger,
     Sensor,
-    Values,
     by_mass_at,
 )
 from model.estimate.identify import solved_for
 from model.estimate.measurement import Measurement
-from model.estimate.parameters import KINDS
+from model.estimate.parameters import PARAMETER_KINDS
 from model.estimate.space import rig_with, space_of
 from model.finger import Grid
 from model.rig.rig import BOUNDS, Rig, Uncertainty
@@ -107,7 +107,7 @@ _OBJECT_STARTS = ((0.02, 0.005), (0.02, 0.05), (0.1, 0.005), (0.1, 0.05))
 _PLACE_STEPS = (0.01, 0.005)  # m; by which the place of an object is refined
 _OBJECT_STD = (0.0, 0.5, 1.0, 0.0)  # of the logarithms of contact stiffness and mass
 _OBJECT_COST = 3 * _COST_OF_CHANGE  # of its mass and of its place
-OBJECT_PLACES: Final = Grid(18, 14)
+_OBJECT_PLACES: Final = Grid(18, 14)
 """Cells in whose middles objects are looked for."""
 
 
@@ -162,7 +162,7 @@ class PlateEstimate:
     def rig(self) -> Rig:
         """The rig as it is known now."""
         before = self.model.rig
-        return rig_with(before, Values(before, self.model.space, self.x), before.uncertainty)
+        return rig_with(before, PlateValues(before, self.model.space, self.x), before.uncertainty)
 
     @property
     def cautious_rig(self) -> Rig:
@@ -316,7 +316,9 @@ def update(
         model,
         frequencies=np.concatenate([each.frequencies for each in patterns]),
         fingers=fingers,
-        space=model.space.extended(KINDS["fingers"], names, Prior(KINDS["fingers"].std)),
+        space=model.space.extended(
+            PARAMETER_KINDS["fingers"], names, Prior(PARAMETER_KINDS["fingers"].std)
+        ),
         last_places={},
     )
     measurement = Measurement(
@@ -560,7 +562,7 @@ def _hypotheses(
         start = known.x.copy()
         start[own] = [size, *(points[number] - sides / 2)] / space.std[own]
         yield BY_MASS, dict(zip(range(mass, mass + 3), [_MASS, *sides / 3], strict=True)), start, ()
-    points = OBJECT_PLACES.centres(plate)
+    points = _OBJECT_PLACES.centres(plate)
     x, y = points[best_of(unchanged.explained_at(points))].tolist()
     for size, damped in _OBJECT_STARTS:
         load = replace(object_load(damped), phalanx_mass=size)

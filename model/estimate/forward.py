@@ -24,7 +24,7 @@ measures adds l² w² m T_sj dT_ss to l dT_sj.
 A vector x has one number for each parameter, in standard deviations of what is known beforehand.
 `ParameterKind` defines how all parameters of a kind change the plate and its responses;
 `model.estimate.parameters` has one class for each kind. `Space` names the parameters of a rig,
-`Values` has the values that they represent.
+`PlateValues` has the values that they represent.
 
 A plate may also have form errors, which a rig file does not describe: a cable glued to it, sides
 that are not cut to size. Left out, they bias fitted values by far more than noise does, and no
@@ -82,18 +82,18 @@ _SLOWEST = 2 * np.pi  # rad/s; of slower modes the frequency of losses is taken 
 
 AnyArray: TypeAlias = NDArray[np.floating[Any]] | NDArray[np.complexfloating[Any, Any]]
 
-Number: TypeAlias = float | NDArray[np.floating[Any]]
+ParameterValues: TypeAlias = float | NDArray[np.floating[Any]]
 """One number for all parameters of a kind, or one for each."""
 
 
 class Prior(NamedTuple):
-    """Prior distribution of the parameters of a kind, in the unit of `Values`."""
+    """Prior distribution of the parameters of a kind, in the unit of `PlateValues`."""
 
-    std: Number
+    std: ParameterValues
     """Standard deviation, 0 if a parameter is known exactly."""
-    lower: Number = -np.inf
+    lower: ParameterValues = -np.inf
     """Lower bound."""
-    upper: Number = np.inf
+    upper: ParameterValues = np.inf
     """Upper bound."""
 
 
@@ -176,13 +176,13 @@ class ParameterKind(ABC):
     """
 
     name: str
-    """Key of the kind in `Space` and `Values`."""
+    """Key of the kind in `Space` and `PlateValues`."""
     std: float
-    """Standard deviation for a plate that was not measured, in the unit of `Values`."""
+    """Standard deviation for a plate that was not measured, in the unit of `PlateValues`."""
     unit = "%"
     """Unit in reports for people; logarithms of factors are written in per cent."""
     per_unit = 100.0
-    """Number of report units in one unit of `Values`."""
+    """Number of report units in one unit of `PlateValues`."""
     drift = 0.0
     """Standard deviation of the random walk in an hour of service."""
     drifts_to = 0.0
@@ -211,7 +211,7 @@ class ParameterKind(ABC):
         """Prior for a rig described by data sheets only; by default known exactly."""
         return Prior(0.0)
 
-    def value(self, values: "Values") -> Any:
+    def value(self, values: "PlateValues") -> Any:
         """The value of the rig that the parameters represent, by default their deviations."""
         return values.deviations(self.name)
 
@@ -227,7 +227,7 @@ class Space:
 
     names: tuple[str, ...]
     std: FloatArray
-    """Standard deviations (p,) in the units of `Values`, 0 where a parameter is known."""
+    """Standard deviations (p,) in the units of `PlateValues`, 0 where a parameter is known."""
     lower: FloatArray
     """Lower bounds of x (p,)."""
     upper: FloatArray
@@ -304,7 +304,7 @@ class Space:
         return self.names.index(name)
 
 
-class Values:
+class PlateValues:
     """Values of a rig's plate by the kinds of parameters x (p,) that change them.
 
     `ParameterKind.value` defines each of them. Arrays have n ERAs, m additional masses, k fingers
@@ -477,7 +477,7 @@ class ForwardModel:
         """The plate for parameters x (p,)."""
         return PlateAt(self, x)
 
-    def places(self, values: Values) -> AttachmentPoints:
+    def places(self, values: PlateValues) -> AttachmentPoints:
         """Solve for all attachments at their places; the last solution is kept.
 
         A plate with form errors is extrapolated from the rig's places by the slopes of its shapes,
@@ -485,7 +485,7 @@ class ForwardModel:
         """
         footprints = self._footprints(values)
         if self.form is not None:
-            nominal = self._footprints(Values(self.rig, self.space, np.zeros(self.space.size)))
+            nominal = self._footprints(PlateValues(self.rig, self.space, np.zeros(self.space.size)))
             return self._solved(nominal).moved(footprints, self.movable)
         footprints[:, :2] = np.clip(footprints[:, :2], 0, self.sides)
         return self._solved(footprints)
@@ -502,7 +502,7 @@ class ForwardModel:
         """Length and width of the plate [m]."""
         return np.array([self.rig.plate.length, self.rig.plate.width])
 
-    def _footprints(self, values: Values) -> FloatArray:
+    def _footprints(self, values: PlateValues) -> FloatArray:
         """Footprints of ERAs, masses, additional masses, fingers and sensors, (a, 3) [m]."""
         feet = [era.foot for era in self.rig.eras]
         fingers = np.array([(each.x, each.y) for each in self.fingers]).reshape(-1, 2)
@@ -528,7 +528,7 @@ class PlateAt:
     def __init__(
         self, model: ForwardModel, x: FloatArray, further: ComplexArray | None = None
     ) -> None:
-        self.model, self.values = model, Values(model.rig, model.space, x)
+        self.model, self.values = model, PlateValues(model.rig, model.space, x)
         self.further = further
         self.functions = self._functions()
         """The free plate's modal receptance and truncated sums as functions of frequency."""

@@ -43,12 +43,12 @@ from model.estimate.fit import (
     are_impossible,
     errors_by_key,
     fit,
-    likeliest,
+    likeliest_fit,
     parameters_of,
 )
-from model.estimate.forward import MODE_SHIFTS, ForwardModel, Sensor, Space, Values, jacobian
+from model.estimate.forward import MODE_SHIFTS, ForwardModel, PlateValues, Sensor, Space, jacobian
 from model.estimate.measurement import Measurement
-from model.estimate.parameters import KINDS
+from model.estimate.parameters import PARAMETER_KINDS
 from model.estimate.space import inwards, plate_with, rig_with, space_of
 from model.finger import Grid
 from model.processes import Progress, unseen
@@ -87,14 +87,14 @@ _MORE_MASS_BEYOND = 1.5  # chi²
 _MASS_GAINS = 25.0  # of the cost: five standard deviations
 
 _SIMPLE, _LOCATED = (
-    [name for name, kind in KINDS.items() if kind.stage <= stage] for stage in (0, 1)
+    [name for name, kind in PARAMETER_KINDS.items() if kind.stage <= stage] for stage in (0, 1)
 )
 
 _THEORY = {
-    "frequency": KINDS["mode_shifts"].theory / 2,
-    "stiffness": KINDS["stiffness"].theory,
-    "damping": KINDS["damping_each"].theory,
-    "place": KINDS["place"].theory,
+    "frequency": PARAMETER_KINDS["mode_shifts"].theory / 2,
+    "stiffness": PARAMETER_KINDS["stiffness"].theory,
+    "damping": PARAMETER_KINDS["damping_each"].theory,
+    "place": PARAMETER_KINDS["place"].theory,
 }
 
 _MAX_PREDICTION_STD = 0.1  # of the rms at a tone; less certain predictions are no test
@@ -156,7 +156,7 @@ class Identification:
         return self.fitted.chi2
 
     @property
-    def values(self) -> Values:
+    def values(self) -> PlateValues:
         """Values of the parameters, gains of sensors among them."""
         return self.fitted.plate.values
 
@@ -338,7 +338,7 @@ def fit_board(rig: Rig, measurement: Measurement) -> Fit:
             each.chi2 <= _GRAIN_GOOD and _mode_shift(each) ** 2 <= _GRAIN_GOOD for each in found
         ):
             break
-    return likeliest(found)
+    return likeliest_fit(found)
 
 
 def _mode_shift(found: Fit) -> float:
@@ -353,7 +353,7 @@ def _grain_shown(found: Fit) -> tuple[float, float]:
     shapes = [each[:, lowest] for each in free.modes.unknowns(np.empty((0, 3)))]
     by_grain = grain_slopes(free.plate, (free.mesh.nx, free.mesh.ny), shapes)
     relative = by_grain / free.modes.eigenvalues[lowest]
-    J = np.column_stack([np.ones(len(lowest)), *relative]) / KINDS["mode_shifts"].std
+    J = np.column_stack([np.ones(len(lowest)), *relative]) / PARAMETER_KINDS["mode_shifts"].std
     shown = np.eye(len(lowest)) - found.stated_covariance[np.ix_(shifts, shifts)]
     information = J.T @ shown @ J + np.eye(3) / _GRAIN_PRIOR**2
     _, across, shear = np.linalg.solve(information, J.T @ found.x[shifts]).tolist()
@@ -395,10 +395,10 @@ def _simple(model: ForwardModel, rough: Measurement) -> Fit:
         start = np.zeros(model.space.size)
         start[model.space.groups["thickness"]] = thickness
         found.append(fit(model, rough, searched=model.space.of(*_SIMPLE), start=start))
-        r, _ = likeliest(found).of_values
+        r, _ = likeliest_fit(found).of_values
         if r @ r < _GOOD * len(r):
             break
-    return likeliest(found)
+    return likeliest_fit(found)
 
 
 def _with_mass(model: ForwardModel, rough: Measurement, x: FloatArray, *, number: int) -> list[Fit]:
@@ -421,7 +421,7 @@ def _with_mass(model: ForwardModel, rough: Measurement, x: FloatArray, *, number
 
 def _in_full(starts: list[Fit], measurement: Measurement) -> Fit:
     """Fit everything to the noise as it is, from the two best starts."""
-    return likeliest([fit(each.model, measurement, start=each.x) for each in starts[:2]])
+    return likeliest_fit([fit(each.model, measurement, start=each.x) for each in starts[:2]])
 
 
 def solved_with_modes_of(free: FreePlate, plate: Plate) -> FreePlate:
@@ -431,7 +431,7 @@ def solved_with_modes_of(free: FreePlate, plate: Plate) -> FreePlate:
     return solve_free_plate(plate, free.mesh, frequency_max=frequency_max)
 
 
-def _check_gains(rig: Rig, measurement: Measurement, values: Values, space: Space) -> None:
+def _check_gains(rig: Rig, measurement: Measurement, values: PlateValues, space: Space) -> None:
     """Raise InputError for gains no drive or sensor has: another unit, a sign, a wrong plug.
 
     A response tells only the product of a drive's and a sensor's gain, so that the fit shares an
@@ -591,7 +591,7 @@ def _advice(found: Identification, combination: FloatArray) -> str:
     return f"play ERA {rig.eras[e].name} at {tones[f]:.0f} Hz and measure at {place}"
 
 
-def standard_errors(found: Identification) -> dict[KeyPath, float]:
+def identification_errors(found: Identification) -> dict[KeyPath, float]:
     """Standard errors of the values that a rig's file states, by the path of their key."""
     rig, groups = found.rig, found.fitted.space.groups
     plate, eras, feet = (

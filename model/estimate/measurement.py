@@ -33,8 +33,8 @@ from model.files.csv_file import Column, CsvLine, read_lines, write_columns
 from model.files.uff import (
     ACCELERATION,
     DISPLACEMENT,
-    FREQUENCY,
     FREQUENCY_RESPONSE,
+    UFF_FREQUENCY,
     Function,
     Universal,
     read_universal,
@@ -55,8 +55,8 @@ LEAST_SENSORS = 3
 COLUMNS = ("era", "sensor", "x_m", "y_m", "frequency_hz", "real_1_s2", "imag_1_s2")
 _PER_VOLT = ("real_m_s2_v", "imag_m_s2_v")
 ERA_COLUMNS = ("era_x_m", "era_y_m")  # optional
-MASS, SETTING = "sensor_mass_g", "setting"  # optional, too
-_NOTE = re.compile(rf"\b{MASS}=(?P<mass>\S+)(?:\s+{SETTING}=(?P<setting>.*))?")
+_MASS, SETTING = "sensor_mass_g", "setting"  # optional, too
+_NOTE = re.compile(rf"\b{_MASS}=(?P<mass>\S+)(?:\s+{SETTING}=(?P<setting>.*))?")
 MAX_SENSOR_MASS = 500.0
 """Largest mass [g] of a sensor that is moved; a heavier one is not an accelerometer."""
 
@@ -458,7 +458,7 @@ def write_responses_csv(
     masses = np.array([each.mass for each in measurement.sensors])
     further: dict[str, Column] = {}
     if masses.any():
-        further[MASS] = 1e3 * masses[s]
+        further[_MASS] = 1e3 * masses[s]
     if setting:
         further[SETTING] = [setting] * len(s)
     write_columns(
@@ -491,7 +491,7 @@ def write_responses_uff(
         for s, sensor in enumerate(sensors):
             values = measurement.values[:, s, e]
             measured = np.isfinite(values)
-            note = f"{MASS}={1e3 * sensor.mass:.10g} {SETTING}={setting}"
+            note = f"{_MASS}={1e3 * sensor.mass:.10g} {SETTING}={setting}"
             if measured.any():
                 functions.append(
                     Function(
@@ -503,7 +503,7 @@ def write_responses_uff(
                         (_UP, _UP),
                         measurement.frequencies[measured],
                         values[measured],
-                        (FREQUENCY, ACCELERATION, reference[0]),
+                        (UFF_FREQUENCY, ACCELERATION, reference[0]),
                         ("m/s^2", reference[1]),
                         note=note if setting or sensor.mass else "",
                     )
@@ -514,7 +514,7 @@ def write_responses_uff(
 
 def _read_csv(path: Path) -> list[MeasuredValue]:
     found = []
-    optional = (*ERA_COLUMNS, MASS, SETTING)
+    optional = (*ERA_COLUMNS, _MASS, SETTING)
     for line in read_lines(path, COLUMNS, optional=optional, instead=_PER_VOLT):
         is_per_volt = _PER_VOLT[0] in line.cells
         at_era = [line.number(name) for name in ERA_COLUMNS if name in line.cells]
@@ -529,7 +529,7 @@ def _read_csv(path: Path) -> list[MeasuredValue]:
             raise InputError(f"{line.place}: frequency_hz must be 0 or more, got {frequency:g}")
         era_point = (at_era[0], at_era[1]) if at_era else None
         value = complex(real, imaginary)
-        mass, setting = line.number(MASS, 0.0), line.cells.get(SETTING, "")
+        mass, setting = line.number(_MASS, 0.0), line.cells.get(SETTING, "")
         found.append(
             MeasuredValue(
                 era,
@@ -634,7 +634,7 @@ def _noted(function: Function) -> tuple[float, str]:
     return sensor_mass(function.place, mass), (found["setting"] or "").strip()
 
 
-def sensor_mass(place: str, grams: float, *, column: str = MASS) -> float:
+def sensor_mass(place: str, grams: float, *, column: str = _MASS) -> float:
     """A sensor's mass [kg] from grams in a column; raises InputError."""
     if not 0 <= grams <= MAX_SENSOR_MASS:  # nor for NaN
         raise InputError(

@@ -23,12 +23,12 @@ from model.estimate.forward import (
     FINGER_PARTS,
     MASS_CELLS,
     MIN_LOSS_FACTOR,
-    Number,
     ParameterKind,
+    ParameterValues,
     PlateAt,
+    PlateValues,
     Prior,
     SearchScope,
-    Values,
     values_of_eras,
 )
 from model.rig.rig import Uncertainty
@@ -105,7 +105,7 @@ class EraFactor(EraParameter):
     largest_factor = 10.0
     """Largest factor that a fit to data sheets can find."""
 
-    def value(self, values: Values) -> FloatArray:
+    def value(self, values: PlateValues) -> FloatArray:
         factors = np.exp(values.deviations(self.name))
         return values_of_eras(values.rig, self.name) * factors
 
@@ -137,7 +137,7 @@ class ExciterFactor(EraFactor):
 # The plate.
 
 
-class Thickness(PlateParameter):
+class ThicknessFactor(PlateParameter):
     """Logarithm of a factor on the thickness; the bending stiffness has its third power."""
 
     name = label = "thickness"
@@ -149,7 +149,7 @@ class Thickness(PlateParameter):
     def prior(self, scope: SearchScope) -> Prior:
         return Prior(scope.uncertainty.thickness)
 
-    def value(self, values: Values) -> float:
+    def value(self, values: PlateValues) -> float:
         return values.factor(self.name)
 
     def derivative(self, plate: PlateAt) -> ComplexArray:
@@ -157,7 +157,7 @@ class Thickness(PlateParameter):
         return np.asarray(2 * plate.by_log_rigidity - by_mass)
 
 
-class Modulus(PlateParameter):
+class ModulusFactor(PlateParameter):
     """Logarithm of a factor on Young's modulus; known exactly if the thickness is."""
 
     name = label = "modulus"
@@ -171,7 +171,7 @@ class Modulus(PlateParameter):
     def datasheet_prior(self, scope: SearchScope) -> Prior:
         return Prior(0.07, -math.log(3.0), math.log(3.0))
 
-    def value(self, values: Values) -> float:
+    def value(self, values: PlateValues) -> float:
         return values.factor(self.name)
 
     def derivative(self, plate: PlateAt) -> ComplexArray:
@@ -191,7 +191,7 @@ class LossFactor(PlateParameter):
     def prior(self, scope: SearchScope) -> Prior:
         return _loss_prior(scope, math.log(scope.uncertainty.damping))
 
-    def value(self, values: Values) -> float:
+    def value(self, values: PlateValues) -> float:
         """Loss factor of the plate, with what `LossAdded` adds."""
         scaled = values.rig.plate.loss_factor * values.factor("loss")
         added = values.deviations("loss_added")[0]
@@ -232,7 +232,7 @@ class LossExponent(PlateParameter):
         lower, upper = -MAX_LOSS_EXPONENT - exponent, MAX_LOSS_EXPONENT - exponent
         return Prior(_loss_prior(scope, self.std).std, lower, upper)
 
-    def value(self, values: Values) -> float:
+    def value(self, values: PlateValues) -> float:
         return float(values.rig.plate.loss_exponent + values.deviations(self.name)[0])
 
     def derivative(self, plate: PlateAt) -> ComplexArray:
@@ -302,7 +302,7 @@ class Damping(PlateParameter):
     def prior(self, scope: SearchScope) -> Prior:
         return Prior(math.log(scope.uncertainty.damping) * _uncertain_damping(scope).max())
 
-    def value(self, values: Values) -> FloatArray:
+    def value(self, values: PlateValues) -> FloatArray:
         """Damping of each ERA (n,) [N s/m], with all three kinds that change it."""
         log_factors = values.deviations("damping") + values.deviations("damping_each")
         scaled = values_of_eras(values.rig, "damping") * np.exp(log_factors)
@@ -375,7 +375,7 @@ class DriveGain(EraParameter):
     def datasheet_prior(self, scope: SearchScope) -> Prior:
         return Prior(1.0, -8.0, 8.0)
 
-    def value(self, values: Values) -> ComplexArray:
+    def value(self, values: PlateValues) -> ComplexArray:
         """Complex factor on each gain, with the phase of `DrivePhase`."""
         return np.exp(values.deviations("gain") + 1j * values.deviations("phase"))
 
@@ -485,7 +485,7 @@ class BoltMass(EraParameter):
         std = np.where(is_coil, _COIL_MASS_STD * bolt, 0.05 * carried)
         return _added_prior(bolt, std=std, largest=np.where(is_coil, 2 * bolt, 5.0 * carried))
 
-    def value(self, values: Values) -> FloatArray:
+    def value(self, values: PlateValues) -> FloatArray:
         added = values.deviations(self.name)
         return np.maximum(values_of_eras(values.rig, self.name) + added, 0.0)
 
@@ -537,7 +537,7 @@ class EraLocation(ParameterKind):
     def datasheet_prior(self, scope: SearchScope) -> Prior:
         return _form_error_prior(scope, self.std)
 
-    def value(self, values: Values) -> FloatArray:
+    def value(self, values: PlateValues) -> FloatArray:
         """Positions of the ERAs (n, 2) [m]."""
         positions = np.array([(era.x, era.y) for era in values.rig.eras])
         return positions + values.deviations(self.name).reshape(-1, 2)
@@ -571,7 +571,7 @@ class AddedMasses(ParameterKind):
         )
         return Prior(*(np.tile(each, scope.masses) for each in one_mass))
 
-    def value(self, values: Values) -> FloatArray:
+    def value(self, values: PlateValues) -> FloatArray:
         """Mass [kg], x and y [m] of each mass (m, 3), moved onto the plate if outside."""
         masses = values.deviations(self.name).reshape(-1, 3)
         plate = values.rig.plate
@@ -599,7 +599,7 @@ class FootStiffness(ParameterKind):
     def datasheet_prior(self, scope: SearchScope) -> Prior:
         return Prior(scope.rig.uncertainty.supports, -math.log(10.0), math.log(10.0))
 
-    def value(self, values: Values) -> FloatArray:
+    def value(self, values: PlateValues) -> FloatArray:
         return np.exp(values.deviations(self.name))
 
     def derivative(self, plate: PlateAt) -> ComplexArray:
@@ -619,7 +619,7 @@ class FingerParts(ParameterKind):
     def names(self, scope: SearchScope) -> Sequence[str]:
         return ()
 
-    def value(self, values: Values) -> FloatArray:
+    def value(self, values: PlateValues) -> FloatArray:
         return values.deviations(self.name).reshape(-1, len(FINGER_PARTS))
 
     def derivative(self, plate: PlateAt) -> ComplexArray:
@@ -638,7 +638,7 @@ class SensorGain(SensorParameter):
     std = 0.05
     stage = 0
 
-    def value(self, values: Values) -> ComplexArray:
+    def value(self, values: PlateValues) -> ComplexArray:
         """Complex factor on each gain, with the phase of `SensorPhase`."""
         return np.exp(values.deviations("sensor_gain") + 1j * values.deviations("sensor_phase"))
 
@@ -672,7 +672,7 @@ class SensorScale(FormError):
     def form_names(self, scope: SearchScope) -> Sequence[str]:
         return [f"scale of sensor {sensor}" for sensor in scope.sensors]
 
-    def value(self, values: Values) -> FloatArray | float:
+    def value(self, values: PlateValues) -> FloatArray | float:
         """Factor on each sensor's reading, 1 on a plate without form errors."""
         errors = values.deviations(self.name)
         return 1 + errors if errors.size else 1.0
@@ -694,7 +694,7 @@ class SensorPosition(FormError):
     def form_names(self, scope: SearchScope) -> Sequence[str]:
         return [f"{axis} of sensor {n}" for n in range(scope.form_of or 0) for axis in "xy"]
 
-    def value(self, values: Values) -> FloatArray:
+    def value(self, values: PlateValues) -> FloatArray:
         return values.deviations(self.name).reshape(-1, 2)
 
     def derivative(self, plate: PlateAt) -> ComplexArray:
@@ -714,7 +714,7 @@ class ForeignMass(FormError):
     def form_names(self, scope: SearchScope) -> Sequence[str]:
         return [f"mass {n}" for n in range(MASS_CELLS.cell_count)]
 
-    def value(self, values: Values) -> FloatArray:
+    def value(self, values: PlateValues) -> FloatArray:
         shares = values.deviations(self.name)
         return np.asarray(shares - shares.mean())
 
@@ -733,7 +733,7 @@ class SideLength(FormError):
     def form_names(self, scope: SearchScope) -> Sequence[str]:
         return ["length", "width"]
 
-    def value(self, values: Values) -> FloatArray:
+    def value(self, values: PlateValues) -> FloatArray:
         """Relative errors of length and width (2,)."""
         plate = values.rig.plate
         return values.deviations(self.name) / [plate.length, plate.width]
@@ -764,7 +764,7 @@ class LossLaw(FormError):
     unit = ""
     per_unit = 1.0
 
-    def value(self, values: Values) -> float:
+    def value(self, values: PlateValues) -> float:
         return float(values.deviations(self.name).sum())
 
     def derivative(self, plate: PlateAt) -> ComplexArray:
@@ -773,8 +773,8 @@ class LossLaw(FormError):
 
 
 ALL_KINDS: tuple[ParameterKind, ...] = (
-    Thickness(),
-    Modulus(),
+    ThicknessFactor(),
+    ModulusFactor(),
     Stiffness(),
     Damping(),
     DampingOfEra(),
@@ -807,14 +807,16 @@ ALL_KINDS: tuple[ParameterKind, ...] = (
 )
 """All kinds of parameters, in the order in which a space lists them."""
 
-KINDS: dict[str, ParameterKind] = {kind.name: kind for kind in ALL_KINDS}
+PARAMETER_KINDS: dict[str, ParameterKind] = {kind.name: kind for kind in ALL_KINDS}
 """All kinds of parameters by name."""
 
 FORM_ERRORS = tuple(kind.name for kind in ALL_KINDS if isinstance(kind, FormError))
 """Names of the kinds that only a plate with form errors has."""
 
 
-def _added_prior(value: Number, *, std: Number, largest: Number) -> Prior:
+def _added_prior(
+    value: ParameterValues, *, std: ParameterValues, largest: ParameterValues
+) -> Prior:
     """Prior of what is added to a value that cannot become negative."""
     return Prior(std, -value, np.maximum(largest - value, value))
 

@@ -27,10 +27,10 @@ from model.estimate.findings import (
     Verdict,
     cycles,
     exchanged_sensors,
-    judged,
     match_beyond,
     other_meaning,
     reversed_axes,
+    with_findings,
 )
 from model.estimate.fit import SensedPlate, gains_of, plate_of, row_rms
 from model.estimate.measurement import (
@@ -158,7 +158,7 @@ def diagnose(
     values = np.where(dead, np.nan, observation.values)
     if not np.isfinite(values).any():
         channels = tuple(_without_response(rig, n, is_dead=bool(dead[n])) for n in range(len(dead)))
-        return judged(Verdict(channels, observation.names, observation.frequencies, skipped))
+        return with_findings(Verdict(channels, observation.names, observation.frequencies, skipped))
     shapes = replace(shapes, mac=np.where(dead[:, None], np.nan, shapes.mac))
     match = best_wiring(plate, values, shapes)
     if exchanged := exchanged_sensors(match, observation):
@@ -245,7 +245,7 @@ def _matched_verdict(
         tuple(hypotheses),
         plate_changes(rig, match) if match.error <= MAX_FIT_ERROR else None,
     )
-    return judged(verdict)
+    return with_findings(verdict)
 
 
 def _dead_channels(

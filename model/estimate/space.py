@@ -12,8 +12,8 @@ from dataclasses import replace
 import numpy as np
 
 from model.arrays import FloatArray
-from model.estimate.forward import MODE_SHIFTS, Prior, SearchScope, Space, Values
-from model.estimate.parameters import ALL_KINDS, KINDS
+from model.estimate.forward import MODE_SHIFTS, PlateValues, Prior, SearchScope, Space
+from model.estimate.parameters import ALL_KINDS, PARAMETER_KINDS
 from model.rig.rig import Rig, Uncertainty
 from model.structure.attachments import Gain, PointLoad
 from model.structure.exciter import Actuator
@@ -61,7 +61,7 @@ def space_of(
     show its error.
     """
     scope = SearchScope(rig, sensors, uncertainty, drives_lag, amplifiers, masses, mode_count)
-    space = Space.empty(KINDS)
+    space = Space.empty(PARAMETER_KINDS)
     for kind in ALL_KINDS:
         names = kind.names(scope)
         prior = kind.prior(scope) if names else Prior(0.0)
@@ -82,7 +82,7 @@ def space_from_datasheets(rig: Rig, sensors: Sequence[str], form_modes: int | No
         mode_count=form_modes or 0,
         form_of=None if form_modes is None else len(sensors),
     )
-    space = Space.empty(KINDS)
+    space = Space.empty(PARAMETER_KINDS)
     for kind in ALL_KINDS:
         names = kind.names(scope)
         prior = kind.datasheet_prior(scope) if names else Prior(0.0)
@@ -107,7 +107,7 @@ def inwards(space: Space, x: FloatArray, *, by: float) -> FloatArray:
     return np.where(space.uncertain, moved, x)
 
 
-def rig_with(rig: Rig, values: Values, uncertainty: Uncertainty) -> Rig:
+def rig_with(rig: Rig, values: PlateValues, uncertainty: Uncertainty) -> Rig:
     """The rig with identified values; additional masses come after its own."""
     thickness, modulus = values["thickness"], values["modulus"]
     laminate = rig.laminate
@@ -123,7 +123,7 @@ def rig_with(rig: Rig, values: Values, uncertainty: Uncertainty) -> Rig:
     )
 
 
-def _eras_with(rig: Rig, values: Values) -> tuple[Actuator, ...]:
+def _eras_with(rig: Rig, values: PlateValues) -> tuple[Actuator, ...]:
     """The rig's ERAs with identified values, gains and positions, which stay on the plate."""
     positions = np.clip(values["place"], 0, [rig.plate.length, rig.plate.width]).tolist()
     eras = []
@@ -133,7 +133,7 @@ def _eras_with(rig: Rig, values: Values) -> tuple[Actuator, ...]:
     return tuple(eras)
 
 
-def _masses_with(rig: Rig, values: Values) -> tuple[PointLoad, ...]:
+def _masses_with(rig: Rig, values: PlateValues) -> tuple[PointLoad, ...]:
     """The rig's masses with identified stiffness of its feet, then the additional masses."""
     masses = list(rig.masses)
     for foot, factor in zip(rig.feet, values["supports"].tolist(), strict=True):
@@ -144,7 +144,7 @@ def _masses_with(rig: Rig, values: Values) -> tuple[PointLoad, ...]:
     return tuple(masses)
 
 
-def plate_with(plate: Plate, values: Values) -> Plate:
+def plate_with(plate: Plate, values: PlateValues) -> Plate:
     """The plate with identified thickness, modulus, losses and modes."""
     shifted = np.column_stack([values["mode_shifts"], values["mode_losses"]])
     count = max(len(plate.mode_deviations), len(shifted))
@@ -159,7 +159,7 @@ def plate_with(plate: Plate, values: Values) -> Plate:
     )
 
 
-def _gains(rig: Rig, values: Values, number: int) -> tuple[Gain, ...]:
+def _gains(rig: Rig, values: PlateValues, number: int) -> tuple[Gain, ...]:
     """Gains of an ERA: those of the rig times what was identified.
 
     An ERA without measured gains gets one at a single frequency, or some over the rig's frequencies
@@ -182,7 +182,7 @@ def _gains(rig: Rig, values: Values, number: int) -> tuple[Gain, ...]:
     )
 
 
-def _delay_of(rig: Rig, values: Values, era: str) -> float:
+def _delay_of(rig: Rig, values: PlateValues, era: str) -> float:
     """Delay of the clock of an ERA's amplifier [s], 0 where clocks agree."""
     amplifiers = sorted({channel.amplifier for channel in rig.wiring.values()})
     delays = dict(zip(amplifiers, values["delay"].tolist(), strict=False))

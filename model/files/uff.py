@@ -22,7 +22,7 @@ from model.files.array_file import whole_or_nothing
 from registry.files import open_regular
 
 TIME_RESPONSE, FREQUENCY_RESPONSE = 1, 4  # function types
-DISPLACEMENT, ACCELERATION, TIME, FREQUENCY = 8, 12, 17, 18  # data types
+DISPLACEMENT, ACCELERATION, UFF_TIME, UFF_FREQUENCY = 8, 12, 17, 18  # data types
 
 _UTF_16 = (b"\xff\xfe", b"\xfe\xff")
 BYTE_ORDER_MARKS = (b"\xef\xbb\xbf", *_UTF_16)
@@ -145,7 +145,7 @@ def read_universal(path: Path) -> Universal:
     """Read a file; raises InputError with file and line if it is damaged or of another format."""
     nodes: dict[int, tuple[float, ...]] = {}
     functions, length = [], 1.0
-    for block in blocks(path, read_bytes(path)):
+    for block in blocks(path, read_measured_bytes(path)):
         if block.kind == 58:
             functions.append(_function(path, block))
         elif block.kind == 164:
@@ -179,7 +179,7 @@ def _encoding(start: bytes) -> str:
     return "utf-16" if start.startswith(_UTF_16) else "utf-8-sig"
 
 
-def read_bytes(path: Path) -> bytes:
+def read_measured_bytes(path: Path) -> bytes:
     """Read a measured file; raises InputError if it is missing, empty or too large."""
     with open_measured(path) as file:
         content = file.read()
@@ -257,7 +257,7 @@ def blocks(path: Path, content: bytes) -> Iterator[DatasetBlock]:
 
 def _as_58(function: Function) -> dict[str, Any]:
     steps = np.diff(function.x)
-    even = function.data_types[0] == TIME and len(steps) > 0 and np.ptp(steps) < 1e-6 * steps[0]
+    even = function.data_types[0] == UFF_TIME and len(steps) > 0 and np.ptp(steps) < 1e-6 * steps[0]
     return {
         "type": 58,
         "func_type": function.function_type,
@@ -273,7 +273,7 @@ def _as_58(function: Function) -> dict[str, Any]:
         "abscissa_spec_data_type": function.data_types[0],
         "ordinate_spec_data_type": function.data_types[1],
         "orddenom_spec_data_type": function.data_types[2],
-        "abscissa_axis_units_lab": "s" if function.data_types[0] == TIME else "Hz",
+        "abscissa_axis_units_lab": "s" if function.data_types[0] == UFF_TIME else "Hz",
         "ordinate_axis_units_lab": function.units[0] or "NONE",
         "orddenom_axis_units_lab": function.units[1] or "NONE",
         "x": function.x,

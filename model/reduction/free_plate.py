@@ -57,8 +57,8 @@ from model.fem import (
 )
 from model.reduction.surface_modes import RESIDUAL_ORDER, SurfaceModes
 from model.spectral.modes import (
-    Band,
     KnownModes,
+    MaterialBand,
     PlateMesh,
     SpectralMesh,
     SpectralPlate,
@@ -73,7 +73,7 @@ from model.structure.attachments import (
     Support,
     as_footprints,
     attached_stiffness,
-    check_on_plate,
+    check_footprints_on_plate,
     coupled_forces,
     footprints_of,
     unit_accelerations,
@@ -236,7 +236,7 @@ class SpectralModes:
     ) -> None:
         self._plate = plate
         self._mesh = mesh
-        band = Band(math.sqrt(shift) / (2 * math.pi), frequency_max)
+        band = MaterialBand(math.sqrt(shift) / (2 * math.pi), frequency_max)
         spectral = SpectralPlate(plate, (mesh.nx, mesh.ny), band.middle)
         cut = (2 * math.pi * cutoff_frequency) ** 2
         self._classes = classes = tuple(
@@ -311,7 +311,7 @@ class SpectralModes:
         points = np.atleast_2d(np.asarray(points, dtype=float))
         key = points.shape, points.tobytes()
         if key not in self._known:
-            check_on_plate(points, length=self._mesh.length, width=self._mesh.width)
+            check_footprints_on_plate(points, length=self._mesh.length, width=self._mesh.width)
             if len(self._known) >= _MAX_CACHED:
                 self._known.pop(next(iter(self._known)))
             degrees = (self._mesh.nx, self._mesh.ny)
@@ -348,7 +348,7 @@ TERMS = 2 * RESIDUAL_ORDER
 """Truncated sums of a receptance between points."""
 
 
-def between(modes: FreeModes, points: FloatArray, others: FloatArray) -> FloatArray:
+def _between(modes: FreeModes, points: FloatArray, others: FloatArray) -> FloatArray:
     """Products of shapes at points and others [m], then truncated sums, (r + TERMS, n, m).
 
     Points (n, 2) or footprints (n, 3).
@@ -494,7 +494,7 @@ class FreePlate:
         """
         eta, lossy = loss_factors(self.plate, omega), self._elasticity.stiffness(omega)
         functions = self.receptance(omega, lossy, eta, thickness)
-        receptance = combined(functions.values, between(self.modes, footprints, footprints))
+        receptance = combined(functions.values, _between(self.modes, footprints, footprints))
         forces = coupled_forces(receptance, stiffness, applied)
         # At points terms of residual vectors suffice, and only few are products of many points.
         modal = functions.modal[..., None] * (self.modes.shapes_at(footprints).T @ forces)

@@ -361,7 +361,7 @@ def supported_modes(
     return SupportedModes(omega / (2 * np.pi), ratios, reduced, own)
 
 
-STEP = 1e-5  # of a side
+_STEP = 1e-5  # of a side
 
 
 def place_slopes(
@@ -372,7 +372,7 @@ def place_slopes(
     field: from places (m, 2 or 3) to (m, ...); sides (2,): of the plate.
     """
     at = places[:, None, :2]
-    step = STEP * sides
+    step = _STEP * sides
     is_inner = np.minimum(at, sides - at)[:, 0] >= step
     inwards = np.where(at[:, 0] > sides / 2, -1.0, 1.0)
     # Steps to two further points, and what they and the point itself count, (n, 2) each.

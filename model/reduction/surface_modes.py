@@ -26,10 +26,10 @@ from functools import cache
 import numpy as np
 
 from model.arrays import FloatArray
-from model.structure.attachments import check_on_plate, mean_over
+from model.structure.attachments import check_footprints_on_plate, mean_over
 from model.structure.modal_elasticity import Dispersion
 from model.structure.plate import Plate
-from model.structure.surface import LEAST_KNOWN, THICKNESS, Surface, surface_shapes, thinned
+from model.structure.surface import LEAST_KNOWN, THICKNESS, Surface, evenly_spaced, surface_shapes
 
 RESIDUAL_ORDER = 4
 """Residual vectors of each point.
@@ -87,7 +87,7 @@ class SurfaceModes:
         u = 1 / (eigenvalues[self._kept :] + shift)
         self.largest_truncated = float(u.max())
         self._powers = (u / u.max()) ** np.arange(1, 2 * RESIDUAL_ORDER + 1)[:, None]
-        chosen = thinned(read.points, _MAX_NODES)
+        chosen = evenly_spaced(read.points, _MAX_NODES)
         sizes = np.full(len(frequencies), math.sqrt(THICKNESS / plate.thickness))
         differing = sizes[read.rigid :][: len(surface.sizes)]
         differing *= surface.sizes[: len(differing)]
@@ -184,7 +184,7 @@ class SurfaceModes:
         points = np.atleast_2d(np.asarray(points, dtype=float))
         key = points.shape, points.tobytes()
         if key not in self._known:
-            check_on_plate(points, **self._sides)
+            check_footprints_on_plate(points, **self._sides)
             found = np.asarray(mean_over(self._spline, points, **self._sides))
             along = np.tensordot(points[:, :2], self._waves[:2], axes=1) + self._waves[2]
             drawn = math.sqrt(2 / _WAVES) * np.cos(along).sum(axis=1)

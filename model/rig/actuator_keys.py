@@ -84,7 +84,7 @@ def _rows(
     return AfterValidator(checked)
 
 
-def one_of(known: Collection[str], what: str, remedy: str = "") -> AfterValidator:
+def _one_of(known: Collection[str], what: str, remedy: str = "") -> AfterValidator:
     """Check of text that is one of the known names of something."""
 
     def checked(name: str) -> str:
@@ -114,7 +114,7 @@ MODES = _rows(
 )
 GainRow = Annotated[tuple[float, float, float], Strict(strict=False)]  # a list in the file
 ModeRow = Annotated[tuple[float, float], Strict(strict=False)]
-ThresholdSet = Annotated[str, one_of(THRESHOLDS, "set of thresholds")]
+ThresholdSet = Annotated[str, _one_of(THRESHOLDS, "set of thresholds")]
 Identifier = Annotated[str, AfterValidator(_identifier)]
 Side = Annotated[float, Quantity(LENGTH, above=0, at_most=100)]
 Coordinate = Annotated[float, Quantity(LENGTH, at_least=-100, at_most=100)]
@@ -130,7 +130,7 @@ def place_on(plate: Plate, place: tuple[float, float]) -> tuple[float, float]:
     return min(max(x, 0.0), plate.length), min(max(y, 0.0), plate.width)
 
 
-def gains_of(rows: Sequence[GainRow] | None) -> tuple[Gain, ...]:
+def _gains_of(rows: Sequence[GainRow] | None) -> tuple[Gain, ...]:
     """Gains of rows with phases in degrees."""
     return tuple((f, size, math.radians(phase)) for f, size, phase in rows or ())
 
@@ -246,7 +246,7 @@ class EraSection(ActuatorSection):
         )
         damping = by_ratio if self.damping is None else self.damping
         at, same = place_on(plate, self.at), self.model_dump(include=_SAME)
-        return Era(name, *at, damping=damping, gains=gains_of(self.gains), **same)
+        return Era(name, *at, damping=damping, gains=_gains_of(self.gains), **same)
 
     @classmethod
     def problems(cls, given: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
@@ -282,7 +282,7 @@ class ExciterSection(ActuatorSection):
     kind: Literal["exciter"]
     """`exciter`."""
 
-    type: Annotated[str, one_of(EXCITER_TYPES, "type of exciter", _OTHER)] | None = None
+    type: Annotated[str, _one_of(EXCITER_TYPES, "type of exciter", _OTHER)] | None = None
     """A type that is sold, whose values are taken where no key gives them.
 
     Limits: a name [below](#exciters)
@@ -408,7 +408,7 @@ class ExciterSection(ActuatorSection):
             inductance=values["inductance"] or 0.0,
             excursion=values["excursion"] or math.inf,
             held=self.magnet == "held",
-            gains=gains_of(self.gains),
+            gains=_gains_of(self.gains),
             foot=self.foot,
         )
 
@@ -454,5 +454,8 @@ def _of_type(name: str | None) -> dict[str, float]:
 ActuatorOfAnyKind: TypeAlias = Annotated[EraSection | ExciterSection, ByKind()]
 """Sections of which `kind` chooses one, ERAs by default."""
 
-KINDS: Mapping[type[Actuator], type[ActuatorSection]] = {Era: EraSection, Exciter: ExciterSection}
+ACTUATOR_KINDS: Mapping[type[Actuator], type[ActuatorSection]] = {
+    Era: EraSection,
+    Exciter: ExciterSection,
+}
 """Section by class of the actuator."""

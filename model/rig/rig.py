@@ -405,7 +405,7 @@ def canonical_json(value: object) -> str:
     return json.dumps(_plain(value), sort_keys=True, separators=(",", ":"))
 
 
-Place = tuple[float, float]
+RelativePlace = tuple[float, float]
 """Place of an ERA as fractions of the length and the width, 0 to 1."""
 
 
@@ -414,7 +414,7 @@ class EraLayout:
     """Places of the ERAs of a rig."""
 
     name: str
-    places: tuple[Place, ...]
+    places: tuple[RelativePlace, ...]
 
     def positions(self, plate: Plate) -> FloatArray:
         """Positions on a plate [m], (eras, 2)."""

@@ -29,7 +29,7 @@ from model.config.fields import Quantity, Section, Validation, section_by_kind
 from model.config.units import LENGTH, RATIO, quantity
 from model.errors import InputError, expect_path, shown
 from model.fem import MITC4, Mesh, element_of
-from model.rig.actuator_keys import KINDS, stiff_mount_problems
+from model.rig.actuator_keys import ACTUATOR_KINDS, stiff_mount_problems
 from model.rig.rig import SAME_POINT, Channel, Rig, canonical_json, physics_of
 from model.rig.sections import (
     ISOTROPIC,
@@ -160,7 +160,7 @@ def check_across(validation: Validation[RigSection], *, mesh_given: bool) -> Non
         validation.add(path, "must be of a surface by its modes; remove it, or give surface")
     eras = {}
     for name, keys in validation.mapping(("eras",)).items():
-        section = section_by_kind([*KINDS.values()], keys)
+        section = section_by_kind([*ACTUATOR_KINDS.values()], keys)
         eras[name] = given = _given(validation, ("eras", name), section)
         for key, problem in section.problems(given) if given else ():
             validation.add(("eras", name, key), problem)

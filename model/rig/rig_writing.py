@@ -24,10 +24,10 @@ from model.config.document import (
 )
 from model.config.fields import Section, Validation
 from model.config.units import LENGTH, quantity
-from model.errors import InputError, expect, expect_path
+from model.errors import InputError, expect_instance, expect_path
 from model.files.array_file import whole_or_nothing
 from model.files.output_paths import check_ending
-from model.rig.actuator_keys import KINDS
+from model.rig.actuator_keys import ACTUATOR_KINDS
 from model.rig.rig import Rig
 from model.rig.rig_file import (
     base_fingerprint,
@@ -115,7 +115,7 @@ def fitted_keys(before: Rig, after: Rig) -> dict[str, Any]:
     section, data = Validation(document, RigSection).finish(), cast("dict[str, Any]", document.data)
     own = _values(before, section)
     restated = {("plate", "loss_factor")} | {
-        ("eras", era.name, key) for era in after.eras for key in KINDS[type(era)].instead
+        ("eras", era.name, key) for era in after.eras for key in ACTUATOR_KINDS[type(era)].instead
     }
     found = {
         path: value
@@ -128,7 +128,7 @@ def fitted_keys(before: Rig, after: Rig) -> dict[str, Any]:
     keys = _nested(found, data)
     for era in after.eras:
         entry, stated_keys = keys["eras"][era.name], data["eras"][era.name]
-        for key, others in KINDS[type(era)].instead.items():
+        for key, others in ACTUATOR_KINDS[type(era)].instead.items():
             if key in entry:
                 entry |= dict.fromkeys(other for other in others if other in stated_keys)
     names = {*(data.get("masses") or ())}
@@ -219,7 +219,7 @@ def _values(rig: Rig, section: RigSection) -> dict[KeyPath, Any]:
         of_plate = section.plate.stated(rig.plate, rig.laminate)
         found |= {("plate", *path): value for path, value in of_plate.items()}
     for era in rig.eras:
-        of_era = KINDS[type(era)].stated(era)
+        of_era = ACTUATOR_KINDS[type(era)].stated(era)
         found |= {("eras", era.name, key): value for key, value in of_era.items()}
     for name, number in zip(rig.foot_names, rig.feet, strict=True):
         found["supports", name, "stiffness"] = rig.masses[number].stiffness
@@ -303,7 +303,9 @@ def rig(
         >>> mine = era.rig(sheet, eras)
     """
     if amplifiers is None:
-        expect(eras, Mapping, what="eras", made_by='{"SW": era.Era(at=(0, 0), stiffness=17e3)}')
+        expect_instance(
+            eras, Mapping, what="eras", made_by='{"SW": era.Era(at=(0, 0), stiffness=17e3)}'
+        )
         amplifiers = {"main": {"url": "sim://"}}
         wired = {name: {"amplifier": "main", "channel": n} for n, name in enumerate(eras)}
         eras = _merged(wired, eras)
@@ -333,7 +335,7 @@ def save_rig(rig: Rig, path: Path | str) -> None:
         >>> era.load_rig("mine.yaml").fingerprint == mine.fingerprint
         True
     """
-    expect(rig, Rig, what="rig", made_by='era.load_rig("rig.yaml")')
+    expect_instance(rig, Rig, what="rig", made_by='era.load_rig("rig.yaml")')
     place, document = expect_path(path, what="path"), stated(rig)
     if (over := document.over) is not None:
         for file in (Path(over.source), base_path(over)):
@@ -361,11 +363,13 @@ def change_rig(rig: Rig, **changes: Any) -> Rig:
     Example:
         >>> thick = era.change_rig(rig, thickness=0.002, eras={"SW": {"stiffness": 2e4}})
     """
-    expect(rig, Rig, what="rig", made_by='era.load_rig("rig.yaml")')
+    expect_instance(rig, Rig, what="rig", made_by='era.load_rig("rig.yaml")')
     check_is_plate(rig.plate, _CHANGED)
     for key in ("plate", "eras"):
         if key in changes:
-            expect(changes[key], Mapping, what=key, made_by='{"thickness": 0.002} or era.Era')
+            expect_instance(
+                changes[key], Mapping, what=key, made_by='{"thickness": 0.002} or era.Era'
+            )
     data: dict[str, Any] = {**stated(rig).data}
     plate_changes = {
         key: value for key, value in changes.items() if key not in RigSection.model_fields

@@ -99,7 +99,7 @@ class SpectralClass:
 
 
 @dataclass(frozen=True, eq=False)
-class Band:
+class MaterialBand:
     """Frequencies [Hz] at which moduli and air are taken: lowest, middle and highest."""
 
     low: float
@@ -149,7 +149,7 @@ class SpectralPlate:
         return ClassFunctions(self._x, self._y, parity, len(self._mass))
 
     def modes(
-        self, parity: tuple[int, int], *, shift: float, cut: float, band: Band
+        self, parity: tuple[int, int], *, shift: float, cut: float, band: MaterialBand
     ) -> SpectralClass:
         """Solve a class for all modes, and for those below the cut [rad²/s²] with their losses.
 
@@ -217,7 +217,7 @@ class _Space:
         plate: SpectralPlate,
         of: ClassFunctions,
         air: AirMotion | None,
-        band: Band,
+        band: MaterialBand,
         shift: float,
         count: int,
     ) -> None:

@@ -454,7 +454,7 @@ def feet_of(loads: Iterable[Support]) -> tuple[int, ...]:
     return tuple(n for n, each in enumerate(loads) if getattr(each, "is_foot", False))
 
 
-Complex = TypeVar("Complex", bound="np.complexfloating[Any, Any]")
+_Complex = TypeVar("_Complex", bound="np.complexfloating[Any, Any]")
 
 
 def footprints_of(*attached: Iterable[Support]) -> FloatArray:
@@ -493,8 +493,8 @@ def unit_accelerations(
 
 
 def coupled_forces(
-    receptance: NDArray[Complex], dynamic_stiffness: NDArray[Complex], applied: NDArray[Complex]
-) -> NDArray[Complex]:
+    receptance: NDArray[_Complex], dynamic_stiffness: NDArray[_Complex], applied: NDArray[_Complex]
+) -> NDArray[_Complex]:
     """Forces F on the free plate [N], from those applied at its attachments: (I + D R) F = P.
 
     receptance R (..., n, n) [m/N]: of the free plate between its attachments; dynamic_stiffness
@@ -566,7 +566,7 @@ def as_footprints(places: FloatArray) -> FloatArray:
     return places if places.shape[1] == 3 else np.column_stack([places, np.zeros(len(places))])
 
 
-def check_on_plate(places: FloatArray, *, length: float, width: float) -> None:
+def check_footprints_on_plate(places: FloatArray, *, length: float, width: float) -> None:
     """Check that points (n, 2) or the centres of footprints (n, 3) [m] are on the plate.
 
     Its edges included; raises InputError.

@@ -195,7 +195,13 @@ class Laminate:
 # Dry air at 20 °C and 101325 Pa (Lemmon and Jacobsen, Int. J. Thermophys. 25 (2004) 21): density
 # [kg/m³], viscosity [Pa s], thermal conductivity [W/(m K)], heat capacity [J/(kg K)], its ratio.
 PRESSURE = 101_325.0
-DENSITY, VISCOSITY, CONDUCTIVITY, HEAT_CAPACITY, HEAT_RATIO = 1.204, 18.2e-6, 25.9e-3, 1006.0, 1.402
+_DENSITY, VISCOSITY, CONDUCTIVITY, HEAT_CAPACITY, HEAT_RATIO = (
+    1.204,
+    18.2e-6,
+    25.9e-3,
+    1006.0,
+    1.402,
+)
 
 # Depth [thicknesses of the boundary layer] down to which friction hardly couples modes, and down to
 # which by some 10 %: responses of the paper's plate and of a panel over 10 um to 10 mm, solved in
@@ -222,18 +228,18 @@ class AirGap:
         3 % over a deeper open gap, 5 % over a deeper sealed one, where it is 0 here; then 10 %, and
         in a gap too narrow for modes half of the response and more.
         """
-        layers = self.depth / math.sqrt(VISCOSITY / (math.pi * DENSITY * frequency))
+        layers = self.depth / math.sqrt(VISCOSITY / (math.pi * _DENSITY * frequency))
         within, modal = _SEALED if self.closed else _OPEN
         return 0.0 if layers >= within else 0.1 if layers >= modal else 0.5
 
     def inertia(self, frequency: float) -> complex:
         """rho b [kg/m³] at a frequency [Hz]: density of air that friction holds back."""
-        wall = self._wall_share(frequency, DENSITY / VISCOSITY)
-        return DENSITY / (1 - wall)
+        wall = self._wall_share(frequency, _DENSITY / VISCOSITY)
+        return _DENSITY / (1 - wall)
 
     def bulk_modulus(self, frequency: float) -> complex:
         """B [Pa] at a frequency [Hz]: isothermal in the slow limit, adiabatic in the fast."""
-        wall = self._wall_share(frequency, DENSITY * HEAT_CAPACITY / CONDUCTIVITY)
+        wall = self._wall_share(frequency, _DENSITY * HEAT_CAPACITY / CONDUCTIVITY)
         return HEAT_RATIO * PRESSURE / (1 + (HEAT_RATIO - 1) * wall)
 
     def _wall_share(self, frequency: float, per_frequency: float) -> complex:

@@ -133,9 +133,9 @@ class SurfaceShapes:
 
 def digest_of_file(path: Path) -> str:
     """Return the SHA-256 of a file's content; raises InputError if it cannot be read."""
-    from model.files.uff import read_bytes  # only a surface needs it
+    from model.files.uff import read_measured_bytes  # only a surface needs it
 
-    return hashlib.sha256(read_bytes(path)).hexdigest()
+    return hashlib.sha256(read_measured_bytes(path)).hexdigest()
 
 
 def centre_of_surface(surface: Surface) -> Point | None:
@@ -166,9 +166,9 @@ def _centre(file: str, digest: str, normal: str) -> Point | None:
 def surface_shapes(file: str, digest: str, normal: str) -> SurfaceShapes:
     """Read modes along a normal from a file with this digest; raises InputError if it has none."""
     from model.files.modal_file import read_modes  # only a surface needs these
-    from model.files.uff import read_bytes
+    from model.files.uff import read_measured_bytes
 
-    content = read_bytes(Path(file))
+    content = read_measured_bytes(Path(file))
     if hashlib.sha256(content).hexdigest() != digest:
         raise InputError(f"{file}: modes have changed since the rig was read; start again")
     read = read_modes(Path(file), content)
@@ -229,7 +229,7 @@ def _rigid_motions(nodes: FloatArray, normals: FloatArray, axis: int) -> FloatAr
     return np.column_stack([translation, *rotations])
 
 
-def thinned(points: FloatArray, count: int) -> FloatArray:
+def evenly_spaced(points: FloatArray, count: int) -> FloatArray:
     """Numbers of at most so many points (n, 2), evenly over the surface; equal places once."""
     _, first = np.unique(np.round(points / (1e-6 * np.ptp(points))), axis=0, return_index=True)
     size = math.sqrt(float(np.prod(np.ptp(points, axis=0))) / count)

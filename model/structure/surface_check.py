@@ -28,9 +28,9 @@ from model.quantities import counted
 from model.structure.surface import (
     RIGID_FREQUENCY,
     SurfaceShapes,
+    evenly_spaced,
     is_within,
     surface_shapes,
-    thinned,
 )
 
 _UNITS = {"mm": 1e-3, "cm": 1e-2, "inches": 0.0254}
@@ -189,7 +189,7 @@ def _on_raster(shapes: SurfaceShapes) -> _Motion:
     from scipy.interpolate import RBFInterpolator  # slow to import
     from scipy.spatial import Delaunay
 
-    chosen = thinned(shapes.points, _MAX_NODES)
+    chosen = evenly_spaced(shapes.points, _MAX_NODES)
     nodes = shapes.points[chosen]
     x, y = (nodes / shapes.size).T
     if np.linalg.matrix_rank(np.column_stack([x**0, x, y, x * x, x * y, y * y]), tol=1e-6) < 6:

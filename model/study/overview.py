@@ -29,7 +29,7 @@ from model.files.array_file import whole_or_nothing
 from model.files.csv_file import write_rows
 from model.finger import FELT_DB_SL, FINGERTIP_RADIUS, highest_measured
 from model.processes import Progress, unseen
-from model.rig.actuator_keys import KINDS
+from model.rig.actuator_keys import ACTUATOR_KINDS
 from model.rig.rig import PHYSICS, Rig
 from model.rig.sections import (
     AirGapSection,
@@ -301,7 +301,7 @@ def _fields(table: LocalizationTable) -> Complex64Array:
 
 _SECTIONS: tuple[type[Section], ...] = (
     *(PlateSection, LayerSection, MaterialSection, AirGapSection, MassSection, FingertipSection),
-    *KINDS.values(),
+    *ACTUATOR_KINDS.values(),
 )
 _NAMES = {"x": "x_m", "y": "y_m", "gains": "gain_hz_ratio_rad", "magnet_mass": "magnet_mass_kg"} | {
     "voltage": "voltage_v"

@@ -30,7 +30,7 @@ from model.arrays import (
     Point,
     lattice,
 )
-from model.compiled.kernels import GivenRaster, kernels, run
+from model.compiled.kernels import GivenRaster, kernels, run_kernel
 from model.drive_modes import highest_levels
 from model.ensemble.attached_plate import (
     AttachedPlate,
@@ -78,9 +78,8 @@ from registry.limits import GuardLimits
 POINTS_PER_WAVELENGTH = 20
 MAX_SPACING, MIN_SPACING = 0.008, 0.003  # m
 PATCH = 6  # points along a side of an interpolation, at least
-FEW = len(FIVE_POINTS.points)
 
-OBJECT_PLACES = Grid(6, 5)
+_OBJECT_PLACES = Grid(6, 5)
 """Cells in whose middles an object may lie that the rig's uncertainty expects."""
 
 OBJECT_FACTOR = 6.0
@@ -143,10 +142,10 @@ class Raster:
         found = interpolation @ values.take(index, axis=0)
         few, fine = weights.astype(np.float32)
         return FingertipShapes(
-            np.ascontiguousarray(found[:, :FEW]),
-            np.ascontiguousarray(found[:, FEW:]),
-            few[:, :FEW],
-            fine[:, FEW:],
+            np.ascontiguousarray(found[:, :_FEW]),
+            np.ascontiguousarray(found[:, _FEW:]),
+            few[:, :_FEW],
+            fine[:, _FEW:],
         )
 
     def at(self, values: Float32Array, points: FloatArray) -> Float32Array:
@@ -223,7 +222,7 @@ class FingertipShapes:
     fine_weights: Float32Array
 
 
-EDGE = 0.05
+_EDGE = 0.05
 """Share of each side at its ends in which errors of exciters' fields do not count."""
 
 DEFAULT_FREQUENCIES = np.arange(40.0, 501.0, 10.0)
@@ -565,7 +564,7 @@ class LocalizationTable:
         by_field = [isinstance(each, Exciter) for each in self.eras]
         # Without the edges, which bend most, and where few fingers rest.
         points = self.raster.points
-        inner = (np.abs(points / points[-1] - 0.5) < 0.5 - EDGE).all(axis=1)
+        inner = (np.abs(points / points[-1] - 0.5) < 0.5 - _EDGE).all(axis=1)
         shapes = self.shapes[inner & self.plate.covers(points)]
         gram = np.asarray(shapes.T @ shapes / np.float32(len(shapes)))
         return with_places(found, self._shifts_of_eras, gram, by_field)
@@ -598,7 +597,7 @@ class LocalizationTable:
         found = error**2 * self._mean_square(fields)
         if mass := self.uncertainty.foreign_mass:
             D = object_load(mass).dynamic_stiffness(self.attached.omega).astype(np.complex64)
-            places = self.shapes_at(OBJECT_PLACES.centres(self.plate)).astype(np.float32)
+            places = self.shapes_at(_OBJECT_PLACES.centres(self.plate)).astype(np.float32)
             for at in places[:, None]:
                 beside = TouchedPlate(self.on_eras, at, D[:, None], np.zeros(1, np.float32))
                 changed = self._mean_square(beside.coordinates() - fields)
@@ -691,7 +690,7 @@ def read_fingertips(table: LocalizationTable, places: Sequence[Point]) -> Finger
     sizes = (k, _FEW, on.r), (k, _FINE, on.r), (k, _FEW), (k, _FINE)
     found = [np.empty(size, dtype=np.float32) for size in sizes]
     to = [c_void_p(each.ctypes.data) for each in found]
-    run(by.library.fingertips_stage, on, c_void_p(at.buffer_info()[0]), k, *to)
+    run_kernel(by.library.fingertips_stage, on, c_void_p(at.buffer_info()[0]), k, *to)
     return FingertipShapes(*found)
 
 

@@ -33,7 +33,7 @@ from pydantic_core import to_jsonable_python
 from model.arrays import FloatArray
 from model.caching import NUMERICS_VERSION, cache_folder, code_version
 from model.drive_modes import UNRESTRICTED, checked_mode
-from model.errors import InputError, expect, expect_path
+from model.errors import InputError, expect_instance, expect_path
 from model.files.array_file import UNREADABLE, Arrays, digest_of, read_arrays, write_arrays
 from model.files.output_paths import begins_with
 from model.finger import Grid, check_has_threshold
@@ -60,7 +60,7 @@ FORMAT_VERSION = 9
 _MAX_SHOWN = 3  # keys in which a table is of another rig
 
 # A table of the paper's plate has 0.3 MB.
-MAX_BYTES = 2 << 30
+_MAX_BYTES = 2 << 30
 
 _DTYPES = {
     "header": "|u1",
@@ -75,7 +75,7 @@ _DTYPES = {
 
 # Bound of accelerations [m/s²], frequencies [rad/s] and shapes [1/sqrt(kg)], whose squares fit into
 # single precision.
-MAX_VALUE = 1e9
+_MAX_VALUE = 1e9
 
 
 class _Header(BaseModel):
@@ -109,7 +109,7 @@ def save_table(table: LocalizationTable, path: Path | str) -> None:
     Example:
         >>> era.save_table(table, "table.npz")
     """
-    expect(table, LocalizationTable, what="table", made_by="era.table(rig)")
+    expect_instance(table, LocalizationTable, what="table", made_by="era.table(rig)")
     place = expect_path(path, what="path")
     arrays = {
         name: np.ascontiguousarray(getattr(table, name), dtype=dtype)
@@ -147,10 +147,10 @@ def load_table(path: Path | str, *, rig: Rig | None = None) -> LocalizationTable
     """
     path = expect_path(path, what="path")
     if rig is not None:
-        expect(rig, Rig, what="rig", made_by='era.load_rig("rig.yaml")')
+        expect_instance(rig, Rig, what="rig", made_by='era.load_rig("rig.yaml")')
     rebuild = f"build it again, with the options it had: era table build RIG -o {path}"
     try:
-        content = read_arrays(path, _DTYPES, max_bytes=MAX_BYTES)
+        content = read_arrays(path, _DTYPES, max_bytes=_MAX_BYTES)
     except FileNotFoundError:
         raise InputError(
             f"{path}: no such table; build one: era table build RIG -o {path.with_suffix('.npz')}"
@@ -240,11 +240,11 @@ def _assemble(header: _Header, arrays: dict[str, Any]) -> LocalizationTable:
         values = getattr(table, name)
         if values.shape != shape:
             raise InputError(f"shape of {name} must be {shape}, got {values.shape}")
-        if not (np.abs(values) <= MAX_VALUE).all():
+        if not (np.abs(values) <= _MAX_VALUE).all():
             largest = np.abs(values).max()
-            raise InputError(f"{name} must be finite and up to {MAX_VALUE:g}, got {largest:.3g}")
+            raise InputError(f"{name} must be finite and up to {_MAX_VALUE:g}, got {largest:.3g}")
     for name in ("shapes", "attachment_shapes", "omega"):
-        if np.abs(getattr(table, name)).max(initial=0) < 1 / MAX_VALUE:
+        if np.abs(getattr(table, name)).max(initial=0) < 1 / _MAX_VALUE:
             raise InputError(f"{name} must not be zero everywhere")
     places = [(each.x, each.y) for each in table.eras] + [(m.x, m.y) for m in table.masses]
     for x, y in places:
@@ -297,9 +297,9 @@ class TableProblem:
         wavelength = plate.bending_wavelength(2 * float(self.frequencies[-1]))
         modes = math.pi * plate.length * plate.width / wavelength**2
         size = 4 * self.raster.point_count * modes
-        if size > MAX_BYTES:
+        if size > _MAX_BYTES:
             raise InputError(
-                f"a table must have up to {MAX_BYTES / 1e9:.1f} GB, got {size / 1e9:.1f} GB; take "
+                f"a table must have up to {_MAX_BYTES / 1e9:.1f} GB, got {size / 1e9:.1f} GB; take "
                 "lower frequencies"
             )
 

@@ -337,10 +337,10 @@ def excursions_of(rig: Rig, free: FreePlate | None = None) -> Excursions:
     )
 
 
-MARGIN = 0.02
+_MARGIN = 0.02
 """Width of the strip along the edges [m] that is left out."""
 
-UP_TO, STEP = 300.0, 10.0
+UP_TO, _STEP = 300.0, 10.0
 """Highest frequency of a reach, and the step of frequencies [Hz]."""
 
 _SPACING = 0.012  # m
@@ -379,8 +379,8 @@ def reach_of(rig: Rig, free: FreePlate) -> Reach:
     """Compute the reach of a rig within its limits, up to UP_TO; free: the rig's plate."""
     plate, limits = rig.plate, rig.limits
     low = limits.frequency_min
-    frequencies = np.arange(low, min(limits.frequency_max, max(UP_TO, low)) + 1e-9, STEP)
-    margins = [(side, min(MARGIN, side / 4)) for side in (plate.length, plate.width)]
+    frequencies = np.arange(low, min(limits.frequency_max, max(UP_TO, low)) + 1e-9, _STEP)
+    margins = [(side, min(_MARGIN, side / 4)) for side in (plate.length, plate.width)]
     places = lattice(
         *(
             np.linspace(edge, side - edge, 1 + math.ceil((side - 2 * edge) / _SPACING))

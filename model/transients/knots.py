@@ -29,12 +29,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.arrays import Complex64Array, ComplexArray, Float32Array, FloatArray, IntArray
-from model.compiled.kernels import ShapedTone, Shaping, kernels, run
+from model.compiled.kernels import ShapedTone, Shaping, kernels, run_kernel
 from model.transients import base_motion
 from model.transients.base_motion import KNOT_STEP
 from model.transients.time_response import PlateInTime
 
-Complex: TypeAlias = NDArray[np.complexfloating[Any, Any]]
+_ComplexArray: TypeAlias = NDArray[np.complexfloating[Any, Any]]
 """Complex arrays of either precision."""
 
 ONSET_KNOTS = 21
@@ -56,7 +56,7 @@ SAMPLES = 5  # for each step; a demodulated response changes little within a mil
 STEPS = ONSET_KNOTS + 9  # of an onset, until the plate has settled
 
 # Relative to the mean of a form's diagonal: keeps it definite, costs no contrast.
-RIDGE = 1e-6
+_RIDGE = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,7 +127,7 @@ def onset_by_numpy(
     weights[:t] = TARGET_WEIGHT * math.sqrt(power)
     hats = found.hats * weights
     combinations = _combinations(hats, amplitudes, found.combinations)
-    combined: Complex = hats @ combinations
+    combined: _ComplexArray = hats @ combinations
     count = combinations.shape[1]
     form = _summed(combined, gain_variance)
     wanted = (weights[:t, 0, 0] * steady[:t].sum(axis=1)).astype(np.complex64)
@@ -196,7 +196,7 @@ def ending_by_numpy(
 
 def while_ending(
     found: FingerResponses, start: ComplexArray, gain_variance: float
-) -> tuple[Complex, Complex]:
+) -> tuple[_ComplexArray, _ComplexArray]:
     """Return form and right-hand side of the mean square at quiet fingers during an ending.
 
     An ending from a start (eras,) is the steady tone, plus a hat at each knot of the knot's
@@ -220,7 +220,7 @@ def _expected_power(responses: ComplexArray, gain_variance: float) -> float:
     return float(together + gain_variance * np.linalg.norm(responses) ** 2)
 
 
-def _summed(responses: Complex, gain_variance: float) -> Complex:
+def _summed(responses: _ComplexArray, gain_variance: float) -> _ComplexArray:
     """Return the expected form over knots and ERAs of squares, summed over samples, rows and steps.
 
     responses (samples, d, knots, eras) as in `FingerResponses.hats`. In the step before the last,
@@ -237,7 +237,7 @@ def _summed(responses: Complex, gain_variance: float) -> Complex:
     return form
 
 
-def _add_errors(form: Complex, eras: int, gain_variance: float) -> None:
+def _add_errors(form: _ComplexArray, eras: int, gain_variance: float) -> None:
     """Add the effect of the ERAs' errors to a form: more of the parts of a single ERA."""
     knots = len(form) // eras
     own = np.einsum("kele->kle", form.reshape(knots, eras, knots, eras))
@@ -308,7 +308,9 @@ RELAXATION = 1.6
 ITERATIONS = 30
 
 
-def bounded_minimum(form: Complex, right: Complex, combinations: Complex64Array) -> ComplexArray:
+def bounded_minimum(
+    form: _ComplexArray, right: _ComplexArray, combinations: Complex64Array
+) -> ComplexArray:
     """Minimise x^H form x - 2 Re right^H x such that no ERA exceeds its stroke; return the knots.
 
     form: positive semidefinite, over knots and combinations; right (k, c); combinations (eras, c):
@@ -318,14 +320,14 @@ def bounded_minimum(form: Complex, right: Complex, combinations: Complex64Array)
     unit, size = np.eye(len(form)), float(form.diagonal().real.mean())
     to_knots, back = combinations.T, combinations.conj()
 
-    def solved(inverse: Complex, right: Complex) -> Complex:
+    def solved(inverse: _ComplexArray, right: _ComplexArray) -> _ComplexArray:
         return np.asarray((inverse @ right.ravel()).reshape(right.shape) @ to_knots)
 
-    found = solved(np.linalg.inv(form + RIDGE * size * unit), right)
+    found = solved(np.linalg.inv(form + _RIDGE * size * unit), right)
     feasible = _within(found)
     if feasible is not found:
         penalty = PENALTY * size
-        inverse = np.linalg.inv(form + (RIDGE * size + penalty) * unit)
+        inverse = np.linalg.inv(form + (_RIDGE * size + penalty) * unit)
         offset, dual = solved(inverse, right), np.zeros_like(feasible)
         for _ in range(ITERATIONS):
             knots = offset + penalty * solved(inverse, (feasible - dual) @ back)
@@ -335,7 +337,7 @@ def bounded_minimum(form: Complex, right: Complex, combinations: Complex64Array)
     return np.asarray(feasible * (1 - 1e-12), dtype=complex)  # within bounds despite rounding
 
 
-def _within(knots: Complex) -> Complex:
+def _within(knots: _ComplexArray) -> _ComplexArray:
     """Limit magnitudes to 1; returns the same array if none is larger."""
     sizes = np.abs(knots)
     return np.asarray(knots / np.maximum(sizes, 1)) if sizes.max() > 1 else knots
@@ -406,7 +408,9 @@ def _found_by_kernel(
         given.targets, given.rows = found.targets, len(found.steady)
         given.combinations = found.combinations
         given.hats, given.steady = found.hats.ctypes.data, found.steady.ctypes.data
-    run(by.library.shaped_knots, c_void_p(knots[1:].ctypes.data), given, _rules(), int(is_ending))
+    run_kernel(
+        by.library.shaped_knots, c_void_p(knots[1:].ctypes.data), given, _rules(), int(is_ending)
+    )
     return True
 
 
@@ -419,7 +423,7 @@ def _rules() -> Shaping:
         knots=ONSET_KNOTS,
         ending_knots=ENDING_KNOTS,
         iterations=ITERATIONS,
-        ridge=RIDGE,
+        ridge=_RIDGE,
         penalty=PENALTY,
         relaxation=RELAXATION,
     )

@@ -22,7 +22,7 @@ from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
-from model.arrays import ComplexArray, FloatArray, IntArray
+from model.arrays import ComplexArray, FloatArray, IntArray, Point
 from model.finger import (
     FIVE_POINTS,
     Grid,
@@ -199,9 +199,7 @@ _COMBINATIONS = 8
 
 _COMBINATIONS_ALONE = 6  # the same without quiet fingers
 
-Position = tuple[float, float]
-
-Fingertips: TypeAlias = Callable[[Sequence[Position]], tuple[FloatArray, FloatArray]]
+Fingertips: TypeAlias = Callable[[Sequence[Point]], tuple[FloatArray, FloatArray]]
 """Weights (k, p) of points under fingertips at positions (k,) [m], and their shapes (k, p, r)."""
 
 
@@ -239,7 +237,7 @@ class Shaper:
         self._centres = _SURROUNDINGS.centres(plate.reduced.plate)
         self._shapes = plate.shapes_at(self._centres)
         # Readings of the last fingers: contents that begin together have each other's.
-        self._fingers: dict[Position, tuple[FloatArray, FloatArray]] = {}
+        self._fingers: dict[Point, tuple[FloatArray, FloatArray]] = {}
         self._felt = lru_cache(_KEPT)(self._read)
         self._resting = lru_cache(_KEPT)(self._quiet_rows)
 
@@ -258,8 +256,8 @@ class Shaper:
         self,
         excitation: Excitation,
         *,
-        targets: Sequence[Position],
-        quiet: Sequence[Position] = (),
+        targets: Sequence[Point],
+        quiet: Sequence[Point] = (),
     ) -> Envelopes:
         """Shape envelopes from rest to an excitation that keep quiet fingers [m] quiet.
 
@@ -278,8 +276,8 @@ class Shaper:
         self,
         excitation: Excitation,
         *,
-        targets: Sequence[Position] = (),
-        quiet: Sequence[Position] = (),
+        targets: Sequence[Point] = (),
+        quiet: Sequence[Point] = (),
     ) -> Envelopes:
         """Shape envelopes from an excitation to silence that bring the whole plate to rest.
 
@@ -323,7 +321,7 @@ class Shaper:
         ]
 
     def _read(
-        self, frequency: float, targets: tuple[Position, ...], quiet: tuple[Position, ...]
+        self, frequency: float, targets: tuple[Point, ...], quiet: tuple[Point, ...]
     ) -> FingerResponses:
         """Read the responses of all ERAs at targets and quiet fingers [m], else over the plate."""
         weights, shapes = self._fingertips(targets)
@@ -335,12 +333,12 @@ class Shaper:
             others = np.asarray(around / math.sqrt(len(around)))
         return responses_at(self.prepare(frequency), means, others, is_alone=not quiet)
 
-    def _quiet_rows(self, positions: tuple[Position, ...]) -> FloatArray:
+    def _quiet_rows(self, positions: tuple[Point, ...]) -> FloatArray:
         """Return rows (d, r) whose sum of squares is that of the fingertips' mean squares."""
         weights, shapes = self._fingertips(positions)
         return np.asarray((np.sqrt(weights)[..., None] * shapes).reshape(-1, shapes.shape[-1]))
 
-    def _fingertips(self, positions: tuple[Position, ...]) -> tuple[FloatArray, FloatArray]:
+    def _fingertips(self, positions: tuple[Point, ...]) -> tuple[FloatArray, FloatArray]:
         """Return weights (k, p) of points under fingertips and their shapes (k, p, r)."""
         known = self._fingers
         # Looked up first, since other threads drop some.
@@ -381,9 +379,7 @@ def of_eras(found: FingerResponses, active: IntArray) -> FingerResponses:
     return replace(found, hats=hats, steady=steady)
 
 
-def _fingertips_on(
-    plate: PlateInTime, positions: Sequence[Position]
-) -> tuple[FloatArray, FloatArray]:
+def _fingertips_on(plate: PlateInTime, positions: Sequence[Point]) -> tuple[FloatArray, FloatArray]:
     """Read the shapes of a plate under fingertips point by point, as `Fingertips`."""
     on = plate.reduced.plate
     points, weights = fingertips_on(

@@ -25,7 +25,7 @@ from drivers.protocol.definition import (
 from drivers.protocol.records import Values
 
 AMBIENT = 25.0  # °C
-RISE = 30.0  # K above ambient in the steady state at full stroke on every channel
+_RISE = 30.0  # K above ambient in the steady state at full stroke on every channel
 TIME_CONSTANT = 120.0  # s
 DERATE_ABOVE = 70.0  # °C
 FAULT_ABOVE = 85.0  # °C
@@ -55,7 +55,7 @@ class ThermalState:
 
     def driven(self, time: float, *, load: float) -> "ThermalState":
         """The state from a time [s], with the mean square level of all channels as load."""
-        return ThermalState(time, self.at(time), AMBIENT + RISE * load)
+        return ThermalState(time, self.at(time), AMBIENT + _RISE * load)
 
 
 LAYERS, VOICES = 8, 16

@@ -4,8 +4,8 @@ Requests and replies are the values of their records (`drivers.protocol.definiti
 the wire. Events happen at their own time: a watchdog that expired between two calls expired when it
 was due, and what plays is a description in time (`drivers.playing`), not samples.
 
-`TRANSITIONS` has the requests that are allowed in each state, and the state that follows; any other
-request is refused (WRONG_STATE). Transitions without a request: OPERATION_ENABLED to
+`AMPLIFIER_TRANSITIONS` has the requests that are allowed in each state, and the state that follows;
+any other request is refused (WRONG_STATE). Transitions without a request: OPERATION_ENABLED to
 FAULT_REACTION_ACTIVE when the watchdog expires, from there to FAULT once silent; SWITCHED_ON,
 entered by Disarm, to SWITCH_ON_DISABLED once silent. Clear needs silence. Arm passes through
 READY_TO_SWITCH_ON and SWITCHED_ON at once.
@@ -68,7 +68,7 @@ _KEPT_BY_STOP = ("NOT_READY", "FAULT_REACTION_ACTIVE", "FAULT")
 _PLAYING = ("Set", "Commit", "Silence")
 _CHANGING = (*_PLAYING, "Arm", "Disarm", "Stop", "Clear", "SetAddress")
 
-TRANSITIONS: Mapping[tuple[str, str], str] = {
+AMPLIFIER_TRANSITIONS: Mapping[tuple[str, str], str] = {
     **{(state, name): state for state in STATES for name in MESSAGES if name not in _CHANGING},
     **{("OPERATION_ENABLED", name): "OPERATION_ENABLED" for name in _PLAYING},
     **{
@@ -332,7 +332,7 @@ class SimulatedAmplifier:
             if is_held and self._intake.keep(values, now):
                 self._last_fed = now
             return {}
-        message, following = MESSAGES[name], TRANSITIONS.get((self.state, name))
+        message, following = MESSAGES[name], AMPLIFIER_TRANSITIONS.get((self.state, name))
         if following is None or (name == "Arm" and self._is_interlock_open):
             raise Refusal(f"{name} must not come in state {self.state}", "WRONG_STATE")
         if message.feeds and self._is_foreign(values["session"], name):

@@ -37,7 +37,7 @@ from drivers.protocol.definition import (
     sensor_reading,
 )
 from drivers.protocol.records import Refusal, Values
-from model.arrays import FloatArray
+from model.arrays import FloatArray, Point
 from model.fem import Mesh
 from model.reduction.reduced_plate import ReducedPlate, reduce_plate
 from model.rig.rig import Rig
@@ -56,18 +56,17 @@ from sim.amplifier.readings import AmplifierClock, StraightClock
 from sim.amplifier.simulated_amplifier import SimulatedAmplifier
 from sim.plant import imperfections
 from sim.plant.fingers import (
-    KEPT,
+    HISTORY_DURATION,
     Accelerometer,
     FeltVibration,
     FingerRecord,
-    Fingers,
-    Position,
+    PlateFingers,
     measure_vibration,
     positions,
     readings,
 )
 from sim.plant.imperfections import Imperfections, PlateErrors, motion_of, realised
-from sim.plant.plant import SAMPLE_RATE, FingerPlacement, LoadedPlate, Plant
+from sim.plant.plant import PLANT_SAMPLE_RATE, FingerPlacement, LoadedPlate, Plant
 
 WRONG = 0.5e-6
 """Most by which a clock of the plate is wrong [s]: 0.1 degrees of 500 Hz, when it is replaced."""
@@ -372,7 +371,7 @@ class Bench:
         rig: Rig,
         *,
         now: float,
-        sample_rate: float = SAMPLE_RATE,
+        sample_rate: float = PLANT_SAMPLE_RATE,
         imperfections: Imperfections = Imperfections(),  # noqa: B008  frozen
     ) -> None:
         imperfections.check(rig)
@@ -387,11 +386,11 @@ class Bench:
         # Behind the amplifiers, and advanced in few large steps: nothing acts back on them.
         self._plant = _plant_of(self.real, now)
         self._sampled_until = now  # up to when [s] fingers and probes have samples
-        self._fingers = Fingers(self._plant.reduced)
+        self._fingers = PlateFingers(self._plant.reduced)
         self._is_sampling = False
         # Fingers that are not on the plate in time yet; the newest, and those that load the plate.
         self._placements: deque[FingerPlacement] = deque()
-        self.positions: Mapping[str, Position] = {}
+        self.positions: Mapping[str, Point] = {}
         self._contacts: Mapping[str, FingertipLoad] = {}
         self.observers: frozenset[str] = frozenset()  # fingers without weight
         self.loads: Mapping[str, float] = {}  # by finger, relative to the rig's fingertip
@@ -425,7 +424,7 @@ class Bench:
         self._played: deque[tuple[int, Voices, float]] = deque()
 
     @property
-    def fingers(self) -> Fingers:
+    def fingers(self) -> PlateFingers:
         """The fingers, with what they have felt up to the present time."""
         self._sample_plate()
         return self._fingers
@@ -444,9 +443,9 @@ class Bench:
 
     def _advance(self, now: float) -> None:
         """Advance the amplifiers to a time [s], and the plate with them if probes listen."""
-        if now - self.time > KEPT and not self._probes:  # older samples are not kept
+        if now - self.time > HISTORY_DURATION and not self._probes:  # older samples are not kept
             self._sample_plate()
-            self._advance_amplifiers(now - KEPT)
+            self._advance_amplifiers(now - HISTORY_DURATION)
             self._sampled_until = self.time
             self._plant.skip(self.time)
         while now - self.time > _MAX_STEP:
@@ -454,7 +453,7 @@ class Bench:
             self._sample_plate()
         self._advance_amplifiers(now)
         behind = self.time - self._sampled_until
-        if self._probes or behind > KEPT:
+        if self._probes or behind > HISTORY_DURATION:
             self._sample_plate()
         elif behind > _MAX_STEP:
             self._sample_what_is_solved()
@@ -477,7 +476,7 @@ class Bench:
 
     def place_fingers(
         self,
-        positions: Mapping[str, Position],
+        positions: Mapping[str, Point],
         *,
         now: float,
         observers: Collection[str] = (),
@@ -493,7 +492,7 @@ class Bench:
 
     def begin_placing(
         self,
-        positions: Mapping[str, Position],
+        positions: Mapping[str, Point],
         *,
         now: float,
         observers: Collection[str] = (),
@@ -581,7 +580,7 @@ class Bench:
             if moment >= to_time:
                 return
 
-    def _contacts_at(self, positions: Mapping[str, Position]) -> Mapping[str, FingertipLoad]:
+    def _contacts_at(self, positions: Mapping[str, Point]) -> Mapping[str, FingertipLoad]:
         """The fingers that load the plate, and the patches of hands."""
         fingertip, size = self.rig.fingertip, (self.rig.plate.length, self.rig.plate.width)
         if fingertip is None:
@@ -658,7 +657,7 @@ class Bench:
             if is_new or (commanded and wired.amplifier in renewed):
                 self._commanded[index] = playing
                 self._apply(index, playing, self._clock_of(index))
-        while self._played and self._played[0][2] < self.time - KEPT:
+        while self._played and self._played[0][2] < self.time - HISTORY_DURATION:
             self._played.popleft()
 
     def _clock_of(self, index: int) -> StraightClock:

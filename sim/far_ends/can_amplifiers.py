@@ -50,7 +50,7 @@ from drivers.wires.can_frames import (
 from registry import threads
 from sim.amplifier.simulated_amplifier import SILENCING_RAMP
 from sim.bench.amplifier_device import AmplifierDevice
-from sim.transport.far_end import AmplifierPort, FarEnd, Send, TimedFarEnd, carry_out
+from sim.transport.far_end import AmplifierPort, FarEnd, SendBytes, TimedFarEnd, carry_out
 from sim.transport.simulated_line import TwoWayLine
 
 TOGGLE = 0x0503_0000
@@ -195,7 +195,7 @@ _POLL = 0.05  # s; between looks whether a heartbeat is wanted again
 class CanAmplifiers(FarEnd):
     """Amplifiers by their nodes on one bus; send: called with their frames."""
 
-    def __init__(self, amplifiers: Mapping[int, AmplifierPort], send: Send) -> None:
+    def __init__(self, amplifiers: Mapping[int, AmplifierPort], send: SendBytes) -> None:
         self._nodes = [_Node(amplifier, node, send) for node, amplifier in amplifiers.items()]
 
     def start(self, now: float) -> None:
@@ -223,7 +223,7 @@ class CanAmplifiers(FarEnd):
 class _Node:
     """An amplifier at a node number."""
 
-    def __init__(self, amplifier: AmplifierPort, number: int, send: Send) -> None:
+    def __init__(self, amplifier: AmplifierPort, number: int, send: SendBytes) -> None:
         self._amplifier = amplifier
         self._send = send
         self._number = number
@@ -434,7 +434,7 @@ _SETTING = re.compile(rb"S[0-9]|s[0-9A-Fa-f]{4,6}|Y[0-9]|[Mm][0-9A-Fa-f]{8}|[ZX]
 class SlcanAdapter(FarEnd):
     """The adapter: text in, `send` called with text, frames to and from a bus."""
 
-    def __init__(self, bus: CanBus, send: Send) -> None:
+    def __init__(self, bus: CanBus, send: SendBytes) -> None:
         self._bus = bus
         self._send = send
         self._rest = b""
@@ -490,7 +490,7 @@ _MAX_ELEMENT = 512  # characters of an element
 class SocketcandClient(FarEnd):
     """One connection, through the states new, open and raw."""
 
-    def __init__(self, bus: CanBus, send: Send) -> None:
+    def __init__(self, bus: CanBus, send: SendBytes) -> None:
         self._bus = bus
         self._send = send
         self._rest = b""

@@ -20,15 +20,15 @@ from drivers.wires.modbus_frames import (
     Adu,
     AduReader,
     Pdu,
-    answer,
     exception_to,
     framed,
     message_shown,
     message_written,
     pack_identity,
     parse_request,
+    response_pdu,
 )
-from sim.transport.far_end import AmplifierPort, FarEnd, Send, carry_out
+from sim.transport.far_end import AmplifierPort, FarEnd, SendBytes, carry_out
 
 FRAME_TIMEOUT = 0.02
 """Longest pause [s] within an RTU frame: less than the 30 ms after which a host repeats it."""
@@ -44,7 +44,7 @@ class ModbusAmplifiers(FarEnd):
     def __init__(
         self,
         amplifiers: Mapping[int, AmplifierPort],
-        send: Send,
+        send: SendBytes,
         *,
         is_rtu: bool,
     ) -> None:
@@ -61,7 +61,7 @@ class ModbusAmplifiers(FarEnd):
         self._last = now
         self._take(self._reader.feed(data), now)
 
-    def of_connection(self, send: Send) -> "ModbusAmplifiers":
+    def of_connection(self, send: SendBytes) -> "ModbusAmplifiers":
         """Return the same units for another connection; send: see above."""
         other = ModbusAmplifiers({}, send, is_rtu=self._is_rtu)
         other._units = self._units
@@ -115,7 +115,9 @@ class _Unit:
             return exception_to(function, _ILLEGAL_VALUE if is_known else _ILLEGAL_FUNCTION)
         if function in READS:
             shown = self._read(request, now)
-            return answer(request, shown) if shown else exception_to(function, _ILLEGAL_ADDRESS)
+            return (
+                response_pdu(request, shown) if shown else exception_to(function, _ILLEGAL_ADDRESS)
+            )
         message = message_written(request)
         if message is None:
             return exception_to(function, _ILLEGAL_ADDRESS)
@@ -130,7 +132,7 @@ class _Unit:
             self.is_moving = message.name == "SetAddress" and done[0] == 0
         else:
             self._replies[message.number] = tag, *done
-        return answer(request)
+        return response_pdu(request)
 
     def _execute(
         self, message: Message, words: Sequence[int], now: float, is_for_all: bool

@@ -29,7 +29,7 @@ from drivers.wires.serial_frames import (
     unpack_words,
     words_of,
 )
-from sim.transport.far_end import AmplifierPort, FarEnd, Send, carry_out
+from sim.transport.far_end import AmplifierPort, FarEnd, SendBytes, carry_out
 
 _SET_ADDRESS = MESSAGES["SetAddress"].number
 
@@ -37,7 +37,7 @@ _SET_ADDRESS = MESSAGES["SetAddress"].number
 class SerialAmplifiers(FarEnd):
     """Amplifiers by their addresses on one line; send: called with the bytes for the host."""
 
-    def __init__(self, amplifiers: Mapping[int, AmplifierPort], send: Send) -> None:
+    def __init__(self, amplifiers: Mapping[int, AmplifierPort], send: SendBytes) -> None:
         self._amplifiers = dict(amplifiers)
         self._send = send
         self._reader = FrameReader()

@@ -27,7 +27,7 @@ from sim.far_ends.can_amplifiers import BUS_NAME, BusNodes, CanBus, SlcanAdapter
 from sim.far_ends.modbus_amplifiers import ModbusAmplifiers
 from sim.far_ends.serial_amplifiers import SerialAmplifiers
 from sim.faults import Faults
-from sim.transport.far_end import HOST, FarEnd, MakeEnd, Send, TcpEnd, TerminalEnd
+from sim.transport.far_end import HOST, FarEnd, MakeEnd, SendBytes, TcpEnd, TerminalEnd
 from sim.transport.simulated_line import LINE_NAMES, PROMPT, delays_of
 
 Urls = AsyncIterator[Mapping[str, str]]
@@ -98,7 +98,7 @@ async def open_wires(wires: Mapping[str, SimulatedWire], devices: Devices) -> Ur
 
 @contextmanager
 def _on_bus(
-    make_adapter: Callable[[CanBus, Send], FarEnd], speed: int | None, numbered: Numbered
+    make_adapter: Callable[[CanBus, SendBytes], FarEnd], speed: int | None, numbered: Numbered
 ) -> Iterator[MakeEnd]:
     with (
         closing(CanBus(speed)) as bus,

@@ -38,7 +38,7 @@ from model.vibration import base_amplitudes
 from sim.plant import imperfections
 from sim.plant.fingers import FingerRecord, felt_peaks, fit_tones
 from sim.plant.imperfections import Imperfections, realised
-from sim.plant.plant import SAMPLE_RATE, LoadedPlate, Plant
+from sim.plant.plant import PLANT_SAMPLE_RATE, LoadedPlate, Plant
 
 STEADY = 0.25
 """Length [s] of the last part, in which steady amplitudes are fitted; resolves 10 Hz."""
@@ -46,16 +46,16 @@ STEADY = 0.25
 LEVEL_WINDOW, LEVEL_STEP = 0.03, 0.005
 """Hann window under which a level over time is a root mean square, and the steps of both [s]."""
 
-RINGING = 3.0
+_RINGING = 3.0
 """Time constants of the slowest vibration that the plate is given: 5 % of its start are left."""
 
-MIN_DURATION = 1.0
+_MIN_DURATION = 1.0
 """Playback [s] where none is given, unless the plate rings longer."""
 
 MIN_SIGNAL = 0.01
 """Shortest signals [s]; shorter ones are followed by zeros."""
 
-MAX_DURATION = 10.0
+_MAX_DURATION = 10.0
 """Longest playback [s]; ten fingers take 150 MB for each layer."""
 
 
@@ -261,8 +261,8 @@ def play(
 ) -> PlatePlayback:
     """Play layers for a duration [s] on a plate at rest, under fingers, by number in the layers.
 
-    duration: at least the onsets and RINGING time constants of the slowest vibration (0.2 to 0.9 s
-    on the plates of the examples), or MAX_DURATION; so long, and a second, for None.
+    duration: at least the onsets and _RINGING time constants of the slowest vibration (0.2 to 0.9 s
+    on the plates of the examples), or _MAX_DURATION; so long, and a second, for None.
 
     The fingers load the plate as the rig's fingertip, by their loads. reduced: the plate that the
     imperfections make of the rig's, for forces at its ERAs and loads. Each layer starts along its
@@ -275,14 +275,14 @@ def play(
     terms = [term for bases in driven for motion in bases for term in motion]
     settled = max([term.start for term in terms], default=0.0)  # of the last, which goes on
     loaded = _plant_under(rig, reduced, fingers, imperfections).loaded
-    slowest = max(-float(loaded.plate.decay.real.max()), RINGING / MAX_DURATION)
-    least = min(settled + RINGING / slowest, MAX_DURATION)
+    slowest = max(-float(loaded.plate.decay.real.max()), _RINGING / _MAX_DURATION)
+    least = min(settled + _RINGING / slowest, _MAX_DURATION)
     if duration is None:
-        duration = max(least, MIN_DURATION)
-    if not least <= duration <= MAX_DURATION:  # false for NaN, too
+        duration = max(least, _MIN_DURATION)
+    if not least <= duration <= _MAX_DURATION:  # false for NaN, too
         raise InputError(
             f"duration must be at least {least:.3g} s, the onset and until the plate rings no "
-            f"more, and at most {MAX_DURATION:g} s, got {duration:g} s; None is long enough"
+            f"more, and at most {_MAX_DURATION:g} s, got {duration:g} s; None is long enough"
         )
     points, vibrations = _points(rig, fingers), []
     for layer, bases in zip(layers, driven, strict=True):
@@ -291,7 +291,7 @@ def play(
         for number, (era, motion) in enumerate(zip(rig.eras, bases, strict=True)):
             plant.set_input(number, realised(motion, imperfections.errors_of(era.name, rig)))
         times, felt = plant.advance(
-            duration, sample_rate=SAMPLE_RATE, shapes=plant.reduced.at(points)
+            duration, sample_rate=PLANT_SAMPLE_RATE, shapes=plant.reduced.at(points)
         )
         records = _records(rig, fingers, times, felt)
         driven_at = tuple(frequencies.tolist())
@@ -315,9 +315,9 @@ def play_signals(
     """
     check_fingers(fingers, rig.plate)
     duration = signals.shape[1] / sample_rate
-    if not MIN_SIGNAL <= duration <= MAX_DURATION:
+    if not MIN_SIGNAL <= duration <= _MAX_DURATION:
         raise InputError(
-            f"signals must last from {MIN_SIGNAL:g} to {MAX_DURATION:g} s, got {duration:g} s"
+            f"signals must last from {MIN_SIGNAL:g} to {_MAX_DURATION:g} s, got {duration:g} s"
         )
     plant = _plant_under(rig, reduced, fingers, imperfections)
     felt = from_rest(

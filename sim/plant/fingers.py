@@ -10,20 +10,17 @@ import math
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TypeAlias
 
 import numpy as np
 
 from model.answer.stimulus import check_on_plate
-from model.arrays import ComplexArray, FloatArray
+from model.arrays import ComplexArray, FloatArray, Point
 from model.errors import InputError
 from model.finger import felt_part, fingertip_points, fingertip_weights
 from model.reduction.reduced_plate import ReducedPlate
 
-KEPT = 10.0  # s
-MAX_FINGERS = 32  # four people with eight fingers each
-
-Position: TypeAlias = tuple[float, float]
+HISTORY_DURATION = 10.0  # s
+_MAX_FINGERS = 32  # four people with eight fingers each
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,7 +31,7 @@ class FingerPositions:
     each finger.
     """
 
-    positions: Mapping[str, Position]
+    positions: Mapping[str, Point]
     points: FloatArray
     weights: FloatArray
     shapes: FloatArray
@@ -55,7 +52,7 @@ class FingerRecord:
     accelerations: FloatArray
 
 
-class Fingers:
+class PlateFingers:
     """Fingers on a reduced plate by id, and their accelerations in the last ten seconds."""
 
     def __init__(self, reduced: ReducedPlate) -> None:
@@ -63,9 +60,7 @@ class Fingers:
         self._pieces: deque[tuple[FingerPositions, FloatArray, FloatArray]] = deque()
         self.layout = self._lay_out({})
 
-    def place(
-        self, positions: Mapping[str, Position], *, reduced: ReducedPlate | None = None
-    ) -> None:
+    def place(self, positions: Mapping[str, Point], *, reduced: ReducedPlate | None = None) -> None:
         """Replace the fingers by those at these positions [m]; InputError changes nothing.
 
         reduced: the plate in new coordinates, where they change.
@@ -76,11 +71,11 @@ class Fingers:
             self._reduced = reduced
             self.layout = self._lay_out(positions)
 
-    def check(self, positions: Mapping[str, Position]) -> None:
+    def check(self, positions: Mapping[str, Point]) -> None:
         """Raise InputError for too many fingers, or positions [m] off the plate."""
-        if len(positions) > MAX_FINGERS:
+        if len(positions) > _MAX_FINGERS:
             raise InputError(
-                f"number of fingers must be at most {MAX_FINGERS}, got {len(positions)}"
+                f"number of fingers must be at most {_MAX_FINGERS}, got {len(positions)}"
             )
         for name, position in positions.items():
             check_on_plate(f"finger {name}", [position], self._reduced.plate)
@@ -89,7 +84,7 @@ class Fingers:
         """Keep samples at the points of the layout: times (n,) [s], accelerations (n, p) [m/s²]."""
         if accelerations.shape[1]:
             self._pieces.append((self.layout, times, accelerations.astype(np.float32, copy=False)))
-        while self._pieces and self._pieces[0][1][-1] < times[-1] - KEPT:
+        while self._pieces and self._pieces[0][1][-1] < times[-1] - HISTORY_DURATION:
             self._pieces.popleft()
 
     def felt(self, since: float, until: float) -> dict[str, FingerRecord]:
@@ -104,7 +99,7 @@ class Fingers:
             for name, layout in last.items()
         }
 
-    def _lay_out(self, positions: Mapping[str, Position]) -> FingerPositions:
+    def _lay_out(self, positions: Mapping[str, Point]) -> FingerPositions:
         plate, columns = self._reduced.plate, {}
         points, weights = [np.zeros((0, 2))], [np.zeros(0)]
         start = 0

@@ -22,17 +22,16 @@ from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
-from model.arrays import ComplexArray, FloatArray
+from model.arrays import ComplexArray, FloatArray, Point
 from model.reduction.reduced_plate import ReducedPlate
 from model.structure.attachments import FingertipLoad, PointLoad, Source
 from model.transients.base_motion import BaseMotions, Motion
 from model.transients.time_response import ForcedVibration, PlateInTime, plate_in_time
-from sim.plant.fingers import Position
 
 Footprint: TypeAlias = tuple[float, float, float]
 """x, y, radius [m]."""
 
-BLOCK = 512  # samples per table of exponentials; a power of 2
+_BLOCK = 512  # samples per table of exponentials; a power of 2
 
 # s; a point keeps its static vectors for so long after a lift, ten times as long as their motion
 # takes to decay.
@@ -50,7 +49,7 @@ class LoadedPlate:
     _tables: dict[float, ComplexArray] = field(default_factory=dict)
 
     def exponentials(self, sample_rate: float) -> ComplexArray:
-        """exp(eigenvalue k / sample_rate [Hz]), k up to a block, (BLOCK, m)."""
+        """exp(eigenvalue k / sample_rate [Hz]), k up to a block, (_BLOCK, m)."""
         if sample_rate not in self._tables:
             self._tables.clear()
             self._tables[sample_rate] = exponentials(self.plate.decay, sample_rate)
@@ -58,10 +57,10 @@ class LoadedPlate:
 
 
 def exponentials(s: ComplexArray, sample_rate: float) -> ComplexArray:
-    """exp(s k / sample_rate) for s (n,) [1/s] and k up to a block, (BLOCK, n)."""
-    table = np.ones((BLOCK, len(s)), dtype=complex)
+    """exp(s k / sample_rate) for s (n,) [1/s] and k up to a block, (_BLOCK, n)."""
+    table = np.ones((_BLOCK, len(s)), dtype=complex)
     done = 1
-    while done < BLOCK:  # doubled, since an exponential costs ten products
+    while done < _BLOCK:  # doubled, since an exponential costs ten products
         np.multiply(table[:done], np.exp(s * (done / sample_rate)), out=table[done : 2 * done])
         done *= 2
     return table
@@ -158,7 +157,7 @@ class FingerPlacement:
     def __init__(
         self,
         time: float,
-        positions: Mapping[str, Position],
+        positions: Mapping[str, Point],
         contacts: Mapping[str, FingertipLoad],
         solve: Callable[[], LoadedPlate] | None,
     ) -> None:
@@ -243,8 +242,8 @@ class Sampler:
         if forced is not self._forced or solution != self._solution:
             self._use(forced, solution)
         rows = forced.rows(solution)
-        for start in range(0, len(times), BLOCK):
-            into = out[start : start + BLOCK]
+        for start in range(0, len(times), _BLOCK):
+            into = out[start : start + _BLOCK]
             tau = float(times[start] - forced.times[solution])
             now = np.exp(self._decay * tau) * free.conj()
             strengths = np.abs(now) * self._strengths
@@ -284,18 +283,18 @@ class Sampler:
         table = _sinusoids(omegas.tobytes(), self.sample_rate)
         self._exponents = np.asarray(-1j * omegas, dtype=complex)
         if forced.a1 is not None:
-            table = np.hstack([table, np.arange(BLOCK)[:, None] / self.sample_rate * table])
+            table = np.hstack([table, np.arange(_BLOCK)[:, None] / self.sample_rate * table])
             self._exponents = np.tile(self._exponents, 2)
         self._forced_table = self._columns(table)
 
 
 @lru_cache(_TABLES_KEPT)
 def _sinusoids(omegas: bytes, sample_rate: float) -> ComplexArray:
-    """exp(i omega k / sample_rate) for k up to a block, (BLOCK, n)."""
+    """exp(i omega k / sample_rate) for k up to a block, (_BLOCK, n)."""
     return exponentials(np.asarray(1j * np.frombuffer(omegas), dtype=complex), sample_rate)
 
 
-SAMPLE_RATE = 10_000.0
+PLANT_SAMPLE_RATE = 10_000.0
 """Default sampling rate [Hz]: peaks at 500 Hz are sampled to within 1.3 %."""
 
 _AT_ONCE = 8  # changes of the drive that are solved together

@@ -52,7 +52,7 @@ def library() -> ctypes.CDLL:
     return kept_library("soft-amp", sources, headers, flags=flags, what=_WHAT)
 
 
-def address_of(name: str) -> int:
+def callback_address(name: str) -> int:
     """Return the address of a function of the library, a callback."""
     found = ctypes.cast(getattr(library(), name), ctypes.c_void_p).value
     assert found is not None  # noqa: S101  of a function

@@ -11,12 +11,12 @@ from typing import Any, TypeAlias
 from drivers.errors import LinkError
 from model.errors import InputError
 from registry.plugins import did_you_mean
-from sim.soft_amp.engine import JackCalls, address_of
+from sim.soft_amp.engine import JackCalls, callback_address
 from sim.soft_amp.engine import library as engine
 from sim.soft_amp.jack import IS_INPUT, JackClient, NoSound, jack_name, libjack
 from sim.soft_amp.settings import SoftAmplifierSettings, check_rate
 
-CLIENT = "era-soft-amp"
+_CLIENT = "era-soft-amp"
 
 _CALLED_BY_ENGINE = {
     "buffer": "jack_port_get_buffer",
@@ -33,7 +33,7 @@ class JackOutput:
     """As many ports as the amplifier has channels, each connected to the next one of a client."""
 
     def __init__(self, settings: SoftAmplifierSettings, *, destination: str) -> None:
-        self._client = JackClient(CLIENT)
+        self._client = JackClient(_CLIENT)
         try:
             self.rate = check_rate(self._client.rate, what="JACK server")
             if settings.rate not in (None, self.rate):
@@ -63,10 +63,10 @@ class JackOutput:
         engine().sound_use_jack(ctypes.byref(calls))
         self._client.start(
             {
-                "jack_set_process_callback": address_of("sound_jack_process"),
-                "jack_set_xrun_callback": address_of("sound_jack_xrun"),
-                "jack_on_shutdown": address_of("sound_jack_shutdown"),
-                "jack_set_port_connect_callback": address_of("sound_jack_connect"),
+                "jack_set_process_callback": callback_address("sound_jack_process"),
+                "jack_set_xrun_callback": callback_address("sound_jack_xrun"),
+                "jack_on_shutdown": callback_address("sound_jack_shutdown"),
+                "jack_set_port_connect_callback": callback_address("sound_jack_connect"),
             }
         )
 
@@ -219,7 +219,7 @@ class PortAudioOutput:
         try:
             self._stream = portaudio_stream(
                 self._number,
-                address_of("sound_portaudio"),
+                callback_address("sound_portaudio"),
                 0,
                 outputs=self._settings.channels,
                 samplerate=self.rate,

@@ -18,7 +18,7 @@ from typing import Self, TypeAlias, cast
 from urllib.parse import urlsplit
 
 from drivers.errors import LinkError
-from drivers.protocol.definition import HELLO, NAK, REQUESTS, nak_of, read_request
+from drivers.protocol.definition import HELLO, NAK, REQUESTS, decode_request, nak_of
 from drivers.protocol.records import Refusal
 from drivers.protocol.sets import is_earlier_part
 from drivers.urls import ADDRESS_MAX
@@ -267,7 +267,7 @@ def carry_out(
     if kind == HELLO:
         return HELLO, REQUESTS["Hello"].reply.pack(amplifier.identity)
     try:
-        name, values = read_request(kind, words)
+        name, values = decode_request(kind, words)
         if is_for_all and not REQUESTS[name].is_broadcast:
             raise Refusal(f"{name} must be for one amplifier")
         if name == "SetAddress" and values["address"] > address_max:
@@ -280,8 +280,8 @@ def carry_out(
     return kind, REQUESTS[name].reply.pack(reply) if reply else ()
 
 
-Send = Callable[[bytes], None]
-MakeEnd = Callable[[Send], FarEnd]
+SendBytes = Callable[[bytes], None]
+MakeEnd = Callable[[SendBytes], FarEnd]
 """Makes a far end, of the function that it sends by; no bytes: the connection ends."""
 
 

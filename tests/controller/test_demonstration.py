@@ -39,7 +39,7 @@ from controller.play.loop import Observers, PlayReport
 from controller.sources.touch import Change, Contact, ContactKey, TouchFrame
 from controller.sources.tuio import TuioSource
 from drivers.errors import LinkError
-from era_haptics.command import run
+from era_haptics.command import run_era as run_command
 from kit.clock import in_virtual_time, run_virtual
 from kit.plates import small_table
 from model.answer.answer import OWN, Sensation
@@ -219,7 +219,7 @@ def demo(
             return DemoRun(rows, why_void)
 
         monkeypatch.setattr(demonstration, "run_demo", run_demo)
-        status = run(["demo", *arguments, "--out", "drawn"])
+        status = run_command(["demo", *arguments, "--out", "drawn"])
         return status, capsys.readouterr().out.splitlines(keepends=True)
 
     def write_pictures(table: object, rows: object, out: Path) -> Pictures:
@@ -473,7 +473,7 @@ async def test_plate_is_armed_again_after_a_fault_but_not_after_a_stop(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """After one of amplifiers that stalled it is cleared, and the recorder hears of both."""
-    monkeypatch.setattr(demonstration, "RECOVERY", 5.0)
+    monkeypatch.setattr(demonstration, "_RECOVERY", 5.0)
     async with asyncio.TaskGroup() as tasks, ready_daemon(tmp_path) as (bench, era):
         recorder = TouchRecorder(cast(SimulatedPlate, None), tasks, on_row=lambda row: None)
         arming = asyncio.create_task(

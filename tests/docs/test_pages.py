@@ -41,7 +41,7 @@ from drivers.by_hand.reaching import check_links
 from drivers.errors import CommandError
 from drivers.protocol.definition import BOOT_TIME, REACTION
 from drivers.wires.wire import address_of
-from era_haptics.command import command_modules, run
+from era_haptics.command import command_modules, run_era
 from model.answer.answer import MIN_CONTRAST_DB, OWN_CONTRAST_DB
 from model.answer.promise import MIN_RAISED_CONTRAST_DB
 from model.cli import app
@@ -358,7 +358,7 @@ def test_readme_shows_what_the_demonstration_prints(
     )
     assert shown.count("of 3 contents") == 3
     monkeypatch.chdir(ROOT)
-    assert run([*command.split(), "--out", str(tmp_path)]) == 0
+    assert run_era([*command.split(), "--out", str(tmp_path)]) == 0
     what = difference(textwrap.dedent(shown), capsys.readouterr().out)
     assert what is None, what
 

@@ -27,8 +27,8 @@ from drivers.protocol.definition import (
     MESSAGES,
     QUANTITIES,
     STAGED_LIFE,
-    reading,
     sensor_reading,
+    status_reading,
 )
 from drivers.protocol.definition import STATUS as STATUS_RECORD
 from drivers.protocol.records import Number, Record, Refusal, Values, WireQuantity
@@ -183,7 +183,7 @@ def test_trace_has_time_direction_bytes_and_meaning(tmp_path: Path) -> None:
 
 def test_slow_file_drops_and_counts(monkeypatch: pytest.MonkeyPatch) -> None:
     """The caller never waits; the number of dropped records stands in the file."""
-    monkeypatch.setattr(trace, "MAX_PENDING", 10)
+    monkeypatch.setattr(trace, "_MAX_PENDING", 10)
     file, may_go_on, is_writing = Mock(), threading.Event(), threading.Event()
     file.write.side_effect = lambda text: is_writing.set() or may_go_on.wait(60)
     writer = TraceWriter(file)
@@ -400,9 +400,9 @@ def test_reading_has_its_unit_in_its_names_and_the_decimals_of_its_step() -> Non
 def test_added_reading_that_fills_a_word_is_refused(low: int, high: int) -> None:
     """With 0 for not stated it needs two words; one value less, or a start at 1, needs one."""
     with pytest.raises(ValueError, match=f"later must be from {low} to {high - 1}, "):
-        reading("later", "of it", low, high, 10, "V", is_added=True)
+        status_reading("later", "of it", low, high, 10, "V", is_added=True)
     for first, last in ((low, high - 1), (1, 65535)):
-        assert reading("later", "of it", first, last, 10, "V", is_added=True).words == 1
+        assert status_reading("later", "of it", first, last, 10, "V", is_added=True).words == 1
 
 
 @pytest.mark.parametrize(

@@ -20,7 +20,7 @@ from matplotlib.patches import Circle
 from typer.testing import CliRunner
 
 import era_haptics as era
-from era_haptics.drive import as_points, layers_of
+from era_haptics.drive import as_points, playable_layers
 from era_haptics.lab.design import problem
 from kit.plates import make_paper_rig
 from model.answer.answer import Layer
@@ -505,13 +505,13 @@ def test_layers_of_accepts_frequency_drive_and_tone() -> None:
     """
     tone = era.Tone(250.0, 3e-5, 0.1)
     drives = {"SW": 110, "SE": era.Drive(110, level=0.25, phase_deg=-90), "NE": tone}
-    assert layers_of(drives, RIG)[0].excitation == {
+    assert playable_layers(drives, RIG)[0].excitation == {
         "SW": era.Tone(110, 1e-4, 0.0),
         "SE": era.Tone(110, 0.25e-4, -math.pi / 2),
         "NE": tone,
     }
     half = era.Drive(110, level=0.5)
-    (layer,) = layers_of({"SW": [half, era.Drive(90, level=0.5)], "SE": [110]}, RIG)
+    (layer,) = playable_layers({"SW": [half, era.Drive(90, level=0.5)], "SE": [110]}, RIG)
     assert layer.excitations == (
         {"SW": era.Tone(110, 0.5e-4), "SE": era.Tone(110, 1e-4)},
         {"SW": era.Tone(90, 0.5e-4)},
@@ -522,7 +522,7 @@ def test_layers_of_converts_numbers_of_numpy() -> None:
     """Of single precision too, which would go on into every command; 110.5 and 0.25 are exact."""
     drive = era.Drive(np.float32(110.5), level=np.float32(0.25), phase_deg=np.float32(0))  # type: ignore[arg-type]
     assert era.Drive(110, level=np.float64(1.0000000000000002)).level == 1  # of divided weights
-    tone = layers_of({"SW": drive}, RIG)[0].excitation["SW"]
+    tone = playable_layers({"SW": drive}, RIG)[0].excitation["SW"]
     assert tone == era.Tone(110.5, 0.25e-4, 0.0)
     assert {type(tone.frequency), type(tone.amplitude), type(tone.phase)} == {float}
 
@@ -553,7 +553,7 @@ def test_as_points_reads_places(places: object, read: tuple[object, ...]) -> Non
             for places in ((0.1,), (0.1, 0.2, 0.3), "SW", [(0.1, 0.2), (0.3,)], 0.1, None)
         ),
         *(  # of a drive: unknown ERAs, frequencies, more than full stroke of one ERA, a tuple
-            (lambda drive=drive: layers_of(drive, RIG), says)
+            (lambda drive=drive: playable_layers(drive, RIG), says)
             for drive, says in (
                 ({"XX": 110}, "XX'; choose from SW, SE, NE, NW"),
                 ({"XX": era.Tone(110, 1e-4)}, "XX'; choose from SW, SE, NE, NW"),

@@ -23,7 +23,7 @@ from cases import read_yaml, shortly
 from controller.sources.touch import open_source
 from drivers.errors import CommandError
 from drivers.wires.wire import address_of
-from era_haptics.command import run
+from era_haptics.command import run_era
 from era_haptics.lab.design.problem import (
     area_of,
 )
@@ -166,7 +166,7 @@ def outcome_of(command: str) -> tuple[int, str]:
     """Exit status of a command, and its standard error."""
     err = io.StringIO()
     with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(err):
-        status = run(shlex.split(command))
+        status = run_era(shlex.split(command))
     return status, err.getvalue()
 
 

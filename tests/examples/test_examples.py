@@ -31,13 +31,13 @@ import yaml
 
 from benchmarks.weekend.chain import BuiltBoard
 from drivers import opening
-from drivers.by_hand.actions import identify
+from drivers.by_hand.actions import identify_amplifier
 from drivers.errors import CommandError, LinkError
 from drivers.host.group import Group
 from drivers.opening import Lines
 from drivers.playing import AmplifierLayer, AmplifierTone
 from drivers.wires.serial_frames import Frame, encode_frame
-from era_haptics.command import run
+from era_haptics.command import run_era
 from era_haptics.lab.conformance.contract import judge, of_kind
 from kit.clock import judged
 from model.caching import cache_folder
@@ -86,7 +86,7 @@ def test_the_board_is_found_from_the_file_of_its_sensor(tmp_path: Path, capsys) 
     found = tmp_path / "calibrated.yaml"
     believed = shutil.copy(WEEKEND / "rig.yaml", tmp_path)
     arguments = [str(believed), str(WEEKEND / "measured.uff"), "-o", str(found)]
-    assert run(["calibrate", *arguments, "--json"]) == 0
+    assert run_era(["calibrate", *arguments, "--json"]) == 0
     report = json.loads(capsys.readouterr().out)
     assert report["held_out"]["error_after"] < 0.05
     true = BuiltBoard.drawn(load_rig(WEEKEND / "rig.yaml"), 0).rig.plate
@@ -505,7 +505,7 @@ def test_program_serves_a_pseudo_terminal_and_leaves_the_users_alone(tmp_path: P
     assert bare.stderr == "usage: amplifier TTY | --pty\n"
     with subprocess.Popen([program, "--pty"], stdout=subprocess.PIPE, text=True) as running:
         url = running.stdout.readline().strip()
-        assert asyncio.run(identify(url))["serial_number"] == "SMALLEST-1"
+        assert asyncio.run(identify_amplifier(url))["serial_number"] == "SMALLEST-1"
         running.kill()
 
 

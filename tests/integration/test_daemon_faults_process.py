@@ -84,7 +84,7 @@ from sim.far_ends.wire_assignment import FAR_ENDS
 from sim.faults import FaultWindow
 from sim.plant import imperfections
 from sim.plant.imperfections import Imperfections, draw_imperfections, realised
-from sim.plant.plant import SAMPLE_RATE, Plant
+from sim.plant.plant import PLANT_SAMPLE_RATE, Plant
 
 
 @pytest.mark.real_time
@@ -532,10 +532,10 @@ def onset_matches_prediction(played: Played, truth: Truth) -> None:
         plant.set_input(number, realised(terms, errors[era.name]))
     discs = {place: truth.fingertip(place) for place in situation.fingers.values()}
     shapes = plant.reduced.at(np.concatenate(list(discs.values())))
-    _, samples = plant.advance(ONSET, sample_rate=SAMPLE_RATE, shapes=shapes)
+    _, samples = plant.advance(ONSET, sample_rate=PLANT_SAMPLE_RATE, shapes=shapes)
     ends = np.cumsum([len(disc) for disc in discs.values()])[:-1]
     peaks = {
-        place: np.abs(felt_part(part, SAMPLE_RATE)).max(axis=0)
+        place: np.abs(felt_part(part, PLANT_SAMPLE_RATE)).max(axis=0)
         for place, part in zip(discs, np.split(samples, ends, axis=1), strict=True)
     }
     weights = fingertip_weights(*truth.stream.places[situation.felt_at], truth.rig.plate)

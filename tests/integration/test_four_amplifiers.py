@@ -50,7 +50,7 @@ from drivers.by_hand import actions
 from drivers.errors import LinkError, LinkTimeout
 from drivers.host.group import GroupState
 from drivers.opening import Lines
-from era_haptics.command import run
+from era_haptics.command import run_era
 from era_haptics.lab.conformance.contract import opened
 from era_haptics.lab.witness.capture import TimeLimits
 from kit.chain import Chain
@@ -248,7 +248,9 @@ async def _conformance(url: str) -> Any:
         return await client.hello()
 
 
-@pytest.mark.parametrize("action", [actions.identify, actions.status, actions.stop, _conformance])
+@pytest.mark.parametrize(
+    "action", [actions.identify_amplifier, actions.status, actions.stop, _conformance]
+)
 @pytest.mark.parametrize("wire", SERIAL)
 @in_virtual_time
 async def test_command_reaches_it(wire: str, action: Callable[[str], Awaitable[Any]]) -> None:
@@ -269,7 +271,7 @@ async def test_mute_amplifier_is_told_after_a_time(wire: str, told_after: float)
         far.device.inject_fault(FaultWindow(fault="hang"))
         began = threads.now()
         with pytest.raises(LinkTimeout) as told:
-            await actions.identify(far.url)
+            await actions.identify_amplifier(far.url)
         assert threads.now() - began == pytest.approx(told_after, abs=0.6)
         assert ("restarts" in str(told.value)) is (wire == "serial")
 
@@ -418,7 +420,7 @@ def demo(table_cache, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
 
     def run_demo(*arguments):
-        status = run(["demo", *map(str, arguments), "--out", str(tmp_path), "--json"])
+        status = run_era(["demo", *map(str, arguments), "--out", str(tmp_path), "--json"])
         printed = capsys.readouterr()
         return status, printed.out, printed.err
 

@@ -13,7 +13,7 @@ import pytest
 from tables import claims, stiffness_study, tables
 
 from cases import shortly
-from era_haptics.command import run
+from era_haptics.command import run_era
 from era_haptics.lab.paper_figures import SWEEP, PaperFigure, equal_area_points, paper_figures
 from kit.plates import make_paper_rig, small_table, with_strokes, write_rig
 from model.figures import Template, _pages, answer_figure, levels_figure, weak_cells_figure
@@ -51,7 +51,7 @@ def test_a_sheet_has_the_lengths_of_the_board(rig: Path, tmp_path: Path, side: s
     """
     paths = [tmp_path / f"{name}.svg" for name in ("one", "two")]
     for path in paths:
-        assert run(["plate", "template", str(rig), "--side", side, "-o", str(path)]) == 0
+        assert run_era(["plate", "template", str(rig), "--side", side, "-o", str(path)]) == 0
     one, two = (path.read_bytes() for path in paths)
     assert one == two
     assert b"<text" not in one
@@ -77,11 +77,11 @@ def test_pages_of_a_pdf_are_a4_and_cover_the_board(rig: Path, tmp_path: Path, ca
     sensors, path = tmp_path / "sensors.csv", tmp_path / "template.pdf"
     sensors.write_text("sensor,x_m,y_m\nP1,47,41\n", "utf-8")
     arguments = ["plate", "template", str(rig), "--sensors", str(sensors), "-o", str(path)]
-    assert run(arguments) == 2
+    assert run_era(arguments) == 2
     assert re.search(r"sensors\.csv:2: sensor P1 .* 0\.047,0\.041", capsys.readouterr().err)
     assert not path.exists()
     sensors.write_text("sensor,x_m,y_m,input,mv_per_m_s2\nP1,0.1,0.1,1,10\n", "utf-8")
-    assert run(arguments) == 0
+    assert run_era(arguments) == 0
     pages = re.findall(rb"/MediaBox \[ 0 0 ([\d.]+) ([\d.]+) \]", path.read_bytes())
     sizes = np.array(pages, dtype=float) * POINT  # mm
     np.testing.assert_allclose(sizes, [[210, 297]] * 2, atol=0.04)

@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 
 from benchmarks.direct_plate import direct_acceleration
-from drivers.host.amplifier_sensors import measure_tones, read_sensors
+from drivers.host.amplifier_sensors import measure_tones, read_amplifier_sensors
 from drivers.playing import AmplifierTone, Voice, VoiceTransition
 from kit.clock import in_virtual_time
 from kit.plates import apart, lock_in
@@ -36,7 +36,7 @@ from registry import threads
 from registry.limits import HAND_LOAD
 from sim.amplifier.readings import AmplifierClock, Crystal
 from sim.bench.bench import WRONG, Bench, StraightClocks
-from sim.control import SimulationContext, carry_out
+from sim.control import SimulationContext, execute
 from sim.plant.fingers import Accelerometer
 from sim.plant.imperfections import Imperfections, PlateErrors, motion_of
 from sim.plant.plant import FingerPlacement
@@ -155,7 +155,7 @@ async def test_host_measures_at_the_feet_what_the_model_says(coarse_rig: Rig) ->
         await rig.group.apply({"main": tones})
         await rig.beat_until(threads.now() + 4.0)
         main = rig.group.amplifiers["main"]
-        sensors = await read_sensors(main)
+        sensors = await read_amplifier_sensors(main)
         found = await measure_tones(main, frequencies, 0.2)
     assert [each.channel for each in sensors[:5]] == [0, 1, 2, 3, None]
     assert (len(sensors), len(found.sensors), found.state) == (32, 32, "COMPLETE")
@@ -368,7 +368,7 @@ async def test_control_replies_while_the_plate_is_solved(
     context = SimulationContext(Bench(rig, now=0.0))
 
     async def ask(now: float, **request: object) -> dict[str, object]:
-        return await carry_out(context, json.dumps(request).encode(), now=now)
+        return await execute(context, json.dumps(request).encode(), now=now)
 
     assert (await ask(0.1, op="fingers", fingers={"a": PLACE_A}))["ok"]
     assert (await ask(0.4, op="state"))["fingers"] == {"a": list(PLACE_A)}

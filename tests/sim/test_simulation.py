@@ -31,7 +31,7 @@ from drivers.opening import Lines
 from drivers.playing import AmplifierLayer, AmplifierTone
 from drivers.protocol.definition import QUANTITIES, STATES
 from era_haptics.lab.cli import app
-from era_haptics.lab.witness.capture import read_capture
+from era_haptics.lab.witness.capture import read_wire_capture
 from era_haptics.lab.witness.relay import parse_endpoint, relays
 from era_haptics.lab.witness.witness import Witness
 from kit.clock import in_virtual_time
@@ -49,10 +49,10 @@ from processes.firmware_machine import play
 from processes.sound_cards import read_recording
 from registry.limits import GuardLimits
 from sim.bench.bench import Bench
-from sim.control import LINE_MAX, SimulationContext, carry_out, control_socket
+from sim.control import LINE_MAX, SimulationContext, control_socket, execute
 from sim.far_ends.wire_assignment import SimulatedWire
 from sim.plant.imperfections import Imperfections, PlateErrors
-from sim.simulation import SimulationView, draw
+from sim.simulation import SimulationView, render_simulation
 
 LIMITS = GuardLimits(40.0, 500.0, 1.0)
 TIMEOUT = 120  # s; for a loaded machine, not an expectation
@@ -94,7 +94,7 @@ def shown(context: SimulationContext, plate: SimulationView) -> tuple[str, list[
     """The view as text on a usual terminal, and the plate's rows, the top one first."""
     console = Console(width=80, force_terminal=False)
     with console.capture() as capture:
-        console.print(draw(context, plate))
+        console.print(render_simulation(context, plate))
     text = capture.get()
     return text, [line[1:-1] for line in text.splitlines() if line.startswith("|")]
 
@@ -233,7 +233,7 @@ def mode(path: Path) -> int | None:
 
 async def ask(context: SimulationContext, now: float, **request: Any) -> dict[str, Any]:
     """One line of control."""
-    return await carry_out(context, json.dumps(request).encode(), now=now)
+    return await execute(context, json.dumps(request).encode(), now=now)
 
 
 async def test_control_keeps_loads_of_fingers(coarse_rig: Rig) -> None:
@@ -290,7 +290,7 @@ async def test_control_refuses_an_invalid_line(coarse_rig: Rig, line: bytes) -> 
     """The response is a short error, and nothing changes."""
     bench = Bench(coarse_rig, now=1.0)
     await ask(SimulationContext(bench), 1.0, op="fingers", fingers={"a": [0.1, 0.1]})
-    reply = await carry_out(SimulationContext(bench), line, now=1.0)
+    reply = await execute(SimulationContext(bench), line, now=1.0)
     assert reply.keys() == {"error"}
     assert len(reply["error"]) < 300
     assert bench.fingers.layout.positions == {"a": (0.1, 0.1)}
@@ -514,7 +514,9 @@ async def test_witness_relays_a_wire_until_interrupted(
     assert int(out.split()[0]) >= 8  # more where a busy machine has a request repeated
     if room == RLIM_INFINITY:
         assert process.returncode == 0
-        assert sum(len(piece.data) > 0 for piece in read_capture(capture, wires=["wire1"])) >= 6
+        assert (
+            sum(len(piece.data) > 0 for piece in read_wire_capture(capture, wires=["wire1"])) >= 6
+        )
     else:
         assert process.returncode == 2
         _, error = err.decode().splitlines()

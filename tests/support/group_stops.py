@@ -26,7 +26,7 @@ import sim
 from drivers.by_hand import actions
 from drivers.errors import CommandRefused, DriverError, LinkError, Preempted
 from drivers.host.group import Group
-from drivers.host.ledger import SILENCING, StopOutcome
+from drivers.host.ledger import SILENCING_TIME, StopOutcome
 from drivers.host.line import Priority
 from drivers.playing import AmplifierLayer, AmplifierTone
 from drivers.protocol.definition import BOOT_TIME, STATES
@@ -416,7 +416,7 @@ async def _stop_by_command(chain: Stopping, wire: str, tally: Tally, seed: int) 
     loop = asyncio.get_running_loop()
     assert isinstance(loop, VirtualLoop)
     loop.kill_hosts()
-    silent_from = loop.time() + chain.controller.watchdog + SILENCING
+    silent_from = loop.time() + chain.controller.watchdog + SILENCING_TIME
     if not is_early:
         chain.lose_some()
     name = rng.choice([*chain.far.urls])

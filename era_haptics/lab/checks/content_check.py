@@ -12,7 +12,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from controller.content.pattern import Pattern, along, hertz_of
+from controller.content.pattern import Pattern, curve_at, hertz_of
 from controller.content.rendition import (
     CLICK_DURATION,
     SMOOTHING,
@@ -21,11 +21,11 @@ from controller.content.rendition import (
     rendered,
     requested_level,
 )
-from era_haptics.lab.checks.layout_check import Position, loaded_plate
+from era_haptics.lab.checks.layout_check import loaded_plate
 from model.answer.answer import Answer
 from model.answer.plan import answer
 from model.answer.stimulus import Finger, Stimulus, check_level
-from model.arrays import FloatArray, best_of
+from model.arrays import FloatArray, Point, best_of
 from model.drive_modes import UNRESTRICTED
 from model.finger import decibels, fingertip_points, fingertip_weights, over_threshold
 from model.quantities import percent, percent_down
@@ -43,7 +43,7 @@ DEFAULT_POSITIONS = (0.5, 0.5), (0.2, 0.3), (0.35, 0.75), (0.65, 0.2), (0.8, 0.6
 """Positions of a finger as shares of the plate's sides: the middle, often on a nodal line, and four
 that no symmetry of a plate relates."""
 
-MIN_DISTANCE = 0.04
+_MIN_DISTANCE = 0.04
 """Distance [m] from a quiet finger to the default positions."""
 
 _MENTIONED = 0.05  # share of the time off its level, or of energy, that is lost without a word
@@ -71,7 +71,7 @@ class Part:
 class CheckedContent:
     """Content at a finger as it will be felt."""
 
-    at: Position
+    at: Point
     """Of the finger [m]."""
     duration: float
     """[s]"""
@@ -164,8 +164,8 @@ def check_content(
     table: LocalizationTable,
     level_db_sl: float,
     *,
-    at: Position,
-    quiet: Sequence[Position] = (),
+    at: Point,
+    quiet: Sequence[Point] = (),
 ) -> CheckedContent:
     """Play a pattern at a finger, in time on a table's plate with the fingers' weight.
 
@@ -198,13 +198,13 @@ def check_content(
     )
 
 
-def default_positions(plate: Plate, quiet: Sequence[Position] = ()) -> list[Position]:
+def default_positions(plate: Plate, quiet: Sequence[Point] = ()) -> list[Point]:
     """Return the default positions of a finger [m] that are not next to a quiet one [m]."""
     positions = [(u * plate.length, v * plate.width) for u, v in DEFAULT_POSITIONS]
     return [
         position
         for position in positions
-        if all(math.dist(position, other) > MIN_DISTANCE for other in quiet)
+        if all(math.dist(position, other) > _MIN_DISTANCE for other in quiet)
     ]
 
 
@@ -213,8 +213,8 @@ def play_content(
     table: LocalizationTable,
     level_db_sl: float,
     *,
-    at: Position,
-    quiet: Sequence[Position] = (),
+    at: Point,
+    quiet: Sequence[Point] = (),
 ) -> tuple[Rendition, tuple[Part, ...], float, FloatArray]:
     """Play a pattern at a finger in time; arguments and errors as of `check_content`.
 
@@ -322,8 +322,8 @@ def _draw_frequencies(
 ) -> None:
     """Draw frequencies at times [s] (n,) wherever something plays: of the file, and felt."""
     if pattern.intensity:
-        hertz = hertz_of(along(pattern.sharpness, times))
-        is_silent = along(pattern.intensity, times, beyond=0.0) <= 0
+        hertz = hertz_of(curve_at(pattern.sharpness, times))
+        is_silent = curve_at(pattern.intensity, times, beyond=0.0) <= 0
         axes.plot(times, np.where(is_silent, np.nan, hertz), color=_REQUESTED, lw=1)
     starts = [tap.time for tap in pattern.transients]
     sharpness = np.array([tap.sharpness for tap in pattern.transients])

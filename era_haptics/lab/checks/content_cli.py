@@ -9,6 +9,7 @@ import typer
 
 from controller.cli.daemon_cli import Socket, connected
 from model.commands.options import (
+    FAILED,
     JsonOption,
     QuietOption,
     Stopwatch,
@@ -24,7 +25,7 @@ if TYPE_CHECKING:
 
     from controller.content.pattern import Pattern
     from era_haptics.lab.checks.content_check import CheckedContent, Part
-    from era_haptics.lab.checks.layout_check import Position
+    from model.arrays import Point
     from model.table.table import LocalizationTable
 
 _RATE = 48000  # Hz; with 16 bits what all players of sound take
@@ -170,8 +171,6 @@ def _simulate(
 
 content_app = typer.Typer(no_args_is_help=True, help="Check content: AHAP, .haptic, HJIF, WAV.")
 
-FAILED = 1
-
 
 @content_app.command()
 def check(
@@ -247,9 +246,9 @@ class _Setting:
     table: "LocalizationTable"
     table_file: Path | None
     """None for the built-in plate."""
-    positions: "Sequence[Position]"
+    positions: "Sequence[Point]"
     """Positions of the finger [m] to try."""
-    quiet: "Sequence[Position]"
+    quiet: "Sequence[Point]"
     level_db_sl: float
     channel: int | None
     least_share: float

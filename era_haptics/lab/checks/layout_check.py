@@ -17,7 +17,7 @@ from controller.play.selection import Chooser
 from controller.sources.touch import Contact, ContactKey
 from model.answer.answer import Answer, Limits
 from model.answer.answer_report import exposures
-from model.arrays import NEARLY, FloatArray
+from model.arrays import NEARLY, FloatArray, Point
 from model.drive_modes import DRIVE_MODES, UNRESTRICTED
 from model.errors import InputError
 from model.finger import decibels, fingertip_points, fingertip_weights, over_threshold
@@ -29,8 +29,6 @@ from model.transients.base_motion import Bases, ramped_pulse
 from model.transients.shaping import SAMPLE_RATE, Transients
 from model.transients.time_response import PlateInTime, plate_in_time
 from model.vibration import base_amplitudes
-
-Position = tuple[float, float]
 
 STEADY_AFTER, STEADY_FOR = 0.3, 0.1
 """Start and length [s] of the part over which a vibration without a duration is felt."""
@@ -48,8 +46,8 @@ class SimulatedTouch:
     it at full strength (`exposures`); reason: why nothing plays.
     """
 
-    at: Position
-    resting: Position | None
+    at: Point
+    resting: Point | None
     frequencies: tuple[float, ...] = ()
     felt_db_sl: float | None = None
     resting_db_sl: float | None = None
@@ -59,7 +57,7 @@ class SimulatedTouch:
     exposure_m_s2: float = 0.0
 
 
-def loaded_plate(table: LocalizationTable, contacts: Sequence[Position]) -> PlateInTime:
+def loaded_plate(table: LocalizationTable, contacts: Sequence[Point]) -> PlateInTime:
     """A table's plate in time with fingers on it, if they weigh anything."""
     if table.fingertip is None:
         return table.in_time
@@ -85,7 +83,7 @@ class TouchSimulator:
         )
         """Of amplifiers that play whatever the table has."""
 
-    def answered(self, target: Target, at: Position, quiet: Sequence[Position]) -> Answer:
+    def answered(self, target: Target, at: Point, quiet: Sequence[Point]) -> Answer:
         """Answer a target at a position [m] among quiet fingers, along plain ramps.
 
         Raises InputError where nothing can be played.
@@ -98,7 +96,7 @@ class TouchSimulator:
         question = Question((finger, *others), ((finger, target),), ())
         return answered(self.table, question, question.lasting, self.capabilities)
 
-    def touch(self, target: Target, at: Position, resting: Position | None) -> SimulatedTouch:
+    def touch(self, target: Target, at: Point, resting: Point | None) -> SimulatedTouch:
         """Play a target's content at a finger."""
         try:
             answer = self.answered(target, at, [] if resting is None else [resting])
@@ -134,7 +132,7 @@ class TouchSimulator:
     def _levels_at(
         self,
         transients: Transients,
-        at: Position,
+        at: Point,
         bases: Bases,
         *,
         length: float,
@@ -238,7 +236,7 @@ LEVEL_TOLERANCE, MARGIN_TOLERANCE = 2.0, 4.0
 
 _ALIKE = 1.25  # ratio of frequencies that hardly differ in feel
 
-MAX_TOUCHES, MAX_POSITIONS = 30, 120  # of one region, of all
+_MAX_TOUCHES, MAX_POSITIONS = 30, 120  # of one region, of all
 _MIN_STEP = 0.008  # m; nearer touches hardly differ
 _RESTING_AWAY = 0.06  # m; at least, from a touch to a resting finger
 
@@ -300,9 +298,9 @@ class CheckedEffect:
             "effect": self.effect,
             "on": self.on,
             "promised_db_sl": self.promised_db_sl,
-            "felt_db_sl": summary(self.felt),
-            "promised_contrast_db": summary(self.promised_contrasts),
-            "felt_contrast_db": summary(self.contrasts),
+            "felt_db_sl": distribution(self.felt),
+            "promised_contrast_db": distribution(self.promised_contrasts),
+            "felt_contrast_db": distribution(self.contrasts),
             "held_back_db": self.held_back_db,
             "exposure_m_s2": self.exposure_m_s2,
             "frequency_hz": self.frequencies,
@@ -311,7 +309,7 @@ class CheckedEffect:
         }
 
 
-def summary(values: Sequence[float]) -> dict[str, float | None]:
+def distribution(values: Sequence[float]) -> dict[str, float | None]:
     """Return minimum, median and maximum; None without values."""
     if not values:
         return {"min": None, "median": None, "max": None}
@@ -335,7 +333,7 @@ def check_layout(
     simulator = TouchSimulator(table)
     parts = [*layout.uses()]
     checked = []
-    count = max(1, min(MAX_TOUCHES, MAX_POSITIONS // max(1, len(parts))))
+    count = max(1, min(_MAX_TOUCHES, MAX_POSITIONS // max(1, len(parts))))
     for number, (region, on, name) in enumerate(parts):
         progress(number, len(parts))
         checked.append(_check(layout, region, on, name, table, simulator, count))
@@ -352,7 +350,7 @@ def _check(
     simulator: TouchSimulator,
     count: int,
 ) -> CheckedEffect:
-    places, area = raster(layout, region, table.plate, count)
+    places, area = touch_positions(layout, region, table.plate, count)
     start = region.shape.centre if region is not None else (places[0] if places else (0.0, 0.0))
     target = strongest_target(layout, name, region, at=start)
     called = ELSEWHERE if region is None else region.name
@@ -375,9 +373,9 @@ def _check(
     return CheckedEffect(called, name, on, target.level_db_sl, tuple(touches), tuple(problems))
 
 
-def raster(
-    layout: SurfaceLayout, region: Region | None, plate: Plate, count: int = MAX_TOUCHES
-) -> tuple[list[Position], float]:
+def touch_positions(
+    layout: SurfaceLayout, region: Region | None, plate: Plate, count: int = _MAX_TOUCHES
+) -> tuple[list[Point], float]:
     """Return at most so many positions [m], evenly over a region, and the area of each [m²].
 
     Without what later regions cover.
@@ -401,7 +399,7 @@ def raster(
         step *= 1.1
 
 
-def _resting(plate: Plate, at: Position, number: int) -> Position:
+def _resting(plate: Plate, at: Point, number: int) -> Point:
     """Return where a second finger rests: each time in another quarter of the plate."""
     quarters = [(x * plate.length, y * plate.width) for x in (0.25, 0.75) for y in (0.25, 0.75)]
     away = [each for each in quarters if math.dist(each, at) >= _RESTING_AWAY]
@@ -444,7 +442,7 @@ def _unnoticed(
     name: str,
     click: Target,
     *,
-    at: Position,
+    at: Point,
 ) -> Iterator[str]:
     """Short effects whose given level hides below what lasts in the region."""
     if on == ON_RELEASE or not click.is_short or not layout.effects[name].gives_level_in(region):

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from model.commands.options import JsonOption, print_report
+from model.commands.options import FAILED, JsonOption, print_report
 from model.quantities import counted
 
 if TYPE_CHECKING:
@@ -15,8 +15,6 @@ if TYPE_CHECKING:
     from model.arrays import FloatArray
 
 layout_app = typer.Typer(no_args_is_help=True, help="Check surface layouts.")
-
-FAILED = 1
 
 
 @layout_app.command()
@@ -134,7 +132,7 @@ def _matrix(names: "Sequence[str]", promised: "FloatArray") -> list[str]:
 
 
 def _span(values: list[float]) -> str:
-    from era_haptics.lab.checks.layout_check import summary
+    from era_haptics.lab.checks.layout_check import distribution
 
-    found = summary(values)
+    found = distribution(values)
     return f"{found['min']:.1f} to {found['max']:.1f} (median {found['median']:.1f})"

@@ -22,15 +22,14 @@ from controller.play.joint_answers import fingers_of, selection_of
 from controller.sources.touch import Contact, ContactKey
 from era_haptics.lab.checks.layout_check import (
     CheckedEffect,
-    Position,
     SimulatedTouch,
     TouchSimulator,
-    raster,
     strongest_target,
+    touch_positions,
 )
 from model.answer.answer import MIN_CONTRAST_DB, OWN_CONTRAST_DB, Answer
 from model.answer.plan import answer
-from model.arrays import FloatArray, best_of
+from model.arrays import FloatArray, Point, best_of
 from model.figures import draw_eras, label_plate
 from model.processes import Progress, unseen
 from model.quantities import counted
@@ -55,7 +54,7 @@ class JointTouch:
     """
 
     regions: tuple[str, ...]
-    at: tuple[Position, ...]
+    at: tuple[Point, ...]
     contrasts: tuple[float, ...]
     worst_db: float
     verdicts: tuple[str, ...]
@@ -84,7 +83,7 @@ def check_together(
     progress: called with the number of pairs and triples answered, and of all.
     """
     simulator = TouchSimulator(table)
-    targets, places = dict[str, Target](), dict[str, list[Position]]()
+    targets, places = dict[str, Target](), dict[str, list[Point]]()
     for region in layout.regions:
         target, some = _target_in(layout, region), _some_of(layout, region, table)
         if target is not None and some:
@@ -93,7 +92,7 @@ def check_together(
     pairs = _nearest(combinations(regions, 2), MAX_PAIRS)
     triples = _nearest(combinations(regions, 3), MAX_TRIPLES)
     total, found = len(pairs) + len(triples), []
-    worst_in: dict[str, dict[str, Position]] = {each.name: {} for each in regions}
+    worst_in: dict[str, dict[str, Point]] = {each.name: {} for each in regions}
     for number, group in enumerate((*pairs, *triples)):
         progress(number, total)
         spots = [places[each.name] for each in group]
@@ -161,9 +160,9 @@ def _target_in(layout: SurfaceLayout, region: Region) -> Target | None:
     return min(felt, key=lambda each: each.is_short, default=None)
 
 
-def _some_of(layout: SurfaceLayout, region: Region, table: LocalizationTable) -> list[Position]:
+def _some_of(layout: SurfaceLayout, region: Region, table: LocalizationTable) -> list[Point]:
     """Return a few places of a region, the middle first, then each farthest from those before."""
-    left, found = raster(layout, region, table.plate)[0], list[Position]()
+    left, found = touch_positions(layout, region, table.plate)[0], list[Point]()
     while left and len(found) < _POSITIONS:
         if found:
             away = [min(math.dist(at, other) for other in found) for at in left]
@@ -188,12 +187,12 @@ def _worst(
     simulator: TouchSimulator,
     group: Sequence[Region],
     targets: Sequence[Target],
-    spots: Sequence[Sequence[Position]],
+    spots: Sequence[Sequence[Point]],
 ) -> JointTouch | None:
     """Answer at all combinations of places; None where no fingers fit there at once."""
     free = [replace(target, is_own=False) for target in targets]
     steady = [replace(target, modulation_hz=None) for target in free]
-    tried: list[tuple[float, tuple[Position, ...]]] = []
+    tried: list[tuple[float, tuple[Point, ...]]] = []
     for at in product(*spots):
         if all(math.dist(*pair) >= _NEAREST for pair in combinations(at, 2)):
             worst = _answered(simulator, _placed(steady, at), []).promised_worst_db
@@ -215,7 +214,7 @@ def _worst(
     )
 
 
-def _placed(targets: Sequence[Target], at: Sequence[Position]) -> list[_Finger]:
+def _placed(targets: Sequence[Target], at: Sequence[Point]) -> list[_Finger]:
     """Return targets with their contacts."""
     return [
         (Contact(target.key, x, y, since=0.0), target)
@@ -438,7 +437,7 @@ def _draw_touches(
     for each in checked:
         size = _SIZES[min(drawn.get(each.region, 0), len(_SIZES) - 1)]
         drawn[each.region] = drawn.get(each.region, 0) + 1
-        found: dict[Position, float | None] = {}
+        found: dict[Point, float | None] = {}
         for touch in each.touches:
             new, before = value(each, touch), found.get(touch.at)
             if before is None or (new is not None and abs(new) > abs(before)):
@@ -452,6 +451,6 @@ def _draw_touches(
         mark(*_columns(felt), c=[*felt.values()], cmap=colors, norm=norm)
 
 
-def _columns(places: Iterable[Position]) -> FloatArray:
+def _columns(places: Iterable[Point]) -> FloatArray:
     """Return positions [m] as rows x and y [cm], (2, n)."""
     return 100 * np.array([*places], dtype=float).reshape(-1, 2).T

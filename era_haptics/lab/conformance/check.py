@@ -23,12 +23,12 @@ from era_haptics.lab.conformance.judge_client import (
     ContractViolation,
     JudgeClient,
     NotApplicable,
-    Rows,
+    RequestRows,
     TooLate,
     UntimedClock,
     UnusableCapability,
-    expect,
     read_as,
+    verify,
 )
 from era_haptics.lab.conformance.subject import Subject
 from registry import threads
@@ -36,12 +36,12 @@ from registry import threads
 _MAX_TIME = 180.0  # s; after which a run begins no other check
 _RETRIED = 2.0  # s; in which silence is tried again, or identification
 
-Steps: TypeAlias = Callable[[Any], Awaitable[None] | Rows]
+Steps: TypeAlias = Callable[[Any], Awaitable[None] | RequestRows]
 """What a check does with a Subject, or its JudgeClient, or the rows that are carried out."""
 
 
 @dataclass(frozen=True, slots=True)
-class Check:
+class ConformanceCheck:
     """A rule of the contract: its name, what it requires, and the place that says so.
 
     drives: whether it arms the amplifier. kinds: of wires on which it can be tried, empty for all.
@@ -87,7 +87,7 @@ _BARS = {
 class CheckResult:
     """Result of a check, the reason that it was not passed, and what it found."""
 
-    check: Check
+    check: ConformanceCheck
     number: int
     result: Result
     reason: str = ""
@@ -173,12 +173,14 @@ class ConformanceReport:
 
 def reading(
     place: str, *kinds: str, drives: bool = False, greets: bool = False
-) -> Callable[[Steps], Check]:
+) -> Callable[[Steps], ConformanceCheck]:
     """Make a check that only reads of its steps, whose docstring begins with 'It'."""
 
-    def make(steps: Steps) -> Check:
+    def make(steps: Steps) -> ConformanceCheck:
         text = " ".join((steps.__doc__ or "").split()).removeprefix("It ").removesuffix(".")
-        return Check(getattr(steps, "__name__", ""), text, place, drives, kinds, steps, greets)
+        return ConformanceCheck(
+            getattr(steps, "__name__", ""), text, place, drives, kinds, steps, greets
+        )
 
     return make
 
@@ -191,23 +193,23 @@ async def greeted(client: JudgeClient) -> Values:
     """Read the identity of an amplifier of this version; raises ContractViolation."""
     identity = await client.hello()
     versions, client.reply_words = identity["versions"], {}
-    expect(bool(versions >> VERSION & 1), "versions", expected=f"bit {VERSION} set", seen=versions)
+    verify(bool(versions >> VERSION & 1), "versions", expected=f"bit {VERSION} set", seen=versions)
     return identity
 
 
-async def identified(client: JudgeClient, level: float) -> Subject:
+async def _identified(client: JudgeClient, level: float) -> Subject:
     """Identify the amplifier at the far end of a client; raises ContractViolation."""
     if client.known is None:
         identity = await greeted(client)
         answer = await client.exchange(MESSAGES["GetCaps"].number, ())
-        expect(not answer.code, "GetCaps", expected="carried out", seen=answer.code)
+        verify(not answer.code, "GetCaps", expected="carried out", seen=answer.code)
         can = read_as("reply to GetCaps", STATED.unpack, answer.words, is_strict=False)
         client.known = Subject(client, identity, Capabilities(can), level)
     return cast(Subject, client.known)
 
 
 async def run_checks(
-    checks: Sequence[tuple[int, Check]],
+    checks: Sequence[tuple[int, ConformanceCheck]],
     client: JudgeClient,
     *,
     level: float,
@@ -238,7 +240,7 @@ async def run_checks(
 
 
 async def _run(
-    number: int, check: Check, client: JudgeClient, level: float
+    number: int, check: ConformanceCheck, client: JudgeClient, level: float
 ) -> tuple[CheckResult, str]:
     began, doubts = threads.now(), 0
     with client.watching():
@@ -271,7 +273,9 @@ async def _run(
     return result, why and f"{check.name} failed"
 
 
-async def _attempt(check: Check, client: JudgeClient, level: float) -> tuple[CheckOutcome, str]:
+async def _attempt(
+    check: ConformanceCheck, client: JudgeClient, level: float
+) -> tuple[CheckOutcome, str]:
     """Run the steps once; return what they found, and why nothing more can be run, or ""."""
     finding = CheckOutcome()
     subject: Subject | None = None
@@ -280,9 +284,9 @@ async def _attempt(check: Check, client: JudgeClient, level: float) -> tuple[Che
         if check.greets:
             await cast("Awaitable[None]", check.run(client))
         else:
-            subject = await identified(client, level)
+            subject = await _identified(client, level)
             await _carry_out(check, subject, level)
-        expect(
+        verify(
             not client.heard,
             "messages that were not asked for",
             expected="none",
@@ -301,7 +305,7 @@ async def _attempt(check: Check, client: JudgeClient, level: float) -> tuple[Che
     return finding, str(left or "")
 
 
-async def _carry_out(check: Check, subject: Subject, level: float) -> None:
+async def _carry_out(check: ConformanceCheck, subject: Subject, level: float) -> None:
     """Carry out the steps of a check, from rest if it drives."""
     subject.sent_set = []
     if check.drives:
@@ -317,7 +321,7 @@ async def _carry_out(check: Check, subject: Subject, level: float) -> None:
 
 
 async def _left(
-    check: Check, client: JudgeClient, subject: Subject | None, level: float
+    check: ConformanceCheck, client: JudgeClient, subject: Subject | None, level: float
 ) -> CheckOutcome | None:
     """Leave it silent, or identified where it was not; returns why it is not, after a few tries."""
     due = threads.now() + _RETRIED
@@ -327,7 +331,7 @@ async def _left(
                 if subject:
                     await subject.rest()
                 else:
-                    await (greeted(client) if check.greets else identified(client, level))
+                    await (greeted(client) if check.greets else _identified(client, level))
             break
         except (ContractViolation, TooLate) as found:
             if threads.now() > due + client.lag:

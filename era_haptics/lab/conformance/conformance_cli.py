@@ -34,9 +34,9 @@ def conformance(
 ) -> None:
     """Check that an amplifier fulfils the contract. Reads only, unless --write is given."""
     from drivers.by_hand.actions import leave
-    from era_haptics.lab.conformance.contract import LEVEL, judge
+    from era_haptics.lab.conformance.contract import DEFAULT_LEVEL, judge
 
-    level = LEVEL if level is None else level
+    level = DEFAULT_LEVEL if level is None else level
     show = (lambda result: None) if json_ else _show_result
     report = run(judge(url, drives=False, level=level, on_result=show), trace)
     if not write and not json_ and sys.stdin.isatty():

@@ -13,8 +13,8 @@ from drivers.errors import LinkError
 from drivers.protocol.definition import MAX_WORDS
 from drivers.wires.wire import address_of
 from era_haptics.lab.conformance.check import (
-    Check,
     CheckResult,
+    ConformanceCheck,
     ConformanceReport,
     Result,
     run_checks,
@@ -27,15 +27,15 @@ from era_haptics.lab.conformance.checks import (
     state_checks,
 )
 from era_haptics.lab.conformance.judge_client import ContractViolation, JudgeClient, TooLate
-from era_haptics.lab.conformance.subject import LEVEL
+from era_haptics.lab.conformance.subject import DEFAULT_LEVEL
 from registry import threads
 
 __all__ = [
     "CHECKS",
     "CLIENTS",
-    "LEVEL",
-    "Check",
+    "DEFAULT_LEVEL",
     "CheckResult",
+    "ConformanceCheck",
     "ConformanceReport",
     "Result",
     "judge",
@@ -43,7 +43,7 @@ __all__ = [
     "opened",
 ]
 
-CHECKS: tuple[Check, ...] = (
+CHECKS: tuple[ConformanceCheck, ...] = (
     reading_checks.identity,
     reading_checks.capabilities,
     reading_checks.starts_disarmed,
@@ -138,7 +138,7 @@ CHECKS: tuple[Check, ...] = (
 """All checks, in their order of execution."""
 
 
-def of_kind(kind: str) -> list[tuple[int, Check]]:
+def of_kind(kind: str) -> list[tuple[int, ConformanceCheck]]:
     """Return the checks of a kind of wire, each with its number."""
     numbered = enumerate(CHECKS, 1)
     return [(number, check) for number, check in numbered if not check.kinds or kind in check.kinds]
@@ -186,7 +186,7 @@ async def judge(
     url: str,
     *,
     drives: bool,
-    level: float = LEVEL,
+    level: float = DEFAULT_LEVEL,
     on_result: Callable[[CheckResult], None] = lambda result: None,
     before: ConformanceReport | None = None,
 ) -> ConformanceReport:

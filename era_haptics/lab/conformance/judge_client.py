@@ -30,9 +30,9 @@ from drivers.protocol.definition import (
     MESSAGES,
     NAK,
     NAK_RECORD,
-    NAMES,
     QUANTITIES,
     REACTION,
+    REQUEST_NAMES,
     SPAN,
     ahead,
     capability_ranges,
@@ -98,7 +98,7 @@ class TooLate(CheckOutcome):
 
 def message_name(number: int) -> str:
     """Return the name of a message with its number, or the number of one without a name."""
-    name = NAMES.get(number)
+    name = REQUEST_NAMES.get(number)
     return f"{name} (message {number})" if name else f"message {number}"
 
 
@@ -114,7 +114,7 @@ def require_in_time(is_in_time: bool, why: str) -> None:
         raise TooLate(why)
 
 
-def expect(condition: bool, what: str, *, expected: object, seen: object) -> None:
+def verify(condition: bool, what: str, *, expected: object, seen: object) -> None:
     """Raise ContractViolation unless the condition holds."""
     if not condition:
         raise ContractViolation(what, expected=expected, seen=seen)
@@ -122,17 +122,17 @@ def expect(condition: bool, what: str, *, expected: object, seen: object) -> Non
 
 def expect_equal(seen: object, expected: object, what: str) -> None:
     """Raise ContractViolation unless both are equal."""
-    expect(seen == expected, what, expected=expected, seen=seen)
+    verify(seen == expected, what, expected=expected, seen=seen)
 
 
 def expect_within(seen: float, low: float, high: float, what: str) -> None:
     """Raise ContractViolation unless a number is within limits."""
-    expect(low <= seen <= high, what, expected=f"{low:.6g} to {high:.6g}", seen=f"{seen:.6g}")
+    verify(low <= seen <= high, what, expected=f"{low:.6g} to {high:.6g}", seen=f"{seen:.6g}")
 
 
 def expect_one_of(seen: object, known: Collection[object], what: str) -> None:
     """Raise ContractViolation unless something is known."""
-    expect(seen in known, what, expected=" or ".join(map(str, known)), seen=seen)
+    verify(seen in known, what, expected=" or ".join(map(str, known)), seen=seen)
 
 
 _MAX_ATTEMPTS = 20  # of a check with all its cases, for which this machine was late
@@ -142,13 +142,13 @@ _MAX_WASTED = 20.0  # s; of a run, for attempts that came too late
 _LOOK = 0.005  # s; between looks whether this machine is late
 BUSY = 0.02
 """Lateness of this machine [s] with which what is found counts once it is found a few times."""
-REPLY_TIMEOUT = 0.5  # s; far above the reaction, so that a busy machine is no mute amplifier
+JUDGE_REPLY_TIMEOUT = 0.5  # s; far above the reaction, so that a busy machine is no mute amplifier
 _DELIVERED = 1.5  # s; beyond that, for a reply which the machine or line delivers late
 GATEWAY_TIMEOUT = 1.5  # s; in which a gateway says that a unit does not reply
 _MAX_SHOWN = 300  # bytes
 _AT_ONCE = 16  # addresses
 _SILENCE = 0.002  # s; between frames
-QUIET = 0.02  # s; beyond the time of an exchange, in which what is replied to has its reply
+QUIET_TIME = 0.02  # s; beyond the time of an exchange, in which what is replied to has its reply
 _T = TypeVar("_T")
 
 
@@ -234,14 +234,14 @@ class JudgeClient(ABC):
         self.reply_words: dict[int, int] = {}
         self.wire_time: Callable[[int, int], float] = lambda words, reply: 0.0
         self.transit, self.pace = 0.0, 1.0
-        self.timeout = REPLY_TIMEOUT
+        self.timeout = JUDGE_REPLY_TIMEOUT
         self.came = b""
         self.neighbours: frozenset[int] = frozenset()
         self.free = self.attempts = 0
         self.fastest: dict[str, float] = {}
         self.reactions: dict[str, list[float]] = defaultdict(list)
         self.wasted = self.lag = self.lateness = 0.0
-        self.quiet = QUIET
+        self.quiet = QUIET_TIME
         self.session = 0
         self.loss: str | None = None
         self._others: set[int] = set()
@@ -322,7 +322,7 @@ class JudgeClient(ABC):
         await asyncio.sleep(self.quiet)  # in which a late one is heard
         self.heard.clear()
         self.free = next((each for each in addresses if each not in self._others), 0)
-        expect(self.free > 0, "addresses without a reply", expected="one at least", seen="none")
+        verify(self.free > 0, "addresses without a reply", expected="one at least", seen="none")
         self.neighbours = self.neighbours or frozenset(self._others)
 
     async def _is_heard(self, addresses: Sequence[int]) -> bool:
@@ -386,7 +386,7 @@ class JudgeClient(ABC):
     async def expect_silence(self, data: bytes, what: str, *before: bytes) -> None:
         """Send frames, data the last of them, to which nothing must be heard."""
         heard = await self.send(data, *before)
-        expect(not heard, f"replies to {what}", expected="none", seen=heard)
+        verify(not heard, f"replies to {what}", expected="none", seen=heard)
 
     async def send(self, data: bytes, *before: bytes, count: int = 0) -> list[HeardMessage]:
         """Send frames, data the last; return what is heard until a reply must have come.
@@ -571,7 +571,7 @@ class Send:
 Row: TypeAlias = "LayerSet | Send | float | Callable[[], Awaitable[object]] | Sequence[Row]"
 """A layer that plays, a request, a pause [s] in which the watchdog is fed, what is awaited, or a
 course: rows that begin at rest, armed, and are followed until all is settled."""
-Rows: TypeAlias = Sequence[Row]
+RequestRows: TypeAlias = Sequence[Row]
 
 
 def send(
@@ -587,12 +587,12 @@ def send(
     return Send(name, raw, values, layers, (code,) if isinstance(code, str) else code, channels)
 
 
-def play(*layers: LayerSet, now: int = 1, **values: Any) -> Send:
+def play_now(*layers: LayerSet, now: int = 1, **values: Any) -> Send:
     """Make a set that plays at once; values: token, session, code, as of `send`."""
     return send("Set", layers=layers, now=now, **values)
 
 
-stage = partial(play, now=0)
+stage = partial(play_now, now=0)
 """Makes a set that is staged."""
 
 _WORD = 0xFFFF

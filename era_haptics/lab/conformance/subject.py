@@ -25,34 +25,34 @@ from drivers.protocol.sets import Command, Envelope, LayerSet, is_last, pack_lay
 from drivers.wires.wire import reply_words
 from era_haptics.lab.conformance.judge_client import (
     FULL,
-    QUIET,
-    REPLY_TIMEOUT,
+    JUDGE_REPLY_TIMEOUT,
+    QUIET_TIME,
     STATED,
     Capabilities,
     Dating,
     Judge,
     JudgeClient,
     RequestOutcome,
-    Rows,
+    RequestRows,
     Send,
     TooLate,
     When,
-    expect,
     expect_equal,
     expect_one_of,
     layer,
-    play,
+    play_now,
     read_as,
     require,
     require_in_time,
     send,
     stage,
+    verify,
 )
 from era_haptics.lab.expected_amplifier import OFF
 from era_haptics.lab.expected_output import SAMPLE
 from registry import threads
 
-LEVEL = 0.2
+DEFAULT_LEVEL = 0.2
 """Level of driven channels unless another is given: perceptible, and far from any limit."""
 _SAMPLES, _EACH = 12, 0.02  # of a transition; s for which one must be in time
 _PROMPT, _SLOWEST = 0.02, 0.1  # s; exchanges of a quick line, and the longest that count
@@ -66,7 +66,7 @@ _POLL, _OVERSLEPT, _SETTLING = 0.0005, 0.05, 0.02  # s
 _LEAD, _MAX_LATENESS = 0.0025, 0.02
 _READ_ALONE = ("GetCaps", "GetStatus", "GetFaults")  # on Modbus: half an exchange
 _BY_EXCEPTION = ("UNKNOWN_TYPE", "BAD_LENGTH")  # on Modbus, where no channel is named
-RATE = 1 / QUANTITIES["rate"].per_unit
+RATE_STEP = 1 / QUANTITIES["rate"].per_unit
 """Of a clock, of one step of the rate of a Ping."""
 _MOVING = STATES["SWITCHED_ON"], STATES["FAULT_REACTION_ACTIVE"]
 
@@ -91,7 +91,7 @@ class Subject:
         self.dating = Dating()
         self._moment = 0  # of the Commit that named one last, a high word of its clock
         self._parts: list[tuple[float, Values, int]] = []  # without a reply, when sent, words
-        client.quiet = REPLY_TIMEOUT
+        client.quiet = JUDGE_REPLY_TIMEOUT
         self.heard_at = threads.now()
         self.channels, layers = range(can["channels"]), can["layers"]
         client.reply_words = {
@@ -207,8 +207,8 @@ class Subject:
         ]
         shaped = layer(0, begins[0]), layer(1, ends[1]), layer(2, ends[2]), layer(3, begins[3])
         return [
-            [play(layer(1, tones[1]), layer(2, tones[2]), *others), play(*changes)],
-            [play(*shaped), play(layer(2), layer(3, other, after=True))],
+            [play_now(layer(1, tones[1]), layer(2, tones[2]), *others), play_now(*changes)],
+            [play_now(*shaped), play_now(layer(2), layer(3, other, after=True))],
         ]
 
     def envelope(self, step: float, *amplitudes: complex) -> Envelope:
@@ -244,7 +244,7 @@ class Subject:
 
     # Requests
 
-    async def run(self, rows: Rows) -> None:
+    async def run(self, rows: RequestRows) -> None:
         """Carry rows out in turn; after each, the status must show what is expected.
 
         A reply that is a status counts as that, but the last.
@@ -268,7 +268,7 @@ class Subject:
             ):
                 await self.status()
 
-    async def _course(self, rows: Rows) -> None:
+    async def _course(self, rows: RequestRows) -> None:
         await self.arm()
         await self.run(rows)
         await self.follow()
@@ -328,7 +328,7 @@ class Subject:
         answer = await client.exchange(message.number, raw)
         self._check_fed()  # or it may have been carried out after the watchdog
         took = threads.now() - sent
-        client.quiet = min(client.quiet, QUIET + took)
+        client.quiet = min(client.quiet, QUIET_TIME + took)
         before = self._parts_came(answer.when.latest)
         if self.expected is not None:
             self.expected.sets.expire(self.dating.interval(answer.when))
@@ -420,7 +420,7 @@ class Subject:
         if shown["state"] != ENABLED:
             dating.pace = 1.0
         elif name == "Ping":
-            dating.pace = 1 + values["rate"] * RATE
+            dating.pace = 1 + values["rate"] * RATE_STEP
         return dated if name == "GetStatus" else dating.between(between.earliest, dated.latest)
 
     async def _learn_achieved(self, token: int, *, is_exact: bool) -> None:
@@ -552,7 +552,7 @@ class Subject:
 
     async def play(self, *layers: LayerSet) -> RequestOutcome:
         """Play a set at once."""
-        return await self.send(play(*layers))
+        return await self.send(play_now(*layers))
 
     async def send_all(self, rows: Sequence[Send]) -> None:
         """Send requests in one go, without a look at the status between."""
@@ -674,7 +674,7 @@ class Subject:
         due, reply = threads.now() + _SETTLED, reply or await self.status()
         while any(reply["levels"]) or reply["state"] in (*_MOVING, ENABLED):
             seen = f"{name_of(STATES, reply['state'])}, levels {reply['levels']}"
-            expect(threads.now() < due, "silence", expected=f"within {_SETTLED:g} s", seen=seen)
+            verify(threads.now() < due, "silence", expected=f"within {_SETTLED:g} s", seen=seen)
             await asyncio.sleep(_POLL)
             reply = await self.status()
         return reply

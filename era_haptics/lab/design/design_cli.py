@@ -93,7 +93,7 @@ def design(
 
     Ctrl-C prints the layouts that were found so far and writes them as a file for --layouts.
     """
-    from era_haptics.lab.design.design_run import UnfinishedDesign, summary, write_design
+    from era_haptics.lab.design.design_run import UnfinishedDesign, design_summary, write_design
     from era_haptics.lab.design.design_run import design as find
     from model.config.document import read_document
     from model.rig.rig_file import rig_of
@@ -131,7 +131,7 @@ def design(
         _report_unfinished(unfinished, rig_file, output, as_json=as_json)
         raise
     files = [str(path) for path in write_design(output, found, document.data)]
-    result = {**summary(found), "time_s": time.perf_counter() - started, "files": files}
+    result = {**design_summary(found), "time_s": time.perf_counter() - started, "files": files}
     _warn_of_light(result["eras"])
     table = output / "table.npz"
     rows = [

@@ -36,8 +36,8 @@ from model.config.fields import section_by_kind
 from model.errors import (
     MAX_VALUE,
     InputError,
-    expect,
     expect_between,
+    expect_instance,
     expect_number,
     expect_path,
     is_whole,
@@ -49,7 +49,7 @@ from model.files.csv_file import write_columns
 from model.finger import STRONG_DB_SL
 from model.processes import Progress, check_progress, on_cluster, on_processes, unseen
 from model.quantities import counted
-from model.rig.actuator_keys import KINDS
+from model.rig.actuator_keys import ACTUATOR_KINDS
 from model.rig.rig import Channel, Rig
 from model.rig.rig_file import rig_of
 from model.rig.rig_writing import stated
@@ -63,7 +63,7 @@ from model.structure.exciter import Actuator
 from model.table.table import LocalizationTable
 from model.table.table_file import build_table
 
-MAX_CHANNELS = 4
+_MAX_CHANNELS = 4
 """Channels of an amplifier beyond the rig's own ones."""
 
 SENSITIVITY_STEP = 0.005
@@ -321,7 +321,7 @@ def design(
         >>> designed = era.design(rig, 4, layouts="random:6", finalists=2)
         >>> better = designed.best.rig
     """
-    expect(rig, Rig, what="rig", made_by='era.load_rig("rig.yaml")')
+    expect_instance(rig, Rig, what="rig", made_by='era.load_rig("rig.yaml")')
     check_progress(progress)
     requested: Any = len(rig.eras) if eras is None else eras
     counts = [requested] if is_whole(requested) or isinstance(requested, str) else requested
@@ -330,7 +330,7 @@ def design(
         ("keep", keep, '["SW"]'),
         ("stiffness", stiffness, "[17e3]"),
     ):
-        expect(row, Sequence, what=what, made_by=made_by)
+        expect_instance(row, Sequence, what=what, made_by=made_by)
     for what, value, least in (
         *(("eras", each, 1) for each in (*counts, len(counts))),
         ("contents", contents, 1),
@@ -522,10 +522,10 @@ def _answers(problems: Sequence[DesignProblem], task: tuple[int, FloatArray | No
     """What positions of ERAs, None for the rig's own, give on fresh contact sets."""
     problem, positions = problems[task[0]], task[1]
     rig = problem.rig if positions is None else problem.rig_with(positions)
-    return judge(rig, problem.judged_sets(), contents=problem.contacts.contents)
+    return assess(rig, problem.judged_sets(), contents=problem.contacts.contents)
 
 
-def judge(rig: Rig, sets: Sequence[FloatArray], *, contents: int = 1) -> Assessment:
+def assess(rig: Rig, sets: Sequence[FloatArray], *, contents: int = 1) -> Assessment:
     """What a rig's table answers at contact sets (fingers, 2) [m], fingers with contents first.
 
     For contents of STRONG_DB_SL, where it cannot be reached for the highest found, none of which is
@@ -566,7 +566,7 @@ def write_design(folder: Path, design: Design, data: Mapping[str, Value]) -> lis
     write_columns(
         table, {"rank": range(1, len(rows) + 1), **columns, "at_m": at, "contrast_db": contrast}
     )
-    pictures = {"contrast.png": contrast_figure, "count.png": count_figure}
+    pictures = {"contrast.png": _contrast_figure, "count.png": count_figure}
     for name, figure in pictures.items():
         save_figure(figure(design), folder / name)
     template = folder / "template.svg"
@@ -636,22 +636,22 @@ def _damped(section: Mapping[str, Any], damping: float) -> dict[str, Any]:
 
 def _instead_of(key: str, section: Mapping[str, Any]) -> tuple[str, ...]:
     """Keys that one replaces in an actuator of the section's kind."""
-    return section_by_kind([*KINDS.values()], section).instead.get(key, ())
+    return section_by_kind([*ACTUATOR_KINDS.values()], section).instead.get(key, ())
 
 
 def _free_channels(rig: Rig, kept: tuple[str, ...], *, count: int) -> list[Channel]:
-    """The rig's channels without those of kept ERAs, and further amplifiers of MAX_CHANNELS."""
+    """The rig's channels without those of kept ERAs, and further amplifiers of _MAX_CHANNELS."""
     free = [channel for name, channel in rig.wiring.items() if name not in kept]
     names = (
         name for number in range(2, 99) if (name := f"amplifier{number}") not in rig.amplifiers
     )
     while len(free) < count:
         name = next(names)
-        free += [Channel(name, number) for number in range(MAX_CHANNELS)]
+        free += [Channel(name, number) for number in range(_MAX_CHANNELS)]
     return free
 
 
-def summary(design: Design) -> dict[str, Any]:
+def design_summary(design: Design) -> dict[str, Any]:
     """The design for JSON."""
     problem, best = design.problem, design.best
     eras, rig = best.eras, problem.rig
@@ -757,7 +757,7 @@ def _row(layout: RankedLayout) -> dict[str, Any]:
     }
 
 
-def contrast_figure(design: Design) -> Figure:
+def _contrast_figure(design: Design) -> Figure:
     """Promised felt contrast of fresh contact sets at their contents, a panel by quiet fingers."""
     contents = design.problem.contacts.contents
     plate, judged = design.problem.rig.plate, design.best.answers

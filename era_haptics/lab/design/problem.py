@@ -22,16 +22,16 @@ from pydantic import ConfigDict, Field, Strict
 from model.arrays import FloatArray, IntArray, best_of, least_gap
 from model.config.document import read_bytes, read_document
 from model.config.fields import (
-    Point,
     PointSection,
     Polygon,
     PolygonSection,
     Quantity,
     Rectangle,
+    RegionShape,
     Section,
-    Shape,
     ShapedSection,
     Validation,
+    _Point,
     box_of,
 )
 from model.config.units import LENGTH
@@ -97,10 +97,10 @@ DEFAULT_ERA_GAP = 0.03
 
 _JUDGED_SEED = 0x5EED  # added to that of a search, whose own sets are others
 
-OWN = "own"
+_OWN = "own"
 """Name of the rig's own layout."""
 
-MAX_LAYOUTS = 1_000_000
+_MAX_LAYOUTS = 1_000_000
 
 _RANDOM = re.compile(r"random:(\d{1,9})")
 _TRIES = 20  # draws for each layout, of which some are there already
@@ -405,14 +405,14 @@ def contact_rule(path: Path | None, plate: Plate, contents: int = 1) -> ContactR
 
 
 def _drawn(
-    shapes: Sequence[Shape], plate: Plate, rng: np.random.Generator, count: int
+    shapes: Sequence[RegionShape], plate: Plate, rng: np.random.Generator, count: int
 ) -> FloatArray:
     """Draw each finger in one of some shapes, each as likely as another."""
     chosen = rng.integers(len(shapes), size=count)
     return np.array([_place_in(shapes[number], plate, rng) for number in chosen])
 
 
-def _place_in(shape: Shape, plate: Plate, rng: np.random.Generator) -> Point:
+def _place_in(shape: RegionShape, plate: Plate, rng: np.random.Generator) -> _Point:
     """A place [m] of the plate in a shape; raises InputError where there is none."""
     box = box_of(shape)
     for _ in range(_MAX_TRIES):
@@ -630,8 +630,8 @@ def layouts_of(text: str, problem: DesignProblem) -> NamedLayouts:
     if found is None:
         return _layouts_of_file(Path(text), problem)
     count = int(found[1])
-    if not 1 <= count <= MAX_LAYOUTS:
-        raise InputError(f"layouts must be random:1 to random:{MAX_LAYOUTS}, got {text}")
+    if not 1 <= count <= _MAX_LAYOUTS:
+        raise InputError(f"layouts must be random:1 to random:{_MAX_LAYOUTS}, got {text}")
     return random_layouts(problem, count)
 
 
@@ -656,7 +656,7 @@ def random_layouts(problem: DesignProblem, count: int) -> NamedLayouts:
 def _different_layouts(problem: DesignProblem, count: int) -> Iterator[tuple[str, FloatArray]]:
     """Names, empty for random ones, and positions."""
     if len(problem.rig.eras) == problem.count and not problem.kept:
-        yield OWN, problem.own_positions
+        yield _OWN, problem.own_positions
     kept = problem.kept_positions
     for layout in named_layouts(problem.count - len(kept)):
         others = layout.positions(problem.rig.plate)

@@ -47,13 +47,13 @@ from model.rig.rig import Rig
 from model.structure.attachments import coupled_forces
 from model.structure.exciter import Actuator
 
-LEVEL_RESERVE = 1.2
+_LEVEL_RESERVE = 1.2
 """Factor on the wanted level for what nine of ten plates need beyond the nominal plate."""
 
 BEST_FREQUENCIES = 3
 """Frequencies of each set at which the maximum over the quiet fingers is minimised."""
 
-LAWSON_STEPS = 2
+_LAWSON_STEPS = 2
 
 LEVEL_PENALTY = 0.1
 """Decibels of score for one of level: with 1 in place of 0 to 0.15 scores follow answers less."""
@@ -110,7 +110,7 @@ class Scorer:
         finger = np.zeros(len(frequencies)) if tip is None else tip.dynamic_stiffness(self._omega)
         self._finger = finger.astype(np.complex64)[:, None]
         self._contents = contents
-        least = LEVEL_RESERVE * contents * 10 ** (STRONG_DB_SL / 20)
+        least = _LEVEL_RESERVE * contents * 10 ** (STRONG_DB_SL / 20)
         threshold = detection_threshold(frequencies, rig.threshold)
         self._required = (least * threshold).astype(np.float32)
         self._free = solve_free_plate(rig.plate, rig.mesh, frequency_max=float(frequencies.max()))
@@ -251,13 +251,13 @@ class Scorer:
         R = power[rows[..., None], quiet]  # (kept, s, q, n, n)
         best = np.full(s, -np.inf)
         shares = np.ones((kept, s, q), dtype=np.float32)
-        for step in range(LAWSON_STEPS + 1):
+        for step in range(_LAWSON_STEPS + 1):
             each = w[:, :, None]
             expected = np.vecdot(each, np.matvec(R, each)).real
             peak = np.abs(np.vecdot(c, w))
             score = peak**2 / np.maximum(expected.max(axis=2), _LEAST)
             best = np.maximum(best, self._decibels(score, c, w, rows).max(axis=0))
-            if step < LAWSON_STEPS:
+            if step < _LAWSON_STEPS:
                 shares = shares * np.sqrt(np.maximum(expected, _LEAST))
                 shares /= shares.sum(axis=2, keepdims=True)
                 mean = (shares[:, :, None] @ R.reshape(kept, s, q, -1)).reshape(kept, s, n, n)

@@ -43,7 +43,14 @@ from model.files.csv_file import read_lines, write_columns
 LOW, HIGH = 10.0, 1000.0
 """Frequencies [Hz] between which a resonance is sought."""
 
-NAMES = ("resistance", "inductance", "semi_inductance", "motional_resistance", "resonance", "q")
+CIRCUIT_NAMES = (
+    "resistance",
+    "inductance",
+    "semi_inductance",
+    "motional_resistance",
+    "resonance",
+    "q",
+)
 """Fitted values, in ohm, H, ohm s^0.5, ohm, Hz and 1."""
 
 INDUCTANCE_AT = 300.0
@@ -99,7 +106,7 @@ class ImpedanceSetup:
 
 @dataclass(frozen=True, eq=False)
 class Circuit:
-    """A fitted impedance: values in the order of NAMES, their covariance, and the misfit.
+    """A fitted impedance: values in the order of CIRCUIT_NAMES, their covariance, and the misfit.
 
     misfit: root mean square of the differences, relative.
     """
@@ -110,10 +117,10 @@ class Circuit:
 
     def __getitem__(self, name: str) -> float:
         """A value by its name."""
-        return float(self.values[NAMES.index(name)])
+        return float(self.values[CIRCUIT_NAMES.index(name)])
 
 
-def fitted(frequencies: FloatArray, impedance: ComplexArray, *, what: str) -> Circuit:
+def fit_circuit(frequencies: FloatArray, impedance: ComplexArray, *, what: str) -> Circuit:
     """Fit the circuit to an impedance (f,) [ohm] at frequencies (f,) [Hz].
 
     Errors are taken as relative, and their size from the misfit. what: names the run. Raises
@@ -131,7 +138,7 @@ def fitted(frequencies: FloatArray, impedance: ComplexArray, *, what: str) -> Ci
             "and that the first input is before the resistor, the second one over it"
         )
     found = _fit(frequencies, impedance)
-    peak = NAMES.index("motional_resistance")
+    peak = CIRCUIT_NAMES.index("motional_resistance")
     error = np.sqrt(found.covariance[peak, peak])
     if not (found.values[peak] > _CLEAR * error and LOW < found["resonance"] < HIGH):
         raise InputError(
@@ -190,7 +197,9 @@ def exciter_values(
     covariance = block_diag(*(each.covariance for each in runs), np.diag(bench.errors**2))
 
     def values(x: FloatArray) -> dict[str, float]:
-        named = [dict(zip(NAMES, x[6 * n : 6 * n + 6], strict=True)) for n in range(len(runs))]
+        named = [
+            dict(zip(CIRCUIT_NAMES, x[6 * n : 6 * n + 6], strict=True)) for n in range(len(runs))
+        ]
         one, (weight, by_base, resistor, ratio) = named[-1], x[-4:]
         coil = bench.coil or 0.0
         if len(runs) == 2:

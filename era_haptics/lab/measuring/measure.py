@@ -37,10 +37,10 @@ from era_haptics.lab.measuring.sound_card import (
     SoundCard,
     WiredSensor,
     converters,
-    default_frequencies,
     estimate,
+    multisine_frequencies,
     open_card,
-    play,
+    play_and_record,
     read_sensors,
     run_time,
 )
@@ -67,7 +67,7 @@ _AS_LATE = 0.02  # of the gain; one sample more at 500 Hz and 48 kHz makes 0.065
 _SAME = 1e-3  # of periods; a lost block makes them differ by 0.8
 
 
-def is_whole(periods: FloatArray, *, samples: int) -> bool:
+def has_all_blocks(periods: FloatArray, *, samples: int) -> bool:
     """Whether all periods of the loop-back (n,) are alike: no block was lost between them.
 
     Not so where it is silent, which tells nothing.
@@ -102,7 +102,7 @@ def latency(response: ComplexArray, frequencies: FloatArray) -> float:
     return float(nearest - slope / (2 * np.pi))
 
 
-TOLERANCE = 2e-6
+_TOLERANCE = 2e-6
 """Of a clock; 13 s of measuring turn 500 Hz by 5 degrees."""
 
 _MAX_DRIFT = 1e-3  # a lost block of 64 samples at 48 kHz looks like more
@@ -130,7 +130,7 @@ def certain_drift(multisine: Multisine, runs: Sequence[FloatArray]) -> float:
     rest = phases - slopes * relative
     error = np.sqrt(float((weights**2 * slopes**2 * rest**2).sum())) / moment
     alike = np.abs((turned * np.exp(-1j * slopes * relative)).sum()) / max(weights.sum(), 1e-300)
-    is_large = max(TOLERANCE, _SURE * error) < abs(relative) < _MAX_DRIFT
+    is_large = max(_TOLERANCE, _SURE * error) < abs(relative) < _MAX_DRIFT
     return relative if is_large and alike > _ALIKE else 0.0
 
 
@@ -199,7 +199,7 @@ def check_wiring(found: ResponseEstimate, desk: Desk) -> None:
         )
 
 
-def check_clocks(multisine: Multisine, recorded: Sequence[FloatArray], desk: Desk) -> None:
+def _check_clocks(multisine: Multisine, recorded: Sequence[FloatArray], desk: Desk) -> None:
     """Raise InputError for inputs with another clock than the outputs'; runs (n, inputs) each."""
     found = [
         f"{1e6 * drift:.0f} millionths at {name} (input {n})"
@@ -285,11 +285,11 @@ def play_run(
         if before is not None:  # a block that was lost between two runs changes the delay
             changed = np.abs(loopback_gain(desk, multisine, number, kept) - before).max()
             is_late = bool(changed > _AS_LATE * np.abs(before).max())
-        return not is_late and is_whole(kept[:, desk.input - 1], samples=multisine.samples)
+        return not is_late and has_all_blocks(kept[:, desk.input - 1], samples=multisine.samples)
 
     seconds = run_time(periods, settling=desk.settling)
     signal = desk.on_outputs(multisine.signal(number, periods=seconds / PERIOD))
-    return play(
+    return play_and_record(
         card,
         signal,
         settling=desk.settling,
@@ -299,7 +299,7 @@ def play_run(
     )
 
 
-LEVEL = 0.3
+_LEVEL = 0.3
 """Usual largest sample of each output."""
 
 
@@ -344,11 +344,11 @@ def open_desk(
     level: None for 0.3, or less where the rig's limits allow less; frequencies (f,) [Hz], None for
     odd ones within its limits. Raises InputError, LinkError.
     """
-    level = min(LEVEL, desk.highest) if level is None else level
+    level = min(_LEVEL, desk.highest) if level is None else level
     desk.check(level)
     if frequencies is None:
         limits = desk.rig.limits
-        frequencies = default_frequencies(limits.frequency_min, limits.frequency_max)
+        frequencies = multisine_frequencies(limits.frequency_min, limits.frequency_max)
     desk.check_frequencies(frequencies, what="--frequencies")
     with closing(open_card(device, outputs=desk.output, inputs=desk.input, limit=level)) as card:
         yield card, Multisine(frequencies, len(desk.sources), card.rate, level, seed)
@@ -385,7 +385,7 @@ def measure(
     # Another signal than the loop-back's, or another clock, looks like lost blocks; that is the
     # cause to be told.
     check_wiring(found, desk)
-    check_clocks(multisine, recorded, desk)
+    _check_clocks(multisine, recorded, desk)
     whole = [run.whole for run in runs]
     check_coherence(found, whole, desk, is_heard=is_heard)
     looped, columns = found.values[:, desk.input - 1, desk.looped], desk.columns

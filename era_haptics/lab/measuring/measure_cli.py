@@ -270,11 +270,11 @@ def impedance(
     holds nine of ten.
     """
     from era_haptics.lab.measuring.impedance import (
+        CIRCUIT_NAMES,
         LINES,
-        NAMES,
         ImpedanceSetup,
         exciter_values,
-        fitted,
+        fit_circuit,
         measured_impedance,
         read_impedance,
         write_impedance,
@@ -283,7 +283,7 @@ def impedance(
     from model.files.output_paths import check_ending, check_place
 
     circuits = {
-        name: fitted(*read_impedance(path), what=f"--{name} {path}")
+        name: fit_circuit(*read_impedance(path), what=f"--{name} {path}")
         for name, path in (("free", free_file), ("glued", glued_file))
         if path is not None
     }
@@ -310,7 +310,7 @@ def impedance(
             found = measured_impedance(
                 card, inputs=taken, series=series, level=level, periods=periods, move=_moved
             )
-        circuits[name] = fitted(*found, what=device)  # what is no exciter is not written
+        circuits[name] = fit_circuit(*found, what=device)  # what is no exciter is not written
         write_impedance(output, *found)
     runs = circuits.get("free", circuits.get("measured")), circuits.get("glued")
     values = exciter_values(*runs, bench)
@@ -331,7 +331,8 @@ def impedance(
     ]
     answer = {
         "runs": {
-            name: dict(zip(NAMES, each.values.tolist(), strict=True)) | {"misfit": each.misfit}
+            name: dict(zip(CIRCUIT_NAMES, each.values.tolist(), strict=True))
+            | {"misfit": each.misfit}
             for name, each in circuits.items()
         },
         "resonance_is": "mounted" if "glued" in circuits else "free",

@@ -31,7 +31,7 @@ from era_haptics.lab.measuring.sound_card import (
     Desk,
     WiredSensor,
     are_positions,
-    default_frequencies,
+    multisine_frequencies,
 )
 from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError
@@ -42,7 +42,7 @@ from model.estimate.measurement import (
     write_responses,
 )
 from model.files.csv_file import read_lines
-from model.files.uff import read_bytes
+from model.files.uff import read_measured_bytes
 from model.files.wav_file import samples_of
 from model.quantities import counted
 from model.reduction.free_plate import solve_free_plate
@@ -75,10 +75,10 @@ class SteppedTone:
     ratios: ComplexArray
 
 
-def tones_of(path: Path, sensors: Sequence[WiredSensor], eras: Sequence[str]) -> list[SteppedTone]:
+def _tones_of(path: Path, sensors: Sequence[WiredSensor], eras: Sequence[str]) -> list[SteppedTone]:
     """Tones of a recording of sensors, that ERAs played; raises InputError, with the time."""
     try:
-        rate, samples = samples_of(read_bytes(path))
+        rate, samples = samples_of(read_measured_bytes(path))
         if not _MIN_RATE <= rate <= _MAX_RATE:
             raise InputError(f"rate must be {_MIN_RATE} to {_MAX_RATE} Hz, got {rate} Hz")
         first = max(sensor.input for sensor in sensors)
@@ -243,7 +243,7 @@ def _of_recording(path: Path, desk: Desk) -> Iterator[MeasuredValue]:
     names = [name for name, _ in desk.eras]
     if "-" in path.stem:
         names = [_era(desk, _in_name(path, 1, "output"), str(path))]
-    for tone in tones_of(path, sensors, names):
+    for tone in _tones_of(path, sensors, names):
         for sensor, ratio in zip(sensors, tone.ratios.tolist(), strict=True):
             if not cmath.isnan(ratio):
                 yield _value(desk, tone.era, sensor, tone.frequency, ratio, tone.place)
@@ -334,7 +334,7 @@ def measured_by_simulation(
     rig, sensors = desk.rig, desk.sensors
     limits, drawn = rig.limits, draw_imperfections(rig, seed=seed)
     if frequencies is None:
-        frequencies = default_frequencies(limits.frequency_min, limits.frequency_max)
+        frequencies = multisine_frequencies(limits.frequency_min, limits.frequency_max)
     desk.check_frequencies(frequencies, what="--frequencies")
     real = drawn.plate.realised(rig)
     plate = solve_free_plate(real.plate, real.mesh, frequency_max=limits.frequency_max)

@@ -40,7 +40,7 @@ from model.rig.rig_file import load_rig
 from model.rig.rig_writing import save_beside
 from registry.plugins import did_you_mean
 
-TONE = 160.0
+_TONE = 160.0
 """Usual frequency [Hz] of the tone: felt well, and soft in air."""
 
 BURST, PAUSE = 0.4, 0.2
@@ -68,7 +68,7 @@ def tone(
     """
     limits, ramp = desk.rig.limits, BURST / 4
     if frequency is None:
-        frequency = float(np.clip(TONE, limits.frequency_min, limits.frequency_max))
+        frequency = float(np.clip(_TONE, limits.frequency_min, limits.frequency_max))
     desk.check_frequencies(np.array([frequency]), what="--frequency")
     desk.check_times(seconds=BURST, slew=np.pi / 2 * level / ramp)
     times = np.arange(round(BURST * rate)) / rate
@@ -93,7 +93,7 @@ class OutputFinding:
     verdict: str = "ok"
 
 
-def listen(
+def listen_to_outputs(
     desk: Desk,
     card: SoundCard,
     beside: int,
@@ -122,10 +122,10 @@ def listen(
         ]
         check_levels(np.concatenate(runs), {beside: f"sensor beside {era.name}"})
         found.append([estimate(sines, [run[:, [beside - 1]]]) for run in runs])
-    return judged(desk.rig, sines.frequencies, found)
+    return _judged(desk.rig, sines.frequencies, found)
 
 
-def judged(
+def _judged(
     rig: Rig, frequencies: FloatArray, found: Sequence[Sequence[ResponseEstimate]]
 ) -> list[OutputFinding]:
     """What each output drives, by the responses beside each actuator at frequencies (f,) [Hz].
@@ -234,7 +234,7 @@ def find_outputs(
         if beside is None:
             heard = _requested(desk, card, count, level=level, frequency=frequency)
         else:
-            heard = listen(desk, card, beside, outputs=count, level=level, move=_moved)
+            heard = listen_to_outputs(desk, card, beside, outputs=count, level=level, move=_moved)
     own = {name: at - 1 for name, at in desk.eras}
     channels = {each.era: each.output - 1 for each in heard if each.era}
     missing = [name for name in own if name not in channels]

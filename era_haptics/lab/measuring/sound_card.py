@@ -37,7 +37,7 @@ from model.rig.rig import Rig
 from model.structure.attachments import footprints_of
 from model.structure.plate import Plate
 from model.transients.time_response import plate_in_time
-from sim.soft_amp.engine import address_of
+from sim.soft_amp.engine import callback_address
 from sim.soft_amp.jack import JackClient, jack_name, libjack
 from sim.soft_amp.output import portaudio_device, portaudio_stream, sounddevice
 
@@ -141,7 +141,7 @@ def ramped(samples: FloatArray, count: int) -> FloatArray:
     return samples * shape
 
 
-def default_frequencies(low: float, high: float) -> FloatArray:
+def multisine_frequencies(low: float, high: float) -> FloatArray:
     """Odd whole frequencies [Hz] in steps of 10 from above a lowest to below a highest one."""
     odd = np.arange(1.0, high + 1e-9, 2)
     odd = odd[odd >= low]
@@ -247,7 +247,7 @@ class DeviceLost(LinkError):
     """A device that is gone, or takes no samples, in the middle of a run."""
 
 
-CLIENT = "era-measure"
+_CLIENT = "era-measure"
 _BLOCK = 512  # frames; late samples are worse than a delay, which is measured
 
 
@@ -288,8 +288,8 @@ class SoundCard:
         ports.frame_time = ctypes.cast(library.jack_last_frame_time, ctypes.c_void_p)
         self._transfer.ports = ctypes.addressof(ports)
         callbacks = {
-            "jack_set_process_callback": address_of("transfer_jack_process"),
-            "jack_on_shutdown": address_of("transfer_jack_shutdown"),
+            "jack_set_process_callback": callback_address("transfer_jack_process"),
+            "jack_on_shutdown": callback_address("transfer_jack_shutdown"),
         }
         client.start(callbacks, self.given)
 
@@ -352,7 +352,7 @@ def open_card(device: str, *, outputs: int, inputs: int, limit: float) -> SoundC
     card = SoundCard(outputs=outputs, inputs=inputs, limit=limit)
     kind, _, other = device.partition(":")
     if kind == "jack":
-        card.name, client = jack_name(other), JackClient(CLIENT)
+        card.name, client = jack_name(other), JackClient(_CLIENT)
         try:
             client.wire(other, outputs=outputs, inputs=inputs)
             card.play_through(client)
@@ -365,7 +365,7 @@ def open_card(device: str, *, outputs: int, inputs: int, limit: float) -> SoundC
     try:
         stream = portaudio_stream(
             found["index"],
-            address_of("transfer_portaudio"),
+            callback_address("transfer_portaudio"),
             card.given,
             outputs=outputs,
             inputs=inputs,
@@ -647,7 +647,7 @@ def run_time(periods: int, *, settling: float = MIN_SETTLING) -> float:
     return settling + PERIOD * periods + _TAIL
 
 
-def play(
+def play_and_record(
     card: SoundCard,
     played: FloatArray,
     *,
@@ -677,7 +677,7 @@ def play_on_one(
     LinkError after three times.
     """
     signal = sines.signal(0, periods=run_time(periods) / PERIOD)
-    return play(
+    return play_and_record(
         card,
         signal * np.eye(outputs)[output - 1],
         settling=MIN_SETTLING,

@@ -9,13 +9,13 @@ import numpy as np
 from drivers.by_hand.actions import BlockingAmplifier
 from drivers.errors import DriverError
 from drivers.playing import AmplifierLayer, AmplifierTone
-from era_haptics.lab.measuring.measure import check_levels, is_whole
+from era_haptics.lab.measuring.measure import check_levels, has_all_blocks
 from era_haptics.lab.measuring.sound_card import (
     Desk,
     Run,
     SoundCard,
     open_card,
-    play,
+    play_and_record,
     ramped,
     read_sensors,
 )
@@ -122,7 +122,7 @@ def _by_amplifier(card: SoundCard, amplifier: BlockingAmplifier, rig: Rig, patte
                 [AmplifierLayer(0, tones, _RAMP)],
                 duration=seconds + _SETTLING,
             )
-            run = play(
+            run = play_and_record(
                 card,
                 np.zeros((round(seconds * card.rate), 0)),
                 settling=_SETTLING,
@@ -152,10 +152,10 @@ def _by_card(card: SoundCard, desk: Desk, level: float, pattern: Layer) -> Run:
             sources[:, number] = tone.amplitude / era.full_level * np.sin(angle)
     sources[:, -1] = min(_MARK_LEVEL, level) * np.sin(2 * np.pi * _MARK * times)
     quarter = round(_WINDOW * card.rate) // 4
-    return play(
+    return play_and_record(
         card,
         desk.on_outputs(ramped(sources, round(_RAMP * card.rate))),
         settling=_SETTLING,
         seconds=_WINDOW,
-        is_whole=lambda kept: is_whole(kept[:, desk.input - 1], samples=quarter),
+        is_whole=lambda kept: has_all_blocks(kept[:, desk.input - 1], samples=quarter),
     )

@@ -31,12 +31,12 @@ from drivers.protocol.definition import (
     MESSAGES,
     NAK,
     NAK_RECORD,
-    NAMES,
     REFUSALS,
+    REQUEST_NAMES,
     STATES,
     STATUS,
     VERSION,
-    read_request,
+    decode_request,
 )
 from drivers.protocol.definition import HELLO as HELLO_NUMBER
 from drivers.protocol.records import Record, Refusal, Values
@@ -45,10 +45,10 @@ from drivers.wires.serial_frames import NEUTRAL, FrameReader, words_of
 from era_haptics.lab.expected_amplifier import FEEDING as FEEDING
 from registry.files import regular_file
 
-Direction: TypeAlias = Literal["amplifier", "host"]
+TransferDirection: TypeAlias = Literal["amplifier", "host"]
 """Direction of transfer: toward the amplifier or the host."""
 _MAX_LINE = 1 << 20  # characters
-_ARROWS: dict[Direction, str] = {"amplifier": ">", "host": "<"}
+_ARROWS: dict[TransferDirection, str] = {"amplifier": ">", "host": "<"}
 
 
 class CapturePiece(NamedTuple):
@@ -56,16 +56,16 @@ class CapturePiece(NamedTuple):
 
     time: float
     wire: str
-    direction: Direction
+    direction: TransferDirection
     data: bytes
 
 
-def capture_line(time: float, wire: str, direction: Direction, data: bytes) -> str:
+def capture_line(time: float, wire: str, direction: TransferDirection, data: bytes) -> str:
     """Return bytes as a line of a capture."""
     return f"{time:.6f} {wire} {_ARROWS[direction]} {data.hex(' ').upper()}"
 
 
-def read_capture(path: Path, *, wires: Collection[str]) -> Iterator[CapturePiece]:
+def read_wire_capture(path: Path, *, wires: Collection[str]) -> Iterator[CapturePiece]:
     """Read the pieces of a capture in order; wires: the names that are allowed.
 
     Raises CommandError with file and line.
@@ -141,7 +141,7 @@ class WitnessReport:
         self._frames: dict[str, deque[str]] = {}  # by wire, the last
         self._followed: list[tuple[RuleViolation, int]] = []  # and how many frames they will have
 
-    def frame(self, wire: str, time: float, direction: Direction, raw: bytes) -> None:
+    def frame(self, wire: str, time: float, direction: TransferDirection, raw: bytes) -> None:
         """Note a frame, and add it to the violations just before it."""
         line = capture_line(time, wire, direction, raw)
         self._frames.setdefault(wire, deque(maxlen=_FRAMES_BEFORE)).append(line)
@@ -202,12 +202,12 @@ class WitnessConfig:
     times: TimeLimits = TimeLimits()
 
 
-HELLO = "Hello"
+HELLO_REQUEST = "Hello"
 A_READ = "a read"
 """Name of a read that is no message, and changes nothing."""
-REPLIES = {HELLO: IDENTITY, **{name: message.reply for name, message in MESSAGES.items()}}
+REPLIES = {HELLO_REQUEST: IDENTITY, **{name: message.reply for name, message in MESSAGES.items()}}
 """Records of replies by the name of the request."""
-BROADCAST = frozenset(name for name, message in MESSAGES.items() if message.is_broadcast)
+BROADCAST_REQUESTS = frozenset(name for name, message in MESSAGES.items() if message.is_broadcast)
 """Requests that may be for all amplifiers of a line."""
 _WITH_STATE = (STATUS, EVENT_RECORD)
 
@@ -279,15 +279,15 @@ class Decoder(ABC):
     """Decodes both directions of a kind of wire; rest: bytes that begin a frame."""
 
     def __init__(self) -> None:
-        self.rest: dict[Direction, bytes] = {"amplifier": b"", "host": b""}
+        self.rest: dict[TransferDirection, bytes] = {"amplifier": b"", "host": b""}
 
     @abstractmethod
-    def feed(self, direction: Direction, time: float, data: bytes) -> list["DecodedFrame"]:
+    def feed(self, direction: TransferDirection, time: float, data: bytes) -> list["DecodedFrame"]:
         """Decode bytes; returns the complete frames."""
 
 
-Message: TypeAlias = WitnessedRequest | WitnessedReply | Notice
-DecodedFrame: TypeAlias = tuple[bytes, Message | None]
+WitnessedMessage: TypeAlias = WitnessedRequest | WitnessedReply | Notice
+DecodedFrame: TypeAlias = tuple[bytes, WitnessedMessage | None]
 """A frame and its message; None for part of a message, or none that concerns the rules."""
 
 
@@ -296,7 +296,7 @@ def damaged(why: str, started_at: float = math.inf) -> Notice:
     return Notice("damaged", text=why, started_at=started_at)
 
 
-def request_of(
+def witnessed_request(
     number: int,
     words: Sequence[int],
     address: int,
@@ -304,11 +304,11 @@ def request_of(
     started_at: float = math.inf,
 ) -> WitnessedRequest:
     """Read a request by the number of its message."""
-    name, values = NAMES.get(number, f"type {number}"), Values()
-    problem = "" if address or name in BROADCAST else "must not be a broadcast"
+    name, values = REQUEST_NAMES.get(number, f"type {number}"), Values()
+    problem = "" if address or name in BROADCAST_REQUESTS else "must not be a broadcast"
     try:
         if number != HELLO_NUMBER:
-            _, values = read_request(number, words)
+            _, values = decode_request(number, words)
     except Refusal as refusal:
         problem = str(refusal)
     return WitnessedRequest(name, address, key, values, problem, started_at)
@@ -345,9 +345,9 @@ def sent_by_amplifier(
             address,
             (address, sequence, *words[: NAK_RECORD.places["request"] + 1]),
         )
-    if number not in NAMES:
+    if number not in REQUEST_NAMES:
         return damaged(f"a reply of unknown type {number}")
-    return reply_of(REPLIES[NAMES[number]], words, address, (address, sequence, number))
+    return reply_of(REPLIES[REQUEST_NAMES[number]], words, address, (address, sequence, number))
 
 
 _CARRIED_OUT: dict[str, Callable[[Values, Values], bool]] = {
@@ -374,14 +374,14 @@ _MAX_REST = 512  # bytes kept of a frame that does not end
 class SerialDecoder(Decoder):
     """Decodes frames between zero bytes."""
 
-    def feed(self, direction: Direction, time: float, data: bytes) -> list[DecodedFrame]:
+    def feed(self, direction: TransferDirection, time: float, data: bytes) -> list[DecodedFrame]:
         """Decode bytes; returns the complete frames."""
         *pieces, rest = (self.rest[direction] + data).split(b"\0")
         self.rest[direction] = rest[-_MAX_REST:]
         return [(b"\0" + one + b"\0", _decode(direction, one)) for one in pieces if one]
 
 
-def _decode(direction: Direction, piece: bytes) -> Message:
+def _decode(direction: TransferDirection, piece: bytes) -> WitnessedMessage:
     frames = FrameReader().feed(piece + b"\0")
     if not frames:
         return damaged("a frame of invalid length or checksum")
@@ -398,7 +398,7 @@ def _decode(direction: Direction, piece: bytes) -> Message:
             return WitnessedRequest(f"type {frame.type}", frame.address, key, problem=str(refusal))
         return WitnessedReply(frame.address, key, problem=str(refusal))
     if direction == "amplifier":
-        request = request_of(frame.type, words, frame.address, key)
+        request = witnessed_request(frame.type, words, frame.address, key)
         # One of another version has its reply, too: the identity, or a refusal.
         wrong = f"version must be {version}, got {frame.version}" if is_other else ""
         return replace(request, problem=wrong or request.problem)

@@ -20,8 +20,8 @@ from drivers.protocol.definition import (
     MAX_WORDS,
     NAK,
     NAK_RECORD,
-    NAMES,
     REFUSALS,
+    REQUEST_NAMES,
     REQUESTS,
 )
 from drivers.protocol.records import Refusal
@@ -62,19 +62,19 @@ from drivers.wires.modbus_frames import (
 )
 from era_haptics.lab.witness.capture import (
     A_READ,
-    HELLO,
+    HELLO_REQUEST,
     REPLIES,
     DecodedFrame,
     Decoder,
-    Direction,
-    Message,
     Notice,
+    TransferDirection,
+    WitnessedMessage,
     WitnessedReply,
     WitnessedRequest,
     damaged,
     reply_of,
-    request_of,
     sent_by_amplifier,
+    witnessed_request,
 )
 
 _MAX_REST = 512  # bytes kept of text that does not end
@@ -95,7 +95,7 @@ class CanDecoder(Decoder):
         # Messages of a sender, by its identifier and whether they are numbered.
         self._senders: dict[tuple[int, bool], Assembler] = {}
 
-    def feed(self, direction: Direction, time: float, data: bytes) -> list[DecodedFrame]:
+    def feed(self, direction: TransferDirection, time: float, data: bytes) -> list[DecodedFrame]:
         """Decode bytes; returns the complete frames."""
         *pieces, rest = self._form.end.split(self.rest[direction] + data)
         self.rest[direction] = rest[-_MAX_REST:]
@@ -129,7 +129,9 @@ class CanDecoder(Decoder):
             else words
         )
 
-    def _from_host(self, time: float, frame: CanFrame, sender: Assembler) -> Message | None:
+    def _from_host(
+        self, time: float, frame: CanFrame, sender: Assembler
+    ) -> WitnessedMessage | None:
         node, kind = frame.id & NODE_MAX, frame.id & ~NODE_MAX
         self._sent.append(frame)
         if frame.id == cob_id("nmt") and len(frame.data) == 2:
@@ -138,15 +140,15 @@ class CanDecoder(Decoder):
         if not isinstance(words, Words):
             return words
         key = (node, words.number, words.type) if node else None
-        return request_of(words.type, words.words, node, key, sender.began)
+        return witnessed_request(words.type, words.words, node, key, sender.began)
 
-    def _from_bus(self, time: float, frame: CanFrame, sender: Assembler) -> Message | None:
+    def _from_bus(self, time: float, frame: CanFrame, sender: Assembler) -> WitnessedMessage | None:
         node, kind = frame.id & NODE_MAX, frame.id & ~NODE_MAX
         if frame.id == cob_id("heartbeat", node) and frame.data == b"\0":
             return Notice("boot", node)
         if kind == REQUEST and node and frame not in self._sent:
             is_first = len(frame.data) == BLOCK and frame.data[1] == 0
-            name = NAMES.get(frame.data[2]) if is_first else None
+            name = REQUEST_NAMES.get(frame.data[2]) if is_first else None
             return Notice("other host", node, text=name) if name else None
         words = self._words(time, frame, sender) if kind == REPLY and node else None
         if not isinstance(words, Words):
@@ -188,7 +190,7 @@ class ModbusDecoder(Decoder):
     def __init__(self, *, over_tcp: bool) -> None:
         super().__init__()
         self._over_tcp = over_tcp
-        self._readers: dict[Direction, AduReader] = {
+        self._readers: dict[TransferDirection, AduReader] = {
             direction: AduReader(
                 is_rtu=not over_tcp,
                 of_requests=direction == "amplifier",
@@ -196,12 +198,12 @@ class ModbusDecoder(Decoder):
             )
             for direction in self.rest
         }
-        self._last: dict[Direction, float] = {}  # times of the last bytes [s]
+        self._last: dict[TransferDirection, float] = {}  # times of the last bytes [s]
         self._open: dict[int, _Transaction] = {}  # by number; over RTU at most one
         self._written: dict[tuple[int, str], _Written] = {}  # by unit and name of the message
         self._requests = 0
 
-    def feed(self, direction: Direction, time: float, data: bytes) -> list[DecodedFrame]:
+    def feed(self, direction: TransferDirection, time: float, data: bytes) -> list[DecodedFrame]:
         """Decode bytes; returns the complete frames."""
         take = self._request if direction == "amplifier" else self._response
         seen: list[DecodedFrame] = []
@@ -215,7 +217,7 @@ class ModbusDecoder(Decoder):
                 self._open.clear()
         return seen
 
-    def _request(self, adu: Adu) -> Message:
+    def _request(self, adu: Adu) -> WitnessedMessage:
         self._requests += 1
         key = (adu.unit, self._requests) if adu.unit or self._over_tcp else None
         request = parse_request(adu)
@@ -230,9 +232,9 @@ class ModbusDecoder(Decoder):
                 )
             else:
                 self._written[adu.unit, message.name] = _Written(tag, key)
-                taken = request_of(message.number, request.registers[1:], adu.unit, key)
+                taken = witnessed_request(message.number, request.registers[1:], adu.unit, key)
         elif request.address == IDENTITY_REGISTER:
-            opened, taken.name = opened._replace(shows=HELLO), HELLO
+            opened, taken.name = opened._replace(shows=HELLO_REQUEST), HELLO_REQUEST
         elif (message := message_shown(request)) and request.address % BOX == REPLY_OFFSET:
             written = self._written.get((adu.unit, message.name))
             opened = opened._replace(shows=message.name, written=written)
@@ -244,7 +246,7 @@ class ModbusDecoder(Decoder):
             self._open[adu.transaction] = opened
         return taken
 
-    def _response(self, adu: Adu) -> Message | None:
+    def _response(self, adu: Adu) -> WitnessedMessage | None:
         opened = self._open.get(adu.transaction)
         if opened is None or opened.adu.unit != adu.unit:
             return WitnessedReply(adu.unit)
@@ -266,7 +268,9 @@ class ModbusDecoder(Decoder):
     def _reply(self, opened: _Transaction, response: Response) -> WitnessedReply:
         unit, key, written, shown = opened.adu.unit, opened.key, opened.written, response.registers
         tag = 0 if written is None else written.tag
-        if not opened.shows or len(shown) < (IDENTITY_COUNT if opened.shows == HELLO else HEAD):
+        if not opened.shows or len(shown) < (
+            IDENTITY_COUNT if opened.shows == HELLO_REQUEST else HEAD
+        ):
             return WitnessedReply(unit, key)
         if shown[0] != tag:
             return WitnessedReply(unit, problem=f"tag must be {tag}, got {shown[0]}")

@@ -406,7 +406,7 @@ _ATTEMPTS = 3  # of a request that has no reply
 _REPEATED = 0.1  # s; within which a stop that is not confirmed goes on, for each amplifier
 CONFIRMED = 0.3  # s; then the host says that it is not
 _READINGS = ("GetStatus", "GetSensors", "Measure", "GetReading", "GetMeasured")
-SILENCING = ("Stop", "Disarm", "Silence")
+SILENCING_REQUESTS = ("Stop", "Disarm", "Silence")
 
 
 class HostRules:
@@ -442,7 +442,9 @@ class HostRules:
             layers = session.amplifier.sets.whole(request.values["token"])
             return layers is not None and not is_vibrating(*layers)
         is_unconfirmed = session.is_disarming or session.first_stop is not None
-        return request.name in SILENCING or (request.name == "GetStatus" and is_unconfirmed)
+        return request.name in SILENCING_REQUESTS or (
+            request.name == "GetStatus" and is_unconfirmed
+        )
 
     def check_order(
         self,
@@ -598,7 +600,7 @@ class HostRules:
         name, values = request.name, request.values
         if name in ("Stop", "GetStatus"):
             session.last_stop = time
-        if name in SILENCING:
+        if name in SILENCING_REQUESTS:
             session.silence_sent(time)
         match name:
             case "Disarm":

@@ -12,7 +12,7 @@ from drivers.errors import CommandError, LinkError
 from drivers.ports import open_port
 from drivers.urls import Endpoint
 from drivers.wires.wire import address_of
-from era_haptics.lab.witness.capture import Direction, WireKind
+from era_haptics.lab.witness.capture import TransferDirection, WireKind
 from era_haptics.lab.witness.witness import Witness
 from model.errors import InputError
 from registry import threads
@@ -101,7 +101,7 @@ class _Observer:
         self.witness = witness
         self._due = threads.now()
 
-    def record(self, wire: str, direction: Direction, at: float, data: bytes) -> None:
+    def record(self, wire: str, direction: TransferDirection, at: float, data: bytes) -> None:
         """Pass on bytes that were read or written at a time [s]."""
         self._check()
         self.witness.record_bytes(wire, direction, at, data)

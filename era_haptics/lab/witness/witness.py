@@ -11,18 +11,18 @@ from dataclasses import replace
 from functools import partial
 
 from era_haptics.lab.witness.capture import (
-    BROADCAST,
+    BROADCAST_REQUESTS,
     CHANGING,
     FEEDING,
-    HELLO,
+    HELLO_REQUEST,
     Decoder,
-    Direction,
-    Message,
     Notice,
     RuleViolation,
     SerialDecoder,
     TimeLimits,
+    TransferDirection,
     WitnessConfig,
+    WitnessedMessage,
     WitnessedReply,
     WitnessedRequest,
     WitnessReport,
@@ -42,7 +42,7 @@ _COPIES = 64  # frames kept to recognise repeated ones
 _PENDING_TIMEOUT = 1.0  # s; then a reply matches nothing any more
 _PRESENT = ("GetStatus", "GetFaults")
 """Requests that are carried out when their reply is read, on Modbus."""
-_CONSTANT = (HELLO, "GetCaps")
+_CONSTANT = (HELLO_REQUEST, "GetCaps")
 
 DECODERS: Mapping[str, Callable[[], Decoder]] = {
     "serial": SerialDecoder,
@@ -73,7 +73,7 @@ class WatchedWire:
         self._kind = kind
         self._decoder = DECODERS[kind]()
         self._host, self._times, self._deadlines, self._report = host, times, deadlines, report
-        self.started_at: dict[Direction, float] = {}
+        self.started_at: dict[TransferDirection, float] = {}
         """When [s] partial frames began."""
         self._pending: dict[Hashable, WitnessedRequest] = {}  # by key of the reply
         self._recent: deque[tuple[float, bytes]] = deque(maxlen=_COPIES)  # of the host, and when
@@ -129,7 +129,7 @@ class WatchedWire:
 
     # frames
 
-    def feed(self, direction: Direction, time: float, data: bytes) -> int:
+    def feed(self, direction: TransferDirection, time: float, data: bytes) -> int:
         """Process bytes; returns how many frames they complete."""
         started_at = self.started_at.pop(direction, time)
         found = self._decoder.feed(direction, time, data)
@@ -167,7 +167,7 @@ class WatchedWire:
             if now > sent.started_at + _PENDING_TIMEOUT:
                 del self._pending[key]
 
-    def _sent(self, time: float, raw: bytes, message: Message, started_at: float) -> None:
+    def _sent(self, time: float, raw: bytes, message: WitnessedMessage, started_at: float) -> None:
         """Process a frame of the host."""
         # Numbers of requests begin anew: what was sent long ago is no copy.
         recent = [each for then, each in self._recent if time <= then + RECOVERY]
@@ -187,13 +187,17 @@ class WatchedWire:
         for session in [each for each in sessions if each is not None]:
             if not is_copy:
                 self._check_request(session, time, sent)
-            if session.is_mute and message.name == HELLO:
+            if session.is_mute and message.name == HELLO_REQUEST:
                 self._drop_pending(session)  # never to be replied to
             has_response = message.has_reply or self._kind.startswith("modbus")
             is_awaited = message.key is not None and has_response
-            if message.key is not None and is_awaited and (not is_copy or message.name == HELLO):
+            if (
+                message.key is not None
+                and is_awaited
+                and (not is_copy or message.name == HELLO_REQUEST)
+            ):
                 self._pending[message.key] = sent
-            session.is_mute &= message.name != HELLO
+            session.is_mute &= message.name != HELLO_REQUEST
             if message.problem:
                 continue
             if not session.is_mute:
@@ -219,7 +223,10 @@ class WatchedWire:
             pending = [
                 one
                 for one in self._pending.values()
-                if not ((is_to_each and one.name in BROADCAST) or (is_tcp and not one.has_reply))
+                if not (
+                    (is_to_each and one.name in BROADCAST_REQUESTS)
+                    or (is_tcp and not one.has_reply)
+                )
             ]
             self._host.check_order(session, request, pending, self._preempted_by)
         self._host.check_request(session, time, request)
@@ -243,7 +250,7 @@ class WatchedWire:
                 session.heard_other_host = time
                 session.amplifier.forget()
 
-    def _received(self, time: float, message: Message) -> None:
+    def _received(self, time: float, message: WitnessedMessage) -> None:
         """Process a frame of an amplifier."""
         session = self.sessions.get(message.address)
         match message:
@@ -272,7 +279,7 @@ class WatchedWire:
         amplifier.unanswered = [one for one in amplifier.unanswered if one is not request]
         if reply.refusal:
             amplifier.refused(request, reply.refusal, time)
-        elif reply.problem or (request.problem and request.name != HELLO):
+        elif reply.problem or (request.problem and request.name != HELLO_REQUEST):
             if request.problem:
                 session.report_always(
                     "garbage", time, f"{session.name} accepted {request.name}: {request.problem}"
@@ -307,7 +314,7 @@ class WatchedWire:
 
     def _move(self, session: AmplifierSession, request: WitnessedRequest) -> None:
         """Follow an amplifier to the address that it is set to, by its serial number."""
-        known = session.constants.get(HELLO, {}).get("serial_number")
+        known = session.constants.get(HELLO_REQUEST, {}).get("serial_number")
         if request.name == "SetAddress" and request.values["serial_number"] == known:
             others = {at: one for at, one in self.sessions.items() if one is not session}
             self.sessions = {**others, request.values["address"]: session}
@@ -381,7 +388,9 @@ class Witness:
         amplifier = WatchedAmplifier(name, slack=slack, report=report, report_always=report_always)
         return AmplifierSession(name, config, amplifier, report_always, report, is_disturbed)
 
-    def record_bytes(self, link: str, direction: Direction, time: float, data: bytes) -> None:
+    def record_bytes(
+        self, link: str, direction: TransferDirection, time: float, data: bytes
+    ) -> None:
         """Process bytes on a wire, toward the amplifier or the host."""
         self._advance(time)
         self._record(capture_line(time, link, direction, data))

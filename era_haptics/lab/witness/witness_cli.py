@@ -174,10 +174,10 @@ def _capture(path: Path | None) -> Iterator[Callable[[str], None]]:
 
 def _replay(path: Path, checker: "Witness") -> float:
     """Check a capture; returns its end [s]."""
-    from era_haptics.lab.witness.capture import read_capture
+    from era_haptics.lab.witness.capture import read_wire_capture
 
     end = None
-    for end, wire, direction, data in read_capture(path, wires=checker.wires):
+    for end, wire, direction, data in read_wire_capture(path, wires=checker.wires):
         checker.record_bytes(wire, direction, end, data)
     if end is None or not checker.frames:
         raise InputError(

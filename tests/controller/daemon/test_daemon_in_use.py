@@ -55,7 +55,7 @@ from controller.operation.operation_states import (
 from controller.process.log import LogThread
 from drivers.errors import CommandError
 from drivers.host.amplifier import WATCHDOG
-from era_haptics.command import run
+from era_haptics.command import run_era
 from kit.clock import in_virtual_time
 from kit.courses import Planted
 from kit.plates import TWO_AMPLIFIERS
@@ -180,7 +180,7 @@ def test_commands_choose_a_layout_and_reload(
     write_layouts(tmp_path)
 
     def era(*line: str) -> tuple[int, str]:
-        status = run([*line, "--socket", str(tmp_path / "era.sock")])
+        status = run_era([*line, "--socket", str(tmp_path / "era.sock")])
         return status, "".join(capsys.readouterr())
 
     with real_daemon(tmp_path, LAYOUTS) as socket, Client.connect(socket) as client:
@@ -581,13 +581,13 @@ def test_stop_exits_with_3_and_names_amplifiers_unless_all_are_silent(
     """Success only if every amplifier is confirmed silent, or else the unconfirmed ones."""
     with ScriptedDaemon(tmp_path) as daemon:
         command = ["stop", "--socket", str(daemon.socket)]
-        assert run(command) == 0
+        assert run_era(command) == 0
         daemon.silence = UNCONFIRMED
-        assert run(command) == 3
+        assert run_era(command) == 3
         errors = capsys.readouterr().err
         assert re.search(r"side .*0\.20 s.*rear", errors)
         assert "main" not in errors
-    assert run(command) == 3
+    assert run_era(command) == 3
 
 
 def test_help_of_watch_names_every_topic() -> None:

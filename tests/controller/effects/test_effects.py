@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from controller.daemon.messages import effects_result
 from controller.effects.effect import Effect, EffectRun, EffectStimulus, NoStimulus, Region
-from controller.effects.kinds import BUILT_IN, Buzz, Click, Detents, Ramp, Texture
+from controller.effects.kinds import BUILT_IN_EFFECTS, Buzz, Click, Detents, Ramp, Texture
 from controller.effects.layout import SurfaceLayout
 from controller.effects.player import EffectPlayer
 from controller.sources.touch import Contact, ContactKey
@@ -544,8 +544,8 @@ def test_every_effect_of_the_project_is_registered() -> None:
     members = [vars(import_module(f"controller.effects.{each.stem}")) for each in modules]
     kinds = {each for every in members for each in every.values() if inspect.isclass(each)}
     effects = {each for each in kinds if issubclass(each, Effect) and not inspect.isabstract(each)}
-    assert effects == set(BUILT_IN), "add it to BUILT_IN in controller/effects/kinds.py"
-    assert sorted(names := [each.kind for each in BUILT_IN]) == names
+    assert effects == set(BUILT_IN_EFFECTS), "add it to BUILT_IN in controller/effects/kinds.py"
+    assert sorted(names := [each.kind for each in BUILT_IN_EFFECTS]) == names
 
 
 def test_effect_kinds_include_plug_ins() -> None:

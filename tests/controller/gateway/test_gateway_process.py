@@ -33,7 +33,7 @@ from controller.api.link import Unreachable
 from controller.api.schema import API_VERSION, ApiMessage, Empty
 from controller.demo.demonstration import check_page
 from controller.gateway import app, connections
-from controller.gateway.app import Gateway, listen, serve
+from controller.gateway.app import Gateway, listening_socket, serve
 from controller.gateway.gateway_settings import GatewaySettings, read_token
 from gateway_attacks import ATTACKS, LIMIT, attack
 from kit.clock import in_virtual_time
@@ -128,7 +128,7 @@ def test_gateway_refuses_a_port_in_use(tmp_path: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as other:
         port = other.getsockname()[1]
         with pytest.raises(InputError, match=rf"port {port} \(Address already in use\).*--listen"):
-            listen(GatewaySettings(socket=tmp_path / "era.sock", port=port))
+            listening_socket(GatewaySettings(socket=tmp_path / "era.sock", port=port))
         page = f"127.0.0.1:{port}"
         with pytest.raises(InputError, match=rf"{page} \(Address already in use\).*--dashboard "):
             check_page(page)

@@ -29,7 +29,7 @@ from controller.play.joint_answers import (
 )
 from controller.play.loop import PlayReport
 from controller.play.slots import CROSSFADE
-from controller.sources.touch import AT_REST, Contact, ContactKey, Motion
+from controller.sources.touch import AT_REST, Contact, ContactKey, FingerMotion
 from drivers.host.group import Group
 from kit.chain import Chain, Position
 from kit.clock import in_virtual_time, run_virtual
@@ -267,7 +267,7 @@ def test_ends_of_ways_are_fingers_where_they_can_be(
 
     So is one that moved until 60 ms ago, of which its source says nothing since.
     """
-    contacts = [contact(1, at, vx=vx), replace(contact(2, OTHER), motion=Motion())]
+    contacts = [contact(1, at, vx=vx), replace(contact(2, OTHER), motion=FingerMotion())]
     given = [Finger(at, stimulus), fingers(contacts)[1]]
     found = with_paths(given, contacts, NOW, paper_table().plate)
     assert len(found) == count

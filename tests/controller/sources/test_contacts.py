@@ -20,7 +20,7 @@ from controller.sources.touch import (
     OVER,
     ContactKey,
     ContactTracker,
-    Motion,
+    FingerMotion,
     RejectCounter,
     Touch,
     TouchFrame,
@@ -409,9 +409,9 @@ def test_tracker_invariants_for_any_sequence(events: list[TouchFrame | float]) -
 FRAME = 0.010  # s
 
 
-def moved(places: np.ndarray) -> Motion:
+def moved(places: np.ndarray) -> FingerMotion:
     """A finger reported every 10 ms at these places (n, 2) [m]; the last at time 0."""
-    motion, count = Motion(), len(places)
+    motion, count = FingerMotion(), len(places)
     for number, (x, y) in enumerate(places.tolist(), start=1):
         motion = motion.followed((number - count) * FRAME, x, y)
     return motion

@@ -32,7 +32,7 @@ from controller.sources.tuio import (
 )
 from controller.sources.udp_source import BACKLOG_THRESHOLD, Datagram, Datagrams, Peer, listen
 from drivers.errors import LinkError
-from era_haptics.command import run
+from era_haptics.command import run_era
 from examples.make_touches import tuio_datagram, write_capture
 from kit.clock import in_virtual_time
 from kit.fingers import bundle, cursor, frame, free_port, message
@@ -831,7 +831,7 @@ def test_era_touch_sends_a_capture(tmp_path: Path) -> None:
         receiver.bind(("127.0.0.1", 0))
         receiver.settimeout(10)
         options = ["--replay", str(path), "--port", str(receiver.getsockname()[1])]
-        assert run(["touch", *options]) == 0
+        assert run_era(["touch", *options]) == 0
         assert [receiver.recv(100) for _ in range(2)] == [b"one", b"two"]
-        assert run(["touch", "0.1,0.1", *options]) == 2
-    assert run(["touch"]) == 2
+        assert run_era(["touch", "0.1,0.1", *options]) == 2
+    assert run_era(["touch"]) == 2

@@ -122,7 +122,7 @@ async def test_identity_has_units_and_the_limits_of_the_wire() -> None:
     At 115 200 baud these 2700 bits are 23.4 ms, 42 sets a second.
     """
     async with WORD_WIRES["serial"](1) as far:
-        rows = await actions.identify(f"{far.url(1)}&baud=115200")
+        rows = await actions.identify_amplifier(f"{far.url(1)}&baud=115200")
     assert (rows["serial_number"], rows["versions"], rows["channels"]) == ("SIM-1", [4], 1)
     assert (rows["watchdog_min_s"], rows["watchdog_max_s"]) == (0.1, 2.0)
     assert rows["channel_limits"][0].keys() == {
@@ -214,12 +214,12 @@ async def test_amplifier_takes_another_address(wire: str) -> None:
     async with WORD_WIRES[wire](2) as far:
         moved = await actions.set_address(far.url(1), 9, None)
         assert moved == {"url": with_address(far.url(1), 9), "serial_number": "SIM-1"}
-        assert (await actions.identify(moved["url"]))["serial_number"] == "SIM-1"
-        assert (await actions.identify(far.url(2)))["serial_number"] == "SIM-2"
+        assert (await actions.identify_amplifier(moved["url"]))["serial_number"] == "SIM-1"
+        assert (await actions.identify_amplifier(far.url(2)))["serial_number"] == "SIM-2"
         with pytest.raises(LinkTimeout):
-            await actions.identify(far.url(1))
+            await actions.identify_amplifier(far.url(1))
         back = await actions.set_address(moved["url"], 10, "SIM-1")
-        assert (await actions.identify(back["url"]))["serial_number"] == "SIM-1"
+        assert (await actions.identify_amplifier(back["url"]))["serial_number"] == "SIM-1"
 
 
 @pytest.mark.real_time
@@ -233,7 +233,7 @@ async def test_armed_amplifier_keeps_its_address() -> None:
         assert far.level(1) == pytest.approx(0.5)
         with pytest.raises(LinkError):
             await actions.set_address(far.url(1), 9, "SIM-nobody")
-        assert (await actions.identify(far.url(1)))["serial_number"] == "SIM-1"
+        assert (await actions.identify_amplifier(far.url(1)))["serial_number"] == "SIM-1"
     with pytest.raises(CommandError, match="address"):
         await actions.set_address("sim://rig.yaml", 9, None)
 

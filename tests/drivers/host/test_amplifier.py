@@ -25,8 +25,8 @@ from drivers.host.amplifier import Amplifier
 from drivers.host.amplifier_sensors import (
     AmplifierSensor,
     measure_tones,
-    read_measured,
-    read_sensors,
+    read_amplifier_sensors,
+    read_electrical,
     start_reading,
 )
 from drivers.host.group import Group
@@ -84,14 +84,14 @@ async def test_sensors_and_their_tones_come_in_several_replies() -> None:
     A place that is unknown, as at the foot of a channel's actuator, is none.
     """
     host = await sensing()
-    sensors = await read_sensors(host)
+    sensors = await read_amplifier_sensors(host)
     assert sensors == (AmplifierSensor("ACCELERATION", None, 0.1, 0.2, 512.0, 1000.0),) * 20
     reading = await measure_tones(host, FREQUENCIES, 0.1)
     assert reading.state == "COMPLETE"
     assert [one.tones for one in reading.sensors] == [((1.0, -90.0), (2.0, -90.0))] * 20
     assert all(one.is_overloaded for one in reading.sensors)
     row = {**ROW, "channel": 1, "x": UNKNOWN_PLACE, "y": UNKNOWN_PLACE}
-    (sensor,) = await read_sensors(await sensing("GetSensors", 1, sensors=[row]))
+    (sensor,) = await read_amplifier_sensors(await sensing("GetSensors", 1, sensors=[row]))
     assert (sensor.channel, sensor.x, sensor.y) == (1, None, None)
 
 
@@ -209,10 +209,10 @@ async def test_voltage_and_current_of_each_channel(kind: str) -> None:
         values if name == "GetMeasured" else handle(name, given, now, **options)
     )
     await host.open()
-    assert await read_measured(host) == [(1234.5, 250e-6), (0.0, 0.0)]
+    assert await read_electrical(host) == [(1234.5, 250e-6), (0.0, 0.0)]
     far.capabilities = {**far.capabilities, "features": 0}
     await host.open()
-    assert await read_measured(host) == []
+    assert await read_electrical(host) == []
 
 
 LIMITS = GuardLimits(20.0, 1000.0, 1.0)

@@ -20,7 +20,7 @@ from unittest.mock import Mock
 import pytest
 
 from drivers.errors import LinkTimeout
-from drivers.host.amplifier_sensors import read_measured
+from drivers.host.amplifier_sensors import read_electrical
 from drivers.host.group import Group
 from drivers.host.joint_sets import PlayedSet
 from drivers.host.ledger import Ledger, StopOutcome
@@ -148,7 +148,7 @@ class OnLines(Taken):
 
     async def measures(self, name: str) -> None:
         """Read the voltages of one."""
-        await read_measured(self.group.amplifiers[name])
+        await read_electrical(self.group.amplifiers[name])
 
     def plans_nothing(self, text: str) -> None:
         """Require that what is planned is refused, with this text."""

@@ -14,11 +14,11 @@ import yaml
 from cases import read_yaml
 from era_haptics.lab.harmless import Names, harmless_records
 from era_haptics.lab.report import (
-    MAX_DUMPS,
     MAX_FILE_SIZE,
+    MAX_REPORTED_DUMPS,
     ReportContents,
     collect,
-    versions,
+    installed_versions,
     write_report,
 )
 from model.rig.rig_file import example_rig_path
@@ -212,19 +212,22 @@ def test_report_includes_files_of_daemon(tmp_path: Path, given: Sequence[str]) -
     (tmp_path / "era.out").write_text(f'{begun}\n{{"message": "link main: lost"}}\n', "utf-8")
     (tmp_path / "t.npz").write_bytes(b"x" * 100)
     (tmp_path / "dumps").mkdir()
-    for number in range(MAX_DUMPS + 2):
+    for number in range(MAX_REPORTED_DUMPS + 2):
         dump = tmp_path / "dumps" / f"era-fault-2026-{number}.jsonl"
         dump.write_text(f'{{"time_s": {number}}}\n', "utf-8")
     (tmp_path / "dumps" / "other.txt").write_text("x", "utf-8")
     report = report_of(tmp_path, *given)
-    dumps = ["fault.jsonl", *(f"fault-{number}.jsonl" for number in range(2, MAX_DUMPS + 1))]
+    dumps = [
+        "fault.jsonl",
+        *(f"fault-{number}.jsonl" for number in range(2, MAX_REPORTED_DUMPS + 1)),
+    ]
     assert {*report.files} == {"daemon.yaml", "rig.yaml", "log.jsonl", *dumps, "versions.json"}
     assert report.files["log.jsonl"].text.splitlines() == [
         '"hidden: a line that is no record"',
         '{"message": "link main: lost"}',
     ]
     shown = [json.loads(report.files[name].text)["time_s"] for name in dumps]
-    assert shown == [*range(2, MAX_DUMPS + 2)]
+    assert shown == [*range(2, MAX_REPORTED_DUMPS + 2)]
     assert [line.partition(" ")[0] for line in report.missing] == ["unreadable.yaml:", "status"]
     found = json.loads(report.files["versions.json"].text)
     assert found["packages"]["numpy"][0].isdigit()
@@ -245,7 +248,7 @@ def test_versions_list_packages_of_plug_ins(
             f"[era_haptics.materials]\ncork = {name}:CORK\n", "utf-8"
         )
     monkeypatch.syspath_prepend(tmp_path)
-    assert versions()["plug-ins"]["materials"] == {
+    assert installed_versions()["plug-ins"]["materials"] == {
         "cork": "cork:CORK (cork 1.5), oak:CORK (oak 2.0)"
     }
 

@@ -25,7 +25,7 @@ from typer.testing import CliRunner
 import era_haptics as api
 from cases import read_yaml
 from controller.cli.config_cli import app as config_commands
-from era_haptics.command import run
+from era_haptics.command import run_era
 from era_haptics.lab.cli import app as lab_app
 from era_haptics.lab.design import design_run, problem, score
 from kit.plates import small_table, smooth_table, write_rig
@@ -214,11 +214,11 @@ def test_interrupted_design_keeps_its_layouts(
         judged.append(judge(*arguments, **options))
         return judged[-1]
 
-    judge = design_run.judge
+    judge = design_run.assess
     typed = ["design", RIG, "--workers", "1", "--eras", "5", "--starts", "1", "-o", str(tmp_path)]
     with monkeypatch.context() as patch:
-        patch.setattr(design_run, "judge", interrupted_judge)
-        assert run([*typed, "--json"]) == 130
+        patch.setattr(design_run, "assess", interrupted_judge)
+        assert run_era([*typed, "--json"]) == 130
     unfinished = json.loads(capsys.readouterr().out)
     assert unfinished["incomplete"] is True
     assert (unfinished["layout_count"], unfinished["judged"]) == (3, 2)
@@ -482,7 +482,7 @@ def test_a_command_prints_and_writes_what_its_case_says(
 
     def printed(line: str) -> tuple[str, str]:
         monkeypatch.setattr("sys.stdin", io.StringIO(case.get("input", "")))
-        assert run(shlex.split(line)[1:]) == case.get("status", 0)
+        assert run_era(shlex.split(line)[1:]) == case.get("status", 0)
         return tuple(capsys.readouterr())
 
     *first, last = [case["typed"]] if isinstance(case["typed"], str) else case["typed"]

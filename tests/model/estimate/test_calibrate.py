@@ -36,7 +36,7 @@ from model.estimate.fit import SensedPlate, fit, sensed_plate
 from model.estimate.fit_report import calibration_json, change_rows, finding_rows
 from model.estimate.forward import MASS_CELLS
 from model.estimate.measurement import Measurement, sensors_at
-from model.estimate.parameters import KINDS
+from model.estimate.parameters import PARAMETER_KINDS
 from model.reduction.free_plate import solve_free_plate
 from model.reduction.reduced_plate import reduced_modes
 from model.rig.rig import Rig
@@ -557,8 +557,8 @@ def test_stiffening_does_not_depend_on_rounding(rig: Rig) -> None:
 
 def test_a_fit_allows_for_what_plates_are_drawn_with() -> None:
     """The mass of one place is that of all cells together, in the root mean square."""
-    allowed = {kind: KINDS[kind].std for kind in FORM if kind != "mass"}
-    allowed["mass"] = KINDS["foreign_mass"].std * MASS_CELLS.cell_count**0.5
+    allowed = {kind: PARAMETER_KINDS[kind].std for kind in FORM if kind != "mass"}
+    allowed["mass"] = PARAMETER_KINDS["foreign_mass"].std * MASS_CELLS.cell_count**0.5
     assert allowed == pytest.approx(FORM)
 
 

@@ -25,11 +25,11 @@ from model.estimate.forward import (
     FINGER_PARTS,
     SENSOR_FOOT,
     ForwardModel,
+    PlateValues,
     Prior,
     RestingFinger,
     Sensor,
     Space,
-    Values,
     by_mass_at,
     jacobian,
 )
@@ -38,11 +38,11 @@ from model.estimate.identify import (
     ClockEstimate,
     Identification,
     clock_estimates,
+    identification_errors,
     identify,
-    standard_errors,
 )
 from model.estimate.measurement import Measurement, Repeat
-from model.estimate.parameters import KINDS
+from model.estimate.parameters import PARAMETER_KINDS
 from model.estimate.space import inwards, rig_with, space_from_datasheets, space_of
 from model.fem import ELEMENTS, Mesh, assemble
 from model.reduction.free_plate import solve_free_plate
@@ -241,7 +241,7 @@ def test_file_with_identified_values_reads_back(found: Identification, tmp_path:
     """The rig that stands beside the file is the one identified, with the errors of the table."""
     shutil.copy(example_rig_path(), tmp_path / "rig.yaml")
     path, before = tmp_path / "identified.yaml", load_rig(tmp_path / "rig.yaml")
-    save_fitted(path, before, found.rig, comment="identified", errors=standard_errors(found))
+    save_fitted(path, before, found.rig, comment="identified", errors=identification_errors(found))
     back, rows = load_rig(path), identification_json(found, [])["parameters"]
     printed = {each["name"]: each for each in rows}
     written: Any = back.document.over.data["standard_errors"]
@@ -450,7 +450,7 @@ def model(rig: Rig) -> ForwardModel:
     names = [sensor.name for sensor in sensors]
     space = space_of(rig, names, rig.uncertainty, drives_lag=True, masses=1)
     names = [f"{part} of finger" for part in FINGER_PARTS]
-    space = space.extended(KINDS["fingers"], names, Prior(KINDS["fingers"].std))
+    space = space.extended(PARAMETER_KINDS["fingers"], names, Prior(PARAMETER_KINDS["fingers"].std))
     free = solve_free_plate(rig.plate, rig.mesh, frequency_max=500.0)
     return ForwardModel(rig, sensors, FORWARD_FREQUENCIES, space, free, [FINGER])
 
@@ -587,7 +587,7 @@ def test_values_that_a_search_tries_are_those_of_a_rig(name: str, of: str) -> No
     rng = np.random.default_rng(0)
     for size in (1, 10):
         for x in rng.normal(0, size, (50, space.size)).clip(space.lower, space.upper):
-            found = rig_with(rig, Values(rig, space, x), known)
+            found = rig_with(rig, PlateValues(rig, space, x), known)
             assert 0 <= found.plate.loss_factor <= 1
             for era in found.eras:
                 if isinstance(era, Exciter):

@@ -24,7 +24,7 @@ from benchmarks.identification.plates import draw
 from benchmarks.weekend.chain import FOLDER, BuiltBoard
 from cases import read_yaml, shortly
 from controller.plate_measurement import MeasuredPlate
-from era_haptics.command import run
+from era_haptics.command import run_era
 from kit.plates import (
     DISTORTIONS,
     as_sold,
@@ -38,7 +38,7 @@ from kit.plates import measured as measured_by_plates
 from model.errors import InputError
 from model.estimate import plate_match
 from model.estimate.calibrate import MAX_OUTLIERS, calibrate, check_consistency
-from model.estimate.findings import KINDS
+from model.estimate.findings import FINDING_KINDS
 from model.estimate.fit import sensed_plate, without_outliers
 from model.estimate.measurement import (
     Measurement,
@@ -326,7 +326,7 @@ def test_a_check_finds_what_is_planted_and_nothing_else(case: dict[str, Any]) ->
 def test_every_kind_of_finding_has_a_scenario_or_a_test() -> None:
     """A new row of text comes with a scenario; a promise takes a table, which others build."""
     shown = {kind for case in SCENARIOS for each in case["finds"] for kind in each}
-    assert KINDS.keys() - shown == {"promise"}
+    assert FINDING_KINDS.keys() - shown == {"promise"}
 
 
 @pytest.mark.parametrize("count", shortly([2, 10], [2]))
@@ -413,7 +413,7 @@ def test_commands_say_why_they_write_no_rig(
     file, made = tmp_path / "measured.uff", tmp_path / "made.yaml"
     write_responses(file, found, WEEKEND)
     rig = shutil.copy(FOLDER / "rig.yaml", tmp_path)
-    assert run(command.format(rig=rig, file=file, made=made).split()) == status
+    assert run_era(command.format(rig=rig, file=file, made=made).split()) == status
     said = "".join(capsys.readouterr())
     if is_dead:
         assert "SW did not; no rig is written. Find out why by era rig check" in said

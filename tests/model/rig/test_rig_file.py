@@ -15,7 +15,7 @@ import pytest
 
 from benchmarks.direct_plate import direct_acceleration
 from controller.rig_file_check import check_rig
-from era_haptics.command import run
+from era_haptics.command import run_era
 from kit.plates import exciter_rig, exciter_rig_text
 from kit.set_table import only
 from model.answer.stimulus import Placement
@@ -455,7 +455,7 @@ def test_weather_is_an_uncertainty_of_what_was_measured(
     assert 2 * known.frequency == pytest.approx(0.8 * change, rel=0.01)
     assert parse_rig("rig", text + "uncertainty: {weather: 0.01}\n").uncertainty.weather == 0.01
     on_feet = text + FEET.replace("[0, 0]", "[0, 228.6 mm]")
-    assert run(["config", "check", str(write(tmp_path, on_feet))]) == 0
+    assert run_era(["config", "check", str(write(tmp_path, on_feet))]) == 0
     said = capsys.readouterr().out
     assert ("change its modulus by" in said) == (change > 0)
     assert ("nothing is known" in said) == ("humidity" in keys and not change)
@@ -903,26 +903,26 @@ def test_show_and_merge_of_what_a_fit_found(
     """Both values side by side with the standard error, as rows and as JSON; one file of both."""
     errors: dict[KeyPath, float] = {("eras", "B", "stiffness"): 123.4}
     _, after, output = fitted(tmp_path, FLOW, other_values, errors)
-    assert run(["rig", "show", str(output)]) == 0
+    assert run_era(["rig", "show", str(output)]) == 0
     rows = [line.split() for line in capsys.readouterr().out.splitlines()]
     assert rows[0] == ["rig.yaml", "rig.fitted.yaml", "standard", "error"]
     assert ["eras.B.stiffness", "9000", "9901", "±", "123"] in rows
     assert ["eras.A.damping_ratio", "0.1", "left", "out"] in rows
     assert ["eras.A.gains", "[]", "2", "rows"] in rows
-    assert run(["rig", "show", str(output), "--json"]) == 0
+    assert run_era(["rig", "show", str(output), "--json"]) == 0
     shown = json.loads(capsys.readouterr().out)
     assert shown["base"] == "rig.yaml"
     row = {"key": "eras.B.stiffness", "base": 9000, "fitted": 9901, "standard_error": 123}
     assert pytest.approx(row) in shown["changes"]
     whole = tmp_path / "whole.yaml"
-    assert run(["rig", "merge", str(output), "-o", str(whole)]) == 0
+    assert run_era(["rig", "merge", str(output), "-o", str(whole)]) == 0
     assert load_rig(whole) == load_rig(output)
     for file in (output, tmp_path / "rig.yaml"):
         with pytest.raises(InputError, match="must be another file than"):
             save_rig(load_rig(output), file)
-    assert run(["rig", "merge", str(whole), "-o", str(tmp_path / "again.yaml")]) == 2
-    assert run(["rig", "show", str(whole)]) == 2
-    assert run(["rig", "merge", str(output), "-o", str(tmp_path / "rig.yaml")]) == 2
+    assert run_era(["rig", "merge", str(whole), "-o", str(tmp_path / "again.yaml")]) == 2
+    assert run_era(["rig", "show", str(whole)]) == 2
+    assert run_era(["rig", "merge", str(output), "-o", str(tmp_path / "rig.yaml")]) == 2
     assert (tmp_path / "rig.yaml").read_text("utf-8") == FLOW
     assert after.eras != load_rig(tmp_path / "rig.yaml").eras
 

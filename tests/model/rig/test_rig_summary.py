@@ -30,7 +30,7 @@ from model.config.fields import Section
 from model.errors import InputError
 from model.reduction.free_plate import solve_free_plate
 from model.rig import sections
-from model.rig.actuator_keys import KINDS
+from model.rig.actuator_keys import ACTUATOR_KINDS
 from model.rig.rig import Rig, Uncertainty, differences
 from model.rig.rig_file import example_rig_path, load_rig, parse_rig, rig_of
 from model.rig.rig_summary import exciter_notes, plate_summary, resonance_notes
@@ -56,7 +56,7 @@ def test_tables_of_keys_are_those_of_the_sections(tmp_path: Path) -> None:
     lists all materials by name, and the minimal rig that it prints loads, with three ERAs.
     """
     every = {each for _, each in inspect.getmembers(sections, inspect.isclass)}
-    every |= {*KINDS.values()}
+    every |= {*ACTUATOR_KINDS.values()}
     assert {each for each in every if issubclass(each, Section)} - {Section} == {
         *rig_page.SECTIONS.values()
     }

@@ -35,7 +35,7 @@ from model.reduction.free_plate import SpectralModes, solve_free_plate
 from model.reduction.reduced_plate import reduce_free_plate, supported_modes
 from model.rig.rig_file import load_rig, mesh_of, parse_mesh, parse_rig
 from model.spectral.direct_solution import AtOneFrequency, grain_slopes, stiffness_slopes
-from model.spectral.modes import Band, SpectralMesh, SpectralPlate, local_compliance
+from model.spectral.modes import MaterialBand, SpectralMesh, SpectralPlate, local_compliance
 from model.spectral.polynomials import CLASSES as PARITY_CLASSES
 from model.spectral.polynomials import EVEN, EdgedFunctions, air_motion
 from model.structure.attachments import Era, footprints_of
@@ -286,7 +286,10 @@ def frequencies_of(plate, degrees, *, parities=((1, 1), (-1, 1), (1, -1), (-1, -
     layered = SpectralPlate(plate, degrees, 150.0)
     found = [
         layered.modes(
-            each, shift=(2 * np.pi * 30) ** 2, cut=(2 * np.pi * cut) ** 2, band=Band(30.0, cut)
+            each,
+            shift=(2 * np.pi * 30) ** 2,
+            cut=(2 * np.pi * cut) ** 2,
+            band=MaterialBand(30.0, cut),
         )
         for each in parities
     ]
@@ -326,7 +329,10 @@ def test_complex_modes_equal_a_complex_eigenproblem():
     plate = panel((PANEL[0], replace(PANEL[1], loss_factor=1.0), PANEL[2]), loss_factor=0.0)
     layered = AtOneFrequency(plate, (10, 8), 150.0)
     modes = layered.modes(
-        (1, 1), shift=(2 * np.pi * 30) ** 2, cut=(2 * np.pi * 500) ** 2, band=Band(30.0, 500.0)
+        (1, 1),
+        shift=(2 * np.pi * 30) ** 2,
+        cut=(2 * np.pi * 500) ** 2,
+        band=MaterialBand(30.0, 500.0),
     )
     for square, loss in list(zip(modes.eigenvalues, modes.losses, strict=True))[1:4]:
         frequency = np.sqrt(square) / (2 * np.pi)

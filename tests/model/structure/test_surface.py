@@ -15,7 +15,7 @@ from benchmarks.setting import random_contacts
 from benchmarks.surface import exported_modes
 from cases import read_yaml
 from controller.sources.touch import ContactTracker, Touch, TouchFrame
-from era_haptics.command import run
+from era_haptics.command import run_era
 from era_haptics.lab.design.problem import area_of
 from model.answer.plan import answer
 from model.answer.stimulus import Finger, Stimulus, check_on_plate
@@ -327,15 +327,15 @@ def test_odd_modes_are_read_or_refused_with_their_place(
         text = text.replace(old, new, -1 if old in ("E+", "\n") else 1)
     (tmp_path / "modes.uff").write_bytes(text.encode())
     rig.write_text(("surface: modes.uff" + ERAS).replace(*odd.get("rig", ("", "")), 1))
-    status = run(["plate", "show", str(rig)])
+    status = run_era(["plate", "show", str(rig)])
     said = capsys.readouterr()
     assert status == (2 if odd["said"] else 0), said.err
     shown = r"surface by \d+ modes up to \d+ Hz of .*modes.uff, 3 of the rigid body(.|\n)*mass  282"
     assert re.search(odd["said"] or shown, said.err if odd["said"] else said.out)
     if not odd["said"]:
-        assert run(["config", "check", str(rig)]) == 0
+        assert run_era(["config", "check", str(rig)]) == 0
         for command in ("plate convergence {0}", "rig identify {0} -o {0}.new --yes --url sim://"):
-            assert run(command.format(rig).split()) == 2
+            assert run_era(command.format(rig).split()) == 2
             assert (
                 "surface by its modes, which has no thickness, size or" in capsys.readouterr().err
             )

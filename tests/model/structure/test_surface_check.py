@@ -9,7 +9,7 @@ import pytest
 
 import era_haptics as era
 from benchmarks.surface import exported_modes
-from era_haptics.command import run
+from era_haptics.command import run_era
 from model.arrays import FloatArray, lattice
 from model.errors import InputError
 from model.files.modal_file import read_modes
@@ -298,7 +298,7 @@ def test_suspicious_modes_warn_in_every_entry(
         f"plate show {rig}",
         f"table build {rig} -o {table} --frequencies 150",
     ):
-        assert run(command.split()) == 0
+        assert run_era(command.split()) == 0
         shown = capsys.readouterr()
         assert expected in shown.out + shown.err
     with pytest.warns(UserWarning, match="modes 11 and 25 .* nearly the same shape"):

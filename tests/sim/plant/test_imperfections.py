@@ -43,7 +43,7 @@ from sim.bench.bench import Bench
 from sim.plant.excited_plate import PlatePlayback as TonePlayback
 from sim.plant.excited_plate import Vibration
 from sim.plant.excited_plate import play as play_excitation
-from sim.plant.fingers import FingerRecord, Fingers, measure_vibration
+from sim.plant.fingers import FingerRecord, PlateFingers, measure_vibration
 from sim.plant.imperfections import (
     ChannelErrors,
     Imperfections,
@@ -365,7 +365,7 @@ def test_fingers_felt_uses_the_last_position(coarse_rig: Rig) -> None:
     One finger goes while another stays: both have their samples, each from its own time. Ten
     seconds are kept, also of fingers that were lifted since.
     """
-    fingers = Fingers(flat_plate(coarse_rig))
+    fingers = PlateFingers(flat_plate(coarse_rig))
     fingers.place({"a": (0.1, 0.1), "b": (0.0, 0.0)})
     assert len(fingers.layout.points) == 2 * 21
     fingers.record(np.array([1.0, 2.0]), np.ones((2, 42)))
@@ -394,7 +394,7 @@ def test_fingers_felt_uses_the_last_position(coarse_rig: Rig) -> None:
 
 def test_fingers_off_the_plate_change_nothing(coarse_rig: Rig) -> None:
     """One finger beside the plate, and all of them stay where they were."""
-    fingers = Fingers(flat_plate(coarse_rig))
+    fingers = PlateFingers(flat_plate(coarse_rig))
     fingers.place({"a": (0.1, 0.1)})
     for bad in [(0.4, 0.1), (float("nan"), 0.1), (0.1, -1e-3)]:
         with pytest.raises(InputError, match="finger c"):

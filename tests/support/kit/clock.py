@@ -33,7 +33,7 @@ from drivers.wires.serial_frames import FrameReader
 from drivers.wires.serial_line import SerialWire
 from drivers.wires.wire import Wire
 from era_haptics.lab.conformance.check import run_checks
-from era_haptics.lab.conformance.contract import CHECKS, LEVEL, CheckResult, of_kind
+from era_haptics.lab.conformance.contract import CHECKS, DEFAULT_LEVEL, CheckResult, of_kind
 from era_haptics.lab.conformance.contract import CLIENTS as BY_PROTOCOL
 from registry import threads
 from registry.limits import GuardLimits
@@ -758,7 +758,7 @@ async def results_of(
     far: Judged,
     names: Sequence[str] = (),
     *,
-    level: float = LEVEL,
+    level: float = DEFAULT_LEVEL,
     on_result: Callable[[CheckResult], None] = lambda result: None,
     neighbours: Mapping[int, SimulatedAmplifier] | None = None,
 ) -> list[CheckResult]:
@@ -775,7 +775,7 @@ def judged(
     kind: str,
     names: Sequence[str] = (),
     *,
-    level: float = LEVEL,
+    level: float = DEFAULT_LEVEL,
     far: Judged | None = None,
     on_result: Callable[[CheckResult], None] = lambda result: None,
     neighbours: Mapping[int, SimulatedAmplifier] | None = None,

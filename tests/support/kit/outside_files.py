@@ -23,7 +23,7 @@ from controller.effects.strengths import read_strengths
 from controller.gateway.gateway_settings import read_token
 from controller.learning.learned_table import load_learned
 from controller.sources.tuio import read_capture
-from era_haptics.command import run
+from era_haptics.command import run_era
 from era_haptics.lab.design.problem import (
     DesignProblem,
     anywhere,
@@ -41,7 +41,7 @@ from model.errors import InputError
 from model.estimate.measurement import read_measured, read_places
 from model.files.array_file import write_arrays
 from model.files.modal_file import read_modes
-from model.files.uff import read_bytes
+from model.files.uff import read_measured_bytes
 from model.rig.rig_file import base_fingerprint, example_rig_path, load_rig
 from model.table.table_file import load_table, save_table
 from sim.faults import load_faults
@@ -62,7 +62,7 @@ def _run_command(words: str, path: Path) -> str:
     arguments = [names.get(word, word) for word in words.split()]
     printed = io.StringIO()
     with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(printed):
-        status = run(arguments)
+        status = run_era(arguments)
     text = printed.getvalue().strip()
     if status == BUG:
         raise RuntimeError(text)
@@ -92,7 +92,7 @@ READERS: Mapping[str, Callable[[Path], object]] = {
     "strengths.json": read_strengths,
     "token.txt": read_token,
     "taps.tuio": read_capture,
-    "wires.txt": lambda path: [*capture.read_capture(path, wires=["wire1"])],
+    "wires.txt": lambda path: [*capture.read_wire_capture(path, wires=["wire1"])],
     "tap.ahap": read_content,
     "tap.haptic": read_content,
     "tap.hjif": read_content,
@@ -105,9 +105,9 @@ READERS: Mapping[str, Callable[[Path], object]] = {
     "free.zma": read_impedance,
     "P1-1.wav": lambda path: read_stepped(path, DESK),
     "P1-1.csv": lambda path: read_stepped(path, DESK),
-    "modes.npz": lambda path: read_modes(path, read_bytes(path)),
-    "modes.uff": lambda path: read_modes(path, read_bytes(path)),
-    "modes.csv": lambda path: read_modes(path, read_bytes(path)),
+    "modes.npz": lambda path: read_modes(path, read_measured_bytes(path)),
+    "modes.uff": lambda path: read_modes(path, read_measured_bytes(path)),
+    "modes.csv": lambda path: read_modes(path, read_measured_bytes(path)),
     "table.npz": load_table,
     "learned.npz": lambda path: load_learned(path, table=""),
     "checked.yaml": partial(_run_command, "config check FILE"),

@@ -30,7 +30,7 @@ from model.answer.answer import Answer
 from model.answer.promise import FingersOnPlate
 from model.answer.stimulus import Placement
 from model.arrays import ComplexArray, FloatArray, Point
-from model.drive_modes import Drive, Forms
+from model.drive_modes import Forms, WeightedTones
 from model.estimate.following import SettledPattern
 from model.estimate.measurement import Measurement, sensors_at
 from model.fem import ELEMENTS, Mesh, assemble
@@ -513,7 +513,7 @@ def resting(
     }
 
 
-def by_hand(forms: Forms, drive: Drive) -> tuple[float, float]:
+def by_hand(forms: Forms, drive: WeightedTones) -> tuple[float, float]:
     """Robust score, and amplitude to threshold at the weakest target: powers of tones add."""
     target = np.zeros(len(forms.targets))
     quiet = np.zeros(forms.quiet.shape[1])

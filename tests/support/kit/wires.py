@@ -30,7 +30,7 @@ from drivers.host.amplifier import WATCHDOG
 from drivers.host.group import Group
 from drivers.opening import Lines
 from drivers.playing import AmplifierLayer, AmplifierTone
-from drivers.protocol.definition import STATES, reading
+from drivers.protocol.definition import STATES, status_reading
 from drivers.protocol.definition import STATUS as DEFINITION_STATUS
 from drivers.protocol.records import Record, Values
 from drivers.wires.can_frames import CanFrame, pack_frames, unpack_frames
@@ -553,7 +553,7 @@ def damage(data: bytes, chance: random.Random) -> bytes:
     return bytes(damaged).ljust(5, b"\0")
 
 
-LATER = reading("later_voltage", "of another supply", -1200, 6000, 100, "V", is_added=True)
+LATER = status_reading("later_voltage", "of another supply", -1200, 6000, 100, "V", is_added=True)
 WORD = 1201
 """That it states: 0 V."""
 AGES = ("older", "same", "newer")

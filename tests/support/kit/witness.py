@@ -25,18 +25,18 @@ from drivers.protocol.sets import LayerSet, is_vibrating
 from era_haptics.lab.expected_output import one_of
 from era_haptics.lab.witness.capture import (
     A_READ,
-    HELLO,
+    HELLO_REQUEST,
     AmplifierConfig,
     ChannelLimits,
-    Direction,
     TimeLimits,
+    TransferDirection,
     WitnessConfig,
     WitnessedRequest,
 )
 from era_haptics.lab.witness.host_rules import (
     CONFIRMED,
     IN_FLIGHT,
-    SILENCING,
+    SILENCING_REQUESTS,
     AmplifierSession,
     HostRules,
 )
@@ -62,7 +62,7 @@ ExpectedSets = Mapping[str, Mapping[int, Sequence[Tone]]]
 """Expected tones by amplifier and channel, over all layers: frequency [Hz], level, phase [deg]."""
 
 _REORDER_WINDOW = 0.020  # s; of two commands given within it the earlier may still be sent first
-_UNORDERED = (A_READ, HELLO, "GetCaps")
+_UNORDERED = (A_READ, HELLO_REQUEST, "GetCaps")
 _STEP = 0.6  # of a step of the wire; tolerance of rounding
 _TOLERANCE = 0.002  # of full level; of a measured one
 _FINE = 0.026  # Hz; half a step of the wire
@@ -236,7 +236,7 @@ class PlateRules(HostRules):
         request: WitnessedRequest,
         layers: Sequence[LayerSet] | None,
     ) -> None:
-        is_silencing = request.name in SILENCING
+        is_silencing = request.name in SILENCING_REQUESTS
         if is_silencing and session.vibrates(time) and not session.is_stopped:
             self._check_release(session, time, request.values["ramp"])
         super()._remember(session, time, request, layers)
@@ -379,7 +379,9 @@ class PlateWitness(Witness):
         for session in () if are_on else wire.sessions.values():
             session.amplifier.forget()  # what it did meanwhile may be unseen
 
-    def record_bytes(self, link: str, direction: Direction, time: float, data: bytes) -> None:
+    def record_bytes(
+        self, link: str, direction: TransferDirection, time: float, data: bytes
+    ) -> None:
         """Process bytes; those behind a frame that a fault has cut are read as its rest."""
         wire = self._wires[link]
         if wire.started_at.get(direction, time) <= self._faults_until[link] < time:

@@ -27,7 +27,7 @@ from typing import Any
 from cases import read_yaml
 from controller.api.client import Client
 from controller.api.jsonrpc import RpcError
-from era_haptics.command import run
+from era_haptics.command import run_era
 from kit.plates import DISTORTIONS, every
 from model.estimate.measurement import measurement_of, read_measured, write_responses_csv
 from model.rig.rig_file import example_rig_path, load_rig
@@ -135,7 +135,7 @@ def provoke(case: Case, folder: Path, shelf: Path) -> Outcome:
         with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
             program, *arguments = shlex.split(case.run)
             assert program == "era"
-            status = run(arguments)
+            status = run_era(arguments)
     text = err.getvalue().replace(str(folder), HOME)
     if case.blur:
         text = re.sub(case.blur, "...", text)
@@ -242,7 +242,7 @@ def filled(shelf: Path) -> Iterator[None]:
     (shelf / "rig.yaml").write_text(RIG, encoding="utf-8")
     table = f"table build {shelf}/rig.yaml -o {shelf}/table.npz --frequencies 60:120:30 --grid 4x3"
     with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
-        assert run(shlex.split(table)) == 0
+        assert run_era(shlex.split(table)) == 0
     (shelf / "rig.yaml").unlink()
     for name in ("measured.csv", "measured.uff", "touches.tuio"):
         (shelf / name).write_bytes((ROOT / "examples" / name).read_bytes())

@@ -76,13 +76,12 @@ from drivers.wires.serial_frames import (
 from era_haptics.lab.conformance.check import driving, reading
 from era_haptics.lab.conformance.judge_client import (
     GATEWAY_TIMEOUT,
-    QUIET,
+    QUIET_TIME,
     HeardMessage,
     JudgeClient,
     RequestOutcome,
     When,
     altered,
-    expect,
     expect_equal,
     layer,
     message_name,
@@ -91,6 +90,7 @@ from era_haptics.lab.conformance.judge_client import (
     require_in_time,
     send,
     stage,
+    verify,
 )
 from era_haptics.lab.conformance.subject import Subject
 from registry import threads
@@ -319,14 +319,14 @@ class ModbusClient(JudgeClient):
         what = f"function {pdu[0]} from register {int.from_bytes(pdu[1:3])}"
         heard = await self.replied(lambda each: each.number == number or not each.type, what)
         unit, response = heard.frame
-        expect(bool(heard.type), "response", expected="a valid frame", seen=response.hex(" "))
+        verify(bool(heard.type), "response", expected="a valid frame", seen=response.hex(" "))
         seen = unit, response[0] & ~EXCEPTION
         expect_equal(seen, (self.address, pdu[0]), "unit, function of a response")
         request = parse_request(Adu(unit, pdu))
         if request is not None:
             fits = response_to(request, Adu(unit, response)) is not None
             expected = "its registers, or address and count"
-            expect(
+            verify(
                 fits, f"response to {pdu[:5].hex(' ')}", expected=expected, seen=response.hex(" ")
             )
         return response, When(sent, heard.at)
@@ -396,7 +396,7 @@ class ModbusClient(JudgeClient):
         self._reader.end()
         heard = await super().send(data, *before, count=count)
         if self.is_rtu:
-            await asyncio.sleep(QUIET)  # ends a frame that is not whole
+            await asyncio.sleep(QUIET_TIME)  # ends a frame that is not whole
         return heard
 
 
@@ -481,7 +481,7 @@ async def present_areas(subject: Subject) -> None:
         await subject.starve()
         await client.send(client.adu(client.write_of(_STOP, [0], tag=4242), unit=0))
         (tag,) = await client.read(BOX * _STOP + REPLY_OFFSET, 1)
-        expect(tag != 4242, "tag after a Stop for all", expected="as before", seen=tag)
+        verify(tag != 4242, "tag after a Stop for all", expected="as before", seen=tag)
 
 
 def _bad_pdus(client: ModbusClient, ping: bytes) -> Iterator[tuple[str, bytes, int]]:
@@ -677,7 +677,7 @@ async def damaged_frames(subject: Subject) -> None:
     for other in client.neighbours if client.kind == "serial" else ():
         client.address = other
         named = await client.hello()
-        expect(named != subject.identity, "addresses that reply", expected=own, seen=other)
+        verify(named != subject.identity, "addresses that reply", expected=own, seen=other)
     client.address = own
     await subject.arm()
     await subject.play(subject.one())

@@ -30,22 +30,22 @@ from era_haptics.lab.conformance.check import driving, reading
 from era_haptics.lab.conformance.judge_client import (
     ContractViolation,
     RequestOutcome,
+    RequestRows,
     Row,
-    Rows,
     UntimedClock,
-    expect,
     expect_equal,
     expect_one_of,
     expect_within,
     layer,
-    play,
+    play_now,
     read_as,
     require,
     require_in_time,
     send,
     stage,
+    verify,
 )
-from era_haptics.lab.conformance.subject import RATE, Subject
+from era_haptics.lab.conformance.subject import RATE_STEP, Subject
 from era_haptics.lab.expected_amplifier import ROUNDED
 from era_haptics.lab.expected_output import DRIFT
 from registry import threads
@@ -62,16 +62,16 @@ _AMID = 0.15  # s; in which a sum comes to its peak
 
 
 @driving(_SETS)
-def layers_add(subject: Subject) -> Rows:
+def layers_add(subject: Subject) -> RequestRows:
     """It plays the sum of its layers, each with its own token, and those not named play on."""
     share, last = 1 / len(subject.layers), len(subject.layers) - 1
     filled = [layer(each, subject.beside(each, share)) for each in reversed(subject.layers)]
     emptied = map(layer, subject.layers[:-1])
-    return [subject.arm, *filled, *emptied, play(filled[-1], layer(last))]
+    return [subject.arm, *filled, *emptied, play_now(filled[-1], layer(last))]
 
 
 @driving(_SETS)
-def layers_play_on(subject: Subject) -> Rows:
+def layers_play_on(subject: Subject) -> RequestRows:
     """It lets ramps, onsets and ends of layers that a set does not name go on as they were."""
     first = subject.one(level=0.75, ramp=subject.ramp, valid_for=subject.ramp + 100)
     loud, quiet = (layer(1, subject.beside(1, each)) for each in (0.25, 0.125))
@@ -79,12 +79,12 @@ def layers_play_on(subject: Subject) -> Rows:
 
 
 @driving(_SETS)
-def valid_for(subject: Subject) -> Rows:
+def valid_for(subject: Subject) -> RequestRows:
     """It ends a layer after its valid_for, along its ramp, and stays armed; 0 and 60 s last."""
     ramp, short = min(100, subject.can["ramp_max"]), subject.lasting(100)
     half, pause = subject.one(level=0.5, valid_for=short), 0.12 * subject.slowness
     lasting = layer(1, subject.beside(1, 0.25), valid_for=60_000)
-    several = play(half, lasting, layer(2, subject.beside(2, 0.25)))
+    several = play_now(half, lasting, layer(2, subject.beside(2, 0.25)))
     return [
         [subject.one(valid_for=1)],
         [subject.one(valid_for=short)],
@@ -95,7 +95,7 @@ def valid_for(subject: Subject) -> Rows:
 
 
 @driving(_SETS)
-def renew(subject: Subject) -> Rows:
+def renew(subject: Subject) -> RequestRows:
     """It starts valid_for anew by a renewal, and changes nothing else."""
     first, second = (
         subject.one(level=0.5, ramp=40, valid_for=subject.lasting(200)),
@@ -114,7 +114,7 @@ def renew(subject: Subject) -> Rows:
 
 
 @driving(_SETS)
-def after(subject: Subject) -> Rows:
+def after(subject: Subject) -> RequestRows:
     """It starts commands with *after* once the onsets of the layer have ended, at once without."""
     first = subject.one(subject.tone(onset=subject.long_onset))
     waiting = layer(0, subject.tone(0, 0.25, frequency=subject.other), after=True)
@@ -143,7 +143,7 @@ def _passed(subject: Subject, sets: int) -> float:
 
 
 @driving(_SETS)
-def after_the_last_onset(subject: Subject) -> Rows:
+def after_the_last_onset(subject: Subject) -> RequestRows:
     """It waits for the last onset with knots of this layer on any channel, and for nothing else."""
     long = subject.long_onset
     short = subject.envelope(min(max(0.02, 2 * subject.exchange_time), 0.1), 0.5)
@@ -164,14 +164,14 @@ def after_the_last_onset(subject: Subject) -> Rows:
         (layer(0, *exchanged[1 - min(last, 1) :]), replace(waiting, commands=named)),
         # One that is released is not waited for.
         (subject.one(subject.tone(0, 0.5, ending=long)), layer(0), waiting),
-        (play(subject.one(level=0.5), shaped), waiting),
+        (play_now(subject.one(level=0.5), shaped), waiting),
         (rising, waiting),
         (unshaped, waiting),
     ]
 
 
 @driving(_SETS)
-def what_waits_for_an_onset(subject: Subject) -> Rows:
+def what_waits_for_an_onset(subject: Subject) -> RequestRows:
     """It plays what waited from its start: its own time, kept amplitudes, of several layers."""
     long, short, lasts = subject.long_onset, subject.envelope(0.04, 1.0), subject.lasting(70)
     half = subject.one(subject.tone(0, 0.5, onset=long))
@@ -190,7 +190,7 @@ def what_waits_for_an_onset(subject: Subject) -> Rows:
         (half, replace(timed, valid_for=2 * lasts)),
         *([(half, kept)] if subject.can["frequency_step"] == 1 else []),  # else it may be another
         (half, other, timed, beside),
-        (play(half, sooner), play(timed, beside)),
+        (play_now(half, sooner), play_now(timed, beside)),
         *([(together, timed)] if is_quarter else []),
         (ends, replace(timed, valid_for=0), _passed(subject, 2)),
         (replace(half, valid_for=subject.lasting(900)), timed, renewed),
@@ -198,7 +198,7 @@ def what_waits_for_an_onset(subject: Subject) -> Rows:
 
 
 @driving(_PLACE)
-def ramps(subject: Subject) -> Rows:
+def ramps(subject: Subject) -> RequestRows:
     """It rises and falls along the ramp of a layer, a raised cosine, on every channel."""
     whole, ramp_max = subject.whole(), subject.can["ramp_max"]
     part = partial(subject.follow, 0.4 * ramp_max / 1000)
@@ -210,7 +210,7 @@ def ramps(subject: Subject) -> Rows:
 
 
 @driving(_PLACE)
-def cross_fades(subject: Subject) -> Rows:
+def cross_fades(subject: Subject) -> RequestRows:
     """It cross-fades tones, each along its own raised cosine, continued where it is interrupted."""
     ramp, part = subject.ramp, 0.4 * subject.ramp / 1000
     half, other = subject.one(level=0.5), subject.tone(0, 0.5, frequency=subject.other)
@@ -224,7 +224,7 @@ def cross_fades(subject: Subject) -> Rows:
 
 
 @driving(_SETS)
-def kept_phase(subject: Subject) -> Rows:
+def kept_phase(subject: Subject) -> RequestRows:
     """It leads a tone whose phase is kept from its present amplitude to the new one."""
     tones = [
         subject.tone(0, fraction, phase, keep=True, frequency=frequency)
@@ -250,7 +250,7 @@ def kept_phase(subject: Subject) -> Rows:
 
 
 @driving(_PLACE)
-def onsets(subject: Subject) -> Rows:
+def onsets(subject: Subject) -> RequestRows:
     """It leads an onset along straight lines in the complex plane, from 0 or what it keeps."""
     subject.require_knots()
     shapes = [
@@ -265,7 +265,7 @@ def onsets(subject: Subject) -> Rows:
 
 
 @driving(_PLACE)
-def endings(subject: Subject) -> Rows:
+def endings(subject: Subject) -> RequestRows:
     """It leads a tone to silence by its ending: without a command, at level 0, at its end."""
     subject.require_knots()
     last, ramp = len(subject.channels) - 1, subject.ramp
@@ -287,7 +287,7 @@ def endings(subject: Subject) -> Rows:
 
 
 @driving(_PLACE)
-def endings_amid(subject: Subject) -> Rows:
+def endings_amid(subject: Subject) -> RequestRows:
     """It begins an ending at the present amplitude, plays it once, and lets nothing prolong it."""
     subject.require_knots()
     slowest = min(subject.exchange_time, 0.1)
@@ -312,7 +312,7 @@ def endings_amid(subject: Subject) -> Rows:
 
 
 @driving(_PLACE)
-def extreme_envelopes(subject: Subject) -> Rows:
+def extreme_envelopes(subject: Subject) -> RequestRows:
     """It plays as many knots as it states, along its shortest and longest step."""
     subject.require_knots()
     count = range(subject.can["knots"])
@@ -333,7 +333,7 @@ async def phases(subject: Subject) -> None:
         angle = 30.0 + 40.0 * number
         tones = [subject.tone(each, 0.5, angle + 5.0 * each) for each in subject.channels]
         silent = [layer(each) for each in subject.layers[1:] if each != number]
-        await subject.run([play(first, layer(number, *tones), *silent)])
+        await subject.run([play_now(first, layer(number, *tones), *silent)])
     for phase, periods in ((0.0, 0.25), (0.0, 0.5), (90.0, 0.75), (180.0, 0.5)):
         time = periods * 20 / max(subject.lowest, _SLOW)
         await subject.in_time(partial(_expect_alike, subject, phase, time))
@@ -366,7 +366,7 @@ async def _expect_alike(subject: Subject, phase: float, time: float) -> None:
 
 
 @driving(_PLACE)
-def voices(subject: Subject) -> Rows:
+def voices(subject: Subject) -> RequestRows:
     """It has all its voices on each channel, and cuts no more, by 2 ms, than what fades longest."""
     channels, last = sorted({0, subject.channels[-1]}), subject.layers[-1]
     count = min(subject.can["voices"], _MAX_VOICES)
@@ -413,11 +413,11 @@ def voices(subject: Subject) -> Rows:
     cuts: list[Row] = []
     for at in range(fades, fades + len(_SHARES)):
         cuts += [partial(subject.at, layer(0, *tones(at), ramp=ramp), lead=lead), look]
-    lasting = play(*(layer(number, *tones(count + number)) for number in subject.layers[1:]))
+    lasting = play_now(*(layer(number, *tones(count + number)) for number in subject.layers[1:]))
     # A full pool refuses neither another layer nor a layer's silence, nor a fade of all.
-    fade_all = play(*(layer(each, ramp=ramp) for each in subject.layers[:3]))
+    fade_all = play_now(*(layer(each, ramp=ramp) for each in subject.layers[:3]))
     silence = send("Silence", ramp=0)
-    full = layer(1, *tones(count + 1), ramp=ramp), fade_all, play(subject.one()), silence
+    full = layer(1, *tones(count + 1), ramp=ramp), fade_all, play_now(subject.one()), silence
     counted = [(partial(count_until, left), look) for left in _LEFT]
     return [
         # The oldest tone fades last: what is cut is the way to 0 that began first.
@@ -442,8 +442,8 @@ async def limited(subject: Subject) -> None:
 
     async def unseen(name: str, **values: int) -> None:
         """Play a tone beside a fade, of which no status tells before that of a request."""
-        beside = play(subject.whole(), layer(1, ramp=subject.ramp))
-        await subject.send_all([play(layer(0), over), beside])
+        beside = play_now(subject.whole(), layer(1, ramp=subject.ramp))
+        await subject.send_all([play_now(layer(0), over), beside])
         await asyncio.sleep(_AMID)
         await subject.request("GetAchieved", layer=0)
         flags = await subject.request(name, **values)
@@ -451,7 +451,7 @@ async def limited(subject: Subject) -> None:
 
     await unseen("Ping")
     opposite = layer(1, subject.tone(0, 1.0, 180.0))
-    await subject.run([layer(1), play(subject.one(), opposite), _AMID])
+    await subject.run([layer(1), play_now(subject.one(), opposite), _AMID])
     flags = await subject.request("GetStatus")
     expect_equal(has_flag(flags.values, "limited"), False, "limited, by tones that cancel")
     await unseen("Stop", ramp=0)
@@ -477,7 +477,7 @@ async def _read(subject: Subject, otherwise: type[ContractViolation] = ContractV
     await subject.request("GetStatus")
     subject.dating.expect_steady(otherwise)
     is_coarse = subject.can["clock_error"] > QUANTITIES["clock_error"].to_wire(HIGH_TIME)
-    expect(is_coarse or len(low) > 1, "low word of the clock", expected="any", seen=low)
+    verify(is_coarse or len(low) > 1, "low word of the clock", expected="any", seen=low)
 
 
 @reading(_CLOCKS_PLACE)
@@ -488,14 +488,14 @@ async def clock_goes_on(subject: Subject) -> None:
 
 
 @driving(_CLOCKS_PLACE)
-def clock_readings(subject: Subject) -> Rows:
+def clock_readings(subject: Subject) -> RequestRows:
     """It shows its clock as it is between request and reply, armed too, for ever on."""
     _require_known(subject)
     return [subject.arm, subject.one(), partial(_read, subject)]
 
 
 @driving(_CLOCKS_PLACE)
-def clock_shifts(subject: Subject) -> Rows:
+def clock_shifts(subject: Subject) -> RequestRows:
     """It moves its clock on by the shift of an Arm, not with the session that it holds."""
     _require_known(subject)
     again = send("Arm", watchdog=subject.can["watchdog_max"], shift=_SHIFTS[1])
@@ -515,7 +515,7 @@ async def clock_rate(subject: Subject) -> None:
     """It runs faster by the rate of a Ping until the next, and by none unless it is armed."""
     _require_known(subject)
     await subject.request("GetStatus")  # whose exchanges all rests on
-    duration = max(0.35, 1.5 * subject.read_time / (_HIGHEST * RATE - DRIFT))
+    duration = max(0.35, 1.5 * subject.read_time / (_HIGHEST * RATE_STEP - DRIFT))
     require(duration <= _MAX_DURATION, "its exchanges are too long to see a rate")
 
     lasting = _LASTING if subject.exchange_time <= _QUICK else duration / 2  # s; not of the clock
@@ -531,7 +531,7 @@ async def clock_rate(subject: Subject) -> None:
         subject.dating.expect_steady()
 
     fast, slow = (send("Ping", rate=each) for each in (_HIGHEST, _LOWEST))
-    changing_nothing: Rows = (
+    changing_nothing: RequestRows = (
         send("Ping", session=77, rate=_LOWEST, code="WRONG_SESSION"),
         send("Silence", ramp=0),
         send("Arm", watchdog=subject.can["watchdog_max"], shift=1),
@@ -607,7 +607,7 @@ async def _described(subject: Subject, first: int = 0) -> list[Values]:
         found += shown["sensors"]
         if first + len(found) >= shown["all"]:
             return found
-        expect(bool(shown["sensors"]), "sensors from a number on", expected="some", seen="none")
+        verify(bool(shown["sensors"]), "sensors from a number on", expected="some", seen="none")
 
 
 @reading(_SENSORS_PLACE)
@@ -619,7 +619,7 @@ async def sensors(subject: Subject) -> None:
         own = *subject.channels, NO_CHANNEL
         expect_one_of(one["channel"], own, f"channel of sensor {number}")
         expect_within(one["range"], _LEAST, math.inf, f"range of sensor {number}")
-        expect(found.count(one) == 1, f"sensor {number}", expected="unlike others", seen=one)
+        verify(found.count(one) == 1, f"sensor {number}", expected="unlike others", seen=one)
 
 
 def _request(number: int, *frequencies: int) -> Values:
@@ -657,7 +657,7 @@ async def _complete(
         low = max(window - (shown.when.latest - began.when.earliest) - ROUNDED, 0.0)
         high = max(window - (shown.when.earliest - began.when.latest) + ROUNDED, 0.0)
         expect_within(left, low, high, "window_left")
-        expect(
+        verify(
             high > 0 or not is_running, "state after the window", expected="over", seen="running"
         )
     seen = shown["reading"], shown["state"]
@@ -667,7 +667,7 @@ async def _complete(
     count = len(await _described(subject))
     while len(found) < count:
         shown, at = await subject.request("GetReading", first=len(found)), 0
-        expect(shown["count"] > 0, "sensors of a reading", expected=count, seen=len(found))
+        verify(shown["count"] > 0, "sensors of a reading", expected=count, seen=len(found))
         for _ in range(shown["count"]):
             row, at = read_as("sensors of a reading", record.read, shown["sensors"], at)
             found.append(row)

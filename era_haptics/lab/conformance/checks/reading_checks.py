@@ -41,10 +41,9 @@ from era_haptics.lab.conformance.judge_client import (
     AlreadyArmed,
     ContractViolation,
     JudgeClient,
-    Rows,
+    RequestRows,
     TooLate,
     When,
-    expect,
     expect_equal,
     expect_one_of,
     expect_within,
@@ -53,6 +52,7 @@ from era_haptics.lab.conformance.judge_client import (
     require_in_time,
     send,
     stage,
+    verify,
 )
 from era_haptics.lab.conformance.subject import Subject
 from era_haptics.lab.expected_amplifier import FAULT, OFF, REACTING
@@ -75,7 +75,7 @@ async def identity(client: JudgeClient) -> None:
     """It says who it is, always the same, and that it speaks version 4."""
     first = await greeted(client)
     for name in ("vendor", "product", "serial_number", "firmware"):
-        expect(bool(first[name]), name, expected="a text", seen="none")
+        verify(bool(first[name]), name, expected="a text", seen="none")
     expect_equal(await client.hello(), first, "identity, read again")
 
 
@@ -159,7 +159,7 @@ async def unknown_types(subject: Subject) -> None:
 
 
 @driving("protocol.md#checks-in-this-order")
-def lengths(subject: Subject) -> Rows:
+def lengths(subject: Subject) -> RequestRows:
     """It refuses messages that are a word too short or too long."""
     known = [name for name in MESSAGES if subject.has(_FEATURE_OF.get(name, ""))]
     shorter = [(name, words[:-1]) for name in known if (words := _shortest(name))]
@@ -257,7 +257,7 @@ async def events(subject: Subject) -> None:
         if is_stated and len(client.order) == count:
             await asyncio.sleep(client.timeout)
         if is_stated:
-            expect(
+            verify(
                 len(client.order) > count,
                 "Events of a watchdog that expires while nothing is asked",
                 expected="one at least",
@@ -500,7 +500,7 @@ async def read_object(client: CanClient, index: int, subindex: int = 0, *, code:
     while len(data) < size:
         answer = await _exchange(client, bytes([0x60 | toggle]) + bytes(7))
         is_next = answer[0] & 0xF0 == toggle
-        expect(
+        verify(
             is_next,
             f"segment of object {index:04x}/{subindex}",
             expected="the next",
@@ -587,7 +587,7 @@ async def heartbeats(subject: Subject) -> None:
         count = 1000 * took / interval if interval else 0
         slack, what = 0.15 * count + (interval > 0), f"heartbeats of {interval} ms in {took:.3g} s"
         expect_within(len(beats), count - slack, count + slack, what)
-        expect({*beats} <= {_OPERATIONAL}, "state in a heartbeat", expected="5", seen=beats)
+        verify({*beats} <= {_OPERATIONAL}, "state in a heartbeat", expected="5", seen=beats)
     client.frames.clear()
     await subject.run([partial(subject.arm, 0.0), subject.starve, subject.settle])
     known, fault = CANOPEN["emergencies"]["WATCHDOG"], FAULTS["WATCHDOG"] << 4
@@ -629,7 +629,7 @@ async def _fails_unheard(subject: Subject) -> None:
     await asyncio.sleep(_BEYOND)
     heard += client.data_of("emergency")
     await client.command("start")
-    expect(bool(heard), "emergencies of a fault", expected="two", seen="none")
+    verify(bool(heard), "emergencies of a fault", expected="two", seen="none")
     require_in_time(state == REACTING, "it was taken out of operation behind the fade of a fault")
     states = [each[3] & 0xF for each in heard]
     expect_equal(states, [REACTING, FAULT], "states in emergencies amid and behind that fade")

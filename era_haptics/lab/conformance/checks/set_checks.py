@@ -33,12 +33,12 @@ from drivers.protocol.sets import Command, Envelope, LayerSet, pack_layers
 from era_haptics.lab.conformance.check import driving
 from era_haptics.lab.conformance.judge_client import (
     FULL,
-    Rows,
+    RequestRows,
     Send,
     expect_within,
     in_batches,
     layer,
-    play,
+    play_now,
     require,
     send,
     stage,
@@ -55,7 +55,7 @@ _TONE = "frequency", "level", "phase"
 
 
 @driving(_PLACE)
-def every_channel(subject: Subject) -> Rows:
+def every_channel(subject: Subject) -> RequestRows:
     """It plays every channel at its own level, and silences those that a set does not name."""
     tones = [subject.tone(channel, 1 - 0.05 * channel) for channel in subject.channels]
     reverse = [replace(tones[-1 - at], channel=at) for at in reversed(subject.channels)]
@@ -65,7 +65,7 @@ def every_channel(subject: Subject) -> Rows:
 
 
 @driving(_PLACE)
-def levels_of_every_frequency(subject: Subject) -> Rows:
+def levels_of_every_frequency(subject: Subject) -> RequestRows:
     """It plays the level that was asked for at its lowest and its highest frequency."""
     ends = [
         (number, limits[end])
@@ -229,7 +229,7 @@ def _flawed_sets(subject: Subject) -> Iterator[Send]:
 
 
 @driving(_PLACE)
-def all_or_nothing(subject: Subject) -> Rows:
+def all_or_nothing(subject: Subject) -> RequestRows:
     """It refuses a set as a whole, says why and names the channel; what plays and waits stays."""
     flawed = [
         row
@@ -244,7 +244,7 @@ def all_or_nothing(subject: Subject) -> Rows:
         subject.arm,
         subject.one(),
         *(partial(subject.send_all, each) for each in in_batches(flawed, _AT_ONCE)),
-        play(subject.one(level=0.5), token=last),
+        play_now(subject.one(level=0.5), token=last),
         stage(subject.one(level=0.25)),
         _part(silent, "BAD_TOKEN", token=last - 1, now=1),
         send("Set", raw=[subject.next_session, 0, 1 << 1, *silent], code="BAD_TOKEN"),
@@ -253,7 +253,7 @@ def all_or_nothing(subject: Subject) -> Rows:
 
 
 @driving("protocol.md#messages")
-def accepts_its_ranges(subject: Subject) -> Rows:
+def accepts_its_ranges(subject: Subject) -> RequestRows:
     """It takes what is just within its ranges, and any frequency of a silent channel."""
     can, quiet = subject.can, round(subject.level * FULL)
     shapes = [
@@ -330,12 +330,12 @@ def _with(row: Send, *, code: str = "", **changed: Any) -> Send:
 
 
 @driving(_PLACE)
-def parts_of_sets(subject: Subject) -> Rows:
+def parts_of_sets(subject: Subject) -> RequestRows:
     """It takes parts in any order and again, and replies to the last alone: once whole, to it."""
     _require_quick(subject)
     made = long_set(subject)
 
-    def in_turn(token: int, now: int) -> Rows:
+    def in_turn(token: int, now: int) -> RequestRows:
         first, *others, last = _cut(subject, *made, token=token, now=now)
         incomplete = send("Commit", token=token, code="INCOMPLETE")
         late = [row for each in (*reversed(others), others[-1]) for row in (each, incomplete, last)]
@@ -344,7 +344,7 @@ def parts_of_sets(subject: Subject) -> Rows:
         again = first, others[0], last, send("Commit", token=token), last
         return [last, *late, first, incomplete, last, last, *again, 0.05]
 
-    others = play(subject.one(), *(layer(each) for each in subject.layers[1:]), token=3)
+    others = play_now(subject.one(), *(layer(each) for each in subject.layers[1:]), token=3)
     at_once, back = _cut(subject, *made, token=6), send("Commit", token=6)
     return [
         subject.arm,
@@ -354,7 +354,7 @@ def parts_of_sets(subject: Subject) -> Rows:
         0.05,
         *in_turn(4, now=1),
         # Back to back, and what says `now` is the last part alone.
-        play(subject.one(), token=5),
+        play_now(subject.one(), token=5),
         partial(subject.send_all, at_once),
         back,
         *(_with(each, token=7, now=1) for each in at_once[:-1]),
@@ -364,7 +364,7 @@ def parts_of_sets(subject: Subject) -> Rows:
 
 
 @driving(_PLACE)
-def parts_that_are_dropped(subject: Subject) -> Rows:
+def parts_that_are_dropped(subject: Subject) -> RequestRows:
     """It drops a part of what it cannot keep without a word, and the set under way stays."""
     _require_quick(subject)
     made = long_set(subject)
@@ -391,7 +391,7 @@ def parts_that_are_dropped(subject: Subject) -> Rows:
     ]
     return [
         subject.arm,
-        play(subject.one(), token=5),
+        play_now(subject.one(), token=5),
         last,
         first,
         drop_all,
@@ -412,7 +412,7 @@ def parts_that_are_dropped(subject: Subject) -> Rows:
 
 
 @driving(_PLACE)
-def parts_again(subject: Subject) -> Rows:
+def parts_again(subject: Subject) -> RequestRows:
     """It replaces a part by one that comes again, and confirms a whole set without a look."""
     _require_quick(subject)
     first, *others, last = _cut(subject, *long_set(subject), token=2)
@@ -434,7 +434,7 @@ def parts_again(subject: Subject) -> Rows:
 
 
 @driving(_PLACE)
-def refused_parts(subject: Subject) -> Rows:
+def refused_parts(subject: Subject) -> RequestRows:
     """It drops the parts of a set that is refused whole, and of no other."""
     _require_quick(subject)
     flawed = layer(len(subject.layers) - 1, subject.tone(), subject.tone())
@@ -450,7 +450,7 @@ def refused_parts(subject: Subject) -> Rows:
         flawed_one(last),
         last,
         stage(half, token=3),
-        flawed_one(play(flawed, token=4)),
+        flawed_one(play_now(flawed, token=4)),
         flawed_one(stage(flawed, token=4)),
         # A last part of a newer set that is not whole changes nothing; one that is kept does.
         good[-1],
@@ -463,13 +463,13 @@ def refused_parts(subject: Subject) -> Rows:
         good[-1],
         send("Commit", token=5),
         stage(half, token=6),
-        play(quarter, token=7),
+        play_now(quarter, token=7),
         send("Commit", token=6, code=_OLD),
     ]
 
 
 @driving(_PLACE)
-def empty_sets(subject: Subject) -> Rows:
+def empty_sets(subject: Subject) -> RequestRows:
     """It takes parts without words, and a set without any, which changes nothing."""
     one, half = subject.one(valid_for=subject.lasting(300)), subject.one(level=0.5)
     first, *_, last = _cut(subject, half, token=4)
@@ -494,7 +494,7 @@ def empty_sets(subject: Subject) -> Rows:
 
 
 @driving(_PLACE)
-def max_set(subject: Subject) -> Rows:
+def max_set(subject: Subject) -> RequestRows:
     """It takes a set of as many words as it states, and refuses a longer one."""
     room = min(subject.can["set_words"], _MAX_TRIED)
     longer = set_of(subject, room + 2)
@@ -505,7 +505,7 @@ def max_set(subject: Subject) -> Rows:
 
 
 @driving(_PLACE)
-def sets_expire(subject: Subject) -> Rows:
+def sets_expire(subject: Subject) -> RequestRows:
     """It discards a set that is not committed, or not complete, 1 s after its first part."""
     _require_quick(subject)
     first, *others, last = _cut(subject, *long_set(subject), token=3)
@@ -553,10 +553,10 @@ _STAGING_LONG, _BEHIND = 0.2, 0.02
 
 
 @driving(_PLACE)
-def stage_and_commit(subject: Subject) -> Rows:
+def stage_and_commit(subject: Subject) -> RequestRows:
     """It plays a staged set by the commit of its token only, once, and confirms it again."""
     both = layer(0, subject.tone(0, 0.5), ramp=50), layer(1, subject.beside(1, 0.25))
-    again = send("Commit", token=2), stage(*both, token=2), play(*both, token=2)
+    again = send("Commit", token=2), stage(*both, token=2), play_now(*both, token=2)
     others = (send("Commit", token=other, code=_OLD) for other in (3, 302, 2 ^ 0x100, 0))
     return [
         subject.arm,
@@ -571,37 +571,41 @@ def stage_and_commit(subject: Subject) -> Rows:
         stage(subject.one(level=0.75), token=3),
         send("Commit", token=2),
         send("Commit", token=3),
-        play(subject.one(), token=2, code=_OLD),
+        play_now(subject.one(), token=2, code=_OLD),
     ]
 
 
 @driving(_PLACE)
-def repeats_change_nothing(subject: Subject) -> Rows:
+def repeats_change_nothing(subject: Subject) -> RequestRows:
     """It starts nothing anew by a commit or set that comes again, even if its vibration ended."""
     one, commit = subject.one(valid_for=300), send("Commit", token=1)
-    again = commit, play(one, token=1)
+    again = commit, play_now(one, token=1)
     return [subject.arm, stage(one), commit, 0.2, *again, 0.13, *again]
 
 
 @driving(_PLACE)
-def tokens_wrap(subject: Subject) -> Rows:
+def tokens_wrap(subject: Subject) -> RequestRows:
     """It takes tokens that are newer by 1 to 32767 modulo 65536, and no others (RFC 1982)."""
-    rows: list[Rows] = [
+    rows: list[RequestRows] = [
         [
-            play(subject.one(level=0.5), token=newer),
+            play_now(subject.one(level=0.5), token=newer),
             *(
-                play(layer(0), token=(newer + ahead) % 0x10000, code=_OLD)
+                play_now(layer(0), token=(newer + ahead) % 0x10000, code=_OLD)
                 for ahead in (32_768, 32_769, 65_534)
                 if newer + ahead != 0x10000
             ),
         ]
         for newer in (65_535, 1, 32_768, 65_535)
     ]
-    return [subject.arm, play(subject.one(), token=65_530), *(row for each in rows for row in each)]
+    return [
+        subject.arm,
+        play_now(subject.one(), token=65_530),
+        *(row for each in rows for row in each),
+    ]
 
 
 @driving(_PLACE)
-def newer_sets_replace(subject: Subject) -> Rows:
+def newer_sets_replace(subject: Subject) -> RequestRows:
     """It keeps the newest staged set alone, and plays what comes with *now* at once."""
     half, quarter = subject.one(level=0.5), subject.one(level=0.25)
     dropped = partial(send, "Commit", code=_OLD)
@@ -627,7 +631,7 @@ def newer_sets_replace(subject: Subject) -> Rows:
 
 
 @driving(_PLACE)
-def committed_together(subject: Subject) -> Rows:
+def committed_together(subject: Subject) -> RequestRows:
     """It starts all layers and channels of a set at one moment."""
     tones = [subject.tone(each, 1 / len(subject.layers)) for each in subject.channels]
     room = subject.can["set_words"] // (LAYER.words + COMMAND.words * len(tones))
@@ -655,7 +659,7 @@ async def _starts(subject: Subject, duration: float, *, shift: int = 0) -> None:
     await subject.run([stage(one)])
     at, began = await subject.commit_in(duration), threads.now()
     await subject.request("Ping", rate=_SLOWEST if is_long else 0)
-    await subject.run([play(one, token=1), send("Commit", token=1)])
+    await subject.run([play_now(one, token=1), send("Commit", token=1)])
     await subject.pause(max(duration * is_ahead - _AROUND - threads.now() + began, 0.0))
     while threads.now() < began + duration * is_ahead + _AROUND:
         shown = await subject.status()
@@ -680,19 +684,19 @@ async def _starts(subject: Subject, duration: float, *, shift: int = 0) -> None:
 
 
 @driving(_PLACE)
-def what_waits_for_its_moment(subject: Subject) -> Rows:
+def what_waits_for_its_moment(subject: Subject) -> RequestRows:
     """It starts what waits before a newer Commit or *now*, and drops it with all that silences."""
     half = layer(1, subject.beside(1, 0.5))
     left = min(0.1 * subject.slowness, 0.4)
     waiting = stage(subject.one(level=0.25))
     arm = send("Arm", watchdog=subject.can["watchdog_max"])
     first, *_ = subject.parts(half, token=2, now=0, count=3)
-    refused = play(layer(0, after=True), token=3, code="BAD_VALUE")
-    ends: list[Rows] = [
+    refused = play_now(layer(0, after=True), token=3, code="BAD_VALUE")
+    ends: list[RequestRows] = [
         *([send(name, ramp=0)] for name in ("Silence", "Stop")),
         [send("Disarm", ramp=0), subject.settle, subject.arm],
         [arm],
-        *([play(one)] for one in (half, subject.one(level=0.5))),
+        *([play_now(one)] for one in (half, subject.one(level=0.5))),
         # It starts before what comes for its own layer.
         [stage(subject.one(level=0.5)), send("Commit", token=2)],
         [send("Set", **first)],
@@ -700,7 +704,11 @@ def what_waits_for_its_moment(subject: Subject) -> Rows:
         [stage(half), send("Commit", token=3, code=_OLD), refused],
     ]
     past = partial(subject.past_moment, _BEHIND)
-    trips: Rows = [send("Arm", watchdog=subject.shortest_watchdog), subject.starve, subject.settle]
+    trips: RequestRows = [
+        send("Arm", watchdog=subject.shortest_watchdog),
+        subject.starve,
+        subject.settle,
+    ]
     later = [waiting, partial(subject.commit_in, min(3 * left, 0.45)), *trips, past]
     # No status is read as it starts; its end counts from there.
     timed = subject.one(ramp=subject.ramp, valid_for=subject.lasting(100))

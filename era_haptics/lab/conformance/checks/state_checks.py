@@ -10,11 +10,11 @@ from drivers.protocol.sets import token_after
 from era_haptics.lab.conformance.check import driving
 from era_haptics.lab.conformance.checks.set_checks import long_set
 from era_haptics.lab.conformance.judge_client import (
+    RequestRows,
     Row,
-    Rows,
     expect_equal,
     layer,
-    play,
+    play_now,
     send,
     stage,
 )
@@ -29,7 +29,7 @@ _READINGS = {"mark": "Mark", "electrical": "GetMeasured"}  # by their features
 
 
 @driving(_STATES)
-def plays_nothing_disarmed(subject: Subject) -> Rows:
+def plays_nothing_disarmed(subject: Subject) -> RequestRows:
     """It plays nothing before it is armed."""
     return _unarmed(subject)
 
@@ -38,7 +38,7 @@ def _unarmed(subject: Subject, ramp: int = 0) -> list[Row]:
     """Make what is refused, or changes no state, unless it is armed; ramp: of a Disarm [ms]."""
     one, beyond = subject.one(level=0.75), QUANTITIES["ramp"].maximum
     # The state comes before what is beyond the capabilities, and a layer that comes twice.
-    others: list[Row] = [play(one, token=9, code=_WRONG), stage(one, one, token=9, code=_WRONG)]
+    others: list[Row] = [play_now(one, token=9, code=_WRONG), stage(one, one, token=9, code=_WRONG)]
     refused = send("Commit", token=1, code=_WRONG), send("Silence", ramp=beyond, code=_WRONG)
     return [*others, *refused, send("Ping", session=77), send("Disarm", ramp=ramp)]
 
@@ -52,17 +52,17 @@ def _latched(subject: Subject) -> list[Row]:
 
 
 @driving(_STATES)
-def arming(subject: Subject) -> Rows:
+def arming(subject: Subject) -> RequestRows:
     """It is silent once armed, with high voltage on, and forgets what was played and staged."""
     return [
         subject.arm,
-        play(subject.one(), token=40_000),
+        play_now(subject.one(), token=40_000),
         stage(subject.one(), token=40_001),
         send("Disarm", ramp=0),
         subject.settle,
         subject.arm,
         send("Commit", token=40_001, code="BAD_TOKEN"),
-        play(subject.one(), token=39_999),  # older than 40 000, but the first of this session
+        play_now(subject.one(), token=39_999),  # older than 40 000, but the first of this session
     ]
 
 
@@ -84,7 +84,7 @@ async def watchdog_ranges(subject: Subject) -> None:
 
 
 @driving(_STATES)
-def arms_again(subject: Subject) -> Rows:
+def arms_again(subject: Subject) -> RequestRows:
     """It takes the same Arm again as a restart of the watchdog with its time, and plays on."""
     low, high = subject.shortest_watchdog, subject.can["watchdog_max"]
     return [
@@ -98,13 +98,13 @@ def arms_again(subject: Subject) -> Rows:
 
 
 @driving(_SESSIONS)
-def sessions(subject: Subject) -> Rows:
+def sessions(subject: Subject) -> RequestRows:
     """It obeys the session that armed it, of 16 bits, and no other; an ended one arms no more."""
     subject.client.session, own = 0x1233, 0x1234
     quarter, maximum = subject.one(level=0.25), subject.can["watchdog_max"]
     outer = QUANTITIES["watchdog"]
     rows = (
-        play(quarter, token=3, code="WRONG_SESSION"),
+        play_now(quarter, token=3, code="WRONG_SESSION"),
         send("Commit", token=2, code="WRONG_SESSION"),
         # The session comes before what is beyond the capabilities.
         send("Silence", ramp=QUANTITIES["ramp"].maximum, code="WRONG_SESSION"),
@@ -129,10 +129,10 @@ def sessions(subject: Subject) -> Rows:
         send("Ping", session=0, code="BAD_VALUE"),
         send("Disarm", ramp=0),
         subject.settle,
-        play(quarter, session=0x1235, code=_WRONG),
+        play_now(quarter, session=0x1235, code=_WRONG),
         send("Arm", watchdog=maximum, session=own, code="WRONG_SESSION"),
         partial(_arm_as, subject, own ^ 0x100),
-        play(quarter, session=own, code="WRONG_SESSION"),
+        play_now(quarter, session=own, code="WRONG_SESSION"),
         send("Stop", ramp=0),
         subject.settle,
         subject.clear,
@@ -147,7 +147,7 @@ async def _arm_as(subject: Subject, session: int) -> None:
 
 
 @driving(_STATES)
-def arming_ends_fades(subject: Subject) -> Rows:
+def arming_ends_fades(subject: Subject) -> RequestRows:
     """It is silent 5 ms after an Arm amid a Disarm's fade, refused with the session of before."""
     disarm = send("Disarm", ramp=subject.can["ramp_max"])
     ended = send("Arm", watchdog=subject.can["watchdog_max"], code="WRONG_SESSION")
@@ -156,7 +156,7 @@ def arming_ends_fades(subject: Subject) -> Rows:
 
 
 @driving(_STATES)
-def stop(subject: Subject) -> Rows:
+def stop(subject: Subject) -> RequestRows:
     """It stops at once, latched and numbered, plays no more, and arms only once it is cleared."""
     return [
         subject.arm,
@@ -171,7 +171,7 @@ def stop(subject: Subject) -> Rows:
 
 
 @driving(_STATES)
-def stop_ramps(subject: Subject) -> Rows:
+def stop_ramps(subject: Subject) -> RequestRows:
     """It falls silent along the ramp of Stop or Disarm, a raised cosine; the sooner of both."""
     whole, fading = subject.whole(), _unarmed(subject, 0xFFFF)
     amid = partial(subject.follow, 0.2 * subject.slowness)
@@ -189,7 +189,7 @@ def stop_ramps(subject: Subject) -> Rows:
 
 
 @driving(_STATES)
-def silence_never_later(subject: Subject) -> Rows:
+def silence_never_later(subject: Subject) -> RequestRows:
     """It is silent by the sooner of two Stops; a later one prolongs nothing, nor does a fault."""
     subject.require_ramp()
     slow, quick = send("Stop", ramp=min(400, subject.can["ramp_max"])), send("Stop", ramp=50)
@@ -204,7 +204,7 @@ def silence_never_later(subject: Subject) -> Rows:
 
 
 @driving(_STATES)
-def stop_ends_all(subject: Subject) -> Rows:
+def stop_ends_all(subject: Subject) -> RequestRows:
     """It ends fades, onsets, endings, waiting sets and all layers by Stop, skipping endings."""
     subject.require_ramp()
     stopped = send("Stop", ramp=10)
@@ -212,7 +212,7 @@ def stop_ends_all(subject: Subject) -> Rows:
 
 
 @driving(_STATES)
-def stops_are_numbered(subject: Subject) -> Rows:
+def stops_are_numbered(subject: Subject) -> RequestRows:
     """It numbers every Stop, also of one disarmed; Clear names the last, else changes nothing."""
     latch = token_after(token_after(token_after(subject.latch)))
     others = (latch - 1) % 0x10000, (latch + 1) % 0x10000, latch ^ 0x100
@@ -231,7 +231,7 @@ def stops_are_numbered(subject: Subject) -> Rows:
 
 
 @driving(_STATES)
-def clear_too_early(subject: Subject) -> Rows:
+def clear_too_early(subject: Subject) -> RequestRows:
     """It stays stopped by a Clear amid its fade."""
     subject.require_ramp()
     ramp = subject.ramp
@@ -240,10 +240,10 @@ def clear_too_early(subject: Subject) -> Rows:
 
 
 @driving("protocol.md#sets")
-def silence(subject: Subject) -> Rows:
+def silence(subject: Subject) -> RequestRows:
     """It silences all layers along the ramp of Silence, drops what is staged, and stays armed."""
     ending = subject.envelope(0.1, 1, 1)
-    several = play(
+    several = play_now(
         layer(0, subject.tone(0, 0.5, ending=ending)),
         layer(1, subject.tone(0, 0.4, frequency=subject.other)),
         layer(2, subject.tone(1 % len(subject.channels), 0.1)),
@@ -317,7 +317,7 @@ async def watchdog_unread(subject: Subject) -> None:
 
 
 @driving(_SESSIONS)
-def what_feeds(subject: Subject) -> Rows:
+def what_feeds(subject: Subject) -> RequestRows:
     """It is fed by Arm, Ping, Set, Commit and Silence of its session, and counts the time left."""
     first, *_, last = subject.parts(*long_set(subject), token=3, now=0, count=3)
     feeds = (
@@ -344,15 +344,15 @@ async def what_does_not_feed(subject: Subject) -> None:
     made = long_set(subject)
     first, *_ = subject.parts(*made, token=7, now=0, count=3)
     flaws = "BAD_VALUE", "BAD_CHANNEL", "BAD_LENGTH"
-    idle: Rows = [
+    idle: RequestRows = [
         *(send(name) for name in ("GetStatus", "GetCaps", "GetFaults")),
         send("GetAchieved", layer=0),
         send("Clear", latch=0),
         subject.client.hello,
         *(send(name) for feature, name in _READINGS.items() if subject.has(feature)),
         send("Ping", session=77, code="WRONG_SESSION"),
-        play(subject.one(), token=7, session=77, code="WRONG_SESSION"),
-        play(subject.one(), token=0x8001, code="BAD_TOKEN"),
+        play_now(subject.one(), token=7, session=77, code="WRONG_SESSION"),
+        play_now(subject.one(), token=0x8001, code="BAD_TOKEN"),
         send("Set", **flawed, code=flaws),
         send("Set", **first, session=77),
         *(send("Set", **{**first, "token": token}) for token in (1, 0x8001)),
@@ -366,9 +366,13 @@ async def what_does_not_feed(subject: Subject) -> None:
         send("Silence", ramp=subject.can["ramp_max"] + 1, code="BAD_VALUE"),
         send("Arm", watchdog=subject.can["watchdog_max"] + 1, code="BAD_VALUE"),
     ]
-    collected: Rows = (send("Set", **first), 0.02, send("Commit", token=7, code="INCOMPLETE"))
+    collected: RequestRows = (
+        send("Set", **first),
+        0.02,
+        send("Commit", token=7, code="INCOMPLETE"),
+    )
     whole = [send("Set", **each) for each in subject.parts(*made, token=8, now=0, count=3)]
-    staged: Rows = (*whole, 0.02, whole[0])  # which is dropped
+    staged: RequestRows = (*whole, 0.02, whole[0])  # which is dropped
     await subject.run([subject.arm, subject.one()])
     for each in idle:
         await subject.unfed()
@@ -380,7 +384,7 @@ async def what_does_not_feed(subject: Subject) -> None:
 async def trips_amid_other_requests(subject: Subject) -> None:
     """It trips at its time amid requests that do not feed it."""
     await subject.run([partial(subject.arm, 0.0), subject.one(), subject.starve])
-    others: Rows = (
+    others: RequestRows = (
         send("GetFaults"),
         send("GetAchieved", layer=0),
         send("Clear", latch=0),

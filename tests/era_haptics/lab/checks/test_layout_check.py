@@ -25,12 +25,21 @@ from controller.cli.config_cli import config_kinds
 from controller.content.formats import named_content, read_content
 from controller.content.pattern import Pattern, Transient
 from controller.effects.effect import Effect, Region
-from controller.effects.kinds import BUILT_IN, Buzz, Click, Detents, Dial, File, Ramp, Texture
+from controller.effects.kinds import (
+    BUILT_IN_EFFECTS,
+    Buzz,
+    Click,
+    Detents,
+    Dial,
+    File,
+    Ramp,
+    Texture,
+)
 from controller.effects.layout import SurfaceLayout, load_layout
 from controller.effects.player import EffectPlayer
 from controller.play.selection import Chooser, Selector
 from controller.sources.touch import Contact, ContactKey
-from era_haptics.command import run as run_era
+from era_haptics.command import run_era
 from era_haptics.lab.checks import layout_check, layout_picture
 from era_haptics.lab.checks.content_check import check_content, content_figure, kept_shares
 from era_haptics.lab.checks.layout_check import (
@@ -68,7 +77,7 @@ SLIDER = Rectangle(0.02, 0.14, 0.26, 0.04)
 @pytest.fixture(autouse=True)
 def _few_touches(monkeypatch: pytest.MonkeyPatch) -> None:
     """A third of the touches of each region that the command tries."""
-    monkeypatch.setattr(layout_check, "MAX_TOUCHES", 10)
+    monkeypatch.setattr(layout_check, "_MAX_TOUCHES", 10)
 
 
 @cache
@@ -195,7 +204,7 @@ def test_strongest_target_of_every_kind(
 @pytest.mark.long
 def test_a_better_known_rig_feels_no_worse(monkeypatch: pytest.MonkeyPatch) -> None:
     """No problem is new, and contrasts promised for the example do not fall by 0.3 dB or more."""
-    monkeypatch.setattr(layout_check, "MAX_TOUCHES", 8)
+    monkeypatch.setattr(layout_check, "_MAX_TOUCHES", 8)
     layout = load_layout(EXAMPLE, smooth_rig().plate)
     table = build_table(smooth_rig(), frequencies=np.arange(100.0, 281.0, 10.0))  # of its bands
     usual, known = (
@@ -268,7 +277,7 @@ def test_files_that_config_init_writes_fit_each_other(
 ) -> None:
     """Each beside the rig; fingers in any two regions of the layout are promised 4 dB at once."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(layout_check, "MAX_TOUCHES", 20)
+    monkeypatch.setattr(layout_check, "_MAX_TOUCHES", 20)
     monkeypatch.setattr(layout_picture, "MAX_TRIPLES", 0)
     assert run_era(["config", "init", "rig.yaml"]) == 0
     if kind != "rig":
@@ -327,8 +336,10 @@ CASES = {
 @pytest.mark.usefixtures("plain_pictures")
 def test_every_kind_has_its_rows() -> None:
     """In both lists of this file; a texture is felt where a finger moves, not where it stops."""
-    assert {type(effect) for effect, *_ in STRONGEST} == {*BUILT_IN}, "a row in STRONGEST each"
-    assert {type(case.effect) for case in CASES.values()} | {Texture} == {*BUILT_IN}, (
+    assert {type(effect) for effect, *_ in STRONGEST} == {*BUILT_IN_EFFECTS}, (
+        "a row in STRONGEST each"
+    )
+    assert {type(case.effect) for case in CASES.values()} | {Texture} == {*BUILT_IN_EFFECTS}, (
         "a row in CASES each, but for kinds that only a moving finger feels"
     )
 

@@ -19,7 +19,7 @@ from cobs import cobs
 import era_haptics
 from cases import shortly
 from drivers.errors import CommandError
-from drivers.protocol.definition import MESSAGES, NAMES
+from drivers.protocol.definition import MESSAGES, REQUEST_NAMES
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Command, LayerSet, pack_layers
 from drivers.trace import tracing
@@ -27,8 +27,8 @@ from drivers.wires.can_frames import pack_frames, unpack_frames
 from drivers.wires.modbus_frames import framed
 from drivers.wires.serial_frames import FrameReader, encode_frame
 from era_haptics.lab.conformance.check import (
-    Check,
     CheckResult,
+    ConformanceCheck,
     ConformanceReport,
     in_words,
     run_checks,
@@ -281,8 +281,12 @@ async def _stalled(stalls: list[float], subject: Subject) -> None:
     await subject.follow(0.12)
 
 
-def _tried(stalls: list[float], steps: Callable[[list[float], Subject], Any] = _stalled) -> Check:
-    return Check("stalled", "passes", "", drives=True, kinds=(), run=partial(steps, stalls))
+def _tried(
+    stalls: list[float], steps: Callable[[list[float], Subject], Any] = _stalled
+) -> ConformanceCheck:
+    return ConformanceCheck(
+        "stalled", "passes", "", drives=True, kinds=(), run=partial(steps, stalls)
+    )
 
 
 async def _wrong(stalls: list[float], subject: Subject) -> None:
@@ -376,7 +380,7 @@ def obey_late(monkeypatch: pytest.MonkeyPatch, delay: float) -> None:
 
     def late(data: bytes) -> tuple[float, bytes]:
         (frame,) = FrameReader().feed(data)
-        is_late = NAMES.get(frame.type & 0x7F) not in ("GetStatus", "GetCaps", "GetFaults")
+        is_late = REQUEST_NAMES.get(frame.type & 0x7F) not in ("GetStatus", "GetCaps", "GetFaults")
         return is_late * delay, data
 
     changed(monkeypatch, "_send", late)

@@ -15,7 +15,7 @@ import pytest
 from matplotlib.image import imsave
 
 from era_haptics.lab.design import problem as problem_module
-from era_haptics.lab.design.design_run import Design, Runner, judge, layout_keys, rank_layouts
+from era_haptics.lab.design.design_run import Design, Runner, assess, layout_keys, rank_layouts
 from era_haptics.lab.design.problem import (
     Area,
     ContactRule,
@@ -90,7 +90,7 @@ def test_a_layout_is_judged_with_the_eras_of_its_problem() -> None:
     corners = {"corners": soft.own_positions}
     found = rank_layouts({soft: corners, stiff: corners}, finalists=1, runner=Runner())
     for each in found.layouts:
-        alone = judge(each.problem.rig_with(soft.own_positions), FEW)
+        alone = assess(each.problem.rig_with(soft.own_positions), FEW)
         assert sorted(each.answers.contrast_db) == pytest.approx(sorted(alone.contrast_db))
 
 
@@ -392,7 +392,7 @@ def test_scores_fall_with_the_error_of_fields_as_answers_do() -> None:
         scorer = Scorer(some, np.arange(60.0, 320.0, 10.0), pairs, eras=some.eras)
         places = scorer.places(np.array([[era.x, era.y] for era in some.eras]))
         scores.append(scorer.mean(places, np.arange(4)))
-        answers.append(judge(some, pairs).mean_db)
+        answers.append(assess(some, pairs).mean_db)
     assert answers[0] - answers[1] > 4
     assert scores[0] - scores[1] == pytest.approx(answers[0] - answers[1], abs=2)
 

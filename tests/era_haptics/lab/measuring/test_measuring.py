@@ -21,12 +21,12 @@ from typer.testing import CliRunner
 from benchmarks.desk.session import open_client
 from benchmarks.desk_plate.desk_plate import Converters, DeskModel, DeskPlate, JackPlate, Truth
 from drivers.errors import LinkError
-from era_haptics.command import run as run_era
+from era_haptics.command import run_era
 from era_haptics.lab.measuring import other_sources
 from era_haptics.lab.measuring.impedance import (
     ImpedanceSetup,
     exciter_values,
-    fitted,
+    fit_circuit,
     read_impedance,
 )
 from era_haptics.lab.measuring.measure import (
@@ -42,7 +42,7 @@ from era_haptics.lab.measuring.sound_card import (
     ResponseEstimate,
     SoundCard,
     WiredSensor,
-    default_frequencies,
+    multisine_frequencies,
 )
 from examples.make_measured import record_responses
 from kit.plates import exciter_rig_text
@@ -55,7 +55,7 @@ from model.structure.attachments import PointLoad
 from processes.sound_cards import DeskCard, ExciterCircuit, jack_server
 from processes.typed_page import ERA
 from sim.plant.fingers import Accelerometer
-from sim.soft_amp.engine import address_of
+from sim.soft_amp.engine import callback_address
 
 PLACES = ((0.03, 0.05), (0.20, 0.11))
 FIXED = tuple(WiredSensor(f"P{n}", x, y, n, 1e-3) for n, (x, y) in enumerate(PLACES, start=1))
@@ -152,7 +152,7 @@ def test_a_plate_that_rings_long_is_given_the_time_to_settle(eta: float, seconds
 
 def test_multisine_has_its_level_and_orthogonal_runs() -> None:
     """No sample above the level in any run; at each line the runs form a unitary matrix."""
-    multisine = Multisine(default_frequencies(40, 500), 5, RATE, LEVEL)
+    multisine = Multisine(multisine_frequencies(40, 500), 5, RATE, LEVEL)
     runs = [multisine.signal(run, periods=2) for run in range(5)]
     assert 0.9 * LEVEL < np.abs(runs).max() <= LEVEL * (1 + 1e-9)
     assert (multisine.frequencies % 2 == 1).all()
@@ -320,7 +320,7 @@ def test_delay_follows_from_the_slope_of_phases() -> None:
     assert latency(np.exp(-2j * np.pi * evenly * 3.7e-3), evenly) == pytest.approx(3.7e-3)
     response = 0.4 * np.exp(-2j * np.pi * PLAYED_HZ * 3.7e-3)
     assert latency(response, PLAYED_HZ) == pytest.approx(3.7e-3)
-    lines = default_frequencies(40, 500)
+    lines = multisine_frequencies(40, 500)
     drawn = np.exp(2j * np.pi * np.random.default_rng(0).uniform(size=len(lines)))
     with pytest.raises(LinkError, match="loop-back"):
         latency(drawn, lines)
@@ -351,7 +351,7 @@ class CallbackCard(SoundCard):
             ctypes.c_ulong,
             ctypes.c_void_p,
         )
-        callback = kind(address_of("transfer_portaudio"))
+        callback = kind(callback_address("transfer_portaudio"))
         block = np.ones(FRAMES, dtype=np.float32)
         out = np.zeros(FRAMES, dtype=np.float32)
         recorded, played, given = block.ctypes.data, out.ctypes.data, self.given
@@ -464,7 +464,7 @@ def test_parts_are_within_their_intervals_in_nine_of_ten_draws(
         for each in exact:
             drawn = rng.normal(size=(2, len(F)))
             noisy = each + 1e-3 * np.abs(each) * (drawn[0] + 1j * drawn[1])
-            runs.append(fitted(F, SERIES * (gain * (noisy / resistor + 1) - 1), what="run"))
+            runs.append(fit_circuit(F, SERIES * (gain * (noisy / resistor + 1) - 1), what="run"))
         weight, base = np.array([WEIGHT, BASE]) + SCALE * rng.normal(size=2)
         bench = ImpedanceSetup(weight, None, base, SCALE, SERIES, series_error, input_error)
         for name, (value, width) in exciter_values(*runs, bench).items():
@@ -479,7 +479,7 @@ def test_parts_are_those_of_the_circuit() -> None:
     """
     rng = np.random.default_rng(0)
     free, glued, light = (
-        fitted(F, run(rng, is_glued=is_glued, base=base, noise=1e-9), what="run")
+        fit_circuit(F, run(rng, is_glued=is_glued, base=base, noise=1e-9), what="run")
         for is_glued, base in ((False, np.inf), (True, np.inf), (True, BASE))
     )
     for circuit, base in ((glued, np.inf), (light, BASE)):
@@ -503,7 +503,7 @@ def test_parts_are_those_of_the_circuit() -> None:
 def test_eddy_currents_are_no_error_of_the_parts() -> None:
     """A semi-inductance of 0.01 ohm s^0.5, 0.8 ohm at 1 kHz: what moves is found as without it."""
     rng = np.random.default_rng(1)
-    glued = fitted(F, run(rng, is_glued=True, noise=1e-4, semi=0.01), what="run")
+    glued = fit_circuit(F, run(rng, is_glued=True, noise=1e-4, semi=0.01), what="run")
     found = exciter_values(None, glued, ImpedanceSetup(MAGNET))
     assert glued["semi_inductance"] == pytest.approx(0.01, rel=0.01)
     for name in ("resonance", "q", "resistance", "force_factor"):
@@ -521,13 +521,14 @@ def test_what_is_no_exciter_is_refused() -> None:
         (8 * (1 + 1e-3 * rng.normal(size=len(F))) + 0j, "resonance"),
     ):
         with pytest.raises(InputError, match=cause):
-            fitted(F, values, what="run")
+            fit_circuit(F, values, what="run")
     free, glued = (
-        fitted(F, run(rng, is_glued=is_glued, noise=1e-4), what="run") for is_glued in (False, True)
+        fit_circuit(F, run(rng, is_glued=is_glued, noise=1e-4), what="run")
+        for is_glued in (False, True)
     )
     with pytest.raises(InputError, match="exchanged"):
         exciter_values(glued, free, ImpedanceSetup(WEIGHT))
-    other = fitted(
+    other = fit_circuit(
         F, RESISTANCE + 2 * (run(rng, is_glued=True, noise=1e-4) - RESISTANCE), what="run"
     )
     with pytest.raises(InputError, match="one exciter"):

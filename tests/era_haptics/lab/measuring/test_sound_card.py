@@ -32,7 +32,7 @@ from benchmarks.desk_plate.desk_plate import (
 from benchmarks.direct_plate import direct_responder
 from controller.plate_measurement import MeasuredPlate
 from drivers.errors import LinkError
-from era_haptics.command import run
+from era_haptics.command import run_era
 from era_haptics.lab.measuring.measure import measure_through
 from era_haptics.lab.measuring.sound_card import (
     Desk,
@@ -447,7 +447,7 @@ class Bench:
         """Exit status of a measurement with these keys."""
         self._keys, self.said = [*keys], ""
         words = ["measure", "rig.yaml", "--device", "memory", "--sensors", "sensors.csv", "-o"]
-        status = run([*words, self.output, "--frequencies", "61:301:80", *more])
+        status = run_era([*words, self.output, "--frequencies", "61:301:80", *more])
         self.out, said = self._capsys.readouterr()
         self.said += said
         return status

@@ -27,7 +27,7 @@ from drivers.playing import AmplifierLayer
 from era_haptics.lab.cli import app as cli_app
 from era_haptics.lab.measuring import table_measurement
 from era_haptics.lab.measuring.other_sources import read_stepped
-from era_haptics.lab.measuring.outputs import OutputFinding, listen, matched, tone
+from era_haptics.lab.measuring.outputs import OutputFinding, listen_to_outputs, matched, tone
 from era_haptics.lab.measuring.sound_card import Desk, SoundCard, WiredSensor, read_sensors
 from kit.plates import exciter_rig
 from model.arrays import ComplexArray, Float32Array, FloatArray
@@ -348,7 +348,7 @@ def test_accelerometer_tells_swapped_backwards_dead_and_weak(rig: Rig, truth: Tr
     """
 
     def heard(card: Cabled) -> list[OutputFinding]:
-        return listen(Desk(rig, ()), card, 1, outputs=4, level=0.1, move=card.move)
+        return listen_to_outputs(Desk(rig, ()), card, 1, outputs=4, level=0.1, move=card.move)
 
     found = heard(cabled(truth, order=(0, 2, 1, 3), gains=(1, 1, -1, 1)))
     assert [each.era for each in found] == [rig.eras[n].name for n in (0, 2, 1, 3)]

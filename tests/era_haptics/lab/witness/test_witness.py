@@ -22,11 +22,11 @@ from controller.sources.touch import Touch, TouchFrame
 from drivers.host.amplifier import Amplifier
 from drivers.wires.modbus_frames import framed
 from era_haptics.lab.witness.capture import (
-    Direction,
-    Message,
+    TransferDirection,
+    WitnessedMessage,
     WitnessedReply,
     WitnessedRequest,
-    read_capture,
+    read_wire_capture,
 )
 from era_haptics.lab.witness.witness import DECODERS, Witness
 from group_stops import RandomGroup
@@ -199,7 +199,7 @@ def test_witness_finds_nothing_in_the_chain(scenario: str, wire: str, amplifiers
     follow(course, scene, rng=random.Random(1))
 
 
-def summary(message: Message) -> tuple[str, dict[str, Any]]:
+def summary(message: WitnessedMessage) -> tuple[str, dict[str, Any]]:
     """Return what a message is, and its values; of one that is wrong what is said of it."""
     if isinstance(message, WitnessedRequest):
         return message.name, {"problem": True} if message.problem else message.values
@@ -352,7 +352,7 @@ def test_decoders_read_what_no_page_shows(talk: str) -> None:
     kind, pieces = TALKS[talk]
     decoder = DECODERS[kind]()
     for arrow, data, what, values in pieces:
-        direction: Direction = "amplifier" if arrow == ">" else "host"
+        direction: TransferDirection = "amplifier" if arrow == ">" else "host"
         heard = [message for _, message in decoder.feed(direction, 0.001, data)]
         name, found = summary(heard[0]) if heard and heard[0] is not None else ("", {})
         assert name == what
@@ -806,7 +806,7 @@ def test_capture_replays_as_it_was_heard(tmp_path: Path) -> None:
     path = tmp_path / "capture.txt"
     path.write_text("\n".join(talk.capture), encoding="utf-8")
     witness = Witness(talk.config)
-    for piece in read_capture(path, wires=witness.wires):
+    for piece in read_wire_capture(path, wires=witness.wires):
         witness.record_bytes(piece.wire, piece.direction, piece.time, piece.data)
     assert [*map(str, witness.finish())] == [*map(str, talk.witness.finish())]
     assert [one.invariant for one in witness.finish()] == ["plays"]

@@ -515,7 +515,7 @@ GOOD: dict[Callable[..., Any], dict[str, Any]] = {
         "rig": COARSE_RIG, "eras": [4], "layouts": "random:3", "keep": ["SW"], "where": "edge",
         "contacts": "contacts.yaml", "contents": 1, "apart": 0.03, "lowest": 20.0,
         "stiffness": [17e3], "finalists": 1, "starts": 1, "seed": 0, "workers": 1,
-        "cluster": "tcp://127.0.0.1:1", "progress": print,
+        "cluster": "tcp://127.0.0.1:1", "progress": print, "on_layout": print,
     },
     era.SolvedPlate: {"rig": COARSE_RIG, "seed": 1},
     SOLVED.map: {"drive": DRIVE, "raster": (3, 3)},

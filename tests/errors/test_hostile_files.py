@@ -33,6 +33,9 @@ READ: dict[str, set[str]] = {
 """By the name of a file the variants that its reader may read."""
 
 
+READ_BY_LINES = {"wires.txt", "token.txt", "questions.jsonl"}
+"""Files of any size, of which no more than a first wrong line is read."""
+
 SHORT = (
     "daemon.yaml",
     "mask.png",
@@ -98,7 +101,7 @@ def _fault_of_message(report: Report, name: str) -> str:
     if INTERNALS.search(message) or not first.isprintable():
         return f"words of Python, or control characters: {message}"
     if report.variant.startswith("sparse") and "must be up to" not in message:
-        return "" if name in ("wires.txt", "token.txt") else f"reads on: {message}"
+        return "" if name in READ_BY_LINES else f"reads on: {message}"
     return ""
 
 

@@ -549,7 +549,7 @@ async def test_stop_waits_for_few_requests_of_clients_that_do_not_read(
     """
     begun = 0
     begun_at_stop: list[int] = []
-    begin = connections.ClientConnection.begin
+    begin = connections.ClientConnection.start_request
     send = AsyncClient.request
 
     def count(connection: connections.ClientConnection, request: web.Request) -> None:
@@ -563,7 +563,7 @@ async def test_stop_waits_for_few_requests_of_clients_that_do_not_read(
         return await send(client, method, params)
 
     monkeypatch.setattr("os.nice", lambda _: 0)
-    monkeypatch.setattr(connections.ClientConnection, "begin", count)
+    monkeypatch.setattr(connections.ClientConnection, "start_request", count)
     monkeypatch.setattr(AsyncClient, "request", note)
     async with serving(daemon.socket) as port, contextlib.AsyncExitStack() as opened:
         flooding = []

@@ -847,8 +847,8 @@ BASES = {
     "absolute": ("base: rig.yaml", "base: /rig.yaml", r"base: must be in the folder of this file"),
     "itself": ("base: rig.yaml", "base: rig.fitted.yaml", r"base: must be the rig file that"),
     "a number": ("base: rig.yaml", "base: 3", r"base: must be the name of a rig file, got 3"),
-    "another ERA": ("  A:", "  Z:", r"eras.Z: must be in rig.yaml, which has none of this name"),
-    "no fingerprint": ("base_fingerprint", "#", r"base: rig.yaml must have the plate, ERAs,"),
+    "another ERA": ("  A:", "  Z:", r"eras.Z: must be in 'rig.yaml', which has none of this name"),
+    "no fingerprint": ("base_fingerprint", "#", r"base: 'rig.yaml' must have the plate, ERAs,"),
     "unknown key": ("    stiffness:", "    stifness:", r"eras.A.stifness: "),
 }
 
@@ -884,8 +884,8 @@ def test_a_base_may_be_wired_anew_but_not_built_anew(tmp_path: Path) -> None:
     assert back.amplifiers == {"m": "serial:///dev/ttyS9"}
     assert back.wiring["C"].number == 5
     for wrong, said in (
-        (FLOW.replace("2 mm", "3 mm"), r"rig.yaml must have the plate, ERAs, masses"),
-        (FLOW.replace("[0.3, 0]", "[0.2, 0]"), r"rig.yaml must have the plate, ERAs, masses"),
+        (FLOW.replace("2 mm", "3 mm"), r"'rig.yaml' must have the plate, ERAs, masses"),
+        (FLOW.replace("[0.3, 0]", "[0.2, 0]"), r"'rig.yaml' must have the plate, ERAs, masses"),
         (FLOW.replace("mesh: 12x9", "mesh: 12x"), r"rig\.yaml:3: mesh: "),
         (
             "rig: other.yaml\nsocket: era.sock\n",

@@ -442,7 +442,7 @@ def test_show_prints_exciters_and_what_they_reach(
     assert found["exciters"][0].keys() >= {"magnet_resonance_hz", "q", "force_at_1_w_n"}
     show(str(path), as_json=False)
     text = capsys.readouterr().out
-    everywhere = "20 dB SL everywhere but 2 cm at the edges, under a finger"
+    everywhere = "20 dB SL (vibrotactile-probe) everywhere but 2 cm at the edges, under a finger"
     assert f"{everywhere}, by the board of the file: from {lowest} Hz" in text
 
 

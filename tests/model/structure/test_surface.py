@@ -246,7 +246,8 @@ def test_modes_that_differ_are_those_of_the_bench_and_of_drawn_plates(
     assert _difference(other, known) > 0.1
     assert _difference(other, bench) < 0.04
     places = [(0.1, 0.1), (0.2, 0.05), (0.15, 0.2)]
-    drive = answer(known, [Finger(places[0], Stimulus())]).layers[0].excitation
+    asked = [Finger(places[0], Stimulus())]
+    drive = answer(known, asked, drive_mode="switched").layers[0].excitation
     of_each = (known, plates), (other, replace(plates, modes=np.ones((1, 2, 0))))
     drawn, expected = (amplitudes_on(table, places, drive, on)[1] for table, on in of_each)
     np.testing.assert_allclose(drawn, expected, rtol=0.1)

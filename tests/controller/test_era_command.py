@@ -378,7 +378,7 @@ LOADED = """
 import contextlib, io, sys
 from importlib.metadata import packages_distributions
 from controller.cli.main import join_commands
-from era_haptics.command import command_modules, run
+from era_haptics.command import command_modules, run_era
 
 if "all" in sys.argv:
     def help_of(command, path):
@@ -389,7 +389,7 @@ if "all" in sys.argv:
 else:
     paths = [[]]
 with contextlib.redirect_stdout(io.StringIO()):
-    assert [run([*path, "--help"]) for path in paths] == [0] * len(paths)
+    assert [run_era([*path, "--help"]) for path in paths] == [0] * len(paths)
 heavy = {"asyncio", "ssl", *packages_distributions()}
 print(len(paths), *sorted(heavy & {name.partition(".")[0] for name in sys.modules}))
 """

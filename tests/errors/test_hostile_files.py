@@ -93,7 +93,7 @@ def _fault_of_message(report: Report, name: str) -> str:
     message = report.text
     first, *others = message.splitlines()
     if name == "questions.jsonl" and first.startswith("{"):
-        return "" if '"line": 1' in message else message  # an answer to the line
+        return "" if '"line": ' in message else message  # the error of a line
     if name not in first:
         return f"does not name the file: {message}"
     if others and not first.endswith(":"):  # problems of a file, or of one that it names, follow

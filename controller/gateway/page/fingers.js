@@ -1,6 +1,6 @@
 // Fingers on the plate's picture: pointers of every kind, one moved by the keyboard, and resting ones. A press with
 // the shift key lets a finger rest until it is pressed the same way again, or Escape lifts all. An effect button
-// whose page holds no finger down puts one where the last one was, for as long as the effect may last.
+// whose page holds no finger down puts one where the last one was, for two seconds.
 
 const STEP_M = 0.005;
 const KEYBOARD = -1;  // an id that no pointer has
@@ -27,9 +27,7 @@ export class Fingers {
     }
     plate.addEventListener("contextmenu", (event) => event.preventDefault());
     plate.addEventListener("keydown", (event) => this.key(event));
-    plate.addEventListener("blur", ({ relatedTarget }) => {
-      if (!relatedTarget?.closest("#effects")) this.removeCursor();
-    });
+    plate.addEventListener("blur", () => this.removeCursor());
   }
 
   press(event, plate) {

@@ -157,6 +157,8 @@ async def run_simulation(
     ready is called once with the URLs by amplifier, view a few times a second. Time is virtual in a
     `SteppedLoop`. Returns a message about the file written. Raises InputError, LinkError.
     """
+    import termios  # noqa: F401  # fails where there are neither terminals nor these signals
+
     ended = asyncio.Event()
     loop = asyncio.get_running_loop()
     for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):  # SIGHUP: the terminal closes

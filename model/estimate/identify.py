@@ -73,6 +73,7 @@ _DRIVE_GAIN, _DRIVE_PHASE_DEG = 0.01, 1.0
 _MIN_VALUES = 16
 _GAIN_STDS = 5.0  # beyond which a gain is wrong
 _GAIN_ALLOWED, _PHASE_ALLOWED = 0.3, math.radians(20)  # whatever the rig's uncertainty
+_LEVEL_ALLOWED = math.log(2.5)  # of all responses together: a g is 9.8 m/s², an inch 25.4 mm
 
 _CLOCK_STDS = 4.0  # beyond which a clock is not as stated
 
@@ -242,6 +243,7 @@ def identify(rig: Rig, measurement: Measurement, *, progress: Progress = unseen)
     fitted = fit_board(rig, measurement)
     board = fitted.model.rig
     found = Identification(rig, board, fitted, fitted.stated_covariance, None)
+    _check_level(found.values)
     if found.is_explained:
         _check_gains(board, measurement, found.values, fitted.space)
     unknown = unknowns(found)
@@ -429,6 +431,21 @@ def solved_with_modes_of(free: FreePlate, plate: Plate) -> FreePlate:
     stiffer = plate.lowest_bending_frequency / free.plate.lowest_bending_frequency
     frequency_max = free.frequency_max * max(stiffer * _FREQUENCY_MARGIN, 1.0)
     return solve_free_plate(plate, free.mesh, frequency_max=frequency_max)
+
+
+def _check_level(values: PlateValues) -> None:
+    """Raise InputError if all responses are far too large or small: another unit.
+
+    This is checked of fits that explain nothing, too: a wrong unit can be why they do not.
+    """
+    drive_level = np.log(np.abs(values["gain"])).mean()
+    sensor_level = np.log(np.abs(values["sensor_gain"])).mean()
+    level = float(drive_level + sensor_level)
+    if abs(level) > _LEVEL_ALLOWED:
+        raise InputError(
+            "measurement must be acceleration in m/s² along the drives' motion, got responses "
+            f"of about {math.exp(level):.2g} times the rig's; check the units of sensors and drives"
+        )
 
 
 def _check_gains(rig: Rig, measurement: Measurement, values: PlateValues, space: Space) -> None:

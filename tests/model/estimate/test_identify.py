@@ -127,8 +127,7 @@ def test_the_same_data_again_tell_no_more_of_the_level(rig: Rig) -> None:
     [
         pytest.param(
             lambda right: replace(right, values=right.values / 9.80665),
-            "must be acceleration in m/s²",
-            marks=pytest.mark.long,
+            r"must be acceleration in m/s².* responses of about 0\.1.* check the units",
             id="in g",
         ),
         pytest.param(

@@ -355,7 +355,12 @@ def test_equivalent_plate_keeps_rotary_inertia():
 
 
 @pytest.mark.parametrize(
-    ("modulus", "frequency"), in_turn([0.1e6, 1e6, 10e6, 1e9], [40.0, 150.0, 500.0, 2000.0])
+    ("modulus", "frequency"),
+    [
+        *in_turn([1e6, 10e6, 1e9], [40.0, 500.0, 2000.0]),
+        # Glass on the softest gel slides by itself at 1.4 kHz: the theory holds to half of that.
+        *in_turn([0.1e6], [150.0, 40.0, 650.0]),
+    ],
 )
 def test_waves_equal_elasticity(modulus, frequency):
     """Frequency of a wave within 0.5 % for adhesives from gel to epoxy, over the limits of a rig.

@@ -658,8 +658,11 @@ async def test_effect_button_always_finds_a_finger_of_its_page(page: Page, era: 
     await contacts(era, 0)
     for _ in range(3):
         await page.click("#effects button")
-        await page.until("document.querySelectorAll('.contact.target').length")
-    assert await page.evaluate("document.querySelector('#problem').innerText") == ""
+        await page.until(
+            "document.querySelectorAll('.contact.target').length"
+            " || document.querySelector('#problem').innerText"
+        )
+        assert await page.evaluate("document.querySelector('#problem').innerText") == ""
     (finger,) = await contacts(era, 1)
     assert math.dist(finger, pressed) < 0.001
     await contacts(era, 0)

@@ -235,6 +235,7 @@ def demo(
 @pytest.mark.parametrize(
     ("given", "then"),
     [((), "era config init my_rig.yaml"), (("mine.yaml",), "era table build mine.yaml")],
+    ids=["example rig", "own rig"],
 )
 def test_lines_say_of_each_touch_what_was_promised_and_felt(
     given: tuple[str, ...], then: str, demo: Demo

@@ -306,13 +306,19 @@ def test_run_runs_a_command_and_returns_zero(
         (["ends", "refused"], 1, ""),
         (["ends", "worse"], 2, "rig.yaml:3: plate.length: is missing; add it"),
         (["ends", "unplugged"], 3, "the line is gone; plug it in"),
-        (["ends", "file"], 2, "/no/such/file: no such folder /no/such"),
-        (["ends", "bug"], 70, "KeyError: 'oops'"),
-        (["ends", "--", "--debug"], 70, "KeyError: '--debug'"),
+        pytest.param(
+            ["ends", "file"], 2, "/no/such/file: no such folder /no/such", id="missing folder"
+        ),
+        pytest.param(["ends", "bug"], 70, "KeyError: 'oops'", id="bug"),
+        pytest.param(
+            ["ends", "--", "--debug"], 70, "KeyError: '--debug'", id="debug behind two dashes"
+        ),
         (["ends", "interrupt"], 130, ""),
         (["ends", "abort"], 130, ""),
         (["god"], 2, "Did you mean 'good'? See era --help"),
-        (["version"], 2, "Did you mean --version? See era --help"),
+        pytest.param(
+            ["version"], 2, "Did you mean --version? See era --help", id="option without dashes"
+        ),
         (["good", "--nmber", "1"], 2, "era good --help"),
         (["good", "--number", "x"], 2, "era good --help"),
         (["ends"], 2, "era ends --help"),
@@ -339,6 +345,7 @@ def test_run_reports_an_error_in_one_line_with_its_status(
 @pytest.mark.parametrize(
     "arguments",
     [["--debug", "ends", "bug"], ["ends", "--debug", "bug"], ["ends", "bug", "--debug"]],
+    ids=["first", "in between", "last"],
 )
 def test_run_shows_the_traceback_with_debug(
     entries: LoadModules, capsys: pytest.CaptureFixture[str], arguments: list[str]

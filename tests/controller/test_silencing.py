@@ -304,7 +304,9 @@ def test_frame_that_silences_is_carried_out_before_it_is_refused(
 
 
 @pytest.mark.parametrize(
-    ("arguments", "options"), [((), {"client": "x" * 81}), ((), {"reason": "door"}), (("hmi",), {})]
+    ("arguments", "options"),
+    [((), {"client": "x" * 81}), ((), {"reason": "door"}), (("hmi",), {})],
+    ids=["long name", "unknown keyword", "positional argument"],
 )
 def test_client_ends_renewal_before_it_complains_about_a_stop(
     place: Place, arguments: tuple[str, ...], options: dict[str, str]

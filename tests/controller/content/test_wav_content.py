@@ -146,6 +146,10 @@ GUID = struct.pack("<HHIH", 22, 16, 4, 1) + bytes.fromhex("000000001000800000aa0
                   .tobytes()),
         ),
     ],
+    ids=[
+        "pipe", "pipe with a list", "31 bits", "31 bits less a head", "no sizes", "empty file",
+        "no size", "list behind", "byte behind", "RF64", "extensible", "RIFX", "24 bits",
+    ],
 )  # fmt: skip
 def test_files_are_read_whole_whatever_their_sizes_say(read: Read, content: bytes) -> None:
     """A second of 150 Hz, as pipes, recorders without power and other programs leave it."""

@@ -291,7 +291,12 @@ DEFAULTS = {
         ({"level_db_sl": "19"}, "", ""),
         ({"layouts": "{a: 10.yaml}"}, "", ""),
         ({"level_db_sl": "21"}, "while armed", ""),
-        ({"layouts": "{a: 10.yaml, b: neighbours.yaml}"}, "while armed", ""),
+        pytest.param(
+            {"layouts": "{a: 10.yaml, b: neighbours.yaml}"},
+            "while armed",
+            "",
+            id="a stronger layout is added",
+        ),
         *(
             ({"level_db_sl": "10", key: value}, key, key)
             for key, value in (

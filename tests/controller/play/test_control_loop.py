@@ -526,6 +526,7 @@ def test_selector_keeps_other_contacts_quiet(recorder: Any) -> None:
         ((105.0, 105.0), (100.0, 100.0)),
         ((310.0, 400.0), (45.0, 300.0)),
     ],
+    ids=["within", "low", "high", "between frequencies", "outside"],
 )
 def test_selector_asks_within_the_band_of_its_target(
     recorder: Any, band: tuple[float, float], asked: tuple[float, float]

@@ -449,6 +449,7 @@ def test_route_wraps_phases(radians: float, degrees: float) -> None:
         ({"A": Tone(110.01, 5e-6), "C": Tone(110.01, 9e-6)}, set()),
         ({"A": Tone(250.0, 5e-6), "C": Tone(250.0, 9e-6)}, set()),
     ],
+    ids=["amplitude", "phase", "one less", "frequency of one", "another", "all by little", "all"],
 )
 def test_route_keeps_phase_only_if_all_eras_continue(wanted: Excitation, kept: set[str]) -> None:
     """A frequency restarts if an ERA joins it."""

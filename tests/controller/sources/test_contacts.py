@@ -457,8 +457,8 @@ def test_jitter_changes_a_velocity_by_a_sixth_at_most_mostly() -> None:
     [
         ((0.04, 0.03), 0, (12 / 9.4) ** 2),  # 12 mm by 6 mm
         ((0.01, 0.01), 0, 0.4),
-        ((0.084, 0.01), 0, HAND_LOAD),  # 25.2 mm by 2 mm
-        ((0.25, 0.2), 0, HAND_LOAD * 1.5**2),  # 75 mm by 40 mm
+        pytest.param((0.084, 0.01), 0, HAND_LOAD, id="25.2 mm by 2 mm"),
+        pytest.param((0.25, 0.2), 0, HAND_LOAD * 1.5**2, id="75 mm by 40 mm"),
         ((0.9, 0.9), 0, 40.0),
         ((0.01, 0.124), 0, 2.5),  # 24.8 mm
         ((0.01, 0.126), 0, HAND_LOAD),

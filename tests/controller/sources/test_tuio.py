@@ -675,6 +675,7 @@ BLOBS = full("a").replace(b"2Dcur", b"2Dblb")
         ([(full("a", 1, 2), PEER), (partial("a", [1, 2], {1: 0.1}), PEER)], 0),
         ([(full("a", 1, 2), PEER), (b"no bundle", PEER)], 0),
     ],
+    ids=["another name or port", "another profile", "profiles mixed", "partial", "no bundle"],
 )
 def test_newest_complete_bundle_supersedes_those_of_its_kind(
     sent: list[tuple[bytes, Peer]], first: int

@@ -157,7 +157,9 @@ async def test_amplifier_may_play_until_what_is_under_way_has_arrived() -> None:
 
 
 @pytest.mark.parametrize("wire", ["serial", "tcp", "can"])
-@pytest.mark.parametrize("missed", [(0.001, 0.028), (0.012, 0.015), (0.001, 0.5)])
+@pytest.mark.parametrize(
+    "missed", [(0.001, 0.028), (0.012, 0.015), (0.001, 0.5)], ids=["early", "late", "long"]
+)
 @grouped(("a",))
 async def test_time_that_this_process_misses_is_no_time_of_the_amplifier(
     group: Group, ends: list[MemoryLine], missed: tuple[float, float]

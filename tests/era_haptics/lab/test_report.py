@@ -136,8 +136,8 @@ def test_report_gives_a_name_one_replacement_in_all_files(tmp_path: Path) -> Non
     assert "left" not in "".join(file.text for file in files.values())
 
 
-RECORDS = [
-    (
+RECORDS = {
+    "level and time": (
         {
             "time": "2026-01-02T03:04:05.123Z",
             "level": "warning",
@@ -149,28 +149,28 @@ RECORDS = [
             "message": "no reply within 30 ms",
         },
     ),
-    (
+    "URL in a message": (
         {"message": "link main: no tcp://me:1@amp:4001 of swordfish, 10.0.0.2:4001 -> lost"},
         {"message": "link main: no … of … … -> lost"},
     ),
-    (
+    "URL of a port": (
         {"url": "serial:///dev/ttyUSB0?baud=9600", "cause": "at serial+tcp://me:1@amp:4001, lost"},
         {"url": "serial:///dev/ttyUSB0?baud=9600", "cause": "at serial+tcp://hidden, lost"},
     ),
-    (
+    "path and address": (
         {"message": "wrote /home/swordfish/era.log for swordfish@example.com, attempts=3"},
         {"message": "wrote … for … attempts=3"},
     ),
-    (
+    "serial number and token": (
         {"serial_number": "A17", "access_token": 4},
         {"serial_number": "hidden", "hidden-2": "hidden"},
     ),
-    ({"time_s": 1.5, "swordfish": 4077361}, {"time_s": 1.5, "hidden-2": "hidden"}),
-    (
+    "unknown key": ({"time_s": 1.5, "swordfish": 4077361}, {"time_s": 1.5, "hidden-2": "hidden"}),
+    "unknown key of a part": (
         {"content": {"state": 7, "channels": [1, None, True], "swordfish": {"state": 1}}},
         {"content": {"state": 7, "channels": [1, None, True], "hidden-3": "hidden"}},
     ),
-    (
+    "traceback": (
         {
             "traceback": 'Traceback:\n  File "/home/swordfish/x.py", line 3, in f\n'
             '  File "/opt/era/controller/cli/main.py", line 12, in run\nValueError: swordfish'
@@ -180,10 +180,10 @@ RECORDS = [
             "  File controller/cli/main.py, line 12\nValueError: …"
         },
     ),
-]
+}
 
 
-@pytest.mark.parametrize(("record", "expected"), RECORDS)
+@pytest.mark.parametrize(("record", "expected"), RECORDS.values(), ids=RECORDS)
 def test_record_is_shown_in_the_programs_own_words(
     record: dict[str, object], expected: dict[str, object]
 ) -> None:

@@ -191,7 +191,7 @@ TARGET, QUIET = (0.09, 0.07), (0.24, 0.17)
 STROKE = 100e-6  # m
 
 
-@pytest.mark.parametrize("loads", [(), (2.5, 0.4)])
+@pytest.mark.parametrize("loads", [(), (2.5, 0.4)], ids=["no fingers", "two fingers"])
 @pytest.mark.parametrize("frequency", [60.0, 110.0, 250.0])
 @pytest.mark.parametrize("duration", [0.02, 0.04, 0.15])
 def test_gain_is_that_of_the_plate_in_time(

@@ -109,7 +109,7 @@ def jump() -> Course:
 
 
 @pytest.mark.parametrize("course", [strokes(), jump()], ids=["strokes", "jump"])
-@pytest.mark.parametrize("loads", [(), (2.5, 0.4)])
+@pytest.mark.parametrize("loads", [(), (2.5, 0.4)], ids=["no fingers", "two fingers"])
 @pytest.mark.parametrize("frequency", [60.0, 110.0, 250.0])
 def test_a_course_is_felt_as_on_the_plate_in_time(
     frequency: float, loads: tuple[float, ...], course: Course

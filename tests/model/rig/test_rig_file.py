@@ -326,12 +326,18 @@ UNMESHED = "\n".join(line for line in GOOD.splitlines()[:20] if not line.startsw
             (Uncertainty(0.01, 5.0, 0.0, 0.1, 1.0, 0.5), ("thickness", "damping")),
         ),
         # feet are known as little by their stiffness as by their kind, those of edges are none
-        (GOOD + FEET, lambda rig: (rig.uncertainty.supports, rig.exactly_known), (0.3, ())),
+        pytest.param(
+            GOOD + FEET,
+            lambda rig: (rig.uncertainty.supports, rig.exactly_known),
+            (0.3, ()),
+            id="feet of a stated stiffness",
+        ),
         (GOOD + TAPE, lambda rig: (rig.uncertainty.supports, rig.exactly_known), (0.0, ())),
-        (
+        pytest.param(
             GOOD + FEET + "uncertainty: {supports: 0}\n",
             lambda rig: (rig.uncertainty.supports, rig.exactly_known),
             (0.0, ("supports",)),
+            id="feet that are known exactly",
         ),
         (GOOD, lambda rig: (rig.fingertip,), (Fingertip(1000, 2, 0.0002, 0.005, 500, 2),)),
         (GOOD + FIRM, lambda rig: (rig.fingertip,), (Fingertip(2000, 2, 0.0003, 0.005, 500, 2),)),

@@ -235,7 +235,12 @@ def test_run_that_lost_a_block_is_played_again(
             InputError,
             "0.9 of output 2 of ERA SE: outputs are swap",
         ),
-        ({"on_inputs": [0, 1, 3, 3]}, InputError, "input 3 must have sensor P3, got output 5"),
+        pytest.param(
+            {"on_inputs": [0, 1, 3, 3]},
+            InputError,
+            "input 3 must have sensor P3, got output 5",
+            id="the cable also at the input of a sensor",
+        ),
         ({"gain": 50.0}, InputError, "clipping"),
         ({"gain": 0.0}, LinkError, "all inputs are silent"),
         ({"on_inputs": [0, 1, 2, 2]}, InputError, "input 4 must bring back .* by a cable"),
@@ -265,10 +270,20 @@ WIRED = np.array([[0.02, 0.03, 0.02, 0.03, 0.0]] * 3 + [[0.0, 0.0, 0.0, 0.0, 0.9
     ("at", "gains", "cause"),
     [
         (4, [0, 0, 0, 0, 0], r"output 5 alone, as the loop-back, got 0 of it; connect them"),
-        (4, [0, 0.03, 0, 0, 0.9], "got 0.03 of output 2 of ERA SE, too; check mixers"),
+        pytest.param(
+            4,
+            [0, 0.03, 0, 0, 0.9],
+            "got 0.03 of output 2 of ERA SE, too; check mixers",
+            id="another output in the loop-back",
+        ),
         (4, [0, 0.01, 0, 0, 0.9], None),  # 1 % is what cables beside each other have
         (4, [0, 0.9, 0, 0, 0], "got 0.9 of output 2 of ERA SE: outputs are swapped"),
-        (2, [0, 0, 0, 0, 0.3], "input 2 must have sensor P2, got output 5 as by a cable"),
+        pytest.param(
+            2,
+            [0, 0, 0, 0, 0.3],
+            "input 2 must have sensor P2, got output 5 as by a cable",
+            id="a cable at the input of a sensor",
+        ),
         (3, [0, 0.8, 0, 0, 0], "input 3 must have sensor P3, got output 2 as by a cable"),
         (3, [0.02, 0.03, 0.02, 0.03, 0.3], None),  # monitoring beside a sensor takes nothing away
     ],
@@ -723,6 +738,10 @@ def _written(form: str, above: str = "", *, comma: bool = False, unit: float = 1
         _written("{f}\t{r}\t{x}", "\N{BYTE ORDER MARK}! VNA\r\nfreq[Hz]\tre:Z\tim:Z\r\n"),
         _written("{f},{z},{d},{r},{x}", "f,|Z|,Phase(deg),Real,Imag\n"),
         _written('"{f}";"{z}";"{d}"', "sep=;\nf/Hz;Z/Ohm;phi/deg\n", comma=True),
+    ],
+    ids=[
+        "no header", "tabs", "REW", "REW with spaces", "REW with decimal commas", "LIMP", "German",
+        "kHz and rad", "milliohms", "parts", "parts in reverse", "VNA", "all", "quoted",
     ],
 )  # fmt: skip
 def test_impedance_of_other_programs_is_read_by_its_meaning(tmp_path: Path, text: str) -> None:

@@ -789,7 +789,9 @@ def test_status_amid_a_fault_may_show_a_mark_that_came_twice(
     assert {*talk.found} == broken
 
 
-@pytest.mark.parametrize(("beats", "broken"), [(2, ["credit"]), (13, [])])
+@pytest.mark.parametrize(
+    ("beats", "broken"), [(2, ["credit"]), (13, [])], ids=["soon", "after a round of numbers"]
+)
 def test_request_with_the_bytes_of_an_old_one_is_no_copy(beats: int, broken: list[str]) -> None:
     """0.4 s later, on a disturbed wire, it is one, without a reply; 2.6 s later it is new."""
     talk = Talk().armed().says(kind=hand.GET_STATUS)

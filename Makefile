@@ -76,7 +76,7 @@ test-kernels: .venv/installed-test
 # What reads and writes Modbus, with the lowest and the newest pymodbus that the bounds allow, each in
 # a folder of its own. Others: make test-pymodbus PYMODBUS=3.12.1
 PYMODBUS := 3.8.* 3.*
-MODBUS := tests/drivers/wires tests/era_haptics/lab/conformance tests/era_haptics/lab/witness tests/sim/amplifier tests/sim/far_ends
+MODBUS := tests/drivers/wires tests/era_haptics/lab/conformance tests/sim
 test-pymodbus: .venv/installed-test
 	@set -f; for version in $(PYMODBUS); do \
 		folder="$(CURDIR)/out/pymodbus-$$version"; rm -rf "$$folder"; export PYTHONPATH="$$folder"; \

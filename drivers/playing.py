@@ -8,7 +8,7 @@ alone. A channel plays the sum of its voices. A voice is one tone of one layer u
 
 The angle is that of the amplifier's clock (`drivers.protocol.definition`) times the frequency word
 n, so it does not depend on when the voice began. The simulated amplifier computes samples from
-this, the ledger the worst case, and the witness and the conformance checks what they expect.
+this, the ledger the worst case, and the conformance checks what they expect.
 
 Amplitudes are complex, in full levels. Times [s] are of any one clock, and never go back. Loops are
 plain and make few calls, because both host and far end play every set.

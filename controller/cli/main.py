@@ -53,7 +53,7 @@ SECTIONS = {
         "reload",
         "report",
     ),
-    "Amplifier": ("amp", "soft-amp", "witness"),
+    "Amplifier": ("amp", "soft-amp"),
 }
 """The commands as help and reference list them, in each section the seldom used ones last."""
 

@@ -15,7 +15,6 @@ from era_haptics.lab.checks.layout_cli import layout_app
 from era_haptics.lab.conformance.conformance_cli import conformance
 from era_haptics.lab.design.design_cli import design_app
 from era_haptics.lab.measuring.measure_cli import MeasureCommand, measure, outputs
-from era_haptics.lab.witness.witness_cli import witness
 from model.commands.options import (
     FolderOption,
     JsonOption,
@@ -112,6 +111,6 @@ app.add_typer(content_app, name="content")
 app.add_typer(layout_app, name="layout")
 app.add_typer(design_app)
 app.add_typer(figure_app)
-for _command in (play, report, witness, outputs):
+for _command in (play, report, outputs):
     app.command()(_command)
 app.command(cls=MeasureCommand)(measure)

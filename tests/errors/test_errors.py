@@ -28,7 +28,6 @@ from era_haptics.lab.design.problem import (
     area_of,
 )
 from era_haptics.lab.paper_figures import paper_figures
-from era_haptics.lab.witness.relay import parse_endpoint
 from kit.outside_files import READERS, RIG
 from model.config.document import read_document
 from model.config.units import parse_frequencies
@@ -288,7 +287,6 @@ PARSERS: dict[str, Callable[[str], object]] = {
     "wire": lambda text: simulated(URL, *text.split()),
     "URL to simulate": simulated,
     "line": lambda text: choose_lines(simulated("serial:///dev/ttyUSB0"), [text]),
-    "endpoint": parse_endpoint,
     "area": lambda text: area_of(text, RIG.plate),
 }
 """By what a text is, what reads it."""

@@ -22,7 +22,6 @@ _BETWEEN_DATASETS = {"UTF-16", "surrogates as UTF-8"}
 READ: dict[str, set[str]] = {
     # Strengths that were never set have no file.
     "strengths.json": {"missing", "UTF-16", "UTF-32"},
-    "wires.txt": {"empty", "blanks", "cut in half", "many empty lines"},
     "measured.csv": {"UTF-16", "cut in half"},
     "measured.uff": {*_BETWEEN_DATASETS, "zero bytes inside"},  # in a description
     "modes.uff": _BETWEEN_DATASETS,
@@ -33,7 +32,7 @@ READ: dict[str, set[str]] = {
 """By the name of a file the variants that its reader may read."""
 
 
-READ_BY_LINES = {"wires.txt", "token.txt", "questions.jsonl"}
+READ_BY_LINES = {"token.txt", "questions.jsonl"}
 """Files of any size, of which no more than a first wrong line is read."""
 
 SHORT = (

@@ -52,7 +52,6 @@ from drivers.host.group import GroupState
 from drivers.opening import Lines
 from era_haptics.command import run_era
 from era_haptics.lab.conformance.contract import opened
-from era_haptics.lab.witness.capture import TimeLimits
 from kit.chain import Chain
 from kit.clock import in_virtual_time
 from kit.fingers import write_schedule
@@ -96,6 +95,7 @@ from registry import threads
 from registry.limits import GuardLimits
 from sim.far_ends.wire_assignment import SimulatedWire
 from sim.faults import FaultWindow
+from witness.capture import TimeLimits
 
 NAMES = ("a", "b", "c", "d")
 BUSES = {

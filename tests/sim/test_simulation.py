@@ -1,45 +1,28 @@
-"""A simulation as a process: its command, its run loop, its view on a terminal, its control socket.
-
-Also the command of the witness, which relays real wires and writes a report, with its errors.
-"""
+"""A simulation as a process: command, run loop, view on a terminal, control socket."""
 
 import asyncio
 import contextlib
 import json
-import os
 import signal
 import socket
 import stat
 import sys
 import tempfile
-from collections.abc import AsyncIterator, Iterator
-from contextlib import asynccontextmanager
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from resource import RLIM_INFINITY, RLIMIT_FSIZE, prlimit
 from typing import Any
 
 import numpy as np
 import pytest
 from rich.console import Console
-from typer.testing import CliRunner
 
 from cases import read_yaml, shortly
-from drivers.by_hand.reaching import random_session
-from drivers.errors import CommandError, LinkError
-from drivers.opening import Lines
-from drivers.playing import AmplifierLayer, AmplifierTone
+from drivers.errors import LinkError
+from drivers.playing import AmplifierTone
 from drivers.protocol.definition import QUANTITIES, STATES
-from era_haptics.lab.cli import app
-from era_haptics.lab.witness.capture import read_wire_capture
-from era_haptics.lab.witness.relay import parse_endpoint, relays
-from era_haptics.lab.witness.witness import Witness
-from kit.clock import in_virtual_time
 from kit.courses import Taken
 from kit.plates import write_rig
-from kit.wires import WIRES, far_side
-from kit.witness import witness_config
-from model.errors import InputError
 from model.rig.rig import Rig
 from model.rig.rig_file import example_rig_path
 from model.structure.attachments import PointLoad
@@ -50,7 +33,6 @@ from processes.sound_cards import read_recording
 from registry.limits import GuardLimits
 from sim.bench.bench import Bench
 from sim.control import LINE_MAX, SimulationContext, control_socket, execute
-from sim.far_ends.wire_assignment import SimulatedWire
 from sim.plant.imperfections import Imperfections, PlateErrors
 from sim.simulation import SimulationView, render_simulation
 
@@ -385,154 +367,3 @@ async def test_plate_operation_refuses_what_is_no_plate(
     bench = Bench(coarse_rig, now=5.0)
     assert "error" in await ask(SimulationContext(bench), 5.1, op="plate", **request_)
     assert bench.imperfections == Imperfections()
-
-
-def _witness(url: str, *, level: float) -> Witness:
-    return Witness(witness_config({"main": url}, level=level))
-
-
-@pytest.mark.parametrize("wire", WIRES)
-@in_virtual_time
-async def test_relay_shows_a_session_to_the_witness(wire: str, coarse_rig: Rig) -> None:
-    """A session passes at a limit of 0.5, and breaks a limit of 0.3."""
-    layer = AmplifierLayer(0, (AmplifierTone(0, 110.0, 0.4, 90.0),), ramp=0.01)
-    for level, broken in ((0.5, set()), (0.3, {"limits"})):
-        async with far_side(WIRES[wire], coarse_rig) as far:
-            witness, endpoint = _witness(far.url, level=level), parse_endpoint(far.url)
-            async with relays([endpoint], [endpoint.location], witness) as (url,):
-                assert url != far.url
-                lines = Lines()
-                amplifier = await lines.amplifier(url, LIMITS, name="main")
-                await amplifier.open()
-                armed = await amplifier.arm(random_session())
-                assert armed["state"] == STATES["OPERATION_ENABLED"]
-                await amplifier.stage(1, [layer], now=True)
-                await amplifier.ping()
-                assert (await amplifier.stop()).is_confirmed
-                assert (await amplifier.clear())["state"] == STATES["SWITCH_ON_DISABLED"]
-                await lines.close()
-            found = witness.finish()
-            assert {one.invariant for one in found} == broken, [str(one) for one in found]
-            assert witness.frames > 10
-
-
-@pytest.mark.parametrize(
-    ("url", "place", "address"),
-    [
-        ("serial:///dev/ttyUSB0?baud=921600&address=3", "/dev/ttyUSB0", 3),
-        ("modbus+tcp://127.0.0.1:5020/2", "127.0.0.1:5020", 2),
-        ("modbus+rtu:///dev/ttyS1?baud=19200#7", "/dev/ttyS1", 7),
-        ("can+slcan:///dev/ttyACM0?bitrate=500000#5", "/dev/ttyACM0", 5),
-        ("can+socketcand://localhost:29536/can0#1", "localhost:29536", 1),
-    ],
-)
-def test_parse_endpoint_splits_a_url(url: str, place: str, address: int) -> None:
-    """Location and address are parsed; the relayed URL keeps all else."""
-    taken = parse_endpoint(url)
-    assert (taken.location, taken.address) == (place, address)
-    assert taken.url_via("X").replace("X", place) == url
-
-
-async def test_relay_closes_connections_when_the_server_refuses(
-    caplog: pytest.LogCaptureFixture,
-) -> None:
-    """The log names the location."""
-    with socket.socket() as bound:
-        bound.bind(("127.0.0.1", 0))
-        url = f"modbus+tcp://127.0.0.1:{bound.getsockname()[1]}/1"
-        endpoint, witness = parse_endpoint(url), _witness(url, level=0.5)
-        async with relays([endpoint], [endpoint.location], witness) as (end,):
-            host, _, port = parse_endpoint(end).location.rpartition(":")
-            reader, writer = await asyncio.open_connection(host, int(port))
-            assert await reader.read() == b""
-            writer.close()
-    (record,) = caplog.records
-    assert parse_endpoint(url).location in record.getMessage()
-
-
-URL = "serial:///dev/ttyUSB0"
-# docs/reference/serial.md: Hello and Arm with their replies, and the Event of Arm.
-SESSION = """
-0.000 wire1 > 00 02 01 03 01 06 05 1C 13 DA AC 00   # Hello
-0.002 wire1 < 00028103010602102D0B6572612D6861707469637313
-0.003 wire1 < 73696D756C6174656420616D706C69666965720553494D2D6101310A6E605200
-0.010 wire1 > 00 05 03 04 01 07 04 17 2A FA 01 01 05 88 99 49 9A 00
-0.011 wire1 < 00051E0401010204010102FF010105626B903600   # Event
-0.012 wire1 < 000583040107020401010201010102FA02FA0308070260010101030804010101
-0.012 wire1 < 0101010101010101010101010101010101010101055A35DF5500
-"""
-
-
-def _replay(tmp_path: Path, text: str, *options: str) -> tuple[int, str]:
-    capture = tmp_path / "capture.txt"
-    capture.write_text(text, encoding="utf-8")
-    arguments = ["witness", URL, "--replay", str(capture), "--json", *options]
-    result = CliRunner().invoke(app, arguments)
-    if isinstance(result.exception, InputError | CommandError):
-        return 2, str(result.exception)
-    return result.exit_code, result.stdout
-
-
-def test_witness_replay_reports_a_damaged_frame_only(tmp_path: Path) -> None:
-    """Five good frames break no rule; a damaged one is named, with the frames before it."""
-    status, out = _replay(tmp_path, SESSION)
-    assert (status, json.loads(out)) == (0, {"frames": 5, "violations": []})
-    damaged = "0.020 wire1 > 00 05 0C 04 01 08 02 07 01 01 05 20 58 84 54 00\n"
-    status, out = _replay(tmp_path, SESSION + damaged)
-    (found,) = json.loads(out)["violations"]
-    assert status == 1
-    assert (found["invariant"], found["wire"], found["time_s"]) == ("garbage", "wire1", 0.02)
-    assert len(found["frames"]) == 6
-
-
-@pytest.mark.parametrize("room", shortly([RLIM_INFINITY, 64], [64]))
-async def test_witness_relays_a_wire_until_interrupted(
-    coarse_rig: Rig, tmp_path: Path, room: int
-) -> None:
-    """A session through the relay passes; a full disk only makes the capture incomplete."""
-    capture = tmp_path / "capture.txt"
-    async with far_side(SimulatedWire("serial"), coarse_rig) as far:
-        options = ("--slack", "5000", "--record", str(capture))
-        code = "import sys; from era_haptics.command import main; sys.exit(main())"
-        process = await asyncio.create_subprocess_exec(
-            # -B: bytecode would be cut off, too, and Python does not notice
-            *(sys.executable, "-B", "-P", "-c", code, "witness", far.url, *options),
-            stdout=asyncio.subprocess.PIPE,
-            stderr=asyncio.subprocess.PIPE,
-            cwd=example_rig_path().parent.parent,
-        )
-        line = await asyncio.wait_for(process.stdout.readline(), TIMEOUT)
-        prlimit(process.pid, RLIMIT_FSIZE, (room, RLIM_INFINITY))
-        url = line.decode().split()[1]
-        lines = Lines()
-        amplifier = await lines.amplifier(url, LIMITS, name="main")
-        await amplifier.open()
-        await amplifier.read_status()
-        await lines.close()
-        process.send_signal(signal.SIGINT)
-        out, err = await asyncio.wait_for(process.communicate(), TIMEOUT)
-    assert int(out.split()[0]) >= 8  # more where a busy machine has a request repeated
-    if room == RLIM_INFINITY:
-        assert process.returncode == 0
-        assert (
-            sum(len(piece.data) > 0 for piece in read_wire_capture(capture, wires=["wire1"])) >= 6
-        )
-    else:
-        assert process.returncode == 2
-        _, error = err.decode().splitlines()
-        assert "capture.txt" in error
-
-
-def test_witness_without_frames_has_checked_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A relay that nothing passed is an error, not "no rule was broken"."""
-
-    @asynccontextmanager
-    async def ended_at_once(*_: object) -> AsyncIterator[list[str]]:
-        os.kill(os.getpid(), signal.SIGTERM)
-        yield ["serial:///dev/pts/9"]
-
-    monkeypatch.setattr("era_haptics.lab.witness.relay.relays", ended_at_once)
-    result = CliRunner().invoke(app, ["witness", URL])
-    assert isinstance(result.exception, InputError | CommandError)
-    assert "nothing was checked" in str(result.exception)
-    assert "Ctrl-C ends" in result.stderr

@@ -43,7 +43,7 @@ SLOWEST = (
     "test_calibrate.py",
     "test_rig_on_wire.py",
     "test_daemon_inputs.py",
-    "test_witness.py",
+    "test_host_rules.py",
     "test_identify.py",
     "test_firmware.py",
     "test_examples.py",

@@ -31,7 +31,6 @@ from controller.play.intent import IntentSource
 from controller.play.loop import PlayReport
 from controller.sources.touch import Touch, TouchFrame
 from drivers.errors import DriverError
-from era_haptics.lab.witness.capture import TimeLimits
 from kit.chain import Chain
 from kit.clock import VirtualLoop, run_virtual
 from kit.plates import make_paper_rig, small_table
@@ -50,6 +49,7 @@ from sim.far_ends.wire_assignment import SimulatedWire
 from sim.faults import FaultKind, FaultWindow
 from sim.plant.imperfections import Imperfections, draw_imperfections
 from sim.transport.simulated_line import LINE_KINDS, PROMPT
+from witness.capture import TimeLimits
 
 KINDS: Mapping[str, Sequence[int | None]] = {
     "serial": (115_200, 921_600),

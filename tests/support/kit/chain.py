@@ -30,12 +30,10 @@ from controller.sources.touch import Touch, TouchFrame
 from drivers.opening import Lines
 from drivers.protocol.records import Values
 from drivers.protocol.sets import LayerSet, is_vibrating, unpack_layers
-from era_haptics.lab.witness.capture import RuleViolation
-from era_haptics.lab.witness.relay import parse_endpoint
 from kit.clock import MemoryMachine, run_virtual
 from kit.set_table import SetTable, SetTiming, make_rig
 from kit.wires import FarSide, far_side
-from kit.witness import STEP, WATCHDOG, LoopWitness, OperatorCommand, PlateJudge
+from kit.witness import STEP, WATCHDOG, LoopWitness, OperatorCommand, PlateJudge, wire_name
 from model.answer.answer_report import Timing
 from model.arrays import ComplexArray, FloatArray
 from model.rig.rig import Rig
@@ -50,6 +48,7 @@ from sim.faults import FaultKind, FaultWindow
 from sim.plant.fingers import Accelerometer, FeltVibration
 from sim.plant.imperfections import Imperfections, draw_imperfections
 from sim.sensors import Accelerometers, Recording
+from witness.capture import RuleViolation
 
 Position = tuple[float, float]
 Finger = tuple[int, float, float]
@@ -334,7 +333,7 @@ class FarEnd:
     @property
     def port(self) -> str:
         """Where its line is."""
-        return parse_endpoint(self._far.urls[self.name]).location
+        return wire_name(self._far.urls[self.name])
 
     @property
     def is_open(self) -> bool:

@@ -2,7 +2,7 @@
 
 According to docs/reference/protocol.md, with none of the product's codecs: a frame is 00, COBS of
 (type, version, address, sequence as u16, payload, CRC-32), 00; words are little-endian. What a host
-or an amplifier must not do is a conversation each, by docs/reference/witness.md.
+or an amplifier must not do is a conversation each.
 """
 
 import struct
@@ -12,13 +12,13 @@ from typing import Any, TypeAlias
 
 from cobs import cobs
 
-from era_haptics.lab.witness.capture import (
+from kit.witness import PlateWitness
+from witness.capture import (
     AmplifierConfig,
     ChannelLimits,
     TimeLimits,
     WitnessConfig,
 )
-from kit.witness import PlateWitness
 
 VERSION = 4
 REPLY = 0x80
@@ -163,8 +163,7 @@ class Talk:
         }
         times = TimeLimits(slack=0.002, heartbeat=3.0)
         self.config = WitnessConfig({"a": "serial"}, amplifiers, times)
-        self.capture: list[str] = []
-        self.witness = PlateWitness(self.config, record=self.capture.append)
+        self.witness = PlateWitness(self.config)
         if expected is not None:
             self.witness.expect({names[0]: {0: list(expected)}})
         self.time = 1.0

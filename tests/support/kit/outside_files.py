@@ -34,7 +34,6 @@ from era_haptics.lab.design.problem import (
 from era_haptics.lab.measuring.impedance import read_impedance
 from era_haptics.lab.measuring.other_sources import read_stepped
 from era_haptics.lab.measuring.sound_card import Desk, WiredSensor, read_sensors
-from era_haptics.lab.witness import capture
 from kit.plates import small_table
 from model.config.document import parse_document
 from model.errors import InputError
@@ -92,7 +91,6 @@ READERS: Mapping[str, Callable[[Path], object]] = {
     "strengths.json": read_strengths,
     "token.txt": read_token,
     "taps.tuio": read_capture,
-    "wires.txt": lambda path: [*capture.read_wire_capture(path, wires=["wire1"])],
     "tap.ahap": read_content,
     "tap.haptic": read_content,
     "tap.hjif": read_content,
@@ -239,7 +237,6 @@ SAMPLES: Mapping[str, Callable[[], bytes]] = {
     "strengths.json": lambda: b'{"table": -3.5}',
     "token.txt": lambda: b"0123456789abcdef0123456789abcdef\n",
     "taps.tuio": (EXAMPLES / "touches.tuio").read_bytes,
-    "wires.txt": lambda: b"0.0125 wire1 > 00 02 01\n0.0150 wire1 < 00 02 01\n",
     "tap.ahap": named_content("tick").read_bytes,
     "tap.haptic": (EXAMPLES / "charging.haptic").read_bytes,
     "tap.hjif": named_content("error").read_bytes,

@@ -22,32 +22,33 @@ from controller.sources.touch import TouchFrame
 from drivers.protocol.definition import MESSAGES, QUANTITIES, STATES
 from drivers.protocol.records import Values
 from drivers.protocol.sets import LayerSet, is_vibrating
+from drivers.wires.wire import address_of
 from era_haptics.lab.expected_output import one_of
-from era_haptics.lab.witness.capture import (
-    A_READ,
-    HELLO_REQUEST,
-    AmplifierConfig,
-    ChannelLimits,
-    TimeLimits,
-    TransferDirection,
-    WitnessConfig,
-    WitnessedRequest,
-)
-from era_haptics.lab.witness.host_rules import (
-    CONFIRMED,
-    IN_FLIGHT,
-    SILENCING_REQUESTS,
-    AmplifierSession,
-    HostRules,
-)
-from era_haptics.lab.witness.relay import parse_endpoint
-from era_haptics.lab.witness.witness import RECOVERY, Witness
 from kit.clock import VirtualLoop
 from kit.wires import FarSide, after_each
 from registry import threads
 from registry.virtual_time import START
 from sim.amplifier.simulated_amplifier import SimulatedAmplifier
 from sim.faults import FaultWindow
+from witness.capture import (
+    A_READ,
+    HELLO_REQUEST,
+    AmplifierConfig,
+    ChannelLimits,
+    TimeLimits,
+    TransferDirection,
+    WireKind,
+    WitnessConfig,
+    WitnessedRequest,
+)
+from witness.host_rules import (
+    CONFIRMED,
+    IN_FLIGHT,
+    SILENCING_REQUESTS,
+    AmplifierSession,
+    HostRules,
+)
+from witness.witness import RECOVERY, Witness
 
 RULES = {
     "justified": "no vibration is commanded without a contact",
@@ -479,6 +480,22 @@ def _is_same(one: Tone, other: Tone) -> bool:
     )
 
 
+_KINDS: Mapping[str, WireKind] = {
+    "serial": "serial",
+    "serial+tcp": "serial",
+    "modbus+tcp": "modbus-tcp",
+    "modbus+rtu": "modbus-rtu",
+    "can+socketcand": "socketcand",
+    "can+slcan": "slcan",
+}
+"""Kinds of wire by scheme."""
+
+
+def wire_name(url: str) -> str:
+    """Return the name of a URL's wire: its device, or HOST:PORT."""
+    return address_of(url).place.name
+
+
 def witness_config(
     urls: Mapping[str, str],
     *,
@@ -487,13 +504,14 @@ def witness_config(
     **limits: Any,
 ) -> WitnessConfig:
     """A configuration with wires named by their location; limits: of all channels."""
-    endpoints = {name: parse_endpoint(url) for name, url in urls.items()}
     of_all = ChannelLimits(**{"frequency": (40, 500), "level": 1.0, **limits})
     return WitnessConfig(
-        {endpoint.location: endpoint.kind for endpoint in endpoints.values()},
+        {wire_name(url): _KINDS[url.partition("://")[0]] for url in urls.values()},
         {
-            name: AmplifierConfig(one.location, one.address, dict.fromkeys(range(channels), of_all))
-            for name, one in endpoints.items()
+            name: AmplifierConfig(
+                wire_name(url), address_of(url).number, dict.fromkeys(range(channels), of_all)
+            )
+            for name, url in urls.items()
         },
         times,
     )

@@ -10,7 +10,7 @@ from collections.abc import Callable, Hashable, Mapping
 from dataclasses import replace
 from functools import partial
 
-from era_haptics.lab.witness.capture import (
+from witness.capture import (
     BROADCAST_REQUESTS,
     CHANGING,
     FEEDING,
@@ -26,10 +26,9 @@ from era_haptics.lab.witness.capture import (
     WitnessedReply,
     WitnessedRequest,
     WitnessReport,
-    capture_line,
 )
-from era_haptics.lab.witness.decoders import CanDecoder, ModbusDecoder
-from era_haptics.lab.witness.host_rules import (
+from witness.decoders import CanDecoder, ModbusDecoder
+from witness.host_rules import (
     AmplifierSession,
     HostRules,
     RuleDeadlines,
@@ -333,21 +332,19 @@ class WatchedWire:
 
 
 class Witness:
-    """Checks the wires of a configuration (`era_haptics.lab.witness.capture`); times in s.
+    """Checks the wires of a configuration (`witness.capture`); times in s.
 
-    record: called with each piece of bytes as a line of a capture; rules: for hosts.
+    rules: for hosts.
     """
 
     def __init__(
         self,
         config: WitnessConfig,
         *,
-        record: Callable[[str], None] = lambda line: None,
         rules: type[HostRules] = HostRules,
     ) -> None:
         self._config = config
         self._report = WitnessReport()
-        self._record = record
         self._now = -math.inf
         self.frames = 0
         self._sessions = {name: self._session(name) for name in self._config.amplifiers}
@@ -393,7 +390,6 @@ class Witness:
     ) -> None:
         """Process bytes on a wire, toward the amplifier or the host."""
         self._advance(time)
-        self._record(capture_line(time, link, direction, data))
         self.frames += self._wires[link].feed(direction, time, data)
 
     def delayed(self, until: float, duration: float) -> None:

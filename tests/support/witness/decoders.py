@@ -60,7 +60,7 @@ from drivers.wires.modbus_frames import (
     reply_in,
     response_to,
 )
-from era_haptics.lab.witness.capture import (
+from witness.capture import (
     A_READ,
     HELLO_REQUEST,
     REPLIES,

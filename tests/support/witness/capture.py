@@ -8,19 +8,16 @@ A capture is text, a line for each piece of bytes:
 TIME is in seconds of any one clock; # begins a comment. The configuration (wires, amplifiers,
 limits of channels, time limits) is independent of the controller's. Messages are alike for every
 kind of wire; the decoder of serial lines is here, the others are in
-`era_haptics.lab.witness.decoders`.
+`witness.decoders`.
 """
 
 import math
 from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Callable, Collection, Hashable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
-from pathlib import Path
-from typing import Literal, NamedTuple, TypeAlias
+from typing import Literal, TypeAlias
 
-from drivers.errors import CommandError
 from drivers.protocol.definition import (
     ENABLED,
     EVENT,
@@ -43,71 +40,15 @@ from drivers.protocol.records import Record, Refusal, Values
 from drivers.protocol.sets import is_last
 from drivers.wires.serial_frames import NEUTRAL, FrameReader, words_of
 from era_haptics.lab.expected_amplifier import FEEDING as FEEDING
-from registry.files import regular_file
 
 TransferDirection: TypeAlias = Literal["amplifier", "host"]
 """Direction of transfer: toward the amplifier or the host."""
-_MAX_LINE = 1 << 20  # characters
 _ARROWS: dict[TransferDirection, str] = {"amplifier": ">", "host": "<"}
-
-
-class CapturePiece(NamedTuple):
-    """Bytes on a wire at a time [s]."""
-
-    time: float
-    wire: str
-    direction: TransferDirection
-    data: bytes
 
 
 def capture_line(time: float, wire: str, direction: TransferDirection, data: bytes) -> str:
     """Return bytes as a line of a capture."""
     return f"{time:.6f} {wire} {_ARROWS[direction]} {data.hex(' ').upper()}"
-
-
-def read_wire_capture(path: Path, *, wires: Collection[str]) -> Iterator[CapturePiece]:
-    """Read the pieces of a capture in order; wires: the names that are allowed.
-
-    Raises CommandError with file and line.
-    """
-    last = -math.inf
-    try:
-        with open(path, encoding="utf-8", errors="backslashreplace", opener=regular_file) as lines:
-            # A line that is longer has no end, as in a sparse file, and no piece is as long.
-            for number, line in enumerate(iter(partial(lines.readline, _MAX_LINE), ""), start=1):
-                text = line.partition("#")[0].strip()
-                if text:
-                    piece = _piece(text, f"{path}:{number}", wires, last)
-                    last = piece.time
-                    yield piece
-    except FileNotFoundError:
-        raise CommandError(f"{path}: no such file; check its name") from None
-    except OSError as problem:
-        raise CommandError(f"{path}: cannot be read: {problem.strerror}") from problem
-
-
-def _piece(text: str, where: str, wires: Collection[str], last: float) -> CapturePiece:
-    """Read a line behind one of a time [s]."""
-    directions = {arrow: direction for direction, arrow in _ARROWS.items()}
-    try:
-        time, wire, arrow, digits = text.split(maxsplit=3)
-        piece = CapturePiece(float(time), wire, directions[arrow], bytes.fromhex(digits))
-    except (ValueError, KeyError):
-        raise CommandError(
-            f"{where}: must be TIME WIRE > HEX (or <), as in 0.0125 wire1 > 00 02 01, got "
-            f"{text[:60]!r}"
-        ) from None
-    if not last <= piece.time < math.inf:
-        raise CommandError(
-            f"{where}: time must be finite and not decrease, got {piece.time:g} s after {last:g} "
-            "s; sort the lines, and use one clock for all wires"
-        )
-    if wire not in wires:
-        raise CommandError(
-            f"{where}: wire must be one of {', '.join(wires)} (by URL), got {wire!r}; give a URL "
-            "for each wire of the capture"
-        )
-    return piece
 
 
 ReportViolation: TypeAlias = Callable[[str, float, str], None]

@@ -19,7 +19,7 @@ from drivers.protocol.records import Values
 from drivers.protocol.sets import Command, LayerSet, is_newer_token, is_vibrating
 from era_haptics.lab.expected_amplifier import OFF, ExpectedAmplifier
 from era_haptics.lab.expected_output import Interval, silent
-from era_haptics.lab.witness.capture import (
+from witness.capture import (
     CHANGING,
     FEEDING,
     REPLIES,

@@ -247,21 +247,18 @@ PAGES = ROOT / "docs" / "how-to"
 PIP = ROOT / "tests" / "support" / "processes/built_pip.py"
 NAMES = [
     "a-plate-for-a-weekend",
-    "add-a-content-format",
-    "add-a-material",
-    "add-a-touch-source",
-    "add-an-effect",
     "bring-your-own-method",
     "drive-a-signal-generator",
     "design-a-layout",
     "play-content",
+    "plug-ins",
     "your-own-application",
 ]
 WITH_CONFORMANCE = ["write-an-amplifier"]
 """It runs the whole of it."""
 WITHOUT_CODE = ["identify-a-plate"]
 """Commands alone, without a file of the examples."""
-SHORT = "add-a-material"
+SHORT = "plug-ins"
 """Executed by every run of the tests; the others by `make test-long`, and when they change."""
 
 

@@ -39,28 +39,32 @@ KIND_OF_PORT: Mapping[str, str] = {
     "ttyACM": "usb-full-speed",
     **dict.fromkeys(("ttyS", "ttyAMA", "ttyO", "ttyPS", "ttymxc", "ttyTHS", "ttySC"), "native"),
 }
-"""By the name of a serial port without its number; others are taken for USB at full speed."""
-_KIND_OF_SCHEME = {
+"""By the name of a serial port without its number."""
+KIND_OF_SCHEME: Mapping[str, str] = {
     **dict.fromkeys(("serial+tcp", "modbus+tcp", "can+socketcand"), "ethernet"),
     **dict.fromkeys(("can+socketcan", "can+python-can"), "can"),
     "can+slcan": "can-usb",
+    "sim": SIMULATED,
 }
+"""By the scheme of a URL that names no serial port."""
+SCHEMES_OF_PORTS: Final = ("serial", "modbus+rtu")
+"""Schemes of URLs that name a serial port."""
+UNKNOWN_KIND: Final = "usb-full-speed"
+"""Assumed for a port of another name and for the scheme of a plug-in."""
 
 
 def line_kind_of(url: str) -> str:
     """Return the kind of line of an amplifier's URL, a key of `CLOCK_ERRORS` where it is valid."""
     scheme, _, rest = url.partition("://")
-    if kind := dict(parse_qsl(rest.partition("?")[2].partition("#")[0])).get("line"):
-        return kind
-    if scheme == "sim":
-        return SIMULATED
-    port = re.match(r"/dev/([a-zA-Z]+)\d", rest)
-    by_scheme = _KIND_OF_SCHEME.get(scheme, "usb-full-speed")
-    return (
-        KIND_OF_PORT.get(port[1], by_scheme)
-        if port and by_scheme == "usb-full-speed"
-        else by_scheme
-    )
+    scheme = scheme.lower()
+    query = rest.partition("?")[2].partition("#")[0]
+    stated_kind = dict(parse_qsl(query)).get("line")
+    if stated_kind:
+        return stated_kind
+    if scheme in SCHEMES_OF_PORTS:
+        port = re.match(r"/dev/([a-zA-Z]+)\d", rest)
+        return KIND_OF_PORT.get(port[1], UNKNOWN_KIND) if port else UNKNOWN_KIND
+    return KIND_OF_SCHEME.get(scheme, UNKNOWN_KIND)
 
 
 ADDRESS: Final = 1

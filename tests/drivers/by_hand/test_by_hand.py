@@ -38,8 +38,17 @@ from drivers.opening import Lines
 from drivers.playing import AmplifierLayer, AmplifierTone
 from drivers.protocol.definition import FEATURES, READINGS, STATUS_FLAGS
 from drivers.trace import tracing
-from drivers.urls import CLOCK_ERRORS, SIMULATED, with_address
+from drivers.urls import (
+    CLOCK_ERRORS,
+    KIND_OF_SCHEME,
+    SCHEMES_OF_PORTS,
+    SIMULATED,
+    UNKNOWN_KIND,
+    line_kind_of,
+    with_address,
+)
 from drivers.wires.can_frames import CanFrame
+from drivers.wires.wire import schemes
 from era_haptics.lab.cli import app as lab_app
 from era_haptics.lab.conformance.check import ConformanceReport
 from kit.wires import WORD_WIRES, WordFarSide, until
@@ -616,6 +625,15 @@ def test_what_would_be_better_is_not_there_already() -> None:
 def test_every_kind_of_line_that_is_simulated_has_an_error() -> None:
     """Under the same names: what the check says of one is measured with it."""
     assert CLOCK_ERRORS.keys() == {*LINE_KINDS, PROMPT}
+
+
+def test_every_scheme_of_the_project_has_a_kind_of_line() -> None:
+    """No scheme counts as unknown because it was forgotten; those of plug-ins do."""
+    own = {scheme for scheme in schemes() if not scheme.startswith("example")}
+    assert own == {*KIND_OF_SCHEME, *SCHEMES_OF_PORTS}
+    assert line_kind_of("MODBUS+TCP://host/1") == "ethernet"
+    assert line_kind_of("example-unix:///run/amplifier") == UNKNOWN_KIND
+    assert line_kind_of("example-unix:///run/amplifier?line=native") == "native"
 
 
 def test_one_amplifier_with_eras_has_no_arrangement() -> None:

@@ -44,7 +44,15 @@ _MIN_LOSS_STD = 0.7
 """Least standard deviation of a loss from a data sheet, relative."""
 
 
-# Base classes: what has one parameter of a kind (the plate, each ERA ...) gives them their names.
+# Base classes: they give parameters their names, and priors that several kinds have.
+
+
+class StatedByRig(ParameterKind):
+    """A kind whose name is also the key of its standard deviation in the rig's `uncertainty`."""
+
+    def prior(self, scope: SearchScope) -> Prior:
+        std: float = getattr(scope.uncertainty, self.name)
+        return Prior(std)
 
 
 class PlateParameter(ParameterKind):
@@ -137,7 +145,7 @@ class ExciterFactor(EraFactor):
 # The plate.
 
 
-class ThicknessFactor(PlateParameter):
+class ThicknessFactor(StatedByRig, PlateParameter):
     """Logarithm of a factor on the thickness; the bending stiffness has its third power."""
 
     name = label = "thickness"
@@ -145,9 +153,6 @@ class ThicknessFactor(PlateParameter):
     drift = 0.01
     stage = 0
     is_listed = True
-
-    def prior(self, scope: SearchScope) -> Prior:
-        return Prior(scope.uncertainty.thickness)
 
     def value(self, values: PlateValues) -> float:
         return values.factor(self.name)
@@ -272,7 +277,7 @@ class ModeLoss(ModeParameter):
 # ERAs and their drives.
 
 
-class Stiffness(EraFactor):
+class Stiffness(StatedByRig, EraFactor):
     """Logarithm of a factor on the stiffness of each ERA."""
 
     name = label = "stiffness"
@@ -281,9 +286,6 @@ class Stiffness(EraFactor):
     theory = 3e-3
     stage = 0
     is_listed = True
-
-    def prior(self, scope: SearchScope) -> Prior:
-        return Prior(scope.uncertainty.stiffness)
 
     def datasheet_prior(self, scope: SearchScope) -> Prior:
         """Prior of stiffnesses from data sheets, which are more precise than assumed values."""
@@ -360,7 +362,7 @@ class DampingAdded(EraParameter):
         return plate.by_sources("damping")
 
 
-class DriveGain(EraParameter):
+class DriveGain(StatedByRig, EraParameter):
     """Logarithm of a factor on the gain of each drive, which multiplies the rig's gains."""
 
     name = label = "gain"
@@ -368,9 +370,6 @@ class DriveGain(EraParameter):
     drift = 0.01
     stage = 0
     is_listed = True
-
-    def prior(self, scope: SearchScope) -> Prior:
-        return Prior(scope.uncertainty.gain)
 
     def datasheet_prior(self, scope: SearchScope) -> Prior:
         return Prior(1.0, -8.0, 8.0)
@@ -583,7 +582,7 @@ class AddedMasses(ParameterKind):
         return plate.by_masses()
 
 
-class FootStiffness(ParameterKind):
+class FootStiffness(StatedByRig):
     """Logarithm of a factor on the stiffness of each foot."""
 
     name = "supports"
@@ -592,9 +591,6 @@ class FootStiffness(ParameterKind):
 
     def names(self, scope: SearchScope) -> Sequence[str]:
         return [f"stiffness of foot {foot}" for foot in scope.rig.foot_names]
-
-    def prior(self, scope: SearchScope) -> Prior:
-        return Prior(scope.uncertainty.supports)
 
     def datasheet_prior(self, scope: SearchScope) -> Prior:
         return Prior(scope.rig.uncertainty.supports, -math.log(10.0), math.log(10.0))

@@ -453,13 +453,9 @@ class Answer:
             for finger in stream.targets:
                 sensations[finger] = self._sensation_of_content(number, finger)
         for finger, contrast, is_disturbing in self.held:
-            worst_level, rig_level = self._foreign_levels(finger)
-            sensations[finger] = Sensation(
-                self.asked[finger],
-                HELD_BACK,
+            sensations[finger] = replace(
+                self._sensation_of_others(finger, HELD_BACK),
                 promised_contrast_db=contrast,
-                foreign_level_db_sl=worst_level,
-                rig_foreign_level_db_sl=rig_level,
                 is_disturbing=is_disturbing,
             )
         for number, finger_asked in enumerate(self.asked):
@@ -491,21 +487,22 @@ class Answer:
     def _sensation_beside(self, finger: int, verdict: str) -> Sensation:
         """Return a finger's contrasts and the level of others there, without its own content."""
         contrast, median, promised = map(_known, self.tones.contrast_db[finger])
-        worst_level, rig_level = self._foreign_levels(finger)
-        return Sensation(
-            self.asked[finger],
-            verdict,
+        return replace(
+            self._sensation_of_others(finger, verdict),
             contrast_db=contrast,
             median_contrast_db=median,
             promised_contrast_db=promised,
-            foreign_level_db_sl=worst_level,
-            rig_foreign_level_db_sl=rig_level,
         )
 
-    def _foreign_levels(self, finger: int) -> tuple[float | None, float | None]:
-        """Return the level of others at a finger: the greatest over all sets, and by the rig's."""
-        levels = self.tones.foreign_db_sl[finger]
-        return _known(max(levels)), _known(levels[0])
+    def _sensation_of_others(self, finger: int, verdict: str) -> Sensation:
+        """Return the levels of other vibrations at a finger, without any contrast."""
+        levels_by_set = self.tones.foreign_db_sl[finger]
+        return Sensation(
+            self.asked[finger],
+            verdict,
+            foreign_level_db_sl=_known(max(levels_by_set)),
+            rig_foreign_level_db_sl=_known(levels_by_set[0]),
+        )
 
     @cached_property
     def layers(self) -> tuple[Layer, ...]:

@@ -10,8 +10,8 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check install --editable
 # Hundreds of processes are started: what is compiled of us is kept, whatever the shell says.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo firmware firmware-test test test-changed test-long test-busy test-kernels test-pymodbus nightly lint weigh pages format docs fuzz faults kill-test fault-test stop-test late-test desk-test qt-test estimate-test surface-test soak bench bench-latency \
-	bench-plant bench-promise dist dist-platform smoke smoke-lowest sbom licences clean
+.PHONY: demo firmware firmware-test test test-changed test-long test-busy test-kernels test-pymodbus nightly lint weigh pages format docs fuzz faults kill-test fault-test stop-test late-test qt-test estimate-test surface-test soak bench bench-latency \
+	bench-promise dist dist-platform smoke smoke-lowest sbom licences clean
 .NOTPARALLEL:
 
 demo: .venv/installed
@@ -44,7 +44,7 @@ test-changed: .venv/installed-test
 
 # All that is long, one target after another, each within an hour; the rest goes on after a failure.
 # Two hours on two cores. Others: make nightly NIGHTLY='soak kill-test'
-NIGHTLY := test-long test-kernels test-pymodbus test-busy faults firmware-test fuzz stop-test late-test kill-test soak desk-test qt-test estimate-test surface-test smoke-lowest weigh
+NIGHTLY := test-long test-kernels test-pymodbus test-busy faults firmware-test fuzz stop-test late-test kill-test soak qt-test estimate-test surface-test smoke-lowest weigh
 nightly: .venv/installed-test
 	@failed=; for target in $(NIGHTLY); do start=$$(date +%s); echo "nightly: $$target"; \
 		$(MAKE) $$target || failed="$$failed $$target"; \
@@ -135,12 +135,6 @@ stop-test: .venv/installed-test
 late-test: .venv/installed-test
 	$(BIN)/python tests/support/late_taps.py $(LATE)
 
-# A plate without hardware, measured, calibrated, played and verified by real processes through
-# JACK (jackd2): three minutes. Others: make desk-test DESK='--plates 10 --promises 20'
-desk-test: .venv/installed-test
-	.ci/install jackd2:jackd gcc:cc
-	$(BIN)/python -m benchmarks.desk --plates 1 --promises 10 --touches 4 $(DESK)
-
 # The Qt application of the examples with PySide6, without a screen.
 qt-test: .venv/installed-qt
 	$(BIN)/pytest -q tests/integration/test_people_at_a_plate.py
@@ -179,9 +173,6 @@ bench-latency: .venv/installed-test
 # Others: make bench-promise PROMISE='--plates 8'
 bench-promise: .venv/installed
 	$(BIN)/python -m benchmarks.promise --report $(PROMISE)
-
-bench-plant: .venv/installed
-	$(BIN)/python -m benchmarks.plant
 
 # The pages as a site, with warnings as errors; nothing in it comes from elsewhere.
 docs: .venv/installed-docs

@@ -21,7 +21,6 @@ from dataclasses import dataclass
 from itertools import combinations
 from typing import Any, TypeAlias
 
-from benchmarks.setting import support
 from controller.effects.layout import SurfaceLayout
 from controller.effects.player import EffectPlayer
 from controller.operation.plate_controller import Controller
@@ -30,18 +29,15 @@ from drivers.host.amplifier import Amplifier
 from drivers.opening import Lines
 from drivers.protocol.definition import CLOCK_TURN, FEATURES, ahead, clock_at
 from drivers.protocol.records import Values
+from kit.clock import run_virtual
+from kit.plates import make_paper_rig, small_table
+from kit.wires import far_side, on_amplifiers
 from model.answer.answer_report import Timing
 from model.rig.rig import Rig
 from registry import threads
 from sim.far_ends.wire_assignment import SimulatedWire
 from sim.plant.imperfections import draw_imperfections
 from sim.simulation import find_firmware, running_firmware
-
-_far_side: Any = support("kit.wires").far_side
-_on_amplifiers: Any = support("kit.wires").on_amplifiers
-_small_table: Any = support("kit.plates").small_table
-_paper_rig: Any = support("kit.plates").make_paper_rig
-run_virtual: Any = support("kit.clock").run_virtual
 
 NAMES = ("west", "middle", "east")
 SPEEDS = {"serial": 921_600, "modbus-rtu": 115_200, "slcan": 500_000, "socketcand": 500_000}
@@ -97,12 +93,12 @@ class Session:
 
 def make_rig(names: tuple[str, ...]) -> Rig:
     """The paper's plate, its ERAs on amplifiers of these names in turn."""
-    return _on_amplifiers(_paper_rig(12, 9), names)  # type: ignore[no-any-return]
+    return on_amplifiers(make_paper_rig(12, 9), names)  # type: ignore[no-any-return]
 
 
 def make_controller(rig: Rig, urls: Mapping[str, str], **more: Any) -> Controller:
     """A control loop in which the newest finger feels a buzz; more: as a `Controller` takes."""
-    table = _small_table()
+    table = small_table()
     intents, timing = EffectPlayer(SurfaceLayout()), Timing(table)
     return Controller(
         rig, table, lines=Lines, urls=urls, intent_source=intents, timing=timing, **more
@@ -116,7 +112,7 @@ async def armed(
     """Open and arm a host."""
     rig = make_rig(names)
     drawn = draw_imperfections(rig, seed=seed)
-    async with _far_side(lines.wires(names, seed), rig, imperfections=drawn) as far:
+    async with far_side(lines.wires(names, seed), rig, imperfections=drawn) as far:
         far.machine.be_prompt()
         for amplifier in () if lines.has_mark else far.bench.amplifiers.values():
             amplifier.capabilities["features"] &= ~(1 << FEATURES["mark"])

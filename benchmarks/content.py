@@ -30,7 +30,7 @@ import numpy as np
 
 from benchmarks.promise.cases import Case
 from benchmarks.promise.session import EARLY, Heard, Log, owner_of
-from benchmarks.setting import random_contacts, support
+from benchmarks.setting import random_contacts
 from controller.content.formats import named_content, named_contents, read_content
 from controller.content.pattern import Pattern
 from controller.content.rendition import rendered
@@ -40,6 +40,8 @@ from controller.effects.layout import SurfaceLayout
 from controller.effects.player import EffectPlayer
 from controller.play.intent import CLICK
 from era_haptics.lab.checks.content_check import MAX_DELAY, check_content
+from kit.chain import Chain
+from kit.clock import run_virtual
 from model.answer.answer_report import Timing
 from model.config.fields import Circle
 from model.errors import InputError
@@ -143,9 +145,6 @@ def _patterns(folder: Path | None) -> Iterator[Pattern]:
             yield pattern
 
 
-_chain: Any = support("kit.chain").Chain
-_run_virtual: Any = support("kit.clock").run_virtual
-
 CASE = Case("files", None)
 _BEFORE, _AFTER = 0.3, 0.3  # s; of the quiet finger alone, and after the file
 
@@ -162,7 +161,7 @@ def outcome(pattern: Pattern, level_db_sl: float, pair: int, seed: int) -> tuple
     finger above the strongest at the loudest point of the other one, the least over the sets of
     thresholds.
     """
-    found: tuple[float, float] = _run_virtual(_run(pattern, level_db_sl, pair, seed))
+    found: tuple[float, float] = run_virtual(_run(pattern, level_db_sl, pair, seed))
     return found
 
 
@@ -176,7 +175,7 @@ async def _run(pattern: Pattern, level_db_sl: float, pair: int, seed: int) -> tu
     layout = SurfaceLayout((region,), {"file": effect}, elsewhere=None)
     drawn = draw_imperfections(rig, seed=1000 + seed)
     on: Any
-    async with _chain.armed(
+    async with Chain.armed(
         SimulatedWire("serial", speed=921_600, shared=True, line_kind=PROMPT, seed=drawn.seed),
         rig,
         table,

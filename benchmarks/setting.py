@@ -1,11 +1,8 @@
 """What benchmarks have in common: the paper's rig, contact sets, and parts of pages they write."""
 
 import re
-import sys
 from collections.abc import Sequence
-from importlib import import_module
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -14,14 +11,6 @@ from model.arrays import FloatArray
 _ROOT = Path(__file__).parents[1]
 RIG = _ROOT / "examples" / "paper_plate.yaml"
 APART = 0.05  # m; between the fingers of a contact set
-
-
-def support(module: str) -> Any:
-    """Return a module of the support of the tests, which they import by its name alone."""
-    folder = str(_ROOT / "tests" / "support")
-    if folder not in sys.path:
-        sys.path.insert(0, folder)
-    return import_module(module)
 
 
 def random_contacts(

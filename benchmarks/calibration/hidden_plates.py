@@ -19,8 +19,8 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.direct_plate import direct_acceleration
 from benchmarks.setting import RIG
+from kit.direct_plate import direct_acceleration
 from model.arrays import ComplexArray, FloatArray
 from model.estimate.fit import gains_of as best_gains
 from model.estimate.fit import row_rms, sensed_plate

@@ -30,7 +30,7 @@ from contextlib import AsyncExitStack, asynccontextmanager, suppress
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 
@@ -51,7 +51,7 @@ from benchmarks.latency.session import (
     running,
     taps,
 )
-from benchmarks.setting import support, write_parts
+from benchmarks.setting import write_parts
 from controller.api.client import AsyncClient
 from controller.api.jsonrpc import RpcError
 from controller.api.link import Unreachable
@@ -67,6 +67,7 @@ from drivers.host.amplifier import Amplifier
 from drivers.host.line import Line
 from drivers.opening import Lines
 from drivers.wires.serial_line import SerialWire
+from kit.clock import run_virtual
 from model.answer.answer_report import Timing
 from model.rig.rig import Rig
 from model.rig.rig_file import load_rig
@@ -74,10 +75,9 @@ from model.table.table_file import cached_table
 from registry.limits import GuardLimits
 from sim.amplifier.simulated_amplifier import SimulatedAmplifier as SimulatedAmplifier
 from sim.far_ends.serial_amplifiers import SerialAmplifiers
+from ways import Recorder
 
 _ROOT = Path(__file__).parents[2]
-_run_virtual: Any = support("kit.clock").run_virtual
-_Recorder: Any = support("ways").Recorder
 _FRAME_INTERVAL, _RESTING = 0.05, 2.0  # s
 _LEVEL = 15.0  # dB SL
 
@@ -133,7 +133,7 @@ class MemoryLines(Lines):
 
 async def measure(rig: Rig) -> list[str]:
     """Return the cells of a rig."""
-    recorder, played = _Recorder(), asyncio.Event()
+    recorder, played = Recorder(), asyncio.Event()
     table, _ = cached_table(rig)
     controller = Controller(
         rig,
@@ -189,7 +189,7 @@ def table(rigs: Mapping[str, str]) -> str:
         "|---|---|---|---|---|",
     ]
     for name, file in rigs.items():
-        cells = _run_virtual(measure(load_rig(_ROOT / "examples" / f"{file}.yaml")))
+        cells = run_virtual(measure(load_rig(_ROOT / "examples" / f"{file}.yaml")))
         rows.append(f"| {' | '.join([name, *cells])} |")
     return "\n".join(rows)
 

@@ -34,13 +34,15 @@ from benchmarks.promise.cases import (
     Case,
     Point,
 )
-from benchmarks.setting import random_contacts, support
+from benchmarks.setting import random_contacts
 from controller.effects.player import CLICK_ABOVE_DB
 from controller.play.intent import CLICK, FingerSensation, HapticIntent, Pulse, Target
 from controller.play.loop import PlayReport
 from controller.play.slots import CROSSFADE, FALL_AFTER
 from controller.sources.touch import ContactKey
 from drivers.playing import Voice
+from kit.chain import Chain
+from kit.clock import run_virtual
 from model.answer.answer_report import Timing
 from model.arrays import FloatArray
 from model.finger import FINGERTIP_RADIUS, detection_threshold
@@ -284,9 +286,6 @@ def _layers_of(report: PlayReport, owner: int) -> list[int]:
     return [n for n, one in report.contents.items() if owner_of(one) == owner]
 
 
-_chain: Any = support("kit.chain").Chain
-_run_virtual: Any = support("kit.clock").run_virtual
-
 SETTLING, STEADY, FIRST, NEXT = 2.0, 0.25, 0.100, 0.080  # s
 EARLY = 0.020  # s; by which amplifiers may start before another: less than between two cross-fades
 SPEED, WAY = 0.2, 0.1  # m/s, m; of the finger that moves
@@ -388,7 +387,7 @@ def outcome(number: int, seed: int) -> Outcome:
 
 def on_plate(case: Case, timing: Timing, seed: int) -> Outcome:
     """Run a case on the plate of a seed."""
-    return _run_virtual(_Session(case, timing, seed).run())  # type: ignore[no-any-return]
+    return run_virtual(_Session(case, timing, seed).run())  # type: ignore[no-any-return]
 
 
 class _Session:
@@ -428,7 +427,7 @@ class _Session:
     async def run(self) -> Outcome:
         """All fingers at once, then each event."""
         on: Any
-        async with _chain.armed(
+        async with Chain.armed(
             self._wires,
             self._rig,
             self._case.table,

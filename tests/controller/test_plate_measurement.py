@@ -9,7 +9,6 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from benchmarks.direct_plate import direct_responder
 from controller.plate_measurement import (
     MeasuredPlate,
     PlateSelfMeasurement,
@@ -22,6 +21,7 @@ from drivers.errors import CommandRefused
 from drivers.host.amplifier_sensors import Reading, SensorReading, measure_tones
 from drivers.opening import Lines
 from kit.clock import run_virtual
+from kit.direct_plate import direct_responder
 from kit.wires import SHARED_WIRES, WIRES, FarSide, far_side, on_two_amplifiers
 from model.answer.plan import query
 from model.answer.stimulus import Placement

@@ -29,7 +29,6 @@ import numpy as np
 import pytest
 import yaml
 
-from benchmarks.weekend.chain import BuiltBoard
 from drivers import opening
 from drivers.by_hand.actions import identify_amplifier
 from drivers.errors import CommandError, LinkError
@@ -40,6 +39,7 @@ from drivers.wires.serial_frames import Frame, encode_frame
 from era_haptics.command import run_era
 from era_haptics.lab.conformance.contract import judge, of_kind
 from kit.clock import judged
+from kit.weekend_boards import BuiltBoard
 from model.caching import cache_folder
 from model.compiled.kernels import kernels
 from model.rig.rig_file import load_rig

@@ -24,7 +24,6 @@ import httpx
 import numpy as np
 import pytest
 
-from benchmarks.direct_plate import direct_responder
 from cases import shortly
 from controller.api.client import AsyncClient
 from controller.play.selection import GIVEN_UP
@@ -33,6 +32,7 @@ from examples.make_touches import tuio_datagram
 from kills import PLACES as KILLED_AT
 from kills import kill_everywhere
 from kit.chain import LEVEL_DB_SL, ONSET, SENSORS, Heard, Played, Situation, Stream, play_stream
+from kit.direct_plate import direct_responder
 from kit.fingers import free_port, panel
 from kit.plates import TWO_AMPLIFIERS, write_rig
 from kit.set_table import only

@@ -29,8 +29,6 @@ import pytest
 from typer.testing import CliRunner
 
 import model
-from benchmarks.desk.session import BLOCK, PLATE, Desk, chain, desk, identified_errors
-from benchmarks.desk_plate.desk_plate import DeskModel, draw_truth
 from benchmarks.latency.session import daemon_session, plain_session, taps
 from cases import shortly
 from controller.api.client import AsyncClient, Client
@@ -42,6 +40,7 @@ from controller.effects.layout import load_layout
 from controller.sources.tuio import read_capture
 from examples.make_measured import record_responses, scanning_grid
 from kit.clock import in_virtual_time, run_virtual
+from kit.desk_plate import DeskModel, draw_truth
 from kit.fingers import write_schedule
 from kit.plates import PERTURBED_PLATE_FREQUENCIES, perturbed
 from model.cli import app
@@ -72,6 +71,7 @@ from processes.daemons import (
     write_daemon,
 )
 from processes.daemons import until as until_seen
+from processes.desk import BLOCK, PLATE, Desk, desk, identified_errors, session
 from processes.floods import flood
 from processes.gateways import TOKEN, gateway_process, real_daemon, wait_for
 from processes.patient_daemon import RESTING, wait_long
@@ -655,7 +655,7 @@ def test_identified_plate_is_the_one_on_the_desk(plate: Desk) -> None:
     errors = [e for e in identified_errors(rig, plate.truth) if e.kind in limits]
     assert len(errors) == 16
     for error in errors:
-        assert abs(error.relative) < limits[error.kind], error
+        assert abs(error.size) < limits[error.kind], error
     done = subprocess.run(
         [*PLATE, "--mesh", DESK_MESH],
         cwd=plate.folder,
@@ -675,16 +675,16 @@ def test_chain_from_measurement_to_touches_keeps_its_promises() -> None:
 
     Stiffness and damping to some percent, as one plate shows; of one plate's promises some fail.
     """
-    found = chain(seed=SEED, promises=6, touched=2)
+    found = session(seed=SEED, promises=6, touched=2)
     assert found.held_out_error < 0.05
-    for error in found.errors:
-        assert abs(error.relative) < 0.1, error
+    for error in found.calibrated:
+        assert abs(error.size) < 0.1, error
     assert sum(row["kept"] for row in found.promises) >= 3
     for row in found.promises:
         assert row["measured_level_db_sl"] == pytest.approx(row["promised_level_db_sl"], abs=1)
         assert row["measured_contrast_db"] > row["promised_contrast_db"] - 6
-    for error in found.identified.errors:
+    for error in found.identified:
         limit = 1e-3 if error.kind == "place" else 0.1
-        assert abs(error.relative) < limit, error
+        assert abs(error.size) < limit, error
     assert len(found.touches) == 2
     assert all(touch.measured_db > 6 for touch in found.touches)

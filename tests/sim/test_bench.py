@@ -18,10 +18,10 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 
-from benchmarks.direct_plate import direct_acceleration
 from drivers.host.amplifier_sensors import measure_tones, read_amplifier_sensors
 from drivers.playing import AmplifierTone, Voice, VoiceTransition
 from kit.clock import in_virtual_time
+from kit.direct_plate import direct_acceleration
 from kit.plates import apart, lock_in
 from kit.wires import WIRES, layer, rig_on_wire
 from model.arrays import FloatArray

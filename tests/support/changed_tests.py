@@ -46,7 +46,7 @@ ALSO: Sequence[tuple[Sequence[str], Sequence[str]]] = (
     (("controller/daemon/", "controller/operation/"), ("make fault-test", "make kill-test")),
     (("controller/play/", "drivers/host/group.py"), ("make soak",)),
     (("model/compiled/",), ("make test-kernels",)),
-    (("sim/soft_amp/", "era_haptics/lab/measuring/"), ("make desk-test",)),
+    (("sim/soft_amp/", "era_haptics/lab/measuring/"), ("make test-long",)),
     (("firmware/",), ("make firmware-test",)),
     (("examples/application/",), ("make qt-test",)),
     (("controller/gateway/",), ("pytest tests/integration/test_dashboard*.py",)),

@@ -12,7 +12,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from benchmarks.direct_plate import direct_acceleration
+from kit.direct_plate import direct_acceleration
 from kit.plates import LENGTH, WIDTH, contact_sets, smooth_rig
 from model.answer.answer import Answer
 from model.answer.plan import answer

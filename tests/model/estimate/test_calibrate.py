@@ -23,11 +23,11 @@ from benchmarks.calibration.hidden_plates import (
     measure,
     true_values,
 )
-from benchmarks.weekend import chain
 from kit import plates as calibration_plates
 from kit.plates import NAMES as PLATES_NAMES
 from kit.plates import make_paper_rig, perturbed
 from kit.plates import measured as plates_measured
+from kit.weekend_boards import FOLDER, measured_board
 from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError
 from model.estimate import plate_match
@@ -102,9 +102,9 @@ def off(found: Rig, true: Rig) -> FloatArray:
 
 def boards(seeds: range) -> Iterator[FloatArray]:
     """Exciters on wood, 1 mm off, of which one sensor is moved about twelve places."""
-    rig = load_rig(chain.FOLDER / "rig.yaml")
+    rig = load_rig(FOLDER / "rig.yaml")
     for seed in seeds:
-        built, responses = chain.measured(rig, seed)
+        built, responses = measured_board(rig, seed)
         yield off(calibrate(rig, responses).rig, built.rig)
 
 

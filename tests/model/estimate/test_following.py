@@ -19,8 +19,12 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from benchmarks.identification.plates import FREQUENCIES as PLATES_FREQUENCIES
-from benchmarks.identification.plates import (
+from cases import shortly
+from controller.learning import learned_table as learned_table_module
+from controller.learning.learned_table import LearnedTable, save_learned
+from kit.plates import SETTLED_PATTERNS_FREQUENCIES, played, settled_patterns
+from kit.thin_plates import FREQUENCIES as PLATES_FREQUENCIES
+from kit.thin_plates import (
     Complexes,
     Hidden,
     Mounted,
@@ -31,10 +35,6 @@ from benchmarks.identification.plates import (
     pattern_of_touches,
     table_of,
 )
-from cases import shortly
-from controller.learning import learned_table as learned_table_module
-from controller.learning.learned_table import LearnedTable, save_learned
-from kit.plates import SETTLED_PATTERNS_FREQUENCIES, played, settled_patterns
 from model.arrays import FloatArray
 from model.errors import InputError
 from model.estimate.fit import Fit

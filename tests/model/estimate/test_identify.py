@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from benchmarks.direct_plate import direct_acceleration
-from benchmarks.identification.plates import Hidden, draw, parameters_held
+from kit.direct_plate import direct_acceleration
 from kit.plates import SETTLED_PATTERNS_FREQUENCIES, as_sold, exciter_rig, exciter_rig_text
+from kit.thin_plates import Hidden, draw, parameters_held
 from model.arrays import ComplexArray, FloatArray
 from model.config.document import parse_document
 from model.errors import InputError

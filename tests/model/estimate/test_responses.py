@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 import pyuff
 
-from benchmarks.desk_plate.desk_plate import DeskModel, draw_truth
-from benchmarks.direct_plate import direct_acceleration
+from kit.desk_plate import DeskModel, draw_truth
+from kit.direct_plate import direct_acceleration
 from model.arrays import FloatArray
 from model.errors import InputError
 from model.estimate.calibrate import calibrate

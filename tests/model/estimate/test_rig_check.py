@@ -10,7 +10,7 @@ import json
 import math
 import shutil
 from collections.abc import Callable, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,10 +18,6 @@ import numpy as np
 import pytest
 
 import controller.cli.rig_cli
-from benchmarks.identification import causes
-from benchmarks.identification.mistakes import on_glue
-from benchmarks.identification.plates import draw
-from benchmarks.weekend.chain import FOLDER, BuiltBoard
 from cases import read_yaml, shortly
 from controller.plate_measurement import MeasuredPlate
 from era_haptics.command import run_era
@@ -35,6 +31,9 @@ from kit.plates import (
     random_gains,
 )
 from kit.plates import measured as measured_by_plates
+from kit.thin_plates import FAULTS, draw, measured_fault
+from kit.weekend_boards import FOLDER, BuiltBoard
+from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError
 from model.estimate import plate_match
 from model.estimate.calibrate import MAX_OUTLIERS, calibrate, check_consistency
@@ -58,7 +57,7 @@ from model.estimate.rig_check import (
 )
 from model.fem import Mesh
 from model.rig.rig import Rig
-from model.rig.rig_file import load_rig, parse_rig
+from model.rig.rig_file import example_rig_path, load_rig, parse_rig
 from model.rig.rig_writing import change_rig
 from model.spectral.direct_solution import direct_spectral_acceleration
 from model.spectral.modes import SpectralMesh
@@ -156,6 +155,30 @@ def on_paper(truth: Rig, rng: np.random.Generator) -> Measurement:
     return measured_by_plates(replace(truth, eras=eras), frequencies=PAPER_TONES, noise=0.02)
 
 
+@dataclass(frozen=True)
+class Glued:
+    """An exciter on a spring of glue [N/m], which loses a fifth."""
+
+    exciter: Any
+    spring: float
+
+    def __getattr__(self, name: str) -> Any:
+        """Its place, its foot and its full level."""
+        return getattr(self.exciter, name)
+
+    def dynamic_stiffness(self, omega: FloatArray) -> ComplexArray:
+        """Of both, one behind the other [N/m]."""
+        return self.exciter.dynamic_stiffness(omega) * self._transmitted(omega)
+
+    def force(self, omega: FloatArray) -> ComplexArray:
+        """Force that the glue transmits [N]."""
+        return self.exciter.force(omega) * self._transmitted(omega)
+
+    def _transmitted(self, omega: FloatArray) -> ComplexArray:
+        glue = self.spring * (1 + 0.2j)
+        return glue / (glue + self.exciter.dynamic_stiffness(omega))
+
+
 def sold(seed: int, glue: Mapping[str, float]) -> tuple[Rig, Measurement]:
     """A board of another rigidity (10 %) with exciters whose parts differ (20 %, 10 degrees).
 
@@ -164,7 +187,7 @@ def sold(seed: int, glue: Mapping[str, float]) -> tuple[Rig, Measurement]:
     rig = exciter_rig("type: DAEX25FHE-4, power: 1 W", frequency="[40, 300]", more=PARTS)
     assert isinstance(rig.mesh, SpectralMesh)
     true = as_sold(rig, np.random.default_rng(seed), modulus=0.1)
-    sources = [on_glue(era, glue[era.name]) if era.name in glue else era for era in true.eras]
+    sources = [Glued(era, glue[era.name]) if era.name in glue else era for era in true.eras]
     values = direct_spectral_acceleration(
         true.plate, rig.mesh, sources, SOLD_TONES, PLACES, loads=rig.masses
     )
@@ -188,7 +211,7 @@ def board_of(case: Mapping[str, Any]) -> tuple[Rig, Measurement]:
     if kind == "sold":
         return sold(int(seed), case.get("glue", {}))
     if kind == "hidden":
-        return load_rig(causes.RIG), causes.measured(causes.FAULTS[case["fault"]], int(seed))
+        return load_rig(example_rig_path()), measured_fault(FAULTS[case["fault"]], int(seed))
     if kind == "weekend":
         return WEEKEND, measured(of_keys(case.get("eras", {})), int(seed))
     right = measurement_of(read_measured(FOLDER / "measured.uff"), WEEKEND)
@@ -309,7 +332,7 @@ def test_a_check_finds_what_is_planted_and_nothing_else(case: dict[str, Any]) ->
             found = found[key]
         assert found == expected
     if case.get("placed"):
-        seed, fault = int(case["board"].split()[1]), causes.FAULTS[case["fault"]]
+        seed, fault = int(case["board"].split()[1]), FAULTS[case["fault"]]
         masses = draw(fault.kind, seed).mounted.masses.tolist()
         if fault.mass:
             at = np.random.default_rng([seed, 93]).uniform(0.1, 0.9, 2) * [0.3048, 0.2286]

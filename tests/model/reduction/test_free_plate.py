@@ -13,8 +13,8 @@ import pytest
 from scipy import sparse
 from scipy.sparse.linalg import splu
 
-from benchmarks.direct_plate import direct_acceleration, direct_responder
 from cases import shortly
+from kit.direct_plate import direct_acceleration, direct_responder
 from kit.plates import ALUMINIUM, LENGTH, WIDTH, make_paper_rig
 from model.arrays import FloatArray
 from model.errors import InputError

@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from benchmarks.direct_plate import direct_acceleration
 from controller.rig_file_check import check_rig
 from era_haptics.command import run_era
+from kit.direct_plate import direct_acceleration
 from kit.plates import exciter_rig, exciter_rig_text
 from kit.set_table import only
 from model.answer.stimulus import Placement

@@ -11,14 +11,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy import linalg, special
+from scipy import linalg, sparse, special
 from scipy.integrate import trapezoid
 from scipy.linalg import eigh
+from scipy.sparse.linalg import spsolve
 
-from benchmarks.layers import air_pressure, cell_middles, strip_frequencies
 from cases import in_turn
+from kit.layered_strips import strip_frequencies
 from kit.plates import ALUMINIUM, LENGTH, WIDTH, make_paper_rig
-from model.arrays import FloatArray
+from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError
 from model.fem import (
     ELEMENTS,
@@ -199,6 +200,41 @@ def polynomial(degree, x, side):
     coefficients = np.zeros(degree + 1)
     coefficients[degree] = np.sqrt((2 * degree + 1) / side)
     return np.polynomial.legendre.legval(2 * x / side - 1, coefficients)
+
+
+def cell_middles(length: float, width: float, cells: tuple[int, int]) -> list[FloatArray]:
+    """Coordinates x and y [m] of the middles of cells, each (nx, ny)."""
+    x = (np.arange(cells[0]) + 0.5) * length / cells[0]
+    y = (np.arange(cells[1]) + 0.5) * width / cells[1]
+    return np.meshgrid(x, y, indexing="ij")
+
+
+def air_pressure(
+    gap: AirGap, deflection: FloatArray, frequency: float, *, length: float, width: float
+) -> ComplexArray:
+    """Pressure (nx, ny) [Pa] against a deflection (nx, ny) [m] away from the gap.
+
+    Finite differences of lap p + omega² rho b / B p = -omega² rho b w / d, on cells with the
+    pressure in their middles: p = 0 at open edges, no slope across sealed ones.
+    """
+    nx, ny = deflection.shape
+    omega2 = (2 * np.pi * frequency) ** 2
+    inertia = gap.inertia(frequency)
+    along_x = sparse.kron(second_difference(nx, length / nx, gap.closed), sparse.eye_array(ny))
+    along_y = sparse.kron(sparse.eye_array(nx), second_difference(ny, width / ny, gap.closed))
+    compression = omega2 * inertia / gap.bulk_modulus(frequency) * sparse.eye_array(nx * ny)
+    source = -omega2 * inertia / gap.depth * deflection.ravel()
+    system = sparse.csc_array(along_x + along_y + compression)
+    return spsolve(system, source.astype(complex)).reshape(nx, ny)
+
+
+def second_difference(count: int, step: float, closed: bool) -> sparse.csr_array:
+    """Second difference [1/m²] between the middles of cells."""
+    diagonal = np.full(count, -2.0)
+    diagonal[[0, -1]] = -1.0 if closed else -3.0  # the edge is half a cell away
+    beside = np.ones(count - 1)
+    differences = sparse.diags_array([beside, diagonal, beside], offsets=[-1, 0, 1])
+    return sparse.csr_array(differences) / step**2
 
 
 @pytest.mark.parametrize(("parity", "closed"), in_turn(CLASSES, [False, True]))

@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 from scipy import linalg
 
-from benchmarks.direct_plate import direct_acceleration
-from benchmarks.layers import wave_number
 from cases import in_turn, shortly
+from kit.direct_plate import direct_acceleration
+from kit.layered_strips import wave_number
 from kit.plates import ALUMINIUM, LENGTH, WIDTH, exciter_rig, make_paper_rig
 from model.arrays import ComplexArray, FloatArray, lattice
 from model.errors import InputError

@@ -7,7 +7,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from benchmarks.direct_plate import direct_acceleration
+from kit.direct_plate import direct_acceleration
 from kit.plates import (
     FREQUENCIES,
     SMALL_TABLE_HZ,

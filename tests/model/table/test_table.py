@@ -7,7 +7,7 @@ from itertools import combinations, product
 import numpy as np
 import pytest
 
-from benchmarks.direct_plate import direct_acceleration
+from kit.direct_plate import direct_acceleration
 from kit.plates import contact_sets, make_paper_rig, smooth_rig, smooth_table
 from kit.set_table import only
 from model.answer.plan import query

@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from benchmarks.direct_plate import direct_acceleration
 from drivers.playing import AmplifierTone, Playback, Voice, VoiceTransition
 from drivers.protocol.sets import Command, Envelope, LayerSet
+from kit.direct_plate import direct_acceleration
 from kit.plates import FINGERTIP, lock_in
 from kit.plates import motion_of as sampled
 from model.answer.answer import Layer

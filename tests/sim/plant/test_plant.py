@@ -14,8 +14,8 @@ from numpy.testing import assert_allclose
 from scipy import linalg, sparse
 from scipy.signal import butter, lsim, sosfiltfilt
 
-from benchmarks.direct_plate import direct_acceleration
 from cases import shortly
+from kit.direct_plate import direct_acceleration
 from kit.plates import BASES as MOVED_BASES
 from kit.plates import (
     FINGERTIP,

@@ -24,13 +24,13 @@ import numpy as np
 import pytest
 from cobs import cobs
 
-from benchmarks.desk.session import Capture
 from cases import shortly
 from drivers.host.amplifier import Amplifier
 from drivers.opening import Lines
 from drivers.protocol.definition import FAULTS, STATES
 from kit import conversation as hand
 from model.errors import InputError
+from processes.desk import Capture
 from processes.gateways import wait_for
 from processes.sound_cards import BLOCK as CARD_BLOCK
 from processes.sound_cards import RATE as CARD_RATE

@@ -21,11 +21,11 @@ from typing import TypeVar
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from benchmarks.direct_plate import direct_acceleration
-from benchmarks.identification.plates import LENGTH as HIDDEN_LENGTH
-from benchmarks.identification.plates import WIDTH as HIDDEN_WIDTH
-from benchmarks.identification.plates import Hidden, Mounted, settled_pattern
 from benchmarks.setting import random_contacts
+from kit.direct_plate import direct_acceleration
+from kit.thin_plates import LENGTH as HIDDEN_LENGTH
+from kit.thin_plates import WIDTH as HIDDEN_WIDTH
+from kit.thin_plates import Hidden, Mounted, settled_pattern
 from model.answer.answer import Answer
 from model.answer.promise import FingersOnPlate
 from model.answer.stimulus import Placement

@@ -32,15 +32,15 @@ import pyuff
 from scipy.io import wavfile
 from scipy.signal import bilinear_zpk, cont2discrete, sosfilt, zpk2sos
 
-from benchmarks.desk.session import Capture
-from benchmarks.desk_plate.desk_plate import DeskPlate
 from era_haptics.lab.measuring.sound_card import SoundCard
+from kit.desk_plate import DeskPlate
 from model.arrays import ComplexArray, Float32Array, FloatArray
 from model.reduction.reduced_plate import modal_matrices, reduce_plate
 from model.rig.rig import Rig
 from model.rig.rig_summary import exciters_of
 from model.structure.attachments import footprints_of
 from model.transients.base_motion import Motion
+from processes.desk import Capture
 from processes.typed_page import ERA
 from sim.plant.plant import Plant
 from sim.sensors import Recording

@@ -2,7 +2,7 @@
 
 import pytest
 
-from benchmarks.desk_plate.desk_plate import Truth, draw_truth
+from kit.desk_plate import Truth, draw_truth
 from model.rig.rig import Rig
 
 

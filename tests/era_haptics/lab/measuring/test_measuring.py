@@ -18,8 +18,6 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from benchmarks.desk.session import open_client
-from benchmarks.desk_plate.desk_plate import Converters, DeskModel, DeskPlate, JackPlate, Truth
 from drivers.errors import LinkError
 from era_haptics.command import run_era
 from era_haptics.lab.measuring import other_sources
@@ -45,6 +43,7 @@ from era_haptics.lab.measuring.sound_card import (
     multisine_frequencies,
 )
 from examples.make_measured import record_responses
+from kit.desk_plate import Converters, DeskModel, DeskPlate, JackPlate, Truth
 from kit.plates import exciter_rig_text
 from model.arrays import Float32Array, FloatArray
 from model.errors import InputError
@@ -52,6 +51,7 @@ from model.estimate.measurement import measurement_of, read_measured
 from model.rig.rig import Rig, Uncertainty
 from model.rig.rig_file import example_rig_path, load_rig, parse_rig
 from model.structure.attachments import PointLoad
+from processes.desk import open_client
 from processes.sound_cards import DeskCard, ExciterCircuit, jack_server
 from processes.typed_page import ERA
 from sim.plant.fingers import Accelerometer

@@ -20,16 +20,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.desk_plate.desk_plate import (
-    Converters,
-    DeskModel,
-    DeskPlate,
-    Truth,
-    as_built,
-    draw_truth,
-    sampled,
-)
-from benchmarks.direct_plate import direct_responder
 from controller.plate_measurement import MeasuredPlate
 from drivers.errors import LinkError
 from era_haptics.command import run_era
@@ -43,12 +33,20 @@ from era_haptics.lab.measuring.sound_card import (
     open_card,
     read_sensors,
 )
-from kit.plates import apart, lock_in
+from kit.desk_plate import (
+    Converters,
+    DeskModel,
+    DeskPlate,
+    Truth,
+    draw_truth,
+    sampled,
+)
+from kit.direct_plate import direct_responder
+from kit.plates import lock_in
 from model.arrays import Float32Array, FloatArray
 from model.errors import InputError
 from model.estimate.identify import identify
 from model.estimate.measurement import measurement_of, read_measured, sensors_at
-from model.finger import fingertips_on
 from model.rig.rig import Rig
 from model.rig.rig_file import example_rig_path, parse_rig
 from model.structure.attachments import PointLoad, fingertip_loads
@@ -112,21 +110,6 @@ def test_plates_in_time_are_those_of_the_direct_solution(
         exact[:, number] *= (each.response(hertz) if places is None else moved)[:, None]
     wrong = np.linalg.norm(found - exact, axis=(1, 2)) / np.linalg.norm(exact, axis=(1, 2))
     assert wrong.max() < 0.005
-
-
-def test_a_board_that_is_given_is_not_drawn(board: Rig) -> None:
-    """Each exciter has the gain of its file amid the band, but for a lag that all have alike."""
-    gains = {"SW": (1.2, 0.1), "SE": (0.8, -0.15), "NE": (1.0, 0.0), "NW": (0.9, 0.2)}
-    eras = [replace(era, gains=((100.0, *gains[era.name]),)) for era in board.eras]
-    truth = as_built(replace(board, eras=tuple(eras)), mesh=MESH)
-    assert truth.rig.plate == board.plate
-    assert [replace(era, gains=()) for era in eras] == [*truth.rig.eras]
-    middle = np.array([np.sqrt(40.0 * 300.0)])
-    found = np.array([each.response(middle)[0] for each in truth.actuators])
-    lag = found / np.array([size * np.exp(1j * phase) for size, phase in gains.values()])
-    np.testing.assert_allclose(lag, lag[0], rtol=1e-12)
-    assert abs(lag[0]) == pytest.approx(1)
-    assert -0.3 < np.angle(lag[0]) < 0
 
 
 DESK = Path(__file__).parents[4] / "examples" / "desk"
@@ -246,35 +229,6 @@ def test_rate_that_gives_no_whole_milliseconds_is_refused(monkeypatch: pytest.Mo
 
 
 PLATE_RATE = 48_000.0
-
-
-def test_fingers_feel_the_plate_under_them(truth: Truth) -> None:
-    """At all points of fingertips whose loads differ, as the direct solution of the loaded plate.
-
-    What differs is damping, viscous here and hysteretic there.
-    """
-    rig, factors, frequency = truth.rig, [0.3, 3.0], 150.0
-    sensors = [WiredSensor("P1", 0.03, 0.05, 1, 1e-3)]
-    desk = DeskPlate(truth, sensors, rate=PLATE_RATE, converters=Converters(), seed=1)
-    desk.set_fingers(FINGERS, factors)
-    played = np.zeros((48_000, 5))
-    played[:, 1] = np.sin(2 * np.pi * frequency * np.arange(len(played)) / PLATE_RATE)
-    desk.advance(played[:38_400])
-    desk.begin_feeling()
-    desk.advance(played[38_400:])
-    felt = desk.felt()
-    points, _ = fingertips_on(np.array(FINGERS), length=rig.plate.length, width=rig.plate.width)
-    assert felt.shape == (600, *points.shape[:2])
-    loads = [
-        replace(each, fingertip=each.fingertip.multiplied(factor))
-        for each, factor in zip(fingertip_loads(rig.fingertip, FINGERS), factors, strict=True)
-    ]
-    direct = direct_responder(rig.plate, rig.mesh)
-    places, hertz = points.reshape(-1, 2), np.array([frequency])
-    exact = direct(rig.eras, hertz, places, loads=[*rig.masses, *loads])[0, 1]
-    exact = exact * truth.actuators[1].response(hertz)
-    times = (38_400 + 16 * np.arange(len(felt))) / PLATE_RATE
-    assert apart(lock_in(times, felt.reshape(len(felt), -1), frequency), exact) < 0.01
 
 
 def test_fingers_are_swapped_without_a_jump(truth: Truth) -> None:

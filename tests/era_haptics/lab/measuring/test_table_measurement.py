@@ -17,8 +17,6 @@ import pytest
 from scipy.io import wavfile
 from typer.testing import CliRunner
 
-from benchmarks.desk_plate.desk_plate import Actuator, Converters, DeskPlate, Truth, draw_truth
-from benchmarks.direct_plate import direct_responder
 from cases import shortly
 from drivers.by_hand.actions import BlockingAmplifier
 from drivers.errors import CommandRefused, LinkError
@@ -29,6 +27,8 @@ from era_haptics.lab.measuring import table_measurement
 from era_haptics.lab.measuring.other_sources import read_stepped
 from era_haptics.lab.measuring.outputs import OutputFinding, listen_to_outputs, matched, tone
 from era_haptics.lab.measuring.sound_card import Desk, SoundCard, WiredSensor, read_sensors
+from kit.desk_plate import Actuator, Converters, DeskPlate, Truth, draw_truth
+from kit.direct_plate import direct_responder
 from kit.plates import exciter_rig
 from model.arrays import ComplexArray, Float32Array, FloatArray
 from model.cli import app

@@ -36,7 +36,6 @@ from drivers.errors import LinkError
 from era_haptics.lab.measuring.sound_card import Desk, WiredSensor, are_positions
 from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError
-from model.finger import fingertips_on
 from model.reduction.reduced_plate import ReducedPlate, reduce_plate
 from model.rig.rig import Rig
 from model.rig.rig_file import parse_mesh
@@ -113,7 +112,6 @@ _RESONANCES = 550.0, 800.0  # Hz, of actuators; above the played range, but felt
 _AMPLIFIERS = 2.5e3, 3.5e3  # Hz, of filters before exciters; far above the band
 _MAGNET = 0.05
 _RATIOS = 0.2, 0.4  # of their damping
-_FLAT, _LEAST_LAG = 0.7, math.radians(3)  # ratio of a damping that lets gains be flat
 _PLACE = 1e-3  # m
 _BOLT = 0.008  # kg
 
@@ -205,31 +203,6 @@ def draw_truth(rig: Rig, *, seed: int, mesh: str = MESH) -> Truth:
     )
 
 
-def as_built(rig: Rig, *, mesh: str) -> Truth:
-    """The plate that a rig describes, solved on another mesh; its gains are those of actuators.
-
-    Of each the magnitude, and the phase amid the rig's band, which no lag makes positive: all are
-    late by what the earliest has too much, and by 3 degrees.
-    """
-    middle = math.sqrt(rig.limits.frequency_min * rig.limits.frequency_max)
-    gains = [complex(era.gain(np.array([middle]))[0]) for era in rig.eras]
-    phases = np.angle(gains)
-    lags = np.tan(phases.max() - phases + _LEAST_LAG)
-    # tan(lag) = 2 zeta x / (1 - x²)
-    x = (np.sqrt(_FLAT**2 + lags**2) - _FLAT) / lags
-    actuators = tuple(
-        Actuator(middle / of_resonance, _FLAT, abs(gain) * _flatness(of_resonance))
-        for of_resonance, gain in zip(x.tolist(), gains, strict=True)
-    )
-    eras = tuple(replace(era, gains=()) for era in rig.eras)
-    return Truth(replace(rig, eras=eras, mesh=parse_mesh(mesh, rig.plate)), actuators)
-
-
-def _flatness(x: float) -> float:
-    """What an actuator lacks of its gain at a share x of its resonance, inverted."""
-    return math.hypot(1 - x**2, 2 * _FLAT * x)
-
-
 def _near(place: Sequence[float], plate: Plate, rng: np.random.Generator) -> tuple[float, float]:
     """A place beside another, on the plate."""
     found = np.abs(np.asarray(place) + _PLACE * rng.standard_normal(2))
@@ -298,16 +271,11 @@ class DeskModel:
         return 2 * self._size + 2 * len(self._truth.rig.eras)
 
     def under(
-        self,
-        fingers: Sequence[FingertipLoad] = (),
-        *,
-        moved: tuple[int, float] | None = None,
-        points: FloatArray | None = None,
+        self, fingers: Sequence[FingertipLoad] = (), *, moved: tuple[int, float] | None = None
     ) -> ModelInTime:
         """The plate with fingers on it.
 
-        moved: the only point with an accelerometer now, by its number, and its mass [kg]; points
-        (p, 2) [m]: in place of the accelerometers'.
+        moved: the only point with an accelerometer now, by its number, and its mass [kg].
         """
         rig, r = self._truth.rig, self._size
         count = len(rig.eras)
@@ -327,8 +295,6 @@ class DeskModel:
             stiffness += load.stiffness * np.outer(shape, shape)
         damping += self._structural(mass, stiffness)
         at_points = self._at_points
-        if points is not None:
-            at_points = self._extended(self._plate.at(points))
         if moved is not None:
             number, weight = moved
             at_points = at_points[[number]]
@@ -425,12 +391,6 @@ class SampledModel:
         )
         return np.asarray(sum(both) / 2 + self.D)
 
-    def outputs(self, history: FloatArray) -> FloatArray:
-        """Accelerations (n, outputs) at the samples of a history (n, state + inputs)."""
-        m = len(self.E)
-        states = history[:, :m] + 1j * history[:, m : 2 * m]
-        return np.asarray((states @ self.C.T).real + history[:, 2 * m :] @ self.D.T)
-
     @cached_property
     def lifted(self) -> FloatArray:
         """The matrix of a block: (state + SAMPLES outputs, state + SAMPLES inputs)."""
@@ -477,17 +437,12 @@ def sampled(model: ModelInTime, *, rate: float) -> SampledModel:
 
 
 class LiftedBlocks:
-    """Advances a sampled model from rest, in multiples of SAMPLES samples.
-
-    history: where, if anywhere, the state and the input (state + inputs,) at the first sample of
-    each SAMPLES are left from now on.
-    """
+    """Advances a sampled model from rest, in multiples of SAMPLES samples."""
 
     def __init__(self, model: SampledModel) -> None:
         self._model = model
         self._lifted = model.lifted
         self._state = np.zeros(2 * len(model.E))
-        self.history: list[FloatArray] | None = None
 
     def advance(self, samples: FloatArray) -> FloatArray:
         """Accelerations (n, outputs) for samples (n, inputs); n a multiple of SAMPLES."""
@@ -495,8 +450,6 @@ class LiftedBlocks:
         rows = np.ascontiguousarray(samples, dtype=float).reshape(-1, SAMPLES * inputs)
         found = np.empty((len(rows), SAMPLES * outputs))
         for row, into in zip(rows, found, strict=True):
-            if self.history is not None:
-                self.history.append(np.concatenate([self._state, row[:inputs]]))
             after = self._lifted @ np.concatenate([self._state, row])
             self._state, into[:] = after[:size], after[size:]
         return found.reshape(-1, outputs)
@@ -554,36 +507,13 @@ class DeskPlate:
         self._plate = self._now()
         self._kept = self._model.shared
 
-    def set_fingers(
-        self, places: Sequence[tuple[float, float]], factors: Sequence[float] = ()
-    ) -> None:
-        """Replace the fingers on the plate, at places [m]; computed here, swapped between blocks.
+    def set_fingers(self, positions: Sequence[tuple[float, float]]) -> None:
+        """Replace the fingers on the plate, at positions [m]; swapped between two blocks.
 
-        factors: of their loads, empty for those of the rig's. The plate's motion is continuous;
-        phalanges begin at rest.
+        The plate's motion is continuous; phalanges begin at rest.
         """
-        loads = fingertip_loads(self._truth.rig.fingertip, places)
-        self._fingers = tuple(
-            replace(each, fingertip=each.fingertip.multiplied(factor))
-            for each, factor in zip(loads, factors or [1.0] * len(loads), strict=True)
-        )
+        self._fingers = fingertip_loads(self._truth.rig.fingertip, positions)
         self._next = self._now()
-
-    def begin_feeling(self) -> None:
-        """Keep from now on what the fingers feel."""
-        self._plate.history = []
-
-    def felt(self) -> FloatArray:
-        """What they felt: accelerations (n, k, p) [m/s²] at the points under k fingertips.
-
-        At the rate of the samples over SAMPLES; until now, and no longer.
-        """
-        history, self._plate.history = self._plate.history, None
-        plate, at = self._truth.rig.plate, np.array([(each.x, each.y) for each in self._fingers])
-        points, _ = fingertips_on(at, length=plate.length, width=plate.width)
-        model = self._model.under(self._fingers, points=points.reshape(-1, 2))
-        found = sampled(model, rate=self._rate).outputs(np.array(history))
-        return found.reshape(-1, *points.shape[:2])
 
     def move_sensor(self, name: str) -> None:
         """Put a sensor that is moved to another of its places; raises InputError."""

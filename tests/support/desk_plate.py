@@ -1,6 +1,6 @@
 """A plate without hardware, as a client of a JACK server.
 
-python -m benchmarks.desk_plate RIG --sensors SENSORS.csv
+python tests/support/desk_plate.py RIG --sensors SENSORS.csv
 """
 
 import json
@@ -10,11 +10,10 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Annotated
 
-import numpy as np
 import typer
 
-from benchmarks.desk_plate.desk_plate import DeskPlate, JackPlate
 from drivers.errors import LinkError
+from kit.desk_plate import DeskPlate, JackPlate
 from model.commands.options import RigArgument
 from model.errors import InputError
 
@@ -47,10 +46,6 @@ def desk_plate(
     mesh: Annotated[
         str | None, typer.Option(metavar="NXxNY", help="Mesh that the plate is solved on.")
     ] = None,
-    built: Annotated[
-        Path | None,
-        typer.Option(metavar="RIG", help="Be the plate of this file, in place of one drawn."),
-    ] = None,
     truth: Annotated[
         Path | None, typer.Option(metavar="FILE.json", help="Write what the plate really is.")
     ] = None,
@@ -58,9 +53,8 @@ def desk_plate(
         bool,
         typer.Option(
             "--until-eof",
-            help='Exit at the end of standard input; lines {"fingers": [[X, Y], ...]} touch it, '
-            '{"sensor": NAME} moves the only sensor, {"feel": SECONDS, "file": FILE.npy} writes '
-            "what the fingers feel.",
+            help='Exit at the end of standard input; lines {"fingers": [[X, Y], ...]} touch the '
+            'plate, and {"sensor": NAME} moves the only sensor.',
         ),
     ] = False,
 ) -> None:
@@ -72,24 +66,14 @@ def desk_plate(
     """
     import gc
 
-    from benchmarks.desk_plate.desk_plate import (
-        MESH,
-        Converters,
-        DeskPlate,
-        JackPlate,
-        as_built,
-        draw_truth,
-    )
     from era_haptics.lab.measuring.sound_card import read_sensors
+    from kit.desk_plate import MESH, Converters, draw_truth
     from model.rig.rig_file import load_rig
     from sim.soft_amp.jack import JackClient
 
     rig = load_rig(rig_file)
     sensors = read_sensors(sensors_file, rig.plate, may_move=True)
-    if built is None:
-        drawn = draw_truth(rig, seed=seed, mesh=mesh or MESH)
-    else:
-        drawn = as_built(load_rig(built), mesh=mesh or MESH)
+    drawn = draw_truth(rig, seed=seed, mesh=mesh or MESH)
     client = JackClient(name, is_only=True)
     try:
         converters = Converters(delay=delay, noise=noise)
@@ -102,12 +86,11 @@ def desk_plate(
         gc.collect()
         gc.freeze()  # what is loaded is never looked through again, in the middle of a block
         running.start()
-        print(f"jack:{name}", flush=True)
-        print(
+        typer.echo(f"jack:{name}")
+        typer.echo(
             f"desk-plate: simulated; {plate.outputs} inputs for what the card plays, "
             f"{plate.inputs} outputs, {client.rate} Hz, blocks of {client.block} frames",
-            file=sys.stderr,
-            flush=True,
+            err=True,
         )
         with suppress(KeyboardInterrupt):
             _run(running, plate, until_eof=until_eof)
@@ -123,39 +106,28 @@ def _run(running: JackPlate, plate: DeskPlate, *, until_eof: bool) -> None:
             line = sys.stdin.readline()
             if not line:
                 return
-            print(json.dumps(_changed(running, plate, line)), flush=True)
+            typer.echo(json.dumps(_changed(plate, line)))
 
 
-def _changed(running: JackPlate, plate: DeskPlate, line: str) -> dict[str, object]:
-    """Change what a line says; return what is there now."""
+def _changed(plate: DeskPlate, line: str) -> dict[str, object]:
+    """Change what a line asks for; return the new state."""
     try:
         wanted = json.loads(line)
         if "sensor" in wanted:
             plate.move_sensor(str(wanted["sensor"]))
             return {"sensor": wanted["sensor"]}
-        if "feel" in wanted:
-            plate.begin_feeling()
-            running.wait(float(wanted["feel"]))
-            felt = plate.felt()
-            np.save(wanted["file"], felt)
-            return {"felt": felt.shape}
-        fingers = [[float(each) for each in finger] for finger in wanted["fingers"]]
-        places, factors = (
-            [(x, y) for x, y, *_ in fingers],
-            [each[2] for each in fingers if each[2:]],
-        )
-        plate.set_fingers(places, factors)
+        positions = [(float(x), float(y)) for x, y in wanted["fingers"]]
+        plate.set_fingers(positions)
     except (ValueError, TypeError, KeyError) as problem:
         raise InputError(
-            'a line must be {"fingers": [[X, Y], ...]}, with a factor of its load after each Y or '
-            f'none, {{"sensor": NAME}} or {{"feel": SECONDS, "file": FILE.npy}}, got {line[:60]!r}'
+            f'a line must be {{"fingers": [[X, Y], ...]}} or {{"sensor": NAME}}, got {line[:60]!r}'
         ) from problem
-    return {"fingers": len(places)}
+    return {"fingers": len(positions)}
 
 
 if __name__ == "__main__":
     try:
         typer.run(desk_plate)
     except (InputError, LinkError) as error:
-        print(f"error: {error}", file=sys.stderr)
+        typer.echo(f"error: {error}", err=True)
         raise SystemExit(3) from None

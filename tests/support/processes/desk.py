@@ -1,9 +1,8 @@
 """A desk of real processes: jackd, a plate, and the commands that a user types.
 
-One plate goes from the first measurement to touches: what a user types, and what came of it.
-Touches are felt while daemon and software amplifier play and accelerometers record, by a JACK
-client that keeps every sample it gets, with a callback in C. A rig that `era rig identify` wrote is
-held against the truth of the plate on the desk.
+One plate goes from the first measurement to touches. While daemon and software amplifier play,
+a JACK client with a callback in C records every sample of the accelerometers. Fitted values are
+compared with the truth of the plate on the desk.
 """
 
 import contextlib
@@ -12,41 +11,42 @@ import itertools
 import json
 import math
 import os
+import shutil
 import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
 
-from benchmarks.desk_plate.desk_plate import Actuator
 from controller.api.client import Client
 from controller.api.jsonrpc import RpcError
 from controller.api.link import Unreachable
 from controller.api.methods import StatusResult
 from drivers.errors import LinkError
 from era_haptics.lab.measuring.sound_card import SoundCard, open_card
-from model.arrays import Float32Array, FloatArray
+from kit.desk_plate import Actuator
+from model.arrays import ComplexArray, Float32Array, FloatArray
 from model.finger import detection_threshold
 from model.rig.rig import Rig
 from model.rig.rig_file import load_rig
 from sim.soft_amp.jack import JackClient
 
 ERA = Path(sys.executable).with_name("era")
-PLATE = (sys.executable, "-m", "benchmarks.desk_plate", "rig.yaml", "--sensors", "sensors.csv")
-EXAMPLES = Path(__file__).parents[2] / "examples" / "desk"
+_ROOT = Path(__file__).parents[3]
+_PROGRAM = _ROOT / "tests" / "support" / "desk_plate.py"
+PLATE = (sys.executable, str(_PROGRAM), "rig.yaml", "--sensors", "sensors.csv")
+EXAMPLES = _ROOT / "examples" / "desk"
 RATE, BLOCK = 48_000, 512
 """Hz, and frames: the most that an amplifier may take, for a machine without real-time priority."""
 
 _START = 60.0  # s; on a busy machine
 _END = 20.0  # s
 _COMMAND = 900.0  # s
-_TRIES = 2  # of a place
-
 Place = tuple[float, float]
 
 _numbers = itertools.count()
@@ -60,7 +60,6 @@ class Desk:
     ) -> None:
         self.folder, self.environment = folder, dict(environment)
         self._plate = plate
-        self._said = self._answered = 0
 
     def run(self, *arguments: object, status: int | None = 0) -> dict[str, Any]:
         """Run an `era` command with --json; None: any exit status. Raises RuntimeError."""
@@ -80,71 +79,19 @@ class Desk:
         found: dict[str, Any] = json.loads(done.stdout)
         return found
 
-    def touch_plate(self, fingers: Sequence[Sequence[float]]) -> None:
-        """Put fingers on the plate: x and y of each [m], and the factor of its load if any."""
+    def touch_plate(self, fingers: Sequence[Place]) -> None:
+        """Put fingers on the plate at positions [m]."""
         self._change({"fingers": list(fingers)})
 
-    def begin_feeling(self, seconds: float) -> None:
-        """Keep for some time what the fingers feel; nothing else may change meanwhile."""
-        self._say({"feel": seconds, "file": str(self.folder / "felt.npy")})
-
-    def felt(self) -> FloatArray:
-        """What they felt (n, k, p) [m/s²], as `DeskPlate.felt`."""
-        self._answer()
-        return np.asarray(np.load(self.folder / "felt.npy"))
-
-    def log_count(self, word: str) -> int:
-        """How many lines of the server and the plate have a word."""
-        return (self.folder / "desk.log").read_text("utf-8", "replace").count(word)
-
-    def measure_by_moving(self, *arguments: object) -> int:
-        """Run `era measure` with one sensor, which is moved as it says; raises RuntimeError.
-
-        Return how often a place was not kept: it is measured again once, and then skipped.
-        """
-        with subprocess.Popen(
-            [str(ERA), "measure", *map(str, arguments)],
-            stdin=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            stdout=subprocess.DEVNULL,
-            text=True,
-            bufsize=1,
-            cwd=self.folder,
-            env=self.environment,
-        ) as process:
-            assert process.stdin is not None
-            assert process.stderr is not None
-            said = ""
-            while letter := process.stderr.read(1):
-                said += letter
-                if said.endswith("then Enter: "):
-                    place = said.rpartition("sensor at ")[2].split(",")[0]
-                    self._change({"sensor": place})
-                    is_refused = said.count(f"{place} is not kept") >= _TRIES
-                    process.stdin.write("s\n" if is_refused else "\n")
-                    process.stdin.flush()
-        if process.returncode:
-            raise RuntimeError(f"era measure: status {process.returncode}: {said}")
-        return said.count(" is not kept: ")
-
-    def _change(self, what: Mapping[str, object]) -> None:
-        self._say(what)
-        self._answer()
-
-    def _say(self, what: Mapping[str, object]) -> None:
+    def _change(self, request: Mapping[str, object]) -> None:
+        """Change the plate, and wait for its reply; raises RuntimeError if it has ended."""
         assert self._plate.stdin is not None
-        self._plate.stdin.write(json.dumps(what) + "\n")
-        self._plate.stdin.flush()
-        self._said += 1
-
-    def _answer(self) -> None:
-        """Wait until the plate has done all that was said; raises RuntimeError if it has ended."""
         assert self._plate.stdout is not None
-        while self._answered < self._said:
-            if not self._plate.stdout.readline():
-                log = (self.folder / "desk.log").read_text("utf-8", "replace")
-                raise RuntimeError(f"the plate ended: {log}")
-            self._answered += 1
+        self._plate.stdin.write(json.dumps(request) + "\n")
+        self._plate.stdin.flush()
+        if not self._plate.stdout.readline():
+            log = (self.folder / "desk.log").read_text("utf-8", "replace")
+            raise RuntimeError(f"the plate ended: {log}")
 
     @property
     def truth(self) -> dict[str, Any]:
@@ -154,19 +101,8 @@ class Desk:
 
 
 @contextlib.contextmanager
-def desk(
-    folder: Path,
-    *,
-    seed: int,
-    mesh: str = "8x6 Q3",
-    rig: str | None = None,
-    sensors: str | None = None,
-    options: Sequence[str] = (),
-) -> Iterator[Desk]:
-    """A desk with a plate of its own; seed: of its deviations.
-
-    rig, sensors: content of other files than the example's; options: further ones of the plate.
-    """
+def desk(folder: Path, *, seed: int, mesh: str = "8x6 Q3") -> Iterator[Desk]:
+    """A desk with a plate of its own; seed: of its deviations."""
     name = f"desk{os.getpid()}-{next(_numbers)}"  # several plates may be on desks at once
     environment = os.environ | {
         "JACK_DEFAULT_SERVER": name,
@@ -174,13 +110,11 @@ def desk(
         "OPENBLAS_NUM_THREADS": "1",
     }
     link = folder / "amp"
-    text = (EXAMPLES / "rig.yaml").read_text("utf-8") if rig is None else rig
-    (folder / "rig.yaml").write_text(text.replace("/tmp/plate", str(link)), "utf-8")
-    given = (EXAMPLES / "sensors.csv").read_text("utf-8") if sensors is None else sensors
-    (folder / "sensors.csv").write_text(given, "utf-8")
+    rig = (EXAMPLES / "rig.yaml").read_text("utf-8")
+    (folder / "rig.yaml").write_text(rig.replace("/tmp/plate", str(link)), "utf-8")
+    shutil.copy(EXAMPLES / "sensors.csv", folder)
     server = ["jackd", "-n", name, "-S", "-r", "-d", "dummy", "-p", str(BLOCK), "-r", str(RATE)]
     plate = [*PLATE, "--seed", seed, "--mesh", mesh, "--truth", "truth.json", "--until-eof"]
-    plate += options
     with contextlib.ExitStack() as stack:
         stack.enter_context(_own_server(name))
         log = stack.enter_context((folder / "desk.log").open("w"))
@@ -319,40 +253,16 @@ def open_client(name: str) -> JackClient:
             time.sleep(0.02)
 
 
-_PERCENT = (100.0, " %")
-_UNITS = {"place": (1e3, " mm"), "phase": (math.degrees(1), "°")}
-
-
 @dataclass(frozen=True)
 class Error:
-    """A found value relative to the truth, bolts to the plate's share; in standard errors too.
+    """Difference of a fitted value from the truth.
 
-    Per mass of the plate, which no response shows; of a place [m] and of a phase [rad] the
-    difference; in_standard_errors: None where none is stated.
+    Relative to the truth, of a bolt to the plate's mass on each ERA; of a position in m, of a phase
+    in radians. All are per mass of the plate, which no response shows.
     """
 
     kind: str
-    relative: float
-    in_standard_errors: float | None
-
-
-def errors_table(errors: Sequence[Error]) -> str:
-    """Lines of a table with a row for each kind of value, in their order."""
-    rows = [
-        "| value | error, median | largest | intervals of 95 % that hold the truth | values |",
-        "|---|---|---|---|---|",
-    ]
-    for kind in dict.fromkeys(one.kind for one in errors):
-        some = [one for one in errors if one.kind == kind]
-        scale, unit = _UNITS.get(kind, _PERCENT)
-        sizes = scale * np.abs([one.relative for one in some])
-        stated = [one.in_standard_errors for one in some if one.in_standard_errors is not None]
-        held = f"{100 * np.mean(np.abs(stated) < 1.96):.0f} %" if stated else "–"
-        rows.append(
-            f"| {kind} | {np.median(sizes):.2f}{unit} | {sizes.max():.2f}{unit} | {held} "
-            f"| {len(some)} |"
-        )
-    return "\n".join(rows)
+    size: float
 
 
 _TOUCHES_START = 180.0  # s; on a busy machine
@@ -473,182 +383,91 @@ def sizes(samples: FloatArray, status: StatusResult, rate: float) -> FloatArray:
     return np.asarray(np.linalg.norm(felt, axis=0))
 
 
-_AT_BOLT = 5e-3  # m; an additional mass nearer than that cannot be distinguished from the bolt
-
-
-@dataclass(frozen=True)
-class Identified:
-    """What came of an identification; contrasts: one for each number of quiet fingers."""
-
-    seed: int
-    measure_s: float
-    solve_s: float
-    chi2: float
-    held_out_error: float
-    contrasts: tuple[dict[str, Any], ...]
-    errors: tuple[Error, ...]
-
-
-def identify(plate: Desk, *, seed: int) -> Identified:
-    """Identify the plate on a desk through its sound card; raises RuntimeError."""
-    told = plate.run(
-        "rig", "identify", "rig.yaml", "--device", "jack:desk", "--sensors", "sensors.csv",
-        "-o", "identified.yaml", "--yes",
-    )  # fmt: skip
-    return Identified(
-        seed=seed,
-        measure_s=told["measure_time_s"],
-        solve_s=told["solve_time_s"],
-        chi2=told["chi2"],
-        held_out_error=told["held_out_error"],
-        contrasts=tuple(told["expected_contrast"]),
-        errors=tuple(identified_errors(load_rig(plate.folder / "identified.yaml"), plate.truth)),
-    )
-
-
 def identified_errors(rig: Rig, truth: dict[str, Any]) -> list[Error]:
-    """Errors of all values, relative, of places [m] and of phases [rad].
+    """Return the errors of each ERA of an identified rig.
 
-    Per mass of the plate, as those of `era calibrate`; rigidity and loss with what was found of
-    single modes, in their geometric mean; gains relative to the mean of all drives, at the worst
-    frequency. Standard errors are those of the rig's `uncertainty`, where that states one.
+    Gain and phase are relative to the mean of all drives, at the worst frequency.
     """
-    plate, std = rig.plate, rig.uncertainty
-    mass = truth["thickness_m"] / plate.thickness  # of the true plate relative to the identified
-    eigenvalues, losses = np.exp(np.mean(np.log(np.reshape(_modes(rig), (-1, 2))), axis=0))
-    scatter = math.log(std.damping)
-    rigidity = mass * plate.flexural_rigidity * eigenvalues / truth["flexural_rigidity_n_m"]
-    loss = plate.loss_factor * losses / truth["loss_factor"]
-    found = [
-        _error("rigidity", rigidity - 1, 2 * std.thickness),
-        _error("loss_factor", loss - 1, scatter),
-    ]
-    share = plate.mass / 4
-    drives = _drives(rig, truth)
-    for era, drive in zip(rig.eras, drives, strict=True):
-        own = truth["eras"][era.name]
-        bolt = era.in_time.mass + sum(
-            each.mass
-            for each in rig.masses
-            if math.hypot(each.x - era.x, each.y - era.y) < _AT_BOLT
-        )
+    mass = truth["thickness_m"] / rig.plate.thickness  # of the true plate by the identified
+    errors = []
+    for era, drive in zip(rig.eras, _drives(rig, truth), strict=True):
+        true = truth["eras"][era.name]
         worst = int(np.abs(np.log(np.abs(drive))).argmax())
-        found += [
-            _error("stiffness", mass * era.stiffness / own["stiffness"] - 1, std.stiffness),
-            _error("damping", mass * era.damping / own["damping"] - 1, scatter),
-            _error("bolt_mass", (mass * bolt - own["bolt_mass"]) / (mass * share)),
-            _error("place", math.dist((era.x, era.y), own["at_m"])),
-            _error("gain", float(np.abs(drive)[worst] - 1), std.gain),
-            _error("phase", float(np.abs(np.angle(drive)).max()), math.radians(std.phase_deg)),
+        errors += [
+            Error("stiffness", mass * era.stiffness / true["stiffness"] - 1),
+            Error("damping", mass * era.damping / true["damping"] - 1),
+            Error("place", math.dist((era.x, era.y), true["at_m"])),
+            Error("gain", float(np.abs(drive)[worst] - 1)),
+            Error("phase", float(np.abs(np.angle(drive)).max())),
         ]
-    return found
+    return errors
 
 
-def _modes(rig: Rig) -> list[tuple[float, float]]:
-    """Factors of eigenvalues and loss factors of the lowest modes."""
-    return [(math.exp(a), math.exp(b)) for a, b in rig.plate.mode_deviations]
-
-
-def _drives(rig: Rig, truth: dict[str, Any]) -> list[np.ndarray]:
+def _drives(rig: Rig, truth: dict[str, Any]) -> list[ComplexArray]:
     """Identified over true gain of each drive at frequencies, relative to the mean of all."""
     frequencies = np.arange(rig.limits.frequency_min, rig.limits.frequency_max + 1, 10.0)
     ratios = []
     for era in rig.eras:
-        own = truth["eras"][era.name]
-        actuator = Actuator(own["resonance_hz"], own["damping_ratio"], own["gain"])
+        true = truth["eras"][era.name]
+        actuator = Actuator(true["resonance_hz"], true["damping_ratio"], true["gain"])
         ratios.append(era.gain(frequencies) / actuator.response(frequencies))
     logarithms = np.log(ratios)
     return list(np.exp(logarithms - logarithms.mean()))
 
 
-def _error(kind: str, size: float, std: float | None = None) -> Error:
-    return Error(kind, size, None if std is None else size / std)
-
-
 @dataclass(frozen=True)
-class Outcome:
-    """Of one plate: times [s], coherence, errors of values, promises and touches.
+class Session:
+    """Results of one plate, from its measurement to touches."""
 
-    errors: of what was calibrated; identified: by `era rig identify`.
-    """
-
-    seed: int
-    measure_s: float
-    latency_samples: float
-    repeated: int
-    coherence_min: float
     held_out_error: float
-    errors: tuple[Error, ...]
+    calibrated: tuple[Error, ...]
+    identified: tuple[Error, ...]
     promises: tuple[dict[str, Any], ...]
     touches: tuple[Touch, ...]
-    identified: Identified
-
-    def as_json(self) -> dict[str, Any]:
-        """For a file of results."""
-        return asdict(self)
 
 
-def chain(
-    *, seed: int, promises: int, touched: int, frequencies: str | None = None, mode: str = "phased"
-) -> Outcome:
+def session(*, seed: int, promises: int, touched: int) -> Session:
     """Measure, calibrate, build a table, verify promises, identify, touch; raises RuntimeError."""
     with tempfile.TemporaryDirectory(prefix="desk") as name, desk(Path(name), seed=seed) as plate:
-        more = [] if frequencies is None else ["--frequencies", frequencies]
-        measured = plate.run(
-            "measure", "rig.yaml", "--device", "jack:desk", "--sensors", "sensors.csv",
-            "-o", "measured.uff", *more,
-        )  # fmt: skip
+        device = ["--device", "jack:desk", "--sensors", "sensors.csv"]
+        plate.run("measure", "rig.yaml", *device, "-o", "measured.uff")
         fitted = plate.run("calibrate", "rig.yaml", "measured.uff", "-o", "calibrated.yaml")
-        lines = measured["frequencies_hz"]
-        band = [] if frequencies is None else ["--frequencies", f"{lines[0]:g}:{lines[-1]:g}:10"]
-        plate.run("table", "build", "calibrated.yaml", "-o", "table.npz", "--mode", mode, *band)
-        verified = plate.run(
-            "table", "verify", "table.npz", "calibrated.yaml", "--device", "jack:desk",
-            "--sensors", "sensors.csv", "--samples", promises, "--seed", seed, status=None,
-        )  # fmt: skip
-        found = identify(plate, seed=seed)  # before fingers weigh on the plate
-        felt = touches(plate, _sets(touched, seed)) if touched else []
-        sensors = measured["sensors"].values()
-        return Outcome(
-            seed=seed,
-            measure_s=measured["measure_time_s"],
-            latency_samples=48_000 * measured["latency_s"],
-            repeated=measured["repeated_runs"],
-            coherence_min=min(each["coherence_min"] for each in sensors),
+        plate.run("table", "build", "calibrated.yaml", "-o", "table.npz", "--mode", "phased")
+        verify = ["table", "verify", "table.npz", "calibrated.yaml", *device]
+        verified = plate.run(*verify, "--samples", promises, "--seed", seed, status=None)
+        # Identified before fingers weigh on the plate.
+        plate.run("rig", "identify", "rig.yaml", *device, "-o", "identified.yaml", "--yes")
+        identified = load_rig(plate.folder / "identified.yaml")
+        return Session(
             held_out_error=fitted["held_out"]["error_after"],
-            errors=tuple(_errors(plate, fitted)),
+            calibrated=tuple(_calibrated_errors(plate.truth, fitted)),
+            identified=tuple(identified_errors(identified, plate.truth)),
             promises=tuple(verified["promises"]),
-            touches=tuple(felt),
-            identified=found,
+            touches=tuple(touches(plate, _random_sets(touched, seed))),
         )
 
 
-def _errors(plate: Desk, fitted: dict[str, Any]) -> list[Error]:
-    """All fitted values against the truth, both per mass of the plate."""
-    truth = plate.truth
-    mass = truth["thickness_m"] / 1.5e-3  # of the true plate relative to the rig's
+def _calibrated_errors(truth: dict[str, Any], fitted: dict[str, Any]) -> Iterator[Error]:
+    """Yield the errors of the fitted values."""
+    mass = truth["thickness_m"] / 1.5e-3  # of the true plate by the rig's
     share = 0.3048 * 0.2286 * 1.5e-3 * 2700 / 4  # kg of the plate on each ERA
-    found = []
     for row in fitted["parameters"]:
+        kind, value = row["kind"], row["after"]
         if row["standard_error"] is None:
             continue
-        kind, size = row["kind"], math.nan
         if kind == "modulus":
-            exact, kind = truth["flexural_rigidity_n_m"] / mass, "rigidity"
-            rigidity = 1.5e-3**3 / (12 * (1 - 0.33**2))
-            after, error = row["after"] * rigidity, row["standard_error"] * rigidity
+            rigidity = value * 1.5e-3**3 / (12 * (1 - 0.33**2))
+            true_rigidity = truth["flexural_rigidity_n_m"] / mass
+            yield Error("rigidity", rigidity / true_rigidity - 1)
         elif kind == "loss_factor":
-            exact, after, error = truth[kind], row["after"], row["standard_error"]
+            yield Error(kind, value / truth[kind] - 1)
         else:
-            exact = truth["eras"][row["era"]][kind] / mass
-            after, error = row["after"], row["standard_error"]
-            size = share if kind == "bolt_mass" else math.nan
-        scale = exact if math.isnan(size) else size
-        found.append(Error(kind, (after - exact) / scale, (after - exact) / error))
-    return found
+            true_value = truth["eras"][row["era"]][kind] / mass
+            scale = share if kind == "bolt_mass" else true_value
+            yield Error(kind, (value - true_value) / scale)
 
 
-def _sets(count: int, seed: int) -> list[list[str]]:
+def _random_sets(count: int, seed: int) -> list[list[str]]:
     """Sets of two and three sensors, the target first."""
     rng = np.random.default_rng([seed, 2])
     names = [f"P{number}" for number in range(1, 13)]

@@ -28,7 +28,7 @@ from model.errors import InputError
 from model.estimate.following import SettledPattern
 from model.estimate.forward import RestingFinger, Sensor, jacobian
 from model.estimate.identify import Identification, identify, model_of, relevant
-from model.estimate.measurement import Measurement
+from model.estimate.measurement import Measurement, sensors_at
 from model.estimate.parameters import PARAMETER_KINDS
 from model.finger import fingertip_points, fingertip_weights
 from model.rig.rig import Rig, Uncertainty
@@ -703,3 +703,62 @@ def _felt(
     ratios = np.array([mean / fields[own:].max(), mean / tone.threshold])
     contrast, level = (20 * np.log10(ratios)).tolist()
     return contrast, level
+
+
+@dataclass(frozen=True)
+class Fault:
+    """A fault of a kind of hidden plate: a taper, a further mass [kg], or a resting finger."""
+
+    kind: str = "plain"
+    taper: float = 0.0
+    mass: float = 0.0
+    has_finger: bool = False
+
+
+FAULTS = {
+    "none": Fault(),
+    "none, with form errors and 3 g": Fault("form"),
+    "bonded frame": Fault("frame"),
+    "thickness ± 3 % from end to end": Fault(taper=0.03),
+    "the same with form errors and 3 g": Fault("wedge"),
+    "10 g": Fault(mass=10e-3),
+    "twice 5 g, with form errors": Fault("two"),
+    "a resting finger": Fault(has_finger=True),
+}
+"""Faults by name."""
+
+FAULT_FREQUENCIES = np.linspace(45.0, 495.0, 16)
+_SENSORS = np.array(
+    [
+        *([0.07, 0.15], [0.37, 0.08], [0.94, 0.12], [0.14, 0.44]),
+        *([0.62, 0.41], [0.91, 0.57], [0.31, 0.80], [0.96, 0.93]),
+    ]
+) * (LENGTH, WIDTH)
+_SENSOR_SCALE = 0.01
+_SENSOR_PLACE = 0.5e-3  # m
+
+
+def measured_fault(fault: Fault, seed: int) -> Measurement:
+    """Responses of a hidden plate with a fault, read by eight accelerometers with 1 % of noise."""
+    rng = np.random.default_rng([seed, 93])
+    mounted = draw(fault.kind, seed).mounted
+    at = rng.uniform(0.1, 0.9, 2) * (LENGTH, WIDTH)
+    angle = rng.uniform(0, 2 * np.pi)
+    if fault.taper:
+        taper = (fault.taper * np.cos(angle), fault.taper * np.sin(angle))
+        mounted = replace(mounted, plate=replace(mounted.plate, taper=taper))
+    if fault.mass:
+        mounted = replace(mounted, masses=np.array([[*at, fault.mass]]))
+    positions = _SENSORS + _SENSOR_PLACE * rng.standard_normal(_SENSORS.shape)
+    fingers = at[None] if fault.has_finger else None
+    rows = []
+    for frequency in FAULT_FREQUENCIES.tolist():
+        load = np.array([finger_stiffness(frequency, np.ones(4))])
+        rows.append(mounted.accelerations(frequency, positions, fingers=fingers, loads=load).T)
+    scales = 1 + _SENSOR_SCALE * rng.standard_normal(len(_SENSORS))
+    values = np.array(rows) * scales
+    rms = np.sqrt((np.abs(values) ** 2).mean(axis=2, keepdims=True))
+    white = rng.standard_normal((2, *values.shape))
+    values = values + NOISE * rms * (white[0] + 1j * white[1]) / np.sqrt(2)
+    names = tuple(f"P{number}" for number in range(1, 1 + len(_SENSORS)))
+    return Measurement(sensors_at(_SENSORS, names), FAULT_FREQUENCIES, values.swapaxes(1, 2))

@@ -1,1 +1,0 @@
-"""A desk without hardware: measured, calibrated, played and verified, by real processes."""

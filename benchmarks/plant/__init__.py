@@ -1,1 +1,0 @@
-"""Speed of the plate in time, and a picture of it."""

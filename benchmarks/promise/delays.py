@@ -18,10 +18,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from benchmarks.clocks import ARRANGEMENTS, NAMES, Arrangement, armed, run_virtual
+from benchmarks.clocks import ARRANGEMENTS, NAMES, Arrangement, armed
 from benchmarks.promise.cases import LEVEL_DB_SL, Case
 from benchmarks.setting import random_contacts
 from controller.play.routing import MARGIN
+from kit.clock import run_virtual
 from model.answer.answer import Answer
 from model.answer.plan import answer
 from model.answer.stimulus import Finger, Placement, Stimulus

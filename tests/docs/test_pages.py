@@ -16,6 +16,7 @@ import shutil
 import tempfile
 import textwrap
 from collections.abc import Iterator
+from importlib import import_module
 from importlib.metadata import requires
 from pathlib import Path
 
@@ -35,19 +36,14 @@ from controller.cli.config_cli import app as config_commands
 from controller.cli.main import join_commands
 from controller.daemon.config import DaemonSection, DumpSection, LogSection, TouchSection
 from controller.operation.operation_states import DaemonState
-from controller.sources.touch import CONTACT_TIMEOUT
 from drivers.by_hand.cli import amp
 from drivers.by_hand.reaching import check_links
 from drivers.errors import CommandError
-from drivers.protocol.definition import BOOT_TIME, REACTION
+from drivers.protocol.definition import BOOT_TIME
 from drivers.wires.wire import address_of
 from era_haptics.command import command_modules, run_era
-from model.answer.answer import MIN_CONTRAST_DB, OWN_CONTRAST_DB
-from model.answer.promise import MIN_RAISED_CONTRAST_DB
 from model.cli import app
 from model.study import overview
-from model.study.contrast_maps import WANTED_CONTRAST_DB
-from model.study.verification import MIN_KEPT_SHARE
 from processes.typed_page import PORTS, PageError, Reader, difference, read_steps
 from registry.limits import GuardLimits
 from ways import WAYS, steps_of
@@ -375,54 +371,21 @@ def text_of(page: str) -> str:
     return (ROOT / page).read_text("utf-8")
 
 
-@pytest.mark.parametrize(
-    ("page", "stated", "constant"),
-    [
-        ("docs/reference/table-file.md", r"must be (\d+) % or more", 100 * MIN_KEPT_SHARE),
-        ("docs/architecture.md", r"no frame confirms \((\d+) ms", 1000 * CONTACT_TIMEOUT),
-        ("docs/reference/touch.md", r"after (\d+) ms without a frame", 1000 * CONTACT_TIMEOUT),
-        ("docs/reference/protocol.md", r"of its request [^|]*\| – \| (\d+) ms", 1000 * REACTION),
-        *(
-            (f"docs/{page}.md", stated, MIN_CONTRAST_DB)
-            for page, stated in (
-                ("reference/effects", r"less than (\d+) dB, contents give way"),
-                ("reference/effects", r"^\| (\d+) to \d+ dB, or more of what pauses"),
-                ("reference/effects", r"\| below (\d+) dB at any finger"),
-                ("reference/effects", r"still below (\d+) dB"),
-                ("reference/effects", r"would fall below (\d+) dB"),
-                ("reference/effects", r"names the pairs below (\d+) dB"),
-                ("reference/commands", r"not even one content reaches (\d+) dB"),
-                ("reference/python-api", r"would have less than (\d+) dB"),
-                ("tutorials/reading-a-table", r"with less than (\d+) dB vibrations are"),
-                ("how-to/design-a-layout", r"same time, below (\d+) dB"),
-                ("measured/promise", r"which below (\d+) dB they are"),
-            )
-        ),
-        *(
-            (f"docs/{page}.md", stated, OWN_CONTRAST_DB)
-            for page, stated in (
-                ("reference/effects", r"^\| from (\d+) dB; of a click"),
-                ("reference/effects", r"^\| \d+ to (\d+) dB, or more of what pauses"),
-                ("reference/effects", r"`own: true`: (\d+) dB are required"),
-                (
-                    "reference/effects",
-                    r"duration; below (\d+) dB, or beside others that are felt, they",
-                ),
-                ("reference/api", r"promised contrast below (\d+) dB"),
-                ("concepts/each-finger-its-own", r"^(\d+) dB make a steady content"),
-                ("tutorials/reading-a-table", r"less than (\d+) dB\s+are `mixed`"),
-                ("how-to/design-a-layout", r"from (\d+) dB two regions"),
-            )
-        ),
-        ("docs/reference/effects.md", r"half of it \((\d+) dB\)", MIN_RAISED_CONTRAST_DB),
-        ("docs/reference/table-file.md", r"has (\d+) dB of felt contrast", WANTED_CONTRAST_DB),
-        ("docs/concepts/localization.md", r"have (\d+) dB to the median", WANTED_CONTRAST_DB),
-    ],
-)
-def test_page_states_the_constant(page: str, stated: str, constant: float) -> None:
-    """The number beside these words is that of the code."""
-    (found,) = re.findall(stated, text_of(page), re.MULTILINE)
-    assert float(found) == pytest.approx(constant)
+UNITS = {"dB": 1.0, "%": 0.01, "ms": 1e-3, "s": 1.0}
+STATED_CONSTANT = re.compile(r"(\d+) (dB|%|ms|s)<!-- ([\w.]+)\.([A-Z_]+) -->")
+"""A number on a page, its unit, and the constant that it states, in a comment after it."""
+
+
+def test_pages_state_the_constants_of_the_code() -> None:
+    """A number that is followed by the name of a constant has its value."""
+    stated = [
+        (page.name, name, float(number) * UNITS[unit], getattr(import_module(module), name))
+        for page in FACT_PAGES
+        for number, unit, module, name in STATED_CONSTANT.findall(page.read_text("utf-8"))
+    ]
+    assert len(stated) > 10
+    wrong = [row for row in stated if row[2] != pytest.approx(row[3])]
+    assert wrong == []
 
 
 @pytest.mark.parametrize("page", ["README.md", "docs/concepts/localization.md"])

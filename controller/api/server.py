@@ -242,7 +242,6 @@ class _Call:
         self.method = ""
         self.params: ApiMessage | None = None
         self.error: Exception | None = None
-        self.record: dict[str, Any] = {}  # for dumps, with the outcome
         self._line = line
         silencing = read_silencing(line)
         self.silences = silencing is not None
@@ -288,8 +287,6 @@ class ApiServer:
     holds_lease: whether a client holds the arming lease, so that it must not be evicted.
     is_busy: whether a touch is on its way to the wire, for which clients wait.
     stop_all: stops all amplifiers where a client's stop has failed on its way.
-    requested: notes a request by its client, its method and when it came [s], and returns the
-        record that gets its outcome.
     clock: of the process [s].
     """
 
@@ -301,7 +298,6 @@ class ApiServer:
         holds_lease: Callable[[Connection], bool],
         is_busy: Callable[[], bool] = lambda: False,
         stop_all: Callable[[], object] = lambda: None,
-        requested: Callable[[str, str, float], dict[str, Any]] = lambda *_: {},
         clock: Callable[[], float] = threads.now,
     ) -> None:
         self.clock = clock
@@ -311,7 +307,6 @@ class ApiServer:
         self._holds_lease = holds_lease
         self._is_busy = is_busy
         self._stop_all = stop_all
-        self._requested = requested
         self._listening: asyncio.Server | None = None
         self._waiting: dict[Connection, None] = {}  # to be served, in this order
         self._scheduled: set[bool] = set()  # turns, by whether they are for stops
@@ -444,7 +439,6 @@ class ApiServer:
                 return
             call.error = _busy()
         try:
-            call.record = self._requested(client.name, call.method, client.received_at)
             if not call.silences:
                 self._check(client, call)
             self._note(client, call)
@@ -513,20 +507,16 @@ class ApiServer:
         client.close_if_finished()
 
     def _respond(self, client: Connection, call: _Call, outcome: ApiMessage | Exception) -> None:
-        """Send the response to a call, and note its outcome."""
+        """Send the response to a call."""
         if call.silences:
             call.read()
         if isinstance(outcome, Exception):
-            error = _rpc_error(outcome)
-            response = error_line(call.id, error)
-            call.record["outcome"] = call.record["refused"] = str(error)
+            response = error_line(call.id, _rpc_error(outcome))
         elif call.error is not None:
             error = _carried_out_despite(_rpc_error(call.error), call.method)
             response = error_line(call.id, error)
-            call.record["outcome"] = f"done, but {error}"
         else:
             response = result_line(call.id, outcome.model_dump_json())
-            call.record["outcome"] = "done"
         if call.expects_response:
             client.respond(response)
 

@@ -103,12 +103,6 @@ class LogSection(Section):
     file: FileName | None = None
 
 
-class DumpSection(Section):
-    """Folder of fault dumps."""
-
-    folder: FileName
-
-
 class DaemonSection(Section):
     """The daemon's configuration; paths are relative to its folder."""
 
@@ -126,7 +120,6 @@ class DaemonSection(Section):
     serial_numbers: Annotated[dict[Identifier, str], Field(max_length=64, default_factory=dict)]
     socket: FileName | None = None
     log: LogSection = LogSection()
-    dumps: DumpSection | None = None
     dashboard: Annotated[str, AfterValidator(loopback_address)] | None = None
 
 
@@ -170,7 +163,6 @@ class DaemonConfig:
     touch: tuple[TouchInput, ...]
     socket: Path
     log_file: Path | None
-    dump_folder: Path | None
 
     def for_table(self, frequencies: FloatArray) -> Self:
         """Return a copy whose layouts are rendered for the frequencies of a table [Hz]."""
@@ -199,10 +191,9 @@ def daemon_config_of(document: Document) -> DaemonConfig:
     layouts = _layouts(validation, document, rig)
     _check_serial_numbers(validation, rig)
     log_file = file_of(document, "log", "file")
-    dump_folder = file_of(document, "dumps", "folder")
     learn = file_of(document, "learn")
     strengths = file_of(document, "strengths")
-    _check_folders(validation, log_file, dump_folder)
+    _check_log(validation, log_file)
     try:
         read_strengths(strengths)
     except InputError as error:
@@ -230,7 +221,6 @@ def daemon_config_of(document: Document) -> DaemonConfig:
         touch=touch,
         socket=socket,
         log_file=log_file,
-        dump_folder=dump_folder,
     )
 
 
@@ -366,21 +356,14 @@ def _calibration(section: CalibrationSection, rig: Rig | None) -> TouchCalibrati
     )
 
 
-def _check_folders(
-    validation: Validation[DaemonSection], log: Path | None, dumps: Path | None
-) -> None:
-    """Check the paths of files that are written later.
-
-    The folder of the log must exist; that of the dumps is created when needed.
-    """
-    if log is not None and log.is_dir():
+def _check_log(validation: Validation[DaemonSection], log: Path | None) -> None:
+    """Check the path of the log, whose folder must exist."""
+    if log is None:
+        return
+    if log.is_dir():
         validation.add(("log", "file"), f"must be a file, got the folder {log}")
-    elif log is not None:
+    else:
         _check_folder_of(validation, log, "log", "file")
-    if dumps is not None:
-        existing = next(each for each in (dumps, *dumps.absolute().parents) if each.exists())
-        if not existing.is_dir():
-            validation.add(("dumps", "folder"), f"must be a folder, got the file {existing}")
 
 
 def _check_folder_of(validation: Validation[DaemonSection], file: Path, *place: str) -> bool:

@@ -12,7 +12,7 @@ import resource
 import signal
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -28,7 +28,6 @@ from controller.daemon.messages import EventPublisher, amplifier_statuses
 from controller.effects.effect import Effect
 from controller.gateway.gateway_settings import require_gateway
 from controller.learning.learning import Learning
-from controller.operation.fault_dumps import FaultDumps
 from controller.operation.operation_states import ENERGISED, DaemonState, Operation
 from controller.operation.plate_controller import Controller
 from controller.operation.supervisor import Supervisor
@@ -41,7 +40,7 @@ from controller.process.daemon_process import (
 )
 from controller.process.log import LogThread, open_log_file, start_log
 from drivers.errors import DriverError
-from drivers.host.amplifier import WATCHDOG, Amplifier
+from drivers.host.amplifier import WATCHDOG
 from drivers.opening import Lines
 from drivers.trace import tracing
 from model.answer.answer_report import Timing
@@ -93,12 +92,10 @@ class Daemon:
         self._next_reload = asyncio.get_running_loop().create_future()
         self._shutdown = asyncio.Event()
         self._shutdown_cause = "the daemon is shutting down"
-        self._dumps = FaultDumps(config.dump_folder)
         self._supervisor = Supervisor(
             state_changed=(
                 lambda old, new: self._publisher.state_changed(old, new),
                 lambda old, new: manager.notify(f"STATUS={headline(new.state.value, new.cause)}"),
-                self._dumps.state_changed,
                 self._follow_state,
             ),
             link_changed=lambda *change: self._publisher.link_changed(*change),
@@ -123,7 +120,6 @@ class Daemon:
             layouts=self._layouts,
             inputs=lambda: self._inputs.event,
             learning=lambda: self.learning,
-            noted=self._dumps.note,
         )
         self.learning: Learning | None = None
         """What learns the plate, if anything is to be learned."""
@@ -134,7 +130,7 @@ class Daemon:
             lines=lines,
             urls=config.urls,
             serial_numbers=config.section.serial_numbers,
-            connected=self._connected,
+            connected=self._supervisor.connected,
             intent_source=self._layouts.player,
             timing=timing,
             drive_mode=config.section.mode,
@@ -178,7 +174,6 @@ class Daemon:
             holds_lease=self._api.holds_lease,
             is_busy=lambda: cycle.is_preparing,
             stop_all=self._supervisor.stop_anyhow,
-            requested=self._dumps.requested,
             clock=threads.now,
         )
         self._gateway: asyncio.Task[None] | None = None
@@ -310,11 +305,6 @@ class Daemon:
                 if isinstance(found, Exception) and not isinstance(found, OSError):
                     _logger.error("closing failed", exc_info=found)
             self._publisher.hub.close()
-
-    def _connected(self, amplifiers: Mapping[str, Amplifier]) -> None:
-        """Follow amplifiers whose lines have been opened."""
-        self._dumps.follow(amplifiers)
-        self._supervisor.connected(amplifiers)
 
     def _follow_state(self, old: Operation, new: Operation) -> None:
         """Learn of the plate from when all amplifiers are open."""

@@ -88,7 +88,6 @@ class EventPublisher:
         its touch inputs.
     layouts: the surface layouts of the daemon.
     learning: returns what learns the plate; None if the plate is not learned.
-    noted: called with a record of every change of contacts and every decision, for dumps.
     """
 
     def __init__(
@@ -99,7 +98,6 @@ class EventPublisher:
         layouts: LayoutChoice,
         inputs: Callable[[], InputsEvent],
         learning: Callable[[], Learning | None],
-        noted: Callable[[Mapping[str, object]], object],
     ) -> None:
         self.view = PlateView(layouts.player.effect_of, why_not=self._why_not)
         self._player = layouts.player
@@ -107,7 +105,6 @@ class EventPublisher:
         self.lift_latencies = LatencyStatistics()
         self.learning_latencies = LatencyStatistics()
         self._learning = learning
-        self._noted = noted
         self.amplifiers = amplifiers
         self.inputs = inputs
         self._operation = operation
@@ -213,12 +210,10 @@ class EventPublisher:
         return None if learning is None else learning.summary(self.learning_latencies.summary())
 
     def _refused(self, reason: str) -> None:
-        self._noted({"time_s": threads.now(), "refused": reason})
         _logger.warning("refused: %s", reason)
 
     def _contacts_changed(self, contacts: tuple[Contact, ...], change: Change) -> None:
         self.view.contacts = contacts
-        self._noted({"time_s": threads.now(), "contacts": contacts})
         self.hub.publish("contacts", self.view.contacts_event)
 
     def _reported(self, report: PlayReport) -> None:
@@ -228,8 +223,6 @@ class EventPublisher:
         """
         self.view.report = report
         topic: Topic = "pattern" if report.contents else "silence"
-        targets = [_noted_sensation(felt) for felt in report.targets]
-        self._noted({"time_s": report.time, topic: targets, "reason": report.reason})
         if report.latency is not None:
             latencies = self.latencies if report.is_touch else self.lift_latencies
             latencies.add(report.latency)
@@ -391,11 +384,6 @@ def _figures(felt: FingerSensation) -> dict[str, object]:
         "is_foreign_felt": sensation.is_foreign_felt,
         "held_back": felt.held_back,
     }
-
-
-def _noted_sensation(felt: FingerSensation) -> dict[str, object]:
-    """Return the sensation of a finger, for a dump."""
-    return {"contact": felt.contact, **_figures(felt)}
 
 
 def playing_of(applied: PlayReport | None) -> dict[str, Any]:

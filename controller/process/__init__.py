@@ -1,1 +1,1 @@
-"""A well-behaved Unix process: log, dumps, locks, service manager, children."""
+"""A well-behaved Unix process: log, locks, service manager, children."""

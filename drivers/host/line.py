@@ -334,11 +334,6 @@ class Line:
         self.name = name
         self.loss: str | None = None
         self.members: dict[int, Member] = {}
-        self.seen: Callable[[str, int, str, object], None] | None = None
-        """Called with each message: its direction (out, in, event, none), address, name, content.
-
-        It must not raise.
-        """
         self.ahead: Callable[[str, Priority], Make | None] | None = None
         """Called before each request to one amplifier.
 
@@ -416,8 +411,6 @@ class Line:
             trace.frame(Direction.IN, data, self.name, lambda: ", ".join(map(repr, arrivals)))
         for arrival in arrivals:
             if isinstance(arrival, Event | OtherHost | DuplicateAddress):
-                if self.seen is not None:
-                    self.seen("event", arrival.address, type(arrival).__name__, arrival)
                 if (unasked := self.members.get(arrival.address)) is not None:
                     unasked.note_unasked(arrival)
                 continue
@@ -438,8 +431,6 @@ class Line:
                 continue
             late = self.time() - job.started_at - job.takes
             self.late = min(max(late, self.late * _LATE_DECAY), _MAX_LATE)
-            if self.seen is not None:
-                self.seen("in", member.address, type(arrival).__name__, arrival)
             if not isinstance(arrival, Reply):
                 self._refused(job, member, arrival)
                 continue
@@ -514,8 +505,6 @@ class Line:
                     job.values = job.parts[0]
                 if member is not None:
                     job.takes = member.next_request(job.name, job.values, job.priority)
-                if self.seen is not None:
-                    self.seen("out", address, job.name, job.values)
                 has_reply = member is not None and job.part >= len(job.parts) - 1
                 data = self.wire.request(address, job.name, job.values, has_reply=has_reply)
             now = self.time()
@@ -694,8 +683,6 @@ class Line:
         member = job.member
         if member is None:
             return
-        if self.seen is not None:
-            self.seen("none", member.address, "no reply", "")
         was_cut = job.priority is Priority.READING and job.due < job.sent_at + job.timeout
         if was_cut or self._must_yield(job):
             job.attempts += 1

@@ -5,7 +5,7 @@ that are public: materials, effects, elements, schemes of URLs. Names that users
 `name-1`, `name-2` ..., the same in all files of a report. Everything else is hidden: free text,
 names of files and hosts, and all that stands under an unknown key, with the name of the key.
 
-Of a record that this program wrote, a line of a log or a dump, these are numbers and the words that
+Of a record that this program wrote, a line of a log, these are numbers and the words that
 stand in the program itself, under keys that stand there, too.
 """
 

@@ -1,6 +1,6 @@
 """`era report`: collect what a bug report needs in one folder.
 
-The folder has versions, configuration, the daemon's status, the end of its log and its fault dumps.
+The folder has versions, configuration, the daemon's status and the end of its log.
 `era_haptics.lab.harmless` decides what of these is shown: values of known keys that are harmless.
 """
 
@@ -20,7 +20,6 @@ from controller.api.client import Client
 from controller.api.jsonrpc import RpcError
 from controller.daemon.config import file_of, is_daemon_document
 from controller.effects.layout import is_layout_document
-from controller.operation.fault_dumps import DUMP_PATTERN
 from drivers.errors import LinkError
 from era_haptics.lab.harmless import (
     Names,
@@ -35,7 +34,6 @@ from registry.files import regular_file
 from registry.plugins import plugins_of
 
 MAX_FILE_SIZE = 1 << 20  # bytes; of a larger file only the end is included
-MAX_REPORTED_DUMPS = 5
 _GROUPS = "era_haptics."  # prefix of our entry point groups
 
 
@@ -82,7 +80,7 @@ class _Report:
         for named in _named_by(document):
             self.add_configuration(named)
         if is_daemon_document(document):
-            self._add_records(document)
+            self._add_log(document)
 
     def _add_unreadable(self, path: Path, lines: Sequence[int | None]) -> None:
         """Add a file of which nothing but the place of its error is shown."""
@@ -95,18 +93,12 @@ class _Report:
         self._add(name, f"# not valid YAML{place}; hidden\n", path)
         self.missing.append(f"{name}: not valid YAML{place}; files that it names are left out")
 
-    def _add_records(self, daemon: Document) -> None:
-        """Add the log of a daemon and its last dumps."""
-        log = file_of(daemon, "log", "file")
-        folder = file_of(daemon, "dumps", "folder")
-        dumps = sorted(folder.glob(DUMP_PATTERN)) if folder is not None else []
-        records = [("log", log)] if log is not None else []
-        records += [("fault", dump) for dump in dumps[-MAX_REPORTED_DUMPS:]]
-        for kind, path in records:
-            if self._is_new(path):
-                self._add_record(self._new_name(kind, ".jsonl"), path)
-
-    def _add_record(self, name: str, path: Path) -> None:
+    def _add_log(self, daemon: Document) -> None:
+        """Add the log of a daemon."""
+        path = file_of(daemon, "log", "file")
+        if path is None or not self._is_new(path):
+            return
+        name = self._new_name("log", ".jsonl")
         try:
             self._add(name, _end_of(path), path)
         except OSError as error:
@@ -159,8 +151,8 @@ class _Report:
 def collect(configs: Iterable[Path], *, socket: Path | None) -> ReportContents:
     """Collect the files of a report.
 
-    configs: rig, layout and daemon files, with the files, the log and the dumps that a daemon's
-    file names; socket: the daemon's, the default if None.
+    configs: rig, layout and daemon files, with the files and the log that a daemon's file
+    names; socket: the daemon's, the default if None.
     """
     report = _Report()
     for path in configs:

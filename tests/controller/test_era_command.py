@@ -1,7 +1,6 @@
 """The `era` command with its exit statuses, and what a daemon's process needs.
 
-The socket reserved for one daemon, its log, notices to systemd, dumps and latencies; none may block
-it.
+The socket reserved for one daemon, its log, notices to systemd and latencies; none may block it.
 """
 
 import errno
@@ -14,7 +13,7 @@ import socket
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from importlib import import_module
 from importlib.metadata import version
@@ -29,18 +28,13 @@ from typer.core import TyperGroup
 from controller.cli.main import LoadModules, join_commands, run
 from controller.daemon.children import gateway_options
 from controller.daemon.messages import LatencyStatistics
-from controller.operation.fault_dumps import DUMP_PATTERN, MAX_DUMPS, FaultDumps, write_dump
 from controller.operation.operation_states import DaemonState, Operation
 from controller.process.daemon_process import ServiceManager, SocketLock
 from controller.process.log import LogFormatter, LogThread, RateLimitFilter
-from drivers.wires.wire import Reply
 from era_haptics.command import command_modules, main
-from kit.chain import set_chain
-from kit.clock import in_virtual_time
 from model.errors import InputError
 from processes.gateways import wait_for
 from processes.interrupted import full_disk
-from registry import threads
 
 
 @pytest.mark.parametrize(
@@ -657,25 +651,6 @@ def test_service_manager_is_told_and_its_watchdog_fed_at_twice_its_rate(
         assert messages == [b"WATCHDOG=1"] * count
 
 
-def test_dump_is_json_lines_for_owner_only(tmp_path: Path) -> None:
-    """The cause first, then each message with its content by name; only the newest files stay."""
-    folder = tmp_path / "new" / "folder"
-    where = {"link": "main", "time_s": 1.5, "way": "out"}
-    records = [
-        {**where, "message": "Arm", "content": {"watchdog": 250, "session": 9}},
-        {**where, "message": "Reply", "content": Reply({"state": 6, "levels": [5000, 0]})},
-        {**where, "message": "no reply", "content": ""},
-    ]
-    for _ in range(MAX_DUMPS + 2):
-        path = write_dump(folder, records, cause="arc\nx")
-    assert path.stat().st_mode & 0o777 == 0o600
-    head, *lines = [json.loads(line) for line in path.read_text("utf-8").splitlines()]
-    assert head["cause"] == "arc\nx"
-    read = {**records[1], "content": {"state": 6, "levels": [5000, 0]}}
-    assert lines == [records[0], read, {**where, "message": "no reply"}]
-    assert len(list(folder.iterdir())) == 20
-
-
 def test_latency_percentiles_are_values_that_occurred() -> None:
     """Of 1, 2, ... 1000 ms the 500th, 990th and 999th; the histogram counts each once."""
     latencies = LatencyStatistics()
@@ -687,79 +662,3 @@ def test_latency_percentiles_are_values_that_occurred() -> None:
     counts = dict(summary.histogram)
     assert (counts[1.0], counts[5.0], counts[50.0], counts[100.0]) == (1, 1, 30, 950)
     assert sum(counts.values()) == summary.count == 1000
-
-
-@in_virtual_time
-async def test_failing_recorder_prevents_no_stop(tmp_path: Path) -> None:
-    """The wire gets the Stop, and the caller its outcome."""
-
-    def fail(record: Mapping[str, object]) -> None:
-        raise MemoryError
-
-    recorder = FaultDumps(tmp_path)
-    async with set_chain(connected=recorder.follow) as chain:
-        await chain.open()
-        assert recorder._ring
-        vars(recorder)["note"] = fail
-        assert (await chain.controller.stop())["main"].is_confirmed
-        assert chain.far_end.requests("Stop")
-        await chain.close()
-
-
-@pytest.fixture
-def now(monkeypatch: pytest.MonkeyPatch) -> list[float]:
-    """The time [s] that the dumps see."""
-    times = [0.0]
-    monkeypatch.setattr(threads, "now", lambda: times[0])
-    return times
-
-
-def _writers() -> list[threading.Thread]:
-    return [thread for thread in threading.enumerate() if thread.name == "dump"]
-
-
-def wait_for_writers() -> None:
-    """Wait until all dumps are written."""
-    for thread in _writers():
-        thread.join(20)
-
-
-def test_dump_that_fails_is_only_logged(
-    tmp_path: Path, now: list[float], caplog: pytest.LogCaptureFixture
-) -> None:
-    """A file in place of the folder raises nothing at the daemon."""
-    (tmp_path / "dumps").write_text("in the way", "utf-8")
-    FaultDumps(tmp_path / "dumps").state_changed(Operation(), FAULT)
-    wait_for_writers()
-    (warning,) = caplog.messages
-    assert str(tmp_path / "dumps") in warning
-
-
-def test_dumps_use_one_thread_when_disk_hangs(
-    tmp_path: Path,
-    now: list[float],
-    monkeypatch: pytest.MonkeyPatch,
-    caplog: pytest.LogCaptureFixture,
-) -> None:
-    """Further dumps are skipped with a warning until the disk works again."""
-    hangs, released = threading.Event(), threading.Event()
-
-    def hang(*args: object, **kwargs: object) -> Path:
-        hangs.set()
-        released.wait(20)
-        return tmp_path
-
-    dumps = FaultDumps(tmp_path)
-    with monkeypatch.context() as patched, caplog.at_level(logging.WARNING):
-        patched.setattr("controller.operation.fault_dumps.write_dump", hang)
-        for now[0] in (0.0, 10.0, 20.0):
-            dumps.state_changed(Operation(), FAULT)
-        assert hangs.wait(20)
-        assert len(_writers()) == 1
-        assert len(caplog.messages) == 2
-        released.set()
-        wait_for_writers()
-    now[0] = 30.0
-    dumps.state_changed(Operation(), FAULT)
-    wait_for_writers()
-    assert len(list(tmp_path.glob(DUMP_PATTERN))) == 1

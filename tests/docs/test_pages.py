@@ -34,7 +34,7 @@ from controller.api.methods import StateEvent
 from controller.api.schema import headline
 from controller.cli.config_cli import app as config_commands
 from controller.cli.main import join_commands
-from controller.daemon.config import DaemonSection, DumpSection, LogSection, TouchSection
+from controller.daemon.config import DaemonSection, LogSection, TouchSection
 from controller.operation.operation_states import DaemonState
 from drivers.by_hand.cli import amp
 from drivers.by_hand.reaching import check_links
@@ -178,7 +178,7 @@ def test_every_key_of_the_daemons_file_is_in_its_table() -> None:
     """As the configuration's model has them, and no others; a section's keys in its row."""
     told = {row[0].strip("`"): row[1] for row in rows("daemon.md", "| key | meaning | default |")}
     assert sorted(told) == sorted(DaemonSection.model_fields)
-    for key, section in {"touch": TouchSection, "log": LogSection, "dumps": DumpSection}.items():
+    for key, section in {"touch": TouchSection, "log": LogSection}.items():
         (listed,) = re.findall(r"`\{(.*?)\}`", told[key])[:1]
         assert listed.split(", ") == list(section.model_fields)
 

@@ -78,7 +78,7 @@ def test_config_has_defaults_for_all_keys_but_rig(folder: Path) -> None:
     assert [era.name for era in config.rig.eras] == ["SW", "SE", "NE", "NW"]
     assert config.urls == {"main": f"sim://{folder}/rig.yaml?amplifier=main"}
     assert config.touch == ()
-    assert (config.table, config.dump_folder, config.log_file, *config.layouts) == (None,) * 4
+    assert (config.table, config.log_file, *config.layouts) == (None,) * 3
     assert config.socket == default_socket()
     assert config.rig_text == example_rig_path().read_text("utf-8")
     named = {"ERA_HAPTICS_SOCKET": "/a/b.sock", "XDG_RUNTIME_DIR": "/run/x"}
@@ -104,12 +104,12 @@ def test_config_paths_are_relative_to_its_folder(
     elsewhere = folder / "elsewhere"
     elsewhere.mkdir()
     monkeypatch.chdir(elsewhere)
-    text = "table: t.npz\nsocket: s.sock\nlog: {file: log}\ndumps: {folder: /d}\n"
+    text = "table: t.npz\nsocket: s.sock\nlog: {file: log}\nstrengths: /tmp/kept.json\n"
     config = load_daemon_config(written(folder, text))
     assert config.table == folder / "t.npz"
     assert config.socket == folder / "s.sock"
     assert config.log_file == folder / "log"
-    assert config.dump_folder == Path("/d")
+    assert config.strengths == Path("/tmp/kept.json")
 
 
 @pytest.mark.parametrize(
@@ -122,8 +122,8 @@ def test_config_paths_are_relative_to_its_folder(
         ("rig.yaml", "socket: rig.yaml", [(2, "socket")]),
         (
             "rig.yaml",
-            "log: {file: none/log}\ndumps: {folder: rig.yaml/dumps}\n",
-            [(2, "log.file"), (3, "dumps.folder")],
+            "log: {file: none/log}\nstrengths: none/kept.json\n",
+            [(2, "log.file"), (3, "strengths")],
         ),
         ("rig.yaml", "log: {file: .}\n", [(2, "log.file")]),
         ("rig.yaml", "serial_numbers: {man: A1}\n", [(2, "serial_numbers.man")]),
@@ -306,7 +306,6 @@ DEFAULTS = {
                 ("serial_numbers", "{main: A1}"),
                 ("touch", "[]"),
                 ("log", "{level: debug}"),
-                ("dumps", "{folder: d}"),
                 ("socket", "t"),
                 ("dashboard", "127.0.0.1:1"),
             )

@@ -1,15 +1,13 @@
-"""A daemon in use, in virtual time: its start and end, its commands, dumps and requests of clients.
+"""A daemon in use, in virtual time: its start and end, its commands and requests of clients.
 
-Dumps have what came before the plate was stopped; a reload may be interrupted; leases have a token
+A reload may be interrupted; leases have a token
 and an end; names and files of strengths are bounded.
 """
 
 import asyncio
 import contextlib
-import itertools
 import json
 import logging
-import math
 import os
 import re
 import resource
@@ -22,8 +20,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
-from typing import Any
-from unittest.mock import DEFAULT, Mock
+from unittest.mock import Mock
 
 import pytest
 import serial
@@ -42,7 +39,6 @@ from controller.daemon.daemon import run_daemon
 from controller.daemon.handlers import check_lease
 from controller.effects.strengths import MAX_NAMES
 from controller.gateway.gateway_settings import read_token
-from controller.operation.fault_dumps import MAX_LINE, MAX_RECORDS, FaultDumps, write_dump
 from controller.operation.operation_states import (
     ENERGISED,
     DaemonEvent,
@@ -57,7 +53,6 @@ from drivers.errors import CommandError
 from drivers.host.amplifier import WATCHDOG
 from era_haptics.command import run_era
 from kit.clock import in_virtual_time
-from kit.courses import Planted
 from kit.plates import TWO_AMPLIFIERS
 from model.errors import InputError
 from processes.daemons import (
@@ -68,7 +63,6 @@ from processes.daemons import (
     Journal,
     daemon_at,
     energised,
-    error_code,
     far_end,
     holding,
     next_event,
@@ -83,76 +77,6 @@ from processes.daemons import (
 from processes.gateways import UNCONFIRMED, ScriptedDaemon, real_daemon
 from registry import threads
 from sim.faults import FaultWindow
-
-
-def dumped(folder: Path, kind: str) -> list[str]:
-    """The dumps of a kind."""
-    return [each.read_text("utf-8") for each in folder.glob(f"dumps/era-{kind}-*.jsonl")]
-
-
-@pytest.mark.parametrize("cause", ["in the loop", "OVER_VOLTAGE", "stopped by 'test'"])
-@in_virtual_time
-async def test_dump_names_the_last_touch_and_request_before_a_stop(
-    tmp_path: Path, cause: str
-) -> None:
-    """With what was played for the finger, what was refused, and how the plate came to stop.
-
-    By a turn of the control loop that fails once, a fault of the amplifier, or a client.
-    """
-    kind = "stop" if cause.startswith("stopped") else "fault"
-    async with ready_daemon(tmp_path, "dumps: {folder: dumps}\n") as (bench, era):
-        lease = await era.arm("me", lease_s=30)
-        assert await error_code(era.play("none", PLACE)) is ErrorCode.REFUSED
-        async with holding(era, far=bench.far):
-            wake = bench.daemon._controller.cycle._wake
-            if kind == "stop":
-                await era.stop()
-            elif cause == "OVER_VOLTAGE":
-                bench.far.device.inject_fault(FaultWindow(fault="over_voltage"))
-            else:
-                once = itertools.chain([Planted(cause)], itertools.repeat(DEFAULT))
-                vars(wake)["clear"] = Mock(wraps=wake.clear, side_effect=once)
-            await until(lambda: dumped(tmp_path, kind))
-        bench.far.device.recover()
-    (text,) = dumped(tmp_path, kind)
-    head, *lines = map(json.loads, text.splitlines())
-    assert cause in head["cause"]
-    assert lease.lease not in text
-
-    def last(key: str, value: object = None) -> Any:
-        """The last record with a key, or with a value of it."""
-        return [each for each in lines if each.get(key) and value in (None, each[key])][-1]
-
-    (finger,), (felt,) = last("contacts")["contacts"], last("pattern")["pattern"]
-    assert (finger["key"], finger["x"]) == (["api:1:python", 1], pytest.approx(PLACE[0]))
-    assert (felt["contact"]["key"], felt["verdict"]) == (finger["key"], "own")
-    assert (last("request", "touch")["client"], last("request", "arm")["outcome"]) == (
-        *("test", "done"),
-    )
-    assert "unknown effect" in last("request", "play")["refused"]
-    assert last("request", "stop" if kind == "stop" else "touch")["time_s"] >= finger["since"]
-    assert last("state")["state"].startswith("OPERATION_ENABLED -> ")
-    assert {"Arm", "Set", "Reply"} <= {each.get("message") for each in lines}
-    assert (times := [each["time_s"] for each in lines]) == sorted(times)
-
-
-def test_what_is_kept_for_a_dump_is_bounded(tmp_path: Path) -> None:
-    """Whatever comes, in number and in length; a client that repeats itself leaves the others."""
-    dumps, long = FaultDumps(tmp_path), "x" * 70_000
-    dumps.requested("other", "arm", 0.0)
-    for _ in range(10 * MAX_RECORDS):
-        dumps.requested("me", "touch", 1.0)["outcome"] = long
-    assert [each["times"] for each in dumps._ring.values()] == [1, 10 * MAX_RECORDS]
-    for number in range(MAX_RECORDS):
-        dumps.requested(f"client {number}", "stop", 2.0)
-        dumps.note({"time_s": 2.0, "message": long})
-        dumps.note({"time_s": math.inf, "contacts": [long]})
-    kept = [*dumps._ring.values()]
-    assert len(kept) == MAX_RECORDS
-    lines = write_dump(tmp_path, kept, cause="").read_text("utf-8").splitlines()
-    assert max(map(len, lines)) <= MAX_LINE
-    assert "Infinity" not in "".join(lines)
-
 
 LAYOUTS = "layouts: {home: home.yaml, climate: climate.yaml}\n"
 

@@ -459,7 +459,7 @@ async def touched(folder: Path) -> AsyncIterator[tuple[DaemonBench, AsyncClient,
 
     calibration = "{turned: 90, mirror: x}"
     panel = f"touch: [{{name: panel, url: 'tuio:', calibration: {calibration}}}]\n"
-    kept = "strengths: kept.json\ndumps: {folder: dumps}\n"
+    kept = "strengths: kept.json\n"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(udp_source, "listen", listen)
         lines = write_layouts(folder, 20.0) + panel + kept

@@ -15,7 +15,6 @@ from cases import read_yaml
 from era_haptics.lab.harmless import Names, harmless_records
 from era_haptics.lab.report import (
     MAX_FILE_SIZE,
-    MAX_REPORTED_DUMPS,
     ReportContents,
     collect,
     installed_versions,
@@ -201,33 +200,21 @@ def test_line_that_is_no_record_is_hidden(line: str) -> None:
 
 @pytest.mark.parametrize("given", [["d.yaml"], ["rig.yaml", "d.yaml"]])
 def test_report_includes_files_of_daemon(tmp_path: Path, given: Sequence[str]) -> None:
-    """Its rig, layout, log and last dumps once, and no table; missing files are listed."""
+    """Its rig, layout and log once, and no table; missing files are listed."""
     (tmp_path / "rig.yaml").write_text(BEFORE["rig.yaml"], "utf-8")
     (tmp_path / "d.yaml").write_text(
-        "rig: rig.yaml\nlayouts: {panel: none.yaml}\ntable: t.npz\ndumps: {folder: dumps}\n"
-        "log: {file: era.out}\n",
+        "rig: rig.yaml\nlayouts: {panel: none.yaml}\ntable: t.npz\nlog: {file: era.out}\n",
         "utf-8",
     )
     begun = "x" * MAX_FILE_SIZE
     (tmp_path / "era.out").write_text(f'{begun}\n{{"message": "link main: lost"}}\n', "utf-8")
     (tmp_path / "t.npz").write_bytes(b"x" * 100)
-    (tmp_path / "dumps").mkdir()
-    for number in range(MAX_REPORTED_DUMPS + 2):
-        dump = tmp_path / "dumps" / f"era-fault-2026-{number}.jsonl"
-        dump.write_text(f'{{"time_s": {number}}}\n', "utf-8")
-    (tmp_path / "dumps" / "other.txt").write_text("x", "utf-8")
     report = report_of(tmp_path, *given)
-    dumps = [
-        "fault.jsonl",
-        *(f"fault-{number}.jsonl" for number in range(2, MAX_REPORTED_DUMPS + 1)),
-    ]
-    assert {*report.files} == {"daemon.yaml", "rig.yaml", "log.jsonl", *dumps, "versions.json"}
+    assert {*report.files} == {"daemon.yaml", "rig.yaml", "log.jsonl", "versions.json"}
     assert report.files["log.jsonl"].text.splitlines() == [
         '"hidden: a line that is no record"',
         '{"message": "link main: lost"}',
     ]
-    shown = [json.loads(report.files[name].text)["time_s"] for name in dumps]
-    assert shown == [*range(2, MAX_REPORTED_DUMPS + 2)]
     assert [line.partition(" ")[0] for line in report.missing] == ["unreadable.yaml:", "status"]
     found = json.loads(report.files["versions.json"].text)
     assert found["packages"]["numpy"][0].isdigit()

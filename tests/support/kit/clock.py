@@ -48,7 +48,7 @@ P = ParamSpec("P")
 T = TypeVar("T")
 
 _FIRST_PORT = 20_000
-_AWAITED = ("reload", "dump", "content")  # names of threads for which time stands still
+_AWAITED = ("reload", "content")  # names of threads for which time stands still
 _LATENCY = (50e-6, 400e-6)  # s; of a loopback connection
 
 Seen = Callable[[str, str, bytes], None]

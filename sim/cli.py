@@ -10,14 +10,12 @@ import typer
 from drivers.errors import LinkError
 from model.commands.options import ExactOption, SeedOption, seed_of_plate
 from model.errors import InputError
-from registry.streams import drawing_on
 from sim.soft_amp.soft_amp_cli import port_option, soft_amp
 
 if TYPE_CHECKING:
-    from sim.control import SimulationContext
     from sim.far_ends.wire_assignment import SimulatedWire
     from sim.plant.fingers import Accelerometer
-    from sim.simulation import Simulation, SimulationView
+    from sim.simulation import Simulation
 
 app = typer.Typer(pretty_exceptions_enable=False)
 app.command("soft-amp")(soft_amp)
@@ -93,10 +91,6 @@ def sim(
         list[str] | None,
         typer.Option(metavar="NAME=X,Y", help="Place an accelerometer [m]; repeatable."),
     ] = None,
-    record: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="Record sensors and fingers to .csv, .wav or .uff."),
-    ] = None,
     rate: Annotated[
         float, typer.Option(metavar="HZ", help="Set the sampling rate of sensors and fingers.")
     ] = 10_000.0,
@@ -151,7 +145,7 @@ def sim(
             raise InputError("--virtual-time needs --control PATH, which advances the time")
         loaded = load_rig(rig)
         _check_rate(rate, frequency_max=loaded.limits.frequency_max)
-        if firmware and (common is not None or wire or line or faults or virtual_time or record):
+        if firmware and (common is not None or wire or line or faults or virtual_time):
             raise InputError(
                 "--firmware has a serial line, real time and a plate that does not move; omit the "
                 "other options"
@@ -177,7 +171,6 @@ def sim(
             sensors=[_sensor(text) for text in sensor or []],
             sample_rate=rate,
             control=control,
-            record=record,
             until_eof=until_eof,
             firmware=programs,
             links={**links_of(wires), **links},
@@ -225,42 +218,12 @@ def _run(simulation: "Simulation", *, virtual_time: bool) -> None:
 
     from sim.simulation import SteppedLoop, make_fine_loop, run_simulation
 
-    view = _LiveView() if sys.stdout.isatty() and simulation.firmware is None else None
     factory = SteppedLoop if virtual_time else make_fine_loop
-    try:
-        with asyncio.Runner(loop_factory=factory) as runner:
-            message = runner.run(run_simulation(simulation, ready=_announce, view=view))
-    finally:
-        if view is not None:
-            view.close()
-    if message is not None:
-        print(message)
+    with asyncio.Runner(loop_factory=factory) as runner:
+        runner.run(run_simulation(simulation, ready=_announce))
 
 
 def _announce(urls: Mapping[str, str]) -> None:
     for name, url in urls.items():
         print(f"{name}: {url}")
     sys.stdout.flush()
-
-
-class _LiveView:
-    """The live view, redrawn in place at each call."""
-
-    def __init__(self) -> None:
-        from rich.console import Console
-        from rich.live import Live
-
-        self._live = Live(console=Console(file=drawing_on(sys.stdout)), auto_refresh=False)
-        self._plate: SimulationView | None = None
-
-    def __call__(self, context: "SimulationContext") -> None:
-        from sim.simulation import SimulationView, render_simulation
-
-        if self._plate is None:
-            self._plate = SimulationView(context.bench)
-            context.bench.probes.append(self._plate)
-            self._live.start()
-        self._live.update(render_simulation(context, self._plate), refresh=True)
-
-    def close(self) -> None:
-        self._live.stop()

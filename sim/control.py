@@ -42,8 +42,6 @@ request does not know are ignored, except by `sensors` and `plate`.
                                                            "end_s" or null, "is_on"}]}}
     {"op": "recover", "amplifier": NAME}               end all faults; of all without a name
     {"op": "step", "seconds": s}                       advance virtual time: {"time_s": t}
-    {"op": "record", "file": PATH}                     record the present sensors and fingers
-    {"op": "finish"}                                   write it: {"file", "seconds", "is_full"}
 
 Times are seconds of the simulation's clock: time.monotonic(), or virtual time from 0. Felt, signals
 and tones cover the last ten seconds. An invalid request returns {"error": TEXT} and changes
@@ -85,7 +83,7 @@ from sim.bench.bench import Bench
 from sim.faults import parse_fault
 from sim.plant.fingers import Accelerometer, measure_vibration
 from sim.plant.imperfections import PlateErrors
-from sim.sensors import Accelerometers, Recorder, Recording
+from sim.sensors import Accelerometers, Recording
 
 _MAX_STEP = 3600.0  # s of virtual time in one request
 _MAX_TONES = 64
@@ -112,14 +110,13 @@ class SensorPlacement(BaseModel):
 class SimulationContext:
     """A bench with its devices on wires and their URLs, both by name.
 
-    step: advances virtual time [s], None in real time; recorder: None while nothing is recorded.
+    step: advances virtual time [s], None in real time.
     """
 
     bench: Bench
     devices: Mapping[str, AmplifierDevice] = field(default_factory=dict)
     urls: Mapping[str, str] = field(default_factory=dict)
     step: Callable[[float], Coroutine[Any, Any, None]] | None = None
-    recorder: Recorder | None = None
     accelerometers: Accelerometers = field(init=False)
     first_plate: PlateErrors = field(init=False)
     _solving: asyncio.Task[None] | None = field(init=False, default=None)
@@ -151,25 +148,6 @@ class SimulationContext:
             self._solving.cancel()
             await asyncio.wait({self._solving})
 
-    def record(self, path: Path) -> None:
-        """Start recording the present sensors and fingers; InputError while another one runs."""
-        if self.recorder is not None:
-            raise InputError(f"already recording {self.recorder.path}; finish it first")
-        self.recorder = Recorder(
-            self.bench,
-            path,
-            sensors=self.accelerometers.sensors,
-            fingers=tuple(self.bench.fingers.layout.positions),
-        )
-
-    def stop_recording(self) -> Recorder:
-        """Stop recording; returns the recorder to be finished. InputError if there is none."""
-        recorder, self.recorder = self.recorder, None
-        if recorder is None:
-            raise InputError("no recording is running")
-        recorder.stop()
-        return recorder
-
     def devices_of(self, amplifier: str | None) -> Sequence[AmplifierDevice]:
         """The device of an amplifier, or all devices; InputError for an unknown name."""
         if amplifier is None:
@@ -178,15 +156,6 @@ class SimulationContext:
             known = ", ".join(self.devices) or "(none on a wire)"
             raise InputError(f"amplifier must be one of {known}, got {str(amplifier)[:40]!r}")
         return (self.devices[amplifier],)
-
-    async def finish_recording(self) -> str | None:
-        """Write the running recording; returns a message about it, None where there is none."""
-        if self.recorder is None:
-            return None
-        recorder = self.stop_recording()
-        await asyncio.to_thread(recorder.finish)
-        full = " (truncated at its maximum size)" if recorder.is_full else ""
-        return f"wrote {recorder.path}: {recorder.seconds:.1f} s{full}"
 
 
 _Response: TypeAlias = dict[str, Any]
@@ -400,27 +369,6 @@ def _recorded(context: SimulationContext, now: float, since_s: float, until_s: f
     _check_window(since_s, until_s)
     context.bench.advance(now)
     return context.accelerometers.read(since_s, until_s)
-
-
-@operation("record")
-async def _record(
-    context: SimulationContext, now: float, *, file: Annotated[str, Field(min_length=1)]
-) -> _Response:
-    context.bench.advance(now)
-    context.record(Path(file))
-    return {"ok": True, "time_s": context.bench.time}
-
-
-@operation("finish")
-async def _finish(context: SimulationContext, now: float) -> _Response:
-    context.bench.advance(now)
-    recorder = context.stop_recording()
-    await asyncio.to_thread(recorder.finish)
-    return {
-        "file": str(recorder.path),
-        "seconds": recorder.seconds,
-        "is_full": recorder.is_full,
-    }
 
 
 @operation("plate", extra="forbid")

@@ -1,8 +1,7 @@
 """The simulation as a process: a bench behind its wires, until a signal ends it.
 
 Time is that of the event loop: the wall clock, or a virtual clock that is stepped explicitly while
-I/O is served as usual. The live view shows amplifiers, peak accelerations and fingers on the
-terminal.
+I/O is served as usual.
 
 The project's firmware may be in place of the simulated amplifiers: a process with a serial line for
 each. `make firmware` builds it from the sources of a checkout; it is not part of the wheel. Its
@@ -19,16 +18,10 @@ from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import numpy as np
-from rich.console import Group, RenderableType
-from rich.table import Table
-from rich.text import Text
-
 from drivers.errors import LinkError
-from model.arrays import FloatArray, Point, lattice
+from model.arrays import Point
 from model.errors import InputError
 from model.rig.rig import Rig
-from model.vibration import G
 from registry import threads
 from registry.threads import no_long_collections
 from sim.bench.amplifier_device import AmplifierDevice
@@ -113,18 +106,14 @@ class SteppedLoop(asyncio.SelectorEventLoop):
             await asyncio.sleep(0)
 
 
-_VIEW_INTERVAL = 0.2  # s
-
-
 @dataclass(frozen=True)
 class Simulation:
     """A rig and the wires of its amplifiers, by name.
 
     faults: with times from when the URLs are printed; fingers: initial positions [m];
     imperfections: in what the bench differs from the rig; sample_rate [Hz]: of sensors and fingers;
-    control: path of the control socket; record: file for the readings of the whole run; until_eof:
-    end with standard input; firmware: in the place of the simulated amplifiers; links: to their
-    pseudo-terminals.
+    control: path of the control socket; until_eof: end with standard input; firmware: in the place
+    of the simulated amplifiers; links: to their pseudo-terminals.
     """
 
     rig: Rig
@@ -135,7 +124,6 @@ class Simulation:
     sensors: Sequence[Accelerometer] = ()
     sample_rate: float = PLANT_SAMPLE_RATE
     control: Path | None = None
-    record: Path | None = None
     until_eof: bool = False
     firmware: Path | None = None
     links: Mapping[str, Path] = field(default_factory=dict)
@@ -150,12 +138,11 @@ async def run_simulation(
     simulation: Simulation,
     *,
     ready: Callable[[Mapping[str, str]], None],
-    view: Callable[[SimulationContext], None] | None,
-) -> str | None:
+) -> None:
     """Simulate until SIGTERM, SIGINT or SIGHUP, or the end of standard input.
 
-    ready is called once with the URLs by amplifier, view a few times a second. Time is virtual in a
-    `SteppedLoop`. Returns a message about the file written. Raises InputError, LinkError.
+    ready is called once with the URLs by amplifier. Time is virtual in a `SteppedLoop`. Raises
+    InputError, LinkError.
     """
     import termios  # noqa: F401  # fails where there are neither terminals nor these signals
 
@@ -174,17 +161,11 @@ async def run_simulation(
         imperfections=simulation.imperfections,
     )
     if ended.is_set():
-        return None
+        return
     bench.place_fingers(simulation.fingers, now=threads.now())
     context = SimulationContext(bench, step=loop.step if isinstance(loop, SteppedLoop) else None)
     context.accelerometers.place(simulation.sensors)
-    if simulation.record is not None:
-        context.record(simulation.record)
-    try:
-        await _serve(simulation, context, ended=ended, ready=ready, view=view)
-    finally:
-        message = await context.finish_recording()
-    return message
+    await _serve(simulation, context, ended=ended, ready=ready)
 
 
 async def _serve(
@@ -193,7 +174,6 @@ async def _serve(
     *,
     ended: asyncio.Event,
     ready: Callable[[Mapping[str, str]], None],
-    view: Callable[[SimulationContext], None] | None,
 ) -> None:
     """Open the wires and serve until the end."""
     bench = context.bench
@@ -212,9 +192,6 @@ async def _serve(
             stack.callback(device.close)
             device.start()
         await stack.enter_async_context(in_background(keep_time(bench), ended.set))
-        if view is not None:
-            viewing = _keep_viewing(context, view)
-            await stack.enter_async_context(in_background(viewing, ended.set))
         stack.enter_context(no_long_collections())
         ready(context.urls)
         await ended.wait()
@@ -244,85 +221,3 @@ def _await_eof(loop: asyncio.AbstractEventLoop, ended: asyncio.Event) -> None:
             pass
     with contextlib.suppress(RuntimeError):  # the loop is closed already
         loop.call_soon_threadsafe(ended.set)
-
-
-async def _keep_viewing(
-    context: SimulationContext, view: Callable[[SimulationContext], None]
-) -> None:
-    while True:
-        view(context)
-        await asyncio.sleep(_VIEW_INTERVAL)
-
-
-_WINDOW = 0.2  # s; of the peaks shown for fingers
-_SHADES = " ·-+*#@"
-_FULL = 5.0  # g; the last shade
-_THRESHOLD = 0.002  # of _FULL; smaller values are not drawn
-_COLUMNS, _ROWS = 28, 10
-_DECAY = 0.5  # of the peaks per picture
-
-
-class SimulationView:
-    """Peak accelerations over a lattice of the plate (rows, columns) [m/s²], fading with time."""
-
-    def __init__(self, bench: Bench) -> None:
-        plate = bench.rig.plate
-        x = (np.arange(_COLUMNS) + 0.5) / _COLUMNS * plate.length
-        y = (np.arange(_ROWS) + 0.5) / _ROWS * plate.width
-        self.begun = bench.time  # s
-        self._bench = bench
-        self._points = lattice(x, y)
-        self._peaks = np.zeros(len(self._points))
-
-    @property
-    def shapes(self) -> FloatArray:
-        """Shapes at its points, in the present coordinates of the plate."""
-        return self._bench.shapes_at(self._points)
-
-    def record(self, times: FloatArray, accelerations: FloatArray) -> None:
-        """Keep the peaks of accelerations (n, p) [m/s²]."""
-        np.maximum(self._peaks, np.abs(accelerations).max(axis=0), out=self._peaks)
-
-    def take(self) -> FloatArray:
-        """Return the peaks and fade them."""
-        peaks = self._peaks.copy()
-        self._peaks *= _DECAY
-        return peaks.reshape(_ROWS, _COLUMNS)
-
-
-def render_simulation(context: SimulationContext, plate: SimulationView) -> RenderableType:
-    """Render the present state; without fingers it fits on 24 lines of 80 columns."""
-    bench = context.bench
-    amplifiers = Table("amplifier", "state", "fault", "set", "level of each channel")
-    for name, amplifier in bench.amplifiers.items():
-        summary = amplifier.summary(bench.time)
-        levels = "  ".join(f"{level:4.0%}" for level in summary.levels)
-        amplifiers.add_row(name, summary.state, summary.fault, str(summary.token), levels)
-    fingers = Table("finger", "at", "peak acceleration")
-    felt = bench.felt(bench.time - _WINDOW, bench.time)
-    for name, (x, y) in bench.positions.items():
-        peak = f"{felt[name].peak.max() / G:.2f} g" if name in felt else ""
-        fingers.add_row(name, f"{x * 1000:.0f}, {y * 1000:.0f} mm", peak)
-    footer = [f"{bench.time - plate.begun:.1f} s"]
-    if context.recorder is not None:
-        full = ", full" if context.recorder.is_full else ""
-        footer.append(f"recording {context.recorder.path}: {context.recorder.seconds:.1f} s{full}")
-    touched = [fingers] if fingers.row_count else []
-    return Group(amplifiers, _picture(bench, plate.take()), *touched, Text("   ".join(footer)))
-
-
-def _picture(bench: Bench, peaks: FloatArray) -> Text:
-    """The plate with y upwards; O are fingers, E are ERAs."""
-    share = np.maximum(peaks / (_FULL * G) - _THRESHOLD, 0)
-    shade = np.ceil(share * (len(_SHADES) - 1)).astype(int)
-    rows = [[_SHADES[min(cell, len(_SHADES) - 1)] for cell in row] for row in shade]
-    size = bench.rig.plate.length, bench.rig.plate.width
-    places = [((era.x, era.y), "E") for era in bench.rig.eras]
-    places += [(at, "O") for at in bench.positions.values()]
-    for (x, y), mark in places:
-        column = min(int(x / size[0] * _COLUMNS), _COLUMNS - 1)
-        rows[min(int(y / size[1] * _ROWS), _ROWS - 1)][column] = mark
-    bar = "+" + "-" * _COLUMNS + "+"
-    lines = [bar, *(f"|{''.join(row)}|" for row in reversed(rows)), bar]
-    legend = f"peak acceleration: {_SHADES[1]} to {_SHADES[-1]} up to {_FULL:g} g; E ERA, O finger"
-    return Text("\n".join([*lines, legend]))

@@ -6,12 +6,7 @@ Each reader refuses what is wrong in words; hostile files are in test_hostile_fi
 import contextlib
 import io
 import re
-import resource
 import shlex
-import signal
-import subprocess
-import sys
-import time
 import zipfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -214,56 +209,6 @@ def test_command_keeps_previous_output_when_the_disk_is_full(
     (line,) = (one for one in said.splitlines() if not re.match(r"\d+ of \d+ ", one))  # progress
     assert line.startswith("era: error: "), said
     assert files(home) == before
-
-
-def recorded(pid: int) -> int:
-    """Size [bytes] of the unnamed file that a process writes; 0 before there is one."""
-    for path in Path(f"/proc/{pid}/fd").iterdir():
-        with contextlib.suppress(OSError):
-            if "(deleted)" in str(path.readlink()):
-                return path.stat().st_size
-    return 0
-
-
-def fill_disk(pid: int) -> None:
-    """Limit the file that a process writes to a little more than it has, until that is reached.
-
-    A file that was longer than the limit at once would say nothing about a write that fails.
-    """
-    end, limit = time.monotonic() + 120, -1
-    while (size := recorded(pid)) != limit:
-        if size > limit:
-            limit = size + 8199  # more than comes while this is done
-            resource.prlimit(pid, resource.RLIMIT_FSIZE, (limit, resource.RLIM_INFINITY))
-        assert time.monotonic() < end, "no recording"
-        time.sleep(0.01)
-
-
-def test_recording_fails_without_a_file_when_the_disk_is_full(home: Path) -> None:
-    """`era sim` reports the error at its end, and leaves no partial recording."""
-    (home / "rig.yaml").write_text(CASE_RIG, encoding="utf-8")
-    era = Path(sys.executable).with_name("era")
-    with subprocess.Popen(
-        # -B: bytecode would be cut off, too, and Python does not notice
-        [
-            *(sys.executable, "-B", era, "sim", "rig.yaml", "--serial"),
-            *("--finger", "0.1,0.1", "--record", "run.wav"),
-        ],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    ) as process:
-        assert "serial://" in process.stdout.readline()
-        try:
-            fill_disk(process.pid)
-            process.send_signal(signal.SIGINT)
-            _, said = process.communicate(timeout=60)
-        finally:
-            process.kill()
-    assert process.returncode == 2
-    assert said.startswith("era: error: run.wav"), said
-    assert len(said.splitlines()) == 1
-    assert not list(home.glob("*run*"))
 
 
 TEN_METRES, URL = Plate(10.0, 10.0, 0.002, material("float-glass")), "sim://"

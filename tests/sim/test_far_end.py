@@ -12,24 +12,17 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
 from drivers.playing import AmplifierTone
 from model.errors import InputError
-from model.rig.rig import Rig
-from processes.firmware_machine import play
-from processes.interrupted import full_disk
-from processes.sound_cards import read_recording
 from registry import threads
 from sim import simulation
-from sim.bench.bench import Bench
 from sim.plant.fingers import Accelerometer, readings
-from sim.sensors import Recorder, Recording, write_recording
+from sim.sensors import Recording
 from sim.transport.far_end import linked_urls, links_by_amplifier
 from sim.transport.simulated_line import LINE_KINDS, Latency, LineKind
 
@@ -72,137 +65,6 @@ def test_tones_are_told_apart_with_their_phases() -> None:
 
 
 HALF_STROKE = AmplifierTone(0, 110.0, 0.5)
-
-
-@pytest.mark.parametrize("ending", ["csv", "wav", "uff"])
-def test_recorder_records_sensors_and_fingers_without_gaps(
-    coarse_rig: Rig, tmp_path: Path, ending: str
-) -> None:
-    """A sensor at the centre of a finger reads what the finger feels."""
-    bench = Bench(coarse_rig, now=3.0, sample_rate=4000.0)
-    bench.place_fingers({"7": (0.1, 0.08)}, now=3.0)
-    path = tmp_path / f"run.{ending}"
-    recorder = Recorder(bench, path, sensors=[Accelerometer("P1", 0.1, 0.08)], fingers=["7"])
-    play(bench, HALF_STROKE, now=3.01, watchdog=2.0)
-    for now in (3.0101, 3.11, 3.5):
-        bench.advance(now)
-    recorder.stop()
-    bench.advance(4.0)
-    recorder.finish()
-    found = read_recording(path)
-    assert found.names == ("P1", "finger_7")
-    assert found.sample_rate == 4000.0
-    assert found.samples.shape == (2000, 2)
-    assert found.start == pytest.approx(3.00025, abs=1e-5)
-    np.testing.assert_allclose(found.points, [[0.1, 0.08]] * 2)
-    np.testing.assert_allclose(found.samples[:, 0], found.samples[:, 1], atol=1e-4)
-    assert not found.samples[:39].any()
-    assert np.abs(found.samples[200:]).max() > 1
-    assert [file.name for file in tmp_path.iterdir() if not file.name.endswith("json")] == [
-        path.name
-    ]
-
-
-def test_recorder_follows_moved_fingers_and_zeroes_lifted_ones(
-    coarse_rig: Rig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The columns are those of the start. At its maximum size further samples are dropped."""
-    monkeypatch.setattr("sim.sensors.max_values", lambda path: 3000)
-    bench = Bench(coarse_rig, now=0.0)
-    bench.place_fingers({"a": (0.1, 0.08), "b": (0.2, 0.1)}, now=0.0)
-    path = tmp_path / "run.csv"
-    recorder = Recorder(bench, path, sensors=[], fingers=["a", "b"])
-    play(bench, HALF_STROKE, now=0.0, watchdog=2.0)
-    bench.advance(0.1)
-    bench.place_fingers({"b": (0.02, 0.02)}, now=0.1)
-    bench.advance(0.149)
-    assert not recorder.is_full
-    bench.advance(0.2)
-    assert recorder.is_full
-    recorder.stop()
-    recorder.finish()
-    found = read_recording(path)
-    assert len(found.samples) == 1500
-    late = found.during(0.101, 0.2)
-    assert not late.samples[:, 0].any()
-    assert np.abs(late.samples[:, 1]).max() > 1
-
-
-def test_recorder_refuses_an_unusable_file_at_the_start(coarse_rig: Rig, tmp_path: Path) -> None:
-    """No channels, an unrelated file, a missing folder, and a name too long for the format."""
-    bench = Bench(coarse_rig, now=0.0)
-    sensor = Accelerometer("a very long name", 0.1, 0.1)
-    letter = tmp_path / "letter.csv"
-    letter.write_text("Dear Sir")
-    for path, sensors in (
-        (tmp_path / "run.csv", []),
-        (letter, [sensor]),
-        (tmp_path / "none" / "run.csv", [sensor]),
-        (tmp_path / "run.uff", [sensor]),
-    ):
-        with pytest.raises(InputError, match=path.name):
-            Recorder(bench, path, sensors=sensors, fingers=[])
-    assert letter.read_text() == "Dear Sir"
-    assert bench.probes == []
-
-
-def test_recorder_survives_a_full_disk(coarse_rig: Rig, tmp_path: Path) -> None:
-    """The bench continues; the error states the recorded time, and no file is left."""
-    path = tmp_path / "run.csv"
-    path.write_text("time_s,old")
-    bench = Bench(coarse_rig, now=0.0, sample_rate=4000.0)
-    recorder = Recorder(bench, path, sensors=[Accelerometer("P1", 0.1, 0.1)], fingers=[])
-    bench.advance(0.5)
-    with full_disk(at=32_000):  # bytes, those of one second
-        for moment in np.arange(0.51, 2.0, 0.01):
-            bench.advance(moment)
-        recorder.stop()
-        with pytest.raises(InputError, match="after 1 s"):
-            recorder.finish()
-    assert path.read_text() == "time_s,old"
-    assert list(tmp_path.iterdir()) == [path]
-
-
-@pytest.fixture
-def recorded() -> Recording:
-    """Two sensors, awkward numbers, begun late."""
-    samples = np.random.default_rng(3).standard_normal((500, 2)) * [40.0, 1e-4] - 1 / 3
-    points = np.array([[0.1, 0.2], [1 / 30, 0.05]])
-    return Recording(("P1", "left edge"), points, 5000.0, 12.25, samples)
-
-
-# Relative to the largest value: every digit, 24 bits, 12 digits.
-@pytest.mark.parametrize(("ending", "step"), [("csv", 0.0), ("wav", 6e-8), ("uff", 1e-11)])
-def test_recording_round_trip(
-    recorded: Recording, tmp_path: Path, ending: str, step: float
-) -> None:
-    """Other tools read all values within the resolution of the format; WAV within full scale."""
-    path = tmp_path / f"run.{ending}"
-    write_recording(path, recorded)
-    back = read_recording(path)
-    assert back.names == recorded.names
-    np.testing.assert_allclose(back.points, recorded.points, rtol=1e-12)
-    assert (back.sample_rate, back.start) == (5000.0, 12.25)
-    largest = np.abs(recorded.samples).max()
-    np.testing.assert_allclose(back.samples, recorded.samples, rtol=0, atol=step * largest)
-
-
-@pytest.mark.parametrize(
-    ("ending", "changes", "text"),
-    [
-        ("txt", {}, r"run.txt: .*csv"),
-        ("csv", {"samples": np.full((500, 2), np.nan)}, "finite"),
-        ("wav", {"sample_rate": 4999.5}, r"4999.5"),
-        ("uff", {"names": ("P1", "a long name")}, "a long name"),
-    ],
-)
-def test_write_recording_refuses_what_a_format_cannot_hold(
-    recorded: Recording, tmp_path: Path, ending: str, changes: dict[str, Any], text: str
-) -> None:
-    """Unknown suffix, values that are not finite, fractional rates in WAV, long names in UFF."""
-    with pytest.raises(InputError, match=text):
-        write_recording(tmp_path / f"run.{ending}", replace(recorded, **changes))
-    assert not list(tmp_path.iterdir())
 
 
 PROMPT = Latency()

@@ -1,4 +1,4 @@
-"""A simulation as a process: command, run loop, view on a terminal, control socket."""
+"""A simulation as a process: command, run loop, control socket."""
 
 import asyncio
 import contextlib
@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from rich.console import Console
 
 from cases import read_yaml, shortly
 from drivers.errors import LinkError
@@ -29,12 +28,10 @@ from model.structure.attachments import PointLoad
 from processes.daemons import SESSION as DAEMONS_SESSION
 from processes.daemons import FarEndProcess, far_end_process, playing
 from processes.firmware_machine import play
-from processes.sound_cards import read_recording
 from registry.limits import GuardLimits
 from sim.bench.bench import Bench
 from sim.control import LINE_MAX, SimulationContext, control_socket, execute
 from sim.plant.imperfections import Imperfections, PlateErrors
-from sim.simulation import SimulationView, render_simulation
 
 LIMITS = GuardLimits(40.0, 500.0, 1.0)
 TIMEOUT = 120  # s; for a loaded machine, not an expectation
@@ -72,42 +69,6 @@ async def test_sim_serves_until_interrupted_or_eof(is_interrupted: bool) -> None
         assert not link.is_symlink()
 
 
-def shown(context: SimulationContext, plate: SimulationView) -> tuple[str, list[str]]:
-    """The view as text on a usual terminal, and the plate's rows, the top one first."""
-    console = Console(width=80, force_terminal=False)
-    with console.capture() as capture:
-        console.print(render_simulation(context, plate))
-    text = capture.get()
-    return text, [line[1:-1] for line in text.splitlines() if line.startswith("|")]
-
-
-def test_view_shows_eras_fingers_and_peaks_in_place(coarse_rig: Rig) -> None:
-    """y points upwards; peaks are darkest near the driven ERA; nothing at rest."""
-    bench = Bench(coarse_rig, now=0.0)
-    context = SimulationContext(bench, urls={"main": "serial:///dev/pts/7?baud=921600"})
-    plate = SimulationView(bench)
-    bench.probes.append(plate)
-    untouched = shown(context, plate)[0].splitlines()
-    assert len(untouched) < 24
-    assert max(map(len, untouched)) <= 80
-    bench.place_fingers({"1": (0.25, 0.05)}, now=0.0)
-    _, rows = shown(context, plate)
-    assert [row[0] + row[-1] for row in (rows[0], rows[-1])] == ["EE", "EE"]
-    # 0.25 of 0.3048 m from the left, 0.05 of 0.2286 m from below.
-    assert rows[-1 - int(0.05 / 0.2286 * len(rows))].index("O") == int(0.25 / 0.3048 * 28)
-    assert set("".join(rows)) == {"E", "O", " "}
-    play(bench, AmplifierTone(0, 40.0, 0.5), now=0.1, watchdog=2.0)
-    bench.advance(1.0)
-    bench.advance(1.3)
-    moving, rows = shown(context, plate)
-    assert "OPERATION_ENABLED" in moving
-    assert " 50%    0%    0%    0%" in moving
-    assert "1.3 s" in moving
-    depth = np.array([[max(" ·-+*#@".find(shade), 0) for shade in row] for row in rows])
-    # SW, where the drive is, is below on the left.
-    assert depth[-3:, :8].mean() > depth[:3, -8:].mean()
-
-
 @dataclass(kw_only=True)
 class Asked(Taken):
     """A simulation as a process that is asked by its control socket; reply: the last one."""
@@ -121,15 +82,14 @@ class Asked(Taken):
 
 
 async def test_simulation_in_virtual_time_advances_only_by_steps(tmp_path: Path) -> None:
-    """Watchdog, faults and recordings follow the steps."""
-    rig, file = write_rig(tmp_path / "rig.yaml"), tmp_path / "run.csv"
+    """Watchdog and faults follow the steps."""
+    rig = write_rig(tmp_path / "rig.yaml")
     courses = read_yaml(Path(__file__).with_name("simulation.yaml"))
     async with far_end_process(
         rig, "--serial", "--virtual-time", "--rate", "2000", "--finger", "0.1,0.1"
     ) as far_end:
         asked = Asked(far_end=far_end)
         await asked.repeats(1, courses["before it plays"])
-        assert (await far_end.ask("record", file=str(file)))["ok"]
         tone = AmplifierTone(0, 110.0, 0.5)
         async with playing(far_end.urls["main"], tone, watchdog=0.5) as amplifier:
             await asked.repeats(1, courses["while it plays"])
@@ -137,14 +97,7 @@ async def test_simulation_in_virtual_time_advances_only_by_steps(tmp_path: Path)
             await amplifier.clear()
             await amplifier.arm(DAEMONS_SESSION + 1, 0.5)
             await asked.repeats(1, courses["once it is armed again"])
-        assert not file.exists()
-        finished = await far_end.ask("finish")
-        assert finished == {"file": str(file), "seconds": 1.0, "is_full": False}
-        assert (await far_end.ask("finish")).keys() == {"error"}
         assert (await far_end.end())[0] == 0
-    recording = read_recording(file)
-    assert recording.names == ("P1", "finger_1")
-    assert (recording.start, recording.samples.shape) == (0.0005, (2000, 2))
 
 
 @pytest.mark.long
@@ -166,21 +119,15 @@ async def test_simulation_applies_a_fault_within_a_step_at_its_time(tmp_path: Pa
 
 
 @pytest.mark.parametrize("number", shortly([signal.SIGTERM, signal.SIGHUP], [signal.SIGTERM]))
-async def test_simulation_writes_its_recording_on_a_signal(
-    tmp_path: Path, number: signal.Signals
-) -> None:
-    """SIGTERM and SIGHUP write the file and print its name."""
-    file = tmp_path / "run.wav"
+async def test_simulation_ends_on_a_signal(tmp_path: Path, number: signal.Signals) -> None:
+    """SIGTERM and SIGHUP end it with status 0, and its control socket goes."""
     async with far_end_process(
-        write_rig(tmp_path / "rig.yaml"),
-        *("--modbus-tcp", "0", "--sensor", "P1=0.1,0.1", "--record", str(file)),
+        write_rig(tmp_path / "rig.yaml"), "--modbus-tcp", "0", "--sensor", "P1=0.1,0.1"
     ) as far_end:
         assert "--virtual-time" in (await far_end.ask("step", seconds=1))["error"]
         assert "frequencies_hz" in (await far_end.ask("tones", since_s=0, until_s=1))["error"]
-        status, printed = await far_end.end(number)
+        status, _ = await far_end.end(number)
     assert status == 0
-    assert str(file) in printed
-    assert read_recording(file).names == ("P1",)
     assert not far_end.control.exists()
 
 

@@ -41,14 +41,12 @@ from controller.api.schema import API_VERSION, ApiMessage
 from controller.api.silencing import readable_params
 from controller.api.summaries import SUMMARIES
 from controller.gateway.access import SUBPROTOCOL, Access
+from controller.gateway.bridge import MAX_READ_FRAME, BrowserSocket, bridge
 from controller.gateway.connections import (
     CLIENT_TIMEOUT,
     CONNECTION,
-    MAX_READ_FRAME,
-    BrowserSocket,
     ClientConnection,
     Connections,
-    bridge,
 )
 from controller.gateway.field import DrawnField
 from controller.gateway.gateway_settings import GatewaySettings

@@ -560,8 +560,8 @@ ENABLED = "OPERATION_ENABLED"
 IMPATIENT = """
 import sys
 from era_haptics.command import main
-from controller.gateway import app, connections
-app.CLIENT_TIMEOUT = connections.CLIENT_TIMEOUT = connections.SEND_TIMEOUT = 1.0
+from controller.gateway import app, bridge, connections
+app.CLIENT_TIMEOUT = connections.CLIENT_TIMEOUT = bridge.SEND_TIMEOUT = 1.0
 sys.exit(main())
 """
 """`era` with shorter timeouts of the gateway."""

@@ -32,9 +32,10 @@ from controller.api.jsonrpc import RpcError
 from controller.api.link import Unreachable
 from controller.api.schema import API_VERSION, ApiMessage, Empty
 from controller.demo.demonstration import check_page
-from controller.gateway import app, connections
+from controller.gateway import app, bridge, connections
 from controller.gateway.app import Gateway, listening_socket, serve
 from controller.gateway.gateway_settings import GatewaySettings, read_token
+from controller.gateway.turns import Turns
 from gateway_attacks import ATTACKS, LIMIT, attack
 from kit.clock import in_virtual_time
 from model.errors import InputError
@@ -697,6 +698,26 @@ async def test_connection_that_waits_is_closed(tmp_path: Path) -> None:
     assert closed() == [each for each in range(len(made)) if each != len(made) - 2]
 
 
+async def test_request_is_not_handed_on_if_its_connection_is_lost_as_its_turn_comes(
+    tmp_path: Path,
+) -> None:
+    """The turn can no longer be cancelled then; aiohttp would log a TypeError."""
+    server, transport = Mock(), Mock()
+    transport.is_closing.return_value = False
+    connection = connections.ClientConnection(lambda: server, connections.Connections(tmp_path))
+    connection.connection_made(transport)
+
+    def lose() -> None:
+        transport.is_closing.return_value = True
+        connection.connection_lost(None)
+
+    received(connection, PAGE_WITHOUT_TOKEN)
+    asyncio.get_running_loop().call_soon(lose)  # behind the turn, before the request is handed on
+    for _ in range(4):
+        await asyncio.sleep(0)
+    assert not server.data_received.called
+
+
 def received(connection: connections.ClientConnection, data: bytes) -> None:
     """Let a connection receive bytes."""
     connection.get_buffer(-1)[: len(data)] = data
@@ -751,12 +772,12 @@ class Browser:
         opened = await link.DaemonLink.open(path, "browser")
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(link.DaemonLink, "open", AsyncMock(return_value=opened))
-            await connections.bridge(
-                cast(connections.BrowserSocket, self),
+            await bridge.bridge(
+                cast(bridge.BrowserSocket, self),
                 "192.0.2.1:1",
                 path,
                 None,
-                connections.Turns(),
+                Turns(),
             )
         await asyncio.gather(*read)
         opened.abort()
@@ -792,7 +813,7 @@ async def test_stop_of_a_browser_that_is_given_up_is_passed_on(
     However its name is written; what only looks like it is not passed on.
     """
     path, read = busy_daemon
-    monkeypatch.setattr(connections, "SEND_TIMEOUT", 0.05)
+    monkeypatch.setattr(bridge, "SEND_TIMEOUT", 0.05)
     touch = (
         '{"jsonrpc":"2.0","method":"touch","params":{"source":"page","touches":[]}}' + " " * 4000
     )
@@ -809,7 +830,7 @@ async def test_others_have_a_turn_after_each_frame(
 ) -> None:
     """However many frames of a browser wait."""
     path, read = busy_daemon
-    monkeypatch.setattr(connections, "SEND_TIMEOUT", 0.5)
+    monkeypatch.setattr(bridge, "SEND_TIMEOUT", 0.5)
     browser, turns = Browser(*["{}"] * 100), 0
     bridging = asyncio.create_task(browser.bridged(path, read))
     async with asyncio.timeout(PATIENCE):

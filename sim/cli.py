@@ -42,23 +42,24 @@ def sim(
         bool,
         typer.Option(
             "--firmware",
-            help="Run the firmware of `make firmware` for each amplifier; the plate does not move.",
+            help="Run the firmware built by `make firmware` for each amplifier; the plate "
+            "does not move.",
         ),
     ] = False,
     wire: Annotated[
         list[str] | None,
         typer.Option(
             metavar="NAME=WIRE",
-            help="Choose the wire of one amplifier: main=serial, side=modbus-tcp:5020; repeatable. "
-            "Without an option the scheme of its url in the rig decides.",
+            help="Wire of one amplifier: main=serial, side=modbus-tcp:5020 (repeatable). "
+            "Default: the scheme of its url in the rig.",
         ),
     ] = None,
     link: Annotated[
         list[str] | None,
         typer.Option(
             metavar="[NAME=]PATH",
-            help="Link a path to the pseudo-terminal of an amplifier, of the first without a name; "
-            "repeatable.",
+            help="Create a symbolic link to the pseudo-terminal of an amplifier (default: "
+            "the first; repeatable).",
         ),
     ] = None,
     shared: Annotated[
@@ -73,9 +74,9 @@ def sim(
         list[str] | None,
         typer.Option(
             metavar="[NAME=]KIND",
-            help="Choose what is between host and amplifiers: native, usb-high-speed, "
-            "usb-full-speed, ftdi, ftdi-low-latency, can, can-usb, ethernet or prompt; repeatable. "
-            "By default what is usual for the wire, and prompt for one amplifier.",
+            help="Simulated link: native, usb-high-speed, usb-full-speed, ftdi, "
+            "ftdi-low-latency, can, can-usb, ethernet or prompt (no added latency); "
+            "repeatable. Default: typical for the wire; prompt for a single amplifier.",
         ),
     ] = None,
     faults: Annotated[
@@ -83,23 +84,26 @@ def sim(
     ] = None,
     finger: Annotated[
         list[str] | None,
-        typer.Option(metavar="X,Y", help="Place a finger [m]; repeatable."),
+        typer.Option(metavar="X,Y", help="Place a finger at this position in metres (repeatable)."),
     ] = None,
     exact: ExactOption = False,
     seed: SeedOption = None,
     sensor: Annotated[
         list[str] | None,
-        typer.Option(metavar="NAME=X,Y", help="Place an accelerometer [m]; repeatable."),
+        typer.Option(
+            metavar="NAME=X,Y",
+            help="Place an accelerometer at this position in metres (repeatable).",
+        ),
     ] = None,
     rate: Annotated[
-        float, typer.Option(metavar="HZ", help="Set the sampling rate of sensors and fingers.")
+        float, typer.Option(metavar="HZ", help="Sampling rate of sensors and fingers in Hz.")
     ] = 10_000.0,
     control: Annotated[
         Path | None, typer.Option(metavar="PATH", help="Serve the control socket at this path.")
     ] = None,
     virtual_time: Annotated[
         bool,
-        typer.Option("--virtual-time", help="Advance time only by the control socket."),
+        typer.Option("--virtual-time", help="Advance time only through the control socket."),
     ] = False,
     until_eof: Annotated[
         bool,

@@ -200,13 +200,13 @@ class AsyncClient(AbstractAsyncContextManager["AsyncClient"]):
     async def stop(self, *, client: str | None = None) -> StopResult:
         """Quick-stop all amplifiers, latched until clear.
 
-        Not an emergency stop. Any client may, at any time; error 1006 unless every amplifier is
-        confirmed silent.
+        Not an emergency stop. Any client can stop, at any time; error 1006 unless every amplifier
+        is confirmed silent.
         """
         return await self._call(StopResult, "stop", client=client)
 
     async def clear(self, *, client: str | None = None, epoch: int | None = None) -> None:
-        """Acknowledge a stop, or a fault whose cause has gone.
+        """Clear a stop, or a fault that no longer exists.
 
         Stays disarmed.
         """

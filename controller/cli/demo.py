@@ -30,17 +30,17 @@ def demo(
     rig_file: Annotated[
         Path | None,
         typer.Argument(
-            metavar="RIG", help="Rig file; without one the paper's plate.", show_default=False
+            metavar="RIG", help="Rig file. Default: the founding paper's plate.", show_default=False
         ),
     ] = None,
     *,
     wire: Annotated[
         str | None,
         typer.Option(
-            help="Wire to the amplifiers: sim (none, they are in this process), or in real time "
-            "serial (a pseudo-terminal), modbus (TCP), can (socketcand) or firmware (the amplifier "
-            "in C on serial, after `make firmware`, whose plate does not move). Default: sim; in "
-            "real time serial.",
+            help="Wire to the amplifiers: sim (none, in this process); in real time serial "
+            "(pseudo-terminal), modbus (TCP), can (socketcand), or firmware (the C "
+            "amplifier on serial, after `make firmware`; its plate does not move). "
+            "Default: sim; in real time serial.",
             show_default=False,
         ),
     ] = None,
@@ -48,7 +48,7 @@ def demo(
         bool,
         typer.Option(
             "--real-time",
-            help="Play in real time, with the amplifiers in a process of their own, and measure "
+            help="Play in real time with the amplifiers in a separate process, and measure "
             "latency.",
         ),
     ] = False,
@@ -72,11 +72,11 @@ def demo(
 ) -> None:
     """Play recorded touches on a simulated plate; measure contrast.
 
-    First one person, of whose fingers one feels it; then two, or on eight ERAs and more three, who
-    each feel a vibration of their own. The plate differs from the table's within the rig's
-    uncertainty, the same for the same --seed; recorded places are shares of its size. Time is
-    virtual, so figures do not depend on the machine. With --real-time, another wire than sim, or
-    --dashboard it is real: a machine that is too slow makes the run void, with exit status 1.
+    Replays one person with a single target finger, then two people (three with eight or more ERAs),
+    each feeling their own vibration. The simulated plate is drawn at random from the rig's
+    tolerances (repeatable with --seed). Recorded touches are scaled to the plate. Time is virtual,
+    so results do not depend on the machine. With --real-time, --dashboard or a wire other than sim,
+    time is real; if the machine is too slow, the run is void and the exit status is 1.
     """
     from controller.demo.demonstration import SIM, WIRES, check_page, write_pictures
     from model.rig.rig_file import example_rig_path, load_rig

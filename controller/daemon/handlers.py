@@ -237,8 +237,8 @@ class ApiService:
     def stop(self, client: Connection, params: RequestedBy) -> Awaitable[StopResult]:
         """Quick-stop all amplifiers, latched until clear.
 
-        Not an emergency stop. Any client may, at any time; error 1006 unless every
-        amplifier is confirmed silent.
+        Not an emergency stop. Any client can stop, at any time; error 1006 unless every amplifier
+        is confirmed silent.
         """
         # The requests to the amplifiers are queued when this returns.
         cause = f"stopped by {params.client or client.name!a}"
@@ -247,7 +247,7 @@ class ApiService:
 
     @api_method(is_repeated=False)  # sent again, it would acknowledge a stop that came meanwhile
     async def clear(self, client: Connection, params: ClearParams) -> Empty:
-        """Acknowledge a stop, or a fault whose cause has gone. Stays disarmed."""
+        """Clear a stop, or a fault that no longer exists. Stays disarmed."""
         operation = self._supervisor.operation
         if operation.state is DaemonState.COMM_LOST:
             raise _wrong_state(operation, ErrorCode.LINK)

@@ -74,7 +74,7 @@ def figure(
 ) -> None:
     """Draw a figure of the founding paper.
 
-    Write a CSV file of its numbers beside it.
+    Also writes its numbers as a CSV file.
     """
     from era_haptics.lab.paper_figures import paper_figures
     from model.figures import save_figure

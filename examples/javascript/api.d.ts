@@ -12,9 +12,9 @@ export interface Methods {
   renew: { params: RenewParams; result: RenewResult };
   /** Ramp to silence, then switch the high voltage off. Any client may. While a link is lost it stops all amplifiers. */
   disarm: { params: DisarmParams; result: Empty };
-  /** Quick-stop all amplifiers, latched until clear. Not an emergency stop. Any client may, at any time; error 1006 unless every amplifier is confirmed silent. */
+  /** Quick-stop all amplifiers, latched until clear. Not an emergency stop. Any client can stop, at any time; error 1006 unless every amplifier is confirmed silent. */
   stop: { params: RequestedBy; result: StopResult };
-  /** Acknowledge a stop, or a fault whose cause has gone. Stays disarmed. */
+  /** Clear a stop, or a fault that no longer exists. Stays disarmed. */
   clear: { params: ClearParams; result: Empty };
   /** Discard what was learned of the plate, and learn anew. Answers are those of the table at once. */
   forget: { params: RequestedBy; result: Empty };

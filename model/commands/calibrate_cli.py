@@ -119,21 +119,27 @@ def calibrate(
             "--output",
             "-o",
             metavar="RIG.fitted.yaml",
-            help="File of the fitted rig, best in the folder of RIG.",
+            help="Output file for the fitted rig, preferably in the folder of RIG.",
         ),
     ],
     mesh: MeshOption = None,
     all_scales: Annotated[
-        bool, typer.Option("--scales", help="Estimate every sensor's scale, not only wrong ones.")
+        bool,
+        typer.Option(
+            "--scales", help="Estimate the scale of every sensor, not only of suspicious ones."
+        ),
     ] = False,
     picture: Annotated[
-        Path | None, typer.Option(metavar="FIT.png", help="Draw measured, before and after.")
+        Path | None,
+        typer.Option(
+            metavar="FIT.png", help="Plot the measurement, and the model before and after the fit."
+        ),
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Fit a rig to measured responses.
 
-    Write what was found beside the rig's file, and print its values with their uncertainties.
+    Writes the fitted values to a separate file, and prints them with their errors.
     """
     from model.estimate.calibrate import calibrate as fit
     from model.estimate.calibrate import calibration_errors

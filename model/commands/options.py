@@ -31,14 +31,12 @@ FolderOption = Annotated[
     Path, typer.Option("--output", "-o", metavar="DIR", help="Folder to write into.")
 ]
 SizeOption = Annotated[
-    str | None, typer.Option("--size", metavar="WxH", help="Size of pictures in cm: 16x10.")
+    str | None, typer.Option("--size", metavar="WxH", help="Size of pictures in cm, such as 16x10.")
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 QuietOption = Annotated[
     list[str] | None,
-    typer.Option(
-        metavar="X,Y", help="Position of a finger that must not feel it, in metres; repeatable."
-    ),
+    typer.Option(metavar="X,Y", help="Position of a quiet finger in metres (repeatable)."),
 ]
 ContactsOption = Annotated[
     Path | None,
@@ -48,19 +46,19 @@ ContactsOption = Annotated[
     ),
 ]
 LowestOption = Annotated[
-    float, typer.Option(min=1.0, help="Least rigid-body frequency of the plate in Hz.")
+    float, typer.Option(min=1.0, help="Minimum rigid-body frequency of the plate in Hz.")
 ]
 ClusterOption = Annotated[
     str | None, typer.Option(metavar="tcp://HOST:PORT", help="Dask scheduler.")
 ]
 ExactOption = Annotated[
-    bool, typer.Option("--exact", help="Simulate the rig's own plate, with no deviation.")
+    bool, typer.Option("--exact", help="Simulate the nominal plate (no parameter errors).")
 ]
 SeedOption = Annotated[
     int | None,
     typer.Option(
         metavar="N",
-        help="Draw another plate, ERAs, channels and fingers within the rig's uncertainty.",
+        help="Random seed for plate, ERAs, channels and fingers within the rig's tolerances.",
         min=0,
     ),
 ]

@@ -53,7 +53,7 @@ def modes(
 ) -> None:
     """Compute natural frequencies.
 
-    The plate is undamped; rigid modes of a free plate are left out.
+    The plate is undamped; rigid-body modes of a free plate are omitted.
     """
     from model.rig.rig_file import load_rig
     from model.vibration import natural_modes
@@ -98,7 +98,8 @@ def plate_map(
     ],
     mesh: MeshOption = None,
     points: Annotated[
-        str | None, typer.Option(metavar="XxY", help="Points of the map; default: the mesh's.")
+        str | None,
+        typer.Option(metavar="XxY", help="Points of the map. Default: those of the mesh."),
     ] = None,
     output: Annotated[
         Path | None, typer.Option("--output", "-o", metavar="MAP.png", help="Picture to draw.")
@@ -263,7 +264,7 @@ def convergence(
 ) -> None:
     """Compare meshes with a finer one.
 
-    Print errors of natural frequencies and of responses.
+    Prints the errors of natural frequencies and responses.
     """
     from model.rig.rig_file import load_rig
     from model.vibration import (
@@ -393,8 +394,7 @@ def materials(as_json: JsonOption = False) -> None:
 def show(rig_file: RigArgument, as_json: JsonOption = False) -> None:
     """Show material, rigidity and exciters of a rig's plate.
 
-    The levels that the exciters reach are those of the plate in the file; a plate whose parts
-    deviate reaches more or less.
+    Levels are for the nominal board; real parts vary, so yours can reach more or less.
     """
     from model.quantities import in_display_unit
     from model.rig.rig_file import load_rig
@@ -574,16 +574,23 @@ def template(
     output: Annotated[
         Path,
         typer.Option(
-            "--output", "-o", metavar="FILE.svg|.pdf", help="A sheet, or A4 pages as PDF."
+            "--output",
+            "-o",
+            metavar="FILE.svg|.pdf",
+            help="Output file: one sheet (.svg), or A4 pages (.pdf).",
         ),
     ],
     side: Annotated[
         Literal["below", "above"],
-        typer.Option(help="Where it is stuck on; actuators are glued below."),
+        typer.Option(help="Face of the board to which the template is taped; actuators go below."),
     ] = "below",
     sensors_file: Annotated[
         Path | None,
-        typer.Option("--sensors", metavar="SENSORS.csv", help="Places of sensors, to be marked."),
+        typer.Option(
+            "--sensors",
+            metavar="SENSORS.csv",
+            help="Mark the sensor positions listed in this file.",
+        ),
     ] = None,
     as_json: JsonOption = False,
 ) -> None:

@@ -54,7 +54,7 @@ def build(
         str | None,
         typer.Option(
             metavar="LO:HI:STEP",
-            help="Frequencies in Hz, both ends included; default: 40:500:10 within the rig's "
+            help="Frequencies in Hz, both ends included. Default: 40:500:10 within "
             "limits.frequency.",
         ),
     ] = None,
@@ -142,45 +142,45 @@ def query(
     table_file: TableArgument,
     target: Annotated[
         list[str] | None,
-        typer.Option(metavar="X,Y", help="Position of a target finger in metres; repeatable."),
+        typer.Option(metavar="X,Y", help="Position of a target finger in metres (repeatable)."),
     ] = None,
     quiet: QuietOption = None,
     own: Annotated[
         list[str] | None,
         typer.Option(
             metavar="X,Y[@LOW-HIGH]",
-            help="Position of a finger in metres that is to feel a vibration of its own, and the "
-            "lowest and highest frequency of it in Hz, or a single one; repeatable.",
+            help="Finger with its own vibration: position in metres and, optionally, a band "
+            "LOW-HIGH or one frequency in Hz (repeatable).",
         ),
     ] = None,
     swap_bands: Annotated[
         bool,
-        typer.Option("--swap-bands", help="With --own: let fingers have each other's bands."),
+        typer.Option("--swap-bands", help="With --own: allow bands to be swapped between fingers."),
     ] = False,
     drive_mode: Annotated[
         str | None,
-        typer.Option("--mode", help="phased or switched; default: the table's."),
+        typer.Option("--mode", help="Drive mode: phased or switched. Default: that of the table."),
     ] = None,
     level: Annotated[
         float, typer.Option(metavar="DB_SL", help="Level at the target, dB SL.")
     ] = 20.0,
     envelopes: Annotated[
-        bool, typer.Option("--envelopes", help="Shape onset and ending by envelopes.")
+        bool, typer.Option("--envelopes", help="Shape onset and ending with envelopes.")
     ] = False,
     batch: Annotated[
         Path | None,
         typer.Option(
             metavar="FILE",
-            help="Questions as JSON lines, - for standard input; print one answer a line. Other "
-            "options are the defaults of keys left out.",
+            help="Read queries from FILE (JSON Lines, - for standard input); print one "
+            "result per line. Other options set the defaults for missing keys.",
         ),
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Find the pattern for target and quiet fingers.
 
-    Or with --own a vibration for each of several fingers. Print frequency, level and phase of each
-    ERA, and predicted levels and contrast.
+    With --own, find a separate vibration for each of several fingers. Prints frequency, level and
+    phase of each ERA, and predicted levels and contrast.
     """
     from model.answer.answer_report import query_one
     from model.table.table_file import load_table
@@ -384,17 +384,20 @@ def contrast_map(
     table_file: TableArgument,
     quiet: Annotated[
         list[str],
-        typer.Option(metavar="X,Y", help="Position of a finger that must not feel it; repeatable."),
+        typer.Option(metavar="X,Y", help="Position of a quiet finger in metres (repeatable)."),
     ],
     modes: Annotated[
         str | None,
-        typer.Option(metavar="MODE,MODE", help="Drive modes side by side; default: the table's."),
+        typer.Option(
+            metavar="MODE,MODE", help="Drive modes to compare. Default: that of the table."
+        ),
     ] = None,
     level: Annotated[
-        float, typer.Option(metavar="DB_SL", help="Level at each place, dB SL.")
+        float, typer.Option(metavar="DB_SL", help="Level at each position, dB SL.")
     ] = 20.0,
     grid: Annotated[
-        str | None, typer.Option(metavar="NXxNY", help="Places along x and y; default: the cells.")
+        str | None,
+        typer.Option(metavar="NXxNY", help="Positions along x and y. Default: the table's cells."),
     ] = None,
     output: Annotated[
         Path | None,
@@ -403,7 +406,7 @@ def contrast_map(
     size: SizeOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Map the promised contrast of every place to given quiet fingers."""
+    """Map the promised contrast of every position to given quiet fingers."""
     from model.finger import Grid
     from model.study.contrast_maps import map_contrast
     from model.table.table_file import load_table
@@ -506,7 +509,9 @@ def export(
     output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="File to write.")],
     content: Annotated[
         Literal["patterns", "fields"] | None,
-        typer.Option(help="Rows of a CSV file: patterns of the map, or fields on the raster."),
+        typer.Option(
+            help="Rows of a CSV file: patterns of the map, or fields on the sampling grid."
+        ),
     ] = None,
     as_json: JsonOption = False,
 ) -> None:

@@ -176,7 +176,7 @@ def verify(
     seed: Annotated[int, typer.Option(min=0, help="Seed of the sample.")] = 0,
     as_json: JsonOption = False,
 ) -> None:
-    """Recompute a sample by other methods, or measure it.
+    """Verify a table against a direct solution.
 
     Solve the plate at each frequency, and in time; with --device play patterns and compare what
     accelerometers measure with what nine of ten plates promise. Exit with 1 if a check fails.

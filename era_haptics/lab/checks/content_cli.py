@@ -177,7 +177,8 @@ def check(
     files: Annotated[
         list[Path],
         typer.Argument(
-            metavar="FILE...", help="Files of content, folders of them, or names of known contents."
+            metavar="FILE...",
+            help="Haptic files, folders of haptic files, or names of built-in contents.",
         ),
     ],
     table_file: Annotated[
@@ -215,12 +216,11 @@ def check(
     level is the share of the time in which the level at the skin is within 3 dB of the file's,
     counted where the file is within 20 dB of its highest level. Levels are means over 20 ms. The
     kept share of the sharpness is the share of the continuous part that plays at about the
-    frequency in the file. Shares are rounded down. Amplifiers are taken as phased, whichever mode
-    the table was built for. Without --table the plate is that of the founding paper. Without --at
-    five positions are tried, the middle among them, and the one with the median share is shown.
-    Several files, or a folder with its subfolders, are listed with one line each. Exit status 1 if
-    a file keeps less of its level than --least, or one of several cannot be read; sharpness has no
-    limit.
+    frequency in the file. Shares are rounded down. Amplifiers are assumed to be phased, whichever
+    mode the table was built for. Without --table, the founding paper's plate is used. Without --at,
+    five positions (including the centre) are simulated and the median one is shown. Several files,
+    or a folder with its subfolders, are listed with one line each. Exit status 1 if a file keeps
+    less of its level than --least, or one of several cannot be read; sharpness has no limit.
     """
     from model.files.output_paths import check_picture
 

@@ -26,13 +26,13 @@ def conformance(
             min=0.1,  # below it fractions are too close together for measured levels
             max=1.0,
             show_default=False,
-            help="Level at which channels are driven, of full level; 0.2 if not given.",
+            help="Level at which channels are driven, relative to full level. Default: 0.2.",
         ),
     ] = None,
     trace: Trace = None,
     json_: Json = False,
 ) -> None:
-    """Check that an amplifier fulfils the contract. Reads only, unless --write is given."""
+    """Check that an amplifier conforms to the protocol. Reads only, unless --write is given."""
     from drivers.by_hand.actions import leave
     from era_haptics.lab.conformance.contract import DEFAULT_LEVEL, judge
 

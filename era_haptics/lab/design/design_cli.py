@@ -38,24 +38,27 @@ def design(
         str,
         typer.Option(
             metavar="N|LO-HI",
-            help="Number of ERAs, kept ones included; at least 3 with other mounts; default: rig.",
+            help="Number of ERAs, including kept ones; at least 3 with other mounts. "
+            "Default: as in the rig.",
         ),
     ] = "",
     layouts: Annotated[
         str,
         typer.Option(
             metavar="random:N|FILE",
-            help="Rank layouts in place of a search: N at random and those with a name, or a file.",
+            help="Rank layouts instead of searching: N random ones and the named ones, or a file.",
         ),
     ] = "",
     finalists: Annotated[
         int,
         typer.Option(
-            min=1, max=1000, help="Given layouts, of each number and stiffness, that are judged."
+            min=1,
+            max=1000,
+            help="Number of candidate layouts evaluated in full, per ERA count and stiffness.",
         ),
     ] = 5,
     keep: Annotated[
-        str, typer.Option(metavar="NAME,NAME", help="ERAs of the rig that stay where they are.")
+        str, typer.Option(metavar="NAME,NAME", help="ERAs of the rig that keep their positions.")
     ] = "",
     where: Annotated[
         str,
@@ -66,18 +69,20 @@ def design(
     ] = "edge",
     contents: Annotated[
         int,
-        typer.Option(min=1, max=MAX_CONTENTS, help="Contents at the same time, a finger for each."),
+        typer.Option(
+            min=1, max=MAX_CONTENTS, help="Number of simultaneous contents, one finger each."
+        ),
     ] = 1,
     contacts: ContactsOption = None,
     apart: Annotated[
-        str, typer.Option(metavar="LENGTH", help="Least distance of two ERAs.")
+        str, typer.Option(metavar="LENGTH", help="Minimum distance between ERAs.")
     ] = "30 mm",
     lowest: LowestOption = 20.0,
     stiffness: Annotated[
         str,
         typer.Option(
             metavar="STIFFNESS,...",
-            help="Stiffnesses of which new ERAs get the best; default: that of the rig's.",
+            help="Candidate stiffnesses for new ERAs; the best is used. Default: the rig's.",
         ),
     ] = "",
     seed: Annotated[int, typer.Option(min=0, help="Seed of contact sets and starts.")] = 0,

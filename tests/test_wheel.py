@@ -19,11 +19,11 @@ from packaging.tags import platform_tags
 from cases import shortly
 from licences import NOTES
 from model.compiled.kernels import versions
+from packages import PACKAGES
 from processes.typed_page import InstalledEra, try_first
 from smoke import lowest, requirements
 
 ROOT = Path(__file__).parents[1]
-PACKAGES = ("registry", "controller", "drivers", "era_haptics", "model", "sim")
 
 # Of the sources: what is neither a program nor made by one.
 DATA = re.compile(

@@ -1,8 +1,8 @@
 """Every page, part of a page, client stub and C header that is written from the code.
 
-`make pages` writes them; with `--check`, as in `make lint`, the stale ones are named. What depends
-on a package index (constraints.txt, reference/licences.md) and what is measured (docs/measured) is
-written by targets of its own.
+`make pages` writes them. With `--check`, as in `make lint`, it lists the stale ones, and names of
+code on pages that are private or do not exist. What depends on a package index (constraints.txt,
+reference/licences.md) and what is measured (docs/measured) is written by targets of its own.
 """
 
 import os
@@ -27,6 +27,7 @@ from findings_page import finding_kinds
 from firmware_header import header
 from firmware_records import records_header
 from metrics_page import metrics
+from page_names import wrong_names
 from processes import error_cases
 from protocol_bytes import BYTES
 from protocol_tables import TABLES
@@ -131,6 +132,10 @@ def main(arguments: Sequence[str], *, root: Path = ROOT) -> int:
                 # What follows is written from this module, which a new process loads.
                 sys.stdout.flush()
                 os.execv(sys.executable, [sys.executable, __file__, *arguments])  # noqa: S606
+    if is_check:
+        for reason in wrong_names(root):
+            sys.stderr.write(f"{reason}\n")
+            status = 1
     return status
 
 

@@ -33,6 +33,7 @@ from controller.process.daemon_process import ServiceManager, SocketLock
 from controller.process.log import LogFormatter, LogThread, RateLimitFilter
 from era_haptics.command import command_modules, main
 from model.errors import InputError
+from packages import PACKAGES
 from processes.gateways import wait_for
 from processes.interrupted import full_disk
 
@@ -415,10 +416,9 @@ def test_help_loads_commands_and_typer_alone(which: str, others: set[str]) -> No
     )
     count, *loaded = done.stdout.split()
     assert int(count) == 1 if not which else int(count) > 40
-    ours = {"registry", "controller", "drivers", "model", "sim"}
     typers = {"typer", "annotated_doc", "shellingham", "typing_extensions", "typing_inspection"}
     of_the_environment = {"_distutils_hack"}  # of setuptools
-    assert set(loaded) - ours - typers - of_the_environment - others == set()
+    assert set(loaded) - set(PACKAGES) - typers - of_the_environment - others == set()
 
 
 def test_summaries_of_commands_fit_in_80_columns() -> None:

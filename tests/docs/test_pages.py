@@ -44,6 +44,8 @@ from drivers.wires.wire import address_of
 from era_haptics.command import command_modules, run_era
 from model.cli import app
 from model.study import overview
+from packages import PACKAGES
+from page_names import wrong_names
 from processes.typed_page import PORTS, PageError, Reader, difference, read_steps
 from registry.limits import GuardLimits
 from ways import WAYS, steps_of
@@ -78,6 +80,26 @@ def test_check_names_what_is_stale_until_it_is_written(
     assert (tmp_path / "a.md").read_text("utf-8") == f"a\n{BEGIN}\n\nnew\n\n{END}\nb\n"
     assert (tmp_path / "b.h").read_text("utf-8") == "1\n"
     assert pages.main(["--check"], root=tmp_path) == 0
+
+
+def test_check_names_private_and_missing_code_on_pages(tmp_path: Path) -> None:
+    """A private name, a class or member that is gone; not those of fenced code or of files."""
+    (tmp_path / "docs").mkdir()
+    (tmp_path / "model").mkdir()
+    (tmp_path / "model" / "plate.py").write_text(
+        "class Plate:\n    width: float\n\n    def mass(self):\n        self.load = 1\n"
+        "class Board(Plate): ...\n"
+    )
+    (tmp_path / "docs" / "page.md").write_text(
+        "`Board.mass`, `Plate.load`, `Plate.md`, `Plate.width`\n\n```\n`plate._mass`\n```\n\n"
+        "`plate._mass` and `..._mass` and `_APART`\n`Plate.height`\n`Table.width`\n"
+    )
+    assert list(wrong_names(tmp_path)) == [
+        "docs/page.md:7: must not name private code, got plate._mass",
+        "docs/page.md:7: must not name private code, got _APART",
+        "docs/page.md:8: must name a member of Plate, got height",
+        "docs/page.md:9: must name a class of the project, got Table in Table.width",
+    ]
 
 
 def test_whatever_says_that_it_is_written_is_among_the_pages() -> None:
@@ -495,9 +517,10 @@ def test_links_beside_the_docs_lead_somewhere(name: str) -> None:
 
 def test_pages_that_are_named_in_code_are_there() -> None:
     """Messages, docstrings and the changelog name pages by their path."""
-    code = ["registry", "controller", "drivers", "era_haptics", "model", "sim"]
     files = [
-        path for name in (*code, "benchmarks", "examples") for path in (ROOT / name).rglob("*.py")
+        path
+        for name in (*PACKAGES, "benchmarks", "examples")
+        for path in (ROOT / name).rglob("*.py")
     ]
     files += [
         ROOT / "CHANGELOG.md",

@@ -35,6 +35,7 @@ from kit.wires import SHARED_WIRES, on_two_amplifiers, rig_on_wire
 from model.reduction.free_plate import solve_free_plate
 from model.rig.rig_writing import change_rig
 from model.table.table_file import build_table
+from packages import PACKAGES
 from python_page import named
 from registry import threads
 
@@ -418,7 +419,7 @@ def test_what_hides_a_package_is_named(tmp_path: Path, hiding: str, distribution
 def test_replaced_and_missing_packages_are_named(tmp_path: Path, replaced: str, words: str) -> None:
     """In the folder of an installation, into which another distribution was installed later."""
     shutil.copytree(ROOT / "era_haptics", tmp_path / "era_haptics")
-    for package in ("controller", "drivers", "model", "registry", "sim"):
+    for package in set(PACKAGES) - {"era_haptics"}:
         (tmp_path / package).mkdir()
         shutil.copy(ROOT / package / "__init__.py", tmp_path / package)
     assert said(PROGRAM, tmp_path) == (0, [])

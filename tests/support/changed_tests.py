@@ -16,7 +16,6 @@ import os
 import re
 import subprocess
 import sys
-import time
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import cache
@@ -26,9 +25,11 @@ import grimp
 import pytest
 
 from cases import SLOWEST
+from packages import PACKAGES
+from time_limit import TimeLimit
 
 ROOT = Path(__file__).parents[2]
-PACKAGES = ("registry", "controller", "drivers", "era_haptics", "model", "sim", "benchmarks")
+IMPORTED = (*PACKAGES, "benchmarks")
 FLAT = ("tests/support", "docs/generators", "examples")
 """Folders whose modules are imported by their bare names."""
 
@@ -65,8 +66,6 @@ _MAX_FILES = 24  # two processors do not finish more within the time, and each c
 _SECONDS = 45.0
 OPTIONS = ("-q", "-r", "fE", "-x", "--in-order", "-m", "not long and not alone")
 """Options of pytest."""
-MIN_TESTS = 50
-"""Tests that always run, however slow the machine is."""
 _MODULES = (".py", ".pyi")
 _WRITER = re.compile(r"<!-- begin: written by \S*?(\w+)\.py")
 _LAST = ("pyproject.toml", "examples/")
@@ -188,7 +187,7 @@ def _tests() -> list[str]:
 def _node(path: str) -> str:
     """Return the name of a file in the graph of imports: that of its module; a test's path."""
     name = path.rpartition(".")[0].removesuffix("/__init__")
-    if path.partition("/")[0] in PACKAGES:
+    if path.partition("/")[0] in IMPORTED:
         return name.replace("/", ".")
     if path.startswith("tests/support/"):
         return name.removeprefix("tests/support/").replace("/", ".")
@@ -221,7 +220,7 @@ def _tests_of_page(path: str) -> Iterator[str]:
 @cache
 def _importers() -> Mapping[str, set[str]]:
     """Return the importers of each module: packages according to grimp, other files to `ast`."""
-    graph = grimp.build_graph(*PACKAGES, cache_dir=str(ROOT / ".import_linter_cache"))
+    graph = grimp.build_graph(*IMPORTED, cache_dir=str(ROOT / ".import_linter_cache"))
     importers: dict[str, set[str]] = defaultdict(set)
     for module in graph.modules:
         importers[module] = graph.find_modules_that_directly_import(module)
@@ -245,27 +244,6 @@ def _imports(file: Path) -> set[str]:
             names.add(node.module)
             names.update(f"{node.module}.{alias.name}" for alias in node.names)
     return names
-
-
-class TimeLimit:
-    """A pytest plugin: end the run some seconds after the first test, but not before MIN_TESTS.
-
-    It ends between two tests, so that a failure of the last one decides the exit status.
-    """
-
-    def __init__(self, seconds: float) -> None:
-        self.seconds = seconds
-        self.started_tests = 0
-        self.ends_at = 0.0
-
-    def pytest_runtest_logstart(self) -> None:
-        """Count a test that is about to start, or end the run if the time is up."""
-        now = time.monotonic()
-        if self.started_tests == 0:
-            self.ends_at = now + self.seconds
-        if self.started_tests >= MIN_TESTS and now >= self.ends_at:
-            pytest.exit(f"{self.seconds:g} s after the first test: no failure so far", returncode=0)
-        self.started_tests += 1
 
 
 def _run(tests: Sequence[str], *, seconds: float) -> int:

@@ -25,6 +25,7 @@ from pathlib import Path
 
 from packaging.requirements import Requirement
 
+from packages import PACKAGES
 from processes.typed_page import (
     Failed,
     InstalledEra,
@@ -42,7 +43,6 @@ HEAD = (
     "| a notebook's imports |\n"
     "|---|---|---|---|---|---|"
 )
-_OURS = ("registry", "controller", "drivers", "era_haptics", "model", "sim")
 _USED = "from era_haptics import SolvedPlate, load_rig, query, table"
 
 
@@ -125,7 +125,7 @@ def weigh(era: InstalledEra) -> Weight:
     }
     return Weight(
         total=sum(sizes.values()),
-        ours=sum(sizes[name] for name in _OURS),
+        ours=sum(sizes[name] for name in PACKAGES),
         distributions=len(has),
         help=_median(lambda: era("--help")),
         imported=_median(lambda: era.script(_USED)),

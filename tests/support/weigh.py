@@ -18,9 +18,10 @@ import sys
 from collections import Counter
 from pathlib import Path
 
+from packages import PACKAGES
+
 ROOT = Path(__file__).resolve().parents[2]
-PRODUCT = ("model", "drivers", "controller", "sim", "era_haptics", "registry")
-PYTHON = (*PRODUCT, "tests", "benchmarks", "examples")
+PYTHON = (*PACKAGES, "tests", "benchmarks", "examples")
 _PRONOUNS = """
     each one ones found other others own several every all_ known made given shown seen left then
     before after said told asked tried kept taken such these those what which whose who rest here
@@ -89,7 +90,7 @@ def weights(root: Path) -> dict[str, Counter[str]]:
         elif path.suffix == ".py" and parts[0] in PYTHON:
             counts = python_weight(path.read_text(encoding="utf-8"))
             folders = ["/".join(parts[:depth]) for depth in (1, 2) if depth < len(parts)]
-            if parts[0] in PRODUCT:
+            if parts[0] in PACKAGES:
                 folders.append("product")
         else:
             continue

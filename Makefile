@@ -10,7 +10,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check install --editable
 # Hundreds of processes are started: what is compiled of us is kept, whatever the shell says.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo firmware firmware-test test test-changed test-long test-busy test-kernels test-pymodbus nightly lint weigh pages format docs fuzz faults kill-test fault-test stop-test late-test qt-test estimate-test surface-test soak bench bench-latency \
+.PHONY: demo firmware firmware-test test test-changed test-long test-busy test-kernels test-pymodbus nightly lint weigh pages format docs fuzz faults mutants rename-test kill-test fault-test stop-test late-test qt-test estimate-test surface-test soak bench bench-latency \
 	bench-promise dist dist-platform smoke smoke-lowest sbom licences clean
 .NOTPARALLEL:
 
@@ -44,7 +44,7 @@ test-changed: .venv/installed-test
 
 # All that is long, one target after another, each within an hour; the rest goes on after a failure.
 # Two hours on two cores. Others: make nightly NIGHTLY='soak kill-test'
-NIGHTLY := test-long test-kernels test-pymodbus test-busy faults firmware-test fuzz stop-test late-test kill-test soak qt-test estimate-test surface-test smoke-lowest weigh
+NIGHTLY := test-long test-kernels test-pymodbus test-busy faults mutants rename-test firmware-test fuzz stop-test late-test kill-test soak qt-test estimate-test surface-test smoke-lowest weigh
 nightly: .venv/installed-test
 	@failed=; for target in $(NIGHTLY); do start=$$(date +%s); echo "nightly: $$target"; \
 		$(MAKE) $$target || failed="$$failed $$target"; \
@@ -108,11 +108,22 @@ pages: .venv/installed-test
 fuzz: .venv/installed-test
 	FRAMES=1000000 $(BIN)/pytest -q tests/drivers/wires/test_frames.py
 
-# Every planted fault (tests/faults) in a copy of the tree, under the tests that must find it;
-# or those that no test of `make test` finds: make faults FAULTS=--nightly.
-# Others: make faults FAULTS='--only wire/ --json out/faults.json'
+# Every planted fault (tests/faults) in a copy of the tree, with the tests that must find it. List those
+# that no test of `make test` finds: make faults FAULTS=--nightly.
+# Others: make faults FAULTS='--only wires/ --json out/faults.json'
 faults: .venv/installed-test
 	$(BIN)/python tests/faults/run.py $(FAULTS)
+
+# Random changes of the code, and which of them the nearest tests notice; at most an hour.
+# Others: make mutants MUTANTS='--package drivers --count 50 --seed 3'
+MUTANTS := --count 20 --minutes 60
+mutants: .venv/installed-test
+	$(BIN)/python tests/faults/mutants.py $(MUTANTS)
+
+# Ten private functions renamed and a module reformatted: no planted fault and no test near them breaks.
+# Others: make rename-test RENAMES='--seed 3'
+rename-test: .venv/installed-test
+	$(BIN)/python tests/faults/renames.py $(RENAMES)
 
 # Two hundred daemons killed at random moments, over every wire, and when all was silent;
 # `make test` takes eight. Others: make kill-test KILLS='--kills 20 --seed 7'

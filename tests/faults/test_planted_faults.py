@@ -1,8 +1,7 @@
-"""The judge of planted faults: it judges rightly, and no fault of today is stale."""
+"""Planted faults: patterns find their code, faults are judged rightly, and no fault is stale."""
 
+import ast
 import json
-import re
-import runpy
 import shutil
 import subprocess
 import sys
@@ -11,13 +10,87 @@ from pathlib import Path
 import pytest
 
 from cases import COLLECTED
+from planting import Edit, StaleEdit, planted
+from run import (
+    PlantedFault,
+    collected,
+    load_faults,
+    missing_imports,
+    missing_tests_report,
+    stale_report,
+)
 
-RUN = Path(__file__).with_name("run.py")
+HERE = Path(__file__).parent
+ROOT = HERE.parents[1]
+MAX_FAULTS = 500
+SOURCE = """
+class Valve:
+    def open(self, pressure: float) -> bool:
+        if pressure > self._limit and not self._is_shut():
+            raise ValueError("too high")
+        width = self._width_of(pressure, margin=1, steps=3)
+        return width > 0
+
+def close(valve):
+    valve.shut()
+"""
+REWRITTEN = """
+class Valve:
+    def open(self, bar: float) -> bool:
+        # The seal does not hold more.
+        if (
+            bar > self._highest
+            and not self._is_closed()
+        ):
+            raise ValueError(f"must be lower, got {bar}")
+        opening = self._opening(bar, margin=1, steps=3)
+        return opening > 0
+
+def close(valve):
+    valve.shut()
+"""
+PATTERNS = {
+    "expression": (
+        "pressure > self._limit and not self._is_shut()",
+        "pressure > self._limit",
+        "if bar > self._highest:",
+    ),
+    "statement": (
+        "width = self._width_of(...)",
+        "width = self._width_of(...) / 2",
+        "opening = self._opening(bar, margin=1, steps=3) / 2",
+    ),
+    "arguments": (
+        "self._width_of(..., steps=3)",
+        "self._width_of(..., steps=2)",
+        "opening = self._opening(bar, steps=2, margin=1)",
+    ),
+    "body": (
+        "if pressure > self._limit and ...:\n    ...",
+        "if ...:\n    ...",
+        "if not self._is_closed():",
+    ),
+    "function": (
+        "def open(self, pressure: float) -> bool:\n    ...\n    return width > 0",
+        "def open(self, pressure: float) -> bool:\n    ...\n    return width > 1",
+        "return opening > 1",
+    ),
+}
+C_SOURCE = """
+static int level(int x) { /* as asked */ return x + 1; }
+int stop(int x)
+{
+    return x
+        + 1; // at once
+}
+"""
 FAULT = """
 - fault: {name}
   behaviour: Two and two are {result}.
   where: [two, three]
-  change: [{{file: sums.py, find: "{find}", replace: "{result}"}}]
+  in: sums.py
+  find: {find}
+  replace: {result}
   found_by: ["tests/test_sums.py::test_sum[{{where}}]"]
 """
 TESTS = """
@@ -29,51 +102,101 @@ def test_sum(below):
 """
 
 
-def judged(run: Path, *options: str) -> tuple[int, dict[str, str]]:
-    """Exit status of the judge, and what became of each fault."""
-    report = run.with_name("judged.json")
-    command = [sys.executable, run, "--workers", "1", "--json", report, *options]
-    status = subprocess.run(command, stdout=subprocess.PIPE).returncode
-    return status, {row["fault"]: row["result"] for row in json.loads(report.read_text("utf-8"))}
+@pytest.mark.parametrize(("find", "replacement", "line"), PATTERNS.values(), ids=PATTERNS)
+def test_pattern_matches_code_with_other_names_and_layout(
+    find: str, replacement: str, line: str
+) -> None:
+    """In rewritten code one line changes, as described, and has the names of that code."""
+    edit = Edit("valve.py", "Valve", find, replacement)
+    assert planted(edit, SOURCE) != SOURCE
+    before = ast.unparse(ast.parse(REWRITTEN)).splitlines()
+    after = planted(edit, REWRITTEN).splitlines()
+    changed = [new.strip() for old, new in zip(before, after, strict=True) if old != new]
+    assert changed == [line]
+
+
+@pytest.mark.parametrize(
+    ("scope", "find", "replacement", "reason"),
+    [
+        ("", "pressure > self.limit", "True", "matches nothing"),
+        ("Valve.opens", "return ... > 0", "return True", "did you mean open"),
+        ("Valve", "self._unknown", "0", "matches in lines"),
+        ("", "valve.close()", "pass", r"nearest, in line 10: valve.shut\(\)"),
+        ("", "valve.shut()", "valve._leak()", "private names"),
+        ("", "return ... > 0", "return ...; ...", "must not have more"),
+        ("", "return ... >", "return", "must be Python"),
+    ],
+)
+def test_pattern_must_match_once(scope: str, find: str, replacement: str, reason: str) -> None:
+    """A pattern without or with several matches is stale; public names must be the same."""
+    edit = Edit("valve.py", scope, find, replacement)
+    with pytest.raises(StaleEdit, match=reason):
+        planted(edit, SOURCE)
+
+
+def test_private_name_of_a_pattern_stands_for_one_name() -> None:
+    """Two private names of a pattern do not match one of the code, nor one of it two."""
+    source = "def f(self):\n    self._a = self._b\n    self._c = self._c\n"
+    edit = Edit("f.py", "f", "self._x = self._y", "self._y = self._x")
+    assert "self._b = self._a" in planted(edit, source)
+    edit = Edit("f.py", "f", "self._x = self._x", "pass")
+    assert "self._a = self._b" in planted(edit, source)
+
+
+def test_other_languages_are_compared_by_tokens_of_a_function() -> None:
+    """Whitespace and comments do not count, and the rest of the file stays as it is."""
+    edit = Edit("stop.c", "stop", "return x+1;", "return x;")
+    assert planted(edit, C_SOURCE) == C_SOURCE.replace("return x\n        + 1;", "return x;")
+    with pytest.raises(StaleEdit, match="matches in lines 2, 5, must match once"):
+        planted(Edit("stop.c", "", "return x+1;", ""), C_SOURCE)
+    with pytest.raises(StaleEdit, match="no function halt"):
+        planted(Edit("stop.c", "halt", "return x+1;", ""), C_SOURCE)
 
 
 def test_no_fault_is_stale(request: pytest.FixtureRequest) -> None:
-    """A text to change occurs once in its file; what is imported and all tests are there."""
-    judge = runpy.run_path(str(RUN))
-    faults = judge["load_faults"]()
-    reports = judge["stale_report"](faults, judge["ROOT"])
+    """Every pattern matches once; the tests that a fault names and its imports exist."""
+    faults = load_faults()
+    assert len(faults) <= MAX_FAULTS
+    reports = stale_report(faults, ROOT) + missing_imports(faults)
     assert not reports, "\n".join(reports)
-    lines = {line.strip() for one in faults for edit in one.edits for line in edit[2].split("\n")}
-    exec("\n".join(line for line in lines if re.fullmatch(r"(from [\w.]+ )?import [\w, ]+", line)))
     folder = request.node.getparent(pytest.Dir)
-    beside = pytest.Module.from_parent(folder, path=RUN.with_name("one_conformance.py"))
-    existing = request.config.stash[COLLECTED] | {test.nodeid for test in beside.collect()}
-    root = RUN.parents[2]
-    unknown = {test for one in faults for test in one.tests} - existing
-    others = {test.partition("::")[0] for test in unknown}
-    files = [file for file in sorted(others) if (root / file).is_file()]
-    if files:  # of tests that were not asked for
-        existing |= judge["collected"](*files)
-    missing = judge["missing_tests_report"](faults, existing)
+    single_checks = pytest.Module.from_parent(folder, path=HERE / "one_conformance.py")
+    existing = request.config.stash[COLLECTED] | {test.nodeid for test in single_checks.collect()}
+    unknown = {test for fault in faults for test in fault.tests} - existing
+    files = {test.partition("::")[0] for test in unknown}
+    not_collected = [file for file in sorted(files) if (ROOT / file).is_file()]
+    if not_collected:
+        existing |= collected(*not_collected)
+    missing = missing_tests_report(faults, existing)
     assert not missing, "\n".join(missing)
 
 
+def small_tree(folder: Path, rows: dict[str, tuple[str, str]]) -> Path:
+    """Make a tree with one module, its test and some faults (find, replace); return the judge."""
+    faults = folder / "tests" / "faults"
+    faults.mkdir(parents=True)
+    for name in ("run.py", "planting.py", "copies.py"):
+        shutil.copy(HERE / name, faults)
+    (folder / "sums.py").write_text("SUM = 2 + 2\n")
+    (folder / "tests" / "test_sums.py").write_text(TESTS)
+    texts = [
+        FAULT.format(name=name, find=find, result=result) for name, (find, result) in rows.items()
+    ]
+    (faults / "sums.yaml").write_text("".join(texts))
+    return faults / "run.py"
+
+
 def test_stale_fault_is_reported_with_its_file_and_the_remedy(tmp_path: Path) -> None:
-    """The report of a fault whose text is gone names both files, the text and the behaviour."""
-    folder = tmp_path / "tests" / "faults"
-    folder.mkdir(parents=True)
-    shutil.copy(RUN, folder)
-    (tmp_path / "sums.py").write_text("SUM = 2 + 2\n")
-    faults = [("sound", "2 + 2"), ("gone", "2 + 1")]
-    texts = [FAULT.format(name=name, find=find, result="5") for name, find in faults]
-    (folder / "sums.yaml").write_text("".join(texts))
-    command = [sys.executable, folder / "run.py", "--check"]
+    """The report names both files, the pattern, what resembles it, and the behaviour."""
+    judge = small_tree(tmp_path, {"sound": ("2 + 2", "5"), "gone": ("2 + 1", "5")})
+    command = [sys.executable, judge, "--check"]
     done = subprocess.run(command, stdout=subprocess.PIPE, text=True)
     assert done.returncode == 1
     assert done.stdout.splitlines() == [
         "tests/faults/sums.yaml: fault gone cannot be planted:",
-        "    sums.py must contain once, got 0 times: 2 + 1",
-        "    Change `find` and `replace` there to the present code, so that again:",
+        "    sums.py matches nothing, must match once: 2 + 1",
+        "        nearest, in line 1: 2 + 2",
+        "    Change `of`, `find` and `replace` there to the present code, so that again:",
         "    Two and two are 5.",
         "    Then: python tests/faults/run.py --only sums/gone",
     ]
@@ -81,19 +204,17 @@ def test_stale_fault_is_reported_with_its_file_and_the_remedy(tmp_path: Path) ->
 
 
 def test_fault_without_its_test_is_reported_with_the_nearest_name() -> None:
-    """A renamed test is named with the fault, its file and the test that comes closest."""
-    judge = runpy.run_path(str(RUN))
-    fault = judge["PlantedFault"](
+    """A renamed test is named with the fault, its file and the most similar test."""
+    fault = PlantedFault(
         name="sums/gone",
         source="tests/faults/sums.yaml",
         behaviour="Two and two are 5.",
         edits=(),
         tests=("tests/test_sums.py::test_sum[four]",),
         shows="",
-        missed="",
     )
     existing = {"tests/test_sums.py::test_sum[for]", "tests/test_other.py::test_sum[four]"}
-    assert judge["missing_tests_report"]([fault], existing) == [
+    assert missing_tests_report([fault], existing) == [
         "tests/faults/sums.yaml: fault gone names no existing test: "
         "tests/test_sums.py::test_sum[four]\n"
         "    Did you mean tests/test_sums.py::test_sum[for]?"
@@ -102,21 +223,18 @@ def test_fault_without_its_test_is_reported_with_the_nearest_name() -> None:
 
 @pytest.mark.long
 def test_fault_is_found_only_if_every_test_of_it_fails(tmp_path: Path) -> None:
-    """It is missed where one passes, stale where it cannot be planted or tested."""
-    folder = tmp_path / "tests" / "faults"
-    folder.mkdir(parents=True)
-    shutil.copy(RUN, folder)
-    (tmp_path / "sums.py").write_text("SUM = 2 + 2\n")
-    (tmp_path / "tests" / "test_sums.py").write_text(TESTS)
-    rows = [
-        ("found", "2 + 2", "5"),
-        ("missed-by-one", "2 + 2", "3"),
-        ("moved", "2 + 1", "5"),
-        ("twice", "2", "5"),
-        ("no-code", "2 + 2", "5 +"),
-        ("no-name", "SUM = 2 + 2", "SUM = 2 + two"),
-    ]
-    texts = [FAULT.format(name=name, find=find, result=result) for name, find, result in rows]
-    (folder / "sums.yaml").write_text("".join(texts))
-    status, results = judged(folder / "run.py")
-    assert (status, *results.values()) == (1, "found", "missed", "stale", "stale", "stale", "stale")
+    """It is missed if one passes, stale if it cannot be planted or tested."""
+    rows = {
+        "found": ("2 + 2", "5"),
+        "missed-by-one": ("2 + 2", "3"),
+        "moved": ("2 + 1", "5"),
+        "twice": ("2", "5"),
+        "no-code": ("2 + 2", "5 +"),
+        "no-name": ("SUM = 2 + 2", "SUM = 2 + two"),
+    }
+    judge = small_tree(tmp_path, rows)
+    report = tmp_path / "judged.json"
+    command = [sys.executable, judge, "--workers", "1", "--json", report]
+    status = subprocess.run(command, stdout=subprocess.PIPE).returncode
+    results = [row["result"] for row in json.loads(report.read_text("utf-8"))]
+    assert (status, *results) == (1, "found", "missed", "stale", "stale", "stale", "stale")

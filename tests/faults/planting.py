@@ -1,0 +1,522 @@
+"""Locate the code that a planted fault changes, by syntax, and change it.
+
+A pattern (`find`) is an expression or some statements of Python. It matches code of the same syntax
+tree, whatever the layout and the comments. `...` in a pattern stands for any code: any number of
+statements, one expression, or all arguments of a call that the pattern does not name; in an index
+it means itself. In the replacement (`replace`), the first `...` stands for the code that the first
+one of the pattern matched, and so on.
+
+If no code has exactly the names of the pattern, names may differ: first private names (with a
+leading underscore), then local variables as well. A name of the pattern always stands for the same
+name of the code, and the replacement gets the names of the code. A pattern must match exactly once
+in its file, or in the class or function that `of` names.
+
+Other languages (C, JavaScript) are compared token by token, without whitespace and comments.
+"""
+
+import ast
+import builtins
+import re
+from collections.abc import Iterable, Iterator, Sequence
+from copy import deepcopy
+from dataclasses import dataclass, field, replace
+from difflib import get_close_matches
+from typing import Any, NamedTuple
+
+_HOLE = "..."
+_FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef)
+_DEFINITIONS = (*_FUNCTIONS, ast.ClassDef)
+_BUILTIN_NAMES = frozenset(dir(builtins))
+
+
+class StaleEdit(ValueError):
+    """An edit does not fit its file any more."""
+
+
+@dataclass(frozen=True)
+class Edit:
+    """A change of one file.
+
+    scope: class, function or method that contains the code, such as `Group.stop`; empty for the
+    whole file.
+    """
+
+    file: str
+    scope: str
+    find: str
+    replace: str
+
+
+def planted(edit: Edit, source: str) -> str:
+    """Return the source text with an edit applied; raise StaleEdit if it does not match once."""
+    if edit.file.endswith(".py"):
+        return _plant_python(edit, source)
+    return _plant_tokens(edit, source)
+
+
+@dataclass(frozen=True)
+class _Binding:
+    """What a pattern has matched so far: a name of the code for each name, and code for each hole.
+
+    names: by kind (private, name, attribute) and name of the pattern.
+    """
+
+    names: dict[tuple[str, str], str] = field(default_factory=dict)
+    holes: tuple[Any, ...] = ()
+
+
+class _Freedom(NamedTuple):
+    """Which names of the code may differ from those of a pattern."""
+
+    private: bool = False
+    local: bool = False
+
+
+_FREEDOMS = (_Freedom(), _Freedom(private=True), _Freedom(private=True, local=True))
+"""Tried in this order, until one of them matches."""
+
+
+def is_private(name: str) -> bool:
+    """Return whether a name has a leading underscore and is not special (`__init__`) or `_`."""
+    return name.startswith("_") and not name.endswith("__") and name != "_"
+
+
+def _kind(owner: ast.AST, name: str) -> str:
+    if is_private(name):
+        return "private"
+    return "attribute" if isinstance(owner, ast.Attribute | ast.keyword) else "name"
+
+
+class _Matcher:
+    """Compares a pattern with code.
+
+    local_names: variables and parameters of the function around the code.
+    global_names: names that cannot be local variables of a pattern.
+    """
+
+    def __init__(
+        self, freedom: _Freedom, local_names: frozenset[str], global_names: frozenset[str]
+    ) -> None:
+        self._freedom = freedom
+        self._local_names = local_names
+        self._global_names = global_names
+
+    def match(self, pattern: Any, code: Any, binding: _Binding) -> Iterator[_Binding]:
+        """Yield each way in which a pattern (a node, a list of nodes, a constant) fits code."""
+        if _is_hole(pattern):
+            yield replace(binding, holes=(*binding.holes, code))
+        elif isinstance(pattern, list):
+            yield from self._match_list(pattern, code, binding)
+        elif not isinstance(pattern, ast.AST):
+            if type(pattern) is type(code) and pattern == code:
+                yield binding
+        elif type(pattern) is type(code):
+            is_call = isinstance(pattern, ast.Call)
+            if is_call and any(_is_hole(argument) for argument in pattern.args):
+                yield from self._match_call(pattern, code, binding)
+            else:
+                matcher = self._within(code)
+                yield from matcher._match_fields(pattern, pattern._fields, code, binding)
+
+    def _within(self, code: ast.AST) -> "_Matcher":
+        """Return the matcher for code in a function if this one is not in a function yet."""
+        if self._local_names or not isinstance(code, _FUNCTIONS):
+            return self
+        return _Matcher(self._freedom, _variables(code), self._global_names)
+
+    def match_start(
+        self, pattern: Sequence[ast.stmt], code: Sequence[ast.stmt], binding: _Binding
+    ) -> Iterator[tuple[_Binding, int]]:
+        """Compare statements with the first ones of a block; yield how many they are."""
+        if not pattern:
+            yield binding, 0
+            return
+        first, rest = pattern[0], pattern[1:]
+        if _is_hole_statement(first):
+            counts = range(len(code) + 1) if rest else [len(code)]
+            for count in counts:
+                with_hole = replace(binding, holes=(*binding.holes, code[:count]))
+                for bound, others in self.match_start(rest, code[count:], with_hole):
+                    yield bound, count + others
+        elif code:
+            for bound_first in self.match(first, code[0], binding):
+                for bound, others in self.match_start(rest, code[1:], bound_first):
+                    yield bound, 1 + others
+
+    def _match_list(self, pattern: list[Any], code: Any, binding: _Binding) -> Iterator[_Binding]:
+        if any(_is_hole_statement(item) for item in pattern):
+            for bound, count in self.match_start(pattern, code, binding):
+                if count == len(code):
+                    yield bound
+        elif len(pattern) == len(code):
+            yield from self._match_all([*zip(pattern, code, strict=True)], binding)
+
+    def _match_all(self, pairs: Sequence[tuple[Any, Any]], binding: _Binding) -> Iterator[_Binding]:
+        """Compare pairs of pattern and code, one after the other."""
+        if not pairs:
+            yield binding
+            return
+        for bound in self.match(*pairs[0], binding):
+            yield from self._match_all(pairs[1:], bound)
+
+    def _match_fields(
+        self, pattern: ast.AST, names: Sequence[str], code: ast.AST, binding: _Binding
+    ) -> Iterator[_Binding]:
+        if not names:
+            yield binding
+            return
+        name, *rest = names
+        value, in_code = getattr(pattern, name), getattr(code, name)
+        is_name = isinstance(value, str) and not isinstance(pattern, ast.Constant)
+        if name in ("ctx", "kind", "type_comment"):
+            matched: Iterable[_Binding] = [binding]
+        elif is_name and isinstance(in_code, str):
+            matched = self._match_name(_kind(pattern, value), value, in_code, binding)
+        else:
+            matched = self.match(value, in_code, binding)
+        for bound in matched:
+            yield from self._match_fields(pattern, rest, code, bound)
+
+    def _match_call(
+        self, pattern: ast.Call, call: ast.Call, binding: _Binding
+    ) -> Iterator[_Binding]:
+        """Compare a call with `...` among its arguments."""
+        first = [argument for argument in pattern.args if not _is_hole(argument)]
+        named = {keyword.arg for keyword in pattern.keywords}
+        same_keywords = [keyword for keyword in call.keywords if keyword.arg in named]
+        other_keywords = [keyword for keyword in call.keywords if keyword.arg not in named]
+        others = (call.args[len(first) :], other_keywords)
+        pairs = [(pattern.func, call.func), (first, call.args[: len(first)])]
+        for bound in self._match_all(pairs, binding):
+            with_hole = replace(bound, holes=(*bound.holes, others))
+            yield from self.match(pattern.keywords, same_keywords, with_hole)
+
+    def _match_name(
+        self, kind: str, name: str, in_code: str, binding: _Binding
+    ) -> Iterator[_Binding]:
+        known = binding.names.get((kind, name))
+        taken = {value for (key, _), value in binding.names.items() if key == kind}
+        if known is not None:
+            if known == in_code:
+                yield binding
+        elif in_code not in taken and (name == in_code or self._may_differ(kind, name, in_code)):
+            yield replace(binding, names={**binding.names, (kind, name): in_code})
+
+    def _may_differ(self, kind: str, name: str, in_code: str) -> bool:
+        if kind == "private":
+            return self._freedom.private and is_private(in_code)
+        is_local = in_code in self._local_names and name not in self._global_names
+        return kind == "name" and self._freedom.local and is_local
+
+
+def _is_hole(node: Any) -> bool:
+    return isinstance(node, ast.Name) and node.id == _HOLE
+
+
+def _is_hole_statement(node: Any) -> bool:
+    return isinstance(node, ast.Expr) and _is_hole(node.value)
+
+
+class _Holes(ast.NodeTransformer):
+    """Marks every `...` of a pattern except in an index."""
+
+    def visit_Constant(self, node: ast.Constant) -> ast.expr:
+        return ast.Name(_HOLE, ast.Load()) if node.value is Ellipsis else node
+
+    def visit_Subscript(self, node: ast.Subscript) -> ast.expr:
+        node.value = self.visit(node.value)
+        return node
+
+
+def _parsed(text: str, what: str) -> list[ast.stmt]:
+    try:
+        tree = ast.parse(text)
+    except SyntaxError as error:
+        raise StaleEdit(f"`{what}` must be Python, got {error}: {text.strip()}") from None
+    statements: list[ast.stmt] = _Holes().visit(tree).body
+    return statements
+
+
+@dataclass(frozen=True)
+class _Match:
+    """Code that a pattern matches: an expression, or statements of a block from `start` on."""
+
+    binding: _Binding
+    line: int
+    expression: ast.expr | None = None
+    block: list[ast.stmt] = field(default_factory=list)
+    start: int = 0
+    count: int = 0
+
+
+def _plant_python(edit: Edit, source: str) -> str:
+    tree = ast.parse(source)
+    pattern = _parsed(edit.find, "find")
+    replacement = _parsed(edit.replace, "replace")
+    _check_private_names(pattern, replacement)
+    scopes = _scopes(tree, edit.scope)
+    for freedom in _FREEDOMS:
+        matches = _matches(tree, scopes, pattern, replacement, freedom)
+        if len(matches) > 1:
+            lines = ", ".join(str(match.line) for match in matches)
+            where = f" of {edit.scope}" if edit.scope else ""
+            raise StaleEdit(f"matches in lines {lines}{where}, must match once: {edit.find}")
+        if matches:
+            _put(tree, matches[0], replacement)
+            return ast.unparse(ast.fix_missing_locations(tree)) + "\n"
+    raise StaleEdit(_nothing_matches(edit, pattern, [scope for scope, _ in scopes]))
+
+
+def _matches(
+    tree: ast.Module,
+    scopes: Sequence[tuple[ast.AST, frozenset[str]]],
+    pattern: list[ast.stmt],
+    replacement: list[ast.stmt],
+    freedom: _Freedom,
+) -> list[_Match]:
+    global_names = _BUILTIN_NAMES | _global_names(tree)
+    are_expressions = _is_expression(pattern) and _is_expression(replacement)
+    matches: list[_Match] = []
+    for scope, local_names in scopes:
+        for owner, names in _nodes(scope, local_names):
+            matcher = _Matcher(freedom, names, global_names)
+            matches += _matches_in(owner, pattern, matcher, are_expressions)
+    return matches
+
+
+def _check_private_names(pattern: list[ast.stmt], replacement: list[ast.stmt]) -> None:
+    """Reject private names that could not follow a renaming."""
+    missing = sorted(_private_names(replacement) - _private_names(pattern))
+    if missing:
+        names = ", ".join(missing)
+        raise StaleEdit(f"private names in `replace` must be in `find`, too, got {names}")
+
+
+def _below(nodes: Sequence[ast.AST]) -> Iterator[ast.AST]:
+    for node in nodes:
+        yield from ast.walk(node)
+
+
+def _private_names(statements: Sequence[ast.AST]) -> set[str]:
+    names = set()
+    for node in _below(statements):
+        for _, value in ast.iter_fields(node):
+            if isinstance(value, str) and not isinstance(node, ast.Constant) and is_private(value):
+                names.add(value)
+    return names
+
+
+def _scopes(tree: ast.Module, dotted: str) -> list[tuple[ast.AST, frozenset[str]]]:
+    """Return the definitions of a dotted name, with the local names around them."""
+    scopes: list[tuple[ast.AST, frozenset[str]]] = [(tree, frozenset())]
+    for name in filter(None, dotted.split(".")):
+        below = []
+        existing = []
+        for scope, names in scopes:
+            for node, around in _nodes(scope, names):
+                if isinstance(node, _DEFINITIONS) and node is not scope:
+                    existing.append(node.name)
+                    if node.name == name:
+                        below.append((node, around))
+        if not below:
+            similar = get_close_matches(name, existing, n=1)
+            hint = f"; did you mean {similar[0]}?" if similar else ""
+            raise StaleEdit(f"has no class or function {name} (of: {dotted}){hint}")
+        scopes = below
+    return scopes
+
+
+def _nodes(
+    node: ast.AST, local_names: frozenset[str] = frozenset()
+) -> Iterator[tuple[ast.AST, frozenset[str]]]:
+    """Yield a node and all below it, with the local names of the outermost function around."""
+    if isinstance(node, _FUNCTIONS) and not local_names:
+        local_names = _variables(node)
+    yield node, local_names
+    for child in ast.iter_child_nodes(node):
+        yield from _nodes(child, local_names)
+
+
+def _variables(node: ast.AST) -> frozenset[str]:
+    """Return the names of variables and parameters in code."""
+    names = set()
+    for below in ast.walk(node):
+        if isinstance(below, ast.Name) and not isinstance(below.ctx, ast.Load):
+            names.add(below.id)
+        elif isinstance(below, ast.arg):
+            names.add(below.arg)
+        elif isinstance(below, ast.ExceptHandler | ast.MatchAs) and below.name:
+            names.add(below.name)
+    return frozenset(names)
+
+
+def _global_names(tree: ast.Module) -> frozenset[str]:
+    """Return the names that a module defines or imports."""
+    names: set[str] = set()
+    for statement in tree.body:
+        if isinstance(statement, _DEFINITIONS):
+            names.add(statement.name)
+        elif isinstance(statement, ast.Import | ast.ImportFrom):
+            names.update(alias.asname or alias.name for alias in statement.names)
+        else:
+            names.update(_variables(statement))
+    return frozenset(names)
+
+
+def _is_expression(statements: list[ast.stmt]) -> bool:
+    return len(statements) == 1 and isinstance(statements[0], ast.Expr)
+
+
+def _matches_in(
+    owner: ast.AST, pattern: list[ast.stmt], matcher: _Matcher, are_expressions: bool
+) -> Iterator[_Match]:
+    """Yield the matches among the direct children of a node."""
+    if are_expressions:
+        assert isinstance(pattern[0], ast.Expr)
+        for child in ast.iter_child_nodes(owner):
+            if isinstance(child, ast.expr):
+                for bound in matcher.match(pattern[0].value, child, _Binding()):
+                    yield _Match(bound, child.lineno, expression=child)
+        return
+    for _, block in ast.iter_fields(owner):
+        if not (isinstance(block, list) and block and isinstance(block[0], ast.stmt)):
+            continue
+        for start in range(len(block)):
+            for bound, count in matcher.match_start(pattern, block[start:], _Binding()):
+                line = block[start].lineno
+                yield _Match(bound, line, block=block, start=start, count=count)
+
+
+def _put(tree: ast.Module, match: _Match, replacement: list[ast.stmt]) -> None:
+    """Put the replacement in place of matched code."""
+    filled = _Filling(match.binding).fill(replacement)
+    if match.expression is None:
+        match.block[match.start : match.start + match.count] = filled
+        if not match.block:
+            match.block.append(ast.Pass())
+        return
+    assert isinstance(filled[0], ast.Expr)
+    for owner in ast.walk(tree):
+        for name, value in ast.iter_fields(owner):
+            if value is match.expression:
+                setattr(owner, name, filled[0].value)
+            elif isinstance(value, list):
+                value[:] = [filled[0].value if item is match.expression else item for item in value]
+
+
+class _Filling(ast.NodeTransformer):
+    """Gives a replacement the names and the code that its pattern matched."""
+
+    def __init__(self, binding: _Binding) -> None:
+        self._names = binding.names
+        self._holes = list(binding.holes)
+
+    def fill(self, replacement: list[ast.stmt]) -> list[ast.stmt]:
+        module = self.visit(ast.Module(deepcopy(replacement), []))
+        statements: list[ast.stmt] = module.body
+        return statements
+
+    def _next_hole(self) -> Any:
+        if not self._holes:
+            raise StaleEdit("`replace` must not have more `...` than `find`")
+        return self._holes.pop(0)
+
+    def visit_Expr(self, node: ast.Expr) -> Any:
+        return self._next_hole() if _is_hole(node.value) else self.generic_visit(node)
+
+    def visit_Call(self, node: ast.Call) -> ast.AST:
+        has_hole = any(_is_hole(argument) for argument in node.args)
+        if not has_hole:
+            return self.generic_visit(node)
+        node.func = self.visit(node.func)
+        first = [self.visit(argument) for argument in node.args if not _is_hole(argument)]
+        other_arguments, other_keywords = self._next_hole()
+        node.args = [*first, *other_arguments]
+        named = [self.visit(keyword) for keyword in node.keywords]
+        node.keywords = [*named, *other_keywords]
+        return node
+
+    def visit(self, node: ast.AST) -> Any:
+        if _is_hole(node):
+            return self._next_hole()
+        for name, value in ast.iter_fields(node):
+            if isinstance(value, str) and not isinstance(node, ast.Constant):
+                setattr(node, name, self._names.get((_kind(node, value), value), value))
+        return super().visit(node)
+
+
+def _nothing_matches(edit: Edit, pattern: list[ast.stmt], scopes: Sequence[ast.AST]) -> str:
+    """Describe what looks most like a pattern that matches nothing."""
+    where = f" in {edit.scope}" if edit.scope else ""
+    lines = [f"matches nothing{where}, must match once: {edit.find}"]
+    wanted = ast.unparse(pattern[0]).partition("\n")[0]
+    texts = {}
+    for node in _below(scopes):
+        if isinstance(node, ast.stmt | ast.expr):
+            texts[ast.unparse(node).partition("\n")[0]] = node.lineno
+    similar = get_close_matches(wanted, texts, n=1)
+    if similar:
+        lines.append(f"nearest, in line {texts[similar[0]]}: {similar[0]}")
+    return "\n    ".join(lines)
+
+
+_TOKEN = re.compile(
+    r"""
+    (?P<blank> \s+ | //[^\n]* | /\*.*?\*/ )
+    | "(?:\\.|[^"\\])*" | '(?:\\.|[^'\\])*' | `(?:\\.|[^`\\])*`
+    | [A-Za-z_$][\w$]* | \d[\w.]* | .
+    """,
+    re.VERBOSE | re.DOTALL,
+)
+
+
+class _Token(NamedTuple):
+    text: str
+    start: int
+    end: int
+
+
+def tokens(source: str) -> list[_Token]:
+    """Return the tokens of C or JavaScript without whitespace and comments."""
+    found = [match for match in _TOKEN.finditer(source) if match["blank"] is None]
+    return [_Token(match[0], match.start(), match.end()) for match in found]
+
+
+def _plant_tokens(edit: Edit, source: str) -> str:
+    code = tokens(source)
+    texts = [token.text for token in code]
+    pattern = [token.text for token in tokens(edit.find)]
+    first, last = _function_span(edit, texts) if edit.scope else (0, len(code))
+    starts = range(first, last - len(pattern) + 1)
+    matches = [start for start in starts if texts[start : start + len(pattern)] == pattern]
+    if len(matches) != 1:
+        lines = [source.count("\n", 0, code[start].start) + 1 for start in matches]
+        where = f" of {edit.scope}" if edit.scope else ""
+        count = f"matches in lines {', '.join(map(str, lines))}" if lines else "matches nothing"
+        similar = get_close_matches(edit.find, source.splitlines(), n=1, cutoff=0.4)
+        hint = f"\n    nearest: {similar[0].strip()}" if similar and not lines else ""
+        raise StaleEdit(f"{count}{where}, must match once: {edit.find}{hint}")
+    begin = code[matches[0]].start
+    end = code[matches[0] + len(pattern) - 1].end
+    return source[:begin] + edit.replace.strip() + source[end:]
+
+
+def _function_span(edit: Edit, texts: Sequence[str]) -> tuple[int, int]:
+    """Return the first token of a function's definition, and the one after its last."""
+    for index, text in enumerate(texts):
+        if text != edit.scope or texts[index + 1 : index + 2] != ["("]:
+            continue
+        body = _closing(texts, index + 1) + 1
+        if texts[body : body + 1] == ["{"]:
+            return index, _closing(texts, body) + 1
+    raise StaleEdit(f"has no function {edit.scope}")
+
+
+def _closing(texts: Sequence[str], opening: int) -> int:
+    """Return the index of the bracket that closes another one."""
+    depth = 0
+    for index in range(opening, len(texts)):
+        depth += (texts[index] in "([{") - (texts[index] in ")]}")
+        if depth == 0:
+            return index
+    return len(texts)

@@ -59,8 +59,8 @@ def gateway(
     require_gateway()
     if certificate or key:
         raise InputError(
-            "--certificate and --key must be left out: TLS is of a reverse proxy, such as Caddy or "
-            "nginx, before a gateway on 127.0.0.1; docs/how-to/deployment.md has the lines for both"
+            "--certificate and --key are not supported; terminate TLS in a reverse proxy in front "
+            "of a gateway on 127.0.0.1 (docs/how-to/deployment.md)"
         )
     from controller.api.link import find_socket
     from controller.gateway.app import serve

@@ -491,8 +491,8 @@ class Ledger:
             if level > highest * TOLERANCE:
                 return refused(
                     channel,
-                    f"level of all layers must be at most {highest:g}, got {level:g}; lower the "
-                    "levels, or let what plays end first",
+                    f"sum of layer levels must be at most {highest:g}, got {level:g}; lower the "
+                    "levels, or wait for current layers to end",
                 )
         if power > self.limits.power * TOLERANCE:
             return CommandRefused(

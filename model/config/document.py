@@ -197,7 +197,7 @@ def decoded(source: str, content: bytes) -> str:
         return content.decode("utf-8")
     except UnicodeDecodeError as error:
         line = content.count(b"\n", 0, error.start) + 1
-        message = f"byte 0x{content[error.start]:02x} is no UTF-8; save the file as UTF-8"
+        message = f"byte 0x{content[error.start]:02x} is not valid UTF-8; save the file as UTF-8"
         raise ConfigError(source, [ConfigProblem(line, "", message)]) from error
 
 

@@ -129,16 +129,16 @@ def _check_wiring(verdict: Verdict) -> None:
     """Raise InputError for channels that drive another ERA or have the opposite sign."""
     for cycle in cycles(verdict.channels):
         raise InputError(
-            f"channels must drive the ERAs of the rig, got swapped ones: those of "
-            f"{_joined([each.era for each in cycle])} drive each other's ERA, as it looks; correct "
-            "the plugs, the names in the file, or the channels in the rig, or the sensors' "
-            "positions if they are mirrored, and measure again"
+            "channels must drive the ERAs of the rig; the channels of "
+            f"{_joined([each.era for each in cycle])} appear to be swapped. Correct the plugs, the "
+            "names in the file, or the channels in the rig (or the sensors' positions if they are "
+            "mirrored), and measure again"
         )
     for channel in verdict.channels:
         if "other ERA" in channel.states:
             raise InputError(
-                f"channels must drive the ERAs of the rig, got ERA {channel.drives} driven by that "
-                f"of {channel.era}, as it looks; correct the plug or the names in the file"
+                f"channels must drive the ERAs of the rig; the channel of {channel.era} appears to "
+                f"drive ERA {channel.drives}. Correct the plug or the names in the file"
             )
     inverted = [channel.era for channel in verdict.channels if "inverted" in channel.states]
     if inverted:
@@ -719,8 +719,8 @@ def _wrong_size(key: str, in_rig: float, measured: float) -> InputError:
     """Error for a side [m] of the plate, by its key, where another size fits the responses."""
     rig_has, fits = (in_display_unit(side, "m", digits=4) for side in (in_rig, measured))
     return InputError(
-        f"{key} must be that of the measured plate, got {rig_has} in the rig while responses fit "
-        f"{fits}, as it looks; measure it, and correct the rig or take its own measurement"
+        f"{key} must match the measured plate, got {rig_has} in the rig; the responses fit {fits}. "
+        "Measure the plate and correct the rig, or use the measurement of this plate"
     )
 
 

@@ -460,8 +460,8 @@ def _check_quantity(plate: SensedPlate, shapes: ShapeMatch, values: ComplexArray
         return
     if gap < np.log(_MAX_GAIN):
         raise InputError(
-            f"responses must be acceleration per base displacement in 1/s², got {name}, as "
-            f"it looks: all are {np.exp(level):.3g} of what the rig predicts; {remedy}"
+            "responses must be acceleration per base displacement in 1/s²; values appear to be in "
+            f"{name}: all are {np.exp(level):.3g} times the prediction; {remedy}"
         )
     raise InputError(
         f"responses must be those of the rig to a factor of {_MAX_GAIN:g}, got "
@@ -474,10 +474,10 @@ def _check_phases(plate: SensedPlate, shapes: ShapeMatch, values: ComplexArray) 
     match, other = (best_wiring(plate, each, shapes) for each in (values, values.conj()))
     if other.fit.cost < match.fit.cost - MIN_COST_REDUCTION:
         raise InputError(
-            "phases must be for exp(+i omega t), got conjugated ones, as it looks: with the signs "
-            "of all imaginary parts changed the plate explains the responses better "
+            "phases must be for exp(+i omega t), but appear to be conjugated: with the signs of "
+            "all imaginary parts changed, the model fits better "
             f"({100 * other.error:.1f} % unexplained instead of {100 * match.error:.1f} %); "
-            "change them"
+            "change the signs"
         )
 
 

@@ -98,9 +98,9 @@ function showBanner() {
     const mayPlay = silences.filter(({ silence }) => silence === "may_play");
     text = `The link to an amplifier is lost${since}. `;
     const after = watchdog ? ` after ${watchdog}\u00a0s` : "";
-    if (silences.length && !mayPlay.length) text += `Its watchdog must have silenced it${after}, unconfirmed.`;
-    else if (mayPlay.some(({ may_play_for_s }) => may_play_for_s === null)) text += "It may play until it is switched off.";
-    else text += `It may still be energised; its watchdog silences it${after}, unconfirmed.`;
+    if (silences.length && !mayPlay.length) text += `Its watchdog should have silenced it${after} (not confirmed).`;
+    else if (mayPlay.some(({ may_play_for_s }) => may_play_for_s === null)) text += "It can play until it is switched off.";
+    else text += `It may still be energised; its watchdog silences it${after} (not confirmed).`;
   } else if (daemon?.rig.simulated) {
     reason = "simulated";
     text = "Simulated amplifiers: nothing vibrates.";

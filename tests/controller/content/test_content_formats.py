@@ -589,7 +589,7 @@ def test_named_contents_are_felt(tmp_path: Path) -> None:
         ("ahap", '{"Pattern": [', ":1: is not valid JSON: .*; its end is missing: export it again"),
         ("haptic", b" " * (2 << 20) + b"{}", "is larger than 2 MiB; shorten the content"),
         ("haptic", '{"a": [1,]}', "is not valid JSON"),
-        ("ahap", b'{\n"\xff"}', ":2: byte 0xff is no UTF-8"),
+        ("ahap", b'{\n"\xff"}', ":2: byte 0xff is not valid UTF-8"),
         ("ahap", '{"a":\n' + "[" * 20 + "]" * 20 + "}", ":2: is nested more than 20 levels deep"),
         pytest.param(
             "ahap",

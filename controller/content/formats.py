@@ -24,6 +24,7 @@ import math
 import re
 from bisect import bisect_left, bisect_right
 from collections import Counter
+from collections.abc import Sequence
 from operator import attrgetter, itemgetter
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeAlias
@@ -281,11 +282,16 @@ class _AhapReading:
             if n
         ]
         clamped = [
-            f"{name}: {counted(len(values), 'value')} out of range clamped, "
-            f"from {min(values):g} to {max(values):g}"
+            f"{name}: {counted(len(values), 'value')} out of range clamped, got {_span(values)}"
             for name, values in self._clamped.items()
         ]
         return (*parameters, *skipped, *clamped)
+
+
+def _span(values: Sequence[float]) -> str:
+    """Format the least and the greatest of values, or one value."""
+    least, greatest = min(values), max(values)
+    return f"{least:g}" if least == greatest else f"{least:g} to {greatest:g}"
 
 
 def _segments(values: dict[str, float], controls: dict[str, _Control]) -> list[Segment]:

@@ -33,6 +33,7 @@ _NORMAL_MODES, _FIRST_ORDER, _SECOND_ORDER = 2, 3, 7
 _MODES = (_NORMAL_MODES, _FIRST_ORDER, _SECOND_ORDER)
 _DISPLACEMENT = (0, 8)  # unknown, displacement
 _MAX_COMPLEX = 0.3  # imaginary part that a turned shape may have, relative to its real part
+_MAX_ROUNDING = 1.0  # Hz; below 0, of the frequencies of rigid-body modes
 _VALUES_A_ROW = 6
 _MAX_REALS = 14  # numbers of a mode before its shape; those that are left out are 0
 _HEAD = {55: (9, 6), 2414: (14, 9)}
@@ -85,6 +86,12 @@ def read_modes(path: Path, content: bytes) -> ModeShapes:
                 f"{path}: {name} of modes must be finite numbers up to {MAX_VALUE:g}; export them "
                 "again"
             )
+    lowest = float(modes.frequencies.min(initial=0.0))
+    if lowest < -_MAX_ROUNDING:
+        raise InputError(
+            f"{path}: frequencies of modes must be 0 Hz or above, got {lowest:g} Hz; export them "
+            "again"
+        )
     return modes
 
 

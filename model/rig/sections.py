@@ -42,6 +42,7 @@ from model.config.units import (
     TIME,
     Dimension,
 )
+from model.errors import InputError
 from model.finger import DEFAULT_THRESHOLD, THRESHOLDS
 from model.rig.actuator_keys import (
     MODES,
@@ -501,6 +502,12 @@ class SurfaceSection(Section):
         shapes = surface_shapes(str(path), digest, self.normal)
         notes = check_surface(str(path), digest, self.normal, self.mass)
         modulus, density, loss = homogeneous(shapes, self.mass)
+        if self.loss_factor is None and not 0 <= loss < 1:
+            raise InputError(
+                f"{path}: damping ratios must be from 0 to below 0.5 in most modes, got "
+                f"{loss / 2:g} in the median; export shares of critical damping, or give "
+                "surface.loss_factor"
+            )
         rings = shapes.outline if self.outline is None else self.outline
         surface = Surface(
             str(path),

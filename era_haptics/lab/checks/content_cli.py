@@ -262,7 +262,8 @@ class _Setting:
 
         pattern = pattern_of(file, self.channel)
         has_level = any(intensity > 0 for _, intensity in pattern.intensity)
-        if not has_level and not pattern.transients:
+        has_tap = any(transient.intensity > 0 for transient in pattern.transients)
+        if not has_level and not has_tap:
             raise InputError(f"{file}: is silent; there is nothing to check")
         results = [
             check_content(pattern, self.table, self.level_db_sl, at=position, quiet=self.quiet)

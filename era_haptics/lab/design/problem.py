@@ -7,7 +7,6 @@ rig's own, those with a name, and random ones."""
 
 import io
 import math
-import re
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -102,7 +101,8 @@ _OWN = "own"
 
 _MAX_LAYOUTS = 1_000_000
 
-_RANDOM = re.compile(r"random:(\d{1,9})")
+_RANDOM_PREFIX = "random:"
+_MAX_DIGITS = 9  # int() would take long for thousands of digits
 _TRIES = 20  # draws for each layout, of which some are there already
 
 NamedLayouts = dict[str, FloatArray]
@@ -626,10 +626,11 @@ def supported_layouts(
 
 def layouts_of(text: str, problem: DesignProblem) -> NamedLayouts:
     """The layouts of `random:N` or of a file; raises InputError for what is wrong in it."""
-    found = _RANDOM.fullmatch(text)
-    if found is None:
+    if not text.startswith(_RANDOM_PREFIX):
         return _layouts_of_file(Path(text), problem)
-    count = int(found[1])
+    number = text.removeprefix(_RANDOM_PREFIX)
+    is_number = number.isascii() and number.isdigit() and len(number) <= _MAX_DIGITS
+    count = int(number) if is_number else 0
     if not 1 <= count <= _MAX_LAYOUTS:
         raise InputError(f"layouts must be random:1 to random:{_MAX_LAYOUTS}, got {text}")
     return random_layouts(problem, count)

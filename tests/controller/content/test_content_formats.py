@@ -499,7 +499,7 @@ def test_what_apple_ignores_passes_and_is_said(read: Read) -> None:
         "'Flavour\\x1b'",
         "1 audio parameter left out: AudioPan",
         "1 audio event left out",
-        "HapticIntensity: 1 value out of range clamped, from 1.5 to 1.5",
+        "HapticIntensity: 1 value out of range clamped, got 1.5",
         "1 unknown key ignored: Colour",
     )
 

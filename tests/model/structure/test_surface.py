@@ -275,6 +275,30 @@ def test_promises_are_kept_where_each_mode_differs(
     assert not_knowing < knowing - 0.15
 
 
+@pytest.mark.parametrize("ratio", [-0.1, 0.5, 1.5])
+def test_modes_of_impossible_damping_are_refused(
+    modes: Mapping[str, FloatArray], tmp_path: Path, ratio: float
+) -> None:
+    """A loss factor, twice the damping ratio, is from 0 to 1; the rig may state one instead."""
+    path = _write(tmp_path, modes, damping_ratios=np.full(len(modes["frequencies"]), ratio))
+    with pytest.raises(
+        InputError, match=rf"modes\.npz: damping ratios must be .* got {ratio:g} in"
+    ):
+        load_rig(path)
+    path.write_text("surface: {modes: modes.npz, loss_factor: 0.02}" + ERAS)
+    assert load_rig(path).plate.loss_factor == 0.02
+
+
+def test_modes_below_zero_are_refused(modes: Mapping[str, FloatArray], tmp_path: Path) -> None:
+    """They would count as rigid-body modes, whose frequencies only rounding makes negative."""
+    frequencies = modes["frequencies"].copy()
+    frequencies[0] = -0.5
+    load_rig(_write(tmp_path, modes, frequencies=frequencies))
+    frequencies[5] *= -1
+    with pytest.raises(InputError, match=r"modes\.npz: frequencies of modes must be 0 Hz or above"):
+        load_rig(_write(tmp_path, modes, frequencies=frequencies))
+
+
 def test_cut_out_has_no_fingers(modes: Mapping[str, FloatArray], tmp_path: Path) -> None:
     """Faces around a hole give two rings; a finger in the hole is refused, no cell is there.
 

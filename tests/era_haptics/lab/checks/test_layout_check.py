@@ -745,7 +745,7 @@ def test_sweep_keeps_its_level_but_not_its_sharpness(tmp_path: Path) -> None:
 
 @pytest.mark.usefixtures("plain_pictures")
 def test_folder_is_listed_with_a_line_for_each_file(tmp_path: Path) -> None:
-    """Files of its subfolders, too; not files of other kinds. One that cannot be read fails it."""
+    """Files of its subfolders, too; not other kinds. An unreadable or silent file fails it."""
     save_table(content_check_table(), tmp_path / "table.npz")
     folder = tmp_path / "contents"
     (folder / "taps").mkdir(parents=True)
@@ -760,9 +760,16 @@ def test_folder_is_listed_with_a_line_for_each_file(tmp_path: Path) -> None:
     assert re.fullmatch(rf" *\d+ % +100 % +0.110,0.130 +{re.escape(str(tick))}: good", row)
     assert last == "1 of 1 files keep at least 10 % of their level"
     (folder / "broken.haptic").write_text("{}")
+    silent_tap = {
+        "EventType": "HapticTransient",
+        "Time": 0,
+        "EventParameters": [{"ParameterID": "HapticIntensity", "ParameterValue": 0}],
+    }
+    (folder / "silent.ahap").write_text(json.dumps({"Pattern": [{"Event": silent_tap}]}))
     result = CliRunner().invoke(app, [*arguments, "--json"])
     assert result.exit_code == 1
-    broken, kept = json.loads(result.stdout)["contents"]
+    broken, silent, kept = json.loads(result.stdout)["contents"]
     assert broken["error"].startswith(str(folder / "broken.haptic"))
+    assert silent["error"] == f"{folder / 'silent.ahap'}: is silent; there is nothing to check"
     assert kept["file"] == str(tick)
     assert kept["kept_share"] >= 0.1

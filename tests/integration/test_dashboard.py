@@ -296,6 +296,8 @@ async def test_touches_become_contacts_of_the_daemon(page: Page, era: Client) ->
             "document.querySelector('#summary').textContent",
             lambda text: re.search(r"\b2\b.* dB SL.* dB ", text) is not None,
         )
+        scale = await page.evaluate("document.querySelector('#threshold-set').innerText")
+        assert scale == f"dB SL: {era.status().threshold}"
         await page.touch("touchMove", await on_plate(page, (0.2, 0.7), (0.6, 0.5)))
         await until_last(era, lambda x: abs(x - 0.6 * LENGTH) < 1e-3)
     assert await contacts(era, 0) == []

@@ -142,6 +142,7 @@ function withThisPage(text) {
 function showStatus(status) {
   showState(status.state, status.word, status.cause, status.epoch);
   ({ layouts } = status);
+  showThresholdSet(status.threshold);
   showLayouts(at("layout-choice"), at("layouts"), layouts, status.layout);
   watchdog = status.watchdog_s;
   silences = silencesOf(status);
@@ -150,6 +151,12 @@ function showStatus(status) {
     showLinkLoss(status.cause, status.remedy);
   }
   showBanner();
+}
+
+// Name the rig's threshold set, to which all levels in dB SL are relative.
+function showThresholdSet(name) {
+  at("threshold-set").textContent = `dB SL: ${name}`;
+  at("threshold-set").hidden = name === null;
 }
 
 const silencesOf = ({ amplifiers }) => amplifiers.map(({ silence }) => silence).filter(Boolean);

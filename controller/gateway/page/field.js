@@ -196,7 +196,7 @@ export class FieldView {
     const name = this.inMotion ? "motion" : this.isOfContents ? "felt" : "amplitude";
     new Uint32Array(image.data.buffer).set(RAMPS[name]);
     context.putImageData(image, 0, 0);
-    if (name === "felt") this.onScale(0, `${BRIGHTEST_DB} dB above threshold`);
+    if (name === "felt") this.onScale(0, `${BRIGHTEST_DB} dB SL`);
     else {
       this.onScale(this.inMotion ? -this.scale : 0, `${this.scale} m/s²`);
     }

@@ -158,8 +158,7 @@ soak: .venv/installed-test
 # True errors of responses in polynomials against their estimates, on 23 plates with 20 layouts;
 # some minutes. `make test` takes one plate with four.
 estimate-test: .venv/installed-test
-	OPENBLAS_NUM_THREADS=1 $(BIN)/python tests/support/error_estimates.py \
-		--write docs/measured/accuracy.md
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python tests/support/error_estimates.py
 
 # A curved glass by the modes that CalculiX computes, against its whole equations; some minutes.
 # Others: make surface-test SURFACE='--sets 200'

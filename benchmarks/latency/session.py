@@ -319,12 +319,6 @@ def _set_nice(process: int, nice: int) -> None:
         Path(f"/proc/{process}/autogroup").write_text(str(nice), "ascii")
 
 
-def peak_memory(pid: int) -> int:
-    """Return the most memory [bytes] that a process has had."""
-    status = Path(f"/proc/{pid}/status").read_text("ascii")
-    return 1024 * int(status.partition("VmHWM:")[2].split()[0])
-
-
 def computed(process: int) -> float:
     """Processor time [s] of all threads of a process so far; 0 where not reported."""
     total = 0

@@ -429,7 +429,7 @@ def kernels() -> Kernels | None:
 WITHOUT_KERNELS = "answers take 6 to 19 times as long without kernels in C"
 """Measured for steady vibrations of one finger to twenty that share, beside 0 to 6 quiet ones.
 
-On four and on twelve ERAs (python -m benchmarks.contents --sharing); clicks take 1.3 times as long.
+On four and on twelve ERAs; clicks take 1.3 times as long.
 """
 
 

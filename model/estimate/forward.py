@@ -189,7 +189,7 @@ class ParameterKind(ABC):
     """Largest standard deviation that drift leads to, 0 for `std`."""
     theory = 0.0
     """Error of a fitted value because of the plate theory: its change with viscous losses and
-    without shear deformation, for plates of 1.5 mm (docs/measured/identification.md)."""
+    without shear deformation, for plates of 1.5 mm."""
     stage = 2
     """When an identification searches it: 0 at first, 1 with the positions of masses, 2 last."""
     is_listed = False

@@ -276,7 +276,7 @@ _PAIR = (Strict(strict=False), AfterValidator(_ascending))
 Temperatures = Annotated[tuple[Temperature, Temperature], *_PAIR]
 Humidities = Annotated[tuple[Humidity, Humidity], *_PAIR]
 
-_AT_ENDS = 0.8  # benchmarks.promise.errors --weather: 86 to 94 % at both ends
+_AT_ENDS = 0.8  # benchmarks.promise weather: 86 to 94 % at both ends
 
 
 class PlateSection(Section):

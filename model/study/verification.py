@@ -287,7 +287,7 @@ CONTENT_TOLERANCE = 1e-4
 """Relative L2 error of the content; the paper's plate has some 1e-5, on its coarsest mesh 2e-5."""
 
 MODAL_ERROR = 0.03
-"""Coupling of modes by lossy layers and air, relative to the field (`benchmarks.layers`)."""
+"""Coupling of modes by lossy layers and air, relative to the field."""
 
 UNKNOWN_MODES_ERROR = 5e-3
 """Estimated compliance of a surface in modes that are not known, near points, to the field."""

@@ -85,7 +85,7 @@ _OBJECT_PLACES = Grid(6, 5)
 OBJECT_FACTOR = 6.0
 """Factor on the mean square of what it changes, which near fingers and ERAs is far more.
 
-Of benchmarks.promise.everyday, so that about eight of ten promises are kept.
+Chosen so that about 80 % of the promises are kept (`benchmarks.promise everyday`).
 """
 
 

@@ -200,7 +200,7 @@ def test_a_map_takes_little_memory_for_each_point(coarse_rig):
 def test_error_is_within_the_estimate_and_the_accuracy(name):
     """Wherever it is above 0.25 %: at most 1.4 times the estimate, and 1 % on mesh auto.
 
-    A part of the programme that prints docs/measured/accuracy.md.
+    A part of `make estimate-test`.
     """
     case = next(case for case in CASES if case.name == name)
     judged = judge(case, degrees=(-2, 0), every=6)

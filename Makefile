@@ -173,16 +173,16 @@ format: .venv/installed-test
 
 # Five minutes. Programs take turns, so that other load affects all of them.
 bench: .venv/installed-peers
-	$(BIN)/python -m benchmarks.plate
+	$(BIN)/python -m benchmarks.plate --report
 
 # Ten minutes, on a machine that is left alone.
 bench-latency: .venv/installed-test
 	$(BIN)/python -m benchmarks.latency --report
 
-# Five minutes: what fingers feel of several contents, beside what they were promised.
-# Others: make bench-promise PROMISE='--plates 8'
+# Promised and felt contrast through the complete signal chain; hours on two cores.
+# Others: make bench-promise PROMISE='--cases 0 --plates 8', or PROMISE=weather
 bench-promise: .venv/installed
-	$(BIN)/python -m benchmarks.promise --report $(PROMISE)
+	$(BIN)/python -m benchmarks.promise $(PROMISE)
 
 # The pages as a site, with warnings as errors; nothing in it comes from elsewhere.
 docs: .venv/installed-docs

@@ -29,7 +29,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.promise.cases import Case
-from benchmarks.promise.session import EARLY, Heard, Log, owner_of
+from benchmarks.promise.hearing import Heard, Log
 from benchmarks.setting import random_contacts
 from controller.content.formats import named_content, named_contents, read_content
 from controller.content.pattern import Pattern
@@ -145,7 +145,7 @@ def _patterns(folder: Path | None) -> Iterator[Pattern]:
             yield pattern
 
 
-CASE = Case("files", None)
+CASE = Case("files")
 _BEFORE, _AFTER = 0.3, 0.3  # s; of the quiet finger alone, and after the file
 
 
@@ -191,9 +191,8 @@ async def _run(pattern: Pattern, level_db_sl: float, pair: int, seed: int) -> tu
         on.at[0], since = at, threads.now()
         await on.hold(pattern.duration + _AFTER)
         promises = dict[int, float]()
+        log.note_owners(on.applied)
         for applied in on.applied:
-            owners = {number: owner_of(one) for number, one in applied.contents.items()}
-            log.own(owners, applied.time - EARLY)
             for one in applied.contents.values():
                 contrast = one.content.sensations[0].promised_contrast_db
                 promises.setdefault(one.content.key[1], contrast)

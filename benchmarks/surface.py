@@ -32,9 +32,10 @@ import yaml
 
 from benchmarks.calculix import RIG as GLASS
 from benchmarks.calculix import CurvedGlass, GlassOnEras
-from benchmarks.contents import promised_worst, share_kept
 from benchmarks.promise.cases import Case
-from benchmarks.promise.session import as_markdown, kept, on_plate
+from benchmarks.promise.contents import promised_worst, share_kept
+from benchmarks.promise.report import as_markdown, kept
+from benchmarks.promise.session import on_plate
 from benchmarks.setting import APART, RIG, random_contacts, write_parts
 from model.answer.answer_report import Timing
 from model.answer.plan import answer
@@ -189,7 +190,7 @@ def _through_the_wire(sets: int) -> tuple[list[str], bool]:
         for name, own in (("", {}), (", each mode drawn", OF_MODES)):
             file = Path(folder) / f"glass{len(name)}.yaml"
             file.write_text(f"{GLASS.read_text('utf-8')}uncertainty: {own}\n", "utf-8")
-            case = Case(f"three contents{name}", None, str(file.with_suffix("")), contents=3)
+            case = Case(f"three contents{name}", str(file.with_suffix("")), contents=3)
             timing = Timing(case.table)
             found[case] = [on_plate(case, timing, seed) for seed in range(sets)]
         rows = as_markdown(found)

@@ -1,30 +1,32 @@
-"""What is promised to each finger and what it feels, over the wire, on plates that deviate.
+"""Promised and felt contrast on plates within the tolerances: docs/measured/promise.md.
 
-    python -m benchmarks.promise [--plates 60] [--first 0] [--cases 1,2] [--workers 2] [--report]
+    python -m benchmarks.promise [--cases 1,2] [--plates 60] [--first 0] [--workers 2]
+    python -m benchmarks.promise contents|clicks|everyday|weather [--sets N] [--plates N]
 
-Fingers anywhere on the plate, 5 cm apart, with contents of 14 dB SL; another plate, ERAs, drives
-and fingertips for each set, drawn within the rig's uncertainty as by `era sim --seed`: the rig's
-own (default), or one as after `era rig identify` (identified). Control loop, serial lines and
-amplifiers run in virtual time, the plate in time under the fingers; contrast is the least over the
-sets of thresholds by which promises hold. With --report, the page
-docs/measured/promise.md is written as well. Exits with status 1 unless 80 to 98 % of the
-promises are kept, of the default and of the identified rigs each.
+Without a word: sessions through the complete signal chain, by the numbers of their cases. Each has
+a plate, ERAs, drives and fingertips of its own, drawn within the uncertainty of the rig; --first is
+the seed of the first plate, and cases with events, which take ten times as long, have a quarter of
+the plates. Control loop, serial lines and amplifiers run in virtual time, and the plate in time
+under the fingers. Exits with status 1 unless 80 to 98 % of the promises are kept, of default and of
+identified rigs each.
+
+contents: by number of ERAs. clicks: without the wire. everyday: hands, force, objects and people;
+--only WORD ... selects rows. weather: after its change.
 """
 
 import argparse
 import sys
+from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
-from pathlib import Path
 
+from benchmarks.promise import clicks, contents, everyday, weather
 from benchmarks.promise.cases import CASES
-from benchmarks.promise.session import Outcome, as_markdown, kept, outcome
-from benchmarks.setting import write_parts
+from benchmarks.promise.report import as_markdown, kept
+from benchmarks.promise.session import Outcome, outcome
 
 QUARTER = 4
-"""Part of the plates for cases with events, which take ten times as long."""
-
-PAGE = Path(__file__).parents[2] / "docs" / "measured" / "promise.md"
+"""Part of the plates for cases with events."""
 
 
 def main() -> None:
@@ -33,35 +35,57 @@ def main() -> None:
         description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("--plates", type=int, default=60)
+    parts = ("sessions", "contents", "clicks", "everyday", "weather")
+    parser.add_argument("part", nargs="?", choices=parts, default="sessions")
+    parser.add_argument("--cases", help="numbers of sessions from 0; default: all")
     parser.add_argument("--first", type=int, default=0, help="seed of the first plate")
-    parser.add_argument("--cases", help="numbers from 0, in the order of the table; default: all")
     parser.add_argument("--workers", type=int, default=2)
-    parser.add_argument("--report", action="store_true")
+    parser.add_argument("--plates", type=int, help="of each case, or of each set of fingers")
+    parser.add_argument("--sets", type=int, help="of fingers")
+    parser.add_argument("--only", nargs="+", default=[""], help="words in the rows of everyday")
     options = parser.parse_args()
+    if options.part == "contents":
+        contents.run(options.sets or 240)
+    elif options.part == "clicks":
+        clicks.run(options.sets or 60, options.plates or 4)
+    elif options.part == "everyday":
+        everyday.run(options.sets or 20, options.plates or 60, options.only)
+    elif options.part == "weather":
+        weather.run(options.sets or 16, options.plates or 40)
+    else:
+        numbers = list(range(len(CASES)))
+        if options.cases:
+            numbers = [int(number) for number in options.cases.split(",")]
+        outcomes = sessions(numbers, options.plates or 60, options.first, options.workers)
+        print(as_markdown({CASES[number]: results for number, results in outcomes.items()}))
+        sys.exit(not are_kept(outcomes))
 
-    numbers = [int(n) for n in options.cases.split(",")] if options.cases else [*range(len(CASES))]
-    jobs = [
-        (number, options.first + plate)
-        for number in numbers
-        for plate in range(max(1, options.plates // (QUARTER if CASES[number].events else 1)))
-    ]
-    found: dict[int, list[Outcome]] = {number: [] for number in numbers}
-    with ProcessPoolExecutor(options.workers, mp_context=get_context("spawn")) as pool:
-        running = [(number, pool.submit(outcome, number, seed)) for number, seed in jobs]
-        for number, job in running:
-            found[number].append(job.result())
+
+def sessions(
+    numbers: Sequence[int], plates: int, first: int, workers: int
+) -> dict[int, list[Outcome]]:
+    """Run sessions of some cases in processes of their own."""
+    outcomes: dict[int, list[Outcome]] = {number: [] for number in numbers}
+    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
+        jobs = []
+        for number in numbers:
+            count = max(1, plates // QUARTER) if CASES[number].events else plates
+            for seed in range(first, first + count):
+                jobs.append((number, pool.submit(outcome, number, seed)))
+        for number, job in jobs:
+            outcomes[number].append(job.result())
             print(".", end="", flush=True, file=sys.stderr)
-    text = as_markdown({CASES[number]: each for number, each in found.items()})
-    print(f"\n{text}")
-    if options.report:
-        run = f"python -m benchmarks.promise --plates {options.plates} --report"
-        write_parts(PAGE, {"figures": f"Printed by `{run}`.\n\n{text}"})
+    print(file=sys.stderr)
+    return outcomes
+
+
+def are_kept(outcomes: dict[int, list[Outcome]]) -> bool:
+    """Whether 80 to 98 % of the promises of steady contents are kept."""
     by_rig: dict[bool, list[Outcome]] = {}
-    for number, each in found.items():
+    for number, results in outcomes.items():
         if not CASES[number].clicks:
-            by_rig.setdefault(CASES[number].is_identified, []).extend(each)
-    sys.exit(not all(0.80 <= kept(each) <= 0.98 for each in by_rig.values()))
+            by_rig.setdefault(CASES[number].is_identified, []).extend(results)
+    return all(0.80 <= kept(results) <= 0.98 for results in by_rig.values())
 
 
 if __name__ == "__main__":

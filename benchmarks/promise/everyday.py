@@ -1,282 +1,277 @@
-"""Whether promises are kept beside hands and objects, under fingers that press, and by a person.
+"""Promises next to hands and objects, under force, and for other people.
 
-    python -m benchmarks.promise.everyday [--sets 20] [--plates 60] [--only WORD ...] [--rigs N ...]
+    python -m benchmarks.promise everyday [--only WORD ...]
 
-Two contents of 14 dB SL at fingers at least 5 cm apart, on plates solved exactly and drawn within
-the uncertainty of a rig. The heel of a hand is four patches 25 mm apart, whose loads together are
-so many fingertips'; those of a hand of another size are farther apart, and the hand that is far is
-one. An object lies anywhere, 3 cm from fingers or more: its mass on a contact spring of 100 kN/m;
-expected, `uncertainty.foreign_mass` says so. Surplus fingers are as far from others. Each row: the
-promise at the worst finger (median, worst tenth) [dB], share of the promises that is kept, and what
-nine of ten plates lack to it [dB].
+Two contents of 14 dB SL at fingers at least 5 cm apart, on plates that are solved exactly and drawn
+within the uncertainty of a rig. The heel of a hand is four patches 25 mm apart, which together have
+the load of so many fingertips. The patches of a larger hand are farther apart; a hand in a corner
+is a single patch. An object is a mass on a contact spring of 100 kN/m, and surplus fingers feel
+nothing; both are anywhere, at least 3 cm from other fingers. Each cell has the promise to the worst
+finger, median (worst 10 %), and the share of promises that is kept.
 """
 
-import argparse
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from benchmarks.promise.cases import Case
+from benchmarks.promise.cases import LEVEL_DB_SL, RIGS, Case, Point
 from benchmarks.setting import random_contacts
 from controller.sources.touch import HAND_MAJOR, IN_MM, LIGHT_FORCE
 from model.answer.answer import Answer
 from model.answer.plan import answer
 from model.answer.stimulus import Finger, Stimulus
-from model.arrays import FloatArray, Point
+from model.arrays import FloatArray
 from model.finger import FINGERTIP_RADIUS, decibels
 from model.structure.attachments import Fingertip, FingertipLoad, object_load
 from model.study.verification import Plates, accelerations_on, draw_plates
 from model.table.table import LocalizationTable, read_fingertips
-from model.vibration import base_amplitudes
+from model.vibration import Excitation, base_amplitudes
 
-RIGS = (("paper_plate", False), ("paper_plate", True), ("car_display", True))
 OBJECT_AWAY = 0.03  # m
 PATCH = 0.0125  # m; of a patch of the heel from its middle, along x and along y
 OH_AND_CHOI = ((40.0, 3.5), (250.0, -7.0))
 """Thresholds of pressing fingers above those of the probe, by frequency [Hz] in dB."""
 STUDIED = (40.0, 100.0, 250.0, 500.0)
-"""Frequencies [Hz] at which a person deviates from the mean on their own, by 4 dB."""
+"""Frequencies [Hz] at which a person differs from the mean independently, by 4 dB."""
+OH_CHOI, DRAWN = "Oh and Choi", "drawn"
 
 
 @dataclass(frozen=True)
 class Situation:
-    """What differs from what the answer counts.
+    """Difference from the situation that the answer is computed for.
 
-    hand: how many fingertips' load it has, 0 for none; distance [m]: of its middle from the nearer
-    finger, 0 for the corner farthest from both; is_counted: whether the answer counts a hand there,
-    and surplus fingers; force [N]: of all fingers; person: how their thresholds differ; fingertip:
-    of the uncertainty that the answer counts, None for that of the rig; mass [kg]: of an object
-    that lies anywhere, 0 for none, which the answer counts as a hand; size, reported [mm]: of the
-    hand's longer axis, and what its source reports; surplus: number of fingers that feel nothing.
+    hand: its load in fingertips, 0 for none; distance [m]: of its middle from the nearer finger, 0
+    for the corner farthest from both; size, reported [mm]: longer axis of the hand, and the value
+    that the touch source reports. surplus: number of fingers that feel nothing. mass [kg]: of an
+    object. is_counted: whether the answer counts the hand, the surplus fingers or the object. force
+    [N]: of all fingers; fingertip: uncertainty that the answer counts, None for the rig's. person:
+    the difference of the thresholds.
     """
 
     name: str
     hand: float = 0.0
-    distance: float = 0.0
-    force: float = LIGHT_FORCE
-    person: str = ""
-    is_counted: bool = True
-    fingertip: float | None = None
-    mass: float = 0.0
+    distance: float = 0.09
     size: float = HAND_MAJOR
     reported: float = HAND_MAJOR
     surplus: int = 0
+    mass: float = 0.0
+    is_counted: bool = True
+    force: float = LIGHT_FORCE
+    fingertip: float | None = None
+    person: str = ""
 
 
 def situations() -> Iterator[Situation]:
-    """The rows of a rig."""
-    palm = Situation("hand of 40 fingertips and 75 mm, of unknown size", 40, 0.09, size=75.0)
-    yield from (
-        Situation("as asked"),
-        replace(palm, name="hand of 40 fingertips and 75 mm, unseen", is_counted=False),
-        palm,
-        replace(palm, name="hand of 40 fingertips and 75 mm, with its size", reported=75.0),
-        Situation("ten surplus fingers, not counted", surplus=10, is_counted=False),
-        Situation("ten surplus fingers, counted", surplus=10),
-    )
-    for load, distance, where in (
-        (20, 0.09, "9 cm away"),
-        (5, 0.09, "9 cm away"),
-        (10, 0.0, "far"),
+    """Yield the rows of the table."""
+    yield Situation("none of these")
+    palm = Situation("hand of 40 fingertips", 40, size=75.0)
+    yield replace(palm, name=f"{palm.name}, not counted", is_counted=False)
+    yield replace(palm, name=f"{palm.name}, counted with unknown size")
+    yield replace(palm, name=f"{palm.name}, counted with its size", reported=75.0)
+    for counted in (
+        Situation("hand of 20 fingertips", 20),
+        Situation("hand of 10 fingertips, far", 10, distance=0.0),
+        Situation("ten surplus fingers", surplus=10),
+        Situation("pen of 5 g", mass=0.005),
+        Situation("phone of 50 g", mass=0.05),
+        Situation("cup of 200 g", mass=0.2),
     ):
-        for is_counted in (False, True):
-            known = "seen" if is_counted else "unseen"
-            yield Situation(
-                f"hand of {load} fingertips, {where}, {known}",
-                load,
-                distance,
-                is_counted=is_counted,
-            )
-    for newtons in (0.3, 1.0, 2.0, 3.0):
-        yield Situation(f"force of {newtons:g} N", force=newtons)
-        yield Situation(f"force of {newtons:g} N, fingertip: 0.9", force=newtons, fingertip=0.9)
-    for name, mass in (("pen", 0.005), ("phone", 0.05), ("cup", 0.2)):
-        for is_counted in (False, True):
-            known = "expected" if is_counted else "not expected"
-            grams = f"{1000 * mass:g} g"
-            yield Situation(f"{name} of {grams}, {known}", mass=mass, is_counted=is_counted)
-    yield Situation("person, as Oh and Choi 2019", person="tilted")
-    yield Situation("person, 4 dB at four frequencies", person="drawn")
+        yield replace(counted, name=f"{counted.name}, not counted", is_counted=False)
+        yield replace(counted, name=f"{counted.name}, counted")
+    yield Situation("force of 1 N", force=1.0)
+    yield Situation("force of 2 N", force=2.0)
+    yield Situation("force of 2 N, fingertip: 0.9", force=2.0, fingertip=0.9)
+    yield Situation("force of 3 N", force=3.0)
+    yield Situation("person according to Oh and Choi", person=OH_CHOI)
+    yield Situation("person, 4 dB at four frequencies", person=DRAWN)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.promise.everyday",
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    parser.add_argument("--sets", type=int, default=20)
-    parser.add_argument("--plates", type=int, default=60)
-    parser.add_argument("--only", nargs="+", default=[""], help="words in the names of rows")
-    parser.add_argument("--rigs", nargs="+", type=int, default=[*range(len(RIGS))])
-    options = parser.parse_args()
-
-    print("| rig | | promised (10 %) | kept | nine of ten lack |\n|---|---|---|---|---|")
-    for name, known in [RIGS[number] for number in options.rigs]:
-        case = Case("", None, name, is_identified=known)
-        title = f"{len(case.rig.eras)} {'identified' if known else 'default'}"
-        for each in situations():
-            if not any(word in each.name for word in options.only):
-                continue
-            promised, above = [], []
-            for seed in range(options.sets):
-                found, plates = _row(
-                    case.table, each, np.random.default_rng([seed, 14]), options.plates
-                )
-                promised.append(min(x.promised_contrast_db or np.nan for x in found.fingers[:2]))
-                above.append(plates)
-            print(
-                f"| {title} | {each.name} | {np.median(promised):.1f} "
-                f"({np.percentile(promised, 10):.1f}) | "
-                f"{100 * np.mean(np.array(above) >= 0):.0f} % | "
-                f"{-np.percentile(np.concatenate(above, axis=1), 10):+.1f} |",
-                flush=True,
-            )
+def run(sets: int, plates: int, words: Sequence[str]) -> None:
+    """Print the rows with one of some words in their names."""
+    cases = [Case("", rig, is_identified=is_identified) for rig, is_identified in RIGS]
+    print(f"| {' | '.join(['', *(case.title.lstrip(', ') for case in cases)])} |")
+    print("|---" * (1 + len(cases)) + "|")
+    for situation in situations():
+        if any(word in situation.name for word in words):
+            cells = [_promised_and_kept(case.table, situation, sets, plates) for case in cases]
+            print(f"| {situation.name} | {' | '.join(cells)} |", flush=True)
 
 
-def _row(
-    table: LocalizationTable, of: Situation, rng: np.random.Generator, count: int
-) -> tuple[Answer, FloatArray]:
-    """An answer, and by how much plates are above its promises (2, d) [dB]."""
-    size = table.plate.length, table.plate.width
-    margin = FINGERTIP_RADIUS + 0.001
-    hand: Point | None = None
-    while True:
-        places = [(float(x), float(y)) for x, y in random_contacts(rng, 2, size, margin=margin)]
-        if not of.hand:
-            break
-        if (hand := _hand_at(rng, places, size, of.distance)) is not None:
-            break
-    changed = {} if of.fingertip is None else {"fingertip": of.fingertip}
-    if of.mass and of.is_counted:
-        changed["foreign_mass"] = of.mass
-    if changed:
-        table = replace(table, uncertainty=replace(table.uncertainty, **changed))
-    fingers = [Finger(at, Stimulus(14.0)) for at in places]
-    patches = _patches(table, places, hand, of, rng)
-    quiet = [Finger((each.x, each.y), is_protected=False) for each in patches[: of.surplus]]
-    if hand is not None:
-        quiet = [Finger(hand, load=IN_MM.load(touch_major=of.reported) or 0.0)]
-    found = answer(
-        table,
-        [*fingers, *(quiet if of.is_counted else [])],
-        drive_mode="phased",
-        min_contrast_db=-np.inf,
-    )
-    plates = draw_plates(
-        rng,
-        replace(
-            table.uncertainty, fingertip=0.0 if of.force != 0.5 else table.uncertainty.fingertip
-        ),
-        of=table,
-        count=count,
-        contact_count=2 + len(patches),
-    )
-    if of.mass:
-        plates.load[:, 2:] = 1.0
-    promised = [[x.promised_contrast_db or np.nan] for x in found.fingers[:2]]
-    return found, contrasts_on(table, found, plates, of, patches, rng) - np.array(promised)
+def _promised_and_kept(
+    table: LocalizationTable, situation: Situation, sets: int, plates: int
+) -> str:
+    promises, kept = [], []
+    for seed in range(sets):
+        scene = _Scene(table, situation, np.random.default_rng([seed, 14]))
+        best = scene.answer()
+        promised = np.array([each.promised_contrast_db for each in best.fingers[:2]], dtype=float)
+        promises.append(promised.min())
+        kept.append(scene.felt(best, plates) >= promised[:, None])
+    median, worst = np.median(promises), np.percentile(promises, 10)
+    return f"{median:.1f} ({worst:.1f}), {100 * np.mean(kept):.0f} %"
 
 
-def _hand_at(
-    rng: np.random.Generator,
-    places: Sequence[Point],
-    size: tuple[float, float],
-    distance: float,
-) -> Point | None:
-    """Where a hand rests: so far from the nearer finger, or in the corner farthest from both."""
-    margin = 2 * PATCH
-    if not distance:
-        corners = [(x, y) for x in (margin, size[0] - margin) for y in (margin, size[1] - margin)]
-        return max(corners, key=lambda at: min(np.hypot(*np.subtract(at, p)) for p in places))
-    for angle in (rng.uniform(0, 2 * np.pi) for _ in range(100)):
-        x, y = np.array(places[0]) + distance * np.array([np.cos(angle), np.sin(angle)])
-        is_on = margin <= x <= size[0] - margin and margin <= y <= size[1] - margin
-        if is_on and np.hypot(x - places[1][0], y - places[1][1]) >= distance:
-            return float(x), float(y)
-    return None
+class _Scene:
+    """Two fingers, and the loads of a situation, on plates of a table."""
 
+    def __init__(
+        self, table: LocalizationTable, situation: Situation, rng: np.random.Generator
+    ) -> None:
+        self._situation = situation
+        self._rng = rng
+        self._hand: Point | None = None
+        self._size = (table.plate.length, table.plate.width)
+        self._fingers = self._draw_fingers()
+        self._table = replace(table, uncertainty=replace(table.uncertainty, **self._known()))
+        self._loads = self._draw_loads(table.fingertip or Fingertip())
 
-def _patches(
-    table: LocalizationTable,
-    places: Sequence[Point],
-    hand: Point | None,
-    of: Situation,
-    rng: np.random.Generator,
-) -> list[FingertipLoad]:
-    """Loads of a hand's patches, or of objects or fingers at least 3 cm from others."""
-    tip, sides = table.fingertip or Fingertip(), (table.plate.length, table.plate.width)
-    if hand is None:
-        load, spots = object_load(of.mass) if of.mass else tip, list[Point]()
-        while len(spots) < of.surplus + (of.mass > 0):
-            at = float(rng.uniform(0, sides[0])), float(rng.uniform(0, sides[1]))
-            if min(math.dist(at, each) for each in (*places, *spots)) >= OBJECT_AWAY:
-                spots.append(at)
-        return [FingertipLoad(*at, load) for at in spots]
-    x, y = hand
-    if not of.distance:
-        return [FingertipLoad(x, y, tip.multiplied(of.hand))]
-    quarter = tip.multiplied(of.hand / 4)
-    ways = [each * PATCH * of.size / HAND_MAJOR for each in (-1, 1)]
-    return [FingertipLoad(x + a, y + b, quarter) for a in ways for b in ways]
+    def _known(self) -> dict[str, float]:
+        """Return the uncertainty that the answer counts in place of the rig's."""
+        known = {}
+        if self._situation.fingertip is not None:
+            known["fingertip"] = self._situation.fingertip
+        if self._situation.mass and self._situation.is_counted:
+            known["foreign_mass"] = self._situation.mass
+        return known
 
+    def _draw_fingers(self) -> list[Point]:
+        """Draw fingers that leave room for the hand."""
+        margin = FINGERTIP_RADIUS + 0.001
+        while True:
+            drawn = random_contacts(self._rng, 2, self._size, margin=margin)
+            fingers = [(float(x), float(y)) for x, y in drawn]
+            if not self._situation.hand:
+                return fingers
+            self._hand = self._draw_hand(fingers)
+            if self._hand is not None:
+                return fingers
 
-def contrasts_on(
-    table: LocalizationTable,
-    found: Answer,
-    plates: Plates,
-    of: Situation,
-    patches: list[FingertipLoad],
-    rng: np.random.Generator,
-) -> FloatArray:
-    """Contrast [dB] of both fingers to the other's content on plates solved exactly, (2, d).
+    def _draw_hand(self, fingers: Sequence[Point]) -> Point | None:
+        """Draw the middle of a hand near the first finger; None if there is no room."""
+        margin, distance = 2 * PATCH, self._situation.distance
+        low = np.full(2, margin)
+        high = np.array(self._size) - margin
+        if not distance:
+            corners = [(x, y) for x in (low[0], high[0]) for y in (low[1], high[1])]
+            return max(corners, key=lambda at: min(math.dist(at, finger) for finger in fingers))
+        for _ in range(100):
+            angle = self._rng.uniform(0, 2 * np.pi)
+            at = np.array(fingers[0]) + distance * np.array([np.cos(angle), np.sin(angle)])
+            is_on = bool(((low <= at) & (at <= high)).all())
+            if is_on and math.dist(at, fingers[1]) >= distance:
+                return float(at[0]), float(at[1])
+        return None
 
-    The least over all sets of thresholds; by those of a person if there is one.
-    """
-    tip, places = table.fingertip or Fingertip(), [each.at for each in found.asked[:2]]
-    pressed = tip.scaled((of.force / LIGHT_FORCE) ** (2 / 3))
-    loads = [*(FingertipLoad(*at, pressed) for at in places), *patches]
-    tips = read_fingertips(table, [(each.x, each.y) for each in loads])
-    shares, discs = tips.fine_weights[:2], tips.fine.astype(float)
-    count = len(plates.thickness)
-    sets = [*range(len(table.threshold_sets))]
-    power = np.zeros((len(sets), 2, 2, discs.shape[1], count))  # set, layer, finger, point, plate
-    offsets = rng.normal(scale=4.0, size=(count, len(STUDIED)))
-    for number, layer in enumerate(found.layers):
-        hertz, bases = base_amplitudes(layer.excitation, table.eras)
+    def _draw_loads(self, tip: Fingertip) -> list[FingertipLoad]:
+        """Return the loads of the hand, or of an object or surplus fingers."""
+        situation = self._situation
+        if self._hand is None:
+            load = object_load(situation.mass) if situation.mass else tip
+            positions: list[Point] = []
+            while len(positions) < situation.surplus + (situation.mass > 0):
+                x, y = self._rng.uniform(0, self._size[0]), self._rng.uniform(0, self._size[1])
+                others = [*self._fingers, *positions]
+                if min(math.dist((x, y), other) for other in others) >= OBJECT_AWAY:
+                    positions.append((float(x), float(y)))
+            return [FingertipLoad(x, y, load) for x, y in positions]
+        x, y = self._hand
+        if not situation.distance:
+            return [FingertipLoad(x, y, tip.multiplied(situation.hand))]
+        quarter = tip.multiplied(situation.hand / 4)
+        offset = PATCH * situation.size / HAND_MAJOR
+        offsets = (-offset, offset)
+        return [FingertipLoad(x + dx, y + dy, quarter) for dx in offsets for dy in offsets]
+
+    def answer(self) -> Answer:
+        """Return the answer to the situation as far as it is counted."""
+        fingers = [Finger(at, Stimulus(LEVEL_DB_SL)) for at in self._fingers]
+        quiet = []
+        if self._situation.is_counted and self._hand is not None:
+            load = IN_MM.load(touch_major=self._situation.reported) or 0.0
+            quiet = [Finger(self._hand, load=load)]
+        elif self._situation.is_counted:
+            surplus = self._loads[: self._situation.surplus]
+            quiet = [Finger((each.x, each.y), is_protected=False) for each in surplus]
+        return answer(self._table, [*fingers, *quiet], drive_mode="phased", min_contrast_db=-np.inf)
+
+    def felt(self, best: Answer, count: int) -> FloatArray:
+        """Return contrasts [dB] of both fingers on plates, the least over the sets, (2, count)."""
+        plates = self._draw_plates(count)
+        offset = self._thresholds_of_persons(best, count)
+        powers = np.array(
+            [
+                self._powers(layer.excitation, plates) / 10 ** (offset[number] / 10)
+                for number, layer in enumerate(best.layers)
+            ]
+        )  # layer, set, finger, point, plate
+        weights = read_fingertips(self._table, self._fingers).fine_weights
+        contrasts = []
+        # A person has thresholds of their own, in place of all sets.
+        for of_set in range(1 if self._situation.person else powers.shape[1]):
+            for finger in range(2):
+                own = weights[finger] @ np.sqrt(powers[finger, of_set, finger])
+                foreign = np.sqrt(powers[1 - finger, of_set, finger].max(axis=0))
+                contrasts.append(decibels(own / foreign))
+        return np.asarray(np.array(contrasts).reshape(-1, 2, count).min(axis=0))
+
+    def _draw_plates(self, count: int) -> Plates:
+        """Draw plates; a force that is stated has no further uncertainty."""
+        uncertainty = self._table.uncertainty
+        if self._situation.force != LIGHT_FORCE:
+            uncertainty = replace(uncertainty, fingertip=0.0)
+        contacts = 2 + len(self._loads)
+        plates = draw_plates(
+            self._rng, uncertainty, of=self._table, count=count, contact_count=contacts
+        )
+        if self._situation.mass:
+            plates.load[:, 2:] = 1.0
+        return plates
+
+    def _thresholds_of_persons(self, best: Answer, count: int) -> FloatArray:
+        """Thresholds of a person for each plate above the default ones, (layers, count) [dB]."""
+        offsets = self._rng.normal(scale=4.0, size=(count, len(STUDIED)))
+        logarithms = np.log([layer.frequency for layer in best.layers])
+        if self._situation.person == OH_CHOI:
+            frequencies, levels = np.transpose(OH_AND_CHOI)
+            return np.interp(logarithms, np.log(frequencies), levels)[:, None] * np.ones(count)
+        if self._situation.person == DRAWN:
+            persons = [np.interp(logarithms, np.log(STUDIED), each) for each in offsets]
+            return np.transpose(persons)
+        return np.zeros((len(best.layers), count))
+
+    def _powers(self, excitation: Excitation, plates: Plates) -> FloatArray:
+        """Powers relative to the threshold under both fingers, (sets, 2, points, plates)."""
+        table = self._table
+        tip = (table.fingertip or Fingertip()).scaled(
+            (self._situation.force / LIGHT_FORCE) ** (2 / 3)
+        )
+        loads = [*(FingertipLoad(*at, tip) for at in self._fingers), *self._loads]
+        discs = read_fingertips(table, [(each.x, each.y) for each in loads]).fine.astype(float)
+        hertz, bases = base_amplitudes(excitation, table.eras)
         rows = table.rows_of(hertz)
-        at = discs, loads
-        one = accelerations_on(table, *at, table.attached, rows, bases[:, None], plates)
+        drives = bases[:, None]
+        count = len(plates.thickness)
+        shape = (count, len(rows), len(loads), -1)
+
+        field = accelerations_on(table, discs, loads, table.attached, rows, drives, plates)
+        field = field[:, :, 0].reshape(shape)
+        relative = np.abs(bases) / table.highest_drives[rows]
+        error = np.sqrt((table.field_error_power[rows] * relative**2).sum(axis=1))
+        field = field + plates.deviation[:, None, :, None] * error[None, :, None, None]
+
         distorted = replace(plates, gain=plates.gain * plates.harmonic)
         twice = table.at_harmonics.plate
-        two = accelerations_on(table, *at, twice, rows, bases[:, None], distorted)
-        errors = np.abs(bases) / table.highest_drives[rows]
-        error = np.sqrt((table.field_error_power[rows] * errors**2).sum(axis=1))
-        one = one[:, :, 0].reshape(count, len(rows), len(loads), -1)
-        one = one + plates.deviation[:, None, :, None] * error[None, :, None, None]
-        two = two[:, :, 0].reshape(count, len(rows), len(loads), -1)
-        person = np.zeros(count)
-        if of.person == "tilted":
-            f, db = np.log(np.array(OH_AND_CHOI).T[0]), np.array(OH_AND_CHOI).T[1]
-            person += np.interp(np.log(hertz[0]), f, db)
-        elif of.person == "drawn":
-            at_f = np.log(hertz[0])
-            person += [np.interp(at_f, np.log(STUDIED), each) for each in offsets]
-        for s in sets:
-            by = (table.thresholds / table.sensitivities[s])[rows]
-            by_two = (table.compared_harmonic_thresholds / table.harmonic_sensitivities[s])[rows]
-            total = (np.abs(one) ** 2 / by[None, :, None, None] ** 2).sum(axis=1)
-            total += (np.abs(two) ** 2 / by_two[None, :, None, None] ** 2).sum(axis=1)
-            power[s, number] = (total / 10 ** (person / 10)[:, None, None]).transpose(1, 2, 0)[:2]
-    contrast = []
-    for s in sets if not of.person else [0]:
-        own = [shares[k] @ np.sqrt(power[s, k, k]) for k in range(2)]
-        other = [np.sqrt(power[s, 1 - k, k].max(axis=0)) for k in range(2)]
-        contrast.append(decibels(np.array(own) / np.array(other)))
-    return np.asarray(np.min(contrast, axis=0))
+        harmonic = accelerations_on(table, discs, loads, twice, rows, drives, distorted)
+        harmonic = harmonic[:, :, 0].reshape(shape)
 
-
-if __name__ == "__main__":
-    main()
+        powers = []
+        for of_set in range(len(table.threshold_sets)):
+            at_tone = (table.thresholds / table.sensitivities[of_set])[rows]
+            sensitivity = table.harmonic_sensitivities[of_set]
+            at_harmonic = (table.compared_harmonic_thresholds / sensitivity)[rows]
+            power = (np.abs(field) ** 2 / at_tone[None, :, None, None] ** 2).sum(axis=1)
+            power += (np.abs(harmonic) ** 2 / at_harmonic[None, :, None, None] ** 2).sum(axis=1)
+            powers.append(power[:, :2].transpose(1, 2, 0))
+        return np.array(powers)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import scipy.linalg
 
-from benchmarks.contents import share_kept
+from benchmarks.promise.contents import share_kept
 from benchmarks.setting import random_contacts
 from benchmarks.surface import exported_modes
 from cases import read_yaml

@@ -95,7 +95,7 @@ def share_kept(
         of=table,
         contact_count=len(placed.contacts),
     )
-    weights = read_fingertips(table, placed.contacts).fine_weights
+    weights = read_fingertips(table, placed.contacts).fine_weights.astype(float)
     powers = []  # of each layer (fingers, points, plates), relative to the threshold
     for layer in best.layers:
         rows, power = powers_on(table, placed, layer.excitation, plates)

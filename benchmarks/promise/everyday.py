@@ -232,13 +232,15 @@ class _Scene:
     def _thresholds_of_persons(self, best: Answer, count: int) -> FloatArray:
         """Thresholds of a person for each plate above the default ones, (layers, count) [dB]."""
         offsets = self._rng.normal(scale=4.0, size=(count, len(STUDIED)))
-        logarithms = np.log([layer.frequency for layer in best.layers])
+        tones = [layer.frequency or np.nan for layer in best.layers]
+        logarithms = np.log(tones)
         if self._situation.person == OH_CHOI:
             frequencies, levels = np.transpose(OH_AND_CHOI)
-            return np.interp(logarithms, np.log(frequencies), levels)[:, None] * np.ones(count)
+            offset = np.interp(logarithms, np.log(frequencies), levels)
+            return np.asarray(offset[:, None] * np.ones(count), dtype=float)
         if self._situation.person == DRAWN:
             persons = [np.interp(logarithms, np.log(STUDIED), each) for each in offsets]
-            return np.transpose(persons)
+            return np.asarray(np.transpose(persons), dtype=float)
         return np.zeros((len(best.layers), count))
 
     def _powers(self, excitation: Excitation, plates: Plates) -> FloatArray:

@@ -281,7 +281,7 @@ async def _first_to_accept(host: str, port: int, connection: _Connection) -> Por
     """Connect to the first address of a host that accepts (RFC 8305); raises OSError."""
     connect = asyncio.get_running_loop().create_connection
     take = [connection].pop  # the first address that accepts gets it, any other an IndexError
-    attempts = [partial(connect, take, each, port) for each in await _addresses(host)]
+    attempts = [partial(connect, take, each, port) for each in await host_addresses(host)]
     try:
         _, index, failures = await staggered_race(attempts, _NEXT_AFTER)
     except BaseException:
@@ -293,7 +293,7 @@ async def _first_to_accept(host: str, port: int, connection: _Connection) -> Por
     return connection
 
 
-async def _addresses(host: str) -> list[str]:
+async def host_addresses(host: str) -> list[str]:
     """Resolve a host name to at least one address; raises OSError."""
     try:
         return [str(ipaddress.ip_address(host))]
@@ -338,7 +338,7 @@ async def open_port(
 
     try:
         port = await in_thread(
-            lambda: _open_device(place), name=f"era-open {name}", undo=lambda port: port.close()
+            lambda: open_device(place), name=f"era-open {name}", undo=lambda port: port.close()
         )
     except (OSError, ValueError, termios.error) as error:  # of pyserial
         raise LinkError(
@@ -348,7 +348,8 @@ async def open_port(
     return SerialPort(port, name, on_data, on_loss)
 
 
-def _open_device(place: Endpoint) -> serial.Serial:
+def open_device(place: Endpoint) -> serial.Serial:
+    """Open a serial port or pseudo-terminal exclusively; raises errors of pyserial."""
     import termios
 
     # A pseudo-terminal has no parity and may refuse all settings if one is given.

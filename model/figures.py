@@ -313,7 +313,7 @@ def write_template(path: Path, template: Template) -> int:
     if path.suffix.lower() != ".pdf":
         save_figure(_page(template, template.paper, name="", edge=0.0), path)
         return 1
-    pages = [*_pages(template)]
+    pages = [*template_pages(template)]
     # Without a date, so that equal rigs make equal bytes.
     with whole_or_nothing(path) as stream, PdfPages(stream, metadata={"CreationDate": None}) as pdf:
         for page in pages:
@@ -321,7 +321,7 @@ def write_template(path: Path, template: Template) -> int:
     return len(pages)
 
 
-def _pages(template: Template) -> Iterator[Figure]:
+def template_pages(template: Template) -> Iterator[Figure]:
     """Yield A4 pages, upright or across, whichever takes fewer, from the top left on."""
     low, high, bottom, top = template.paper
     sizes = [(width - 2 * NOT_PRINTED, height - NOT_PRINTED - STRIP) for width, height in A4]

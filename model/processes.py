@@ -175,9 +175,9 @@ def on_cluster(
             )
         version = code_version()
         # Held on the cluster, so that the scheduler can repeat it if its worker is lost.
-        held = client.submit(_run_same_code, version, _itself, shared, pure=False)
+        held = client.submit(run_same_code, version, _itself, shared, pure=False)
         numbers = {
-            client.submit(_run_same_code, version, solve, held, task, pure=False): n
+            client.submit(run_same_code, version, solve, held, task, pure=False): n
             for n, task in tasks.items()
         }
         try:
@@ -195,7 +195,7 @@ def _itself(shared: Shared) -> Shared:
     return shared
 
 
-def _run_same_code(version: str, function: Callable[..., Any], *arguments: Any) -> Any:
+def run_same_code(version: str, function: Callable[..., Any], *arguments: Any) -> Any:
     """Call a function on a machine that must run the code of this version."""
     if version != code_version():
         raise InputError(

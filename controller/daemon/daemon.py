@@ -359,7 +359,7 @@ def run_daemon(path: Path, *, dashboard: str | None, trace: Path | None = None) 
         stack.callback(lock.release)
         log = start_log(config.log_file, level=config.section.log.level)
         stack.callback(log.close)
-        _run(config, lock, log=log, dashboard=address or _page_of_file(config))
+        run_until_stopped(config, lock, log=log, dashboard=address or _page_of_file(config))
     atexit.register(leave_work)
 
 
@@ -426,10 +426,13 @@ def _check_log_file(config: DaemonConfig) -> None:
         ) from error
 
 
-def _run(config: DaemonConfig, lock: SocketLock, *, log: LogThread, dashboard: str | None) -> None:
+def run_until_stopped(
+    config: DaemonConfig, lock: SocketLock, *, log: LogThread, dashboard: str | None
+) -> None:
+    """Prepare the table and serve until the daemon is terminated."""
     manager = ServiceManager()
     manager.notify("STATUS=preparing the localization table")
-    table = _table(config)
+    table = prepared_table(config)
     sys.setswitchinterval(_SWITCH_INTERVAL)
 
     async def run() -> None:
@@ -458,7 +461,8 @@ def _load_table(config: DaemonConfig, file: Path) -> LocalizationTable:
         raise ConfigError(document.source, [problem]) from error
 
 
-def _table(config: DaemonConfig) -> LocalizationTable:
+def prepared_table(config: DaemonConfig) -> LocalizationTable:
+    """Load the table that the configuration names, or build the one of its rig."""
     kernels()  # may be compiled, which must not be in the event loop
     if config.table is not None:
         return _load_table(config, config.table)

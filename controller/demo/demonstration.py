@@ -237,8 +237,10 @@ async def run_demo(
                         watchdog=SIMULATED_WATCHDOG,
                     )
                     serving = tasks.create_task(daemon.run(lock))
-                    arming = tasks.create_task(_keep_armed(daemon, config.socket, recorder))
-                    playing = tasks.create_task(_play(scenes, touches, recorder, config.socket))
+                    arming = tasks.create_task(keep_armed(daemon, config.socket, recorder))
+                    playing = tasks.create_task(
+                        play_scenes(scenes, touches, recorder, config.socket)
+                    )
                     await asyncio.wait({serving, playing}, return_when=asyncio.FIRST_COMPLETED)
                     if not playing.done():  # a signal has ended the daemon
                         raise KeyboardInterrupt
@@ -357,7 +359,7 @@ def check_page(address: str) -> None:
         ) from error
 
 
-async def _keep_armed(daemon: Daemon, path: Path, recorder: TouchRecorder) -> None:
+async def keep_armed(daemon: Daemon, path: Path, recorder: TouchRecorder) -> None:
     """Arm a daemon at a socket, and again after every fault, as of a machine that stalled.
 
     Raises LinkError if that takes too long.
@@ -390,7 +392,7 @@ async def _armed(era: AsyncClient) -> str:
         await asyncio.sleep(_PAUSE)
 
 
-async def _play(
+async def play_scenes(
     scenes: Sequence[Scene],
     touches: RecordedTouches,
     recorder: TouchRecorder,

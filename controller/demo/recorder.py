@@ -289,15 +289,16 @@ async def simulated_plate(
                 base = f"sim://{quote(os.fsencode(rig_file))}?control={quote(os.fsencode(path))}&{plate}&amplifier="
                 urls = {name: base + quote(name) for name in amplifiers}
             else:
-                process = await _start(rig_file, wire=wire, control=path, seed=seed)
-                stack.push_async_callback(_terminate, process)
+                process = await start_simulation(rig_file, wire=wire, control=path, seed=seed)
+                stack.push_async_callback(end_simulation, process)
                 urls = await _read_urls(process, count=len(amplifiers))
             yield SimulatedPlate(path, urls, thresholds=thresholds)
 
 
-async def _start(
+async def start_simulation(
     rig_file: Path, *, wire: str, control: Path, seed: int | None
 ) -> asyncio.subprocess.Process:
+    """Start simulated amplifiers as a process that ends with this one."""
     return await asyncio.create_subprocess_exec(
         # -P: do not import a folder named sim in the working directory
         sys.executable,
@@ -334,7 +335,8 @@ async def _read_urls(process: asyncio.subprocess.Process, *, count: int) -> dict
     return urls
 
 
-async def _terminate(process: asyncio.subprocess.Process) -> None:
+async def end_simulation(process: asyncio.subprocess.Process) -> None:
+    """Terminate the process of simulated amplifiers, and wait until it has ended."""
     with contextlib.suppress(ProcessLookupError):
         process.terminate()
     await ended(process, EXIT_TIMEOUT)

@@ -626,7 +626,7 @@ class Clocks:
                 interval = max(least, busy[line] / _MAX_LOAD) / len(of_line)
                 for number in range(1, int(HEARTBEAT / interval)):
                     loop.call_later(
-                        self.later(number * interval), self._read, next(self._turns[line])
+                        self.later(number * interval), self.read_clock, next(self._turns[line])
                     )
 
     def later(self, duration: float = 0.0) -> float:
@@ -634,7 +634,7 @@ class Clocks:
         self._dither = (self._dither + _GOLDEN) % 1.0
         return duration + self._dither * _FRAME
 
-    def _read(self, amplifier: Amplifier) -> None:
+    def read_clock(self, amplifier: Amplifier) -> None:
         """Read the status of an amplifier, if it replies, can be steered and is not being read."""
         reading = self._readings.get(amplifier)
         is_free = amplifier.clock.can_be_steered and (reading is None or reading.done())

@@ -244,7 +244,7 @@ class AduReader:
         """Return what the rest is, which a pause has ended."""
         data, found = self.rest, list[Adu]()
         if self._is_rtu and data:
-            whole = _checked(data)
+            whole = checked_adu(data)
             found = [whole] if whole else self._split_rtu(data, None, waits=False)
             data = b"" if whole else self.rest
         self.rest, self._is_lost = b"", False
@@ -257,7 +257,7 @@ class AduReader:
         while start < len(data):
             size = self._size(data[start : start + RTU_MAX])
             is_whole = 0 < size <= len(data) - start
-            adu = _checked(data[start : start + size]) if is_whole else None
+            adu = checked_adu(data[start : start + size]) if is_whole else None
             is_behind = self._is_lost or start > 0
             if adu and not (is_behind and self._is_host and response_to(request, adu) is None):
                 if start:
@@ -293,7 +293,7 @@ class AduReader:
         return size if size <= RTU_MAX else 0
 
 
-def _checked(frame: bytes) -> Adu | None:
+def checked_adu(frame: bytes) -> Adu | None:
     """Return what an RTU frame holds if its CRC is valid, else None."""
     if len(frame) < _RTU_MIN:
         return None

@@ -108,8 +108,8 @@ class AtOneFrequency(SpectralPlate):
         moduli = [each + own_loss * each.real for each in moduli]
         m = of.deflections
         D: ComplexArray = np.asarray(
-            self._stiffness(of, [each.real for each in moduli])
-            + 1j * self._stiffness(of, [each.imag for each in moduli])
+            self.stiffness(of, [each.real for each in moduli])
+            + 1j * self.stiffness(of, [each.imag for each in moduli])
         )
         D[m:, m:] -= omega**2 * along_mass(of, self._mass, np.eye(of.size - m))
         D[:m, :m] -= omega**2 * self._inertia(of)

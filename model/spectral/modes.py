@@ -180,7 +180,8 @@ class SpectralPlate:
         """Mass between the polynomials of the deflection, (m, m)."""
         return sum(layer.surface_density for layer in self._layers) * np.eye(of.deflections)
 
-    def _stiffness(self, of: ClassFunctions, moduli: Sequence[float]) -> FloatArray:
+    def stiffness(self, of: ClassFunctions, moduli: Sequence[float]) -> FloatArray:
+        """Return the stiffness matrix of a parity class; moduli: Young's modulus of each layer."""
         section = section_of(self._layers, moduli, self._corrections)
         return class_stiffness(of, section.in_motions(self._opposite))
 
@@ -194,7 +195,7 @@ class SpectralPlate:
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Stiffness and mass in deflection and flows, and what follows the deflection."""
         m = of.deflections
-        K = self._stiffness(of, moduli)
+        K = self.stiffness(of, moduli)
         follows = follow(of, K, self._mass, shift)
         rotary = follows.T @ along_mass(of, self._mass, follows)
         stiffness = K[:m, :m] + K[:m, m:] @ follows - shift * rotary
@@ -254,7 +255,7 @@ class _Space:
         fixed = [layer.material.E if layer.is_elastic else 0.0 for layer in layers]
         unit = [[float(each is soft) for each in layers] for soft in self._soft]
         self._fixed, *self._by_layer = (
-            basis.T @ (along.T @ (plate._stiffness(of, moduli) @ along)) @ basis
+            basis.T @ (along.T @ (plate.stiffness(of, moduli) @ along)) @ basis
             for moduli in (fixed, *unit)
         )
         self._mass = basis.T @ heavy @ basis

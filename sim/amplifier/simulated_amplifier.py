@@ -458,7 +458,7 @@ class SimulatedAmplifier:
             case "Clear":
                 self._clear(values["latch"], following, now)
             case "Set":
-                return self._take(values, now)
+                return self.take_part(values, now)
             case "Commit":
                 layers = self._intake.commit(values["token"], now)
                 if layers is not None:
@@ -513,7 +513,7 @@ class SimulatedAmplifier:
             self.fault = "NONE"
             self._enter(following, now)
 
-    def _take(self, part: Values, now: float) -> Values:
+    def take_part(self, part: Values, now: float) -> Values:
         """Take the last part of a set, and play it where it is whole and says so."""
         token = part["token"]
         taken = None if token == self._intake.committed else self._intake.take(part, now)

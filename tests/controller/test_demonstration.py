@@ -477,9 +477,7 @@ async def test_plate_is_armed_again_after_a_fault_but_not_after_a_stop(
     monkeypatch.setattr(demonstration, "_RECOVERY", 5.0)
     async with asyncio.TaskGroup() as tasks, ready_daemon(tmp_path) as (bench, era):
         recorder = TouchRecorder(cast(SimulatedPlate, None), tasks, on_row=lambda row: None)
-        arming = asyncio.create_task(
-            demonstration._keep_armed(bench.daemon, bench.socket, recorder)
-        )
+        arming = asyncio.create_task(demonstration.keep_armed(bench.daemon, bench.socket, recorder))
         await recorder.start()
         await until_state(era, ENABLED)
         bench.far.device.inject_fault(FaultWindow(fault="over_voltage", lasts=0.05))
@@ -502,7 +500,7 @@ async def test_fault_that_lasts_aborts_the_demonstration() -> None:
         recorder.failed(f"{FAULT}; once the cause is gone, clear and arm again")
         nothing = cast(Any, None)
         with pytest.raises(LinkError, match=f"aborted: {FAULT}$"):
-            await demonstration._play([], nothing, recorder, nothing)
+            await demonstration.play_scenes([], nothing, recorder, nothing)
 
 
 async def test_far_end_terminates_process_when_not_ready_in_time(
@@ -511,13 +509,13 @@ async def test_far_end_terminates_process_when_not_ready_in_time(
     """After the startup timeout the process is terminated."""
     monkeypatch.setattr(far_end, "STARTUP_TIMEOUT", 0.0)
     exit_statuses: list[int | None] = []
-    terminate = far_end._terminate
+    terminate = far_end.end_simulation
 
     async def note(process: "far_end.asyncio.subprocess.Process") -> None:
         await terminate(process)
         exit_statuses.append(process.returncode)
 
-    monkeypatch.setattr(far_end, "_terminate", note)
+    monkeypatch.setattr(far_end, "end_simulation", note)
     with pytest.raises(LinkError):
         async with simulated_plate(example_rig_path(), ["main"], wire="serial"):
             pass

@@ -49,7 +49,7 @@ def test_device_is_opened_alone_with_low_latency_and_its_settings(
     made = Mock()
     made.return_value.fileno.return_value = near
     monkeypatch.setattr(ports.serial, "Serial", made)
-    ports._open_device(Endpoint(device, baud=19_200, parity="O", stop=2))
+    ports.open_device(Endpoint(device, baud=19_200, parity="O", stop=2))
     made.return_value.set_low_latency_mode.assert_called_once_with(True)
     settings = {key: made.call_args.kwargs[key] for key in ("baudrate", "parity", "stopbits")}
     assert settings == {"baudrate": 19_200, "parity": parity, "stopbits": 2}
@@ -186,7 +186,7 @@ async def test_next_address_of_a_host_is_tried(first: str, monkeypatch: pytest.M
         return ["fd00::1", "192.0.2.1"]
 
     monkeypatch.setattr(loop, "create_connection", connecting)
-    monkeypatch.setattr(ports, "_addresses", found)
+    monkeypatch.setattr(ports, "host_addresses", found)
     began = loop.time()
     connection = await open_connection("amplifier.test", 502, lambda _: None, losses.append)
     assert loop.time() - began == pytest.approx(0.25 if first == "hangs" else 0.0, abs=0.01)
@@ -223,7 +223,7 @@ async def test_link_local_address_keeps_its_zone(
     of_name = ("fe80::1", 0, 0, 4000), ("fd00::1", 0, 0, 0), ("192.0.2.1", 0)
     found = [(0, 0, 0, "", address) for address in of_name]
     monkeypatch.setattr(ports.socket, "getaddrinfo", lambda *args, **kwargs: found)
-    assert await ports._addresses("amplifier.test") == ["fe80::1%4000", "fd00::1", "192.0.2.1"]
+    assert await ports.host_addresses("amplifier.test") == ["fe80::1%4000", "fd00::1", "192.0.2.1"]
 
 
 def test_unresolved_name_does_not_delay_the_end_of_the_program() -> None:

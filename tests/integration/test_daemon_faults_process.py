@@ -96,7 +96,7 @@ async def test_start_that_is_stuck_ends_by_sigterm(tmp_path: Path) -> None:
         "    lock, mutex = ctypes.CDLL(None).pthread_mutex_lock, ctypes.create_string_buffer(64)\n"
         "    print(flush=True)\n"
         "    lock(mutex), lock(mutex)\n"
-        "daemon._table = table\nmain()"
+        "daemon.prepared_table = table\nmain()"
     )
     process = await asyncio.create_subprocess_exec(
         *(sys.executable, "-c", stuck, "daemon", write_daemon(tmp_path, {"main": "sim://"})),

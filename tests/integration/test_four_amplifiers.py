@@ -491,8 +491,8 @@ def test_demo_reports_a_far_end_that_ended(capture, demo, monkeypatch):
     def killing(*arguments, on_row):
         return TouchRecorder(*arguments, on_row=lambda row: far_ends[0].kill())
 
-    start_far_end = controller.demo.recorder._start
-    monkeypatch.setattr(controller.demo.recorder, "_start", start)
+    start_far_end = controller.demo.recorder.start_simulation
+    monkeypatch.setattr(controller.demo.recorder, "start_simulation", start)
     monkeypatch.setattr(controller.demo.demonstration, "TouchRecorder", killing)
     status, out, said = demo("--real-time", "--touches", capture)
     assert status == 3, said

@@ -16,7 +16,7 @@ from cases import shortly
 from era_haptics.command import run_era
 from era_haptics.lab.paper_figures import SWEEP, PaperFigure, equal_area_points, paper_figures
 from kit.plates import make_paper_rig, small_table, with_strokes, write_rig
-from model.figures import Template, _pages, answer_figure, levels_figure, weak_cells_figure
+from model.figures import Template, answer_figure, levels_figure, template_pages, weak_cells_figure
 from model.finger import Grid
 from model.reduction.free_plate import solve_free_plate
 from model.rig.rig import FOUR_ERA_LAYOUTS, alike
@@ -93,7 +93,7 @@ def test_labels_keep_off_the_frames_of_pages(rig: Path) -> None:
     places = product(np.arange(0.003, 0.3, 0.036), np.arange(0.003, 0.22, 0.036))
     sensors = {f"P{n}": (float(x), float(y)) for n, (x, y) in enumerate(places)}
     found = set()
-    for page in _pages(Template(load_rig(rig), sensors)):
+    for page in template_pages(Template(load_rig(rig), sensors)):
         page.canvas.draw()
         axes = page.axes[0]
         frame = axes.get_window_extent()

@@ -147,9 +147,7 @@ def test_cluster_gives_up_on_a_task_that_kills_its_workers(address: str, monkeyp
     """A task that ends whichever worker takes it, as one does for which memory is too short."""
     from distributed import Client
 
-    monkeypatch.setattr(
-        processes, "_run_same_code", lambda *_: os.kill(os.getpid(), signal.SIGKILL)
-    )
+    monkeypatch.setattr(processes, "run_same_code", lambda *_: os.kill(os.getpid(), signal.SIGKILL))
     with Client(address, set_as_default=False) as client:
         client.run_on_scheduler(_allow_failures, 0)
     with pytest.raises(InputError, match="memory"):
@@ -186,7 +184,7 @@ def test_cluster_without_workers_or_scheduler_is_refused(monkeypatch) -> None:
 def test_every_worker_checks_its_code() -> None:
     """Nothing is called on a worker that joins later, with other code."""
     with pytest.raises(InputError, match="same era-haptics"):
-        processes._run_same_code("0.0.1+123456789abc", pytest.fail, "called")
+        processes.run_same_code("0.0.1+123456789abc", pytest.fail, "called")
 
 
 ITEMS = "abcde"

@@ -441,7 +441,7 @@ def test_daemon_goes_on_without_the_page_of_its_file_when_not_installed(
     pages: list[str | None] = []
     monkeypatch.setattr("controller.gateway.gateway_settings.find_spec", lambda name: None)
     monkeypatch.setattr(
-        "controller.daemon.daemon._run",
+        "controller.daemon.daemon.run_until_stopped",
         lambda config, lock, *, log, dashboard: pages.append(dashboard),
     )
     monkeypatch.setattr(

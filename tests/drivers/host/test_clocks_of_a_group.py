@@ -467,7 +467,7 @@ async def test_clocks_are_read_the_seldomer_the_better_they_are_known(
     """
     read: list[float] = []
     monkeypatch.setattr(HeldClock, "scatter", lambda clock, time: error)
-    monkeypatch.setattr(Clocks, "_read", lambda clocks, amplifier: read.append(error))
+    monkeypatch.setattr(Clocks, "read_clock", lambda clocks, amplifier: read.append(error))
     group, clocks = await held("native", 1, "a", "b")
     read.clear()
     await skew(group, clocks, 1.0)

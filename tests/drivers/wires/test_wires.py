@@ -338,8 +338,8 @@ def test_noise_without_end_is_neither_kept_nor_searched_without_bound(
         tried += 1
         return checked(frame)
 
-    checked = modbus_frames._checked
-    monkeypatch.setattr(modbus_frames, "_checked", counted)
+    checked = modbus_frames.checked_adu
+    monkeypatch.setattr(modbus_frames, "checked_adu", counted)
     reader = AduReader(is_rtu=True, of_requests=waits, waits=waits)
     data = (noise * (1 << 16))[: 1 << 16]
     found: list[Adu] = []
@@ -447,7 +447,7 @@ async def test_close_does_not_wait_for_a_device_that_hangs(
 
     device = Mock(port="/dev/ttyUSB9", recv=recv, close=close, shutdown=close)
     device.fileno.return_value = ends[0]
-    monkeypatch.setattr(ports, "_open_device", lambda *_: device)
+    monkeypatch.setattr(ports, "open_device", lambda *_: device)
     monkeypatch.setattr(can, "Bus", lambda **how: device)
     monkeypatch.setattr(threads, "CLOSE_TIMEOUT", 0.05)
     if kind == "port":

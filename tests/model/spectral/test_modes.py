@@ -505,7 +505,7 @@ def _all_eigenvalues(plate: Plate, degrees, parity) -> np.ndarray:
     """omega² of all unknowns of a class, displacements along the plate with their inertia."""
     spectral = SpectralPlate(plate, degrees, 150.0)
     of = spectral.functions(parity)
-    K = spectral._stiffness(of, [plate.material.E])
+    K = spectral.stiffness(of, [plate.material.E])
     M = plate.material.rho * plate.thickness * np.eye(of.size)
     M[of.deflections :, of.deflections :] /= 6  # of opposite unit motions
     return linalg.eigvalsh(K, M)

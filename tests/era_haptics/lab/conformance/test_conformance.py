@@ -149,8 +149,8 @@ class _Coarse(SimulatedAmplifier):
             phase=(phase + 18_000) % 36_000 - 18_000,
         )
 
-    def _take(self, part: Values, now: float) -> Values:
-        return {**super()._take(part, now), "exact": 0}
+    def take_part(self, part: Values, now: float) -> Values:
+        return {**super().take_part(part, now), "exact": 0}
 
 
 OWN_STEPS = [

@@ -113,7 +113,7 @@ async def _take(folder: Path) -> None:
                         await page.until("document.querySelectorAll('#layers button').length === 3")
                         # Solved after the event.
                         field = "document.querySelector('#scale-high').textContent"
-                        await page.until(f"{field}.includes('threshold')")
+                        await page.until(f"{field}.includes('dB SL')")
                         await asyncio.sleep(0.3)
                         await page.screenshot(folder / f"dashboard_{screen.name}.png")
                     await page.click("#disarm")

@@ -50,7 +50,6 @@ from model.structure.attachments import Source
 from model.structure.plate import Plate
 from model.study.contrast_maps import WANTED_CONTRAST_DB, ContrastMap, WeakCells
 from model.study.overview import Overview
-from model.study.promise_at_sensors import MeasuredVerification
 from model.table.table import LocalizationTable
 from model.vibration import NULL_SHARE, Excitation, G, PlateMap
 
@@ -201,34 +200,6 @@ def calibration_figure(calibration: Calibration) -> Figure:
         axis.set_ylabel("m/s² per µm of base")
     handles, labels = axes[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside upper center", ncols=3, fontsize=9)
-    return figure
-
-
-def promise_figure(found: MeasuredVerification) -> Figure:
-    """Draw measured over promised felt contrast; points below the line break their promise."""
-    promised = np.array([each.contrast_db for each in found.measured])
-    measured = np.array([each.measured_contrast_db for each in found.measured])
-    quiet = np.array([len(each.sensors) - 1 for each in found.measured])
-    figure = Figure(figsize=(5, 4.6), layout="constrained")
-    axes = figure.subplots()
-    both = np.concatenate([promised, measured])
-    ends = [float(both.min()) - 1, float(both.max()) + 1]
-    axes.plot(ends, ends, color="grey", linewidth=1)
-    for count, marker in zip(np.unique(quiet), "os^Dv", strict=False):
-        chosen = quiet == count
-        colors = np.where(measured[chosen] < promised[chosen], ACTIVE_COLOR, "black")
-        axes.scatter(
-            promised[chosen],
-            measured[chosen],
-            c=colors,
-            marker=marker,
-            s=18,
-            label=f"{count} quiet",
-        )
-    axes.legend(loc="upper left")
-    axes.set_xlabel("promised felt contrast, dB (nine of ten plates)")
-    axes.set_ylabel("measured, dB")
-    axes.set_title(f"{100 * found.kept_share:.0f} % of {len(promised)} promises kept")
     return figure
 
 

@@ -86,7 +86,6 @@ class Accelerometers:
         for sensor in sensors:
             check_on_plate(f"sensor {sensor.name}", [(sensor.x, sensor.y)], self._bench.rig.plate)
         self.sensors = tuple(sensors)
-        self._bench.place_sensors(sensors)
         self._pieces.clear()
         if self in self._bench.probes:
             self._bench.probes.remove(self)

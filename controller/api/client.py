@@ -212,13 +212,6 @@ class AsyncClient(AbstractAsyncContextManager["AsyncClient"]):
         """
         await self._call(Empty, "clear", client=client, epoch=epoch)
 
-    async def forget(self, *, client: str | None = None) -> None:
-        """Discard what was learned of the plate, and learn anew.
-
-        Answers are those of the table at once.
-        """
-        await self._call(Empty, "forget", client=client)
-
     async def layout(self, name: str) -> LayoutResult:
         """Use one of the daemon's layouts.
 
@@ -609,7 +602,6 @@ class Client(AbstractContextManager["Client"]):
     disarm = _blocking(AsyncClient.disarm)
     stop = _blocking(AsyncClient.stop)
     clear = _blocking(AsyncClient.clear)
-    forget = _blocking(AsyncClient.forget)
     touch = _blocking(AsyncClient.touch)
     layout = _blocking(AsyncClient.layout)
     reload = _blocking(AsyncClient.reload)

@@ -27,10 +27,8 @@ from controller.api.schema import (
     Empty,
     Epoch,
     LatencySummary,
-    LearningSummary,
     Name,
     PatternFields,
-    PlateEvent,
     RigSummary,
     TableSummary,
     Topic,
@@ -119,9 +117,6 @@ class StatusResult(StrengthResult, PatternFields, CauseAndRemedy):
     )
     lost_events: dict[str, Count] = Field(
         default={}, description="notifications that clients were too slow to read, by topic"
-    )
-    learning: LearningSummary | None = Field(
-        None, description="of the plate while it plays; null where nothing is to be learned"
     )
     layout: str | None = Field(None, description="name of the layout in use; null without any")
     layouts: list[str] = Field(default=[], description="names that `layout` accepts")
@@ -374,7 +369,6 @@ TOPICS: dict[Topic, TopicData] = {
     "log": TopicData(LogEvent, "log records from level info, without those of `state` and `link`"),
     "link": TopicData(LinkEvent, "links to amplifiers that were degraded, lost or reopened"),
     "layout": TopicData(LayoutEvent, "another surface layout is in use, or it was replaced"),
-    "plate": TopicData(PlateEvent, "the plate has changed, or is followed otherwise"),
     "inputs": TopicData(
         InputsEvent, "touch inputs that are missing, mute or back; rejected touches, each second"
     ),
@@ -443,7 +437,6 @@ METHODS: dict[str, Method] = {
     "disarm": Method(DisarmParams, Empty, is_limited=False, silences=True, in_reserve=True),
     "stop": Method(RequestedBy, StopResult, is_limited=False, silences=True, in_reserve=True),
     "clear": Method(ClearParams, Empty, is_repeated=False),
-    "forget": Method(RequestedBy, Empty),
     "touch": Method(TouchParams, Empty, is_limited=False),
     "layout": Method(LayoutParams, LayoutResult),
     "reload": Method(Empty, ReloadResult),

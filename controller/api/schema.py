@@ -63,7 +63,6 @@ Topic: TypeAlias = Literal[
     "log",
     "link",
     "layout",
-    "plate",
     "inputs",
     "strength",
 ]
@@ -365,58 +364,6 @@ class LatencySummary(ApiMessage):
     histogram: list[tuple[float, int]] = Field(
         description="[upper edge in ms, number above the previous edge and up to this one]; "
         "values above the last edge are counted in the last"
-    )
-
-
-LearningState: TypeAlias = Literal["following", "changed", "off"]
-"""Whether answers follow the plate, the plate has changed unexplained, or neither."""
-
-LEARNING_WORDS: dict[LearningState, str] = {
-    "following": "following",
-    "changed": "changed, promises lowered until you run era rig check",
-    "off": "off",
-}
-"""What people read of it."""
-
-
-class PlateObject(ApiMessage):
-    """An object that was found on the plate; its place is from the south-west corner."""
-
-    x_m: float
-    y_m: float
-    mass_kg: float
-
-
-class PlateEvent(CauseAndRemedy):
-    """What is known of the plate has changed, or whether it is followed."""
-
-    state: LearningState
-    cautious: bool = Field(
-        description="whether answers are those of a plate that is not known: it has changed in an "
-        "unknown way, an object lies on it, or there was no estimator for a minute"
-    )
-    alarms: Count = Field(description="patterns so far that show another plate than the known one")
-    object: PlateObject | None = Field(
-        default=None, description="what lies on it, where that is the change; optional"
-    )
-
-
-class LearningSummary(PlateEvent):
-    """What is learned of the plate while it plays, and how often."""
-
-    readings: Count = Field(description="settled patterns that were measured")
-    estimates: Count = Field(description="of these, by the estimator")
-    discarded: Count = Field(
-        description="of these, not estimated, since the estimator ended or had too many"
-    )
-    disturbed: Count = Field(
-        description="settled patterns whose measurement a change, an overload or the link spoilt"
-    )
-    corrections: Count = Field(description="of the answers to touches")
-    restarts: Count = Field(description="of the estimator")
-    last_estimate_s: float | None = Field(description="time since the last estimate")
-    latency_ms: LatencySummary = Field(
-        description="from the end of a measurement to the answers that follow it"
     )
 
 

@@ -13,7 +13,6 @@ SUMMARIES = {
     "disarm": "Ramp to silence, then switch the high voltage off. Any client may. While a link is lost it stops all amplifiers.",
     "stop": "Quick-stop all amplifiers, latched until clear. Not an emergency stop. Any client can stop, at any time; error 1006 unless every amplifier is confirmed silent.",
     "clear": "Clear a stop, or a fault that no longer exists. Stays disarmed.",
-    "forget": "Discard what was learned of the plate, and learn anew. Answers are those of the table at once.",
     "touch": "Report all fingers of a touch source of this client.",
     "layout": "Use one of the daemon's layouts. Of resting fingers, what ends by itself and what a program plays goes on to its end; what lasts follows the new layout at once.",
     "reload": "Read the daemon's files again and apply their layouts. Any other change is refused, and needs a restart.",

@@ -102,7 +102,7 @@ app.command(cls=DashboardCommand)(daemon)
 app.command(cls=DashboardCommand)(demo)
 for _command in (gateway, touch, watch):
     app.command()(_command)
-for _name in ("disarm", "stop", "clear", "forget"):
+for _name in ("disarm", "stop", "clear"):
     app.command(_name, help=SUMMARIES[_name])(of_method(_name))
 for _more in (arm, reload, status, strength):
     app.command(

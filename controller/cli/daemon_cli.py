@@ -1,7 +1,7 @@
 """`era daemon`, the commands that are its clients, and how they show status and events.
 
-Clients: `status`, `arm`, `disarm`, `stop`, `clear`, `forget`, `reload`, `strength`, `touch`,
-`watch`, `layout use`.
+Clients: `status`, `arm`, `disarm`, `stop`, `clear`, `reload`, `strength`, `touch`, `watch`,
+`layout use`.
 """
 
 import json
@@ -34,7 +34,7 @@ Socket = Annotated[
 DASHBOARD = "127.0.0.1:8137"
 """Default address of the page, as of `era gateway`."""
 
-_DEFAULT_TOPICS = ["state", "contacts", "pattern", "silence", "link", "log", "plate", "inputs"]
+_DEFAULT_TOPICS = ["state", "contacts", "pattern", "silence", "link", "log", "inputs"]
 """Topics of `era watch`: all but those that are published without end, and the whole layout."""
 
 _MORE_TOPICS = ["amplifiers", "latency", "strength", "layout"]

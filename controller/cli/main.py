@@ -49,7 +49,6 @@ SECTIONS = {
         "strength",
         "watch",
         "gateway",
-        "forget",
         "reload",
         "report",
     ),

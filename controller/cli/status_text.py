@@ -5,10 +5,8 @@ from datetime import datetime
 from controller.api.link import Notification
 from controller.api.methods import StatusResult
 from controller.api.schema import (
-    LEARNING_WORDS,
     AmplifierStatus,
     ContactStatus,
-    LearningSummary,
     headline,
 )
 from drivers.by_hand.cli import in_words
@@ -42,7 +40,6 @@ def show_status(status: StatusResult) -> str:
         *map(_contact, status.contacts),
         *[f"  strength {name}: {gain:g} dB" for name, gain in status.strengths.items() if gain],
         *_given(("  silent: {}", status.silence_reason if status.contacts else None)),
-        *([] if status.learning is None else _learning(status.learning)),
     ]
     lines += [
         f"  ERA {era}: {tone.frequency_hz:g} Hz, level {tone.level:.3f}, {tone.phase_deg:g} deg"
@@ -126,25 +123,6 @@ def _contact(contact: ContactStatus) -> str:
         f"  finger {contact.source} {contact.id} at {contact.x_m:.3f}, {contact.y_m:.3f} m: "
         f"{contact.role or 'not driven'}{''.join(details)}"
     )
-
-
-def _learning(learning: LearningSummary) -> list[str]:
-    """Format what is learned of the plate."""
-    state, words = learning.state, LEARNING_WORDS[learning.state]
-    last, took = learning.last_estimate_s, learning.latency_ms.median
-    within = "".join(_given((", median {:.0f} ms after a measurement", took)))
-    ago = "".join(_given((", last estimated {:.0f} s ago", last)))
-    measured = (
-        f"{counted(learning.readings, 'pattern')} measured{ago}; "
-        f"{counted(learning.corrections, 'correction')} of answers{within}"
-    )
-    return [
-        f"  plate {words.replace(state, state.upper()) if learning.cautious else words}: "
-        f"{learning.cause}",
-        *_given(("    answers promise what a plate that is not known gives", learning.cautious)),
-        *_given(("    remedy: {}", learning.remedy)),
-        *_given(("    {}", measured if learning.readings else None)),
-    ]
 
 
 def _amplifier(amplifier: AmplifierStatus) -> str:

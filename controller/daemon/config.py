@@ -22,7 +22,6 @@ from controller.effects.layout import (
     load_layout,
 )
 from controller.effects.strengths import read_strengths
-from controller.learning.learned_table import was_learned
 from controller.process.daemon_process import check_socket_path
 from controller.rig_file_check import clock_costs, whole_url
 from controller.sources.touch import (
@@ -109,7 +108,6 @@ class DaemonSection(Section):
     rig: FileName
     table: FileName | None = None
     mode: Annotated[str, AfterValidator(_mode)] | None = None
-    learn: FileName | None = None
     level_db_sl: LevelDbSl = STRONG_DB_SL
     layouts: Annotated[
         dict[Identifier, FileName], Field(max_length=MAX_LAYOUTS, default_factory=dict)
@@ -153,8 +151,6 @@ class DaemonConfig:
     """URL of each amplifier by name."""
     table: Path | None
     """File of the localization table; None: it is built or taken from the cache."""
-    learn: Path | None
-    """File of what is learned of the plate; None: nothing is learned."""
     layouts: Mapping[str | None, SurfaceLayout]
     """Layouts by name, in the file's order; if it has none, one under None that buzzes at every
     touch."""
@@ -191,7 +187,6 @@ def daemon_config_of(document: Document) -> DaemonConfig:
     layouts = _layouts(validation, document, rig)
     _check_serial_numbers(validation, rig)
     log_file = file_of(document, "log", "file")
-    learn = file_of(document, "learn")
     strengths = file_of(document, "strengths")
     _check_log(validation, log_file)
     try:
@@ -200,7 +195,6 @@ def daemon_config_of(document: Document) -> DaemonConfig:
         validation.add(("strengths",), str(error))
     if strengths is not None:
         _check_folder_of(validation, strengths, "strengths")
-    _check_learn(validation, learn)
     socket = file_of(document, "socket") or default_socket()
     try:
         check_socket_path(socket)
@@ -215,7 +209,6 @@ def daemon_config_of(document: Document) -> DaemonConfig:
         rig_text=rig_text,
         urls=urls,
         table=table,
-        learn=learn,
         layouts=layouts,
         strengths=strengths,
         touch=touch,
@@ -372,22 +365,6 @@ def _check_folder_of(validation: Validation[DaemonSection], file: Path, *place: 
     if not is_there:
         validation.add(place, f"folder not found: {file.parent}; create it")
     return is_there
-
-
-def _check_learn(validation: Validation[DaemonSection], file: Path | None) -> None:
-    """Refuse to learn into a file that is something else; its folder must exist.
-
-    A damaged file, or one of another version, is set aside by the estimator.
-    """
-    if file is None or not _check_folder_of(validation, file, "learn"):
-        return
-    try:
-        is_free = not file.exists() or was_learned(file)
-    except OSError as error:
-        validation.add(("learn",), f"{file}: {error.strerror}; make it readable for the daemon")
-        return
-    if not is_free:
-        validation.add(("learn",), f"{file}: must be a learned plate; give another name")
 
 
 def _check_serial_numbers(validation: Validation[DaemonSection], rig: Rig | None) -> None:

@@ -27,8 +27,7 @@ from controller.daemon.layouts import ConfigChange, LayoutChoice, TouchInputs, r
 from controller.daemon.messages import EventPublisher, amplifier_statuses
 from controller.effects.effect import Effect
 from controller.gateway.gateway_settings import require_gateway
-from controller.learning.learning import Learning
-from controller.operation.operation_states import ENERGISED, DaemonState, Operation
+from controller.operation.operation_states import ENERGISED
 from controller.operation.plate_controller import Controller
 from controller.operation.supervisor import Supervisor
 from controller.play.loop import Observers
@@ -96,7 +95,6 @@ class Daemon:
             state_changed=(
                 lambda old, new: self._publisher.state_changed(old, new),
                 lambda old, new: manager.notify(f"STATUS={headline(new.state.value, new.cause)}"),
-                self._follow_state,
             ),
             link_changed=lambda *change: self._publisher.link_changed(*change),
             alive=lambda: manager.alive(threads.now()),
@@ -119,11 +117,7 @@ class Daemon:
             ),
             layouts=self._layouts,
             inputs=lambda: self._inputs.event,
-            learning=lambda: self.learning,
         )
-        self.learning: Learning | None = None
-        """What learns the plate, if anything is to be learned."""
-        timing = Timing(table)
         self._controller = self._supervisor.controller = Controller(
             config.rig,
             table,
@@ -132,7 +126,7 @@ class Daemon:
             serial_numbers=config.section.serial_numbers,
             connected=self._supervisor.connected,
             intent_source=self._layouts.player,
-            timing=timing,
+            timing=Timing(table),
             drive_mode=config.section.mode,
             watchdog=watchdog,
         )
@@ -140,17 +134,6 @@ class Daemon:
         cycle.tracker.max_fingers = config.section.max_fingers
         self._supervisor.observe(cycle.observers)
         self._publisher.observe(cycle.observers)
-        if config.learn is not None:
-            self.learning = Learning(
-                config.rig,
-                table,
-                timing,
-                config.learn,
-                controller=self._controller,
-                changed=self._publisher.plate_changed,
-                estimated=self._publisher.learning_latencies.add,
-            )
-            self.learning.readings.observe(cycle.observers)
         observe(cycle.observers)
         self._inputs = TouchInputs(
             cycle.deliver,
@@ -165,7 +148,6 @@ class Daemon:
             self._supervisor,
             publisher=self._publisher,
             layouts=self._layouts,
-            learning=self.learning,
             reload=self.reload,
         )
         self._server = ApiServer(
@@ -294,26 +276,14 @@ class Daemon:
                     task.cancel()
                     await asyncio.wait({task})
             self._log.subscriber = None
-            learning = () if self.learning is None else (self.learning.close(),)
             gateway = () if self._gateway is None else (self._gateway,)
             for task in gateway:
                 task.cancel()
             closing = (self._inputs.close(), self._server.close(), self._api.close())
-            for found in await asyncio.gather(
-                *learning, *closing, *gateway, return_exceptions=True
-            ):
+            for found in await asyncio.gather(*closing, *gateway, return_exceptions=True):
                 if isinstance(found, Exception) and not isinstance(found, OSError):
                     _logger.error("closing failed", exc_info=found)
             self._publisher.hub.close()
-
-    def _follow_state(self, old: Operation, new: Operation) -> None:
-        """Learn of the plate from when all amplifiers are open."""
-        if self.learning is None:
-            return
-        if new.state is DaemonState.READY_TO_SWITCH_ON:
-            self.learning.open()
-        if new.state is not DaemonState.OPERATION_ENABLED:
-            self.learning.readings.ended()
 
     def _status_line(self) -> str:
         operation = self._supervisor.operation

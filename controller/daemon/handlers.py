@@ -44,7 +44,6 @@ from controller.daemon.layouts import LayoutChoice
 from controller.daemon.messages import EventPublisher, effects_result, hello_result, playing_of
 from controller.effects.effect import MIN_DB_SL, Effect
 from controller.effects.kinds import File
-from controller.learning.learning import Learning
 from controller.operation.operation_states import (
     ENERGISED,
     DaemonEvent,
@@ -88,7 +87,6 @@ class ApiService:
         *,
         publisher: EventPublisher,
         layouts: LayoutChoice,
-        learning: Learning | None,
         reload: Callable[[], Awaitable[ReloadResult]],
     ) -> None:
         self._config = config
@@ -97,7 +95,6 @@ class ApiService:
         self._supervisor = supervisor
         self._publisher = publisher
         self._layouts = layouts
-        self._learning = learning
         self._reload = reload
         self._next_number = itertools.count(1)
         self._started = threads.now()
@@ -173,7 +170,6 @@ class ApiService:
             rejected_examples=dict(self._controller.cycle.rejects.examples),
             inputs=self._publisher.inputs().inputs,
             clicks_too_late=self._controller.cycle.clicks_too_late,
-            learning=self._publisher.learning_summary(),
             layout=self._layouts.name,
             layouts=self._layouts.names,
             strengths=self._publisher.strengths().strengths,
@@ -266,22 +262,6 @@ class ApiService:
             operation = self._supervisor.operation
         if operation.state is not DaemonState.READY_TO_SWITCH_ON:
             raise _wrong_state(operation)
-        return Empty()
-
-    @api_method()
-    async def forget(self, client: Connection, params: RequestedBy) -> Empty:
-        """Discard what was learned of the plate, and learn anew.
-
-        Answers are those of the table at once.
-        """
-        if self._learning is None:
-            raise RpcError(
-                ErrorCode.WRONG_STATE,
-                "nothing is learned of the plate",
-                remedy="name a file in learn of the daemon's configuration",
-            )
-        await self._learning.forget()
-        _logger.info("plate: forgotten by %a", params.client or client.name)
         return Empty()
 
     @api_method(is_limited=False)  # the newest frame counts, so they never queue up

@@ -43,9 +43,7 @@ from controller.api.schema import (
     EffectDescription,
     EraPosition,
     LatencySummary,
-    LearningSummary,
     LinkCounters,
-    PlateEvent,
     PlayedTone,
     RigSummary,
     TableSummary,
@@ -56,7 +54,6 @@ from controller.daemon.config import DaemonConfig
 from controller.daemon.layouts import LayoutChoice
 from controller.effects.layout import SurfaceLayout
 from controller.effects.strengths import UNNAMED
-from controller.learning.learning import Learning
 from controller.operation.operation_states import DaemonState, Loss, Operation
 from controller.operation.supervisor import LinkChange
 from controller.play.intent import BEING_CHOSEN, NO_CONTACTS, FingerSensation, leaks_db_sl
@@ -87,7 +84,6 @@ class EventPublisher:
     operation, amplifiers, inputs: return the current state of the daemon, of its amplifiers and of
         its touch inputs.
     layouts: the surface layouts of the daemon.
-    learning: returns what learns the plate; None if the plate is not learned.
     """
 
     def __init__(
@@ -97,14 +93,11 @@ class EventPublisher:
         amplifiers: Callable[[], list[AmplifierStatus]],
         layouts: LayoutChoice,
         inputs: Callable[[], InputsEvent],
-        learning: Callable[[], Learning | None],
     ) -> None:
         self.view = PlateView(layouts.player.effect_of, why_not=self._why_not)
         self._player = layouts.player
         self.latencies = LatencyStatistics()  # of touches alone
         self.lift_latencies = LatencyStatistics()
-        self.learning_latencies = LatencyStatistics()
-        self._learning = learning
         self.amplifiers = amplifiers
         self.inputs = inputs
         self._operation = operation
@@ -119,7 +112,6 @@ class EventPublisher:
                 "amplifiers": lambda: AmplifiersEvent(amplifiers=amplifiers()),
                 "latency": lambda: LatencyEvent(latency_ms=self.latencies.summary()),
                 "layout": layouts.event,
-                "plate": lambda: None if (found := learning()) is None else found.event,
                 "inputs": inputs,
                 "strength": self.strengths,
             },
@@ -158,10 +150,6 @@ class EventPublisher:
         if operation.degraded:
             return f"{operation.cause}; {operation.remedy}"
         return self._player.why_not(key)
-
-    def plate_changed(self, event: PlateEvent) -> None:
-        """Publish that the plate has changed, or that it is learned in another way."""
-        self.hub.publish("plate", lambda: event)
 
     def link_changed(self, change: LinkChange, lost: Sequence[str], message: str) -> None:
         """Publish that the link to amplifiers was degraded, restored, lost, retried or reopened."""
@@ -203,11 +191,6 @@ class EventPublisher:
         regions = [each.name for each in self._player.layout.regions]
         names = sorted({*inputs, *known.sources, *clients, *regions})
         return StrengthResult(strengths={**dict.fromkeys(names, 0.0), **known.gains_db})
-
-    def learning_summary(self) -> LearningSummary | None:
-        """Return what was learned of the plate; None if it is not learned."""
-        learning = self._learning()
-        return None if learning is None else learning.summary(self.learning_latencies.summary())
 
     def _refused(self, reason: str) -> None:
         _logger.warning("refused: %s", reason)

@@ -20,7 +20,6 @@ from controller.api.schema import (
     AmplifierStatus,
     DaemonStateName,
     LatencySummary,
-    LearningState,
 )
 from drivers.host.clock import ReportKind
 from drivers.protocol.definition import READINGS
@@ -101,7 +100,6 @@ def exposition(status: StatusResult | None) -> bytes:
 
 
 def _gauges(status: StatusResult) -> list[_Row]:
-    learning = status.learning
     return [
         ("state", "1 for the current state.", _one_of(DaemonStateName, status.state), ("state",)),
         ("armed", "Whether a client holds the lease.", {(): status.armed_by is not None}, ()),
@@ -144,24 +142,6 @@ def _gauges(status: StatusResult) -> list[_Row]:
             ("input",),
         ),
         (
-            "learning_state",
-            "1 for what happens to measured patterns.",
-            _one_of(LearningState, learning.state) if learning else {},
-            ("state",),
-        ),
-        (
-            "cautious_answers",
-            "Whether answers are those of a plate that is not known.",
-            {(): getattr(learning, "cautious", None)},
-            (),
-        ),
-        (
-            "estimate_age_seconds",
-            "Time since the last estimate.",
-            {(): getattr(learning, "last_estimate_s", None)},
-            (),
-        ),
-        (
             "amplifier_report",
             "1 for what it has reported lately.",
             {
@@ -184,7 +164,6 @@ def _gauges(status: StatusResult) -> list[_Row]:
 
 
 def _counters(status: StatusResult) -> list[_Row]:
-    learning = status.learning
     return [
         (
             "clicks_too_late",
@@ -205,18 +184,6 @@ def _counters(status: StatusResult) -> list[_Row]:
             ("topic",),
         ),
         *(
-            (name, text, {(): getattr(learning, key, None)}, ())
-            for name, key, text in (
-                ("readings", "readings", "Settled patterns that were measured."),
-                ("estimates", "estimates", "Of these, by the estimator."),
-                ("discarded_readings", "discarded", "Of these, not estimated."),
-                ("disturbed_readings", "disturbed", "Begun, and spoilt by a change or the link."),
-                ("corrections", "corrections", "Corrections of the answers."),
-                ("plate_alarms", "alarms", "Patterns that show another plate than known."),
-                ("estimator_restarts", "restarts", "Restarts of the estimator."),
-            )
-        ),
-        *(
             (
                 f"link_{name}",
                 text,
@@ -229,18 +196,12 @@ def _counters(status: StatusResult) -> list[_Row]:
 
 
 def _histograms(status: StatusResult) -> list[tuple[str, str, LatencySummary | None]]:
-    learning = status.learning
     return [
         ("touch_to_wire", "From a touch to the last byte of the command.", status.latency_ms),
         (
             "lift_to_wire",
             "From a lift, or an end without a touch, likewise.",
             status.lift_latency_ms,
-        ),
-        (
-            "reading_to_answers",
-            "From the end of a measurement to the answers that follow it.",
-            getattr(learning, "latency_ms", None),
         ),
     ]
 

@@ -89,16 +89,6 @@ class Controller:
             return self.cycle.planner.capabilities.drive_mode
         return self._drive_mode or UNRESTRICTED
 
-    def replace_answers(self, table: LocalizationTable, timing: Timing) -> None:
-        """Answer touches by another table of this plate from now on, in one step.
-
-        What plays is kept until its contacts change or rest. The caller prepares the table: nothing
-        is computed here.
-        """
-        self.table, self._timing = table, timing
-        if self.cycle.planner is not None:
-            self.cycle.planner.replace_answers(table, timing)
-
     async def open(self) -> None:
         """Open every amplifier, or none, and prepare what they can play; all stay disarmed.
 

@@ -145,11 +145,6 @@ class Planner:
         self._last_choice: PendingChoice | None = None
         self._waiting_changes: dict[ContactKey | None, float] = {}  # wait for that choice
 
-    def replace_answers(self, table: LocalizationTable, timing: Timing) -> None:
-        """Use another table of this plate; present contents continue until all fingers rest."""
-        self.slots.timing = timing
-        self._use(self._chooser_of(self.clocks.counted_by(table)))
-
     def replace_limits(self, limits: Limits) -> None:
         """Use other limits, because an amplifier was identified again."""
         if limits != self.capabilities.limits:
@@ -539,8 +534,6 @@ class PlayReport:
     """Foreign levels at quiet contacts (`Selection.foreign_levels`), by the rig's set first."""
     settled_after: float = 0.0
     """Time [s] until the last fade or envelope has ended."""
-    lasts: bool = True
-    """Whether all contents play until their contacts change."""
 
     @property
     def newest(self) -> Slot:
@@ -601,7 +594,6 @@ def play_report(
             for contact in selection.quiet
         },
         settled_after=plan.sets.settled_after,
-        lasts=not any(content.pulses for content in selection.contents),
     )
 
 

@@ -28,16 +28,14 @@ from drivers.protocol.definition import (
     NO_CHANNEL,
     QUANTITIES,
     REACTION,
-    READING_STATES,
     REFUSALS,
-    SENSOR_UNITS,
+    RESERVED_MESSAGES,
     STAGED_LIFE,
     STATES,
     STATUS_FLAGS,
     VERSION,
-    sensor_reading,
 )
-from drivers.protocol.records import TEXT_MAX, Bits, Number, Numbers, Real, Record, Rest, Rows, Text
+from drivers.protocol.records import TEXT_MAX, Bits, Number, Numbers, Record, Rest, Rows, Text
 from drivers.protocol.sets import MAX_PARTS, PART_WORDS
 from drivers.wires.modbus_frames import (
     AREA,
@@ -77,10 +75,7 @@ def json_text() -> str:
 
 
 def _protocol() -> dict[str, Any]:
-    records = {
-        **{"layer": LAYER, "command": COMMAND, "envelope": ENVELOPE, "knot": KNOT},
-        **{"sensor_of_a_reading": sensor_reading(1)},
-    }
+    records = {"layer": LAYER, "command": COMMAND, "envelope": ENVELOPE, "knot": KNOT}
     return {
         "version": VERSION,
         "limits": {
@@ -115,9 +110,10 @@ def _protocol() -> dict[str, Any]:
             "Event": {"number": EVENT, "reply": _fields(EVENT_RECORD)},
             "Nak": {"number": NAK, "reply": _fields(NAK_RECORD)},
         },
+        "reserved_numbers": [*RESERVED_MESSAGES],
         **{"states": STATES, "faults": FAULTS, "codes": REFUSALS, "features": FEATURES},
-        **{"status_flags": STATUS_FLAGS, "sensor_units": SENSOR_UNITS},
-        **{"reading_states": READING_STATES, "serial": _SERIAL, "modbus": _modbus()},
+        "status_flags": STATUS_FLAGS,
+        **{"serial": _SERIAL, "modbus": _modbus()},
     }
 
 
@@ -153,8 +149,6 @@ def _field(field: object) -> dict[str, Any]:
         case Bits(parts=parts):
             # From the highest bits of the word that are used to the lowest.
             return {"kind": "bits", "parts": [{"name": each, "bits": bits} for each, bits in parts]}
-        case Real(name=name):
-            return {"name": name, "kind": "f32"}
         case Text(name=name):
             return {"name": name, "kind": "text"}
         case Numbers(name=name, count=count, quantity=quantity):

@@ -25,13 +25,11 @@ from drivers.protocol.definition import (
     STATES,
     STATUS,
     STATUS_FLAGS,
-    sensor_reading,
 )
 from drivers.protocol.records import (
     Bits,
     Number,
     Numbers,
-    Real,
     Record,
     Rest,
     Rows,
@@ -46,7 +44,6 @@ _REPLIES: Mapping[str, Record] = {
     **{"Capabilities": MESSAGES["GetCaps"].reply, "Status": STATUS},
     **{"Taken": MESSAGES["Set"].reply, "Faults": MESSAGES["GetFaults"].reply},
     **{"Achieved": MESSAGES["GetAchieved"].reply, "Measured": MESSAGES["GetMeasured"].reply},
-    **{"Sensors": MESSAGES["GetSensors"].reply, "Reading": MESSAGES["GetReading"].reply},
 }
 _OTHERS: Mapping[str, Record] = {
     **{"layer": LAYER, "command": COMMAND, "envelope": ENVELOPE, "knot": KNOT},
@@ -79,7 +76,7 @@ _MEANINGS = {
     **{"events": "it sends Events on this wire"},
     **{"levels_measured": "the levels of Status are measured, not computed"},
     **{"interlock": "it has an interlock", "electrical": "GetMeasured"},
-    **{"sensors": "GetSensors, Measure, GetReading", "address": "SetAddress", "mark": "Mark"},
+    **{"address": "SetAddress", "mark": "Mark"},
     **{"high_voltage": "", "interlock_open": ""},
     **{"limited": "a sum was limited since the last Status"},
 }
@@ -144,8 +141,7 @@ def messages() -> str:
 def records() -> str:
     """Return the words of replies and of the parts of a set."""
     rows = ((name, layout(record)) for name, record in {**_OTHERS, **_REPLIES}.items())
-    last = "sensor of a Reading", layout(sensor_reading(1))
-    return _table(("record", "words"), iter([*rows, last]))
+    return _table(("record", "words"), rows)
 
 
 def readings() -> str:
@@ -174,8 +170,6 @@ def _field(field: object) -> str:
             return name + kind + (f" ({marks})" if marks else "")
         case Bits(parts=parts):
             return "[" + ", ".join(f"{name} {bits}" for name, bits in parts) + "]"
-        case Real(name=name):
-            return f"{name}: f32 (2 words)"
         case Text(name=name):
             return f"{name}: text"
         case Numbers(name=name, count=count, quantity=quantity):

@@ -5,9 +5,8 @@
         tone = AmplifierTone(channel=0, frequency=110, level=0.2)
         amplifier.play([AmplifierLayer(0, (tone,))], duration=0.5)
 
-Each action returns the rows of its result, with units in the names of keys. Only `play` and
-`measure`, while they wait, and `heartbeat` feed the watchdog: the amplifier of a script that hangs
-falls silent.
+Each action returns the rows of its result, with units in the names of keys. Only `play`, while it
+waits, and `heartbeat` feed the watchdog: the amplifier of a script that hangs falls silent.
 """
 
 import asyncio
@@ -33,21 +32,12 @@ from drivers.by_hand.reaching import (
 )
 from drivers.errors import CommandError, CommandRefused, DriverError, LinkError
 from drivers.host.amplifier import WATCHDOG, Amplifier
-from drivers.host.amplifier_sensors import (
-    AmplifierSensor,
-    Reading,
-    check_tones,
-    measure_tones,
-    read_amplifier_sensors,
-    read_electrical,
-)
 from drivers.host.ledger import StagedSet, StopOutcome
 from drivers.host.line import Priority
 from drivers.playing import AmplifierLayer, AmplifierTone
 from drivers.protocol.definition import (
     BOOT_TIME,
     COMMAND,
-    ENABLED,
     FAULTS,
     HEARTBEAT,
     LATCHED,
@@ -72,13 +62,6 @@ _RAMP = 0.05  # s; neither start nor end of a drive clicks
 _TOKEN = 1
 _MAX_PHASE_ERROR = 5.0  # degrees, between channels that play one frequency together
 _UNKNOWN = "it is unknown when its watchdog was fed last: switch it off"
-_SENSOR_UNITS = {
-    "ACCELERATION": "m/s²",
-    "VELOCITY": "m/s",
-    "DISPLACEMENT": "m",
-    "FORCE": "N",
-    "VOLTAGE": "V",
-}
 
 
 async def identify_amplifier(url: str) -> dict[str, Any]:
@@ -114,54 +97,17 @@ async def status(url: str) -> dict[str, Any]:
         }
 
 
-async def sensors(url: str) -> dict[str, Any]:
-    """Read what the sensors measure, and where."""
-    async with identified(url) as amplifier:
-        found = await read_amplifier_sensors(amplifier)
-    return {
-        "url": url,
-        "sensors": [
-            {
-                "sensor": number,
-                "measures": one.unit.lower(),
-                "unit": _SENSOR_UNITS.get(one.unit),
-                "channel": one.channel,
-                "x_m": one.x,
-                "y_m": one.y,
-                "range": one.range,
-                "frequency_max_hz": one.frequency_max,
-            }
-            for number, one in enumerate(found)
-        ],
-    }
-
-
-async def measure_sensors(url: str, frequencies: Sequence[float], window: float) -> dict[str, Any]:
-    """Measure tones [Hz] at every sensor over a window [s]; what plays goes on."""
-    check_tones(frequencies, window)
-    async with identified(url) as amplifier:
-        described = await read_amplifier_sensors(amplifier)
-        if not described:
-            raise CommandError("the amplifier has no sensors")
-        reading = await measure_tones(amplifier, frequencies, window)
-    return {
-        "url": url,
-        "state": reading.state,
-        "token": reading.token,
-        "window_s": window,
-        "sensors": [
-            {
-                "sensor": number,
-                "unit": _SENSOR_UNITS.get(described[number].unit),
-                "overload": one.is_overloaded,
-                "tones": [
-                    {"frequency_hz": at, "amplitude": amplitude, "phase_deg": phase}
-                    for at, (amplitude, phase) in zip(frequencies, one.tones, strict=True)
-                ],
-            }
-            for number, one in enumerate(reading.sensors)
-        ],
-    }
+async def read_electrical(amplifier: Amplifier) -> list[tuple[float, float]]:
+    """Read voltage [V] and current [A] of each channel; empty if it does not measure them."""
+    if not has_feature(amplifier.ledger.capabilities, "electrical"):
+        return []
+    measured = await amplifier.request("GetMeasured", {}, Priority.READING)
+    voltage = QUANTITIES["channel_voltage"]
+    current = QUANTITIES["channel_current"]
+    return [
+        (voltage.from_wire(row["channel_voltage"]), current.from_wire(row["channel_current"]))
+        for row in measured["channels"]
+    ]
 
 
 async def stop(url: str) -> dict[str, Any]:
@@ -371,17 +317,6 @@ class BlockingAmplifier:
         values = {"session": self._amplifier.session, "rate": 0}
         return status_rows(self._wait(self._amplifier.request("Ping", values, Priority.HEARTBEAT)))
 
-    def sensors(self) -> tuple[AmplifierSensor, ...]:
-        """Read what its sensors measure, and where; empty if it has none."""
-        return self._wait(read_amplifier_sensors(self._amplifier))
-
-    def measure(self, frequencies: Sequence[float], window: float) -> Reading:
-        """Measure tones [Hz] at all sensors over a window [s], feeding the watchdog meanwhile.
-
-        What plays must have settled before. Raises CommandRefused if the amplifier stops by itself.
-        """
-        return self._wait(self._measured(frequencies, window))
-
     def apply(self, layers: Sequence[AmplifierLayer]) -> StagedSet:
         """Play these layers from now on, all else silent; returns them as on the wire.
 
@@ -411,17 +346,6 @@ class BlockingAmplifier:
 
     async def _stopped(self) -> StopOutcome:
         return await self._amplifier.stop()
-
-    async def _measured(self, frequencies: Sequence[float], window: float) -> Reading:
-        is_armed = (await self._amplifier.read_status())["state"] == ENABLED
-        measuring = asyncio.ensure_future(measure_tones(self._amplifier, frequencies, window))
-        try:
-            while is_armed and not measuring.done():
-                await asyncio.wait([measuring], timeout=HEARTBEAT)
-                await self._amplifier.ping()
-            return await measuring
-        finally:
-            measuring.cancel()
 
     def _end(self) -> None:
         try:

@@ -152,31 +152,6 @@ def drive(
 
 
 @amp.command()
-def sensors(url: Url, trace: Trace = None, json_: Json = False) -> None:
-    """Show what the sensors measure, and where."""
-    from drivers.by_hand import actions
-
-    _act(actions.sensors(url), trace=trace, json_=json_)
-
-
-@amp.command()
-def measure(
-    url: Url,
-    frequency: Annotated[
-        list[float],
-        typer.Option("--frequency", help="Frequency of a tone [Hz]; once for each, up to 16."),
-    ],
-    window: Annotated[float, typer.Option(help="Time over which to measure [s].")] = 0.5,
-    trace: Trace = None,
-    json_: Json = False,
-) -> None:
-    """Measure amplitude and phase of tones at every sensor. Changes nothing that plays."""
-    from drivers.by_hand.actions import measure_sensors
-
-    _act(measure_sensors(url, frequency, window), trace=trace, json_=json_)
-
-
-@amp.command()
 def stop(url: Url, trace: Trace = None, json_: Json = False) -> None:
     """Stop all channels at once. Latched until cleared.
 
@@ -243,19 +218,15 @@ def _act(
     json_: bool,
     needs_trace: bool = True,
 ) -> dict[str, Any]:
-    """Run an action and show its result: as rows, then a line for each sensor."""
+    """Run an action and show its result as rows."""
     result = run(action, trace, needs_trace=needs_trace)
     if json_:
         print(json.dumps(result))
         return result
-    rows = {k: value for k, value in result.items() if k != "sensors" and value not in (None, "")}
+    rows = {k: value for k, value in result.items() if value not in (None, "")}
     width = max(map(len, rows))
     for key, value in rows.items():
         print(f"{key:{width}}  {in_words(value)}")
-    for one in result.get("sensors", ()):
-        print(in_words(one))
-    if result.get("sensors") == []:
-        print("no sensors")
     return result
 
 

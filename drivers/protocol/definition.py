@@ -17,7 +17,6 @@ from drivers.protocol.records import (
     Bits,
     Number,
     Numbers,
-    Real,
     Record,
     Refusal,
     Rest,
@@ -100,25 +99,12 @@ REFUSALS: Mapping[str, int] = {
     "INCOMPLETE": 12,
 }
 STATUS_FLAGS: Mapping[str, int] = {"high_voltage": 0, "interlock_open": 1, "limited": 2}
-SENSOR_UNITS: Mapping[str, int] = {
-    "ACCELERATION": 1,
-    "VELOCITY": 2,
-    "DISPLACEMENT": 3,
-    "FORCE": 4,
-    "VOLTAGE": 5,
-}
-"""m/s², m/s, m, N and V, of the range and of the amplitudes of a sensor."""
-READING_STATES: Mapping[str, int] = {"NONE": 0, "RUNNING": 1, "COMPLETE": 2, "DISTURBED": 3}
-"""DISTURBED: complete as well, but what plays has changed within its window."""
-UNKNOWN_PLACE: Final = 0xFFFF
-"""Coordinate of a sensor whose place the amplifier does not know."""
 FEATURES: Mapping[str, int] = {
     "output": 0,
     "events": 1,
     "levels_measured": 2,
     "interlock": 3,
     "electrical": 4,
-    "sensors": 5,
     "address": 6,
     "mark": 7,
 }
@@ -163,13 +149,6 @@ _QUANTITIES = (
     _word("count", 0, 65535),
     _word("flags", 0, 65535),
     _word("code", 0, 65535),
-    _word("sensor", 0, 31),
-    _word("place", 0, 65535, 10000, "m"),
-    _word("reading", 1, 65535),
-    _word("held_reading", 0, 65535),
-    _word("window", 1, 10000, 1000, "s"),
-    _word("window_left", 0, 10000, 1000, "s"),
-    _word("tone_count", 1, 16),
     _word("clock", 0, 0xFFFFFFFF),
     _word("shift", 0, 65535),
     _word("at", 0, 65535),
@@ -255,12 +234,6 @@ _TAKEN = Record(
 )
 _FAULT = Record(*_numbers("fault:code", "channel:code", "age"))
 _MEASURED = Record(*_numbers("channel_voltage", "channel_current"))
-_SENSOR = Record(
-    *_numbers("unit:code", "channel:code", "x:place", "y:place"),
-    Real("range"),
-    *_numbers("frequency_max:frequency"),
-)
-_TONE = Record(Real("amplitude"), *_numbers("phase"))
 
 
 @dataclass(frozen=True, slots=True)
@@ -286,18 +259,6 @@ IDENTITY = Record(
 TEXTS = [field for field in IDENTITY.fields if isinstance(field, Text)]
 """The texts of an identity, in their order."""
 
-
-def sensor_reading(tones: int) -> Record:
-    """Return the record of one sensor of a reading: its flags (bit 0 overload), then its tones."""
-    return Record(*_numbers("flags"), Rows("tones", tones, _TONE))
-
-
-_READING = Record(
-    *_numbers("reading:held_reading", "state:code", "window_left"),
-    *_numbers("window_start:clock"),
-    *_numbers("token:played_token", "tones:count", "count"),
-    Rest("sensors"),  # see `sensor_reading`
-)
 
 _MESSAGES = (
     Message("GetCaps", 2, Record(), _CAPABILITIES),
@@ -348,25 +309,11 @@ _MESSAGES = (
         STATUS,
         is_broadcast=True,
     ),
-    Message(
-        "GetSensors",
-        16,
-        Record(*_numbers("first:sensor")),
-        Record(*_numbers("all:count", "count"), Rows("sensors", "count", _SENSOR)),
-    ),
-    Message(
-        "Measure",
-        17,
-        Record(
-            *_numbers("reading", "window", "tones:tone_count"),
-            Numbers("frequencies", "tones", QUANTITIES["frequency"]),
-        ),
-        _READING,
-    ),
-    Message("GetReading", 18, Record(*_numbers("first:sensor")), _READING),
     Message("Mark", 19, Record(), STATUS, is_broadcast=True),
 )
 MESSAGES: Mapping[str, Message] = {message.name: message for message in _MESSAGES}
+RESERVED_MESSAGES: Final = (16, 17, 18)
+"""Numbers of former messages, with feature bit 5; must not be reused."""
 BY_NUMBER: Mapping[int, Message] = {message.number: message for message in _MESSAGES}
 REQUESTS: Mapping[str, Message] = {"Hello": Message("Hello", HELLO, Record(), IDENTITY), **MESSAGES}
 """Requests by name: Hello, which every version has, and those of this version."""

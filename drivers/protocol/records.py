@@ -20,7 +20,6 @@ WORD = 0x10000
 _CODES = {"channel": "BAD_CHANNEL", "token": "BAD_TOKEN"}
 """Of Naks, by quantity; others are BAD_VALUE."""
 TEXT_MAX = 32  # bytes
-_REAL_MAX = (2 - 2**-23) * 2.0**127  # of IEEE 754 binary32
 _TOLERANCE = 1e-3  # of a step; sums of floats may exceed a range by rounding
 
 UNITS: Mapping[str, tuple[str, str]] = {
@@ -208,29 +207,6 @@ class Bits:
 
 
 @dataclass(frozen=True, slots=True)
-class Real:
-    """A number of type f32: finite and not negative, two words."""
-
-    name: str
-    words = 2
-
-    def pack(self, values: Mapping[str, Any], words: list[int]) -> None:
-        """Append the number."""
-        value = values[self.name]
-        if not 0 <= value <= _REAL_MAX:
-            raise ValueError(f"{self.name} must be 0 to {_REAL_MAX:.4g}, got {value:g}")
-        words.extend(struct.unpack(">HH", struct.pack(">f", value)))
-
-    def unpack(self, words: Sequence[int], at: int, values: Values) -> int:
-        """Read the number."""
-        (value,) = struct.unpack(">f", struct.pack(">HH", words[at], words[at + 1]))
-        if not 0 <= value <= _REAL_MAX:
-            raise Refusal(f"{self.name} must be 0 to {_REAL_MAX:.4g}, got {value}")
-        values[self.name] = value
-        return at + 2
-
-
-@dataclass(frozen=True, slots=True)
 class Text:
     """A text of at most 32 bytes of UTF-8: its length, then two bytes a word, the first high."""
 
@@ -324,7 +300,7 @@ class Rest:
         return len(words)
 
 
-Field = Number | Bits | Real | Text | Numbers | Rows | Rest
+Field = Number | Bits | Text | Numbers | Rows | Rest
 
 
 class Record:
@@ -344,7 +320,7 @@ class Record:
         self.places: dict[str, int] = {}
         self.words = 0
         for field in fields:
-            if not isinstance(field, Number | Bits | Real) or field in self.added:
+            if not isinstance(field, Number | Bits) or field in self.added:
                 break
             names = dict(field.parts) if isinstance(field, Bits) else [field.name]
             self.places |= dict.fromkeys(names, self.words)

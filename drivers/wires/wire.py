@@ -34,7 +34,6 @@ from drivers.protocol.records import (
     Bits,
     Number,
     Numbers,
-    Real,
     Record,
     Refusal,
     Rest,
@@ -178,7 +177,7 @@ def _words(record: Record, rows: Mapping[str, int]) -> int:
                 words += MAX_WORDS
             case Text():
                 words += 1 + TEXT_MAX // 2
-            case Number() | Bits() | Real():
+            case Number() | Bits():
                 words += field.words
     return min(words, MAX_WORDS)
 

@@ -16,8 +16,6 @@ export interface Methods {
   stop: { params: RequestedBy; result: StopResult };
   /** Clear a stop, or a fault that no longer exists. Stays disarmed. */
   clear: { params: ClearParams; result: Empty };
-  /** Discard what was learned of the plate, and learn anew. Answers are those of the table at once. */
-  forget: { params: RequestedBy; result: Empty };
   /** Report all fingers of a touch source of this client. */
   touch: { params: TouchParams; result: Empty };
   /** Use one of the daemon's layouts. Of resting fingers, what ends by itself and what a program plays goes on to its end; what lasts follows the new layout at once. */
@@ -57,8 +55,6 @@ export interface Topics {
   link: LinkEvent;
   /** another surface layout is in use, or it was replaced */
   layout: LayoutEvent;
-  /** the plate has changed, or is followed otherwise */
-  plate: PlateEvent;
   /** touch inputs that are missing, mute or back; rejected touches, each second */
   inputs: InputsEvent;
   /** strengths of sources, clients and regions, at rate_hz */
@@ -153,8 +149,6 @@ export interface StatusResult {
   clicks_too_late?: number;
   /** notifications that clients were too slow to read, by topic */
   lost_events?: Record<string, number>;
-  /** of the plate while it plays; null where nothing is to be learned */
-  learning?: LearningSummary | null;
   /** name of the layout in use; null without any */
   layout?: string | null;
   /** names that `layout` accepts */
@@ -279,14 +273,14 @@ export interface StrengthResult {
 
 /** Topics to receive, and the rate of the periodic ones. */
 export interface SubscribeParams {
-  topics: Array<"state" | "contacts" | "pattern" | "silence" | "amplifiers" | "latency" | "log" | "link" | "layout" | "plate" | "inputs" | "strength">;
+  topics: Array<"state" | "contacts" | "pattern" | "silence" | "amplifiers" | "latency" | "log" | "link" | "layout" | "inputs" | "strength">;
   /** of amplifiers and latency; default 10 */
   rate_hz?: number | null;
 }
 
 /** Topics to receive no longer. */
 export interface UnsubscribeParams {
-  topics: Array<"state" | "contacts" | "pattern" | "silence" | "amplifiers" | "latency" | "log" | "link" | "layout" | "plate" | "inputs" | "strength">;
+  topics: Array<"state" | "contacts" | "pattern" | "silence" | "amplifiers" | "latency" | "log" | "link" | "layout" | "inputs" | "strength">;
 }
 
 /** The daemon changed its state. */
@@ -366,21 +360,6 @@ export interface LayoutEvent {
   name?: string | null;
   /** the surface layout; null without one */
   layout: Record<string, unknown> | null;
-}
-
-/** What is known of the plate has changed, or whether it is followed. */
-export interface PlateEvent {
-  /** why it is so */
-  cause: string;
-  /** what to do about it; null if nothing */
-  remedy: string | null;
-  state: "following" | "changed" | "off";
-  /** whether answers are those of a plate that is not known: it has changed in an unknown way, an object lies on it, or there was no estimator for a minute */
-  cautious: boolean;
-  /** patterns so far that show another plate than the known one */
-  alarms: number;
-  /** what lies on it, where that is the change; optional */
-  object?: PlateObject | null;
 }
 
 /** A touch input was opened, fell silent or was lost, or touches were rejected. */
@@ -511,37 +490,6 @@ export interface TouchInputStatus {
   problem?: string | null;
 }
 
-/** What is learned of the plate while it plays, and how often. */
-export interface LearningSummary {
-  /** why it is so */
-  cause: string;
-  /** what to do about it; null if nothing */
-  remedy: string | null;
-  state: "following" | "changed" | "off";
-  /** whether answers are those of a plate that is not known: it has changed in an unknown way, an object lies on it, or there was no estimator for a minute */
-  cautious: boolean;
-  /** patterns so far that show another plate than the known one */
-  alarms: number;
-  /** what lies on it, where that is the change; optional */
-  object?: PlateObject | null;
-  /** settled patterns that were measured */
-  readings: number;
-  /** of these, by the estimator */
-  estimates: number;
-  /** of these, not estimated, since the estimator ended or had too many */
-  discarded: number;
-  /** settled patterns whose measurement a change, an overload or the link spoilt */
-  disturbed: number;
-  /** of the answers to touches */
-  corrections: number;
-  /** of the estimator */
-  restarts: number;
-  /** time since the last estimate */
-  last_estimate_s: number | null;
-  /** from the end of a measurement to the answers that follow it */
-  latency_ms: LatencySummary;
-}
-
 /** What an amplifier may play, after a stop or where it does not reply. */
 export interface AmplifierSilence {
   /** confirmed by its status after a stop; may play; or unconfirmed, but its watchdog must have silenced it */
@@ -570,13 +518,6 @@ export interface EffectDescription {
   description: string;
   /** by their names in a layout, in SI units */
   parameters: Record<string, unknown>;
-}
-
-/** An object that was found on the plate; its place is from the south-west corner. */
-export interface PlateObject {
-  x_m: number;
-  y_m: number;
-  mass_kg: number;
 }
 
 /** Position of an ERA under the plate, from the south-west corner, and its wiring. */

@@ -57,22 +57,14 @@ class Timing:
     Takes about ten milliseconds to make, and one more at the first use of each frequency.
     """
 
-    def __init__(self, table: LocalizationTable, *, shaper: Shaper | None = None) -> None:
+    def __init__(self, table: LocalizationTable) -> None:
         self._table, self._eras = table, table.eras
-        variance = table.uncertainty.gain_variance
-        self._shaper = shaper or Shaper(
+        self._shaper = Shaper(
             table.in_time,
-            gain_variance=variance,
+            gain_variance=table.uncertainty.gain_variance,
             fingertips=partial(_few_points, table),
             magnets=table.magnets,
         )
-
-    def following(self, table: LocalizationTable) -> "Timing":
-        """Return the timing of a table that was updated to its plate, with this one's shaper.
-
-        Nothing has to be prepared again.
-        """
-        return Timing(table, shaper=self._shaper)
 
     def prepare(self, frequencies: Iterable[float]) -> None:
         """Compute in advance what shaping needs at frequencies [Hz]."""

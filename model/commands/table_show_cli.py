@@ -1,16 +1,13 @@
-"""`era table show` and `era table verify`: a table's summary, and checks of its answers.
+"""`era table show` and `era table verify`: a table's summary, and its answers by other methods."""
 
-A table is verified by other methods of solution, or by measuring on the plate itself.
-"""
-
-from collections.abc import Callable, Iterator
-from pathlib import Path
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from model.commands.options import (
     JsonOption,
+    RigArgument,
     Stopwatch,
     TableArgument,
     next_line,
@@ -18,16 +15,11 @@ from model.commands.options import (
     progress_bar,
 )
 from model.errors import InputError
-from model.files.output_paths import begins_with, check_picture
-from model.quantities import counted
+from model.files.output_paths import begins_with
 
 if TYPE_CHECKING:
     from model.study.contrast_maps import WeakCells
-    from model.study.promise_at_sensors import CheckSettings, MeasuredVerification
     from model.study.verification import Verification
-
-check_by_card: "Callable[..., MeasuredVerification] | None" = None
-"""Plays promises of a table through a sound card; set by the lab, which knows such cards."""
 
 
 def show(
@@ -139,82 +131,23 @@ def _map_rows(cells: "WeakCells", *, listed: bool) -> Iterator[str]:
 
 def verify(
     table_file: TableArgument,
-    rig_file: Annotated[
-        Path | None,
-        typer.Argument(
-            metavar="RIG",
-            help="Rig file; with --device its wiring, by default ERAs in order; --url needs it.",
-        ),
-    ] = None,
-    device: Annotated[
-        str | None,
-        typer.Option(metavar="DEVICE", help="Measure instead, through this sound card."),
-    ] = None,
-    sensors_file: Annotated[
-        Path | None,
-        typer.Option(
-            "--sensors", metavar="SENSORS.csv", help="Accelerometers at its inputs, as of measure."
-        ),
-    ] = None,
-    url: Annotated[
-        str | None,
-        typer.Option(metavar="URL", help="Amplifier that plays, in place of the sound card."),
-    ] = None,
-    level: Annotated[
-        float | None,
-        typer.Option(
-            metavar="LEVEL",
-            help="Level of the loudest ERA with --device, 0..1 of its stroke: with a RIG half of "
-            "what its limits allow by default; without one to be stated, and the limit.",
-        ),
-    ] = None,
-    picture: Annotated[
-        Path | None,
-        typer.Option(metavar="PROMISED.png", help="Draw promised and measured, with --device."),
-    ] = None,
+    rig_file: RigArgument,
     samples: Annotated[int, typer.Option(min=1, max=10_000, help="Answers to recompute.")] = 12,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the sample.")] = 0,
     as_json: JsonOption = False,
 ) -> None:
-    """Verify a table against a direct solution.
+    """Verify a table against a direct solution at each frequency, and in time.
 
-    Solve the plate at each frequency, and in time; with --device play patterns and compare what
-    accelerometers measure with what nine of ten plates promise. Exit with 1 if a check fails.
+    Exit with 1 if a check fails.
     """
-    from model.table.table_file import ZIP
+    from model.rig.rig_file import load_rig
+    from model.study.verification import verify_table
+    from model.table.table_file import ZIP, load_table
 
-    if rig_file is not None and begins_with(rig_file, ZIP) and not begins_with(table_file, ZIP):
+    if begins_with(rig_file, ZIP) and not begins_with(table_file, ZIP):
         raise InputError(
             f"the table must come before the rig: era table verify {rig_file} {table_file}"
         )
-    if device is not None:
-        from model.study.promise_at_sensors import CheckSettings
-
-        if sensors_file is None:
-            raise InputError("--sensors is missing: a file of the accelerometers at the inputs")
-        if url is not None and rig_file is None:
-            raise InputError(
-                "the rig is missing, with limits and wiring of the amplifier at --url: "
-                f"era table verify {table_file} RIG.yaml --device {device} --url {url}"
-            )
-        settings = CheckSettings(device, sensors_file, url, samples, seed, level)
-        _verify_by_measuring(table_file, rig_file, settings, picture=picture, as_json=as_json)
-        return
-    for option, given in (("--sensors", sensors_file), ("--url", url), ("--picture", picture)):
-        if given is not None:
-            raise InputError(f"{option} is of a measurement; give --device too")
-    if rig_file is None:
-        raise InputError(f"the rig is missing: era table verify {table_file} RIG.yaml")
-    _verify_by_solving(table_file, rig_file, samples=samples, seed=seed, as_json=as_json)
-
-
-def _verify_by_solving(
-    table_file: Path, rig_file: Path, *, samples: int, seed: int, as_json: bool
-) -> None:
-    from model.rig.rig_file import load_rig
-    from model.study.verification import verify_table
-    from model.table.table_file import load_table
-
     rig = load_rig(rig_file)
     table = load_table(table_file, rig=rig)
     with Stopwatch() as timed, progress_bar("answers") as progress:
@@ -259,72 +192,4 @@ def _verification_rows(found: "Verification", threshold: str) -> Iterator[str]:
     yield (
         f"\npromised contrast kept on {100 * promise.kept_share:.0f} % of {plates}  "
         f"{'passed' if promise.is_passed else 'FAILED'}"
-    )
-
-
-def _verify_by_measuring(
-    table_file: Path,
-    rig_file: Path | None,
-    settings: "CheckSettings",
-    *,
-    picture: Path | None,
-    as_json: bool,
-) -> None:
-    """Measure promises of a table; exit with 1 where too few are kept."""
-    from model.rig.rig_file import load_rig
-    from model.study.promise_at_sensors import plain_rig
-    from model.table.table_file import load_table
-
-    if picture is not None:
-        check_picture(picture)
-    if rig_file is None:
-        if settings.level is None:
-            raise InputError(
-                "limits must be known: give the rig too, or --level, which no output will exceed; "
-                "a table has none"
-            )
-        table = load_table(table_file)
-        rig = plain_rig(table, level=settings.level)
-    else:
-        rig = load_rig(rig_file)
-        table = load_table(table_file, rig=rig)
-    assert check_by_card is not None  # noqa: S101  the lab is loaded
-    with Stopwatch() as timed, progress_bar("patterns") as progress:
-        found = check_by_card(table, rig, settings, progress=progress)
-    files = []
-    if picture is not None:
-        from model.figures import promise_figure, save_figure
-
-        save_figure(promise_figure(found), picture)
-        files.append(str(picture))
-    rows = [
-        *_measured_rows(found, table.threshold),
-        f"{counted(len(found.measured), 'pattern')} measured in {timed.elapsed:.1f} s "
-        f"(seed {settings.seed})",
-        f"wrote {', '.join(files)}" if files else None,
-    ]
-    answer = {"seed": settings.seed, "verify_time_s": timed.elapsed, "files": files}
-    print_report(rows, found.as_json() | answer, as_json=as_json)
-    if not found.is_passed:
-        raise typer.Exit(1)
-
-
-def _measured_rows(found: "MeasuredVerification", threshold: str) -> Iterator[str]:
-    """Yield what was promised and measured of each pattern; threshold: set of all levels."""
-    from model.finger import scale_in_words
-
-    yield scale_in_words(threshold)
-    yield "                                    felt contrast, dB            level, dB SL"
-    yield "target  quiet                  promised   median  measured  promised  measured"
-    for each in found.measured:
-        target, *quiet = each.sensors
-        yield (
-            f"{target:7s} {', '.join(quiet):20s} {each.contrast_db:10.1f} "
-            f"{each.median_db:8.1f} {each.measured_contrast_db:9.1f} "
-            f"{each.level_db_sl:9.1f} {each.measured_level_db_sl:9.1f}  "
-            f"{'kept' if each.is_kept else 'BROKEN'}"
-        )
-    yield (
-        f"promised contrast kept by {100 * found.kept_share:.0f} % of the patterns, nine of ten "
-        f"are expected  {'passed' if found.is_passed else 'FAILED'}"
     )

@@ -14,7 +14,7 @@ import numpy as np
 from model.arrays import FloatArray, Point
 from model.estimate.calibrate import Calibration
 from model.estimate.fit import Parameter
-from model.estimate.identify import MAX_CHI2, MAX_MODE_SHIFT, Identification, clock_estimates
+from model.estimate.identify import MAX_CHI2, MAX_MODE_SHIFT, Identification
 from model.estimate.parameters import PARAMETER_KINDS
 from model.estimate.space import MAX_GUESSED, UNIT_KEYS
 from model.quantities import counted, in_display_unit, percent, with_error
@@ -303,21 +303,6 @@ def parameter_rows(found: Identification) -> list[str]:
     return estimate_table(rows)
 
 
-def clock_rows(found: Identification) -> list[str]:
-    """Lines of the clocks' delays, which the rig's gains correct, and of unbelievable ones."""
-    rows = []
-    for each in clock_estimates(found):
-        late = f"{with_error(each.delay_us, each.error_us, sign='+')} us"
-        rows.append(f"clock of amplifier {each.amplifier}: {late}, taken off by its ERAs' gains")
-        if not each.is_believed:
-            rows.append(
-                f"amplifier {each.amplifier} or the first one must be within "
-                f"{each.stated_us:.0f} us, as stated, got {late}; its clock_error is not true, "
-                "or its output is late otherwise than that of its product"
-            )
-    return rows
-
-
 def contrast_rows(expected: Sequence[ExpectedContrast]) -> list[str]:
     """Lines of the contrast to expect before and after, and of what is promised."""
     if not expected:
@@ -352,9 +337,6 @@ def identification_json(
                 "standard_deviation_before": each.prior,
             }
             for each in identified_parameters(found)
-        ],
-        "clocks": [
-            {**asdict(each), "is_believed": each.is_believed} for each in clock_estimates(found)
         ],
         "uncertainty": asdict(found.rig.uncertainty),
         "expected_contrast": [

@@ -48,7 +48,6 @@ from model.reduction.free_plate import TERMS, FreePlate, FreeReceptance, combine
 from model.reduction.reduced_plate import AttachmentPoints, Modes, ReducedModes, places_of
 from model.rig.rig import Rig, Uncertainty
 from model.structure.attachments import (
-    Fingertip,
     attached_stiffness,
     coupled_forces,
     drive_forces,
@@ -71,9 +70,6 @@ MASS_CELLS = Grid(8, 6)
 
 MIN_LOSS_FACTOR = 1e-9
 """Least loss factor, so that there are derivatives by its logarithm."""
-
-FINGER_PARTS = ("contact mass", "pulp", "phalanx", "joint")
-"""Parts of a finger's load that vary independently."""
 
 MODE_SHIFTS = 12
 """Number of the lowest elastic modes with eigenvalues and loss factors of their own."""
@@ -106,21 +102,8 @@ class Sensor:
     """Name of the ERA at whose bolt it is, "" for one at x, y [m]."""
     x: float = 0.0
     y: float = 0.0
-    amplifier: str = ""
-    """Amplifier on whose clock its phases count, "" for that of no amplifier."""
     mass: float = 0.0
     """Mass [kg] on the plate while this sensor measures, as of one that is moved."""
-
-
-@dataclass(frozen=True)
-class RestingFinger:
-    """A finger that rests at x, y [m], with the load that is known of it."""
-
-    x: float
-    y: float
-    fingertip: Fingertip
-    tones: tuple[int, ...] | None = None
-    """Numbers of the tones during which it rests, None for all."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,8 +117,6 @@ class SearchScope:
     """How well the rig is known; none for one that data sheets alone describe."""
     drives_lag: bool = False
     """Whether bases follow what is played with a lag that nothing states."""
-    amplifiers: Sequence[str] = ()
-    """Names of the amplifiers whose clocks may be off."""
     masses: int = 0
     """Number of additional masses."""
     mode_count: int = MODE_SHIFTS
@@ -183,10 +164,6 @@ class ParameterKind(ABC):
     """Unit in reports for people; logarithms of factors are written in per cent."""
     per_unit = 100.0
     """Number of report units in one unit of `PlateValues`."""
-    drift = 0.0
-    """Standard deviation of the random walk in an hour of service."""
-    drifts_to = 0.0
-    """Largest standard deviation that drift leads to, 0 for `std`."""
     theory = 0.0
     """Error of a fitted value because of the plate theory: its change with viscous losses and
     without shear deformation, for plates of 1.5 mm."""
@@ -214,11 +191,6 @@ class ParameterKind(ABC):
     def value(self, values: "PlateValues") -> Any:
         """The value of the rig that the parameters represent, by default their deviations."""
         return values.deviations(self.name)
-
-    @property
-    def widest(self) -> float:
-        """Largest standard deviation that drift leads to."""
-        return self.drifts_to or self.std
 
 
 @dataclass(frozen=True, eq=False)
@@ -307,8 +279,8 @@ class Space:
 class PlateValues:
     """Values of a rig's plate by the kinds of parameters x (p,) that change them.
 
-    `ParameterKind.value` defines each of them. Arrays have n ERAs, m additional masses, k fingers
-    or s sensors.
+    `ParameterKind.value` defines each of them. Arrays have n ERAs, m additional masses or s
+    sensors.
     """
 
     def __init__(self, rig: Rig, space: Space, x: FloatArray) -> None:
@@ -351,7 +323,7 @@ class PlateValues:
 
 @dataclass(frozen=True, eq=False)
 class ForwardModel:
-    """A rig's plate on its attachments, with sensors and fingers, as a function of parameters.
+    """A rig's plate on its attachments, with sensors, as a function of parameters.
 
     Raises InputError for a plate that does not scale with a thickness or modulus that may differ.
     """
@@ -364,11 +336,8 @@ class ForwardModel:
     """Parameters, those that may differ from the rig's values among them."""
     free: FreePlate
     """The free plate, solved for the rig's thickness and modulus or for others."""
-    fingers: Sequence[RestingFinger] = ()
     form: ReducedModes | None = None
     """The plate in coordinates in which it may have form errors."""
-    amplifiers: Sequence[str] = ()
-    """Names of the amplifiers whose clocks may be off, in the order of the delays."""
     law: ComplexArray | None = None
     """Change of the receptance (f, s, n) [m/N] where losses are viscous, None to leave it out."""
     last_places: dict[bytes, AttachmentPoints] = field(default_factory=dict)
@@ -393,22 +362,10 @@ class ForwardModel:
     def observed(self) -> IntArray:
         """Indices of the sensors among the attachments, (s,)."""
         names = [era.name for era in self.rig.eras]
-        after = len(names) + len(self.rig.masses) + self.mass_count + len(self.fingers)
+        after = len(names) + len(self.rig.masses) + self.mass_count
         at_eras = [names.index(each.era) if each.era else -1 for each in self.sensors]
         alone = np.array(at_eras) < 0
         return np.where(alone, after + np.cumsum(alone) - 1, at_eras)
-
-    @cached_property
-    def lateness(self) -> FloatArray:
-        """Sign of the delay of each response by the clock of each amplifier, (s, n, amplifiers).
-
-        1 where the amplifier plays, -1 where it hears, since what it hears seems early.
-        """
-        names = [*self.amplifiers]
-        plays = [self.rig.wiring[era.name].amplifier for era in self.rig.eras]
-        hears = [each.amplifier for each in self.sensors]
-        own = [np.array([[each == name for name in names] for each in of]) for of in (plays, hears)]
-        return np.asarray(own[0].astype(float)[None] - own[1].astype(float)[:, None])
 
     @property
     def modes(self) -> Modes:
@@ -469,7 +426,7 @@ class ForwardModel:
             return np.array([], dtype=int)
         first = len(self.rig.eras) + len(self.rig.masses)
         movable = [*range(len(self.rig.eras)), *range(first, first + self.mass_count)]
-        last = first + self.mass_count + len(self.fingers)
+        last = first + self.mass_count
         sensors = range(last, last + len(self.space.indices("sensor_place")) // 2)
         return np.array([*movable, *sensors], dtype=int)
 
@@ -503,10 +460,9 @@ class ForwardModel:
         return np.array([self.rig.plate.length, self.rig.plate.width])
 
     def _footprints(self, values: PlateValues) -> FloatArray:
-        """Footprints of ERAs, masses, additional masses, fingers and sensors, (a, 3) [m]."""
+        """Footprints of ERAs, masses, additional masses and sensors, (a, 3) [m]."""
         feet = [era.foot for era in self.rig.eras]
-        fingers = np.array([(each.x, each.y) for each in self.fingers]).reshape(-1, 2)
-        points = np.vstack([values["masses"][:, 1:], fingers])
+        points = values["masses"][:, 1:]
         pads = self.pads.copy()
         pads[: len(values["sensor_place"]), :2] += values["sensor_place"]
         return np.vstack(
@@ -542,19 +498,12 @@ class PlateAt:
         self.full_levels = np.array([each.full_level for each in self.sources])
         self.force = drive_forces(model.omega, self.sources) / self.full_levels
         """Force of each ERA on a plate that is held, per unit of its drive, (f, n)."""
-        loads = [
-            _finger(each, logs, model.omega)
-            for each, logs in zip(model.fingers, values["fingers"], strict=True)
-        ]
-        self.finger_slopes = [slopes for _, slopes in loads]
-        """Derivatives of each finger's dynamic stiffness by its parts, (f, 4)."""
         fixed = model.fixed_stiffness.copy()
         fixed[:, list(model.rig.feet)] += (values["supports"] - 1) * model.springs
         held = [
             attached_stiffness(model.omega, self.sources),
             fixed,
             -(w**2) * values["masses"][:, 0],
-            *(load[:, None] for load, _ in loads),
             np.zeros((len(w), len(model.pads))),
         ]
         self.stiffness = Z = np.concatenate(held, axis=1)
@@ -608,13 +557,7 @@ class PlateAt:
     def scale(self) -> ComplexArray:
         """Factors from T at sensors and ERAs to responses, (f, s, n)."""
         gains = self.values["sensor_gain"] * self.values["sensor_scale"]
-        return np.asarray(gains[:, None] * self.drive[:, None] * self.late)
-
-    @cached_property
-    def late(self) -> ComplexArray:
-        """Factor of responses by clocks that are off (f, s, n)."""
-        delays = self.model.lateness @ self.values["delay"]
-        return np.asarray(np.exp(-1j * self.model.omega[:, None, None] * delays))
+        return np.asarray(gains[:, None] * self.drive[:, None])
 
     @cached_property
     def loaded(self) -> ComplexArray:
@@ -822,29 +765,6 @@ class PlateAt:
             found = found + loaded.reshape(*loaded.shape, *further) * own
             found = found * self.lightness.reshape(*self.lightness.shape, 1, *further)
         return np.asarray(found * self.scale.reshape(*self.scale.shape, *further))
-
-
-def _finger(
-    finger: RestingFinger, logs: FloatArray, omega: FloatArray
-) -> tuple[ComplexArray, ComplexArray]:
-    """Dynamic stiffness (f,) of a finger with scaled parts, and its derivatives by each (f, 4).
-
-    logs (4,): logarithms of the factors on contact mass, pulp, phalanx and joint.
-    """
-    tip, rests = finger.fingertip, np.ones(len(omega))
-    if finger.tones is not None:
-        rests = np.isin(np.arange(len(omega)), finger.tones).astype(float)
-    mass, pulp, phalanx, joint = np.exp(logs)
-    w = omega
-    Zm = -(w**2) * tip.contact_mass * mass
-    Zp = pulp * (tip.stiffness + 1j * w * tip.damping)
-    Zb = -(w**2) * tip.phalanx_mass * phalanx
-    Zj = joint * (tip.joint_stiffness + 1j * w * tip.joint_damping)
-    total = Zp + Zb + Zj
-    by_pulp, by_bone = ((Zb + Zj) / total) ** 2, (Zp / total) ** 2
-    D = Zm + Zp * (Zb + Zj) / total
-    slopes = np.column_stack([Zm, by_pulp * Zp, by_bone * Zb, by_bone * Zj])
-    return rests * D, rests[:, None] * slopes
 
 
 def viscous_difference(model: ForwardModel, x: FloatArray) -> ComplexArray:

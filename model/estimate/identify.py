@@ -75,7 +75,6 @@ _GAIN_STDS = 5.0  # beyond which a gain is wrong
 _GAIN_ALLOWED, _PHASE_ALLOWED = 0.3, math.radians(20)  # whatever the rig's uncertainty
 _LEVEL_ALLOWED = math.log(2.5)  # of all responses together: a g is 9.8 m/s², an inch 25.4 mm
 
-_CLOCK_STDS = 4.0  # beyond which a clock is not as stated
 
 _EXTRA_NOISE = 0.05  # of the rms at each frequency, in the first stages
 _THICKNESSES = (0.0, 1.5, -1.5)  # standard deviations from which the first stage starts
@@ -307,17 +306,16 @@ def model_of(
 
     free: the rig's free plate, as solved; more: further sensors beside those of the measurement.
     """
-    sensors, amplifiers = (*measurement.sensors, *more), sorted(measurement.clock_errors)
+    sensors = (*measurement.sensors, *more)
     space = space_of(
         rig,
         [sensor.name for sensor in sensors],
         rig.uncertainty,
         drives_lag=measurement.drives_lag,
-        amplifiers=amplifiers,
         masses=masses,
         mode_count=len(lowest_elastic(free.modes.eigenvalues, MODE_SHIFTS)),
     )
-    return ForwardModel(rig, sensors, measurement.frequencies, space, free, amplifiers=amplifiers)
+    return ForwardModel(rig, sensors, measurement.frequencies, space, free)
 
 
 def fit_board(rig: Rig, measurement: Measurement) -> Fit:
@@ -407,7 +405,7 @@ def _with_mass(model: ForwardModel, rough: Measurement, x: FloatArray, *, number
     """Fit places and an additional mass from where it explains most, and from none, best first."""
     space, plate = model.space, model.rig.plate
     start = inwards(space, x, by=_INWARDS)
-    others = space.uncertain & ~space.of("masses", "mode_shifts", "mode_losses", "fingers")
+    others = space.uncertain & ~space.of("masses", "mode_shifts", "mode_losses")
     linear = fit(model, rough, searched=others, start=start, evaluations=1)
     points, own = _MASS_GRID.centres(plate), space.groups["masses"].start + 3 * number
     starts = [start]
@@ -619,34 +617,3 @@ def identification_errors(found: Identification) -> dict[KeyPath, float]:
     own = parameters_of(rig, ("thickness", "loss_factor"), ("stiffness", "damping"), rig.foot_names)
     stated = zip(own, relative, strict=False)  # feet that no spring holds have no error
     return errors_by_key(rig, ((each, each.before * error) for each, error in stated))
-
-
-@dataclass(frozen=True)
-class ClockEstimate:
-    """Delay of an amplifier's clock against the first one's, as the plate shows it."""
-
-    amplifier: str
-    delay_us: float
-    error_us: float
-    """Standard error of the delay."""
-    stated_us: float
-    """Rms error of both clocks, as they and their lines state."""
-
-    @property
-    def is_believed(self) -> bool:
-        """Whether the stated errors explain the delay; one true statement in 16 000 fails."""
-        return abs(self.delay_us) <= _CLOCK_STDS * math.hypot(self.error_us, self.stated_us)
-
-
-def clock_estimates(found: Identification) -> list[ClockEstimate]:
-    """Delays of all amplifiers' clocks to that of the first one by name."""
-    stated = found.fitted.measurement.clock_errors
-    first, *others = sorted(stated) or [""]
-    part = found.fitted.space.groups["delay"]
-    rows = zip([first, *others], found.values["delay"], found.std[part], strict=False)
-    estimated = [
-        ClockEstimate(name, 1e6 * delay, 1e6 * error, 1e6 * math.hypot(stated[first], stated[name]))
-        for name, delay, error in rows
-        if name != first
-    ]
-    return [each for each in estimated if math.isfinite(each.stated_us)]

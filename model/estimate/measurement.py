@@ -16,7 +16,7 @@ import logging
 import math
 import re
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import compress
 from pathlib import Path
@@ -132,9 +132,6 @@ class Measurement:
     and no polarity."""
     drives_lag: bool = False
     """Whether bases follow what is played with an unknown lag, as behind voltage amplifiers."""
-    clock_errors: Mapping[str, float] = field(default_factory=dict)
-    """Errors of the clocks of the amplifiers that played and heard, rms [s], by name, as they and
-    their lines state; empty where all have one clock."""
     skipped: int = 0
     """Number of values that were read beyond the rig's limits of frequency."""
     gain_std: float = 0.0
@@ -246,6 +243,23 @@ class Measurement:
                         f"response to ERA {repeat.era} at {repeat.frequency:g} Hz must stay within "
                         f"{100 * limit:g} %, got {100 * difference:.1f} % {cause}"
                     )
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredPlate:
+    """A measurement and the circumstances in which it was made."""
+
+    measurement: Measurement
+    level: float | None
+    """Largest sample of each output, 0..1 of full scale; None for a file."""
+    duration: float | None
+    """Duration [s]; None for a file."""
+    sensors: tuple[Mapping[str, object], ...]
+    """The sensors used, for programs."""
+    notes: tuple[str, ...]
+    """Lines for people."""
+    details: Mapping[str, object]
+    """Further keys and values for programs."""
 
 
 def sensors_at(

@@ -18,9 +18,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from model.arrays import ComplexArray, FloatArray, IntArray
+from model.arrays import ComplexArray, FloatArray
 from model.estimate.forward import (
-    FINGER_PARTS,
     MASS_CELLS,
     MIN_LOSS_FACTOR,
     ParameterKind,
@@ -150,7 +149,6 @@ class ThicknessFactor(StatedByRig, PlateParameter):
 
     name = label = "thickness"
     std = _AS_BUILT.thickness
-    drift = 0.01
     stage = 0
     is_listed = True
 
@@ -189,7 +187,6 @@ class LossFactor(PlateParameter):
     name = "loss"
     label = "loss factor"
     std = _DAMPING_STD
-    drift = 0.1
     stage = 0
     is_listed = True
 
@@ -282,7 +279,6 @@ class Stiffness(StatedByRig, EraFactor):
 
     name = label = "stiffness"
     std = _AS_BUILT.stiffness
-    drift = 0.03
     theory = 3e-3
     stage = 0
     is_listed = True
@@ -320,8 +316,6 @@ class DampingOfEra(EraParameter):
     name = "damping_each"
     label = "damping"
     std = 0.2
-    drift = 0.07
-    drifts_to = _DAMPING_STD
     theory = 0.01
     stage = 0
 
@@ -367,7 +361,6 @@ class DriveGain(StatedByRig, EraParameter):
 
     name = label = "gain"
     std = _AS_BUILT.gain
-    drift = 0.01
     stage = 0
     is_listed = True
 
@@ -389,7 +382,6 @@ class DrivePhase(EraParameter):
     std = math.radians(_AS_BUILT.phase_deg)
     unit = "°"
     per_unit = math.degrees(1)
-    drift = math.radians(1)
     stage = 0
     is_listed = True
 
@@ -434,30 +426,6 @@ class DriveDrag(EraParameter):
     def derivative(self, plate: PlateAt) -> ComplexArray:
         kilohertz = 1e-3 * plate.model.frequencies[:, None]
         return plate.by_drives((-1j * kilohertz * plate.lag)[:, None, None])
-
-
-class ClockDelay(ParameterKind):
-    """Delay of each amplifier's clock [s]; exchanges over different kinds of lines do not show it.
-
-    Only differences between amplifiers matter, so the first one is known.
-    """
-
-    name = "delay"
-    std = 200e-6
-    unit = "us"
-    per_unit = 1e6
-    stage = 0
-
-    def names(self, scope: SearchScope) -> Sequence[str]:
-        return [f"delay of amplifier {amplifier}" for amplifier in scope.amplifiers]
-
-    def prior(self, scope: SearchScope) -> Prior:
-        is_first = np.arange(len(scope.amplifiers)) == 0
-        return Prior(np.where(is_first, 0.0, self.std))
-
-    def derivative(self, plate: PlateAt) -> ComplexArray:
-        omega = plate.model.omega[:, None, None, None]
-        return np.asarray(-1j * omega * plate.responses[..., None] * plate.model.lateness)
 
 
 class BoltMass(EraParameter):
@@ -507,7 +475,6 @@ class ForceFactor(ExciterFactor):
 
     name = "force_factor"
     label = "force factor"
-    drift = 0.01
     largest_factor = math.inf
 
 
@@ -603,26 +570,6 @@ class FootStiffness(StatedByRig):
         return plate.by_stiffness(feet, plate.values[self.name] * plate.model.springs)
 
 
-class FingerParts(ParameterKind):
-    """Logarithms of factors on the `FINGER_PARTS` of each finger.
-
-    A rig has none; the daemon adds one for each resting finger.
-    """
-
-    name = "fingers"
-    std = 0.5
-
-    def names(self, scope: SearchScope) -> Sequence[str]:
-        return ()
-
-    def value(self, values: PlateValues) -> FloatArray:
-        return values.deviations(self.name).reshape(-1, len(FINGER_PARTS))
-
-    def derivative(self, plate: PlateAt) -> ComplexArray:
-        slopes = np.concatenate(plate.finger_slopes, axis=1)
-        return plate.by_stiffness(_finger_attachments(plate), slopes)
-
-
 # Sensors.
 
 
@@ -675,7 +622,7 @@ class SensorScale(FormError):
 
     def derivative(self, plate: PlateAt) -> ComplexArray:
         gain = plate.values["sensor_gain"][:, None]
-        unscaled = gain * plate.drive[:, None] * plate.late * plate.seen
+        unscaled = gain * plate.drive[:, None] * plate.seen
         return np.asarray(unscaled[..., None] * np.eye(len(plate.model.sensors))[:, None])
 
 
@@ -782,7 +729,6 @@ ALL_KINDS: tuple[ParameterKind, ...] = (
     DrivePhase(),
     DriveInertia(),
     DriveDrag(),
-    ClockDelay(),
     SensorGain(),
     SensorPhase(),
     BoltMass(),
@@ -793,7 +739,6 @@ ALL_KINDS: tuple[ParameterKind, ...] = (
     ModeStiffness(),
     ModeLoss(),
     FootStiffness(),
-    FingerParts(),
     SensorScale(),
     SensorPosition(),
     ForeignMass(),
@@ -847,10 +792,3 @@ def _uncertain_damping(scope: SearchScope) -> FloatArray:
 def _by_log_damping(plate: PlateAt) -> ComplexArray:
     """Derivatives by the logarithm of the damping of each ERA (f, s, n, n)."""
     return np.asarray(plate.by_sources("damping") * plate.values["damping"])
-
-
-def _finger_attachments(plate: PlateAt) -> IntArray:
-    """Index of the attachment to which each finger parameter belongs (4 k,)."""
-    before = len(plate.sources) + len(plate.model.rig.masses) + plate.model.mass_count
-    fingers = np.arange(len(plate.finger_slopes))
-    return np.repeat(before + fingers, len(FINGER_PARTS))

@@ -430,8 +430,13 @@ def judged_by_promises(verdict: Verdict, rig: Rig) -> Verdict:
     return replace(verdict, promise_margins=margins, findings=(*verdict.findings, *found))
 
 
-def check_meaning(rig: Rig, observation: Measurement) -> None:
-    """Raise InputError for a rig whose grain or resonances are clearly the wrong ones."""
+def check_meaning(rig: Rig, measurement: Measurement) -> None:
+    """Raise InputError for a rig whose grain or resonances are clearly the wrong ones.
+
+    Also for a plate that was not linear, or that has changed during the measurement.
+    """
+    measurement.check()
+    observation = replace(measurement, errors=None, has_phases=False)  # bases lag
     plate = plate_of(rig, observation)
     found = other_meaning(plate, match_shapes(plate, observation.values), observation)
     if found:

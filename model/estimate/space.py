@@ -51,7 +51,6 @@ def space_of(
     uncertainty: Uncertainty,
     *,
     drives_lag: bool = False,
-    amplifiers: Sequence[str] = (),
     masses: int = 0,
     mode_count: int = MODE_SHIFTS,
 ) -> Space:
@@ -60,7 +59,7 @@ def space_of(
     The rig's `common_gain` is no parameter: if it was measured with the same sensors, they cannot
     show its error.
     """
-    scope = SearchScope(rig, sensors, uncertainty, drives_lag, amplifiers, masses, mode_count)
+    scope = SearchScope(rig, sensors, uncertainty, drives_lag, masses, mode_count)
     space = Space.empty(PARAMETER_KINDS)
     for kind in ALL_KINDS:
         names = kind.names(scope)
@@ -163,31 +162,21 @@ def _gains(rig: Rig, values: PlateValues, number: int) -> tuple[Gain, ...]:
     """Gains of an ERA: those of the rig times what was identified.
 
     An ERA without measured gains gets one at a single frequency, or some over the rig's frequencies
-    where its drive or the clock of its amplifier lags.
+    where its drive lags.
     """
     era, gain = rig.eras[number], values["gain"][number]
-    delay = _delay_of(rig, values, era.name)
     drive_lags = bool(values["inertia"][number] or values["drag"][number])
-    if gain == 1 and not drive_lags and not delay:
+    if gain == 1 and not drive_lags:
         return era.gains
     gains = era.gains or ((LOSS_FREQUENCY, 1.0, 0.0),)
-    if drive_lags or (delay and not era.gains):
+    if drive_lags:
         gains = _unit_gains(rig.limits.frequency_min, rig.limits.frequency_max)
     frequencies = np.array([frequency for frequency, _, _ in gains])
-    by_clock = np.exp(-2j * np.pi * frequencies * delay)
-    factors = gain * values.lag(frequencies)[:, number] * by_clock
+    factors = gain * values.lag(frequencies)[:, number]
     return tuple(
         (frequency, magnitude * abs(factor), phase + float(np.angle(factor)))
         for (frequency, magnitude, phase), factor in zip(gains, factors.tolist(), strict=True)
     )
-
-
-def _delay_of(rig: Rig, values: PlateValues, era: str) -> float:
-    """Delay of the clock of an ERA's amplifier [s], 0 where clocks agree."""
-    amplifiers = sorted({channel.amplifier for channel in rig.wiring.values()})
-    delays = dict(zip(amplifiers, values["delay"].tolist(), strict=False))
-    delay: float = delays.get(rig.wiring[era].amplifier, 0.0)
-    return delay
 
 
 def _unit_gains(lowest: float, highest: float) -> tuple[Gain, ...]:

@@ -39,7 +39,7 @@ from model.rig.rig_file import (
 from model.rig.sections import PlateSection, RigSection
 from model.structure.material import known_material
 from model.structure.modal_elasticity import check_is_plate
-from model.structure.plate import FOLLOWED_FIELDS
+from model.structure.plate import FIELDS_BESIDE_THEORY
 
 _SAME, _NONE = 1e-9, 1e-12  # relative; and what counts as nothing of every quantity
 
@@ -260,7 +260,7 @@ _CHANGED = "change_rig"
 _PLACED = {"eras", "masses", "supports"}
 """Those of what has a place on the plate."""
 
-_OF_THEORY = PlateSection.model_fields.keys() - {*FOLLOWED_FIELDS, "modes"}
+_OF_THEORY = PlateSection.model_fields.keys() - {*FIELDS_BESIDE_THEORY, "modes"}
 """Keys of a plate that decide the modes to which its `modes` are relative."""
 
 _REWRITTEN = ("plate", "mesh", "eras", "masses", "laminate", "uncertainty")

@@ -76,9 +76,6 @@ class Source(ABC):
     plate's motion.
     """
 
-    LEARNED: ClassVar[tuple[str, ...]]
-    """Fields that measurements of a plate change."""
-
     UNIT: ClassVar[str]
     """Unit of its drive: m for an ERA's base, V for an exciter."""
 
@@ -183,7 +180,6 @@ class Era(Source):
     damps.
     """
 
-    LEARNED: ClassVar[tuple[str, ...]] = ("x", "y", "stiffness", "damping", "bolt_mass", "gains")
     UNIT: ClassVar[str] = "m"
 
     bolt_mass: float

@@ -39,16 +39,6 @@ class Exciter(Source):
     converter.
     """
 
-    LEARNED: ClassVar[tuple[str, ...]] = (
-        "x",
-        "y",
-        "stiffness",
-        "damping",
-        "magnet_mass",
-        "coil_mass",
-        "force_factor",
-        "gains",
-    )
     UNIT: ClassVar[str] = "V"
 
     magnet_mass: float  # M [kg]

@@ -420,12 +420,12 @@ class Plate(Sheet):
         return is_within(self.surface.outline, points)
 
 
-FOLLOWED_FIELDS = tuple(
+FIELDS_BESIDE_THEORY = tuple(
     plate_field.name
     for plate_field in fields(Plate)
     if not plate_field.metadata.get("is_of_theory", True)
 )
-"""Fields of a plate that a table follows, and that leave the modes of the plate's theory alone."""
+"""Fields of a plate that leave the modes of its theory as they are."""
 
 _MAX_STEPS = 200  # of the iteration for a wavenumber, which takes some twenty
 

@@ -1,15 +1,10 @@
-"""Building, keeping, reading and adapting localization tables.
+"""Building, keeping and reading localization tables.
 
 A table is built the same to the bit by any number of processes, and kept between runs in the user's
 cache folder. Its file is an uncompressed .npz with a JSON header. Members are `header` (JSON as
 bytes) and the arrays of `LocalizationTable` under their own names. The header has the format
 version, the plate's fingerprint, the inputs of the table, and a SHA-256 over the content, so that a
 damaged or foreign file is refused before any of it is used.
-
-A table follows what is learned of its plate, in a millisecond instead of a build
-(`table_following`). Modulus and thickness scale the modes that the table holds; springs, dampers,
-gains, losses and mode deviations are values of the rig; masses and moved ERAs act where the raster
-gives their shapes. Changes are small, as of a plate in service; for another rig it is built anew.
 """
 
 import hashlib
@@ -17,12 +12,12 @@ import json
 import logging
 import math
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, TypeVar, get_type_hints
+from typing import Any, get_type_hints
 from zipfile import BadZipFile
 
 import numpy as np
@@ -44,9 +39,7 @@ from model.rig.rig import PHYSICS, Rig, canonical_json, differences
 from model.rig.rig_file import parse_mesh
 from model.spectral.modes import PlateMesh
 from model.structure.attachments import check_supported, footprints_of
-from model.structure.exciter import Actuator
 from model.structure.modal_elasticity import Dispersion, check_scales
-from model.structure.plate import FOLLOWED_FIELDS, Plate
 from model.table.table import PAPER_GRID, LocalizationTable, Raster, default_drive_frequencies
 from model.vibration import estimate_error, finer_mesh
 from registry.wording import first_problem
@@ -487,69 +480,3 @@ def _clean_up(folder: Path) -> None:
     recent = sorted(current, key=lambda path: path.stat().st_mtime)[-MAX_CACHED_TABLES:]
     for path in set(tables) - set(recent):
         path.unlink(missing_ok=True)
-
-
-_Part = TypeVar("_Part", bound=Plate | Actuator)
-
-_SAME_PLACE = 1e-9  # m
-_MAX_SCALE, _MAX_SCALE_ON_AIR = 0.1, 0.01  # mass and stiffness of air do not follow the plate's
-
-_FOLLOWED_OF_RIG = ("masses", "uncertainty", "fingertip", "threshold")
-"""Fields of a rig that may differ, beside those of its plate and `LEARNED` of its ERAs.
-
-All others must be the table's.
-"""
-
-
-def table_following(table: LocalizationTable, rig: Rig) -> LocalizationTable:
-    """The table for a rig whose parameters differ from those that it was built for.
-
-    Raises InputError for a rig that differs in more than modulus and thickness, those of all layers
-    alike, and what is followed; for frequencies or masses of modes that differ by more than 10 %,
-    1 % before an air gap; and for a plate of which a part does not scale.
-    """
-    before, after = table.plate, rig.plate
-    thicker = after.thickness / before.thickness
-    stiffer = after.material.E / before.material.E
-    others = {era.name: era for era in rig.eras}
-    like = replace(
-        table,
-        plate=_taking(before.scaled(modulus=stiffer, thickness=thicker), after, FOLLOWED_FIELDS),
-        eras=tuple(_taking(era, others.get(era.name, era), era.LEARNED) for era in table.eras),
-        **{name: getattr(rig, name) for name in _FOLLOWED_OF_RIG},
-    )
-    if different := differences(like, rig):
-        raise InputError(
-            "a table can follow one factor on all moduli and one on all thicknesses; but for that "
-            f"{'; '.join(different)}; build it again"
-        )
-    check_scales(before, thicker, stiffer, remedy="build the table again")
-    faster = thicker * np.sqrt(stiffer)
-    max_scale = _MAX_SCALE if before.air_gap is None else _MAX_SCALE_ON_AIR
-    if max(abs(thicker - 1), abs(faster - 1)) > max_scale:
-        raise InputError(
-            f"thickness and frequencies must be within {100 * max_scale:g} % of the table's, got "
-            f"factors of {thicker:.4g} and {faster:.4g}; build it again"
-        )
-    # Shapes where nothing has moved stay as they were built.
-    own, places = (footprints_of(each.eras, each.masses) for each in (table, rig))
-    shapes = table.shapes_at(places)
-    for number, place in enumerate(places):
-        same = np.flatnonzero(np.abs(own - place).max(axis=1) < _SAME_PLACE)
-        if len(same):
-            shapes[number] = table.attachment_shapes[same[0]]
-    return replace(
-        like,
-        omega=faster * table.omega,
-        losses=faster**2 * table.losses,
-        dispersion=faster**2 * table.dispersion,
-        attachment_shapes=shapes / np.sqrt(thicker),
-        shapes=(table.shapes / np.float32(np.sqrt(thicker))).astype(np.float32),
-    )
-
-
-def _taking(own: _Part, other: _Part, names: Sequence[str]) -> _Part:
-    """A part of a rig with some fields of another, unless that is of another kind."""
-    if type(other) is not type(own):
-        return own
-    return replace(own, **{name: getattr(other, name) for name in names})

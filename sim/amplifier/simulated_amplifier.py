@@ -18,13 +18,12 @@ import math
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import Protocol, TypeAlias
+from typing import TypeAlias
 
 from drivers.playing import Voice, playback_of
 from drivers.protocol.definition import (
     AHEAD_MAX,
     FAULTS,
-    FEATURES,
     HIGH_WORDS,
     MESSAGES,
     NO_CHANNEL,
@@ -204,21 +203,7 @@ _DERATING_RAMP = 0.02  # s; no click
 _ENABLED = "OPERATION_ENABLED"
 _ENDING = ("SWITCHED_ON", "FAULT_REACTION_ACTIVE")
 _LATCHED = ("QUICK_STOP_ACTIVE", "FAULT")
-_SENSING = ("GetSensors", "Measure", "GetReading")
 _Q = QUANTITIES
-
-
-class SensorPort(Protocol):
-    """Sensors that an amplifier reports."""
-
-    def handle(self, name: str, values: Values, now: float) -> Values:
-        """Reply to a request at a time [s]; raises Refusal."""
-
-    def changed(self, moment: float) -> None:
-        """Note that what plays changes at a time [s]."""
-
-    def forget(self) -> None:
-        """Forget the reading, as without supply."""
 
 
 class SimulatedAmplifier:
@@ -255,16 +240,7 @@ class SimulatedAmplifier:
         self._heat = ThermalState(since=-math.inf)
         self._is_interlock_open = False
         self.clock = AmplifierClock() if clock is None else clock
-        self._sensing: SensorPort | None = None
         self._start()
-
-    def attach(self, sensing: SensorPort) -> None:
-        """Give it sensors."""
-        self._sensing = sensing
-        self.capabilities = {
-            **self.capabilities,
-            "features": self.capabilities["features"] | 1 << FEATURES["sensors"],
-        }
 
     def _start(self) -> None:
         """Reset all but the temperature and the fault history."""
@@ -425,8 +401,6 @@ class SimulatedAmplifier:
         self.fault = "NONE"
         self._start()
         self.clock.restart(moment)
-        if self._sensing is not None:
-            self._sensing.forget()
         self._enter("SWITCH_ON_DISABLED", moment)
 
     def _carry_out(self, name: str, values: Values, following: str, now: float) -> Values | None:
@@ -477,10 +451,6 @@ class SimulatedAmplifier:
             case "SetAddress":
                 if values["serial_number"] != self.identity["serial_number"]:
                     raise Refusal("serial number must be this amplifier's")
-            case _ if name in _SENSING:
-                if self._sensing is None:
-                    raise Refusal("no sensors are there", "UNKNOWN_TYPE")
-                return self._sensing.handle(name, values, now)
         return None
 
     def _is_foreign(self, session: int, name: str) -> bool:
@@ -585,8 +555,6 @@ class SimulatedAmplifier:
 
     def _changed(self, moment: float) -> None:
         """Note that what plays changes."""
-        if self._sensing is not None:
-            self._sensing.changed(moment)
         squares = (self.playback.settled(channel) ** 2 for channel in self._channels)
         self._heat = self._heat.driven(moment, load=sum(squares) / len(self._channels))
 

@@ -202,7 +202,7 @@ class Accelerometer:
     """A sensor at x, y [m].
 
     noise_density [m/s²/sqrt(Hz)]; reach: range, plus or minus [m/s²]; resolution: step [m/s²], 0
-    for none; scale: reading per acceleration; channel: whose ERA it sits at, if at any.
+    for none; scale: reading per acceleration.
     """
 
     name: str
@@ -212,7 +212,6 @@ class Accelerometer:
     reach: float = math.inf
     resolution: float = 0.0
     scale: float = 1.0
-    channel: int | None = None
 
     def __post_init__(self) -> None:
         """Check the ranges."""

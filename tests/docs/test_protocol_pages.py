@@ -30,12 +30,9 @@ from drivers.protocol.definition import (
     NAK,
     NAK_RECORD,
     QUANTITIES,
-    READING_STATES,
     REFUSALS,
-    SENSOR_UNITS,
     STATES,
     STATUS_FLAGS,
-    sensor_reading,
 )
 from drivers.protocol.records import Record
 from drivers.protocol.sets import Command, Envelope, LayerSet
@@ -257,7 +254,6 @@ RECORDS: dict[str, tuple[list[Any], Record]] = {
     "Hello": (SHEET["messages"]["Hello"]["reply"], IDENTITY),
     "Event": (SHEET["messages"]["Event"]["reply"], EVENT_RECORD),
     "Nak": (SHEET["messages"]["Nak"]["reply"], NAK_RECORD),
-    "sensor_of_a_reading": (SHEET["records"]["sensor_of_a_reading"], sensor_reading(1)),
     **{
         name: (SHEET["records"][name.lower()], record)
         for name, record in {
@@ -406,8 +402,7 @@ def test_numbers_and_names_are_all_there() -> None:
             assert value == pytest.approx(quantity.from_wire(integer))
         assert (listed["type"], listed["unit"]) == (quantity.wire, quantity.unit)
     tables = {"states": STATES, "faults": FAULTS, "codes": REFUSALS, "features": FEATURES}
-    tables |= {"status_flags": STATUS_FLAGS, "sensor_units": SENSOR_UNITS}
-    tables["reading_states"] = READING_STATES
+    tables["status_flags"] = STATUS_FLAGS
     assert {name: SHEET[name] for name in tables} == {
         name: json.loads(json.dumps(each)) for name, each in tables.items()
     }

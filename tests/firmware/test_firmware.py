@@ -466,7 +466,7 @@ def test_firmware_passes_conformance(kind: str, replaying: Path) -> None:
     skipped = {each.check.name for each in results if each.result == "skipped"}
     of_wire = {"events"} if kind in ("rtu", "tcp") else set()
     assert skipped == of_wire | {
-        *("sensors", "steps_as_stated", "readings", "measured", "limited"),
+        *("steps_as_stated", "measured", "limited"),
     }
 
 

@@ -671,18 +671,14 @@ def test_identified_plate_is_the_one_on_the_desk(plate: Desk) -> None:
 @pytest.mark.alone
 @pytest.mark.needs("jackd", "cc")
 def test_chain_from_measurement_to_touches_keeps_its_promises() -> None:
-    """Values found are the plate's, promises are kept, and touches are felt where they are.
+    """Values found are the plate's, and touches are felt where they are.
 
-    Stiffness and damping to some percent, as one plate shows; of one plate's promises some fail.
+    Stiffness and damping to some percent, as one plate shows.
     """
-    found = session(seed=SEED, promises=6, touched=2)
+    found = session(seed=SEED, touched=2)
     assert found.held_out_error < 0.05
     for error in found.calibrated:
         assert abs(error.size) < 0.1, error
-    assert sum(row["kept"] for row in found.promises) >= 3
-    for row in found.promises:
-        assert row["measured_level_db_sl"] == pytest.approx(row["promised_level_db_sl"], abs=1)
-        assert row["measured_contrast_db"] > row["promised_contrast_db"] - 6
     for error in found.identified:
         limit = 1e-3 if error.kind == "place" else 0.1
         assert abs(error.size) < limit, error

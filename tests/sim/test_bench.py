@@ -1,11 +1,9 @@
 """A whole rig in numbers, on a virtual clock: from a request to what a finger feels.
 
-What voices do to the plate follows the clock of their amplifier, with its law, crystal and rate;
-sensors of amplifiers measure, are disturbed, and refuse.
+What voices do to the plate follows the clock of their amplifier, with its law, crystal and rate.
 """
 
 import asyncio
-import cmath
 import json
 import math
 import random
@@ -18,12 +16,9 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 
-from drivers.host.amplifier_sensors import measure_tones, read_amplifier_sensors
 from drivers.playing import AmplifierTone, Voice, VoiceTransition
-from kit.clock import in_virtual_time
 from kit.direct_plate import direct_acceleration
 from kit.plates import apart, lock_in
-from kit.wires import WIRES, layer, rig_on_wire
 from model.arrays import FloatArray
 from model.fem import assemble
 from model.finger import fingertip_points
@@ -32,13 +27,12 @@ from model.structure.attachments import Fingertip, FingertipLoad
 from processes.firmware_machine import SESSION as BENCH_SESSION
 from processes.firmware_machine import arm_bench, keep_alive
 from processes.firmware_machine import play as play_at_once
-from registry import threads
 from registry.limits import HAND_LOAD
 from sim.amplifier.readings import AmplifierClock, Crystal
 from sim.bench.bench import WRONG, Bench, StraightClocks
 from sim.control import SimulationContext, execute
 from sim.plant.fingers import Accelerometer
-from sim.plant.imperfections import Imperfections, PlateErrors, motion_of
+from sim.plant.imperfections import Imperfections, motion_of
 from sim.plant.plant import FingerPlacement
 from sim.sensors import Accelerometers
 
@@ -134,44 +128,6 @@ def test_plate_follows_a_steered_clock_by_few_changes() -> None:
         clock.steer(steady + chance.randrange(-10, 11), time)
         changes += len(plate.renew(time))
     assert changes < 60
-
-
-@in_virtual_time
-async def test_host_measures_at_the_feet_what_the_model_says(coarse_rig: Rig) -> None:
-    """Amplitude and phase of two tones at four feet and at 28 places more, two a reply: 2 %.
-
-    Against the sparse direct solve; phases count on the clock, whenever the set was committed. An
-    ERA that stands 12 mm beside its place has its foot there.
-    """
-    frequencies = [110.0 + 20 * number for number in range(16)]
-    x = np.linspace(0.02, 0.28, 28)
-    errors = PlateErrors(places={coarse_rig.eras[0].name: (12e-3, 5e-3)})
-    real = errors.realised(coarse_rig)
-    async with rig_on_wire(coarse_rig, WIRES["serial"]) as rig:
-        rig.bench.change_plate(errors, now=threads.now())
-        rig.bench.place_sensors([Accelerometer("", each, 0.11) for each in x])
-        await rig.group.arm()
-        tones = [layer((0, 110.0, 1.0)), layer((3, 210.0, 0.5), number=1)]
-        await rig.group.apply({"main": tones})
-        await rig.beat_until(threads.now() + 4.0)
-        main = rig.group.amplifiers["main"]
-        sensors = await read_amplifier_sensors(main)
-        found = await measure_tones(main, frequencies, 0.2)
-    assert [each.channel for each in sensors[:5]] == [0, 1, 2, 3, None]
-    assert (len(sensors), len(found.sensors), found.state) == (32, 32, "COMPLETE")
-    points = np.array([[each.x, each.y] for each in (*real.eras, *sensors[4:])], dtype=float)
-    unit = direct_acceleration(
-        assemble(coarse_rig.plate, coarse_rig.mesh),
-        real.eras,
-        np.array([110.0, 210.0]),
-        points,
-    )
-    for index, expected in ((0, unit[0, 0]), (5, 0.5 * unit[1, 3])):
-        measured = [
-            cmath.rect(one.tones[index][0], math.radians(one.tones[index][1]))
-            for one in found.sensors
-        ]
-        assert apart(np.array(measured), expected) < 0.02
 
 
 START = 98765.4321  # as large as a clock may be

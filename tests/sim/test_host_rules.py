@@ -243,9 +243,9 @@ WHOLE = rtu(
 """A status of which 13 bytes, from the 27th on, are a frame of unit 10 with its checksum."""
 OFF = "0000 0000 0001 0000 0000 0000 0000 00FA 0708 0000 0101 0000 0000 0000 0000"
 """Registers of a status without a tag: state 1, one channel and one layer."""
-TONES = ("201 04 00 11 05 01 00 64 00", "201 04 01 02 00 D0 07 E8 03")
-"""Measure, two tones."""
-MEASURE = {"reading": 1, "window": 100, "tones": 2, "frequencies": [2000, 1000]}
+SET_ADDRESS = ("201 04 00 0F 04 09 00 03 00", "201 04 01 2D 41 00 31 00 00")
+"""Address 9 for the amplifier A-1, in two frames."""
+NEW_ADDRESS = {"address": 9, "serial_number": "A-1"}
 TALKS: dict[str, tuple[str, tuple[Heard, ...]]] = {
     "unknown type": ("modbus-tcp", (*PING, ("<", tcp(6, "84 02"), "refusal", {"code": 1}))),
     "busy": ("modbus-tcp", (*PING, ("<", tcp(6, "84 06"), "refusal", {"code": 7}))),
@@ -314,15 +314,15 @@ TALKS: dict[str, tuple[str, tuple[Heard, ...]]] = {
     "frames in any order, and a copy": (
         "slcan",
         (
-            (">", can(TONES[1]), "", {}),
-            (">", can(TONES[0]), "Measure", MEASURE),
-            (">", can(TONES[0]), "", {}),
+            (">", can(SET_ADDRESS[1]), "", {}),
+            (">", can(SET_ADDRESS[0]), "SetAddress", NEW_ADDRESS),
+            (">", can(SET_ADDRESS[0]), "", {}),
         ),
     ),
     "frame that does not come": (
         "slcan",
         (
-            (">", can(TONES[0]), "", {}),
+            (">", can(SET_ADDRESS[0]), "", {}),
             (
                 ">",
                 can("201 05 00 0C 02 07 00 00 00"),

@@ -41,7 +41,7 @@ SLOWEST = (
     "test_rig_check.py",
     "test_daemon_faults_process.py",
     "test_calibrate.py",
-    "test_rig_on_wire.py",
+    "test_application_page.py",
     "test_daemon_inputs.py",
     "test_host_rules.py",
     "test_identify.py",

@@ -6,7 +6,7 @@ import { Fingers } from "./fingers.js";
 import { atLeast, felt, fixed, PlateOverlay } from "./plate.js";
 import { addEvent, annotate, showAmplifiers, showEffects, showLatency, showLayouts, showStrengths, timeOfDay } from "./side.js";
 
-const TOPICS = ["state", "contacts", "pattern", "silence", "amplifiers", "latency", "log", "link", "layout", "plate", "inputs", "strength"];
+const TOPICS = ["state", "contacts", "pattern", "silence", "amplifiers", "latency", "log", "link", "layout", "inputs", "strength"];
 const TOKEN_KEY = "era-haptics-token";
 const DISARMED = ["SWITCH_ON_DISABLED", "READY_TO_SWITCH_ON"];
 const LATCHED = ["QUICK_STOP_ACTIVE", "FAULT"];
@@ -25,7 +25,6 @@ const log = at("log");
 let connection;
 let state = null;
 let epoch = null;  // of what is shown: a clear acknowledges nothing that came later
-let knownAlarms;  // of the plate; undefined before the first event of it
 let daemon = null;  // result of hello; null while disconnected
 let ownName;  // of this page, in the daemon's log
 let failure = "unreachable";
@@ -276,15 +275,6 @@ const HANDLERS = {
   },
   latency({ latency_ms }) {
     showLatency(at("latency-numbers"), at("latency"), latency_ms);
-  },
-  plate({ state, cause, remedy, cautious, alarms, object }) {
-    overlay.show({ object: object ?? null });
-    const words = state === "changed" ? "changed, promises lowered until you run era rig check" : state;
-    const isAlarm = alarms > knownAlarms;
-    knownAlarms = alarms;
-    at("known").textContent = `Plate ${words}: ${cause}`;
-    at("known").classList.toggle("bad", cautious);
-    if (cautious || remedy || isAlarm) addEvent(log, "warning", cause, remedy);
   },
   inputs({ inputs, rejected_touches }) {
     const lacking = inputs.filter(({ problem }) => problem);

@@ -4,7 +4,6 @@ import { colourOf } from "./field.js";
 
 const SVG = "http://www.w3.org/2000/svg";
 const FINGERTIP_M = 0.0065;  // radius
-const OBJECT_M = 0.03;  // radius at which an object is drawn
 const SMALL_PX = 480;  // below it labels are shorter
 const TEXT_PX = 12;
 const ERA_PX = 12;
@@ -30,10 +29,9 @@ export class PlateOverlay {
   constructor(plate, svg) {
     this.plate = plate;
     this.svg = svg;
-    this.layers = ["regions", "object", "eras", "contacts", "cursor"].map((name) => element("g", { id: `layer-${name}` }));
+    this.layers = ["regions", "eras", "contacts", "cursor"].map((name) => element("g", { id: `layer-${name}` }));
     svg.replaceChildren(...this.layers);
     this.contacts = [];
-    this.object = null;  // that lies on the plate
     this.drives = new Map();  // by layer, by ERA
     new ResizeObserver(() => this.redraw()).observe(plate);
   }
@@ -47,9 +45,8 @@ export class PlateOverlay {
     this.redraw();
   }
 
-  show({ contacts, layers, object }) {
+  show({ contacts, layers }) {
     if (contacts) this.contacts = contacts;
-    if (object !== undefined) this.object = object;
     if (layers) this.drives = new Map(Object.entries(layers).map(([layer, drive]) => [Number(layer), drive]));
     this.redraw();
   }
@@ -85,12 +82,11 @@ export class PlateOverlay {
     if (!this.rig || !this.plate.clientWidth) return;
     this.px = this.rig.length_m / this.plate.clientWidth;  // metres per pixel
     this.isSmall = this.plate.clientWidth < SMALL_PX;
-    const [regions, object, eras, contacts, cursor] = this.layers;
+    const [regions, eras, contacts, cursor] = this.layers;
     this.occupied = [];  // boxes that no text may cover
     eras.replaceChildren(...this.rig.eras.flatMap((era) => this.era(era)));
     this.occupied.push(...this.contacts.map((contact) => this.ringBox(contact)));
     contacts.replaceChildren(...this.contacts.flatMap((contact) => this.contact(contact)));
-    object.replaceChildren(...(this.object ? this.lying(this.object) : []));
     regions.replaceChildren(...this.regions.flatMap((region) => this.region(region)));
     cursor.replaceChildren(...(this.cursor ? [this.circle(this.cursor, "cursor", FINGERTIP_M)] : []));
   }
@@ -201,12 +197,6 @@ export class PlateOverlay {
     if (layer !== undefined) below = `${fixed(frequency_hz)} Hz, ${felt(contact)}${isKnown(promised) ? `, ≥ ${atLeast(promised)} dB` : ""}`;
     if (held_back && verdict) below = verdict;
     return [...rings, this.besideRing(contact, above, 0), this.besideRing(contact, below, 1)];
-  }
-
-  // What lies on the plate, about where it was found.
-  lying(object) {
-    const mass = `about ${Number(object.mass_kg.toPrecision(1))} kg`;
-    return [this.circle(object, "object", OBJECT_M), this.besideRing(object, mass, 1)];
   }
 
   // A text above (0) or below (1) a finger, or if occupied on the other side, left or right.

@@ -52,7 +52,6 @@ CHECKS: tuple[ConformanceCheck, ...] = (
     reading_checks.unknown_types,
     reading_checks.reading_changes_nothing,
     reading_checks.hello_for_ever,
-    playing_checks.sensors,
     frame_checks.areas,
     frame_checks.pieces,
     reading_checks.objects,
@@ -133,7 +132,6 @@ CHECKS: tuple[ConformanceCheck, ...] = (
     reading_checks.mark,
     reading_checks.addresses,
     playing_checks.measured,
-    playing_checks.readings,
 )
 """All checks, in their order of execution."""
 

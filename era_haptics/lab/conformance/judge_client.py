@@ -623,7 +623,7 @@ def _ranges(can: Values) -> Iterator[tuple[str, int, int, int]]:
                 name = word.name if record is _REPLY else "limits"
                 yield name, word.quantity.minimum, row[word.name], word.quantity.maximum
     yield from capability_ranges(can)
-    yield "features", 0, can["features"], (1 << len(FEATURES)) - 1
+    yield "features", 0, can["features"], (2 << max(FEATURES.values())) - 1
     for one in can["limits"]:
         low, high = one["frequency_min"], one["frequency_max"]
         yield "limits", can["frequency_min"], low, high

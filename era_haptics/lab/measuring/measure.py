@@ -24,7 +24,6 @@ from typing import Any
 
 import numpy as np
 
-from controller.plate_measurement import MeasuredPlate
 from drivers.errors import LinkError
 from era_haptics.lab.measuring.sound_card import (
     PERIOD,
@@ -48,6 +47,7 @@ from model.arrays import ComplexArray, FloatArray, best_first
 from model.commands.options import Stopwatch, progress_bar
 from model.errors import InputError
 from model.estimate.measurement import (
+    MeasuredPlate,
     Measurement,
     Repeat,
     measurement_of,

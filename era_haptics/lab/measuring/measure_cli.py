@@ -12,14 +12,12 @@ from typer.core import TyperCommand
 from typer.main import get_command
 
 from controller.cli import rig_cli
-from model.commands import table_show_cli
 from model.commands.options import JsonOption, RigArgument, next_line, print_report
 from model.errors import InputError
 
 if TYPE_CHECKING:
-    from controller.plate_measurement import MeasuredPlate
     from era_haptics.lab.measuring.impedance import Circuit, ImpedanceSetup
-    from model.study.promise_at_sensors import MeasuredVerification
+    from model.estimate.measurement import MeasuredPlate
 
 
 def _measure_plate(*given: Any, **named: Any) -> "MeasuredPlate":
@@ -28,14 +26,7 @@ def _measure_plate(*given: Any, **named: Any) -> "MeasuredPlate":
     return measure_plate(*given, **named)
 
 
-def _check_table(*given: Any, **named: Any) -> "MeasuredVerification":
-    from era_haptics.lab.measuring.table_measurement import check_table
-
-    return check_table(*given, **named)
-
-
-# `era rig identify --device` and `era table verify --device` are of the layers below.
-rig_cli.measure_by_card, table_show_cli.check_by_card = _measure_plate, _check_table
+rig_cli.measure_by_card = _measure_plate
 
 
 def measure(

@@ -513,7 +513,7 @@ async def test_daemon_sends_exactly_the_documented_keys(tmp_path: Path) -> None:
     received: set[str] = set()
 
     async with contextlib.AsyncExitStack() as stack:
-        bench = await stack.enter_async_context(running_daemon(tmp_path, "learn: l.npz\n"))
+        bench = await stack.enter_async_context(running_daemon(tmp_path))
         async with await bench.client() as era:
             await until_state(era, READY)
         reader, writer = await asyncio.open_unix_connection(bench.socket, limit=1 << 20)

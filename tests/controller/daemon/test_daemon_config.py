@@ -128,9 +128,7 @@ def test_config_paths_are_relative_to_its_folder(
         ("rig.yaml", "log: {file: .}\n", [(2, "log.file")]),
         ("rig.yaml", "serial_numbers: {man: A1}\n", [(2, "serial_numbers.man")]),
         ("rig.yaml", 'touch: [{name: api, url: "tuio:3333"}]\n', [(2, "touch[0].name")]),
-        ("rig.yaml", "learn: rig.yaml\n", [(2, "learn")]),
-        ("rig.yaml", "learn: .\n", [(2, "learn")]),
-        ("rig.yaml", "learn: none/learned.npz\n", [(2, "learn")]),
+        ("rig.yaml", "learn: learned.npz\n", [(2, "learn")]),
         ("rig.yaml", "strengths: none/kept.json\n", [(2, "strengths")]),
         ("rig.yaml", "strengths: /dev/zero\n", [(2, "strengths")]),
         ("rig.yaml", "touch: 3\n", [(2, "touch")]),
@@ -167,14 +165,6 @@ def test_config_paths_are_relative_to_its_folder(
 def test_config_refuses(folder: Path, rig: str, more: str, expected: list[tuple[int, str]]) -> None:
     """Impossible paths, unknown amplifiers, reserved names, wrong shapes; all at once."""
     assert problems(written(folder, more, rig=rig)) == expected
-
-
-@pytest.mark.parametrize("content", [b"", b"PK\x03\x04cut"])
-def test_damaged_learned_file_starts_a_daemon(folder: Path, content: bytes) -> None:
-    """As after a loss of supply; the estimator sets it aside."""
-    (folder / "learned.npz").write_bytes(content)
-    config = load_daemon_config(written(folder, "learn: learned.npz\n"))
-    assert config.learn == folder / "learned.npz"
 
 
 @pytest.mark.parametrize("name", ["car_display", "table"])

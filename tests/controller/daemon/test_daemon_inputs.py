@@ -48,13 +48,11 @@ from examples.make_touches import tuio_datagram
 from kit.clock import MemoryMachine, VirtualLoop, in_virtual_time
 from kit.fingers import bundle, frame, free_port, message, panel
 from kit.witness import tell_first
-from model.answer.answer_report import Timing
 from model.errors import InputError
 from processes.daemons import (
     ENABLED,
     DaemonBench,
     Journal,
-    daemon_table,
     holding,
     ready_daemon,
     until,
@@ -508,10 +506,6 @@ def calls(
         await era.status()
         await era.touch([], source="many")
 
-    async def follow() -> None:
-        table = daemon_table()
-        bench.daemon._controller.replace_answers(table, Timing(table))
-
     async def again(name: str) -> None:
         await era.stop()
         await era.clear()
@@ -532,7 +526,6 @@ def calls(
         "disarm": lambda: again("disarm"),
         "stop": lambda: again("stop"),
         "clear": era.clear,
-        "forget": era.forget,
         "touch": touch,
         "layout": lambda: era.layout(("two", "one")[next(numbers) % 2]),
         "reload": reload,
@@ -542,7 +535,6 @@ def calls(
         "subscribe": lambda: era.subscribe(*TOPICS, rate_hz=60),
         "unsubscribe": lambda: era.unsubscribe(*TOPICS),
         "datagrams of a panel": datagrams,
-        "a table that follows": follow,
     }
 
 

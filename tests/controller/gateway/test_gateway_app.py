@@ -23,7 +23,14 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from controller.api.jsonrpc import ErrorCode, RpcError
 from controller.api.link import Unreachable
-from controller.api.methods import METHODS, LogEvent, PatternEvent, RequestedBy, StatusResult
+from controller.api.methods import (
+    METHODS,
+    ClearParams,
+    LogEvent,
+    PatternEvent,
+    RequestedBy,
+    StatusResult,
+)
 from controller.api.schema import ApiMessage, PlayedTone
 from controller.api.server import Hub
 from controller.gateway import app
@@ -286,7 +293,6 @@ PARAMETERS: dict[str, dict[str, object]] = {
     "touch": {"source": "me", "touches": [{"id": 1, "x_m": 0.1, "y_m": 0.2}]},
     "effects": {},
     "play": {"effect": "tap", "x_m": 0.1, "y_m": 0.2},
-    "forget": {},
     "strength": {"name": "page", "gain_db": -6},
     "layout": {"name": "home"},
     "reload": {},
@@ -378,9 +384,9 @@ def test_http_body_may_have_line_feeds_wait_or_be_missing(
     A stop needs only the token: no body, nor a content type. One that waits for 100 (RFC 9110
     10.1.1) gets the interim response first, then that to the request.
     """
-    for method in ("stop", "forget"):
+    for method in ("stop", "clear"):
         assert http(gateway, f"/api/v1/{method}", body=b'{"client":"a"\n}').status == 200
-    assert daemon.calls == [(name, RequestedBy(client="a")) for name in ("stop", "forget")]
+    assert daemon.calls == [("stop", RequestedBy(client="a")), ("clear", ClearParams(client="a"))]
     assert http(gateway, "/api/v1/stop", body=b"").status == 200
     assert http(gateway, "/api/v1/stop", body=b"", media=None).status == 200
     assert daemon.methods[2:] == ["stop", "stop"]

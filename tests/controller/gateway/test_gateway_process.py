@@ -593,7 +593,7 @@ async def test_requests_that_came_at_once_are_answered_in_their_order(
     media = "Content-Type: application/json"
     requests = [
         head_of("GET", "/icon.svg"),
-        head_of("POST", "/api/v1/forget", media, f"Content-Length: {len(body)}") + body,
+        head_of("POST", "/api/v1/clear", media, f"Content-Length: {len(body)}") + body,
         b"\r\n\r\n" + head_of("GET", "/nothing"),
         head_of("POST", "/api/v1/stop"),
     ]

@@ -331,18 +331,6 @@ def test_blocking_amplifier_rejects_what_its_steps_round_away(
             amplifier.play([made], duration=0.03)
 
 
-def test_blocking_amplifier_measures_while_it_feeds_the_watchdog() -> None:
-    """Over a window longer than the watchdog; the ERA that plays moves its own foot most."""
-    with BlockingAmplifier(DRAWN, limits=WIDE_LIMITS) as amplifier:
-        amplifier.arm(1.0)
-        amplifier.apply([layer(2, 110.0, 0.2)])
-        reading = amplifier.measure([110.0], 1.2)
-        assert amplifier.status()["state"] == "OPERATION_ENABLED"
-        sensors = amplifier.sensors()
-        loudest = max(range(len(sensors)), key=lambda n: reading.sensors[n].tones[0][0])
-        assert sensors[loudest].channel == 2
-
-
 def test_play_raises_when_the_watchdog_has_tripped(monkeypatch: pytest.MonkeyPatch) -> None:
     """The error names fault and remedy."""
     monkeypatch.setattr("drivers.by_hand.actions.HEARTBEAT", 0.15)
@@ -413,19 +401,6 @@ def test_stop_needs_no_trace(tmp_path: Path) -> None:
     options = ("--trace", str(tmp_path / "missing" / "trace.txt"))
     assert isinstance(invoke("clear", URL, *options).exception, CommandError)
     assert invoke("stop", URL, *options).exit_code == 0
-
-
-def test_tones_are_measured_by_hand() -> None:
-    """Sensors with unit and channel; a reading of two tones at each, of a plate at rest."""
-    sensors = result_of("sensors", URL)["sensors"]
-    assert [one["channel"] for one in sensors] == [0, 1, 2, 3]
-    assert {(one["measures"], one["unit"]) for one in sensors} == {("acceleration", "m/s²")}
-    tones = ["--frequency", "110", "--frequency", "150", "--window", "0.1"]
-    reading = result_of("measure", URL, *tones)
-    assert (reading["state"], reading["token"]) == ("COMPLETE", 0)
-    for one in reading["sensors"]:
-        assert [tone["frequency_hz"] for tone in one["tones"]] == [110.0, 150.0]
-        assert [tone["amplitude"] for tone in one["tones"]] == [0.0, 0.0]
 
 
 def test_conformance_reads_first_and_reports_what_is_left() -> None:

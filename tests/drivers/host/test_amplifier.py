@@ -1,39 +1,25 @@
 """The host's amplifier of protocol 4, on real terminals, TCP connections and CAN adapters.
 
-Which amplifier is at an address, what it says that it plays beside what it was sent, and readings
-of its sensors that contradict themselves or the request.
+Which amplifier is at an address, and what it reports that it plays against what it was sent.
 """
 
 import asyncio
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from dataclasses import asdict, replace
-from typing import Any
 from unittest.mock import AsyncMock, Mock
 
 import pytest
 
 from cases import shortly
-from drivers.errors import (
-    CommandError,
-    CommandRefused,
-    FrameError,
-    LinkError,
-    LinkTimeout,
-)
+from drivers.by_hand.actions import read_electrical
+from drivers.errors import CommandError, LinkError, LinkTimeout
 from drivers.host.amplifier import Amplifier
-from drivers.host.amplifier_sensors import (
-    AmplifierSensor,
-    measure_tones,
-    read_amplifier_sensors,
-    read_electrical,
-    start_reading,
-)
 from drivers.host.group import Group
 from drivers.opening import Lines
 from drivers.playing import AmplifierLayer, AmplifierTone
 from drivers.ports import PORT_OPENER
-from drivers.protocol.definition import MESSAGES, READING_STATES, UNKNOWN_PLACE, sensor_reading
+from drivers.protocol.definition import MESSAGES
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Command, LayerSet, achieved_problem
 from drivers.wires.can_frames import unpack_frames
@@ -45,91 +31,6 @@ from kit.wires import WORD_WIRES, hanging_interface, until
 from registry.limits import GuardLimits
 from sim.amplifier.readings import capabilities
 from sim.amplifier.simulated_amplifier import SimulatedAmplifier
-
-FREQUENCIES = [110.0, 173.5]
-ROW = {"unit": 1, "channel": 255, "x": 1000, "y": 2000, "range": 512.0, "frequency_max": 20_000}
-TONES = [{"amplitude": 1.0, "phase": -9000}, {"amplitude": 2.0, "phase": -9000}]
-
-
-async def sensing(to: str = "", sensor_count: int = 20, **changes: Any) -> Amplifier:
-    """The host of an amplifier with sensors, identified; to, changes: a request, and its reply."""
-    line, begun = MemoryLine("serial", "a"), dict[str, Any]()
-
-    def handle(name: str, values: Values, now: float) -> Values:
-        if name == "Measure":
-            begun.update(values)
-        left, words = sensor_count - values.get("first", 0), list[int]()
-        for _ in range(min(left, 16)):
-            sensor_reading(2).append(words, {"flags": 1, "tones": TONES})
-        rows = [ROW] * min(left, 10)
-        head = {"reading": begun.get("reading"), "window_start": 0, "token": 0, "tones": 2}
-        running = {"state": READING_STATES["RUNNING"], "window_left": 100, "count": 0}
-        complete = {"state": READING_STATES["COMPLETE"], "window_left": 0, "count": min(left, 16)}
-        replies = {
-            "GetSensors": {"all": sensor_count, "count": len(rows), "sensors": rows},
-            "Measure": {**head, **running, "sensors": []},
-            "GetReading": {**head, **complete, "sensors": words},
-        }
-        return {**replies[name], **(changes if name == to else {})}
-
-    line.far["a"].attach(Mock(handle=handle))
-    await line.hosts["a"].open()
-    return line.hosts["a"]
-
-
-@in_virtual_time
-async def test_sensors_and_their_tones_come_in_several_replies() -> None:
-    """Twenty: ten descriptions and sixteen readings in a reply, in the units of the wire.
-
-    A place that is unknown, as at the foot of a channel's actuator, is none.
-    """
-    host = await sensing()
-    sensors = await read_amplifier_sensors(host)
-    assert sensors == (AmplifierSensor("ACCELERATION", None, 0.1, 0.2, 512.0, 1000.0),) * 20
-    reading = await measure_tones(host, FREQUENCIES, 0.1)
-    assert reading.state == "COMPLETE"
-    assert [one.tones for one in reading.sensors] == [((1.0, -90.0), (2.0, -90.0))] * 20
-    assert all(one.is_overloaded for one in reading.sensors)
-    row = {**ROW, "channel": 1, "x": UNKNOWN_PLACE, "y": UNKNOWN_PLACE}
-    (sensor,) = await read_amplifier_sensors(await sensing("GetSensors", 1, sensors=[row]))
-    assert (sensor.channel, sensor.x, sensor.y) == (1, None, None)
-
-
-@pytest.mark.parametrize(
-    ("to", "changes", "error", "text"),
-    [
-        ("Measure", {"reading": 0}, CommandRefused, "replaced"),
-        ("GetReading", {"reading": 0}, CommandRefused, "replaced"),
-        ("GetReading", {"state": READING_STATES["RUNNING"]}, FrameError, "."),
-        ("GetReading", {"count": 0, "sensors": []}, FrameError, "."),
-        ("GetReading", {"count": 17}, FrameError, "."),
-        ("GetReading", {"tones": 1}, FrameError, "."),
-        ("GetReading", {"tones": 60_000}, FrameError, "."),
-    ],
-    ids=[
-        *("begun by another host", "of another host", "never ends", "no sensors"),
-        *("too few words", "other tones", "absurd tones"),
-    ],
-)
-@in_virtual_time
-async def test_reading_that_is_not_the_one_begun_is_an_error(
-    to: str, changes: dict[str, Any], error: type[Exception], text: str
-) -> None:
-    """One of another number, or that never ends, or has other sensors or tones than were begun."""
-    with pytest.raises(error, match=text):
-        await measure_tones(await sensing(to, **changes), FREQUENCIES, 0.1)
-
-
-@in_virtual_time
-async def test_tones_that_the_window_does_not_tell_apart_are_not_sent() -> None:
-    """110 and 112 Hz need half a second; no tone and seventeen are none, nor are 11 s."""
-    host = await sensing()
-    for window, frequencies in (
-        *((0.4, each) for each in ([110.0, 112.0], [], [20.0 * each for each in range(1, 18)])),
-        (11.0, [110.0]),
-    ):
-        with pytest.raises(CommandError):
-            await start_reading(host, frequencies, window)
 
 
 def test_second_status_amid_hello_is_not_of_another_amplifier() -> None:

@@ -19,8 +19,8 @@ from unittest.mock import Mock
 
 import pytest
 
+from drivers.by_hand.actions import read_electrical
 from drivers.errors import LinkTimeout
-from drivers.host.amplifier_sensors import read_electrical
 from drivers.host.group import Group
 from drivers.host.joint_sets import PlayedSet
 from drivers.host.ledger import Ledger, StopOutcome

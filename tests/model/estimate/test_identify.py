@@ -4,7 +4,6 @@ Boards with moduli or exciters of their own and amplifiers whose clocks are off 
 responses. These, and their derivatives, are those of the plate solved anew.
 """
 
-import math
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
@@ -15,19 +14,16 @@ import numpy as np
 import pytest
 
 from kit.direct_plate import direct_acceleration
-from kit.plates import SETTLED_PATTERNS_FREQUENCIES, as_sold, exciter_rig, exciter_rig_text
+from kit.plates import as_sold, exciter_rig, exciter_rig_text
 from kit.thin_plates import Hidden, draw, parameters_held
 from model.arrays import ComplexArray, FloatArray
 from model.config.document import parse_document
 from model.errors import InputError
-from model.estimate.fit_report import clock_rows, fit_rows, identification_json, parameter_rows
+from model.estimate.fit_report import fit_rows, identification_json, parameter_rows
 from model.estimate.forward import (
-    FINGER_PARTS,
     SENSOR_FOOT,
     ForwardModel,
     PlateValues,
-    Prior,
-    RestingFinger,
     Sensor,
     Space,
     by_mass_at,
@@ -35,23 +31,20 @@ from model.estimate.forward import (
 )
 from model.estimate.identify import (
     MAX_CHI2,
-    ClockEstimate,
     Identification,
-    clock_estimates,
     identification_errors,
     identify,
 )
 from model.estimate.measurement import Measurement, Repeat
-from model.estimate.parameters import PARAMETER_KINDS
 from model.estimate.space import inwards, rig_with, space_from_datasheets, space_of
 from model.fem import ELEMENTS, Mesh, assemble
 from model.reduction.free_plate import solve_free_plate
-from model.rig.rig import Channel, Rig
+from model.rig.rig import Rig
 from model.rig.rig_file import example_rig_path, load_rig, mesh_of, rig_of
 from model.rig.rig_writing import save_fitted, stated
 from model.spectral.direct_solution import direct_spectral_acceleration
 from model.spectral.modes import SpectralMesh
-from model.structure.attachments import Fingertip, FingertipLoad, PointLoad, Support
+from model.structure.attachments import PointLoad, Support
 from model.structure.exciter import Exciter
 from model.structure.material import Material, Orthotropy
 from model.structure.plate import Bond, Laminate, LaminateLayer, equivalent_plate
@@ -362,96 +355,18 @@ def test_moduli_along_across_and_of_shear_are_found() -> None:
     assert back.plate.material.moduli == pytest.approx(known.material.moduli, rel=1e-5)
 
 
-LATE = 30e-6
-"""Delay of amplifier b [s]."""
-
-OF = np.array([0, 0, 1, 1])
-
-
-def halves() -> tuple[Rig, list[Sensor]]:
-    """The paper's plate on two amplifiers of two ERAs, each with sensors at these."""
-    rig = load_rig(example_rig_path())
-    wiring = {era.name: Channel("ab"[OF[n]], n % 2) for n, era in enumerate(rig.eras)}
-    rig = replace(rig, wiring=wiring, amplifiers={"a": "sim://", "b": "sim://"})
-    sensors = [Sensor(era, era, amplifier=at.amplifier) for era, at in wiring.items()]
-    return rig, sensors
-
-
-def test_a_constant_delay_is_found_and_taken_off() -> None:
-    """Of tones that b plays late and, with the same clock, hears as early.
-
-    Within 5 us of 30, far below the 60 degrees of a gain; the rig's gains of b turn by it. It is
-    more than four times what two clocks of 4 us make, and less than of 17: the former are accused.
-    """
-    rig, sensors = halves()
-    values = draw("form", 1).measured(SETTLED_PATTERNS_FREQUENCIES, np.random.default_rng(1))
-    late = LATE * (OF[None, :] - OF[:, None])
-    values = values * np.exp(-2j * math.pi * SETTLED_PATTERNS_FREQUENCIES[:, None, None] * late)
-    measurement = Measurement(sensors, SETTLED_PATTERNS_FREQUENCIES, values)
-    found = identify(rig, replace(measurement, clock_errors={"a": 4e-6, "b": 4e-6}))
-    (clock,) = clock_estimates(found)
-    assert clock.amplifier == "b"
-    assert clock.delay_us == pytest.approx(1e6 * LATE, abs=5)
-    assert clock.error_us < 3
-    assert found.is_explained
-    (shown,) = identification_json(found, ())["clocks"]
-    assert shown["delay_us"] == clock.delay_us
-    for era in found.rig.eras[2:]:
-        low, high = np.angle(era.gain(np.array([100.0, 400.0])))
-        slope = math.remainder(high - low, 2 * math.pi) / (2 * math.pi * 300.0)
-        assert slope == pytest.approx(-LATE, abs=5e-6)
-    assert all(len(era.gains) == 1 for era in found.rig.eras[:2])
-    for error, is_believed in ((4e-6, False), (17e-6, True)):
-        of = replace(found.fitted.measurement, clock_errors=dict.fromkeys("ab", error))
-        claimed = replace(found, fitted=replace(found.fitted, measurement=of))
-        assert [each.is_believed for each in clock_estimates(claimed)] == [is_believed]
-        assert len(clock_rows(claimed)) == 1 + (not is_believed)
-
-
-@pytest.mark.parametrize(
-    ("late", "is_believed"),
-    [
-        pytest.param(19.9, True, id="late"),
-        pytest.param(-20.1, False, id="early"),
-    ],
-)
-def test_a_delay_within_four_standard_errors_is_believed(late: float, is_believed: bool) -> None:
-    """Of an estimate known to 3 us and clocks that state 4 us: 5 us together, so up to 20 us."""
-    assert ClockEstimate("b", late, 3.0, 4.0).is_believed == is_believed
-
-
-def test_phases_turn_with_the_delays_of_who_plays_and_who_hears() -> None:
-    """By hand: exp(-2 pi i f d) between amplifiers, nothing within one; slopes by differences."""
-    rig, sensors = halves()
-    space = space_of(rig, [each.name for each in sensors], rig.uncertainty, amplifiers=["a", "b"])
-    free = solve_free_plate(rig.plate, rig.mesh, frequency_max=500.0)
-    tones = np.array([60.0, 240.0])
-    model = ForwardModel(rig, sensors, tones, space, free, amplifiers=["a", "b"])
-    x = np.zeros(space.size)
-    exact = model.at(x).responses
-    number = space.index("delay of amplifier b")
-    x[number] = LATE / space.std[number]
-    turned = np.angle(model.at(x).responses / exact)
-    by_hand = -2 * math.pi * tones[:, None, None] * LATE * (OF[None, :] - OF[:, None])
-    np.testing.assert_allclose(turned, by_hand, atol=1e-9)
-    assert space.std[space.index("delay of amplifier a")] == 0
-
-
 FORWARD_FREQUENCIES = np.array([60.0, 140.0, 222.0, 350.0, 480.0])
 PAD = Sensor("pad", x=0.1, y=0.07)
-FINGER = RestingFinger(0.2, 0.05, Fingertip())
 
 
 @pytest.fixture(scope="module")
 def model(rig: Rig) -> ForwardModel:
-    """That plate with sensors at its ERAs and elsewhere, an additional mass and a finger."""
+    """That plate with sensors at its ERAs and elsewhere, and an additional mass."""
     sensors = [*(Sensor(era.name, era.name) for era in rig.eras), PAD]
     names = [sensor.name for sensor in sensors]
     space = space_of(rig, names, rig.uncertainty, drives_lag=True, masses=1)
-    names = [f"{part} of finger" for part in FINGER_PARTS]
-    space = space.extended(PARAMETER_KINDS["fingers"], names, Prior(PARAMETER_KINDS["fingers"].std))
     free = solve_free_plate(rig.plate, rig.mesh, frequency_max=500.0)
-    return ForwardModel(rig, sensors, FORWARD_FREQUENCIES, space, free, [FINGER])
+    return ForwardModel(rig, sensors, FORWARD_FREQUENCIES, space, free)
 
 
 def somewhere(space: Space, seed: int) -> FloatArray:
@@ -479,7 +394,7 @@ def test_deviating_rig_is_solved_without_solving_it_again(rig: Rig, model: Forwa
     space = model.space
     x = somewhere(space, 1)
     x[space.of("thickness", "mode_shifts", "mode_losses", "sensor_gain", "sensor_phase")] = 0
-    x[space.of("gain", "phase", "inertia", "drag", "fingers")] = 0
+    x[space.of("gain", "phase", "inertia", "drag")] = 0
     values = model.at(x).values
     eras = tuple(
         replace(era, stiffness=k, damping=c, bolt_mass=m, x=place[0], y=place[1])
@@ -500,11 +415,8 @@ def test_deviating_rig_is_solved_without_solving_it_again(rig: Rig, model: Forwa
         loss_exponent=values["loss_exponent"],
     )
     ((mass, at_x, at_y),) = values["masses"]
-    loads: list[Support] = [
-        PointLoad(at_x, at_y, mass=mass),
-        FingertipLoad(FINGER.x, FINGER.y, FINGER.fingertip),
-    ]
-    expected = direct(replace(rig, plate=plate, eras=eras), loads)
+    load = PointLoad(at_x, at_y, mass=mass)
+    expected = direct(replace(rig, plate=plate, eras=eras), [load])
     found = model.at(x).responses
     np.testing.assert_allclose(found, expected, atol=3e-4 * np.abs(expected).max())
 
@@ -545,26 +457,9 @@ def test_mass_anywhere_changes_responses_as_derived(rig: Rig, model: ForwardMode
     space = model.space
     x = np.zeros(space.size)
     point, mass = np.array([[0.21, 0.16]]), 1e-6
-    finger = FingertipLoad(FINGER.x, FINGER.y, FINGER.fingertip)
-    change = direct(rig, [finger, PointLoad(*point[0], mass=mass)]) - direct(rig, [finger])
+    change = direct(rig, [PointLoad(*point[0], mass=mass)]) - direct(rig, [])
     found = mass * by_mass_at(model.at(x), point)[..., 0]
     np.testing.assert_allclose(found, change, atol=2e-3 * np.abs(change).max())
-
-
-def test_finger_of_known_parts_has_its_dynamic_stiffness(model: ForwardModel) -> None:
-    """A finger with twice the pulp and half the phalanx loads the plate as such a fingertip."""
-    x = np.zeros(model.space.size)
-    x[model.space.groups["fingers"]] = np.log([1.0, 2.0, 0.5, 1.0]) / 0.5
-    tip = FINGER.fingertip
-    other = replace(
-        tip,
-        stiffness=2 * tip.stiffness,
-        damping=2 * tip.damping,
-        phalanx_mass=tip.phalanx_mass / 2,
-    )
-    same = replace(model, fingers=[replace(FINGER, fingertip=other)], last_places={})
-    expected = same.at(np.zeros(model.space.size)).responses
-    np.testing.assert_allclose(model.at(x).responses, expected, rtol=1e-10)
 
 
 @pytest.mark.parametrize("name", ["paper_plate", "glass_panel", "weekend/rig"])

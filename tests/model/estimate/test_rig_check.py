@@ -17,10 +17,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-import controller.cli.rig_cli
 from cases import read_yaml, shortly
-from controller.plate_measurement import MeasuredPlate
+from controller.cli import rig_cli
 from era_haptics.command import run_era
+from era_haptics.lab.measuring import measure_cli as measure_cli  # sets `measure_by_card`
+from examples.make_measured import record_responses, scanning_grid
 from kit.plates import (
     DISTORTIONS,
     as_sold,
@@ -29,6 +30,7 @@ from kit.plates import (
     noise_like,
     perturbed,
     random_gains,
+    write_rig,
 )
 from kit.plates import measured as measured_by_plates
 from kit.thin_plates import FAULTS, draw, measured_fault
@@ -40,11 +42,14 @@ from model.estimate.calibrate import MAX_OUTLIERS, calibrate, check_consistency
 from model.estimate.findings import FINDING_KINDS
 from model.estimate.fit import sensed_plate, without_outliers
 from model.estimate.measurement import (
+    MeasuredPlate,
     Measurement,
     measurement_of,
     read_measured,
     sensors_at,
     write_responses,
+    write_responses_csv,
+    write_responses_uff,
 )
 from model.estimate.plate_match import MAX_FIT_ERROR, ShapeMatch, match_plate
 from model.estimate.rig_check import (
@@ -61,6 +66,7 @@ from model.rig.rig_file import example_rig_path, load_rig, parse_rig
 from model.rig.rig_writing import change_rig
 from model.spectral.direct_solution import direct_spectral_acceleration
 from model.spectral.modes import SpectralMesh
+from sim.plant.fingers import Accelerometer
 
 TONES = np.arange(91.0, 300.0, 20.0)
 NAMES = ("NE", "NW", "SW", "SE")
@@ -409,7 +415,7 @@ def test_parts_that_differ_are_refused_with_what_is_at_a_bound() -> None:
     ("command", "status"),
     [
         ("calibrate {rig} {file} -o {made}", 1),
-        ("rig identify {rig} --yes -o {made}", 1),
+        ("rig identify {rig} --yes --device card --sensors {file} -o {made}", 1),
         pytest.param("calibrate {rig} {file} -o {made}", 2, marks=pytest.mark.long),
         pytest.param("rig identify {rig} --measured {file} -o {made}", 2, marks=pytest.mark.long),
         pytest.param("rig check {rig} --measured {file}", 1, marks=pytest.mark.long),
@@ -422,7 +428,7 @@ def test_commands_say_why_they_write_no_rig(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    """Of a board cut the other way, by a file and of what amplifiers would have measured.
+    """Of a board cut the other way, by a file and through a sound card.
 
     A file of a board with a dead exciter would say that it moves the plate: exit status 1, and what
     to type instead.
@@ -432,7 +438,7 @@ def test_commands_say_why_they_write_no_rig(
     found = measured(true, 1)
     found.values[..., 2] *= 1e-4 if is_dead else 1
     here = MeasuredPlate(found, None, None, (), (), {})
-    monkeypatch.setattr(controller.cli.rig_cli, "measured_by_amplifiers", lambda *_, **__: here)
+    monkeypatch.setattr(rig_cli, "measure_by_card", lambda *_, **__: here)
     file, made = tmp_path / "measured.uff", tmp_path / "made.yaml"
     write_responses(file, found, WEEKEND)
     rig = shutil.copy(FOLDER / "rig.yaml", tmp_path)
@@ -444,6 +450,42 @@ def test_commands_say_why_they_write_no_rig(
     else:
         assert "plate.grain must be width, got length" in said
     assert not made.exists()
+
+
+@pytest.mark.parametrize("ending", shortly(["csv", "uff"], ["uff"]))
+def test_responses_of_a_real_plate_are_read_from_a_file(
+    tmp_path: Path, ending: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Measured by a modal test in time, two plugs exchanged: the file's names are the rig's own."""
+    path = write_rig(tmp_path / "rig.yaml", mesh="12x9")
+    rig = load_rig(path)
+    sensors = scanning_grid(rig.plate, 3, 2, like=Accelerometer("", 0, 0, noise_density=5e-3))
+    responses = record_responses(rig, sensors, np.linspace(61, 461, 6))
+    swapped = replace(responses, values=responses.values[..., [0, 3, 2, 1]])
+    file = tmp_path / f"measured.{ending}"
+    write = write_responses_csv if ending == "csv" else write_responses_uff
+    write(file, swapped, rig)
+    assert run_era(["rig", "check", str(path), "--measured", str(file)]) == 1
+    printed = capsys.readouterr().out
+    assert "SWAPPED: channel 1 of amplifier main (ERA SE in the rig) drives ERA NW" in printed
+    assert "PLATE" not in printed
+    assert "INVERTED" not in printed
+
+
+def test_check_fails_for_a_plate_that_misses_its_promises(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """10 % thinner with all else as written: within tolerances, but fewer than half are kept."""
+    path = write_rig(tmp_path / "rig.yaml", mesh="12x9")
+    rig = load_rig(path)
+    thinner = replace(rig, plate=replace(rig.plate, thickness=0.9 * rig.plate.thickness))
+    file = tmp_path / "measured.csv"
+    write_responses_csv(file, measured_by_plates(thinner, frequencies=PAPER_TONES), rig)
+    assert run_era(["rig", "check", str(path), "--measured", str(file), "--json"]) == 1
+    report = json.loads(capsys.readouterr().out)
+    assert report["plate"]["matches"]
+    assert report["plate"]["kept_share"] < 0.5
+    assert any(row.startswith("PROMISE: ") for row in report["findings"])
 
 
 FREQUENCIES = np.arange(60.0, 421.0, 40.0)

@@ -1,7 +1,7 @@
 """Keys of rig files: their reference page, plain keys and fields of a plate, and exciters.
 
 Every key and field of a plate, also a new one, is covered: a plain key is in both solvers, in a
-rigid plate and in a summary; a field is written, read back, and followed by tables as it states.
+rigid plate and in a summary; a field is written and read back.
 """
 
 import inspect
@@ -40,8 +40,7 @@ from model.rig.sections import PLAIN_KEYS, PlateSection
 from model.structure.attachments import rigid_body_frequencies
 from model.structure.exciter import Exciter
 from model.structure.material import EXCITER_TYPES, KNOWN_MATERIALS, Material
-from model.structure.plate import FOLLOWED_FIELDS, AirGap, Laminate, Plate
-from model.table.table_file import build_table, table_following
+from model.structure.plate import AirGap, Laminate, Plate
 from model.transients.excursions import excursion_notes
 from model.vibration import natural_modes
 
@@ -152,11 +151,8 @@ FORMS: dict[str, dict[str, Any]] = {
 
 # A surface takes the place of all other keys of a plate: tests/model/structure/test_surface.py.
 @pytest.mark.parametrize("name", [each.name for each in fields(Plate) if each.name != "surface"])
-def test_a_field_that_differs_is_written_and_followed_as_it_says(name: str) -> None:
-    """Of each field, also a new one: the rig's text states it, and reads back.
-
-    A table follows fields beside the theory, a thickness and a modulus of all layers, no other.
-    """
+def test_a_field_that_differs_is_written(name: str) -> None:
+    """Of each field, also a new one: the rig's text states it, and reads back."""
     keys = FORMS.get(name, {"material": GLASS, "thickness": 0.002})
     data = rig_data({"length": 0.3, "width": 0.2, **keys}, "10x8 Legendre", 17e3)
     for era in data["eras"].values():
@@ -167,12 +163,6 @@ def test_a_field_that_differs_is_written_and_followed_as_it_says(name: str) -> N
     back = rig_of(keys_of(after))
     assert differences(back, after) == []
     assert differences(back, before) != []
-    table = build_table(before, frequencies=np.array([80.0, 150.0]))
-    if name in {*FOLLOWED_FIELDS, "thickness", "material", "laminate"}:
-        assert table_following(table, after).fingerprint == after.fingerprint
-        return
-    with pytest.raises(InputError, match=f"plate.{name}"):
-        table_following(table, after)
 
 
 def with_other(rig: Rig, name: str) -> Rig:
@@ -370,7 +360,7 @@ def test_what_may_harm_an_exciter_is_said() -> None:
 
 
 def test_a_fitted_exciter_is_written_and_reads_back() -> None:
-    """Stiffness and damping take the place of resonance and q, and are followed by a table."""
+    """Stiffness and damping take the place of resonance and q."""
     text = exciter_rig_text("type: DAEX25CT-4, resonance: 300, resonance_is: free, q: 4")
     before = parse_rig("board.yaml", text)
     fitted = replace(
@@ -385,11 +375,6 @@ def test_a_fitted_exciter_is_written_and_reads_back() -> None:
     for key in ("stiffness", "damping", "magnet_mass", "coil_mass", "force_factor", "voltage"):
         assert getattr(back.eras[0], key) == pytest.approx(getattr(fitted, key), rel=1e-5)
     assert "resonance" not in data_text(written.data)
-    table = build_table(before, frequencies=np.array([80.0, 150.0]))
-    followed = table_following(table, after)
-    expected = build_table(after, frequencies=np.array([80.0, 150.0]))
-    points = np.array([[0.1, 0.1], [0.25, 0.05]])
-    assert followed.unit_fields(points) == pytest.approx(expected.unit_fields(points), rel=2e-3)
 
 
 def test_programs_make_and_change_exciters(tmp_path: Path) -> None:

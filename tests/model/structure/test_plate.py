@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy import linalg
 
 from cases import in_turn, shortly
 from kit.direct_plate import direct_acceleration
@@ -54,7 +53,6 @@ from model.structure.plate import (
     wave_rigidity,
     wavenumber_of,
 )
-from model.table.table_file import build_table, table_following
 from model.vibration import natural_modes, reference_mesh
 
 # DAEX25FHE-4 of its sheet with Qms 3, R_g 0.1 ohm, 1 W.
@@ -742,21 +740,3 @@ def test_foam_loses_the_same_share_of_energy_in_frequency_and_in_time() -> None:
     omega = 2 * np.pi * frequencies
     receptance = 1 / (8e3 * (1 + 0.15j) - omega**2 * 0.6)
     np.testing.assert_allclose(found[:, 0, 0], receptance, rtol=2e-3)
-
-
-def test_a_table_follows_a_board_that_is_thicker_and_stiffer() -> None:
-    """Its framed modes move as the independent solver has them at 1.1 times the thickness."""
-    rig = board(masses=FRAME, supports=FEET, limits={"frequency": [40, 200]})
-    table = build_table(rig, frequencies=np.array([60.0, 150.0]), drive_mode="phased")
-    followed = table_following(table, replace(rig, plate=rig.plate.scaled(thickness=1.05)))
-    shapes = followed.attachment_shapes[1:]
-    mass = (
-        np.eye(len(followed.omega)) + (shapes.T * [each.mass for each in followed.masses]) @ shapes
-    )
-    squares = linalg.eigvalsh(np.diag(followed.omega**2), mass)
-    found = np.sqrt(np.maximum(squares, 0))[3:7] / (2 * np.pi)
-    thin, thick = np.array(FRAMED[1.0][:4]), np.array(FRAMED[1.1])
-    expected = thin * (thick / thin) ** (math.log(1.05) / math.log(1.1))
-    np.testing.assert_allclose(found, expected, rtol=3e-3)
-    with pytest.raises(InputError):
-        table_following(table, board({"material": {**BIRCH, "E2": 5e9, "rho": 680.0}}))

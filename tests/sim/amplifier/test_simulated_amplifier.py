@@ -26,7 +26,7 @@ import can
 import pytest
 
 from drivers.errors import LinkError
-from drivers.protocol.definition import FAULTS, READING_STATES, REFUSALS, STATES
+from drivers.protocol.definition import FAULTS, REFUSALS, STATES
 from drivers.protocol.records import Refusal, Values
 from drivers.protocol.sets import Command, LayerSet, pack_layers, parts
 from drivers.wires.can_frames import CanFrame, pack_frames
@@ -206,8 +206,7 @@ class Handled(Taken):
 
 def _named(what: str, values: Values) -> Any:
     """A value, a state or fault by its name."""
-    states = READING_STATES if "window_left" in values else STATES
-    names = {"state": states, "fault": FAULTS}.get(what, {})
+    names = {"state": STATES, "fault": FAULTS}.get(what, {})
     return next((name for name, code in names.items() if code == values[what]), values[what])
 
 

@@ -44,7 +44,6 @@ from kit.chain import Chain, Position, set_chain
 from kit.clock import run_virtual
 from kit.courses import Acted, Planted, Step, fits
 from kit.plates import smooth_rig
-from kit.set_table import SetTiming
 from kit.wires import after_each
 from model.answer.answer import Limits
 from model.answer.answer_report import Timing
@@ -341,10 +340,6 @@ class Hands(Acted, Fingers):
             raise CommandRefused("not now")
 
         self.patch.setattr(group, "apply", refuse)
-
-    def has_no_envelopes(self) -> None:
-        """Answer from now on by a timing without envelopes."""
-        self.controller.replace_answers(table(), SetTiming())  # type: ignore[arg-type]
 
     def renews_not(self, layer: int) -> None:
         """Let a layer not be renewed any more."""

@@ -5,7 +5,6 @@ A reader that is missing here is not tested against hostile files (`processes.ho
 
 import contextlib
 import io
-import json
 import struct
 import tempfile
 from collections.abc import Callable, Mapping
@@ -21,7 +20,6 @@ from controller.daemon.config import load_daemon_config
 from controller.effects.layout import load_layout
 from controller.effects.strengths import read_strengths
 from controller.gateway.gateway_settings import read_token
-from controller.learning.learned_table import load_learned
 from controller.sources.tuio import read_capture
 from era_haptics.command import run_era
 from era_haptics.lab.design.problem import (
@@ -38,7 +36,6 @@ from kit.plates import small_table
 from model.config.document import parse_document
 from model.errors import InputError
 from model.estimate.measurement import read_measured, read_places
-from model.files.array_file import write_arrays
 from model.files.modal_file import read_modes
 from model.files.uff import read_measured_bytes
 from model.rig.rig_file import base_fingerprint, example_rig_path, load_rig
@@ -107,7 +104,6 @@ READERS: Mapping[str, Callable[[Path], object]] = {
     "modes.uff": lambda path: read_modes(path, read_measured_bytes(path)),
     "modes.csv": lambda path: read_modes(path, read_measured_bytes(path)),
     "table.npz": load_table,
-    "learned.npz": lambda path: load_learned(path, table=""),
     "checked.yaml": partial(_run_command, "config check FILE"),
     "base.yaml": _fitted_on,
     "questions.jsonl": partial(_run_command, "table query TABLE --batch FILE"),
@@ -208,14 +204,6 @@ def _table() -> bytes:
     return table_file().read_bytes()
 
 
-def _learned() -> bytes:
-    header = {"version": 3, "table": "", "base": "", "names": ["thickness"], "change": 0.0}
-    encoded = np.frombuffer(json.dumps(header | {"lying": None}).encode(), dtype=np.uint8)
-    path = Path(tempfile.mkdtemp()) / "learned.npz"
-    write_arrays(path, {"header": encoded, "x": np.zeros(1), "covariance": np.ones((1, 1))})
-    return path.read_bytes()
-
-
 def _daemon() -> bytes:
     return f"rig: {example_rig_path()}\nlevel_db_sl: 20.0\n".encode()
 
@@ -255,7 +243,6 @@ SAMPLES: Mapping[str, Callable[[], bytes]] = {
     "modes.uff": _modes_uff,
     "modes.csv": _modes_csv,
     "table.npz": _table,
-    "learned.npz": _learned,
     "checked.yaml": (EXAMPLES / "tutorial_rig.yaml").read_bytes,
     "base.yaml": (EXAMPLES / "tutorial_rig.yaml").read_bytes,
     "questions.jsonl": lambda: b'{"target": [0.1, 0.1], "quiet": [[0.2, 0.15]]}\n',

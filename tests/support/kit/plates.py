@@ -4,34 +4,27 @@ Also what fingers feel of answers on plates that deviate, each solved exactly at
 
 The founding paper's plate, also on a mesh that is quick to solve, with a table that is built in a
 moment or in time on its ERAs; boards on exciters; a plate that is not quite the paper's, with
-responses measured on it, sound ones and others that are not what they claim; settled patterns of a
-hidden plate, whose theory is not the model's. Second solutions are a stepping solver, bases that
-move in a way known twice, and scores of a drive tone by tone.
+responses measured on it, sound ones and others that are not what they claim. Second solutions are a
+stepping solver, bases that move in a way known twice, and scores of a drive tone by tone.
 """
 
 import cmath
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
-from typing import TypeVar
 
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from benchmarks.setting import random_contacts
 from kit.direct_plate import direct_acceleration
-from kit.thin_plates import LENGTH as HIDDEN_LENGTH
-from kit.thin_plates import WIDTH as HIDDEN_WIDTH
-from kit.thin_plates import Hidden, Mounted, settled_pattern
 from model.answer.answer import Answer
 from model.answer.promise import FingersOnPlate
 from model.answer.stimulus import Placement
 from model.arrays import ComplexArray, FloatArray, Point
 from model.drive_modes import Forms, WeightedTones
-from model.estimate.following import SettledPattern
 from model.estimate.measurement import Measurement, sensors_at
 from model.fem import ELEMENTS, Mesh, assemble
 from model.finger import Grid, detection_threshold
@@ -525,51 +518,6 @@ def by_hand(forms: Forms, drive: WeightedTones) -> tuple[float, float]:
         for q, form in enumerate(forms.quiet[f].astype(complex)):
             quiet[q] += (w.conj() @ form @ w).real / threshold_power
     return float(np.sqrt(target.min() / quiet.max())), float(np.sqrt(target.min()))
-
-
-SETTLED_PATTERNS_FREQUENCIES = np.linspace(40.0, 500.0, 27)
-SECONDS = 12.0  # between patterns
-
-_Found = TypeVar("_Found")
-
-
-def settled_patterns(
-    hidden: Hidden,
-    plate: Mounted,
-    *,
-    count: int,
-    start: int = 0,
-    noise: float = 0.01,
-    heaviest: float | None = None,
-) -> Iterator[SettledPattern]:
-    """Patterns from a number on, under two to four fingers of unknown loads, read with noise.
-
-    heaviest: load of the first finger of each, relative to the usual one.
-    """
-    for number in range(start, start + count):
-        rng = np.random.default_rng([7, number])
-        places = random_contacts(
-            rng, int(rng.integers(2, 5)), (HIDDEN_LENGTH, HIDDEN_WIDTH), margin=0.013
-        )
-        frequency = float(rng.choice(SETTLED_PATTERNS_FREQUENCIES))
-        bases = 50e-6 * rng.uniform(0.2, 1, 4) * np.exp(2j * np.pi * rng.uniform(size=4))
-        factors = np.exp(0.5 * rng.standard_normal(len(places)))
-        if heaviest is not None:
-            factors[0] = heaviest
-        tone, time = (np.array([frequency]), bases[None]), number * SECONDS
-        yield settled_pattern(hidden, plate, tone, places, factors, rng, time=time, noise=noise)
-
-
-def played(
-    take: Callable[[SettledPattern], _Found],
-    hidden: Hidden,
-    plate: Mounted,
-    *,
-    count: int,
-    start: int = 0,
-) -> list[_Found]:
-    """What is found of each of some patterns."""
-    return [take(each) for each in settled_patterns(hidden, plate, count=count, start=start)]
 
 
 @dataclass(frozen=True)

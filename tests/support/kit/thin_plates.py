@@ -25,14 +25,13 @@ from model.answer.stimulus import Placement
 from model.arrays import Complex64Array
 from model.ensemble.attached_plate import AttachedPlate
 from model.errors import InputError
-from model.estimate.following import SettledPattern
-from model.estimate.forward import RestingFinger, Sensor, jacobian
+from model.estimate.forward import Sensor, jacobian
 from model.estimate.identify import Identification, identify, model_of, relevant
 from model.estimate.measurement import Measurement, sensors_at
 from model.estimate.parameters import PARAMETER_KINDS
 from model.finger import fingertip_points, fingertip_weights
 from model.rig.rig import Rig, Uncertainty
-from model.structure.attachments import Era, Fingertip, PointLoad
+from model.structure.attachments import Era, PointLoad
 from model.structure.plate import LOSS_FREQUENCY
 from model.table.table import LocalizationTable
 from model.table.table_file import build_table
@@ -349,62 +348,6 @@ def finger_stiffness(frequency: float, factors: Reals) -> complex:
     moved = pulp / (pulp + joint - w**2 * PHALANX * bone)
     return complex(-(w**2) * CONTACT * mass + pulp * (1 - moved))
 
-
-def settled_pattern(
-    hidden: Hidden,
-    mounted: Mounted,
-    tones: tuple[Reals, Complexes],
-    places: Reals,
-    factors: Reals,
-    rng: np.random.Generator,
-    *,
-    time: float,
-    lying: tuple[float, float, float] | None = None,
-    noise: float = 0.01,
-    has_phase: bool = True,
-) -> SettledPattern:
-    """Tones (k,) [Hz] of bases (k, n) [m] as they are read with noise at the hidden plate's ERAs.
-
-    places (q, 2) [m], factors (q,): of fingers and of their loads, which a reader takes for usual
-    ones; lying: place x, y [m] and mass [kg] of an object on a spring of `CONTACT_SPRING`.
-    """
-    values = []
-    at = places if lying is None else np.vstack([places, lying[:2]])
-    for frequency, bases in zip(*tones, strict=True):
-        loads = [finger_stiffness(frequency, np.full(4, each)) for each in factors]
-        if lying is not None:
-            inertia = (2 * np.pi * frequency) ** 2 * lying[2]
-            loads.append(-inertia * CONTACT_SPRING / (CONTACT_SPRING - inertia))
-        felt = mounted.accelerations(frequency, mounted.at, fingers=at, loads=np.array(loads))
-        read, parts = hidden.sensor_gain * (felt @ bases), rng.standard_normal((2, len(bases)))
-        values.append(read + noise * np.abs(read) * (parts[0] + 1j * parts[1]))
-    fingers = tuple(RestingFinger(x, y, Fingertip()) for x, y in places.tolist())
-    return SettledPattern(time, *tones, np.array(values), fingers, has_phase=has_phase)
-
-
-def pattern_of_touches(
-    hidden: Hidden,
-    rng: np.random.Generator,
-    *,
-    time: float,
-    lying: tuple[float, float, float] | None = None,
-) -> SettledPattern:
-    """One to three tones under two to four fingers, 3 cm or more from an object that lies there."""
-    away = -1.0
-    while away < 0.03:
-        places = random_contacts(rng, int(rng.integers(2, 5)), (LENGTH, WIDTH), margin=0.013)
-        away = 1.0 if lying is None else float(np.hypot(*(places - lying[:2]).T).min())
-    frequencies = np.sort(rng.choice(FREQUENCIES, int(rng.integers(1, 4)), replace=False))
-    size = (len(frequencies), len(hidden.mounted.at))
-    bases = 50e-6 * rng.uniform(0.2, 1, size) * np.exp(2j * np.pi * rng.uniform(size=size))
-    factors, own = np.exp(LOAD_STD * rng.standard_normal(len(places))), hidden.mounted
-    tones = frequencies, bases
-    return settled_pattern(
-        hidden, own, tones, places, factors, rng, time=time, lying=lying, has_phase=False
-    )
-
-
-CONTACT_SPRING = 1e5 * (1 + 0.1j)  # N/m; of an object that lies on a plate
 
 DRIVES = Uncertainty(gain=0.01, phase_deg=1, thickness=0, stiffness=0, damping=1, fingertip=0)
 

@@ -405,7 +405,7 @@ _OTHER_HOST = 2.0  # s; for which a host that hears another one sends nothing th
 _ATTEMPTS = 3  # of a request that has no reply
 _REPEATED = 0.1  # s; within which a stop that is not confirmed goes on, for each amplifier
 CONFIRMED = 0.3  # s; then the host says that it is not
-_READINGS = ("GetStatus", "GetSensors", "Measure", "GetReading", "GetMeasured")
+_READINGS = ("GetStatus", "GetMeasured")
 SILENCING_REQUESTS = ("Stop", "Disarm", "Silence")
 
 

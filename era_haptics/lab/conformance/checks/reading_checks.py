@@ -20,8 +20,8 @@ from drivers.protocol.definition import (
     FAULTS,
     MESSAGES,
     NO_CHANNEL,
-    QUANTITIES,
     REACTION,
+    RESERVED_MESSAGES,
     STATES,
     STATUS,
     STATUS_FLAGS,
@@ -58,14 +58,11 @@ from era_haptics.lab.conformance.subject import Subject
 from era_haptics.lab.expected_amplifier import FAULT, OFF, REACTING
 from registry import threads
 
-_UNKNOWN = (20, 24, 29, 63)  # numbers of no message, below those of vendors
+_UNKNOWN = (*RESERVED_MESSAGES, 20, 24, 29, 63)  # numbers of no message, below those of vendors
 _TRIES, _AT_ONCE = 20, 4
 _FEATURE_OF = {
     "GetMeasured": "electrical",
     "SetAddress": "address",
-    "GetSensors": "sensors",
-    "Measure": "sensors",
-    "GetReading": "sensors",
     "Mark": "mark",
 }
 
@@ -217,14 +214,9 @@ def _shortest(name: str, **others: Any) -> list[int]:
         "layer": 0,
         "address": 9,
         "serial_number": "?",
-        "first": 0,
-        "reading": 1,
-        "window": 1000,
-        "tones": 1,
         "shift": 0,
         "rate": 0,
         "at": 0,
-        "frequencies": [QUANTITIES["frequency"].to_wire(100.0)],
         **others,
     }
     return MESSAGES[name].request.pack(values)

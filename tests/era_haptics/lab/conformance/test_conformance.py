@@ -53,18 +53,16 @@ from kit.clock import (
     short_checks,
     varied,
 )
-from model.rig.rig import Rig
 from registry import threads
 from sim.amplifier.readings import capabilities
 from sim.amplifier.simulated_amplifier import SimulatedAmplifier
-from sim.bench.bench import Bench, keep_time
 from sim.far_ends.serial_amplifiers import SerialAmplifiers
 
 SKIPPED = {
-    "serial": {"sensors", "steps_as_stated", "limited", "readings"},
-    "can": {"sensors", "steps_as_stated", "limited", "readings"},
-    "rtu": {"sensors", "steps_as_stated", "limited", "readings", "events"},
-    "tcp": {"sensors", "steps_as_stated", "limited", "readings", "events"},
+    "serial": {"steps_as_stated", "limited"},
+    "can": {"steps_as_stated", "limited"},
+    "rtu": {"steps_as_stated", "limited", "events"},
+    "tcp": {"steps_as_stated", "limited", "events"},
 }
 MINUTE = 60.0
 PAGES = Path(era_haptics.__file__).parents[1] / "docs" / "reference"
@@ -114,17 +112,6 @@ def test_amplifier_with_the_whole_table_passes_loud(names: list[str]) -> None:
     """At 0.9 of full level, where a sum of layers is limited."""
     results = judged("serial", names, level=0.9, far=plain())
     expect_passed(results, set() if names else SKIPPED["serial"] - {"limited"})
-
-
-@in_virtual_time
-async def test_sensors_on_a_plate_pass(coarse_rig: Rig) -> None:
-    """Those at the feet of a rig's actuators, which read what plays."""
-    bench = Bench(coarse_rig, now=threads.now())
-    (far,) = bench.amplifiers.values()
-    running = asyncio.ensure_future(keep_time(bench))
-    results = await results_of("serial", far, ["sensors", "readings"])
-    running.cancel()
-    expect_passed(results, set())
 
 
 class _Coarse(SimulatedAmplifier):

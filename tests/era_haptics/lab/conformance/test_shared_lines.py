@@ -12,7 +12,7 @@ from kit.clock import JUDGED_LINE_KINDS, JudgedLine, judged, varied
 from sim.amplifier.simulated_amplifier import SimulatedAmplifier
 from sim.far_ends.modbus_amplifiers import ModbusAmplifiers
 
-SKIPPED = {"sensors", "steps_as_stated", "limited", "readings"}
+SKIPPED = {"steps_as_stated", "limited"}
 FOR_ALL = {
     "serial": {"broadcasts", "discarded_frames"},
     "rtu": {"broadcasts", "present_areas", "events"},

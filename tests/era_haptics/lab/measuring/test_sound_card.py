@@ -20,7 +20,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from controller.plate_measurement import MeasuredPlate
 from drivers.errors import LinkError
 from era_haptics.command import run_era
 from era_haptics.lab.measuring.measure import measure_through
@@ -46,7 +45,7 @@ from kit.plates import lock_in
 from model.arrays import Float32Array, FloatArray
 from model.errors import InputError
 from model.estimate.identify import identify
-from model.estimate.measurement import measurement_of, read_measured, sensors_at
+from model.estimate.measurement import MeasuredPlate, measurement_of, read_measured, sensors_at
 from model.rig.rig import Rig
 from model.rig.rig_file import example_rig_path, parse_rig
 from model.structure.attachments import PointLoad, fingertip_loads

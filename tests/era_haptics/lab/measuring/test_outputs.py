@@ -1,12 +1,11 @@
-"""Promises of a table to accelerometers, outputs and their actuators, and stepped sines in files.
+"""Outputs and their actuators, and stepped sines in files.
 
-Promises are played and measured on a plate in memory; outputs are assigned by a person or by one
-accelerometer; sines are as other programs record or measure them, compared with their source.
+Outputs are assigned by a person or by one accelerometer; sines are as other programs record or
+measure them, compared with their source.
 """
 
 import json
 import shutil
-import threading
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import product
@@ -18,283 +17,21 @@ from scipy.io import wavfile
 from typer.testing import CliRunner
 
 from cases import shortly
-from drivers.by_hand.actions import BlockingAmplifier
-from drivers.errors import CommandRefused, LinkError
-from drivers.host.ledger import StagedSet
-from drivers.playing import AmplifierLayer
 from era_haptics.lab.cli import app as cli_app
-from era_haptics.lab.measuring import table_measurement
 from era_haptics.lab.measuring.other_sources import read_stepped
 from era_haptics.lab.measuring.outputs import OutputFinding, listen_to_outputs, matched, tone
-from era_haptics.lab.measuring.sound_card import Desk, SoundCard, WiredSensor, read_sensors
-from kit.desk_plate import Actuator, Converters, DeskPlate, Truth, draw_truth
-from kit.direct_plate import direct_responder
+from era_haptics.lab.measuring.sound_card import Desk, WiredSensor
+from kit.desk_plate import Converters, DeskPlate, Truth
 from kit.plates import exciter_rig
 from model.arrays import ComplexArray, Float32Array, FloatArray
-from model.cli import app
 from model.errors import InputError
 from model.estimate.measurement import Measurement, measurement_of
-from model.finger import detection_threshold
 from model.reduction.free_plate import solve_free_plate
-from model.rig.rig import Rig, Uncertainty
-from model.rig.rig_file import example_rig_path, load_rig
-from model.study.promise_at_sensors import CheckSettings, Promise, promises
-from model.table.table import LocalizationTable
-from model.table.table_file import build_table, save_table
-from model.vibration import tone_fields
+from model.rig.rig import Rig
+from model.rig.rig_file import load_rig
 from processes.sound_cards import DeskCard
 
 RATE = 8_000.0
-LEVEL = 0.5
-PLACES = {"A": (0.04, 0.05), "B": (0.20, 0.11), "C": (0.28, 0.20), "D": (0.06, 0.19)}
-SENSORS = "sensor,x_m,y_m,input,mv_per_m_s2\n" + "".join(
-    f"{name},{x},{y},{number},1\n" for number, (name, (x, y)) in enumerate(PLACES.items(), start=1)
-)
-
-
-@pytest.fixture(scope="module")
-def known() -> Rig:
-    """The paper's plate, known exactly."""
-    return replace(load_rig(example_rig_path()), uncertainty=Uncertainty.none())
-
-
-@pytest.fixture(scope="module")
-def table(known: Rig) -> LocalizationTable:
-    """Its table, of few frequencies."""
-    return build_table(known, frequencies=np.array([110.0, 170.0, 230.0]), drive_mode="phased")
-
-
-class EndingCard(SoundCard):
-    """A card whose only run ends in an exception that a call raises."""
-
-    def __init__(self, end: Callable[[], None]) -> None:
-        self.rate, self._end = RATE, end
-
-    def run(self, played: FloatArray) -> Float32Array:
-        """Raise it."""
-        self._end()
-        raise NotImplementedError
-
-    def close(self) -> None:
-        """Nothing is open."""
-
-
-@pytest.fixture
-def sensors_file(tmp_path: Path) -> Path:
-    """The places of four accelerometers."""
-    path = tmp_path / "sensors.csv"
-    path.write_text(SENSORS)
-    return path
-
-
-def check_on_card(
-    monkeypatch: pytest.MonkeyPatch,
-    table: LocalizationTable,
-    rig: Rig,
-    path: Path,
-    opened: Callable[..., SoundCard],
-    *,
-    url: str | None = None,
-    level: float | None = LEVEL,
-) -> None:
-    """Check one promise of a table by sensors of a file, through a card that is opened."""
-    monkeypatch.setattr(table_measurement, "open_card", opened)
-    settings = CheckSettings("memory", path, url, 1, 0, level)
-    table_measurement.check_table(table, rig, settings, progress=lambda _done, _count: None)
-
-
-def as_written(known: Rig) -> Truth:
-    """The plate as its rig has it, its bases stiff up to high frequencies."""
-    return replace(draw_truth(known, seed=1), rig=known, actuators=(Actuator(3e3, 0.7, 1.0),) * 4)
-
-
-def felt_contrast(known: Rig, promise: Promise) -> float:
-    """Felt contrast [dB] at the sensors of a promise, by the direct solver."""
-    points = np.array([PLACES[name] for name in promise.sensors])
-    respond = direct_responder(known.plate, known.mesh)
-    frequencies, found = tone_fields(
-        promise.layer.excitation, known.eras, lambda f: respond(known.eras, f, points)
-    )
-    felt = np.linalg.norm(found / detection_threshold(frequencies)[:, None], axis=0)
-    return float(20 * np.log10(felt[0] / felt[1:].max()))
-
-
-def measured_on(
-    truth: Truth,
-    table: LocalizationTable,
-    path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    *more: str,
-    **wires: object,
-) -> tuple[int, dict[str, object]]:
-    """`era table verify --device` on a plate in memory: exit status and report."""
-    save_table(table, path.with_name("t.npz"))
-    sensors = read_sensors(path, truth.rig.plate)
-
-    def opened(_device: str, **_counts: int) -> DeskCard:
-        plate = DeskPlate(truth, sensors, rate=RATE, converters=Converters(noise=5e-3), seed=1)
-        return DeskCard(plate, rate=RATE, **wires)  # type: ignore[arg-type]
-
-    monkeypatch.setattr(table_measurement, "open_card", opened)
-    arguments = ["table", "verify", str(path.with_name("t.npz")), "--device", "memory"]
-    arguments += ["--samples", "4", "--sensors", str(path), "--json", "--level", "0.5", *more]
-    result = CliRunner().invoke(app, arguments)
-    if result.exception is not None and not isinstance(result.exception, SystemExit):
-        raise result.exception
-    return result.exit_code, json.loads(result.stdout)
-
-
-def test_promises_of_a_known_plate_are_the_direct_solution(
-    known: Rig, table: LocalizationTable
-) -> None:
-    """Where every parameter is exact, nine of ten plates and every other are this one."""
-    for promise in promises(table, PLACES, count=3, level=LEVEL, seed=0):
-        exact = min(felt_contrast(known, promise), 25.0)  # deeper nulls show the error of the mesh
-        assert min(promise.contrast_db, 25.0) == pytest.approx(exact, abs=0.5)
-        assert min(promise.median_db, 25.0) == pytest.approx(exact, abs=0.5)
-        strokes = known.full_levels
-        tones = promise.layer.excitation.items()
-        assert max(t.amplitude / strokes[n] for n, t in tones) == pytest.approx(LEVEL)
-
-
-def test_contrast_that_is_measured_is_that_of_the_plate(
-    known: Rig, table: LocalizationTable, sensors_file: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Played, recorded and fitted: what the direct solver says of the same patterns.
-
-    In time damping is viscous, and the direct solver's hysteretic, which moves nulls.
-    """
-    _, report = measured_on(as_written(known), table, sensors_file, monkeypatch)
-    asked = list(promises(table, PLACES, count=4, level=LEVEL, seed=0))
-    rows = report["promises"]
-    assert [len(row["quiet"]) for row in rows] == [1, 2, 3, 1]
-    for row, promise in zip(rows, asked, strict=True):
-        exact = min(felt_contrast(known, promise), 25.0)
-        assert min(row["measured_contrast_db"], 25.0) == pytest.approx(exact, abs=1.5)
-        assert row["measured_level_db_sl"] == pytest.approx(row["promised_level_db_sl"], abs=0.5)
-
-
-def test_plate_that_is_another_breaks_promises(
-    known: Rig, table: LocalizationTable, sensors_file: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A plate built from the same drawing, not measured: exit status 1, with its picture."""
-    loose = replace(known, uncertainty=Uncertainty())
-    picture = sensors_file.with_name("p.png")
-    truth = draw_truth(loose, seed=3, mesh="6x4 Q3")
-    status, report = measured_on(truth, table, sensors_file, monkeypatch, "--picture", str(picture))
-    assert (status, report["passed"]) == (1, False)
-    assert picture.read_bytes().startswith(b"\x89PNG")
-
-
-@pytest.mark.parametrize(
-    ("factors", "error", "cause"),
-    [
-        ({3: 0.0}, LinkError, "silent: .*input 3"),
-        ({3: 1e4}, InputError, "clipping of sensor C"),
-        ({5: 0.0}, LinkError, r"loop-back of output 5 \(input 5\)"),
-    ],
-)
-def test_dead_and_clipped_inputs_keep_no_promise(
-    known: Rig,
-    table: LocalizationTable,
-    sensors_file: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    factors: dict[int, float],
-    error: type[Exception],
-    cause: str,
-) -> None:
-    """Zeros at a quiet place would be a contrast without end, and clipping one that is too low.
-
-    A silent loop-back cannot tell of lost blocks.
-    """
-    with pytest.raises(error, match=cause):
-        measured_on(as_written(known), table, sensors_file, monkeypatch, factors=factors)
-
-
-@pytest.mark.parametrize(
-    ("limits", "level", "key"),
-    [
-        ({"level": 0.2}, 0.3, "--level"),
-        ({"power": 0.16}, 0.21, "--level"),  # of four ERAs, 0.2 each
-        ({"on_time": 2.0}, LEVEL, "on_time"),
-        ({"duty": 0.5}, LEVEL, "duty"),
-        ({"slew": 15.0}, LEVEL, "slew"),
-        ({"frequency_max": 100.0}, LEVEL, "frequency"),
-    ],
-)
-def test_limits_of_the_rig_hold_for_a_card(
-    known: Rig,
-    table: LocalizationTable,
-    sensors_file: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    limits: dict[str, float],
-    level: float,
-    key: str,
-) -> None:
-    """No guard is behind a card: each limit is checked before a sample is played."""
-    bounded = replace(known, limits=replace(known.limits, **limits))
-    card = EndingCard(lambda: pytest.fail("a sample was played"))
-    with pytest.raises(InputError, match=key):
-        check_on_card(monkeypatch, table, bounded, sensors_file, lambda *_, **__: card, level=level)
-
-
-def test_no_output_exceeds_half_of_what_the_rig_allows(
-    known: Rig, table: LocalizationTable, sensors_file: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Nor does the loop-back's: 0.05 of a level of 0.1."""
-    sensors = read_sensors(sensors_file, known.plate)
-    plate = DeskPlate(as_written(known), sensors, rate=RATE, converters=Converters(), seed=1)
-    card = DeskCard(plate, rate=RATE)
-
-    def opened(_device: str, *, limit: float, **_counts: int) -> DeskCard:
-        assert limit == pytest.approx(0.05)
-        return card
-
-    bounded = replace(known, limits=replace(known.limits, level=0.1))
-    check_on_card(monkeypatch, table, bounded, sensors_file, opened, level=None)
-    assert card.loudest[[card.loudest.argmax(), -1]] == pytest.approx(0.05, rel=1e-3)
-
-
-@pytest.mark.parametrize("trouble", [KeyboardInterrupt, LinkError])
-def test_amplifier_is_disarmed_as_soon_as_the_card_ends(
-    known: Rig,
-    table: LocalizationTable,
-    sensors_file: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    trouble: type[BaseException],
-) -> None:
-    """Ctrl-C and a lost card end a vibration on its way, not four seconds later when it is over."""
-    playing, ended = threading.Event(), []
-
-    class Observed(BlockingAmplifier):
-        """Notes how what it plays ends."""
-
-        def apply(self, layers: Sequence[AmplifierLayer]) -> StagedSet:
-            staged = super().apply(layers)
-            playing.set()
-            return staged
-
-        def play(self, layers: Sequence[AmplifierLayer], *, duration: float) -> StagedSet:
-            try:
-                staged = super().play(layers, duration=duration)
-            except CommandRefused:
-                ended.append("disarmed")
-                raise
-            ended.append("played to its end")
-            return staged
-
-    def end() -> None:
-        assert playing.wait(60.0)
-        raise trouble
-
-    monkeypatch.setattr(table_measurement, "BlockingAmplifier", Observed)
-    url = f"sim://{example_rig_path()}"
-    with pytest.raises(trouble):
-        check_on_card(
-            monkeypatch, table, known, sensors_file, lambda *_, **__: EndingCard(end), url=url
-        )
-    assert ended == ["disarmed"]
-
 
 EXAMPLE = Path(__file__).parents[4] / "examples" / "desk" / "rig.yaml"
 SENSITIVITY = 0.01  # that the command does not know

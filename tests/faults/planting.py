@@ -21,6 +21,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, field, replace
 from difflib import get_close_matches
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 _HOLE = "..."
@@ -90,15 +91,16 @@ def _kind(owner: ast.AST, name: str) -> str:
 class _Matcher:
     """Compares a pattern with code.
 
-    local_names: variables and parameters of the function around the code.
+    function: the outermost function around the code, or None; its variables and parameters are the
+        local names.
     global_names: names that cannot be local variables of a pattern.
     """
 
     def __init__(
-        self, freedom: _Freedom, local_names: frozenset[str], global_names: frozenset[str]
+        self, freedom: _Freedom, function: ast.AST | None, global_names: frozenset[str]
     ) -> None:
         self._freedom = freedom
-        self._local_names = local_names
+        self._function = function
         self._global_names = global_names
 
     def match(self, pattern: Any, code: Any, binding: _Binding) -> Iterator[_Binding]:
@@ -120,9 +122,9 @@ class _Matcher:
 
     def _within(self, code: ast.AST) -> "_Matcher":
         """Return the matcher for code in a function if this one is not in a function yet."""
-        if self._local_names or not isinstance(code, _FUNCTIONS):
+        if self._function or not isinstance(code, _FUNCTIONS):
             return self
-        return _Matcher(self._freedom, _variables(code), self._global_names)
+        return _Matcher(self._freedom, code, self._global_names)
 
     def match_start(
         self, pattern: Sequence[ast.stmt], code: Sequence[ast.stmt], binding: _Binding
@@ -205,8 +207,9 @@ class _Matcher:
     def _may_differ(self, kind: str, name: str, in_code: str) -> bool:
         if kind == "private":
             return self._freedom.private and is_private(in_code)
-        is_local = in_code in self._local_names and name not in self._global_names
-        return kind == "name" and self._freedom.local and is_local
+        if kind != "name" or not self._freedom.local or self._function is None:
+            return False
+        return in_code in _variables(self._function) and name not in self._global_names
 
 
 def _is_hole(node: Any) -> bool:
@@ -243,6 +246,7 @@ class _Match:
 
     binding: _Binding
     line: int
+    owner: ast.AST
     expression: ast.expr | None = None
     block: list[ast.stmt] = field(default_factory=list)
     start: int = 0
@@ -258,18 +262,18 @@ def _plant_python(edit: Edit, source: str) -> str:
     for freedom in _FREEDOMS:
         matches = _matches(tree, scopes, pattern, replacement, freedom)
         if len(matches) > 1:
-            lines = ", ".join(str(match.line) for match in matches)
+            lines = ", ".join(map(str, sorted(match.line for match in matches)))
             where = f" of {edit.scope}" if edit.scope else ""
             raise StaleEdit(f"matches in lines {lines}{where}, must match once: {edit.find}")
         if matches:
-            _put(tree, matches[0], replacement)
-            return ast.unparse(ast.fix_missing_locations(tree)) + "\n"
+            _put(matches[0], replacement)
+            return ast.unparse(tree) + "\n"
     raise StaleEdit(_nothing_matches(edit, pattern, [scope for scope, _ in scopes]))
 
 
 def _matches(
     tree: ast.Module,
-    scopes: Sequence[tuple[ast.AST, frozenset[str]]],
+    scopes: Sequence[tuple[ast.AST, ast.AST | None]],
     pattern: list[ast.stmt],
     replacement: list[ast.stmt],
     freedom: _Freedom,
@@ -277,9 +281,9 @@ def _matches(
     global_names = _BUILTIN_NAMES | _global_names(tree)
     are_expressions = _is_expression(pattern) and _is_expression(replacement)
     matches: list[_Match] = []
-    for scope, local_names in scopes:
-        for owner, names in _nodes(scope, local_names):
-            matcher = _Matcher(freedom, names, global_names)
+    for scope, around in scopes:
+        for owner, function in _nodes(scope, around):
+            matcher = _Matcher(freedom, function, global_names)
             matches += _matches_in(owner, pattern, matcher, are_expressions)
     return matches
 
@@ -306,18 +310,18 @@ def _private_names(statements: Sequence[ast.AST]) -> set[str]:
     return names
 
 
-def _scopes(tree: ast.Module, dotted: str) -> list[tuple[ast.AST, frozenset[str]]]:
-    """Return the definitions of a dotted name, with the local names around them."""
-    scopes: list[tuple[ast.AST, frozenset[str]]] = [(tree, frozenset())]
+def _scopes(tree: ast.Module, dotted: str) -> list[tuple[ast.AST, ast.AST | None]]:
+    """Return the definitions of a dotted name, with the outermost function around each."""
+    scopes: list[tuple[ast.AST, ast.AST | None]] = [(tree, None)]
     for name in filter(None, dotted.split(".")):
         below = []
         existing = []
-        for scope, names in scopes:
-            for node, around in _nodes(scope, names):
+        for scope, around in scopes:
+            for node, function in _nodes(scope, around):
                 if isinstance(node, _DEFINITIONS) and node is not scope:
                     existing.append(node.name)
                     if node.name == name:
-                        below.append((node, around))
+                        below.append((node, function))
         if not below:
             similar = get_close_matches(name, existing, n=1)
             hint = f"; did you mean {similar[0]}?" if similar else ""
@@ -327,16 +331,19 @@ def _scopes(tree: ast.Module, dotted: str) -> list[tuple[ast.AST, frozenset[str]
 
 
 def _nodes(
-    node: ast.AST, local_names: frozenset[str] = frozenset()
-) -> Iterator[tuple[ast.AST, frozenset[str]]]:
-    """Yield a node and all below it, with the local names of the outermost function around."""
-    if isinstance(node, _FUNCTIONS) and not local_names:
-        local_names = _variables(node)
-    yield node, local_names
-    for child in ast.iter_child_nodes(node):
-        yield from _nodes(child, local_names)
+    node: ast.AST, function: ast.AST | None = None
+) -> Iterator[tuple[ast.AST, ast.AST | None]]:
+    """Yield a node and all below it, with the outermost function around each."""
+    queue = [(node, function)]
+    while queue:
+        node, function = queue.pop()
+        if function is None and isinstance(node, _FUNCTIONS):
+            function = node
+        yield node, function
+        queue += [(child, function) for child in ast.iter_child_nodes(node)]
 
 
+@lru_cache(maxsize=256)
 def _variables(node: ast.AST) -> frozenset[str]:
     """Return the names of variables and parameters in code."""
     names = set()
@@ -376,7 +383,7 @@ def _matches_in(
         for child in ast.iter_child_nodes(owner):
             if isinstance(child, ast.expr):
                 for bound in matcher.match(pattern[0].value, child, _Binding()):
-                    yield _Match(bound, child.lineno, expression=child)
+                    yield _Match(bound, child.lineno, owner, expression=child)
         return
     for _, block in ast.iter_fields(owner):
         if not (isinstance(block, list) and block and isinstance(block[0], ast.stmt)):
@@ -384,10 +391,10 @@ def _matches_in(
         for start in range(len(block)):
             for bound, count in matcher.match_start(pattern, block[start:], _Binding()):
                 line = block[start].lineno
-                yield _Match(bound, line, block=block, start=start, count=count)
+                yield _Match(bound, line, owner, block=block, start=start, count=count)
 
 
-def _put(tree: ast.Module, match: _Match, replacement: list[ast.stmt]) -> None:
+def _put(match: _Match, replacement: list[ast.stmt]) -> None:
     """Put the replacement in place of matched code."""
     filled = _Filling(match.binding).fill(replacement)
     if match.expression is None:
@@ -396,12 +403,11 @@ def _put(tree: ast.Module, match: _Match, replacement: list[ast.stmt]) -> None:
             match.block.append(ast.Pass())
         return
     assert isinstance(filled[0], ast.Expr)
-    for owner in ast.walk(tree):
-        for name, value in ast.iter_fields(owner):
-            if value is match.expression:
-                setattr(owner, name, filled[0].value)
-            elif isinstance(value, list):
-                value[:] = [filled[0].value if item is match.expression else item for item in value]
+    for name, value in ast.iter_fields(match.owner):
+        if value is match.expression:
+            setattr(match.owner, name, filled[0].value)
+        elif isinstance(value, list):
+            value[:] = [filled[0].value if item is match.expression else item for item in value]
 
 
 class _Filling(ast.NodeTransformer):

@@ -8,14 +8,12 @@ layout. Then every planted fault must still fit, and the nearest tests must pass
 
 import argparse
 import ast
-import io
-import keyword
 import os
 import random
+import re
 import subprocess
 import sys
-import tokenize
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from copies import ROOT, sound_copy
@@ -51,25 +49,13 @@ def private_functions(files: Sequence[Path]) -> Mapping[str, list[Path]]:
     return {name: paths for name, paths in sorted(defined.items()) if name not in used}
 
 
-def rename(path: Path, names: Mapping[str, str]) -> bool:
-    """Rename in one module, token by token; return whether it has changed."""
+def rename(path: Path, names: Mapping[str, str]) -> None:
+    """Rename in one module, in f-strings and docstrings as well."""
     text = path.read_text("utf-8")
-    lines = text.splitlines(keepends=True)
-    for token in reversed([*_names_in(text)]):
-        if token.string in names:
-            line, column = token.start[0] - 1, token.start[1]
-            rest = lines[line][column + len(token.string) :]
-            lines[line] = lines[line][:column] + names[token.string] + rest
-    changed = "".join(lines)
+    for name, other in names.items():
+        text = re.sub(rf"\b{name}\b", other, text)
     path.unlink()  # it may be a hard link
-    path.write_text(changed, "utf-8")
-    return changed != text
-
-
-def _names_in(text: str) -> Iterator[tokenize.TokenInfo]:
-    for token in tokenize.generate_tokens(io.StringIO(text).readline):
-        if token.type == tokenize.NAME and not keyword.iskeyword(token.string):
-            yield token
+    path.write_text(text, "utf-8")
 
 
 def reformat(path: Path) -> None:

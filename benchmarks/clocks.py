@@ -1,14 +1,16 @@
-"""Print how far apart clocks, clicks and sets of three amplifiers are, for each kind of line.
+"""Differences between the clocks, clicks and sets of three amplifiers, for each kind of line.
 
-clocks: rms of one clock, from the differences of each two, over a second from 1 s, 30 s and 10 min
-after arming on, and what the host says of them then; a finger rests from 0.5 s on. click: the
-longest of 40 from the first amplifier's start to the last one's. set: median from a touch until all
-play, of three amplifiers and of one.
+    python -m benchmarks.clocks [--seeds 2] [--moments 1 30] [--only WORDS] [--firmware SECONDS]
 
-A host holds three amplifiers on lines as they are, in virtual time, with the daemon's own loop;
-crystals are 50 ppm off and warm up, as `draw_imperfections` has them. Three processes of the
-firmware on terminals are held by the same loop in real time; their clocks are judged by the
-machine's: each status by the middle of its exchange, of those that took least time.
+Prints the table in the section Clocks of several amplifiers of docs/measured/figures.md, and the
+clock errors in docs/reference/several-amplifiers.md. Clocks: root mean square error of one clock
+over a second after some moments from arming on, and the host's estimate of it, while a finger
+rests. Click: largest difference between the first and the last start in 40 clicks. Set: median time
+from a touch until all play, for three amplifiers and for one.
+
+The daemon's control loop runs in virtual time; crystals are 50 ppm off and warm up as in
+`draw_imperfections`. With --firmware three processes of the firmware on terminals run in real time,
+and their clocks are compared with the machine's.
 """
 
 import argparse

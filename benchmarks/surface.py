@@ -1,23 +1,21 @@
-"""A surface by its modes against what they come from: fields, contrast and promises.
+"""A surface described by its modes, compared with its source: fields, contrast and promises.
 
-    python -m benchmarks.surface [--solver calculix] [--sets N] [--page]
+    python -m benchmarks.surface [--solver calculix] [--sets N] [--wire] [--page]
 
-The paper's plate is exported as another program would, by its modes at 25 x 19 nodes up to 1.5, 3
-and 5 times the highest frequency of its limits, and read again as a surface. Beside the plate's own
-table: the largest difference of the field of any ERA at any frequency, its mean, and what the
-surface's table states as its error, mean; two to four fingers, one of which feels a content: the
-median of what each table promises to it, phased. Last, the share of the promises of each table that
-hold on plates drawn around the plate and solved by its own table.
+Prints the tables in the section How well of docs/how-to/surface.md; --page writes them there.
 
-With --solver calculix the curved glass of examples/calculix, whose modes CalculiX computes, with
-six ERAs: against its whole equations, which CalculiX stores, with ERAs and fingers
-(`benchmarks.calculix`). Two to four of FINGERS places, switched and phased; judged on glasses drawn
-within the rig's uncertainty, last with each mode by itself in place of thickness and modulus. Exits
-with status 1 unless 80 to 98 % of the promises are kept, and
-fields are within 3 % with modes up to 2.5 times the highest frequency or more, in the mean. With
---wire three contents on that glass, over the wire, on simulated glasses that deviate.
+The paper's plate is exported as another program would, by its modes at 25 x 19 nodes up to
+1.5, 3 and 5 times the highest frequency of its limits, and imported as a surface. Compared with the
+plate's own table: largest and mean difference of the fields of all ERAs, and the error that the
+surface's table states; the median promise of each table to one finger with one to three quiet
+fingers (phased); the share of promises that hold on plates drawn around the plate.
 
-With --page a table goes to docs/how-to/surface.md.
+With --solver calculix the same for the curved glass of examples/calculix with six ERAs, whose modes
+and equations CalculiX computes (`benchmarks.calculix`); two to four of FINGERS positions, switched
+and phased, on glasses drawn within the rig's uncertainty, at last with each mode drawn separately.
+Exits with status 1 unless 80 to 98 % of the promises are kept, and mean field errors are below 3 %
+with modes up to 2.5 times the highest frequency or more. With --wire three contents on that glass
+through the complete signal chain.
 """
 
 import argparse

@@ -1,11 +1,12 @@
-"""How far a calibration's intervals hold: `python -m benchmarks.calibration [PLATES] [SHARE]`.
+"""How far the intervals of a calibration hold: `python -m benchmarks.calibration [PLATES] [SHARE]`.
 
-Plates are hidden in a process of their own. It is counted how often intervals of 90 % hold the
-truth.
+Prints the table in the section Calibration of docs/measured/figures.md, by the number of sensors:
+how often intervals of 90 % hold the true value on plates that another process hides. SHARE is that
+of the form errors that a fit allows for.
 
-Gains and phases: of what every ERA does to the plate at every frequency, by the uncertainty in the
-calibrated rig; values: by their standard errors. Fields: by how much they are off with the best
-gains, root mean square over the plate relative to what the rig states.
+Gain, phase: effect of every ERA at every frequency, compared with the uncertainty in the calibrated
+rig. Field: its error with the best gains, root mean square over the plate. Other values: compared
+with their standard errors.
 """
 
 import json

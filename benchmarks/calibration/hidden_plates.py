@@ -2,13 +2,13 @@
 
 Solved with finite elements of fourth order (Q4, strips along the edges) and a sparse solve for each
 frequency, where the product uses modes of polynomials; with form errors that the rig's description
-cannot express, or a share of them. These are as large as a fit allows for, but said here once more:
-a fit that allowed for less would be found on these plates.
+cannot express, or a share of them. They are as large as a fit allows for, but stated here again: a
+fit that allowed for less would fail on these plates.
 
     python -m benchmarks.calibration.hidden_plates FOLDER FIRST COUNT SHARE
 
-writes what sensors read of each plate as CSV, three, four, six and twelve of them in turn, and its
-true values as JSON: calibration runs in another process and has the CSV alone.
+writes the readings of three, four, six and twelve sensors in turn as CSV, and the true values as
+JSON. Calibration runs in another process and reads the CSV only.
 """
 
 import json

@@ -1,23 +1,23 @@
-"""Score patterns of any origin on the project's data set.
+"""Contrast of any method on the project's data set: scores of patterns.
 
     python -m benchmarks.contrast score FILE
     python -m benchmarks.contrast export -o DIR
 
-The data set is plates with their rigs, and sets of fingers on them: one JSON file,
-`localization-1.json` beside this module. Another version is another file. An entry is a JSON file
-of patterns for these sets:
+Prints a row of the table in the section Contrast of other methods of docs/measured/figures.md. The
+data set is `localization-1.json`: plates with their rigs, and sets of fingers on them. A change is
+a new version in a new file. An entry is a JSON file of patterns for these sets:
 
     {"benchmark": "era-localization", "version": 1, "name": "time reversal",
      "patterns": {"paper_plate/1-00": {"SW": [250, 0.8, -90.0], ...}, ...}}
 
-By set, each driven ERA with its frequency [Hz], level 0..1 of its stroke, and phase [degrees]: its
-base moves by level * stroke * sin(2 pi frequency t + phase).
+A pattern has for each driven ERA the frequency [Hz], the level 0..1 of its stroke, and the phase
+[degrees]: the base moves by level * stroke * sin(2 pi frequency t + phase).
 
-Of each set the tenth percentile of contrast counts, over plates drawn within the rig's uncertainty
-and solved exactly: what nine of ten plates give. A pattern that leaves the target of more than one
-plate in ten over 0.5 dB below the level, and a set without a pattern, count 0 dB. The best drive of
-a single frequency is climbed on that percentile itself (Adam, from several starts at the best
-frequencies), independently of the search of the model.
+The score of a set is the 10th percentile of the contrast, over plates drawn within the rig's
+uncertainty and solved exactly. A set without a pattern counts 0 dB, and so does a pattern that
+leaves the target more than 0.5 dB below the level on more than 10 % of the plates. The optimum in
+hindsight climbs this percentile itself (Adam, from several starts at the best frequencies),
+independently of the model's search.
 """
 
 import hashlib

@@ -2,17 +2,17 @@
 
     OPENBLAS_NUM_THREADS=1 python -m benchmarks.contrast.entries -o DIR [--methods random,paper]
 
-Writes a file for each method, for `python -m benchmarks.contrast score`. All but the paper's drive
-every ERA at one frequency of the table's 47, the one where the method itself does best on the
-nominal plate:
+Writes a file for each method, for `python -m benchmarks.contrast score`, which prints the rows in
+docs/measured/figures.md. All methods except paper drive every ERA at one of the table's 47
+frequencies, the best one on the nominal plate:
 
 - random: any frequency, levels and phases
 - time-reversal: each ERA by the conjugate of its field at the target
 - paper: one or two ERAs at full stroke, each at any frequency, the best nominally
 - era-haptics: `era.query`, mode phased
-- hindsight: climbed on the very plates that judge, at the four frequencies of best promise
+- hindsight: climbed on the plates that judge, at the four frequencies of best promise
 
-Those of acoustic contrast control and pressure matching are by `examples/sound_zones.py`.
+`examples/sound_zones.py` writes those of acoustic contrast control and pressure matching.
 """
 
 import argparse

@@ -35,9 +35,7 @@ from drivers.protocol.sets import Assembly, is_last, pack_layers, parts, unpack_
 from drivers.trace import Direction, TraceWriter, tracing
 from drivers.wires.wire import address_of
 from firmware_records import records_header
-from kit import conversation as hand
 from kit.clock import KINDS, MemoryLine, group_of, in_virtual_time, judged
-from kit.conversation import HALF, Talk
 from kit.wires import LATER, WORD
 from kit.wires import age as age
 from processes.interrupted import full_disk
@@ -78,14 +76,6 @@ def test_conformance_takes_another_edition(kind: str, age: str) -> None:
     """Words behind those that are known, or fewer, break no rule."""
     checks = "capabilities", "starts_disarmed", "areas", "present_areas", "objects", "lengths"
     assert {each.result for each in judged(kind, checks)} == {"passed"}
-
-
-def test_witness_takes_another_edition(age: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A conversation written by hand breaks no rule, with a word more of the amplifier or not."""
-    status = hand.status
-    words = [] if age == "older" else [*_UNSTATED, WORD]
-    monkeypatch.setattr(hand, "status", lambda *given, **more: [*status(*given, **more), *words])
-    assert Talk().armed().fed(2).playing().says(**HALF).found == []
 
 
 def test_objects_are_as_many_as_the_amplifier_states(age: str) -> None:

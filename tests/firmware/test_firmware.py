@@ -45,9 +45,9 @@ from drivers.protocol.records import Bits, Number, Numbers, Record, Rows, Values
 from drivers.wires.can_frames import REQUEST, SLCAN, CanFrame, segments
 from drivers.wires.modbus_frames import framed
 from firmware_records import records_header
-from kit import conversation as hand
+from kit import hand_frames as hand
 from kit.clock import judged
-from kit.conversation import tone as command
+from kit.hand_frames import tone as command
 from kit.wires import MASTERS, damage, drive
 from model.arrays import FloatArray
 from processes.firmware_machine import (

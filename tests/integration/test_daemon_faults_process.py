@@ -567,7 +567,7 @@ def all_is_off_in_the_end(played: Played, truth: Truth) -> None:
         assert not any(amplifier.levels), amplifier
 
 
-def witness_reports_nothing(played: Played, truth: Truth) -> None:
+def no_rule_is_broken(played: Played, truth: Truth) -> None:
     """No rule is broken: patterns and silences are in time, levels within limits."""
     assert not played.violations, played.violations[0]
 
@@ -581,7 +581,7 @@ CHECKS: Mapping[str, Callable[[Played, Truth], None]] = {
         onset_matches_prediction,
         plate_decays,
         all_is_off_in_the_end,
-        witness_reports_nothing,
+        no_rule_is_broken,
     )
 }
 

@@ -53,6 +53,7 @@ from era_haptics.lab.conformance.contract import opened
 from kit.chain import Chain
 from kit.clock import in_virtual_time
 from kit.fingers import write_schedule
+from kit.host_rules import HostTimes
 from kit.set_table import SetTable, make_rig
 from kit.wires import WIRES, far_side
 from model.fem import Mesh
@@ -93,7 +94,6 @@ from registry import threads
 from registry.limits import GuardLimits
 from sim.far_ends.wire_assignment import SimulatedWire
 from sim.faults import FaultWindow
-from witness.capture import TimeLimits
 
 NAMES = ("a", "b", "c", "d")
 BUSES = {
@@ -135,7 +135,7 @@ def four_amplifiers(wires: Mapping[str, SimulatedWire]) -> AbstractAsyncContextM
     }
     table = SetTable(tones, rig.plate)
     # On one bus four heartbeats go one after the other, of 20 ms each over RTU.
-    return Chain.armed(wires, rig, table, judged={"times": TimeLimits(heartbeat=0.05 + 5 * 0.02)})
+    return Chain.armed(wires, rig, table, times=HostTimes(heartbeat=0.05 + 5 * 0.02))
 
 
 def touch(four: Chain) -> None:
@@ -179,7 +179,7 @@ async def test_loss_of_one_of_four_silences_all(arranged: str, lost: str) -> Non
         touch(four)
         await four.hold(0.3)
         assert all(level > 0 for each in four.levels().values() for level in each)
-        four.witness.disturb()
+        four.host_rules.disturb()
         four.far.devices[lost].inject_fault(FaultWindow(fault="hang"))
         holding = asyncio.create_task(four.hold(0.6))
         await asyncio.sleep(OWN)

@@ -31,10 +31,11 @@ from drivers.host.line import Priority
 from drivers.playing import AmplifierLayer, AmplifierTone
 from drivers.protocol.definition import BOOT_TIME, STATES
 from drivers.protocol.sets import Envelope
+from kit import host_rules, plate_judge
 from kit import wires as real_wires
-from kit import witness as plate_witness
 from kit.chain import Chain
 from kit.clock import VirtualLoop, run_virtual
+from kit.host_rules import ChannelLimits
 from kit.set_table import SetTable, make_rig
 from kit.wires import after_each
 from registry import threads
@@ -74,9 +75,9 @@ class RandomGroup(Chain):
             "capabilities": {"layers": _LAYERS},
             "watchdog": rng.choice((0.25, 0.5)),
         }
-        judged = {"frequency": (20, 1000)}
+        limits = ChannelLimits(frequency=(20.0, 1000.0))
         table = SetTable({}, rig.plate)
-        return cls.on(wires, rig, table, judged=judged, sensed_every=0.002, **options)
+        return cls.on(wires, rig, table, limits=limits, sensed_every=0.002, **options)
 
     async def _turn(self, step: Callable[[], Awaitable[None]]) -> None:
         try:
@@ -97,7 +98,7 @@ class RandomGroup(Chain):
 
     def disturb(self, *windows: FaultWindow) -> None:
         """Have faults of frames on all wires from now on, until `recover`."""
-        self.witness.disturb()
+        self.host_rules.disturb()
         for far_end in self.far_ends:
             for window in windows:
                 far_end.device.inject_fault(window)
@@ -106,7 +107,7 @@ class RandomGroup(Chain):
         """End the faults of frames."""
         for far_end in self.far_ends:
             far_end.recover()
-        self.witness.disturb(-1)
+        self.host_rules.disturb(-1)
 
     async def live(self, steps: int, *, lossy_steps: int = 0) -> None:
         """Open and arm the group, take so many steps, the first lossy, and disarm."""
@@ -221,7 +222,7 @@ _LATE = 2 * _MAX_DELAY + 0.05  # s; until every late frame and its late copy hav
 _MOMENTS = 20  # at which what plays is looked at
 _MOST_LINES = 1500  # of a stop without faults; the place of an exception is drawn among them
 _WATCHED, _SIMULATED = (str(Path(package.__path__[0])) for package in (drivers, sim))
-_FAR = (_SIMULATED, str(plate_witness.__file__), str(real_wires.__file__))
+_FAR = (_SIMULATED, str(host_rules.__file__), str(plate_judge.__file__), str(real_wires.__file__))
 _GRANTING = ("Arm", "Set", "Commit")
 _FRAME_FAULTS: tuple[FaultKind, ...] = ("drop", "duplicate", "delay")
 

@@ -87,7 +87,7 @@ def play(wire: str, amplifiers: int, seed: int, taps: int = PER_CHAIN) -> Counte
             chain.is_felt = chain.must_be_felt = False
             await chain.open()
             await _armed(chain)
-            chain.witness.disturb()
+            chain.host_rules.disturb()
             chain.operation.passing = (0.0, LATEST)
             for end in chain.far_ends:
                 end.device.inject_fault(FaultWindow(fault="duplicate", share=_DOUBLED))

@@ -33,9 +33,9 @@ from controller.sources.touch import Touch, TouchFrame
 from drivers.errors import DriverError
 from kit.chain import Chain
 from kit.clock import VirtualLoop, run_virtual
+from kit.host_rules import HostTimes
 from kit.plates import make_paper_rig, small_table
 from kit.wires import after_each, on_amplifiers
-from kit.witness import PlateTimes
 from model.answer.answer_report import Timing
 from model.config.fields import Rectangle
 from model.finger import STRONG_DB_SL, Grid
@@ -43,13 +43,11 @@ from model.rig.rig import Rig
 from model.rig.rig_file import load_rig
 from model.table.table import LocalizationTable
 from model.table.table_file import TableProblem, solve_table
-from registry import threads
 from registry.virtual_time import START, Stuck
 from sim.far_ends.wire_assignment import SimulatedWire
 from sim.faults import FaultKind, FaultWindow
 from sim.plant.imperfections import Imperfections, draw_imperfections
 from sim.transport.simulated_line import LINE_KINDS, PROMPT
-from witness.capture import TimeLimits
 
 KINDS: Mapping[str, Sequence[int | None]] = {
     "serial": (115_200, 921_600),
@@ -62,7 +60,7 @@ KINDS: Mapping[str, Sequence[int | None]] = {
 _SERIAL_LINES = ("native", "usb-high-speed", "usb-full-speed", "ftdi-low-latency", "ftdi")
 LINES: Mapping[str, Sequence[str]] = {
     "serial": _SERIAL_LINES,
-    "modbus-rtu": _SERIAL_LINES[:-1],  # in responses later than that a witness reads nothing
+    "modbus-rtu": _SERIAL_LINES[:-1],  # a response that is later ends the exchange
     "modbus-tcp": ("ethernet",),
     "socketcand": ("can",),
     "slcan": ("can-usb",),
@@ -441,7 +439,7 @@ async def _run(
     options: dict[str, Any] = {
         "timing": soak_timing(plan.plate),
         "intent_source": soak_source(plan.plate),
-        "judged": _judged(plan),
+        "times": _times_of(plan),
         "seed": plan.seed,
     }
     if plan.amplifiers > 1:
@@ -459,8 +457,8 @@ async def _run(
         soak.plate_judge.violate(f"{len(left)} tasks are left: {names}")
 
 
-def _judged(plan: Plan) -> Mapping[str, Any]:
-    """By what the witness judges: bounds without faults, on the slowest wire."""
+def _times_of(plan: Plan) -> HostTimes:
+    """The bounds by which a host without faults is judged, on the slowest wire."""
 
     def release(preceding: int) -> float:
         """How long after the last finger the plate may play [s], after bytes on the line."""
@@ -468,15 +466,13 @@ def _judged(plan: Plan) -> Mapping[str, Any]:
         return _RELEASE + max(on_wire) + _ON_THE_WIRE + _late(plan)
 
     gaps = any(line.kind == "modbus-rtu" for line in plan.lines) * _GAPS_BETWEEN_FEEDS
-    return {
-        "limits": PlateTimes(
-            lift=release(_BYTES),
-            release=release(_BYTES) + _RAMP,
-            touch=_TOUCH + _late(plan),
-            stop=release(_BYTES),
-        ),
-        "times": TimeLimits(heartbeat=_HEARTBEAT + release(_BYTES_BETWEEN_FEEDS) + gaps),
-    }
+    return HostTimes(
+        heartbeat=_HEARTBEAT + release(_BYTES_BETWEEN_FEEDS) + gaps,
+        lift=release(_BYTES),
+        release=release(_BYTES) + _RAMP,
+        touch=_TOUCH + _late(plan),
+        stop=release(_BYTES),
+    )
 
 
 def _late(plan: Plan) -> float:
@@ -503,7 +499,7 @@ class Soak(Chain):
         assert isinstance(loop, VirtualLoop)
         self.loop = loop
         loop.seen = self._seen
-        self.witness.contacts(loop.time(), ())
+        self.host_rules.set_contacts(())
         loop.set_exception_handler(self._unhandled)
         for name, device in self.far.devices.items():
             after_each(device, self._count_request)
@@ -528,7 +524,6 @@ class Soak(Chain):
         self.counts["bytes on the wires"] += len(data)
         if self.trace is not None:
             self.note("bytes", link, toward, data.hex())
-        self.witness.seen(link, toward, data)
 
     def make_host(self, **more: Any) -> None:
         """Make a supervisor with its control loop."""
@@ -576,7 +571,7 @@ class Soak(Chain):
                 case FaultInjection(number=number, window=window):
                     self.counts[f"fault {window.fault}"] += 1
                     self.note("fault", devices[number].name, window)
-                    self.witness.inject_fault(window)
+                    self.host_rules.inject_fault(window)
                     devices[number].inject_fault(window)
                     if window.fault == "unplug":
                         self._expect_loss(number)
@@ -674,7 +669,7 @@ class Soak(Chain):
         """Kill the host's process, and start another."""
         self.operation.kill_host()
         self.loop.kill_hosts()
-        self.witness.closes()
+        self.host_rules.closed()
         work = [self.hosting, *self.supervisor._tasks]
         for task in work:
             task.cancel()
@@ -698,5 +693,5 @@ class Soak(Chain):
         if len(self.loop._scheduled) > _TIMERS_MAX:
             self.plate_judge.violate(f"{len(self.loop._scheduled)} timers wait")
         self.plate_judge.check()
-        self.plate_judge.violations += map(str, self.witness.finish(threads.now()))
-        self.counts["frames seen by the witness"] = self.witness.frames
+        self.plate_judge.violations += map(str, self.host_rules.finish())
+        self.counts["requests judged"] = self.host_rules.requests

@@ -47,7 +47,7 @@ from controller.sources.touch import (
 from examples.make_touches import tuio_datagram
 from kit.clock import MemoryMachine, VirtualLoop, in_virtual_time
 from kit.fingers import bundle, frame, free_port, message, panel
-from kit.witness import tell_first
+from kit.host_rules import tell_first
 from model.errors import InputError
 from processes.daemons import (
     ENABLED,

@@ -398,7 +398,7 @@ async def test_close_waits_for_zero_then_stops(
         return {**chain.far_end.status(), "levels": [3000, 0, 0]}
 
     caplog.set_level(logging.INFO)
-    async with set_running(breaks="silent") as chain:
+    async with set_running() as chain:
         chain.far_end.answer = lag
     assert bool(chain.far_end.requests("Stop")) is is_stopped
     assert not chain.far_end.is_open

@@ -105,7 +105,7 @@ def eight() -> LocalizationTable:
 async def test_three_fingers_feel_three_files_apart() -> None:
     """Each at its own frequency with the contrast that it is promised, turn after turn.
 
-    The witness finds every piece of each on the wire where the one before ends.
+    Every piece of each is on the wire where the one before ends.
     """
     plate, files = eight().plate, (SWELL, SHARPER, FADING)
     places = [(0.2, 0.25), (0.8, 0.2), (0.4, 0.85)]

@@ -470,7 +470,7 @@ def test_late_frames_are_no_fault(wire: str, amplifiers: int, seed: int) -> None
 async def test_watchdog_that_stands_still_is_found_where_replies_are_late() -> None:
     """On a line that amplifiers share, where one commit feeds all of them before each in turn."""
     async with set_running("a", "b", of=Acted, wire="modbus-rtu") as chain:
-        chain.witness.disturb()  # a status goes before what feeds
+        chain.host_rules.disturb()  # a status goes before what feeds
         chain.delays(0.012)
         await chain.holds(1.0, "finger")
         assert chain.controller.group.is_armed

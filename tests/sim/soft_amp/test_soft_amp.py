@@ -28,7 +28,7 @@ from cases import shortly
 from drivers.host.amplifier import Amplifier
 from drivers.opening import Lines
 from drivers.protocol.definition import FAULTS, STATES
-from kit import conversation as hand
+from kit import hand_frames as hand
 from model.errors import InputError
 from processes.desk import Capture
 from processes.gateways import wait_for

@@ -1,7 +1,7 @@
-"""The one chain, in virtual time: control loop, wires in memory, far ends, plate and witness.
+"""The one chain, in virtual time: control loop, wires in memory, far ends and plate.
 
 Everything between the touch frames and the plate is the project's own, with the durations of the
-wires; only the lines are memory. The witness reads every byte, and the plate is judged beside it. A
+wires; only the lines are memory. `HostRules` judge what the host sends, `PlateJudge` what plays. A
 chain has a table that a test sets, on a rig for which nothing has to be solved, or one of two
 patterns with scenarios of touches and commands whose results are known by hand, or plays the touch
 stream: then fingers are at every place of the stream, so that what they felt can be read for any
@@ -30,10 +30,12 @@ from controller.sources.touch import Touch, TouchFrame
 from drivers.opening import Lines
 from drivers.protocol.records import Values
 from drivers.protocol.sets import LayerSet, is_vibrating, unpack_layers
+from drivers.wires.wire import address_of
 from kit.clock import MemoryMachine, run_virtual
+from kit.host_rules import ChannelLimits, HostRules, HostTimes, OperatorCommand, RuleViolation
+from kit.plate_judge import STEP, WATCHDOG, PlateJudge
 from kit.set_table import SetTable, SetTiming, make_rig
 from kit.wires import FarSide, far_side
-from kit.witness import STEP, WATCHDOG, LoopWitness, OperatorCommand, PlateJudge, wire_name
 from model.answer.answer_report import Timing
 from model.arrays import ComplexArray, FloatArray
 from model.rig.rig import Rig
@@ -48,7 +50,6 @@ from sim.faults import FaultKind, FaultWindow
 from sim.plant.fingers import Accelerometer, FeltVibration
 from sim.plant.imperfections import Imperfections, draw_imperfections
 from sim.sensors import Accelerometers, Recording
-from witness.capture import RuleViolation
 
 Position = tuple[float, float]
 Finger = tuple[int, float, float]
@@ -71,7 +72,7 @@ class Chain:
 
     far: FarSide
     operation: MemoryMachine
-    witness: LoopWitness
+    host_rules: HostRules
     plate_judge: PlateJudge
     make_controller: Callable[..., Controller]
     controller: Controller = field(init=False)
@@ -91,14 +92,16 @@ class Chain:
 
     def __post_init__(self) -> None:
         """Make the control loop, and hear of all that is requested of the far ends."""
-        self.far_ends = [FarEnd(self.far, name, self.witness.disturb) for name in self.far.devices]
+        self.far_ends = [
+            FarEnd(self.far, name, self.host_rules.disturb) for name in self.far.devices
+        ]
         self.make_host()
         self.table = self.controller.table
 
     def make_host(self, **more: Any) -> None:
         """Make a control loop in place of the one before, if any; more: as a `Controller` takes."""
         controller = self.controller = self.make_controller(**more)
-        self.witness.follow(controller)
+        self.host_rules.follow(controller)
         cycle = controller.cycle
         cycle.step = partial(self._turn, cycle.step)  # type: ignore[method-assign]
         self.turning.set()
@@ -113,11 +116,11 @@ class Chain:
     async def _turn(self, step: Callable[[], Awaitable[None]]) -> None:
         """Turn the control loop once, unless it stalls."""
         if not self.turning.is_set():
-            self.witness.set_stalled(threads.now())
+            self.host_rules.set_stalled()
             try:
                 await self.turning.wait()
             finally:
-                self.witness.set_stalled(threads.now(), False)
+                self.host_rules.set_stalled(False)
         await step()
 
     @property
@@ -136,7 +139,8 @@ class Chain:
         passing: tuple[float, float] | None = None,
         plate: Rig | None = None,
         imperfections: Imperfections = Imperfections(),  # noqa: B008  frozen
-        judged: Mapping[str, Any] | None = None,
+        limits: ChannelLimits | None = None,
+        times: HostTimes | None = None,
         sensed_every: float = STEP,
         capabilities: Mapping[str, int] = MappingProxyType({}),
         seed: int = 1,
@@ -146,19 +150,21 @@ class Chain:
         """A chain whose wires are not open yet; wires: of all amplifiers, or of each by name.
 
         passing [s]: shortest and longest time of bytes on serial lines, None for those of machines;
-        plate: the rig of the far side, if it is another; judged: by what the witness judges, as for
-        `witness_config`; sensed_every [s]: while a channel vibrates; capabilities: what each
-        amplifier has in place of its own; seed: of faults; observe: adds the first observers of
+        plate: the rig of the far side, if it is another; limits, times: by which the host is
+        judged; sensed_every [s]: while a channel vibrates; capabilities: what each amplifier has in
+        place of its own; seed: of faults; observe: adds the first observers of
         the control loop; options: as a `Controller` takes them.
         """
         far_end = far_side(wires, plate or rig, seed=seed, imperfections=imperfections)
         async with far_end as far:
             for amplifier in far.bench.amplifiers.values():
                 amplifier.capabilities.update(capabilities)
-            witness = LoopWitness(far.urls, **(judged or {}))
+            host_rules = HostRules(
+                far.urls, limits=limits or ChannelLimits(), times=times or HostTimes()
+            )
             given = {"timing": SetTiming(), "watchdog": WATCHDOG, **options}
             watchdog = given["watchdog"]
-            plate_judge = PlateJudge(far, witness, step=sensed_every, watchdog=watchdog)
+            plate_judge = PlateJudge(far, host_rules, step=sensed_every, watchdog=watchdog)
 
             def make(**more: Any) -> Controller:
                 own = {"intent_source": EffectPlayer(SurfaceLayout()), **given, **more}
@@ -168,7 +174,7 @@ class Chain:
 
             far.machine.passing = passing or far.machine.passing
             try:
-                yield cls(far, far.machine, witness, plate_judge, make)
+                yield cls(far, far.machine, host_rules, plate_judge, make)
             finally:
                 plate_judge.close()
 
@@ -177,9 +183,9 @@ class Chain:
     async def armed(
         cls, *given: Any, breaks: str | None = None, **options: Any
     ) -> AsyncIterator[Self]:
-        """A chain as of `on`, armed; closed at the end, when the witness is asked.
+        """A chain as of `on`, armed; closed and judged at the end.
 
-        breaks: the only rule of the witness that is broken.
+        breaks: the only rule that is broken.
         """
         async with cls.on(*given, **options) as chain:
             await chain.open()
@@ -189,17 +195,17 @@ class Chain:
             chain.judge(breaks)
 
     def judge(self, breaks: str | None = None) -> None:
-        """Ask the witness and what judges the plate.
+        """Judge the host, the amplifiers and the plate.
 
-        breaks: the only rules of the witness that are broken, spaces between, or "plate" if none
-        is but the plate may play.
+        breaks: the only rules that are broken, with spaces between, or "plate" if none is but the
+        plate may play.
         """
-        found = self.witness.finish(threads.now())
-        broken = sorted({one.invariant for one in found})
-        first = "".join(map(str, found[:1]))
-        assert {*broken} == {*(breaks or "").split()} - {"plate"}, f"{', '.join(broken)}: {first}"
+        violations = self.host_rules.finish()
+        broken = {violation.rule for violation in violations}
+        expected = {*(breaks or "").split()} - {"plate"}
+        assert broken == expected, "\n".join(map(str, violations[:5]))
         assert breaks or not self.plate_judge.violations, self.plate_judge.violations
-        assert self.witness.frames
+        assert self.host_rules.requests
 
     async def open(self) -> None:
         """Open all wires, and start the control loop."""
@@ -265,7 +271,7 @@ class Chain:
 
     async def close(self) -> None:
         """Disarm and close all; raises what ended the control loop."""
-        self.witness.commanded("disarm")
+        self.host_rules.commanded("disarm")
         await self.controller.close()
         self.turning.set()  # one that stalls has nothing to end it
         if self.running is not None:
@@ -333,7 +339,7 @@ class FarEnd:
     @property
     def port(self) -> str:
         """Where its line is."""
-        return wire_name(self._far.urls[self.name])
+        return address_of(self._far.urls[self.name]).place.name
 
     @property
     def is_open(self) -> bool:
@@ -350,7 +356,7 @@ class FarEnd:
         self.disturb()
 
     def lie(self, answer: Callable[[str, Values], Values | None]) -> None:
-        """Answer by this from now on, which no witness is to judge."""
+        """Answer by this from now on, which nothing judges."""
         self.answer = answer
         self.disturb()
 
@@ -527,7 +533,7 @@ class Heard:
 
 @dataclass(frozen=True)
 class Played:
-    """Results of a stream; violations: what the witness found."""
+    """Results of a stream; violations: broken rules."""
 
     heard: list[Heard]
     summaries: Sequence[AmplifierSummary]
@@ -569,7 +575,7 @@ def play_stream(
             ]
             await chain.close()
             summaries = [chain.far.summary(name) for name in chain.far.devices]
-            return Played(heard, summaries, chain.witness.finish(threads.now()))
+            return Played(heard, summaries, chain.host_rules.finish())
 
     return run_virtual(run(), rng=random.Random(1))
 

@@ -281,7 +281,7 @@ class MemoryMachine:
         port = self._open[name] = MemoryPort(self, terminal, on_data, on_loss)
         if self.boots:
             port.hears_from = self._loop.time() + self.boots
-            self.later(_NOTICED, port.outward.take, _BOOT_TEXT)  # which no witness judges
+            self.later(_NOTICED, port.outward.take, _BOOT_TEXT)  # which nothing judges
         return port
 
     def be_prompt(self) -> None:

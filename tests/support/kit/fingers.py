@@ -216,8 +216,8 @@ async def fingers_on(
 ) -> AsyncIterator[Placed]:
     """Fingers on a layout, armed, with four ERAs on amplifiers in turn.
 
-    of: their class; at: those that are held for a time [s] first; breaks: the only rule of the
-    witness that what is planted breaks.
+    of: their class; at: those that are held for a time [s] first; breaks: the only rule that
+    the planted fault breaks.
     """
     rig, count = smooth_rig(), len(amplifiers)
     wired = [(era, Channel(amplifiers[n % count], n // count)) for n, era in enumerate(rig.wiring)]
@@ -810,7 +810,7 @@ async def watched(
 
     amplifiers: one unless more are named; refuses: whether it refuses all requests at first;
     unplugged: whether the first is not reached then;
-    breaks: the only rules of the witness that are broken; options: as for `set_chain`.
+    breaks: the only rules that are broken; options: as for `set_chain`.
     """
 
     def heard(name: str, value: object) -> None:
@@ -840,7 +840,7 @@ async def watched(
             yield daemon
         finally:
             daemon.failing = ""
-            daemon.witness.commanded("disarm")
+            daemon.host_rules.commanded("disarm")
             await supervisor.close("end of the test")
             await asyncio.wait_for(running, 20)
             assert not any(each.is_open for each in daemon.far_ends)

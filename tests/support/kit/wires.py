@@ -557,7 +557,7 @@ LATER = status_reading("later_voltage", "of another supply", -1200, 6000, 100, "
 WORD = 1201
 """That it states: 0 V."""
 AGES = ("older", "same", "newer")
-"""Of an amplifier beside its host, its judge or the witness."""
+"""Of an amplifier beside its host or its judge."""
 
 
 def make_of_age(age: str, monkeypatch: pytest.MonkeyPatch) -> None:

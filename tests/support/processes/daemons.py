@@ -1,7 +1,7 @@
 """Daemons for tests: within the event loop, as a process, or only their API in memory.
 
-In the loop and in virtual time the line to the simulated amplifiers is memory, and a witness that
-reads every byte is the judge; in real time it is a pseudo-terminal. As a process it plays over real
+In the loop and in virtual time the line to the simulated amplifiers is memory, and every request
+is judged; in real time it is a pseudo-terminal. As a process it plays over real
 wires to a far end in the test's own process, whose clock, time.monotonic(), is the same for all
 processes, or to a far end that is a process too, with its control socket at hand.
 """
@@ -46,9 +46,10 @@ from drivers.protocol.records import Number, Refusal, Values
 from drivers.protocol.sets import unpack_layers
 from kit.chain import Chain
 from kit.clock import VirtualLoop, feed
+from kit.host_rules import HostRules, tell_first
+from kit.plate_judge import PlateJudge
 from kit.plates import small_table, write_rig
 from kit.wires import WIRES, FarSide, far_side
-from kit.witness import LoopWitness, PlateJudge, tell_first
 from model.arrays import FloatArray
 from model.rig.rig import Rig
 from model.rig.rig_file import example_rig_path, load_rig
@@ -213,13 +214,13 @@ def _read_here(file: Path, frequencies: FloatArray) -> DaemonConfig:
 def chain_of(daemon: Daemon, far: FarSide) -> Chain:
     """The chain of a daemon in virtual time, which hears of its fingers and faults."""
     assert far.machine is not None
-    witness = LoopWitness(far.urls)
-    chain = Chain(far, far.machine, witness, PlateJudge(far, witness), lambda: daemon._controller)
+    rules = HostRules(far.urls)
+    chain = Chain(far, far.machine, rules, PlateJudge(far, rules), lambda: daemon._controller)
     touched = partial(chain.plate_judge.touched, must_be_felt=False)
     for owner, method in ((daemon._controller.cycle, "deliver"), (daemon._inputs, "_deliver")):
         tell_first(owner, method, touched)
     for device in far.devices.values():
-        tell_first(device, "inject_fault", lambda *_: witness.disturb())
+        tell_first(device, "inject_fault", lambda *_: rules.disturb())
     return chain
 
 

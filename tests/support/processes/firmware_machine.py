@@ -30,7 +30,7 @@ from drivers.protocol.records import Record, Values
 from drivers.protocol.sets import Command, Envelope, LayerSet, pack_layers, parts, token_after
 from drivers.wires.can_frames import SLCAN, TextReader, pack_frames, unpack_frames
 from drivers.wires.serial_frames import Frame, FrameReader, encode_frame, pack_words, unpack_words
-from kit import conversation as hand
+from kit import hand_frames as hand
 from model.arrays import FloatArray
 from registry import threads
 from sim.amplifier.simulated_amplifier import SimulatedAmplifier

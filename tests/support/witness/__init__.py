@@ -1,1 +1,0 @@
-"""The witness: checks the traffic between hosts and amplifiers."""

@@ -37,7 +37,7 @@ READ_BY_LINES = {"token.txt", "questions.jsonl"}
 
 SHORT = (
     "daemon.yaml",
-    "mask.png",
+    "polygons.yaml",
     "tap.ahap",
     "measured.csv",
     "modes.npz",

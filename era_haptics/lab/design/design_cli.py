@@ -64,7 +64,7 @@ def design(
         str,
         typer.Option(
             metavar="edge|anywhere|FILE",
-            help="Where ERAs may stand: a picture of the plate, white there, or polygons in YAML.",
+            help="Where ERAs may stand; FILE: polygons in YAML.",
         ),
     ] = "edge",
     contents: Annotated[

@@ -1,25 +1,24 @@
 """The problem of a design: a number of ERAs, where they may stand, and the contacts they serve.
 
-ERAs may stand along the edge, anywhere, in polygons, or on the white of a picture. Contact sets
-have fingers with contents, and some quiet ones. A layout supports the plate by its lowest
-rigid-body mode, and with weight on every ERA. Layouts to be ranked are those of a file, or the
-rig's own, those with a name, and random ones."""
+ERAs may stand along the edge, anywhere, or in polygons. Contact sets have fingers with contents,
+and some quiet ones. A layout supports the plate by its lowest rigid-body mode, and with weight on
+every ERA. Layouts to be ranked are those of a file, or the rig's own, those with a name, and random
+ones.
+"""
 
-import io
 import math
-import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import ConfigDict, Field, Strict
 
 from model.arrays import FloatArray, IntArray, best_of, least_gap
-from model.config.document import read_bytes, read_document
+from model.config.document import read_document
 from model.config.fields import (
     PointSection,
     Polygon,
@@ -43,20 +42,9 @@ from model.structure.plate import Plate
 from model.table.table import default_drive_frequencies
 from registry.limits import MAX_CONTACTS, MAX_CONTENTS
 
-if TYPE_CHECKING:  # only pictures need it
-    from PIL import Image
-
 EDGE, ANYWHERE = "edge", "anywhere"
 """Names of the areas that need no file."""
 
-PICTURES = (".png", ".jpg", ".jpeg")
-
-PROPORTION_TOLERANCE = 0.02
-"""By how much the height of a picture may differ from the plate's proportions, relative."""
-
-_PICTURE_SIDE = 1000  # pixels of the longer side of the picture proposed
-_MAX_BYTES = 16 << 20
-_MAX_PIXELS = 4_000_000
 _ON_EDGE = 1e-9  # m
 _MAX_CANDIDATES = 2000
 
@@ -139,28 +127,22 @@ class Area:
 
 
 def area_of(where: str, plate: Plate) -> Area:
-    """The area of a name, a picture or a file of polygons.
+    """Return the area of a name or of a file of polygons.
 
-    Raises InputError for a picture that cannot be read or has other proportions than the plate, and
-    for another kind of file.
+    Raises InputError for another kind of file, and for one that cannot be read.
     """
     length, width = plate.length, plate.width
     if where in (EDGE, ANYWHERE):
         contains = everywhere if where == ANYWHERE else partial(_on_edge, length, width)
         return Area(where, length, width, partial(_both, plate.covers, contains))
     path = Path(where)
-    if path.suffix.lower() in PICTURES:
-        content = read_bytes(path, _MAX_BYTES, is_for="draw it smaller", give="a picture")
-        contains = partial(_is_white, _white(path, content, plate), length, width)
-        return Area(content.hex(), length, width, partial(_both, plate.covers, contains))
     if path.suffix.lower() not in (".yaml", ".yml"):
         raise InputError(
-            f"where must be {EDGE}, {ANYWHERE}, a picture ({', '.join(PICTURES)}) or a .yaml "
-            f"file of polygons, got {where!r}"
+            f"where must be {EDGE}, {ANYWHERE} or a .yaml file of polygons, got {where!r}"
         )
     document = read_document(path, if_empty="it must have polygons, each a name with its corners")
     polygons = Validation(document, _PolygonsSection).finish().polygons
-    shapes = [Polygon(tuple(each)) for each in polygons.values()]
+    shapes = [Polygon(tuple(corners)) for corners in polygons.values()]
     contains = partial(_in_any, shapes)
     return Area(document.text, length, width, partial(_both, plate.covers, contains))
 
@@ -215,65 +197,10 @@ def _in_any(polygons: Sequence[Polygon], points: FloatArray) -> NDArray[np.bool_
     return np.array(found, dtype=bool)
 
 
-def _is_white(
-    white: NDArray[np.bool_], length: float, width: float, points: FloatArray
-) -> NDArray[np.bool_]:
-    """Whether points are in the white: rows from the top, y = width, down; columns from x = 0."""
-    rows, columns = white.shape
-    column = np.minimum((points[:, 0] / length * columns).astype(int), columns - 1)
-    row = np.minimum(((1 - points[:, 1] / width) * rows).astype(int), rows - 1)
-    return np.asarray(white[row, column])
-
-
 class _PolygonsSection(Section):
     """Polygons in which ERAs may stand, by name."""
 
     polygons: Annotated[dict[Identifier, PolygonSection], Field(min_length=1, max_length=256)]
-
-
-def _white(path: Path, content: bytes, plate: Plate) -> NDArray[np.bool_]:
-    """Pixels brighter than half, (rows, columns), of a picture with the plate's proportions.
-
-    To PROPORTION_TOLERANCE, or half a pixel.
-    """
-    from PIL import Image
-
-    try:
-        # Of what decodes to more than it may Pillow warns.
-        with (
-            warnings.catch_warnings(action="error"),
-            Image.open(io.BytesIO(content), formats=("PNG", "JPEG")) as picture,
-        ):
-            columns, rows = picture.size
-            is_white = _bright_pixels(picture) if columns * rows <= _MAX_PIXELS else None
-    except Exception as error:  # of a damaged file anything
-        raise InputError(
-            f"{path}: cannot be read as a picture; save it as PNG or JPEG, of {_PICTURE_SIDE} "
-            "pixels a side or less"
-        ) from error
-    if is_white is None:
-        raise InputError(
-            f"{path}: picture must have up to {_MAX_PIXELS / 1e6:g} megapixels, got {columns} by "
-            f"{rows} pixels; {_PICTURE_SIDE} pixels a side are enough"
-        )
-    expected = columns * plate.width / plate.length
-    if abs(rows - expected) > max(PROPORTION_TOLERANCE * expected, 0.5):
-        scale = _PICTURE_SIDE / max(plate.length, plate.width)
-        across, up = (max(1, round(side * scale)) for side in (plate.length, plate.width))
-        raise InputError(
-            f"{path}: must have the proportions of the plate of {plate.length:g} m by "
-            f"{plate.width:g} m, got {columns} by {rows} pixels; draw the whole plate, without a "
-            f"margin, for example on {across} by {up} pixels"
-        )
-    return is_white
-
-
-def _bright_pixels(picture: "Image.Image") -> NDArray[np.bool_]:
-    """Whether the mean of red, green and blue is above half, (rows, columns)."""
-    if picture.mode.startswith("I"):  # grey of 16 bits
-        return np.asarray(picture) > 0x7FFF
-    colours = np.asarray(picture.convert("RGB"))
-    return np.asarray(colours.sum(axis=-1, dtype=np.uint16) > 3 * 0xFF // 2)
 
 
 @dataclass(frozen=True, eq=False)

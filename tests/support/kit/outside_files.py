@@ -12,7 +12,6 @@ from functools import cache, partial
 from pathlib import Path
 
 import numpy as np
-from matplotlib.image import imsave
 
 from controller.cli.main import BUG
 from controller.content.formats import named_content, read_content
@@ -80,8 +79,6 @@ READERS: Mapping[str, Callable[[Path], object]] = {
     "layout.yaml": lambda path: load_layout(path, None),
     "daemon.yaml": load_daemon_config,
     "polygons.yaml": lambda path: area_of(str(path), RIG.plate),
-    "mask.png": lambda path: area_of(str(path), RIG.plate),
-    "mask.jpg": lambda path: area_of(str(path), RIG.plate),
     "contacts.yaml": lambda path: contact_rule(path, RIG.plate),
     "layouts.yaml": lambda path: layouts_of(str(path), DESIGN),
     "faults.yaml": lambda path: load_faults(path, amplifiers=["main"]),
@@ -117,12 +114,6 @@ def table_file() -> Path:
     path = Path(tempfile.mkdtemp()) / "table.npz"
     save_table(small_table(), path)
     return path
-
-
-def _picture(ending: str) -> bytes:
-    content = io.BytesIO()
-    imsave(content, np.ones((90, 120)), cmap="gray", vmin=0, vmax=1, format=ending)
-    return content.getvalue()
 
 
 def wav(samples: bytes, *, code: int, channels: int, rate: int, bits: int) -> bytes:
@@ -213,8 +204,6 @@ SAMPLES: Mapping[str, Callable[[], bytes]] = {
     "layout.yaml": (EXAMPLES / "panel_layout.yaml").read_bytes,
     "daemon.yaml": _daemon,
     "polygons.yaml": lambda: b"polygons:\n  left: [[0.0, 0.0], [0.1, 0.0], [0.1, 0.2]]\n",
-    "mask.png": partial(_picture, "png"),
-    "mask.jpg": partial(_picture, "jpg"),
     "contacts.yaml": lambda: (
         b"quiet: [3, 6]\nregions: {a: {circle: {at: [0.1, 0.1], radius: 0.05}}}\n"
     ),

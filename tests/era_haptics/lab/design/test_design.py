@@ -12,7 +12,6 @@ from itertools import combinations
 
 import numpy as np
 import pytest
-from matplotlib.image import imsave
 
 from era_haptics.lab.design import problem as problem_module
 from era_haptics.lab.design.design_run import Design, Runner, assess, layout_keys, rank_layouts
@@ -128,41 +127,6 @@ def test_polygons_hold_their_points(tmp_path) -> None:
     assert (places.sum(axis=1) <= 0.12 + 1e-9).all()
     assert area.contains(np.array([[0.06, 0.06], [0.07, 0.06]])).tolist() == [True, False]
     assert (area.moved(np.array([0.06, 0.06]), 0.01).sum(axis=1) <= 0.12 + 1e-9).all()
-
-
-def test_white_of_a_picture_is_where_eras_may_stand(tmp_path) -> None:
-    """The picture's top row is the plate's far side."""
-    pixels = np.zeros((21, 28))
-    pixels[:5, 14:] = 1.0
-    imsave(tmp_path / "mask.png", pixels, cmap="gray", vmin=0, vmax=1)
-    x, y = area_of(str(tmp_path / "mask.png"), PLATE).candidates(0.01).T
-    assert x.min() >= PLATE.length / 2
-    assert y.min() >= 0.75 * PLATE.width
-    assert y.max() == PLATE.width
-
-
-@pytest.mark.parametrize(
-    ("rows", "columns", "is_refused"),
-    [
-        (300, 400, False),
-        (306, 400, False),
-        (294, 400, False),
-        (307, 400, True),
-        (293, 400, True),
-        (400, 300, True),
-        (100, 100, True),
-        (22, 30, False),
-    ],
-)
-def test_picture_has_the_proportions_of_the_plate(tmp_path, rows, columns, is_refused) -> None:
-    """12 by 9 inches is 400 by 300 pixels, to 2 % of the height or half a pixel."""
-    path = tmp_path / "mask.png"
-    imsave(path, np.ones((rows, columns)), cmap="gray", vmin=0, vmax=1)
-    if not is_refused:
-        assert area_of(str(path), PLATE).contains(np.array([[0.1, 0.1]])).all()
-        return
-    with pytest.raises(InputError, match=rf"mask\.png.*0\.3048 m.*{columns} by {rows} pixels"):
-        area_of(str(path), PLATE)
 
 
 def test_contacts_in_regions_of_a_layout(tmp_path) -> None:

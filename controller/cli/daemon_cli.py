@@ -165,15 +165,7 @@ def strength(
 
 
 def touch(
-    at: Annotated[
-        list[str] | None, typer.Argument(metavar="[X,Y ...]", help="Fingers on the plate [m].")
-    ] = None,
-    replay: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="TUIO capture to send instead of fingers.")
-    ] = None,
-    port: Annotated[
-        int, typer.Option(help="UDP port of the daemon's source tuio: on this machine.")
-    ] = 3333,
+    at: Annotated[list[str], typer.Argument(metavar="X,Y ...", help="Fingers on the plate [m].")],
     duration: Annotated[
         float, typer.Option("--for", metavar="S", min=0, max=3600, help="Duration.")
     ] = 1.0,
@@ -183,19 +175,11 @@ def touch(
     """Put fingers on the plate for a while, and show the status.
 
     Each feels what the layout has at its place; without a layout the last one feels a buzz, and
-    the others are quiet. With --replay send a recorded TUIO stream to the daemon at its pace.
+    the others are quiet.
     """
-    import asyncio
-
-    from controller.sources.tuio import read_capture, replay_capture
     from model.config.units import in_metres, parse_point
 
-    if (at is None) == (replay is None):
-        raise InputError("era touch must have either fingers, such as 0.10,0.05, or --replay FILE")
-    if replay is not None:
-        asyncio.run(replay_capture(read_capture(replay), "127.0.0.1", port))
-        return
-    positions = [parse_point(text, what="era touch") for text in at or ()]
+    positions = [parse_point(text, what="era touch") for text in at]
     with connected(socket) as era:
         plate = era.hello("era").rig
         length, width = plate.length_m, plate.width_m

@@ -18,10 +18,8 @@ Seconds from the start and the datagram in hexadecimal; further lines that start
 comments. Malformed datagrams are kept as received.
 """
 
-import asyncio
 import math
 import re
-import socket
 import struct
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
@@ -34,7 +32,6 @@ from typing import TextIO, TypeAlias
 
 from controller.sources.touch import Touch, TouchFrame
 from controller.sources.udp_source import MAX_DATAGRAM, Datagram, Peer, UdpSource
-from drivers.errors import LinkError, system_message
 from model.errors import InputError
 from registry import threads
 from registry.files import LineTooLong, lines_of, open_regular
@@ -534,24 +531,3 @@ def _datagrams_in(path: Path, stream: TextIO) -> list[RecordedDatagram]:
     if not datagrams:
         raise InputError(f"{path}: capture must contain datagrams")
     return datagrams
-
-
-async def replay_capture(datagrams: Sequence[RecordedDatagram], host: str, port: int) -> None:
-    """Send datagrams to a UDP port at their recorded pace, on the event loop's clock.
-
-    Raises LinkError if the port is closed.
-    """
-    loop = asyncio.get_running_loop()
-    try:
-        found = await loop.getaddrinfo(host, port, type=socket.SOCK_DGRAM)
-        with socket.socket(found[0][0], socket.SOCK_DGRAM) as sender:
-            sender.connect(found[0][4])
-            start = loop.time()
-            for datagram in datagrams:
-                await asyncio.sleep(max(0.0, start + datagram.time - loop.time()))
-                sender.send(datagram.payload)
-    except OSError as error:
-        raise LinkError(
-            f"cannot send to UDP {host}:{port} ({system_message(error)}); check the address, and "
-            "start the controller first"
-        ) from error

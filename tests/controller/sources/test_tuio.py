@@ -28,11 +28,8 @@ from controller.sources.tuio import (
     RecordedDatagram,
     TuioSource,
     read_capture,
-    replay_capture,
 )
 from controller.sources.udp_source import BACKLOG_THRESHOLD, Datagram, Datagrams, Peer, listen
-from drivers.errors import LinkError
-from era_haptics.command import run_era
 from examples.make_touches import tuio_datagram, write_capture
 from kit.clock import in_virtual_time
 from kit.fingers import bundle, cursor, frame, free_port, message
@@ -791,48 +788,3 @@ def test_read_capture_reads_the_documented_format_up_to_its_maximum_size(tmp_pat
     os.truncate(path, MAX_BYTES + 1)
     with pytest.raises(InputError, match="16 MiB"):
         read_capture(path)
-
-
-@in_virtual_time
-async def test_replay_capture_keeps_times_over_udp() -> None:
-    """Datagrams arrive unchanged, each at its own time."""
-    loop = asyncio.get_running_loop()
-    start = loop.time()
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
-        receiver.bind(("127.0.0.1", 0))
-        receiver.setblocking(False)
-        datagrams = [
-            RecordedDatagram(0.0, b"one"),
-            RecordedDatagram(0.25, b"two"),
-            RecordedDatagram(1.0, b"three"),
-        ]
-        port = receiver.getsockname()[1]
-        replay = asyncio.create_task(replay_capture(datagrams, "127.0.0.1", port))
-        received = [(await loop.sock_recv(receiver, 100), loop.time() - start) for _ in datagrams]
-        await replay
-    assert received == [(b"one", 0.0), (b"two", 0.25), (b"three", 1.0)]
-
-
-@in_virtual_time
-async def test_replay_capture_raises_when_a_port_is_closed_or_the_system_refuses() -> None:
-    """The refusal of one datagram at the next; an address to which none may be sent at once."""
-    datagrams = [RecordedDatagram(t, b"x") for t in (0.0, 0.1, 0.2)]
-    port = free_port()
-    with pytest.raises(LinkError, match=rf"127.0.0.1:{port} \(Connection refused\)"):
-        await replay_capture(datagrams, "127.0.0.1", port)
-    with pytest.raises(LinkError, match=r"255\.255\.255\.255:3333 \(Perm"):
-        await replay_capture(datagrams[:1], "255.255.255.255", 3333)
-
-
-def test_era_touch_sends_a_capture(tmp_path: Path) -> None:
-    """To the UDP port of the daemon's source; fingers and a capture exclude each other."""
-    path = tmp_path / "taps.tuio"
-    write_capture(path, [RecordedDatagram(0.0, b"one"), RecordedDatagram(0.0, b"two")])
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
-        receiver.bind(("127.0.0.1", 0))
-        receiver.settimeout(10)
-        options = ["--replay", str(path), "--port", str(receiver.getsockname()[1])]
-        assert run_era(["touch", *options]) == 0
-        assert [receiver.recv(100) for _ in range(2)] == [b"one", b"two"]
-        assert run_era(["touch", "0.1,0.1", *options]) == 2
-    assert run_era(["touch"]) == 2

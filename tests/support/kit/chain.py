@@ -564,7 +564,7 @@ def play_stream(
             intent_source=EffectPlayer(SurfaceLayout(effects=default_effects(LEVEL_DB_SL))),
             timing=Timing(table),
             drive_mode=drive_mode,
-            judged={"level": LEVEL_LIMIT},
+            limits=ChannelLimits(level=LEVEL_LIMIT),
         ) as chain:
             await chain.open()
             await chain.operate("arm")

@@ -84,7 +84,7 @@ _ResultT = TypeVar("_ResultT", bound=ApiMessage)
 _MethodT = TypeVar("_MethodT", bound=Callable[..., Coroutine[Any, Any, Any]])
 
 
-def _lenient(method: _MethodT) -> _MethodT:
+def lenient(method: _MethodT) -> _MethodT:
     """A method that is carried out without those of its arguments that it does not take.
 
     Raises their TypeError afterwards.
@@ -188,7 +188,7 @@ class AsyncClient(AbstractAsyncContextManager["AsyncClient"]):
         """Extend the lease."""
         return await self._call(RenewResult, "renew", lease=lease)
 
-    @_lenient
+    @lenient
     async def disarm(self, *, client: str | None = None, lease: str | None = None) -> None:
         """Ramp to silence, then switch the high voltage off.
 
@@ -196,7 +196,7 @@ class AsyncClient(AbstractAsyncContextManager["AsyncClient"]):
         """
         await self._call(Empty, "disarm", client=client, lease=lease)
 
-    @_lenient
+    @lenient
     async def stop(self, *, client: str | None = None) -> StopResult:
         """Quick-stop all amplifiers, latched until clear.
 

@@ -90,7 +90,7 @@ def _method(name: str, method: Method, summary: str) -> Iterator[str]:
     if len(head) > _WIDTH:
         head = head.replace("(", "(\n        ").replace(") ->", "\n    ) ->")
     if method.silences:
-        yield "    @_lenient"
+        yield "    @lenient"
     yield head
     first, dot, rest = summary.partition(". ")
     wrapped = textwrap.wrap(rest, _WIDTH - 8)

@@ -5,7 +5,6 @@ be compressed or pickled, and no array may declare more than the file holds. Out
 checked for their ending, their folder, and the kind of file that they would replace.
 """
 
-import glob
 import hashlib
 import math
 import os
@@ -13,7 +12,7 @@ import struct
 import uuid
 import zipfile
 from collections.abc import Collection, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any, BinaryIO, TypeAlias
 
@@ -73,13 +72,6 @@ def whole_or_nothing(path: Path) -> Iterator[IO[bytes]]:
         raise
 
 
-def remove_partial(path: Path) -> None:
-    """Remove temporary files of killed writers; the file must not be written meanwhile."""
-    for left in path.parent.glob(f".{glob.escape(path.name)}.{'[0-9a-f]' * _RANDOM}"):
-        with suppress(OSError):
-            left.unlink()
-
-
 def write_arrays(path: Path, arrays: Arrays) -> None:
     """Write arrays by name, atomically."""
     with whole_or_nothing(path) as stream:
@@ -125,14 +117,6 @@ def arrays_in(
             with archive.open(entry) as stream:
                 arrays[name] = np.lib.format.read_array(stream, allow_pickle=False)
         return arrays
-
-
-def array_names(path: Path, *, max_bytes: int) -> list[str]:
-    """Names of the arrays that a file may hold; raises one of UNREADABLE."""
-    with open_regular(path, max_bytes) as file:
-        _check_end(file, file.seek(0, os.SEEK_END))
-        with zipfile.ZipFile(file) as archive:
-            return [name.removesuffix(".npy") for name in archive.namelist()]
 
 
 def _check_end(file: BinaryIO, file_bytes: int) -> None:

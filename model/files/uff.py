@@ -21,7 +21,7 @@ from model.errors import MAX_VALUE, InputError
 from model.files.array_file import whole_or_nothing
 from registry.files import open_regular
 
-TIME_RESPONSE, FREQUENCY_RESPONSE = 1, 4  # function types
+FREQUENCY_RESPONSE = 4  # function type
 DISPLACEMENT, ACCELERATION, UFF_TIME, UFF_FREQUENCY = 8, 12, 17, 18  # data types
 
 _UTF_16 = (b"\xff\xfe", b"\xfe\xff")

@@ -1,17 +1,12 @@
-"""What is found of one hidden plate, and what answers then give on it.
+"""Hidden plates that another theory solves: thin plates on ERAs, with and without faults.
 
-A hidden plate is thin, in Bogner-Fox-Schmit elements, which is another theory and element than the
-model's: Kirchhoff's plate without shear and rotary inertia, products of cubic Hermite polynomials
-on a regular grid, all of its modes; ERAs, masses and fingers attached by their equations of motion.
-Its loss is that of viscous modes, eta w w_r in place of eta w_r². Nothing of the model is used.
-
-The model answers for a rig as written, as identified, and for the plate known exactly. It is
-counted how often 95 % intervals of parameters and regions of fields hold the truth.
+They are solved in Bogner-Fox-Schmit elements, which is another theory and element than the model's:
+Kirchhoff's plate without shear and rotary inertia, products of cubic Hermite polynomials on a
+regular grid, all of its modes; ERAs, masses and fingers attached by their equations of motion. The
+loss is that of viscous modes, eta w w_r in place of eta w_r². Nothing of the model is used.
 """
 
-import time
-from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TypeAlias
 
@@ -19,22 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
-from benchmarks.setting import random_contacts
-from model.answer.plan import query
-from model.answer.stimulus import Placement
-from model.arrays import Complex64Array
-from model.ensemble.attached_plate import AttachedPlate
-from model.errors import InputError
-from model.estimate.forward import Sensor, jacobian
-from model.estimate.identify import Identification, identify, model_of, relevant
+from model.estimate.identify import Identification, relevant
 from model.estimate.measurement import Measurement, sensors_at
 from model.estimate.parameters import PARAMETER_KINDS
-from model.finger import fingertip_points, fingertip_weights
-from model.rig.rig import Rig, Uncertainty
-from model.structure.attachments import Era, PointLoad
-from model.structure.plate import LOSS_FREQUENCY
-from model.table.table import LocalizationTable
-from model.table.table_file import build_table
 
 Reals: TypeAlias = NDArray[np.float64]
 Complexes: TypeAlias = NDArray[np.complex128]
@@ -251,16 +233,6 @@ class Hidden:
         parts = noise[:, 0] + 1j * noise[:, 1]
         return np.asarray(clean + NOISE * np.abs(clean) * parts[0] + FLOOR * rms * parts[1])
 
-    def felt(self, frequency: float, points: Reals, fingers: Reals, factors: Reals) -> Complexes:
-        """Acceleration at points (p, 2) per base displacement (p, n) [1/s²].
-
-        fingers (k, 2) [m], factors (k, 4) of their loads, (0, 4) for weightless ones.
-        """
-        loads = np.array([finger_stiffness(frequency, each) for each in factors], dtype=complex)
-        return self.mounted.accelerations(
-            frequency, points, fingers=fingers if len(loads) else None, loads=loads
-        )
-
 
 def draw(kind: str, seed: int) -> Hidden:
     """Draw a plate of a set.
@@ -349,108 +321,6 @@ def finger_stiffness(frequency: float, factors: Reals) -> complex:
     return complex(-(w**2) * CONTACT * mass + pulp * (1 - moved))
 
 
-DRIVES = Uncertainty(gain=0.01, phase_deg=1, thickness=0, stiffness=0, damping=1, fingertip=0)
-
-
-@dataclass(frozen=True, eq=False)
-class _UnderKnownFingers(AttachedPlate):
-    """A plate whose fingers are of dynamic stiffness (f, k) [N/m], of none for k = 0."""
-
-    fingers: Complex64Array
-
-    def finger_stiffness(self, count: int, loads: Sequence[float] = ()) -> Complex64Array:
-        """As they are."""
-        is_known = self.fingers.shape[-1] == count
-        return self.fingers if is_known else super().finger_stiffness(count, loads)
-
-
-def table_of(rig: Rig, frequencies: Reals, *, loaded: bool) -> LocalizationTable:
-    """The table of a rig with the rig's fingers or weightless ones."""
-    fingertip = rig.fingertip if loaded else None
-    return build_table(
-        replace(rig, fingertip=fingertip), frequencies=frequencies, drive_mode="phased"
-    )
-
-
-def known_table(
-    table: LocalizationTable, own: Mounted, shapes: Reals, factors: Reals
-) -> LocalizationTable:
-    """A table of the plate as it is, and of fingers (k, 4) as they are, if not weightless.
-
-    shapes (p, r): of the plate at the table's points.
-    """
-    eras = tuple(
-        replace(
-            era,
-            x=float(own.at[n, 0]),
-            y=float(own.at[n, 1]),
-            stiffness=float(own.stiffness[n]),
-            damping=float(own.damping[n]),
-            bolt_mass=float(own.bolt[n]),
-            gains=((LOSS_FREQUENCY, float(abs(own.gain[n])), float(np.angle(own.gain[n]))),),
-        )
-        for n, era in enumerate(table.eras)
-        if isinstance(era, Era)
-    )
-    known = replace(
-        table,
-        eras=eras,
-        masses=tuple(PointLoad(x, y, mass=mass) for x, y, mass in own.masses.tolist()),
-        uncertainty=DRIVES,
-        omega=np.sqrt(own.plate.modes[0]),
-        losses=np.zeros(len(own.plate.modes[0])),
-        attachment_shapes=own.attached,
-        shapes=shapes.astype(np.float32),
-        discretisation_error=np.zeros(len(table.frequencies)),
-    )
-    # Its loss is not hysteretic, and its fingers are not multiples of one.
-    stiffness = [[finger_stiffness(float(f), each) for each in factors] for f in table.frequencies]
-    receptance = np.array([own.receptance(float(f)) for f in table.frequencies])
-    square = (2 * np.pi * table.frequencies[:, None]) ** 2
-    known.__dict__["attached"] = _UnderKnownFingers(
-        **(vars(known.attached) | {"modal": 1 / receptance + square}),
-        fingers=np.array(stiffness, dtype=np.complex64),
-    )
-    return known
-
-
-@dataclass(frozen=True, eq=False)
-class Answer:
-    """A tone for a target among quiet fingers, with what nine of ten plates shall give.
-
-    frequency [Hz]; bases (n,): amplitudes [m]; threshold [m/s²] there; contrast, level [dB, dB SL].
-    """
-
-    frequency: float
-    bases: Complexes
-    threshold: float
-    contrast: float
-    level: float
-
-
-def answer(table: LocalizationTable, places: Reals) -> Answer:
-    """The table's answer for fingers (k, 2) [m], the first the target."""
-    points = [(float(x), float(y)) for x, y in places]
-    found = query(table, Placement((points[0],), tuple(points[1:])), 0.0)
-    tones = [found.layers[0].excitation.get(era.name) for era in table.eras]
-    (frequency,) = {tone.frequency for tone in tones if tone is not None}
-    contrast = found.fingers[0].promised_contrast_db
-    level = found.fingers[0].promised_level_db_sl
-    assert contrast is not None
-    return Answer(
-        float(frequency),
-        np.array([0 if tone is None else tone.phasor for tone in tones], dtype=complex),
-        float(np.interp(frequency, table.frequencies, table.thresholds)),
-        contrast,
-        level,
-    )
-
-
-_WITHIN = 1.96
-_REGION = 5.991  # of two normal numbers
-_PLACES = np.array([(0.25, 0.2), (0.5, 0.5), (0.8, 0.4), (0.35, 0.75)])
-
-
 def parameters_held(found: Identification, own: Mounted) -> dict[str, Reals]:
     """Errors in standard deviations by kind: springs and dampers over mass, gains, frequencies."""
     space, x, plate = found.fitted.space, found.fitted.x, found.before.plate
@@ -485,167 +355,6 @@ def parameters_held(found: Identification, own: Mounted) -> dict[str, Reals]:
         std = np.hypot(found.std[at : at + 3], [0.0, *[PARAMETER_KINDS["place"].theory] * 2])
         errors["mass"] = off / std
     return errors
-
-
-def fields_held(found: Identification, hidden: Hidden, frequencies: Reals) -> Reals:
-    """Squared distances of true fields from those identified, in their covariance, (values,)."""
-    plate, model = found.before.plate, found.fitted.model
-    points = _PLACES * [plate.length, plate.width]
-    pads = [Sensor(f"point {n}", x=x, y=y) for n, (x, y) in enumerate(points.tolist())]
-    masses, tones = model.mass_count, frequencies[1::4]
-    wider = model_of(found.before, model.free, found.fitted.measurement, masses=masses, more=pads)
-    wider = replace(wider, frequencies=tones)
-    x, covariance = found.within(wider.space)
-    at = wider.at(x)
-    J = jacobian(at)[:, len(model.sensors) :]
-    own_fields = at.responses[:, len(model.sensors) :]
-    nothing = np.zeros((0, 4))
-    true = np.array([hidden.felt(float(f), points, points, nothing) for f in tones])
-    error = own_fields - true
-    parts = np.stack([J.real, J.imag], axis=-2)
-    spread = parts @ covariance @ parts.swapaxes(-1, -2)
-    both = np.stack([error.real, error.imag], axis=-1)
-    solved = np.linalg.solve(spread, both[..., None])[..., 0]
-    return np.asarray((both * solved).sum(axis=-1)).ravel()
-
-
-def share_within(errors: Reals) -> float:
-    """Share of errors in standard deviations that are within the 95 % interval."""
-    return float((np.abs(errors) < _WITHIN).mean())
-
-
-def share_in_region(distances: Reals) -> float:
-    """Share of squared distances that are in the 95 % region."""
-    return float((distances < _REGION).mean())
-
-
-FREQUENCIES = np.linspace(40.0, 500.0, 27)
-QUIET = (1, 2, 3)
-WAYS = ("written", "identified", "known")
-GAIN, PHASE_DEG = 0.01, 1.0
-_MARGIN = 0.013
-
-
-@dataclass
-class Outcome:
-    """Of one plate: contrasts [dB] by way, load and number of quiet fingers, and its fit.
-
-    kept: by what is promised and load, whether the plate as identified gives it; is_explained:
-    whether anything is promised of it; seconds: of
-    processor time of the identification; errors, fields: see `coverage`.
-    """
-
-    kind: str
-    contrasts: dict[tuple[str, bool, int], list[float]]
-    kept: dict[tuple[str, bool], list[bool]] = field(default_factory=dict)
-    chi2: float = np.nan
-    mode_shift: float = np.nan
-    held_out: float = np.nan
-    unexplained: float = np.nan
-    seconds: float = np.nan
-    errors: dict[str, Reals] = field(default_factory=dict)
-    fields: Reals = field(default_factory=lambda: np.zeros(0))
-    refusal: str = ""
-    is_explained: bool = False
-    sensors: int = 4
-
-
-def outcome(
-    hidden: Hidden,
-    rig: Rig,
-    written: dict[bool, LocalizationTable],
-    kind: str,
-    seed: int,
-    *,
-    sets: int,
-    rounds: int = 4,
-    sensors: int = 4,
-) -> Outcome:
-    """Identify a hidden plate and judge answers on it.
-
-    written: tables of the rig as it is written, by whether fingers load it; rounds: of interleaved
-    tones, four for every ERA at each tone; sensors: at the first ERAs, then INSIDE.
-    """
-    found = Outcome(kind, {}, sensors=sensors)
-    started = time.process_time()
-    try:
-        measured = _measurement(hidden, rig, seed, rounds, sensors)
-        identified = identify(rig, measured)
-    except InputError as refusal:
-        found.refusal = str(refusal)
-        return found
-    found.seconds = time.process_time() - started
-    found.chi2, found.mode_shift = identified.chi2, identified.mode_shift
-    found.is_explained = identified.is_explained
-    if identified.held_out:
-        found.held_out = identified.held_out.total
-        found.unexplained = identified.held_out.unexplained
-    own = hidden.mounted
-    shapes = own.plate.shapes(written[False].raster.points)
-    found.errors = parameters_held(identified, own)
-    found.fields = fields_held(identified, hidden, FREQUENCIES)
-    is_judged = identified.is_explained or kind in FAMILY
-    for loaded in (False, True) if sets and is_judged else ():
-        tables = {"written": written[loaded], "identified": _table(identified, loaded)}
-        for quiet in QUIET:
-            rng = np.random.default_rng([seed, quiet])
-            for _ in range(sets):
-                size = (rig.plate.length, rig.plate.width)
-                places = random_contacts(rng, quiet + 1, size, margin=_MARGIN)
-                factors = np.exp(LOAD_STD * rng.standard_normal((quiet + 1, 4)))
-                if not loaded:
-                    factors = factors[:0]
-                known = known_table(written[loaded], own, shapes, factors)
-                error = 1 + GAIN * rng.standard_normal(len(rig.eras))
-                turn = np.radians(PHASE_DEG) * rng.standard_normal(len(rig.eras))
-                drives = error * np.exp(1j * turn)
-                for way, table in {**tables, "known": known}.items():
-                    tone = answer(table, places)
-                    contrast, level = _felt(hidden, rig, places, factors, tone, drives)
-                    found.contrasts.setdefault((way, loaded, quiet), []).append(contrast)
-                    if way == "identified":
-                        for what, reached in (
-                            ("contrast", contrast >= tone.contrast),
-                            ("level", level >= tone.level),
-                        ):
-                            found.kept.setdefault((what, loaded), []).append(reached)
-    return found
-
-
-def _table(identified: Identification, loaded: bool) -> LocalizationTable:
-    return table_of(identified.rig, FREQUENCIES, loaded=loaded)
-
-
-def _measurement(hidden: Hidden, rig: Rig, seed: int, rounds: int, count: int) -> Measurement:
-    values = hidden.measured(FREQUENCIES, np.random.default_rng([seed, 1]), count)
-    played = (np.arange(len(FREQUENCIES))[:, None] + np.arange(len(rig.eras))) % 4 < rounds
-    sensors = [Sensor(era.name, era.name) for era in rig.eras]
-    sensors += [Sensor(f"inside {n}", x=x, y=y) for n, (x, y) in enumerate(INSIDE.tolist())]
-    return Measurement(sensors[:count], FREQUENCIES, np.where(played[:, None], values, np.nan))
-
-
-def _felt(
-    hidden: Hidden,
-    rig: Rig,
-    places: Reals,
-    factors: Reals,
-    tone: Answer,
-    drives: Complexes,
-) -> tuple[float, float]:
-    """Contrast [dB] and level [dB SL] on the hidden plate, by the mean under the target.
-
-    drives (n,): factors on its ERAs; contrast: to the loudest point under a quiet finger.
-    """
-    discs = [fingertip_points(float(x), float(y), rig.plate) for x, y in places]
-    points = np.concatenate(discs)
-    unit = hidden.felt(tone.frequency, points, places, factors)
-    fields = np.abs(unit @ (tone.bases * drives))
-    weights = fingertip_weights(float(places[0, 0]), float(places[0, 1]), rig.plate)
-    own = len(discs[0])
-    mean = weights @ fields[:own]
-    ratios = np.array([mean / fields[own:].max(), mean / tone.threshold])
-    contrast, level = (20 * np.log10(ratios)).tolist()
-    return contrast, level
 
 
 @dataclass(frozen=True)

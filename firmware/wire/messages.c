@@ -25,9 +25,9 @@ bool message_is_known(uint8_t type)
     case MESSAGE_MARK:
         return (FEATURES & FEATURE_MARK) != 0;
     case MESSAGE_GET_MEASURED:
-    case MESSAGE_GET_SENSORS:
-    case MESSAGE_MEASURE:
-    case MESSAGE_GET_READING:
+    case 16: /* reserved, as are 17 and 18 */
+    case 17:
+    case 18:
         return false;
     default:
         return type >= MESSAGE_GET_CAPS && type < sizeof REQUESTS / sizeof REQUESTS[0];

@@ -10,6 +10,8 @@ import math
 import random
 from collections.abc import Callable, Collection, Sequence
 from contextlib import suppress
+from functools import partial
+from typing import Any
 
 import pytest
 
@@ -433,7 +435,9 @@ async def test_frames_of_full_speed_are_read_at_all_phases(
 
 @pytest.mark.parametrize("lines", [("abc",), ("a", "b")], ids="-".join)
 @in_virtual_time
-async def test_sets_beside_readings_of_clocks_are_played(lines: tuple[str, ...]) -> None:
+async def test_sets_beside_readings_of_clocks_are_played(
+    monkeypatch: pytest.MonkeyPatch, lines: tuple[str, ...]
+) -> None:
     """40 sets at any time between the readings of USB of full speed, of which each takes 2 ms.
 
     On one line a reading may show a set before its own status does; on several no reading goes
@@ -441,16 +445,23 @@ async def test_sets_beside_readings_of_clocks_are_played(lines: tuple[str, ...])
     """
     group, _ = await held("usb-full-speed", 1, *lines, features=0)
     rng, sent = random.Random(1), list[str]()
+
+    def record(
+        request: Callable[..., bytes], address: int, name: str, *words: Any, **options: Any
+    ) -> bytes:
+        sent.append(name)
+        return request(address, name, *words, **options)
+
     for line in group.members.lines:
-        line.seen = lambda way, _, name, __: sent.append(f"{way} {name}")
+        monkeypatch.setattr(line.wire, "request", partial(record, line.wire.request))
     for number in range(40):
         await asyncio.sleep(0.03)
         await group.beat()
         await asyncio.sleep(rng.uniform(0.005, 0.02))
         sent.clear()
         await group.apply({each: [loud(0.1 + number / 100)] for each in group.amplifiers})
-        between = sent[sent.index("out Set") : sent.index("out Commit")]
-        assert len(lines) == 1 or "out GetStatus" not in between
+        between = sent[sent.index("Set") : sent.index("Commit")]
+        assert len(lines) == 1 or "GetStatus" not in between
     assert {each.committed for each in group.amplifiers.values()} == {group.sets.token}
 
 

@@ -109,11 +109,11 @@ def identify(
     ] = 0,
     as_json: JsonOption = False,
 ) -> None:
-    """Identify the plate in place by its own ERAs, and write its rig with the remaining errors.
+    """Identify the plate in place and write its rig.
 
-    With --device a sound card plays multisines and records accelerometers, as era measure does,
-    with its loop-back cable; with --measured nothing is played. Exit status 1, and no rig is
-    written, if the model does not explain the responses.
+    The new rig states the remaining errors. With --device a sound card plays multisines and records
+    accelerometers, as era measure does, with its loop-back cable; with --measured nothing is
+    played. Exit status 1, and no rig is written, if the model does not explain the responses.
     """
     import time
 

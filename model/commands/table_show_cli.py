@@ -136,9 +136,9 @@ def verify(
     seed: Annotated[int, typer.Option(min=0, help="Seed of the sample.")] = 0,
     as_json: JsonOption = False,
 ) -> None:
-    """Verify a table against a direct solution at each frequency, and in time.
+    """Verify a table against a direct solution.
 
-    Exit with 1 if a check fails.
+    Compares a sample of answers at each frequency and in time. Exits with 1 if a check fails.
     """
     from model.rig.rig_file import load_rig
     from model.study.verification import verify_table

@@ -118,7 +118,7 @@ REQUESTS: list[tuple[str, Values]] = [
     *(("Arm", {"session": 9, "watchdog": 2000, "shift": 0}), ("Ping", {"session": 9, "rate": 0})),
     *(("Stop", {"ramp": 5}), ("Clear", {"latch": 1}), ("Disarm", {"ramp": 5})),
     *(("Commit", {"session": 9, "token": 7, "at": 0}), ("Silence", {"session": 9, "ramp": 5})),
-    *(("GetAchieved", {"layer": 0})),
+    ("GetAchieved", {"layer": 0}),
     ("Set", parts(pack_layers(LAYERS), session=9, token=7, now=True)[0]),
     *(("Set", part) for part in CUT),
 ]

@@ -359,7 +359,7 @@ def test_odd_modes_are_read_or_refused_with_their_place(
     assert re.search(odd["said"] or shown, said.err if odd["said"] else said.out)
     if not odd["said"]:
         assert run_era(["config", "check", str(rig)]) == 0
-        for command in ("plate convergence {0}", "rig identify {0} -o {0}.new --yes --url sim://"):
+        for command in ("plate convergence {0}", "rig identify {0} -o {0}.new --measured {0}"):
             assert run_era(command.format(rig).split()) == 2
             assert (
                 "surface by its modes, which has no thickness, size or" in capsys.readouterr().err

@@ -10,7 +10,6 @@ from collections import deque
 from collections.abc import Sequence
 from typing import TypeAlias
 
-from drivers.playing import Playback
 from drivers.protocol.definition import (
     ENABLED,
     FAULTS,
@@ -251,16 +250,6 @@ class ExpectedAmplifier:
             return _NEVER
         early, late = self.watchdog * (1 - DRIFT), (self.watchdog + _TRIP) * (1 + DRIFT)
         return self.fed[0] + early - ROUNDED, self.fed[1] + late
-
-    @property
-    def to_play(self) -> Playback:
-        """What it plays, with the set that waits, from its moment on."""
-        if self._waiting is None:
-            return self.outputs.playback
-        when, token, layers, _ = self._waiting
-        playback = self.outputs.playback.copied()
-        playback.commit(layers, token, sum(when) / 2)
-        return playback
 
     # What it is asked and does
 

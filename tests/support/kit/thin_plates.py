@@ -210,7 +210,6 @@ INSIDE = np.array([(0.31, 0.37), (0.68, 0.59)]) * (LENGTH, WIDTH)
 """Places of sensors that are not at ERAs."""
 NOISE, FLOOR = 0.01, 0.001
 PULP, PULP_DAMPING, CONTACT, PHALANX, JOINT, JOINT_DAMPING = 1000.0, 2.0, 2e-4, 5e-3, 500.0, 2.0
-LOAD_STD = 0.5
 
 
 @dataclass(frozen=True, eq=False)

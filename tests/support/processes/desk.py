@@ -207,8 +207,6 @@ class Capture(SoundCard):
         self._client.wire(None, inputs=channels)
         self.play_through(self._client)
         frames = round(longest * self.rate)
-        self._times = np.zeros(frames // self.block + 1, dtype=np.int64)  # us
-        self._transfer.arrivals = self._times.ctypes.data
         self._samples = self.start(np.zeros((frames, 0)))
 
     def samples(self, count: int) -> Float32Array:
@@ -219,26 +217,14 @@ class Capture(SoundCard):
         """Whether the last block had sound."""
         return self.position > 0 and bool(np.abs(self.samples(self.block)).max() > AUDIBLE)
 
-    def last_sound(self) -> float:
-        """When the last block with sound came (monotonic, s)."""
-        return 1e-6 * float(self._times[(self.end_of_sound() - 1) // self.block])
-
     def end_of_sound(self) -> int:
         """The position after the last sample with sound."""
-        return int(self._loud(0)[-1]) + 1
-
-    def first_sound(self, since: int) -> float:
-        """When the first sample with sound from a position on was played (monotonic, s)."""
-        first = int(self._loud(since)[0])
-        return 1e-6 * float(self._times[first // self.block]) + first % self.block / self.rate
+        loudest = np.abs(self._samples[: self.position]).max(axis=1)
+        return int(np.flatnonzero(loudest > AUDIBLE)[-1]) + 1
 
     def is_played_to(self, port: str) -> bool:
         """Whether a program plays to a port of the server."""
         return bool(self._client.connected_to(port))
-
-    def _loud(self, since: int) -> "np.ndarray[tuple[int], np.dtype[np.intp]]":
-        loud = np.abs(self._samples[since : self.position]).max(axis=1) > AUDIBLE
-        return np.flatnonzero(loud) + since
 
 
 def open_client(name: str) -> JackClient:

@@ -114,9 +114,9 @@ fuzz: .venv/installed-test
 faults: .venv/installed-test
 	$(BIN)/python tests/faults/run.py $(FAULTS)
 
-# Random changes of the code, and which of them the nearest tests notice; at most an hour.
+# Random changes of the code, and which of them the nearest tests notice; at most 20 minutes.
 # Others: make mutants MUTANTS='--package drivers --count 50 --seed 3'
-MUTANTS := --count 20 --minutes 60
+MUTANTS := --count 10 --minutes 20
 mutants: .venv/installed-test
 	$(BIN)/python tests/faults/mutants.py $(MUTANTS)
 
@@ -150,7 +150,7 @@ late-test: .venv/installed-test
 qt-test: .venv/installed-qt
 	$(BIN)/pytest -q tests/integration/test_people_at_a_plate.py
 
-# The whole chain in virtual time, by as many seeds as 40 minutes allow; `make test` takes seven.
+# The whole chain in virtual time, by as many seeds as 20 minutes allow; `make test` takes seven.
 # Others: make soak SOAK='--minutes 10 --wire serial', or one again: make soak SOAK='--seed 17'
 soak: .venv/installed-test
 	$(BIN)/python tests/support/soak.py $(SOAK)

@@ -77,7 +77,7 @@ def main() -> int:
     parser.add_argument("--seeds", type=int, default=4000, help="how many short ones")
     parser.add_argument("--long", type=int, default=500, help="how many long ones")
     parser.add_argument("--first", type=int, default=0, help="the first of each")
-    parser.add_argument("--minutes", type=float, default=40.0, help="at most, of real time")
+    parser.add_argument("--minutes", type=float, default=20.0, help="at most, of real time")
     parser.add_argument("--wire", choices=tuple(KINDS), help="on this kind of wire only")
     parser.add_argument("--plate", choices=PLATES, help="this plate only")
     parser.add_argument("--short", action="store_true", help="with --seed: the short one")

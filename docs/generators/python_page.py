@@ -1,11 +1,10 @@
 """The entries of docs/reference/python-api.md: signatures and docstrings of `era_haptics`.
 
-Each block goes up to the next section, below the comment that has its names: `<!-- api: query;
-Drive: frequency, level; Client(): * -->` is a function, a class with two of its members, and one
-that is made elsewhere, with all of its members. Functions are a list, a class has a heading and a
-list of its members, of which the fields with docstrings come first. Defaults are of what a program
-makes. `Example:` at the end of a docstring is a session, which tests/docs/test_pages.py
-types.
+Each block is between `<!-- end -->` and a comment that lists its names: `<!-- begin: api: query;
+Drive: frequency, level; Client(): * -->` is a function, a class with two of its members, and a
+class that other code creates, with all of its members. Functions form a list. A class has a
+heading and a list of its members, documented fields first. `Example:` at the end of a docstring is
+a session, which tests/docs/test_pages.py types.
 """
 
 import ast
@@ -18,7 +17,7 @@ from typing import Any, TypeAlias
 
 import era_haptics
 
-_BLOCK = re.compile(r"(<!-- api: (.+?) -->\n\n).*?(?=\n## |\Z)", re.DOTALL)
+_BLOCK = re.compile(r"(<!-- begin: api: (.+?) -->\n\n).*?(?=\n<!-- end -->)", re.DOTALL)
 
 Function: TypeAlias = ast.FunctionDef | ast.AsyncFunctionDef
 

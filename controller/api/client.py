@@ -10,8 +10,8 @@
         async for event in era.events():
             print(event.data)
 
-`Client` runs an `AsyncClient` in an event loop on a thread of its own. Methods that are one request
-each are written by `make pages` from their registration in `controller/daemon/handlers.py`.
+`Client` runs an `AsyncClient` in an event loop on its own thread. `make pages` generates the
+methods that send a single request from their registrations in `controller/daemon/handlers.py`.
 """
 
 import asyncio
@@ -75,9 +75,9 @@ from controller.api.silencing import readable_params
 from model.errors import InputError
 from registry.threads import LoopThread, pauses
 
-MAX_QUEUED_EVENTS = 1000  # not yet taken; the oldest is dropped
-_REPEATED_FOR = 0.3  # s; requests whose connection is lost, as by a daemon with many clients
-_RENEWAL_INTERVAL = 0.25  # s; within it a lost lease is noticed, however long it was
+MAX_QUEUED_EVENTS = 1000  # waiting to be read; the oldest is dropped
+_REPEATED_FOR = 0.3  # s; of requests that lose their connection, as happens with many clients
+_RENEWAL_INTERVAL = 0.25  # s; bounds the time until a lost lease is noticed
 
 _T = TypeVar("_T")
 _ResultT = TypeVar("_ResultT", bound=ApiMessage)
@@ -85,9 +85,9 @@ _MethodT = TypeVar("_MethodT", bound=Callable[..., Coroutine[Any, Any, Any]])
 
 
 def lenient(method: _MethodT) -> _MethodT:
-    """A method that is carried out without those of its arguments that it does not take.
+    """Wrap a method so that it runs even when called with unknown arguments.
 
-    Raises their TypeError afterwards.
+    The unknown arguments are left out; their TypeError is raised afterwards.
     """
     signature = inspect.signature(method)
 
@@ -105,16 +105,16 @@ def lenient(method: _MethodT) -> _MethodT:
 
 
 class AsyncClient(AbstractAsyncContextManager["AsyncClient"]):
-    """A client of the daemon, made by `connect`; any number of calls may be pending.
+    """A client of the daemon, made by `connect`; any number of calls can be pending.
 
-    One that is constructed directly connects with its first call. After a lost connection, or one
-    without a response in time, the next call connects again and restores all subscriptions. Every
-    method returns within the timeout and raises RpcError for an error of the daemon, Unreachable
-    (a LinkError) without a response, and LeaseLost, except for `stop` and `disarm`, once the lease
-    of `armed` is lost.
+    A client constructed directly connects on its first call. After a lost connection or a response
+    timeout, the next call reconnects and restores all subscriptions. Every method returns within
+    the timeout. It raises RpcError for an error of the daemon and Unreachable (a LinkError) without
+    a response. Once the lease of `armed` is lost, methods other than `stop` and `disarm` raise
+    LeaseLost.
 
-    `stop` and `disarm` are sent whatever is wrong with their arguments; InputError or TypeError is
-    raised afterwards.
+    `stop` and `disarm` are sent even with invalid arguments; InputError or TypeError is raised
+    afterwards.
     """
 
     def __init__(self, path: Path, *, name: str, timeout: float) -> None:
@@ -128,15 +128,15 @@ class AsyncClient(AbstractAsyncContextManager["AsyncClient"]):
         self._connections = 0
         self._link: DaemonLink | None = None
         self._reading: asyncio.Task[None] | None = None
-        self._pending: dict[int, asyncio.Future[Any]] = {}  # of the present connection, by id
+        self._pending: dict[int, asyncio.Future[Any]] = {}  # of the current connection, by id
         self._ids = itertools.count(1)
         self._rates: dict[Topic, float | None] = {}  # of the subscriptions
-        self._restored: DaemonLink | None = None  # the connection that has all subscriptions
-        self._events: deque[tuple[int, Notification]] = deque()  # with the number of its connection
-        self._lost = 0  # events that were dropped here before the next one
+        self._restored: DaemonLink | None = None  # the connection with all subscriptions
+        self._events: deque[tuple[int, Notification]] = deque()  # with their connection numbers
+        self._lost = 0  # events dropped here before the next one
         self._changed = asyncio.Event()  # an event arrived, or connection or lease was lost
         self._renewing: asyncio.Task[LeaseLost] | None = None  # while armed by `armed`
-        self._seen: tuple[int, int] | None = None  # connection and epoch of what was seen last
+        self._seen: tuple[int, int] | None = None  # connection and epoch received last
 
     @classmethod
     async def connect(
@@ -146,10 +146,10 @@ class AsyncClient(AbstractAsyncContextManager["AsyncClient"]):
         name: str = "python",
         timeout: float = RESPONSE_TIMEOUT,
     ) -> Self:
-        """Connect to the daemon at a socket (default: the usual one) and introduce this client.
+        """Connect to the daemon's socket (default: see `find_socket`) and introduce this client.
 
-        Raises Unreachable if no daemon answers, one of another major version, or a process that is
-        not to be believed.
+        Raises Unreachable if no daemon responds, its major version differs, or the process is not
+        trusted (`check_peer`).
         """
         client = cls(find_socket(path), name=name, timeout=timeout)
         await client._repeated(client._connected)
@@ -170,11 +170,11 @@ class AsyncClient(AbstractAsyncContextManager["AsyncClient"]):
     # begin: written by docs/generators/client_stub.py methods
 
     async def hello(self, client: str) -> HelloResult:
-        """Introduce the client; returns what the daemon drives."""
+        """Introduce the client; returns the daemon's rig, table and layout."""
         return await self._call(HelloResult, "hello", client=client)
 
     async def status(self) -> StatusResult:
-        """Show daemon, amplifiers and contacts."""
+        """Show the state of daemon, amplifiers and contacts."""
         return await self._call(StatusResult, "status")
 
     async def arm(self, owner: str, *, lease_s: float = 10.0) -> ArmResult:
@@ -192,7 +192,7 @@ class AsyncClient(AbstractAsyncContextManager["AsyncClient"]):
     async def disarm(self, *, client: str | None = None, lease: str | None = None) -> None:
         """Ramp to silence, then switch the high voltage off.
 
-        Any client may. While a link is lost it stops all amplifiers.
+        Any client can disarm. While a link is lost, this stops all amplifiers.
         """
         await self._call(Empty, "disarm", client=client, lease=lease)
 
@@ -200,8 +200,8 @@ class AsyncClient(AbstractAsyncContextManager["AsyncClient"]):
     async def stop(self, *, client: str | None = None) -> StopResult:
         """Quick-stop all amplifiers, latched until clear.
 
-        Not an emergency stop. Any client can stop, at any time; error 1006 unless every amplifier
-        is confirmed silent.
+        Not an emergency stop. Any client can stop at any time. Error 1006 unless every amplifier is
+        confirmed silent.
         """
         return await self._call(StopResult, "stop", client=client)
 
@@ -213,29 +213,28 @@ class AsyncClient(AbstractAsyncContextManager["AsyncClient"]):
         await self._call(Empty, "clear", client=client, epoch=epoch)
 
     async def layout(self, name: str) -> LayoutResult:
-        """Use one of the daemon's layouts.
+        """Switch to another of the daemon's layouts.
 
-        Of resting fingers, what ends by itself and what a program plays goes on to its end; what
-        lasts follows the new layout at once.
+        Continuous effects under resting fingers change immediately. Effects of limited duration,
+        and effects that a program plays, continue to their end.
         """
         return await self._call(LayoutResult, "layout", name=name)
 
     async def reload(self) -> ReloadResult:
         """Read the daemon's files again and apply their layouts.
 
-        Any other change is refused, and needs a restart.
+        All other changes are rejected; they need a restart.
         """
         return await self._call(ReloadResult, "reload")
 
     async def effects(self) -> EffectsResult:
-        """List the effects."""
+        """List the available effects."""
         return await self._call(EffectsResult, "effects")
 
     async def strength(self, name: str, gain_db: float | None = None) -> StrengthResult:
         """Set or show the strength of a source, client or region.
 
-        The name is that of a touch source, a client or a region; the status shows all strengths.
-        Active effects are faded to it within 100 ms.
+        The status shows all strengths. Active effects fade to the new strength within 100 ms.
         """
         return await self._call(StrengthResult, "strength", name=name, gain_db=gain_db)
 
@@ -256,10 +255,10 @@ class AsyncClient(AbstractAsyncContextManager["AsyncClient"]):
         taps: Sequence[tuple[float, float, float]] = (),
         loop: bool = False,
     ) -> None:
-        """Play an effect at the finger nearest to x, y [m]; its status says what it feels.
+        """Play an effect at the finger nearest to x, y [m]; the status reports what it feels.
 
-        effect: its name, or points of what lasts: time [s], intensity and sharpness, 0 to 1; taps:
-        the same of short ones beside them.
+        effect: its name, or points of a continuous event: time [s], intensity and sharpness, 0 to
+        1. taps: transients, in the same format.
         """
         x, y = as_position(position)
         played = {"effect": effect} if isinstance(effect, str) else {"points": [*map(list, effect)]}
@@ -267,7 +266,7 @@ class AsyncClient(AbstractAsyncContextManager["AsyncClient"]):
         await self._call(Empty, "play", **played, x_m=x, y_m=y, **more)
 
     async def subscribe(self, *topics: Topic, rate_hz: float | None = None) -> None:
-        """Receive notifications of topics; see `events`."""
+        """Subscribe to topics; see `events`."""
         await self._call(Empty, "subscribe", topics=list(topics), rate_hz=rate_hz)
         self._rates.update(dict.fromkeys(topics, rate_hz))
 
@@ -288,7 +287,7 @@ class AsyncClient(AbstractAsyncContextManager["AsyncClient"]):
         try:
             lease = await asyncio.shield(arming)
         except asyncio.CancelledError:
-            with suppress(RpcError, Unreachable):  # if refused, another client's lease
+            with suppress(RpcError, Unreachable):  # if rejected: another client's lease
                 await self.disarm(lease=(await arming).lease)
             raise
         self._renewing = asyncio.create_task(self._renewed(lease), name="lease")
@@ -309,9 +308,9 @@ class AsyncClient(AbstractAsyncContextManager["AsyncClient"]):
     async def next_event(self, *, timeout: float | None = None) -> Notification | None:
         """Wait for a notification; None after a timeout [s] or `close`; raises Unreachable.
 
-        A lost connection is made again, for which the client's timeout holds. Of those that are not
-        taken the oldest are dropped, and counted in `lost` of the next one. Raises LeaseLost,
-        after the notifications that have arrived, once the lease of `armed` is lost.
+        Reconnects after a lost connection, within the client's timeout. If too many notifications
+        wait, the oldest are dropped and counted in `lost` of the next one. Once the lease of
+        `armed` is lost, raises LeaseLost after the notifications that have arrived.
         """
         with suppress(TimeoutError):
             async with asyncio.timeout(timeout):
@@ -332,8 +331,8 @@ class AsyncClient(AbstractAsyncContextManager["AsyncClient"]):
     async def _call(self, result: type[_ResultT], method: str, **values: Any) -> _ResultT:
         """Call a method with these parameters and return its result.
 
-        What `clear` acknowledges is what this client has seen, in its last `status`, `stop` or
-        state event.
+        `clear` acknowledges the epoch that this client last received in a `status`, `stop` or state
+        event.
         """
         if method in SILENCING:
             return await self._silence(result, method, values)
@@ -350,9 +349,9 @@ class AsyncClient(AbstractAsyncContextManager["AsyncClient"]):
     async def _silence(
         self, result: type[_ResultT], method: str, values: Mapping[str, object]
     ) -> _ResultT:
-        """Call a method that silences, and raise what is wrong with its arguments afterwards.
+        """Call a method that silences, then raise the errors in its arguments.
 
-        From a stop on no lease is renewed, even if no daemon responds.
+        After a stop no lease is renewed, even if no daemon responds.
         """
         if method == "stop":
             self._end_renewal()
@@ -363,14 +362,14 @@ class AsyncClient(AbstractAsyncContextManager["AsyncClient"]):
         try:
             make_params(method, **values)
         except InputError as error:
-            raise InputError(f"{error} ({method} was carried out all the same)") from None
+            raise InputError(f"{error} ({method} was carried out nevertheless)") from None
         return read
 
     async def request(self, method: str, params: ApiMessage) -> Any:
-        """Send a request, again over new connections if that is harmless.
+        """Send a request; after a lost connection, send it again if that is harmless.
 
-        Returns its result as parsed JSON, with the keys of a later daemon. What silences is sent
-        before subscriptions are restored.
+        Returns its result as parsed JSON, including unknown keys of a newer daemon. Requests that
+        silence are sent before subscriptions are restored.
         """
         connected = self._opened if method in SILENCING else self._connected
 
@@ -381,7 +380,7 @@ class AsyncClient(AbstractAsyncContextManager["AsyncClient"]):
         return await self._repeated(attempt, again if METHODS[method].is_repeated else ())
 
     async def _exchange(self, link: DaemonLink, method: str, params: ApiMessage) -> Any:
-        """Send a request over the present connection; raises RpcError and Unreachable."""
+        """Send a request over the current connection; raises RpcError and Unreachable."""
         id, pending = next(self._ids), self._pending
         response = pending[id] = asyncio.get_running_loop().create_future()
         try:
@@ -398,7 +397,7 @@ class AsyncClient(AbstractAsyncContextManager["AsyncClient"]):
         *,
         duration: float = _REPEATED_FOR,
     ) -> _T:
-        """The result of an attempt, which is repeated after some errors for a while [s].
+        """Return the result of an attempt; repeat it for a while [s] after some errors.
 
         Raises Unreachable if it does not end within the client's timeout.
         """
@@ -416,12 +415,12 @@ class AsyncClient(AbstractAsyncContextManager["AsyncClient"]):
                             raise
                         await asyncio.sleep(pause)
         except TimeoutError as error:
-            if self._link is not None:  # else what waits in it would grow without bounds
+            if self._link is not None:  # otherwise its queue would grow without bounds
                 self._link.abort()
             raise Unreachable.at(self.path, error) from error
 
     async def _connected(self) -> DaemonLink:
-        """The connection with all subscriptions; raises RpcError and Unreachable."""
+        """Return the connection with all subscriptions; raises RpcError and Unreachable."""
         async with self._restoring:
             link = await self._opened()
             if link is not self._restored:
@@ -429,7 +428,7 @@ class AsyncClient(AbstractAsyncContextManager["AsyncClient"]):
             return link
 
     async def _opened(self) -> DaemonLink:
-        """The connection, made again if it was lost; raises RpcError and Unreachable."""
+        """Return the connection, reconnecting if it was lost; raises RpcError and Unreachable."""
         async with self._opening:
             if self._is_closed:
                 raise Unreachable(f"this client of the daemon at {self.path} is closed")
@@ -442,7 +441,7 @@ class AsyncClient(AbstractAsyncContextManager["AsyncClient"]):
             return self._link
 
     async def _restore(self, link: DaemonLink) -> None:
-        """Subscribe again over a new connection, which is closed if that fails."""
+        """Restore subscriptions on a new connection; close it if that fails."""
         try:
             for topic, rate in list(self._rates.items()):
                 params = make_params("subscribe", topics=[topic], rate_hz=rate)
@@ -455,7 +454,7 @@ class AsyncClient(AbstractAsyncContextManager["AsyncClient"]):
     async def _read(
         self, link: DaemonLink, pending: dict[int, asyncio.Future[Any]], connection: int
     ) -> None:
-        """Hand out responses and events until a connection is lost; then fail what is pending."""
+        """Dispatch responses and events until the connection is lost; then fail pending calls."""
         try:
             while True:
                 received = read_line(await link.next_line())
@@ -465,7 +464,7 @@ class AsyncClient(AbstractAsyncContextManager["AsyncClient"]):
                     self._events.append((connection, received))
                     self._changed.set()
                     continue
-                for id, response in pending.items():  # without an id, of all of them
+                for id, response in pending.items():  # a response without an id is for all
                     if received["id"] in (id, None) and not response.done():
                         response.set_result(received)
         except Unreachable as error:
@@ -476,7 +475,7 @@ class AsyncClient(AbstractAsyncContextManager["AsyncClient"]):
         self._changed.set()
 
     def _see(self, connection: int, epoch: int | None) -> None:
-        """Note an epoch seen, unless a later one was: another connection may begin lower."""
+        """Store the latest epoch received; on a new connection, it can be lower than before."""
         if epoch is not None:
             self._seen = max(self._seen or (0, 0), (connection, epoch))
 
@@ -486,13 +485,13 @@ class AsyncClient(AbstractAsyncContextManager["AsyncClient"]):
             raise self._renewing.result().with_traceback(None)
 
     def _end_renewal(self) -> None:
-        """Renew the lease no longer, unless it is lost."""
+        """Stop renewing the lease, unless it is lost."""
         if self._renewing is not None and not self._renewing.done():
             self._renewing.cancel()
             self._renewing = None
 
     async def _disarmed(self, lease: ArmResult) -> None:
-        """End `armed`: disarm, unless this client has; raises LeaseLost if it was lost before."""
+        """End `armed`: disarm unless already done; raises LeaseLost if the lease was lost."""
         renewing, self._renewing = self._renewing, None
         if renewing is None:
             return
@@ -507,10 +506,10 @@ class AsyncClient(AbstractAsyncContextManager["AsyncClient"]):
             raise await self._loss(error) from error
 
     async def _renewed(self, lease: ArmResult) -> LeaseLost:
-        """Renew a lease, over a new connection if need be, until it is lost; return how it was.
+        """Renew a lease until it is lost, reconnecting if necessary; return the reason of the loss.
 
-        While no daemon responds it is tried again for as long as the lease lasts. Nothing arms
-        again: a lease that the daemon has ended is lost.
+        While no daemon responds, retries until the lease expires. Nothing arms again: a lease
+        ended by the daemon is lost.
         """
         loop = asyncio.get_running_loop()
         params = make_params("renew", lease=lease.lease)
@@ -532,7 +531,7 @@ class AsyncClient(AbstractAsyncContextManager["AsyncClient"]):
         return await self._loss(reason or Unreachable.at(self.path, TimeoutError()))
 
     async def _loss(self, reason: RpcError | Unreachable) -> LeaseLost:
-        """The loss of the lease with the daemon's cause, where the daemon has refused it."""
+        """Return the loss of the lease, with the daemon's cause if the daemon rejected it."""
         if isinstance(reason, RpcError):
             with suppress(RpcError, Unreachable):
                 status = await self.status()
@@ -546,7 +545,7 @@ _P = ParamSpec("_P")
 def _blocking(
     method: Callable[Concatenate[AsyncClient, _P], Coroutine[Any, Any, _T]],
 ) -> Callable[Concatenate["Client", _P], _T]:
-    """The same method of the blocking client."""
+    """Wrap a method for the blocking client."""
 
     @functools.wraps(method)
     def call(self: "Client", /, *args: _P.args, **options: _P.kwargs) -> _T:
@@ -571,10 +570,10 @@ class Client(AbstractContextManager["Client"]):
         name: str = "python",
         timeout: float = RESPONSE_TIMEOUT,
     ) -> Self:
-        """Connect to the daemon at a socket (default: the usual one) and introduce this client.
+        """Connect to the daemon's socket (default: see `find_socket`) and introduce this client.
 
-        Raises Unreachable if no daemon answers, one of another major version, or a process that is
-        not to be believed.
+        Raises Unreachable if no daemon responds, its major version differs, or the process is not
+        trusted (`check_peer`).
         """
         loop = LoopThread("API")
         try:

@@ -1,10 +1,10 @@
-"""The client's side of the API: where the daemon's socket is, and the lines to and from it.
+"""Client side of the API: find the daemon's socket, and exchange lines with it.
 
-`find_socket` chooses the socket, `check_peer` decides whether the process behind it is trusted.
-`DaemonLink` is a connection in the name of a client, which passes lines on as they are. Without I/O
-are arguments to parameters (`make_params`, `touches_at`) and lines to responses and notifications
-(`read_line`, `result_of`, `read_result`). A daemon of a later minor version sends keys that this
-program does not know: they are ignored here, whereas the server is strict about every request.
+`find_socket` chooses the socket; `check_peer` decides whether to trust the process behind it.
+`DaemonLink` is a connection under a client's name that passes lines on unchanged. Functions without
+I/O convert arguments to parameters (`make_params`, `touches_at`) and lines to responses and
+notifications (`read_line`, `result_of`, `read_result`). Unknown keys from a daemon of a later minor
+version are ignored here; the server validates every request strictly.
 """
 
 import asyncio
@@ -30,17 +30,17 @@ from drivers.errors import LinkError
 from model.errors import InputError, expect_path, shown
 from registry.wording import first_problem
 
-RESPONSE_TIMEOUT = 5.0  # s; arming takes longest, some tenths of a second
+RESPONSE_TIMEOUT = 5.0  # s; arming takes the longest, some tenths of a second
 
 _MessageT = TypeVar("_MessageT", bound=ApiMessage)
 
 
 class Unreachable(LinkError):
-    """No daemon answers at the socket, or one of an incompatible version."""
+    """No daemon responds at the socket, or its version is incompatible."""
 
     @classmethod
     def at(cls, path: Path, error: OSError) -> "Unreachable":
-        """The failure to talk to a daemon at a socket, with its remedy."""
+        """Return the error for a failed connection to a socket, with its remedy."""
         if path.exists() and not path.is_socket():
             return cls(f"{path} is not a socket; give the one that `era daemon` printed")
         if isinstance(error, FileNotFoundError | ConnectionRefusedError):
@@ -59,7 +59,7 @@ class Unreachable(LinkError):
 
 
 class ConnectionLost(Unreachable):
-    """The daemon closed a connection, or has too many clients at once."""
+    """The daemon closed a connection, or has too many clients."""
 
 
 class LeaseLost(RpcError):
@@ -81,7 +81,7 @@ class Notification:
 
 @contextmanager
 def _expected() -> Iterator[None]:
-    """Raise Unreachable where what the daemon has sent is of another form than expected."""
+    """Raise Unreachable if a line from the daemon does not have the expected form."""
     try:
         yield
     except (ValueError, AttributeError, KeyError, TypeError) as error:
@@ -93,10 +93,10 @@ def _expected() -> Iterator[None]:
 
 @_expected()
 def read_line(line: bytes) -> Mapping[str, Any] | Notification:
-    """Read a line of a daemon, a response or an event; raises Unreachable for what is neither."""
+    """Parse a line of the daemon as a response or event; raises Unreachable if it is neither."""
     content: dict[str, Any] = json.loads(line)
     if content.get("method") != "event":
-        content["id"]  # None: of a request that could not be read
+        content["id"]  # None: the request could not be parsed
         return content
     params = content["params"]
     return Notification(params["topic"], params["time_s"], params["lost"], params["data"])
@@ -104,7 +104,7 @@ def read_line(line: bytes) -> Mapping[str, Any] | Notification:
 
 @_expected()
 def result_of(response: Any) -> Any:
-    """The result of a response; raises the RpcError that it holds instead."""
+    """Return the result of a response, or raise its RpcError."""
     if "error" in response:
         raise read_error(response["error"])
     return response["result"]
@@ -122,13 +122,13 @@ def check_version(hello: Any, path: Path) -> None:
     version: str = hello["api_version"]
     if version.partition(".")[0] != API_VERSION.partition(".")[0]:
         raise Unreachable(
-            f"the daemon at {path} speaks version {version:.20} of the API, this program "
+            f"the daemon at {path} uses API version {version:.20}, this program "
             f"{API_VERSION}; update the older of the two"
         )
 
 
 def make_params(method: str, **values: object) -> ApiMessage:
-    """The parameters of a method; raises InputError with the key and the value that is wrong."""
+    """Make the parameters of a method; raises InputError with the invalid key and value."""
     try:
         return METHODS[method].params(**values)
     except ValidationError as error:
@@ -138,7 +138,7 @@ def make_params(method: str, **values: object) -> ApiMessage:
 
 
 def touches_at(positions: Iterable[tuple[float, float]]) -> list[TouchPoint]:
-    """Fingers at x, y [m] of a touch frame; raises InputError."""
+    """Make the touch points of a frame from positions x, y [m]; raises InputError."""
     if not isinstance(positions, Iterable):
         raise InputError(
             f"touch: positions must be a list of x, y in metres, got {shown(positions)}"
@@ -150,7 +150,7 @@ def touches_at(positions: Iterable[tuple[float, float]]) -> list[TouchPoint]:
 
 
 def as_position(position: object) -> tuple[float, float]:
-    """A finger's x, y [m]; raises InputError."""
+    """Convert a position to x, y [m]; raises InputError."""
     got = shown(position)
     with suppress(TypeError, ValueError, OverflowError):
         x, y = (float(each) for each in cast("Iterable[float]", position))
@@ -167,11 +167,11 @@ SYSTEM_SOCKET = Path("/run/era-haptics/daemon.sock")
 """The socket of the system service."""
 
 SOCKET_VARIABLE = "ERA_HAPTICS_SOCKET"
-"""The environment variable that names the socket of a daemon and of its clients."""
+"""Environment variable with the socket path, for the daemon and its clients."""
 
 
 def default_socket(environment: Mapping[str, str] = os.environ) -> Path:
-    """The socket of this user's daemon, unless its file or an option names another."""
+    """Return the default socket of this user's daemon."""
     named = environment.get(SOCKET_VARIABLE)
     if named:
         return Path(named)
@@ -183,7 +183,7 @@ def default_socket(environment: Mapping[str, str] = os.environ) -> Path:
 
 
 def find_socket(given: Path | str | None) -> Path:
-    """The socket to connect to: the given one, the environment's, this user's, or the service's."""
+    """Find the socket: as given, from the environment, this user's, or the service's."""
     if given is not None:
         return expect_path(given, what="path")
     own = default_socket()
@@ -192,14 +192,14 @@ def find_socket(given: Path | str | None) -> Path:
     try:
         SYSTEM_SOCKET.stat()
     except PermissionError:
-        pass  # its folder is another user's: connecting reports whose it is
+        pass  # the folder belongs to another user: connecting reports the owner
     except OSError:
         return own
     return SYSTEM_SOCKET
 
 
 SERVICE_USER_VARIABLE = "ERA_HAPTICS_USER"
-_SERVICE_USER = "era-haptics"  # as the system service is installed
+_SERVICE_USER = "era-haptics"  # default of the system service
 _CREDENTIALS = struct.Struct("3i")  # process, user, group
 
 
@@ -208,9 +208,9 @@ def check_peer(
 ) -> None:
     """Check the peer of a connected socket; raises Unreachable.
 
-    Folder, socket and process must have one owner: root, the caller, or the user of the service,
-    `era-haptics` unless the variable ERA_HAPTICS_USER names another. Otherwise any user could pose
-    as the daemon in a folder that all may write to.
+    Folder, socket and process must have the same owner: root, the caller, or the service's user
+    (the variable ERA_HAPTICS_USER, by default `era-haptics`). Otherwise any user could impersonate
+    the daemon in a folder that all users can write to.
     """
     service = environment.get(SERVICE_USER_VARIABLE, _SERVICE_USER)
     owners = {"folder": path.parent.stat().st_uid, "socket": path.stat().st_uid}
@@ -232,8 +232,8 @@ def check_peer(
 
 
 def credentials_of(connected: socket.socket) -> tuple[int, int] | None:
-    """Process and user ids of the peer of a socket; None where the system does not give them."""
-    option = getattr(socket, "SO_PEERCRED", None)  # of Linux
+    """Return process and user ids of the peer of a socket; None if the system has none."""
+    option = getattr(socket, "SO_PEERCRED", None)  # Linux only
     if option is None:
         return None
     raw = connected.getsockopt(socket.SOL_SOCKET, option, _CREDENTIALS.size)
@@ -242,7 +242,7 @@ def credentials_of(connected: socket.socket) -> tuple[int, int] | None:
 
 
 def _account(find: Callable[[Any], pwd.struct_passwd], user: str | int) -> Any:
-    """The account of a user by name or id, or None."""
+    """Return the account of a user by name or id, or None."""
     try:
         return find(user)
     except KeyError:
@@ -250,13 +250,13 @@ def _account(find: Callable[[Any], pwd.struct_passwd], user: str | int) -> Any:
 
 
 _QUEUE_INTERVAL = 0.002  # s
-_READ = 1 << 16  # bytes; read ahead, and the rest of a line that is incomplete
+_READ = 1 << 16  # bytes; read-ahead, and the rest of an incomplete line
 
 
 class DaemonLink:
-    """A connection to the daemon in the name of a client, made by `open`.
+    """A connection to the daemon under a client's name, made by `open`.
 
-    hello: the daemon's reply to the hello of that name, whose id it is; without its line feed.
+    hello: the daemon's reply to `hello`, without its line feed; the name is its id.
     """
 
     def __init__(
@@ -270,7 +270,7 @@ class DaemonLink:
 
     @classmethod
     async def open(cls, path: Path, name: str) -> Self:
-        """Connect, check the peer, and introduce a client by its name in the daemon's log.
+        """Connect, check the peer, and introduce a client under its name.
 
         Raises InputError for the name, RpcError and Unreachable.
         """
@@ -280,7 +280,7 @@ class DaemonLink:
         link: Self | None = None
         try:
             async with asyncio.timeout(RESPONSE_TIMEOUT):  # the daemon's queue may be full
-                while True:  # asyncio would take a full queue for a connection in progress
+                while True:  # asyncio would mistake a full queue for a connection in progress
                     try:
                         connecting.connect(str(path))
                         break
@@ -304,7 +304,7 @@ class DaemonLink:
         return not (self._writer.is_closing() or self._reader.at_eof() or self._reader.exception())
 
     async def send(self, line: bytes) -> None:
-        """Send a line with its line feed, as soon as the daemon reads; raises Unreachable."""
+        """Send a line with its line feed once the daemon reads; raises Unreachable."""
         self.write(line)
         try:
             await self._writer.drain()
@@ -312,7 +312,7 @@ class DaemonLink:
             raise Unreachable.at(self._path, error) from error
 
     def write(self, line: bytes) -> None:
-        """Send a line with its line feed without waiting, even the last one before `close`."""
+        """Send a line with its line feed without waiting; `close` still delivers it."""
         self._writer.write(line)
 
     async def next_line(self) -> bytes:
@@ -329,13 +329,13 @@ class DaemonLink:
         return line
 
     def close(self) -> None:
-        """Close once the daemon has carried out what it was sent, at the latest after a while.
+        """Close once the daemon has carried out all requests, or after a timeout.
 
-        For the daemon its client has left: its fingers are lifted, and it is not armed for.
+        To the daemon, the client has left: its fingers are lifted, its pending arm is cancelled.
         """
         self._writer.write_eof()
         asyncio.get_running_loop().call_later(RESPONSE_TIMEOUT, self.abort)
 
     def abort(self) -> None:
-        """Close at once; the daemon lifts this client's fingers."""
+        """Close immediately; the daemon lifts this client's fingers."""
         self._writer.transport.abort()

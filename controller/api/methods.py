@@ -1,9 +1,9 @@
 """The methods and topics of the API: their messages, and how requests and events are treated.
 
-A method is registered by `api_method` where it is handled (`controller/daemon/handlers.py`). From
-its registration `make pages` writes what clients, gateway and pages read without loading the
-daemon: `METHODS` below, the methods of the clients, `summaries.py` and docs/reference/api.md.
-A topic is a row of `TOPICS`.
+`api_method` registers a method at its handler (`controller/daemon/handlers.py`). From the
+registrations, `make pages` generates everything that clients, the gateway and pages need without
+loading the daemon: `METHODS` below, the methods of the clients, `summaries.py` and
+docs/reference/api.md. Each topic is a row of `TOPICS`.
 """
 
 from collections.abc import Callable
@@ -42,7 +42,7 @@ DEFAULT_LEASE = 10.0  # s
 MAX_TOUCHES = 64  # per frame; a panel reports ten, a forearm some more
 
 BY_PLACE = "by place"
-"""Mark of an optional parameter that the Python clients accept by position, too."""
+"""Marks an optional parameter that the Python clients also accept by position."""
 
 
 class HelloParams(ApiMessage):
@@ -52,7 +52,7 @@ class HelloParams(ApiMessage):
 
 
 class HelloResult(ApiMessage):
-    """Rig, table and layout of the daemon; constant while it runs, except for the layout."""
+    """Rig, table and layout of the daemon; only the layout can change while it runs."""
 
     api_version: str = Field(description="major.minor; major versions are incompatible")
     software_version: str
@@ -62,18 +62,17 @@ class HelloResult(ApiMessage):
     layout: dict[str, Any] | None = Field(description="the surface layout; null without one")
     readings: dict[str, tuple[str, str, Count]] = Field(
         {},
-        description="of amplifiers, for a page: name, unit, decimals, by the key in their status",
+        description="amplifier readings that a page shows: label, unit and decimals by status key",
     )
 
 
 class StrengthResult(ApiMessage):
-    """The strengths of touch sources, clients and regions that are known."""
+    """Strengths of all known touch sources, clients and regions."""
 
     strengths: dict[str, float] = Field(
         default={},
-        description="gain in dB by name, 0 where none is set: of the inputs of the configuration, "
-        "sources that had fingers, clients that are connected, regions of the layout in use, and "
-        "what else is set",
+        description="gain in dB by name, 0 if none is set: configured inputs, sources that have "
+        "had fingers, connected clients, regions of the current layout, other names with a gain",
     )
 
 
@@ -85,7 +84,7 @@ class StatusResult(StrengthResult, PatternFields, CauseAndRemedy):
     state: DaemonStateName
     word: str = Field(
         default_factory=lambda known: STATE_WORDS[known["state"]],
-        description="the state in a word for people",
+        description="the state in plain words",
     )
     epoch: Epoch
     assume_energised: bool = Field(description="whether lost amplifiers may still be playing")
@@ -97,30 +96,32 @@ class StatusResult(StrengthResult, PatternFields, CauseAndRemedy):
     )
     armed_by: str | None
     lease_left_s: float | None
-    silence_reason: str | None = Field(None, description="why nothing plays although armed")
+    silence_reason: str | None = Field(None, description="why nothing plays while armed")
     amplifiers: list[AmplifierStatus]
     latency_ms: LatencySummary = Field(
-        description="of touches: a finger came, moved or pressed harder or less"
+        description="after a finger came, moved or changed its pressure"
     )
     lift_latency_ms: LatencySummary | None = Field(
-        None, description="of lifts, and of all that changes without a touch, as an effect's end"
+        None, description="after a lift, or a change without a touch, such as the end of an effect"
     )
     rejected_touches: dict[str, Count] = Field(description="number by reason, of all sources")
     rejected_examples: dict[str, str] = Field(
-        default_factory=dict, description="the newest of each reason: what came, and from where"
+        default_factory=dict, description="the newest of each reason: its content and its source"
     )
     inputs: list[TouchInputStatus] = Field(
-        default_factory=list, description="touch inputs of the configuration"
+        default_factory=list, description="configured touch inputs"
     )
     clicks_too_late: Count = Field(
-        0, description="short vibrations that came too late to be felt; the plate plays on"
+        0, description="short vibrations that came too late to be felt; playback continues"
     )
     lost_events: dict[str, Count] = Field(
         default={}, description="notifications that clients were too slow to read, by topic"
     )
-    layout: str | None = Field(None, description="name of the layout in use; null without any")
+    layout: str | None = Field(
+        None, description="name of the current layout; null if there is none"
+    )
     layouts: list[str] = Field(default=[], description="names that `layout` accepts")
-    slow_reason: str | None = Field(None, description="why answers take longer than they need")
+    slow_reason: str | None = Field(None, description="why queries take longer than necessary")
     threshold: str | None = Field(
         None, description="name of the rig's threshold set, to which levels in dB SL are relative"
     )
@@ -128,7 +129,7 @@ class StatusResult(StrengthResult, PatternFields, CauseAndRemedy):
 
 
 class ArmParams(ApiMessage):
-    """Who arms, and how long the lease lasts without renewal."""
+    """Who arms, and the duration of the lease without renewal."""
 
     owner: Name
     lease_s: Annotated[float, Field(ge=MIN_LEASE, le=MAX_LEASE)] = DEFAULT_LEASE
@@ -147,13 +148,13 @@ class RenewResult(ApiMessage):
 
 
 class ArmResult(RenewResult):
-    """The lease, to be renewed within lease_s."""
+    """The lease; renew it within lease_s."""
 
     lease: str
 
 
 class RequestedBy(ApiMessage):
-    """Who requests it, for the log, if it is not the connection's own client."""
+    """Name for the log, if another client than that of the connection makes the request."""
 
     client: Name | None = None
 
@@ -162,7 +163,7 @@ class DisarmParams(RequestedBy):
     """Whose lease to end."""
 
     lease: Annotated[str, Field(min_length=1, max_length=80)] | None = Field(
-        None, description="disarm only while this lease lasts; null: whoever armed"
+        None, description="disarm only if this lease is current; null: under any lease"
     )
 
 
@@ -174,15 +175,15 @@ class StopResult(ApiMessage):
 
 
 class ClearParams(RequestedBy):
-    """What is acknowledged; a later stop, fault or loss is not."""
+    """The epoch up to which to acknowledge; a later stop, fault or loss stays latched."""
 
     epoch: Epoch | None = Field(
-        None, description="as last seen in a status, stop or state event; null: whatever is latched"
+        None, description="as last received in a status, stop or state event; null: the current one"
     )
 
 
 class TouchParams(ApiMessage):
-    """All fingers of one source of this client; valid for 150 ms, to be repeated."""
+    """All fingers of one source of this client; valid for 150 ms, so repeat it."""
 
     source: Name
     touches: Annotated[list[TouchPoint], Field(max_length=MAX_TOUCHES), FailFast()]
@@ -195,17 +196,17 @@ class LayoutParams(ApiMessage):
 
 
 class LayoutResult(ApiMessage):
-    """The layout in use, and all that may be used."""
+    """The current layout, and all available ones."""
 
     layout: str
     layouts: list[str]
 
 
 class ReloadResult(ApiMessage):
-    """What came of reading the daemon's files again."""
+    """Result of reading the daemon's files again."""
 
-    reloaded: bool = Field(description="whether they are in use now; else all is as before")
-    reasons: list[str] = Field(description="what has changed; if refused, why")
+    reloaded: bool = Field(description="whether the new files are in use; if not, nothing changed")
+    reasons: list[str] = Field(description="the changes, or the reasons for rejection")
 
 
 class EffectsResult(ApiMessage):
@@ -222,57 +223,55 @@ class PlayParams(ApiMessage):
     """Play an effect, or points, at the finger nearest to a position; they end when it lifts."""
 
     effect: Name | None = Field(
-        None, description="of the layout, or a named content; null where points or taps are given"
+        None, description="an effect of the layout or a built-in content; null with points or taps"
     )
     x_m: float = Field(description="a finger must be within 20 mm of the position")
     y_m: float
     level_db_sl: float | None = Field(
         None,
-        description="from -20; at most, and by default, the effect's own; of points by default 20, "
-        "at most the highest of the layout",
+        description="-20 or more. For an effect, default and maximum are its own level; for "
+        "points, the default is 20 and the maximum is that of the layout",
     )
     points: _Points = Field(
         [],
-        description="of what lasts: `[time_s, intensity, sharpness]` in order of time, 0 to 60 s, "
-        "0 to 1",
+        description="continuous event: `[time_s, intensity, sharpness]` in order of time; 0 to "
+        "60 s, 0 to 1, 0 to 1",
     )
-    taps: _Points = Field([], description="short ones beside it, in the same way")
-    loop: bool = Field(False, description="whether points or a file begin anew at their end")
+    taps: _Points = Field([], description="transients, in the same format")
+    loop: bool = Field(False, description="whether points or a file repeat from the start")
 
 
 class StrengthParams(ApiMessage):
-    """A touch source, client or region and its gain; without a gain nothing is set."""
+    """A touch source, client or region and its gain; without a gain, nothing changes."""
 
-    name: SourceName = Field(
-        description="of an input, a sender there, a source, a client or a region"
-    )
+    name: SourceName = Field(description="name of an input, sender, source, client or region")
     gain_db: Annotated[GainDb | None, BY_PLACE] = Field(
-        None, description="of all that it brings or has, 0 for what layout and limits allow"
+        None, description="applied to all its effects; 0 is the level that layout and limits allow"
     )
 
 
 class UnsubscribeParams(ApiMessage):
-    """Topics to receive no longer."""
+    """Topics to unsubscribe from."""
 
     topics: Annotated[list[Topic], Field(min_length=1, max_length=16)]
 
 
 class SubscribeParams(UnsubscribeParams):
-    """Topics to receive, and the rate of the periodic ones."""
+    """Topics to subscribe to, and the rate of the periodic ones."""
 
     rate_hz: Annotated[float, Field(ge=1, le=MAX_RATE)] | None = Field(
-        None, description="of amplifiers and latency; default 10"
+        None, description="rate of the periodic topics; default 10"
     )
 
 
 class StateEvent(CauseAndRemedy):
-    """The daemon changed its state."""
+    """The daemon changed state."""
 
     old: DaemonStateName
     new: DaemonStateName
     word: str = Field(
         default_factory=lambda known: STATE_WORDS[known["new"]],
-        description="the new state in a word for people",
+        description="the new state in plain words",
     )
     epoch: Epoch
 
@@ -292,7 +291,7 @@ class PatternEvent(PatternFields):
 
 
 class SilenceEvent(ApiMessage):
-    """No channel is driven; if a link is lost (see the state), as far as known."""
+    """No channel is driven; if a link is lost (see the state), as far as is known."""
 
     contacts: list[ContactStatus]
     reason: str
@@ -334,16 +333,16 @@ class LinkEvent(ApiMessage):
 
 
 class LayoutEvent(ApiMessage):
-    """Another surface layout is in use, or it was replaced; `effects` may have changed with it."""
+    """The layout was changed or replaced; its effects can differ."""
 
-    name: str | None = Field(None, description="of the layout in use; null without one")
+    name: str | None = Field(None, description="name of the current layout; null if there is none")
     layout: dict[str, Any] | None = Field(description="the surface layout; null without one")
 
 
 class InputsEvent(ApiMessage):
     """A touch input was opened, fell silent or was lost, or touches were rejected."""
 
-    inputs: list[TouchInputStatus] = Field(description="all of the configuration")
+    inputs: list[TouchInputStatus] = Field(description="all configured inputs")
     rejected_touches: dict[str, Count] = Field(description="number by reason, of all sources")
 
 
@@ -353,24 +352,26 @@ class TopicData(NamedTuple):
     data: type[ApiMessage]
     summary: str
     sent: Literal["always", "newest", "periodically"] = "always"
-    """At every change; or the newest of several changes, at most 60 times per second; or at the
-    rate that a client has subscribed with."""
+    """After every change; or only the newest change, at most 60 times per second; or periodically,
+    at the rate of the subscription."""
 
 
 TOPICS: dict[Topic, TopicData] = {
     "state": TopicData(StateEvent, "every change of state or epoch, with its cause"),
     "contacts": TopicData(ContactsEvent, "fingers touched, moved or lifted", "newest"),
-    "pattern": TopicData(PatternEvent, "what plays now, as the amplifiers confirmed it", "newest"),
-    "silence": TopicData(SilenceEvent, "nothing plays now, and why", "newest"),
+    "pattern": TopicData(
+        PatternEvent, "the current playback, as confirmed by the amplifiers", "newest"
+    ),
+    "silence": TopicData(SilenceEvent, "playback has ended, and why", "newest"),
     "amplifiers": TopicData(
         AmplifiersEvent, "status of the amplifiers, at rate_hz", "periodically"
     ),
     "latency": TopicData(LatencyEvent, "latency from touch to command, at rate_hz", "periodically"),
-    "log": TopicData(LogEvent, "log records from level info, without those of `state` and `link`"),
-    "link": TopicData(LinkEvent, "links to amplifiers that were degraded, lost or reopened"),
-    "layout": TopicData(LayoutEvent, "another surface layout is in use, or it was replaced"),
+    "log": TopicData(LogEvent, "log records from level info, except state and link changes"),
+    "link": TopicData(LinkEvent, "an amplifier link was degraded, lost or reopened"),
+    "layout": TopicData(LayoutEvent, "the surface layout was changed or replaced"),
     "inputs": TopicData(
-        InputsEvent, "touch inputs that are missing, mute or back; rejected touches, each second"
+        InputsEvent, "touch inputs lost, mute or restored; rejected touches, every second"
     ),
     "strength": TopicData(
         StrengthResult, "strengths of sources, clients and regions, at rate_hz", "periodically"
@@ -396,26 +397,26 @@ class Method(NamedTuple):
     params: type[ApiMessage]
     result: type[ApiMessage]
     is_limited: bool = True
-    """Whether requests count in a client's rate."""
+    """Whether requests count towards a client's rate limit."""
     silences: bool = False
-    """Whether the method ends what plays."""
+    """Whether the method silences the plate."""
     in_reserve: bool = False
-    """Whether clients in reserve are served, too."""
+    """Whether reserve connections can use the method."""
     needs_reply: bool = False
-    """Whether a request is carried out only for a client that gets the reply."""
+    """Whether a request is carried out only for a client that receives the reply."""
     is_repeated: bool = True
-    """Whether clients send it again after a lost connection, so that it may be done twice."""
+    """Whether clients repeat the request after a lost connection, which can carry it out twice."""
     over_http: bool = True
-    """Whether it needs no lasting connection."""
+    """Whether the method works without a persistent connection."""
 
 
 _HandlerT = TypeVar("_HandlerT", bound=Callable[..., Any])
 
 
 def api_method(**treatment: bool) -> Callable[[_HandlerT], _HandlerT]:
-    """Register a handler as the method of its name; treatment: as of `Method`.
+    """Register a handler as an API method under its own name; treatment: fields of `Method`.
 
-    Parameters and result are those of its annotations, its docstring is the help.
+    Its annotations define parameters and result; its docstring is the help text.
     """
 
     def register(handler: _HandlerT) -> _HandlerT:
@@ -451,4 +452,4 @@ METHODS: dict[str, Method] = {
 # end
 
 SILENCING = frozenset(name for name, method in METHODS.items() if method.silences)
-"""Names of the methods that end what plays."""
+"""Names of the methods that silence the plate."""

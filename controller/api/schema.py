@@ -11,14 +11,14 @@ API_VERSION = "1.0"
 """major.minor: major versions are incompatible; a higher minor version only adds."""
 
 PROMISED = (
-    "felt contrast, target over loudest quiet finger, that nine of ten plates within the rig's "
-    "uncertainty give; null for a single finger"
+    "felt contrast, target over loudest quiet finger, that 90 % of plates within the rig's "
+    "tolerances reach; null for a single finger"
 )
-"""Description of the figure that is promised."""
+"""Description of the promised contrast."""
 
 MIN_LEASE = 1.0  # s
-MAX_LEASE = 60.0  # s; a client that has gone away cannot stop anything meanwhile
-MAX_RATE = 60.0  # Hz; of notifications, as fast as a screen shows them
+MAX_LEASE = 60.0  # s; without a client, nothing can stop the plate sooner
+MAX_RATE = 60.0  # Hz; of notifications: the refresh rate of a screen
 
 DaemonStateName: TypeAlias = Literal[
     "NOT_READY",
@@ -31,7 +31,7 @@ DaemonStateName: TypeAlias = Literal[
     "FAULT",
     "COMM_LOST",
 ]
-"""State of the daemon: the names of CiA 402, and COMM_LOST."""
+"""State of the daemon: the states of CiA 402, and COMM_LOST."""
 
 STATE_WORDS: dict[str | None, str] = {
     "NOT_READY": "not ready",
@@ -44,11 +44,11 @@ STATE_WORDS: dict[str | None, str] = {
     "FAULT": "fault",
     "COMM_LOST": "lost",
 }
-"""What people see of a state, of the daemon and of an amplifier."""
+"""Label of each daemon or amplifier state, for display."""
 
 
 def headline(state: DaemonStateName, cause: str) -> str:
-    """A state and its cause in one line for people."""
+    """Return a state and its cause as one line of text."""
     word = STATE_WORDS[state]
     return cause if cause.startswith(word) else f"{word}: {cause}"
 
@@ -88,7 +88,7 @@ Epoch: TypeAlias = Annotated[
     int,
     Field(
         ge=0,
-        description="rises with every change of state, stop, fault and loss; begins by chance",
+        description="increases with every state change, stop, fault and loss; starts at random",
     ),
 ]
 
@@ -104,9 +104,9 @@ class Empty(ApiMessage):
 
 
 class CauseAndRemedy(ApiMessage):
-    """A state, and why."""
+    """Cause of a state, and its remedy."""
 
-    cause: str = Field(description="why it is so")
+    cause: str = Field(description="cause of the state")
     remedy: str | None = Field(description="what to do about it; null if nothing")
 
 
@@ -121,19 +121,19 @@ class EraPosition(ApiMessage):
 
 
 class RigSummary(ApiMessage):
-    """The rig, as far as drawing it needs."""
+    """The rig data needed to draw it."""
 
     length_m: float
     width_m: float
     eras: list[EraPosition]
     simulated: bool = Field(description="whether any of its amplifiers is simulated")
-    frequency_hz: list[float] = Field(description="lowest and highest that the rig allows")
+    frequency_hz: list[float] = Field(description="lowest and highest allowed by the rig")
 
 
 class TableSummary(ApiMessage):
-    """The localization table in use."""
+    """The current localization table."""
 
-    fingerprint: str = Field(description="of the plate and ERAs that it was built for")
+    fingerprint: str = Field(description="identifies the plate and ERAs it was built for")
     mode: str = Field(description="switched or phased")
     frequencies_hz: list[float]
     cells_x: Count
@@ -149,18 +149,18 @@ class TouchPoint(ApiMessage):
     x_m: float = Field(description="from the plate's south-west corner")
     y_m: float = Field(description="from the plate's south-west corner, upwards")
     radius_m: float | None = Field(
-        None, description="of the contact, where it is known; a hand rests from 12.5 mm on"
+        None, description="radius of the contact, if known; 12.5 mm or more is a resting hand"
     )
 
 
 class TouchInputStatus(ApiMessage):
-    """A touch input of the configuration: whether touches can come from it."""
+    """A configured touch input and whether it works."""
 
     name: str
     url: str
     state: Literal["open", "mute", "missing", "ended"] = Field(
-        description="mute: open, but nothing comes although it should; missing: not opened, or "
-        "lost, and tried again; ended: a recording at its end"
+        description="mute: open, but silent although it should send; missing: not opened, or lost, "
+        "and being retried; ended: a recording at its end"
     )
     problem: str | None = Field(
         None, description="why it is mute or missing, and what to do; null if it is neither"
@@ -176,8 +176,8 @@ class ContactStatus(ApiMessage):
     y_m: float
     role: Literal["target", "quiet", "hand", "surplus"] | None = Field(
         None,
-        description="whether it is to feel the pattern, or only its load counts: of a hand that "
-        "rests, or of a finger beyond max_fingers; null before the first decision",
+        description="target: feels the pattern; quiet: kept quiet; hand (a resting hand), surplus "
+        "(a finger beyond max_fingers): only its load counts; null before the first decision",
     )
     level_db_sl: float | None = Field(
         None,
@@ -188,54 +188,52 @@ class ContactStatus(ApiMessage):
     contrast_db: float | None = Field(
         None, description="predicted, target over loudest quiet finger; null for a single finger"
     )
-    effect: str | None = Field(None, description="what it is to feel: an effect, if any")
-    feels: str | None = Field(
-        None, description="the effect that it feels: its own, or that of another finger"
-    )
+    effect: str | None = Field(None, description="the effect selected for it, if any")
+    feels: str | None = Field(None, description="the effect it feels: its own, or another finger's")
     verdict: Literal["own", "mixed", "shared", "held back"] | None = Field(
         None,
-        description="what a target feels: its own, mixed with the contents of others (promised "
-        "contrast below 12 dB, or these are felt beside one that pauses), the content of another "
-        "finger, or none",
+        description="what a target feels. own: its content; mixed: its own and others' (promised "
+        "contrast below 12 dB, or others are felt during its pauses); shared: another finger's "
+        "content; held back: nothing",
     )
     frequency_hz: float | None = Field(
         None,
-        description="of what it feels, as asked for, which amplifiers may round; null for several",
+        description="requested frequency of its content, before rounding; null for several",
     )
     foreign_level_db_sl: float | None = Field(
         None,
-        description="of the contents of others there, which nine of ten plates do not exceed, by "
-        "the most sensitive thresholds: not to be compared with level_db_sl; null where there are "
-        "none",
+        description="crosstalk level of others' contents here, not exceeded on 90 % of "
+        "plates, relative to the most sensitive published thresholds (not comparable with level_db_sl); "
+        "null if there are no other contents",
     )
     rig_foreign_level_db_sl: float | None = Field(
         None,
-        description="the same level relative to the rig's threshold set, as level_db_sl is",
+        description="the same level relative to the rig's threshold set, like level_db_sl",
     )
     is_foreign_felt: bool = Field(
         False,
-        description="whether the contents of others may be felt there: foreign_level_db_sl is "
-        "above 0; beside a verdict own these are weaker by 12 dB or more",
+        description="whether other contents can be felt here (foreign_level_db_sl above 0); "
+        "with verdict own they are at least 12 dB weaker",
     )
     leak_db_sl: float | None = Field(
         None,
-        description="of the contents of others where it is now, on the nominal plate, relative "
-        "to the rig's threshold set: more than promised while it moves; in the status only, null "
-        "where there are none",
+        description="crosstalk level at its current position on the nominal plate, relative to the "
+        "rig's threshold set; can exceed the promise while the finger moves; only in the status; "
+        "null if there are no other contents",
     )
     held_back: str | None = Field(
         None,
-        description="why it does not feel an effect of its own, or not its click over what lasts; "
-        "null if it does",
+        description="why its own effect, or a click over its continuous effect, is not played; "
+        "null if it is",
     )
     load: float = Field(
         1.0,
-        description="on the plate, relative to the rig's fingertip; 1 where none is reported",
+        description="load on the plate relative to the rig's fingertip; 1 if not reported",
     )
 
 
 class PlayedTone(ApiMessage):
-    """Tone of one ERA as confirmed by its amplifier."""
+    """Tone of one ERA, confirmed by its amplifier."""
 
     frequency_hz: float
     level: float = Field(description="0 to 1 of the full stroke")
@@ -243,18 +241,18 @@ class PlayedTone(ApiMessage):
 
 
 class PatternFields(ApiMessage):
-    """The contacts, and what plays for them."""
+    """The contacts, and the tones played for them."""
 
     contacts: list[ContactStatus] = Field(description="in order of arrival, newest last")
     drive: dict[str, PlayedTone] = Field(
-        description="of the newest content, by ERA, without silent ones"
+        description="tones of the newest content by ERA; silent ERAs are omitted"
     )
     layers: dict[str, dict[str, PlayedTone]] = Field(
         default_factory=dict,
-        description="what plays of each content, by layer, then as `drive`; they add up",
+        description="tones of each content by layer, then by ERA as in `drive`; layers add up",
     )
     promised_contrast_db: float | None = Field(None, description=PROMISED)
-    predicted_contrast_db: float | None = Field(None, description="the same, nominal")
+    predicted_contrast_db: float | None = Field(None, description="the same on the nominal plate")
     predicted_level_db_sl: float | None
 
 
@@ -264,7 +262,7 @@ class LinkCounters(ApiMessage):
     frames_out: Count
     frames_in: Count
     invalid_frames: Count = Field(
-        description="frames with a wrong checksum, length, form or version"
+        description="frames with a wrong checksum, length, format or version"
     )
     unexpected_frames: Count = Field(description="valid but unexpected frames")
     events: Count
@@ -275,21 +273,21 @@ class LinkCounters(ApiMessage):
 
 
 class AmplifierSilence(ApiMessage):
-    """What an amplifier may play, after a stop or where it does not reply."""
+    """Whether an amplifier is silent, after a stop or without its reply."""
 
     silence: Literal["confirmed_silent", "may_play", "watchdog_elapsed"] = Field(
         description="confirmed by its status after a stop; may play; or unconfirmed, but its "
         "watchdog must have silenced it"
     )
     may_play_for_s: float | None = Field(
-        description="time until its watchdog must have silenced it; null if that is not known to "
-        "happen, or if silence is confirmed"
+        description="time until its watchdog must have silenced it; null without a known watchdog "
+        "or after confirmed silence"
     )
     cause: str
 
     @property
     def words(self) -> str:
-        """For people."""
+        """Return the silence as text."""
         match self.silence, self.may_play_for_s:
             case "confirmed_silent", _:
                 return "confirmed silent"
@@ -301,7 +299,7 @@ class AmplifierSilence(ApiMessage):
 
 
 class AmplifierReport(CauseAndRemedy):
-    """What an amplifier reports beside a fault, and who feels it; it plays on."""
+    """A condition that an amplifier reports, other than a fault; it continues to play."""
 
     kind: ReportKind
 
@@ -312,34 +310,33 @@ class AmplifierStatus(ApiMessage):
     name: str
     url: str
     serial_number: str | None
-    state: str | None = Field(description="its own state, by the names of CiA 402")
+    state: str | None = Field(description="its own state, as named by CiA 402")
     word: str | None = Field(
         default_factory=lambda known: STATE_WORDS.get(known["state"]),
-        description="the state in a word for people",
+        description="the state in plain words",
     )
     fault: str | None
     levels: list[float] = Field(
-        description="0 to 1 of the full stroke, by channel, as it reports; empty if unknown"
+        description="reported level of each channel, 0 to 1 of the full stroke; empty if unknown"
     )
     high_voltage: bool | None
     reply_age_s: float | None = Field(description="time since its last reply")
     clock_skew_us: float | None = Field(
         None,
-        description="rms error of its clock against those of the others, as the host sees it; null "
-        "for one alone, and where it is not held to them",
+        description="RMS error of its clock relative to the others, estimated by the host; null "
+        "for a single amplifier or one that is not synchronised",
     )
     degraded: bool = Field(
-        False, description="whether it does not reply but may still play, so that nothing new plays"
+        False,
+        description="whether it does not reply but may still play; nothing new plays",
     )
     lost: bool = Field(description="whether the link to it is lost")
     closed_with_lost: bool = Field(
-        description="whether it still replied but was closed because another one is lost"
+        description="whether it was closed, although it replied, because another one is lost"
     )
-    reports: list[AmplifierReport] = Field(
-        [], description="what it has reported within the last 10 s"
-    )
+    reports: list[AmplifierReport] = Field([], description="its reports of the last 10 s")
     silence: AmplifierSilence | None = Field(
-        None, description="what it may play while it does not reply; null while it does"
+        None, description="whether it is silent, while it does not reply; null while it does"
     )
     statistics: LinkCounters
 
@@ -352,9 +349,9 @@ class AmplifierStatus(ApiMessage):
 
 
 class LatencySummary(ApiMessage):
-    """Latency from a touch frame's arrival to the last byte of the resulting command, all in ms.
+    """Latency from the arrival of a touch frame to the last byte of its command, in ms.
 
-    Over the last patterns; median and percentiles are null before the first.
+    Taken over the latest patterns; median and percentiles are null before the first one.
     """
 
     count: Count
@@ -373,4 +370,4 @@ class EffectDescription(ApiMessage):
     name: str
     kind: str
     description: str
-    parameters: dict[str, Any] = Field(description="by their names in a layout, in SI units")
+    parameters: dict[str, Any] = Field(description="by name in a layout file, in SI units")

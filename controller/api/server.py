@@ -1,18 +1,17 @@
-"""The API's server and the hub of its notifications, within the control loop's event loop.
+"""API server and notification hub, running in the control loop's event loop.
 
-A `Connection` never waits. Its input is taken a line at a time, and both what it has sent and what
-it has not read are bounded. `ApiServer` serves the connections in turns, each of 0.1 ms and at most
-one request more, between which everything else runs. A turn begins with clients that touch or hold
-the lease, and waits while a touch is on its way to the wire. A connection whose input may hold a
-stop has turns of its own, which wait for nothing.
+A `Connection` never waits. Its input is processed line by line, and both its unserved input and its
+unread output are bounded. `ApiServer` serves the connections in turns of 0.1 ms plus at most one
+request; everything else runs between turns. A turn serves clients that touch or hold the lease
+first, and waits while a touch is on its way to the wire. Connections whose input may contain a stop
+have separate turns that never wait.
 
-There are places for a bounded number of clients. Further ones are in reserve, where only methods
-that silence are served, so that another client can always connect and `stop`. What takes longer,
-such as arming, runs as a task of its own. How often a topic is sent is a row of `TOPICS`
-(`controller/api/methods.py`).
+The number of clients is bounded. Additional clients get reserve connections, where only methods
+that silence are served, so that another client can always connect and `stop`. Slow methods, such as
+arming, run as tasks. `TOPICS` (`controller/api/methods.py`) defines how often each topic is sent.
 
-A request that silences is carried out before anything else of it is checked, and counts in no
-bound (`controller/api/silencing.py`). Its errors are reported afterwards.
+A request that silences is carried out before the rest of it is checked, and counts towards no
+limit (`controller/api/silencing.py`). Its errors are reported afterwards.
 """
 
 import asyncio
@@ -53,32 +52,32 @@ from drivers.errors import CommandRefused, DriverError, LinkError
 from model.errors import InputError
 from registry import threads
 
-MAX_UNREAD_BYTES = 1 << 18  # written but not read by the client; half of it by notifications
-_MAX_READ = 1 << 14  # bytes in an iteration of the event loop
-_MAX_READ_AHEAD = 1 << 16  # bytes that wait to be served
-UNREAD_TIMEOUT = 5.0  # s; for losing notifications before the connection is closed
+MAX_UNREAD_BYTES = 1 << 18  # written but not yet read by the client; notifications use at most half
+_MAX_READ = 1 << 14  # bytes per iteration of the event loop
+_MAX_READ_AHEAD = 1 << 16  # bytes waiting to be served
+UNREAD_TIMEOUT = 5.0  # s; of dropped notifications, before the connection is closed
 MAX_REQUEST_RATE = 2000.0  # 1/s, and as many in a burst
-MAX_PENDING = 8  # requests of one client that take long; those that silence are always accepted
-MAX_PENDING_STOPS = 64  # requests without responses, above which no further line is taken
+MAX_PENDING = 8  # slow requests of one client; requests that silence are always accepted
+MAX_PENDING_STOPS = 64  # requests without responses; above it no further line is read
 STOP = b'"stop"'
 
 MAX_CONNECTIONS = 32  # for all methods
-RESERVE = 8  # further ones, for the methods in reserve alone
-IDLE_TIMEOUT = 1.0  # s; without a request, after which a client may be evicted
-_QUEUE = 512  # connections that wait to be accepted, of which an iteration accepts one
-MAX_TURN = 0.0001  # s, and one request; how long a touch waits for clients
-MAX_DEFERRAL = 0.003  # s; of a turn by touches, which may follow each other without a gap
-_RECHECK = 0.0005  # s; of a turn that is deferred
+RESERVE = 8  # additional connections, for the reserve methods only
+IDLE_TIMEOUT = 1.0  # s; a client without a request for this long can be evicted
+_QUEUE = 512  # connections waiting to be accepted, one per iteration
+MAX_TURN = 0.0001  # s, plus one request; the time that a touch can wait for clients
+MAX_DEFERRAL = 0.003  # s; of a turn, by touches that follow each other without a gap
+_RECHECK = 0.0005  # s; for a deferred turn
 _RESERVE_METHODS = sorted(name for name, method in METHODS.items() if method.in_reserve)
 
-# Made anew each time: an exception that is raised again and again keeps all its tracebacks.
+# A new exception each time: an exception raised repeatedly accumulates tracebacks.
 _busy = partial(RpcError, ErrorCode.BUSY, "too many requests", remedy="send fewer per second")
 
 _logger = logging.getLogger(__name__)
 
 
 class Connection(asyncio.BufferedProtocol):
-    """A client's connection, and what the server and its methods note of the client."""
+    """A client's connection, with the server's and the methods' state of the client."""
 
     _transport: asyncio.Transport
 
@@ -87,19 +86,19 @@ class Connection(asyncio.BufferedProtocol):
         self.process = 0  # its id; 0 if unknown
         self.received_at = server.clock()  # s; when the last bytes arrived
         self.is_reserve = False  # whether it is in reserve
-        self.is_at_end = False  # whether it sends, or is served, no further line
+        self.is_at_end = False  # whether no further line is read or served
         self.pending: set[asyncio.Task[None]] = set()
         self.silenced = 0  # its stops and disarms
-        self.touched_at = -math.inf  # s; when it sent fingers, unless it has lifted them since
-        self.topics: dict[Topic, asyncio.TimerHandle | None] = {}  # subscriptions; None: unperiodic
-        self.lease = ""  # token of the last lease that it armed or renewed
-        self.number: int | None = None  # of those that have touched
+        self.touched_at = -math.inf  # s; when it last sent fingers, unless it has lifted them since
+        self.topics: dict[Topic, asyncio.TimerHandle | None] = {}  # subscriptions; None: aperiodic
+        self.lease = ""  # token of the last lease it armed or renewed
+        self.number: int | None = None  # index among the clients that have touched
         self.rate = RateLimiter(MAX_REQUEST_RATE, clock=server.clock)
         self._server = server
         self._received = memoryview(bytearray(_MAX_READ))
         self._input = bytearray()
-        self._line_end = -1  # of the next line in _input; -1: not received yet
-        self._stop_at = -1  # of the last text in _input that may be a stop; -1: none
+        self._line_end = -1  # end of the next line in _input; -1: not received yet
+        self._stop_at = -1  # position of the last possible stop in _input; -1: none
         self._lost = 0
         self._losing_since = math.inf  # s
 
@@ -110,7 +109,7 @@ class Connection(asyncio.BufferedProtocol):
 
     @property
     def has_left(self) -> bool:
-        """Whether the client has closed its side or is to be closed, or the connection is lost."""
+        """Whether the client has closed its side, is about to be closed, or is lost."""
         return self.is_at_end or not self.is_open
 
     @property
@@ -138,7 +137,7 @@ class Connection(asyncio.BufferedProtocol):
         return self._received
 
     def buffer_updated(self, nbytes: int) -> None:
-        """Keep the bytes received, undivided; pause reading while much waits to be served."""
+        """Append the bytes received; pause reading while too much waits to be served."""
         self.received_at = self._server.clock()
         before = len(self._input)
         self._input += self._received[:nbytes]
@@ -150,7 +149,7 @@ class Connection(asyncio.BufferedProtocol):
         self._server.add(self)
 
     def eof_received(self) -> bool:
-        """Finish what the client requested before it closed its side, then close."""
+        """Finish the requests sent before the client closed its side, then close."""
         self.is_at_end = True
         if self._input and not self._input.endswith(b"\n"):  # the last line may lack its line feed
             self._input += b"\n"
@@ -161,11 +160,11 @@ class Connection(asyncio.BufferedProtocol):
         return True
 
     def connection_lost(self, error: Exception | None) -> None:
-        """Report the end; pending requests are carried out all the same."""
+        """Report the end; pending requests are still carried out."""
         self._server.forget(self)
 
     def next_line(self) -> bytes:
-        """Take the next line, or all that has come of one that is too long; then read no more."""
+        """Take the next line, or the start of an overlong line and stop reading."""
         end = self._line_end if self._line_end >= 0 else len(self._input)
         line = bytes(memoryview(self._input)[:end])
         del self._input[: end + 1]
@@ -179,7 +178,7 @@ class Connection(asyncio.BufferedProtocol):
         return line
 
     def take_rest(self) -> bytes:
-        """Take all lines that wait to be served, and read no more."""
+        """Take all waiting lines, and stop reading."""
         rest = bytes(self._input)
         self._input.clear()
         self._line_end = self._stop_at = -1
@@ -188,7 +187,7 @@ class Connection(asyncio.BufferedProtocol):
         return rest
 
     def close_if_finished(self) -> None:
-        """Close after the last response, if no further line is taken from the client."""
+        """Close after the last response, if no further line is read from the client."""
         if self.is_at_end and not self.has_lines and not self.pending:
             self.close()
 
@@ -201,7 +200,7 @@ class Connection(asyncio.BufferedProtocol):
             self._transport.write(line)
 
     def notify(self, make_line: Callable[[int], bytes]) -> bool:
-        """Send a notification, made with the number of those dropped before it, or drop it too.
+        """Send a notification with the number of dropped predecessors, or drop it too.
 
         Returns whether it was dropped because the client reads too slowly.
         """
@@ -222,7 +221,7 @@ class Connection(asyncio.BufferedProtocol):
         self._transport.close()
 
     def abort(self) -> None:
-        """Close at once."""
+        """Close immediately."""
         self._transport.abort()
 
 
@@ -230,10 +229,10 @@ Handler: TypeAlias = Callable[[Connection, Any], ApiMessage | Awaitable[ApiMessa
 
 
 class _Call:
-    """A line of a client: a method with its parameters, and what is wrong with it, if anything.
+    """A line of a client: a method with its parameters, and its error, if any.
 
-    A line that silences is only identified, so that nothing delays what it does; `read` then finds
-    out what is wrong with it.
+    A line that silences is only identified at first, so that nothing delays it; `read` then finds
+    its errors.
     """
 
     def __init__(self, line: bytes) -> None:
@@ -257,7 +256,7 @@ class _Call:
             self._read()
         except InvalidRequest as error:
             self.id, self.error = error.id, error
-        except Exception as error:  # of the parameters, or a bug
+        except Exception as error:  # invalid parameters, or a bug
             self.error = error
 
     def _read(self) -> None:
@@ -273,7 +272,7 @@ class _Call:
 
     @property
     def is_limited(self) -> bool:
-        """Whether it counts in the rate of requests."""
+        """Whether it counts towards the request rate."""
         if self.silences:
             return False
         return self.error is not None or METHODS[self.method].is_limited
@@ -282,12 +281,12 @@ class _Call:
 class ApiServer:
     """Serves the methods of the API to clients on a Unix socket.
 
-    handlers: by name of all METHODS, called with the client and the parameters.
+    handlers: one for each of METHODS, by name, called with the client and the parameters.
     on_disconnect: called with every client that disconnects.
-    holds_lease: whether a client holds the arming lease, so that it must not be evicted.
-    is_busy: whether a touch is on its way to the wire, for which clients wait.
-    stop_all: stops all amplifiers where a client's stop has failed on its way.
-    clock: of the process [s].
+    holds_lease: whether a client holds the arming lease and must not be evicted.
+    is_busy: whether a touch is on its way to the wire; clients wait meanwhile.
+    stop_all: stops all amplifiers if a client's stop fails before it reaches them.
+    clock: clock of the process [s].
     """
 
     def __init__(
@@ -308,14 +307,14 @@ class ApiServer:
         self._is_busy = is_busy
         self._stop_all = stop_all
         self._listening: asyncio.Server | None = None
-        self._waiting: dict[Connection, None] = {}  # to be served, in this order
-        self._scheduled: set[bool] = set()  # turns, by whether they are for stops
+        self._waiting: dict[Connection, None] = {}  # waiting to be served, in this order
+        self._scheduled: set[bool] = set()  # scheduled turns; True: for possible stops
         self._deferred_since: float | None = None  # s
 
     async def open(self, bound: socket.socket) -> None:
         """Listen on a bound Unix socket; its permissions decide who may connect."""
         loop = asyncio.get_running_loop()
-        # asyncio accepts as many in an iteration as it lets wait.
+        # asyncio accepts as many connections per iteration as its backlog holds.
         self._listening = await loop.create_unix_server(
             partial(Connection, self), sock=bound, backlog=1
         )
@@ -336,7 +335,7 @@ class ApiServer:
         new.is_reserve = not self._has_room()
         reserve = [new, *(each for each in self.clients if each.is_reserve)]
         if new.is_reserve and len(reserve) > RESERVE:
-            # Of the process with the most of them, so that others keep their places.
+            # Evict from the process with the most connections, so that other processes keep theirs.
             counts = Counter(each.process for each in reserve)
             evicted = min(
                 (each for each in reserve if not each.pending),
@@ -348,7 +347,7 @@ class ApiServer:
             self.clients[new] = None
 
     def _has_room(self) -> bool:
-        """Whether there is a place for all methods, if need be that of the longest idle client."""
+        """Whether a full connection is free, if necessary by evicting the longest idle client."""
         full = [each for each in self.clients if not each.is_reserve]
         if len(full) < MAX_CONNECTIONS:
             return True
@@ -368,10 +367,10 @@ class ApiServer:
         self._on_disconnect(client)
 
     def add(self, client: Connection) -> None:
-        """Serve a client that has lines: with what may be a stop at once.
+        """Serve a client that has lines; immediately if one may be a stop.
 
-        Others have their turn in the next iteration but one. Data that arrived meanwhile and what
-        it wakes, such as the control loop for a touch, run first.
+        Other clients have their turn two iterations later. Data that arrived meanwhile, and the
+        tasks it wakes, such as the control loop for a touch, run first.
         """
         if not client.has_lines:
             return
@@ -385,9 +384,9 @@ class ApiServer:
                 loop.call_soon(loop.call_soon, self._take_turn, False)
 
     def _take_turn(self, is_urgent: bool) -> None:
-        """Serve a line of each client of a rank, round and round, until the turn's time is up.
+        """Serve one line of each client of a rank in rotation, until the turn's time is up.
 
-        Of each rank at least one line, so that none keeps the next one waiting for ever.
+        Serves at least one line of each rank, so that no rank blocks the next one forever.
         """
         if not is_urgent and self._is_deferred():
             asyncio.get_running_loop().call_later(_RECHECK, self._take_turn, False)
@@ -402,13 +401,13 @@ class ApiServer:
                     self._waiting.pop(client, None)
                     if client.has_lines:
                         self._serve(client, client.next_line())
-                    if client.has_lines:  # behind the others
+                    if client.has_lines:  # to the end of the queue
                         self._waiting[client] = None
                         clients.append(client)
                     client.close_if_finished()
                     if time.perf_counter() >= end:
                         break
-        finally:  # whatever fails: others wait, perhaps with a stop
+        finally:  # after any failure: others are waiting, perhaps with a stop
             for each in [*self._waiting]:
                 self.add(each)
 
@@ -424,13 +423,13 @@ class ApiServer:
         return self._deferred_since is not None
 
     def _rank(self, client: Connection) -> int:
-        """Its place in turns: 0 with what may be a stop, 1 if it touches or holds the lease."""
-        # Fingers that a client no longer reports count as lifted.
+        """Return a client's rank: 0 for a possible stop, 1 if it touches or holds the lease."""
+        # Fingers that the client no longer reports count as lifted.
         touches = self.clock() - client.touched_at <= CONTACT_TIMEOUT
         return 0 if client.is_urgent else 1 if touches or self._holds_lease(client) else 2
 
     def _serve(self, client: Connection, line: bytes) -> None:
-        """Carry out a line of a client, or start to; respond if it has ended."""
+        """Carry out a line of a client, or start a task for it; respond if it is finished."""
         call = _Call(line)
         if call.is_limited and not client.rate.take():
             if call.error is not None:
@@ -457,13 +456,13 @@ class ApiServer:
         task.add_done_callback(lambda task: self._finished(client, task))
 
     def _end_input(self, client: Connection) -> None:
-        """Serve no further line of a client, but for what silences in the rest of its input."""
+        """Serve no further line of a client, except remaining requests that silence."""
         rest = client.take_rest()
         if read_silencing(rest) is not None:
             self._serve(client, rest)
 
     def _note(self, client: Connection, call: _Call) -> None:
-        """Note that a client silences or touches."""
+        """Record that a client silences or touches."""
         client.silenced += METHODS[call.method].silences
         if isinstance(call.params, TouchParams):
             client.touched_at = self.clock() if call.params.touches else -math.inf
@@ -471,7 +470,7 @@ class ApiServer:
     def _handler(
         self, client: Connection, call: _Call
     ) -> Callable[[], ApiMessage | Awaitable[ApiMessage]]:
-        """The handler of a call; that of an arm waits until more of the input is read."""
+        """Return the handler of a call; an arm handler first waits for more input."""
         method = METHODS[call.method]
         handle = partial(self._handlers[call.method], client, call.params)
         if not method.needs_reply:
@@ -481,7 +480,7 @@ class ApiServer:
         return partial(_for_one_who_stays, client, client.silenced, handle)
 
     def _check(self, client: Connection, call: _Call) -> None:
-        """Raise why a call is not carried out; one that silences always is."""
+        """Raise an error if a call must not be carried out; calls that silence always are."""
         if call.error is not None:
             raise call.error
         if client.is_reserve and not METHODS[call.method].in_reserve:
@@ -524,11 +523,11 @@ class ApiServer:
 async def _for_one_who_stays(
     client: Connection, silenced: int, handle: Callable[[], ApiMessage | Awaitable[ApiMessage]]
 ) -> ApiMessage:
-    """Handle a request of a client that has not left, or silenced all, with the same bytes.
+    """Handle a request, unless the client leaves or silences all amplifiers in the same bytes.
 
-    silenced: its stops and disarms before the request.
+    silenced: number of its stops and disarms before the request.
     """
-    for _ in range(2):  # iterations in which its end is received
+    for _ in range(2):  # iterations that receive the end of its input
         await asyncio.sleep(0)
     if client.silenced != silenced:
         raise RpcError(ErrorCode.LEASE, "stopped or disarmed meanwhile", remedy="arm again")
@@ -539,7 +538,7 @@ async def _for_one_who_stays(
 
 
 def _rpc_error(error: Exception) -> RpcError:
-    """Translate an exception for the client; the details of a bug go to the log alone."""
+    """Translate an exception for the client; the details of a bug go only to the log."""
     match error:
         case RpcError():
             return error
@@ -560,9 +559,9 @@ def _rpc_error(error: Exception) -> RpcError:
 
 
 def _carried_out_despite(error: RpcError, method: str) -> RpcError:
-    """The error of a request that silences, which was carried out."""
+    """Return the error of a request that silences and was carried out."""
     data = error.data
-    what = f"{data.what} ({method} was carried out all the same)"
+    what = f"{data.what} ({method} was carried out nevertheless)"
     return RpcError(error.code, what, where=data.where, remedy=data.remedy)
 
 
@@ -572,7 +571,7 @@ DEFAULT_RATE = 10.0  # Hz
 class Hub:
     """Sends notifications to subscribers.
 
-    current: makes the present data of a topic, None if it has none.
+    current: returns the current data of a topic, or None.
     """
 
     def __init__(
@@ -583,18 +582,18 @@ class Hub:
     ) -> None:
         self._current = current
         self._clock = clock
-        self._subscribers: dict[Connection, None] = {}  # in the order of their first subscription
+        self._subscribers: dict[Connection, None] = {}  # ordered by first subscription
         self._newest: dict[Topic, Callable[[], ApiMessage | None]] = {}
         self._flush: asyncio.TimerHandle | None = None
         self._flushed_at = -1.0
         self._failing: set[Topic] = set()
         self.lost = Counter[str]()
-        """Notifications that were dropped, as their clients read too slowly, by topic."""
+        """Number of notifications dropped because clients read too slowly, by topic."""
 
     def subscribe(
         self, connection: Connection, topics: Iterable[Topic], *, rate: float | None = None
     ) -> None:
-        """Add topics, and send their current data; rate [Hz]: of those that are periodic."""
+        """Add topics, and send their current data; rate [Hz]: rate of periodic topics."""
         new = sorted(set(topics))
         self.unsubscribe(connection, new)
         self._subscribers[connection] = None
@@ -627,7 +626,7 @@ class Hub:
             return
         if not self._subscribers:
             return
-        self._newest.pop(topic, None)  # sent in the order of the newest
+        self._newest.pop(topic, None)  # sent in order of the newest change
         self._newest[topic] = make_data
         if self._flush is None:
             delay = max(0.0, self._flushed_at + 1 / MAX_RATE - self._clock())
@@ -661,9 +660,9 @@ class Hub:
         try:
             message = make_data()
             data = b"" if message is None else message.model_dump_json().encode()
-        except Exception:  # the next change is sent all the same
-            if topic not in self._failing:  # once; marked, as the log is a topic too
-                _logger.exception("topic %s: data not made", topic, extra={"topic": topic})
+        except Exception:  # the next change is still sent
+            if topic not in self._failing:  # log once; marked, because the log is also a topic
+                _logger.exception("topic %s: no data made", topic, extra={"topic": topic})
             self._failing.add(topic)
             return
         self._failing.discard(topic)

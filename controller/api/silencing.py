@@ -1,8 +1,8 @@
-"""Requests that silence the plate, `stop` and `disarm`, read leniently.
+"""Lenient parsing of requests that silence the plate: `stop` and `disarm`.
 
-A newer client must be able to stop an older daemon, and a client with a mistake must be able to
-stop at all. So a request that silences is identified by its method alone, and is carried out
-whatever else is wrong with it; the error is reported afterwards.
+A newer client must be able to stop an older daemon, and so must a client with a bug. A request that
+silences is therefore identified by its method alone, and is carried out in spite of any other
+error; the error is reported afterwards.
 """
 
 import re
@@ -14,13 +14,13 @@ from controller.api.jsonrpc import parse_json
 from controller.api.methods import METHODS
 from controller.api.schema import ApiMessage
 
-_PRECEDENCE = ("stop", "disarm")  # of the methods that silence, where a line names both
-_MARKS = (*(name.encode() for name in _PRECEDENCE), b"\\u")  # any line that silences has one
+_PRECEDENCE = ("stop", "disarm")  # if a line names both methods
+_MARKS = (*(name.encode() for name in _PRECEDENCE), b"\\u")  # every line that silences contains one
 _NAMED = re.compile(rb'"method"\s*:\s*"(%s)"' % "|".join(_PRECEDENCE).encode())
 
 
 class SilencingRequest(NamedTuple):
-    """A method that silences, with those of its parameters that can be read."""
+    """A method that silences, with its readable parameters."""
 
     method: str
     params: ApiMessage
@@ -29,14 +29,14 @@ class SilencingRequest(NamedTuple):
 def read_silencing(line: bytes) -> SilencingRequest | None:
     """Identify a request that silences; None if the line names no such method. Never fails.
 
-    The method is looked up where a request has it, in a batch in each of its requests. A line that
-    is not JSON, repeats a key or exceeds a bound is searched as text, at any depth.
+    Reads the method key of the request, or of each request of a batch. A line that is not JSON,
+    repeats a key or exceeds a bound is searched as text, at any depth.
     """
     if not any(mark in line for mark in _MARKS):
         return None
     try:
         document = parse_json(line)
-    except Exception:  # also of a bug: the text decides
+    except Exception:  # including bugs: the text decides
         return _search(line)
     batch = document if isinstance(document, list) else [document]
     requests = [request for request in batch if isinstance(request, dict)]
@@ -57,11 +57,11 @@ def _search(text: bytes) -> SilencingRequest | None:
 
 
 def readable_params(method: str, given: object) -> ApiMessage:
-    """The parameters of a method that silences: each one that is valid, defaults for all others."""
+    """Return the parameters of a method that silences, with defaults for invalid ones."""
     model = METHODS[method].params
     params: dict[str, Any] = {}
     if isinstance(given, Mapping):
         for name in model.model_fields.keys() & given.keys():
-            with suppress(Exception):  # whatever is wrong with it
+            with suppress(Exception):  # any error: use the default
                 params[name] = getattr(model(**{name: given[name]}), name)
     return model(**params)

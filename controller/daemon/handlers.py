@@ -1,4 +1,4 @@
-"""The methods of the API, implemented by the daemon."""
+"""API methods, implemented by the daemon."""
 
 import asyncio
 import itertools
@@ -70,13 +70,13 @@ _logger = logging.getLogger(__name__)
 PLAY_RADIUS = 0.020
 """Largest distance [m] from the position of a requested effect to the finger that feels it."""
 
-_SAVE_TIMEOUT = 0.2  # s; of what is being written when the daemon ends
+_SAVE_TIMEOUT = 0.2  # s; for a pending write when the daemon ends
 
 _ENABLED = DaemonState.OPERATION_ENABLED
 
 
 class ApiService:
-    """Handles requests of clients. Arming takes a lease; every client may disarm and stop."""
+    """Handles requests of clients. Arming takes a lease; every client can disarm and stop."""
 
     def __init__(
         self,
@@ -98,18 +98,18 @@ class ApiService:
         self._reload = reload
         self._next_number = itertools.count(1)
         self._started = threads.now()
-        self._clients = set[Connection]()  # that are connected and have said or done something
+        self._clients = set[Connection]()  # connected, and active at least once
         self._strengths = layouts.player.strengths
         self._saving: asyncio.Task[None] | None = None
-        self._save_problem = ""  # of the last attempt
-        self._preparing = asyncio.Lock()  # of what is played, for which clients wait
+        self._save_problem = ""  # error of the last attempt
+        self._preparing = asyncio.Lock()  # held while an effect that a client plays is prepared
 
     def handlers(self) -> Mapping[str, Handler]:
         """Handlers by method name."""
         return {name: getattr(self, name) for name in METHODS}
 
     def client_left(self, client: Connection) -> None:
-        """Release what a disconnected client holds; lift its fingers."""
+        """Release the lease and subscriptions of a disconnected client; lift its fingers."""
         self._publisher.hub.forget(client)
         if client.number is not None:
             self._controller.cycle.lift(f"{_origin(client)}:")
@@ -117,7 +117,7 @@ class ApiService:
         self._clients_changed()
 
     def _clients_changed(self) -> None:
-        """Pass the names of all clients on to the strengths, which the control loop reads."""
+        """Pass the names of all clients to the strengths, which the control loop reads."""
         names = [(_origin(client), client.name) for client in self._clients]
         self._strengths.clients = tuple(names)
 
@@ -128,11 +128,11 @@ class ApiService:
 
     @api_method(in_reserve=True)
     def hello(self, client: Connection, params: HelloParams) -> HelloResult:
-        """Introduce the client; returns what the daemon drives."""
+        """Introduce the client; returns the daemon's rig, table and layout."""
         client.name = params.client
         self._clients.add(client)
         self._clients_changed()
-        if self._strengths.gains_db:  # its fingers may rest
+        if self._strengths.gains_db:  # fingers of this client may be resting
             self._controller.cycle.request_update()
         return hello_result(
             self._config,
@@ -144,7 +144,7 @@ class ApiService:
 
     @api_method(in_reserve=True)
     def status(self, client: Connection, params: Empty) -> StatusResult:
-        """Show daemon, amplifiers and contacts."""
+        """Show the state of daemon, amplifiers and contacts."""
         operation, view, now = self._supervisor.operation, self._publisher.view, threads.now()
         lease = operation.lease_at(now)
         return StatusResult(
@@ -181,7 +181,7 @@ class ApiService:
     @api_method(needs_reply=True, is_repeated=False)
     async def arm(self, client: Connection, params: ArmParams) -> ArmResult:
         """Switch the high voltage on. Touches are felt until the lease expires."""
-        if self._supervisor.operation.is_lease_over(threads.now()):  # what plays is not inherited
+        if self._supervisor.operation.is_lease_over(threads.now()):  # current playback ends
             await self._supervisor.handle(LEASE_OVER)
         lease = Lease(params.owner, params.lease_s)
         cause = f"armed by {params.owner!a}"
@@ -199,7 +199,7 @@ class ApiService:
             self._supervisor.withdraw(lease.token, "arming failed")
             raise
         client.lease = lease.token
-        # After the reply was sent, or failed to be sent.
+        # After the reply was sent, or could not be sent.
         asyncio.get_running_loop().call_soon(self._check_holder, client, lease.token)
         return ArmResult(lease=lease.token, lease_s=lease.duration)
 
@@ -216,11 +216,11 @@ class ApiService:
     async def disarm(self, client: Connection, params: DisarmParams) -> Empty:
         """Ramp to silence, then switch the high voltage off.
 
-        Any client may. While a link is lost it stops all amplifiers.
+        Any client can disarm. While a link is lost, this stops all amplifiers.
         """
         if params.lease is not None:
             check_lease(self._supervisor.operation.lease, params.lease, threads.now())
-        if self._supervisor.operation.state is DaemonState.COMM_LOST:  # then a stop is all there is
+        if self._supervisor.operation.state is DaemonState.COMM_LOST:  # only a stop is possible
             await self.stop(client, params)
         cause = f"disarmed by {params.client or client.name!a}"
         await self._supervisor.handle(DaemonEvent(Trigger.DISARM, cause))
@@ -233,15 +233,15 @@ class ApiService:
     def stop(self, client: Connection, params: RequestedBy) -> Awaitable[StopResult]:
         """Quick-stop all amplifiers, latched until clear.
 
-        Not an emergency stop. Any client can stop, at any time; error 1006 unless every amplifier
-        is confirmed silent.
+        Not an emergency stop. Any client can stop at any time. Error 1006 unless every amplifier is
+        confirmed silent.
         """
         # The requests to the amplifiers are queued when this returns.
         cause = f"stopped by {params.client or client.name!a}"
         stopping = self._supervisor.stop(cause, "clear (era clear), then arm again")
         return _silence(stopping, self._supervisor.operation.epoch)
 
-    @api_method(is_repeated=False)  # sent again, it would acknowledge a stop that came meanwhile
+    @api_method(is_repeated=False)  # a repetition would acknowledge a stop that came meanwhile
     async def clear(self, client: Connection, params: ClearParams) -> Empty:
         """Clear a stop, or a fault that no longer exists. Stays disarmed."""
         operation = self._supervisor.operation
@@ -251,10 +251,10 @@ class ApiService:
             if params.epoch not in (None, operation.epoch):
                 raise RpcError(
                     ErrorCode.WRONG_STATE,
-                    f"epoch must be that of what is latched now, {operation.epoch}, got "
-                    f"{params.epoch}: another stop, fault or loss came since",
+                    f"epoch must be the current one, {operation.epoch}, got "
+                    f"{params.epoch}: there was another stop, fault or loss since",
                     where="epoch",
-                    remedy="look at the status, then clear again",
+                    remedy="check the status, then clear again",
                 )
             await self._supervisor.handle(
                 DaemonEvent(Trigger.CLEAR, f"acknowledged by {params.client or client.name!a}")
@@ -266,7 +266,7 @@ class ApiService:
 
     @api_method(is_limited=False)  # the newest frame counts, so they never queue up
     def touch(self, client: Connection, params: TouchParams) -> Empty:
-        """Report all fingers of a touch source of this client."""
+        """Report all fingers of one touch source of this client."""
         if client.number is None:
             client.number = next(self._next_number)
             self._clients.add(client)
@@ -283,17 +283,17 @@ class ApiService:
             )
             for point in params.touches
         )
-        # The same source name of two clients denotes two sources.
+        # Two clients with the same source name are two sources.
         name = f"{origin}:{params.source}"
         self._controller.cycle.deliver(TouchFrame(name, client.received_at, touches, origin=origin))
         return Empty()
 
     @api_method()
     def layout(self, client: Connection, params: LayoutParams) -> LayoutResult:
-        """Use one of the daemon's layouts.
+        """Switch to another of the daemon's layouts.
 
-        Of resting fingers, what ends by itself and what a program plays goes on to its end; what
-        lasts follows the new layout at once.
+        Continuous effects under resting fingers change immediately. Effects of limited duration,
+        and effects that a program plays, continue to their end.
         """
         self._layouts.use(params.name)
         return LayoutResult(layout=params.name, layouts=self._layouts.names)
@@ -302,19 +302,19 @@ class ApiService:
     def reload(self, client: Connection, params: Empty) -> Awaitable[ReloadResult]:
         """Read the daemon's files again and apply their layouts.
 
-        Any other change is refused, and needs a restart.
+        All other changes are rejected; they need a restart.
         """
         return self._reload()
 
     @api_method()
     def effects(self, client: Connection, params: Empty) -> EffectsResult:
-        """List the effects."""
+        """List the available effects."""
         return effects_result(self._layouts.player.layout)
 
     @api_method(is_repeated=False)
     async def play(self, client: Connection, params: PlayParams) -> Empty:
-        """Play an effect, or points, at a finger; only while armed."""
-        # At the contact nearest to the position, at the effect's own level or below.
+        """Play an effect, or points and taps, at a finger; only while armed."""
+        # At the contact nearest to the position, at most at the effect's own level.
         name, effect, level_max = self._played(params)
         level = params.level_db_sl
         if level is not None and not MIN_DB_SL <= level <= level_max:
@@ -323,12 +323,12 @@ class ApiService:
                 ErrorCode.REFUSED,
                 f"level{whose} must be from {MIN_DB_SL:g} to {level_max:g} dB SL, got {level:g}",
                 where="level_db_sl",
-                remedy="choose one of these, or another level in the surface layout",
+                remedy="choose a level in this range, or change the level in the surface layout",
             )
         contact = self._nearest(params)
         if not effect.is_prepared(effect.level_db_sl if level is None else level):
-            epoch = self._supervisor.operation.epoch  # before, so that a stop meanwhile is seen
-            made = effect.for_table(self._table.frequencies)  # its renditions are its own
+            epoch = self._supervisor.operation.epoch  # read first, to detect a stop meanwhile
+            made = effect.for_table(self._table.frequencies)  # a copy with its own renditions
             work = partial(made.prepare, made.level_db_sl if level is None else level)
             async with self._preparing:
                 await in_thread(work, name="content")
@@ -350,7 +350,7 @@ class ApiService:
         return Empty()
 
     def _nearest(self, params: PlayParams) -> Contact:
-        """Return the contact at which is played; raises RpcError without one, or if disarmed."""
+        """Return the contact to play at; raises RpcError without one, or if disarmed."""
         operation = self._supervisor.operation
         if operation.state is not _ENABLED or self._controller.group.members.degraded:
             raise _wrong_state(operation)
@@ -374,12 +374,12 @@ class ApiService:
         return nearest
 
     def _played(self, params: PlayParams) -> tuple[str, Effect, float]:
-        """Return what is to be played: its name, effect and highest level; raises RpcError."""
+        """Return name, effect and highest level to play; raises RpcError."""
         layout, is_made = self._layouts.player.layout, bool(params.points or params.taps)
         if (params.effect is None) != is_made:
             raise RpcError(
                 ErrorCode.INVALID_PARAMS,
-                "play must have an effect, or points and taps, got both or neither",
+                "play must have either an effect, or points and taps, got both or neither",
                 where="effect",
                 remedy="leave one of them out",
             )
@@ -406,7 +406,7 @@ class ApiService:
         if not isinstance(effect, File):
             raise RpcError(
                 ErrorCode.REFUSED,
-                f"loop must be left out of effect {name!a}, which is no file",
+                f"loop must be left out for effect {name!a}, which is not a file",
                 where="loop",
             )
         return name, effect.model_copy(update={"loop": True}), level
@@ -415,8 +415,7 @@ class ApiService:
     def strength(self, client: Connection, params: StrengthParams) -> StrengthResult:
         """Set or show the strength of a source, client or region.
 
-        The name is that of a touch source, a client or a region; the status shows all strengths.
-        Active effects are faded to it within 100 ms.
+        The status shows all strengths. Active effects fade to the new strength within 100 ms.
         """
         known, name = self._publisher.strengths().strengths, params.name
         if name not in known:
@@ -434,28 +433,28 @@ class ApiService:
         return StrengthResult(strengths={name: self._strengths.gains_db.get(name, 0.0)})
 
     async def _save_strengths(self) -> None:
-        """Keep the strengths, the newest last; no request waits for the disk."""
+        """Save the strengths; no request waits for the disk."""
         saved: Mapping[str, float] | None = None
         while (file := self._config.strengths) and saved is not self._strengths.gains_db:
             saved = self._strengths.gains_db
             try:
                 await asyncio.to_thread(self._strengths.save, file)
-            except (OSError, RuntimeError) as error:  # no thread is left
-                if self._save_problem != str(error):  # said once
-                    _logger.error("strengths: not kept: %s", error)
+            except (OSError, RuntimeError) as error:  # no thread available
+                if self._save_problem != str(error):  # log it once
+                    _logger.error("strengths: not saved: %s", error)
                 self._save_problem = str(error)
             else:
                 self._save_problem = ""
 
     async def close(self) -> None:
-        """Wait until the strengths are kept, 0.2 s at most."""
+        """Wait until the strengths are saved, at most 0.2 s."""
         if self._saving is not None:
             with suppress(TimeoutError):
                 await asyncio.wait_for(self._saving, _SAVE_TIMEOUT)
 
     @api_method(over_http=False)
     def subscribe(self, client: Connection, params: SubscribeParams) -> Empty:
-        """Receive notifications of topics."""
+        """Subscribe to notifications of topics."""
         # After the reply, so that no event precedes it.
         asyncio.get_running_loop().call_soon(self._subscribe_now, client, params)
         return Empty()
@@ -466,7 +465,7 @@ class ApiService:
 
     @api_method(over_http=False)
     def unsubscribe(self, client: Connection, params: UnsubscribeParams) -> Empty:
-        """Receive no more notifications of topics."""
+        """Unsubscribe from notifications of topics."""
         self._publisher.hub.unsubscribe(client, params.topics)
         return Empty()
 
@@ -477,29 +476,29 @@ class ApiService:
 
 
 def check_lease(lease: Lease | None, token: str, now: float) -> Lease:
-    """Return a lease; raises RpcError if it has expired [s], or is not that of a token."""
+    """Return the lease; raises RpcError if it has expired, or has another token."""
     if lease is None or now >= lease.expires_at:
         raise RpcError(ErrorCode.LEASE, "lease has expired", remedy="arm again")
     if not secrets.compare_digest(lease.token.encode(), token.encode()):
         raise RpcError(
             ErrorCode.LEASE,
             f"lease belongs to {lease.owner!a}",
-            remedy="wait until it expires, or disarm first: every client may",
+            remedy="wait until it expires, or disarm first: any client can",
         )
     return lease
 
 
 def _origin(client: Connection) -> str:
-    """Return the origin of a client's touches, with which the names of its sources begin."""
+    """Return the origin of a client's touches: the prefix of its source names."""
     return f"{API_SOURCES}:{client.number}"
 
 
 def _armed_already(operation: Operation) -> RpcError:
-    """Return the error of a client that arms what another has armed, or is arming."""
+    """Return the error for arming while another client has armed, or is arming."""
     what, lease = "another client is arming", operation.lease
     if operation.state is _ENABLED and lease is not None:
         what = f"armed by {lease.owner!a} for {lease.expires_at - threads.now():.1f} s more"
-    return RpcError(ErrorCode.LEASE, what, remedy="wait, or disarm first: every client may")
+    return RpcError(ErrorCode.LEASE, what, remedy="wait, or disarm first: any client can")
 
 
 async def _silence(stopping: Awaitable[Mapping[str, StopOutcome]], epoch: int) -> StopResult:

@@ -2,35 +2,35 @@
 
 /** Every method by name: its parameters and its result. */
 export interface Methods {
-  /** Introduce the client; returns what the daemon drives. */
+  /** Introduce the client; returns the daemon's rig, table and layout. */
   hello: { params: HelloParams; result: HelloResult };
-  /** Show daemon, amplifiers and contacts. */
+  /** Show the state of daemon, amplifiers and contacts. */
   status: { params: Empty; result: StatusResult };
   /** Switch the high voltage on. Touches are felt until the lease expires. */
   arm: { params: ArmParams; result: ArmResult };
   /** Extend the lease. */
   renew: { params: RenewParams; result: RenewResult };
-  /** Ramp to silence, then switch the high voltage off. Any client may. While a link is lost it stops all amplifiers. */
+  /** Ramp to silence, then switch the high voltage off. Any client can disarm. While a link is lost, this stops all amplifiers. */
   disarm: { params: DisarmParams; result: Empty };
-  /** Quick-stop all amplifiers, latched until clear. Not an emergency stop. Any client can stop, at any time; error 1006 unless every amplifier is confirmed silent. */
+  /** Quick-stop all amplifiers, latched until clear. Not an emergency stop. Any client can stop at any time. Error 1006 unless every amplifier is confirmed silent. */
   stop: { params: RequestedBy; result: StopResult };
   /** Clear a stop, or a fault that no longer exists. Stays disarmed. */
   clear: { params: ClearParams; result: Empty };
-  /** Report all fingers of a touch source of this client. */
+  /** Report all fingers of one touch source of this client. */
   touch: { params: TouchParams; result: Empty };
-  /** Use one of the daemon's layouts. Of resting fingers, what ends by itself and what a program plays goes on to its end; what lasts follows the new layout at once. */
+  /** Switch to another of the daemon's layouts. Continuous effects under resting fingers change immediately. Effects of limited duration, and effects that a program plays, continue to their end. */
   layout: { params: LayoutParams; result: LayoutResult };
-  /** Read the daemon's files again and apply their layouts. Any other change is refused, and needs a restart. */
+  /** Read the daemon's files again and apply their layouts. All other changes are rejected; they need a restart. */
   reload: { params: Empty; result: ReloadResult };
-  /** List the effects. */
+  /** List the available effects. */
   effects: { params: Empty; result: EffectsResult };
-  /** Play an effect, or points, at a finger; only while armed. */
+  /** Play an effect, or points and taps, at a finger; only while armed. */
   play: { params: PlayParams; result: Empty };
-  /** Set or show the strength of a source, client or region. The name is that of a touch source, a client or a region; the status shows all strengths. Active effects are faded to it within 100 ms. */
+  /** Set or show the strength of a source, client or region. The status shows all strengths. Active effects fade to the new strength within 100 ms. */
   strength: { params: StrengthParams; result: StrengthResult };
-  /** Receive notifications of topics. */
+  /** Subscribe to notifications of topics. */
   subscribe: { params: SubscribeParams; result: Empty };
-  /** Receive no more notifications of topics. */
+  /** Unsubscribe from notifications of topics. */
   unsubscribe: { params: UnsubscribeParams; result: Empty };
 }
 export type Method = keyof Methods;
@@ -41,21 +41,21 @@ export interface Topics {
   state: StateEvent;
   /** fingers touched, moved or lifted */
   contacts: ContactsEvent;
-  /** what plays now, as the amplifiers confirmed it */
+  /** the current playback, as confirmed by the amplifiers */
   pattern: PatternEvent;
-  /** nothing plays now, and why */
+  /** playback has ended, and why */
   silence: SilenceEvent;
   /** status of the amplifiers, at rate_hz */
   amplifiers: AmplifiersEvent;
   /** latency from touch to command, at rate_hz */
   latency: LatencyEvent;
-  /** log records from level info, without those of `state` and `link` */
+  /** log records of level info and above, except state and link changes */
   log: LogEvent;
-  /** links to amplifiers that were degraded, lost or reopened */
+  /** an amplifier link was degraded, lost or reopened */
   link: LinkEvent;
-  /** another surface layout is in use, or it was replaced */
+  /** the surface layout was changed or replaced */
   layout: LayoutEvent;
-  /** touch inputs that are missing, mute or back; rejected touches, each second */
+  /** touch inputs lost, mute or restored; rejected touches, every second */
   inputs: InputsEvent;
   /** strengths of sources, clients and regions, at rate_hz */
   strength: StrengthResult;
@@ -77,7 +77,7 @@ export interface HelloParams {
   client: string;
 }
 
-/** Rig, table and layout of the daemon; constant while it runs, except for the layout. */
+/** Rig, table and layout of the daemon; only the layout can change while it runs. */
 export interface HelloResult {
   /** major.minor; major versions are incompatible */
   api_version: string;
@@ -88,7 +88,7 @@ export interface HelloResult {
   rig_text: string;
   /** the surface layout; null without one */
   layout: Record<string, unknown> | null;
-  /** of amplifiers, for a page: name, unit, decimals, by the key in their status */
+  /** amplifier readings that a page shows: label, unit and decimals by status key */
   readings?: Record<string, [string, string, number]>;
 }
 
@@ -98,31 +98,31 @@ export interface Empty {
 
 /** State of the daemon, the amplifiers and the plate. */
 export interface StatusResult {
-  /** why it is so */
+  /** cause of the state */
   cause: string;
   /** what to do about it; null if nothing */
   remedy: string | null;
   /** in order of arrival, newest last */
   contacts: Array<ContactStatus>;
-  /** of the newest content, by ERA, without silent ones */
+  /** tones of the newest content by ERA; silent ERAs are omitted */
   drive: Record<string, PlayedTone>;
-  /** what plays of each content, by layer, then as `drive`; they add up */
+  /** tones of each content by layer, then by ERA as in `drive`; layers add up */
   layers?: Record<string, Record<string, PlayedTone>>;
-  /** felt contrast, target over loudest quiet finger, that nine of ten plates within the rig's uncertainty give; null for a single finger */
+  /** felt contrast, target over loudest quiet finger, that 90 % of plates within the rig's tolerances reach; null for a single finger */
   promised_contrast_db?: number | null;
-  /** the same, nominal */
+  /** the same on the nominal plate */
   predicted_contrast_db?: number | null;
   predicted_level_db_sl: number | null;
-  /** gain in dB by name, 0 where none is set: of the inputs of the configuration, sources that had fingers, clients that are connected, regions of the layout in use, and what else is set */
+  /** gain in dB by name, 0 if none is set: configured inputs, sources that have had fingers, connected clients, regions of the current layout, and any other name with a gain */
   strengths?: Record<string, number>;
   /** time of this response on CLOCK_MONOTONIC */
   time_s: number;
   /** the same time on the wall clock */
   unix_time_s: number;
   state: "NOT_READY" | "SWITCH_ON_DISABLED" | "READY_TO_SWITCH_ON" | "SWITCHED_ON" | "OPERATION_ENABLED" | "QUICK_STOP_ACTIVE" | "FAULT_REACTION_ACTIVE" | "FAULT" | "COMM_LOST";
-  /** the state in a word for people */
+  /** the state in plain words */
   word?: string;
-  /** rises with every change of state, stop, fault and loss; begins by chance */
+  /** increases with every state change, stop, fault and loss; starts at random */
   epoch: number;
   /** whether lost amplifiers may still be playing */
   assume_energised: boolean;
@@ -132,41 +132,41 @@ export interface StatusResult {
   watchdog_s: number;
   armed_by: string | null;
   lease_left_s: number | null;
-  /** why nothing plays although armed */
+  /** why nothing plays while armed */
   silence_reason?: string | null;
   amplifiers: Array<AmplifierStatus>;
-  /** of touches: a finger came, moved or pressed harder or less */
+  /** after a finger came, moved or changed its pressure */
   latency_ms: LatencySummary;
-  /** of lifts, and of all that changes without a touch, as an effect's end */
+  /** after a lift, or a change without a touch, such as the end of an effect */
   lift_latency_ms?: LatencySummary | null;
   /** number by reason, of all sources */
   rejected_touches: Record<string, number>;
-  /** the newest of each reason: what came, and from where */
+  /** the newest of each reason: its content and its source */
   rejected_examples?: Record<string, string>;
-  /** touch inputs of the configuration */
+  /** configured touch inputs */
   inputs?: Array<TouchInputStatus>;
-  /** short vibrations that came too late to be felt; the plate plays on */
+  /** short vibrations that came too late to be felt; playback continues */
   clicks_too_late?: number;
   /** notifications that clients were too slow to read, by topic */
   lost_events?: Record<string, number>;
-  /** name of the layout in use; null without any */
+  /** name of the current layout; null if there is none */
   layout?: string | null;
   /** names that `layout` accepts */
   layouts?: Array<string>;
-  /** why answers take longer than they need */
+  /** why table queries take longer than necessary */
   slow_reason?: string | null;
   /** name of the rig's threshold set, to which levels in dB SL are relative */
   threshold?: string | null;
   uptime_s: number;
 }
 
-/** Who arms, and how long the lease lasts without renewal. */
+/** Who arms, and the duration of the lease without renewal. */
 export interface ArmParams {
   owner: string;
   lease_s?: number;
 }
 
-/** The lease, to be renewed within lease_s. */
+/** The lease; renew it within lease_s. */
 export interface ArmResult {
   lease_s: number;
   lease: string;
@@ -185,31 +185,31 @@ export interface RenewResult {
 /** Whose lease to end. */
 export interface DisarmParams {
   client?: string | null;
-  /** disarm only while this lease lasts; null: whoever armed */
+  /** disarm only if this lease is current; null: under any lease */
   lease?: string | null;
 }
 
-/** Who requests it, for the log, if it is not the connection's own client. */
+/** Name for the log, if another client than that of the connection makes the request. */
 export interface RequestedBy {
   client?: string | null;
 }
 
 /** Every amplifier is confirmed silent. */
 export interface StopResult {
-  /** rises with every change of state, stop, fault and loss; begins by chance */
+  /** increases with every state change, stop, fault and loss; starts at random */
   epoch: number;
   /** by name */
   amplifiers?: Record<string, AmplifierSilence>;
 }
 
-/** What is acknowledged; a later stop, fault or loss is not. */
+/** The epoch up to which to acknowledge; a later stop, fault or loss stays latched. */
 export interface ClearParams {
   client?: string | null;
-  /** as last seen in a status, stop or state event; null: whatever is latched */
+  /** as last received in a status, stop or state event; null: the current one */
   epoch?: number | null;
 }
 
-/** All fingers of one source of this client; valid for 150 ms, to be repeated. */
+/** All fingers of one source of this client; valid for 150 ms, so repeat it. */
 export interface TouchParams {
   source: string;
   touches: Array<TouchPoint>;
@@ -221,17 +221,17 @@ export interface LayoutParams {
   name: string;
 }
 
-/** The layout in use, and all that may be used. */
+/** The current layout, and all available ones. */
 export interface LayoutResult {
   layout: string;
   layouts: Array<string>;
 }
 
-/** What came of reading the daemon's files again. */
+/** Result of reading the daemon's files again. */
 export interface ReloadResult {
-  /** whether they are in use now; else all is as before */
+  /** whether the new files are in use; if not, nothing changed */
   reloaded: boolean;
-  /** what has changed; if refused, why */
+  /** the changes, or the reasons for rejection */
   reasons: Array<string>;
 }
 
@@ -242,58 +242,58 @@ export interface EffectsResult {
 
 /** Play an effect, or points, at the finger nearest to a position; they end when it lifts. */
 export interface PlayParams {
-  /** of the layout, or a named content; null where points or taps are given */
+  /** an effect of the layout or a built-in content; null with points or taps */
   effect?: string | null;
   /** a finger must be within 20 mm of the position */
   x_m: number;
   y_m: number;
-  /** from -20; at most, and by default, the effect's own; of points by default 20, at most the highest of the layout */
+  /** -20 or more. For an effect, default and maximum are its own level; for points, the default is 20 and the maximum is that of the layout */
   level_db_sl?: number | null;
-  /** of what lasts: `[time_s, intensity, sharpness]` in order of time, 0 to 60 s, 0 to 1 */
+  /** continuous event: `[time_s, intensity, sharpness]` in order of time; 0 to 60 s, 0 to 1, 0 to 1 */
   points?: Array<Array<number>>;
-  /** short ones beside it, in the same way */
+  /** transients, in the same format */
   taps?: Array<Array<number>>;
-  /** whether points or a file begin anew at their end */
+  /** whether points or a file repeat from the start */
   loop?: boolean;
 }
 
-/** A touch source, client or region and its gain; without a gain nothing is set. */
+/** A touch source, client or region and its gain; without a gain, nothing changes. */
 export interface StrengthParams {
-  /** of an input, a sender there, a source, a client or a region */
+  /** name of an input, sender, source, client or region */
   name: string;
-  /** of all that it brings or has, 0 for what layout and limits allow */
+  /** applied to all its effects; 0 is the level that layout and limits allow */
   gain_db?: number | null;
 }
 
-/** The strengths of touch sources, clients and regions that are known. */
+/** Strengths of all known touch sources, clients and regions. */
 export interface StrengthResult {
-  /** gain in dB by name, 0 where none is set: of the inputs of the configuration, sources that had fingers, clients that are connected, regions of the layout in use, and what else is set */
+  /** gain in dB by name, 0 if none is set: configured inputs, sources that have had fingers, connected clients, regions of the current layout, and any other name with a gain */
   strengths?: Record<string, number>;
 }
 
-/** Topics to receive, and the rate of the periodic ones. */
+/** Topics to subscribe to, and the rate of the periodic ones. */
 export interface SubscribeParams {
   topics: Array<"state" | "contacts" | "pattern" | "silence" | "amplifiers" | "latency" | "log" | "link" | "layout" | "inputs" | "strength">;
-  /** of amplifiers and latency; default 10 */
+  /** rate of the periodic topics; default 10 */
   rate_hz?: number | null;
 }
 
-/** Topics to receive no longer. */
+/** Topics to unsubscribe from. */
 export interface UnsubscribeParams {
   topics: Array<"state" | "contacts" | "pattern" | "silence" | "amplifiers" | "latency" | "log" | "link" | "layout" | "inputs" | "strength">;
 }
 
-/** The daemon changed its state. */
+/** The daemon changed state. */
 export interface StateEvent {
-  /** why it is so */
+  /** cause of the state */
   cause: string;
   /** what to do about it; null if nothing */
   remedy: string | null;
   old: "NOT_READY" | "SWITCH_ON_DISABLED" | "READY_TO_SWITCH_ON" | "SWITCHED_ON" | "OPERATION_ENABLED" | "QUICK_STOP_ACTIVE" | "FAULT_REACTION_ACTIVE" | "FAULT" | "COMM_LOST";
   new: "NOT_READY" | "SWITCH_ON_DISABLED" | "READY_TO_SWITCH_ON" | "SWITCHED_ON" | "OPERATION_ENABLED" | "QUICK_STOP_ACTIVE" | "FAULT_REACTION_ACTIVE" | "FAULT" | "COMM_LOST";
-  /** the new state in a word for people */
+  /** the new state in plain words */
   word?: string;
-  /** rises with every change of state, stop, fault and loss; begins by chance */
+  /** increases with every state change, stop, fault and loss; starts at random */
   epoch: number;
 }
 
@@ -306,20 +306,20 @@ export interface ContactsEvent {
 export interface PatternEvent {
   /** in order of arrival, newest last */
   contacts: Array<ContactStatus>;
-  /** of the newest content, by ERA, without silent ones */
+  /** tones of the newest content by ERA; silent ERAs are omitted */
   drive: Record<string, PlayedTone>;
-  /** what plays of each content, by layer, then as `drive`; they add up */
+  /** tones of each content by layer, then by ERA as in `drive`; layers add up */
   layers?: Record<string, Record<string, PlayedTone>>;
-  /** felt contrast, target over loudest quiet finger, that nine of ten plates within the rig's uncertainty give; null for a single finger */
+  /** felt contrast, target over loudest quiet finger, that 90 % of plates within the rig's tolerances reach; null for a single finger */
   promised_contrast_db?: number | null;
-  /** the same, nominal */
+  /** the same on the nominal plate */
   predicted_contrast_db?: number | null;
   predicted_level_db_sl: number | null;
   /** from the touch to the last byte of the command; null if none was needed */
   latency_ms: number | null;
 }
 
-/** No channel is driven; if a link is lost (see the state), as far as known. */
+/** No channel is driven; if a link is lost (see the state), as far as is known. */
 export interface SilenceEvent {
   contacts: Array<ContactStatus>;
   reason: string;
@@ -354,9 +354,9 @@ export interface LinkEvent {
   remedy: string | null;
 }
 
-/** Another surface layout is in use, or it was replaced; `effects` may have changed with it. */
+/** The layout was changed or replaced; its effects can differ. */
 export interface LayoutEvent {
-  /** of the layout in use; null without one */
+  /** name of the current layout; null if there is none */
   name?: string | null;
   /** the surface layout; null without one */
   layout: Record<string, unknown> | null;
@@ -364,26 +364,26 @@ export interface LayoutEvent {
 
 /** A touch input was opened, fell silent or was lost, or touches were rejected. */
 export interface InputsEvent {
-  /** all of the configuration */
+  /** all configured inputs */
   inputs: Array<TouchInputStatus>;
   /** number by reason, of all sources */
   rejected_touches: Record<string, number>;
 }
 
-/** The rig, as far as drawing it needs. */
+/** The rig data needed to draw it. */
 export interface RigSummary {
   length_m: number;
   width_m: number;
   eras: Array<EraPosition>;
   /** whether any of its amplifiers is simulated */
   simulated: boolean;
-  /** lowest and highest that the rig allows */
+  /** lowest and highest allowed by the rig */
   frequency_hz: Array<number>;
 }
 
-/** The localization table in use. */
+/** The current localization table. */
 export interface TableSummary {
-  /** of the plate and ERAs that it was built for */
+  /** identifies the plate and ERAs it was built for */
   fingerprint: string;
   /** switched or phased */
   mode: string;
@@ -398,37 +398,37 @@ export interface ContactStatus {
   id: number;
   x_m: number;
   y_m: number;
-  /** whether it is to feel the pattern, or only its load counts: of a hand that rests, or of a finger beyond max_fingers; null before the first decision */
+  /** target: feels the pattern; quiet: kept quiet; hand (a resting hand) and surplus (a finger beyond max_fingers): only its load counts; null before the first decision */
   role?: "target" | "quiet" | "hand" | "surplus" | null;
   /** predicted level of a target relative to the rig's threshold set (`threshold` of `status`); null if unknown */
   level_db_sl?: number | null;
-  /** felt contrast, target over loudest quiet finger, that nine of ten plates within the rig's uncertainty give; null for a single finger */
+  /** felt contrast, target over loudest quiet finger, that 90 % of plates within the rig's tolerances reach; null for a single finger */
   promised_contrast_db?: number | null;
   /** predicted, target over loudest quiet finger; null for a single finger */
   contrast_db?: number | null;
-  /** what it is to feel: an effect, if any */
+  /** the effect selected for it, if any */
   effect?: string | null;
-  /** the effect that it feels: its own, or that of another finger */
+  /** the effect it feels: its own, or another finger's */
   feels?: string | null;
-  /** what a target feels: its own, mixed with the contents of others (promised contrast below 12 dB, or these are felt beside one that pauses), the content of another finger, or none */
+  /** what a target feels: own: its own content; mixed: its own and others' (promised contrast below 12 dB, or others are felt during its pauses); shared: another finger's content; held back: nothing */
   verdict?: "own" | "mixed" | "shared" | "held back" | null;
-  /** of what it feels, as asked for, which amplifiers may round; null for several */
+  /** requested frequency of what it feels (amplifiers can round it); null for several */
   frequency_hz?: number | null;
-  /** of the contents of others there, which nine of ten plates do not exceed, by the most sensitive thresholds: not to be compared with level_db_sl; null where there are none */
+  /** crosstalk level of other fingers' contents here, not exceeded on 90 % of plates, relative to the most sensitive published thresholds (so not comparable with level_db_sl); null if there are no other contents */
   foreign_level_db_sl?: number | null;
-  /** the same level relative to the rig's threshold set, as level_db_sl is */
+  /** the same level relative to the rig's threshold set, like level_db_sl */
   rig_foreign_level_db_sl?: number | null;
-  /** whether the contents of others may be felt there: foreign_level_db_sl is above 0; beside a verdict own these are weaker by 12 dB or more */
+  /** whether other fingers' contents can be felt here (foreign_level_db_sl above 0); with verdict own they are at least 12 dB weaker */
   is_foreign_felt?: boolean;
-  /** of the contents of others where it is now, on the nominal plate, relative to the rig's threshold set: more than promised while it moves; in the status only, null where there are none */
+  /** crosstalk level at its current position on the nominal plate, relative to the rig's threshold set; can exceed the promise while the finger moves; only in the status; null if there are no other contents */
   leak_db_sl?: number | null;
-  /** why it does not feel an effect of its own, or not its click over what lasts; null if it does */
+  /** why its own effect, or a click over its continuous effect, is not played; null if it is */
   held_back?: string | null;
-  /** on the plate, relative to the rig's fingertip; 1 where none is reported */
+  /** load on the plate relative to the rig's fingertip; 1 if not reported */
   load?: number;
 }
 
-/** Tone of one ERA as confirmed by its amplifier. */
+/** Tone of one ERA, confirmed by its amplifier. */
 export interface PlayedTone {
   frequency_hz: number;
   /** 0 to 1 of the full stroke */
@@ -441,27 +441,27 @@ export interface AmplifierStatus {
   name: string;
   url: string;
   serial_number: string | null;
-  /** its own state, by the names of CiA 402 */
+  /** its own state, as named by CiA 402 */
   state: string | null;
-  /** the state in a word for people */
+  /** the state in plain words */
   word?: string | null;
   fault: string | null;
-  /** 0 to 1 of the full stroke, by channel, as it reports; empty if unknown */
+  /** reported level of each channel, 0 to 1 of the full stroke; empty if unknown */
   levels: Array<number>;
   high_voltage: boolean | null;
   /** time since its last reply */
   reply_age_s: number | null;
-  /** rms error of its clock against those of the others, as the host sees it; null for one alone, and where it is not held to them */
+  /** RMS error of its clock relative to the others, estimated by the host; null for a single amplifier or one that is not synchronised */
   clock_skew_us?: number | null;
-  /** whether it does not reply but may still play, so that nothing new plays */
+  /** whether it does not reply but may still play; nothing new plays meanwhile */
   degraded?: boolean;
   /** whether the link to it is lost */
   lost: boolean;
-  /** whether it still replied but was closed because another one is lost */
+  /** whether it was closed, although it replied, because another one is lost */
   closed_with_lost: boolean;
-  /** what it has reported within the last 10 s */
+  /** its reports of the last 10 s */
   reports?: Array<AmplifierReport>;
-  /** what it may play while it does not reply; null while it does */
+  /** whether it is silent, while it does not reply; null while it does */
   silence?: AmplifierSilence | null;
   statistics: LinkCounters;
   /** of the amplifier */
@@ -470,7 +470,7 @@ export interface AmplifierStatus {
   high_voltage_v: number | null;
 }
 
-/** Latency from a touch frame's arrival to the last byte of the resulting command, all in ms. Over the last patterns; median and percentiles are null before the first. */
+/** Latency from the arrival of a touch frame to the last byte of its command, in ms. Taken over the latest patterns; median and percentiles are null before the first one. */
 export interface LatencySummary {
   count: number;
   median: number | null;
@@ -480,21 +480,21 @@ export interface LatencySummary {
   histogram: Array<[number, number]>;
 }
 
-/** A touch input of the configuration: whether touches can come from it. */
+/** A configured touch input and whether it works. */
 export interface TouchInputStatus {
   name: string;
   url: string;
-  /** mute: open, but nothing comes although it should; missing: not opened, or lost, and tried again; ended: a recording at its end */
+  /** mute: open, but silent although it should send; missing: not opened, or lost, and being retried; ended: a recording at its end */
   state: "open" | "mute" | "missing" | "ended";
   /** why it is mute or missing, and what to do; null if it is neither */
   problem?: string | null;
 }
 
-/** What an amplifier may play, after a stop or where it does not reply. */
+/** Whether an amplifier is silent, after a stop or without its reply. */
 export interface AmplifierSilence {
   /** confirmed by its status after a stop; may play; or unconfirmed, but its watchdog must have silenced it */
   silence: "confirmed_silent" | "may_play" | "watchdog_elapsed";
-  /** time until its watchdog must have silenced it; null if that is not known to happen, or if silence is confirmed */
+  /** time until its watchdog must have silenced it; null without a known watchdog or after confirmed silence */
   may_play_for_s: number | null;
   cause: string;
 }
@@ -507,7 +507,7 @@ export interface TouchPoint {
   x_m: number;
   /** from the plate's south-west corner, upwards */
   y_m: number;
-  /** of the contact, where it is known; a hand rests from 12.5 mm on */
+  /** radius of the contact, if known; 12.5 mm or more is a resting hand */
   radius_m?: number | null;
 }
 
@@ -516,7 +516,7 @@ export interface EffectDescription {
   name: string;
   kind: string;
   description: string;
-  /** by their names in a layout, in SI units */
+  /** by name in a layout file, in SI units */
   parameters: Record<string, unknown>;
 }
 
@@ -529,9 +529,9 @@ export interface EraPosition {
   channel: number;
 }
 
-/** What an amplifier reports beside a fault, and who feels it; it plays on. */
+/** A condition that an amplifier reports, other than a fault; it continues to play. */
 export interface AmplifierReport {
-  /** why it is so */
+  /** cause of the state */
   cause: string;
   /** what to do about it; null if nothing */
   remedy: string | null;
@@ -542,7 +542,7 @@ export interface AmplifierReport {
 export interface LinkCounters {
   frames_out: number;
   frames_in: number;
-  /** frames with a wrong checksum, length, form or version */
+  /** frames with a wrong checksum, length, format or version */
   invalid_frames: number;
   /** valid but unexpected frames */
   unexpected_frames: number;

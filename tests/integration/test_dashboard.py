@@ -502,7 +502,7 @@ async def test_elements_have_roles_names_and_tab_order(fresh: Page) -> None:
         ("button", "Arm"),
         ("button", "Disarm"),
         ("button", "Clear"),
-        ("checkbox", "in slow motion"),
+        ("checkbox", "slow motion"),
         ("list", "Events, newest first"),
         ("region", "Amplifiers"),
         ("region", "Touch to wire"),
@@ -742,7 +742,7 @@ async def test_only_the_lost_amplifier_is_shown_as_lost(page: Page) -> None:
     unknown = ("channels: unknown", "unknown")
     assert shown == [
         ["tile bad", "left", "no link", *unknown, "72 rpm", "1 s ago"],
-        ["tile", "right", "closed with the lost one", *unknown, "1 s ago"],
+        ["tile", "right", "closed with a lost amplifier", *unknown, "1 s ago"],
     ]
 
 

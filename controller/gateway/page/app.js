@@ -1,4 +1,4 @@
-// The dashboard: shows the daemon's events, and sends fingers and buttons to the daemon.
+// Dashboard: shows the daemon's events, and sends fingers and button presses to the daemon.
 
 import { Connection } from "./connection.js";
 import { colourOf, decodeField, FieldView } from "./field.js";
@@ -10,12 +10,12 @@ const TOPICS = ["state", "contacts", "pattern", "silence", "amplifiers", "latenc
 const TOKEN_KEY = "era-haptics-token";
 const DISARMED = ["SWITCH_ON_DISABLED", "READY_TO_SWITCH_ON"];
 const LATCHED = ["QUICK_STOP_ACTIVE", "FAULT"];
-// States that are left at once: the events before or after them are shown.
+// States that last only a moment; the events before or after them are shown instead.
 const TRANSIENT = ["SWITCHED_ON", "FAULT_REACTION_ACTIVE", "READY_TO_SWITCH_ON"];
 // Why there is no connection to the daemon, and the remedy.
 const FAILURES = {
   daemon: ["The daemon does not respond", "the gateway is connecting to the daemon"],
-  refused: ["The gateway refuses the token of this page", "open the URL that it printed at its start"],
+  refused: ["The gateway rejected the token of this page", "open the URL that it printed at startup"],
   full: ["The gateway responds but has too many clients", "retrying"],
   unreachable: ["The gateway does not respond", "retrying"],
 };
@@ -24,16 +24,16 @@ const at = (id) => document.getElementById(id);
 const log = at("log");
 let connection;
 let state = null;
-let epoch = null;  // of what is shown: a clear acknowledges nothing that came later
+let epoch = null;  // of the state shown: a clear does not acknowledge later events
 let daemon = null;  // result of hello; null while disconnected
-let ownName;  // of this page, in the daemon's log
+let ownName;  // name of this page in the daemon's log
 let failure = "unreachable";
 let lostSince = null;  // when the gateway, the daemon or a link to an amplifier was lost
 let watchdog;  // s; after which an amplifier without commands silences itself
-let silences = [];  // what amplifiers may play that do not reply
-let outage = null;  // the event of the loss of gateway or daemon, until reconnected
-let layouts = [];  // names of those that may be chosen
-let linkLoss = null;  // the event of a lost link, and the number of retries
+let silences = [];  // of amplifiers that do not reply
+let outage = null;  // log entry of a lost gateway or daemon, until reconnected
+let layouts = [];  // names of the layouts to choose from
+let linkLoss = null;  // log entry of a lost link, and the number of retries
 
 const overlay = new PlateOverlay(at("plate"), at("overlay"));
 const fieldView = new FieldView(at("field"), at("scale"), (low, high) => {
@@ -49,7 +49,7 @@ function showError(error) {
   addEvent(log, "error", error.message, remedy && !error.message.includes(remedy) ? remedy : null);
 }
 
-// The result of what is called; null, and shown, if it is refused.
+// Await a call and return its result; on an error, show it and return null.
 async function attempt(called) {
   at("problem").textContent = "";
   try {
@@ -62,7 +62,7 @@ async function attempt(called) {
 
 const NOT_SILENT = 1006;
 const SAME_PLACE_M = 0.01;  // half the radius within which the daemon looks for a finger
-const CONTACT_WAIT_MS = 5000;  // of a busy machine
+const CONTACT_WAIT_MS = 5000;  // enough for a busy machine
 
 async function stop() {
   try {
@@ -95,7 +95,7 @@ function showBanner() {
   } else if (state === "COMM_LOST") {
     reason = "link-lost";
     const mayPlay = silences.filter(({ silence }) => silence === "may_play");
-    text = `The link to an amplifier is lost${since}. `;
+    text = `Link to an amplifier lost${since}. `;
     const after = watchdog ? ` after ${watchdog}\u00a0s` : "";
     if (silences.length && !mayPlay.length) text += `Its watchdog should have silenced it${after} (not confirmed).`;
     else if (mayPlay.some(({ may_play_for_s }) => may_play_for_s === null)) text += "It can play until it is switched off.";
@@ -124,7 +124,7 @@ function showState(next, word, cause, newEpoch = null) {
   showHint();
 }
 
-// What to do first, on a plate without fingers.
+// Show the first step, on a plate without fingers.
 function showHint() {
   const hints = { OPERATION_ENABLED: "Touch the plate", QUICK_STOP_ACTIVE: "Clear and arm, then touch", FAULT: "Clear and arm, then touch" };
   const hint = DISARMED.includes(state) ? "Arm, then touch" : hints[state];
@@ -132,7 +132,7 @@ function showHint() {
   at("hint").textContent = hint ?? "";
 }
 
-// A text of the daemon in which this page is called so.
+// Replace the name of this page in a text of the daemon by "this page".
 function withThisPage(text) {
   for (const name of [`dashboard (${ownName})`, ownName]) text = text?.replaceAll(`by '${name}'`, "from this page");
   return text;
@@ -152,7 +152,7 @@ function showStatus(status) {
   showBanner();
 }
 
-// Name the rig's threshold set, to which all levels in dB SL are relative.
+// Show the name of the rig's threshold set; levels in dB SL are relative to it.
 function showThresholdSet(name) {
   at("threshold-set").textContent = `dB SL: ${name}`;
   at("threshold-set").hidden = name === null;
@@ -165,7 +165,7 @@ function showOutage(message) {
   outage ??= addEvent(log, "error", message);
 }
 
-// Without events the state of plate and amplifiers is unknown.
+// Without events, the state of plate and amplifiers is unknown.
 function showUnknown(cause) {
   showState(null, null, cause);
   overlay.show({ contacts: [], layers: {} });
@@ -182,7 +182,7 @@ function showLinkLoss(cause, remedy) {
   linkLoss ??= { item: addEvent(log, "error", `link lost: ${cause}`, remedy), remedy, retries: 0 };
 }
 
-// Buttons for the field of one content or of all, where there are several.
+// Show buttons that select the field of one content or of all, if there are several.
 function showLayers() {
   const { contents } = overlay;
   if (!contents.some(({ layer }) => layer === fieldView.layer)) fieldView.select(null);
@@ -202,13 +202,13 @@ function showLayers() {
   }));
 }
 
-// isDrawn: whether the plate shows it to those who see it.
+// isDrawn: whether the plate shows the same, so that only screen readers need the text.
 function summarise(text, isDrawn = false) {
   at("summary").textContent = text;
   at("summary").classList.toggle("drawn", isDrawn);
 }
 
-// What every finger feels, with the figures that are beside it on the plate; why one feels nothing is not there.
+// Summarise what each finger feels, with the figures drawn on the plate; the reason for feeling nothing is not drawn.
 function summarisePattern({ contacts }) {
   const targets = contacts.filter(({ role }) => role === "target").map((contact) => {
     const { verdict, frequency_hz, level_db_sl, promised_contrast_db, held_back } = contact;
@@ -220,7 +220,7 @@ function summarisePattern({ contacts }) {
   summarise(`${contacts.length} ${contacts.length === 1 ? "finger" : "fingers"}: ${targets.join("; ")}`, isDrawn);
 }
 
-// Why fingers feel nothing, if because of the state.
+// Explain why fingers feel nothing, if the state is the reason.
 function summariseSilence() {
   if (!overlay.contacts.length) summarise("");
   else if (DISARMED.includes(state)) summarise("silent: arm to feel touches");
@@ -290,7 +290,7 @@ const HANDLERS = {
     addEvent(log, level, withThisPage(cause ? `${message}: ${cause}` : message), remedy);
   },
   link({ event, message }) {
-    if (event !== "retry" || !linkLoss) return;  // the state shows the others
+    if (event !== "retry" || !linkLoss) return;  // other link events appear as states
     annotate(linkLoss.item, `retry ${++linkLoss.retries}: ${message}`, linkLoss.remedy);
   },
 };
@@ -314,13 +314,13 @@ async function play(effect) {
   });
 }
 
-// What came since the state was shown is not acknowledged, but shown.
+// Events after the state shown are not acknowledged, but shown.
 async function clear() {
   await attempt(() => connection.call("clear", { epoch }));
   connection.call("status").then(showStatus, () => {});
 }
 
-// Of one that is refused the status shows what is in use.
+// If the layout is rejected, the status restores the current one.
 async function choose({ target }) {
   if (await attempt(() => connection.layout(target.value)) === null) connection.call("status").then(showStatus, () => {});
 }
@@ -340,7 +340,7 @@ function opened(hello, name) {
   outage = null;
   showBanner();
   overlay.setUp(daemon);
-  connection.call("status").then(showStatus).catch((error) => error.code && showError(error));  // 0: an outage, shown already
+  connection.call("status").then(showStatus).catch((error) => error.code && showError(error));  // 0: an outage, already shown
   updateEffects();
 }
 
@@ -387,7 +387,7 @@ at("login").addEventListener("submit", (event) => {
   sessionStorage.setItem(TOKEN_KEY, at("token").value.trim());
   location.reload();
 });
-// The space bar stops, whatever has the focus, and does nothing else.
+// The space bar stops, regardless of the focus, and does nothing else.
 window.addEventListener("keydown", (event) => {
   if (event.code !== "Space" || event.target.id === "token") return;
   event.preventDefault();

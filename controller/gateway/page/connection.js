@@ -1,14 +1,14 @@
-// The plate over the gateway's WebSocket (JSON-RPC 2.0), for the dashboard and for pages of your own,
-// which import it from the gateway or copy it: docs/how-to/your-own-application.md.
+// Client of the gateway's WebSocket (JSON-RPC 2.0), for the dashboard and for your own pages, which
+// import it from the gateway or copy it: docs/how-to/your-own-application.md.
 //
-// It reconnects by itself and subscribes anew. Calls that are pending at a loss are rejected and never
-// sent again: whether to arm, play or clear then is for the caller to decide.
+// It reconnects and renews its subscriptions automatically. Calls pending when the connection is lost
+// are rejected and never repeated: the caller decides whether to arm, play or clear again.
 
 const RETRY_MS = [200, 500, 1000, 2000];
 const RESPONSE_TIMEOUT_MS = 6000;
 const CHECK_MS = 1000;
-const QUIET_CHECKS = 2;  // after as many without a message the gateway is asked for one
-const SILENT_CHECKS = { open: 4, opening: 8 };  // after as many it is left: a lost network closes nothing
+const QUIET_CHECKS = 2;  // after this many checks without a message, request one from the gateway
+const SILENT_CHECKS = { open: 4, opening: 8 };  // then reconnect: a lost network does not close the socket
 const LEASE_S = 5;
 const REPEAT_MS = 50;  // the daemon lifts fingers that are not repeated within 150 ms
 const NO_DAEMON = 4001;  // close code of the gateway
@@ -23,7 +23,7 @@ export class RpcError extends Error {
 }
 
 
-// Throws a TypeError that names the first value that is no finite number: JSON would make it null.
+// Throws a TypeError naming the first value that is not a finite number: JSON would turn it into null.
 function requireFinite(values) {
   for (const [key, value] of Object.entries(values)) {
     if (!Number.isFinite(value)) throw new TypeError(`${key} must be a finite number, got ${value}`);
@@ -33,13 +33,18 @@ function requireFinite(values) {
 const noResponse = () => new RpcError({ code: 0, message: "the gateway does not respond" });
 
 export class Connection {
-  // topics: to subscribe to. handlers, all optional: opened(hello, name) once the daemon has responded, after a loss too,
-  // closed(), failed(why) after each loss or failed attempt to connect, event({ topic, data, lost }),
-  // disarmed() when the lease is lost: refused by the daemon, or not renewed in time, stopped(result) of each stop, lifted() when all fingers were lifted because
-  // the page lost the focus or is hidden: forget them; field(ArrayBuffer). name: of this page, in
-  // the daemon's log. why: "daemon" if the daemon does not respond, "refused" because of the token,
-  // "full" if the gateway responds but accepts no WebSocket, "unreachable". gateway: its URL. source: name of the
-  // fingers and of the effects of this page, by which their strength is kept.
+  // topics: topics to subscribe to.
+  // handlers, all optional:
+  //   opened(hello, name): the daemon has responded, also after a loss; name: of this page in the daemon's log
+  //   closed(): the connection was lost
+  //   failed(why): after each loss or failed attempt to connect; why: "daemon" (does not respond), "refused"
+  //     (wrong token), "full" (the gateway responds but accepts no WebSocket) or "unreachable"
+  //   event({ topic, data, lost })
+  //   disarmed(): the lease was lost, because the daemon rejected it or it was not renewed in time
+  //   stopped(result): after each stop
+  //   lifted(): all fingers were lifted because the page lost the focus or is hidden; forget them
+  //   field(ArrayBuffer)
+  // gateway: its URL. source: name under which the daemon stores the strength of this page's fingers and effects.
   constructor(token, topics, handlers, gateway = import.meta.url, source = null) {
     this.token = token;
     this.topics = topics;
@@ -51,7 +56,7 @@ export class Connection {
     this.attempts = 0;
     this.wasEverAccepted = false;
     this.wasOpen = false;  // since the last attempt to connect
-    this.lease = null;  // while armed by `arm`; it outlives a shorter loss
+    this.lease = null;  // while armed by `arm`; it survives a shorter loss of connection
     this.leaseEnds = 0;  // ms
     this.isArming = false;
     this.touches = [];
@@ -87,7 +92,7 @@ export class Connection {
     this.wasOpen = this.wasEverAccepted = true;
     this.call("subscribe", { topics: this.topics, rate_hz: 10 }).then(() => { this.attempts = 0; }, () => {
       if (socket !== this.socket) return;
-      this.wasOpen = false;  // the daemon has too many clients: connected later
+      this.wasOpen = false;  // the daemon has too many clients: reconnect later
       socket.close();
     });
     if (this.source) this.call("hello", { client: this.source }).catch(() => {});
@@ -126,7 +131,7 @@ export class Connection {
       this.handlers.event?.(message.params);
       return;
     }
-    if (!this.wasOpen) {  // the first is the response to the gateway's hello
+    if (!this.wasOpen) {  // the first message is the response to the gateway's hello
       this.opened(message);
       return;
     }
@@ -137,7 +142,7 @@ export class Connection {
     else call.resolve(message.result);
   }
 
-  // Ask a silent gateway for a message, and connect again if none comes.
+  // Request a message from a silent gateway; reconnect if none comes.
   check() {
     this.silentChecks += 1;
     if (this.silentChecks > SILENT_CHECKS[this.isOpen ? "open" : "opening"]) {
@@ -147,7 +152,7 @@ export class Connection {
     } else if (this.silentChecks > QUIET_CHECKS && this.isOpen) this.call("status").catch(() => {});
   }
 
-  // Call a method; a promise of its result.
+  // Call a method; returns a promise of its result.
   call(method, params = {}) {
     if (!this.isOpen) {
       return Promise.reject(new RpcError({ code: 0, message: "not connected to the gateway" }));
@@ -164,7 +169,7 @@ export class Connection {
     });
   }
 
-  // Switch the high voltage on, and renew the lease until `disarm` or `stop`, or until it is lost.
+  // Switch the high voltage on, and renew the lease until `disarm`, `stop` or its loss.
   async arm(owner) {
     this.isArming = true;
     const sent = performance.now();
@@ -181,7 +186,7 @@ export class Connection {
     this.leaseEnds = sent + 1000 * LEASE_S;
   }
 
-  // Renew the lease, after a loss too; nothing arms again.
+  // Renew the lease, also after a reconnection; nothing arms again automatically.
   renew() {
     const { lease } = this;
     const now = performance.now();
@@ -200,21 +205,21 @@ export class Connection {
     }
   }
 
-  // Ramp to silence and switch the high voltage off; over HTTP while there is no WebSocket.
+  // Ramp to silence and switch the high voltage off; over HTTP if the WebSocket is closed.
   disarm() {
     this.lease = null;
     return this.isOpen ? this.call("disarm") : this.callOverHttp("disarm");
   }
 
-  // Lift all fingers of this page, whose user may not see it any more.
+  // Lift all fingers of this page, because its user may no longer see it.
   lift() {
     if (!this.touches.length) return;
     this.touch([]);
     this.handlers.lifted?.();
   }
 
-  // A page that is left cannot stop anything: lift, and disarm if it armed or is arming; once, over HTTP,
-  // which outlives the page: a second one might arrive when others have armed.
+  // The user leaves the page, and can no longer stop: lift all fingers, and disarm if this page armed or is
+  // arming. Only once, over HTTP, which outlives the page: a second disarm could arrive after others armed.
   leave() {
     this.lift();
     if (!this.lease && !this.isArming) return;
@@ -222,7 +227,7 @@ export class Connection {
     this.post("disarm").catch(() => {});
   }
 
-  // Lift all fingers, disarm if it armed, and end the connection for good.
+  // Lift all fingers, disarm if this page armed, and close the connection permanently.
   close() {
     this.leave();
     this.handlers = {};
@@ -234,14 +239,14 @@ export class Connection {
     this.rejectPending();
   }
 
-  // Use one of the daemon's layouts; a promise of { layout, layouts }. A restarted daemon begins with the
-  // first: choose again in `opened`.
+  // Switch to another of the daemon's layouts; returns a promise of { layout, layouts }. A restarted daemon
+  // starts with the first layout: choose again in `opened`.
   layout(name) {
     return this.call("layout", { name });
   }
 
-  // Report all fingers that are down, [{ id, x_m, y_m }, ...], the newest last; repeated until the next
-  // call, and reported to the daemon again after a loss.
+  // Report all fingers on the plate, [{ id, x_m, y_m }, ...], newest last. The report is repeated until
+  // the next call, also after a reconnection.
   touch(touches) {
     for (const { id, x_m, y_m } of touches) requireFinite({ id, x_m, y_m });
     this.touches = touches;
@@ -250,22 +255,23 @@ export class Connection {
     this.socket.send(JSON.stringify({ jsonrpc: "2.0", method: "touch", params }));
   }
 
-  // Set the strength of a touch source, client or region, -40 to 0 dB, or ask for it; a promise of it.
+  // Set the strength of a touch source, client or region, -40 to 0 dB; without a gain, only read it. Returns
+  // a promise of the strength.
   async strength(name, gain_db = null) {
     if (gain_db !== null) requireFinite({ gain_db });
     return (await this.call("strength", { name, gain_db })).strengths[name];
   }
 
-  // Stop over the WebSocket and over HTTP; a promise that all amplifiers are confirmed silent.
+  // Stop over both WebSocket and HTTP; the promise resolves once all amplifiers are confirmed silent.
   stop() {
     this.lease = null;
-    const overWebSocket = this.call("stop");  // first: it needs nothing of what a browser may lack
+    const overWebSocket = this.call("stop");  // first, because it needs no feature that a browser can lack
     const stops = [overWebSocket, this.callOverHttp("stop")];
     for (const each of stops) each.then(this.handlers.stopped, () => {});
     return Promise.any(stops);
   }
 
-  // Call a method without parameters over HTTP; a promise of its result.
+  // Call a method without parameters over HTTP; returns a promise of its result.
   async callOverHttp(method) {
     const response = await this.post(method).catch(() => { throw noResponse(); });
     const result = await response.json();
@@ -274,7 +280,7 @@ export class Connection {
     return result;
   }
 
-  // Find out why the WebSocket was refused: browsers do not report it.
+  // Find out why the WebSocket was rejected: browsers do not report the reason.
   diagnose() {
     this.post("effects")
       .then(({ status }) => (status === 401 ? "refused" : "full"), () => "unreachable")

@@ -1,13 +1,13 @@
-// Draws the plate's vibration: amplitude, which content is felt where, or motion slowed down.
+// Draws the plate's vibration: its amplitude, the content felt at each point, or its motion in slow motion.
 
 const AMPLITUDE = ["#0b1026", "#27306b", "#4b3f8f", "#8a4f8d", "#c8637a", "#f08c5a", "#fbc557", "#fdf3a7"];
 const MOTION = ["#053061", "#2f79b5", "#a7cfe4", "#f4f4f4", "#f9b98e", "#c8493a", "#67001f"];
 const CONTENTS = ["#35e07a", "#4f9dff", "#ffa62b", "#ff5fa2", "#c58bff", "#e8e34f", "#59e0e8", "#ff7d66"];
-const GREY = 0.62;  // where contents mix
-const OWN_DB = 12;  // above all others a content is felt as a finger's own
-const BRIGHTEST_DB = 30;  // above the threshold of feeling
+const GREY = 0.62;  // for mixed contents
+const OWN_DB = 12;  // a content this far above all others is felt as a finger's own
+const BRIGHTEST_DB = 30;  // above the detection threshold
 const SLOW_DOWN = 100;  // factor
-const SCALE_HELD_MS = 10000;  // for so long a scale stays that less would do for
+const SCALE_HELD_MS = 10000;  // time before a scale that is too large shrinks
 
 const rgb = (hex) => [1, 3, 5].map((at) => parseInt(hex.slice(at, at + 2), 16));
 
@@ -26,10 +26,10 @@ function ramp(stops) {
 
 const RAMPS = { amplitude: ramp(AMPLITUDE), motion: ramp(MOTION), felt: ramp(["#000000", "#9e9e9e"]) };
 
-// The colour of a layer's content, of its finger and of its field.
+// Colour of a layer's content, for its finger and its field.
 export const colourOf = (layer) => CONTENTS[layer % CONTENTS.length];
 
-// Decode what controller/gateway/field.py encodes.
+// Decode a field as encoded by controller/gateway/field.py.
 export function decodeField(buffer) {
   const view = new DataView(buffer);
   const [columns, rows, count] = [0, 2, 4].map((at) => view.getUint16(at, true));
@@ -51,8 +51,8 @@ export class FieldView {
     this.scaleCanvas = scaleCanvas;
     this.onScale = onScale;
     this.inMotion = false;
-    this.layer = null;  // the only one that is drawn; null for all
-    this.scale = this.neededAt = 0;  // neededAt: when the plate last vibrated by as much as the scale
+    this.layer = null;  // the only layer to draw; null for all
+    this.scale = this.neededAt = 0;  // neededAt: last time the plate's vibration needed this scale
     this.frames = 0;
     this.clear();
     requestAnimationFrame((now) => this.draw(now));
@@ -69,7 +69,7 @@ export class FieldView {
     this.drawScale();
   }
 
-  // The drawn fields, by number.
+  // Indices of the fields drawn.
   get drawn() {
     return this.field.layers.flatMap((layer, k) => (this.layer === null || layer === this.layer ? [k] : []));
   }
@@ -111,7 +111,7 @@ export class FieldView {
     requestAnimationFrame((next) => this.draw(next));
     this.frames++;
     const target = roundUp(this.peak);
-    // At rest it stays; otherwise it falls at once, not in steps.
+    // At rest the scale stays; otherwise it drops in one step.
     if (target >= this.scale || this.peak === 0) this.neededAt = now;
     if (target > this.scale || now - this.neededAt > SCALE_HELD_MS) {
       this.scale = target;
@@ -138,8 +138,8 @@ export class FieldView {
     }
   }
 
-  // The strongest content in its colour, above the threshold of feeling; paler, up to grey, the less it
-  // is above all others.
+  // Draw the strongest content in its colour, by its level above the detection threshold. The smaller its
+  // margin over all others, the paler the colour, down to grey.
   paintContents() {
     const { width, height } = this.canvas;
     const { layers, thresholds, parts } = this.field;
@@ -203,7 +203,7 @@ export class FieldView {
   }
 }
 
-// The next of 1, 2, 5, 10, ... above a value; at least 1 m/s².
+// Round a value up to the next of 1, 2, 5, 10, ...; at least 1 m/s².
 function roundUp(value) {
   for (let power = 1; ; power *= 10) {
     for (const step of [1, 2, 5]) if (value <= step * power) return step * power;

@@ -1,23 +1,23 @@
-// Fingers on the plate's picture: pointers of every kind, one moved by the keyboard, and resting ones. A press with
-// the shift key lets a finger rest until it is pressed the same way again, or Escape lifts all. An effect button
-// whose page holds no finger down puts one where the last one was, for two seconds.
+// Fingers on the plate's picture: pointers of every kind, a finger moved by the keyboard, and resting fingers.
+// Shift-click places a resting finger; shift-click on it, or Escape, lifts it. If no finger is down, an effect
+// button places one at the last position, for two seconds.
 
 const STEP_M = 0.005;
-const KEYBOARD = -1;  // an id that no pointer has
-const BUTTON = -2;  // the finger that an effect button puts on the plate
-const RESTING = -3;  // the first of those that rest; the next ones are lower
-const BUTTON_MS = 2000;  // after which the finger of an effect button is lifted
-const NEAR_PX = 24;  // of a resting finger
-const PX_M = 0.0254 / 96;  // of a CSS pixel: a finger has its size whatever that of the picture
-const LEAST_M = 0.001;  // radius; a pointer of unknown size has sides of one or two pixels
+const KEYBOARD = -1;  // an id no pointer has
+const BUTTON = -2;  // the finger that an effect button places
+const RESTING = -3;  // id of the first resting finger; further ids count down
+const BUTTON_MS = 2000;  // time until the finger of an effect button is lifted
+const NEAR_PX = 24;  // distance within which a press hits a resting finger
+const PX_M = 0.0254 / 96;  // size of a CSS pixel: fingers keep their size at any size of the picture
+const LEAST_M = 0.001;  // smallest radius; a pointer of unknown size reports one or two pixels
 
 export class Fingers {
-  // send(touches) is called with all fingers at every change.
+  // send(touches) is called with all fingers after every change.
   constructor(plate, overlay, send) {
     this.overlay = overlay;
     this.send = send;
-    this.positions = new Map();  // by id, of the fingers that are down
-    this.last = null;  // position of the finger that moved last, also after it was lifted
+    this.positions = new Map();  // positions of the fingers on the plate, by id
+    this.last = null;  // position of the finger that moved last, even after its lift
     this.buttonTimer = null;  // lifts the finger of an effect button
     this.isMoveScheduled = false;
     plate.addEventListener("pointerdown", (event) => this.press(event, plate));
@@ -42,7 +42,7 @@ export class Fingers {
     this.put(event.pointerId, this.contact(event));
   }
 
-  // Place of a pointer, and the radius of a touch whose size is known.
+  // Position of a pointer, and the radius of a touch if its size is known.
   contact(event) {
     const place = this.overlay.position(event);
     const radius_m = (Math.max(event.width, event.height) / 2) * PX_M;
@@ -61,7 +61,7 @@ export class Fingers {
     });
   }
 
-  // Lift the resting finger here, or let one rest here.
+  // Lift the resting finger at this position, or place one.
   rest(position) {
     const ids = [...this.positions.keys()].filter((id) => id <= RESTING);
     const isNear = ({ x_m, y_m }) =>
@@ -77,7 +77,7 @@ export class Fingers {
     this.report();
   }
 
-  // Position for an effect button: of the newest finger that is down, or of one that is put where the last one was.
+  // Position for an effect button: that of the newest finger, or of a new finger at the last position.
   forButton() {
     const newest = [...this.positions.keys()].filter((id) => id !== BUTTON).at(-1);
     if (newest !== undefined) return this.positions.get(newest);
@@ -92,7 +92,7 @@ export class Fingers {
     if (this.positions.delete(id)) this.report();
   }
 
-  // The connection has lifted all.
+  // The connection has lifted all fingers.
   clear() {
     this.positions.clear();
   }

@@ -1,4 +1,4 @@
-// Drawn over the plate: ERAs, regions, and fingers with their predicted sensations.
+// Overlay on the plate: ERAs, regions, and fingers with their predicted sensations.
 
 import { colourOf } from "./field.js";
 
@@ -19,10 +19,10 @@ const textWidth = (text) => 0.62 * TEXT_PX * text.length;  // approximate, in pi
 
 export const fixed = (value, digits = 0) => (value === null || value === undefined ? "–" : value.toFixed(digits));
 
-// What is promised is not rounded up.
+// A promise is rounded down.
 export const atLeast = (value) => fixed(value === null ? null : Math.floor(value));
 
-// What a finger feels: its own content, whether others are felt beside it, or why not its own.
+// Verdict of a finger, with a note if other contents are also felt.
 export const felt = ({ verdict, is_foreign_felt }) => (verdict === "own" && is_foreign_felt ? "own, others faintly felt" : verdict);
 
 export class PlateOverlay {
@@ -36,7 +36,7 @@ export class PlateOverlay {
     new ResizeObserver(() => this.redraw()).observe(plate);
   }
 
-  // Take rig and layout of `hello`.
+  // Set rig and layout from `hello`.
   setUp({ rig, layout }) {
     this.rig = rig;
     this.regions = layout?.regions ?? [];
@@ -51,13 +51,13 @@ export class PlateOverlay {
     this.redraw();
   }
 
-  // The frequencies of each layer [Hz].
+  // Frequencies of each layer [Hz].
   get contents() {
     return [...this.drives].map(([layer, drive]) =>
       ({ layer, frequencies: [...new Set(Object.values(drive).map((tone) => tone.frequency_hz))] }));
   }
 
-  // The layer of a contact's content; undefined where there is only one content or none of its own.
+  // Layer of a contact's content; undefined for a single content or a contact without its own.
   layerOf({ role, frequency_hz }) {
     if (role !== "target" || this.drives.size < 2) return undefined;
     return this.contents.find(({ frequencies }) => frequencies.includes(frequency_hz))?.layer;
@@ -83,7 +83,7 @@ export class PlateOverlay {
     this.px = this.rig.length_m / this.plate.clientWidth;  // metres per pixel
     this.isSmall = this.plate.clientWidth < SMALL_PX;
     const [regions, eras, contacts, cursor] = this.layers;
-    this.occupied = [];  // boxes that no text may cover
+    this.occupied = [];  // boxes that text must not cover
     eras.replaceChildren(...this.rig.eras.flatMap((era) => this.era(era)));
     this.occupied.push(...this.contacts.map((contact) => this.ringBox(contact)));
     contacts.replaceChildren(...this.contacts.flatMap((contact) => this.contact(contact)));
@@ -110,7 +110,7 @@ export class PlateOverlay {
     return element("text", { class: name, x, y: height, "font-size": size, "text-anchor": anchor }, text);
   }
 
-  // The first of several positions at which a text covers nothing.
+  // First of several positions where a text covers nothing.
   firstFree(positions, text, isTopAligned = false) {
     const [room, size] = [textWidth(text) * this.px, TEXT_PX * this.px];
     return positions.find(([x, y]) => {
@@ -143,8 +143,8 @@ export class PlateOverlay {
     return position ? [outline, this.label(position, name, "label name")] : [outline];
   }
 
-  // Position of a region's name: at its upper edge, where fingers hide it least, at its lower edge,
-  // anywhere in it, or just outside.
+  // Position of a region's name: at its upper edge, where fingers hide it least; otherwise at its lower
+  // edge, anywhere inside, or just outside.
   namePosition([left, top, right, bottom], middle, name) {
     const [width, height, gap] = [textWidth(name) * this.px, TEXT_PX * this.px, 4 * this.px];
     const xs = [middle, left + gap + width / 2, right - gap - width / 2];
@@ -154,7 +154,7 @@ export class PlateOverlay {
     return this.firstFree(rows.flatMap((y) => xs.map((x) => [x, y])), name, true);
   }
 
-  // Centre of an ERA's square, which lies within the plate.
+  // Centre of an ERA's square, moved inside the plate.
   eraCentre({ x_m, y_m }) {
     const half = (ERA_PX * this.px) / 2;
     const inset = (value, max) => Math.min(max - half, Math.max(half, value));
@@ -199,7 +199,7 @@ export class PlateOverlay {
     return [...rings, this.besideRing(contact, above, 0), this.besideRing(contact, below, 1)];
   }
 
-  // A text above (0) or below (1) a finger, or if occupied on the other side, left or right.
+  // Place a text above (0) or below (1) a finger; if occupied, on the other side, left or right.
   besideRing({ x_m, y_m }, text, first) {
     const [away, line] = [this.ringRadius + 4 * this.px, 1.25 * TEXT_PX * this.px];
     const [x, y, aside] = [x_m, this.flip(y_m), away + (textWidth(text) * this.px) / 2];

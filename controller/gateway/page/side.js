@@ -1,4 +1,4 @@
-// Beside the plate: amplifiers, latencies, effects, events.
+// Side panel: amplifiers, latencies, effects, events.
 
 import { fixed } from "./plate.js";
 
@@ -28,13 +28,13 @@ function silenceText({ silence, may_play_for_s }) {
   return may_play_for_s === null ? "may play until it is switched off" : `may play for ${fixed(may_play_for_s, 2)} s more`;
 }
 
-// eras: of the rig, for the names of the channels. readings: of the daemon's hello, which of them are shown, and how.
+// eras: the rig's ERAs, for channel names. readings: from the daemon's hello: the readings to show, and their format.
 function tile(amplifier, eras, readings) {
   const { name, word, state, fault, levels, high_voltage, reply_age_s, lost, closed_with_lost, silence, reports = [] } = amplifier;
   const isFaulty = fault && fault !== "NONE";
   const made = element("article", undefined, lost || isFaulty || reports.length ? "tile bad" : "tile");
   const title = element("h3");
-  const status = lost ? "no link" : closed_with_lost ? "closed with the lost one" : isFaulty ? `fault: ${fault.toLowerCase().replaceAll("_", " ")}` : word ?? "unknown";
+  const status = lost ? "no link" : closed_with_lost ? "closed with a lost amplifier" : isFaulty ? `fault: ${fault.toLowerCase().replaceAll("_", " ")}` : word ?? "unknown";
   title.append(element("span", name), element("span", status));
   title.title = state ?? "";
   made.append(title);
@@ -87,14 +87,14 @@ export function showLatency(numbers, svg, { count, median, p99, p999, histogram 
   histogram.forEach(([upper, number], index) => {
     const height = number ? Math.max(2, 64 * Math.log1p(number) / Math.log1p(max)) : 0;
     add("rect", { x: index * width + 1, y: 80 - height, width: Math.max(1, width - 2), height });
-    if (index === histogram.length - 1) {  // includes what is above its edge
+    if (index === histogram.length - 1) {  // includes values above its edge
       add("text", { x: 320, y: 96, "text-anchor": "end" }, `> ${histogram.at(-2)?.[0] ?? 0}`);
     } else if (index % Math.ceil(histogram.length / 6) === 0) {
       add("text", { x: (index + 1) * width, y: 96, "text-anchor": "middle" }, `${upper}`);
     }
   });
   add("line", { x1: 0, x2: 320, y1: 80, y2: 80 });
-  add("text", { x: 320, y: 10, "text-anchor": "end" }, "ms, logarithmic count");
+  add("text", { x: 320, y: 10, "text-anchor": "end" }, "ms (logarithmic count)");
   svg.replaceChildren(...parts);
 }
 
@@ -109,16 +109,16 @@ export function showEffects(section, container, effects, play) {
   }));
 }
 
-// The layout in use, where one of several may be chosen.
+// Show the current layout, if there are several to choose from.
 export function showLayouts(choice, select, names, name) {
   choice.hidden = names.length < 2;
   select.replaceChildren(...names.map((each) => new Option(each, each, false, each === name)));
 }
 
 const LOWEST_DB = -40;
-const FADE_MS = 100;  // the daemon leads to another strength within as long
+const FADE_MS = 100;  // the daemon fades to another strength in this time
 
-// A slider for each touch source and client, set(name, gain_db); one that is being moved stays as it is.
+// Show a slider for each touch source and client, calling set(name, gain_db); one being moved is not updated.
 export function showStrengths(section, container, strengths, set) {
   section.hidden = !strengths.length;
   const before = new Map([...container.children].map((row) => [row.dataset.name, row]));
@@ -167,7 +167,7 @@ export function addEvent(log, level, message, remedy) {
   return item;
 }
 
-// Show the outcome of an event and its remedy, in place of earlier ones.
+// Show the outcome of an event and its remedy, replacing earlier ones.
 export function annotate(item, outcome, remedy) {
   for (const old of item.querySelectorAll(".note")) old.remove();
   for (const each of [outcome, remedy]) if (each) item.append(element("span", each, "note"));

@@ -239,7 +239,7 @@ async def test_a_disk_that_hangs_delays_no_other_request(
         await era.disarm()
         disk.set()
         await asyncio.sleep(0.1)
-        assert caplog.text.count("strengths: not kept: [Errno 28] No space left on device") == 1
+        assert caplog.text.count("strengths: not saved: [Errno 28] No space left on device") == 1
         full.clear()
         await era.strength("test", -11.0)
     assert json.loads((tmp_path / "kept.json").read_text()) == {"test": -11.0}

@@ -203,8 +203,8 @@ class ContactStatus(ApiMessage):
     foreign_level_db_sl: float | None = Field(
         None,
         description="crosstalk level of others' contents here, not exceeded on 90 % of "
-        "plates, relative to the most sensitive published thresholds (not comparable with level_db_sl); "
-        "null if there are no other contents",
+        "plates, relative to the most sensitive published thresholds (not comparable with "
+        "level_db_sl); null if there are no other contents",
     )
     rig_foreign_level_db_sl: float | None = Field(
         None,

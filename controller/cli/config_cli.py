@@ -27,7 +27,7 @@ def init(
 ) -> None:
     """Write a commented file to edit.
 
-    Write its schema for editors beside it.
+    Also writes its schema for editors to the same folder.
     """
     from model.files.array_file import whole_or_nothing
 

@@ -1,4 +1,4 @@
-"""`era daemon`, the commands that are its clients, and how they show status and events.
+"""`era daemon`, and the commands that are its clients.
 
 Clients: `status`, `arm`, `disarm`, `stop`, `clear`, `reload`, `strength`, `touch`, `watch`,
 `layout use`.
@@ -32,14 +32,14 @@ Socket = Annotated[
 ]
 
 DASHBOARD = "127.0.0.1:8137"
-"""Default address of the page, as of `era gateway`."""
+"""Default address of the page, same as for `era gateway`."""
 
 _DEFAULT_TOPICS = ["state", "contacts", "pattern", "silence", "link", "log", "inputs"]
-"""Topics of `era watch`: all but those that are published without end, and the whole layout."""
+"""Default topics of `era watch`: all except periodic ones and the layout."""
 
 _MORE_TOPICS = ["amplifiers", "latency", "strength", "layout"]
 
-_RELOAD_TIMEOUT = 130.0  # s; the daemon gives up after 60 s, and another may be reloading
+_RELOAD_TIMEOUT = 130.0  # s; the daemon gives up after 60 s, and another reload can come first
 _REPEAT_INTERVAL = 0.05  # s; a touch that is not repeated for 150 ms is lifted
 
 
@@ -108,7 +108,7 @@ def arm(
     ] = 10.0,
     owner: Annotated[str, typer.Option(help="Name shown to other clients.")] = "era arm",
     once: Annotated[
-        bool, typer.Option("--once", help="Exit at once and let the lease expire.")
+        bool, typer.Option("--once", help="Exit immediately and let the lease expire.")
     ] = False,
     socket: Socket = None,
     as_json: JsonOption = False,
@@ -122,7 +122,7 @@ def arm(
         try:
             with era.armed(owner, lease_s=lease) as granted:
                 _print_lease(granted, "until Ctrl-C", as_json=as_json)
-                for _ in era.events():  # of none; raises LeaseLost
+                for _ in era.events():  # no topics: ends only by LeaseLost
                     pass
         except KeyboardInterrupt:
             if not as_json:
@@ -130,7 +130,7 @@ def arm(
 
 
 def of_method(method: str) -> Callable[..., None]:
-    """The command of a method of the API, which shows the state after it."""
+    """Make a command that calls an API method and prints the resulting state."""
 
     def call(socket: Socket = None, as_json: JsonOption = False) -> None:
         from controller.api.schema import headline
@@ -149,12 +149,13 @@ def strength(
         str | None, typer.Argument(metavar="[SOURCE|CLIENT|REGION]", help="Default: show all.")
     ] = None,
     gain_db: Annotated[
-        float | None, typer.Argument(metavar="[DB]", help="-40 to 0; default: show what is set.")
+        float | None,
+        typer.Argument(metavar="[DB]", help="-40 to 0; default: show the current strength."),
     ] = None,
     socket: Socket = None,
     as_json: JsonOption = False,
 ) -> None:
-    """It is kept by this name; what layout and limits allow is 0."""
+    """Stored under this name. 0 dB is the level that layout and limits allow."""
     with connected(socket) as era:
         strengths = (era.status() if name is None else era.strength(name, gain_db)).strengths
     print_report(
@@ -174,8 +175,8 @@ def touch(
 ) -> None:
     """Put fingers on the plate for a while, and show the status.
 
-    Each feels what the layout has at its place; without a layout the last one feels a buzz, and
-    the others are quiet.
+    Each finger feels the layout's effect at its position. Without a layout, the last finger feels a
+    buzz and the others are quiet.
     """
     from model.config.units import in_metres, parse_point
 
@@ -183,7 +184,7 @@ def touch(
     with connected(socket) as era:
         plate = era.hello("era").rig
         length, width = plate.length_m, plate.width_m
-        for x, y in positions:  # the daemon would only reject and count those beyond the plate
+        for x, y in positions:  # the daemon would only count fingers outside the plate as rejected
             if not (0 <= x <= length and 0 <= y <= width):
                 remedy = in_metres(x, y, length=length, width=width)
                 raise InputError(
@@ -201,7 +202,7 @@ def touch(
 
 
 def _hold(era: "Client", positions: list[tuple[float, float]], end: float) -> None:
-    """Repeat fingers until a time [s] of time.monotonic(), and there once more."""
+    """Repeat fingers until a time of time.monotonic() [s], and once more at that time."""
     while True:
         era.touch(positions, source="era touch")
         left = end - time.monotonic()
@@ -253,10 +254,10 @@ def watch(
 
 
 def reload(socket: Socket = None, as_json: JsonOption = False) -> None:
-    """Exit status 1 if they are refused; all is as before then."""
+    """Exit status 1 if the files are rejected; nothing changes in that case."""
     with connected(socket, timeout=_RELOAD_TIMEOUT) as era:
         done = era.reload()
-    outcome = "reloaded" if done.reloaded else "refused; all is as before"
+    outcome = "reloaded" if done.reloaded else "rejected; nothing changed"
     rows = [outcome, *(f"  {reason}" for reason in done.reasons)]
     print_report(rows, done.model_dump(), as_json=as_json)
     if not done.reloaded:
@@ -265,7 +266,7 @@ def reload(socket: Socket = None, as_json: JsonOption = False) -> None:
 
 @contextmanager
 def connected(socket: Path | None, *, timeout: float | None = None) -> "Iterator[Client]":
-    """Connect; translate refusals of the daemon to errors with their exit status.
+    """Connect; translate errors of the daemon to errors with exit status.
 
     timeout [s]: for each call, the client's own if None.
     """
@@ -291,7 +292,7 @@ def _print_lease(granted: "ArmResult", how_long: str, *, as_json: bool) -> None:
         typer.echo(f"on: armed {how_long}; era stop stops everything at once")
 
 
-layout_app = typer.Typer(no_args_is_help=True, help="Check surface layouts, or choose one.")
+layout_app = typer.Typer(no_args_is_help=True, help="Check or choose surface layouts.")
 
 
 @layout_app.command()

@@ -177,7 +177,7 @@ def _play(
     is_real_time: bool,
     is_quiet: bool,
 ) -> "DemoRun":
-    """Play a recording, or those that come with the package; print a line for each touch."""
+    """Play a recording (default: the package's own); print a line for each touch."""
     import asyncio
 
     from controller.demo.demonstration import example_scenes, run_demo
@@ -220,7 +220,7 @@ def _heading(threshold: str, *, has_latency: bool) -> str:
     return "\n".join([scale, groups.rstrip(), units.rstrip(), columns, ""])
 
 
-_MAX_NAMES = 4  # of ERAs in a row
+_MAX_NAMES = 4  # ERA names per row
 
 
 def _line(row: "TouchRow", *, has_latency: bool) -> str:
@@ -258,21 +258,20 @@ def _number(value: float | None) -> str:
 
 
 def _summary(rows: "list[TouchRow]") -> str:
-    """Count the touches that kept the promise, of those that reached the steady state."""
+    """Count touches that kept the promise, among those that reached the steady state."""
     kept = [row.keeps_promise for row in rows if row.keeps_promise is not None]
     touches = counted(len(rows), "touch", plural="touches")
     if not kept:
         return touches
     return (
         f"{touches}; of {len(kept)} with other fingers on the plate {sum(kept)} "
-        f"({sum(kept) / len(kept):.0%}) felt at least the contrast promised\n"
-        "(a promise is what 90 % of plates within the rig's uncertainty reach; --seed draws "
-        "another plate)"
+        f"({sum(kept) / len(kept):.0%}) felt at least the promised contrast\n"
+        "(90 % of plates within the rig's tolerances reach a promise; --seed draws another plate)"
     )
 
 
 def _void_report(run: "DemoRun") -> list[str]:
-    """Report that the figures of a run do not count, and why."""
+    """Report that a run is void, and why."""
     touches = counted(len(run.rows), "touch", plural="touches")
     return [
         f"{touches}; no pictures were drawn; try again on a less busy machine or in virtual time",

@@ -1,6 +1,6 @@
 """How commands run: one group for the commands of several modules, and an exit status per error.
 
-`era_haptics.command` lists the modules of `era`, `controller.cli.__main__` those of this package.
+`era_haptics.command` lists the modules of `era`, `controller.cli.__main__` the modules here.
 """
 
 import errno
@@ -54,7 +54,7 @@ SECTIONS = {
     ),
     "Amplifier": ("amp", "soft-amp"),
 }
-"""The commands as help and reference list them, in each section the seldom used ones last."""
+"""Commands in the order of help and reference; rarely used ones are last in each section."""
 
 BAD_INPUT = 2
 BUG = 70  # EX_SOFTWARE of sysexits.h
@@ -68,7 +68,7 @@ class CommandModule(Protocol):
     """A module that provides commands."""
 
     app: typer.Typer
-    """Its commands appear under `era`; those of a group join the group of that name."""
+    """Its commands appear under `era`; commands of a group join the group of that name."""
     EXIT_STATUS: ExitStatus
     """Exit status for each class of error that its commands raise on purpose."""
 
@@ -76,7 +76,7 @@ class CommandModule(Protocol):
 LoadModules: TypeAlias = Callable[[], Sequence[CommandModule]]
 """Imports modules with commands, which takes a second."""
 
-# With two threads the small systems here take up to three times as long, and vary widely.
+# With two threads, small systems take up to three times as long, with wide variation.
 _THREAD_COUNTS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 
 
@@ -87,7 +87,7 @@ def main(load: LoadModules) -> int:
     """
     for variable in _THREAD_COUNTS:
         os.environ.setdefault(variable, "1")
-    # Pictures go to files; a notebook hands its own backend to what it starts, also with `!era`.
+    # Pictures go to files; a notebook passes its own backend to child processes, such as `!era`.
     os.environ["MPLBACKEND"] = "agg"
     protect_streams()
     # While modules load nothing is armed, and a KeyboardInterrupt could be swallowed.
@@ -100,7 +100,7 @@ def main(load: LoadModules) -> int:
 
 
 COMPLETE = "_ERA_COMPLETE"
-"""Variable by which the scripts of `era --install-completion` request words at a tab."""
+"""Variable that completion scripts of `era --install-completion` set to request words."""
 
 
 def _complete(instruction: str, load: LoadModules) -> int:
@@ -134,7 +134,7 @@ def run(
     try:
         on_loaded()
         status = _invoke(group, arguments)
-        print(end="", flush=True)  # there may be no sys.stdout, which may be closed
+        print(end="", flush=True)  # sys.stdout can be missing or closed
     except BrokenPipeError:
         # Python would complain again when it flushes at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -149,7 +149,7 @@ def run(
 
 
 class _Commands(TyperGroup):
-    """The commands of `era` by section; those without one come last."""
+    """The commands of `era` by section; commands without a section come last."""
 
     def list_commands(self, ctx: Any) -> list[str]:
         """Names in the order of help and reference."""
@@ -165,7 +165,7 @@ class _Commands(TyperGroup):
         return {**listed, "Others": sorted(others)}
 
     def resolve_command(self, ctx: Any, args: list[str]) -> tuple[str | None, Any, list[str]]:
-        """Find a command; where an option was meant, as in `era version`, say so."""
+        """Find a command; for the name of an option, such as `era version`, suggest the option."""
         option = f"--{args[0]}"
         if any(option in parameter.opts for parameter in self.get_params(ctx)):
             ctx.fail(f"No such command {args[0]!r}. Did you mean {option}?")
@@ -262,7 +262,7 @@ def _report(error: Exception, statuses: ExitStatus) -> int:
         return BAD_INPUT
     _print_error(
         f"error: this is a bug in era-haptics, please report it ({type(error).__name__}: {error}). "
-        "Run the same command again with --debug to see where it arose"
+        "Run the same command with --debug to see the traceback"
     )
     return BUG
 
@@ -295,7 +295,7 @@ def _file_error(error: OSError) -> str:
 
 
 def _report_usage(error: typer.TyperException) -> int:
-    """Print what is wrong with the command line, or the help without a command."""
+    """Print a usage error, or the help if there is no command."""
     message = reworded(error.format_message())
     context = getattr(error, "ctx", None)
     if context is None:

@@ -1,5 +1,5 @@
-"""The group `era rig`: `check`, whether a rig is wired and built as its file says; `identify`;
-`show` and `merge` of what a fit found.
+"""The group `era rig`: `check` compares a rig with its file; `identify` fits the plate's
+parameters; `show` and `merge` use the result of a fit.
 
 `era rig identify` finds the parameters of the plate in place, through a sound card that plays and
 records accelerometers, or from a file of responses. `era rig check` reads such a file.
@@ -24,17 +24,17 @@ if TYPE_CHECKING:
     from model.rig.rig import Rig
 
 measure_by_card: "Callable[..., MeasuredPlate] | None" = None
-"""Measures a plate through a sound card; set by the lab, which knows such cards."""
+"""Measures a plate through a sound card; set by the lab, which implements sound cards."""
 
 _NOT_EXPLAINED = (
     "chi² must be at most 2 for a plate that the model explains; no rig is written. Check that "
-    "nothing touches the plate, and by era rig check that it is that of the file and wired as it "
-    "says"
+    "nothing touches the plate, and run era rig check to verify that plate and wiring match the "
+    "file"
 )
 _NOT_KNOWN = (
-    "modes must be those of the rig's plate to 2 standard deviations; no rig is written. Its "
-    "fields between the sensors are not known: remove what is bonded to the plate, such as a frame "
-    "along its edges, or use the rig as written; sensors inside the plate show where it differs"
+    "modes must match the rig's plate within 2 standard deviations; no rig is written. The fields "
+    "between the sensors are unknown: remove parts bonded to the plate, such as a frame along its "
+    "edges, or use the rig as it is; sensors inside the plate show where it differs"
 )
 
 
@@ -95,9 +95,7 @@ def identify(
     ] = None,
     untouched: Annotated[
         bool,
-        typer.Option(
-            "--yes", help="Nothing touches the plate, and nothing will: do not ask on a terminal."
-        ),
+        typer.Option("--yes", help="Skip the prompt; confirms that nothing touches the plate."),
     ] = False,
     seed: Annotated[
         int,
@@ -128,7 +126,7 @@ def identify(
 
     if measured_file is not None:
         played = {"--level": level, "--device": device}
-        _refuse(played, rule="plays; leave it out beside --measured")
+        _refuse(played, rule="plays; leave it out with --measured")
     elif device is None:
         raise InputError("give --device, a sound card, or --measured, a file of responses")
     if device is None:
@@ -199,7 +197,7 @@ def _refuse(given: Mapping[str, object], *, rule: str) -> None:
 def _read_measured_plate(path: Path, rig: "Rig") -> "MeasuredPlate":
     """Read responses, and leave out sensors without a signal.
 
-    Raises InputError for responses that are not what they claim to be.
+    Raises InputError for inconsistent responses.
     """
     from model.estimate.calibrate import check_consistency
     from model.estimate.measurement import MeasuredPlate, measurement_of, read_measured
@@ -232,13 +230,13 @@ def require_untouched(*, is_known: bool, has_terminal: bool) -> None:
         return
     if not (has_terminal and sys.stdin.isatty()):
         raise InputError(
-            "nothing may touch the plate while it is measured; look, and say so with --yes"
+            "nothing must touch the plate during the measurement; check it, and confirm with --yes"
         )
-    typer.confirm("Nothing touches the plate, and will not for a minute?", abort=True, err=True)
+    typer.confirm("Is nothing touching the plate, for the next minute?", abort=True, err=True)
 
 
 def measured_line(rig: "Rig", measured: "MeasuredPlate") -> str:
-    """What was measured, in one line."""
+    """Return a summary of the measurement in one line."""
     from model.quantities import counted
 
     measurement = measured.measurement
@@ -253,7 +251,7 @@ def measured_line(rig: "Rig", measured: "MeasuredPlate") -> str:
 
 
 def measured_json(measured: "MeasuredPlate") -> dict[str, object]:
-    """How it was measured, for programs."""
+    """Return the measurement settings for JSON output."""
     measurement = measured.measurement
     return {
         "sensors": list(measured.sensors),
@@ -279,8 +277,8 @@ def show(
 ) -> None:
     """Show the values of a fit next to those of its base.
 
-    The base is the rig file that the fit began with. Values are in SI units, as the rig file states
-    them, and those of the fit have standard errors.
+    The base is the rig file that the fit started from. Values are in SI units, with standard errors
+    for the fitted ones.
     """
     from model.rig.rig_file import load_rig
     from model.rig.rig_writing import fitted_rows
@@ -288,7 +286,7 @@ def show(
     rig = load_rig(fitted)
     changes = fitted_rows(rig)
     assert rig.document is not None  # noqa: S101  it was read from a file
-    assert rig.document.over is not None  # noqa: S101  else there were no rows
+    assert rig.document.over is not None  # noqa: S101  there are rows
     base = str(rig.document.over.data["base"])
     table = [
         (
@@ -311,7 +309,7 @@ def show(
 
 
 def _value_text(value: object) -> str:
-    """A value of a rig file for people: five digits of a number, the count of rows."""
+    """Format a value of a rig file: numbers with five digits, tables as their row count."""
     match value:
         case float():
             return f"{value:.5g}"
@@ -331,8 +329,8 @@ def merge(
 ) -> None:
     """Write one rig file from a fitted rig and its base.
 
-    It has the values of the fit and all other keys of the rig file that the fit began with, without
-    its comments. The table of the fitted rig serves it, too.
+    It has the fitted values and all other keys of the base, without comments. The table of the
+    fitted rig remains valid for it.
     """
     from model.files.array_file import whole_or_nothing
     from model.rig.rig_file import load_rig
@@ -341,7 +339,7 @@ def merge(
     rig = load_rig(fitted)
     assert rig.document is not None  # noqa: S101  it was read from a file
     if rig.document.over is None:
-        raise InputError(f"{fitted} must be a fitted rig, with a `base`; this one is whole")
+        raise InputError(f"{fitted} must be a fitted rig, with a `base`, got a complete one")
     text = f"# {fitted.name} merged by `era rig merge`:\n\n{rig.document.whole_text}"
     with whole_or_nothing(output) as stream:
         stream.write(text.encode())
@@ -400,7 +398,7 @@ def check(
 
 
 def _read(measured: Path, rig_file: Path, *, mesh: str | None) -> "tuple[Rig, Measurement]":
-    """Read what was measured from a file."""
+    """Read a measurement from a file."""
     from model.estimate.measurement import measurement_of, read_measured
     from model.rig.rig_file import load_rig
 

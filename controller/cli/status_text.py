@@ -1,4 +1,4 @@
-"""Status and events of the daemon, as commands show them to people."""
+"""Format the daemon's status and events for display."""
 
 from datetime import datetime
 
@@ -68,10 +68,10 @@ def show_status(status: StatusResult) -> str:
 
 
 def _scale(status: StatusResult) -> str | None:
-    """Name the threshold set of the levels that are shown; None if none is."""
+    """Name the threshold set of the displayed levels; None without levels."""
     from model.finger import scale_in_words
 
-    if status.threshold is None:  # a daemon of an earlier version
+    if status.threshold is None:  # an older daemon
         return None
     for contact in status.contacts:
         if contact.level_db_sl is not None or contact.rig_foreign_level_db_sl is not None:
@@ -80,31 +80,31 @@ def _scale(status: StatusResult) -> str | None:
 
 
 def _layout(status: StatusResult) -> str:
-    """Return the layout in use, and which there are if there are several."""
+    """Return the current layout, and all layouts if there are several."""
     others = f" (of {', '.join(status.layouts)})" if len(status.layouts) > 1 else ""
     return f"{status.layout}{others}"
 
 
 def _given(*texts: tuple[str, object]) -> list[str]:
-    """Texts with their values, but for those whose value is None or False."""
+    """Format texts with their values; texts whose value is None or False are left out."""
     return [text.format(value) for text, value in texts if value is not None and value is not False]
 
 
 def _loss(status: StatusResult) -> str | None:
-    """What is to be assumed of amplifiers that are lost, if any are."""
+    """Return the state to assume of lost amplifiers; None if none is lost."""
     if status.lost_for_s is None:
         return None
     watchdog = f"its watchdog silences it after {status.watchdog_s:g} s without heartbeats"
     if status.assume_energised:
         silences = [each.silence for each in status.amplifiers if each.silence is not None]
         if any(each.silence == "may_play" and each.may_play_for_s is None for each in silences):
-            watchdog = "nothing that is known silences it: switch it off"
+            watchdog = "it has no known watchdog: switch it off"
         return f"ASSUME ENERGISED: a lost amplifier may still be playing; {watchdog}"
     return f"unreachable for {status.lost_for_s:.1f} s: {watchdog}, unconfirmed"
 
 
 def _contact(contact: ContactStatus) -> str:
-    """Format a finger and what it feels."""
+    """Format a finger and its sensation."""
     from model.answer.answer import OWN, verdict_shown
 
     verdict = verdict_shown(contact.verdict, is_foreign_felt=contact.is_foreign_felt)

@@ -1,13 +1,12 @@
-"""Child processes of the daemon that must not disturb its loop: the gateway, a reader of its files.
+"""Child processes that keep work out of the daemon's loop: the gateway and a file reader.
 
 The gateway is an ordinary API client. It is restarted after a growing pause when it exits, and
 ends with the daemon, even if that is killed.
 
-A configuration is read by `python -m controller.daemon.children FILE`, which renders its content
-for the frequencies that it is given, and writes the configuration, or the text of its problems, in
-Python's pickle format. A thread that parses for a second would hold the interpreter's lock up to
-5 ms at a time, and longer while another program has its processor, so that the loop and its
-heartbeats would wait for it.
+`python -m controller.daemon.children FILE` reads a configuration, renders its content for the given
+frequencies, and writes the configuration, or the text of its problems, as a pickle. A parsing
+thread would hold the interpreter lock for 5 ms at a time, and longer if another program has its
+processor; the loop and its heartbeats would have to wait.
 """
 
 import asyncio
@@ -39,8 +38,8 @@ _logger = logging.getLogger(__name__)
 def gateway_options(address: str, socket: Path, *, shows_token: bool = False) -> list[str]:
     """Return options of a gateway that serves the page at HOST:PORT, with a new token.
 
-    Where the gateway would print its token into a log, the token is in a file that only its owner
-    may read, unless shows_token is true. Raises InputError if that cannot be written.
+    If the gateway would print its token into a log, the token goes to a file that only its owner
+    can read, unless shows_token is true. Raises InputError if the file cannot be written.
     """
     options = ["--socket", str(socket), "--listen", address]
     if shows_token or sys.stdout.isatty():
@@ -81,8 +80,8 @@ async def keep_gateway(options: list[str]) -> None:
         await asyncio.sleep(pause)
 
 
-_TIMEOUT = 60.0  # s; a plug-in or a file on a lost network folder may hang
-_NICE = 10  # above that of the daemon, whose loop comes first
+_TIMEOUT = 60.0  # s; a plug-in or a lost network folder can hang
+_NICE = 10  # added to that of the daemon, whose loop has priority
 
 
 def read_in_child(file: Path, frequencies: FloatArray) -> DaemonConfig:
@@ -111,7 +110,7 @@ def read_in_child(file: Path, frequencies: FloatArray) -> DaemonConfig:
         except (EOFError, OSError, pickle.UnpicklingError) as error:
             _logger.debug("config: child ended early: %s", error)
         except (ImportError, AttributeError, TypeError) as error:
-            process.kill()  # it would wait for the rest to be read
+            process.kill()  # it would wait for a reader of the rest
             raise InputError(
                 f"{file} uses a plug-in that was installed or changed after the daemon started "
                 f"({error}); restart the daemon"
@@ -145,7 +144,7 @@ def _main() -> None:
     with contextlib.suppress(OSError):
         os.nice(_NICE)
     output = sys.stdout.buffer
-    sys.stdout = sys.stderr  # for what a plugin prints
+    sys.stdout = sys.stderr  # for output of plug-ins
     read: DaemonConfig | str
     try:
         frequencies = pickle.load(sys.stdin.buffer)  # noqa: S301  of the daemon

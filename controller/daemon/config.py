@@ -150,10 +150,10 @@ class DaemonConfig:
     urls: Mapping[str, str]
     """URL of each amplifier by name."""
     table: Path | None
-    """File of the localization table; None: it is built or taken from the cache."""
+    """File of the localization table; None: build it or use the cache."""
     layouts: Mapping[str | None, SurfaceLayout]
-    """Layouts by name, in the file's order; if it has none, one under None that buzzes at every
-    touch."""
+    """Layouts by name, in the order of the file; without layouts, one named None that buzzes at
+    every touch."""
     strengths: Path | None
     """File in which strengths are kept; None: they last as long as the daemon runs."""
     touch: tuple[TouchInput, ...]
@@ -172,7 +172,7 @@ def load_daemon_config(path: Path) -> DaemonConfig:
 
 
 def daemon_config_of(document: Document) -> DaemonConfig:
-    """Load what a daemon's file names; raises as `load_daemon_config`."""
+    """Load the files that a daemon file names; raises the errors of `load_daemon_config`."""
     from controller.api.link import default_socket  # not on Windows, where rigs are checked
 
     _check_kind(document)
@@ -218,7 +218,7 @@ def daemon_config_of(document: Document) -> DaemonConfig:
 
 
 def is_daemon_document(document: Document) -> bool:
-    """Whether a document is a daemon's: it has keys of one and does not describe a plate."""
+    """Whether a document is a daemon file: it has daemon keys and describes no plate."""
     keys = document.data.keys()
     return bool(keys & DaemonSection.model_fields.keys()) and keys.isdisjoint({"plate", "surface"})
 
@@ -238,7 +238,7 @@ def _check_kind(document: Document) -> None:
 
 
 def file_of(document: Document, *keys: str) -> Path | None:
-    """The path at nested keys of a daemon's file, relative to its folder; None if it has none."""
+    """Return the path at nested keys, relative to the file's folder; None if it is missing."""
     value: object = document.data
     for key in keys:
         value = value.get(key) if isinstance(value, dict) else None
@@ -253,7 +253,7 @@ def _rig(validation: Validation[DaemonSection], file: Path | None) -> tuple[Rig 
         document = with_base(read_document(file))
         rig = rig_of(document)
         check_supported(rig.plate, rig.eras, loads=rig.masses)
-        assert rig.document is not None  # noqa: S101  it was made of one
+        assert rig.document is not None  # noqa: S101  the rig was loaded from a document
         return rig, rig.document.whole_text
     except ConfigError as error:
         validation.add(("rig",), "invalid rig:\n    " + str(error).replace("\n", "\n  "))
@@ -336,7 +336,7 @@ def _touch(
 def _calibration(section: CalibrationSection, rig: Rig | None) -> TouchCalibration:
     if section.points is not None and (section.turned or section.mirror):
         raise InputError("must have only one of turned and mirror, points")
-    if section.points is None or rig is None:  # an invalid rig is reported already
+    if section.points is None or rig is None:  # an invalid rig is already reported
         return turned(section.turned, mirror=section.mirror)
     plate = rig.plate
     return fit_touch_calibration(
@@ -382,7 +382,7 @@ def _checked(document: Document) -> CheckedFile:
     rig = config.rig
     _, warnings = check_links(config.urls, channels=rig.channel_counts, limits=rig.limits)
     daemon = f"era daemon {document.source}"
-    hint = "" if config.table is None else f". {daemon} --check reads its table, too"
+    hint = "" if config.table is None else f". {daemon} --check also reads its table"
     line = (
         f"good: ERAs {', '.join(era.name for era in config.rig.eras)} on "
         f"{', '.join(f'{name} ({url})' for name, url in config.urls.items())}; touches from "

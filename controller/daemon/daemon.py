@@ -61,7 +61,7 @@ class Daemon:
     """A daemon; create it within the event loop that runs it.
 
     dashboard: HOST:PORT at which the gateway serves the page, or None.
-    shows_token: whether the page's token is printed where it may be logged, too.
+    shows_token: whether to print the page's token even if the output may be logged.
     observe: adds observers of the control loop.
     lines: makes the lines to the amplifiers.
     watchdog [s]: of the amplifiers; longer for simulated ones on a busy machine.
@@ -370,9 +370,9 @@ def _check_limits() -> None:
 
 @contextmanager
 def _ignored_signals() -> Iterator[None]:
-    """Ignore signals that would end the daemon but request nothing of it, or too early.
+    """Ignore signals that would end the daemon by accident or too early.
 
-    SIGTERM ends it at once until it serves: nothing is open yet, and a library may be stuck.
+    SIGTERM ends it immediately until it serves: nothing is open yet, and a library could be stuck.
     """
     before = {number: signal.signal(number, signal.SIG_IGN) for number in _IGNORED}
     before[signal.SIGTERM] = signal.signal(signal.SIGTERM, signal.SIG_DFL)

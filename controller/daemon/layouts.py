@@ -1,8 +1,8 @@
-"""What a running daemon can exchange: its surface layouts, its configuration, its touch inputs.
+"""Parts that a running daemon can replace: surface layouts, configuration, touch inputs.
 
-`LayoutChoice` holds the layouts, one of which is in use. `read_again` reads the configuration a
-second time and `ConfigChange` says what may be applied; both block and run outside the event loop,
-as large layouts take a while to compare. `TouchInputs` runs the configured touch sources.
+`LayoutChoice` holds the layouts and the current one. `read_again` reads the configuration again and
+returns a `ConfigChange` with the changes that can be applied; it blocks, and runs outside the event
+loop because comparing large layouts takes a while. `TouchInputs` runs the configured touch sources.
 """
 
 import asyncio
@@ -35,23 +35,23 @@ _APPLIED = ("layouts", "level_db_sl")  # keys that a running daemon can apply
 
 @dataclass(frozen=True)
 class ConfigChange:
-    """A configuration, and how it differs from the one in use."""
+    """A configuration, and its differences from the current one."""
 
     config: DaemonConfig
     restart: list[str]
     """Changed keys that need a restart."""
     changes: list[str]
-    """All other changes, in words."""
+    """Descriptions of all other changes."""
     layouts: frozenset[str | None]
-    """Names of the layouts that differ; None is the layout of a configuration without any."""
+    """Names of the changed layouts; None: the default layout of a configuration without layouts."""
     old_max_db_sl: float
     max_db_sl: float
     """Highest level of all layouts, before and after [dB SL]."""
     effects: list[Effect]
-    """All effects of both configurations, in use or not; see `release`."""
+    """All effects of both configurations; see `release`."""
 
     def refusals(self, *, is_armed: bool) -> list[str]:
-        """Return the reasons why the configuration must not be applied; empty if it may be."""
+        """Return the reasons for rejecting the configuration; empty if it can be applied."""
         reasons = [f"{key}: changed, which needs a restart" for key in self.restart]
         if is_armed and self.max_db_sl > self.old_max_db_sl:
             reasons.append(
@@ -64,9 +64,9 @@ class ConfigChange:
 def read_again(old: DaemonConfig, frequencies: FloatArray) -> ConfigChange:
     """Read a daemon's configuration again for a table's frequencies [Hz]; blocks.
 
-    Raises as `read_in_child`.
+    Raises the errors of `read_in_child`.
     """
-    with without_collections():  # of large layouts
+    with without_collections():  # large layouts would take long
         change = config_change(old, read_in_child(old.source, frequencies))
         warn_of_bands(
             {name: change.config.layouts.get(name) for name in change.layouts}, frequencies
@@ -77,7 +77,7 @@ def read_again(old: DaemonConfig, frequencies: FloatArray) -> ConfigChange:
 def warn_of_bands(
     layouts: Mapping[str | None, SurfaceLayout | None], frequencies: FloatArray
 ) -> None:
-    """Log what layouts play where a table of frequencies [Hz] has none within a band."""
+    """Log the frequencies played for bands that contain no frequency of the table [Hz]."""
     for name, layout in layouts.items():
         for problem in layout.band_problems(frequencies) if layout else ():
             _logger.warning("layout %s: %s", name, problem)
@@ -118,8 +118,8 @@ def _effects_of(config: DaemonConfig) -> list[Effect]:
 async def release(effects: list[Effect]) -> None:
     """Free the effects of replaced layouts, one in each turn of the event loop.
 
-    The caller has no other reference to these layouts. The interpreter is held while an object is
-    freed with all that it refers to, so layouts of many files must not be freed as a whole.
+    The caller must hold no other reference to these layouts. Freeing an object together with all
+    its contents blocks the interpreter, so layouts of many files must not be freed as a whole.
     """
     while effects:
         effects.pop()
@@ -127,10 +127,10 @@ async def release(effects: list[Effect]) -> None:
 
 
 class LayoutChoice:
-    """The layouts of a daemon's configuration; the first is in use until another one is chosen.
+    """The layouts of a daemon's configuration; the first is current until another is chosen.
 
-    config: rendered for the table with these frequencies [Hz].
-    changed: called when another layout, or the same with other content, is in use.
+    config: configuration rendered for the table's frequencies [Hz].
+    changed: called after the current layout or its content changes.
     """
 
     def __init__(
@@ -139,67 +139,67 @@ class LayoutChoice:
         self._layouts = config.layouts
         self._changed = changed
         self.name = next(iter(self._layouts))
-        """Name of the layout in use; None if no layout is configured."""
+        """Name of the current layout; None if no layout is configured."""
         self.player = EffectPlayer(
             self._layouts[self.name], Strengths(read_strengths(config.strengths))
         )
-        """Plays the layout in use."""
+        """Plays the current layout."""
         warn_of_bands(self._layouts, frequencies)
 
     @property
     def names(self) -> list[str]:
-        """The names that may be chosen."""
+        """Names of the available layouts."""
         return [name for name in self._layouts if name is not None]
 
     def use(self, name: str) -> None:
-        """Play a layout for all that comes from now on; raises RpcError for an unknown name."""
+        """Switch to a layout; raises RpcError for an unknown name."""
         if name not in self._layouts:
             remedy = f"{did_you_mean(name, self.names)}choose one of {', '.join(self.names)}"
             raise RpcError(
                 ErrorCode.INVALID_PARAMS,
                 f"unknown layout {name!a}",
                 where="name",
-                remedy=remedy if self.names else "name some in layouts of the daemon's file",
+                remedy=remedy if self.names else "add layouts to the daemon's file",
             )
         if name != self.name:
             self._play(name)
 
     def apply(self, change: ConfigChange) -> list[str]:
-        """Take the layouts of a configuration that was read again; the one in use stays in use.
+        """Apply the layouts of a configuration that was read again; the current name is kept.
 
-        If that was removed, the first is in use; the result is a note of it, otherwise empty.
+        If the current layout was removed, switches to the first and returns a note, otherwise [].
         """
         before, self._layouts = self.name, change.config.layouts
         name = before if before in self._layouts else next(iter(self._layouts))
         if name != before or name in change.layouts:
             self._play(name)
-        return [] if name == before else [f"layout in use: {name or 'none'}"]
+        return [] if name == before else [f"current layout: {name or 'none'}"]
 
     def event(self) -> LayoutEvent:
-        """The layout in use, as an event."""
+        """Return the current layout as an event."""
         layout = None if self.name is None else self.player.layout.as_json()
         return LayoutEvent(name=self.name, layout=layout)
 
     def _play(self, name: str | None) -> None:
         self.name = name
         self.player.replace(self._layouts[name])
-        _logger.info("layout: %s in use", name or "none")
+        _logger.info("layout: using %s", name or "none")
         self._changed()
 
 
 _MIN_PAUSE, _MAX_PAUSE = 1.0, 30.0  # s; before a failed source is restarted
 _CLOSE_TIMEOUT = 0.2  # s
-_WATCH_INTERVAL = 1.0  # s; in which the state of all inputs is looked at
+_WATCH_INTERVAL = 1.0  # s; between checks of all inputs
 
 
 class TouchInputs:
     """Runs touch sources concurrently; a source that fails is restarted after a growing pause.
 
-    deliver: receives their frames in coordinates of the plate, with the configured name as prefix
-        of the source's name.
+    deliver: receives their frames in plate coordinates; source names start with the configured
+        name.
     lift: receives the prefix of a source that ends, fails or is cancelled.
-    rejects: counter of all sources.
-    changed: called when `event` has changed.
+    rejects: counter shared by all sources.
+    changed: called after `event` changes.
     """
 
     def __init__(
@@ -215,10 +215,10 @@ class TouchInputs:
         self._rejects = rejects
         self._changed = changed
         self._sources: dict[TouchInput, TouchSource | str | None] = {}
-        """Source of each input; the reason in words while it has no source; None at its end."""
+        """Source of each input; a text with the reason if it has none; None after its end."""
         self._running: list[asyncio.Task[None]] = []
         self.event = InputsEvent(inputs=[], rejected_touches={})
-        """State of all inputs and rejected touches, at most a second old."""
+        """State of all inputs and rejected touches, at most one second old."""
 
     def start(self, inputs: Sequence[TouchInput]) -> None:
         """Run these sources until `close`."""
@@ -229,15 +229,15 @@ class TouchInputs:
         self._running.append(asyncio.create_task(self._watch(), name="touch inputs"))
 
     async def close(self) -> None:
-        """Stop all sources; one of a plug-in that goes on is ended where it waits."""
+        """Stop all sources; close the coroutine of a plug-in that ignores cancellation."""
         for task in self._running:
             task.cancel()
         if not self._running:
             return
         _, late = await asyncio.wait(self._running, timeout=_CLOSE_TIMEOUT)
-        for task in late:  # else the end of the program would wait for it
-            _logger.warning("%s: does not end when cancelled", task.get_name())
-            with suppress(Exception):  # it ignores this as well, or fails
+        for task in late:  # otherwise the program would wait for it at its end
+            _logger.warning("%s: not ended by cancellation", task.get_name())
+            with suppress(Exception):  # it can ignore this too, or fail
                 task.get_coro().close()
             task.cancel()
         ends = asyncio.gather(*late, return_exceptions=True)
@@ -247,7 +247,7 @@ class TouchInputs:
         prefix, calibration = f"{touch_input.name}:", touch_input.calibration
 
         def deliver(frame: TouchFrame) -> None:
-            # The sender chooses the name, which is printed on terminals.
+            # The sender chooses the name, and terminals print it.
             source = frame.source if frame.source.isprintable() else ascii(frame.source)
             touches = frame.touches
             if calibration != ALIGNED:
@@ -258,7 +258,7 @@ class TouchInputs:
         while True:
             started_at = threads.now()
             try:
-                # A plug-in may block.
+                # A plug-in can block.
                 source = await in_thread(touch_input.make, name="touch source")
                 source.rejects = self._rejects
                 self._sources[touch_input] = source
@@ -274,11 +274,11 @@ class TouchInputs:
                 return
             finally:
                 self._lift(prefix)
-            # A panel may be plugged in later, a port be released.
+            # A panel can be plugged in later, or a port released.
             await asyncio.sleep(backoff.pause(ran_for=threads.now() - started_at))
 
     def _look(self, *changed: tuple[TouchInput, TouchSource | str | None]) -> None:
-        """Look at all inputs, of which some have changed."""
+        """Update the state of all inputs after some have changed."""
         self._sources.update(changed)
         statuses = [_status(*each) for each in self._sources.items()]
         event = InputsEvent(inputs=statuses, rejected_touches=dict(self._rejects.counts))
@@ -287,14 +287,14 @@ class TouchInputs:
             self._changed()
 
     async def _watch(self) -> None:
-        """Look at all inputs from time to time."""
+        """Update the state of all inputs periodically."""
         while True:
             await asyncio.sleep(_WATCH_INTERVAL)
             self._look()
 
 
 def _status(touch_input: TouchInput, source: TouchSource | str | None) -> TouchInputStatus:
-    """Describe an input by its source, or by the reason for having no source."""
+    """Describe an input by its source, or by the reason for its missing source."""
     try:
         problem = source.problem if isinstance(source, TouchSource) else source
     except Exception as error:  # of a plug-in

@@ -1,9 +1,9 @@
-"""Messages of the API that say what the daemon, the plate and its amplifiers do.
+"""API messages about the state of the daemon, the plate and its amplifiers.
 
-`EventPublisher` keeps what was last reported and sends every change to the clients that subscribed
-to its topic. `PlateView` describes the fingers and what plays for them, `amplifier_statuses` the
-amplifiers, `hello_result` and `effects_result` what a client can use. `LatencyStatistics` sums up
-how quickly touches were answered.
+`EventPublisher` keeps the latest reports and sends every change to the subscribers of its topic.
+`PlateView` describes the fingers and their playback, `amplifier_statuses` the amplifiers,
+`hello_result` and `effects_result` the features available to a client. `LatencyStatistics`
+summarises the latencies of touches.
 """
 
 import asyncio
@@ -96,7 +96,7 @@ class EventPublisher:
     ) -> None:
         self.view = PlateView(layouts.player.effect_of, why_not=self._why_not)
         self._player = layouts.player
-        self.latencies = LatencyStatistics()  # of touches alone
+        self.latencies = LatencyStatistics()  # touches only
         self.lift_latencies = LatencyStatistics()
         self.amplifiers = amplifiers
         self.inputs = inputs
@@ -125,10 +125,10 @@ class EventPublisher:
         loop.refused.append(self._refused)
 
     def state_changed(self, old: Operation, new: Operation) -> None:
-        """Publish a transition of the daemon, and the silence that it causes.
+        """Publish a transition of the daemon, and the resulting silence.
 
-        Nothing plays outside OPERATION_ENABLED. The control loop does not report the end of what
-        another part of the daemon has silenced.
+        Nothing plays outside OPERATION_ENABLED. The control loop does not report silence that
+        another part of the daemon has caused.
         """
         self.hub.publish("state", lambda: _state_event(old, new))
         if new.state is DaemonState.OPERATION_ENABLED:
@@ -143,7 +143,7 @@ class EventPublisher:
             self.hub.publish("silence", lambda: silence)
 
     def _why_not(self, key: ContactKey) -> str:
-        """Return why a contact feels nothing of its own, unless the loop has reported it."""
+        """Return why a contact feels no effect of its own, if the loop has not reported it."""
         operation = self._operation()
         if operation.state is not DaemonState.OPERATION_ENABLED:
             return f"{STATE_WORDS[operation.state]}: {operation.next_step or operation.cause}"
@@ -167,13 +167,13 @@ class EventPublisher:
     def logged(self, record: logging.LogRecord) -> None:
         """Publish a log record, from any thread.
 
-        A record that is marked with a topic is left out: an event of that topic reports it.
+        A record marked with a topic is left out, because an event of that topic reports it.
         """
         if hasattr(record, "topic"):
             return
         event = {
             "level": "error" if record.levelno >= logging.ERROR else record.levelname.lower(),
-            # File names may contain bytes that are not valid text.
+            # File names can contain bytes that are not valid text.
             "message": record.getMessage()[:_MAX_MESSAGE]
             .encode(errors="backslashreplace")
             .decode(),
@@ -225,7 +225,7 @@ def _state_event(old: Operation, new: Operation) -> StateEvent:
 
 @dataclass
 class PlateView:
-    """The contacts on the plate and the last report of what plays for them."""
+    """The contacts on the plate and the last report of their playback."""
 
     effect_of: Callable[[ContactKey], str | None]
     """Returns the effect that plays for a contact."""
@@ -236,7 +236,7 @@ class PlateView:
     None before the first one, and after another part of the daemon has silenced the plate.
     """
     why_not: Callable[[ContactKey], str] = lambda key: ""
-    """Returns why a contact feels nothing if the report does not say it; "" if it should feel."""
+    """Returns why a contact feels nothing if the report gives no reason; "" if it should feel."""
 
     @property
     def applied(self) -> PlayReport | None:
@@ -249,7 +249,7 @@ class PlateView:
 
     @property
     def silence_reason(self) -> str | None:
-        """Why nothing plays for the present contacts; None while a pattern plays."""
+        """Why nothing plays for the current contacts; None while a pattern plays."""
         if self.applied is not None:
             return None
         reasons = dict.fromkeys(each.held_back for each in self.contact_statuses())
@@ -257,7 +257,7 @@ class PlateView:
 
     def _statuses(self, contacts: Iterable[Contact]) -> list[ContactStatus]:
         report, reason = self.report, ""
-        if report and not report.targets:  # as by a failure
+        if report and not report.targets:  # for instance after a failure
             reason = report.reason
         known = {(each.key, each.since) for each in report.contacts} if report and reason else ()
         return [
@@ -272,7 +272,7 @@ class PlateView:
         ]
 
     def statuses_now(self, table: LocalizationTable) -> list[ContactStatus]:
-        """Describe all contacts with their roles and with what leaks to their present places."""
+        """Describe all contacts with roles, and crosstalk at their current positions."""
         statuses = self.contact_statuses()
         if self.applied is None:
             return statuses
@@ -285,7 +285,7 @@ class PlateView:
 
     @property
     def targets(self) -> list[str]:
-        """The fingers that feel something now, each as its source and number."""
+        """The current targets, each as source and number."""
         keys = [each.contact.key for each in self.applied.targets] if self.applied else []
         return [f"{key.source} {key.id}" for key in keys]
 
@@ -321,7 +321,7 @@ def _contact_status(
 ) -> ContactStatus:
     """Describe a contact, its predicted sensation and its effect.
 
-    why_not: why it feels nothing of its own; used if it is not a target of the report.
+    why_not: reason if it is not a target of the report.
     """
     status: dict[str, object] = {
         "source": contact.key.source,
@@ -334,7 +334,7 @@ def _contact_status(
     }
     if report is not None:
         for felt in report.targets:
-            # A report may be older than a finger of the same number.
+            # A report can be older than a new finger with the same number.
             if (felt.contact.key, felt.contact.since) == (contact.key, contact.since):
                 status |= {"role": "target", **_figures(felt)}
     if report and any(each.key == contact.key for each in report.quiet):
@@ -392,7 +392,7 @@ def playing_of(applied: PlayReport | None) -> dict[str, Any]:
 
 
 def _played_tones(drive: Drive) -> dict[str, PlayedTone]:
-    """Describe the tones of one layer by ERA."""
+    """Describe the tones of a layer by ERA."""
     return {
         era: PlayedTone(frequency_hz=tone.frequency, level=tone.level, phase_deg=tone.phase)
         for era, tone in drive.items()
@@ -418,9 +418,9 @@ def amplifier_statuses(
 
     are_open: whether all are open together; otherwise their last statuses are outdated.
     lost: the loss after which the other amplifiers were closed.
-    what_may_play: returns what an amplifier that does not reply may play, by its name.
+    what_may_play: returns the possible output of an amplifier that does not reply, by name.
     clock_errors: RMS errors of the clocks [s]; see `Group`.
-    targets: the fingers that feel something now.
+    targets: the fingers that currently feel something.
     """
     now, statuses = threads.now(), []
     for name, url in urls.items():
@@ -479,7 +479,7 @@ def amplifier_statuses(
 def _report(kind: ReportKind, targets: Sequence[str]) -> AmplifierReport:
     """Describe a report of an amplifier.
 
-    Limited levels are felt less by every finger that feels something, so its cause names them.
+    Limited levels are felt by every target, so the cause names all targets.
     """
     cause, remedy = REPORTS[kind]
     if kind == "limited" and targets:
@@ -495,7 +495,7 @@ def hello_result(
     drive_mode: str,
     layout: dict[str, object] | None,
 ) -> HelloResult:
-    """Describe what the daemon drives."""
+    """Describe rig, table and layout of the daemon."""
     rig = config.rig
     return HelloResult(
         api_version=API_VERSION,
@@ -552,7 +552,7 @@ def effects_result(layout: SurfaceLayout) -> EffectsResult:
 
 BUCKETS_MS = (0.25, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 7.5, 10.0, 15.0, 20.0, 50.0, 100.0)
 """Upper edges of the histogram of latencies [ms]."""
-_WINDOW = 10_000  # latencies, of which the percentiles are taken
+_WINDOW = 10_000  # latencies used for the percentiles
 
 
 class LatencyStatistics:
@@ -575,7 +575,7 @@ class LatencyStatistics:
         quantiles: list[float | None] = [None, None, None]
         if self._count:
             recent = self._recent_ms[: self._count]
-            # inverted_cdf returns a value that occurred
+            # inverted_cdf returns a measured value
             found = np.quantile(recent, [0.5, 0.99, 0.999], method="inverted_cdf")
             quantiles = [float(value) for value in found]
         median, p99, p999 = quantiles

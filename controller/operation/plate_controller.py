@@ -1,4 +1,4 @@
-"""The controller of a plate: opens, arms, stops and releases the amplifiers of its control loop."""
+"""Controller of a plate: opens, arms, stops and releases the amplifiers of its control loop."""
 
 import asyncio
 from collections.abc import Awaitable, Callable, Coroutine, Mapping, Sequence
@@ -19,19 +19,23 @@ from model.errors import InputError
 from model.rig.rig import Rig
 from model.table.table import LocalizationTable
 
-CLOSING_RAMP = 0.050  # s; not urgent, so longer than a release
+CLOSING_RAMP = 0.050  # s; not urgent, so longer than a normal release
 
 
 class Controller:
     """Drives the amplifiers of a rig by touch frames: open, arm, run its `cycle`, close.
 
-    It starts disarmed: contacts are followed but nothing is sent. The loop sends the heartbeat
-    itself after it has run, so that the watchdogs of the amplifiers trip when it hangs.
+    It starts disarmed: contacts are followed but nothing is sent. The loop itself sends the
+    heartbeat at the end of each cycle, so that the amplifiers' watchdogs trip if the loop hangs.
 
-    table: for this rig; lines: makes the lines to its amplifiers, anew for each opening;
-    intent_source: says what contacts shall feel; timing: shapes the patterns of the table; urls,
-    serial_numbers: by amplifier name; drive_mode: None for the best that the amplifiers can play;
-    connected: called with all amplifiers when their lines are open; watchdog [s]: of armed ones.
+    table: localization table of this rig.
+    lines: makes the lines to the amplifiers; called for each opening.
+    intent_source: selects the effects for contacts.
+    timing: shapes the patterns of the table.
+    urls, serial_numbers: by amplifier name.
+    drive_mode: None for the best mode that the amplifiers support.
+    connected: called with all amplifiers once their lines are open.
+    watchdog: watchdog time of armed amplifiers [s].
     """
 
     def __init__(
@@ -52,7 +56,7 @@ class Controller:
         """The control loop."""
         self._rig, self._intent_source, self._timing = rig, intent_source, timing
         self.table = table
-        """The table that answers."""
+        """The localization table to query."""
         self.urls = dict(rig.amplifiers if urls is None else urls)
         if self.urls.keys() != rig.amplifiers.keys():
             raise InputError(
@@ -60,16 +64,16 @@ class Controller:
                 f"{', '.join(sorted(self.urls)) or 'none'}"
             )
         self._make_lines = lines
-        self._lines: Lines | None = None  # also after an attempt to open that has failed
-        self._before: Lines | None = None  # the last ones, also once they are closed
-        self._opened: dict[str, Amplifier] = {}  # last, identified or not
+        self._lines: Lines | None = None  # also set after a failed attempt to open
+        self._before: Lines | None = None  # the previous lines, kept after closing
+        self._opened: dict[str, Amplifier] = {}  # latest ones, identified or not
         self._owed: dict[str, asyncio.Future[Awaitable[Mapping[str, StopOutcome]]]] = {}  # stops
         self._serial_numbers = dict(serial_numbers or {})
         self._connected = connected
         self.watchdog = watchdog
         """Watchdog of armed amplifiers [s]."""
         self.amplifiers: dict[str, Amplifier] = {}
-        """Amplifiers by name, as identified last; empty before."""
+        """Amplifiers by name, as last identified; empty before."""
         self._drive_mode = drive_mode
 
     @property
@@ -84,20 +88,19 @@ class Controller:
 
     @property
     def drive_mode(self) -> str:
-        """The drive mode of questions to the table; the best possible one until `open`."""
+        """Drive mode for table queries; the best possible mode until `open`."""
         if self.cycle.planner is not None:
             return self.cycle.planner.capabilities.drive_mode
         return self._drive_mode or UNRESTRICTED
 
     async def open(self) -> None:
-        """Open every amplifier, or none, and prepare what they can play; all stay disarmed.
+        """Open all amplifiers or none, and prepare their playback; all stay disarmed.
 
-        A stop reaches each as soon as its line is open, whatever becomes of the others.
-        An amplifier that was open before must have the serial number that it had, and keeps the
-        vibrations that its limits over time count. Raises LinkError, CommandError, and InputError
-        for a wired channel that its amplifier does not have or a drive mode that one cannot play.
-        After a LinkError the lines stay open for the next attempt, until `release`: a board may
-        restart whenever its port is opened.
+        A pending stop reaches each amplifier as soon as its line is open, even if others fail. An
+        amplifier that was open before must have the same serial number; its history for limits
+        over time is kept. Raises LinkError, CommandError, and InputError if an amplifier lacks a
+        wired channel or cannot play the drive mode. After a LinkError the lines stay open for the
+        next attempt, until `release`, because a board may restart whenever its port is opened.
         """
         cycle = self.cycle
         cycle.is_closed = False
@@ -105,7 +108,7 @@ class Controller:
             self._lines = self._before = self._make_lines(self._before)
         lines = self._lines
         try:
-            async with cycle.sending:  # to those of before
+            async with cycle.sending:  # to the previous amplifiers
                 cycle.group = Group(
                     self._opened, watchdog=self.watchdog, restored=cycle.feed_at_once
                 )
@@ -138,7 +141,7 @@ class Controller:
                 too_late=cycle.count_too_late,
                 clock_errors=lambda: self.group.clock_errors,
             )
-            await asyncio.to_thread(planner.prepare)  # seconds, of a large rig
+            await asyncio.to_thread(planner.prepare)  # takes seconds for a large rig
         except BaseException as error:
             if not isinstance(error, LinkError):
                 await self.release()
@@ -146,10 +149,10 @@ class Controller:
         cycle.planner = planner
 
     async def _amplifier(self, lines: Lines, name: str) -> Amplifier:
-        """Open the line of an amplifier, and send the stop that it is owed.
+        """Open the line of an amplifier, and send its pending stop, if any.
 
-        An amplifier whose line is open since another attempt is kept, with a stop in progress.
-        Raises LinkError, CommandError.
+        Keeps an amplifier whose line is still open from an earlier attempt, with any stop in
+        progress. Raises LinkError, CommandError.
         """
         before = amplifier = self._opened.get(name)
         if amplifier is None or amplifier.line.loss is not None:
@@ -169,7 +172,7 @@ class Controller:
         return amplifier
 
     async def arm(self) -> None:
-        """Switch the high voltage on, so that touches are felt; `cycle` runs or starts at once."""
+        """Switch the high voltage on, so that touches are felt; `cycle` must run or start now."""
         was_armed = self.group.is_armed
         await self.group.arm()
         self.cycle.note_armed(limits_of(self._rig, self.amplifiers), was_armed=was_armed)
@@ -179,24 +182,26 @@ class Controller:
         await self.group.disarm()
 
     def stop(self) -> Coroutine[Any, Any, Mapping[str, StopOutcome]]:
-        """Quick-stop every amplifier on an open line; latched until `clear`; see `Group.stop`."""
+        """Quick-stop all amplifiers on open lines; latched until `clear`; see `Group.stop`."""
         return self.group.stop()
 
     def stop_all(self) -> Coroutine[Any, Any, Mapping[str, StopOutcome]]:
-        """Quick-stop every amplifier, those whose lines are closed as soon as they are opened.
+        """Quick-stop all amplifiers; those with closed lines as soon as their lines are opened.
 
-        The requests on open lines are queued when this returns. Await it for what is known of each,
-        by name: of one whose line is opened within 0.3 s by its reply.
+        The requests on open lines are queued when this returns. Await the result for the outcome
+        by amplifier name; it includes replies on lines that are opened within 0.3 s.
         """
         stopping = self.group.stop()
-        if self.group.state is GroupState.CLOSED:  # who replies on open lines is not known for sure
+        if (
+            self.group.state is GroupState.CLOSED
+        ):  # the amplifiers on open lines are not identified yet
             opened = [each for each in self.group.amplifiers.values() if each.line.loss is None]
             stopping = _identified(opened, stopping)
         self._owe()
         return self._stopped(asyncio.ensure_future(stopping), {**self._owed})
 
     def _owe(self) -> None:
-        """Owe a stop to each amplifier whose line is closed."""
+        """Register a pending stop for each amplifier with a closed line."""
         for name in self.urls:
             amplifier = self.group.amplifiers.get(name)
             if amplifier is None or amplifier.line.loss is not None:
@@ -210,30 +215,30 @@ class Controller:
         if owed:
             await asyncio.wait(owed.values(), timeout=CONFIRM_TIMEOUT)
         outcomes = {**await stopping}
-        self._owe()  # what was lost meanwhile
+        self._owe()  # for amplifiers lost meanwhile
         for opened in owed.values():
             if opened.done():
                 outcomes |= await opened.result()
         return {name: outcomes.get(name, self.what_may_play(name)) for name in self.urls}
 
     def what_may_play(self, name: str, cause: str = "") -> StopOutcome:
-        """Return what an amplifier may be playing; cause: why no more is known."""
+        """Return the possible output of an amplifier; cause: why its state is unknown."""
         opened = self._opened.get(name)
         return UNREACHED if opened is None else opened.what_may_play(cause)
 
     async def clear(self) -> None:
-        """Acknowledge stops, and faults whose cause is gone; nothing arms by itself."""
+        """Acknowledge stops and faults without a remaining cause; nothing arms automatically."""
         await self.group.clear()
 
     async def close(self) -> None:
-        """Release the amplifiers, and end the cycle."""
+        """Release the amplifiers and end the cycle."""
         self.cycle.is_closed = True
         self.cycle.wake()
         await self.release()
 
     async def release(self) -> None:
         """Ramp to zero in 50 ms, confirm it by reading back, disarm and close all lines."""
-        lines = self._lines  # those of now: others may be opened meanwhile
+        lines = self._lines  # the current lines: others can be opened meanwhile
         if lines is not None:
             lines.is_closing = True
         try:
@@ -250,7 +255,7 @@ class Controller:
 async def _identified(
     amplifiers: Sequence[Amplifier], stopping: Awaitable[Mapping[str, StopOutcome]]
 ) -> Mapping[str, StopOutcome]:
-    """Await a stop, and identify amplifiers meanwhile: an unknown one confirms nothing."""
+    """Await a stop while identifying amplifiers: unknown amplifiers confirm nothing."""
     for each in amplifiers:
         each.capabilities = {}
     requests = [each.identify(timeout=REPLY_TIMEOUT) for each in amplifiers]

@@ -49,7 +49,7 @@ export interface Topics {
   amplifiers: AmplifiersEvent;
   /** latency from touch to command, at rate_hz */
   latency: LatencyEvent;
-  /** log records of level info and above, except state and link changes */
+  /** log records from level info, except state and link changes */
   log: LogEvent;
   /** an amplifier link was degraded, lost or reopened */
   link: LinkEvent;
@@ -113,7 +113,7 @@ export interface StatusResult {
   /** the same on the nominal plate */
   predicted_contrast_db?: number | null;
   predicted_level_db_sl: number | null;
-  /** gain in dB by name, 0 if none is set: configured inputs, sources that have had fingers, connected clients, regions of the current layout, and any other name with a gain */
+  /** gain in dB by name, 0 if none is set: configured inputs, sources that have had fingers, connected clients, regions of the current layout, other names with a gain */
   strengths?: Record<string, number>;
   /** time of this response on CLOCK_MONOTONIC */
   time_s: number;
@@ -153,7 +153,7 @@ export interface StatusResult {
   layout?: string | null;
   /** names that `layout` accepts */
   layouts?: Array<string>;
-  /** why table queries take longer than necessary */
+  /** why queries take longer than necessary */
   slow_reason?: string | null;
   /** name of the rig's threshold set, to which levels in dB SL are relative */
   threshold?: string | null;
@@ -267,7 +267,7 @@ export interface StrengthParams {
 
 /** Strengths of all known touch sources, clients and regions. */
 export interface StrengthResult {
-  /** gain in dB by name, 0 if none is set: configured inputs, sources that have had fingers, connected clients, regions of the current layout, and any other name with a gain */
+  /** gain in dB by name, 0 if none is set: configured inputs, sources that have had fingers, connected clients, regions of the current layout, other names with a gain */
   strengths?: Record<string, number>;
 }
 
@@ -398,7 +398,7 @@ export interface ContactStatus {
   id: number;
   x_m: number;
   y_m: number;
-  /** target: feels the pattern; quiet: kept quiet; hand (a resting hand) and surplus (a finger beyond max_fingers): only its load counts; null before the first decision */
+  /** target: feels the pattern; quiet: kept quiet; hand (a resting hand), surplus (a finger beyond max_fingers): only its load counts; null before the first decision */
   role?: "target" | "quiet" | "hand" | "surplus" | null;
   /** predicted level of a target relative to the rig's threshold set (`threshold` of `status`); null if unknown */
   level_db_sl?: number | null;
@@ -410,15 +410,15 @@ export interface ContactStatus {
   effect?: string | null;
   /** the effect it feels: its own, or another finger's */
   feels?: string | null;
-  /** what a target feels: own: its own content; mixed: its own and others' (promised contrast below 12 dB, or others are felt during its pauses); shared: another finger's content; held back: nothing */
+  /** what a target feels. own: its content; mixed: its own and others' (promised contrast below 12 dB, or others are felt during its pauses); shared: another finger's content; held back: nothing */
   verdict?: "own" | "mixed" | "shared" | "held back" | null;
-  /** requested frequency of what it feels (amplifiers can round it); null for several */
+  /** requested frequency of its content, before rounding; null for several */
   frequency_hz?: number | null;
-  /** crosstalk level of other fingers' contents here, not exceeded on 90 % of plates, relative to the most sensitive published thresholds (so not comparable with level_db_sl); null if there are no other contents */
+  /** crosstalk level of others' contents here, not exceeded on 90 % of plates, relative to the most sensitive published thresholds (not comparable with level_db_sl); null if there are no other contents */
   foreign_level_db_sl?: number | null;
   /** the same level relative to the rig's threshold set, like level_db_sl */
   rig_foreign_level_db_sl?: number | null;
-  /** whether other fingers' contents can be felt here (foreign_level_db_sl above 0); with verdict own they are at least 12 dB weaker */
+  /** whether other contents can be felt here (foreign_level_db_sl above 0); with verdict own they are at least 12 dB weaker */
   is_foreign_felt?: boolean;
   /** crosstalk level at its current position on the nominal plate, relative to the rig's threshold set; can exceed the promise while the finger moves; only in the status; null if there are no other contents */
   leak_db_sl?: number | null;
@@ -453,7 +453,7 @@ export interface AmplifierStatus {
   reply_age_s: number | null;
   /** RMS error of its clock relative to the others, estimated by the host; null for a single amplifier or one that is not synchronised */
   clock_skew_us?: number | null;
-  /** whether it does not reply but may still play; nothing new plays meanwhile */
+  /** whether it does not reply but may still play; nothing new plays */
   degraded?: boolean;
   /** whether the link to it is lost */
   lost: boolean;

@@ -191,7 +191,7 @@ LINES = """\
   still ringing
  12.0   10.0, 10.0       1  SW SE 50 Hz, NE 120 Hz   12.0   14.0    20.0   19.0     9.6\
   own, of 2 contents
-7 touches; of 3 with other fingers on the plate 2 (67%) felt at least the contrast promised
+7 touches; of 3 with other fingers on the plate 2 (67%) felt at least the promised contrast
 """
 
 

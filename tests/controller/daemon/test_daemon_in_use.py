@@ -126,7 +126,7 @@ def test_commands_choose_a_layout_and_reload(
                 text.replace(", climate: climate.yaml", ""),
                 "click",
                 True,
-                ["layouts.home: changed", "layouts.climate: removed", "layout in use: home"],
+                ["layouts.home: changed", "layouts.climate: removed", "current layout: home"],
             ),
         ):
             config.write_text(keys, "utf-8")

@@ -16,7 +16,6 @@ import changed_tests
 import client_stub
 import effects_page
 import rig_page
-import ways
 from amplifier_dbc import dbc_text
 from amplifier_eds import eds_text
 from amplifier_json import json_text
@@ -102,9 +101,6 @@ WRITTEN: Mapping[str, Sequence[Writer]] = {
     "docs/reference/errors.md": [error_cases.with_messages],
     "docs/reference/rig.md": _parts("rig_page.py", rig_page.PARTS),
     "docs/reference/effects.md": _parts("effects_page.py", effects_page.PARTS),
-    "docs/architecture.md": [
-        part(f"{ways.WRITER} {name}", write) for name, write in ways.PARTS.items()
-    ],
     "CONTRIBUTING.md": [part("tests/support/changed_tests.py", changed_tests.table)],
 }
 """The writers of each file, by its path from the root."""

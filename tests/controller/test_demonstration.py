@@ -21,7 +21,6 @@ from controller.demo.demonstration import (
     DemoRun,
     Pictures,
     Scene,
-    choose_rows,
     example_scenes,
     run_demo,
 )
@@ -43,8 +42,7 @@ from era_haptics.command import run_era as run_command
 from kit.clock import in_virtual_time, run_virtual
 from kit.plates import small_table
 from model.answer.answer import OWN, Sensation
-from model.answer.plan import query
-from model.answer.stimulus import Finger, Placement
+from model.answer.stimulus import Finger
 from model.finger import detection_threshold
 from model.rig.rig_file import example_rig_path, load_rig
 from model.table import table_file
@@ -253,13 +251,6 @@ def test_lines_say_of_each_touch_what_was_promised_and_felt(
     assert lines[-1].startswith(f"Next: {then}")
 
 
-def test_demo_prints_no_latency_in_virtual_time(demo: Demo) -> None:
-    """The same lines without their last number, 9.6 ms, and without its column."""
-    _, (_, _, groups, _, _, *lines) = demo()
-    assert "latency" not in groups
-    assert "".join(lines).startswith(LINES.replace("     9.6", ""))
-
-
 def test_void_run_prints_no_share_and_draws_nothing(demo: Demo) -> None:
     """Its last line says that the machine was too slow, and why; the exit status is 1."""
     status, lines = demo("--real-time", why_void="a reaction took 400 ms")
@@ -267,48 +258,6 @@ def test_void_run_prints_no_share_and_draws_nothing(demo: Demo) -> None:
     assert "%" not in "".join(lines)
     assert not any(line.startswith("wrote") for line in lines)
     assert lines[-1].startswith("void: this machine was too slow (a reaction took 400 ms)")
-
-
-@pytest.mark.parametrize(
-    ("rows", "omitted"),
-    [
-        ([replace(ROWS[3], measured_level_db_sl=None)], ["touches.png", "contents.png"]),
-        ([replace(ROWS[6], measured_level_db_sl=None)], ["touches.png", "contents.png"]),
-        ([ROWS[0]], ["contents.png"]),
-    ],
-    ids=["one that was silent", "two contents, not measured", "one finger alone"],
-)
-def test_each_picture_that_is_not_drawn_has_a_reason(
-    rows: list[TouchRow], omitted: list[str], tmp_path: Path
-) -> None:
-    """By name; the others are written."""
-    pictures = demonstration.write_pictures(small_table(), rows, tmp_path)
-    assert [reason.removeprefix("no ").partition(":")[0] for reason in pictures.omitted] == omitted
-    assert {file.name for file in pictures.files} == {"touches.png", "contents.png"} - {*omitted}
-    assert {*tmp_path.iterdir()} == {*pictures.files}
-
-
-def test_picture_shows_highest_contrasts_of_each_number_of_fingers():
-    """Six panels, fewest fingers first, one finger alone once; none without a measurement.
-
-    Each has its title, and the level over the plate if it was driven.
-    """
-    rows = [row(n, contrast=float(n), others=n % 3) for n in range(12)]
-    silent = replace(row(99.0, contrast=99.0, others=1), measured_level_db_sl=None)
-    chosen = choose_rows([*rows, silent])
-    assert [(len(each.quiet), each.time_s) for each in chosen] == [
-        *((0, 9), (1, 10), (1, 7), (1, 4), (2, 11), (2, 8))
-    ]
-    table = small_table()
-    (layer,) = query(table, Placement(((0.1, 0.1),), ((0.2, 0.1),))).layers
-    alone = replace(chosen[0], measured_contrast_db=None, pattern=layer)
-    beside = replace(chosen[1], promised_contrast_db=8.0)
-    panels = demonstration.touches_figure(table, [alone, beside]).axes[:2]
-    assert [each.get_title() for each in panels] == [
-        "one finger alone",
-        "felt contrast 10.0 dB, promised 8.0",
-    ]
-    assert [len(each.collections) + len(each.images) > 0 for each in panels] == [True, False]
 
 
 FAULT = "amplifier d: state must be OPERATION_ENABLED, got FAULT with fault WATCHDOG"
@@ -533,34 +482,3 @@ async def test_far_end_reports_exit_status_when_rig_is_invalid(
         async with simulated_plate(rig, ["main"], wire="serial"):
             pass
     assert f"{rig}:1: plate: " in capfd.readouterr().err
-
-
-@pytest.mark.parametrize(
-    ("said", "reason"),
-    [
-        (b'{"error": "finger is 1; it must be a text"}\n', r"felt refused: finger is 1"),
-        (b'{"fingers": ', r"/sock: no reply to felt"),
-        (b"x" * (2 << 20), r"/sock: no reply to felt"),
-        (b"3\n", r"/sock: no reply to felt"),
-        (b'{"fingers": {"1": {"weights": 3}}}\n', r"/sock: no reply to felt .*fingers.1"),
-        (None, r"/sock: no reply to felt .*too long"),
-    ],
-    ids=["an error", "half a line", "no line", "a number", "other keys", "nothing"],
-)
-async def test_plate_without_a_reply_is_an_error(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, said: bytes | None, reason: str
-) -> None:
-    """Of the link, with what was asked; a plate that hangs is not waited for."""
-    monkeypatch.setattr(far_end, "_REPLY_TIMEOUT", 10.0 if said else 0.02)
-    hung = asyncio.Event()
-
-    async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        if said is None:
-            await hung.wait()
-        writer.write(said or b"")
-        writer.close()
-
-    async with await asyncio.start_unix_server(serve, tmp_path / "sock"):
-        with pytest.raises(LinkError, match=reason):
-            await SimulatedPlate(tmp_path / "sock", {}).vibration(0.0, 1.0)
-        hung.set()

@@ -27,8 +27,6 @@ from typer.core import TyperGroup
 
 from controller.cli.main import LoadModules, join_commands, run
 from controller.daemon.children import gateway_options
-from controller.daemon.messages import LatencyStatistics
-from controller.operation.operation_states import DaemonState, Operation
 from controller.process.daemon_process import ServiceManager, SocketLock
 from controller.process.log import LogFormatter, LogThread, RateLimitFilter
 from era_haptics.command import command_modules, main
@@ -470,9 +468,6 @@ def test_main_loads_every_package_of_the_project(
     assert capsys.readouterr().err == ""
 
 
-FAULT = Operation(DaemonState.FAULT, "arc")
-
-
 def record(message: str, line: int = 1, **extra: object) -> logging.LogRecord:
     """A record of a logging call at a line."""
     made = logging.LogRecord("era.x", logging.WARNING, "/x.py", line, message, (), None)
@@ -649,16 +644,3 @@ def test_service_manager_is_told_and_its_watchdog_fed_at_twice_its_rate(
         while (message := bound.recv(100)) != b"STOPPING=1":
             messages.append(message)
         assert messages == [b"WATCHDOG=1"] * count
-
-
-def test_latency_percentiles_are_values_that_occurred() -> None:
-    """Of 1, 2, ... 1000 ms the 500th, 990th and 999th; the histogram counts each once."""
-    latencies = LatencyStatistics()
-    assert latencies.summary().median is None
-    for milliseconds in range(1, 1001):
-        latencies.add(milliseconds / 1e3)
-    summary = latencies.summary()
-    assert (summary.median, summary.p99, summary.p999) == (500, 990, 999)
-    counts = dict(summary.histogram)
-    assert (counts[1.0], counts[5.0], counts[50.0], counts[100.0]) == (1, 1, 30, 950)
-    assert sum(counts.values()) == summary.count == 1000

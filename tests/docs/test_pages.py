@@ -45,61 +45,10 @@ from era_haptics.command import command_modules, run_era
 from model.cli import app
 from model.study import overview
 from packages import PACKAGES
-from page_names import wrong_names
-from processes.typed_page import PORTS, PageError, Reader, difference, read_steps
+from processes.typed_page import Reader, difference, read_steps
 from registry.limits import GuardLimits
-from ways import WAYS, steps_of
 
 ROOT = Path(__file__).parents[2]
-BEGIN, END = "<!-- begin: written by a.py -->", "<!-- end -->"
-
-
-@pytest.mark.parametrize("page", ["a\nb\n", f"a\n<!-- begin: written by b.py -->\n{END}\n"])
-def test_a_page_without_these_marks_is_left_alone(page: str) -> None:
-    """Neither without any nor with those of another name."""
-    with pytest.raises(ValueError, match="no lines"):
-        pages.insert(page, "new", name="a.py")
-
-
-def test_check_names_what_is_stale_until_it_is_written(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """A file that is missing, and one whose part has another text; the check writes neither.
-
-    What was between the marks is replaced, what stands around stays, and again it changes nothing.
-    """
-    written = {"b.h": [pages.whole(lambda: "1\n")], "a.md": [pages.part("a.py", lambda: "new")]}
-    monkeypatch.setattr(pages, "WRITTEN", written)
-    (tmp_path / "a.md").write_text(f"a\n{BEGIN}\nold\n{END}\nb\n", "utf-8")
-    assert pages.main(["--check"], root=tmp_path) == 1
-    assert re.findall(r"^(\S+) is stale: run `make pages`$", capsys.readouterr().err, re.M) == [
-        *written
-    ]
-    assert [path.name for path in tmp_path.iterdir()] == ["a.md"]
-    assert pages.main([], root=tmp_path) == 0
-    assert (tmp_path / "a.md").read_text("utf-8") == f"a\n{BEGIN}\n\nnew\n\n{END}\nb\n"
-    assert (tmp_path / "b.h").read_text("utf-8") == "1\n"
-    assert pages.main(["--check"], root=tmp_path) == 0
-
-
-def test_check_names_private_and_missing_code_on_pages(tmp_path: Path) -> None:
-    """A private name, a class or member that is gone; not those of fenced code or of files."""
-    (tmp_path / "docs").mkdir()
-    (tmp_path / "model").mkdir()
-    (tmp_path / "model" / "plate.py").write_text(
-        "class Plate:\n    width: float\n\n    def mass(self):\n        self.load = 1\n"
-        "class Board(Plate): ...\n"
-    )
-    (tmp_path / "docs" / "page.md").write_text(
-        "`Board.mass`, `Plate.load`, `Plate.md`, `Plate.width`\n\n```\n`plate._mass`\n```\n\n"
-        "`plate._mass` and `..._mass` and `_APART`\n`Plate.height`\n`Table.width`\n"
-    )
-    assert list(wrong_names(tmp_path)) == [
-        "docs/page.md:7: must not name private code, got plate._mass",
-        "docs/page.md:7: must not name private code, got _APART",
-        "docs/page.md:8: must name a member of Plate, got height",
-        "docs/page.md:9: must name a class of the project, got Table in Table.width",
-    ]
 
 
 def test_whatever_says_that_it_is_written_is_among_the_pages() -> None:
@@ -119,20 +68,6 @@ def test_whatever_says_that_it_is_written_is_among_the_pages() -> None:
     }
     assert len(found) > 6
     assert found <= set(pages.WRITTEN)
-
-
-MOST_FILES = {"touch": 25, "stop": 9, "question": 11, "build": 25}
-MOST_STEPS = 12
-
-
-@pytest.mark.parametrize("name", WAYS)
-def test_page_follows_the_code(name: str) -> None:
-    """The functions to break at are called in the order of the page, in files that can be read."""
-    steps, called = steps_of(name), [*WAYS[name]().functions]
-    assert [step for step in steps if step not in called] == []
-    assert steps == sorted(steps, key=called.index)
-    assert len(steps) <= MOST_STEPS
-    assert 5 <= len({file for file, _ in steps}) <= MOST_FILES[name]
 
 
 def test_constraints_pin_every_dependency_within_its_bounds() -> None:
@@ -203,71 +138,6 @@ def test_every_key_of_the_daemons_file_is_in_its_table() -> None:
     for key, section in {"touch": TouchSection, "log": LogSection}.items():
         (listed,) = re.findall(r"`\{(.*?)\}`", told[key])[:1]
         assert listed.split(", ") == list(section.model_fields)
-
-
-@pytest.mark.parametrize(
-    ("shown", "printed"),
-    [
-        ("level 20.0 dB", "level  20.1 dB\n"),  # the last digit
-        ("median 31.9 dB", "median 32.4 dB"),  # two in a hundred
-        ("wrote x ... s", "wrote x in 0.3 s"),
-        ("first\n...\nlast", "first\nbetween\nbetween\nlast"),
-        ("...\nlast", "last"),
-        ("first\n...", "first"),
-        ("-13.4 dB SL, unaware", "-13.5 dB SL, below its threshold"),
-        ("level 20.0 dB", "contrast 20.0 dB"),
-        ("armed by 'era', ... s left", "armed by 'era'; 59.8 s left"),
-        ("mesh 11x7 ..., ERAs SW", "mesh 11x7, ERAs SW"),
-        ("mesh 11x7 ...: within 0.09 % ...", "mesh 11x7 Q5, strips of 4 mm: within 0.09 % (17x11)"),
-        ("armed until Ctrl-C", "armed; Ctrl-C disarms"),
-        ("READY: all is well", "READY: nothing is wrong"),
-    ],
-)
-def test_difference_is_none(shown: str, printed: str) -> None:
-    """Words, blanks, last digits and what `...` stands for make no difference."""
-    assert difference(shown, printed) is None
-
-
-@pytest.mark.parametrize(
-    ("shown", "printed", "line"),
-    [
-        ("level 20.0 dB", "level 21.0 dB", "line 1"),
-        ("READY: all is well", "FAULT: all is well", "line 1"),
-        ("wrote my.yaml", "wrote your.yaml", "line 1"),
-        ("5 ERAs", "6 ERAs", "line 1"),  # a count is exact
-        ("1 a\n2 b", "1 a", "line 2"),
-        ("1 a", "1 a\n2 b", "beyond"),
-        ("1 first\n...\n3 last", "1 first\n2 between", "line 3"),
-        ("ready", "", "lines"),
-        ("33.4 dB", "-33.4 dB", "line 1"),
-    ],
-)
-def test_difference_has_its_place(shown: str, printed: str, line: str) -> None:
-    """Another name, number, sign, count, or line is reported with its place."""
-    assert line in (difference(shown, printed) or "")
-
-
-@pytest.mark.parametrize("comment", ["statsu: 1", "edit: a.yaml"])
-def test_read_steps_refuses_an_unknown_comment(tmp_path: Path, comment: str) -> None:
-    """A misspelt comment, or one above the wrong kind of fence, is refused with its line."""
-    page = tmp_path / "page.md"
-    page.write_text(f"<!-- {comment} -->\n```yaml\na: 1\n```\n", encoding="utf-8")
-    with pytest.raises(PageError, match=r"page\.md:[12]"):
-        read_steps(page)
-
-
-def test_ports_include_all_ports_of_pages() -> None:
-    """Every port of a page is replaced by a free one."""
-    docs = ROOT / "docs"
-    pages = [*docs.glob("tutorials/*.md"), *docs.glob("how-to/*.md")]
-    named = {
-        port
-        for page in pages
-        for step in read_steps(page)
-        for port in re.findall(r"(?:127\.0\.0\.1:|--port )(\d+)", str(step))
-    }
-    assert len(named) > 4
-    assert named <= set(PORTS)
 
 
 PAGE = (ROOT / "docs" / "reference" / "commands.md").read_text("utf-8")

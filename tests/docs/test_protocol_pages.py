@@ -451,15 +451,3 @@ def test_each_read_of_the_status_object_is_a_status() -> None:
     amplifier.withdraw_status()  # for all, without a reply
     shown = [int.from_bytes(objects.read(0x2002, high, 3.0), "little") for _ in range(2)]
     assert [round(each * 20 / 65536) for each in shown] == [1, 3]
-
-
-def test_pages_are_short() -> None:
-    """What people write: 300 lines of the contract, and 100 of a wire; a table's rows are free.
-
-    So are the parts that `make pages` writes, with their marks.
-    """
-    written = re.compile(r"<!-- begin: written by .*?<!-- end -->\n", re.DOTALL)
-    texts = {page: (DOCS / f"{page}.md").read_text("utf-8") for page in BYTES}
-    lines = {page: written.sub("", text).count("\n") for page, text in texts.items()}
-    assert lines.pop("protocol") <= 300
-    assert max(lines.values()) <= 100

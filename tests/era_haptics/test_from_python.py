@@ -10,12 +10,9 @@ import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-from matplotlib.colors import to_hex
-from matplotlib.contour import QuadContourSet
 from matplotlib.patches import Circle
 from typer.testing import CliRunner
 
@@ -28,7 +25,6 @@ from model.cli import app
 from model.drive_modes import playable_drive_modes
 from model.rig.rig import Channel
 from model.structure.attachments import PointLoad
-from model.table.table_file import build_table
 from model.vibration import plate_map
 
 TARGET, QUIET, BOTH = (0.08, 0.06), [(0.22, 0.16)], [(0.22, 0.16), (0.25, 0.04)]
@@ -57,12 +53,6 @@ def test_solved_plate_map_equals_direct_solve() -> None:
     direct = plate_map(rig, excitation, raster=(13, 9))
     np.testing.assert_array_equal(found.x, np.linspace(0, 0.3048, 13))
     np.testing.assert_allclose(found.peak, direct.peak, atol=1e-4 * direct.peak.max())
-
-
-@pytest.mark.parametrize("raster", [[5, 4], np.array([5, 4]), (np.int64(5), 4)])
-def test_solved_plate_map_accepts_sequences_as_raster(raster: Any) -> None:
-    """Five columns, four rows: a list, an array, and a number of numpy's."""
-    assert PLATE.map({"SW": 110}, raster=raster).peak.shape == (4, 5)
 
 
 @pytest.mark.parametrize("envelopes", [False, True])
@@ -168,25 +158,6 @@ def test_signals_of_a_ramped_tone_are_felt_as_the_drive(seed: int | None) -> Non
     assert played.transient_contrast_db == pytest.approx(other.transient_contrast_db, abs=1e-3)
 
 
-def test_signals_settle_at_the_responses() -> None:
-    """Amplitude and phase of a tone, to 1e-5 where the plate itself loses nothing.
-
-    Its loss is hysteretic in one and viscous in the other; ERAs and fingers lose enough to settle.
-    """
-    rig = era.load_rig(era.example_rig_path())
-    plate = era.SolvedPlate(replace(rig, plate=replace(rig.plate, loss_factor=0.0)))
-    signals = np.array([[0.5], [0.0], [-0.3], [0.0]]) * SIGNAL
-    played = plate.play(signals, TARGET, quiet=QUIET, sample_rate=RATE)
-    for record in (*played.targets, *played.quiet):
-        late = slice(COUNT - 3000, COUNT - 600)
-        angles = 2 * np.pi * 333.3 * record.times[late]
-        basis = np.column_stack([np.sin(angles), np.cos(angles)])
-        sine, cosine = np.linalg.lstsq(basis, record.accelerations[late])[0]
-        fields = plate.responses(record.points, [333.3], fingers=[TARGET, *QUIET])[0]
-        expected = np.exp(1j * np.radians(20)) * np.array([0.5, 0, -0.3, 0]) @ fields
-        np.testing.assert_allclose(sine + 1j * cosine, expected, atol=1e-5 * abs(expected).max())
-
-
 def test_play_lasts_until_it_is_steady() -> None:
     """The least duration that is accepted is right to 0.3 dB where 0.1 s, refused, is 7 dB off."""
     weak = {"SW": 40}
@@ -195,20 +166,6 @@ def test_play_lasts_until_it_is_steady() -> None:
     )
     assert shortest == pytest.approx(long, abs=0.3)
     assert default == pytest.approx(long, abs=0.05)
-
-
-@pytest.mark.parametrize("quiet", [[], QUIET])
-def test_signals_of_silence_have_no_contrast(quiet: Any) -> None:
-    """Nothing is felt, without a warning of numpy's, beside a quiet finger, too.
-
-    What exceeds full stroke by rounding is full stroke.
-    """
-    loud = [np.full((4, 60), level) for level in (1, 1 + 5e-10)]
-    first, second = (PLATE.play(each, TARGET, sample_rate=4000).level_db_sl for each in loud)
-    assert first == second
-    played = PLATE.play(np.zeros((4, 60)), TARGET, quiet=quiet, sample_rate=4000)
-    assert played.level_db_sl == -np.inf
-    assert (played.contrast_db, played.transient_contrast_db) == (None, None)
 
 
 def test_map_has_complex_fields_whose_magnitudes_are_the_peak() -> None:
@@ -341,16 +298,6 @@ def test_query_is_the_answer_to_fingers_that_must_feel_one(
     assert heavy.layers != same.layers
 
 
-def test_query_converts_numbers_of_numpy(table: era.LocalizationTable) -> None:
-    """Single precision becomes float, so that results can be written as JSON."""
-    plain, given = (era.query(table, TARGET, level_db_sl=kind(12)) for kind in (float, np.float32))
-    levels = [each.fingers[0].level_db_sl for each in (given, plain)]
-    assert json.dumps(levels[0]) == json.dumps(levels[1])
-    drive = given.layers[0].excitation
-    assert {type(tone.amplitude) for tone in drive.values()} == {float}
-    assert drive == plain.layers[0].excitation
-
-
 def test_results_become_frames(table: era.LocalizationTable) -> None:
     """A row a finger of an answer, a mode, a point of a map, a moment of a playback."""
     fingers = [era.Finger(at, era.Stimulus()) for at in (TARGET, BOTH[0])]
@@ -378,29 +325,6 @@ def test_frames_need_pandas(monkeypatch: pytest.MonkeyPatch) -> None:
         PLATE.modes.to_frame()
 
 
-def test_draw_map_marks_driven_eras() -> None:
-    """Orange where driven, white elsewhere, by place in cm; the scale ends at the largest value.
-
-    One colour is dark and the other bright, so that they differ for those who see no red or green.
-    """
-    drive = {"SW": 110, "NE": era.Drive(110, level=0.5)}
-    axes, scale = era.draw_map(PLATE, drive, title="a diagonal").axes
-    orange, white = "#d55e00", "#ffffff"
-    colours = {
-        tuple(np.round(line.get_xydata()[0]).tolist()): to_hex(line.get_color())
-        for line in axes.lines
-        if line.get_marker() == "o"
-    }
-    assert colours == {(0, 0): orange, (30, 0): white, (30, 23): orange, (0, 23): white}
-    assert axes.get_title() == "a diagonal"
-    field = PLATE.map(drive)
-    assert scale.get_ylim()[1] == pytest.approx(field.peak.max() / 9.8)
-    (contour,) = [one for one in axes.collections if isinstance(one, QuadContourSet)]
-    assert contour.levels == pytest.approx([field.peak.max() / 10])
-    inside = [path for path in contour.get_paths() if len(path.vertices)]
-    assert inside  # around the nulls, all of which are below a tenth
-
-
 def test_draw_answer_shows_fingers_and_levels(table: era.LocalizationTable) -> None:
     """Circles of 13 mm at the fingers, the promise in the title, levels in decibels."""
     answer = era.query(table, TARGET, quiet=BOTH)
@@ -418,45 +342,6 @@ def test_draw_answer_shows_fingers_and_levels(table: era.LocalizationTable) -> N
     drawn = np.asarray(axes.collections[0].get_array()).reshape(121, 121)
     row, column = round(0.06 / 0.2286 * 120), round(0.08 / 0.3048 * 120)
     assert drawn[row, column] == pytest.approx(felt.level_db_sl, abs=1.0)
-
-
-def test_draw_contents_colours_each_finger_by_its_content() -> None:
-    """The plate under a finger has the hue of its ring; its promise is beside it; a panel each."""
-    # At 90 and 120 Hz both fingers are served by all sets of thresholds; at 60 and 120 Hz by one.
-    frequencies, grid = np.array([60.0, 90.0, 120.0, 250.0]), era.Grid(4, 3)
-    table = build_table(PLATE.rig, frequencies=frequencies, grid=grid, drive_mode="phased")
-    answer = era.answer(table, [era.Finger(at, era.Stimulus()) for at in (TARGET, BOTH[0])])
-    whole, *alone = era.draw_contents(table, answer).axes
-    assert len(alone) == len(answer.layers) == 2
-    for axes, layer in zip(alone, answer.layers, strict=True):
-        assert axes.get_title() == f"{layer.frequency:g} Hz alone"
-    rings = [patch for patch in whole.patches if isinstance(patch, Circle)][1::2]
-    pixels = np.asarray(whole.images[0].get_array())
-    for felt, ring, text in zip(answer.fingers, rings, whole.texts, strict=True):
-        (x, y), (rows, columns, _) = felt.finger.at, pixels.shape
-        here = pixels[round(y / 0.2286 * (rows - 1)), round(x / 0.3048 * (columns - 1))]
-        assert np.argmax(here) == np.argmax(ring.get_edgecolor()[:3])
-        assert np.ptp(here) > 0.2
-        assert f"{felt.promised_contrast_db:.0f} dB above the others" in text.get_text()
-
-
-@pytest.mark.parametrize("is_signals", [False, True])
-def test_draw_playback_shows_peaks_over_time(is_signals: bool) -> None:
-    """A line for each finger, at the end in the ratio of the steady contrast."""
-    if is_signals:
-        tone = np.outer([0.1, 0, 0, 0], np.sin(2 * np.pi * 110 * np.arange(0, 1.2, 1 / 4000)))
-        played = PLATE.play(tone, TARGET, quiet=BOTH, sample_rate=4000)
-    else:
-        played = PLATE.play({"SW": era.Drive(110, level=0.1)}, TARGET, quiet=BOTH, duration=1.2)
-    axes = era.draw_playback(played).axes[0]
-    names = [text.get_text() for text in axes.get_legend().get_texts()]
-    assert names == ["target 1", "quiet 1", "quiet 2"]
-    lines = dict(zip(names, axes.lines, strict=True))
-    assert float(lines["target 1"].get_xdata()[-1]) == pytest.approx(1200.0, abs=0.3)
-    at_target = float(lines["target 1"].get_ydata()[-1])
-    loudest = max(float(lines[name].get_ydata()[-1]) for name in names[1:])
-    assert 20 * np.log10(at_target / loudest) == pytest.approx(played.contrast_db, abs=0.1)
-    assert f"{played.contrast_db:.1f} dB steady" in axes.get_title()
 
 
 URL = f"sim://{era.example_rig_path()}"
@@ -516,15 +401,6 @@ def test_layers_of_accepts_frequency_drive_and_tone() -> None:
         {"SW": era.Tone(110, 0.5e-4), "SE": era.Tone(110, 1e-4)},
         {"SW": era.Tone(90, 0.5e-4)},
     )
-
-
-def test_layers_of_converts_numbers_of_numpy() -> None:
-    """Of single precision too, which would go on into every command; 110.5 and 0.25 are exact."""
-    drive = era.Drive(np.float32(110.5), level=np.float32(0.25), phase_deg=np.float32(0))  # type: ignore[arg-type]
-    assert era.Drive(110, level=np.float64(1.0000000000000002)).level == 1  # of divided weights
-    tone = playable_layers({"SW": drive}, RIG)[0].excitation["SW"]
-    assert tone == era.Tone(110.5, 0.25e-4, 0.0)
-    assert {type(tone.frequency), type(tone.amplitude), type(tone.phase)} == {float}
 
 
 SPLIT = replace(RIG, amplifiers={"a": "sim://", "b": "sim://"})

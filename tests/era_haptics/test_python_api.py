@@ -181,32 +181,6 @@ def answer(request: pytest.FixtureRequest) -> era.Answer:
     return found
 
 
-def test_played_answer_is_the_sum_of_its_layers(answer: era.Answer) -> None:
-    """At every finger and moment; over the plate at every frequency; and so are several tones."""
-    played = PLATE.play(answer, duration=0.6)
-    places = [each.finger.at for each in answer.fingers]
-    loads = [each.finger.load for each in answer.fingers]
-    alone = [PLATE.play(each, places, loads=loads, duration=0.6) for each in answer.layers]
-    for number, record in enumerate(played.records):
-        parts = [each.records[number].accelerations for each in alone]
-        peak = np.abs(record.accelerations).max()
-        np.testing.assert_allclose(record.accelerations, sum(parts), atol=1e-9 * peak)
-        layer = answer.fingers[number].layer
-        if layer is not None:
-            level = alone[layer].fingers[number].levels_db_sl
-            np.testing.assert_allclose(played.fingers[number].levels_db_sl, level, atol=1e-9)
-    field = PLATE.map(answer, raster=(5, 4))
-    maps = [PLATE.map(each, raster=(5, 4)) for each in answer.layers]
-    together = np.concatenate([each.field for each in maps])
-    order = np.argsort(np.concatenate([each.frequencies for each in maps]))
-    np.testing.assert_allclose(field.field, together[order], rtol=1e-9)
-    drives = {
-        name: [layer[name] for one in answer.layers for layer in one.excitations]
-        for name in RIG.wiring
-    }
-    np.testing.assert_allclose(PLATE.map(drives, raster=(5, 4)).field, field.field, rtol=1e-9)
-
-
 def test_each_finger_feels_what_the_answer_says(answer: era.Answer) -> None:
     """Levels, and contrasts by the set that says least, in the end of what is played in time."""
     played = PLATE.play(answer, duration=1.5)
@@ -431,14 +405,6 @@ def test_replaced_and_missing_packages_are_named(tmp_path: Path, replaced: str, 
     assert status == 1
     assert f"{tmp_path / replaced} " in lines[-1]
     assert words in lines[-1]
-
-
-def test_names_that_hide_nothing_do_not_disturb(tmp_path: Path) -> None:
-    """A folder without modules, and a file behind ours on the path; `era` answers."""
-    (tmp_path / "sim").mkdir()
-    assert said(PROGRAM, tmp_path) == (0, [])
-    written(tmp_path / "model.py")
-    assert said(PROGRAM, ROOT, tmp_path) == (0, [])
 
 
 NOTEBOOK = "module://ipykernel_of_elsewhere.backend_inline"

@@ -507,13 +507,6 @@ def test_program_serves_a_pseudo_terminal_and_leaves_the_users_alone(tmp_path: P
         running.kill()
 
 
-def test_source_is_small() -> None:
-    """At most 500 lines of at most 100 characters."""
-    lines = SOURCE.read_text(encoding="utf-8").splitlines()
-    assert len(lines) <= 500
-    assert max(map(len, lines)) <= 100
-
-
 BUTTON = ROOT / "examples" / "javascript" / "button.mjs"
 TARGET, QUIET = "0.08,0.06", "0.22,0.16"
 

@@ -1,10 +1,6 @@
 """Planted faults: patterns find their code, faults are judged rightly, and no fault is stale."""
 
 import ast
-import json
-import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -12,7 +8,6 @@ import pytest
 from cases import COLLECTED
 from planting import Edit, StaleEdit, planted
 from run import (
-    PlantedFault,
     collected,
     load_faults,
     missing_imports,
@@ -84,22 +79,6 @@ int stop(int x)
         + 1; // at once
 }
 """
-FAULT = """
-- fault: {name}
-  behaviour: Two and two are {result}.
-  where: [two, three]
-  in: sums.py
-  find: {find}
-  replace: {result}
-  found_by: ["tests/test_sums.py::test_sum[{{where}}]"]
-"""
-TESTS = """
-import pytest
-@pytest.mark.parametrize("below", [pytest.param(2, id="two"), pytest.param(3, id="three")])
-def test_sum(below):
-    from sums import SUM
-    assert below < SUM < 5
-"""
 
 
 @pytest.mark.parametrize(("find", "replacement", "line"), PATTERNS.values(), ids=PATTERNS)
@@ -134,15 +113,6 @@ def test_pattern_must_match_once(scope: str, find: str, replacement: str, reason
         planted(edit, SOURCE)
 
 
-def test_private_name_of_a_pattern_stands_for_one_name() -> None:
-    """Two private names of a pattern do not match one of the code, nor one of it two."""
-    source = "def f(self):\n    self._a = self._b\n    self._c = self._c\n"
-    edit = Edit("f.py", "f", "self._x = self._y", "self._y = self._x")
-    assert "self._b = self._a" in planted(edit, source)
-    edit = Edit("f.py", "f", "self._x = self._x", "pass")
-    assert "self._a = self._b" in planted(edit, source)
-
-
 def test_other_languages_are_compared_by_tokens_of_a_function() -> None:
     """Whitespace and comments do not count, and the rest of the file stays as it is."""
     edit = Edit("stop.c", "stop", "return x+1;", "return x;")
@@ -169,72 +139,3 @@ def test_no_fault_is_stale(request: pytest.FixtureRequest) -> None:
         existing |= collected(*not_collected)
     missing = missing_tests_report(faults, existing)
     assert not missing, "\n".join(missing)
-
-
-def small_tree(folder: Path, rows: dict[str, tuple[str, str]]) -> Path:
-    """Make a tree with one module, its test and some faults (find, replace); return the judge."""
-    faults = folder / "tests" / "faults"
-    faults.mkdir(parents=True)
-    for name in ("run.py", "planting.py", "copies.py"):
-        shutil.copy(HERE / name, faults)
-    (folder / "sums.py").write_text("SUM = 2 + 2\n")
-    (folder / "tests" / "test_sums.py").write_text(TESTS)
-    texts = [
-        FAULT.format(name=name, find=find, result=result) for name, (find, result) in rows.items()
-    ]
-    (faults / "sums.yaml").write_text("".join(texts))
-    return faults / "run.py"
-
-
-def test_stale_fault_is_reported_with_its_file_and_the_remedy(tmp_path: Path) -> None:
-    """The report names both files, the pattern, what resembles it, and the behaviour."""
-    judge = small_tree(tmp_path, {"sound": ("2 + 2", "5"), "gone": ("2 + 1", "5")})
-    command = [sys.executable, judge, "--check"]
-    done = subprocess.run(command, stdout=subprocess.PIPE, text=True)
-    assert done.returncode == 1
-    assert done.stdout.splitlines() == [
-        "tests/faults/sums.yaml: fault gone cannot be planted:",
-        "    sums.py matches nothing, must match once: 2 + 1",
-        "        nearest, in line 1: 2 + 2",
-        "    Change `of`, `find` and `replace` there to the present code, so that again:",
-        "    Two and two are 5.",
-        "    Then: python tests/faults/run.py --only sums/gone",
-    ]
-    assert subprocess.run([*command, "other.py"]).returncode == 0
-
-
-def test_fault_without_its_test_is_reported_with_the_nearest_name() -> None:
-    """A renamed test is named with the fault, its file and the most similar test."""
-    fault = PlantedFault(
-        name="sums/gone",
-        source="tests/faults/sums.yaml",
-        behaviour="Two and two are 5.",
-        edits=(),
-        tests=("tests/test_sums.py::test_sum[four]",),
-        shows="",
-    )
-    existing = {"tests/test_sums.py::test_sum[for]", "tests/test_other.py::test_sum[four]"}
-    assert missing_tests_report([fault], existing) == [
-        "tests/faults/sums.yaml: fault gone names no existing test: "
-        "tests/test_sums.py::test_sum[four]\n"
-        "    Did you mean tests/test_sums.py::test_sum[for]?"
-    ]
-
-
-@pytest.mark.long
-def test_fault_is_found_only_if_every_test_of_it_fails(tmp_path: Path) -> None:
-    """It is missed if one passes, stale if it cannot be planted or tested."""
-    rows = {
-        "found": ("2 + 2", "5"),
-        "missed-by-one": ("2 + 2", "3"),
-        "moved": ("2 + 1", "5"),
-        "twice": ("2", "5"),
-        "no-code": ("2 + 2", "5 +"),
-        "no-name": ("SUM = 2 + 2", "SUM = 2 + two"),
-    }
-    judge = small_tree(tmp_path, rows)
-    report = tmp_path / "judged.json"
-    command = [sys.executable, judge, "--workers", "1", "--json", report]
-    status = subprocess.run(command, stdout=subprocess.PIPE).returncode
-    results = [row["result"] for row in json.loads(report.read_text("utf-8"))]
-    assert (status, *results) == (1, "found", "missed", "stale", "stale", "stale", "stale")

@@ -18,7 +18,7 @@ import struct
 import subprocess
 import sys
 import zlib
-from collections.abc import AsyncIterator, Callable, Iterator, Mapping, Sequence
+from collections.abc import AsyncIterator, Callable, Iterator, Sequence
 from contextlib import asynccontextmanager
 from functools import partial
 from pathlib import Path
@@ -115,9 +115,6 @@ def test_record_is_sent_by_the_names_of_its_fields(tmp_path: Path) -> None:
     assert count == len(words)
 
 
-PAIR = "struct pair { int a, b; };\nstruct pair "
-
-
 def problems(root: Path) -> list[str]:
     """What the check of sources finds in a checkout."""
     installed_program("gcc", package="gcc")
@@ -141,27 +138,6 @@ def test_ranges_of_the_header_are_used() -> None:
     ranges = re.findall(r"\b(?:WIRE_\w+|\w+_PER_UNIT)\b", header)
     assert len(ranges) > 10
     assert [each for each in ranges if not re.search(rf"\b{each}\b", used)] == []
-
-
-@pytest.mark.parametrize(
-    ("sources", "place"),
-    [
-        ({"a.c": f"{PAIR}one = {{1, 2}};"}, "firmware/core/a.c:2:"),
-        ({"a.c": f"{PAIR}all[] = {{{{.a = 1}}, {{3}}}};"}, "firmware/core/a.c:2:"),
-        ({"a.h": '#include "b.h"', "b.h": "int b;", "b.c": '#include "a.h"'}, "a < b < a"),
-        ({"a.c": "int b(void); int a(void) { return b(); }"}, "a < b < a"),
-        ({"../a.c": ""}, "firmware/a.c: its folder"),
-    ],
-    ids=["by position", "within", "circle of headers", "circle of uses", "elsewhere"],
-)
-def test_what_is_wrong_is_found(sources: Mapping[str, str], place: str, tmp_path: Path) -> None:
-    """An initialiser by position, and a circle of what files include or use of each other."""
-    folder = tmp_path / "firmware" / "core"
-    folder.mkdir(parents=True)
-    (folder / "b.c").write_text("int a(void); int b(void) { return a(); }")
-    for name, text in sources.items():
-        (folder / name).write_text(text)
-    assert place in problems(tmp_path)[0]
 
 
 COUNT = int(os.environ.get("FRAMES", "1000"))

@@ -4,7 +4,6 @@ One browser and one daemon for all tests, and one tab for those that load nothin
 """
 
 import asyncio
-import logging
 import math
 import re
 from collections.abc import AsyncIterator, Callable, Iterator
@@ -53,8 +52,6 @@ LENGTH, WIDTH = 0.3048, 0.2286  # m; 12 by 9 inches, as in the rig's file
 DESKTOP, PHONE = SCREENS[0], SCREENS[2]
 WORD = "document.querySelector('#state').textContent"
 PROBES = (Path(dashboard_pictures.__file__).with_name("page_probes.js")).read_text(encoding="utf-8")
-
-_logger = logging.getLogger(__name__)  # what was measured; shown by pytest --log-cli-level=info
 
 
 @pytest.fixture(scope="module")
@@ -178,21 +175,6 @@ async def test_page_shows_the_rig_without_console_messages(page: Page) -> None:
     assert origins == []
     assert await page.evaluate("location.hash") == ""  # the token is not to be seen
     assert page.complaints == []
-
-
-async def test_field_is_drawn_at_the_frame_rate(page: Page, era: Client) -> None:
-    """Many colours on the plate while a finger is felt, one without."""
-    await arm(page, era)
-    async with fingers_down(page, PLACES[1]):
-        colours = f"({PROBES}).colours('#field')"
-        assert await page.until(colours, lambda count: count > 50)
-        await page.click("#motion")
-        frames, seconds = await page.evaluate(f"({PROBES}).frames()")
-        _logger.info("%.1f frames/s in motion", frames / seconds)
-        assert frames > 1  # how many a second, only an idle machine tells
-        await page.click("#motion")
-        assert await page.evaluate("document.querySelector('#scale-low').textContent") == "0"
-    assert await page.until(colours, lambda count: count == 1)  # still again
 
 
 @pytest.mark.long
@@ -522,24 +504,6 @@ async def test_elements_have_roles_names_and_tab_order(fresh: Page) -> None:
     assert {"banner", "problem"} <= set(live)
 
 
-@pytest.mark.long
-async def test_page_is_still_with_reduced_motion(fresh: Page, era: Client) -> None:
-    """No animation; the picture of a steady vibration does not change."""
-    await fresh.call(
-        "Emulation.setEmulatedMedia",
-        features=[{"name": "prefers-reduced-motion", "value": "reduce"}],
-    )
-    await arm(fresh, era)
-    async with fingers_down(fresh, PLACES[1]):
-        await fresh.until("document.querySelectorAll('.era.driven').length")
-        # The swell rises for 0.6 s; what moves by itself would never be the same twice.
-        await fresh.until(
-            "new Promise(done => { const draw = () => document.querySelector('#field').toDataURL();"
-            "const first = draw(); setTimeout(() => done(first === draw()), 300); })"
-        )
-    assert await fresh.evaluate("document.getAnimations().length") == 0
-
-
 async def test_names_are_shown_as_text(page: Page, era: Client) -> None:
     """HTML in a name is not interpreted."""
     name = "<img src=x onerror=alert(1)><b>bold</b>"
@@ -549,81 +513,6 @@ async def test_names_are_shown_as_text(page: Page, era: Client) -> None:
     assert name in await page.evaluate("document.querySelector('#log').innerText")
     assert await page.evaluate("document.querySelectorAll('img, b').length") == 0
     assert page.complaints == []
-
-
-@pytest.mark.long
-async def test_region_names_lie_beside_eras(page: Page) -> None:
-    """With ERAs at the edges of regions, on a large and a small plate."""
-    hidden = (
-        "import('./plate.js').then(({ PlateOverlay }) => {"
-        " const plate = document.body.appendChild(document.createElement('div'));"
-        " const svg = document.createElementNS('http://www.w3.org/2000/svg', 'svg');"
-        " plate.append(svg);"
-        " plate.style.width = '%dpx';"
-        " const era = (x_m, y_m) => ({ name: `E${x_m}${y_m}`, x_m, y_m });"
-        " const rig = { length_m: 0.3, width_m: 0.2, eras: [era(0.15, 0.18), era(0.1, 0.1),"
-        "  era(0.07, 0.05), era(0.2, 0.1)] };"
-        " const regions = ["
-        "  { name: 'slider', shape: 'rectangle', x_m: 0.02, y_m: 0.14, width_m: 0.26,"
-        "   height_m: 0.04 },"
-        "  { name: 'keypad', shape: 'rectangle', x_m: 0.02, y_m: 0.02, width_m: 0.1,"
-        "   height_m: 0.03 },"
-        "  { name: 'knob', shape: 'circle', x_m: 0.2, y_m: 0.06, radius_m: 0.04 },"
-        "  { name: 'patch', shape: 'polygon', points_m: [[0.08, 0.1], [0.12, 0.1], [0.1, 0.06]] }];"
-        " const overlay = new PlateOverlay(plate, svg);"
-        " overlay.setUp({ rig, layout: { regions } });"
-        " const boxes = (selector) => [...svg.querySelectorAll(selector)].map((each) =>"
-        "  each.getBoundingClientRect());"
-        " const meet = (a, b) => a.left < b.right && b.left < a.right && a.top < b.bottom"
-        "  && b.top < a.bottom;"
-        " const [names, eras] = [boxes('.label.name'), boxes('.era')];"
-        " plate.remove();"
-        " return [names.length, eras.length,"
-        "  names.filter((name) => eras.some((each) => meet(name, each))).length];"
-        "})"
-    )
-    for width in (800, 360):
-        assert await page.evaluate(hidden % width) == [4, 4, 0]
-
-
-@pytest.mark.long
-async def test_texts_on_the_plate_do_not_overlap(page: Page) -> None:
-    """Contacts, ERAs and names of regions, also as narrow as on a phone."""
-    covered = (
-        "import('./plate.js').then(({ PlateOverlay }) => {"
-        " const plate = document.body.appendChild(document.createElement('div'));"
-        " plate.append(document.createElementNS('http://www.w3.org/2000/svg', 'svg'));"
-        " plate.style.width = '%dpx';"
-        " plate.firstChild.style.width = '100%%';"
-        " const overlay = new PlateOverlay(plate, plate.firstChild);"
-        " const eras = [['SW', 0, 0], ['SE', 0.3, 0], ['NE', 0.3, 0.2], ['mid', 0.15, 0.08]]"
-        "  .map(([name, x_m, y_m]) => ({ name, x_m, y_m }));"
-        " const box = { shape: 'rectangle', width_m: 0.1, height_m: 0.08 };"
-        " const regions = [{ ...box, name: 'keypad', x_m: 0.02, y_m: 0.1 },"
-        "  { ...box, name: 'slider', x_m: 0.18, y_m: 0.1 }];"
-        " overlay.setUp({ rig: { length_m: 0.3, width_m: 0.2, eras }, layout: { regions } });"
-        " const target = { role: 'target', level_db_sl: 22, promised_contrast_db: 40 };"
-        " const drive = { mid: { frequency_hz: 110, level: 0.5 } };"
-        " const found = [];"
-        " const places = [[0.15, 0.1], [0.02, 0.03], [0.28, 0.02], [0.29, 0.17], [0.07, 0.17]];"
-        " for (const [x_m, y_m] of places) {"
-        "  overlay.show({ drive, contacts: [{ ...target, x_m, y_m },"
-        "   { role: 'quiet', level_db_sl: null, x_m: 0.22, y_m: 0.12 }] });"
-        "  const texts = [...plate.querySelectorAll('text')].filter((each) => each.textContent);"
-        "  const boxes = texts.map((each) => each.getBoundingClientRect());"
-        "  const meet = (a, b) => a.left < b.right - 1 && b.left < a.right - 1"
-        "   && a.top < b.bottom - 3 && b.top < a.bottom - 3;"  # boxes have room above and below
-        "  boxes.forEach((a, i) => boxes.slice(i + 1).forEach((b, j) => {"
-        "   if (meet(a, b)) found.push([texts[i].textContent, texts[i + j + 1].textContent]);"
-        "  }));"
-        "  if (texts.length !== 9) found.push(texts.map((each) => each.textContent));"
-        " }"
-        " plate.remove();"
-        " return found;"
-        "})"
-    )
-    for width in (800, 360, 300):
-        assert await page.evaluate(covered % width) == []
 
 
 async def test_effect_button_always_finds_a_finger_of_its_page(page: Page, era: Client) -> None:
@@ -668,57 +557,6 @@ async def test_effect_button_always_finds_a_finger_of_its_page(page: Page, era: 
     (finger,) = await contacts(era, 1)
     assert math.dist(finger, pressed) < 0.001
     await contacts(era, 0)
-
-
-async def test_effects_and_events_are_seen_on_a_laptop(page: Page, era: Client) -> None:
-    """Of 1280 by 800 pixels, without scrolling.
-
-    So is the choice of a layout, which the daemon then uses.
-    """
-    await show_on(page, Screen("laptop", 1280, 800))
-    for name in ("other", "panel"):
-        await page.evaluate(
-            "((choice) => {"
-            f" choice.value = '{name}'; choice.dispatchEvent(new Event('change'));"
-            "})(document.querySelector('#layouts'))"
-        )
-        await asyncio.to_thread(wait_for, lambda name=name: era.status().layout == name)
-    await page.until("document.querySelector('#layouts').value === 'panel'")
-    laid = ("#layouts", "#effects button:last-child", "#strengths output", "#log li:first-child")
-    for shown in laid:
-        place = f"document.querySelector('{shown}').getBoundingClientRect().bottom"
-        assert 0 < await page.evaluate(place) < 800
-
-
-async def test_scale_of_the_field_holds_for_ten_seconds(page: Page) -> None:
-    """By hand: 3 m/s² need 5, 0.4 need 1, but not before 10 s in which 3 did not return.
-
-    Nor at rest; it rises at once.
-    """
-    peaks = [[3, 1], [0.4, 2], [3, 9], [0.4, 10], [0, 12], [0, 60], [0.4, 61], [0.4, 69]]
-    peaks += [[0.4, 71], [30, 72]]
-    shown = await page.evaluate(
-        "import('./field.js').then(({ FieldView }) => {"
-        " const canvas = () => document.createElement('canvas');"
-        " const view = new FieldView(canvas(), canvas(), () => {});"
-        f" return {peaks}.map(([peak, s]) =>"
-        " { view.peak = peak; view.draw(1000 * s); return view.scale; }); })"
-    )
-    assert shown == [5, 5, 5, 5, 5, 5, 5, 5, 1, 50]
-
-
-@pytest.mark.long
-async def test_repeated_event_takes_one_line(page: Page) -> None:
-    """So that retries do not push out why a link was lost."""
-    shown = await page.evaluate(
-        "import('./side.js').then(({ addEvent }) => {"
-        " const log = document.createElement('ol');"
-        " for (const text of ['lost', 'retry', 'retry', 'retry', 'back', 'retry'])"
-        "   addEvent(log, 'error', text, null);"
-        " return [...log.querySelectorAll('span')].map(e => e.textContent);"
-        "})"
-    )
-    assert shown == ["retry", "back", "retry (3 times)", "lost"]
 
 
 async def test_only_the_lost_amplifier_is_shown_as_lost(page: Page) -> None:

@@ -4,7 +4,6 @@ Templates have their lengths on paper, are mirrored for the underside, and need 
 """
 
 import re
-from itertools import product
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -12,17 +11,11 @@ import numpy as np
 import pytest
 from tables import claims, stiffness_study, tables
 
-from cases import shortly
 from era_haptics.command import run_era
-from era_haptics.lab.paper_figures import SWEEP, PaperFigure, equal_area_points, paper_figures
+from era_haptics.lab.paper_figures import PaperFigure, paper_figures
 from kit.plates import make_paper_rig, small_table, with_strokes, write_rig
-from model.figures import Template, answer_figure, levels_figure, template_pages, weak_cells_figure
-from model.finger import Grid
-from model.reduction.free_plate import solve_free_plate
-from model.rig.rig import FOUR_ERA_LAYOUTS, alike
+from model.figures import answer_figure, levels_figure
 from model.rig.rig_file import load_rig
-from model.spectral.modes import SpectralMesh
-from model.study.contrast_maps import WeakCells
 
 POINT = 25.4 / 72  # mm
 SVG = "{http://www.w3.org/2000/svg}"
@@ -88,35 +81,6 @@ def test_pages_of_a_pdf_are_a4_and_cover_the_board(rig: Path, tmp_path: Path, ca
     assert len(load_rig(rig).eras) == 4
 
 
-def test_labels_keep_off_the_frames_of_pages(rig: Path) -> None:
-    """Of places 36 mm apart all over the board; SW, on channel 0, is labelled with output 1."""
-    places = product(np.arange(0.003, 0.3, 0.036), np.arange(0.003, 0.22, 0.036))
-    sensors = {f"P{n}": (float(x), float(y)) for n, (x, y) in enumerate(places)}
-    found = set()
-    for page in template_pages(Template(load_rig(rig), sensors)):
-        page.canvas.draw()
-        axes = page.axes[0]
-        frame = axes.get_window_extent()
-        for label in axes.texts:
-            name, _, place = label.get_text().partition("\n")
-            if place and frame.contains(*axes.transData.transform(label.xy)):
-                letters = label.get_window_extent()
-                assert frame.contains(*letters.min), name
-                assert frame.contains(*letters.max), name
-                found.add(name)
-    assert found >= {*sensors, "SW, output 1"}
-
-
-def test_grain_is_drawn_along_its_side(tmp_path: Path) -> None:
-    """Plywood with its grain along the width has an arrow along y; a board without grain none."""
-    shown = []
-    for material in ("aluminium", "plywood\n  grain: length", "plywood\n  grain: width"):
-        change = ("material: aluminium", f"material: {material}")
-        made = write_rig(tmp_path / "rig.yaml", change, mesh="auto")
-        shown.append(Template(load_rig(made), {}).grain)
-    assert shown == [None, (1.0, 0.0), (0.0, 1.0)]
-
-
 @pytest.fixture(scope="module")
 def figures() -> dict[str, PaperFigure]:
     """All figures of the paper's rig, on a mesh that is near converged."""
@@ -154,18 +118,6 @@ def test_figure_6_shapes_are_half_waves(figures):
         by_hand = np.sin(waves * np.pi * x) * np.sin(waves * np.pi * y)
         shape = np.asarray(shapes[mode])
         np.testing.assert_allclose(shape * np.sign(shape @ by_hand), by_hand, atol=0.02)
-
-
-@pytest.mark.parametrize(("name", "sets"), [("figure_10", 4), ("figure_11_boxplots", 6)])
-def test_box_plots_list_every_activation_set(figures, name, sets):
-    """Seven layouts, each with its four ERAs or six pairs; quartiles in order, above zero."""
-    table = figures[name].tables[""]
-    assert len(table["layout"]) == 7 * sets
-    five = [
-        table[f"{key}_m_s2"]
-        for key in ("minimum", "lower_quartile", "median", "upper_quartile", "maximum")
-    ]
-    assert (np.diff([np.zeros(7 * sets), *five], axis=0) > 0).all()
 
 
 def test_figure_11_pairs_exceed_single_eras_and_edges_agree_with_diagonals(figures):
@@ -211,43 +163,6 @@ def test_figure_13_doubled_stiffness_scales_the_map(figures):
     assert maximum[rows] == pytest.approx([soft.max() / 9.8, stiff.max() / 9.8])
     assert stiffness[study["correlation"].argmax()] == pytest.approx(17, rel=0.1)
     assert study["correlation"].max() <= 1 + 1e-12
-
-
-@pytest.mark.parametrize(
-    "layout", shortly(FOUR_ERA_LAYOUTS, FOUR_ERA_LAYOUTS[:2]), ids=lambda layout: layout.name
-)
-def test_equal_area_points_have_the_stated_accuracy(layout):
-    """Against 96 x 72 cells: medians within 3 %, quartiles 8 %, maxima at most 12 % low."""
-    plate = make_paper_rig(12, 9).plate
-    eras = alike(make_paper_rig(12, 9).eras[0], layout.positions(plate))
-    free = solve_free_plate(plate, SpectralMesh(20, 20, plate.length, plate.width))
-    few, many = (
-        np.percentile(
-            np.abs(free.acceleration(eras, SWEEP, points)).sum(axis=0), [25, 50, 75, 100], axis=1
-        )
-        for points in (equal_area_points(plate), Grid(96, 72).centres(plate))
-    )
-    lower, median, upper, maximum = few / many - 1
-    assert np.abs(median).max() < 0.03
-    assert np.abs([lower, upper]).max() < 0.08
-    assert -0.12 < maximum.min() <= maximum.max() < 1e-3
-
-
-def test_weak_cells_figure_crosses_out_weak_cells():
-    """Left those not feasible, right those weak; cells without a value are white."""
-    weak = WeakCells(
-        Grid(2, 1),
-        np.zeros((2, 2)),
-        median_db=np.array([20.0, 9.0]),
-        tenth_db=np.array([11.0, -np.inf]),
-        errors_db=np.zeros((2, 2)),
-        pairs_db=np.empty((2, 0)),
-    )
-    left, right = weak_cells_figure(small_table(), weak).axes[:2]
-    # Centres of two cells over 30.48 cm.
-    assert crossed(left) == pytest.approx([22.86])
-    assert crossed(right) == pytest.approx([7.62, 22.86])
-    assert right.collections[0].get_array().mask.tolist() == [[False, True]]
 
 
 def crossed(axes):

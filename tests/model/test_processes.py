@@ -6,7 +6,6 @@ The library is built, cached, and refused if damaged; its memory is judged under
 import ctypes
 import hashlib
 import json
-import math
 import os
 import signal
 import subprocess
@@ -35,7 +34,6 @@ from model.compiled.kernels import (
 )
 from model.errors import InputError
 from model.processes import on_cluster, on_processes
-from model.quantities import in_display_unit, percent, percent_down, with_error
 from reference_figures import RECORD, reference_figures
 
 
@@ -229,42 +227,6 @@ def test_the_first_of_the_nearly_equal_best_is_chosen(choose, scores, expected):
     for seed in range(20):
         rounding = np.random.default_rng(seed).uniform(-1, 1, np.shape(scores))
         assert choose(np.array(scores) * (1 + NEARLY / 4 * rounding)) == expected
-
-
-@pytest.mark.parametrize(
-    ("shown", "expected"),
-    [
-        (lambda: in_display_unit(70e9, "Pa", digits=3), "70 GPa"),
-        (lambda: in_display_unit(19041.2, "N/m", digits=5), "19.041 kN/m"),
-        (lambda: in_display_unit(0.0015, "m", digits=3), "1.5 mm"),
-        (lambda: in_display_unit(0.012006, "kg", digits=2), "12 g"),
-        (lambda: in_display_unit(4.8489, "N s/m", digits=3), "4.85 N s/m"),
-        (lambda: in_display_unit(0.01302, "", digits=2), "0.013"),
-        (lambda: in_display_unit(1.2, "m", digits=3), "1200 mm"),
-        (lambda: in_display_unit(0.9996, "m", digits=3), "1000 mm"),
-        (lambda: in_display_unit(117e3, "N/m", digits=2), "117 kN/m"),
-        *((lambda by=by: percent(by), f"{said} %") for by, said in ((1.43, 143), (0.124, 12))),
-        *((lambda by=by: percent(by), f"{said} %") for by, said in ((0.0999, 10), (0.0123, 1.2))),
-        (lambda: percent(0.0), "0 %"),
-        *(
-            (lambda share=share: percent_down(share), text)
-            for share, text in ((0.7959, "79 %"), (0.9999, "99 %"), (0.29, "29 %"), (1.0, "100 %"))
-        ),
-        (lambda: with_error(74.0241e9, 0.8712e9, "Pa"), "74.02 ± 0.87 GPa"),
-        (lambda: with_error(0.0130284, 2.72e-5, ""), "0.013028 ± 0.000027"),
-        (lambda: with_error(0.0119941, 0.000996, "kg"), "12.0 ± 1.0 g"),
-        (lambda: with_error(1231.4, 217.0, "Hz", sign="+"), "+1231 ± 217 Hz"),
-        (lambda: with_error(1.25, math.inf, ""), "1.25 ± inf"),
-        (lambda: with_error(1.0, 0.0, "m"), "1000 ± 0 mm"),
-    ],
-)
-def test_quantities_are_shown_in_the_unit_of_plates(shown, expected) -> None:
-    """Giga, kilo and milli where plates have them; any other unit as it is, and none without.
-
-    Per cents are whole from ten on, below with two digits. A value and its error have the same
-    decimals, none below two digits of the error.
-    """
-    assert shown() == expected
 
 
 RUNNABLE = [each for each in versions() if each.features.keys() <= processor_features()]

@@ -5,7 +5,6 @@ thresholds, levels, the band that is felt, and the grid of fingers.
 """
 
 import math
-import tracemalloc
 from dataclasses import replace
 
 import numpy as np
@@ -33,7 +32,6 @@ from model.finger import (
     sensitivities,
 )
 from model.rig.rig_file import mesh_of
-from model.spectral.modes import SpectralMesh
 from model.structure.material import Material
 from model.structure.plate import Plate
 from model.vibration import (
@@ -109,18 +107,6 @@ def test_meshes_to_compare_converge_to_the_same_field(automatic):
     assert elements.response.max() < 1e-2
 
 
-@pytest.mark.long
-@pytest.mark.parametrize(("count", "free"), [(1, 2), (2, 1)])
-def test_unsupported_motion_is_not_compared(count, free):
-    """On one ERA the plate can tilt both ways, on two about their line: 0 Hz has no error."""
-    rig = make_paper_rig(12, 9)
-    few = replace(rig, eras=rig.eras[:count], limits=replace(rig.limits, frequency_max=120.0))
-    study = study_convergence(few, [Mesh(24, 18, LENGTH, WIDTH)], frequencies=[110.0])
-    assert len(study.natural_frequencies) == len(study.errors[0].frequency) == 12 - free
-    assert study.natural_frequencies[0] > 1
-    assert np.abs(study.errors[0].frequency).max() < 0.03
-
-
 FULL = 100e-6
 
 
@@ -178,19 +164,6 @@ def test_plate_map_refuses_invalid_excitations(coarse_rig, excitation, says):
     """No answer is given for no ERA, a foreign ERA, no frequency, or one the mesh cannot carry."""
     with pytest.raises(InputError, match=says):
         plate_map(coarse_rig, excitation)
-
-
-def test_a_map_takes_little_memory_for_each_point(coarse_rig):
-    """Of 160 000 points less than 1 kB for each, on polynomials, and the same at those of a few."""
-    mesh = SpectralMesh(13, 11, LENGTH, WIDTH)
-    rig, excitation = replace(coarse_rig, mesh=mesh), {"SW": Tone(110.0, FULL)}
-    tracemalloc.start()
-    fine = plate_map(rig, excitation, raster=(400, 400)).peak
-    _, most = tracemalloc.get_traced_memory()
-    tracemalloc.stop()
-    assert most < 160e6
-    coarse = plate_map(rig, excitation, raster=(4, 4)).peak
-    np.testing.assert_allclose(fine[::133, ::133], coarse, rtol=1e-9)
 
 
 @pytest.mark.parametrize(

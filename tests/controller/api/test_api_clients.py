@@ -279,25 +279,6 @@ async def test_connect_fails_when_the_peer_is_no_compatible_daemon(
         assert {getattr(each.value, "code", None) for each in (one, other)} == {ErrorCode.BUSY}
 
 
-def test_client_subscribes_again_with_the_rate_of_each_topic(tmp_path: Path) -> None:
-    """A later subscription to another topic does not change it."""
-    done = b'{"jsonrpc":"2.0","id":%d,"result":{}}\n'
-    with (
-        responding(tmp_path / "s", HELLO, done % 1, done % 2) as received,
-        Client.connect(tmp_path / "s") as era,
-    ):
-        era.subscribe("amplifiers", rate_hz=2.0)
-        era.subscribe("state")
-        with pytest.raises(ConnectionLost):
-            era.status()
-    subscriptions = [
-        (params["topics"], params.get("rate_hz"))
-        for line in received
-        if (params := json.loads(line)["params"]).get("topics")
-    ]
-    assert subscriptions[:4] == 2 * [(["amplifiers"], 2.0), (["state"], None)]
-
-
 @pytest.mark.parametrize(
     ("method", "is_repeated"),
     [("stop", True), ("status", True), ("clear", False), ("play", False), ("arm", False)],

@@ -9,7 +9,6 @@ import contextlib
 import json
 import re
 import socket
-import time
 from collections import Counter
 from collections.abc import AsyncIterator, Callable, Mapping
 from contextlib import asynccontextmanager, suppress
@@ -62,7 +61,6 @@ from processes.daemons import (
     until_state,
 )
 from registry import threads
-from registry.threads import no_long_collections
 
 PARAMS = {
     "arm": '{"owner":"me","lease_s":5}',
@@ -648,82 +646,6 @@ def test_client_that_does_not_read_loses_notifications_then_the_connection() -> 
         for _ in range(500):
             connection.notify(make)
     assert wire.is_aborted
-
-
-API_BOUNDS_TOUCH = '{"id":1,"x_m":0.1,"y_m":0.1}'
-WRONG = '{"id":"a","x_m":"b","y_m":[],"z":0,"t":0}'
-HEAVY = {
-    "newlines": b"\n" * (1 << 18),
-    "keys": request("arm", "{" + ",".join(f'"{n}":1' for n in range(7000)) + "}"),
-    "keys within the bound": request("arm", "{" + ",".join(f'"{n}":1' for n in range(240)) + "}"),
-    "repeated keys": request("arm", "{" + ",".join(['"a":1'] * 240) + "}"),
-    "members": b"{" + b",".join(b'"%d":1' % n for n in range(240)) + b"}\n",
-    "depth": b'{"a":' * 5000 + b"\n",
-    "depth within the bound": b"[" * 79 + b"]" * 79 + b"\n",
-    "touches": request("touch", f'{{"source":"a","touches":[{",".join([API_BOUNDS_TOUCH] * 64)}]}}')
-    * 30,
-    "touches in turn": b"".join(
-        request("touch", f'{{"source":"{n}","touches":[{",".join([API_BOUNDS_TOUCH] * 64)}]}}')
-        for n in range(30)
-    ),
-    "wrong touches": request("touch", f'{{"source":"a","touches":[{",".join([WRONG] * 70)}]}}'),
-    "digits": b"9" * 60_000 + b"\n" + request("stop", "{}", id="9" * 4000),
-    "text": request("hello", f'{{"client":"{"é" * 30_000}"}}', id=1),
-    "no end": b"x" * (1 << 18),
-    "requests": request("hello", '{"client":"a"}', id=1) * 3000,
-    "stops": request("stop", id=1) * 3000,
-    "wrong stops": request("stop", '{"x":1}', id=1) * 3000,
-    "wrong stops with keys": request("stop", "{" + ",".join(f'"{n}":1' for n in range(240)) + "}"),
-    "text of a stop": b'"stop"' * 10_000 + b"\n",
-    "names of a stop": b'"method":' * 7000 + b'"stop"\n',
-}
-
-
-def reference_time() -> float:
-    """Processor time [s] of some fixed work, about that of fifty requests."""
-    frame = HEAVY["touches"].partition(b"\n")[0]
-    begin = time.thread_time()
-    for _ in range(15):
-        json.loads(frame)
-        {str(number): number for number in range(400)}
-    return time.thread_time() - begin
-
-
-async def callback_times(data: bytes) -> list[float]:
-    """Processor time [s] of each callback while a client's data is handled, a line in each turn."""
-    connection, _ = ServedApi().client()
-    times: list[float] = []
-    run = asyncio.Handle._run
-
-    def timed(handle: asyncio.Handle) -> None:
-        begin = time.thread_time()
-        run(handle)
-        times.append(time.thread_time() - begin)
-
-    with no_long_collections(), pytest.MonkeyPatch.context() as patch:
-        patch.setattr(asyncio.Handle, "_run", timed)
-        asyncio.get_running_loop().call_soon(feed, connection, data)
-        for _ in range(300):
-            await asyncio.sleep(0)
-    connection.abort()
-    await asyncio.gather(*connection.pending)
-    assert len(times) > 300
-    return times
-
-
-@pytest.mark.parametrize("name", HEAVY)
-async def test_no_line_takes_longer_than_some_fixed_work(name: str) -> None:
-    """Of processor time, whatever a client sends at once.
-
-    Each callback and the fixed work count with their least time of five runs one after the other,
-    as a virtual machine counts what its host takes as well.
-    """
-    runs, references = [], []
-    for _ in range(5):
-        references.append(reference_time())
-        runs.append(await callback_times(HEAVY[name]))
-    longest = max(map(min, zip(*runs, strict=False)))
-    assert longest < min(references)
 
 
 async def test_hub_survives_an_exception_of_a_producer(caplog: pytest.LogCaptureFixture) -> None:

@@ -20,12 +20,11 @@ from scipy.io import wavfile
 
 from controller.content.formats import (
     Ahap,
-    content_formats,
     named_content,
     named_contents,
     read_content,
 )
-from controller.content.pattern import Curve, Pattern, Transient, pattern_of_points, points_of
+from controller.content.pattern import Curve, Pattern, Transient, pattern_of_points
 from controller.content.rendition import rendered, requested_level
 from model.errors import InputError
 
@@ -691,20 +690,3 @@ def test_points_and_taps_of_a_program() -> None:
     ):
         with pytest.raises(InputError, match=words):
             pattern_of_points(points)
-
-
-def test_points_are_given_of_a_pattern_whose_curves_have_their_own_times() -> None:
-    """A step stays one; sharpness is given at its own times too; 2 001 points become 500."""
-    level, sharp = ((0.0, 0.0), (0.1, 1.0), (0.1, 0.5), (0.4, 0.5)), ((0.0, 0.0), (0.2, 1.0))
-    points, taps = points_of(Pattern(0.4, level, sharp, (Transient(0.3, 1, 0),)))
-    assert points == [(0, 0, 0), (0.1, 1, 0.5), (0.1, 0.5, 0.5), (0.2, 0.5, 1), (0.4, 0.5, 1)]
-    assert taps == [(0.3, 1, 0)]
-    rise = tuple((number / 1000, number / 2000) for number in range(2001))
-    many, _ = points_of(Pattern(2.0, rise[::5], rise, (Transient(0.3, 1, 0),)))
-    assert len(many) == 499
-    assert max(abs(each - time / 2) for time, *both in many for each in both) < 1e-9
-
-
-def test_formats_are_listed() -> None:
-    """Those of the project first."""
-    assert content_formats()[:4] == ("ahap", "haptic", "hjif", "wav")

@@ -5,16 +5,12 @@ it is read in another process, and what it costs the loop.
 """
 
 import asyncio
-import gc
 import itertools
 import json
 import os
 import signal
 import subprocess
 import sys
-import threading
-import weakref
-from collections import Counter
 from pathlib import Path
 
 import numpy as np
@@ -23,11 +19,9 @@ from typer.testing import CliRunner
 
 from controller.api.link import default_socket
 from controller.cli.config_cli import config_app
-from controller.content.pattern import Pattern
 from controller.daemon.children import read_in_child
 from controller.daemon.config import DAEMON, DaemonConfig, DaemonSection, load_daemon_config
 from controller.daemon.layouts import config_change
-from controller.effects.kinds import File
 from controller.process.child import child_command
 from controller.sources.touch import Touch
 from kit.clock import in_virtual_time
@@ -383,85 +377,6 @@ async def test_reload_costs_the_loop_nothing(
         assert (await era.status()).state == ENABLED
     with pytest.raises(InputError, match=r"missing\.yaml"):
         read_in_child(tmp_path / "missing.yaml", FREQUENCIES)
-
-
-FILES, LAYOUTS = 50, 6  # effects of files in a layout, and layouts
-
-
-def write_layouts_of_files(folder: Path, *, level: int) -> None:
-    """Layouts of many files, all at one level [dB SL]."""
-    effects = [
-        f"  f{number}: {{kind: file, file: tick, level: {level}}}" for number in range(FILES)
-    ]
-    text = "\n".join(["effects:", *effects, "elsewhere: null", ""])
-    for number in range(LAYOUTS):
-        (folder / f"layout{number}.yaml").write_text(text, encoding="utf-8")
-
-
-@in_virtual_time
-async def test_reload_frees_one_effect_in_each_turn_when_300_files_are_replaced(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """All effects of the old layouts are freed, in the loop's thread, and never two in one turn.
-
-    The interpreter is held while objects are freed, so that a stop would wait. Turns are counted,
-    since a duration depends on the machine.
-    """
-    turns = itertools.count()
-    turn = next(turns)
-    freed = list[tuple[int, int]]()
-    run = asyncio.Handle._run
-
-    def counted(handle: asyncio.Handle) -> None:
-        nonlocal turn
-        turn = next(turns)
-        run(handle)
-
-    def note() -> None:
-        freed.append((threading.get_ident(), turn))
-
-    write_layouts_of_files(tmp_path, level=14)
-    files = ", ".join(f"l{number}: layout{number}.yaml" for number in range(LAYOUTS))
-    async with ready_daemon(tmp_path, f"layouts: {{{files}}}\n") as (bench, _):
-        for layout in bench.daemon._config.layouts.values():
-            for name, effect in layout.effects.items():
-                if name.startswith("f"):
-                    weakref.finalize(effect, note)
-            del effect
-        del layout
-        write_layouts_of_files(tmp_path, level=15)
-        with monkeypatch.context() as counting:
-            counting.setattr(asyncio.Handle, "_run", counted)
-            assert (await asyncio.create_task(bench.daemon.reload())).reloaded
-        assert len(freed) == FILES * LAYOUTS
-        assert {thread for thread, _ in freed} == {threading.get_ident()}
-        assert max(Counter(freed).values()) == 1
-
-
-def test_effect_of_a_long_file_consists_of_few_objects() -> None:
-    """With 20 000 points, rendered at two levels, it is freed as fewer than 1000 blocks of memory.
-
-    As tuples its points alone would be 60 000.
-    """
-    times = np.linspace(0, 60, 20_000).tolist()
-    pattern = Pattern(60.0, tuple([(time, time / 60) for time in times]))
-    effect = File.of(pattern, name="long", level_db_sl=20.0)
-    for level in (14.0, 20.0):
-        effect.prepare(level)
-    del pattern, times
-    gc.collect()
-    blocks = sys.getallocatedblocks()
-    del effect
-    assert 0 < blocks - sys.getallocatedblocks() < 1000
-
-
-def test_reading_a_configuration_in_a_child_is_bounded_in_time(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """An error of the system, as if the child had failed; a child cannot start in no time."""
-    monkeypatch.setattr("controller.daemon.children._TIMEOUT", 0.0)
-    with pytest.raises(OSError, match="took longer"):
-        read_in_child(tmp_path / "daemon.yaml", FREQUENCIES)
 
 
 def test_plugin_installed_meanwhile_needs_a_restart(

@@ -7,20 +7,15 @@ and an end; names and files of strengths are bounded.
 import asyncio
 import contextlib
 import json
-import logging
 import os
 import re
 import resource
 import signal
 import socket
-import subprocess
-import sys
 import threading
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from datetime import datetime
 from pathlib import Path
-from unittest.mock import Mock
 
 import pytest
 import serial
@@ -28,12 +23,10 @@ from typer.testing import CliRunner
 
 from controller.api.client import Client
 from controller.api.jsonrpc import ErrorCode, RpcError
-from controller.api.link import Notification
-from controller.api.methods import TOPICS
 from controller.api.schema import ContactStatus
 from controller.cli.commands import app
 from controller.cli.main import BAD_INPUT
-from controller.cli.status_text import show_event, show_status
+from controller.cli.status_text import show_status
 from controller.daemon.children import gateway_options
 from controller.daemon.daemon import run_daemon
 from controller.daemon.handlers import check_lease
@@ -67,7 +60,6 @@ from processes.daemons import (
     holding,
     next_event,
     ready_daemon,
-    running_daemon,
     silent_from,
     stated_readings,
     until,
@@ -289,39 +281,6 @@ async def test_event_read_late_takes_nothing_back_that_was_seen(tmp_path: Path) 
         assert (await era.status()).state == READY
 
 
-@in_virtual_time
-async def test_reload_ends_after_unexpected_error_and_as_the_daemon_is_shut_down(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The service manager gets the end of it, and the next reload works.
-
-    One whose configuration is still being read at the shutdown applies nothing.
-    """
-    async with ready_daemon(tmp_path) as (bench, _):
-        daemon, is_reading, notices = bench.daemon, asyncio.Event(), list[str]()
-        await daemon._supervisor.started.wait()
-        for _ in range(10):  # the start is reported within three cycles of the event loop
-            await asyncio.sleep(0)
-        monkeypatch.setattr(daemon._manager, "notify", lambda first, *_: notices.append(first))
-        with monkeypatch.context() as patched:
-            failing = Mock(side_effect=RuntimeError("injected"))
-            patched.setattr("controller.daemon.layouts.read_in_child", failing)
-            await daemon.reload()
-        await daemon.reload()
-        assert notices == ["RELOADING=1", "READY=1"] * 2
-
-        async def read_for_ever(load: object, *, name: str) -> object:
-            is_reading.set()
-            await asyncio.Event().wait()
-            raise AssertionError("unreachable")
-
-        monkeypatch.setattr("controller.daemon.daemon.in_thread", read_for_ever)
-        daemon._reload_requested.set()
-        await is_reading.wait()
-        daemon.shut_down("end of the test")
-        await until(daemon._reloading.cancelled)
-
-
 async def test_shutdown_while_a_port_is_opened_leaves_none_open(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -345,19 +304,6 @@ async def test_shutdown_while_a_port_is_opened_leaves_none_open(
         assert len(opened) == 1
         with serial.Serial(opened[0].port, exclusive=True):
             pass
-
-
-@in_virtual_time
-async def test_log_event_escapes_bytes_that_are_not_text(tmp_path: Path) -> None:
-    """A file name that is not UTF-8 reaches subscribers."""
-    async with running_daemon(tmp_path) as bench, await bench.client() as era:
-        await era.subscribe("log")
-        record = logging.makeLogRecord({"msg": "wrote %s", "args": ("/tmp/\udcff",)})
-        record.levelno, record.levelname = logging.WARNING, "WARNING"
-        bench.daemon._publisher.logged(record)
-        while "wrote" not in (event := await next_event(era, "log")).data["message"]:
-            pass
-        assert event.data["message"] == r"wrote /tmp/\udcff"
 
 
 def test_lease_lasts_its_duration_from_each_renewal_by_its_token() -> None:
@@ -394,20 +340,6 @@ def test_lease_exists_while_energised_alone(state: DaemonState, trigger: Trigger
         assert after.lease is None
     if state in ENERGISED and after.state not in ENERGISED:
         assert after.epoch == 8
-
-
-def test_event_is_shown_by_wall_clock_without_unknown_values() -> None:
-    """On the second day of 1970 at 0:01:05.25 local time; figures are rounded."""
-    finger = {"source": "panel", "id": 1, "x_m": 0.1 + 0.2, "role": None, "effect": "buzz"}
-    ahead = datetime(1970, 1, 2).timestamp() + 60.0
-    drive = {"SW": {"frequency_hz": 110.0, "level": 0.05}}
-    event = Notification("pattern", 5.25, 3, {"contacts": [finger], "drive": drive})
-    assert show_event(event, ahead=ahead) == (
-        "00:01:05.250  pattern    contacts source panel, id 1, x_m 0.3, effect buzz, "
-        "drive (SW (frequency_hz 110, level 0.05))  (3 lost)"
-    )
-    empty = Notification("contacts", 0.0, 0, {"contacts": []})
-    assert show_event(empty, ahead=ahead).split()[2:] == ["contacts", "none"]
 
 
 @pytest.mark.parametrize(
@@ -489,16 +421,6 @@ def test_daemon_refuses_pipe_as_log_or_trace(tmp_path: Path) -> None:
     assert not (tmp_path / "era.sock").exists()
 
 
-def test_daemon_imports_no_package_of_other_commands() -> None:
-    """Its start does not wait for optimisers, pictures or web servers."""
-    program = "import sys, controller.daemon.daemon; print(*sys.modules)"
-    modules = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, check=True
-    ).stdout.split()
-    assert "scipy.linalg" in modules
-    assert not set(modules) & {"scipy.optimize", "scipy.ndimage", "matplotlib", "aiohttp"}
-
-
 def test_stop_exits_with_3_and_names_amplifiers_unless_all_are_silent(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -512,12 +434,6 @@ def test_stop_exits_with_3_and_names_amplifiers_unless_all_are_silent(
         assert re.search(r"side .*0\.20 s.*rear", errors)
         assert "main" not in errors
     assert run_era(command) == 3
-
-
-def test_help_of_watch_names_every_topic() -> None:
-    """Those of the API, though help does not load it."""
-    said = CliRunner().invoke(app, ["watch", "--help"]).output
-    assert [topic for topic in TOPICS if topic not in said] == []
 
 
 @in_virtual_time

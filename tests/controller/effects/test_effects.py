@@ -1,13 +1,10 @@
 """Effects at a finger, regions, and priorities among several fingers."""
 
-import inspect
 import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from importlib import import_module
 from itertools import pairwise
-from pathlib import Path
 from types import EllipsisType
 
 import pytest
@@ -16,7 +13,7 @@ from hypothesis import strategies as st
 
 from controller.daemon.messages import effects_result
 from controller.effects.effect import Effect, EffectRun, EffectStimulus, NoStimulus, Region
-from controller.effects.kinds import BUILT_IN_EFFECTS, Buzz, Click, Detents, Ramp, Texture
+from controller.effects.kinds import Buzz, Click, Detents, Ramp, Texture
 from controller.effects.layout import SurfaceLayout
 from controller.effects.player import EffectPlayer
 from controller.sources.touch import Contact, ContactKey
@@ -362,16 +359,6 @@ def test_texture_level_has_hysteresis() -> None:
     assert len(levels) == 1
 
 
-def test_layout_max_level() -> None:
-    """The first level of a ramp counts too, also where a region lowers its last."""
-    falling = Ramp(start_level=40.0, level=12.0)
-    assert SurfaceLayout(effects={"fall": falling}).max_db_sl == 40.0
-    region = Region("pad", LEFT, on_press="soft", level_db_sl=30.0, has_level=True)
-    assert SurfaceLayout((region,), {"soft": Click(level=10.0)}).max_db_sl == 30.0
-    free = Region("pad", LEFT, on_press="soft", level_db_sl=None, has_level=True)
-    assert SurfaceLayout((free,), {"soft": Click(level=10.0)}).max_db_sl == float("inf")
-
-
 def test_detents_click_once_per_detent() -> None:
     """Detents lie at 5, 15, 25 mm from where the finger came down, 10 mm apart.
 
@@ -536,16 +523,6 @@ def test_shapes(
     """Edges and corners belong to a shape."""
     assert [shape.contains(*point) for point in inside] == [True] * len(inside)
     assert [shape.contains(*point) for point in outside] == [False] * len(outside)
-
-
-def test_every_effect_of_the_project_is_registered() -> None:
-    """In BUILT_IN of controller/effects/kinds.py, by name."""
-    modules = Path(inspect.getfile(Effect)).parent.glob("*.py")
-    members = [vars(import_module(f"controller.effects.{each.stem}")) for each in modules]
-    kinds = {each for every in members for each in every.values() if inspect.isclass(each)}
-    effects = {each for each in kinds if issubclass(each, Effect) and not inspect.isabstract(each)}
-    assert effects == set(BUILT_IN_EFFECTS), "add it to BUILT_IN in controller/effects/kinds.py"
-    assert sorted(names := [each.kind for each in BUILT_IN_EFFECTS]) == names
 
 
 def test_effect_kinds_include_plug_ins() -> None:

@@ -240,13 +240,6 @@ def test_every_key_is_documented_and_no_other(heading: str) -> None:
     assert set(key_rows(PAGE.read_text("utf-8"), heading)) == KEYS[heading]
 
 
-def test_tables_of_kinds_say_what_the_classes_do() -> None:
-    """Unit, default, limits and meaning of a key; whose finger feels a kind."""
-    page = PAGE.read_text("utf-8")
-    assert "| `click.duration` | s | 40 ms | at least 0.02, at most 0.5 | the plate needs" in page
-    assert "| `dial` | a moving finger in a region | yes | a click at each detent" in page
-
-
 ONE, TWO = (Contact(ContactKey("panel", id), 0.1 * id, 0.1, 0.0) for id in (1, 2))
 
 # One second at intensity 1, and two taps of intensity 0.5, the second one sharp.

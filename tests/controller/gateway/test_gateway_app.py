@@ -12,7 +12,7 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
-from unittest.mock import AsyncMock, Mock
+from unittest.mock import AsyncMock
 
 import httpx
 import numpy as np
@@ -21,7 +21,6 @@ from aiohttp import web
 from aiohttp.test_utils import make_mocked_request
 from prometheus_client.parser import text_string_to_metric_families
 
-from controller.api.jsonrpc import ErrorCode, RpcError
 from controller.api.link import Unreachable
 from controller.api.methods import (
     METHODS,
@@ -31,17 +30,16 @@ from controller.api.methods import (
     RequestedBy,
     StatusResult,
 )
-from controller.api.schema import ApiMessage, PlayedTone
-from controller.api.server import Hub
+from controller.api.schema import PlayedTone
 from controller.gateway import app
 from controller.gateway.access import Access
 from controller.gateway.app import serve
-from controller.gateway.field import DrawnField, FieldSolver
+from controller.gateway.field import FieldSolver
 from controller.gateway.gateway_settings import GatewaySettings
 from controller.gateway.metrics import exposition
 from model.arrays import ComplexArray
 from model.rig.rig_file import example_rig_path, load_rig
-from processes.daemons import PATIENCE, ready_daemon, stated_readings, until
+from processes.daemons import ready_daemon, stated_readings
 from processes.gateways import (
     TOKEN,
     UNCONFIRMED,
@@ -173,52 +171,6 @@ def pattern(**layers: dict[str, PlayedTone]) -> PatternEvent:
         predicted_level_db_sl=None,
         latency_ms=1.0,
     )
-
-
-class UnknownPattern(ApiMessage):
-    """A pattern of an incompatible daemon."""
-
-    layers: dict[str, dict[str, dict[str, str]]] = {  # noqa: RUF012  pydantic copies it
-        "0": {"SW": {"tone": "110 Hz"}}
-    }
-
-
-async def test_field_is_drawn_after_what_cannot_be_drawn(
-    daemon: ScriptedDaemon, caplog: pytest.LogCaptureFixture
-) -> None:
-    """A tone that is not understood leaves no picture and one line in the log, nothing more."""
-    known = pattern(**{"0": {"SW": PlayedTone(frequency_hz=110.0, level=0.5, phase_deg=0.0)}})
-    field = DrawnField(daemon.socket)
-    running = asyncio.create_task(field.run())
-    frames = field.frames()
-    frame = await anext(frames)
-    waiting = asyncio.ensure_future(anext(frames))
-    async with asyncio.timeout(PATIENCE):
-        for event, frequencies in ((known, 1), (UnknownPattern(), 0), (known, 1)):
-            while struct.unpack_from("<H", frame, 4) != (frequencies,):
-                daemon.publish("pattern", event)
-                await asyncio.wait({waiting}, timeout=0.1)
-                if waiting.done():
-                    frame, waiting = waiting.result(), asyncio.ensure_future(anext(frames))
-    waiting.cancel()
-    running.cancel()
-    await asyncio.wait({running})
-    assert caplog.text.count("field of the plate not drawn") == 1
-
-
-async def test_field_is_followed_again_after_a_refusal(
-    daemon: ScriptedDaemon, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """As by a daemon that has too many clients for a while."""
-    monkeypatch.setattr("controller.gateway.field._RETRY_INTERVAL", 0.0)
-    busy = RpcError(ErrorCode.BUSY, "too many clients", remedy="try again later")
-    subscribe = Mock(side_effect=busy)
-    monkeypatch.setattr(Hub, "subscribe", subscribe)
-    running = asyncio.create_task(DrawnField(daemon.socket).run())
-    await until(lambda: subscribe.call_count > 2, patience=PATIENCE / 6)
-    running.cancel()
-    await asyncio.wait({running})
-    assert caplog.text.count("too many clients") == 1
 
 
 def test_frame_has_a_field_of_each_content() -> None:

@@ -36,7 +36,6 @@ from controller.gateway import app, bridge, connections
 from controller.gateway.app import Gateway, listening_socket, serve
 from controller.gateway.gateway_settings import GatewaySettings, read_token
 from controller.gateway.turns import Turns
-from gateway_attacks import ATTACKS, LIMIT, attack
 from kit.clock import in_virtual_time
 from model.errors import InputError
 from processes.daemons import PATIENCE, until
@@ -48,7 +47,6 @@ from processes.gateways import (
     frame,
     gateway_process,
     http,
-    real_daemon,
     upgrade,
     wait_for,
     wait_for_daemon,
@@ -267,36 +265,6 @@ def test_gateway_connects_to_a_daemon_that_starts_later(tmp_path: Path) -> None:
             wait_for(lambda: http(gateway).status == 503)
 
 
-MAX_GROWTH = 400.0  # MB; of responses that are not read
-
-
-@pytest.fixture(scope="module")
-def attacked_daemon(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """The socket of a real daemon for all attacks."""
-    with real_daemon(tmp_path_factory.mktemp("daemon")) as path:
-        yield path
-
-
-@pytest.mark.long
-@pytest.mark.real_time
-@pytest.mark.alone
-@pytest.mark.parametrize("name", ATTACKS)
-def test_stops_get_through_an_attack(attacked_daemon: Path, tmp_path: Path, name: str) -> None:
-    """Each is carried out, and the gateway takes less than half a second of a processor meanwhile.
-
-    Other programs do not lengthen that, unlike the duration on a busy machine. It logs nothing.
-    """
-    with gateway_process(tmp_path, attacked_daemon) as gateway:
-        wait_for_daemon(gateway)
-        outcome = attack(gateway, name, seconds=6.0)
-        print(outcome.row(name))  # noqa: T201 (with -s it is the table)
-        assert len(outcome.stops) >= 5
-        assert all(each.is_done for each in outcome.stops)
-        assert max(each.processor for each in outcome.stops) < LIMIT
-        assert outcome.memory_most - outcome.memory_before < MAX_GROWTH
-        assert gateway.log() == ""
-
-
 PAGE = Path(controller.__file__).parents[1] / "docs" / "how-to" / "deployment.md"
 CADDY = "{{\n    admin off\n    auto_https disable_redirects\n}}\n{site}"
 NGINX = """daemon off;
@@ -424,27 +392,6 @@ def test_gateway_is_used_through_a_proxy(
         assert http(panel, more=["Origin: https://evil.example"]).status == 403
         assert b"lease" not in http(panel, host=["evil.example"]).body
         assert daemon.calls == []
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("line", ["Upgrade", "Connection", "proxy_http_version"])
-def test_page_without_a_header_of_nginx_has_no_websocket(
-    proxy: Proxy, behind: GatewayProcess, line: str
-) -> None:
-    """The page and the methods are there all the same."""
-    with proxied("nginx", proxy, behind, without=line) as panel:
-        assert http(panel).status == 200
-        assert status(panel, upgrade(panel)) == b"403"
-
-
-@pytest.mark.long
-def test_page_without_host_of_nginx_is_served_to_foreign_hosts(
-    proxy: Proxy, behind: GatewayProcess
-) -> None:
-    """The gateway sees the name by which nginx calls it."""
-    for without, expected in (("(?!)", 421), ("Host", 200)):
-        with proxied("nginx", proxy, behind, without=without) as panel:
-            assert http(panel, host=["evil.example"]).status == expected
 
 
 @pytest.mark.long
@@ -840,20 +787,3 @@ async def test_others_have_a_turn_after_each_frame(
         browser.frames.put_nowait(LEFT)
         await bridging
     assert turns >= 100
-
-
-async def test_lines_that_came_together_are_not_sent_to_a_browser_that_has_left(
-    tmp_path: Path,
-) -> None:
-    """Each of them would be a warning in the log."""
-
-    async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        await reader.readline()
-        writer.write(HELLO + 1000 * b"{}\n")
-        await reader.read()
-        writer.close()
-
-    path, browser = tmp_path / "era.sock", Browser(leaves=True)
-    async with await asyncio.start_unix_server(serve, path), asyncio.timeout(PATIENCE):
-        await browser.bridged(path)
-    assert 1 <= browser.sent < 10

@@ -22,7 +22,6 @@ from controller.operation.operation_states import (
     Action,
     DaemonEvent,
     DaemonState,
-    DeferredCalls,
     Operation,
     Trigger,
     failed,
@@ -39,7 +38,6 @@ from kit.clock import in_virtual_time, run_virtual
 from kit.courses import Planted, Step, courses, follow
 from kit.fingers import Watched, watched
 from registry import threads
-from ways import stop
 
 STEPS: Sequence[Step] = (
     "ARM",
@@ -445,31 +443,6 @@ async def test_failing_action_ends_in_a_stop(
             assert made.far_end.requests("Stop", *(["Disarm"] if action else []))
             assert made.far_end.state != "OPERATION_ENABLED"
         await arm_again(made)
-
-
-@in_virtual_time
-async def test_flush_makes_each_call_once() -> None:
-    """In order, with those that are added meanwhile; nothing is left for the event loop."""
-    problems: list[object] = []
-    asyncio.get_running_loop().set_exception_handler(lambda _, context: problems.append(context))
-    calls, made = DeferredCalls(), list[int]()
-    calls.add(lambda: made.append(1))
-    calls.add(lambda: calls.add(lambda: made.append(3)))
-    calls.add(lambda: made.append(2))
-    calls.flush()
-    await asyncio.sleep(1.0)
-    assert made == [1, 2, 3]
-    assert not problems
-
-
-def test_stop_takes_one_turn_and_few_functions() -> None:
-    """Nothing waits on its way, and what it passes through can be read in a few minutes."""
-    way = stop()
-    path = [*way.functions]
-    assert path[0][1].endswith("Connection.buffer_updated")
-    assert path[-1][0] == "drivers/host/line.py"
-    assert len(path) < 13, path
-    assert way.calls.total() < 100
 
 
 ARMED, STOPPED = "OPERATION_ENABLED", "QUICK_STOP_ACTIVE"

@@ -29,7 +29,7 @@ from controller.play.joint_answers import (
 )
 from controller.play.loop import PlayReport
 from controller.play.slots import CROSSFADE
-from controller.sources.touch import AT_REST, Contact, ContactKey, FingerMotion
+from controller.sources.touch import AT_REST, Contact, ContactKey
 from drivers.host.group import Group
 from kit.chain import Chain, Position
 from kit.clock import in_virtual_time, run_virtual
@@ -39,7 +39,6 @@ from kit.plates import contact_sets, smooth_rig
 from kit.wires import on_two_amplifiers
 from model.answer.answer import Limits
 from model.answer.answer_report import Timing
-from model.answer.plan import answer
 from model.answer.stimulus import Finger, Placement, Stimulus
 from model.config.fields import Rectangle
 from model.rig.rig import Rig, Uncertainty
@@ -235,37 +234,6 @@ def test_a_moving_finger_is_answered_around_the_next_8_mm() -> None:
     )
     assert other == fingers(contacts)[1]
     assert sum(each.load for each in (first, middle, last)) == pytest.approx(1.0)
-
-
-@pytest.mark.parametrize(
-    ("at", "vx", "stimulus", "count"),
-    [
-        (MOVER, 0.02, Stimulus(14.0), 2),  # slower than 50 mm/s
-        (MOVER, 0.2, None, 4),  # as quiet for all others
-        (
-            (paper_table().plate.length - 0.005, 0.08),
-            0.2,
-            Stimulus(14.0),
-            2,
-        ),  # its way ends at the edge
-        ((OTHER[0] - 0.02, OTHER[1]), 0.2, Stimulus(14.0), 2),  # it would meet the other
-        (MOVER, 0.2, Stimulus(14.0, modulation_hz=20.0), 2),
-        (MOVER, 0.2, Stimulus(14.0, name="2"), 2),  # which both may share
-    ],
-)
-def test_ends_of_ways_are_fingers_where_they_can_be(
-    at: tuple[float, float], vx: float, stimulus: Stimulus | None, count: int
-) -> None:
-    """Else the finger alone, on the plate; any of these is answered.
-
-    So is one that moved until 60 ms ago, of which its source says nothing since.
-    """
-    contacts = [contact(1, at, vx=vx), replace(contact(2, OTHER), motion=FingerMotion())]
-    given = [Finger(at, stimulus), fingers(contacts)[1]]
-    found = with_paths(given, contacts, NOW, paper_table().plate)
-    assert len(found) == count
-    assert len(answer(paper_table(), found, drive_mode="phased").fingers) == count
-    assert with_paths(given, contacts, NOW + 0.06, paper_table().plate) == given
 
 
 def test_what_is_felt_on_a_way_is_the_mean_power_there_and_a_share_for_side_bands() -> None:

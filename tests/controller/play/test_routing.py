@@ -26,7 +26,6 @@ from controller.play.routing import (
     playback_capabilities,
     route,
     thinned,
-    tones_by_era,
 )
 from controller.sources.touch import Contact, ContactKey
 from drivers.host.group import Group
@@ -35,7 +34,7 @@ from drivers.playing import AmplifierLayer
 from drivers.playing import AmplifierTone as Played
 from drivers.protocol.definition import CLOCK_UNKNOWN
 from drivers.protocol.records import Values
-from drivers.protocol.sets import Command, Envelope, LayerSet
+from drivers.protocol.sets import Envelope
 from kit.chain import FarEnd
 from kit.clock import in_virtual_time
 from kit.fingers import LAYOUT, LEFT, RIGHT, Fingers
@@ -186,14 +185,6 @@ async def test_promise_is_kept_beside_a_clock_that_is_not_steered() -> None:
     found = await beyond_the_promise()
     assert len(found) == 2
     assert min(found.values()) > 0
-
-
-@pytest.mark.long
-@in_virtual_time
-async def test_promise_is_broken_if_clocks_are_not_counted(monkeypatch: pytest.MonkeyPatch) -> None:
-    """So what plays over both amplifiers is felt by who should not."""
-    monkeypatch.setattr(CountedClocks, "counted_by", lambda clocks, table, known: table)
-    assert min((await beyond_the_promise()).values()) < -1
 
 
 class _Changing(dict[ContactKey | None, float]):
@@ -421,24 +412,6 @@ def test_route_by_hand() -> None:
 
 
 @pytest.mark.parametrize(
-    ("radians", "degrees"),
-    [
-        (0.0, 0.0),
-        (math.pi, 180.0),
-        (-math.pi, -180.0),
-        (1.5 * math.pi, -90.0),
-        (-1.5 * math.pi, 90.0),
-        (6 * math.pi, 0.0),
-        (20 * math.pi + 0.1, math.degrees(0.1)),
-    ],
-)
-def test_route_wraps_phases(radians: float, degrees: float) -> None:
-    """Phases lie within half a turn, of which both ends are one."""
-    command = route({"C": Tone(100.0, 1e-6, radians)}, PAIRED_RIG, ramp=0)["right"].tones[0]
-    assert command.phase == pytest.approx(degrees)
-
-
-@pytest.mark.parametrize(
     ("wanted", "kept"),
     [
         ({"A": Tone(110.0, 5e-6), "C": Tone(110.0, 9e-6)}, {"A", "C"}),
@@ -463,15 +436,3 @@ def test_route_keeps_phase_only_if_all_eras_continue(wanted: Excitation, kept: s
     } == kept
     first = route(wanted, PAIRED_RIG, ramp=0)
     assert not any(tone.keep_phase for each in first.values() for tone in each.tones)
-
-
-def test_drive_of_eras_by_hand() -> None:
-    """What each ERA plays, without silent ones."""
-    achieved = {
-        "left": [LayerSet(0, 20, 0, (Command(0, 800, 0, 0), Command(1, 2201, 1999, -9000)))],
-        "right": [LayerSet(0, 20, 0, (Command(0, 5000, 4000, 0),))],
-    }
-    assert tones_by_era(achieved, PAIRED_RIG) == {
-        "A": Played(1, 110.05, 0.1999, -90.0),
-        "C": Played(0, 250.0, 0.4),
-    }

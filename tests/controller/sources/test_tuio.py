@@ -650,37 +650,6 @@ def waiting(*sent: tuple[bytes, Peer]) -> list[Datagram]:
     return [Datagram(data, peer, float(number)) for number, (data, peer) in enumerate(sent)]
 
 
-BLOBS = full("a").replace(b"2Dcur", b"2Dblb")
-
-
-@pytest.mark.parametrize(
-    ("sent", "first"),
-    [
-        # another name, port or profile is of another kind; the order stays
-        (
-            [
-                (full("a", 1), PEER),
-                (full("b"), PEER),
-                (full("a"), OTHER),
-                (full("a"), PEER),
-            ],
-            1,
-        ),
-        ([(full("a", 1), PEER), (BLOBS, PEER)], 0),
-        ([(BLOBS, PEER), (full("a", 1), PEER), (BLOBS, PEER)], 1),
-        # the position of a cursor that is alive may be in an older bundle only
-        ([(full("a", 1, 2), PEER), (partial("a", [1, 2], {1: 0.1}), PEER)], 0),
-        ([(full("a", 1, 2), PEER), (b"no bundle", PEER)], 0),
-    ],
-    ids=["another name or port", "another profile", "profiles mixed", "partial", "no bundle"],
-)
-def test_newest_complete_bundle_supersedes_those_of_its_kind(
-    sent: list[tuple[bytes, Peer]], first: int
-) -> None:
-    """All are kept from the first of these on."""
-    assert TuioSource("tuio:").drop_superseded(waiting(*sent)) == waiting(*sent)[first:]
-
-
 bundles = st.builds(
     lambda source, alive, placed: partial(
         source, alive, {id: 0.1 * id for id in alive if id in placed}

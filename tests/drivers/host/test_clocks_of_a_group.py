@@ -16,9 +16,7 @@ from typing import Any
 import pytest
 
 from drivers.errors import DriverError, LinkDegraded, Preempted
-from drivers.host.clock import HeldClock
 from drivers.host.group import Group
-from drivers.host.joint_sets import Clocks
 from drivers.playing import AmplifierLayer, AmplifierTone
 from drivers.protocol.definition import CLOCK_UNKNOWN, FEATURES, HELLO, HIGH_TIME, MESSAGES, SPAN
 from drivers.wires.can_frames import CanFrame, pack_frames
@@ -463,27 +461,6 @@ async def test_sets_beside_readings_of_clocks_are_played(
         between = sent[sent.index("Set") : sent.index("Commit")]
         assert len(lines) == 1 or "GetStatus" not in between
     assert {each.committed for each in group.amplifiers.values()} == {group.sets.token}
-
-
-@pytest.mark.parametrize(
-    ("error", "readings"), [(5e-6, 0), (6e-6, 0), (6.5e-6, 1), (7e-6, 2), (7.6e-6, 3)]
-)
-@in_virtual_time
-async def test_clocks_are_read_the_seldomer_the_better_they_are_known(
-    monkeypatch: pytest.MonkeyPatch, error: float, readings: int
-) -> None:
-    """Beside each heartbeat of 50 ms: each 10 ms from 8 us on, which cost a tenth of a dB.
-
-    Nearer to 5 us, which cost nothing, as much more seldom: 6.5 us are half way, so each 20 ms.
-    """
-    read: list[float] = []
-    monkeypatch.setattr(HeldClock, "scatter", lambda clock, time: error)
-    monkeypatch.setattr(Clocks, "read_clock", lambda clocks, amplifier: read.append(error))
-    group, clocks = await held("native", 1, "a", "b")
-    read.clear()
-    await skew(group, clocks, 1.0)
-    await asyncio.sleep(0.049)
-    assert len(read) == 20 * 2 * readings
 
 
 @pytest.mark.parametrize(("lost", "bound"), [(0.0, 2e-6), (0.02, 10e-6)], ids=["all", "lossy"])

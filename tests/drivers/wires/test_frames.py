@@ -344,19 +344,6 @@ def test_echo_without_a_response_is_named() -> None:
     assert "request itself came back" in wire.counters.remark
 
 
-@pytest.mark.parametrize("is_rtu", [True, False])
-def test_noise_is_counted_and_not_kept(is_rtu: bool) -> None:
-    """All of its bytes, over as many parts as it has."""
-    wire = ModbusWire(115_200, is_rtu=is_rtu, number=0)
-    wire.request(1, "GetStatus", {})
-    for _ in range(100):
-        assert wire.received(b"\xff" * 4096) == []
-    assert wire.counters.invalid_frames == 1
-    assert len(wire._damaged) < 512
-    wire.withdraw()
-    assert f"{100 * 4096} bytes that are no valid frame" in wire.counters.remark
-
-
 def test_number_of_an_unanswered_broadcast_can_be_used_again() -> None:
     """Transactions come again after 65 535: then one is a healthy unit's."""
     wire, peer = ModbusWire(0, is_rtu=False, number=0), Peer(is_rtu=False)

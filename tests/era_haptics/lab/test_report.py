@@ -17,7 +17,6 @@ from era_haptics.lab.report import (
     MAX_FILE_SIZE,
     ReportContents,
     collect,
-    installed_versions,
     write_report,
 )
 from model.rig.rig_file import example_rig_path
@@ -219,25 +218,6 @@ def test_report_includes_files_of_daemon(tmp_path: Path, given: Sequence[str]) -
     found = json.loads(report.files["versions.json"].text)
     assert found["packages"]["numpy"][0].isdigit()
     assert set(found) >= {"packages", "plug-ins"}
-
-
-def test_versions_list_packages_of_plug_ins(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """All packages that provide the same name are listed with it."""
-    for name, version in (("cork", "1.5"), ("oak", "2.0")):
-        package = tmp_path / f"{name}-{version}.dist-info"
-        package.mkdir()
-        (package / "METADATA").write_text(
-            f"Metadata-Version: 2.1\nName: {name}\nVersion: {version}\n", "utf-8"
-        )
-        (package / "entry_points.txt").write_text(
-            f"[era_haptics.materials]\ncork = {name}:CORK\n", "utf-8"
-        )
-    monkeypatch.syspath_prepend(tmp_path)
-    assert installed_versions()["plug-ins"]["materials"] == {
-        "cork": "cork:CORK (cork 1.5), oak:CORK (oak 2.0)"
-    }
 
 
 def test_report_has_the_place_of_what_is_invalid(tmp_path: Path) -> None:

@@ -13,13 +13,11 @@ from kit.set_table import phased as answer
 from model.answer.answer import NO_LIMITS, Limits
 from model.answer.answer_report import query_one
 from model.answer.plan import answer as answer_by_table
-from model.answer.plan import prepare_answers, with_gains
+from model.answer.plan import prepare_answers
 from model.answer.promise import felt_amplitudes, loudest_power
 from model.answer.stimulus import NEVER, Finger, Placement, Stimulus
-from model.answer.tone_search import choose_tones
 from model.errors import InputError
 from model.finger import detection_threshold
-from model.rig.rig_file import example_rig_path, load_rig
 from model.structure.attachments import HAND_PATCHES, HAND_STD
 from model.study.verification import Plates, draw_plates
 from model.table.table_file import build_table
@@ -69,23 +67,6 @@ def test_figures_as_modelled_are_those_of_the_exact_plate(contents, other):
     assert [each.level_db_sl for each in found.fingers[:contents]] == pytest.approx(
         levels, abs=0.02
     )
-
-
-def test_level_of_others_is_stated_by_the_rigs_set_too() -> None:
-    """28 dB less than by the most sensitive set at 250 Hz, as the page about people has it.
-
-    A quiet finger and one with a content of its own, of which the other plays at 100 Hz: 31 dB.
-    """
-    table = build_table(load_rig(example_rig_path()), frequencies=np.array([100.0, 250.0]))
-    assert len(table.threshold_sets) == 2
-    requests = [wants(NEAR, (250.0, 250.0)), wants(FAR, (100.0, 100.0))]
-    (_, quiet), (_, other) = (
-        answer(table, requests[:1], [Finger(FAR)]).fingers,
-        answer(table, [requests[1], requests[0]], min_contrast_db=-99).fingers,
-    )
-    for sensation, difference in ((quiet, 28.0), (other, 31.0)):
-        found = sensation.foreign_level_db_sl - sensation.rig_foreign_level_db_sl
-        assert found == pytest.approx(difference, abs=0.5)
 
 
 HAND = (0.17, 0.13)
@@ -296,36 +277,6 @@ def test_fingers_that_may_share_feel_one_content():
 TWENTY = [(0.025 + 0.06 * x, 0.03 + 0.055 * y) for x in range(5) for y in range(4)]
 
 
-@pytest.mark.parametrize(
-    ("given", "most"),
-    [
-        (lambda n: {"name": "a"}, 1),
-        (lambda n: {"may_share": True, "priority": n}, 1),
-        (lambda n: {"name": "ab"[n % 2]}, 4),
-        (lambda n: {}, 25),
-        (lambda n: {"name": "abcde"[n % 5], "priority": n % 3}, 62),
-        (lambda n: {"max_foreign_db_sl": -50.0, "is_protected": n % 2 == 0}, 43),
-        (lambda n: {"level_db_sl": 60.0, "min_contrast_db": 12.0}, 25),
-        (lambda n: {"modulation_hz": 20.0, "band_hz": (40.0, 300.0 + n)}, 31),  # and side bands
-    ],
-)
-def test_twenty_fingers_take_few_searches(given, most, monkeypatch):
-    """As long as one of a content where a name is shared by all, as three of twenty at most.
-
-    A search takes as long as it has contents and fingers on the plate; two fingers are soon asked.
-    """
-    asked = []
-
-    def counted(table, contents):
-        asked.append(contents)
-        return choose_tones(table, contents)
-
-    monkeypatch.setattr("model.answer.plan.choose_tones", counted)
-    found = answer(smooth_table(), [wants(at, **given(n)) for n, at in enumerate(TWENTY)])
-    assert len(found.fingers) == 20
-    assert sum(len(each.streams) * len(each.places) for each in asked) <= 20 * most
-
-
 def test_twenty_fingers_take_little_memory(without_kernels):
     """In numpy, whose arrays are counted: less than a table, though the level is out of reach."""
     without_kernels()
@@ -421,20 +372,6 @@ def sides_of(layer):
     return sorted(next(iter(tones.values())).frequency for tones in layer.side_bands)
 
 
-def test_contents_lowered_alike_are_served_as_before(table):
-    """Contrasts are ratios of levels, so none of crowded fingers has less than it had."""
-    crowded = 0
-    for places in contact_sets(8, fingers=4, seed=4):
-        requests = [wants(at, level_db_sl=15.0) for at in places]
-        found = answer(table, requests, min_contrast_db=-99.0)
-        if found.promised_worst_db < 6.0:
-            crowded += 1
-            for gain_db in (-1.0, -3.0, -7.0):
-                lowered = with_gains(table, found, np.full(4, gain_db))
-                assert lowered.promised_worst_db == pytest.approx(found.promised_worst_db, abs=1e-4)
-    assert crowded > 2
-
-
 def test_side_bands_lie_evenly_about_the_carrier_at_half_its_amplitude(table):
     """Full modulation: half of the carrier's amplitude at the finger each, 1.8 dB more in all."""
     requests = [wants((0.126, 0.081), level_db_sl=14.0), wants((0.234, 0.049))]
@@ -461,19 +398,6 @@ def test_side_bands_lie_evenly_about_the_carrier_at_half_its_amplitude(table):
     )  # errors of three tones differ
     assert found.layers[1].excitation == plain.layers[1].excitation
     assert found.layers[1].side_bands == ()
-
-
-def test_side_bands_of_their_own_leak_less_than_those_of_the_carrier(table):
-    """At the same weights 20 Hz of modulation cost 5 dB and more, at their own at most 3."""
-    lost = []
-    for places in contact_sets(6, fingers=2, seed=7):
-        first, second = (wants(at, level_db_sl=12.0) for at in places)
-        found = answer(table, [modulated(first, 20.0), second])
-        if found.layers[0].side_bands:
-            plain = answer(table, [first, second])
-            lost.append(plain.promised_worst_db - found.promised_worst_db)
-    assert len(lost) >= 4
-    assert np.median(lost) < 3.0
 
 
 def test_a_modulation_is_left_out_where_a_finger_would_feel_too_much(table):
@@ -551,19 +475,6 @@ def test_a_modulation_between_two_steps_of_the_table_plays_the_nearest(table):
     for limits, count in ((NO_LIMITS, 2), (Limits((100.0, 300.0)), 0)):
         (layer,) = answer(table, [low], [Finger((0.234, 0.049))], limits=limits).layers
         assert len(layer.side_bands) == count
-
-
-def test_side_bands_keep_apart_from_what_plays_already(table):
-    """Whichever frequency plays, each of the three tones is 30 Hz from it; some sets have three."""
-    counts = []
-    for playing in (80.0, 120.0, 160.0, 200.0, 240.0):
-        request = wants((0.09, 0.07), level_db_sl=12.0, modulation_hz=20.0)
-        found = answer(table, [request], [Finger(FAR)], avoided_hz=[playing])
-        (layer,) = found.layers
-        tones = [tone.frequency for each, _ in layer.drives for tone in each.values()]
-        assert min(abs(frequency - playing) for frequency in tones) >= 30.0
-        counts.append(len({*tones}))
-    assert {*counts} >= {3}
 
 
 @pytest.mark.parametrize("modulation", [20.0, 30.0])

@@ -4,7 +4,6 @@ import errno
 import json
 import re
 from dataclasses import replace
-from math import pi
 from unittest.mock import Mock
 
 import numpy as np
@@ -32,7 +31,7 @@ from model.rig.rig import Uncertainty
 from model.structure.attachments import footprints_of
 from model.table.table_file import build_table, save_table
 from model.transients.base_motion import ramped_ending, ramped_onset, shaped
-from model.transients.shaping import Shaper, Transients
+from model.transients.shaping import Transients
 from model.transients.time_response import plate_in_time
 
 PUBLISHED = {
@@ -82,8 +81,6 @@ TARGET = (0.15, 0.12)
 PLATE = smooth_rig().plate
 AREA = PLATE.length * PLATE.width
 POINTS = cell_centres(PLATE)
-NEAR = np.hypot(*(POINTS - TARGET).T) <= 0.05
-CIRCLE = pi * 0.05**2
 
 
 def concentration(*amplitudes, frequencies=(100.0,)):
@@ -92,16 +89,6 @@ def concentration(*amplitudes, frequencies=(100.0,)):
     return concentration_of(
         np.array(frequencies), field, ~is_beyond(POINTS, [TARGET]), felt=1.0, plate=PLATE
     )
-
-
-def test_concentration_weighs_energy_and_sums_amplitudes_over_frequencies():
-    """Half the frequency is four times the energy; two quarters of the target make a half."""
-    found = concentration(NEAR, ~NEAR, frequencies=(100.0, 200.0))
-    assert found.energy_share_near == pytest.approx(4 / (4 + (AREA / CIRCLE - 1)), rel=0.01)
-    left = POINTS[:, 0] < PLATE.length / 2
-    for amplitude, area in ((0.249, 0.0), (0.251, AREA / 2)):
-        found = concentration(amplitude * left, amplitude * left, frequencies=(100.0, 200.0))
-        assert found.area_above_half == pytest.approx(area, rel=0.01)
 
 
 def test_concentration_on_a_plate_within_five_centimetres():
@@ -181,24 +168,6 @@ def test_transient_measures_agree_with_another_solution_of_the_plate(rig, table)
     assert found[1][0] > found[0][0] + 3
     assert found[1][1] < found[0][1] - 10
     assert shaped_layer.excitation == plain.excitation
-
-
-@pytest.mark.parametrize("quiet", [(), ((0.25, 0.18), (0.005, 0.1))])
-def test_envelopes_are_those_of_fingertips_read_point_by_point(table, quiet):
-    """Knots within a per mille of the largest, at an edge of the plate as well.
-
-    Without quiet fingers there is no contrast; what is left after the end is known all the same.
-    """
-    placed, timing = replace(PLACED, quiet=quiet), Timing(table)
-    layer, _ = only(table, placed, drive_mode="phased")
-    found = timing.with_envelopes(layer, placed)
-    shaper = Shaper(table.in_time, gain_variance=table.uncertainty.gain_variance)
-    onset = shaper.onset(found.excitation, targets=placed.targets, quiet=quiet)
-    largest = max(each.largest for each in onset.values())
-    for name, each in onset.items():
-        np.testing.assert_allclose(found.onset[name].knots, each.knots, atol=1e-3 * largest)
-    assert (timing.transient_contrast_db(found, placed) is None) == (not quiet)
-    assert timing.residual_db(found, placed) < -20
 
 
 def test_query_batch_has_knots_only_with_envelopes(table):

@@ -10,23 +10,21 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy.linalg import eigh
 
 from benchmarks.promise.clicks import given
 from cases import shortly
 from kit.plates import (
     SMALL_TABLE_HZ,
     contact_sets,
-    forms_of,
     small_table,
     smooth_rig,
     smooth_table,
 )
 from kit.set_table import only, phased, wants
 from model.answer import tone_search
-from model.answer.answer import KEPT, MISSING, Contents, Limits, Stream
+from model.answer.answer import Contents, Stream
 from model.answer.plan import answer, query
-from model.answer.promise import FingersOnPlate, RingingUnderFingers, share_stroke
+from model.answer.promise import RingingUnderFingers, share_stroke
 from model.answer.stimulus import (
     Course,
     DriveEnvelope,
@@ -37,8 +35,8 @@ from model.answer.stimulus import (
     pulse_ramp,
     together,
 )
-from model.answer.tone_search import choose_by_numpy, choose_tones, ranked, worst_ratios
-from model.arrays import FloatArray, Point
+from model.answer.tone_search import choose_by_numpy, choose_tones, worst_ratios
+from model.arrays import FloatArray
 from model.ensemble.draws import ClockErrors
 from model.errors import InputError
 from model.finger import THRESHOLDS, Grid, detection_threshold, fingertip_points, fingertip_weights
@@ -161,24 +159,6 @@ def test_a_course_that_is_a_click_is_answered_as_the_click() -> None:
         assert other.fingers[0].level_db_sl == pytest.approx(level, abs=0.01)
 
 
-@pytest.mark.parametrize("quiet", [(), (QUIET,)], ids=["alone", "beside"])
-def test_a_course_that_stays_faint_is_answered_as_a_strong_one(quiet: tuple[Point, ...]) -> None:
-    """A fiftieth of it, 34 dB fainter, 34 dB above: all is linear, so it is the same drive."""
-    strong, faint = (
-        query(
-            smooth_table(),
-            Placement((TARGET,), quiet),
-            -14 - 20 * math.log10(height),
-            course=along(1.0, np.array([0.0, height, 0.0])),
-            drive_mode="phased",
-        ).layers[0]
-        for height in (1.0, 0.02)
-    )
-    assert faint.frequency == strong.frequency
-    for name, tone in strong.excitation.items():
-        assert abs(0.02 * faint.excitation[name].phasor / tone.phasor - 1) < 1e-3
-
-
 @pytest.mark.long
 @pytest.mark.parametrize(
     ("first", "second"),
@@ -201,12 +181,6 @@ def test_promise_over_a_course_is_kept(first: Stimulus, second: Stimulus | None)
     promised = np.array([each.fingers[0].promised_contrast_db for each in answers])
     found = given(table, smooth_rig(), answers, 12, seed=4)
     assert 0.86 <= np.mean(found >= promised[:, None]) <= 0.97
-
-
-def test_a_stimulus_has_the_duration_of_its_course() -> None:
-    """Also with another level."""
-    stimulus = Stimulus(20.0, course=along(0.5, np.array([0.0, 1.0, 0.0])))
-    assert stimulus.duration == replace(stimulus, level_db_sl=10.0).duration == 0.5
 
 
 PLACES = [
@@ -324,29 +298,6 @@ GRID = [
 ]
 
 
-def test_bound_and_level_are_those_of_the_best_weights_for_the_mean() -> None:
-    """The frequency of the highest bound that reaches the level is kept, few that miss it.
-
-    Bounds by a general optimiser: the largest eigenvalue of the target's form to the mean one.
-    """
-    of = table()
-    placed = Placement((PLACES[0],), tuple(PLACES[1:4]))
-    forms, contents = forms_of(of, placed), content(of, placed)
-    c = forms.targets[0].conj().astype(complex)
-    R = forms.quiet.mean(axis=1).astype(complex)
-    bounds, levels = [], []
-    for target, form in zip(c, R, strict=True):
-        values, vectors = eigh(np.outer(target, target.conj()), form)
-        bounds.append(values[-1])
-        levels.append(abs(target.conj() @ vectors[:, -1]) / np.abs(vectors[:, -1]).max())
-    reaches = np.array(levels) >= forms.wanted * forms.threshold
-    kept = ranked(FingersOnPlate.of(of, contents.places, ()), contents)
-    assert len(kept) == min(KEPT, int(reaches.sum()) + int((~reaches[kept]).sum()))
-    assert int((~reaches[kept]).sum()) <= MISSING
-    best = np.argsort(-np.array(bounds)[reaches])[: int(reaches[kept].sum())]
-    assert set(np.flatnonzero(reaches)[best]) == set(kept[reaches[kept]])
-
-
 def test_answers_lose_little(monkeypatch: pytest.MonkeyPatch) -> None:
     """Against a search of all frequencies: 0.1 dB in the mean, and the level is as high."""
     of, lost = table(), []
@@ -361,20 +312,6 @@ def test_answers_lose_little(monkeypatch: pytest.MonkeyPatch) -> None:
         lost.append(every.worst_db - some.worst_db)
         assert some.level_db_sl[0][1] > every.level_db_sl[0][1] - 0.1
     assert np.mean(lost) < 0.1
-
-
-@pytest.mark.usefixtures("kernels_or_numpy")
-def test_level_that_no_kept_frequency_reaches_is_sought_at_all(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """Where the ranking keeps only a frequency that is too weak the answer is that of all."""
-    monkeypatch.setattr(tone_search, "KEPT", 1)
-    monkeypatch.setattr(tone_search, "MISSING", 1)
-    of = replace(table())  # that keeps no rules yet
-    contents = content(of, Placement((PLACES[0],), (PLACES[1],)), 50.0)
-    (kept,) = ranked(FingersOnPlate.of(of, contents.places, ()), contents).tolist()
-    found = choose_tones(of, contents)
-    assert found.rows[0] != kept
 
 
 def test_prepared_table_goes_to_another_process() -> None:
@@ -565,19 +502,6 @@ def test_a_limit_is_as_strong_as_quiet_fingers_allow():
             else:
                 assert felt.level_db_sl == pytest.approx(26.0, abs=1e-3)
             assert felt.lowered_db == pytest.approx(26.0 - felt.promised_level_db_sl, abs=1e-3)
-
-
-@pytest.mark.parametrize("slew", [math.inf, 0.3, 0.1])
-def test_a_click_that_is_a_limit_stays_so_along_the_ramp_that_the_slew_needs(slew: float):
-    """Quiet fingers have -10 dB SL at most; it does not return to the level of its search."""
-    click = Finger(TARGET, Stimulus(26.0, duration=0.04, is_limit=True))
-    for quiet in contact_sets(6, fingers=2, seed=5):
-        if min(math.dist(at, TARGET) for at in quiet) < 0.02:
-            continue
-        found = answer(
-            smooth_table(), [click], quiet=quiet, drive_mode="phased", limits=Limits(slew=slew)
-        )
-        assert max(each.foreign_level_db_sl for each in found.fingers[1:]) <= -10.0 + 1e-3
 
 
 def test_a_limit_is_not_lowered_for_what_others_play():

@@ -4,7 +4,6 @@ What they write and print: files and pictures, progress and next lines; what oth
 succeed, by the cases of `printed.yaml`.
 """
 
-import csv
 import io
 import json
 import os
@@ -30,8 +29,7 @@ from era_haptics.lab.cli import app as lab_app
 from era_haptics.lab.design import design_run, problem, score
 from kit.plates import small_table, smooth_table, write_rig
 from model.cli import app
-from model.commands import options
-from model.commands.options import next_line, progress_bar
+from model.commands.options import next_line
 from model.compiled.kernels import WITHOUT_KERNELS
 from model.config.document import read_document
 from model.errors import InputError
@@ -159,29 +157,6 @@ def test_the_best_of_several_stiffnesses_is_written(small, tmp_path: Path) -> No
     best, rig = max(by_stiffness, key=by_stiffness.get), load_rig(tmp_path / "rig.yaml")
     assert {era.stiffness for era in rig.eras if era.name != "NE"} == {float(best)}
     assert rig.era("NE").stiffness == load_rig(RIG).era("NE").stiffness
-
-
-@pytest.mark.usefixtures("plain_pictures")
-def test_given_layouts_are_ranked_and_the_best_written(small, tmp_path: Path) -> None:
-    """Judged ones first, by contrast, others by score; a row each."""
-    arguments = ("--layouts", "random:20", "--eras", "3-4", "--finalists", "2")
-    found = design(*arguments, "-o", tmp_path)
-    with (tmp_path / "layouts.csv").open(encoding="utf-8") as stream:
-        rows = list(csv.DictReader(stream))
-    assert len(rows) == found["layout_count"]
-    assert {len(row["at_m"].split()) for row in rows} == {3, 4}
-    judged = [float(row["contrast_db"]) for row in rows if row["contrast_db"]]
-    assert len(judged) == 4
-    assert judged == sorted(judged, reverse=True)
-    assert [row["contrast_db"] != "" for row in rows] == [True] * 4 + [False] * (len(rows) - 4)
-    scores = [float(row["score"]) for row in rows[4:] if row["supported"] == "True"]
-    assert scores == sorted(scores, reverse=True)
-    assert sum(row["supported"] == "False" for row in rows) == found["unsupported"] > 0
-    assert found["contrast_db"] == found["layouts"][0]["contrast_db"]
-    places = [[era.x, era.y] for era in load_rig(tmp_path / "rig.yaml").eras]
-    best = list(found["layouts"][0]["at_m"].values())
-    assert places == [pytest.approx(each, abs=1e-6) for each in best]
-    assert set(found["by_count_db"]) == {"3", "4"}
 
 
 @pytest.mark.usefixtures("plain_pictures")
@@ -370,34 +345,6 @@ def test_convergence_lists_errors_of_finer_and_finer_meshes(monkeypatch, tmp_pat
     assert [each is None for each in estimates] == 2 * [True] + [False, True]
     text = era("plate", *arguments).stdout
     assert all(f"{error:.3f} %" in text for error in [*errors, *estimates[-2]])
-
-
-@pytest.mark.usefixtures("plain_pictures")
-def test_log_gets_a_line_every_two_seconds(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """Of ten steps of half a second those at 2 and 4 s are printed, without a bar.
-
-    With the time that the rest takes at the same pace; a second stage has its own pace.
-    """
-    now = [0.0]
-    monkeypatch.setattr(options.time, "monotonic", lambda: now[0])
-    with progress_bar("cells") as update:
-        for done in range(1, 11):
-            now[0] = 0.5 * done
-            update(done, 10)
-        for done in (1, 2):
-            now[0] += 90.0
-            update(done, 3)
-        now[0] += 90.0
-        update(3, 3)
-    assert capsys.readouterr().err.splitlines() == [
-        "4 of 10 cells, about 3 s left",
-        "8 of 10 cells, about 1 s left",
-        "1 of 3 cells, about 3 min left",
-        "2 of 3 cells, about 90 s left",
-        "3 of 3 cells",
-    ]
 
 
 @pytest.mark.usefixtures("plain_pictures")

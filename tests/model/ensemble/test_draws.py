@@ -5,7 +5,6 @@ by differences of the direct solve, and by rebuilt plates.
 """
 
 import math
-from collections.abc import Mapping
 from dataclasses import replace
 from functools import cache
 
@@ -21,7 +20,6 @@ from model.answer.stimulus import Finger, Stimulus
 from model.arrays import ComplexArray, FloatArray
 from model.ensemble.attached_plate import MODELLED, PlateOnEras, attach, thickness_nodes
 from model.ensemble.draws import (
-    EXACT_CLOCKS,
     PROMISED_DRAWS,
     ClockErrors,
     Drawing,
@@ -58,21 +56,6 @@ def test_common_gain_moves_all_channels_together():
 
 CERTAIN = {"gain": 0.0, "phase": 0.0, "common_gain": 0.0, "harmonic": 0.0, "thicknesses": 1}
 """Plates of which nothing that is drawn deviates."""
-
-
-def test_feet_leave_all_else_that_is_drawn_as_it_is() -> None:
-    """Plates of the same rig without feet, and with weights alone, are drawn as ever."""
-    errors = {"gain": 0.05, "phase": 0.1, "common_gain": 0.02, "harmonic": 0.01}
-    drawn = [
-        draw(4, 2, masses=3, to_feet=count, count=64, seed=1, thicknesses=5, **errors)
-        for count in (0, 2)
-    ]
-    for name, plain in vars(drawn[0]).items():
-        with_feet = np.array(getattr(drawn[1], name))
-        if name == "own":
-            assert with_feet[4:6].std(axis=1) == pytest.approx(1.0, abs=1e-6)
-            with_feet[4:6] = 0.0
-        np.testing.assert_array_equal(with_feet, plain)
 
 
 PLACES = ((0.09, 0.07), (0.25, 0.18))
@@ -212,23 +195,6 @@ def test_eras_of_one_amplifier_are_late_together() -> None:
     np.testing.assert_allclose(np.abs(1 + off[1]), np.abs(1 + exact.gains), rtol=1e-5)
 
 
-@pytest.mark.parametrize(
-    ("wiring", "errors"),
-    [
-        (dict.fromkeys(ERAS, Channel("a", 0)), {"a": math.inf}),
-        (WIRING, {"a": 0.0, "b": 0.0}),
-    ],
-    ids=["one amplifier", "exact"],
-)
-def test_nothing_changes_where_no_clock_is_off(
-    wiring: Mapping[str, Channel], errors: Mapping[str, float]
-) -> None:
-    """All ERAs on one amplifier, however bad its clock is; or clocks that agree: the same table."""
-    found = ClockErrors.of(ERAS, wiring, errors)
-    assert found == EXACT_CLOCKS
-    assert late_table().with_clocks(found) is late_table()
-
-
 @pytest.mark.usefixtures("kernels_or_numpy")
 def test_expected_power_is_the_mean_square_of_delayed_drives() -> None:
     """w^H R w of random weights is the mean over 4000 plates, relative to the mean amplitude's.
@@ -283,17 +249,6 @@ def test_amplifiers_that_are_held_play_together_beside_one_that_is_not() -> None
     for errors in ({"a": 1e-6}, {"a": 1e-6, "b": math.nan}, {"a": 0, "b": -1e-6}):
         with pytest.raises(InputError, match="amplifier b"):
             ClockErrors.of(ERAS, WIRING, errors)
-
-
-def test_clocks_change_nothing_else() -> None:
-    """Errors of a femtosecond change no promise, where the places of ERAs are uncertain, too."""
-    known = replace(late_table(), uncertainty=replace(IDENTIFIED, place=0.003))
-    places = next(iter(contact_sets(1, fingers=2, seed=5)))
-    exact, off = (
-        two(each, places).promised_worst_db
-        for each in (known, known.with_clocks(clocks(a=1e-15, b=1e-15)))
-    )
-    assert off == pytest.approx(exact, abs=1e-3)
 
 
 TOUCHED_PLATE_PLACES = np.array([[0.09, 0.07], [0.25, 0.18], [0.03, 0.19]])
@@ -500,15 +455,6 @@ def test_sensitivities_of_a_thicker_plate_are_differences_of_the_direct_solve(wh
     )
     exact = np.einsum("e,fep->fp", TOUCHED_PLATE_WEIGHTS, (more - less) / 2e-3)
     assert furthest(found, exact) < 0.01
-
-
-@pytest.mark.parametrize("count", [2, 5, 10])
-def test_thickness_nodes_are_those_of_a_normal_deviation(count):
-    """Mean 0, variance 1; with many, nine of ten are below 1.28."""
-    nodes = thickness_nodes(count)
-    assert (nodes.mean(), nodes.var()) == pytest.approx((0, 1))
-    assert (np.diff(nodes) > 0).all()
-    assert np.quantile(thickness_nodes(1000), 0.9) == pytest.approx(1.2816, abs=0.01)
 
 
 def felt_of(touched, points, weights, **drawn):

@@ -4,18 +4,14 @@ Rigs are fitted to responses of plates that are known, solved without the fit's 
 are those of extrapolated differences, and responses with other values those of a plate solved anew.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
-from typing import Any
 
 import numpy as np
 import pytest
-from scipy import optimize
 
 from benchmarks.calibration.hidden_plates import (
-    FORM,
-    SENSORS,
     draw_plate,
     field_deviations,
     fields_of,
@@ -28,21 +24,16 @@ from kit.plates import NAMES as PLATES_NAMES
 from kit.plates import make_paper_rig, perturbed
 from kit.plates import measured as plates_measured
 from kit.weekend_boards import FOLDER, measured_board
-from model.arrays import ComplexArray, FloatArray
+from model.arrays import FloatArray
 from model.errors import InputError
-from model.estimate import plate_match
 from model.estimate.calibrate import calibrate
-from model.estimate.fit import SensedPlate, fit, sensed_plate
+from model.estimate.fit import SensedPlate, sensed_plate
 from model.estimate.fit_report import calibration_json, change_rows, finding_rows
-from model.estimate.forward import MASS_CELLS
-from model.estimate.measurement import Measurement, sensors_at
-from model.estimate.parameters import PARAMETER_KINDS
-from model.reduction.free_plate import solve_free_plate
-from model.reduction.reduced_plate import reduced_modes
+from model.estimate.measurement import sensors_at
 from model.rig.rig import Rig
 from model.rig.rig_file import example_rig_path, load_rig
-from model.spectral.modes import SpectralMesh, stretched
-from model.structure.attachments import PointLoad, footprints_of
+from model.spectral.modes import SpectralMesh
+from model.structure.attachments import PointLoad
 
 FREQUENCIES = np.arange(40.0, 321.0, 40.0)
 STIFF, SOFT = 30e3, 10.0  # N/m; the latter is 3e-4 of an ERA's
@@ -287,79 +278,6 @@ def test_calibrate_refuses_what_tells_nothing(coarse, truth):
 RIG = make_paper_rig(12, 9)
 POINTS = np.random.default_rng(0).uniform(0.02, 0.2, (5, 2))
 NAMES = tuple(f"P{number}" for number in range(len(POINTS)))
-FIT_FREQUENCIES = np.array([70.0, 130.0, 260.0, 410.0])
-
-
-def fit_measured(rig: Rig) -> ComplexArray:
-    """Responses (f, e, s) of the rig with other gains, noise, and one value left out."""
-    rng = np.random.default_rng(3)
-    values = sensed_plate(rig, sensors_at(POINTS), FIT_FREQUENCIES).responses().swapaxes(1, 2)
-    values = values * rng.uniform(0.8, 1.2, (*values.shape[:2], 1))
-    values = values * (1 + 0.1 * rng.standard_normal(values.shape))
-    values[1, 2, 3] = np.nan
-    return np.asarray(values)
-
-
-def fit_a_rig() -> None:
-    """Search with gains free, and with a prior that holds the mean of all scales."""
-    plate = sensed_plate(RIG, sensors_at(POINTS), FIT_FREQUENCIES, has_form=True)
-    values = fit_measured(RIG).swapaxes(1, 2)
-    measurement = Measurement(sensors_at(POINTS, NAMES), FIT_FREQUENCIES, values)
-    space, count = plate.model.space, len(POINTS)
-    covariance, own = np.eye(space.size), np.arange(space.size)[space.groups["sensor_scale"]]
-    covariance[np.ix_(own, own)] += 1e2 * (np.eye(count) - 1 / count)
-    fit(
-        plate.model,
-        replace(measurement, gain_std=np.inf),
-        searched=space.uncertain & ~space.of("gain"),
-        prior=(np.zeros(space.size), covariance),
-    )
-
-
-def match_a_plate() -> None:
-    """Search for a plate with one channel that was not driven."""
-    values = fit_measured(replace(RIG, plate=RIG.plate.scaled(modulus=1.1)))
-    values[:, 1] = np.nan
-    plate = sensed_plate(RIG, sensors_at(POINTS), FIT_FREQUENCIES)
-    plate_match.match_plate(plate, values.swapaxes(1, 2), drives=[0, 2, 1, 3])
-
-
-@pytest.mark.parametrize(
-    "searched",
-    [
-        pytest.param(fit_a_rig, id="rig and all scales", marks=pytest.mark.long),
-        pytest.param(match_a_plate, id="plate"),
-    ],
-)
-def test_jacobians_of_searches_are_exact(
-    searched: Callable[[], None], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """By every argument at the first start of each size, to 1e-6 of the column's largest."""
-    solver: Callable[..., Any] = vars(optimize)["least_squares"]
-    checked: set[int] = set()
-
-    def checking(
-        residuals: Callable[[FloatArray], FloatArray],
-        start: FloatArray,
-        jacobian: Callable[[FloatArray], FloatArray],
-        **options: Any,
-    ) -> Any:
-        if len(start) not in checked:
-            at = start + 0.05
-            half, whole = (
-                np.array([residuals(at + d) - residuals(at - d) for d in step * np.eye(len(at))])
-                / (2 * step)
-                for step in (5e-4, 1e-3)
-            )
-            exact = (4 * half - whole) / 3  # Richardson's extrapolation
-            size = np.abs(exact).max(axis=1, keepdims=True)
-            np.testing.assert_allclose(jacobian(at).T / size, exact / size, atol=1e-6)
-            checked.add(len(start))
-        return solver(residuals, start, jacobian, **options)
-
-    monkeypatch.setattr(optimize, "least_squares", checking)
-    searched()
-    assert checked
 
 
 FINGER = PointLoad(0.1, 0.08, stiffness=500.0, damping=2.0, mass=0.003)
@@ -430,8 +348,6 @@ def test_deviations_are_those_of_factors_where_losses_are_more(solved, stated, e
 
 FORM_ERRORS_FREQUENCIES = np.arange(50.0, 491.0, 40.0)
 
-CELL = 10
-
 USUAL = {
     "place": 1.5e-3,
     "side": 0.5e-3,
@@ -441,125 +357,6 @@ USUAL = {
     "mass": 0.01,
 }
 """Form errors of a plate that was built with some care, as `FORM`."""
-
-
-FORM_ERRORS = {
-    "longer": ("side", [1e-3, 0.0], lambda rig: longer(rig)),
-    "another ratio": (
-        "poisson",
-        [0.02],
-        lambda rig: of_material(rig, nu=rig.plate.material.nu + 0.02),
-    ),
-    "heavier in one cell": (
-        "foreign_mass",
-        0.005 * np.eye(48)[CELL],
-        lambda rig: replace(
-            of_material(rig, rho=0.995 * rig.plate.material.rho),
-            masses=(
-                *rig.masses,
-                PointLoad(*MASS_CELLS.centres(rig.plate)[CELL], mass=0.005 * rig.plate.mass),
-            ),
-        ),
-    ),
-    "ERA moved": (
-        "place",
-        [5e-4, 5e-4, *[0.0] * 6],
-        lambda rig: replace(
-            rig,
-            eras=(
-                replace(rig.eras[0], x=rig.eras[0].x + 5e-4, y=rig.eras[0].y + 5e-4),
-                *rig.eras[1:],
-            ),
-        ),
-    ),
-    "sensors moved": ("sensor_place", np.tile([5e-4, -5e-4], 12), lambda rig: rig),
-}
-"""A kind of parameter and its values, and the rig that is built so.
-
-Of the plate in one cell, 0.5 % of its mass is taken from all of it, and put there.
-"""
-
-
-def of_material(rig: Rig, **values: float) -> Rig:
-    """The rig whose plate's material has other values."""
-    return replace(rig, plate=replace(rig.plate, material=replace(rig.plate.material, **values)))
-
-
-def longer(rig: Rig) -> Rig:
-    """The rig with a plate 1 mm longer, all that is on it moved and grown in proportion.
-
-    No response tells of a factor on all masses, springs and dampers.
-    """
-    share = 1 + 1e-3 / rig.plate.length
-    plate = replace(rig.plate, length=share * rig.plate.length)
-    eras = tuple(
-        replace(
-            era,
-            x=share * era.x,
-            stiffness=share * era.stiffness,
-            damping=share * era.damping,
-            bolt_mass=share * era.bolt_mass,
-        )
-        for era in rig.eras
-    )
-    masses = tuple(replace(one, x=share * one.x, mass=share * one.mass) for one in rig.masses)
-    return replace(rig, plate=plate, mesh=stretched(rig.mesh, plate), eras=eras, masses=masses)
-
-
-@pytest.mark.parametrize(("kind", "values", "other"), FORM_ERRORS.values(), ids=FORM_ERRORS)
-def test_form_errors_are_those_of_a_plate_solved_anew(
-    rig: Rig, kind: str, values: list[float] | FloatArray, other: Callable[[Rig], Rig]
-) -> None:
-    """They move the responses as on a plate that is built so, to a fifth of what that changes.
-
-    ERAs move by slopes alone here, and a mass couples modes up to twice the highest frequency.
-    Without form errors responses in coordinates of the reduced plate are those of the free plate's
-    modes, also with a mass on it and where modes deviate from their theory.
-    """
-    points = SENSORS * [rig.plate.length, rig.plate.width]
-    rig = replace(rig, masses=(PointLoad(0.1, 0.05, mass=0.004),))
-    plate = replace(rig.plate, loss_exponent=0.3, mode_deviations=((0.02, 0.3), (-0.01, 0.0)))
-    rig = replace(rig, plate=plate)
-    sensed = sensed_plate(rig, sensors_at(points), FORM_ERRORS_FREQUENCIES, has_form=True)
-    nominal = sensed_plate(rig, sensors_at(points), FORM_ERRORS_FREQUENCIES).responses()
-    np.testing.assert_allclose(sensed.responses(), nominal, atol=2e-5 * np.abs(nominal).max())
-
-    space, z = sensed.model.space, np.zeros(sensed.model.space.size)
-    z[space.groups[kind]] = values / space.std[space.groups[kind]]
-    found = sensed.responses(z)
-    built = other(rig)
-    points = points * [built.plate.length / plate.length, 1]
-    if kind == "sensor_place":
-        points += np.array([5e-4, -5e-4])
-    change = sensed_plate(built, sensors_at(points), FORM_ERRORS_FREQUENCIES).responses() - nominal
-    np.testing.assert_allclose(found - nominal, change, atol=0.2 * np.abs(change).max())
-
-
-def test_stiffening_does_not_depend_on_rounding(rig: Rig) -> None:
-    """Moduli that differ in the eleventh digit give derivatives by the sides that agree to 1e-4.
-
-    Relative to the modes' own stiffness, as couplings are that move a mode's frequency.
-    """
-
-    cells = MASS_CELLS.centres(rig.plate)
-
-    def couplings(share: float) -> FloatArray:
-        other = of_material(rig, E=rig.plate.material.E * (1 + share))
-        free = solve_free_plate(other.plate, other.mesh)
-        modes = reduced_modes(free, footprints_of(rig.eras, rig.masses), cells)
-        size = np.sqrt(modes.eigenvalues + 4e4)  # of a rigid body on springs of some 30 Hz
-        return np.abs(modes.stiffening) / np.outer(size, size)
-
-    exact = couplings(0.0)
-    for share in (1e-11, 2e-11, 3e-11):
-        np.testing.assert_allclose(couplings(share), exact, atol=1e-4)
-
-
-def test_a_fit_allows_for_what_plates_are_drawn_with() -> None:
-    """The mass of one place is that of all cells together, in the root mean square."""
-    allowed = {kind: PARAMETER_KINDS[kind].std for kind in FORM if kind != "mass"}
-    allowed["mass"] = PARAMETER_KINDS["foreign_mass"].std * MASS_CELLS.cell_count**0.5
-    assert allowed == pytest.approx(FORM)
 
 
 @pytest.mark.long

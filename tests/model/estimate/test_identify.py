@@ -23,10 +23,8 @@ from model.estimate.fit_report import fit_rows, identification_json, parameter_r
 from model.estimate.forward import (
     SENSOR_FOOT,
     ForwardModel,
-    PlateValues,
     Sensor,
     Space,
-    by_mass_at,
     jacobian,
 )
 from model.estimate.identify import (
@@ -36,7 +34,7 @@ from model.estimate.identify import (
     identify,
 )
 from model.estimate.measurement import Measurement, Repeat
-from model.estimate.space import inwards, rig_with, space_from_datasheets, space_of
+from model.estimate.space import inwards, space_of
 from model.fem import ELEMENTS, Mesh, assemble
 from model.reduction.free_plate import solve_free_plate
 from model.rig.rig import Rig
@@ -44,7 +42,7 @@ from model.rig.rig_file import example_rig_path, load_rig, mesh_of, rig_of
 from model.rig.rig_writing import save_fitted, stated
 from model.spectral.direct_solution import direct_spectral_acceleration
 from model.spectral.modes import SpectralMesh
-from model.structure.attachments import PointLoad, Support
+from model.structure.attachments import PointLoad
 from model.structure.exciter import Exciter
 from model.structure.material import Material, Orthotropy
 from model.structure.plate import Bond, Laminate, LaminateLayer, equivalent_plate
@@ -379,48 +377,6 @@ def somewhere(space: Space, seed: int) -> FloatArray:
     return inwards(space, x, by=0.6)
 
 
-def direct(rig: Rig, loads: list[Support]) -> ComplexArray:
-    """Responses at ERAs and pad per base displacement (f, s, n), from the rig solved directly."""
-    assert isinstance(rig.mesh, SpectralMesh)
-    points = np.array([*((era.x, era.y) for era in rig.eras), (PAD.x, PAD.y)])
-    found = direct_spectral_acceleration(
-        rig.plate, rig.mesh, rig.eras, FORWARD_FREQUENCIES, points, loads=loads
-    )
-    return found.swapaxes(1, 2) / [era.stroke for era in rig.eras]
-
-
-def test_deviating_rig_is_solved_without_solving_it_again(rig: Rig, model: ForwardModel) -> None:
-    """Springs, bolts, places, modulus, loss and a mass move the responses as a solution anew."""
-    space = model.space
-    x = somewhere(space, 1)
-    x[space.of("thickness", "mode_shifts", "mode_losses", "sensor_gain", "sensor_phase")] = 0
-    x[space.of("gain", "phase", "inertia", "drag")] = 0
-    values = model.at(x).values
-    eras = tuple(
-        replace(era, stiffness=k, damping=c, bolt_mass=m, x=place[0], y=place[1])
-        for era, k, c, m, place in zip(
-            rig.eras,
-            values["stiffness"],
-            values["damping"],
-            values["bolt_mass"],
-            values["place"],
-            strict=True,
-        )
-    )
-    material = replace(rig.plate.material, E=values["modulus"] * rig.plate.material.E)
-    plate = replace(
-        rig.plate,
-        material=material,
-        loss_factor=values["loss"],
-        loss_exponent=values["loss_exponent"],
-    )
-    ((mass, at_x, at_y),) = values["masses"]
-    load = PointLoad(at_x, at_y, mass=mass)
-    expected = direct(replace(rig, plate=plate, eras=eras), [load])
-    found = model.at(x).responses
-    np.testing.assert_allclose(found, expected, atol=3e-4 * np.abs(expected).max())
-
-
 def of_a_laminate(model: ForwardModel) -> ForwardModel:
     """The model with a plate of glass, whose modes lose in a soft layer."""
     glass = Material("glass", E=70e9, rho=2500.0, nu=0.23)
@@ -450,43 +406,6 @@ def test_drive_lags_as_an_actuator_with_a_resonance(model: ForwardModel) -> None
     lagging, rigid = (at_resonance.at(each).responses[0] for each in (x, np.zeros(space.size)))
     np.testing.assert_allclose(lagging[:, 1], rigid[:, 1] / 0.6j)
     np.testing.assert_allclose(lagging[:, [0, 2, 3]], rigid[:, [0, 2, 3]])
-
-
-def test_mass_anywhere_changes_responses_as_derived(rig: Rig, model: ForwardModel) -> None:
-    """The derivative by a mass at a point is the change that a small load there makes."""
-    space = model.space
-    x = np.zeros(space.size)
-    point, mass = np.array([[0.21, 0.16]]), 1e-6
-    change = direct(rig, [PointLoad(*point[0], mass=mass)]) - direct(rig, [])
-    found = mass * by_mass_at(model.at(x), point)[..., 0]
-    np.testing.assert_allclose(found, change, atol=2e-3 * np.abs(change).max())
-
-
-@pytest.mark.parametrize("name", ["paper_plate", "glass_panel", "weekend/rig"])
-@pytest.mark.parametrize("of", ["fit", "sheets"])
-def test_values_that_a_search_tries_are_those_of_a_rig(name: str, of: str) -> None:
-    """Ten standard deviations off, within the space's bounds: no value that a file could not have.
-
-    A loss factor beyond 1, or a coil whose current does not follow its back EMF, would be refused
-    as if a person had given them.
-    """
-    rig = load_rig(example_rig_path().parent / f"{name}.yaml")
-    rig = replace(rig, plate=replace(rig.plate, loss_factor=0.6))
-    known = rig.uncertainty
-    space = (
-        space_of(rig, ["P"], known, masses=1)
-        if of == "fit"
-        else space_from_datasheets(rig, ["P"], 3)
-    )
-    rng = np.random.default_rng(0)
-    for size in (1, 10):
-        for x in rng.normal(0, size, (50, space.size)).clip(space.lower, space.upper):
-            found = rig_with(rig, PlateValues(rig, space, x), known)
-            assert 0 <= found.plate.loss_factor <= 1
-            for era in found.eras:
-                if isinstance(era, Exciter):
-                    current = (era.force_factor / era.loop_resistance) ** 2 * era.inductance
-                    assert current <= 0.1 * era.magnet_mass * (1 + 1e-9)
 
 
 KEYS = "type: DAEX25FHE-4, power: 1 W"

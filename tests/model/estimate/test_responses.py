@@ -13,12 +13,9 @@ import pytest
 import pyuff
 
 from kit.desk_plate import DeskModel, draw_truth
-from kit.direct_plate import direct_acceleration
 from model.arrays import FloatArray
 from model.errors import InputError
 from model.estimate.calibrate import calibrate
-from model.estimate.fit import sensed_plate
-from model.estimate.forward import jacobian, viscous_difference
 from model.estimate.measurement import (
     Measurement,
     measurement_of,
@@ -27,7 +24,6 @@ from model.estimate.measurement import (
     write_responses_csv,
     write_responses_uff,
 )
-from model.fem import Mesh, assemble
 from model.rig.rig import Rig
 from model.rig.rig_file import load_rig
 from model.structure.exciter import Exciter
@@ -63,38 +59,6 @@ def test_loss_factor_of_a_plate_in_time_is_within_its_standard_error() -> None:
     loss = next(one for one in found.parameters if one.kind == "loss_factor")
     off = abs(loss.value - truth.rig.plate.loss_factor)
     assert off < loss.standard_error < 0.01 * loss.value
-
-
-@pytest.mark.long
-def test_viscous_plate_differs_as_its_model_in_time_does() -> None:
-    """The difference of both laws, a few thousandths of the response, to a fifth of it.
-
-    By a model in time and a direct solution, both of finite elements, whose resonances are 0.2 %
-    from those of polynomials.
-    """
-    rig, points = rig_and_points()
-    plate = sensed_plate(rig, sensors_at(points), TONES, has_form=True)
-    zero = np.zeros(plate.model.space.size)
-    difference = viscous_difference(plate.model, zero)
-    model = replace(plate.model, law=difference)
-    space, law = model.space, model.space.groups["loss_law"]
-    viscous = zero.copy()
-    viscous[law] = 1 / space.std[law]
-    change = model.at(viscous).responses - model.at(zero).responses
-    slope = jacobian(model.at(zero))[..., law][..., 0]
-    np.testing.assert_allclose(slope, change * space.std[law], atol=1e-9 * np.abs(change).max())
-    found = np.swapaxes(change, 1, 2)
-    exact = draw_truth(rig, seed=1)
-    exact = replace(exact, rig=replace(rig, mesh=exact.rig.mesh))
-    gains = np.array([each.response(TONES) for each in exact.actuators]).T
-    strokes = np.array([era.stroke for era in rig.eras])
-    in_time = DeskModel(exact, points).under().response(TONES).swapaxes(1, 2)
-    in_time = in_time / strokes[:, None] / gains[:, :, None]
-    mesh = exact.rig.mesh
-    assert isinstance(mesh, Mesh)
-    hysteretic = direct_acceleration(assemble(rig.plate, mesh), rig.eras, TONES, points)
-    expected = in_time - hysteretic / strokes[:, None]
-    assert np.linalg.norm(found - expected) < 0.2 * np.linalg.norm(expected)
 
 
 WRITERS = {"csv": write_responses_csv, "uff": write_responses_uff}

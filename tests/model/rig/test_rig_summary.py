@@ -4,7 +4,6 @@ Every key and field of a plate, also a new one, is covered: a plain key is in bo
 rigid plate and in a summary; a field is written and read back.
 """
 
-import inspect
 import json
 import math
 import re
@@ -17,67 +16,25 @@ import numpy as np
 import pytest
 import yaml
 
-import era_haptics
-import model
-import rig_page
 from cases import shortly
 from controller.rig_file_check import RIG
 from key_tables import quantities
 from kit.plates import exciter_rig, exciter_rig_text
 from model.commands.plate_cli import show
 from model.config.document import ConfigError, data_text, parse_document
-from model.config.fields import Section
 from model.errors import InputError
 from model.reduction.free_plate import solve_free_plate
-from model.rig import sections
-from model.rig.actuator_keys import ACTUATOR_KINDS
 from model.rig.rig import Rig, Uncertainty, differences
-from model.rig.rig_file import example_rig_path, load_rig, parse_rig, rig_of
+from model.rig.rig_file import example_rig_path, parse_rig, rig_of
 from model.rig.rig_summary import exciter_notes, plate_summary, resonance_notes
-from model.rig.rig_writing import change_rig
 from model.rig.rig_writing import stated as keys_of
 from model.rig.sections import PLAIN_KEYS, PlateSection
 from model.structure.attachments import rigid_body_frequencies
 from model.structure.exciter import Exciter
-from model.structure.material import EXCITER_TYPES, KNOWN_MATERIALS, Material
+from model.structure.material import EXCITER_TYPES, Material
 from model.structure.plate import AirGap, Laminate, Plate
 from model.transients.excursions import excursion_notes
 from model.vibration import natural_modes
-
-ROOT = Path(model.__file__).parent.parent
-PAGE = (ROOT / "docs" / "reference" / "rig.md").read_text("utf-8")
-
-
-def test_tables_of_keys_are_those_of_the_sections(tmp_path: Path) -> None:
-    """Of every section; unit, default, limits and meaning of a key.
-
-    Choices are in the row of a key that may be left out, as in that of one with a default. The page
-    lists all materials by name, and the minimal rig that it prints loads, with three ERAs.
-    """
-    every = {each for _, each in inspect.getmembers(sections, inspect.isclass)}
-    every |= {*ACTUATOR_KINDS.values()}
-    assert {each for each in every if issubclass(each, Section)} - {Section} == {
-        *rig_page.SECTIONS.values()
-    }
-    for row in (
-        "| `thickness` | m | required, or `layers` | at least 1e-06, at most 1 | at most the",
-        "| `stroke` | m | 0.1 mm | above 0, at most 0.01 | amplitude of its base at level 1,",
-        "| `channel` | | none | 0 to 255 | its channel;",
-        "| `bond` | | `full` | `full`, `none` | whether",
-        "| `frequency` | Hz | `[40, 500]` | at least 1, at most 2000 | lowest and highest",
-        "| `resonance_is` | | required with `resonance` | `free`, `mounted` | whose resonance",
-        "| `kind` | | none | `foam`, `rubber` | kind of",
-        "| `magnet` | | `free` | `free`, `held` |",
-        "| `E` | Pa | required, or those with a grain | at least 1000, at most 1e+13 | Young's",
-    ):
-        assert f"\n{row}" in PAGE
-    assert "| `kind` | | none | `foam`, `rubber` |" in rig_page.PARTS["supports"]()
-    (names,) = re.findall(r"Materials by name are (.+?);", PAGE, re.DOTALL)
-    assert re.findall(r"`([\w-]+)`", names) == [*KNOWN_MATERIALS]
-    minimal = re.search(r"```yaml\n(.*?)```", PAGE, re.DOTALL)
-    (tmp_path / "rig.yaml").write_text(minimal[1] if minimal else "", encoding="utf-8")
-    assert [era.name for era in load_rig(tmp_path / "rig.yaml").eras] == ["SW", "SE", "N"]
-
 
 PLATE = {"length": 0.3, "width": 0.2, "thickness": 0.002}
 GLASS = {"E": 70e9, "rho": 2500.0, "nu": 0.2}
@@ -375,27 +332,6 @@ def test_a_fitted_exciter_is_written_and_reads_back() -> None:
     for key in ("stiffness", "damping", "magnet_mass", "coil_mass", "force_factor", "voltage"):
         assert getattr(back.eras[0], key) == pytest.approx(getattr(fitted, key), rel=1e-5)
     assert "resonance" not in data_text(written.data)
-
-
-def test_programs_make_and_change_exciters(tmp_path: Path) -> None:
-    """`era.Exciter` beside `era.Era`, `change_rig` and `save_rig`."""
-    corners = {"a": (0, 0), "b": (0.3, 0), "c": (0.15, 0.23)}
-    made = era_haptics.rig(
-        era_haptics.Plate(length=0.3, width=0.23, thickness=0.005, material="acrylic"),
-        {
-            **{n: era_haptics.Era(at=at, stiffness=2e3) for n, at in corners.items()},
-            "x": era_haptics.Exciter(at=(0.1, 0.1), type="DAEX25CT-4", amplifier="card", channel=0),
-        },
-        amplifiers={"card": {"url": "sim://"}},
-    )
-    assert [era.name for era in made.eras] == ["x"]
-    assert made.supports == ("a", "b", "c")
-    changed = change_rig(made, eras={"x": {"type": "DAEX13-4SM"}}, thickness=0.006)
-    assert changed.eras[0].magnet_mass == pytest.approx(14.3e-3)
-    era_haptics.save_rig(changed, tmp_path / "board.yaml")
-    assert era_haptics.load_rig(tmp_path / "board.yaml") == changed
-    with pytest.raises(ConfigError, match="kind"):
-        era_haptics.Exciter(at=(0, 0), kind="coil")
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 from scipy import linalg, sparse, special
 from scipy.integrate import trapezoid
-from scipy.linalg import eigh
 from scipy.sparse.linalg import spsolve
 
 from cases import in_turn
@@ -24,13 +23,9 @@ from model.errors import InputError
 from model.fem import (
     ELEMENTS,
     Q5,
-    Element,
     Mesh,
-    PlateMatrices,
     assemble,
     element_slopes,
-    lowest_modes,
-    rigidities,
 )
 from model.reduction.free_plate import SpectralModes, solve_free_plate
 from model.reduction.reduced_plate import reduce_free_plate, supported_modes
@@ -38,7 +33,7 @@ from model.rig.rig_file import load_rig, mesh_of, parse_mesh, parse_rig
 from model.spectral.direct_solution import AtOneFrequency, grain_slopes, stiffness_slopes
 from model.spectral.modes import MaterialBand, SpectralMesh, SpectralPlate, local_compliance
 from model.spectral.polynomials import CLASSES as PARITY_CLASSES
-from model.spectral.polynomials import EVEN, EdgedFunctions, air_motion
+from model.spectral.polynomials import air_motion
 from model.structure.attachments import Era, footprints_of
 from model.structure.material import Material, Orthotropy
 from model.structure.plate import (
@@ -76,12 +71,6 @@ def test_patches_dent_as_the_infinite_plate_says():
     compliance = 1 / (PAPER.flexural_rigidity * k**4) + 1 / (shear * k**2)
     expected = trapezoid(shapes * compliance * k**2 / (2 * math.pi), np.log(k))  # k d ln k = dk
     assert weights @ np.diagonal(between[0]).real == pytest.approx(expected, rel=0.02)
-
-
-def test_a_layer_that_polynomials_resolve_is_left_out():
-    """On a plate as thick as long, degree 24 has the layer's function already."""
-    for decay, count in ((3 / 0.3, 13), (2000.0, 14)):
-        assert EdgedFunctions(0.3, 24, (decay,)).count(EVEN) == count
 
 
 GLASS = Material("glass", E=70e9, rho=2500.0, nu=0.22)
@@ -165,20 +154,6 @@ def test_slopes_by_a_grain_are_those_of_boards_of_other_moduli(number, key):
     more, less = (elastic_modes(board(by), SPECTRAL)[0] for by in (STEP, -STEP))
     expected = (more - less) / (2 * STEP) / eigenvalues
     np.testing.assert_allclose(slopes / eigenvalues, expected, atol=2e-3)
-
-
-def test_a_thin_plate_scales_with_the_fourth_power_of_its_size():
-    """Both sides lower every stiffness alike and couple no modes, up to its edges' share.
-
-    Kirchhoff's theory, without boundary layers as wide as the plate is thick.
-    """
-    eigenvalues, (length, width, _) = slopes_of(THIN_PLATE, SPECTRAL)
-    size = np.sqrt(np.outer(eigenvalues, eigenvalues))
-    np.testing.assert_allclose(
-        (length + width) / size,
-        -4 * np.eye(len(size)),
-        atol=THIN_PLATE.thickness / THIN_PLATE.width,
-    )
 
 
 PANE = Plate(0.375, 0.225, 2.5e-3, Material("glass", E=70e9, rho=2500.0, nu=0.2))
@@ -575,40 +550,6 @@ def test_acceleration_of_a_rigid_plate_equals_mass_on_springs(coarse_rig):
     np.testing.assert_allclose(response[0].sum(axis=0), by_hand, rtol=2e-3)
 
 
-MESHES = [Mesh(12, 9, LENGTH, WIDTH), Mesh(4, 3, LENGTH, WIDTH, ELEMENTS["MITC4"], 0.002)] + [
-    Mesh(3, 2, LENGTH, WIDTH, element, 0.003) for element in ELEMENTS.values()
-]
-
-
-@pytest.mark.parametrize("mesh", MESHES, ids=str)
-def test_interpolation_is_exact_for_polynomials_of_the_element(mesh):
-    """Every polynomial up to the element's order, along both sides, comes out at any point."""
-    points = np.random.default_rng(0).uniform(0, [LENGTH, WIDTH], (60, 2))
-    points[0] = [LENGTH, WIDTH]
-    order = mesh.element.order
-
-    def carried(at):
-        return (1 + at[:, 0] / LENGTH) ** order * (2 - at[:, 1] / WIDTH) ** order
-
-    np.testing.assert_allclose(
-        mesh.interpolation(points) @ carried(mesh.nodes), carried(points), rtol=1e-12
-    )
-
-
-def test_mesh_strips_lie_along_every_edge():
-    """Strips of 3 mm are the first and last elements; those between share the rest evenly.
-
-    Neither no elements nor strips that fill the plate make a mesh.
-    """
-    mesh = Mesh(4, 3, 0.3, 0.2, ELEMENTS["Q5"], 0.003)
-    x, y = (line.ends for line in mesh.along)
-    np.testing.assert_allclose(x, [0, 0.003, 0.0765, 0.15, 0.2235, 0.297, 0.3])
-    np.testing.assert_allclose(y, [0, 0.003, 0.003 + 0.194 / 3, 0.003 + 2 * 0.194 / 3, 0.197, 0.2])
-    for change in ({"nx": 0}, {"strip": 0.1}, {"strip": -0.001}, {"strip": float("nan")}):
-        with pytest.raises(InputError, match=r"^mesh: "):
-            replace(mesh, **change)
-
-
 def test_mesh_is_read_as_it_is_printed():
     """By elements, with strips, and by degrees, as commands and pages name meshes."""
     plate = Plate(LENGTH, WIDTH, 0.0015, ALUMINIUM)
@@ -645,119 +586,7 @@ def test_coarsest_mesh_is_the_coarsest_that_resolves_its_frequency(sides):
         assert (again.nx, again.ny) == (mesh.nx, mesh.ny)
 
 
-DX, DY = 0.03, 0.02  # m; not square, so that a swap of x and y shows
 PLATE = Plate(0.3, 0.24, 0.002, ALUMINIUM)
-SLENDER = Plate(0.3, 0.24, 0.3e-3, ALUMINIUM)  # so thin that locking shows
-
-
-@pytest.fixture(params=ELEMENTS.values(), ids=ELEMENTS)
-def element(request: pytest.FixtureRequest) -> Element:
-    """Each element in turn."""
-    return request.param
-
-
-def nodal(element: Element, w: object, beta_x: object, beta_y: object) -> FloatArray:
-    """Degrees of freedom of the element for fields of x and y [m] from its lower left."""
-    side = (1 + np.array(element.side)) / 2
-    x, y = np.tile(DX * side, len(side)), np.repeat(DY * side, len(side))
-    fields = [np.broadcast_to(field(x, y), x.shape) for field in (w, beta_x, beta_y)]
-    return np.stack(fields, axis=1).ravel()
-
-
-def of_one(element: Element) -> PlateMatrices:
-    """Stiffness and mass of a rectangle that is one element."""
-    return assemble(replace(PLATE, length=DX, width=DY), Mesh(1, 1, DX, DY, element))
-
-
-def test_rigidities_equal_hand_calculation():
-    """2 mm of E = 70 GPa, nu = 0.33; the tests of elements stand on these.
-
-    D = E h³ / (12 (1 - nu²)) = 560 / 10.6932 = 52.3697 N m, kappa G h = 5/6 of 70 GPa / 2.66 times
-    2 mm = 43.8596 MN/m.
-    """
-    expected = {"coupled": 17.2820, "twist": 17.5439}
-    expected |= {f"bending_{side}": 52.3697 for side in "xy"}
-    expected |= {f"shear_{side}": 43.8596e6 for side in "xy"}
-    assert rigidities(PLATE) == pytest.approx(expected, rel=1e-5)
-
-
-def test_three_motions_take_no_force(element):
-    """Up and down, and both tilts; there are no spurious modes."""
-    stiffness = of_one(element).stiffness.toarray()
-    for fields in (
-        (lambda x, y: 1, lambda x, y: 0, lambda x, y: 0),
-        (lambda x, y: x, lambda x, y: 1, lambda x, y: 0),
-        (lambda x, y: y, lambda x, y: 0, lambda x, y: 1),
-    ):
-        force = stiffness @ nodal(element, *fields)
-        assert np.abs(force).max() < 1e-9 * np.abs(stiffness).max()
-    energies = np.linalg.eigvalsh(stiffness)
-    assert (energies <= 1e-9 * energies[-1]).sum() == 3
 
 
 D, NU = PLATE.flexural_rigidity, PLATE.material.nu
-SHEAR = 5 / 6 * PLATE.material.E / (2 * (1 + NU)) * PLATE.thickness
-
-
-@pytest.mark.parametrize(
-    ("fields", "expected"),
-    [
-        ((lambda x, y: x**2 / 2, lambda x, y: x, lambda x, y: 0), D / 2),
-        ((lambda x, y: y**2 / 2, lambda x, y: 0, lambda x, y: y), D / 2),
-        ((lambda x, y: (x**2 - y**2) / 2, lambda x, y: x, lambda x, y: -y), D * (1 - NU)),
-        ((lambda x, y: x * y, lambda x, y: y, lambda x, y: x), D * (1 - NU)),
-        ((lambda x, y: x, lambda x, y: 0, lambda x, y: 0), SHEAR / 2),
-        ((lambda x, y: y, lambda x, y: 0, lambda x, y: 0), SHEAR / 2),
-    ],
-    ids=["along x", "along y", "saddle", "twist", "shear x", "shear y"],
-)
-def test_constant_strain_has_the_energy_of_plate_theory(element, fields, expected):
-    """Per area D/2 of a unit curvature, D (1 - nu) of a saddle and a twist, kappa G h / 2."""
-    motion = nodal(element, *fields)
-    energy = motion @ of_one(element).stiffness @ motion / 2 / (DX * DY)
-    assert energy == pytest.approx(expected, rel=1e-9)
-
-
-def frequency_error(element: Element, count: int) -> float:
-    """Relative error of a thin plate's lowest natural frequency with count by count elements.
-
-    On hard simple supports, w and the rotation along the edge fixed, w = sin(pi x / L) sin(pi y /
-    W) with rotations alike solves the Reissner-Mindlin plate exactly.
-    """
-    mesh = Mesh(count, count, SLENDER.length, SLENDER.width, element)
-    assembled = assemble(SLENDER, mesh)
-    node = np.arange(mesh.node_count).reshape(mesh.rows, mesh.columns)
-    sides, ends = node[:, [0, -1]].ravel(), node[[0, -1]].ravel()
-    fixed = np.concatenate([3 * sides, 3 * sides + 2, 3 * ends, 3 * ends + 1])
-    free = np.setdiff1d(np.arange(mesh.dof), fixed)
-    a, b = np.pi / SLENDER.length, np.pi / SLENDER.width
-    S = rigidities(SLENDER)["shear_x"]
-    D, nu = SLENDER.flexural_rigidity, SLENDER.material.nu
-    density = SLENDER.material.rho * SLENDER.thickness
-    moving = density * np.diag([1, SLENDER.thickness**2 / 12, SLENDER.thickness**2 / 12])
-    coupled = D * a * b * (1 + nu) / 2
-    stiffness = np.array(
-        [
-            [S * (a**2 + b**2), -S * a, -S * b],
-            [-S * a, D * (a**2 + (1 - nu) / 2 * b**2) + S, coupled],
-            [-S * b, coupled, D * (b**2 + (1 - nu) / 2 * a**2) + S],
-        ]
-    )
-    exact = float(eigh(stiffness, moving, eigvals_only=True)[0])
-    eigenvalues, _ = lowest_modes(
-        assembled.stiffness[free][:, free], assembled.mass[free][:, free], 1, shift=exact
-    )
-    return float(np.sqrt(max(eigenvalues[0], 0.0) / exact) - 1)
-
-
-@pytest.mark.parametrize(("name", "expected"), [("MITC4", 2.0), ("Q3", 4.0), ("Q4", 6.0)])
-def test_elements_converge_with_theoretical_rates(name, expected):
-    """A frequency errs as the energy does (Strang and Fix, ch. 6).
-
-    By h² where rotations are linear; by h^2(p - 1) where slopes and rotations of order p are made
-    equal by being thin alone. Q5 is exact to rounding with 8 elements a side.
-    """
-    # With 8 elements a side Q4 errs by 7e-9 of a thin plate's frequency, no more than by rounding.
-    coarse, fine = (abs(frequency_error(ELEMENTS[name], count)) for count in (3, 6))
-    assert np.log2(coarse / fine) == pytest.approx(expected, abs=0.15)
-    assert abs(frequency_error(ELEMENTS["Q5"], 8)) < 1e-7

@@ -6,7 +6,6 @@ rigs that are made without a file.
 """
 
 import math
-from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -17,7 +16,7 @@ from cases import in_turn, shortly
 from kit.direct_plate import direct_acceleration
 from kit.layered_strips import wave_number
 from kit.plates import ALUMINIUM, LENGTH, WIDTH, exciter_rig, make_paper_rig
-from model.arrays import ComplexArray, FloatArray, lattice
+from model.arrays import FloatArray, lattice
 from model.errors import InputError
 from model.fem import ELEMENTS, Mesh, assemble
 from model.reduction.free_plate import solve_free_plate
@@ -37,7 +36,7 @@ from model.structure.attachments import (
     static_loads,
     support_problem,
 )
-from model.structure.exciter import Actuator, Exciter
+from model.structure.exciter import Exciter
 from model.structure.material import Material, Orthotropy, known_material, material
 from model.structure.plate import (
     AirGap,
@@ -136,34 +135,6 @@ def test_response_on_a_board_against_magnet_and_current_solved_beside_it(magnet:
     )
     apart = np.linalg.norm(found - expected, axis=2) / np.linalg.norm(expected, axis=2)
     assert apart.max() < 3e-3
-
-
-def test_damping_of_suspension_and_current_act_alike() -> None:
-    """What one damps 40 % more the current damps less, at as much force: fields within 0.2 %.
-
-    From 40 to 300 Hz, on four coin exciters with 0.6 of c + Bl² / R in the suspension; the
-    suspension's alone changes them by 10 % and more.
-    """
-    rig = exciter_rig("type: DAEX25CT-4", frequency="[40, 300]")
-    free = solve_free_plate(rig.plate, rig.mesh, frequency_max=300.0)
-    points = lattice(np.linspace(0, 0.3, 7), np.linspace(0, 0.23, 5))
-    swapped, damped = [], []
-    for each in rig.eras:
-        assert isinstance(each, Exciter)
-        moved = 0.4 * each.damping
-        weaker = np.sqrt(each.force_factor**2 - each.loop_resistance * moved)
-        louder = ((100.0, each.force_factor / weaker, 0.0),)
-        damped.append(replace(each, damping=each.damping + moved))
-        swapped.append(replace(damped[-1], force_factor=float(weaker), gains=louder))
-
-    def fields(eras: Sequence[Actuator]) -> ComplexArray:
-        return free.acceleration(eras, np.arange(40.0, 301.0, 10.0), points, loads=rig.masses)
-
-    as_is, alike, other = (fields(each) for each in (rig.eras, swapped, damped))
-    size = np.linalg.norm(as_is, axis=(1, 2))
-    apart, alone = (np.linalg.norm(each - as_is, axis=(1, 2)) / size for each in (alike, other))
-    assert apart.max() < 2e-3
-    assert alone.max() > 0.1
 
 
 GLASS = Material("glass", 70e9, 2500.0, 0.2)
@@ -414,13 +385,6 @@ def test_modulus_by_frequency_is_a_power_law_between_rows():
     assert layer.modulus(5e3) == pytest.approx(4 * 70e6 * (1 + 0.6j))
 
 
-def test_modulus_of_one_row_is_the_same_at_every_frequency():
-    """A single row states a modulus that frequency does not change."""
-    layer = LaminateLayer(FOAM, 1e-3, by_frequency=((100.0, 0.5, 0.2),))
-    moduli = [layer.modulus(frequency) for frequency in (1.0, 100.0, 5e3)]
-    assert moduli == pytest.approx([35e6 * (1 + 0.2j)] * 3)
-
-
 @pytest.mark.parametrize(
     "rows",
     [
@@ -546,25 +510,6 @@ def test_dynamic_stiffness_of_a_fingertip(
 
 
 LONG, WIDE, A = 0.3, 0.2, 0.01
-# Moments of a disc of radius a about its centre, of its half and quarter beyond an edge or corner:
-# mean of x - x0, and of (x - x0)². Half: 4 a / 3 pi and a² / 4.
-CASES = {
-    "inside": ((0.1, 0.08), (0.0, 0.0)),
-    "edge": ((0.0, 0.08), (4 * A / (3 * math.pi), 0.0)),
-    "corner": ((LONG, WIDE), (-4 * A / (3 * math.pi), -4 * A / (3 * math.pi))),
-}
-
-
-@pytest.mark.parametrize(("centre", "shift"), CASES.values(), ids=CASES)
-def test_means_are_those_of_a_disc_by_hand(centre, shift):
-    """Mean of x, y and of squares over what is on the plate of a disc."""
-
-    def functions(points):
-        off = points[:, :2] - centre
-        return np.hstack([off, off**2])
-
-    found = mean_over(functions, np.array([[*centre, A]]), length=LONG, width=WIDE)
-    np.testing.assert_allclose(found[0], [*shift, A**2 / 4, A**2 / 4], rtol=1e-4, atol=1e-9)
 
 
 def test_an_annular_wave_averages_to_the_bessel_function():
@@ -639,14 +584,6 @@ def test_one_solution_serves_framed_boards_of_other_thicknesses(thicker: float) 
         near = expected * np.linspace(0.99, 1.01, 81)
         found, _ = free.receptances(place, place, near, loads=rig.masses, thickness=thicker)
         assert near[np.abs(found[:, 0, 0]).argmax()] == pytest.approx(expected, rel=3e-3)
-
-
-def test_grain_along_the_width_is_the_board_turned() -> None:
-    """A board of 0.4 x 0.3 m has the modes of one of 0.3 x 0.4 m cut the other way."""
-    turned = board({"length": 0.3, "width": 0.4, "grain": "width"})
-    np.testing.assert_allclose(modes(turned, 6), modes(board(), 6), rtol=1e-9)
-    across = modes(board({"grain": "width"}), 6)
-    assert np.abs(across / modes(board(), 6) - 1).max() > 0.05
 
 
 @pytest.mark.parametrize(

@@ -27,12 +27,10 @@ from model.structure.plate import AirGap, Laminate, LaminateLayer
 from model.study import overview
 from model.study.contrast_maps import (
     WeakCells,
-    ask_once,
     contrasts_reached,
     find_weak_cells,
     map_grid,
     pair_questions,
-    sampling_error,
     text_map,
 )
 from model.study.overview import (
@@ -46,7 +44,7 @@ from model.study.overview import (
     set_questions,
     summarize,
 )
-from model.table.table_file import build_table, save_table
+from model.table.table_file import build_table
 
 IDENTIFIED = Uncertainty(0.015, 1.5, 0.002, 0.01, 1.1, 0.5, modulus=0.0, place=0.0, harmonic=0.0)
 RIG = """
@@ -249,16 +247,6 @@ def test_export_csv_of_fields(table, tmp_path):
     assert found == table.unit_fields(table.raster.points)[2, 2, 7]
 
 
-def test_format_page_names_everything_exported(struct, tmp_path, table):
-    """Every field of the struct, every array and every key of the header."""
-    page = (Path(__file__).parents[3] / "docs/reference/table-file.md").read_text("utf-8")
-    names = [*struct._fieldnames]
-    save_table(table, tmp_path / "t.npz")
-    with np.load(tmp_path / "t.npz") as content:
-        names += [*content, *json.loads(content["header"].tobytes())]
-    assert [name for name in names if f"`{name}`" not in page] == []
-
-
 QUIET = (0.2286, 0.0381)  # m; centre of the fourth cell of the lowest row
 MODES = ("switched", "phased")
 
@@ -333,59 +321,6 @@ def test_weak_cells_take_percentiles_over_fingers_all_over_the_plate(table):
         np.testing.assert_allclose(
             sorted(size[0] - mirrored[:, 0]), sorted(x for x, _ in others), atol=1e-12
         )
-
-
-def test_other_fingers_mirror_each_other_only_where_the_plate_does(table):
-    """A mass on the middle line leaves symmetry along x, a weaker corner none."""
-    length, width = table.plate.length, table.plate.width
-
-    def rounded(places):
-        return sorted((round(x, 9), round(y, 9)) for x, y in places)
-
-    def symmetries(some):
-        asked = {
-            rounded(each[0].targets)[0]: [one.quiet[0] for one in each]
-            for each in pair_questions(some)
-        }
-        for at in (lambda x, y: (length - x, y), lambda x, y: (x, width - y)):
-            yield all(
-                rounded(at(*place) for place in places) == rounded(asked[rounded([at(*target)])[0]])
-                for target, places in asked.items()
-            )
-
-    mass = PointLoad(length / 2, width / 4, mass=0.05)
-    weaker = replace(table.eras[0], stroke=0.9 * table.eras[0].stroke)
-    assert list(symmetries(table)) == [True, True]
-    assert list(symmetries(replace(table, masses=(mass,)))) == [True, False]
-    assert list(symmetries(replace(table, eras=(weaker, *table.eras[1:])))) == [False, False]
-
-
-def test_questions_that_mirror_each_other_are_one_sample(table):
-    """On a symmetric plate both have the answer of one of them, to the bit; not on another one."""
-    (target,), (other,) = (pair := pair_questions(table)[0][0]).targets, pair.quiet
-    image = Placement(
-        ((table.plate.length - target[0], target[1]),),
-        ((table.plate.length - other[0], other[1]),),
-    )
-    ask = ask_once(table)
-    assert ask(pair) == ask(image)
-    weaker = replace(table.eras[0], stroke=0.5 * table.eras[0].stroke)
-    ask = ask_once(replace(table, eras=(weaker, *table.eras[1:])))
-    assert ask(pair) != ask(image)
-
-
-def test_sampling_error_is_how_much_a_percentile_of_random_samples_varies():
-    """Of 5000 samples of 64 normal values the median is within 0.157, the tenth within 0.214.
-
-    The standard deviation of a percentile is sqrt(p (1 - p) / n) over the density there. Copies of
-    the values tell nothing more.
-    """
-    samples = np.random.default_rng(0).normal(size=(5000, 64))
-    for percent, expected in ((50, 0.1567), (10, 0.2137)):
-        stated = np.array([sampling_error(each, percent) for each in samples])
-        assert stated.mean() == pytest.approx(expected, rel=0.15)
-        assert sampling_error(np.tile(samples[0], 4), percent) == stated[0]
-    assert math.isnan(sampling_error([-np.inf, -np.inf, 1.0, 2.0], 50))
 
 
 def test_weak_and_feasible_follow_from_twelve_decibels(table):

@@ -19,7 +19,6 @@ from kit.plates import (
 )
 from kit.set_table import only
 from model.answer.stimulus import Placement
-from model.ensemble.draws import percentile
 from model.fem import assemble
 from model.finger import Grid, detection_threshold, fingertip_points, fingertip_weights
 from model.reduction.free_plate import solve_free_plate
@@ -354,14 +353,6 @@ def test_draw_plates_has_the_spreads_of_the_uncertainty():
     ]
     for values, std in expected_stds:
         assert values.std() == pytest.approx(std, rel=0.04)
-
-
-def test_percentile_is_that_of_numpy():
-    """Linear between values."""
-    values = np.random.default_rng(0).normal(size=(3, 64))
-    for percent in (10, 50, 90):
-        expected = np.percentile(values, percent, axis=1)
-        np.testing.assert_allclose(percentile(values, percent), expected)
 
 
 @pytest.mark.parametrize(

@@ -45,16 +45,9 @@ from model.transients.excursions import (
     relative_motions,
 )
 from model.transients.knots import (
-    Carrier,
-    FingerResponses,
-    ending_by_numpy,
-    ending_knots,
-    onset_by_numpy,
-    onset_knots,
-    quiet_weight,
     steady_states,
 )
-from model.transients.shaping import Shaper, Transients, of_eras, responses_at
+from model.transients.shaping import Shaper, Transients
 from model.transients.time_response import (
     PlateInTime,
     enveloped_accelerations,
@@ -264,53 +257,6 @@ def test_lowest_modes_are_those_of_a_board_and_magnets_worked_out() -> None:
 
 
 VARIANCE = 0.05**2 + np.radians(5) ** 2
-
-
-def random_plate(rng, eras: int, quiet: int) -> tuple[Carrier, FingerResponses]:
-    """Responses that ring and decay, of one target and so many quiet fingers."""
-    r, samples, steps = 6 + quiet, 5, 30
-
-    def drawn(*shape):
-        return rng.standard_normal(shape) + 1j * rng.standard_normal(shape)
-
-    ago = np.arange(steps)[::-1, None] + np.arange(samples) / samples
-    rates = rng.uniform(-0.4, -0.1, r) + 1j * rng.uniform(-2, 2, r)
-    shapes = drawn(r, eras)
-    hats = np.exp(rates * ago[..., None]).transpose(1, 2, 0)[..., None] * shapes[:, None]
-    rows = drawn(8 * eras, 8 * eras) * np.repeat(0.5 ** np.arange(8), eras)[::-1]
-    form = rows.conj().T @ rows
-    single = np.complex64
-    carrier = Carrier(
-        hats.astype(single), drawn(eras, r), form.astype(single), gain_variance=VARIANCE
-    )
-    at = rng.standard_normal((1 + 5 * quiet, r))
-    return carrier, responses_at(carrier, at[:1], at[1:])
-
-
-@pytest.mark.usefixtures("kernels_or_numpy")
-@pytest.mark.parametrize(("eras", "quiet"), list(product([4, 5, 8, 11, 16], [1, 9])))
-@pytest.mark.parametrize("level", [0.05, 1.0])
-def test_knots_are_those_of_numpy(eras, quiet, level):
-    """Random tones, low ones and at full stroke; some ERAs silent in the endings.
-
-    In single precision; the bounded ones of the others after thirty steps.
-    """
-    rng = np.random.default_rng(100 * eras + quiet)
-    carrier, found = random_plate(rng, eras, quiet)
-    weights = rng.standard_normal(eras) + 1j * rng.standard_normal(eras)
-    weights *= level / np.abs(weights).max()
-    onset = onset_knots(weights, found, VARIANCE), onset_by_numpy(weights, found, VARIANCE)
-    ways = [(0 * weights, *onset, weights)]
-    active = np.arange(eras)[rng.permutation(eras) > 0]
-    for felt in (None, of_eras(found, active)):
-        weight = 0.0 if felt is None else quiet_weight(carrier, weights, active, felt)
-        knots = ending_knots(carrier, weights, active, felt)
-        expected = ending_by_numpy(carrier, weights, active, felt, weight)
-        ways.append((weights[active], knots, expected, 0 * weights[active]))
-    for first, knots, expected, last in ways:
-        np.testing.assert_allclose(knots[1:-1], expected, atol=2e-3 * np.abs(expected).max())
-        np.testing.assert_array_equal(knots[[0, -1]], [first, last])
-        assert np.abs(knots[1:-1]).max() <= 1
 
 
 @pytest.mark.parametrize("rig", shortly(["paper_plate", "eight_eras", "table"], ["eight_eras"]))

@@ -3,7 +3,6 @@
 import cmath
 import math
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,17 +17,13 @@ from kit.plates import (
     shaped_base,
     stepped_acceleration,
 )
-from kit.set_table import only
-from model.answer.stimulus import Placement
 from model.arrays import lattice
 from model.errors import InputError
 from model.finger import Grid, fingertip_points, fingertip_weights
 from model.reduction.reduced_plate import ReducedPlate
-from model.rig.rig_file import load_rig
 from model.structure.attachments import Era
 from model.structure.material import material
 from model.structure.plate import Plate
-from model.table.table_file import build_table
 from model.transients.base_motion import (
     BaseEnvelope,
     BaseMotions,
@@ -40,20 +35,15 @@ from model.transients.base_motion import (
     shaped,
 )
 from model.transients.knots import (
-    ENDING_KNOTS,
     ONSET_KNOTS,
     bounded_minimum,
     hat_accelerations,
-    mean_square,
-    solve_carrier,
     steady_states,
-    while_ending,
 )
-from model.transients.shaping import SAMPLE_RATE, Shaper, Transients, responses_at
+from model.transients.shaping import SAMPLE_RATE, Shaper, Transients
 from model.transients.time_response import plate_in_time
 from model.vibration import Excitation, Tone
 
-EXAMPLES = Path(__file__).parents[3] / "examples"
 VARIANCE = 0.05**2 + np.radians(5) ** 2
 FREQUENCIES = [40.0, 75.4, 110.8, 217.0, 500.0]
 
@@ -184,27 +174,6 @@ def test_shaped_onset_keeps_most_of_the_steady_contrast(setup, target, quiet, fr
     ramp = contrast(ramped_onset(excitation, rig.eras, ramp=0.02))
     assert np.median(realised) > ramp + 6
     assert np.median(realised) > np.median(steady) - 6
-
-
-def test_onset_of_many_eras_is_as_good_as_of_few():
-    """Of sixteen, more than it combines: within the stroke, to the pattern, 6 dB above a ramp."""
-    table = build_table(load_rig(EXAMPLES / "table.yaml"), frequencies=np.array([130.0]))
-    size = np.array([table.plate.length / 0.3048, table.plate.width / 0.2286])
-    shaper = Shaper(table.in_time, gain_variance=VARIANCE)
-    transients = Transients(table.in_time)
-    gained = []
-    for *places, _ in PAIRS:
-        target, quiet = (tuple((size * place).tolist()) for place in places)
-        at = {"targets": [target], "quiet": [quiet]}
-        layer, _ = only(table, Placement((target,), (quiet,)), drive_mode="phased")
-        onset = shaper.onset(layer.excitation, **at)
-        for era in table.eras:
-            assert onset[era.name].largest <= era.stroke
-            assert onset[era.name].knots[-1] == pytest.approx(layer.excitation[era.name].phasor)
-        ramp = ramped_onset(layer.excitation, table.eras, ramp=0.04)
-        shaped_db = transients.contrast_db(shaped(onset, table.eras), **at)
-        gained.append(shaped_db - transients.contrast_db(ramp, **at))
-    assert np.median(gained) > 6
 
 
 def test_shaping_includes_the_errors_of_the_eras(setup):
@@ -380,56 +349,6 @@ def test_residual_db_equals_sampled_plate(setup):
     assert found == pytest.approx(10 * math.log10(left / steady), abs=0.1)
 
 
-def test_while_ending_is_the_mean_square_of_the_response(setup):
-    """For knots at random, what the form adds to a tone that stops is that of sampled vibrations.
-
-    Mean over phases.
-    """
-    rig, plate, _, transients = setup
-    frequency = 217.0
-    carrier = solve_carrier(
-        plate, frequency, residual_form=mean_square(plate, 0.1), gain_variance=0.0
-    )
-    point = np.array([[0.21, 0.06]])
-    rows = plate.reduced.at(point)
-
-    def sampled(knots) -> float:
-        found = 0.0
-        for phase in (0.0, math.pi / 2):  # their squares add up to that of the complex amplitude
-            turned = knots * np.exp(1j * phase)
-            envelopes, tones = {}, {}
-            for number, era in enumerate(rig.eras):
-                start, *rest = (turned[:, number] * era.stroke).tolist()
-                envelopes[era.name] = BaseEnvelope(frequency, start, (*rest, 0j))
-                tones[era.name] = Tone(frequency, abs(start), float(np.angle(start)))
-            felt = transients.acceleration(
-                shaped(envelopes, rig.eras), point, duration=0.005 * ENDING_KNOTS, after=tones
-            )
-            found += (felt**2).mean()
-        return found
-
-    for seed in range(3):
-        rng = np.random.default_rng(seed)
-        shape = (ENDING_KNOTS, 4)  # the tone, then seven knots, in strokes; the eighth is silence
-        knots = 0.1 * (rng.standard_normal(shape) + 1j * rng.standard_normal(shape))
-        knots += (rng.standard_normal(4) + 1j) * np.linspace(1, 0, ENDING_KNOTS)[:, None]
-        felt = responses_at(carrier, rows, rows)
-        form, right = while_ending(felt, knots[0], gain_variance=0.0)
-        added = value(form, right, knots[1:].ravel())
-        stopped = np.vstack([knots[:1], 0 * knots[1:]])
-        assert added == pytest.approx(sampled(knots) - sampled(stopped), abs=0.03 * sampled(knots))
-
-
-def test_envelope_terms_are_linear_between_knots():
-    """Half way between knots the complex amplitude is their mean, at its carrier's phase."""
-    envelope = BaseEnvelope(100.0, 0j, (2e-5 + 1e-5j, -4e-5j), step=0.005)
-    times = np.array([0.0025, 0.0075, 0.02])
-    amplitudes = np.array([1e-5 + 0.5e-5j, 1e-5 - 1.5e-5j, -4e-5j])  # the last knot stays
-    expected = (amplitudes * np.exp(2j * math.pi * 100.0 * times)).imag
-    assert motion_of(envelope.terms(), times) == pytest.approx(expected, abs=1e-17)
-    assert envelope.amplitude(times) == pytest.approx(amplitudes)
-
-
 def test_ramped_onset_and_ending_are_raised_cosines():
     """Half way through a ramp, up or down, the amplitude is half, and none or all at its ends."""
     rig = make_paper_rig(2, 2)
@@ -470,32 +389,6 @@ def test_bounded_minimum_equals_a_general_optimiser(seed):
     assert np.abs(np.linalg.solve(A, b)).max() > 1  # the bounds are in the way
     assert np.abs(found).max() <= 1
     assert value(A, b, found) <= 0.99 * general.fun
-
-
-def test_bounds_are_those_of_eras_not_of_their_combinations():
-    """Two combinations of five ERAs: none exceeds its stroke, and all stay combinations."""
-    A, b = random_form(3, 6)
-    rng = np.random.default_rng(4)
-    rows = rng.standard_normal((5, 2)) + 1j * rng.standard_normal((5, 2))
-    combinations = np.linalg.qr(rows)[0]
-    free = np.linalg.solve(A, b).reshape(3, 2) @ combinations.T
-    knots = bounded_minimum(A, 1.3 / np.abs(free).max() * b.reshape(3, 2), combinations)
-    assert knots.shape == (3, 5)
-    assert 0.99 < np.abs(knots).max() <= 1
-    within = knots @ combinations.conj() @ combinations.T
-    np.testing.assert_allclose(within, knots, atol=0.02)
-
-
-def test_bounded_minimum_of_few_rows_is_right_in_single_precision():
-    """A form of three rows with decades between them, of forty unknowns, gains nearly all."""
-    for seed in range(5):
-        rng = np.random.default_rng(seed)
-        rows = np.logspace(0, -3, 3)[:, None] * rng.standard_normal((3, 40))
-        A = (rows.T @ rows).astype(complex)
-        wanted = 0.05 * rng.standard_normal(40)
-        right = A @ wanted
-        found = bounded_minimum(A, right.reshape(-1, 4), np.eye(4)).ravel()
-        assert value(A, right, found) <= 0.99 * value(A, right, wanted)
 
 
 OMEGA = 2 * math.pi * 110.0
@@ -542,13 +435,6 @@ def test_terms_of_fades_add_up_to_raised_cosines(time: float) -> None:
         (of_set,) = motions.active([number], [time])
         moved = y[of_set & (motions.era == era)].sum()
         assert moved == pytest.approx(sum(faded(time, *fade) for fade in fades), abs=1e-17)
-
-
-def test_terms_that_have_ended_are_left_out() -> None:
-    """A fade to silence is forgotten once it is silent, a lasting tone is not."""
-    motions = BaseMotions([terms(FADES[0], FADES[2])], since=1.05)
-    assert motions.omega.tolist() == [OMEGA]
-    assert motions.end.tolist() == [math.inf]
 
 
 ERA = Era("", 0, 0, stiffness=100.0**2, damping=2 * 100.0, bolt_mass=0.0, stroke=1e-4)

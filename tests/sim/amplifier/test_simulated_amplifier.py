@@ -17,7 +17,6 @@ import tty
 from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
-from fractions import Fraction
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -79,18 +78,6 @@ def test_warm_up_settles() -> None:
     assert clock.straight(1000.0).pace - 1 == pytest.approx(10e-6, rel=1e-9)
     # The integral of 10 (1 - exp(-t / 10)) ppm over 10 s is 100 / e us.
     assert clock.seconds(10.0) - 10 == pytest.approx(100e-6 / math.e, abs=1e-11)
-
-
-def test_steering_for_an_hour_adds_no_rounding() -> None:
-    """Rates that change every 50 ms for an hour add up to the exact sum of fractions."""
-    clock = AmplifierClock()
-    rates = [(number * 7919) % 65535 - 32767 for number in range(72_000)]
-    exact = Fraction(0)
-    for number, rate in enumerate(rates):
-        since, until = Fraction(number / 20), Fraction((number + 1) / 20)
-        clock.steer(rate, number / 20)
-        exact += (until - since) * (1 + Fraction(rate, 10_000_000))
-    assert abs(Fraction(clock.seconds(3600.0)) - exact) < Fraction(1, 10**11)
 
 
 def test_shift_moves_the_high_word_on() -> None:
@@ -263,19 +250,6 @@ def test_moments_beyond_half_a_second_are_now(moment: int, waits: bool) -> None:
     amplifier, at = armed(), 100.5 * 20 / 65536
     play_from(amplifier, 1, 5000, at, moment)
     assert (levels(amplifier, at) == [0, 0]) is waits
-
-
-def test_ping_in_the_very_moment_does_not_put_it_off_by_a_turn() -> None:
-    """In the last floating-point number before each of 50 moments, by a rate for each."""
-    amplifier = SimulatedAmplifier("a", channels=2)
-    amplifier.handle("Arm", {**ARM, "watchdog": 2000}, 0.0)
-    amplifier.clock = AmplifierClock(Crystal(error=4e-5, warm_up=1e-6))
-    for number in range(1, 51):
-        at = number / 2
-        play_from(amplifier, number, 100 * number, at, (amplifier.clock.reading(at) >> 16) + 300)
-        moment = math.nextafter(amplifier.next_event, 0.0)
-        amplifier.handle("Ping", {"session": 7, "rate": 600 * number}, moment)
-        assert levels(amplifier, moment + 0.001) == [100 * number, 0]
 
 
 @pytest.mark.parametrize("name", MASTERS)

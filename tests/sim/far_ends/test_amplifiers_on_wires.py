@@ -461,15 +461,6 @@ def test_line_delivers_frames_at_its_speed_until_closed(is_closed: bool) -> None
     assert arrived == pytest.approx(pieces, abs=STEP)
 
 
-def test_faults_combine_on_one_frame() -> None:
-    """A frame truncated to nothing does not arrive."""
-    kinds: tuple[FaultKind, ...] = ("truncate", "truncate", "corrupt", "incomplete_set")
-    faults = Faults([FaultWindow(fault=kind) for kind in kinds])
-    arrived = [faults.pass_on(b"ab", toward="amplifier", time=1.0) for _ in range(200)]
-    assert {len(data) for frames in arrived for _, data in frames} <= {1}
-    assert [] in arrived
-
-
 @pytest.mark.parametrize("kind", ["corrupt", "truncate", "incomplete_set"])
 def test_wire_that_finds_damage_loses_the_frame(kind: FaultKind) -> None:
     """As TCP does; what is only late or double arrives."""

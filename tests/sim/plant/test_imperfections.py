@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from drivers.playing import AmplifierTone, Playback, Voice, VoiceTransition
+from drivers.playing import AmplifierTone, Playback
 from drivers.protocol.sets import Command, Envelope, LayerSet
 from kit.direct_plate import direct_acceleration
 from kit.plates import FINGERTIP, lock_in
@@ -24,7 +24,6 @@ from model.arrays import FloatArray
 from model.errors import InputError
 from model.fem import assemble
 from model.finger import (
-    detection_threshold,
     fingertip_points,
     fingertip_weights,
     mean_level_db_sl,
@@ -40,8 +39,6 @@ from model.vibration import Tone as VibrationTone
 from processes.firmware_machine import arm_bench, keep_alive, play
 from sim.amplifier.readings import StraightClock
 from sim.bench.bench import Bench
-from sim.plant.excited_plate import PlatePlayback as TonePlayback
-from sim.plant.excited_plate import Vibration
 from sim.plant.excited_plate import play as play_excitation
 from sim.plant.fingers import FingerRecord, PlateFingers, measure_vibration
 from sim.plant.imperfections import (
@@ -148,15 +145,6 @@ def test_imperfections_latency_keeps_the_order_of_commands(two_amplifiers: Rig) 
         )
     assert frequencies[0] == [(), (110.0,), (170.0,)]
     assert frequencies[1] == frequencies[0]
-
-
-def test_draw_imperfections_has_the_given_deviations(two_amplifiers: Rig) -> None:
-    """Over five hundred benches gains spread by 5 % and phases by 5 degrees, about the truth."""
-    drawn = [draw_imperfections(two_amplifiers, seed=seed) for seed in range(500)]
-    errors = [each for one in drawn for each in one.channels.values()]
-    gains, phases = np.array([(each.gain, np.degrees(each.phase)) for each in errors]).T
-    assert (gains.mean(), gains.std()) == pytest.approx((1, 0.05), abs=0.004)
-    assert (phases.mean(), phases.std()) == pytest.approx((0, 5), abs=0.4)
 
 
 def test_draw_imperfections_is_within_the_rigs_uncertainty(coarse_rig: Rig) -> None:
@@ -319,16 +307,6 @@ def test_base_moves_by_its_voices(seed: int, late: float) -> None:
             assert moved == pytest.approx(expected, abs=1e-16)
 
 
-@pytest.mark.parametrize("start", [0.0, 1000.1, 23193.384082])
-def test_pieces_of_an_envelope_join(start: float) -> None:
-    """One piece plays at any moment: there is no gap by rounding that a sample could fall into."""
-    knots = tuple(0.01j * n for n in range(1, 19))
-    way = VoiceTransition(start, 0.005, 0j, 0.19j, start + 0.095, knots)
-    terms = motion_of([Voice(0, 80.0, start, way)], EXACT, stroke=1e-4)
-    assert [one.end for one in terms[:-1]] == [one.start for one in terms[1:]]
-    assert (terms[0].start, terms[-1].end) == (start, math.inf)
-
-
 def flat_plate(rig: Rig) -> ReducedPlate:
     """A plate that can only move up and down."""
     return ReducedPlate(
@@ -444,30 +422,6 @@ def test_playback_steady_measures_agree_with_the_frequency_domain(
     assert (abs(level - free) > 1) is (fingertip is not None)
 
 
-def test_playback_measures_of_several_targets() -> None:
-    """Of made-up records: means over targets, the loudest quiet point, the lesser target."""
-    times = np.arange(1, 10_001) / 10_000
-    points = np.zeros((2, 2))
-
-    def record(*amplitudes: float) -> FingerRecord:
-        wave = np.sin(2 * np.pi * 100 * times)
-        early = np.where(times <= 0.1, 0.5, 1.0)  # half as strong while it starts
-        return FingerRecord(
-            points, np.full(2, 0.5), times, (wave * early)[:, None] * np.array(amplitudes)
-        )
-
-    quiet = record(0.1, 0.2)
-    quiet.accelerations[:1000] *= 10.0  # louder while it starts
-    at_targets = record(3.0, 5.0), record(2.0, 2.0)
-    vibration = Vibration((100.0,), (0, 1), (*at_targets, quiet))
-    played = TonePlayback((vibration,), settled=0.1)
-    assert played.contrast_db == pytest.approx(20 * math.log10(2 / 0.2), abs=1e-6)
-    assert played.transient_contrast_db == pytest.approx(20 * math.log10(1.0 / 1.0), abs=0.01)
-    assert played.level_db_sl - played.quiet_level_db_sl == pytest.approx(20.0, abs=1e-6)
-    alone = TonePlayback((Vibration((100.0,), (0,), at_targets[:1]),), settled=0.1)
-    assert (alone.contrast_db, alone.transient_contrast_db, alone.quiet_level_db_sl) == (None,) * 3
-
-
 def test_playback_with_an_onset_envelope(coarse_rig: Rig, reduced: ReducedPlate) -> None:
     """What fingertips go through is what another solution in time says, the model's own."""
     excitation = {"SW": VibrationTone(110.0, 1e-5)}
@@ -509,13 +463,3 @@ def test_playback_refuses_invalid_input(
             together(fingers, Stimulus()),
             duration=duration,
         )
-
-
-def test_playback_reads_steady_measures_at_the_end() -> None:
-    """Ten times as much until a quarter of a second before the end does not count."""
-    times = np.arange(10_000) / 10_000.0
-    tone = np.where(times < 0.75, 10.0, 1.0) * np.sin(2 * np.pi * 100.0 * times)
-    record = FingerRecord(np.array([[0.1, 0.1]]), np.ones(1), times, tone[:, None])
-    playback = TonePlayback((Vibration((100.0,), (0,), (record,)),), settled=0.04)
-    expected = -20 * np.log10(detection_threshold(np.array([100.0]))[0])
-    assert playback.level_db_sl == pytest.approx(expected, abs=0.01)

@@ -12,9 +12,8 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 from scipy import linalg, sparse
-from scipy.signal import butter, lsim, sosfiltfilt
+from scipy.signal import butter, sosfiltfilt
 
-from cases import shortly
 from kit.direct_plate import direct_acceleration
 from kit.plates import BASES as MOVED_BASES
 from kit.plates import (
@@ -28,23 +27,17 @@ from kit.plates import (
     shaped_base,
 )
 from kit.plates import STROKE as BASE_STROKE
-from kit.set_table import only
-from model.answer.answer import Layer
-from model.answer.answer_report import Timing
 from model.answer.plan import query
 from model.answer.stimulus import Finger, Placement, Stimulus
 from model.arrays import FloatArray
 from model.errors import InputError
 from model.fem import Mesh, PlateMatrices, assemble
-from model.finger import contrast_db, felt_part, fingertip_points, fingertip_weights
 from model.reduction.reduced_plate import ReducedPlate, modal_matrices, reduce_plate
 from model.rig.rig import Rig
 from model.structure.attachments import Era, Fingertip, FingertipLoad, footprints_of
 from model.structure.plate import Plate
 from model.table.table_file import build_table
 from model.transients.base_motion import Term, raised_cosine
-from model.transients.shaping import ONSET_WINDOW
-from model.transients.time_response import from_rest
 from sim.plant.excited_plate import play
 from sim.plant.plant import Plant
 
@@ -79,86 +72,6 @@ def test_plant_refuses_an_unsupported_plate(coarse_rig: Rig, reduced: ReducedPla
     """Two ERAs leave the axis through them free to rotate."""
     with pytest.raises(InputError, match="supported"):
         Plant(reduced, coarse_rig.eras[:2])
-
-
-RATE = 48_000.0
-PAIRS = (((0.06, 0.04), (0.22, 0.16)), ((0.15, 0.1), (0.28, 0.03)), ((0.25, 0.2), (0.05, 0.15)))
-ABOVE = ((560.0, 0.3), (640.0, 0.2), (720.0, 0.4), (800.0, 0.25))
-"""Resonance [Hz] and damping ratio of each actuator, as behind a sound card."""
-WITHIN = ((180.0, 0.12), (260.0, 0.1), (340.0, 0.2), (420.0, 0.15))
-"""The same with resonances among the frequencies that are played."""
-
-
-def gain(frequencies: FloatArray, resonance: float, ratio: float) -> FloatArray:
-    """Motion of a base by an output, as of a damped oscillator."""
-    x = frequencies / resonance
-    return np.asarray(1 / (1 - x**2 + 2j * ratio * x))
-
-
-def driven_by(rig: Rig, pattern: Layer, times: FloatArray) -> FloatArray:
-    """What an onset would move the bases by, (n, eras) [m], if they followed at once."""
-    bases = np.zeros((len(times), len(rig.eras)))
-    for number, era in enumerate(rig.eras):
-        if pattern.onset and era.name in pattern.onset:
-            envelope = pattern.onset[era.name]
-            amplitude, frequency = envelope.amplitude(times), envelope.frequency
-        elif not pattern.onset and era.name in pattern.excitation:
-            tone = pattern.excitation[era.name]
-            rise = (1 - np.cos(np.pi * np.clip(times / pattern.ramp, 0, 1))) / 2
-            amplitude, frequency = rise * tone.phasor, tone.frequency
-        else:
-            continue
-        bases[:, number] = (amplitude * np.exp(2j * np.pi * frequency * times)).imag
-    return bases
-
-
-@pytest.mark.parametrize("actuators", [ABOVE, WITHIN])
-@pytest.mark.parametrize("is_shaped", shortly([True, False], [True]))
-def test_contrast_of_an_onset_behind_actuators_that_lag(
-    coarse_rig: Rig, is_shaped: bool, actuators: tuple[tuple[float, float], ...]
-) -> None:
-    """That of their equation of motion within 1 dB of the one that gains predict, on one plate.
-
-    But for a shaped onset through resonances that are played, which loses up to 6 dB.
-    """
-    rows = np.arange(30.0, 521.0, 5.0)
-    eras = tuple(
-        replace(
-            era,
-            gains=tuple(
-                zip(rows, abs(gain(rows, *each)), np.angle(gain(rows, *each)), strict=True)
-            ),
-        )
-        for era, each in zip(coarse_rig.eras, actuators, strict=True)
-    )
-    rig = replace(coarse_rig, eras=eras, fingertip=None)
-    table = build_table(rig, frequencies=np.arange(80.0, 401.0, 40.0))
-    timing = Timing(table)
-    times = (np.arange(round(ONSET_WINDOW * RATE)) + 1) / RATE
-    for target, quiet in PAIRS:
-        placed = Placement((target,), (quiet,))
-        layer, _ = only(table, placed, 15.0)
-        pattern = timing.with_envelopes(layer, placed, onset=is_shaped, ending=False)
-        predicted = timing.transient_contrast_db(pattern, placed)
-        bases = driven_by(rig, pattern, times)
-        for number, (resonance, ratio) in enumerate(actuators):
-            omega = 2 * np.pi * resonance
-            system = ([omega**2], [1, 2 * ratio * omega, omega**2])
-            _, moved, _ = lsim(system, np.append(0.0, bases[:, number]), np.append(0.0, times))
-            bases[:, number] = moved[1:]
-        plant = Plant(table.in_time.reduced, coarse_rig.eras)
-        discs = [fingertip_points(*at, rig.plate) for at in (target, quiet)]
-        felt = from_rest(
-            plant.loaded.plate,
-            bases.T / [[era.full_level] for era in coarse_rig.eras],
-            plant.reduced.at(np.concatenate(discs)),
-            sample_rate=RATE,
-            factors=np.ones(len(bases.T), dtype=complex),
-        )
-        peaks = np.split(np.abs(felt_part(felt, RATE)).max(axis=0), [len(discs[0])])
-        weights = [fingertip_weights(*target, rig.plate)]
-        lost = predicted - contrast_db(peaks[:1], peaks[1], weights)
-        assert -1 < lost < (6 if is_shaped and actuators is WITHIN else 1)
 
 
 BASES = (
@@ -245,38 +158,6 @@ def test_contacts_drop_vectors_of_lifted_fingers(coarse_rig: Rig, reduced: Reduc
     assert len(plant.reduced.omega) == len(reduced.omega) + 3
     for old, new in zip(before, on_the_mesh(plant), strict=True):
         assert_allclose(new, old, rtol=0, atol=1e-4 * np.abs(old).max())
-
-
-def test_contacts_are_solved_once(
-    coarse_rig: Rig, reduced: ReducedPlate, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A finger that taps on one spot again and again costs one solve, not one a tap."""
-    plant = Plant(reduced, coarse_rig.eras)
-    plant.set_contacts(ONE)
-    plant.set_contacts({})
-    monkeypatch.setattr("sim.plant.plant.plate_in_time", None)
-    for _ in range(5):
-        plant.skip(plant.time + 0.05)
-        plant.set_contacts(ONE)
-        plant.skip(plant.time + 0.05)
-        plant.set_contacts({})
-
-
-def test_plant_sampling_rate_may_change(coarse_rig: Rig, reduced: ReducedPlate) -> None:
-    """Every tenth sample at 10 kHz is the sample at 1 kHz, also right after the other rate."""
-    quick, mixed = (vibrating(reduced, coarse_rig) for _ in range(2))
-    shapes = reduced.at(np.array([[0.11, 0.07], [0.03, 0.2], [0.3, 0.02]]))
-    _, expected = quick.advance(0.12, sample_rate=10_000.0, shapes=shapes)
-    mixed.advance(0.07, sample_rate=10_000.0, shapes=shapes)
-    assert mixed.advance(0.10, sample_rate=1000.0, shapes=shapes[:0])[1].shape == (30, 0)
-    times, found = mixed.advance(0.12, sample_rate=1000.0, shapes=shapes)
-    assert_allclose(times, np.arange(0.101, 0.1205, 0.001))
-    assert_allclose(
-        found,
-        expected[np.round((times - 0.05) * 10_000).astype(int) - 1],
-        rtol=0,
-        atol=1e-9 * np.abs(expected).max(),
-    )
 
 
 def plant_of(rig: Rig) -> Plant:

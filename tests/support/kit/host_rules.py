@@ -6,6 +6,23 @@ commands, stalls of the control loop and injected faults. Times are in s.
 
 During a fault and for `RECOVERY` afterwards deadlines are not judged, since a request or its reply
 may be lost; limits, stops, sessions and tokens are judged at all times.
+
+The rules by name:
+
+- `limits`: frequency, level and slew of each channel, over all its layers, stay within its limits.
+- `enabled`: no vibrating set goes to an amplifier that the host knows to be disarmed.
+- `session`: sets belong to the session that armed; nothing feeds an amplifier of another host.
+- `token`: a token names one set, and tokens ascend.
+- `commit`: if one amplifier plays a set, all amplifiers that have it play it, or are silenced.
+- `stop`: a stop is the next request, is repeated until confirmed, and holds until it is cleared.
+- `heartbeat`: enabled amplifiers are fed in time, but not while the control loop stalls.
+- `armed`: an amplifier is armed only after an operator's request.
+- `identified`: an amplifier is identified after its wire was opened, and before it is armed.
+- `credit`: a request waits for the reply to the previous one on its wire, unless it silences.
+- `justified`: no vibration is commanded without a contact.
+- `pattern`: a set is the expected one, if one is given.
+- `lift`: after the last lift, a silencing request and silence follow in time.
+- `touch`: a new contact leads to a pattern in time.
 """
 
 import asyncio
@@ -45,24 +62,6 @@ from drivers.wires.wire import (
 from era_haptics.lab.expected_output import silent
 from registry import threads
 from sim.faults import FaultWindow
-
-RULES: Mapping[str, str] = {
-    "limits": "frequency, level and slew of every channel, over all layers, are within its limits",
-    "enabled": "no vibrating set is sent to an amplifier that the host knows to be disarmed",
-    "session": "sets are of the session that armed; nothing feeds next to another host",
-    "token": "a token names one set, and tokens ascend",
-    "commit": "a set that one amplifier plays is played by all that have it, or silenced",
-    "stop": "a stop is the next request, goes on until it is confirmed, and lasts until cleared",
-    "heartbeat": "enabled amplifiers are fed in time, and not while the control loop stalls",
-    "armed": "an amplifier is armed only after an operator's request",
-    "identified": "an amplifier is identified after its wire was opened, and before it is armed",
-    "credit": "a request waits for the reply to the last one on its wire, unless it silences",
-    "justified": "no vibration is commanded without a contact",
-    "pattern": "a set is the expected one, where one is given",
-    "lift": "after the last lift: a silencing request and silence in time",
-    "touch": "a new contact leads to a pattern in time",
-}
-"""The rules by name."""
 
 OperatorCommand = Literal["arm", "disarm", "stop", "clear"]
 Tone: TypeAlias = tuple[float, float, float]

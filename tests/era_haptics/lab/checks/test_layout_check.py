@@ -12,7 +12,6 @@ import wave
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +25,6 @@ from controller.content.formats import named_content, read_content
 from controller.content.pattern import Pattern, Transient
 from controller.effects.effect import Effect, Region
 from controller.effects.kinds import (
-    BUILT_IN_EFFECTS,
     Buzz,
     Click,
     Detents,
@@ -35,7 +33,7 @@ from controller.effects.kinds import (
     Ramp,
     Texture,
 )
-from controller.effects.layout import SurfaceLayout, load_layout
+from controller.effects.layout import SurfaceLayout
 from controller.effects.player import EffectPlayer
 from controller.play.selection import Chooser, Selector
 from controller.sources.touch import Contact, ContactKey
@@ -48,7 +46,7 @@ from era_haptics.lab.checks.layout_check import (
     loaded_plate,
     strongest_target,
 )
-from era_haptics.lab.checks.layout_picture import JointTouch, check_together, close_pairs, matrix_of
+from era_haptics.lab.checks.layout_picture import JointTouch, check_together, close_pairs
 from era_haptics.lab.cli import app
 from kit.fingers import WIRES, Pressed, playable
 from kit.fingers import table as paper_table
@@ -63,13 +61,11 @@ from model.finger import (
     fingertip_weights,
     over_threshold,
 )
-from model.rig.rig import Uncertainty
 from model.table.table import LocalizationTable
 from model.table.table_file import build_table, save_table
 from model.transients.base_motion import along_lines, raised_cosine
 from model.transients.shaping import SAMPLE_RATE, Transients
 
-EXAMPLE = Path(__file__).parents[4] / "examples" / "panel_layout.yaml"
 BUTTON = Rectangle(0.05, 0.04, 0.012, 0.012)
 SLIDER = Rectangle(0.02, 0.14, 0.26, 0.04)
 
@@ -200,23 +196,6 @@ def test_strongest_target_of_every_kind(
     assert (felt.pulse and felt.pulse.duration) == duration
 
 
-@pytest.mark.usefixtures("plain_pictures")
-@pytest.mark.long
-def test_a_better_known_rig_feels_no_worse(monkeypatch: pytest.MonkeyPatch) -> None:
-    """No problem is new, and contrasts promised for the example do not fall by 0.3 dB or more."""
-    monkeypatch.setattr(layout_check, "_MAX_TOUCHES", 8)
-    layout = load_layout(EXAMPLE, smooth_rig().plate)
-    table = build_table(smooth_rig(), frequencies=np.arange(100.0, 281.0, 10.0))  # of its bands
-    usual, known = (
-        check_layout(layout, replace(table, uncertainty=uncertainty))
-        for uncertainty in (Uncertainty(), Uncertainty.none())
-    )
-    for before, each in zip(usual, known, strict=True):
-        assert {*each.problems} <= {*before.problems}
-        for measure in (min, np.median):
-            assert measure(each.promised_contrasts) > measure(before.promised_contrasts) - 0.3
-
-
 LAYOUT = """\
 effects: {notches: {kind: detents}}
 regions:
@@ -334,17 +313,6 @@ CASES = {
 
 
 @pytest.mark.usefixtures("plain_pictures")
-def test_every_kind_has_its_rows() -> None:
-    """In both lists of this file; a texture is felt where a finger moves, not where it stops."""
-    assert {type(effect) for effect, *_ in STRONGEST} == {*BUILT_IN_EFFECTS}, (
-        "a row in STRONGEST each"
-    )
-    assert {type(case.effect) for case in CASES.values()} | {Texture} == {*BUILT_IN_EFFECTS}, (
-        "a row in CASES each, but for kinds that only a moving finger feels"
-    )
-
-
-@pytest.mark.usefixtures("plain_pictures")
 @pytest.mark.parametrize(("name", "wire"), in_turn(CASES, [*WIRES]))
 def test_effect_is_felt_as_promised_and_alike_at_every_press(name: str, wire: str) -> None:
     """Within 3 dB of what layout and report promise, all presses within 2 dB, on the plate."""
@@ -384,26 +352,10 @@ def region(name: str, corner: tuple[float, float]) -> Region:
     return Region(name, Rectangle(*corner, SIZE, SIZE), on_press=name)
 
 
-FOUR = [region(name, at) for name, at in zip("abcd", (WEST, EAST, NEXT, NORTH), strict=True)]
-
-
 def layout(*regions: Region) -> SurfaceLayout:
     """A layout of regions."""
     effects = {each.name: Buzz(level=14.0) for each in regions}
     return SurfaceLayout(regions, effects, elsewhere=None)
-
-
-def test_mirrored_regions_are_promised_the_same() -> None:
-    """The plate and its ERAs are symmetric: east and west of north alike, but for the draws."""
-    found = check_together(
-        layout(region("west", WEST), region("east", EAST), region("north", NORTH)),
-        paper_table(),
-    )
-    worst = {each.regions: each.worst_db for each in found}
-    assert len(worst) == 4
-    assert worst["west", "north"] == pytest.approx(worst["east", "north"], abs=1.5)
-    # A third finger leaves no two more than they had.
-    assert worst["west", "east", "north"] < min(worst[pair] for pair in [*worst][:3]) + 0.5
 
 
 def test_places_are_the_worst_of_their_regions() -> None:
@@ -473,51 +425,6 @@ async def test_what_comes_and_goes_is_promised_as_the_daemon_promises_it(effect:
     )  # less while a click plays
 
 
-def test_matrix_has_two_below_and_three_above_the_diagonal() -> None:
-    """Of three above it the least with any third."""
-    found = check_together(layout(*FOUR), paper_table())
-    names, promised = matrix_of(found)
-    assert names == [*"abcd"]
-    assert np.isnan(np.diag(promised)).all()
-    for one, other in pairwise(range(4)):
-        (pair,) = (each for each in found if each.regions == (names[one], names[other]))
-        third = min(
-            each.worst_db
-            for each in found
-            if len(each.regions) == 3 and {names[one], names[other]} <= {*each.regions}
-        )
-        assert (promised[other, one], promised[one, other]) == (pair.worst_db, third)
-
-
-def test_picture_has_the_plate_in_centimetres_and_the_names_of_its_regions() -> None:
-    """Upright beside one that is more than twice as tall as wide; marks and crosses on it."""
-    tall = Region("tall", Rectangle(0.2, 0.05, 0.02, 0.12), on_press="it")
-    flat = Region("flat", BUTTON, on_press="it")
-    shown = SurfaceLayout((tall, flat), {"it": Buzz(level=15.0)}, elsewhere=None)
-    found = check_together(shown, paper_table())
-    figure = layout_picture.check_figure(shown, paper_table(), (), found)
-    plate, *_, matrix = [each for each in figure.axes if each.get_title()]
-    panels = [axes for axes in figure.axes if axes.get_label() != "<colorbar>"]
-    assert [axes.get_title() for axes in panels if not axes.get_title()] == []
-    named = {each.get_text(): each.get_rotation() for each in plate.texts}
-    assert (named["tall"], named["flat"]) == (90, 0)
-    outline = plate.patches[0].get_path().vertices[2]
-    assert outline == pytest.approx((30.48, 22.86))
-    assert plate.get_xlim()[1] > 30.48
-    assert plate.get_ylim()[1] > 22.86
-    assert [each.get_text() for each in matrix.get_xticklabels()] == ["tall", "flat"]
-    assert any("worst finger" in each.get_ylabel() for each in figure.axes)
-
-
-def test_of_many_regions_the_nearest_are_checked(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A bound on what is computed keeps the pair that is hardest to tell apart."""
-    monkeypatch.setattr(layout_picture, "MAX_PAIRS", 1)
-    monkeypatch.setattr(layout_picture, "MAX_TRIPLES", 0)
-    silent = Region("silent", Rectangle(0.03, 0.10, SIZE, SIZE))
-    (found,) = check_together(layout(*FOUR, silent), paper_table())
-    assert found.regions == ("a", "c")
-
-
 AT, QUIET = (0.11, 0.13), (0.21, 0.06)
 SWELL = Pattern(
     0.4, ((0.0, 0.4), (0.3, 1.0), (0.4, 0.0)), ((0.0, 0.5),), (Transient(0.15, 1.0, 0.2),)
@@ -578,15 +485,6 @@ def test_what_lasts_has_its_level_and_taps_theirs() -> None:
     assert found.given[round(1.3 / found.step) :].max() == pytest.approx(15.0, abs=2.0)
     assert found.kept_share > 0.9
     assert found.delay <= 0.01
-
-
-@pytest.mark.usefixtures("plain_pictures")
-def test_long_content_that_jumps_has_its_level() -> None:
-    """Five seconds of 20 dB SL; by less than 2 dB more the plate overshoots after the jump."""
-    pattern = Pattern(5.0, ((0.0, 0.0), (0.005, 1.0), (5.0, 1.0)))
-    found = check_content(pattern, content_check_table(), 20.0, at=AT)
-    assert np.median(found.given[: round(4.5 / found.step)]) == pytest.approx(20.0, abs=2.0)
-    assert found.kept_share > 0.95
 
 
 @pytest.mark.usefixtures("plain_pictures")

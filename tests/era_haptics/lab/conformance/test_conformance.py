@@ -19,7 +19,7 @@ from cobs import cobs
 import era_haptics
 from cases import shortly
 from drivers.errors import CommandError
-from drivers.protocol.definition import MESSAGES, REQUEST_NAMES
+from drivers.protocol.definition import REQUEST_NAMES
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Command, LayerSet, pack_layers
 from drivers.trace import tracing
@@ -49,7 +49,6 @@ from kit.clock import (
     in_virtual_time,
     judged,
     plain,
-    results_of,
     short_checks,
     varied,
 )
@@ -321,47 +320,6 @@ async def test_machine_that_is_always_late_has_no_verdict() -> None:
     assert last.reason.startswith("no verdict since the time of the run is used up: "), last.reason
 
 
-@in_virtual_time
-async def test_machine_that_was_late_once_has_a_verdict_on_voices(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """By 1 s, beside replies of 9 ms and ramps of 0.7 s: what it leads by fits into these."""
-    monkeypatch.setattr("kit.clock.DELAY", 0.0045)
-    far = varied()
-    far.capabilities.update(ramp_max=700)
-    chosen = [each for each in of_kind("tcp") if each[1].name == "voices"]
-    with closing(JudgedLine("tcp", far)) as line:
-        line.client.lateness = 1.0
-        (result,) = await run_checks(chosen, line.client, level=0.2)
-    assert result.result is Result.PASSED, result.reason
-
-
-SLOW = {
-    "serial": [
-        "lengths",
-        "trips_amid_other_requests",
-        "parts_of_sets",
-        "sets_expire",
-        "valid_for",
-        "renew",
-        "after",
-        "endings_amid",
-        "doubled_frames",
-        "tolerated_frames",
-    ],
-    "tcp": ["pieces", "lengths", "watchdog_ranges", "arms_again", "watchdog_unread", "renew"],
-    "can": ["watchdog_ranges", "network_management"],
-}
-
-
-@pytest.mark.parametrize("kind", shortly(SLOW, ["tcp"]))
-def test_slow_line_has_its_verdicts(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """At 40 ms each way and back: times are long against it, and what comes late is heard."""
-    monkeypatch.setattr("kit.clock.DELAY", 0.02)
-    for found in judged(kind, SLOW[kind]):
-        assert (found.result, found.attempts) == (Result.PASSED, 1), found
-
-
 def obey_late(monkeypatch: pytest.MonkeyPatch, delay: float) -> None:
     """Let the amplifier of a serial line reply late [s] to all but what is only read."""
 
@@ -418,55 +376,6 @@ def test_amplifier_that_replies_just_in_time_passes(
     skipped = set() if names else SKIPPED[kind]
     twice = kind == "tcp"  # each request that changes something is a write and a read
     expect_passed(judged(kind, names), skipped, within=(1.7 if twice else 1.4) * MINUTE)
-
-
-def test_request_that_comes_after_an_onset_is_no_violation(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """The first question what is achieved takes 300 ms, until the set that waited plays."""
-    delays = [0.3]
-
-    def late(data: bytes) -> tuple[float, bytes]:
-        (frame,) = FrameReader().feed(data)
-        is_meant = frame.type == MESSAGES["GetAchieved"].number and delays
-        return delays.pop() if is_meant else 0.0, data
-
-    changed(monkeypatch, "write", late)
-    (result,) = judged("serial", ["after"])
-    assert (result.result, delays) == (Result.PASSED, []), result.reason
-
-
-@pytest.mark.parametrize("is_obeyed_late", [False, True])
-@pytest.mark.parametrize("delay", shortly([0.005, 0.009, 0.03, 0.042], [0.009, 0.042]))
-def test_set_whose_reply_is_late_is_no_violation(
-    delay: float, is_obeyed_late: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """It began at once or late, and what waits for its onset counts from then, renewed too."""
-    is_meant = [False]
-
-    def written(data: bytes) -> tuple[float, bytes]:
-        (frame,) = FrameReader().feed(data)
-        is_set = frame.type == MESSAGES["Set"].number
-        is_meant[0] = is_set and b"\x84\x03" in frame.payload  # 900 ms
-        return delay * (is_meant[0] and is_obeyed_late), data
-
-    changed(monkeypatch, "write", written)
-    changed(monkeypatch, "_send", lambda data: (delay * (is_meant[0] and not is_obeyed_late), data))
-    (result,) = judged("serial", ["what_waits_for_an_onset"])
-    assert result.result is Result.PASSED, result.reason
-
-
-@pytest.mark.parametrize("late", [1, 1000], ids=["once", "always"])
-def test_reply_that_is_delivered_late_is_no_violation(
-    late: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The seventh takes 0.7 s more, as on a terminal of a busy machine; a slow amplifier fails."""
-    count = iter(range(1_000_000))
-    changed(monkeypatch, "_send", lambda data: (0.7 * (7 <= next(count) < 7 + late), data))
-    found = [each for each in judged("serial", ["arming", "stop"]) if each.result != "passed"]
-    assert bool(found) is (late > 1)
-    assert {each.result for each in found} <= {Result.FAILED, Result.NOT_RUN}, found
-    assert all(", but later" in each.reason for each in found[:1])
 
 
 class _Unsteered(SimulatedAmplifier):
@@ -788,25 +697,3 @@ def test_garbage_has_a_verdict(kind: str, share: float, monkeypatch: pytest.Monk
     assert sum(each.seconds for each in results) < 2 * MINUTE
     if share < 0.1:
         assert [each.result for each in results].count(Result.PASSED) > 10
-
-
-@pytest.mark.parametrize("names", shortly([[], TIMED], [TIMED]))
-@in_virtual_time
-async def test_busy_machine_has_its_verdicts(
-    names: list[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """It stands still every 80 ms on the average, for 30 ms, and a reply is lost: nothing fails."""
-    count, rng = iter(range(10_000_000)), random.Random(2)
-    changed(monkeypatch, "_send", lambda data: (0.0, b"" if next(count) == 60 else data))
-
-    async def stand_still() -> None:
-        while True:
-            await asyncio.sleep(rng.expovariate(1 / 0.08))
-            _stall(0.03)
-
-    stalling = asyncio.ensure_future(stand_still())
-    results = await results_of("serial", varied(), names)
-    stalling.cancel()
-    assert not [(each.check.name, each.reason) for each in results if each.result == "failed"]
-    assert [each.check.name for each in results if isinstance(each.finding, TooLate)] == []
-    assert sum(each.seconds for each in results) < 2 * MINUTE

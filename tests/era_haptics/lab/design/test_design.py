@@ -117,18 +117,6 @@ PAIRS = tuple(replace(anywhere(PLATE), quiet=(1, 1)).sets(4, seed=4))
 OF_PAIRS = ContactRule((1, 1), 0.05, lambda rng, n: np.zeros((n, 2)), PAIRS)
 
 
-def test_polygons_hold_their_points(tmp_path) -> None:
-    """Candidates and steps are in a triangle, its edges included."""
-    path = tmp_path / "where.yaml"
-    path.write_text("polygons:\n  left: [[0, 0], [12 cm, 0], [0, 12 cm]]\n")
-    area = area_of(str(path), PLATE)
-    places = area.candidates(0.02)
-    assert len(places) > 5
-    assert (places.sum(axis=1) <= 0.12 + 1e-9).all()
-    assert area.contains(np.array([[0.06, 0.06], [0.07, 0.06]])).tolist() == [True, False]
-    assert (area.moved(np.array([0.06, 0.06]), 0.01).sum(axis=1) <= 0.12 + 1e-9).all()
-
-
 def test_contacts_in_regions_of_a_layout(tmp_path) -> None:
     """Fingers are in the regions, so many of them, so far apart; effects are passed over."""
     path = tmp_path / "layout.yaml"
@@ -256,22 +244,6 @@ def problem(**changes) -> DesignProblem:
     return DesignProblem(rig=some, **(usual | changes))
 
 
-def test_further_eras_never_score_less(monkeypatch) -> None:
-    """The best layout of ever more ERAs has ever more contrast, and moved places no less."""
-    monkeypatch.setitem(problem_module.CANDIDATES, True, 16)
-    search = LayoutSearch(problem())
-    positions, values = np.empty((0, 2)), []
-    for _ in range(4):
-        added = search.add(positions)
-        positions = added.positions
-        values.append(added.score_db)
-    assert values == sorted(values)
-    found = search.refine(positions)
-    assert found.score_db >= added.score_db - 1e-3
-    (again,) = search.scored([found.positions])
-    assert again.score_db == pytest.approx(found.score_db, abs=0.02)
-
-
 def test_kept_eras_stay_and_all_keep_their_distance() -> None:
     """A start at random, exchanged and moved, leaves what is kept and the least distance."""
     search = LayoutSearch(problem(kept=("SW", "NE"), apart=0.08))
@@ -297,17 +269,6 @@ def test_static_loads_of_a_seesaw() -> None:
     # The centre of mass behind all of them: the plate tips.
     assert shortfall(some, [replace(era, y=0.2 * era.y) for era in eras], lowest=1.0) > 0
     assert shortfall(some, eras, lowest=1e4) > 0
-
-
-def test_steps_along_the_edge_end_at_its_corners_and_turn_there() -> None:
-    """A step past a corner ends on it, one from there goes along either side."""
-    edge = area_of("edge", replace(RIG.plate, length=0.3, width=0.2))
-    assert sorted(edge.moved(np.array([0.29, 0.0]), 0.03).tolist()) == [[0.26, 0], [0.3, 0]]
-    assert sorted(edge.moved(np.array([0.3, 0.0]), 0.03).tolist()) == [[0.27, 0], [0.3, 0.03]]
-    places = edge.candidates(0.03)
-    assert len(places) == 2 * (10 + 7)  # 30 cm in ten parts, 20 cm in seven
-    assert edge.contains(places).all()
-    assert not edge.contains(np.array([[0.1, 0.1]])).any()
 
 
 def test_area_without_room_is_refused() -> None:

@@ -7,10 +7,8 @@ Parts of an exciter are compared with the equations of coil, magnet and circuit:
 
 import ctypes
 import json
-import os
-import subprocess
 from collections.abc import Sequence
-from contextlib import closing, nullcontext
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
@@ -30,7 +28,6 @@ from era_haptics.lab.measuring.impedance import (
 from era_haptics.lab.measuring.measure import (
     MeasuredResponses,
     check_wiring,
-    latency,
     measure,
 )
 from era_haptics.lab.measuring.measure_cli import app
@@ -43,7 +40,7 @@ from era_haptics.lab.measuring.sound_card import (
     multisine_frequencies,
 )
 from examples.make_measured import record_responses
-from kit.desk_plate import Converters, DeskModel, DeskPlate, JackPlate, Truth
+from kit.desk_plate import Converters, DeskModel, DeskPlate, Truth
 from kit.plates import exciter_rig_text
 from model.arrays import Float32Array, FloatArray
 from model.errors import InputError
@@ -51,9 +48,7 @@ from model.estimate.measurement import measurement_of, read_measured
 from model.rig.rig import Rig, Uncertainty
 from model.rig.rig_file import example_rig_path, load_rig, parse_rig
 from model.structure.attachments import PointLoad
-from processes.desk import open_client
-from processes.sound_cards import DeskCard, ExciterCircuit, jack_server
-from processes.typed_page import ERA
+from processes.sound_cards import DeskCard, ExciterCircuit
 from sim.plant.fingers import Accelerometer
 from sim.soft_amp.engine import callback_address
 
@@ -300,16 +295,6 @@ def test_wiring_is_judged_by_the_gains_from_outputs_to_inputs(
         check_wiring(found, Desk(rig, SENSORS))
 
 
-def test_sensors_of_a_single_source_are_no_cables(rig: Rig) -> None:
-    """One ERA with the loop-back beside it: all inputs have that output alone."""
-    alone = Desk(replace(rig, eras=rig.eras[:1]), SENSORS, is_shared=True)
-    each = np.full((len(PLAYED_HZ), 4, 1), 0.4 + 0j)
-    check_wiring(ResponseEstimate(each, abs(each), abs(each), np.zeros(4)), alone)
-    each[:, 3] = 1e-5
-    with pytest.raises(InputError, match="connect them by a cable"):
-        check_wiring(ResponseEstimate(each, abs(each), abs(each), np.zeros(4)), alone)
-
-
 def test_amplifier_that_is_off_is_named(rig: Rig, truth: Truth) -> None:
     """An actuator without gain behind output 3, beside noise that any sensor has."""
     off = list(truth.actuators)
@@ -327,18 +312,6 @@ def test_levels_and_frequencies_that_cannot_be_played_are_refused(rig: Rig) -> N
     for frequency in (61.5, 3999.0):
         with pytest.raises(InputError, match="frequencies"):
             Multisine(np.array([frequency]), 5, RATE, LEVEL)
-
-
-def test_delay_follows_from_the_slope_of_phases() -> None:
-    """3.7 ms by hand, also of lines at equal distances; random phases are no delay."""
-    evenly = np.arange(61.0, 500.0, 60.0)
-    assert latency(np.exp(-2j * np.pi * evenly * 3.7e-3), evenly) == pytest.approx(3.7e-3)
-    response = 0.4 * np.exp(-2j * np.pi * PLAYED_HZ * 3.7e-3)
-    assert latency(response, PLAYED_HZ) == pytest.approx(3.7e-3)
-    lines = multisine_frequencies(40, 500)
-    drawn = np.exp(2j * np.pi * np.random.default_rng(0).uniform(size=len(lines)))
-    with pytest.raises(LinkError, match="loop-back"):
-        latency(drawn, lines)
 
 
 FRAMES = 64
@@ -670,29 +643,6 @@ def _check(told: dict[str, dict[str, dict[str, float]]]) -> None:
     for name, true in PARTS.items():
         assert values[name]["value"] == pytest.approx(true, rel=0.01), name
         assert values[name]["half_width_90"] < 0.01 * true
-
-
-@pytest.mark.real_time
-@pytest.mark.needs("jackd", "cc")
-def test_parts_are_found_through_a_real_server(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Two commands of the installed program, a simulated exciter as a client of the server."""
-    name = f"coil{os.getpid()}"
-    monkeypatch.setenv("JACK_DEFAULT_SERVER", name)
-    with jack_server(name) as server:
-        for is_glued in (False, True):
-            with closing(open_client("desk")) as client:
-                plate = JackPlate(client, ExciterCircuit(is_glued=is_glued, rate=IMPEDANCE_RATE))  # type: ignore[arg-type]  # called by JACK
-                plate.start()
-                more = ("--free", "0.csv", "--weight", str(EXCITER_GRAMS)) if is_glued else ()
-                done = subprocess.run(
-                    [ERA, "measure", "--impedance", "--device", "jack:desk", "--json", "-o",
-                     f"{is_glued:d}.csv", "--series-error", "0.1", "--input-error", "0.1", *more],
-                    cwd=tmp_path, env=server.environment, capture_output=True, check=True,
-                )  # fmt: skip
-                plate.wait(0)
-    _check(json.loads(done.stdout))
 
 
 def _impedance(frequency: float) -> complex:

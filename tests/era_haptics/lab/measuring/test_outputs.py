@@ -293,15 +293,6 @@ def test_table_of_another_program_is_read(
     check(rig, measurement_of(read_stepped(path, Desk(rig, FIXED)), rig), rtol=1e-7)
 
 
-def test_lines_of_a_file_stay_at_their_frequencies(rig: Rig, tmp_path: Path) -> None:
-    """200 lines 0.05 Hz apart, nearer than clocks tell tones of recordings apart."""
-    written = [250 + 0.05 * number for number in range(200)]
-    rows = [f"{frequency:.2f},1,0" for frequency in written]
-    (tmp_path / "P1-1.csv").write_text("\n".join(["frequency_hz,real,imag", *rows]))
-    found = [each.frequency for each in read_stepped(tmp_path / "P1-1.csv", Desk(rig, FIXED))]
-    assert found == pytest.approx(written, rel=1e-9)
-
-
 def test_columns_that_are_not_there_are_in_the_name(rig: Rig, tmp_path: Path) -> None:
     """P2-SE.csv, frequency and response only."""
     (tmp_path / "P2-SE.csv").write_text("frequency_hz,magnitude,phase_deg\n61,0.2,90\n")

@@ -37,18 +37,14 @@ from kit.desk_plate import (
     DeskModel,
     DeskPlate,
     Truth,
-    draw_truth,
-    sampled,
 )
-from kit.direct_plate import direct_responder
-from kit.plates import lock_in
 from model.arrays import Float32Array, FloatArray
 from model.errors import InputError
 from model.estimate.identify import identify
 from model.estimate.measurement import MeasuredPlate, measurement_of, read_measured, sensors_at
 from model.rig.rig import Rig
 from model.rig.rig_file import example_rig_path, parse_rig
-from model.structure.attachments import PointLoad, fingertip_loads
+from model.structure.attachments import PointLoad
 from processes.gateways import wait_for
 from processes.sound_cards import DeskCard, JackServer, capture_on, jack_server
 from processes.typed_page import ERA
@@ -68,47 +64,17 @@ amplifiers:
   card: {url: "serial:///tmp/plate", full_level: output}
 limits: {frequency: [40 Hz, 300 Hz], level: 1.0}
 """
-FREQUENCIES = np.array([41.0, 77.0, 150.0, 233.0, 291.0])
 FEET = tuple(
     PointLoad(x, y, stiffness=2000.0, damping=2.0, foot=5e-3)
     for x in (0.01, 0.29)
     for y in (0.01, 0.22)
 )
-MESH = "9x8 Legendre"
-POINTS = np.array([[0.05, 0.05], [0.15, 0.11], [0.27, 0.2]])
-PLATE_POINTS = np.array([[0.03, 0.05], [0.20, 0.11], [0.29, 0.20]])
-PLATE_HZ = np.array([61.0, 150.0, 233.0, 410.0])
-FINGERS = [(0.1, 0.1), (0.25, 0.06)]
 
 
 @pytest.fixture(scope="module")
 def board() -> Rig:
     """Acrylic on feet of foam, with four exciters."""
     return replace(parse_rig("board.yaml", BOARD), masses=FEET)
-
-
-@pytest.mark.parametrize("places", [[], FINGERS, None], ids=["bare", "fingers", "board"])
-def test_plates_in_time_are_those_of_the_direct_solution(
-    truth: Truth, board: Rig, places: list[tuple[float, float]] | None
-) -> None:
-    """At each frequency within 0.5 %: ERAs, without and with fingers; exciters on their board.
-
-    Coil, magnet and back EMF are solved at each frequency, and the ERA by its differential equation
-    is gain w² / (w² - omega² + 2 i zeta w omega). What differs is damping, viscous here and
-    hysteretic there, and a coil's inductance, of which equations in time have the first order.
-    """
-    real = draw_truth(board, seed=5, mesh=MESH) if places is None else truth
-    hertz, points = (FREQUENCIES, POINTS) if places is None else (PLATE_HZ, PLATE_POINTS)
-    fingers = fingertip_loads(real.rig.fingertip, places or [])
-    found = DeskModel(real, points).under(fingers).response(hertz).swapaxes(1, 2)
-    respond = direct_responder(real.rig.plate, real.rig.mesh)
-    exact = respond(real.rig.eras, hertz, points, loads=[*real.rig.masses, *fingers])
-    for number, each in enumerate(real.actuators):
-        w, omega = 2 * np.pi * each.resonance, 2 * np.pi * hertz
-        moved = each.gain * w**2 / (w**2 - omega**2 + 2j * each.ratio * w * omega)
-        exact[:, number] *= (each.response(hertz) if places is None else moved)[:, None]
-    wrong = np.linalg.norm(found - exact, axis=(1, 2)) / np.linalg.norm(exact, axis=(1, 2))
-    assert wrong.max() < 0.005
 
 
 DESK = Path(__file__).parents[4] / "examples" / "desk"
@@ -225,31 +191,6 @@ def test_rate_that_gives_no_whole_milliseconds_is_refused(monkeypatch: pytest.Mo
         with closing(card("jack:card")) as measuring:
             assert measuring.rate == 44_100
         capture.close()
-
-
-PLATE_RATE = 48_000.0
-
-
-def test_fingers_are_swapped_without_a_jump(truth: Truth) -> None:
-    """The vibration goes on where it was, and settles to that of the plate under fingers."""
-    sensors = [WiredSensor(f"P{n}", x, y, n + 1, 1e-3) for n, (x, y) in enumerate(PLATE_POINTS)]
-    quiet = Converters(delay=0, noise=0.0)
-    desk = DeskPlate(truth, sensors, rate=PLATE_RATE, converters=quiet, seed=1)
-    times = np.arange(48_000) / PLATE_RATE
-    played = np.zeros((len(times), 5))
-    played[:, 0] = np.sin(2 * np.pi * 233 * times)
-    before = desk.advance(played[:9600])
-    desk.set_fingers(FINGERS)
-    after = desk.advance(played[9600:])
-    joined = np.concatenate([before[-48:], after[:48]])[:, :3]
-    steps = np.abs(np.diff(joined, n=2, axis=0)).max(axis=1)
-    # A contact mass that joins changes accelerations by a few percent, no more.
-    assert steps[46:49].max() < 0.1 * np.abs(joined).max()
-    loaded = DeskModel(truth, PLATE_POINTS).under(fingertip_loads(truth.rig.fingertip, FINGERS))
-    (exact,) = sampled(loaded, rate=PLATE_RATE).response(np.array([233.0]))
-    found = lock_in(times[-9600:], after[-9600:, :3], 233.0)
-    late = quiet.response(np.array([233.0]), rate=PLATE_RATE)[0]
-    np.testing.assert_allclose(found / (1e-3 * late), exact[:, 0], rtol=0.01)
 
 
 CARD_RATE, LEVEL = 8_000.0, 0.3

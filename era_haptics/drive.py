@@ -51,13 +51,13 @@ def warn_of_surface(rig: Rig) -> None:
 
 
 def as_frequencies(given: object) -> FloatArray:
-    """Frequencies (f,) [Hz] in the order given, one at least."""
+    """Convert to frequencies (f,) [Hz], at least one, in the given order."""
     rule = "frequencies must be a sequence of numbers in hertz, such as range(60, 321, 10)"
     return _row(given, rule, least=1)
 
 
 def as_loads(given: object) -> tuple[float, ...]:
-    """Loads for a question; raises InputError for anything but a sequence of numbers."""
+    """Check finger loads for a query; raises InputError for anything but a sequence of numbers."""
     rule = (
         "loads must be a sequence with one number per finger, relative to the rig's fingertip, "
         "such as [1, 1.5]"
@@ -66,7 +66,7 @@ def as_loads(given: object) -> tuple[float, ...]:
 
 
 def as_points(positions: Positions, *, what: str) -> tuple[Point, ...]:
-    """Positions for a question; what: the argument, for the InputError."""
+    """Check positions for a query; `what` names the argument in the InputError."""
     found = _numbers(positions)
     if found.size == 0:
         return ()
@@ -79,7 +79,8 @@ def as_points(positions: Positions, *, what: str) -> tuple[Point, ...]:
 
 
 def as_fingers(given: object, *, what: str) -> tuple[Finger, ...]:
-    """Fingers, of positions as such without a stimulus; what: the argument, for the InputError."""
+    """Convert to fingers, positions without a stimulus; `what` names the argument in the
+    InputError."""
     if isinstance(given, Sequence) and any(isinstance(each, Finger) for each in given):
         return tuple(
             each if isinstance(each, Finger) else Finger(cast(Point, each)) for each in given
@@ -88,7 +89,8 @@ def as_fingers(given: object, *, what: str) -> tuple[Finger, ...]:
 
 
 def as_signals(given: object, rig: Rig, sample_rate: object) -> FloatArray:
-    """Signals of all ERAs (eras, n) in full strokes; raises InputError for what no ERA plays."""
+    """Check signals of all ERAs (eras, n), 1 = full stroke; raises InputError if an ERA cannot play
+    them."""
     expect_number(sample_rate, what="sample_rate", unit="hertz")
     least = 2 * rig.limits.frequency_max
     if not least < cast(float, sample_rate) < math.inf:
@@ -114,7 +116,7 @@ def as_signals(given: object, rig: Rig, sample_rate: object) -> FloatArray:
 
 
 def as_pair(given: object, *, what: str, such_as: str) -> tuple[int, int]:
-    """Two whole numbers, also of an array; raises InputError for anything else."""
+    """Convert to two integers, also from an array; raises InputError for anything else."""
     pair = tuple(given) if isinstance(given, Sequence | np.ndarray) else ()
     if len(pair) != 2 or not all(is_whole(count) for count in pair):
         raise InputError(f"{what} must be two whole numbers, {such_as}, got {shown(given)}")
@@ -122,7 +124,8 @@ def as_pair(given: object, *, what: str, such_as: str) -> tuple[int, int]:
 
 
 def _row(given: object, rule: str, *, least: int = 0) -> FloatArray:
-    """A sequence of numbers as an array (n,); raises InputError, which says the rule."""
+    """Convert a sequence of numbers to an array (n,); raises InputError, with `rule` in its
+    text."""
     found = _numbers(given)
     if found.ndim != 1 or len(found) < least:
         raise InputError(f"{rule}, got {shown(given)}")
@@ -130,7 +133,7 @@ def _row(given: object, rule: str, *, least: int = 0) -> FloatArray:
 
 
 def _numbers(given: Any) -> FloatArray:
-    """Numbers as an array; of three dimensions, which no argument has, for anything else."""
+    """Convert numbers to an array; anything else becomes a 3-D array, which all callers reject."""
     try:
         if np.iscomplexobj(given):
             raise TypeError
@@ -141,9 +144,9 @@ def _numbers(given: Any) -> FloatArray:
 
 @dataclass(frozen=True)
 class Drive:
-    """The drive of one ERA: frequency [Hz], level (0..1 of its full stroke), phase [degrees].
+    """Drive of one ERA: frequency [Hz], level (0 to 1 of full stroke), phase [degrees].
 
-    Raises InputError for a frequency of zero or less and a level outside 0..1.
+    Raises InputError if the frequency is not positive or the level is outside 0 to 1.
     """
 
     frequency: float
@@ -172,25 +175,27 @@ class Drive:
 
 
 Driven: TypeAlias = float | Drive | Tone
-"""A frequency [Hz] at full level, a `Drive`, or a `Tone` [Hz; m, or V of an exciter; rad]."""
+"""A frequency [Hz] at full level, a `Drive`, or a `Tone` [Hz; m, or V for an exciter; rad]."""
 
 Drives: TypeAlias = Mapping[str, Driven | Sequence[Driven]]
-"""By ERA name: what it plays, or a list of what it plays at once."""
+"""What each ERA plays, by name: one drive, or several that play simultaneously."""
 
 Played: TypeAlias = Answer | Layer | Drives
-"""What ERAs are to play: an answer with all its layers, one layer, or drives."""
+"""What all ERAs play: an answer with all its layers, one layer, or drives."""
 
 
 def playable_layers(drive: Played, rig: Rig) -> tuple[Layer, ...]:
-    """The layers of an answer, or one; raises InputError for silence, and what the rig cannot play.
+    """Return the layers of an answer, of one layer, or of drives, checked against the rig.
 
-    That is an unknown ERA, a frequency beyond the rig's limits, and more than full stroke of all
-    that an ERA plays at once.
+    Raises InputError for an answer without layers, an unknown ERA, a frequency outside the rig's
+    limits, or drives of one ERA that sum to more than full stroke.
     """
     if isinstance(drive, Answer | Layer):
         layers = drive.layers if isinstance(drive, Answer) else (drive,)
         if not layers:
-            raise InputError("an answer must have a layer to be played, got one of quiet fingers")
+            raise InputError(
+                "an answer must have a layer to be played, got one with quiet fingers only"
+            )
     else:
         layers = (_layer_of(drive, rig),)
     limits, levels = rig.limits, defaultdict[str, float](float)
@@ -206,14 +211,14 @@ def playable_layers(drive: Played, rig: Rig) -> tuple[Layer, ...]:
     for name, level in levels.items():
         if not level <= _MAX_SUM:  # NaN, too
             raise InputError(
-                f"level of {name}, the sum of all that it plays at once, must be at most 1, full "
-                f"level of {rig.era(name).full_level:g} {rig.era(name).UNIT}, got {level}"
+                f"total level of {name} must be at most 1, full level of "
+                f"{rig.era(name).full_level:g} {rig.era(name).UNIT}, got {level}"
             )
     return layers
 
 
 def _layer_of(drive: object, rig: Rig) -> Layer:
-    """The layer of drives, all at once."""
+    """Combine drives into one layer."""
     if not isinstance(drive, Mapping):
         raise InputError(
             "drive must be an answer, a layer or a mapping of names of ERAs, such as "
@@ -233,11 +238,11 @@ def _layer_of(drive: object, rig: Rig) -> Layer:
 
 
 def _tone_of(given: Driven, name: str, rig: Rig) -> Tone:
-    """The tone that an ERA is given; raises InputError for anything else."""
+    """Convert the drive of one ERA to a tone; raises InputError for anything else."""
     stroke = rig.era(name).full_level
     if isinstance(given, tuple):
         raise InputError(
-            f"drive of {name} must be a frequency, a Drive, a Tone or a list of these, got "
+            f"drive of {name} must be a frequency, a Drive, a Tone or a list of drives, got "
             f"{given}; make one drive with era.Drive(110, 0.5, 90)"
         )
     if isinstance(given, Tone):

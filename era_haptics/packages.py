@@ -1,7 +1,7 @@
-"""Checks of the packages behind `era_haptics`, before any of them is loaded.
+"""Check the packages behind `era_haptics` before any of them is loaded.
 
-Their names are common, and Python takes the first one on its path: a file beside a program, or the
-package of another distribution.
+Their names are common, and Python imports the first match on its path: a file next to a program, or
+a package of another distribution.
 """
 
 import os
@@ -11,17 +11,17 @@ from importlib.util import find_spec
 from pathlib import Path
 
 PACKAGES = ("controller", "drivers", "model", "registry", "sim")
-_OWN = "of era-haptics"  # in the docstring of each
+_OWN = "of era-haptics"  # in every package's docstring
 
 
 class HiddenPackage(ImportError):
-    """A package of era-haptics that a file, a folder or another distribution hides or replaced."""
+    """A package of era-haptics is hidden or replaced by a file, folder or other distribution."""
 
 
 def check_packages() -> None:
-    """Raise HiddenPackage for the first package that is not found beside `era_haptics`.
+    """Raise HiddenPackage for the first package that was not installed with `era_haptics`.
 
-    In the command `era`, end with the sentence and its exit status of invalid input instead.
+    The command `era` prints the message and exits with the status for invalid input instead.
     """
     for package in PACKAGES:
         try:
@@ -34,9 +34,9 @@ def check_packages() -> None:
 
 
 def drop_foreign_backend() -> None:
-    """Remove the `MPLBACKEND` of a notebook that started this program if it is not installed here.
+    """Remove `MPLBACKEND` if a notebook started this program and its backend is not installed here.
 
-    matplotlib refuses to be imported with it. In a notebook it stays, and draws inline.
+    matplotlib cannot be imported with a missing backend. In the notebook itself the variable stays.
     """
     named = os.environ.get("MPLBACKEND", "").partition("module://")[2]
     try:
@@ -49,7 +49,7 @@ def drop_foreign_backend() -> None:
 
 def _check(package: str) -> None:
     own = Path(__file__).resolve().parents[1] / package / "__init__.py"
-    loaded = sys.modules.get(package)  # which need not have a specification
+    loaded = sys.modules.get(package)  # can lack a specification
     found = find_spec(package) if loaded is None else None
     origin = Path(getattr(loaded, "__file__", None) or (found and found.origin) or own)
     if not own.exists():
@@ -70,7 +70,7 @@ def _check(package: str) -> None:
 
 
 def _distribution(file: Path) -> str | None:
-    """The name of another installed distribution that has a file, None without one."""
+    """Return the name of another installed distribution that contains a file; None without one."""
     for each in distributions():
         files = map(str, map(each.locate_file, each.files or ()))
         if each.name != "era-haptics" and str(file) in files:

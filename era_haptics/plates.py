@@ -1,4 +1,4 @@
-"""The plate of a rig, solved once: modes, maps, playback in time, and pictures of these.
+"""Solved plate of a rig: modes, acceleration maps, playback in time, and their pictures.
 
 Pictures are matplotlib figures, made without pyplot.
 """
@@ -45,15 +45,15 @@ from sim.plant.excited_plate import LEVEL_WINDOW, PlatePlayback, play, play_sign
 from sim.plant.fingers import FingerRecord
 from sim.plant.imperfections import Imperfections, draw_of_ensemble
 
-if TYPE_CHECKING:  # slow to import, as what draws
+if TYPE_CHECKING:  # slow to import, like all drawing modules
     from matplotlib.figure import Figure
 
 
 class SolvedPlate:
-    """A rig's plate on its ERAs, up to the highest frequency of the rig's limits.
+    """Plate of a rig on its ERAs, solved once at first use, up to the rig's highest frequency.
 
-    seed: of a plate, ERAs, channels and fingers drawn within the rig's uncertainty, as `era table
-    verify` draws them, on another mesh; None for the rig's own. Solved once, at the first use.
+    seed: draws plate, ERAs, channels and fingers at random from the rig's tolerances, as `era table
+    verify` does, on another mesh; None for the nominal rig.
 
     Example:
         >>> plate = era.SolvedPlate(rig)
@@ -79,10 +79,10 @@ class SolvedPlate:
 
     @cached_property
     def modes(self) -> SupportedModes:
-        """Natural frequencies (n,) [Hz], damping ratios (n,), and shapes anywhere by `at`.
+        """Natural frequencies (n,) [Hz], damping ratios (n,), and mode shapes at any point (`at`).
 
-        Up to the highest frequency of the rig's limits, as `era plate modes`. Raises InputError
-        for a plate that is not supported.
+        Up to the highest frequency of the rig's limits, like `era plate modes`. Raises InputError
+        for a plate without supports.
         """
         rig = self._real
         return supported_modes(
@@ -97,14 +97,17 @@ class SolvedPlate:
         fingers: Fingers = (),
         seed: int | None = None,
     ) -> ComplexArray:
-        """Compute the acceleration [m/s²] at points by each ERA alone at full stroke.
+        """Compute the acceleration [m/s²] at points for each ERA alone at full stroke.
 
-        points (p, 2) [m]; frequencies (f,) [Hz]: those of a table by default; fingers: that rest on
-        the plate, as positions [m] or with their loads; seed: of another plate, as
-        `SolvedPlate(rig, seed=seed)`. Complex peak amplitudes h (f, ERAs, p), ERAs as in
-        `rig.eras`: weights w in full strokes give a(t) = Im[h w exp(i omega t)], without fingers
-        the field of `map`. Raises InputError for points and fingers off the plate, and frequencies
-        for which it is not solved.
+        - points (p, 2) [m].
+        - frequencies (f,) [Hz]: default those of a table.
+        - fingers: resting on the plate, as positions [m] or with their loads.
+        - seed: of another plate, as in `SolvedPlate(rig, seed=seed)`.
+
+        Returns complex peak amplitudes h (f, ERAs, p), with ERAs in the order of `rig.eras`:
+        weights w (1 = full stroke) give a(t) = Im[h w exp(i omega t)], which without fingers is the
+        field of `map`. Raises InputError for points and fingers off the plate, and for frequencies
+        outside the solved range.
 
         Example:
             >>> plate.responses([(0.08, 0.06), (0.22, 0.16)], [110, 240]).shape
@@ -130,9 +133,9 @@ class SolvedPlate:
     def map(self, drive: Played, *, raster: tuple[int, int] | None = None) -> PlateMap:
         """Compute the steady peak acceleration [m/s²] over the plate, and its nulls.
 
-        raster: number of points along x and y, by default enough for all that the mesh resolves.
-        All layers of an answer play, without the fingers: these move nulls, as `responses` and
-        `play` show. ERAs at one frequency add as complex amplitudes, magnitudes of several
+        raster: number of points along x and y; default: as many as the mesh resolves. All layers of
+        an answer play, without the load of fingers, which moves nulls (`responses` and `play`
+        include it). ERAs at one frequency add as complex amplitudes; the magnitudes of different
         frequencies add (paper Eq. 28). Raises InputError for a drive that the rig cannot play.
 
         Example:
@@ -167,15 +170,18 @@ class SolvedPlate:
         duration: float | None = None,
         sample_rate: float | None = None,
     ) -> PlatePlayback:
-        """Compute what fingers feel during a duration [s], from rest, by default until steady.
+        """Compute what fingers feel during a duration [s], starting at rest; default: until steady.
 
-        target: positions [m] of fingers that all of it is for, by default the fingers of an answer,
-        each with its own layer and load; loads: relative to the rig's fingertip, targets first, 1
-        without. A layer starts with its onset or its ramp, drives with a ramp of 40 ms. With a
-        sample_rate [Hz] drive is an array (ERAs, samples) of band-limited signals in full strokes,
-        which say the duration and where records are sampled. The plate in time is solved exactly,
-        without steps (`docs/concepts/plant.md`). Raises InputError for fingers off the plate, a
-        duration in which the slowest vibration does not decay to 5 %, and what no ERA can play.
+        - target: positions [m] of fingers that the whole drive is meant for; default: the fingers
+          of an answer, each with its own layer and load.
+        - loads: relative to the rig's fingertip, targets first; default 1.
+        - sample_rate [Hz]: if given, drive is an array (ERAs, samples) of band-limited signals (1 =
+          full stroke), which determines the duration and the sampling of the records.
+
+        A layer starts with its onset or its ramp, drives with a 40 ms ramp. The plate is solved
+        exactly in time, without time steps (`docs/concepts/plant.md`). Raises InputError for
+        fingers off the plate, a duration in which the slowest vibration does not decay to 5 %, and
+        drives that an ERA cannot play.
 
         Example:
             >>> felt = plate.play({"SW": 110}, target=(0.08, 0.06), quiet=(0.22, 0.16))
@@ -192,8 +198,8 @@ class SolvedPlate:
             fingers = [*drive.asked]
         else:
             raise InputError(
-                "target must be positions of fingers such as (0.08, 0.06), got None; only the "
-                "fingers of an answer, with their loads, are known without"
+                "target must be positions of fingers such as (0.08, 0.06), got None; only an "
+                "answer has fingers of its own"
             )
         if isinstance(drive, np.ndarray) or sample_rate is not None:
             return play_signals(
@@ -231,7 +237,7 @@ class SolvedPlate:
 def draw_map(plate: SolvedPlate, drive: Played, *, title: str = "") -> "Figure":
     """Draw the peak acceleration over the plate in g (1 g = 9.8 m/s²), ERAs, nulls as red crosses.
 
-    The picture of `era plate map`. Raises InputError for a drive that the rig cannot play.
+    Same picture as `era plate map`. Raises InputError for a drive that the rig cannot play.
 
     Example:
         >>> era.draw_map(plate, {"SW": 110}).savefig("map.png")
@@ -245,9 +251,9 @@ def draw_map(plate: SolvedPlate, drive: Played, *, title: str = "") -> "Figure":
 
 
 def draw_answer(table: LocalizationTable, answer: Answer, *, layer: int = 0) -> "Figure":
-    """Draw the level of a layer of an answer over the plate [dB SL], and the fingers.
+    """Draw the level of one layer of an answer over the plate [dB SL], and the fingers.
 
-    Raises InputError for a layer that it does not have.
+    Raises InputError for a missing layer.
 
     Example:
         >>> era.draw_answer(table, only).savefig("answer.png")
@@ -258,8 +264,7 @@ def draw_answer(table: LocalizationTable, answer: Answer, *, layer: int = 0) -> 
     expect_instance(answer, Answer, what="answer", made_by="era.query(table, target)")
     if not is_whole(layer) or not 0 <= layer < len(answer.layers):
         raise InputError(
-            f"layer must be the number of one of the answer's {len(answer.layers)}, from 0, got "
-            f"{shown(layer)}"
+            f"layer must be a number from 0 to {len(answer.layers) - 1}, got {shown(layer)}"
         )
     return layer_figure(table, answer, layer)
 
@@ -267,8 +272,8 @@ def draw_answer(table: LocalizationTable, answer: Answer, *, layer: int = 0) -> 
 def draw_contents(table: LocalizationTable, answer: Answer) -> "Figure":
     """Draw all layers of an answer over the plate, each in its colour, grey where they mix.
 
-    Beside every finger its frequency, verdict, promised level and contrast; each layer alone. The
-    picture of `era demo`. Raises InputError for an answer without layers.
+    Each finger has its frequency, verdict, promised level and contrast next to it. Each layer is
+    also drawn alone. Same picture as `era demo`. Raises InputError for an answer without layers.
 
     Example:
         >>> era.draw_contents(table, both).savefig("contents.png")
@@ -278,7 +283,7 @@ def draw_contents(table: LocalizationTable, answer: Answer) -> "Figure":
     expect_instance(table, LocalizationTable, what="table", made_by="era.table(rig)")
     expect_instance(answer, Answer, what="answer", made_by="era.answer(table, fingers)")
     if not answer.layers:
-        raise InputError("an answer must have a layer to be drawn, got one of quiet fingers")
+        raise InputError("an answer must have a layer to be drawn, got one with quiet fingers only")
     return contents_figure(
         table,
         answer.layers,
@@ -292,9 +297,9 @@ def draw_contents(table: LocalizationTable, answer: Answer) -> "Figure":
 
 
 def draw_contrast_map(table: LocalizationTable, found: ContrastMap) -> "Figure":
-    """Draw promised contrast of every place to quiet fingers, drive modes side by side.
+    """Draw the promised contrast of every position to quiet fingers, drive modes side by side.
 
-    The picture of `era table map`.
+    Same picture as `era table map`.
 
     Example:
         >>> era.draw_contrast_map(table, found).savefig("contrast.png")
@@ -309,8 +314,9 @@ def draw_contrast_map(table: LocalizationTable, found: ContrastMap) -> "Figure":
 def draw_playback(playback: PlatePlayback) -> "Figure":
     """Draw the acceleration at each finger over time [m/s²], on a logarithmic scale.
 
-    The peak within a period of the lowest frequency, of signals within 30 ms: the mean over the
-    fingertip of a target, the loudest point of a quiet finger, as in contrast.
+    The curves are peaks within a period of the lowest frequency (within 30 ms for signals): mean
+    over the fingertip at a target, loudest point at a quiet finger, as in the definition of
+    contrast.
 
     Example:
         >>> era.draw_playback(plate.play(only)).savefig("playback.png")
@@ -345,7 +351,7 @@ def draw_playback(playback: PlatePlayback) -> "Figure":
 
 
 def _peaks(record: FingerRecord, period: float) -> tuple[FloatArray, FloatArray]:
-    """Times (n,) [s] and the largest acceleration (n, p) [m/s²] within the period before each."""
+    """Return times (n,) [s] and peak accelerations (n, p) [m/s²] over the preceding period."""
     step = record.times[1] - record.times[0]
     width = min(max(1, round(period / step)), len(record.times))
     windows = sliding_window_view(np.abs(record.accelerations), width, axis=0)

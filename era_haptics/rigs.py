@@ -1,5 +1,4 @@
-"""Rigs for scripts: parts by the keys of a rig file, amplifiers, layers for them, and
-calibration."""
+"""Build rigs from rig-file keys, open amplifiers, convert drives to layers, and calibrate."""
 
 from pathlib import Path
 from typing import Any
@@ -20,7 +19,7 @@ from model.rig.sections import PlateSection
 
 
 class PlateKeys(dict[str, Any]):
-    """A plate by the keys of `plate` in a rig file.
+    """Plate given by the keys of `plate` in a rig file.
 
     `Plate(length="12 in", width="9 in", thickness=0.0015, material="aluminium")`. Raises
     ConfigError, an InputError, with all problems.
@@ -31,7 +30,7 @@ class PlateKeys(dict[str, Any]):
 
 
 class EraKeys(dict[str, Any]):
-    """An ERA by the keys below `eras` in a rig file.
+    """ERA given by the keys below `eras` in a rig file.
 
     `Era(at=(0, 0), stiffness="17 kN/m", amplifier="main", channel=0)`. Raises ConfigError.
     """
@@ -41,7 +40,7 @@ class EraKeys(dict[str, Any]):
 
 
 class ExciterKeys(dict[str, Any]):
-    """An exciter by the keys below `eras` in a rig file, of which `kind` is stated already.
+    """Exciter given by the keys below `eras` in a rig file; `kind` is set already.
 
     `Exciter(type="DAEX25CT-4", at=(0.1, 0.1), amplifier="card", channel=0)`. Raises ConfigError.
     """
@@ -54,10 +53,10 @@ class ExciterKeys(dict[str, Any]):
 def open_amplifier(
     rig: Rig, name: str | None = None, *, url: str | None = None
 ) -> BlockingAmplifier:
-    """Make an amplifier of the rig, open within a `with` block and disarmed after it.
+    """Return an amplifier of the rig, open within a `with` block and disarmed after it.
 
-    name: optional if the rig has only one; url: instead of the rig's. Commands beyond the rig's
-    limits are refused. Raises InputError for an unknown name; in the block CommandError for an
+    name: optional if the rig has only one; url: replaces the rig's. Commands beyond the rig's
+    limits are rejected. Raises InputError for an unknown name; in the block CommandError for an
     invalid URL, LinkError without a reply, CommandRefused.
 
     Example:
@@ -78,10 +77,11 @@ def open_amplifier(
 
 
 def commands_for(rig: Rig, drive: Played) -> dict[str, tuple[AmplifierLayer, ...]]:
-    """Convert to layers by name of the amplifier, for its `play` and `apply`.
+    """Convert a drive to amplifier layers by amplifier name, for `play` and `apply`.
 
-    One for each layer of an answer, and for each of its side bands, with its ramp, onset and
-    ending; channels by the rig's wiring. Raises InputError for a drive that the rig cannot play.
+    Each layer of an answer and each of its side bands becomes one amplifier layer, with its ramp,
+    onset and ending. Channels follow the rig's wiring. Raises InputError for a drive that the rig
+    cannot play.
 
     Example:
         >>> layers = era.commands_for(rig, only)["main"]
@@ -107,12 +107,12 @@ def commands_for(rig: Rig, drive: Played) -> dict[str, tuple[AmplifierLayer, ...
 def calibrate(
     rig: Rig, measured: Path | str, *, all_scales: bool = False, progress: Progress = unseen
 ) -> Calibration:
-    """Fit a rig to measured responses, a .csv, .uff or .unv file, as `era calibrate` does.
+    """Fit a rig to responses measured in a .csv, .uff or .unv file, like `era calibrate`.
 
     all_scales: estimate the scale of every sensor, not only of wrong ones; progress: called with
-    the fits done and all. The result's `rig` has the fitted values and their uncertainty, its
-    `parameters` their standard errors; use it only if `is_good`. Raises InputError for responses
-    that are not what they claim, by their cause.
+    the number of fits done and the total. The result has the fitted `rig` with its uncertainty, and
+    `parameters` with standard errors; use it only if `is_good`. Raises InputError, with the cause,
+    for responses that contradict their metadata.
 
     Example:
         >>> fit = era.calibrate(rig, "examples/measured.csv")

@@ -1,4 +1,4 @@
-"""Localization tables of rigs, their answers for fingers, and maps of their contrast."""
+"""Build localization tables, query them for fingers, and map contrast."""
 
 from collections.abc import Sequence
 from functools import lru_cache
@@ -35,13 +35,17 @@ def table(
     grid: Grid = PAPER_GRID,
     progress: Progress = unseen,
 ) -> LocalizationTable:
-    """Load the rig's localization table from the user's cache, or build it in a second or two.
+    """Return the rig's localization table from the user's cache, or build it in a second or two.
 
-    drive_mode: default of later queries, `phased` (any levels and phases) or, for amplifiers that
-    cannot set phases, `switched` (one or two ERAs without phases, one vibration at a time);
-    frequencies (f,) [Hz]: ascending, within the rig's limits, by default 40 to 500 in steps of 10
-    within these; grid: target cells; progress: called with the parts built and all. The table of
-    `era table build`; `load_table` and `save_table` are for files. Raises InputError.
+    - drive_mode: default of later queries, `phased` (any levels and phases) or, for amplifiers that
+      cannot set phases, `switched` (one or two ERAs without phases, one vibration at a time).
+    - frequencies (f,) [Hz]: ascending, within the rig's limits; default: 40 to 500 in steps of 10,
+      as far as the limits allow.
+    - grid: target cells.
+    - progress: called with the number of parts built and the total.
+
+    Same table as `era table build`; for files, use `load_table` and `save_table`. Raises
+    InputError.
 
     Example:
         >>> table = era.table(rig)
@@ -67,11 +71,14 @@ def query(
     drive_mode: str | None = None,
     shaped: bool = False,
 ) -> Answer:
-    """Answer fingers at these positions [m], which feel one vibration together.
+    """Query the table for fingers at these positions [m] that share one vibration.
 
-    target: one position or several; level_db_sl: above the detection threshold, 20 dB is strong;
-    duration [s]: of a short effect, whose level is over it. The rest as of `answer`, of which this
-    is the short form. The same as `era table query --target`.
+    Short form of `answer`; other parameters are explained there. Same as `era table query
+    --target`.
+
+    - target: one position or several.
+    - level_db_sl: above the detection threshold; 20 dB is strong.
+    - duration [s]: of a short effect, over which the level is averaged.
 
     Example:
         >>> only = era.query(table, one, quiet=other)
@@ -93,15 +100,18 @@ def answer(
     apart_hz: float = APART_HZ,
     bands_may_swap: bool = False,
 ) -> Answer:
-    """Answer several fingers at once, each with a vibration of its own.
+    """Query the table for several fingers, each with its own vibration.
 
-    quiet: the others, which are to be kept quiet, as positions [m] or as fingers; drive_mode: the
-    table's own if None, which must be `phased` for more than one vibration; shaped: for amplifiers
-    that play shaped onsets and endings; apart_hz: distance of the frequencies; bands_may_swap:
-    whether a finger may have another one's band. Where the worst finger would have less than 6 dB,
-    vibrations are shared or held back as the fingers allow, and levels are lowered to what the
-    ERAs' stroke allows (`Answer.applied`). Raises InputError for fingers off the plate or at one
-    place, and for a band without frequencies. The same as `era table query --own`.
+    - quiet: fingers that should feel nothing, as positions [m] or as fingers.
+    - drive_mode: default the table's; must be `phased` for more than one vibration.
+    - shaped: for amplifiers that play shaped onsets and endings.
+    - apart_hz: minimum distance between frequencies.
+    - bands_may_swap: allow bands to be swapped between fingers.
+
+    If the worst finger would have less than 6 dB, vibrations are shared or held back as the fingers
+    allow. Levels are lowered to the ERAs' full stroke (`Answer.applied`). Raises InputError for
+    fingers off the plate or at the same position, and for a band without frequencies. Same as `era
+    table query --own`.
 
     Example:
         >>> one, other = (0.08, 0.06), (0.22, 0.16)
@@ -132,9 +142,9 @@ def answer(
 
 
 def measures(table: LocalizationTable, answer: Answer) -> Measures:
-    """Compute the transient contrast of an answer's first layer, its residual, its concentration.
+    """Compute transient contrast, residual and concentration of an answer's first layer.
 
-    Takes some ten milliseconds.
+    Takes about ten milliseconds.
 
     Example:
         >>> f"{era.measures(table, only).transient_contrast_db:.0f} dB in the first 100 ms"
@@ -154,11 +164,12 @@ def contrast_map(
     grid: Grid | None = None,
     progress: Progress = unseen,
 ) -> ContrastMap:
-    """Map the contrast of a finger at every place to these quiet fingers [m], as `era table map`.
+    """Map the contrast of a finger at each position to these quiet fingers [m], like `era table
+    map`.
 
-    drive_modes: the table's own for none, several to compare them; level_db_sl: at each place;
-    grid: places, the table's cells if None; progress: called with the questions asked and all.
-    Raises InputError for fingers off the plate, and for an unknown drive mode.
+    drive_modes: several to compare them, default the table's; level_db_sl: at each position; grid:
+    positions, default the table's cells; progress: called with the number of queries done and the
+    total. Raises InputError for fingers off the plate, and for an unknown drive mode.
 
     Example:
         >>> found = era.contrast_map(table, quiet=other, grid=era.Grid(6, 4))
@@ -189,6 +200,6 @@ def _expect_mode(given: object) -> None:
         raise InputError(f"drive_mode must be a name such as 'phased', got {shown(given)}")
 
 
-@lru_cache(maxsize=2)  # a notebook asks one table after the other, many times each
+@lru_cache(maxsize=2)  # notebooks query one table many times, then the next
 def _timing(table: LocalizationTable) -> Timing:
     return Timing(table)

@@ -1,1 +1,1 @@
-"""What people measure, judge and design with: it imports all other packages, none imports it."""
+"""Measurement, conformance, design and checks. Imports all other packages; none imports it."""

@@ -1,8 +1,4 @@
-"""The lab's share of the `era` command: to measure, judge, design, check and report.
-
-`era report` collects what a bug report needs in one folder; `era figure` draws the founding paper's
-figures.
-"""
+"""`era report` (files for a bug report) and `era figure` (figures of the founding paper)."""
 
 from pathlib import Path
 from typing import Annotated
@@ -41,8 +37,9 @@ def report(
 ) -> None:
     """Collect files for a bug report in a folder.
 
-    They have versions, configuration files, the daemon's state and the end of its log: values of
-    known, harmless keys. Texts, names, hosts and all that is unknown are hidden.
+    The folder contains versions, configuration files, the daemon's state and the end of its log,
+    reduced to harmless values of known keys. Free text, names, hosts and everything unknown are
+    hidden.
     """
     from era_haptics.lab.report import collect, write_report
 
@@ -56,7 +53,7 @@ def report(
         print(f"  {name}: {len(file.text)} characters{source}")
     for what in collected.missing:
         print(f"  skipped: {what}")
-    print(f"wrote {output}\nNext: read the files, and send the folder")
+    print(f"wrote {output}\nNext: read the files, then send the folder")
 
 
 figure_app = typer.Typer()

@@ -1,7 +1,7 @@
-"""An amplifier as it must be after the requests it was sent: states, sessions, sets and outputs.
+"""Expected state of an amplifier after the requests sent to it: states, sessions, sets, outputs.
 
-A request was carried out at some time between itself and its reply, and a status was true at some
-time between, so both are compared with all of that interval. Nothing is known until the first
+A request is carried out at some time between sending it and its reply, and a status is true at some
+time in between, so both are compared over that whole interval. Nothing is known until the first
 status.
 """
 
@@ -46,26 +46,27 @@ from era_haptics.lab.expected_output import (
 
 
 class ExpectedSet:
-    """The newest set to one amplifier; times [s]. is_exact: it plays to the word, as is said.
+    """The newest set sent to one amplifier; times [s]. is_exact: it plays without rounding.
 
-    staged: token of the set that is staged, 0 for none. has_expired: one may have, by now.
+    staged: token of the staged set, 0 for none. has_expired: one may have expired by now.
     """
 
     def __init__(self) -> None:
         self.is_exact, self.has_expired = True, False
         self._whole: tuple[int, tuple[LayerSet, ...]] = (0, ())  # token, and layers
-        self._replaced = 0  # token of a set of which it is known what really plays
+        self._replaced = 0  # token of the set whose achieved values are known
         self.drop()
 
     def drop(self) -> None:
-        """Discard what is collected or staged."""
+        """Discard all collected and staged parts."""
         self._parts = Assembly()  # that are kept
         self.staged = 0
-        self._began: Interval = (-math.inf, -math.inf)  # when the first part came
-        self._is_unclear = False  # whether a part came before the set expired, or after
+        self._began: Interval = (-math.inf, -math.inf)  # interval in which the first part arrived
+        self._is_unclear = False  # whether it is unclear if a part arrived before the set expired
 
     def keep(self, part: Values, when: Interval) -> bool:
-        """Note a part but the last that comes between two times; returns whether it is kept."""
+        """Record a part other than the last that arrives in an interval; returns whether it is
+        kept."""
         token = part["token"]
         self.expire(when)
         if token != self._parts.token:
@@ -76,7 +77,7 @@ class ExpectedSet:
         return not self.staged and self._parts.keep(part, when[1])
 
     def sent(self, last: Values) -> str:
-        """Note the last part of a set that is sent; returns what is wrong with it, or ""."""
+        """Record that the last part of a set was sent; returns its error, or ""."""
         stream = self._parts.whole(last)
         try:
             if not isinstance(stream, int):
@@ -86,23 +87,24 @@ class ExpectedSet:
         return ""
 
     def whole(self, token: int) -> tuple[LayerSet, ...] | None:
-        """Return the layers of a set, all parts of which were sent."""
+        """Return the layers of a set if all its parts were sent."""
         return self._whole[1] if token == self._whole[0] else None
 
     def replace(self, token: int, layers: tuple[LayerSet, ...]) -> None:
-        """Note what an amplifier really plays of a set."""
+        """Record the achieved layers of a set."""
         self._whole, self.is_exact, self._replaced = (token, layers), True, token
 
     def staged_until(self, token: object) -> Interval:
-        """Return until when a set is kept, at the least and at the most, if it is staged."""
+        """Return the interval in which a set expires if it is staged."""
         if not self.staged or token != self.staged:
             return -math.inf, -math.inf
         return self._began[0] + STAGED_LIFE, self._began[1] + STAGED_LIFE
 
     def taken(self, last: Values, reply: Values, when: Interval) -> Sequence[int] | None:
-        """Note the reply to the last part of a set, which came within an interval.
+        """Record the reply to the last part of a set, which arrived within an interval.
 
-        Returns what it must say: missing, staged and played; None where its set expired just then.
+        Returns the expected `missing`, `staged` and `played`; None if the set expired in that
+        interval.
         """
         token = last["token"]
         self.expire(when)
@@ -125,14 +127,14 @@ class ExpectedSet:
         return 0, 1 - last["now"], last["now"]
 
     def refused(self, last: Values) -> None:
-        """Note that a last part was refused, with its set where all others are there."""
+        """Record that a last part was rejected, and with it the set if all other parts arrived."""
         is_own = last["token"] == self._parts.token and not self.staged
         is_one = last["index"] < last["parts"] == self._parts.count
         if is_own and is_one and not isinstance(self._parts.whole(last), int):
             self.drop()
 
     def expire(self, when: Interval) -> None:
-        """Drop what has expired by an interval."""
+        """Drop the set if it expired before the end of an interval."""
         lived = when[0] - self._began[1], when[1] - self._began[0]
         self.has_expired |= STAGED_LIFE < lived[1] < math.inf
         if lived[0] > STAGED_LIFE:
@@ -140,38 +142,47 @@ class ExpectedSet:
         self._is_unclear |= lived[0] <= STAGED_LIFE < lived[1]
 
 
-ROUNDED = 0.002  # s; of times in milliseconds
-_TRIP, FADE, _SETTLING = 0.005, 0.005, 0.01  # s; until a trip, of a fault, until a state shows
+ROUNDED = 0.002  # s, rounding of times in milliseconds
+_TRIP, FADE, _SETTLING = (
+    0.005,
+    0.005,
+    0.01,
+)  # s; until a trip; fade after a fault; until a state is reported
 OFF, STOPPED = STATES["SWITCH_ON_DISABLED"], STATES["QUICK_STOP_ACTIVE"]
 REACTING, FAULT = STATES["FAULT_REACTION_ACTIVE"], STATES["FAULT"]
 SWITCHED_ON, _READY = STATES["SWITCHED_ON"], STATES["READY_TO_SWITCH_ON"]
 DISARMED = STATES["NOT_READY"], OFF, _READY
 _FALLING = {SWITCHED_ON: OFF, REACTING: FAULT}
-"""States until all is silent, and then."""
+"""States during a fade, and the states after it."""
 _NEVER: Interval = (-math.inf, math.inf)
 
-_WARM = QUANTITIES["temperature"].to_wire(60.0)  # from here on an amplifier may derate
+_WARM = QUANTITIES["temperature"].to_wire(60.0)  # above this temperature an amplifier can derate
 FEEDING = frozenset(name for name, message in MESSAGES.items() if message.feeds)
-"""Requests that feed the watchdog unless they are refused."""
+"""Requests that feed the watchdog unless they are rejected."""
 _ONLY_IN = {
     **dict.fromkeys(("Set", "Commit", "Silence"), (ENABLED,)),
     "SetAddress": DISARMED,
     "Arm": (*DISARMED, SWITCHED_ON, ENABLED),
 }
-"""States in which alone a request is accepted."""
+"""The only states in which a request is accepted."""
 _NOT_LOOKED_AT = "WRONG_SESSION", "WRONG_STATE", "BUSY"
-"""Refusals of a part by what it does not hold."""
+"""Reasons for rejecting a part that do not depend on its content."""
 _Waiting: TypeAlias = tuple[Interval, int, tuple[LayerSet, ...], bool]
-"""A committed set: its moment, token and layers, and whether it plays to the word."""
+"""A committed set: its start, token and layers, and whether it plays without rounding."""
 
 
 class ExpectedAmplifier:
-    """One amplifier; state, latch, token and session are None while unknown; times [s].
+    """Expected state of one amplifier; state, latch, token and session are None if unknown; times
+    [s].
 
-    report: takes what is wrong, always: what nothing excuses, unclear: why that is not known.
-    may_fail: it may have faults of its own. slack: of times, left_slack: of the time that is left
-    of the watchdog. fed: when that was fed last, silent: when all that fades is silent. is_shown:
-    it has shown its state itself. last_status: since when nothing was seen. can: its capabilities.
+    - report: receives violations; always: receives violations that nothing excuses; unclear:
+      receives the reason why the state is unknown.
+    - may_fail: the amplifier can have faults of its own.
+    - slack: tolerance of times; left_slack: tolerance of the watchdog's remaining time.
+    - fed: last time the watchdog was fed; silent: when all fades have ended.
+    - is_shown: the amplifier has reported its state itself.
+    - last_status: start of the interval without observations.
+    - can: the amplifier's capabilities.
     """
 
     def __init__(
@@ -190,25 +201,27 @@ class ExpectedAmplifier:
         self.forget()
         self.last_status = -math.inf
 
-    def forget(self, cause: str = "what was not heard") -> None:
-        """Treat all as unknown until the next status."""
+    def forget(self, cause: str = "missed messages") -> None:
+        """Treat everything as unknown until the next status."""
         self.token: int | None = None
         self.session: int | None = None
         self.sets = ExpectedSet()
         self.clock = ExpectedClock(self.report, self.slack)
         self._waiting: _Waiting | None = None
-        self._started = -math.inf  # by when a set that has waited has surely started
+        self._started = -math.inf  # latest start of a waiting set
         self.state: int | None = None
         self.fault = FAULTS["NONE"]
         self.latch: int | None = None
         self.watchdog, self.fed, self.silent = math.inf, _NEVER, _NEVER
         self.is_shown = True
-        self._faults: deque[tuple[int, Interval]] = deque(maxlen=2)  # the newest first, and when
+        self._faults: deque[tuple[int, Interval]] = deque(
+            maxlen=2
+        )  # newest first, with their intervals
         self._settle(cause)
         self.outputs.forget()
 
     def _settle(self, cause: str, when: Interval = _NEVER) -> None:
-        """Treat all channels as silent from some time between two on."""
+        """Treat all channels as silent from some time in an interval."""
         self.outputs = ExpectedOutputs(
             self.can,
             report=self.report,
@@ -222,11 +235,11 @@ class ExpectedAmplifier:
         """Note its capabilities."""
         if capabilities != self.can:
             self.can = capabilities
-            self._settle("what was not heard")
+            self._settle("missed messages")
             self.outputs.forget()
 
     def _expect(self, rule: str, time: float, what: str, must: object, seen: object) -> None:
-        """Report what is not as it must be."""
+        """Report a value that differs from the expected one."""
         if must != seen:
             self.report(rule, time, what, must=must, seen=seen)
 
@@ -235,29 +248,29 @@ class ExpectedAmplifier:
 
     @property
     def is_enabled(self) -> bool:
-        """Whether it is armed, as far as is known."""
+        """Return whether it is armed, as far as is known."""
         return self.state == ENABLED
 
     @property
     def is_in_fault(self) -> bool:
-        """Whether it is in a fault, or reacting to one."""
+        """Return whether it is in a fault or reacting to one."""
         return self.state in (REACTING, FAULT)
 
     @property
     def expiry(self) -> Interval:
-        """When the watchdog trips if it is not fed, at the earliest and at the latest."""
+        """Return the earliest and latest time at which the watchdog trips if it is not fed."""
         if self.watchdog == math.inf:  # not known
             return _NEVER
         early, late = self.watchdog * (1 - DRIFT), (self.watchdog + _TRIP) * (1 + DRIFT)
         return self.fed[0] + early - ROUNDED, self.fed[1] + late
 
-    # What it is asked and does
+    # Requests
 
     def granted(self, name: str, values: Values, reply: Values, when: Interval) -> None:
-        """Apply a request that was carried out between two times, and compare its reply."""
+        """Apply a request carried out in an interval, and compare its reply."""
         self.advance(when[0])
         self._check_allowed(name, values, when[1])
-        is_late = reply.get("state") in (REACTING, FAULT)  # it may have expired before
+        is_late = reply.get("state") in (REACTING, FAULT)  # it can have expired before
         if name in FEEDING and self.state in (None, ENABLED) and not is_late:
             self.fed = when
         match name:
@@ -273,7 +286,7 @@ class ExpectedAmplifier:
             self.check(reply, when)
 
     def _check_allowed(self, name: str, values: Values, time: float) -> None:
-        """Only the session that is held plays and feeds; nothing plays unless armed."""
+        """Check that only the held session plays and feeds, and that nothing plays unless armed."""
         session, token = values.get("session"), values.get("token", 0)
         if name in FEEDING and self.is_enabled and self.session not in (None, session):
             self.report("session", time, f"session of {name}", must=self.session, seen=session)
@@ -292,7 +305,7 @@ class ExpectedAmplifier:
             )
 
     def carry_out(self, name: str, values: Values, shown: Values, when: Interval) -> None:
-        """Apply a request carried out between two times, as its reply or a later status shows."""
+        """Apply a request carried out in an interval, as its reply or a later status shows."""
         ramp = min(values.get("ramp", 0), self.can.get("ramp_max", math.inf)) / 1000
         cause = f"{name} {values}"
         has_expired = self.is_enabled and shown.get("fault") == FAULTS["WATCHDOG"]
@@ -324,7 +337,7 @@ class ExpectedAmplifier:
                 self.clock.mark(when)
 
     def _clear(self, latch: int, state: int, when: Interval) -> None:
-        """Leave a stop or a fault, once all is silent, where its cause is gone."""
+        """Leave a stop or a fault once everything is silent, if its cause has gone."""
         is_gone = self.fault in (FAULTS["NONE"], FAULTS["WATCHDOG"])
         is_off = state in DISARMED and when[1] >= self.silent[0] - ROUNDED
         if is_off and self.latch is not None:
@@ -334,7 +347,7 @@ class ExpectedAmplifier:
             self.outputs.cause = "Clear"
 
     def advance(self, time: float) -> None:
-        """Apply what must have happened without a request until now."""
+        """Apply everything that must have happened without a request until now."""
         if self.is_enabled and time > self.expiry[1] + ROUNDED + self.slack:
             self._trip(FAULTS["WATCHDOG"], self.expiry, "the watchdog")
             self.is_shown = False
@@ -355,7 +368,7 @@ class ExpectedAmplifier:
         self, state: int, when: Interval, ramp: float, cause: str, *, has_floor: bool = True
     ) -> None:
         self.sets.drop()
-        if self.may_start(when):  # so that what falls silent is unknown
+        if self.may_start(when):  # then the layers that fall silent are unknown
             self.outputs.forget()
         self._waiting = None
         self.state = state
@@ -364,7 +377,7 @@ class ExpectedAmplifier:
     # Sets
 
     def _take(self, part: Values, reply: Values, when: Interval) -> None:
-        """Compare the reply to a part of a set, and play a set that is played at once."""
+        """Compare the reply to a part of a set, and play the set if it plays immediately."""
         token, end = part["token"], when[1]
         self._expect("credit", end, "token of a reply to Set", token, reply["token"])
         is_fine = all(self.can.get(f"{each}_step", 1) <= 1 for each in TONE)
@@ -385,7 +398,7 @@ class ExpectedAmplifier:
             self._play(token, when)
 
     def part_came(self, part: Values, when: Interval) -> None:
-        """Apply a part of a set but the last, which is kept or dropped without a word."""
+        """Apply a part other than the last, which is kept or dropped without a reply."""
         self.advance(when[0])
         is_held = self.state in (None, ENABLED) and self.session in (None, part["session"])
         is_newer = is_newer_token(part["token"], self.token or 0)
@@ -393,7 +406,7 @@ class ExpectedAmplifier:
             self.fed = when
 
     def part_refused(self, part: Values, code: str) -> None:
-        """Apply a refusal of the last part of a set, by its code."""
+        """Apply the rejection of the last part of a set, by its code."""
         if code not in _NOT_LOOKED_AT:
             self.sets.refused(part)
 
@@ -410,13 +423,13 @@ class ExpectedAmplifier:
         self._play(token, when, self.clock.moment(commit["at"], when))
 
     def may_start(self, when: Interval) -> bool:
-        """Whether a set that waits, or has waited, may start within an interval."""
+        """Return whether a set that waits, or has waited, can start within an interval."""
         if self._waiting is not None and when[1] >= self._waiting[0][0] - self.slack:
             return True
         return when[0] <= self._started + self.slack
 
     def _start_waiting(self, sooner: Interval = (math.inf, math.inf)) -> None:
-        """Start the set that waits at its moment, or sooner before another one."""
+        """Start the waiting set at its own time, or earlier if another set replaces it."""
         if self._waiting is not None:
             (early, late), token, layers, is_exact = self._waiting
             when, is_at_once = (min(early, sooner[0]), min(late, sooner[1])), sooner[0] < late
@@ -424,7 +437,7 @@ class ExpectedAmplifier:
             self.outputs.play(layers, token, when, is_exact=is_exact, is_at_once=is_at_once)
 
     def _play(self, token: int, when: Interval, moment: Interval | None = None) -> None:
-        """Play a set between two times or from a moment on, unless it is the one that plays."""
+        """Play a set from some time in an interval, or from a given time, unless it is playing."""
         if token == self.token:
             return
         self._start_waiting(when)
@@ -438,10 +451,10 @@ class ExpectedAmplifier:
             self._waiting = moment, token, layers, self.sets.is_exact
         self.sets.drop()
 
-    # What it shows
+    # Statuses
 
     def check(self, shown: Values, when: Interval) -> None:
-        """Compare a status that was true at some time between two."""
+        """Compare a status that was true at some time in an interval."""
         self.advance(when[0])
         self.outputs.may_derate = shown["temperature"] >= _WARM
         if not self.note_state(shown, when):
@@ -466,7 +479,7 @@ class ExpectedAmplifier:
         self.last_status = when[0]
 
     def note_state(self, shown: Values, when: Interval) -> bool:
-        """Compare state, fault and latch, and go on with them; returns whether the state fits."""
+        """Compare state, fault and latch, and adopt them; returns whether the state is possible."""
         now, fault, latch, end = shown["state"], shown["fault"], shown["latch"], when[1]
         if self.state is None:
             self._adopt(shown, when)
@@ -480,7 +493,7 @@ class ExpectedAmplifier:
             self.report(self._rule_against(now), end, what, must=must, seen=self._name_of(now))
             return False
         if fault and fault != self.fault and self._may_fail and not self.is_shown:
-            self.fault = fault  # which came before the watchdog, of which nothing was seen
+            self.fault = fault  # a fault before the watchdog expired that was not observed
             self._faults[0] = fault, (self.last_status, end)
         rule, cause = "latched" if now in LATCHED else "state", self.outputs.cause
         self._expect(rule, end, f"fault after {cause}", self.fault, fault)
@@ -490,7 +503,7 @@ class ExpectedAmplifier:
         return True
 
     def _adopt(self, shown: Values, when: Interval) -> None:
-        """Go on with a status as it is."""
+        """Adopt a status without comparing it."""
         state = shown["state"]
         if state != self.state:
             self.state, self.silent = state, (-math.inf, math.inf)
@@ -507,7 +520,7 @@ class ExpectedAmplifier:
         self.is_shown, self.last_status = True, when[0]
 
     def _states(self, when: Interval) -> list[int]:
-        """Return the states in which it may be between two times."""
+        """Return the states in which the amplifier can be during an interval."""
         here = self.state or 0
         if here not in _FALLING:
             return [0, OFF] if here == STATES["NOT_READY"] else [here]
@@ -517,11 +530,11 @@ class ExpectedAmplifier:
         return states
 
     def _is_silent(self, when: Interval) -> bool:
-        """Whether it must have been silent, and its state show so, between two times."""
+        """Return whether it must have been silent, and report so, during an interval."""
         return when[0] > self.silent[1] + _SETTLING + ROUNDED + self.slack
 
     def _rule_against(self, now: int) -> str:
-        """Which rule a state breaks."""
+        """Return the rule that a state violates."""
         if not self.is_shown:
             return "watchdog" if now == ENABLED else "latched"
         if now == ENABLED:
@@ -529,7 +542,7 @@ class ExpectedAmplifier:
         return "latched" if self.state in LATCHED else "state"
 
     def _tripped(self, fault: int, when: Interval) -> None:
-        """Check a transition into a fault: the watchdog not before its time."""
+        """Check a transition into a fault: the watchdog must not trip early."""
         since = min(self.last_status, when[1]), when[1]
         if fault == FAULTS["WATCHDOG"]:
             early, late = self.expiry
@@ -545,13 +558,13 @@ class ExpectedAmplifier:
         self._trip(fault, since, f"fault {name_of(FAULTS, fault)}")
 
     def _expired_by(self, time: float) -> Interval:
-        """Return between which times the watchdog tripped that has tripped by a time."""
+        """Return the interval in which the watchdog tripped, if it had tripped by `time`."""
         early, late = self.expiry
         first = min(max(early, self.last_status), time)
         return first, max(min(late, time), first)
 
     def _check_voltage(self, shown: Values, when: Interval) -> None:
-        """Check high voltage, and the interlock of one that has it."""
+        """Check high voltage, and the interlock if the amplifier has one."""
         is_fading = when[1] < self.silent[0] - ROUNDED - self.slack and any(shown["levels"])
         must_be = self.state in (ENABLED, SWITCHED_ON) or (self.state == STOPPED and is_fading)
         where, end = f"in {self._name_of(self.state)} after {self.outputs.cause}", when[1]
@@ -563,7 +576,7 @@ class ExpectedAmplifier:
             self._expect("high_voltage", end, f"high_voltage {where}", must_be, is_on)
 
     def _check_faults(self, listed: Sequence[Values], when: Interval) -> None:
-        """Check a list of faults: the newest first, those that were seen, of their ages."""
+        """Check a fault list: newest first, all observed faults, with their ages."""
         ages = [each["age"] for each in listed]
         self._expect("faults", when[1], "ages of faults", sorted(ages), ages)
         unfed = {each["channel"] for each in listed if each["fault"] == FAULTS["WATCHDOG"]}
@@ -580,7 +593,7 @@ class ExpectedAmplifier:
                 return
 
     def _check_achieved(self, number: int, reply: Values, when: Interval) -> None:
-        """Compare what a layer plays with what it must."""
+        """Compare the achieved values of a layer with its commands."""
         outputs = self.outputs
         if self.may_start(when) or not (sure := outputs.sure(when)):
             return
@@ -613,5 +626,5 @@ class ExpectedAmplifier:
     def report_silence(
         self, rule: str, time: float, what: str, *, must: object, seen: object
     ) -> None:
-        """Take silence where there must be none, which a fault that is not shown would explain."""
+        """Report unexpected silence as a violation that a hidden fault could explain."""
         self.report(rule, time, what, must=must, seen=seen)

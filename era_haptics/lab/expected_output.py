@@ -1,8 +1,8 @@
-"""What an amplifier must show of its outputs and clock after sets whose times are intervals.
+"""Expected outputs and clock of an amplifier after sets whose start is known only as an interval.
 
-A set begins at some time between its commit and the reply, or a little later. The playback has each
-commit in the middle of its interval; every transition has by how much sooner or later it may have
-begun, and a radius by which its first amplitude may differ. Times [s] are of any one clock.
+A set starts at some time between its commit and the reply, or slightly later. The playback places
+each commit in the middle of its interval. Every transition has a half-width of its start time and a
+radius by which its first amplitude can differ. Times [s] are those of any one clock.
 """
 
 import math
@@ -28,36 +28,37 @@ _PER_RAMP, _PER_VALID_FOR = QUANTITIES["ramp"].per_unit, QUANTITIES["valid_for"]
 
 
 class UncertainPlayback:
-    """Bounds of what channels play; playback: with every commit in the middle of its interval.
+    """Bounds of channel outputs; playback: places each commit in the middle of its interval.
 
-    half: by how much what a layer plays may end or start sooner or later by itself.
+    half: half-width of the time at which a layer ends or starts on its own.
     """
 
     def __init__(self, playback: Playback) -> None:
         self.playback = playback
         self.half = [0.0] * LAYERS_MAX
-        # Channels of transitions that are gone, and until when [s] they may still play.
+        # Replaced transitions by channel, and until when [s] they can still play.
         self._ghosts: list[tuple[int, VoiceTransition, float]] = []
 
     @property
     def lag(self) -> float:
-        """Longest time by which a transition under way may be earlier or later [s]."""
+        """Largest half-width of a running transition's start time [s]."""
         voices = chain.from_iterable(self.playback.all_voices)
         return max(*self.half, *(voice.transition.half for voice in voices), 0.0)
 
     def is_ambiguous(
         self, when: Interval, layers: Sequence[LayerSet] | None = None, ramp: float = 0.0
     ) -> bool:
-        """Whether something else may happen by itself just as what is to happen.
+        """Return whether a spontaneous change can coincide with a requested one.
 
-        layers: of a set; None: all fall silent along a ramp [s].
+        layers: of a set; None: all layers fade along a ramp [s].
         """
         if self.shortened_by(when, layers, ramp) > -math.inf:
             return True
         changed = dict.fromkeys(range(LAYERS_MAX), False)
         if layers is not None:
             changed = {one.layer: one.after for one in layers}
-        # Of all layers: what is due is taken to have happened before what is to happen, or after.
+        # (time, half-width) of spontaneous changes, which the playback places before or after the
+        # request.
         ends = [(due, self.half[layer]) for due, layer in self.playback.dues]
         ends += [(self.playback.end_of(layer), self.half[layer]) for layer in changed]
         by_then = self._by(when[0])
@@ -73,10 +74,10 @@ class UncertainPlayback:
     def shortened_by(
         self, when: Interval, layers: Sequence[LayerSet] | None, ramp: float = 0.0
     ) -> float:
-        """Return by when [s] what leads to silence has ended that a ramp may shorten, or not.
+        """Return until when [s] it is unclear whether a ramp shortens an ending.
 
-        As its own end and that of the ramp are too close; minus infinity: there is none. layers,
-        ramp: see `is_ambiguous`.
+        This happens if the ending and the ramp end almost simultaneously; minus infinity if none
+        do. layers, ramp: see `is_ambiguous`.
         """
         left = dict.fromkeys(range(LAYERS_MAX), ramp)
         if layers is not None:
@@ -90,31 +91,31 @@ class UncertainPlayback:
         return latest
 
     def _by(self, time: float) -> Playback:
-        """Return what plays with all carried out that is due by a time."""
+        """Return the playback with everything carried out that is due by a time."""
         by_then = self.playback.copied()
         while (due := by_then.next_due) <= time:
             by_then.advance(due)
         return by_then
 
     def _half_of(self, voice: Voice) -> float:
-        """Return by how much what a voice plays may end sooner or later."""
+        """Return the half-width of the time at which a voice ends."""
         return max(voice.transition.half, self.half[voice.layer])
 
     def _ends_after(self, one: LayerSet) -> float:
-        """Return how long after a set a layer is silent that falls silent by it [s]."""
+        """Return how long a layer takes to fall silent after a set that ends it [s]."""
         if not one.renew:
             return one.ramp / _PER_RAMP
         return self.playback.ramp_of(one.layer) + one.valid_for / _PER_VALID_FOR
 
     def commit(self, layers: Sequence[LayerSet], token: int, when: Interval) -> None:
-        """Play a set from some time between two on."""
+        """Play a set from some time in an interval."""
         half = (when[1] - when[0]) / 2
         self.advance(when[0])
         self._pass_until(when[0] + half)
         for one in layers:
             known = self.half[one.layer]
             onset_by = self.playback.onsets_end(one.layer, -math.inf) + known
-            # What waits, or will, starts as the onset ends, whenever that is renewed.
+            # A waiting set starts when the onset ends, whenever the onset is renewed.
             is_kept = one.after or (one.renew and onset_by > when[0])
             self.half[one.layer] = max(half, known if is_kept else 0.0)
         before = [*self.playback.all_voices]
@@ -122,7 +123,7 @@ class UncertainPlayback:
         self._mark(before, when)
 
     def silence(self, when: Interval, ramp: float) -> None:
-        """Fade all layers along a ramp [s], from some time between two on."""
+        """Fade all layers along a ramp [s], from some time in an interval."""
         middle = (when[0] + when[1]) / 2
         self.advance(when[0])
         self._pass_until(middle)
@@ -131,25 +132,25 @@ class UncertainPlayback:
         self._mark(before, when)
 
     def advance(self, time: float) -> None:
-        """End layers and start what waits, where that must have happened by a time."""
+        """End layers and start waiting sets that must have done so by a time."""
         certain = time - self.lag
         self._pass_until(certain)
         self.playback.advance(certain)
 
     def _pass_until(self, time: float) -> None:
-        """Carry out what is due by a time."""
+        """Carry out everything due by a time."""
         while (due := self.playback.next_due) <= time:
             half, before = max(self.half), [*self.playback.all_voices]
             self.playback.advance(due)
             self._mark(before, (due - half, due + half))
 
     def unsure(self, start: float, end: float) -> set[int]:
-        """Return the layers that may end or start by themselves about between two times."""
+        """Return the layers that can end or start on their own in an interval."""
         self.advance(start)
         return self.playback.unsure(end, self.half)
 
     def _mark(self, before: Sequence[Sequence[Voice]], when: Interval) -> None:
-        """Note by how much every transition that is new may differ."""
+        """Set the half-width and radius of every new transition."""
         half = (when[1] - when[0]) / 2
         ghosts = [each for each in self._ghosts if each[2] > when[0]]
         for channel, were in enumerate(before):
@@ -169,14 +170,14 @@ class UncertainPlayback:
         self._ghosts = ghosts
 
     def bounds(self, channel: int, start: float, end: float, *, is_exact: bool = False) -> Interval:
-        """Return the lowest and the largest level of a channel between two times.
+        """Return the lowest and the highest level of a channel during an interval.
 
-        What layers play that may end or start then may be anything up to its largest. is_exact:
-        tones of one frequency interfere; else they may add up as if they did not.
+        A layer that can end or start in the interval counts from zero to its peak. is_exact: tones
+        of one frequency interfere; otherwise their amplitudes can add up.
         """
         unsure = self.unsure(start, end)
         lowest = highest = extra = 0.0
-        began = start - 3 * self.lag  # or later; by the clocks of layer, set and transition
+        began = start - 3 * self.lag  # or later; layer, set and transition have separate clocks
         for one in self.playback.waiting:
             tones = [each for each in one.commands if each.channel == channel]
             for tone in tones if one.layer in unsure else ():
@@ -200,7 +201,7 @@ class UncertainPlayback:
 
 
 def radius_of(way: VoiceTransition, start: float, end: float) -> float:
-    """Return by how much an amplitude may differ from that in the middle of an interval.
+    """Return how far an amplitude can differ from that in the middle of an interval.
 
     Its transition has begun by then.
     """
@@ -209,56 +210,63 @@ def radius_of(way: VoiceTransition, start: float, end: float) -> float:
     reach = max(abs(each - center) for each in way.points(since, until))
     if not way.radius:
         return reach
-    # The first amplitude counts the less the farther its transition has led.
+    # The effect of the first amplitude decays along its transition.
     left = VoiceTransition(way.start, way.step, way.radius, 0, way.end, (0j,) * len(way.knots))
     return reach + abs(left.at(since))
 
 
 def _reached(way: VoiceTransition, time: float) -> complex:
-    """Return the amplitude at a time, or at the start of a transition that has begun sooner."""
+    """Return the amplitude at a time, or at the start of a transition that begins later."""
     return way.at(max(time, way.start))
 
 
-LATE, SAMPLE = 0.002, 0.0001  # s; by which a set may begin later: at once; at its moment
+LATE, SAMPLE = (
+    0.002,
+    0.0001,
+)  # s; delay of a set that plays immediately, and of one with a start time
 DRIFT = 1e-3
-"""Of a time; of the amplifier's clock."""
-_TOLERANCE = 0.0015  # of full level: rounding, and the last step of a fade
-_MAX_STEPS = 4  # halves of a step of the level, beside one of each voice
+"""Relative drift of the amplifier's clock."""
+_TOLERANCE = 0.0015  # of full level; rounding, and the last step of a fade
+_MAX_STEPS = 4  # of half a level step, in addition to one per voice
 _MAX_ENDING = 3.3  # s; 32 knots, 0.1 s apart
-_PERIOD = 0.1  # s; in which a sum of tones has its peak
-_LASTING = 3.0  # s; what ends after it is not awaited
-_AMBIGUOUS = "a request came as a layer ended by itself, or its onset"
+_PERIOD = 0.1  # s; a sum of tones reaches its peak within this time
+_LASTING = 3.0  # s; later endings are not awaited
+_AMBIGUOUS = "a request arrived while a layer or its onset was ending"
 _RAMP, _LEVEL = QUANTITIES["ramp"], QUANTITIES["level"]
 _LAYERS, _VOICES = QUANTITIES["layer_count"].maximum, QUANTITIES["voices"].maximum
 _ALL_LAYERS = {*range(_LAYERS)}
 
 
 class ReportMismatch(Protocol):
-    """Takes a violation: rule, time [s], what must be what, and what was seen."""
+    """Receives a violation: rule, time [s], name, expected and seen value."""
 
     def __call__(self, rule: str, time: float, what: str, *, must: object, seen: object) -> None:
         """Report it."""
 
 
 Unclear: TypeAlias = Callable[[str], None]
-"""Takes why it is unclear what plays: things came too close together."""
+"""Receives the reason why the output is unclear: two events were too close together."""
 
 
 def silent() -> Playback:
-    """Return a silent playback with all the channels and voices that there can be.
+    """Return a silent playback with the maximum number of channels and voices.
 
-    No fade is cut short in it, so that its levels are upper bounds.
+    It never cuts a fade short, so its levels are upper bounds.
     """
     return Playback(QUANTITIES["channel_count"].maximum, _VOICES)
 
 
 class ExpectedOutputs:
-    """The channels and layers of one amplifier, silent at first; times [s], intervals of two.
+    """Expected channels and layers of one amplifier, initially silent; times and intervals in
+    seconds.
 
-    can: its capabilities, empty while unknown; slack [s]: of times. began: when what plays was
-    changed last, by its cause. is_exact: levels are those asked for, to the step; may_derate: or
-    lower, since it is warm. interferes: levels show how tones of one frequency interfere. lasting:
-    `valid_for` that a layer may show, of its set or what waits.
+    - can: capabilities, empty while unknown.
+    - slack [s]: tolerance of times.
+    - began, cause: interval and cause of the last change.
+    - is_exact: levels equal the commands within one step; may_derate: levels can be lower because
+      the amplifier is warm.
+    - interferes: levels show the interference of tones of one frequency.
+    - lasting: values of `valid_for` that a layer can report, of its set or a waiting one.
     """
 
     def __init__(
@@ -276,24 +284,26 @@ class ExpectedOutputs:
         self.is_exact, self.may_derate, self.interferes = True, False, False
         self._report, self._unclear, self._slack = report, unclear, slack
         self.playback = playback_of(can) if can else silent()
-        """What plays, with each commit in the middle of its interval."""
+        """Playback with each commit in the middle of its interval."""
         self._plays = UncertainPlayback(self.playback)
         self._half_step = can.get("level_step", 1) / 2 / _LEVEL.per_unit
-        self._has_floor = True  # or levels may be lower: of a fault, whose fade may be shorter
-        self._unknown = [-math.inf] * _LAYERS  # until when what a layer plays is unknown [s]
+        self._has_floor = True  # False after a fault, which can cut a fade short
+        self._unknown = [-math.inf] * _LAYERS  # per layer, until when its output is unknown [s]
         self.lasting: dict[int, set[int]] = {}
-        self._before: Sequence[float] = ()  # levels of channels before the last set
-        self._highest = 0.0  # of the sums of a channel since the last status, at most
-        self._unlimited_since = math.inf  # a sum is surely beyond full level, and not said to be
+        self._before: Sequence[float] = ()  # channel levels before the last set
+        self._highest = 0.0  # upper bound of any channel's sum since the last status
+        self._unlimited_since = (
+            math.inf
+        )  # since when a sum exceeds full level without being reported
 
     def forget(self) -> None:
-        """Treat what plays as unknown."""
+        """Treat all outputs as unknown."""
         self._unknown = [math.inf] * _LAYERS
 
     # What happens
 
     def _faded(self, one: LayerSet, time: float) -> float:
-        """Return when what a layer plays has faded, however it ends by a time, also by a set."""
+        """Return when a layer has faded, whether it ends on its own or by a set."""
         ramp = max(_RAMP.from_wire(one.ramp), self.playback.ramp_of(one.layer))
         ends = [
             voice.ended(time, ramp).transition.end
@@ -312,9 +322,9 @@ class ExpectedOutputs:
         is_exact: bool,
         is_at_once: bool = True,
     ) -> None:
-        """Play a set from some time between two on; is_exact: every command to the word.
+        """Play a set from some time in an interval; is_exact: every command without rounding.
 
-        is_at_once: it may begin a little later, unlike one for whose moment it has waited.
+        is_at_once: the set can start slightly later, unlike one with a start time.
         """
         is_prompt = not (is_at_once or any(map(_is_timed, layers)))
         start, end = when[0], when[1] + (SAMPLE if is_prompt else LATE)
@@ -332,7 +342,7 @@ class ExpectedOutputs:
                 lasting.add(one.valid_for)
             half = self._plays.half[number]
             if start - half <= self.playback.end_of(number) <= end + half:
-                # It may end by itself, and then on other ways than by the set.
+                # It can end on its own, and then by other transitions than the set's.
                 goes_on = one.renew or any(each.keep_phase for each in one.commands)
                 self._unknown[number] = math.inf if goes_on else self._faded(one, end)
             elif not one.renew and not one.after:
@@ -347,10 +357,11 @@ class ExpectedOutputs:
     def silence(
         self, when: Interval, ramp: float, cause: str, *, has_floor: bool = True
     ) -> Interval:
-        """Silence all along a ramp [s] from some time between two on; return when it is silent."""
+        """Fade all layers along a ramp [s] from some time in an interval; return when all are
+        silent."""
         start, end = when[0], when[1] + LATE
         if self._plays.is_ambiguous((start, end), None, ramp):
-            self._unknown = [math.inf] * _LAYERS  # it fades, or falls silent by its ending
+            self._unknown = [math.inf] * _LAYERS  # fades, or falls silent by its ending
             if self._unclear is not None:
                 self._unclear(_AMBIGUOUS)
         self._plays.silence((start, end), ramp)
@@ -361,35 +372,35 @@ class ExpectedOutputs:
         first = max(ends - lag, start) if has_floor and is_known else when[0]
         return first, max(ends + lag, end if is_known else end + ramp)
 
-    # What is known
+    # Knowledge
 
     def _widened(self, when: Interval) -> Interval:
-        """Return an interval as the amplifier's clock may have it."""
+        """Return an interval widened by the clock's drift."""
         since = self.began[0]
         extra = self._slack + DRIFT * (when[1] - since)
         return when[0] - extra, when[1] + extra
 
     def sure(self, when: Interval) -> set[int]:
-        """Return the layers of which it is known what they play between two times.
+        """Return the layers whose output is known throughout an interval.
 
-        No layer while what one of them plays is unknown.
+        No layer is known while the output of any layer is unknown.
         """
         start, end = self._widened(when)
         is_known = max(self._unknown) < start
         return _ALL_LAYERS - self._plays.unsure(start, end) if is_known else set()
 
     def tokens_of(self, layer: int, sure: set[int]) -> set[int]:
-        """Return the tokens that a layer may show; sure: layers of which it is known."""
+        """Return the tokens that a layer can report; sure: layers whose output is known."""
         if layer in sure:
             return {self.playback.tokens.get(layer, 0)}
         return self.playback.next_tokens(layer)
 
     def waits(self, when: Interval) -> bool:
-        """Whether a set surely waits for the end of an onset, whenever within an interval."""
+        """Return whether a set surely waits for the end of an onset throughout an interval."""
         return self.sure(when) == _ALL_LAYERS and bool(self.playback.waiting)
 
     def settled_at(self, now: float) -> float:
-        """Return when all that plays lasts for long or is silent [s], as far as is known."""
+        """Return when all outputs are constant for long or silent [s], as far as is known."""
         playback, last = self.playback.copied(), now + _LASTING
         while (due := playback.next_due) < last:
             playback.advance(due)
@@ -397,10 +408,11 @@ class ExpectedOutputs:
         ends = [voice.transition.end for voices in playback.all_voices for voice in voices]
         return max([now, *ends])
 
-    # What is shown
+    # Statuses
 
     def check(self, shown: Values, when: Interval) -> None:
-        """Compare a status that was true at some time between two; the next counts from there."""
+        """Compare a status that was true at some time in an interval, and start the next from
+        there."""
         tokens, start = shown["tokens"], self._widened(when)[0]
         levels = [_LEVEL.from_wire(level) for level in shown["levels"]]
         if sure := self.sure(when):
@@ -429,7 +441,7 @@ class ExpectedOutputs:
         self._highest = self._peak(start)
 
     def _peak(self, time: float) -> float:
-        """The largest sum of a channel from a time on, with endings; infinite if a set waits."""
+        """Return the largest future sum of a channel with endings; infinite if a set waits."""
         if self.playback.waiting:
             return math.inf
         return max(sum(voice.peak(time) for voice in voices) for voices in self.playback.all_voices)
@@ -437,9 +449,9 @@ class ExpectedOutputs:
     def check_levels(
         self, levels: Sequence[float], when: Interval, report_low: ReportMismatch | None
     ) -> float:
-        """Compare levels of channels; returns the largest level that one surely has.
+        """Compare channel levels; returns the highest level that a channel surely has.
 
-        report_low: takes levels that are too low, None where they may be.
+        report_low: receives levels that are too low; None if low levels are allowed.
         """
         can_be_low = self.may_derate or not self.is_exact or report_low is None
         start, end = self._widened(when)
@@ -463,7 +475,7 @@ class ExpectedOutputs:
         return f"{low:.1f} to {high:.1f} ms after {self.cause}"
 
     def _rule(self, channel: int, level: float, when: Interval) -> str:
-        """Which rule a wrong level breaks."""
+        """Return the rule that a wrong level violates."""
         if self.cause == "the watchdog":
             return "watchdog"
         if self.playback.settles_at > self._widened(when)[0] - self._plays.lag:
@@ -475,56 +487,56 @@ class ExpectedOutputs:
 
 
 def _is_timed(one: LayerSet) -> bool:
-    """Whether something of a layer ends or starts later by itself, which may be late."""
+    """Return whether a layer ends or starts on its own later, possibly with a delay."""
     is_shaped = any(each.onset is not None and each.onset.knots for each in one.commands)
     return bool(one.valid_for or one.after or is_shaped)
 
 
 def one_of(known: Iterable[object]) -> str:
-    """Return what something must be: one of some values."""
+    """Format the allowed values."""
     return " or ".join(map(str, known))
 
 
 CLOCK_DRIFT = DRIFT + QUANTITIES["rate"].high
-"""Of the clock, at any rate."""
+"""Drift of the clock, including the largest rate."""
 
 
 class ExpectedClock:
-    """The clock of one amplifier, unknown at first; report: takes what is wrong; slack [s]."""
+    """Expected clock of one amplifier, first unknown; report: receives violations; slack [s]."""
 
     def __init__(self, report: ReportMismatch, slack: float) -> None:
         self._report, self._slack = report, slack
-        self._read: tuple[int, Interval] | None = None  # the last one, and when
+        self._read: tuple[int, Interval] | None = None  # last reading and its interval
         self._marked: Interval | None = None
         self._is_unclear = False
 
     @property
     def present(self) -> int:
-        """The high word that was read last, which names no moment ahead."""
+        """Return the high word read last, which is not in the future."""
         return 0 if self._read is None else high_word(self._read[0])
 
     @property
     def is_marked(self) -> bool:
-        """Whether the next status shows the clock of a Mark."""
+        """Return whether the next status shows the clock of a Mark."""
         return self._marked is not None
 
     def mark(self, when: Interval) -> None:
-        """Note a Mark that comes between two times."""
+        """Record a Mark that arrives in an interval."""
         self._marked = when
 
     def shifted(self) -> None:
-        """Note that it may go on from elsewhere."""
+        """Record that the clock can continue from another value."""
         self._read = None
 
     def unheard(self) -> None:
-        """Note that the next status may show another clock than what was heard says.
+        """Record that the next status can show a clock other than that of the last known request.
 
-        The present one, if a status before showed the Mark, or that of a Mark that came twice.
+        Either the current clock, if an earlier status showed the Mark, or that of a repeated Mark.
         """
         self._is_unclear = True
 
     def check(self, shown: int, when: Interval) -> None:
-        """Note what a status shows, or compare it where it is the clock of a Mark."""
+        """Record the clock in a status, or compare it if it is the clock of a Mark."""
         marked, self._marked = self._marked, None
         is_unclear, self._is_unclear = self._is_unclear, False
         if is_unclear:
@@ -537,13 +549,16 @@ class ExpectedClock:
             low, high = marked[0] - read[1] - slack, marked[1] - read[0] + slack
             passed = ahead(shown, clock)
             if not low <= passed <= high:
-                what, must = "time from the clock read last to that of a Mark", f"{low} to {high} s"
+                what, must = (
+                    "time from the last clock reading to that of a Mark",
+                    f"{low} to {high} s",
+                )
                 self._report("clock", when[1], what, must=must, seen=passed)
 
     def moment(self, at: int, when: Interval) -> Interval | None:
-        """Return when a set starts whose commit names a high word and comes between two times.
+        """Return when a set starts whose commit names a high word and arrives in an interval.
 
-        None where that is surely at once.
+        None if it surely starts immediately.
         """
         if self._read is None:
             return when[0], when[1] + MAX_AHEAD

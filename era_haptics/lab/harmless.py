@@ -1,12 +1,12 @@
-"""What files and records of users may show to others: harmless values of known keys, and no more.
+"""Reduce users' files and records to harmless values of known keys, so that they can be shared.
 
-Of a configuration these are, as its schema declares them, numbers, quantities, choices, and words
-that are public: materials, effects, elements, schemes of URLs. Names that users gave become
-`name-1`, `name-2` ..., the same in all files of a report. Everything else is hidden: free text,
-names of files and hosts, and all that stands under an unknown key, with the name of the key.
+Of a configuration these are numbers, quantities, choices, and public words (materials, effects,
+elements, URL schemes), as declared by its schema. User-defined names become `name-1`, `name-2` ...,
+the same in all files of a report. Everything else is hidden: free text, file names, host names, and
+every unknown key with its value.
 
-Of a record that this program wrote, a line of a log, these are numbers and the words that
-stand in the program itself, under keys that stand there, too.
+Of a record that this program wrote, such as a log line, these are numbers, and words that occur in
+the program itself, under keys that occur there, too.
 """
 
 import builtins
@@ -47,7 +47,7 @@ from model.structure.material import EXCITER_TYPES, KNOWN_MATERIALS
 HIDDEN = "hidden"
 
 Schema: TypeAlias = Mapping[str, Any]
-"""A JSON schema, or a part of one."""
+"""JSON schema or part of one."""
 
 _ROOT = Path(__file__).parents[2]
 _PACKAGES = ("registry", "drivers", "model", "controller", "sim", "era_haptics")
@@ -59,7 +59,7 @@ _QUANTITY = re.compile(rf"({_NUMBER})\s*(.*)")
 _SIZES = re.compile(r"\d{1,4}[x×]\d{1,4}")
 _IDENTIFIER = re.compile(r"[A-Za-z][A-Za-z0-9_-]{0,31}")
 _DEVICE = re.compile(rf"/dev/(?:{'|'.join(KIND_OF_PORT)}|input/event)\d{{1,3}}")
-_SHORT = re.compile(r"\d{1,3}")  # the address of an amplifier
+_SHORT = re.compile(r"\d{1,3}")  # address of an amplifier
 _OPTION = re.compile(rf"{_NUMBER}|yes|[NEO]")
 _TIME = re.compile(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d(?:\.\d{1,6})?Z?")
 _WORD = re.compile(r"[^\W\d_]+")
@@ -67,26 +67,26 @@ _FRAME = re.compile(r'\s*File "([^"]*)", line (\d{1,6})')
 
 
 class Names:
-    """Replacements of the names that users gave, in the order in which they come."""
+    """Replacements of user-defined names, numbered in order of appearance."""
 
     def __init__(self) -> None:
         self._replacements: dict[str, str] = {}
         self.files: dict[str, str] = {}
-        """Names of files in the report, by the real path of each."""
+        """Names of files in the report, by real path."""
 
     def declared(self, name: str) -> str:
-        """The replacement of a name that a mapping declares; public names stay."""
+        """Return the replacement of a name declared by a mapping; public names stay."""
         if name in public_words() or not _IDENTIFIER.fullmatch(name):
             return name if name in public_words() else HIDDEN
         return self._replacements.setdefault(name, f"name-{len(self._replacements) + 1}")
 
     def known(self, name: str) -> str | None:
-        """The replacement of a name that was declared; None for another text."""
+        """Return the replacement of a declared name; None for other text."""
         return self._replacements.get(name)
 
 
 def harmless_configuration(document: Document, names: Names) -> str:
-    """The text of a rig, daemon or layout file with its harmless values; names: of all files."""
+    """Return the harmless text of a rig, daemon or layout file; names: shared by all files."""
     schema, definitions = _schema_of(document)
     reader = _Configuration(document, definitions, names)
     reader.declare(document.data, schema)
@@ -94,13 +94,13 @@ def harmless_configuration(document: Document, names: Names) -> str:
 
 
 def declare_names(document: Document, names: Names) -> None:
-    """Note the names of a file, before any file that may refer to them is shown."""
+    """Collect the names that a file declares, before any file that may refer to them is shown."""
     schema, definitions = _schema_of(document)
     _Configuration(document, definitions, names).declare(document.data, schema)
 
 
 class _Configuration:
-    """Goes through a document along its schema."""
+    """Walk through a document along its schema."""
 
     def __init__(self, document: Document, definitions: Schema, names: Names) -> None:
         self._document = document
@@ -108,7 +108,7 @@ class _Configuration:
         self._names = names
 
     def declare(self, value: Value, schema: Schema) -> None:
-        """Note the names that mappings of users' names have."""
+        """Collect the names that mappings of user-defined names declare."""
         if isinstance(value, list):
             items = self._of_kind(schema, "array")
             for number, entry in enumerate(value):
@@ -127,7 +127,7 @@ class _Configuration:
     def mapping(
         self, path: tuple[str | int, ...], value: Mapping[str, Value], schema: Schema
     ) -> dict[str, Value]:
-        """The harmless part of a mapping; its unknown keys are counted."""
+        """Return the harmless part of a mapping; its unknown keys are counted."""
         best = self._mapping_schema(value, schema)
         properties = best.get("properties", {})
         further = best.get("additionalProperties")
@@ -148,7 +148,7 @@ class _Configuration:
     def _described(
         self, path: tuple[str | int, ...], unknown: Sequence[str], known: Sequence[str]
     ) -> str:
-        """Unknown keys in words that have nothing of them: their lines, and keys they are like."""
+        """Describe unknown keys without quoting them: their lines and similar known keys."""
         lines = [self._document.line_of((*path, key)) for key in unknown]
         places = ", ".join(f"line {line}" for line in lines if line)
         meant = sorted({word for key in unknown for word in get_close_matches(key[:40], known, 1)})
@@ -185,7 +185,7 @@ class _Configuration:
         return public_text(text, self._names) or self._names.known(text) or HIDDEN
 
     def _mapping_schema(self, value: Mapping[str, Value], schema: Schema) -> Schema:
-        """The alternative that a mapping fits best: by its kind, then by its known keys."""
+        """Return the alternative that fits a mapping best: by its kind, then by its known keys."""
 
         def fit(choice: Schema) -> tuple[bool, int]:
             properties = choice.get("properties", {})
@@ -218,7 +218,7 @@ def _types_of(schema: Schema) -> set[str]:
 
 
 def _item_schema(arrays: Sequence[Schema], number: int) -> Schema:
-    """The schema of an entry of a list; {} if none is declared."""
+    """Return the schema of a list item; {} if none is declared."""
     for array in arrays:
         entries: Sequence[Schema] = array.get("prefixItems", ())
         if number < len(entries):
@@ -229,7 +229,7 @@ def _item_schema(arrays: Sequence[Schema], number: int) -> Schema:
 
 
 def _schema_of(document: Document) -> tuple[Schema, Schema]:
-    """The schema of a document's kind and its definitions; one without keys for another file."""
+    """Return the schema of a document's kind and its definitions; empty for other files."""
     schemas, definitions = _schemas()
     if is_daemon_document(document):
         return schemas["daemon"], definitions
@@ -240,7 +240,7 @@ def _schema_of(document: Document) -> tuple[Schema, Schema]:
 
 @cache
 def _schemas() -> tuple[dict[str, Schema], Schema]:
-    """Schemas of the kinds of files, and their common definitions."""
+    """Return the schemas of all kinds of files, and their common definitions."""
     sections: list[type[BaseModel]] = [RigSection, DaemonSection, LayoutSection, *EFFECTS]
     by_model, whole = models_json_schema([(section, "validation") for section in sections])
     definitions = whole["$defs"]
@@ -248,7 +248,7 @@ def _schemas() -> tuple[dict[str, Schema], Schema]:
         dict(definitions[by_model[section, "validation"]["$ref"].rpartition("/")[2]])
         for section in sections
     )
-    # A fitted rig is beside its base. Effects are under the names of users, with a kind.
+    # A fitted rig has standard errors; effects are stored under user-defined names, with a kind.
     errors = {"type": "object", "additionalProperties": {"type": "number"}}
     beside = {"base": {"type": "string"}, "base_fingerprint": {"type": "string"}}
     rig["properties"] = rig["properties"] | beside | {"standard_errors": errors}
@@ -263,7 +263,7 @@ def _schemas() -> tuple[dict[str, Schema], Schema]:
 
 @cache
 def public_words() -> frozenset[str]:
-    """Words that everybody may read in this program: choices, and names of its own example."""
+    """Return the public words of this program: choices, and names in its own example."""
     example = read_document(example_rig_path()).data
     names = [name for key in ("eras", "amplifiers") for name in _keys_of(example[key])]
     kinds = [effect.kind for effect in EFFECTS]
@@ -277,20 +277,20 @@ def _keys_of(value: Value) -> list[str]:
 
 @cache
 def _public_units() -> frozenset[str]:
-    """Units that the messages of this program use."""
+    """Return the units in this program's messages."""
     dimensions = [each for each in vars(units).values() if isinstance(each, units.Dimension)]
     examples = [dimension.example.partition(" ")[2] for dimension in dimensions]
     return frozenset([*(unit for each in dimensions for unit in each.factors), *examples, ""])
 
 
 def is_quantity(text: str) -> bool:
-    """Whether a text is a number with a common unit."""
+    """Return whether a text is a number with a common unit."""
     match = _QUANTITY.fullmatch(text.strip())
     return match is not None and match[2].strip() in _public_units()
 
 
 def public_text(text: str, names: Names) -> str:
-    """A text of public words and sizes of a mesh, or the public part of a URL; "" for another."""
+    """Return a text of public words and mesh sizes, or the public part of a URL; "" otherwise."""
     if text in public_words():
         return text
     parts = text.split()
@@ -305,7 +305,7 @@ def public_text(text: str, names: Names) -> str:
 
 
 def _public_url(scheme: str, rest: str, names: Names) -> str:
-    """A URL with its scheme and a usual device; of a valid one its options and number as well."""
+    """Return a URL's scheme and common device; if the URL is valid, also its options and number."""
     slashes = "//" if rest.startswith("//") else ""
     place, _, options = rest.removeprefix("//").partition("?")
     options, _, number = options.partition("#")
@@ -330,12 +330,12 @@ def _public_option(value: str, names: Names) -> str:
 
 
 def harmless_records(text: str, names: Names) -> str:
-    """Lines of JSON that this program wrote, with what is harmless of each."""
+    """Return the harmless part of JSON lines that this program wrote."""
     return "".join(f"{_harmless_line(line, names)}\n" for line in text.splitlines())
 
 
 def harmless_json(text: str, names: Names) -> str:
-    """One value of JSON that this program wrote, with what is harmless of it."""
+    """Return the harmless part of one JSON value that this program wrote."""
     return json.dumps(_recorded(json.loads(text), names), indent=2)
 
 
@@ -343,7 +343,7 @@ def _harmless_line(line: str, names: Names) -> str:
     try:
         record = json.loads(line)
     except (ValueError, RecursionError):
-        return f'"{HIDDEN}: a line that is no record"'
+        return f'"{HIDDEN}: a line that is not a record"'
     return json.dumps(_recorded(record, names))
 
 
@@ -370,7 +370,7 @@ def _recorded(value: Any, names: Names) -> Any:
 
 
 def harmless_words(text: str, names: Names) -> str:
-    """A text with an ellipsis for all but numbers, the program's own words and known names."""
+    """Replace everything by an ellipsis except numbers, the program's own words and known names."""
 
     def shown(found: re.Match[str]) -> str:
         token = found[0]
@@ -401,7 +401,7 @@ def _is_own(core: str) -> bool:
 
 
 def _harmless_traceback(text: str, names: Names) -> str:
-    """A traceback with the files of this program, and the words of its other lines."""
+    """Return a traceback with this program's files and the known words of its other lines."""
     lines = ["Traceback"]
     for line in text.splitlines()[1:]:
         frame = _FRAME.match(line)
@@ -426,8 +426,8 @@ def _own_modules() -> frozenset[str]:
 
 @cache
 def own_words() -> frozenset[str]:
-    """Words and identifiers in the program: of its texts, its keys and its names."""
-    words = set(dir(builtins))  # classes of errors, in tracebacks
+    """Return all words and identifiers of the program: in its texts, keys and names."""
+    words = set(dir(builtins))  # error classes, for tracebacks
     pending: list[object] = [
         SourceFileLoader("own", str(_ROOT / file)).get_code("own") for file in _own_files()
     ]

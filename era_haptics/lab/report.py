@@ -1,7 +1,7 @@
-"""`era report`: collect what a bug report needs in one folder.
+"""`era report`: collect the files for a bug report in one folder.
 
-The folder has versions, configuration, the daemon's status and the end of its log.
-`era_haptics.lab.harmless` decides what of these is shown: values of known keys that are harmless.
+The folder contains versions, configuration, the daemon's status and the end of its log, reduced by
+`era_haptics.lab.harmless` to harmless values of known keys.
 """
 
 import json
@@ -33,7 +33,7 @@ from model.errors import InputError
 from registry.files import regular_file
 from registry.plugins import plugins_of
 
-MAX_FILE_SIZE = 1 << 20  # bytes; of a larger file only the end is included
+MAX_FILE_SIZE = 1 << 20  # bytes; only the end of a larger file is included
 _GROUPS = "era_haptics."  # prefix of our entry point groups
 
 
@@ -43,19 +43,19 @@ class CollectedFile:
 
     text: str
     source: Path | None = None
-    """Where it comes from, for the user alone; None for what the report itself finds out."""
+    """Path of the original, shown only to the user; None for data collected by the report."""
 
 
 @dataclass(frozen=True)
 class ReportContents:
-    """What a report has: files by name, and what is missing, in words without any of the user's."""
+    """Contents of a report: files by name, and what is missing, described without user data."""
 
     files: Mapping[str, CollectedFile]
     missing: list[str]
 
 
 class _Report:
-    """Files under the names of their kinds, so that no name of the user's is in the report."""
+    """Files named after their kinds, so that no user-defined name is in the report."""
 
     def __init__(self) -> None:
         self.files: dict[str, CollectedFile] = {}
@@ -65,7 +65,7 @@ class _Report:
         self._documents: list[tuple[str, Path, Document]] = []
 
     def add_configuration(self, path: Path) -> None:
-        """Read a configuration file and those that it names; `collected` shows them."""
+        """Read a configuration file and the files it refers to; `collected` reduces them."""
         if not self._is_new(path):
             return
         try:
@@ -83,7 +83,7 @@ class _Report:
             self._add_log(document)
 
     def _add_unreadable(self, path: Path, lines: Sequence[int | None]) -> None:
-        """Add a file of which nothing but the place of its error is shown."""
+        """Add a file that cannot be parsed; only the position of the error is shown."""
         name = self._new_name("unreadable", ".yaml")
         if not path.exists():
             self.missing.append(f"{name}: no such file")
@@ -91,7 +91,7 @@ class _Report:
         numbers = ", ".join(str(line) for line in lines if line is not None)
         place = f" at line {numbers}" if numbers else ""
         self._add(name, f"# not valid YAML{place}; hidden\n", path)
-        self.missing.append(f"{name}: not valid YAML{place}; files that it names are left out")
+        self.missing.append(f"{name}: not valid YAML{place}; files that it refers to are left out")
 
     def _add_log(self, daemon: Document) -> None:
         """Add the log of a daemon."""
@@ -105,7 +105,7 @@ class _Report:
             self.missing.append(f"{name}: {error.strerror}")
 
     def add_status(self, socket: Path | None) -> None:
-        """Add the status of the daemon that runs."""
+        """Add the status of the running daemon."""
         try:
             with Client.connect(socket, name="era report") as daemon:
                 status = daemon.status().model_dump_json()
@@ -115,7 +115,7 @@ class _Report:
         self._add("status.json", harmless_json(status, self.names))
 
     def collected(self) -> ReportContents:
-        """All files, shown once the names of all of them are known."""
+        """Return all files, reduced once all their names are known."""
         shown = dict(self.files)
         for name, path, document in self._documents:
             text = harmless_configuration(document, self.names)
@@ -128,7 +128,7 @@ class _Report:
         return ReportContents(shown, self.missing)
 
     def _is_new(self, path: Path) -> bool:
-        """Whether a file was not met before, under this path or another."""
+        """Return whether a file is new, under this path or another."""
         place = os.path.realpath(path)
         is_new = place not in self._seen
         self._seen.add(place)
@@ -151,8 +151,8 @@ class _Report:
 def collect(configs: Iterable[Path], *, socket: Path | None) -> ReportContents:
     """Collect the files of a report.
 
-    configs: rig, layout and daemon files, with the files and the log that a daemon's file
-    names; socket: the daemon's, the default if None.
+    configs: rig, layout and daemon files; for a daemon file, also the files and the log that it
+    refers to; socket: the daemon's socket, the default socket if None.
     """
     report = _Report()
     for path in configs:
@@ -162,14 +162,14 @@ def collect(configs: Iterable[Path], *, socket: Path | None) -> ReportContents:
 
 
 def write_report(folder: Path, report: ReportContents) -> None:
-    """Write a new folder of mode 0700, completely or not at all.
+    """Write a new folder with mode 0700, completely or not at all.
 
-    Raises InputError if it exists already or cannot be created, OSError if writing fails.
+    Raises InputError if it already exists or cannot be created, OSError if writing fails.
     """
     try:
         folder.mkdir(mode=0o700)
     except FileExistsError as error:
-        raise InputError(f"{folder}: exists already; choose another with -o") from error
+        raise InputError(f"{folder}: already exists; choose another folder with -o") from error
     except OSError as error:
         raise InputError(f"{folder}: cannot write: {error.strerror}") from error
     missing = CollectedFile("".join(f"{line}\n" for line in report.missing))
@@ -182,7 +182,7 @@ def write_report(folder: Path, report: ReportContents) -> None:
 
 
 def installed_versions() -> dict[str, Any]:
-    """Versions of Python, the system, era-haptics and all installed packages, and all plug-ins."""
+    """Return versions of Python, the system, era-haptics, installed packages and plug-ins."""
     plug_ins = {
         group.removeprefix(_GROUPS): {
             name: ", ".join(sorted(f"{point.value} ({_package(point.dist)})" for point in points))
@@ -203,7 +203,7 @@ def installed_versions() -> dict[str, Any]:
 
 @cache
 def _packages(path: tuple[str, ...]) -> Sequence[tuple[str, str]]:
-    """Name and version of each installed package, in order; path: of modules."""
+    """Return name and version of each installed package, sorted; path: module search path."""
     return sorted((each.name, each.version) for each in distributions(path=[*path]))
 
 
@@ -218,9 +218,9 @@ def _kind_of(document: Document) -> str:
 
 
 def _named_by(document: Document) -> Iterator[Path]:
-    """Configuration files that a file names: its base, and a daemon's rig and layouts.
+    """Yield the configuration files that a file refers to: its base, a daemon's rig and layouts.
 
-    A table is large and can be built again.
+    Tables are left out: they are large and can be built again.
     """
     base = document.data.get("base")
     if is_file_name(base):
@@ -238,7 +238,7 @@ def _named_by(document: Document) -> Iterator[Path]:
 
 
 def _end_of(path: Path) -> str:
-    """Return a text file, of a large one only the end. Raises OSError."""
+    """Return a text file, or the end of a large one. Raises OSError."""
     with open(path, "rb", opener=regular_file) as stream:
         stream.seek(max(0, path.stat().st_size - MAX_FILE_SIZE))
         return stream.read(MAX_FILE_SIZE).decode("utf-8", errors="replace")

@@ -1,7 +1,6 @@
-"""Interfaces for plug-ins: a module for each kind, named as the group of its entry points.
+"""Interfaces for plug-ins, one module per kind, named like the entry point group.
 
-`wires`, `touch_sources`, `effects`, `content_formats` and `materials` hold what a plug-in of that
-kind derives from, takes and gives. The names in their `__all__` stay while the modules behind them
-move. Each module brings only what its kind needs, so that a wire does not wait for the plate's
-model.
+`wires`, `touch_sources`, `effects`, `content_formats` and `materials` contain the base classes and
+types that a plug-in of that kind needs, and nothing else, so that a wire does not load the plate
+model. The names in their `__all__` are stable; the modules behind them can change.
 """

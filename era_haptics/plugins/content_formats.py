@@ -1,6 +1,6 @@
-"""Interfaces for formats of content: entry points `era_haptics.content_formats`.
+"""Interfaces for content formats: entry points `era_haptics.content_formats`.
 
-`read_content` is for trying one.
+Use `read_content` to try a format.
 """
 
 from controller.content.formats import read_content

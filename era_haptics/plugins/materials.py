@@ -1,4 +1,4 @@
-"""Interfaces for materials by name: entry points `era_haptics.materials`."""
+"""Interfaces for named materials: entry points `era_haptics.materials`."""
 
 from model.structure.material import KnownMaterial, Material, Orthotropy
 

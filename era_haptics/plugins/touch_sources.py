@@ -1,6 +1,6 @@
-"""Interfaces for panels with their own protocol: entry points `era_haptics.touch_sources`.
+"""Interfaces for touch panels with their own protocol: entry points `era_haptics.touch_sources`.
 
-`open_source`, `ContactTracker` and what it tells are for trying one, as contacts on a plate.
+Use `open_source` and `ContactTracker` to try a source and see its contacts on a plate.
 """
 
 from controller.sources.touch import (

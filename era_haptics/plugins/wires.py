@@ -1,8 +1,8 @@
-"""Interfaces for further wires to amplifiers: entry points `era_haptics.wires`.
+"""Interfaces for additional wires to amplifiers: entry points `era_haptics.wires`.
 
-A wire has an address made of a URL, a port of bytes, and one of the three protocols of bytes, or
-frames of its own. A `CanWire` takes and gives frames as `pack_frames` and `unpack_frames` have
-them.
+A wire consists of an address parsed from a URL, a byte port, and one of the three byte protocols or
+its own frames. A `CanWire` sends and receives frames in the format of `pack_frames` and
+`unpack_frames`.
 """
 
 from drivers.errors import CommandError, LinkError, WireCounters

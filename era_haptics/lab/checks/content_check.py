@@ -1,4 +1,4 @@
-"""How much of a content file a finger will feel, simulated in time on the plate of a table."""
+"""Simulate in time how much of a haptic file a finger will feel on a table's plate."""
 
 import math
 from bisect import bisect_left
@@ -36,26 +36,26 @@ from model.transients.time_response import from_rest
 from model.vibration import base_amplitudes
 
 TOLERANCE_DB, RANGE_DB, MAX_DELAY = 3.0, 20.0, 0.010
-"""What is within so many dB of what is expected is kept; that counts within so many dB of
-its highest; a plate may be late by so long [s], the same for all of a file."""
+"""Tolerance of the felt level [dB]; range below the file's highest level that counts [dB]; longest
+delay of the plate, one for the whole file [s]."""
 
 DEFAULT_POSITIONS = (0.5, 0.5), (0.2, 0.3), (0.35, 0.75), (0.65, 0.2), (0.8, 0.6)
-"""Positions of a finger as shares of the plate's sides: the middle, often on a nodal line, and four
-that no symmetry of a plate relates."""
+"""Finger positions as fractions of the plate's length and width: the centre, often on a nodal line,
+and four positions that no symmetry of the plate relates."""
 
 _MIN_DISTANCE = 0.04
-"""Distance [m] from a quiet finger to the default positions."""
+"""Minimum distance from a quiet finger to the default positions [m]."""
 
-_MENTIONED = 0.05  # share of the time off its level, or of energy, that is lost without a word
-_AFTER = 0.1  # s; followed after the end
-_MIN_RATE, _RATE = 1250.0, 3.5  # Hz; and by the highest frequency that plays
+_MENTIONED = 0.05  # fraction of the time or energy; smaller losses are not reported
+_AFTER = 0.1  # s, simulated after the end
+_MIN_RATE, _RATE = 1250.0, 3.5  # Hz; multiple of the highest frequency played
 # Odd numbers of samples whose Fourier transforms are fast.
 _FAST = sorted(3**a * 5**b * 7**c for a, b, c in product(range(13), range(9), range(8)))
 
 
 @dataclass(frozen=True)
 class Part:
-    """One stimulus of a content from a time [s] on, and its answer."""
+    """One stimulus of a content, its start [s], and its answer."""
 
     start: float
     stimulus: Stimulus
@@ -63,38 +63,39 @@ class Part:
 
     @property
     def frequency(self) -> float | None:
-        """Of its carrier [Hz]; None of several."""
+        """Carrier frequency [Hz]; None for several carriers."""
         return self.answer.layers[0].frequency
 
 
 @dataclass(frozen=True, eq=False)
 class CheckedContent:
-    """Content at a finger as it will be felt."""
+    """Content as felt at one finger."""
 
     at: Point
     """Of the finger [m]."""
     duration: float
     """[s]"""
     parts: tuple[Part, ...]
-    """The continuous part, if there is one, and the taps."""
+    """The continuous part, if any, and the taps."""
     lost: tuple[str, ...]
-    """What was changed or left out, in words."""
+    """Changes and omissions, one sentence each."""
     step: float
-    """Time [s] between two levels."""
+    """Interval of the levels [s]."""
     expected: FloatArray
-    """Levels (n,) [dB SL] that the file asks for, root mean squares over 20 ms."""
+    """Levels in the file (n,) [dB SL], RMS over 20 ms."""
     given: FloatArray
-    """Levels (n,) [dB SL] that the finger feels."""
+    """Levels felt at the finger (n,) [dB SL]."""
     kept: FloatArray
-    """Shares of the time in which both agree, for delays of 0, 1, 2 ... steps."""
+    """Fraction of the time in which both levels agree, for delays of 0, 1, 2 ... steps."""
     sharpness_kept: float = 1.0
-    """Share of the continuous part, by its energy, that plays at about the file's frequency."""
+    """Fraction of the continuous part's energy that plays at about the file's frequency."""
     out_of_band_share: float = 0.0
-    """Share of a sampled signal's energy that was left out, 0 to 1."""
+    """Fraction of a sampled signal's energy that was left out, 0 to 1."""
 
     @property
     def headline(self) -> str:
-        """The kept shares in words, rounded down, and what was left out of a signal."""
+        """Summarize the kept percentages, rounded down, and the energy left out of a sampled
+        signal."""
         level = f"level {percent_down(self.kept_share)} kept"
         sharpness = f"sharpness {percent_down(self.sharpness_kept)} kept"
         if self.out_of_band_share < _MENTIONED:
@@ -103,16 +104,16 @@ class CheckedContent:
 
     @property
     def delay(self) -> float:
-        """By how much the plate is late [s]: with it most is kept."""
+        """Delay of the plate [s] at which the most is kept."""
         return self.step * best_of(self.kept)
 
     @property
     def kept_share(self) -> float:
-        """Share of the time in which what is felt is within 3 dB of what is expected, 0 to 1."""
+        """Fraction of the time in which the felt level is within 3 dB of the file's, 0 to 1."""
         return float(self.kept.max())
 
     def as_json(self) -> dict[str, Any]:
-        """Return it as `era content check --json` prints it."""
+        """Return the JSON object of `era content check --json`."""
         every = max(round(KNOT_STEP / self.step), 1)
         expected, given = (
             [round(each, 2) if np.isfinite(each) else None for each in levels[::every].tolist()]
@@ -142,19 +143,19 @@ class CheckedContent:
 
 
 def kept_shares(expected: FloatArray, given: FloatArray, count: int) -> FloatArray:
-    """Shares of the time in which levels [dB] (n,) agree, for delays of what is given (count,)."""
+    """Return the fraction of the time in which levels (n,) [dB] agree, for each delay (count,)."""
     late = [_deviations(expected, given, each) for each in range(count)]
     return np.asarray(np.mean(np.abs(late) <= TOLERANCE_DB, axis=1))
 
 
 def _deviations(expected: FloatArray, given: FloatArray, late: int) -> FloatArray:
-    """What is felt so many samples late above what is expected [dB], where that counts."""
+    """Return felt minus expected level [dB] at a delay in samples, where the file is loud."""
     counts = expected > expected.max() - RANGE_DB
     return np.asarray(np.roll(given, -late)[counts] - expected[counts])
 
 
 def least_promise(parts: Sequence[Part]) -> float | None:
-    """The least promised contrast of parts [dB] to what quiet fingers feel; None without these."""
+    """Return the lowest promised contrast of the parts [dB]; None without quiet fingers."""
     found = [each.answer.fingers[0].promised_contrast_db for each in parts]
     return min((each for each in found if each is not None), default=None)
 
@@ -167,10 +168,11 @@ def check_content(
     at: Point,
     quiet: Sequence[Point] = (),
 ) -> CheckedContent:
-    """Play a pattern at a finger, in time on a table's plate with the fingers' weight.
+    """Simulate a pattern at one finger on a table's plate, loaded by all fingers.
 
-    level_db_sl: of intensity 1; at, quiet [m]: of the finger, and of others that are to feel
-    nothing, beside which it is smoothed. Raises InputError for fingers off the plate or too close.
+    level_db_sl: level of intensity 1; at [m]: position of the finger; quiet [m]: positions of
+    fingers that should feel nothing. With quiet fingers the pattern is smoothed. Raises InputError
+    for fingers off the plate or too close together.
     """
     rendition, parts, rate, accelerations = play_content(
         pattern, table, level_db_sl, at=at, quiet=quiet
@@ -199,7 +201,7 @@ def check_content(
 
 
 def default_positions(plate: Plate, quiet: Sequence[Point] = ()) -> list[Point]:
-    """Return the default positions of a finger [m] that are not next to a quiet one [m]."""
+    """Return the default finger positions [m] that are not next to a quiet finger [m]."""
     positions = [(u * plate.length, v * plate.width) for u, v in DEFAULT_POSITIONS]
     return [
         position
@@ -216,10 +218,10 @@ def play_content(
     at: Point,
     quiet: Sequence[Point] = (),
 ) -> tuple[Rendition, tuple[Part, ...], float, FloatArray]:
-    """Play a pattern at a finger in time; arguments and errors as of `check_content`.
+    """Simulate a pattern at one finger; arguments and errors are those of `check_content`.
 
-    Returns its rendition and the parts of that, the sample rate [Hz], and accelerations (n, p)
-    [m/s²] at the points of the fingertip, by 0.1 s or more longer than the rendition.
+    Returns the rendition, its parts, the sample rate [Hz], and accelerations (n, p) [m/s²] at the
+    points of the fingertip, which continue for at least 0.1 s after the end.
     """
     check_level(level_db_sl)
     rendition = rendered(pattern, level_db_sl, table.frequencies)
@@ -251,7 +253,7 @@ def play_content(
 
 
 def _signals(parts: Sequence[Part], table: LocalizationTable, times: FloatArray) -> FloatArray:
-    """What moves the ERAs, in full strokes, (eras, n)."""
+    """Return the drive signals of all ERAs (eras, n), 1 = full stroke."""
     signals = np.zeros((len(table.eras), len(times)))
     strokes = np.array([era.full_level for era in table.eras])
     for part in parts:
@@ -269,17 +271,17 @@ def _signals(parts: Sequence[Part], table: LocalizationTable, times: FloatArray)
 
 
 def _off_level(deviations: FloatArray) -> Iterator[str]:
-    """Where what is felt is off what is wanted by more than the tolerance, in words."""
+    """Describe where the felt level differs from the file's by more than the tolerance."""
     for by, how in (
-        (deviations, "stronger than wanted: the plate builds up and rings at this place"),
-        (-deviations, "weaker than wanted: the plate follows too slowly at this place"),
+        (deviations, "stronger than wanted: the plate builds up and rings at this position"),
+        (-deviations, "weaker than wanted: the plate follows too slowly at this position"),
     ):
         if (share := float(np.mean(by > TOLERANCE_DB))) > _MENTIONED:
             yield f"{percent(share)} of the time, {how}, by up to {by.max():.1f} dB"
 
 
 def _weaker(parts: Sequence[Part]) -> Iterator[str]:
-    """What is weaker than asked, in words."""
+    """Describe the parts that are weaker than in the file."""
     continuous = [part for part in parts if part.stimulus.course]
     taps = [part for part in parts if not part.stimulus.course]
     for kind, of_kind in (("continuous part", continuous), ("taps", taps)):
@@ -287,15 +289,15 @@ def _weaker(parts: Sequence[Part]) -> Iterator[str]:
         count = np.count_nonzero(lowered)
         if count:
             subject = kind if len(of_kind) == 1 else f"{count} of {len(of_kind)} {kind}"
-            yield f"{subject} up to {max(lowered):.1f} dB weaker: all that the plate allows here"
+            yield f"{subject} up to {max(lowered):.1f} dB weaker: the plate's limit here"
 
 
 _REQUESTED, _FELT = "#888888", "#0b5cad"
-_FAINT = 0.1  # share of the highest amplitude below which no frequency is drawn
+_FAINT = 0.1  # fraction of the highest amplitude; weaker frequencies are not drawn
 
 
 def content_figure(pattern: Pattern, checked: CheckedContent) -> Figure:
-    """Draw level and frequency over time: of the file in grey, what is felt of it in blue."""
+    """Draw level and frequency over time: the file in grey, felt vibration in blue."""
     figure = Figure(figsize=(8.0, 4.6), layout="constrained")
     levels, tones = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))
     times = np.asarray(checked.step * np.arange(len(checked.expected)), dtype=float)
@@ -320,7 +322,7 @@ def content_figure(pattern: Pattern, checked: CheckedContent) -> Figure:
 def _draw_frequencies(
     axes: Axes, pattern: Pattern, checked: CheckedContent, times: FloatArray
 ) -> None:
-    """Draw frequencies at times [s] (n,) wherever something plays: of the file, and felt."""
+    """Draw the frequencies of the file and of the felt vibration at times (n,) [s]."""
     if pattern.intensity:
         hertz = hertz_of(curve_at(pattern.sharpness, times))
         is_silent = curve_at(pattern.intensity, times, beyond=0.0) <= 0

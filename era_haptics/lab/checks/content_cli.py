@@ -28,39 +28,42 @@ if TYPE_CHECKING:
     from model.arrays import Point
     from model.table.table import LocalizationTable
 
-_RATE = 48000  # Hz; with 16 bits what all players of sound take
+_RATE = 48000  # Hz; every audio player supports it with 16 bits
 _MAX_SAMPLE = (1 << 15) - 1  # of 16 bits
-_FULL_SCALE = 20.0  # m/s²; contents of 20 dB SL reach 3 to 5
+_FULL_SCALE = 20.0  # m/s²; contents at 20 dB SL reach 3 to 5
 
 
 def play(
     file: Annotated[
         Path,
         typer.Argument(
-            metavar="FILE", help="A file of content, or the name of an effect or a content."
+            metavar="FILE", help="Haptic file, or name of an effect or built-in content."
         ),
     ],
     at: Annotated[str, typer.Option(metavar="X,Y", help="Position of the finger in metres.")],
     level: Annotated[
         float | None,
-        typer.Option(metavar="DB_SL", help="Level of intensity 1, dB SL; default: 20, or its own."),
+        typer.Option(
+            metavar="DB_SL", help="Level of intensity 1 in dB SL; default: 20, or the effect's."
+        ),
     ] = None,
-    loop: Annotated[bool, typer.Option("--loop", help="Begin anew at the end.")] = False,
+    loop: Annotated[bool, typer.Option("--loop", help="Repeat until the finger lifts.")] = False,
     channel: Annotated[
-        int | None, typer.Option(metavar="N", help="Channel of a file that has several.", min=1)
+        int | None,
+        typer.Option(metavar="N", help="Channel of a multi-channel file; default: 1.", min=1),
     ] = None,
     simulate: Annotated[
         Path | None,
-        typer.Option(metavar="TABLE", help="Table file of a plate that is simulated instead."),
+        typer.Option(metavar="TABLE", help="Simulate on the plate of this table instead."),
     ] = None,
     output: Annotated[
         Path | None,
-        typer.Option("--output", "-o", metavar="WAV", help="With --simulate: what is felt."),
+        typer.Option("--output", "-o", metavar="WAV", help="WAV file to write, with --simulate."),
     ] = None,
     full_scale: Annotated[
         float,
         typer.Option(
-            metavar="M_S2", help="With --simulate: acceleration at full scale, m/s².", min=1e-3
+            metavar="M_S2", help="Acceleration at full scale in m/s², with --simulate.", min=1e-3
         ),
     ] = _FULL_SCALE,
     socket: Socket = None,
@@ -68,9 +71,9 @@ def play(
 ) -> None:
     """Play content at a finger, or write it as sound.
 
-    It plays once, at a finger that is on the plate within 20 mm of a position. With --simulate
-    write the acceleration at a finger that is alone there as sound, to listen to and to look at: 16
-    bits at 48 kHz. All sounds have the same full scale, so their loudness can be compared by ear.
+    Plays the content once at the finger within 20 mm of --at. With --simulate, writes the simulated
+    acceleration at a single finger there as a WAV file (16 bits, 48 kHz) instead, to listen to or
+    to plot. The full scale is fixed, so the loudness of several files can be compared by ear.
     """
     place = parse_point(at, what="--at")
     if (simulate is None) != (output is None):
@@ -106,7 +109,7 @@ def play(
 
 
 def pattern_of(file: Path, channel: int | None = None) -> "Pattern":
-    """Read a file of content, or the one that a name without an ending stands for."""
+    """Read a haptic file, or a built-in content given by its name without a suffix."""
     from controller.content.formats import named_content, read_content
 
     return read_content(file if file.suffix else named_content(str(file)), channel)
@@ -123,7 +126,7 @@ def _simulate(
     full_scale: float,
     as_json: bool,
 ) -> None:
-    """Write what a finger feels as a WAV file; raises InputError above full scale [m/s²]."""
+    """Write the felt acceleration as a WAV file; raises InputError above full scale [m/s²]."""
     import numpy as np
     from scipy.io import wavfile
     from scipy.signal import resample
@@ -198,11 +201,12 @@ def check(
         float, typer.Option(metavar="DB_SL", help="Level of intensity 1, dB SL.")
     ] = 20.0,
     channel: Annotated[
-        int | None, typer.Option(metavar="N", help="Channel of a file that has several.", min=1)
+        int | None,
+        typer.Option(metavar="N", help="Channel of a multi-channel file; default: 1.", min=1),
     ] = None,
     least: Annotated[
         float,
-        typer.Option(metavar="SHARE", help="Least share of the level to keep.", min=0, max=1),
+        typer.Option(metavar="SHARE", help="Minimum kept fraction of the level.", min=0, max=1),
     ] = 0.8,
     picture: Annotated[
         Path | None,
@@ -210,17 +214,18 @@ def check(
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Simulate what a finger will feel of content.
+    """Simulate what a finger will feel of haptic files.
 
-    It is simulated in time, for a finger alone or next to quiet fingers. The kept share of the
-    level is the share of the time in which the level at the skin is within 3 dB of the file's,
-    counted where the file is within 20 dB of its highest level. Levels are means over 20 ms. The
-    kept share of the sharpness is the share of the continuous part that plays at about the
-    frequency in the file. Shares are rounded down. Amplifiers are assumed to be phased, whichever
-    mode the table was built for. Without --table, the founding paper's plate is used. Without --at,
-    five positions (including the centre) are simulated and the median one is shown. Several files,
-    or a folder with its subfolders, are listed with one line each. Exit status 1 if a file keeps
-    less of its level than --least, or one of several cannot be read; sharpness has no limit.
+    The simulation is in the time domain, for a single finger or with quiet fingers present. A level
+    is kept while the level at the skin, averaged over 20 ms, is within 3 dB of the file's; times at
+    which the file is more than 20 dB below its peak do not count. Sharpness is kept while the
+    continuous part plays at about the file's frequency. Percentages are rounded down. Amplifiers
+    are assumed to be phased, whichever mode the table was built for.
+
+    Without --table, the founding paper's plate is used. Without --at, five positions (including the
+    centre) are simulated and the median one is shown. Several files, or a folder with its
+    subfolders, are listed with one line each. Exits with status 1 if a file keeps less of its level
+    than --least, or one of several files cannot be read; sharpness has no limit.
     """
     from model.files.output_paths import check_picture
 
@@ -241,7 +246,7 @@ def check(
 
 @dataclass(frozen=True)
 class _Setting:
-    """Where and how strongly contents are checked."""
+    """Plate, positions and levels of a check."""
 
     table: "LocalizationTable"
     table_file: Path | None
@@ -254,7 +259,7 @@ class _Setting:
     least_share: float
 
     def check(self, file: Path) -> "tuple[Pattern, list[CheckedContent]]":
-        """Check a file at every position; return it with the results, the least kept first.
+        """Check a file at every position; return its pattern and the results, the worst first.
 
         Raises InputError for a file that cannot be read or is silent.
         """
@@ -264,7 +269,7 @@ class _Setting:
         has_level = any(intensity > 0 for _, intensity in pattern.intensity)
         has_tap = any(transient.intensity > 0 for transient in pattern.transients)
         if not has_level and not has_tap:
-            raise InputError(f"{file}: is silent; there is nothing to check")
+            raise InputError(f"{file}: must not be silent")
         results = [
             check_content(pattern, self.table, self.level_db_sl, at=position, quiet=self.quiet)
             for position in self.positions
@@ -278,7 +283,7 @@ class _Setting:
 
     @property
     def plate_row(self) -> str | None:
-        """A line about the built-in plate; None if a table was given."""
+        """Return a line about the built-in plate; None if a table was given."""
         if self.table_file is not None:
             return None
         plate = self.table.plate
@@ -289,7 +294,7 @@ class _Setting:
         )
 
     def as_json(self) -> dict[str, Any]:
-        """Return the part of the report that all files share."""
+        """Return the JSON keys that all files share."""
         return {
             "table": None if self.table_file is None else str(self.table_file),
             "quiet_m": [[*position] for position in self.quiet],
@@ -330,7 +335,7 @@ def _setting(
 
 
 def _built_in_table() -> "LocalizationTable":
-    """Return the table of the founding paper's plate, from the user's cache if it is there."""
+    """Return the table of the founding paper's plate, cached per user."""
     from model.rig.rig_file import example_rig_path, load_rig
     from model.table.table_file import cached_table
 
@@ -340,9 +345,9 @@ def _built_in_table() -> "LocalizationTable":
 
 
 def _content_files(paths: "Sequence[Path]") -> list[Path]:
-    """Return files and names as they are, and the contents of folders in order of their names.
+    """Return files and names unchanged, and the haptic files in folders, sorted by name.
 
-    Raises InputError for a folder without content.
+    Raises InputError for a folder without haptic files.
     """
     from controller.content.formats import content_formats
 
@@ -358,9 +363,7 @@ def _content_files(paths: "Sequence[Path]") -> list[Path]:
             if file.name.lower().endswith(endings) and file.is_file()
         ]
         if not in_folder:
-            raise InputError(
-                f"{path}: must contain files of content ({', '.join(endings)}), got none"
-            )
+            raise InputError(f"{path}: must contain haptic files ({', '.join(endings)}), got none")
         files += in_folder
     return files
 
@@ -399,7 +402,7 @@ def _check_one(file: Path, setting: _Setting, picture: Path | None, *, as_json: 
 
 
 def _check_list(files: "Sequence[Path]", setting: _Setting, *, as_json: bool) -> bool:
-    """Report on files, a line each; return whether enough of the level of all is kept."""
+    """Print one line per file; return whether all keep enough of their level."""
     rows = [setting.plate_row, "level  sharpness  at [m]        file"]
     contents: list[dict[str, Any]] = []
     failures = 0
@@ -426,7 +429,7 @@ def _check_list(files: "Sequence[Path]", setting: _Setting, *, as_json: bool) ->
 
 
 def _list_row(file: Path, checked: "CheckedContent", setting: _Setting) -> str:
-    """Format a file of several."""
+    """Format one of several files."""
     level = percent_down(checked.kept_share)
     sharpness = percent_down(checked.sharpness_kept)
     verdict, _, _ = _verdict(checked, setting).partition(";")
@@ -435,11 +438,11 @@ def _list_row(file: Path, checked: "CheckedContent", setting: _Setting) -> str:
 
 
 _ROWS = 12
-_REMEDY = "try --at another place, another sharpness, slower rises or a lower --level"
+_REMEDY = "try another position (--at), another sharpness, slower rises or a lower --level"
 
 
 def _verdict(checked: "CheckedContent", setting: _Setting) -> str:
-    """Judge content in words: the first loss that counts, then its details after a semicolon."""
+    """Return the verdict: the first loss that counts, then its details after a semicolon."""
     from era_haptics.lab.checks.content_check import least_promise
     from model.answer.answer import MIN_CONTRAST_DB
 
@@ -450,23 +453,23 @@ def _verdict(checked: "CheckedContent", setting: _Setting) -> str:
     if checked.sharpness_kept < setting.least_share:
         losses.append("its sharpness is lost")
     if 1 - checked.out_of_band_share < setting.least_share:
-        losses.append("part of it is left out")
+        losses.append("part of the signal is left out")
     promised = least_promise(checked.parts)
     if promised is not None and promised < MIN_CONTRAST_DB:
         losses.append(
-            f"other fingers feel much of it; {promised:.1f} dB promised above them, "
-            f"{MIN_CONTRAST_DB:g} dB or more are felt apart"
+            f"other fingers feel much of it: promised {promised:.1f} dB above them, should be "
+            f"at least {MIN_CONTRAST_DB:g} dB"
         )
     return f"level good, but {', '.join(losses)}" if losses else "good"
 
 
 def _exact_percent(share: float) -> str:
-    """Format a limit with all its digits."""
+    """Format a percentage with all its digits."""
     return f"{100 * share:.10g} %"
 
 
 def _position_row(results: "Sequence[CheckedContent]", setting: _Setting) -> Iterator[str]:
-    """Format how much is kept at several positions, and which of them is shown."""
+    """Format the kept percentages of several positions, and the position shown."""
     if len(results) == 1:
         return
     worst, shown, best = results[0], results[len(results) // 2], results[-1]
@@ -483,7 +486,7 @@ def _position_row(results: "Sequence[CheckedContent]", setting: _Setting) -> Ite
 
 
 def _lines(checked: "CheckedContent") -> Iterator[str]:
-    """Format levels over time, what plays at which frequency and promise, and what is lost."""
+    """Format the levels over time, frequencies and promise of each part, and losses."""
     import numpy as np
 
     yield "     time [s]   wanted   felt [dB SL]"
@@ -504,22 +507,22 @@ def _lines(checked: "CheckedContent") -> Iterator[str]:
 
 
 def _level(db_sl: float) -> str:
-    """Format a level that is felt at all."""
+    """Format a level [dB SL], `-` if it cannot be felt."""
     return f"{db_sl:8.1f}" if db_sl > -10 else f"{'-':>8}"
 
 
 def _played(parts: "Sequence[Part]") -> str:
-    """Format frequencies, levels, and the least promise."""
+    """Format frequencies, highest level, and the lowest promised contrast."""
     from era_haptics.lab.checks.content_check import least_promise
 
     tones = [part.frequency for part in parts if part.frequency is not None]
     levels = [part.answer.fingers[0].level_db_sl for part in parts]
     promised = least_promise(parts)
-    beside = "" if promised is None else f", promised {promised:.1f} dB above quiet fingers"
-    return f"{_span(tones)} Hz, up to {max(levels):.1f} dB SL{beside}"
+    contrast = "" if promised is None else f", promised {promised:.1f} dB above quiet fingers"
+    return f"{_span(tones)} Hz, up to {max(levels):.1f} dB SL{contrast}"
 
 
 def _span(values: "Sequence[float]") -> str:
-    """Format one value or the lowest and highest."""
+    """Format a single value, or the lowest and highest."""
     low, high = f"{min(values):g}", f"{max(values):g}"
     return low if low == high else f"{low} to {high}"

@@ -1,4 +1,4 @@
-"""How every region of a surface layout will feel, simulated in time on the plate of a table."""
+"""Simulate in time how every region of a surface layout feels on a table's plate."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -31,19 +31,23 @@ from model.transients.time_response import PlateInTime, plate_in_time
 from model.vibration import base_amplitudes
 
 STEADY_AFTER, STEADY_FOR = 0.3, 0.1
-"""Start and length [s] of the part over which a vibration without a duration is felt."""
+"""Start and length [s] of the interval over which a continuous vibration is evaluated."""
 
-_AFTER = 0.1  # s; what a resting finger feels after the end counts, too
+_AFTER = 0.1  # s; the vibration of a resting finger counts until then
 
 
 @dataclass(frozen=True)
 class SimulatedTouch:
-    """A touch at a position [m], with a resting finger [m] or None.
+    """Simulated touch at a position [m], with a resting second finger [m] or None.
 
-    frequencies [Hz]; felt_db_sl: over the duration of the effect; resting_db_sl: the strongest that
-    the resting finger feels over as long, None without one; promised_contrast_db: over that finger
-    on nine of ten plates; held_back_db: by how much it is weaker for that finger; exposure_m_s2: of
-    it at full strength (`exposures`); reason: why nothing plays.
+    - frequencies [Hz]
+    - felt_db_sl: level over the duration of the effect.
+    - resting_db_sl: highest level at the resting finger over an equally long interval; None without
+      one.
+    - promised_contrast_db: contrast with the resting finger on 90 % of plates.
+    - held_back_db: reduction of the level for the resting finger's sake.
+    - exposure_m_s2: weighted acceleration at full strength (`exposures`).
+    - reason: why nothing plays.
     """
 
     at: Point
@@ -58,7 +62,7 @@ class SimulatedTouch:
 
 
 def loaded_plate(table: LocalizationTable, contacts: Sequence[Point]) -> PlateInTime:
-    """A table's plate in time with fingers on it, if they weigh anything."""
+    """Return a table's plate in the time domain, loaded by fingers unless they are massless."""
     if table.fingertip is None:
         return table.in_time
     loads = fingertip_loads(table.fingertip, contacts)
@@ -66,27 +70,26 @@ def loaded_plate(table: LocalizationTable, contacts: Sequence[Point]) -> PlateIn
 
 
 class TouchSimulator:
-    """Plays effects as the controller does, along plain ramps, on the plate of a table in time.
-
-    The fingers weigh on it.
+    """Play effects as the controller does, with plain ramps, on a table's plate loaded by the
+    fingers.
     """
 
     def __init__(self, table: LocalizationTable) -> None:
         self.table = table
         self.chooser = Chooser(table)
-        """Chooses what is played beside other contents."""
+        """Chooses frequencies and weights with other contents present."""
         self.capabilities = PlaybackCapabilities(
             drive_mode=UNRESTRICTED,
             playable=DRIVE_MODES,
             limits=Limits((float(table.frequencies[0]), float(table.frequencies[-1]))),
             envelope_support=RAMPS_ONLY,
         )
-        """Of amplifiers that play whatever the table has."""
+        """Limits of amplifiers that can play the whole table."""
 
     def answered(self, target: Target, at: Point, quiet: Sequence[Point]) -> Answer:
-        """Answer a target at a position [m] among quiet fingers, along plain ramps.
+        """Answer a target at a position [m] with quiet fingers, using plain ramps.
 
-        Raises InputError where nothing can be played.
+        Raises InputError if nothing can be played.
         """
         finger = Contact(target.key, *at, since=0.0)
         others = [
@@ -138,9 +141,10 @@ class TouchSimulator:
         length: float,
         until: float,
     ) -> FloatArray:
-        """Level [dB SL] of the rms over each stretch of a length [s] up to a time [s], (n,).
+        """Level [dB SL] of the RMS over each window of `length` [s] that ends before `until` [s],
+        (n,).
 
-        Mean over a fingertip; one value for each sample at which a stretch starts.
+        Averaged over a fingertip; one value per sample at which a window starts.
         """
         plate = self.table.plate
         points, weights = fingertip_points(*at, plate), fingertip_weights(*at, plate)
@@ -152,8 +156,8 @@ class TouchSimulator:
         return decibels(math.sqrt(2) * np.sqrt(mean) @ weights)
 
 
-_REPORT = 0.01  # s; between two reports of the panel
-_WATCHED = 3.0  # s; of an effect that changes with time
+_REPORT = 0.01  # s, interval of the panel's reports
+_WATCHED = 3.0  # s; simulated length of an effect that changes with time
 _MAX_STEPS = 2000
 _WAY = 0.12  # m
 _SPEEDS = (0.05, 0.2, 1.0, 5.0)  # m/s
@@ -165,9 +169,10 @@ _KEY = ContactKey("check", 1)
 def strongest_target(
     layout: SurfaceLayout, name: str, region: Region | None, *, at: tuple[float, float]
 ) -> Target | None:
-    """Return what an effect, by name, makes felt most in a region, or outside of all; or None.
+    """Return the strongest target of an effect in a region, or outside all regions; None for none.
 
-    at [m]: where a finger comes down. An effect for motion is moved along x, y and around `at`.
+    at [m]: where the finger lands. A finger of a motion effect is moved along x, along y and around
+    `at`.
     """
     effect, level = layout.effects[name], layout.level_of(name, region)
     watch = _while_moving if effect.is_for_motion else _while_resting
@@ -217,7 +222,7 @@ def _while_moving(
 def _along(
     at: tuple[float, float], direction: tuple[float, float] | None, distance: float
 ) -> tuple[float, float]:
-    """Return the position [m] after a distance [m] in a direction, None for around a circle."""
+    """Return the position [m] after a distance [m] in a direction, or around a circle for None."""
     if direction is not None:
         return (at[0] + distance * direction[0], at[1] + distance * direction[1])
     angle = distance / _TURNING_RADIUS
@@ -232,21 +237,23 @@ def _finger(at: tuple[float, float]) -> Contact:
 
 
 LEVEL_TOLERANCE, MARGIN_TOLERANCE = 2.0, 4.0
-"""How far [dB] a level may be off, and above where it is promised on nine of ten plates."""
+"""Tolerances of a level [dB]: below or above the promised one, and above one promised on 90 % of
+plates."""
 
-_ALIKE = 1.25  # ratio of frequencies that hardly differ in feel
+_ALIKE = 1.25  # ratio of frequencies that feel nearly alike
 
-_MAX_TOUCHES, MAX_POSITIONS = 30, 120  # of one region, of all
-_MIN_STEP = 0.008  # m; nearer touches hardly differ
-_RESTING_AWAY = 0.06  # m; at least, from a touch to a resting finger
+_MAX_TOUCHES, MAX_POSITIONS = 30, 120  # in one region, in all
+_MIN_STEP = 0.008  # m; closer touches hardly differ
+_RESTING_AWAY = 0.06  # m, minimum distance from a touch to the resting finger
 
 
 @dataclass(frozen=True)
 class CheckedEffect:
-    """An effect of a region as it will feel.
+    """Simulated touches of one effect in one region.
 
-    on: the key that plays it; promised_db_sl: None for as strong as the neighbours allow; touches:
-    each position alone, then with a resting finger; area [m²]: of the region for each position.
+    on: layout key that plays the effect; promised_db_sl: None for as strong as the neighbours
+    allow; touches: at each position alone, then with a resting finger; area [m²]: share of the
+    region for each position.
     """
 
     region: str
@@ -258,12 +265,12 @@ class CheckedEffect:
 
     @property
     def felt(self) -> list[float]:
-        """Levels over the effect [dB SL] of all touches that are felt."""
+        """Levels [dB SL] of all touches that are felt, over the effect."""
         return [each.felt_db_sl for each in self.touches if each.felt_db_sl is not None]
 
     @property
     def contrasts(self) -> list[float]:
-        """Level above that of the resting finger on the nominal plate [dB]."""
+        """Contrast with the resting finger on the nominal plate [dB]."""
         return [
             each.felt_db_sl - each.resting_db_sl
             for each in self.touches
@@ -272,27 +279,27 @@ class CheckedEffect:
 
     @property
     def promised_contrasts(self) -> list[float]:
-        """Level above that of the resting finger on nine of ten plates [dB]."""
+        """Contrast with the resting finger on 90 % of plates [dB]."""
         found = [each.promised_contrast_db for each in self.touches]
         return [each for each in found if each is not None]
 
     @property
     def held_back_db(self) -> float:
-        """By how much [dB] a touch is weaker at most so that the resting finger feels no more."""
+        """Largest reduction of a touch [dB] for the resting finger's sake."""
         return max((each.held_back_db for each in self.touches), default=0.0)
 
     @property
     def exposure_m_s2(self) -> float:
-        """Weighted acceleration of a touch at most [m/s²], root mean square (`exposures`)."""
+        """Highest weighted RMS acceleration of a touch [m/s²] (`exposures`)."""
         return max((each.exposure_m_s2 for each in self.touches), default=0.0)
 
     @property
     def frequencies(self) -> list[float]:
-        """All frequencies that play [Hz], ascending."""
+        """All frequencies played [Hz], ascending."""
         return sorted({frequency for each in self.touches for frequency in each.frequencies})
 
     def as_json(self) -> dict[str, Any]:
-        """Return it as `era layout check --json` prints it."""
+        """Return the JSON object of `era layout check --json`."""
         return {
             "region": self.region,
             "effect": self.effect,
@@ -328,7 +335,7 @@ def check_layout(
 ) -> list[CheckedEffect]:
     """Simulate touches over every region of a layout, alone and with a resting second finger.
 
-    progress: called with the number of effects checked, and of all.
+    progress: called with the number of effects checked and the total.
     """
     simulator = TouchSimulator(table)
     parts = [*layout.uses()]
@@ -376,9 +383,9 @@ def _check(
 def touch_positions(
     layout: SurfaceLayout, region: Region | None, plate: Plate, count: int = _MAX_TOUCHES
 ) -> tuple[list[Point], float]:
-    """Return at most so many positions [m], evenly over a region, and the area of each [m²].
+    """Return up to `count` positions [m], evenly spaced over a region, and the area of each [m²].
 
-    Without what later regions cover.
+    Excludes parts that later regions cover.
     """
     corners = [(0.0, 0.0), (plate.length, plate.width)]
     if region is not None:
@@ -400,7 +407,7 @@ def touch_positions(
 
 
 def _resting(plate: Plate, at: Point, number: int) -> Point:
-    """Return where a second finger rests: each time in another quarter of the plate."""
+    """Return the position of the second finger: in another quarter of the plate each time."""
     quarters = [(x * plate.length, y * plate.width) for x in (0.25, 0.75) for y in (0.25, 0.75)]
     away = [each for each in quarters if math.dist(each, at) >= _RESTING_AWAY]
     if not away:
@@ -409,7 +416,7 @@ def _resting(plate: Plate, at: Point, number: int) -> Point:
 
 
 def _silent(target: Target, touches: Sequence[SimulatedTouch], area: float) -> Iterator[str]:
-    # As strong as the neighbours allow may be nothing.
+    # The level that the neighbours allow can be zero.
     can_be = target.level_db_sl is None
     silent = [each for each in touches if each.reason is not None and not (can_be and each.resting)]
     if silent:
@@ -444,7 +451,7 @@ def _unnoticed(
     *,
     at: Point,
 ) -> Iterator[str]:
-    """Short effects whose given level hides below what lasts in the region."""
+    """Yield short effects whose stated level is masked by a continuous effect of the region."""
     if on == ON_RELEASE or not click.is_short or not layout.effects[name].gives_level_in(region):
         return
     for other, beside, lasting in layout.uses():
@@ -456,8 +463,8 @@ def _unnoticed(
         if click.level_db_sl < felt.level_db_sl + NOTICED_ABOVE_DB:
             yield (
                 f"level {click.level_db_sl:g} dB SL is less than {NOTICED_ABOVE_DB:g} dB above "
-                f"{lasting}, {felt.level_db_sl:g} dB SL, beside which it is hardly noticed; raise "
-                f"it, or give {name} no level: it is {CLICK_ABOVE_DB:g} dB above then"
+                f"{lasting}, {felt.level_db_sl:g} dB SL, and is hardly noticed; raise "
+                f"it, or give {name} no level: it is then {CLICK_ABOVE_DB:g} dB above"
             )
 
 
@@ -474,7 +481,7 @@ def _off_band(
     if band is None:
         if must_be_alike and played[-1] > _ALIKE * played[0]:
             yield (
-                f"frequency is {played[0]:g} to {played[-1]:g} Hz, another at every place; give it "
+                f"frequency is {played[0]:g} to {played[-1]:g} Hz, depending on position; give it "
                 "a frequency or a band"
             )
         return
@@ -484,11 +491,11 @@ def _off_band(
 
 
 def _where(some: Sequence[SimulatedTouch], touches: Sequence[SimulatedTouch], area: float) -> str:
-    """Format on how much of a region something happens, and where."""
+    """Format the part of a region, in percent and by position, in which something happens."""
     places = sorted({each.at for each in some})
     share = len(places) / len({each.at for each in touches})
     (x0, y0), (x1, y1) = np.min(places, axis=0), np.max(places, axis=0)
-    second = "" if any(each.resting is None for each in some) else ", beside a second finger"
+    second = "" if any(each.resting is None for each in some) else ", with a second finger"
     return (
         f"on {100 * share:.0f} % of the region ({1e4 * area * len(places):.1f} cm²), x {x0:.3f} to "
         f"{x1:.3f}, y {y0:.3f} to {y1:.3f} m{second}"

@@ -1,4 +1,4 @@
-"""`era layout check`: how a surface layout will feel."""
+"""`era layout check`: simulate how a surface layout feels."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -29,11 +29,12 @@ def check(
         typer.Option("--output", "-o", metavar="PICTURE", help="Picture to write, e.g. P.png."),
     ] = None,
 ) -> None:
-    """Simulate what every region makes felt, and what is felt apart.
+    """Simulate every region of a layout and report which regions stay distinct.
 
-    In time, by touches over the region, alone and with a resting second finger; and what two and
-    three fingers at once are promised at their worst places. Amplifiers are taken as phased,
-    whichever mode the table was built for. Exit status 1 if a region falls short of the layout.
+    Touches are simulated in the time domain over each region, alone and with a resting second
+    finger. Pairs and triples of regions are then touched simultaneously, at the positions with the
+    lowest promised contrast. Amplifiers are assumed to be phased, whichever mode the table was
+    built for. Exits with status 1 if a region falls short of the layout.
     """
     import time
 
@@ -52,7 +53,7 @@ def check(
     started = time.perf_counter()
     with progress_bar("effects") as progress:
         checked = check_layout(layout, table, progress=progress)
-    with progress_bar("regions at once") as progress:
+    with progress_bar("pairs and triples") as progress:
         together = check_together(layout, table, progress=progress)
     elapsed = time.perf_counter() - started
     files = []
@@ -102,27 +103,27 @@ def _lines(each: "CheckedEffect") -> list[str]:
     if each.contrasts:
         lines.append(
             f"  {_span(each.promised_contrasts)} dB above what a resting second finger feels, on "
-            "nine of ten plates"
+            "90 % of plates"
         )
         lines.append(f"  {_span(each.contrasts)} dB nominal")
     if each.held_back_db > _SHOWN_FROM:
         held = f"  up to {each.held_back_db:.1f} dB weaker"
-        lines.append(f"{held} so that it feels half of it at most")
+        lines.append(f"{held} so that the resting finger feels at most half of it")
     if each.promised_db_sl is not None and each.promised_db_sl > DEFAULT_MAX_DB_SL:
-        lines.append(f"  exposure up to {each.exposure_m_s2:.2g} m/s², weighted as by ISO 5349-1")
+        lines.append(f"  exposure up to {each.exposure_m_s2:.2g} m/s², weighted per ISO 5349-1")
     return [*lines, *(f"  PROBLEM {problem}" for problem in each.problems)]
 
 
 def _matrix(names: "Sequence[str]", promised: "FloatArray") -> list[str]:
-    """Format what fingers in every two regions are promised."""
+    """Format the promised contrasts of all pairs and triples of regions."""
     from model.answer.answer import MIN_CONTRAST_DB, OWN_CONTRAST_DB
 
     width = max(map(len, names)) + 4
     lines = [
-        "promised contrast of the worst finger in dB: below the diagonal in two regions at once, "
-        "above it in three, with the worst third",
-        f"(from {OWN_CONTRAST_DB:g} own, from {MIN_CONTRAST_DB:g} mixed, below shared or held "
-        "back)",
+        "promised contrast of the worst finger in dB: pairs of regions below the diagonal, "
+        "triples above it (with the worst third region)",
+        f"({OWN_CONTRAST_DB:g} or more: own, {MIN_CONTRAST_DB:g} or more: mixed, less: shared or "
+        "held back)",
         f"{'':{width}}" + "".join(f"{number:6d}" for number in range(1, len(names) + 1)),
     ]
     for number, (name, row) in enumerate(zip(names, promised.tolist(), strict=True), start=1):

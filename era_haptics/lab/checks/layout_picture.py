@@ -1,4 +1,4 @@
-"""Which regions of a layout are felt apart at once, and the picture of a checked layout."""
+"""Contrast between simultaneously touched regions of a layout, and pictures of checked layouts."""
 
 import math
 from collections.abc import Callable, Iterable, Sequence
@@ -36,21 +36,22 @@ from model.quantities import counted
 from model.table.table import LocalizationTable
 
 MAX_PAIRS, MAX_TRIPLES = 150, 150
-"""Of a layout with many regions those whose centres are nearest."""
+"""In layouts with many regions, only the closest pairs and triples are checked."""
 
-_POSITIONS = 4  # of a region: the middle, and those farthest from it and from each other
+_POSITIONS = 4  # per region: the centre, then points farthest from it and from each other
 _NAMED = 4  # pairs that are close
-_NEAREST = 0.02  # m; two fingertips side by side
+_NEAREST = 0.02  # m; two fingertips next to each other
 
 _Finger: TypeAlias = tuple[Contact, Target]
 
 
 @dataclass(frozen=True)
 class JointTouch:
-    """Fingers in two or three regions at once, where the worst one has least contrast.
+    """Simultaneous fingers in two or three regions, at the positions with the lowest contrast.
 
-    at [m]: of each; contrasts [dB]: promised of each content above those of the others there, all
-    played; worst_db: of all fingers on the same plates; verdicts: what the rule makes of them.
+    at [m]: finger positions; contrasts [dB]: promised contrast of each content with the others
+    there, if all play; worst_db: lowest contrast of all fingers on the same plates; verdicts: after
+    the rule that mixes, shares or holds back.
     """
 
     regions: tuple[str, ...]
@@ -60,7 +61,7 @@ class JointTouch:
     verdicts: tuple[str, ...]
 
     def as_json(self) -> dict[str, Any]:
-        """Return it as `era layout check --json` prints it."""
+        """Return the JSON object of `era layout check --json`."""
         return {
             "regions": [*self.regions],
             "at_m": [[*at] for at in self.at],
@@ -76,11 +77,11 @@ def check_together(
     *,
     progress: Progress = unseen,
 ) -> list[JointTouch]:
-    """Answer fingers in every two and every three regions at their worst places.
+    """Answer fingers in all pairs and triples of regions at their worst positions.
 
-    Worst, if all were steady, of four places of each of two regions; of three regions of those of
-    their pairs.
-    progress: called with the number of pairs and triples answered, and of all.
+    For a pair, these are the worst of four positions per region, with all effects taken as steady;
+    for a triple, the worst of the positions of its pairs. progress: called with the number of pairs
+    and triples answered and the total.
     """
     simulator = TouchSimulator(table)
     targets, places = dict[str, Target](), dict[str, list[Point]]()
@@ -119,9 +120,9 @@ def check_together(
 
 
 def matrix_of(together: Sequence[JointTouch]) -> tuple[list[str], FloatArray]:
-    """Return the regions' names, and the promise of the worst finger in every two of them [dB].
+    """Return the regions' names, and the promised contrast of the worst finger (n, n) [dB].
 
-    (n, n): below the diagonal two at once, above it three, with the worst third; NaN for none.
+    Below the diagonal: pairs. Above: triples with the worst third region. NaN if not checked.
     """
     names = [*dict.fromkeys(name for each in together for name in each.regions)]
     found = np.full((len(names), len(names)), np.nan)
@@ -134,10 +135,7 @@ def matrix_of(together: Sequence[JointTouch]) -> tuple[list[str], FloatArray]:
 
 
 def close_pairs(together: Sequence[JointTouch]) -> str:
-    """Say which two regions are felt as one at the same time, hardest to tell apart first.
-
-    Nothing where there are none.
-    """
+    """Format the pairs of regions felt as one, lowest contrast first; empty without any."""
     pairs = [each for each in together if len(each.regions) == 2]
     close = sorted(
         (each for each in pairs if each.worst_db < MIN_CONTRAST_DB), key=lambda each: each.worst_db
@@ -148,12 +146,12 @@ def close_pairs(together: Sequence[JointTouch]) -> str:
     more = f" and {len(close) - _NAMED} more" if len(close) > _NAMED else ""
     return (
         f", but {len(close)} of {counted(len(pairs), 'pair')} of regions below "
-        f"{MIN_CONTRAST_DB:g} dB at once: {', '.join(named)}{more}"
+        f"{MIN_CONTRAST_DB:g} dB together: {', '.join(named)}{more}"
     )
 
 
 def _target_in(layout: SurfaceLayout, region: Region) -> Target | None:
-    """Return what a finger in a region feels: what lasts rather than what is short."""
+    """Return what a finger in a region feels; continuous effects come first."""
     names = [name for name in (region.on_press, region.on_move) if name is not None]
     found = [strongest_target(layout, name, region, at=region.shape.centre) for name in names]
     felt = [each for each in found if each is not None]
@@ -161,7 +159,7 @@ def _target_in(layout: SurfaceLayout, region: Region) -> Target | None:
 
 
 def _some_of(layout: SurfaceLayout, region: Region, table: LocalizationTable) -> list[Point]:
-    """Return a few places of a region, the middle first, then each farthest from those before."""
+    """Return a few positions in a region: the centre, then each the farthest from those before."""
     left, found = touch_positions(layout, region, table.plate)[0], list[Point]()
     while left and len(found) < _POSITIONS:
         if found:
@@ -173,7 +171,7 @@ def _some_of(layout: SurfaceLayout, region: Region, table: LocalizationTable) ->
 
 
 def _nearest(groups: Iterable[tuple[Region, ...]], count: int) -> list[tuple[Region, ...]]:
-    """Return the groups of regions whose centres are nearest, in the order of the layout."""
+    """Return the groups of regions whose centres are closest, in the order of the layout."""
     every = [*groups]
 
     def size(number: int) -> float:
@@ -189,7 +187,7 @@ def _worst(
     targets: Sequence[Target],
     spots: Sequence[Sequence[Point]],
 ) -> JointTouch | None:
-    """Answer at all combinations of places; None where no fingers fit there at once."""
+    """Answer at all combinations of positions; None if the fingers never fit."""
     free = [replace(target, is_own=False) for target in targets]
     steady = [replace(target, modulation_hz=None) for target in free]
     tried: list[tuple[float, tuple[Point, ...]]] = []
@@ -225,10 +223,10 @@ def _placed(targets: Sequence[Target], at: Sequence[Point]) -> list[_Finger]:
 def _felt(
     simulator: TouchSimulator, fingers: Sequence[_Finger], protected: frozenset[ContactKey] | None
 ) -> tuple[float, list[tuple[float, str]]]:
-    """Return the contrast of the worst finger, and of each finger its contrast and verdict.
+    """Return the contrast of the worst finger, and the contrast and verdict of each finger.
 
-    What is short plays beside what lasts, one at a time, all other fingers quiet. protected: None
-    to play all contents, whatever they reach.
+    Short effects play on top of continuous ones, one at a time, with all other fingers quiet. If
+    protected is None, all contents play, whatever their contrast.
     """
     lasting = tuple(each for each in fingers if not each[1].is_short)
     short = tuple(each for each in fingers if each[1].is_short)
@@ -259,7 +257,7 @@ def _answered(
     quiet: Sequence[Contact],
     protected: frozenset[ContactKey] | None = None,
 ) -> Answer:
-    """Answer fingers that feel what lasts, with its modulation; protected: as of `_felt`."""
+    """Answer fingers with continuous effects, including modulation; protected: see `_felt`."""
     table, capabilities = simulator.table, simulator.capabilities
     every = fingers_of(table, fingers, quiet, capabilities, protected or frozenset())
     least = -math.inf if protected is None else MIN_CONTRAST_DB
@@ -276,9 +274,9 @@ _LEVEL_EDGES = [-12.0, -6.0, -4.0, -2.0, 2.0, 4.0, 6.0, 12.0]  # dB
 _MAX_CONTRAST = 30.0  # dB
 _FREQUENCY_TICKS = (40, 60, 100, 150, 250, 400, 600)  # Hz
 _NO_PROMISE = "#bbbbbb"
-_MAX_JOINED = 12  # fingers at once that are drawn joined, of each count
-_BRIGHT = 0.6  # of a scale of colours, from which black is read better than white
-_SIZES = (90.0, 36.0, 10.0)  # of marks; those of a region's further effects lie within
+_MAX_JOINED = 12  # simultaneous fingers drawn connected, for each count
+_BRIGHT = 0.6  # position on a colour scale above which black text is readable
+_SIZES = (90.0, 36.0, 10.0)  # of marks; smaller marks are a region's further effects
 
 
 @dataclass(frozen=True)
@@ -289,13 +287,13 @@ class _TouchPanel:
     label: str
     """Of the colour bar."""
     value: Callable[[CheckedEffect, SimulatedTouch], float | None]
-    """What a mark's colour stands for; None without a value."""
+    """Value shown by a mark's colour; None without a value."""
     norm: Normalize
     colors: str
 
 
 def _touch_panels(frequencies: FloatArray) -> list[_TouchPanel]:
-    """Return the panels of a table with these frequencies [Hz]."""
+    """Return the panels for a table with these frequencies [Hz]."""
     low, high = float(frequencies[0]), float(frequencies[-1])
     return [
         _TouchPanel(
@@ -328,11 +326,12 @@ def check_figure(
     checked: Sequence[CheckedEffect],
     together: Sequence[JointTouch] = (),
 ) -> Figure:
-    """Draw three panels, with one mark for each touch; crosses where nothing is felt.
+    """Draw three panels with one mark per touch, and crosses where nothing is felt.
 
-    Level: what is felt less what is promised, the worse of alone and beside a resting finger;
-    frequency; and how far a resting finger feels less, as promised. Below, fingers in two
-    and in three regions at once, at their worst places, and what the worst one is promised.
+    The panels show the felt minus the promised level (the worse of alone and with a resting
+    finger), the frequency, and the promised contrast with the resting finger. Below, simultaneous
+    fingers in two and three regions at their worst positions, and the promised contrast of the
+    worst finger.
     """
     ratio = table.plate.width / table.plate.length
     rows = 2 if together else 1
@@ -362,13 +361,13 @@ def _draw_together(
     table: LocalizationTable,
     together: Sequence[JointTouch],
 ) -> None:
-    """Draw fingers at once at their worst places, joined by lines, the worst on top; the matrix."""
+    """Draw simultaneous fingers at their worst positions, connected by lines, and the matrix."""
     colors, norm = colormaps["viridis"], Normalize(0.0, 2 * OWN_CONTRAST_DB)
     for axes, count in zip(panels, (2, 3), strict=False):
         _draw_layout(axes, layout, table)
         of_count = [each for each in together if len(each.regions) == count]
         shown = sorted(of_count, key=lambda each: each.worst_db)[:_MAX_JOINED]
-        title = f"fingers in {count} regions at once, at their worst places"
+        title = f"fingers in {count} regions, at their worst positions"
         if len(shown) < len(of_count):
             title += f": the worst {len(shown)} of {len(of_count)}"
         axes.set_title(title, fontsize=9)
@@ -383,7 +382,7 @@ def _draw_together(
             axes.text(column, row, f"{value:.0f}", ha="center", va="center", color=ink, fontsize=8)
     axes.set_xticks(range(len(names)), names, rotation=90, fontsize=8)
     axes.set_yticks(range(len(names)), names, fontsize=8)
-    axes.set_title("two at once below the diagonal, three above", fontsize=9)
+    axes.set_title("pairs below the diagonal, triples above", fontsize=9)
     label = "promised contrast of the worst finger / dB"
     figure.colorbar(ScalarMappable(norm, colors), ax=axes, label=label, shrink=0.85)
 
@@ -409,7 +408,7 @@ def _draw_layout(axes: Axes, layout: SurfaceLayout, table: LocalizationTable) ->
 
 
 def _label_region(axes: Axes, name: str, corners: FloatArray) -> None:
-    """Write the name above a region, or upright beside one that is much taller than wide."""
+    """Write the name above a region, or rotated next to a region that is much taller than wide."""
     length, width = np.ptp(corners, axis=0)
     is_beside = width > 2 * length
     across = corners[:, 0 if is_beside else 1]
@@ -432,7 +431,7 @@ def _draw_touches(
     norm: Normalize,
     colors: str,
 ) -> None:
-    """Draw the value of every touch that is farthest from zero or lowest in contrast."""
+    """Draw for every touch the value farthest from zero, or the lowest contrast."""
     drawn: dict[str, int] = {}
     for each in checked:
         size = _SIZES[min(drawn.get(each.region, 0), len(_SIZES) - 1)]

@@ -1,7 +1,7 @@
-"""The contract of every amplifier of protocol 4, on whatever wire, as checks.
+"""Conformance contract of every protocol 4 amplifier, as a list of checks for all wires.
 
-Run against hardware by its URL, and by the project's tests over every wire in virtual time. Checks
-that only read come first; the others arm the amplifier and drive its channels.
+Runs against hardware by URL, and in the project's tests over every wire in virtual time. Read-only
+checks come first; the others arm the amplifier and drive its channels.
 """
 
 import random
@@ -133,11 +133,11 @@ CHECKS: tuple[ConformanceCheck, ...] = (
     reading_checks.addresses,
     playing_checks.measured,
 )
-"""All checks, in their order of execution."""
+"""All checks in order of execution."""
 
 
 def of_kind(kind: str) -> list[tuple[int, ConformanceCheck]]:
-    """Return the checks of a kind of wire, each with its number."""
+    """Return the checks for a kind of wire with their numbers."""
     numbered = enumerate(CHECKS, 1)
     return [(number, check) for number, check in numbered if not check.kinds or kind in check.kinds]
 
@@ -148,14 +148,14 @@ CLIENTS: Mapping[str, Callable[[int], JudgeClient]] = {
     "Modbus RTU": partial(frame_checks.ModbusClient, is_rtu=True),
     "Modbus TCP": partial(frame_checks.ModbusClient, is_rtu=False),
 }
-"""Clients by the protocol that a wire's settings name."""
+"""Client classes by the protocol of a wire."""
 
 
 @asynccontextmanager
 async def opened(url: str) -> AsyncIterator[JudgeClient]:
-    """The client of an amplifier by its URL while its line is open, and its board has started.
+    """Open an amplifier by its URL within a context, and wait until its board has started.
 
-    Raises CommandError for text that is no URL, LinkError for a line that cannot be opened.
+    Raises CommandError for an invalid URL, LinkError for a line that cannot be opened.
     """
     address = address_of(url)
     protocol = str(address.settings["protocol"])
@@ -167,7 +167,7 @@ async def opened(url: str) -> AsyncIterator[JudgeClient]:
     client.transmit = port.write
     try:
         boots_until = threads.now() + address.boot_time
-        while threads.now() < boots_until:  # what a board says while it starts is no reply
+        while threads.now() < boots_until:  # ignore boot messages of the board
             with suppress(ContractViolation, TooLate):
                 await client.hello()
                 break
@@ -190,9 +190,9 @@ async def judge(
 ) -> ConformanceReport:
     """Check the amplifier at a URL, and leave it silent and disarmed.
 
-    drives: also what arms it and drives its channels, at this level of full level at most.
-    on_result: called with each result. before: report of checks that are not run again. Raises
-    CommandError for text that is no URL, LinkError for a line that cannot be opened or is lost.
+    drives: include checks that arm it and drive its channels, at up to `level` of full level.
+    on_result: called with each result. before: report of checks that are not repeated. Raises
+    CommandError for an invalid URL, LinkError for a line that cannot be opened or is lost.
     """
     results = () if before is None else before.results
     known = {each.number for each in results}

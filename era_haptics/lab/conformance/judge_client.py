@@ -1,15 +1,15 @@
-"""A host below the host: one raw message at a time, and the findings that end a check.
+"""Raw protocol client for conformance checks: one message at a time, no retries, no recovery.
 
-A client of a kind of wire makes frames and reads them. It repeats nothing and gives nothing up by
-itself; it keeps messages that no request was waiting for, so that checks see them. A check finds a
-violation of the contract, that it does not apply, or that this machine was too late.
+There is one client class per kind of wire, which builds and parses frames. Messages that no request
+was waiting for are kept for the checks. A check ends with one of three outcomes: a violation of the
+contract, not applicable, or too late (this machine missed a deadline).
 
-`Dating` gives times by the amplifier's own clock, however late this machine was: a reading that
-shows u seconds came between s and r, so the clock is ahead of that of this machine by u - r to
-u - s. What is common to all these intervals is short.
+`Dating` converts to times of the amplifier's own clock, however late this machine was: a reading
+that shows u seconds was taken between s and r, so the amplifier's clock is ahead of this machine's
+by u - r to u - s. The intersection of all these intervals is short.
 
-`Capabilities` are what the amplifier states, `Row` what a check sends, and `Judge` the amplifier as
-it must be.
+`Capabilities` are those that the amplifier states, `Row` is what a check sends, and `Judge` is the
+expected state of the amplifier.
 """
 
 import asyncio
@@ -47,17 +47,17 @@ from registry import threads
 
 
 class CheckOutcome(Exception):
-    """What ends the steps of a check; by itself: nothing is wrong.
+    """Ends the steps of a check; this class itself means that nothing is wrong.
 
     seen, expected: of a violation; sent: the last set before it, in words and hexadecimal; came:
-    the last bytes of the amplifier.
+    the last bytes received from the amplifier.
     """
 
     seen = expected = sent = came = ""
 
 
 class ContractViolation(CheckOutcome):
-    """The amplifier does other than the contract: what must be what, and what was seen."""
+    """The amplifier violates the contract; holds the name, the expected and the seen value."""
 
     def __init__(self, what: str, *, expected: object, seen: object) -> None:
         must, got = (
@@ -69,7 +69,7 @@ class ContractViolation(CheckOutcome):
 
 
 class NoReply(ContractViolation):
-    """It did not reply in time: to what, and what came instead."""
+    """The amplifier did not reply in time; holds the request and the bytes received instead."""
 
     def __init__(self, what: str, seen: str) -> None:
         super().__init__(what, expected="a reply", seen=seen)
@@ -77,39 +77,39 @@ class NoReply(ContractViolation):
 
 
 class AlreadyArmed(ContractViolation):
-    """It is armed, perhaps by another host: nothing is driven."""
+    """The amplifier is armed already, perhaps by another host: nothing is driven."""
 
 
 class UntimedClock(ContractViolation):
-    """Its clock does not go on with time: nothing that plays can be judged."""
+    """The amplifier's clock does not follow time, so playback cannot be judged."""
 
 
 class NotApplicable(CheckOutcome):
-    """The amplifier, or its wire, does not have what is checked, as the contract allows."""
+    """The amplifier or its wire lacks an optional feature that the check needs."""
 
 
 class UnusableCapability(CheckOutcome):
-    """A capability that the check needs is not as it must be, which its own check reports."""
+    """A capability that the check needs is invalid; its own check reports this."""
 
 
 class TooLate(CheckOutcome):
-    """This machine was too late for what the check needs: it must be made again."""
+    """This machine was too late for the check, which must be repeated."""
 
 
 def message_name(number: int) -> str:
-    """Return the name of a message with its number, or the number of one without a name."""
+    """Return a message's name with its number, or the number if it has no name."""
     name = REQUEST_NAMES.get(number)
     return f"{name} (message {number})" if name else f"message {number}"
 
 
 def require(is_possible: bool, why: str) -> None:
-    """Raise NotApplicable, with the reason, unless the check can be made."""
+    """Raise NotApplicable, with the reason, if the check is impossible."""
     if not is_possible:
         raise NotApplicable(why)
 
 
 def require_in_time(is_in_time: bool, why: str) -> None:
-    """Raise TooLate, with the reason, unless this machine was in time."""
+    """Raise TooLate, with the reason, if this machine was late."""
     if not is_in_time:
         raise TooLate(why)
 
@@ -126,34 +126,36 @@ def expect_equal(seen: object, expected: object, what: str) -> None:
 
 
 def expect_within(seen: float, low: float, high: float, what: str) -> None:
-    """Raise ContractViolation unless a number is within limits."""
+    """Raise ContractViolation unless a number is within limits (inclusive)."""
     verify(low <= seen <= high, what, expected=f"{low:.6g} to {high:.6g}", seen=f"{seen:.6g}")
 
 
 def expect_one_of(seen: object, known: Collection[object], what: str) -> None:
-    """Raise ContractViolation unless something is known."""
+    """Raise ContractViolation unless a value is one of the known ones."""
     verify(seen in known, what, expected=" or ".join(map(str, known)), seen=seen)
 
 
-_MAX_ATTEMPTS = 20  # of a check with all its cases, for which this machine was late
+_MAX_ATTEMPTS = 20  # per check with all its cases, if this machine is late
 FEW = 3
-"""Times that this machine does not make wrong by chance."""
-_MAX_WASTED = 20.0  # s; of a run, for attempts that came too late
-_LOOK = 0.005  # s; between looks whether this machine is late
+"""Number of occurrences that exclude chance lateness of this machine."""
+_MAX_WASTED = 20.0  # s per run, for attempts that came too late
+_LOOK = 0.005  # s, interval at which this machine's lateness is measured
 BUSY = 0.02
-"""Lateness of this machine [s] with which what is found counts once it is found a few times."""
-JUDGE_REPLY_TIMEOUT = 0.5  # s; far above the reaction, so that a busy machine is no mute amplifier
-_DELIVERED = 1.5  # s; beyond that, for a reply which the machine or line delivers late
-GATEWAY_TIMEOUT = 1.5  # s; in which a gateway says that a unit does not reply
+"""Lateness of this machine [s] up to which a finding that recurs `FEW` times counts."""
+JUDGE_REPLY_TIMEOUT = (
+    0.5  # s; far above the reaction time, so that a busy machine does not look like a missing reply
+)
+_DELIVERED = 1.5  # s, in addition, for a reply delayed by the machine or the line
+GATEWAY_TIMEOUT = 1.5  # s, within which a gateway reports that a unit does not reply
 _MAX_SHOWN = 300  # bytes
 _AT_ONCE = 16  # addresses
 _SILENCE = 0.002  # s; between frames
-QUIET_TIME = 0.02  # s; beyond the time of an exchange, in which what is replied to has its reply
+QUIET_TIME = 0.02  # s, in addition to the time of an exchange, within which a reply arrives
 _T = TypeVar("_T")
 
 
 class When(NamedTuple):
-    """An interval in which something happened [s]."""
+    """Interval in which something happened [s]."""
 
     earliest: float
     latest: float
@@ -161,9 +163,9 @@ class When(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class HeardMessage:
-    """A message of the amplifier: number of its request (0: an event), type, words.
+    """Message from the amplifier: number of its request (0: an event), type, words.
 
-    frame: that it came in, as its wire has it. Without a type these are bytes that are no frame.
+    frame: the wire's frame that contained it. Without a type, the bytes were not a valid frame.
     """
 
     at: float
@@ -175,9 +177,9 @@ class HeardMessage:
 
 @dataclass(frozen=True, slots=True)
 class RequestOutcome:
-    """What became of a request: code of a refusal, empty where it was carried out; its words.
+    """Outcome of a request: error code (empty if it was carried out) and words of the reply.
 
-    channel: that a refusal names; when: between sending and the reply [s]; values: of the words.
+    channel: named by a rejection; when: between sending and the reply [s]; values: decoded words.
     """
 
     code: str
@@ -194,36 +196,40 @@ class RequestOutcome:
 class JudgeClient(ABC):
     """One amplifier at an address of a line.
 
-    number: of the last request. heard: messages that no request was waiting for, but Events; order:
-    all, as they came. known: the amplifier as it is judged, once it was identified.
-    reply_words: the longest reply to each message by its number, where it is known. quiet: time [s]
-    in which a reply comes; timeout: for which one is awaited. wire_time: on the wire [s], of a
-    request and a reply by their words; transit: of the longest reply; pace: how much of that it
-    really takes, at most, as on a terminal without bits. session: that was begun last.
-    loss: why the line was lost. came: bytes of the amplifier since the last request.
-
-    neighbours, free: other addresses that reply, and the highest at which nothing does, once it has
-    looked around. fastest, reactions: the shortest exchange by the name of its message [s], and the
-    times until a reply began. attempts: of this check that came too late; wasted: the time [s] of
-    all of the run. lag: by how much this machine was late in an attempt, at most; lateness: by how
-    much this machine or a reply was, of all.
+    - number: of the last request; session: begun last.
+    - heard: messages that no request was waiting for, except Events; order: all messages as
+      received.
+    - known: the expected amplifier, once identified.
+    - reply_words: longest reply to each message by message number, if known.
+    - quiet: time within which a reply arrives [s]; timeout: how long a reply is awaited [s].
+    - wire_time: time on the wire for a request and a reply, from their word counts [s]; transit:
+      that of the longest reply; pace: fraction of wire_time that the line really takes, at most (a
+      terminal has no bit times).
+    - loss: why the line was lost; came: bytes received since the last request.
+    - neighbours: other addresses that reply; free: the highest address without a reply. Both are
+      set by `look_around`.
+    - fastest: shortest exchange by message name [s]; reactions: times until a reply began [s].
+    - attempts: repetitions of the current check because of lateness; wasted: their total time in
+      the run [s].
+    - lag: this machine's largest lateness in an attempt [s]; lateness: the largest lateness of this
+      machine or a reply in the run [s].
     """
 
     kind: ClassVar[str]
     """Kind of wire: serial, rtu, tcp or can."""
     has_events: ClassVar[bool] = True
-    """Whether the wire carries messages that were not asked for."""
+    """Whether the wire carries unsolicited messages."""
     has_broadcasts: ClassVar[bool] = True
     """Whether one request can reach all addresses."""
     addresses: ClassVar[int] = 247
     """The highest address."""
     transactions: ClassVar[int] = 1
-    """What the wire makes of a request that changes something, each with a reply."""
+    """Number of transactions, each with a reply, that the wire needs for a request that writes."""
 
     transmit: Callable[[bytes], None]
-    """Sends bytes on its line, once that is open; raises LinkError."""
+    """Sends bytes on the open line; raises LinkError."""
     name = ""
-    """Under which its bytes are traced."""
+    """name for the trace of its bytes"""
 
     def __init__(self, address: int) -> None:
         self.address = address
@@ -259,20 +265,20 @@ class JudgeClient(ABC):
 
     @abstractmethod
     def hear(self, data: bytes) -> bytes:
-        """Take messages from bytes; returns those bytes that are the amplifier's."""
+        """Parse messages from bytes; returns the bytes that came from the amplifier."""
 
     @abstractmethod
     def question(self, address: int) -> bytes:
-        """Return the frame of a request that only reads, to an address."""
+        """Return the frame of a read-only request to an address."""
 
     @abstractmethod
     async def hello(self) -> Values:
         """Read the identity; raises ContractViolation."""
 
     async def exchange(self, number: int, words: Sequence[int], **more: Any) -> RequestOutcome:
-        """Send a message and await its reply; raises ContractViolation where none comes.
+        """Send a message and await its reply; raises ContractViolation without a reply.
 
-        more: of the request.
+        more: keyword arguments of `request`.
         """
         data, sent = self.request(number, words, **more), threads.now()
         self.write(data)
@@ -285,29 +291,30 @@ class JudgeClient(ABC):
         return outcome
 
     def check_reply(self, heard: HeardMessage, number: int, code: str) -> None:
-        """Require the type of a reply, and what else belongs to it; code: of a refusal."""
+        """Check the type of a reply, and what the wire adds to it; code: of a rejection."""
         expect_equal(heard.type, number, "type of a reply")
 
     async def part(self, number: int, words: Sequence[int]) -> None:
-        """Send a message that has no reply: a part of a set but the last."""
+        """Send a message without a reply: a part of a set other than the last."""
         self.write(self.request(number, words))
 
     @abstractmethod
     def request(self, number: int, words: Sequence[int], *, to: int | None = None) -> bytes:
-        """Return the frames of a request; to: its address, 0 for all, None for this amplifier.
+        """Return the frames of a request; to: its address, 0 for broadcast, None for this
+        amplifier.
 
-        Its number is that of the request from then on.
+        Also increments `number`, the request's number.
         """
 
     @abstractmethod
     def damaged(self, number: int, words: Sequence[int]) -> Iterator[tuple[str, bytes]]:
-        """Yield what is wrong, and frames that must have no effect and no reply, made in turn."""
+        """Yield damaged frames, each with a description, which must have no effect and no reply."""
 
     async def look_around(self) -> None:
-        """Learn who else is on the line, by what only reads; once.
+        """Find the other amplifiers on the line by read-only requests, once.
 
-        Every address is asked where a broadcast would reach it, else until one is free. Many are
-        asked at once, and each of them alone where anything is heard.
+        On wires with broadcasts all addresses are queried, otherwise only until one is free.
+        Addresses are queried in batches, and individually within a batch that produced a reply.
         """
         if self.free:
             return
@@ -319,14 +326,14 @@ class JudgeClient(ABC):
                     self._others.add(each)
             if not (self.has_broadcasts or is_heard):
                 break
-        await asyncio.sleep(self.quiet)  # in which a late one is heard
+        await asyncio.sleep(self.quiet)  # a late reply arrives meanwhile
         self.heard.clear()
         self.free = next((each for each in addresses if each not in self._others), 0)
         verify(self.free > 0, "addresses without a reply", expected="one at least", seen="none")
         self.neighbours = self.neighbours or frozenset(self._others)
 
     async def _is_heard(self, addresses: Sequence[int]) -> bool:
-        """Whether anything is heard once addresses were asked, one after the other."""
+        """Return whether there is any reply after querying addresses one after the other."""
         self.heard.clear()
         self.came = b""
         for each in addresses:
@@ -337,24 +344,24 @@ class JudgeClient(ABC):
 
     @property
     def is_shared(self) -> bool:
-        """Whether replies of several amplifiers may collide."""
+        """Return whether replies of several amplifiers can collide."""
         return self.kind in ("serial", "rtu")
 
     @property
     def slow_reply(self) -> str:
-        """Which message it always replies to later than it may, and by when; empty if none."""
+        """Return which message it always answers too late, and by when; empty if none."""
         for name, times in self.reactions.items():
             if len(times) >= FEW and (least := min(times)) > REACTION:
-                return f"its replies to {name} begin after {1e3 * least:.3g} ms at least"
+                return f"its replies to {name} begin after at least {1e3 * least:.3g} ms"
         return ""
 
     @property
     def is_used_up(self) -> bool:
-        """Whether the time of the run for attempts that came too late is used up."""
+        """Return whether the run's time for late attempts is used up."""
         return self.wasted >= _MAX_WASTED
 
     def was_late(self, since: float) -> bool:
-        """Note an attempt from a time on that came too late; returns whether to make it again."""
+        """Record an attempt that began at `since` and was late; returns whether to repeat it."""
         if self.slow_reply:
             return False
         self.attempts = min(self.attempts + 1, _MAX_ATTEMPTS)
@@ -363,7 +370,7 @@ class JudgeClient(ABC):
 
     @contextmanager
     def watching(self) -> Iterator[None]:
-        """Measure by how much this machine is late while the context lasts."""
+        """Measure this machine's lateness within the context."""
 
         async def look() -> None:
             while True:
@@ -380,24 +387,24 @@ class JudgeClient(ABC):
             looking.cancel()
 
     def lost(self, cause: str) -> None:
-        """Note why the line was lost."""
+        """Record why the line was lost."""
         self.loss = cause
 
     async def expect_silence(self, data: bytes, what: str, *before: bytes) -> None:
-        """Send frames, data the last of them, to which nothing must be heard."""
+        """Send frames (data last) that must produce no message."""
         heard = await self.send(data, *before)
         verify(not heard, f"replies to {what}", expected="none", seen=heard)
 
     async def send(self, data: bytes, *before: bytes, count: int = 0) -> list[HeardMessage]:
-        """Send frames, data the last; return what is heard until a reply must have come.
+        """Send frames (data last); return the messages received until a reply must have arrived.
 
-        count: of replies that must come, which are awaited longer.
+        count: number of replies that must arrive, for which the wait is longer.
         """
         self.heard.clear()
         self.came = b""
         for each in before:
             self.write(each)
-            await asyncio.sleep(self.quiet / 4)  # also what ends a frame of Modbus RTU
+            await asyncio.sleep(self.quiet / 4)  # also ends a Modbus RTU frame
         self.write(data)
         replies = [await self.next(lambda each: True, self.timeout) for _ in range(count)]
         await asyncio.sleep(self.quiet)
@@ -405,12 +412,12 @@ class JudgeClient(ABC):
         return heard
 
     async def reply_to(self, data: bytes) -> HeardMessage | None:
-        """Send frames, and return what is heard first, None if nothing is, however late."""
+        """Send frames and return the first message, however late; None without one."""
         self.write(data)
         return await self.next(lambda each: True, self.timeout)
 
     def take(self, message: HeardMessage, *, is_event: bool = False) -> None:
-        """Keep a message that was heard."""
+        """Keep a received message."""
         if not is_event:
             self.heard.append(message)
         self.order.append(message)
@@ -419,7 +426,7 @@ class JudgeClient(ABC):
     async def next(
         self, is_meant: Callable[[HeardMessage], bool], timeout: float
     ) -> HeardMessage | None:
-        """Return the first message that is meant, None if it does not come in time [s]."""
+        """Return the first matching message; None if there is none in time [s]."""
         self.came = b""
         loop, due = asyncio.get_running_loop(), threads.now() + timeout
         timer = loop.call_at(due, self._news.set)
@@ -439,9 +446,9 @@ class JudgeClient(ABC):
             timer.cancel()
 
     async def replied(self, is_meant: Callable[[HeardMessage], bool], what: str) -> HeardMessage:
-        """Return the reply to what was sent.
+        """Return the reply to the last request.
 
-        Raises ContractViolation where none comes; one that is late counts as a machine that is.
+        Raises ContractViolation without a reply; a late reply counts as lateness of this machine.
         """
         began = threads.now()
         found = await self.next(is_meant, self.timeout)
@@ -454,64 +461,66 @@ class JudgeClient(ABC):
         raise NoReply(what, f"no reply within {self.timeout:g} s{others}")
 
     def remark(self) -> str:
-        """Return what is wrong with the bytes that came in place of a reply, if that is known."""
+        """Describe what is wrong with bytes received instead of a reply, if known."""
         return ""
 
     def refusal(
         self, sent: float, came: float, number: int, words: Sequence[int]
     ) -> RequestOutcome:
-        """Make the answer of a Nak; ContractViolation where it names another request."""
+        """Convert a Nak to an outcome; raises ContractViolation if it names another request."""
         nak = read_as("Nak", read_nak, words, is_strict=True)
         expect_equal(words[NAK_RECORD.places["request"]], number, "request that a Nak names")
         return RequestOutcome(nak.code, nak.channel, (), When(sent, came))
 
 
 def in_batches(rows: Sequence[_T], size: int) -> list[Sequence[_T]]:
-    """Cut rows into batches of a size, the last of which may be smaller."""
+    """Split rows into batches; the last batch can be shorter."""
     return [rows[at : at + size] for at in range(0, len(rows), size)]
 
 
 def altered(data: bytes, at: int) -> bytes:
-    """Return bytes with one bit of one of them wrong."""
+    """Return bytes with one bit flipped."""
     changed = bytearray(data)
     changed[at] ^= 0x10
     return bytes(changed)
 
 
 def read_as(what: str, read: Callable[..., _T], *arguments: object, **options: object) -> _T:
-    """Return what is read; ContractViolation where it cannot be read."""
+    """Return the value that `read` returns; raises ContractViolation if it cannot be parsed."""
     try:
         return read(*arguments, **options)
     except Refusal as error:
         raise ContractViolation(what, expected="as in the table", seen=error) from None
 
 
-_LONG = 5.0  # s; without a reading, after which it may have gone round
-_BESIDE = 0.0002  # s; by which levels may be older than the clock beside them
+_LONG = 5.0  # s without a reading, after which the clock can have wrapped
+_BESIDE = 0.0002  # s; levels in a status can be older than its clock by this
 _ERROR = QUANTITIES["clock_error"]
 
 
 class Dating:
-    """Times [s] by the clock of one amplifier, which began near those of this machine.
+    """Convert times [s] to the clock of one amplifier, which starts near this machine's time.
 
-    pace: seconds of the clock in one of its crystal. error: by how much readings contradict each
-    other beyond what the clock may drift, since that was set to 0.
+    pace: seconds of the clock per second of its crystal. error: largest contradiction between
+    readings beyond the allowed drift, since it was reset to 0.
     """
 
     def __init__(self) -> None:
         self.pace, self.error = 1.0, 0.0
-        self._last: tuple[int, float] | None = None  # the clock, and until when it was read
-        self._time, self._ahead = 0.0, (0.0, 0.0)  # of the last reading; of this machine's
+        self._last: tuple[int, float] | None = (
+            None  # last clock reading and the end of its interval
+        )
+        self._time, self._ahead = 0.0, (0.0, 0.0)  # of the last reading; ahead of this machine's
 
     def shift(self, steps: int) -> None:
-        """Move the clock on by steps of its high word."""
+        """Advance the clock by steps of its high word."""
         if self._last is not None:
             self._last = (self._last[0] + steps * HIGH_STEPS) % SPAN, self._last[1]
 
     def expect_steady(self, otherwise: type[ContractViolation] = ContractViolation) -> None:
-        """Raise ContractViolation, or another one, where readings contradict each other."""
+        """Raise ContractViolation (or `otherwise`) if readings contradict each other."""
         if self.error > 0:
-            what = "by how much readings of its clock contradict each other"
+            what = "contradiction between readings of its clock"
             raise otherwise(what, expected="0 ms", seen=f"{1e3 * self.error:.3g} ms")
 
     def between(self, earliest: float, latest: float) -> When:
@@ -521,7 +530,7 @@ class Dating:
         return When(min(earliest, latest), latest)
 
     def interval(self, when: When) -> When:
-        """Return what is between two times of this machine, behind the last reading."""
+        """Convert an interval of this machine after the last reading."""
         if self._last is None:
             return when
         drift = DRIFT * max(when.latest - self._last[1], 0.0)
@@ -531,7 +540,7 @@ class Dating:
         )
 
     def dated(self, clock: int, when: When, stated: int) -> When:
-        """Return when a status was true that shows the clock and was read in an interval.
+        """Return when a status with this clock, read in an interval of this machine, was true.
 
         stated: `clock_error` of the amplifier.
         """
@@ -554,10 +563,10 @@ class Dating:
 
 @dataclass(frozen=True, slots=True)
 class Send:
-    """A request by its values, the session that is held unless one is given, or by raw words.
+    """Request given by its values (the held session unless another is given) or by raw words.
 
-    layers: of a set, which is sent in its parts. codes: one of which must be the answer, an empty
-    one: carried out. channels: one of which a refusal must name.
+    layers: of a set, which is sent in parts. codes: allowed outcomes, "" meaning carried out.
+    channels: those that a rejection can name.
     """
 
     name: str
@@ -569,8 +578,10 @@ class Send:
 
 
 Row: TypeAlias = "LayerSet | Send | float | Callable[[], Awaitable[object]] | Sequence[Row]"
-"""A layer that plays, a request, a pause [s] in which the watchdog is fed, what is awaited, or a
-course: rows that begin at rest, armed, and are followed until all is settled."""
+"""A layer to play, a request, a pause [s] with a fed watchdog, an awaitable, or a sequence.
+
+A sequence of rows starts at rest and armed, and is followed until all outputs have settled.
+"""
 RequestRows: TypeAlias = Sequence[Row]
 
 
@@ -583,23 +594,23 @@ def send(
     layers: tuple[LayerSet, ...] = (),
     **values: Any,
 ) -> Send:
-    """Make a request that must be carried out, or refused with a code."""
+    """Build a request that must be carried out, or rejected with a code."""
     return Send(name, raw, values, layers, (code,) if isinstance(code, str) else code, channels)
 
 
 def play_now(*layers: LayerSet, now: int = 1, **values: Any) -> Send:
-    """Make a set that plays at once; values: token, session, code, as of `send`."""
+    """Build a set that plays immediately; values: token, session, code, as in `send`."""
     return send("Set", layers=layers, now=now, **values)
 
 
 stage = partial(play_now, now=0)
-"""Makes a set that is staged."""
+"""Build a set that is staged."""
 
 _WORD = 0xFFFF
 
 
 def _unlimited(field: Field) -> Field:
-    """Return a field whose numbers, but that of channels, may be any."""
+    """Return a copy of a field without limits on its numbers, except for channels."""
     if isinstance(field, RowsOf):
         return replace(field, record=Record(*map(_unlimited, field.record.fields)))
     if isinstance(field, Number) and field.name != "channels":
@@ -611,11 +622,11 @@ def _unlimited(field: Field) -> Field:
 _REPLY = MESSAGES["GetCaps"].reply
 (_LIMITS,) = (field.record for field in _REPLY.fields if isinstance(field, RowsOf))
 STATED = Record(*map(_unlimited, _REPLY.fields))
-"""The reply to GetCaps; a number may be any word, of which those that are wrong are found."""
+"""Reply to GetCaps; any word is accepted as a number, so that wrong ones can be reported."""
 
 
 def _ranges(can: Values) -> Iterator[tuple[str, int, int, int]]:
-    """Yield each number with its name, between the least and the most that it may be."""
+    """Yield the name, value, minimum and maximum of each number."""
     rows = [(_REPLY, can), *((_LIMITS, one) for one in can["limits"])]
     for record, row in rows:
         for word in record.fields:
@@ -632,9 +643,9 @@ def _ranges(can: Values) -> Iterator[tuple[str, int, int, int]]:
 
 
 class Capabilities(dict[str, Any]):
-    """Capabilities by name; wrong: what each must be that cannot be so, and what is stated.
+    """Capabilities by name; wrong: the invalid ones, each with the required and the stated value.
 
-    Raises UnusableCapability for one of those, so that what does not ask for it goes on.
+    Raises UnusableCapability on access to an invalid one, so that checks without it can run.
     """
 
     def __init__(self, stated: Values) -> None:
@@ -663,12 +674,12 @@ def layer(
     after: bool = False,
     renew: bool = False,
 ) -> LayerSet:
-    """Make what one layer is to play; ramp, valid_for in ms."""
+    """Build the content of one layer; ramp, valid_for in ms."""
     return LayerSet(number, ramp, valid_for, commands, after, renew)
 
 
 class Judge(ExpectedAmplifier):
-    """An amplifier with these capabilities since a status at rest.
+    """Expected state of an amplifier with these capabilities, starting from a status at rest.
 
     Raises ContractViolation and TooLate.
     """
@@ -683,9 +694,9 @@ class Judge(ExpectedAmplifier):
         raise ContractViolation(what, expected=must, seen=seen)
 
     def achieved(self, one: LayerSet, shown: Values) -> LayerSet:
-        """Return a layer as it plays by a GetAchieved.
+        """Return a layer as achieved according to GetAchieved.
 
-        Raises ContractViolation for a difference of more than half a step.
+        Raises ContractViolation if a value differs by more than half a step.
         """
         driven = tuple(tone for tone in one.commands if tone.is_driven)
         one = replace(one, commands=driven)

@@ -1,4 +1,4 @@
-"""The amplifier that is judged: requests by name, each status compared with what it must show."""
+"""The amplifier under test: send requests by name, compare each status with the expected one."""
 
 import asyncio
 import math
@@ -53,30 +53,30 @@ from era_haptics.lab.expected_output import SAMPLE
 from registry import threads
 
 DEFAULT_LEVEL = 0.2
-"""Level of driven channels unless another is given: perceptible, and far from any limit."""
-_SAMPLES, _EACH = 12, 0.02  # of a transition; s for which one must be in time
-_PROMPT, _SLOWEST = 0.02, 0.1  # s; exchanges of a quick line, and the longest that count
-_NARROW = 0.006  # s; of the uncertainty of a sample, beyond two exchanges
-_SETTLED = 3.2  # s; the longest watchdog and ramp, and what a state may take
+"""Default level of driven channels: perceptible and far from any limit."""
+_SAMPLES, _EACH = 12, 0.02  # samples per transition; s, within which one must succeed
+_PROMPT, _SLOWEST = 0.02, 0.1  # s, exchange time of a fast line, and the longest that counts
+_NARROW = 0.006  # s, allowed uncertainty of a sample beyond two exchanges
+_SETTLED = 3.2  # s, the longest watchdog and ramp, plus the delay of a state
 _MAX_WATCHDOG_USE = 0.8
 _DONE = "carried out"
-_MAX_UNFED, _UNFED = 0.1, 0.02  # of the watchdog; s before what must not feed
+_MAX_UNFED, _UNFED = 0.1, 0.02  # of the watchdog; s before requests that must not feed it
 _POLL, _OVERSLEPT, _SETTLING = 0.0005, 0.05, 0.02  # s
-# s; of a commit before its moment, beside the exchanges until then, and for lateness at most
+# s; lead of a Commit before its moment, in addition to the exchanges; largest lateness allowed for
 _LEAD, _MAX_LATENESS = 0.0025, 0.02
-_READ_ALONE = ("GetCaps", "GetStatus", "GetFaults")  # on Modbus: half an exchange
-_BY_EXCEPTION = ("UNKNOWN_TYPE", "BAD_LENGTH")  # on Modbus, where no channel is named
+_READ_ALONE = ("GetCaps", "GetStatus", "GetFaults")  # on Modbus, takes half an exchange
+_BY_EXCEPTION = ("UNKNOWN_TYPE", "BAD_LENGTH")  # on Modbus, rejections without a channel
 RATE_STEP = 1 / QUANTITIES["rate"].per_unit
-"""Of a clock, of one step of the rate of a Ping."""
+"""Relative change of the clock per step of a Ping's rate."""
 _MOVING = STATES["SWITCHED_ON"], STATES["FAULT_REACTION_ACTIVE"]
 
 
 class Subject:
-    """An identified amplifier at the far end of a client; level: of driven channels, at most.
+    """Identified amplifier behind a client; level: upper bound for driven channels.
 
-    expected: what it must show, None until it was brought to rest. token: of the last set made.
-    sent_set: the parts of the last set that was sent. dating: of its statuses, by its clock.
-    is_at_rest: nothing was sent since it was brought to rest.
+    expected: expected state, None until it was brought to rest. token: of the last set built.
+    sent_set: parts of the last set sent. dating: converts times to its clock. is_at_rest: nothing
+    was sent since it was brought to rest.
     """
 
     def __init__(
@@ -89,8 +89,8 @@ class Subject:
         self.is_starving, self.is_at_rest = True, False
         self.sent_set: list[Sequence[int]] = []
         self.dating = Dating()
-        self._moment = 0  # of the Commit that named one last, a high word of its clock
-        self._parts: list[tuple[float, Values, int]] = []  # without a reply, when sent, words
+        self._moment = 0  # high word of its clock named by the last such Commit
+        self._parts: list[tuple[float, Values, int]] = []  # unanswered parts: time sent, words
         client.quiet = JUDGE_REPLY_TIMEOUT
         self.heard_at = threads.now()
         self.channels, layers = range(can["channels"]), can["layers"]
@@ -101,11 +101,11 @@ class Subject:
 
     @property
     def shown(self) -> Judge:
-        """What it must show."""
+        """Expected state."""
         assert self.expected is not None  # noqa: S101
         return self.expected
 
-    # What it can play; a capability is looked at where it is needed
+    # Supported values; a capability is read only when needed
 
     @property
     def layers(self) -> range:
@@ -114,7 +114,7 @@ class Subject:
 
     @cached_property
     def level(self) -> float:
-        """Of driven channels, at most; NotApplicable where it has none so low."""
+        """Level of driven channels; NotApplicable if no level step is that low."""
         limits, step = [self.can, *self.can["limits"]], self.can["level_step"] / FULL
         level: float = min(self._level, *(one["level_max"] / FULL for one in limits))
         require(level >= step, f"its level_max of {level:g} is below its level_step of {step:g}")
@@ -122,7 +122,7 @@ class Subject:
 
     @cached_property
     def lowest(self) -> int:
-        """The lowest frequency of every channel, in steps; NotApplicable where they share none."""
+        """Lowest frequency common to all channels, in steps; NotApplicable if there is none."""
         limits = [self.can, *self.can["limits"]]
         lowest = max(one["frequency_min"] for one in limits)
         require(lowest <= self.highest, "its channels have no frequency in common")
@@ -141,20 +141,20 @@ class Subject:
 
     @cached_property
     def other(self) -> int:
-        """Another frequency, where there is one, in steps."""
+        """A second frequency, in steps, if there is one."""
         both = self.frequency + 800, self.lowest, self.highest
         return next(each for each in both if each <= self.highest)
 
     def has(self, feature: str) -> bool:
-        """Whether it states a feature; empty: what all have."""
+        """Return whether it states a feature; empty: one that all amplifiers have."""
         return not feature or has_feature(self.can, feature)
 
     def require(self, feature: str) -> None:
-        """Raise NotApplicable where it does not state a feature."""
+        """Raise NotApplicable unless it states a feature."""
         require(self.has(feature), f"it states no {feature}")
 
     def require_knots(self) -> None:
-        """Raise NotApplicable where its envelopes have no knots."""
+        """Raise NotApplicable unless its envelopes have knots."""
         require(self.can["knots"] > 0, "it has no knots")
 
     def tone(
@@ -168,9 +168,9 @@ class Subject:
         onset: Envelope | None = None,
         ending: Envelope | None = None,
     ) -> Command:
-        """Make a command at a fraction of the test level; frequency in steps, 0 for the usual.
+        """Build a command at a fraction of the test level; frequency in steps, 0 for the usual one.
 
-        Raises NotApplicable for a level that the amplifier may round to 0.
+        Raises NotApplicable for a level that the amplifier can round to 0.
         """
         level, step = round(fraction * self.level * FULL), self.can["level_step"]
         require(
@@ -183,16 +183,16 @@ class Subject:
     def one(
         self, *commands: Command, level: float = 1.0, ramp: int = 0, valid_for: int = 0
     ) -> LayerSet:
-        """Make what layer 0 is to play, by default the usual tone on channel 0."""
+        """Build the content of layer 0, by default the usual tone on channel 0."""
         tones = commands or [self.tone(0, level)]
         return layer(0, *tones, ramp=ramp, valid_for=valid_for)
 
     def whole(self) -> LayerSet:
-        """Make the usual tone on all channels."""
+        """Build the usual tone on all channels."""
         return layer(0, *map(self.tone, self.channels))
 
     def transitions(self, ramp: int) -> list[list[Send]]:
-        """Make sets one after the other, amid which layers rise, fade, begin, end and wait."""
+        """Build a sequence of sets during which layers rise, fade, begin, end and wait."""
         slow = self.envelope(0.1, 0.25, 0.25, 0.25)
         tones = [self.beside(number, 0.25) for number in range(4)]
         begins = [replace(each, onset=slow) for each in tones]
@@ -212,9 +212,10 @@ class Subject:
         ]
 
     def envelope(self, step: float, *amplitudes: complex) -> Envelope:
-        """Make an envelope of knots in fractions of the test level, or the nearest step [s].
+        """Build an envelope of knots in fractions of the test level, with the nearest possible step
+        [s].
 
-        Of as many knots as there can be.
+        Uses as many knots as the amplifier supports.
         """
         amplitudes = amplitudes[: self.can["knots"]]
         low, high = self.can["envelope_step_min"], self.can["envelope_step_max"]
@@ -227,16 +228,16 @@ class Subject:
         return Envelope(steps, tuple(knots))
 
     def beside(self, number: int, fraction: float) -> Command:
-        """Make a tone on channel 0 that does not interfere with those of other layers."""
+        """Build a tone on channel 0 that does not interfere with the tones of other layers."""
         return self.tone(0, fraction, frequency=self.apart(number))
 
     def near(self, number: int) -> int:
-        """Return one of many frequencies, all alike where there is no room."""
+        """Return one of many close frequencies; all equal if there is no room."""
         room = max(self.highest - self.frequency, 0)
         return int(self.frequency + min(max(10, self.can["frequency_step"]) * number, room))
 
     def apart(self, number: int) -> int:
-        """Return a frequency of a layer of its own, so that layers do not interfere."""
+        """Return a separate frequency for a layer, so that layers do not interfere."""
         step = self.can["frequency_step"]
         above = self.frequency + max(40, step) * number
         highest = self.highest - (len(self.layers) - number) * step
@@ -245,9 +246,9 @@ class Subject:
     # Requests
 
     async def run(self, rows: RequestRows) -> None:
-        """Carry rows out in turn; after each, the status must show what is expected.
+        """Carry out rows in order; after each, compare a status with the expected one.
 
-        A reply that is a status counts as that, but the last.
+        If the reply to the last request is a status, it is not used for this.
         """
         for at, row in enumerate(rows, 1):
             found: object = None
@@ -274,7 +275,7 @@ class Subject:
         await self.follow()
 
     async def send(self, row: Send) -> RequestOutcome:
-        """Send a request, whose answer must be one of its codes."""
+        """Send a request whose outcome must be one of its codes."""
         name, several = row.name, [row.values]
         if row.layers:
             token, now = row.values.get("token", 0), row.values["now"]
@@ -290,7 +291,7 @@ class Subject:
             is_of_set = name == "Set" or (name == "Commit" and answer.code != "")
             if is_of_set and self.expected is not None and self.shown.sets.has_expired:
                 require_in_time((answer.code or _DONE) in codes, f"a set expired before {name}")
-            # First, since what has words too few has not all of its values.
+            # Check this first: a message that is too short lacks some of its values.
             expect_one_of(answer.code or _DONE, codes, f"answer to {what}")
             if answer.code:
                 break
@@ -303,9 +304,9 @@ class Subject:
     async def answer(
         self, name: str, raw: Sequence[int] | None = None, **values: Any
     ) -> RequestOutcome:
-        """Send a request by its values, or raw words, and return what became of it.
+        """Send a request by its values, or raw words, and return the outcome.
 
-        A part of a set but the last has no reply, which what is heard with the next shows.
+        A part other than the last has no reply; errors show in what arrives with the next message.
         """
         self._check_fed()
         message, values = MESSAGES[name], self.filled(values)
@@ -326,7 +327,7 @@ class Subject:
             await client.part(message.number, raw)
             return RequestOutcome("", None, (), When(sent, threads.now()))
         answer = await client.exchange(message.number, raw)
-        self._check_fed()  # or it may have been carried out after the watchdog
+        self._check_fed()  # it can have been carried out after the watchdog tripped
         took = threads.now() - sent
         client.quiet = min(client.quiet, QUIET_TIME + took)
         before = self._parts_came(answer.when.latest)
@@ -335,7 +336,7 @@ class Subject:
             if "index" in values and answer.code:
                 self.expected.part_refused(values, answer.code)
         bits = client.wire_time(len(raw), len(answer.words))
-        if not answer.code:  # a refusal may come sooner
+        if not answer.code:  # a rejection can arrive earlier
             client.pace = min(client.pace, took / bits if bits else 0.0)
             client.fastest[name] = min(client.fastest.get(name, math.inf), took)
         beyond = max(took - client.pace * (before + bits), 0.0)
@@ -347,19 +348,19 @@ class Subject:
         return answer
 
     def moment(self, duration: float) -> int:
-        """Return the high word of its clock that comes a time [s] after its last status."""
+        """Return the high word of its clock `duration` [s] after its last status."""
         return round(self.shown.clock.present + duration / HIGH_TIME) % HIGH_WORDS
 
     def filled(self, values: Values) -> Values:
-        """Return values with those that a request has unless others are given."""
+        """Return values completed by the default values of a request."""
         present = self.expected.clock.present if self.expected is not None else 0
         return {"session": self.session, "rate": 0, "shift": 0, "at": present, **values}
 
     def _parts_came(self, latest: float) -> float:
-        """Have the parts that were sent come by a time [s]; returns what they take on the wire."""
+        """Mark the sent parts as received by a time [s]; returns their time on the wire."""
         made, self._parts = self._parts, []
         if made:
-            expect_equal(len(self.client.heard), 0, "number of replies to parts but the last")
+            expect_equal(len(self.client.heard), 0, "number of replies to parts before the last")
         for sent, part, _ in made if self.expected is not None else ():
             self.shown.part_came(part, self.dating.interval(When(sent, latest)))
         if self.client.transactions > 1:  # each had its response
@@ -367,13 +368,13 @@ class Subject:
         return sum(self.client.wire_time(words, 0) for _, _, words in made)
 
     async def request(self, name: str, **values: Any) -> RequestOutcome:
-        """Send a request that must be carried out; its reply must show what is expected."""
+        """Send a request that must be carried out; its reply must match the expected state."""
         return await self.send(send(name, **values))
 
     async def _carried_out(
         self, name: str, values: Values, answer: RequestOutcome
     ) -> RequestOutcome:
-        """Read the reply to a request, and compare it with what must be shown."""
+        """Parse the reply to a request, and compare it with the expected state."""
         record = STATED if name == "GetCaps" else MESSAGES[name].reply
         shown = read_as(f"reply to {name}", record.unpack, answer.words, is_strict=False)
         if name == "GetCaps":
@@ -392,21 +393,22 @@ class Subject:
                 is_exact = shown.get("exact", self.expected.sets.is_exact)
                 await self._learn_achieved(values["token"], is_exact=bool(is_exact))
             self.expected.granted(name, values, shown, answer.when)
-            if is_dated:  # what starts with the next sample may be shown by now
+            if is_dated:  # sets that start with the next sample can show already
                 read = answer.when.latest - SAMPLE, answer.when.latest
                 self.expected.clock.check(shown["clock"], read)
             self.is_starving = self.is_starving or name in ("Stop", "Disarm")
         return replace(answer, values=shown)
 
     def _is_dated(self, name: str, shown: Values) -> bool:
-        """Whether a reply shows the clock as it is."""
+        """Return whether a reply contains the current clock."""
         is_marked = name == "Mark" or (self.expected and self.expected.clock.is_marked)
         return "clock" in shown and not is_marked
 
     def _dated(self, name: str, values: Values, shown: Values, when: When) -> When:
-        """Return between which times a status was true, and its request carried out, by its clock.
+        """Return the interval, by its clock, in which a status was true and its request carried
+        out.
 
-        That may have been read later than the request was carried out, but for a GetStatus.
+        The clock can be read after the request is carried out, except for GetStatus.
         """
         dating, judge = self.dating, self.expected
         between = dating.interval(when)
@@ -424,7 +426,7 @@ class Subject:
         return dated if name == "GetStatus" else dating.between(between.earliest, dated.latest)
 
     async def _learn_achieved(self, token: int, *, is_exact: bool) -> None:
-        """Read what is played of a set that is not played to the word."""
+        """Read the achieved values of a set that does not play exactly."""
         judge, played = self.shown, []
         layers = judge.sets.whole(token) if token != judge.token else None
         if layers is None or is_exact:
@@ -438,7 +440,7 @@ class Subject:
         judge.sets.replace(token, tuple(played))
 
     async def status(self) -> RequestOutcome:
-        """Read the status; feeds the watchdog where that is due."""
+        """Read the status; feed the watchdog if due."""
         if self.is_hungry:
             return await self.ping()
         return await self.request("GetStatus")
@@ -450,10 +452,10 @@ class Subject:
     async def arm(
         self, watchdog: float = 2.0, *, is_fed: bool = True, shift: int = 0
     ) -> RequestOutcome:
-        """Arm under a new session with a watchdog [s], or the nearest that is possible.
+        """Arm with a new session and the nearest possible watchdog [s].
 
-        is_fed: the nearest in which it can be fed, else it may expire from now on. shift: of its
-        clock.
+        is_fed: choose a watchdog that can be fed in time; otherwise it can expire from now on.
+        shift: of its clock.
         """
         self.session = self.client.session = self.next_session
         self.token, self.is_starving = 0, not is_fed
@@ -467,7 +469,7 @@ class Subject:
         return self.client.session % 0xFFFF + 1
 
     async def clear(self) -> RequestOutcome:
-        """Acknowledge the last stop or fault."""
+        """Clear the last stop or fault."""
         return await self.request("Clear", latch=self.latch)
 
     @property
@@ -476,7 +478,7 @@ class Subject:
         return self.shown.latch or 0
 
     def _check_fed(self) -> None:
-        """Raise TooLate where this machine may have starved the watchdog."""
+        """Raise TooLate if this machine can have missed the watchdog's deadline."""
         require_in_time(self._since_fed <= _MAX_WATCHDOG_USE, "the watchdog was not fed in time")
 
     @property
@@ -488,11 +490,11 @@ class Subject:
 
     @property
     def is_hungry(self) -> bool:
-        """Whether its watchdog is to be fed."""
+        """Return whether the watchdog must be fed now."""
         return self._since_fed > 0.25
 
     async def unfed(self) -> None:
-        """Feed it where that is due, so that it was fed a while ago, and is not due soon."""
+        """Feed the watchdog if due, so that it was fed a while ago and is not due soon."""
         if self._since_fed > _MAX_UNFED:
             await self.ping()
         await asyncio.sleep(max(self.shown.fed[1] + _UNFED - threads.now(), 0.0))
@@ -512,9 +514,9 @@ class Subject:
         self.expected, self.is_at_rest = Judge(self.can, reply.values, reply.when), True
 
     def require_alone(self) -> None:
-        """Raise NotApplicable where what is for all would reach other amplifiers."""
+        """Raise NotApplicable if a broadcast would reach other amplifiers."""
         where = ", ".join(map(str, sorted(self.client.neighbours)))
-        require(not where, f"left out, since it would reach others: what is for all ({where})")
+        require(not where, f"skipped: a broadcast would reach others ({where})")
 
     async def watch(self) -> None:
         """Judge all replies from now on, by the status as it is."""
@@ -535,23 +537,23 @@ class Subject:
         return [{name: each[name] for name in each if name != "session"} for each in made]
 
     def words_of(self, *layers: LayerSet) -> tuple[Values, list[int]]:
-        """Return a set of one part that plays at once, and its words."""
+        """Return a set of one part that plays immediately, and its words."""
         (part,) = self.parts(*layers)
         words = MESSAGES["Set"].request.pack({"session": self.session, **part})
         self.sent_set = [words]
         return part, words
 
     def since(self, sent: float) -> When:
-        """Return what is between a time of this machine and now, by the amplifier's clock."""
+        """Return the interval from a time of this machine until now, by the amplifier's clock."""
         return self.dating.interval(When(sent, threads.now()))
 
     def played(self, part: Values, sent: float) -> None:
-        """Note that a set of one part was carried out that was sent at a time."""
+        """Record that a set of one part, sent at a given time, was carried out."""
         self.shown.sets.sent(part)
         self.shown.carry_out("Set", part, {}, self.since(sent))
 
     async def play(self, *layers: LayerSet) -> RequestOutcome:
-        """Play a set at once."""
+        """Play a set immediately."""
         return await self.send(play_now(*layers))
 
     async def send_all(self, rows: Sequence[Send]) -> None:
@@ -566,10 +568,10 @@ class Subject:
         return self._moment
 
     async def at(self, *layers: LayerSet, lead: float, apart: float = 0.0) -> None:
-        """Play a set from a moment of its clock on, a time [s] apart from the last such moment.
+        """Play a set from a moment of its clock, `apart` [s] after the last such moment.
 
-        lead: how long before its moment its Commit is sent [s], where that is not apart from
-        another. Raises TooLate where its Commit may have come behind that.
+        lead: time by which the Commit precedes its moment [s], if apart is 0. Raises TooLate if the
+        Commit can have arrived after its moment.
         """
         await self.send(stage(*layers))
         await self.commit_in(self._until_moment + apart if apart else lead)
@@ -600,10 +602,10 @@ class Subject:
 
     @property
     def exchange_time(self) -> float:
-        """The shortest exchange [s] of the slowest message so far, or what it may take if less.
+        """Shortest exchange [s] of the slowest message so far, or the allowed time if shorter.
 
-        Lest an amplifier that is late has longer times. A line may delay more than is known of it,
-        which a reading shows.
+        The bound keeps a slow amplifier from extending its own deadlines. An unknown delay of the
+        line shows in a reading.
         """
         count, fastest, read = self.client.transactions, self.client.fastest, self.read_time
         slowest = max((fastest[each] for each in fastest if each not in _READ_ALONE), default=read)
@@ -637,7 +639,7 @@ class Subject:
         return int(min(required, self.can["ramp_max"]))
 
     def require_ramp(self, duration: float = 0.0) -> None:
-        """Raise NotApplicable where no ramp lasts as long as a time [s], or as a few exchanges."""
+        """Raise NotApplicable unless a ramp can last for `duration` [s], or for a few exchanges."""
         duration = max(duration, 0.03 + 2 * min(self.exchange_time, 1.0))
         require(
             self.can["ramp_max"] >= 1000 * duration, f"its ramps are shorter than {duration:.2g} s"
@@ -680,9 +682,9 @@ class Subject:
         return reply
 
     async def follow(self, duration: float | None = None) -> None:
-        """Read statuses for a time [s] from the last change on, None until all is settled.
+        """Read statuses for a time [s] after the last change; None: until all outputs have settled.
 
-        Raises TooLate where this machine was too slow to see what happens.
+        Raises TooLate if this machine was too slow to observe the changes.
         """
         began = self.shown.outputs.began
         end = self.shown.outputs.settled_at(began[1]) + _SETTLING
@@ -714,7 +716,7 @@ class Subject:
                     raise
 
     async def require_interference(self) -> None:
-        """Raise NotApplicable where levels do not show that tones of one frequency cancel."""
+        """Raise NotApplicable unless levels show that tones of one frequency cancel."""
         halves = [self.tone(0, 0.5, phase) for phase in (0.0, 180.0)]
         await self.play(*(layer(at, each) for at, each in enumerate(halves)))
         level = (await self.request("GetStatus"))["levels"][0]

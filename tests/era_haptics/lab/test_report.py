@@ -194,7 +194,7 @@ def test_record_is_shown_in_the_programs_own_words(
 )
 def test_line_that_is_no_record_is_hidden(line: str) -> None:
     """As the first of a long log, which is cut off, or what a library printed."""
-    assert harmless_records(line, Names()) == '"hidden: a line that is no record"\n'
+    assert harmless_records(line, Names()) == '"hidden: a line that is not a record"\n'
 
 
 @pytest.mark.parametrize("given", [["d.yaml"], ["rig.yaml", "d.yaml"]])
@@ -211,7 +211,7 @@ def test_report_includes_files_of_daemon(tmp_path: Path, given: Sequence[str]) -
     report = report_of(tmp_path, *given)
     assert {*report.files} == {"daemon.yaml", "rig.yaml", "log.jsonl", "versions.json"}
     assert report.files["log.jsonl"].text.splitlines() == [
-        '"hidden: a line that is no record"',
+        '"hidden: a line that is not a record"',
         '{"message": "link main: lost"}',
     ]
     assert [line.partition(" ")[0] for line in report.missing] == ["unreadable.yaml:", "status"]

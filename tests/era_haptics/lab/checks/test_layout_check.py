@@ -668,6 +668,6 @@ def test_folder_is_listed_with_a_line_for_each_file(tmp_path: Path) -> None:
     assert result.exit_code == 1
     broken, silent, kept = json.loads(result.stdout)["contents"]
     assert broken["error"].startswith(str(folder / "broken.haptic"))
-    assert silent["error"] == f"{folder / 'silent.ahap'}: is silent; there is nothing to check"
+    assert silent["error"] == f"{folder / 'silent.ahap'}: must not be silent"
     assert kept["file"] == str(tick)
     assert kept["kept_share"] >= 0.1

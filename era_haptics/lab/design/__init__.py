@@ -1,1 +1,1 @@
-"""Design: places of actuators for the best promised contrast."""
+"""Optimise the positions of actuators for the best promised contrast."""

@@ -1,4 +1,4 @@
-"""`era design`: places of ERAs for the best promised felt contrast, searched or given."""
+"""`era design`: optimise or rank ERA positions by promised felt contrast."""
 
 import time
 from collections.abc import Iterator, Sequence
@@ -39,7 +39,7 @@ def design(
         typer.Option(
             metavar="N|LO-HI",
             help="Number of ERAs, including kept ones; at least 3 with other mounts. "
-            "Default: as in the rig.",
+            "Default: that of the rig.",
         ),
     ] = "",
     layouts: Annotated[
@@ -64,7 +64,7 @@ def design(
         str,
         typer.Option(
             metavar="edge|anywhere|FILE",
-            help="Where ERAs may stand; FILE: polygons in YAML.",
+            help="Area allowed for ERAs; FILE: polygons in YAML.",
         ),
     ] = "edge",
     contents: Annotated[
@@ -94,9 +94,9 @@ def design(
     mesh: MeshOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Find or rank places of ERAs for the best promised contrast.
+    """Optimise or rank ERA positions by promised felt contrast.
 
-    Ctrl-C prints the layouts that were found so far and writes them as a file for --layouts.
+    Ctrl-C prints the layouts found so far and writes them to a file for --layouts.
     """
     from era_haptics.lab.design.design_run import UnfinishedDesign, design_summary, write_design
     from era_haptics.lab.design.design_run import design as find
@@ -151,7 +151,7 @@ def design(
 def _report_unfinished(
     unfinished: "UnfinishedDesign", rig_file: Path, output: Path, *, as_json: bool
 ) -> None:
-    """Print what an interrupted design has found, and write its layouts, if there are any."""
+    """Print the result of an interrupted design, and write its layouts, if there are any."""
     result = unfinished.summary()
     files: list[str] = []
     rows = ["interrupted: this design is incomplete; no layout was found so far"]
@@ -159,18 +159,19 @@ def _report_unfinished(
         file = output / "unfinished.yaml"
         unfinished.write(file)
         files = [str(file)]
-        counts = f"{result['layout_count']} layouts were found so far, {result['judged']} judged"
+        found = f"{result['layout_count']} layouts were found so far"
+        counts = f"{found}, {result['judged']} evaluated in full"
         rows = [
             f"interrupted: this design is incomplete; {counts}",
             *_rows_of_layouts(result["layouts"]),
-            f"wrote {file}, to judge these layouts; give the other options as before",
+            f"wrote {file}, to evaluate these layouts; give the other options as before",
             next_line("era", "design", rig_file, "--layouts", file, "-o", output),
         ]
     print_report(rows, {**result, "files": files}, as_json=as_json)
 
 
 def _counts(text: str) -> Sequence[int]:
-    """Numbers of ERAs of N or LO-HI."""
+    """Parse N or LO-HI as a range of ERA counts."""
     low, _, high = text.partition("-")
     ends = [end.strip() for end in (low, high or low)]
     if not all(end.isdecimal() for end in ends):
@@ -184,12 +185,12 @@ def _counts(text: str) -> Sequence[int]:
 
 
 def _listed(text: str) -> list[str]:
-    """What stands between commas."""
+    """Split a comma-separated list."""
     return [each.strip() for each in text.split(",") if each.strip()]
 
 
 def _quantity(text: str, dimension: Dimension, option: str) -> float:
-    """The value of an option in its SI unit."""
+    """Return the value of an option in its SI unit."""
     try:
         return quantity(text, dimension)
     except ValueError as error:
@@ -197,24 +198,25 @@ def _quantity(text: str, dimension: Dimension, option: str) -> float:
 
 
 LIGHT = 0.2
-"""Share of the ERAs' mean load below which the plate may tip when a finger presses elsewhere."""
+"""Fraction of the ERAs' mean load below which the plate can tip when a finger presses elsewhere."""
 
 
 def _warn_of_light(eras: dict[str, dict[str, Any]]) -> None:
-    """Name the ERAs that carry so little that the plate nearly tips."""
+    """Warn of ERAs that carry so little weight that the plate nearly tips."""
     loads = {name: era["static_load_n"] for name, era in eras.items()}
     least = LIGHT * sum(loads.values()) / len(loads)
     if light := [f"{name} ({load:.2f} N)" for name, load in loads.items() if load < least]:
         typer.echo(
             f"era: warning: {', '.join(light)}: carries less than {least:.2f} N of the plate's "
-            "weight, a fifth of the mean; a finger may lift the plate off: fix it there, or leave "
-            "out places by --where",
+            "weight, a fifth of the mean; a finger can lift the plate off: fasten it there, or "
+            "exclude these positions with --where",
             err=True,
         )
 
 
 def _rows(result: dict[str, Any], *, own_count: int) -> Iterator[str]:
-    """Yield places, contrast, starts, and what each ERA buys; own_count: ERAs of the rig."""
+    """Yield positions, contrast, starts, and the gain per ERA; own_count: number of ERAs of the
+    rig."""
     own = f"the rig's own {counted(own_count, 'ERA')}"
     yield f"{len(result['eras'])} ERAs in {result['time_s']:.1f} s"
     yield "name      x / mm   y / mm   dB per mm   load / N"
@@ -225,7 +227,7 @@ def _rows(result: dict[str, Any], *, own_count: int) -> Iterator[str]:
             f"{era['static_load_n']:8.2f}"
         )
     if result["contents"] > 1:
-        yield f"{result['contents']} contents at the same time, contrast of the worst finger:"
+        yield f"{result['contents']} simultaneous contents, contrast of the worst finger:"
     for title, key in (("this layout", "contrast_db"), (own, "own_contrast_db")):
         if result[key] is not None:
             medians = " / ".join(
@@ -242,7 +244,8 @@ def _rows(result: dict[str, Any], *, own_count: int) -> Iterator[str]:
         gap = f"{starts} starts, the worst {result['gap_db']:.1f} dB behind"
         yield f"{gap if starts > 1 else '1 start'}; {reached}"
     else:
-        yield f"{result['layout_count']} layouts, {result['unsupported']} unsupported; {reached}"
+        unsupported = f"{result['unsupported']} do not support the plate"
+        yield f"{result['layout_count']} layouts, {unsupported}; {reached}"
         yield from _rows_of_layouts(result["layouts"])
     for stiffness, value in result["by_stiffness_db"].items():
         yield f"ERAs of {stiffness} N/m: mean {value:.1f} dB"
@@ -252,7 +255,7 @@ def _rows(result: dict[str, Any], *, own_count: int) -> Iterator[str]:
 
 
 def _rows_of_layouts(layouts: list[dict[str, Any]]) -> Iterator[str]:
-    """Yield the first of given layouts."""
+    """Yield the best of the given layouts."""
     yield "rank  layout                          stiffness  contrast  score"
     for layout in layouts:
         contrast = f"{layout['contrast_db']['mean']:.1f} dB" if layout["contrast_db"] else "-"

@@ -1,8 +1,8 @@
-"""A design: layouts of ERAs searched or given, judged on processes, and written as files.
+"""Search or rank ERA layouts, evaluate them on parallel processes, and write the results.
 
-A layout is judged by the answers of its localization table to contact sets that no search has seen.
-`design` checks the request, then searches or ranks layouts; `write_design` writes the rig with the
-best one, a table of all layouts, pictures and a template.
+A layout is evaluated in full by querying its localization table at contact sets that no search has
+used. `design` checks the arguments, then searches or ranks layouts. `write_design` writes the rig
+with the best layout, a table of all layouts, pictures and a template.
 """
 
 import math
@@ -64,19 +64,19 @@ from model.table.table import LocalizationTable
 from model.table.table_file import build_table
 
 _MAX_CHANNELS = 4
-"""Channels of an amplifier beyond the rig's own ones."""
+"""Channels per added amplifier."""
 
 SENSITIVITY_STEP = 0.005
-"""Step [m] of an ERA by which the sensitivity to its place is measured."""
+"""Displacement of an ERA [m] for the sensitivity to its position."""
 
 DEFAULT_FINALISTS = 5
-"""Given layouts of each number and stiffness of ERAs that are judged."""
+"""Number of given layouts evaluated in full, per ERA count and stiffness."""
 
 CHUNK = 100
-"""Given layouts that are scored together, about a second of work."""
+"""Given layouts scored per task, about a second of work."""
 
 Machines: TypeAlias = Callable[..., Iterator[tuple[int, Any]]]
-"""Solves tasks: `model.processes.on_processes` or `model.processes.on_cluster` somewhere."""
+"""Solves tasks: `model.processes.on_processes`, or `model.processes.on_cluster` with an address."""
 
 _HERE: Machines = partial(on_processes, 1)
 
@@ -85,7 +85,7 @@ _search_of = lru_cache(maxsize=4)(LayoutSearch)
 _LEVEL_MARGIN = 0.1  # dB
 
 MAX_SHOWN = 10
-"""Layouts in a summary; the CSV file has all."""
+"""Layouts in a summary; the CSV file contains all."""
 
 MAX_STIFFNESSES, MAX_ERAS = 9, 32
 
@@ -94,7 +94,7 @@ MAX_STIFFNESSES, MAX_ERAS = 9, 32
 class Assessment:
     """Answers at contact sets (s,): promised felt contrast [dB] of the worst finger.
 
-    quiet (s,): numbers of quiet fingers; level_db_sl (s,): promised level of the weakest content.
+    quiet (s,): number of quiet fingers; level_db_sl (s,): promised level of the weakest content.
     """
 
     quiet: IntArray
@@ -106,7 +106,7 @@ class Assessment:
 
     @property
     def mean_db(self) -> float:
-        """Mean contrast [dB], each number of quiet fingers counting the same."""
+        """Mean contrast [dB]; every number of quiet fingers has the same weight."""
         return float(np.mean([self.contrast_db[self.quiet == k].mean() for k in self.kinds]))
 
     @property
@@ -120,21 +120,21 @@ class Assessment:
 
     @property
     def summary(self) -> dict[str, float]:
-        """Mean and medians [dB] for JSON."""
+        """Return mean and medians [dB] for JSON."""
         return {"mean": self.mean_db} | {f"median_{k}_quiet": self.median_db(k) for k in self.kinds}
 
     @property
     def reached_share(self) -> float:
-        """Share of the sets whose contents have the level on nine of ten plates."""
+        """Fraction of the sets in which all contents reach their level on 90 % of plates."""
         return float((self.level_db_sl >= STRONG_DB_SL - _LEVEL_MARGIN).mean())
 
 
 @dataclass(frozen=True, eq=False)
 class RankedLayout:
-    """A layout of a design, and its answers on fresh contact sets if it was judged.
+    """Layout of a design, with its answers at new contact sets if it was evaluated in full.
 
-    name: of a given one, or the number of its start; judged: its answers, to compare with `own` of
-    the design.
+    name: of a given layout, or the number of its start; judged: its answers, comparable with `own`
+    of the design.
     """
 
     problem: DesignProblem
@@ -149,13 +149,13 @@ class RankedLayout:
 
     @property
     def answers(self) -> Assessment:
-        """Answers of one that was judged."""
+        """Answers of a fully evaluated layout."""
         assert self.judged is not None  # noqa: S101
         return self.judged
 
     @property
     def mean_db(self) -> float:
-        """Mean contrast of one that was judged [dB]."""
+        """Mean contrast of a fully evaluated layout [dB]."""
         return self.answers.mean_db
 
     @property
@@ -165,12 +165,13 @@ class RankedLayout:
 
     @property
     def contrast(self) -> float | None:
-        """Promised felt contrast [dB], mean over numbers of quiet fingers, if it was judged."""
+        """Promised felt contrast [dB], averaged over numbers of quiet fingers; None unless
+        evaluated in full."""
         return None if self.judged is None else self.mean_db
 
     @property
     def score(self) -> float | None:
-        """A number that ranks layouts before they are judged; None if the plate is not supported.
+        """Score that ranks layouts before full evaluation; None if the plate is not supported.
 
         It has no unit and cannot be compared with a contrast.
         """
@@ -183,7 +184,7 @@ class RankedLayout:
 
     @property
     def rig(self) -> Rig:
-        """The rig with these ERAs on free channels, if need be of another, simulated amplifier."""
+        """The rig with these ERAs on free channels, if necessary of a new, simulated amplifier."""
         keys = layout_keys(self.problem, self.found.positions, stated(self.problem.rig).data)
         return rig_of(Document("RankedLayout.rig", "", keys))
 
@@ -192,11 +193,13 @@ class RankedLayout:
 class Design:
     """Result of a design.
 
-    layouts: judged ones first by their mean contrast, then others by score; starts: ends of the
-    best problem's searches; by_count: the best judged for each number of ERAs of that problem;
-    by_stiffness: the best for each stiffness [N/m] tried; sensitivities (n,): change of the score
-    [dB/m] with the place of each ERA of the best; own: the rig's own layout, None if it does not
-    support the plate.
+    - layouts: fully evaluated ones by mean contrast, then the others by score.
+    - starts: final layouts of the best problem's searches.
+    - by_count: best evaluated layout for each number of ERAs of that problem.
+    - by_stiffness: best layout for each stiffness [N/m] tried.
+    - sensitivities (n,): change of the score [dB/m] with the position of each ERA of the best
+      layout.
+    - own: the rig's own layout, None if it does not support the plate.
     """
 
     layouts: tuple[RankedLayout, ...]
@@ -213,26 +216,26 @@ class Design:
 
     @property
     def best(self) -> RankedLayout:
-        """The layout of the most contrast of as many ERAs as were sought."""
+        """The layout with the highest contrast among those with the requested number of ERAs."""
         return self.layouts[0]
 
     @property
     def problem(self) -> DesignProblem:
-        """That of the best layout."""
+        """The problem that the best layout solves."""
         return self.best.problem
 
     @property
     def gap_db(self) -> float:
-        """How far the worst start is behind the best [dB]."""
+        """How far the worst start is below the best [dB]."""
         return max((self.best.mean_db - each.mean_db for each in self.starts), default=0.0)
 
 
 LayoutListener: TypeAlias = Callable[[RankedLayout], None]
-"""Is called with every layout as soon as it is scored, and again once it is judged."""
+"""Called with every layout as soon as it is scored, and again once it is evaluated in full."""
 
 
 def ignore_layout(layout: RankedLayout) -> None:
-    """Ignore a layout that was scored or judged."""
+    """Ignore a layout (default listener)."""
 
 
 @dataclass(frozen=True)
@@ -241,7 +244,7 @@ class Runner:
 
     machines: Machines = _HERE
     progress: Progress = unseen
-    """Of one stage after the other."""
+    """Progress of the current stage."""
     on_layout: LayoutListener = ignore_layout
 
     def run(
@@ -253,7 +256,7 @@ class Runner:
     ) -> list[Any]:
         """Return the results of tasks, in their order.
 
-        on_result: called with the number of each task and its result as soon as it is done.
+        on_result: called with each task's number and result as soon as it is done.
         """
         results: dict[int, Any] = {}
         for number, result in self.machines(solve, shared, dict(enumerate(tasks))):
@@ -269,9 +272,9 @@ class Runner:
         tasks: Sequence[Any],
         layouts_of_result: Callable[[int, Any], list[RankedLayout]],
     ) -> list[RankedLayout]:
-        """Return the layouts of all results, in the order of their tasks; tell the listener.
+        """Return the layouts of all results, in the order of their tasks, and notify the listener.
 
-        layouts_of_result: the layouts of a task's number and result.
+        layouts_of_result: converts a task's number and result to layouts.
         """
 
         def tell(number: int, result: Any) -> None:
@@ -305,17 +308,26 @@ def design(
     progress: Progress = unseen,
     on_layout: LayoutListener = ignore_layout,
 ) -> Design:
-    """Find or compare layouts of ERAs, the best promised felt contrast first, as `era design` does.
+    """Search or rank layouts of ERAs, the best promised felt contrast first, like `era design`.
 
-    eras: how many, or several numbers, as many as the rig's for None; layouts: None to search,
-    `random:N` or a file to rank layouts; keep: names of ERAs that stay; where: `edge`, `anywhere`
-    or a file; contacts: a file, anywhere for None; contents: at the same time, a finger for each;
-    apart [m]: least distance of two ERAs; lowest [Hz]: least rigid-body frequency of a supported
-    plate; stiffness [N/m]: of which new ERAs get the best, that of the rig's for none; finalists:
-    given layouts that are judged by their tables' answers; starts: of a search; workers: processes,
-    one for None; cluster: address of a Dask scheduler in their place; progress: called with the
-    tasks done and all, of one stage after the other; on_layout: called with every layout as soon as
-    it is scored, and again once it is judged. Raises InputError.
+    - eras: number of ERAs, or several numbers; None: as many as the rig has.
+    - layouts: None to search, `random:N` or a file to rank layouts.
+    - keep: names of ERAs that keep their positions.
+    - where: `edge`, `anywhere` or a file.
+    - contacts: a file; None: anywhere.
+    - contents: number of simultaneous contents, one finger each.
+    - apart [m]: minimum distance between ERAs.
+    - lowest [Hz]: minimum rigid-body frequency of a supported plate.
+    - stiffness [N/m]: candidates for new ERAs, of which the best is used; empty: that of the rig's.
+    - finalists: number of given layouts that are evaluated in full.
+    - starts: of a search.
+    - workers: number of processes; None: one.
+    - cluster: address of a Dask scheduler, instead of workers.
+    - progress: called with the number of tasks done and the total, for one stage after the other.
+    - on_layout: called with every layout as soon as it is scored, and again once it is evaluated in
+      full.
+
+    Raises InputError.
 
     Example:
         >>> designed = era.design(rig, 4, layouts="random:6", finalists=2)
@@ -390,10 +402,10 @@ def design(
 
 
 def search_layouts(problems: Sequence[DesignProblem], *, starts: int, runner: Runner) -> Design:
-    """Search from several starts and judge what they find, for problems of different stiffness.
+    """Search from several starts, and evaluate the results, for problems of different stiffness.
 
-    The first start adds one ERA after the other and so gives a layout for each number; the others
-    begin at random. Raises InputError for an area without room, and where no layout supports the
+    The first start adds one ERA after the other and so produces a layout for each number; the
+    others start at random. Raises InputError if the area has no room, or if no layout supports the
     plate.
     """
     tasks = [(number, start) for number in range(len(problems)) for start in range(starts)]
@@ -423,7 +435,8 @@ def search_layouts(problems: Sequence[DesignProblem], *, starts: int, runner: Ru
 def rank_layouts(
     given: Mapping[DesignProblem, NamedLayouts], *, finalists: int, runner: Runner
 ) -> Design:
-    """Rank given layouts, some of which support the plate; of each problem the first are judged."""
+    """Rank given layouts, some of which support the plate; evaluate the first of each problem in
+    full."""
     problems = list(given)
     chunks = [
         (number, dict(list(given[problem].items())[at : at + CHUNK]))
@@ -454,7 +467,7 @@ def rank_layouts(
 def _design(
     best: RankedLayout, layouts: list[RankedLayout], starts: list[RankedLayout], runner: Runner
 ) -> Design:
-    """The result of layouts, of which some were judged, the best among them."""
+    """Assemble the result from layouts, some of them evaluated in full, and the best of these."""
     judged = [each for each in layouts if each.judged is not None]
     order = best_first([each.mean_db for each in judged]).tolist()
     ranked = [judged[each] for each in order]
@@ -483,7 +496,7 @@ def _design(
 
 
 def _judged(layouts: Sequence[RankedLayout], runner: Runner) -> list[RankedLayout]:
-    """The layouts with their answers; those of several starts that end in one are found once."""
+    """Return the layouts with their answers; one that several starts reach counts once."""
     problems = list(dict.fromkeys(each.problem for each in layouts))
     keys = [(problems.index(each.problem), each.found.positions.tobytes()) for each in layouts]
     different = dict(zip(keys, layouts, strict=True))
@@ -499,7 +512,7 @@ def _judged(layouts: Sequence[RankedLayout], runner: Runner) -> list[RankedLayou
 
 
 def _start(problems: Sequence[DesignProblem], task: tuple[int, int]) -> list[ScoredLayout]:
-    """Layouts of one start of one problem, the last of the number of ERAs that is sought."""
+    """Return the layouts of one start of one problem; the last has the requested number of ERAs."""
     number, start = task
     problem = problems[number]
     search = _search_of(problem)
@@ -513,22 +526,22 @@ def _start(problems: Sequence[DesignProblem], task: tuple[int, int]) -> list[Sco
 def _score(
     problems: Sequence[DesignProblem], task: tuple[int, list[FloatArray]]
 ) -> list[ScoredLayout]:
-    """Scores of given layouts of one problem."""
+    """Score given layouts of one problem."""
     number, layouts = task
     return _search_of(problems[number]).scored(layouts)
 
 
 def _answers(problems: Sequence[DesignProblem], task: tuple[int, FloatArray | None]) -> Assessment:
-    """What positions of ERAs, None for the rig's own, give on fresh contact sets."""
+    """Answer new contact sets with ERAs at given positions, None for the rig's own."""
     problem, positions = problems[task[0]], task[1]
     rig = problem.rig if positions is None else problem.rig_with(positions)
     return assess(rig, problem.judged_sets(), contents=problem.contacts.contents)
 
 
 def assess(rig: Rig, sets: Sequence[FloatArray], *, contents: int = 1) -> Assessment:
-    """What a rig's table answers at contact sets (fingers, 2) [m], fingers with contents first.
+    """Answer contact sets (fingers, 2) [m], fingers with contents first, with a rig's table.
 
-    For contents of STRONG_DB_SL, where it cannot be reached for the highest found, none of which is
+    Contents are at STRONG_DB_SL, or at the highest level found if that cannot be reached; none is
     shared or held back. Raises InputError for ERAs that do not support the plate.
     """
     table = build_table(rig)
@@ -552,7 +565,7 @@ def _answer(table: LocalizationTable, contacts: FloatArray, contents: int) -> tu
 
 
 def write_design(folder: Path, design: Design, data: Mapping[str, Value]) -> list[Path]:
-    """Write rig.yaml, layouts.csv, contrast.png, count.png and template.svg; data: of the file.
+    """Write rig.yaml, layouts.csv, contrast.png, count.png and template.svg; data: of the rig file.
 
     Raises OSError if the folder cannot be written.
     """
@@ -575,24 +588,25 @@ def write_design(folder: Path, design: Design, data: Mapping[str, Value]) -> lis
 
 
 def rig_text(design: Design, data: Mapping[str, Value]) -> str:
-    """The text of the rig's file with the ERAs of the best layout, on free channels."""
+    """Return the text of the rig file with the best layout's ERAs on free channels."""
     keys = layout_keys(design.problem, design.best.found.positions, data)
     added = [name for name in keys["amplifiers"] if name not in design.problem.rig.amplifiers]
     comment = (
         f"# Designed for contrast: {design.best.count} ERAs, "
-        f"{design.best.mean_db:.1f} dB over fresh contact sets.\n"
+        f"{design.best.mean_db:.1f} dB over new contact sets.\n"
     )
     if added:
-        comment += f"# Give the amplifiers {', '.join(added)} the URLs of real ones.\n"
+        comment += f"# Replace the URLs of amplifiers {', '.join(added)} by those of real ones.\n"
     return comment + data_text(keys)
 
 
 def layout_keys(
     problem: DesignProblem, positions: FloatArray, data: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """Data of a rig file with ERAs at positions [m], on free channels; data: of the rig's file.
+    """Return rig-file data with ERAs at positions [m], on free channels; data: of the original rig
+    file.
 
-    Amplifiers that are missing are added, simulated.
+    Missing amplifiers are added as simulated ones.
     """
     rig = problem.rig
     before, amplifiers = data["eras"], data["amplifiers"]
@@ -625,9 +639,9 @@ def layout_keys(
 
 
 def _damped(section: Mapping[str, Any], damping: float) -> dict[str, Any]:
-    """A copy of an ERA's keys with its damping by itself: a ratio refers to the number of ERAs.
+    """Return an ERA's keys with absolute damping, since a ratio depends on the number of ERAs.
 
-    And a quality of an exciter to its stiffness.
+    For an exciter, Q is converted likewise, since it depends on the stiffness.
     """
     replaced = _instead_of("damping", section)
     keys = {key: value for key, value in deepcopy(section).items() if key not in replaced}
@@ -635,12 +649,12 @@ def _damped(section: Mapping[str, Any], damping: float) -> dict[str, Any]:
 
 
 def _instead_of(key: str, section: Mapping[str, Any]) -> tuple[str, ...]:
-    """Keys that one replaces in an actuator of the section's kind."""
+    """Return the keys that `key` replaces in an actuator of the section's kind."""
     return section_by_kind([*ACTUATOR_KINDS.values()], section).instead.get(key, ())
 
 
 def _free_channels(rig: Rig, kept: tuple[str, ...], *, count: int) -> list[Channel]:
-    """The rig's channels without those of kept ERAs, and further amplifiers of _MAX_CHANNELS."""
+    """Return the rig's channels without those of kept ERAs, then channels of added amplifiers."""
     free = [channel for name, channel in rig.wiring.items() if name not in kept]
     names = (
         name for number in range(2, 99) if (name := f"amplifier{number}") not in rig.amplifiers
@@ -688,19 +702,20 @@ def design_summary(design: Design) -> dict[str, Any]:
 
 
 class UnfinishedDesign:
-    """The layouts of a design that was interrupted, as far as they were scored or judged."""
+    """Layouts of an interrupted design, as far as they were scored or evaluated in full."""
 
     def __init__(self) -> None:
         self._layouts: dict[tuple[DesignProblem, bytes], RankedLayout] = {}
 
     def add(self, layout: RankedLayout) -> None:
-        """Add a layout that was scored, or replace it once it is judged."""
+        """Add a scored layout, or replace it once it is evaluated in full."""
         key = layout.problem, layout.found.positions.tobytes()
         self._layouts[key] = layout
 
     @property
     def layouts(self) -> list[RankedLayout]:
-        """Layouts that support the plate: judged ones by their contrast, then others by score."""
+        """Layouts that support the plate: fully evaluated ones by contrast, then the others by
+        score."""
         supported = [layout for layout in self._layouts.values() if layout.found.is_supported]
         return sorted(supported, key=_rank)
 
@@ -718,7 +733,7 @@ class UnfinishedDesign:
         }
 
     def write(self, path: Path) -> None:
-        """Write the first layouts as a file that `design` takes as `layouts`.
+        """Write the best layouts as a file for the `layouts` argument of `design`.
 
         Raises OSError if it cannot be written.
         """
@@ -726,18 +741,18 @@ class UnfinishedDesign:
         for rank, layout in enumerate(self.layouts[:MAX_SHOWN], start=1):
             added = layout.found.positions[len(layout.problem.kept) :]
             positions[f"{rank}: {_name(layout)}"] = added.tolist()
-        comment = "# Layouts of a design that was interrupted, the best first.\n"
+        comment = "# Layouts of an interrupted design, best first.\n"
         with whole_or_nothing(path) as stream:
             stream.write((comment + data_text({"layouts": positions})).encode())
 
 
 def _name(layout: RankedLayout) -> str:
-    """The name of a layout among those of several numbers of ERAs."""
+    """Return the name of a layout, unique across numbers of ERAs."""
     return f"{layout.name}, {counted(layout.count, 'ERA')}"
 
 
 def _rank(layout: RankedLayout) -> tuple[bool, float]:
-    """A key that sorts judged layouts by their contrast, then others by their score."""
+    """Return a key that sorts evaluated layouts by contrast, then the others by score."""
     if layout.judged is None:
         return True, -layout.found.score_db
     return False, -layout.mean_db
@@ -758,7 +773,7 @@ def _row(layout: RankedLayout) -> dict[str, Any]:
 
 
 def _contrast_figure(design: Design) -> Figure:
-    """Promised felt contrast of fresh contact sets at their contents, a panel by quiet fingers."""
+    """Draw the promised felt contrast of new contact sets, a panel per number of quiet fingers."""
     contents = design.problem.contacts.contents
     plate, judged = design.problem.rig.plate, design.best.answers
     eras = design.best.eras
@@ -789,7 +804,7 @@ def _contrast_figure(design: Design) -> Figure:
 
 
 def count_figure(design: Design) -> Figure:
-    """Contrast against the number of ERAs, with what each buys."""
+    """Draw contrast against the number of ERAs, and the gain of each."""
     counts = list(design.by_count)
     means = [each.mean_db for each in design.by_count.values()]
     figure = Figure(figsize=(5.2, 3.6), layout="constrained")
@@ -803,7 +818,7 @@ def count_figure(design: Design) -> Figure:
     axes.set_xlabel("ERAs")
     axes.set_ylabel("promised contrast / dB")
     axes.set_xticks(counts)
-    axes.margins(x=0.1)  # the last figure stands beside its point
+    axes.margins(x=0.1)  # room for the last number next to its point
     axes.grid(alpha=0.3)
     axes.legend(fontsize=8)
     return figure

@@ -1,9 +1,9 @@
-"""The problem of a design: a number of ERAs, where they may stand, and the contacts they serve.
+"""Design problem: number of ERAs, the area allowed for them, and the contact sets they serve.
 
-ERAs may stand along the edge, anywhere, or in polygons. Contact sets have fingers with contents,
-and some quiet ones. A layout supports the plate by its lowest rigid-body mode, and with weight on
-every ERA. Layouts to be ranked are those of a file, or the rig's own, those with a name, and random
-ones.
+The area is the edge, the whole plate, or polygons. Contact sets consist of fingers with contents
+and quiet fingers. A layout supports the plate if the lowest rigid-body mode is high enough and
+every ERA carries weight. Layouts to be ranked come from a file, or are the rig's own, named ones
+and random ones.
 """
 
 import math
@@ -43,46 +43,48 @@ from model.table.table import default_drive_frequencies
 from registry.limits import MAX_CONTACTS, MAX_CONTENTS
 
 EDGE, ANYWHERE = "edge", "anywhere"
-"""Names of the areas that need no file."""
+"""Names of areas without a file."""
 
 _ON_EDGE = 1e-9  # m
 _MAX_CANDIDATES = 2000
 
 DEFAULT_FINGER_GAP = 0.05
-"""Distance [m] between the fingers of a set."""
+"""Minimum distance between the fingers of a set [m]."""
 
 DEFAULT_QUIET = {True: (1, 3), False: (0, 1)}
-"""Fewest and most quiet fingers beside one content, and beside several."""
+"""Minimum and maximum number of quiet fingers, with one content and with several."""
 
 MIN_FINGERS = 2
 """Fingers of a set."""
 
 _MAX_TRIES = 20_000
-_DRAWN_FOR_EACH = 8  # drawn for each place of a pool, of which the loneliest is taken
+_DRAWN_FOR_EACH = 8  # candidates per position of a pool; the most isolated one is used
 
 Draw = Callable[[np.random.Generator, int], FloatArray]
-"""Draws places [m] (n, 2)."""
+"""Draws positions [m] (n, 2)."""
 
 DEFAULT_LOWEST = 20.0
-"""Lowest natural frequency [Hz] of the plate on its ERAs: it sags by 0.6 mm under its weight."""
+"""Minimum natural frequency of the plate on its ERAs [Hz]; it sags by 0.6 mm under its weight."""
 
 MIN_SUPPORTING = 3
-"""ERAs, and other mounts, that can support a plate."""
+"""Minimum number of ERAs and other mounts that support a plate."""
 
-_ROUNDING = 1e-9  # share of the mean load below which a pull is none: an ERA may carry nothing
+_ROUNDING = (
+    1e-9  # of the mean load; smaller negative loads count as zero, since an ERA can be unloaded
+)
 
 CANDIDATES = {True: 48, False: 80}
-"""Candidates along the edge, and over an area."""
+"""Number of candidates along the edge, and over an area."""
 
 SEARCH_FINGERS, SEARCH_FREQUENCIES = 32, 16
 
 JUDGED_SETS = 200
-"""Contact sets by which layouts are judged, other than those of the search."""
+"""Number of contact sets for full evaluation, different from those of the search."""
 
 DEFAULT_ERA_GAP = 0.03
-"""Least distance [m] of two ERAs."""
+"""Minimum distance between two ERAs [m]."""
 
-_JUDGED_SEED = 0x5EED  # added to that of a search, whose own sets are others
+_JUDGED_SEED = 0x5EED  # added to the seed of a search, so that the sets differ
 
 _OWN = "own"
 """Name of the rig's own layout."""
@@ -90,18 +92,18 @@ _OWN = "own"
 _MAX_LAYOUTS = 1_000_000
 
 _RANDOM_PREFIX = "random:"
-_MAX_DIGITS = 9  # int() would take long for thousands of digits
-_TRIES = 20  # draws for each layout, of which some are there already
+_MAX_DIGITS = 9  # int() is slow for thousands of digits
+_TRIES = 20  # draws per layout, since some repeat earlier ones
 
 NamedLayouts = dict[str, FloatArray]
-"""Positions [m] (n, 2) of the ERAs by the name of a layout, those kept first."""
+"""Positions of the ERAs [m] (n, 2) by layout name, kept ERAs first."""
 
 
 @dataclass(frozen=True)
 class Area:
-    """A part of a plate of a length and a width [m], where a function of points (n, 2) is true.
+    """Part of a plate of a length and a width [m] in which a function of points (n, 2) is true.
 
-    text: what identifies it: its name, or the content of its file.
+    text: identifies it; its name, or the content of its file.
     """
 
     text: str
@@ -110,7 +112,7 @@ class Area:
     contains: Callable[[FloatArray], NDArray[np.bool_]]
 
     def candidates(self, spacing: float) -> FloatArray:
-        """Places on a raster over the plate, edges included."""
+        """Return the points of a raster over the plate, edges included, that are in the area."""
         x, y = (
             np.linspace(0, side, max(1, round(side / spacing)) + 1)
             for side in (self.length, self.width)
@@ -119,7 +121,7 @@ class Area:
         return places[self.contains(places)]
 
     def moved(self, place: FloatArray, step: float) -> FloatArray:
-        """A step along x and y, to and fro, no further than the plate's edges."""
+        """Return a position moved by +/- step in x and in y, clipped at the plate's edges."""
         steps = step * np.array([[1, 0], [-1, 0], [0, 1], [0, -1]])
         places = np.clip(place + steps, 0, [self.length, self.width])
         is_other = (np.abs(places - place) > _ON_EDGE).any(axis=1)
@@ -127,9 +129,9 @@ class Area:
 
 
 def area_of(where: str, plate: Plate) -> Area:
-    """Return the area of a name or of a file of polygons.
+    """Return an area given by its name or by a file of polygons.
 
-    Raises InputError for another kind of file, and for one that cannot be read.
+    Raises InputError for another kind of file, or one that cannot be read.
     """
     length, width = plate.length, plate.width
     if where in (EDGE, ANYWHERE):
@@ -140,7 +142,9 @@ def area_of(where: str, plate: Plate) -> Area:
         raise InputError(
             f"where must be {EDGE}, {ANYWHERE} or a .yaml file of polygons, got {where!r}"
         )
-    document = read_document(path, if_empty="it must have polygons, each a name with its corners")
+    document = read_document(
+        path, if_empty="it must have polygons, each with a name and its corners"
+    )
     polygons = Validation(document, _PolygonsSection).finish().polygons
     shapes = [Polygon(tuple(corners)) for corners in polygons.values()]
     contains = partial(_in_any, shapes)
@@ -148,20 +152,20 @@ def area_of(where: str, plate: Plate) -> Area:
 
 
 def everywhere(points: FloatArray) -> NDArray[np.bool_]:
-    """True for every point (n, 2), (n,)."""
+    """Return True for every point (n, 2), (n,)."""
     return np.ones(len(points), dtype=bool)
 
 
 def candidates_of(area: Area, *, count: int) -> tuple[FloatArray, float]:
-    """About a count of candidate places, (c, 2) [m], and how far apart they are [m].
+    """Return about `count` candidate positions (c, 2) [m], and their spacing [m].
 
-    Raises InputError for an area without any.
+    Raises InputError if the area contains none.
     """
     size = area.length * area.width
     spacing = math.sqrt(size / count)
     if area.text == EDGE:
         spacing = 2 * (area.length + area.width) / count
-    for _ in range(6):  # of a small area the raster is finer
+    for _ in range(6):  # refine the raster for a small area
         places = area.candidates(spacing)
         if len(places) >= count / 2:
             return places, spacing
@@ -170,8 +174,8 @@ def candidates_of(area: Area, *, count: int) -> tuple[FloatArray, float]:
         spacing *= 0.7
     if len(places) == 0:
         raise InputError(
-            "where must leave room for ERAs on the plate, got none; check that it is in metres, "
-            "from the plate's corner, and white where ERAs may stand"
+            "where must leave room for ERAs on the plate, got none; check that its polygons are on "
+            "the plate, in metres from its corner"
         )
     return places, spacing
 
@@ -181,35 +185,38 @@ def _both(
     contains: Callable[[FloatArray], NDArray[np.bool_]],
     points: FloatArray,
 ) -> NDArray[np.bool_]:
-    """Whether points (n, 2) are on a plate, not in a cut-out of a surface, and in an area of it."""
+    """Return whether points (n, 2) are on the plate, outside cut-outs of a surface, and in the
+    area."""
     return np.asarray(covers(points) & contains(points))
 
 
 def _on_edge(length: float, width: float, points: FloatArray) -> NDArray[np.bool_]:
-    """Whether points (n, 2) are on the edge of a plate."""
+    """Return whether points (n, 2) are on the edge of a plate."""
     gaps = np.minimum(np.abs(points), np.abs([length, width] - points))
     return np.asarray((gaps <= _ON_EDGE).any(axis=1))
 
 
 def _in_any(polygons: Sequence[Polygon], points: FloatArray) -> NDArray[np.bool_]:
-    """Whether points (n, 2) are in any of some polygons, their edges included."""
+    """Return whether points (n, 2) are in any of the polygons, edges included."""
     found = [any(each.contains(x, y) for each in polygons) for x, y in points.tolist()]
     return np.array(found, dtype=bool)
 
 
 class _PolygonsSection(Section):
-    """Polygons in which ERAs may stand, by name."""
+    """Polygons allowed for ERAs, by name."""
 
     polygons: Annotated[dict[Identifier, PolygonSection], Field(min_length=1, max_length=256)]
 
 
 @dataclass(frozen=True, eq=False)
 class ContactRule:
-    """Distribution of contact sets: anywhere, in regions, or those given.
+    """Distribution of contact sets: anywhere, in regions, or given.
 
-    quiet: fewest and most quiet fingers; apart [m]: between fingers; draw: of places; given: sets
-    of contacts (fingers, 2) [m], which replace all that; contents: how
-    many fingers of a set, its first ones, feel a content of their own.
+    - quiet: minimum and maximum number of quiet fingers.
+    - apart [m]: minimum distance between fingers.
+    - draw: draws positions.
+    - given: sets of contacts (fingers, 2) [m], which replace the random ones.
+    - contents: number of fingers, first in a set, with a content of their own.
     """
 
     quiet: tuple[int, int]
@@ -219,9 +226,9 @@ class ContactRule:
     contents: int = 1
 
     def sets(self, count: int, *, seed: int) -> list[FloatArray]:
-        """Draw about a count of sets, as many for each number of quiet fingers.
+        """Draw about `count` sets, equally many for each number of quiet fingers.
 
-        Those given are taken in turn. Raises InputError where fingers find no room.
+        Given sets are used in turn. Raises InputError if fingers find no room.
         """
         rng = np.random.default_rng(seed)
         if self.given:
@@ -232,10 +239,10 @@ class ContactRule:
         return [self._one(rng, self.contents + low + number % kinds) for number in range(count)]
 
     def pooled_sets(self, fingers: int, *, seed: int) -> list[FloatArray]:
-        """Sets of a number of fingers only, far apart, each the first once for each number.
+        """Draw sets that use only `fingers` finger positions, far apart from each other.
 
-        For what is computed once for each finger. Sets given are taken as they are, up to three for
-        each finger.
+        For quantities computed once per finger. Every finger is the first of one set per number of
+        quiet fingers. Given sets are used unchanged, up to three per finger.
         """
         low, high = self.quiet
         if self.given:
@@ -255,7 +262,8 @@ class ContactRule:
     def _others(
         self, rng: np.random.Generator, pool: FloatArray, first: int, count: int
     ) -> IntArray:
-        """Numbers of a finger and a count of others of a pool that are far enough apart."""
+        """Draw `count` other fingers of a pool that are far enough from one finger, and return
+        their numbers."""
         for _ in range(_MAX_TRIES):
             others = rng.choice(len(pool), count, replace=False)
             numbers = np.concatenate([[first], others])
@@ -273,22 +281,22 @@ class ContactRule:
     def _no_room(self, fingers: int) -> InputError:
         return InputError(
             f"{fingers} fingers {1000 * self.apart:g} mm apart must find room in the regions of "
-            f"contacts, got none in {_MAX_TRIES} draws; lower apart or quiet, or enlarge the "
+            f"contacts, found none in {_MAX_TRIES} draws; lower apart or quiet, or enlarge the "
             "regions"
         )
 
 
 def anywhere(plate: Plate, contents: int = 1) -> ContactRule:
-    """Fingers with contents and DEFAULT_QUIET ones anywhere on a plate."""
+    """Return the rule for fingers anywhere on a plate, with DEFAULT_QUIET quiet ones."""
     draw = partial(_drawn, [Rectangle(0.0, 0.0, plate.length, plate.width)], plate)
     return ContactRule(DEFAULT_QUIET[contents == 1], DEFAULT_FINGER_GAP, draw, contents=contents)
 
 
 def contact_rule(path: Path | None, plate: Plate, contents: int = 1) -> ContactRule:
-    """The rule of a file, regions as those of a surface layout, or sets; `anywhere` for None.
+    """Read a rule from a file with regions (as in a surface layout) or sets; `anywhere` for None.
 
-    contents: at the same time, each for a finger of its own. Raises ConfigError for what is wrong
-    in the file.
+    contents: number of simultaneous contents, one finger each. Raises ConfigError for errors in the
+    file.
     """
     if not 1 <= contents <= MAX_CONTENTS:
         raise InputError(f"contents must be 1 to {MAX_CONTENTS}, got {contents}")
@@ -304,7 +312,7 @@ def contact_rule(path: Path | None, plate: Plate, contents: int = 1) -> ContactR
     section = validation.finish()
     given = tuple(np.array([*each.first, *each.quiet]) for each in section.sets)
     problems = [
-        f"sets[{number}] must have {contents} fingers with contents, target or own, and another "
+        f"sets[{number}] must have {contents} fingers with contents (target or own) and another "
         f"finger, got {len(each.first)} and {len(each.quiet)} quiet ones"
         for number, each in enumerate(section.sets)
         if len(each.first) != contents or len(each.first) + len(each.quiet) < MIN_FINGERS
@@ -334,23 +342,23 @@ def contact_rule(path: Path | None, plate: Plate, contents: int = 1) -> ContactR
 def _drawn(
     shapes: Sequence[RegionShape], plate: Plate, rng: np.random.Generator, count: int
 ) -> FloatArray:
-    """Draw each finger in one of some shapes, each as likely as another."""
+    """Draw each finger in one of the shapes, all equally likely."""
     chosen = rng.integers(len(shapes), size=count)
     return np.array([_place_in(shapes[number], plate, rng) for number in chosen])
 
 
 def _place_in(shape: RegionShape, plate: Plate, rng: np.random.Generator) -> _Point:
-    """A place [m] of the plate in a shape; raises InputError where there is none."""
+    """Draw a position [m] of the plate in a shape; raises InputError if there is none."""
     box = box_of(shape)
     for _ in range(_MAX_TRIES):
         x, y = rng.uniform(*box).tolist()
         if plate.contains(x, y) and shape.contains(x, y):
             return x, y
-    raise InputError("regions of contacts must have an area, got one that has none")
+    raise InputError("regions of contacts must have an area, got one without")
 
 
 class _RegionSection(ShapedSection):
-    """A region; what it plays, in a surface layout, does not matter here."""
+    """Region of contacts; its effects in a surface layout are ignored."""
 
     model_config = ConfigDict(extra="ignore")
 
@@ -370,7 +378,7 @@ class _SetSection(Section):
 
 
 class _ContactsSection(Section):
-    """Contacts of a design. Effects and the like of a surface layout are passed over."""
+    """Contacts of a design. Effects and other keys of a surface layout are ignored."""
 
     quiet: Annotated[tuple[int, int], Strict(strict=False)] | None = None
     apart: Annotated[float, Quantity(LENGTH, at_least=0.026, at_most=10)] = DEFAULT_FINGER_GAP
@@ -383,9 +391,9 @@ class _ContactsSection(Section):
 
 
 def shortfall(rig: Rig, eras: Sequence[Actuator], *, lowest: float) -> float:
-    """How far ERAs are from supporting a rig's plate, 0 if they do.
+    """Return how far ERAs are from supporting a rig's plate, 0 if they do.
 
-    lowest [Hz]: least rigid-body frequency. No mount may be pulled upwards by the plate's weight,
+    lowest [Hz]: minimum rigid-body frequency. The plate's weight must not pull any mount upwards,
     so that the centre of mass is within them and the plate does not tip.
     """
     frequency = float(rigid_body_frequencies(rig.plate, eras, loads=rig.masses)[0])
@@ -398,11 +406,15 @@ def shortfall(rig: Rig, eras: Sequence[Actuator], *, lowest: float) -> float:
 
 @dataclass(frozen=True, eq=False)
 class DesignProblem:
-    """What is sought.
+    """Requested design.
 
-    kept: ERAs of the rig that stay, by name; count: of all ERAs; apart [m]: least distance of two;
-    lowest [Hz]: least rigid-body frequency; stiffness [N/m]: of ERAs that do not stay, None: that
-    of the rig's. Raises InputError for fewer ERAs than can support the plate.
+    - kept: names of the rig's ERAs that keep their positions.
+    - count: number of all ERAs.
+    - apart [m]: minimum distance between ERAs.
+    - lowest [Hz]: minimum rigid-body frequency.
+    - stiffness [N/m]: of ERAs that are not kept; None: that of the rig's.
+
+    Raises InputError for too few ERAs to support the plate.
     """
 
     rig: Rig
@@ -425,29 +437,30 @@ class DesignProblem:
 
     @property
     def supports(self) -> int:
-        """Mounts beside the ERAs."""
+        """Number of mounts other than the ERAs."""
         return sum(load.stiffness > 0 for load in self.rig.masses)
 
     @property
     def kept_positions(self) -> FloatArray:
-        """Places [m] of the ERAs that stay, (k, 2)."""
+        """Positions of the kept ERAs [m], (k, 2)."""
         eras = [self.rig.era(name) for name in self.kept]
         return np.array([[era.x, era.y] for era in eras]).reshape(-1, 2)
 
     @property
     def own_positions(self) -> FloatArray:
-        """Places [m] of the rig's own ERAs, (eras, 2)."""
+        """Positions of the rig's own ERAs [m], (eras, 2)."""
         return np.array([[era.x, era.y] for era in self.rig.eras])
 
     @property
     def like(self) -> Actuator:
-        """The rig's ERA like which those are that do not stay."""
+        """The rig's ERA that serves as the template for new ones."""
         return next((era for era in self.rig.eras if era.name not in self.kept), self.rig.eras[0])
 
     def eras(self, positions: FloatArray) -> tuple[Actuator, ...]:
-        """ERAs at positions [m] (n, 2): those kept, and more like the first of the others.
+        """Return ERAs at positions [m] (n, 2): the kept ones, then copies of the first that is not
+        kept.
 
-        Named E1, E2, ... by names that no kept ERA has.
+        Copies are named E1, E2, ..., skipping names of kept ERAs.
         """
         like = self.like
         if self.stiffness is not None:
@@ -463,15 +476,16 @@ class DesignProblem:
         return replace(self.rig, eras=self.eras(positions), wiring={}, amplifiers={})
 
     def shortfall(self, positions: FloatArray) -> float:
-        """How far ERAs at positions are from supporting the plate, 0 if they do."""
+        """Return how far ERAs at positions are from supporting the plate, 0 if they do."""
         return shortfall(self.rig, self.eras(positions), lowest=self.lowest)
 
     @property
     def searched_frequencies(self) -> FloatArray:
-        """Frequencies [Hz] of the scores, some of those of the rig's tables, (f,).
+        """Frequencies of the scores [Hz], a subset of those of the rig's tables, (f,).
 
-        As many times more as there are contents, each of which needs some of its own: three at
-        all 47 follow answers with a correlation of 0.83, at 16 of 0.49 (16 layouts of four ERAs).
+        Their number is proportional to the number of contents, each of which needs separate
+        frequencies: for three contents, scores at all 47 frequencies correlate with answers by
+        0.83, at 16 by 0.49 (16 layouts of four ERAs).
         """
         every = default_drive_frequencies(self.rig.limits)
         count = min(len(every), SEARCH_FREQUENCIES * self.contacts.contents)
@@ -479,12 +493,12 @@ class DesignProblem:
         return np.asarray(every[chosen.astype(int)])
 
     def judged_sets(self) -> list[FloatArray]:
-        """Contact sets that no search has seen, (fingers, 2) [m] each."""
+        """Contact sets that no search has used, (fingers, 2) [m] each."""
         return self.contacts.sets(JUDGED_SETS, seed=self.seed + _JUDGED_SEED)
 
     @property
     def candidates(self) -> FloatArray:
-        """Places [m] from which a search begins, (c, 2); raises InputError where there are none."""
+        """Start positions of a search [m], (c, 2); raises InputError if there are none."""
         return self._raster[0]
 
     @property
@@ -497,27 +511,27 @@ class DesignProblem:
         return candidates_of(self.area, count=CANDIDATES[self.area.text == EDGE])
 
     def open_candidates(self, positions: FloatArray) -> IntArray:
-        """Numbers of candidates far enough from positions (n, 2) [m].
+        """Return the numbers of candidates far enough from positions (n, 2) [m].
 
-        Raises InputError where there are none.
+        Raises InputError if there are none.
         """
         gaps = np.linalg.norm(self.candidates[:, None] - positions, axis=-1)
         found = np.flatnonzero(gaps.min(axis=1, initial=np.inf) >= self.apart)
         if not len(found):
             raise InputError(
-                f"where must have room for {self.count} ERAs {1000 * self.apart:g} mm apart, got "
+                f"where must have room for {self.count} ERAs {1000 * self.apart:g} mm apart, found "
                 f"room for {len(positions)}; enlarge it, or reduce eras or apart"
             )
         return found
 
     def are_apart(self, positions: FloatArray) -> bool:
-        """Whether positions (n, 2) [m] keep the least distance."""
+        """Return whether positions (n, 2) [m] keep the minimum distance."""
         return least_gap(positions) >= self.apart
 
     def random_layout(self, rng: np.random.Generator) -> FloatArray:
-        """ERAs at candidates by chance, those kept first, far enough apart: (count, 2) [m].
+        """Draw a layout at candidates far enough apart, kept ERAs first: (count, 2) [m].
 
-        Raises InputError where there is no room for so many.
+        Raises InputError if there is no room for that many.
         """
         found = self.kept_positions
         while len(found) < self.count:
@@ -527,7 +541,7 @@ class DesignProblem:
 
 
 class _LayoutsSection(Section):
-    """Places of the ERAs that are not kept, by the name of the layout."""
+    """Positions of the ERAs that are not kept, by layout name."""
 
     layouts: Annotated[
         dict[str, Annotated[list[PointSection], Field(min_length=1, max_length=32)]],
@@ -538,21 +552,21 @@ class _LayoutsSection(Section):
 def supported_layouts(
     text: str, problems: Sequence[DesignProblem]
 ) -> dict[DesignProblem, NamedLayouts]:
-    """The `layouts_of` each problem; raises InputError where none supports the plate."""
+    """Return `layouts_of` each problem; raises InputError if none supports the plate."""
     given = {problem: layouts_of(text, problem) for problem in problems}
     if not any(
         problem.shortfall(each) == 0 for problem in given for each in given[problem].values()
     ):
         raise InputError(
-            f"a given layout must support the plate with its lowest rigid-body frequency at "
-            f"least {problems[0].lowest:g} Hz and weight on each ERA, got none that does; add ERAs "
+            f"at least one layout must support the plate with its lowest rigid-body frequency at "
+            f"least {problems[0].lowest:g} Hz and weight on each ERA; add ERAs "
             "or stiffer ones, widen where, or reduce lowest"
         )
     return given
 
 
 def layouts_of(text: str, problem: DesignProblem) -> NamedLayouts:
-    """The layouts of `random:N` or of a file; raises InputError for what is wrong in it."""
+    """Return the layouts of `random:N` or of a file; raises InputError for an invalid file."""
     if not text.startswith(_RANDOM_PREFIX):
         return _layouts_of_file(Path(text), problem)
     number = text.removeprefix(_RANDOM_PREFIX)
@@ -564,10 +578,10 @@ def layouts_of(text: str, problem: DesignProblem) -> NamedLayouts:
 
 
 def random_layouts(problem: DesignProblem, count: int) -> NamedLayouts:
-    """A number of different layouts: the rig's own, those with a name, others at candidates.
+    """Return `count` different layouts: the rig's own, named ones, then random ones at candidates.
 
-    The first two where they are in the area. Fewer where there are no more; a longer list starts
-    with a shorter one.
+    The first two only if they are in the area. Fewer if no more exist. A longer list starts with
+    the shorter ones.
     """
     found: NamedLayouts = {}
     known: set[bytes] = set()
@@ -582,7 +596,7 @@ def random_layouts(problem: DesignProblem, count: int) -> NamedLayouts:
 
 
 def _different_layouts(problem: DesignProblem, count: int) -> Iterator[tuple[str, FloatArray]]:
-    """Names, empty for random ones, and positions."""
+    """Yield names (empty for random layouts) and positions."""
     if len(problem.rig.eras) == problem.count and not problem.kept:
         yield _OWN, problem.own_positions
     kept = problem.kept_positions
@@ -597,7 +611,9 @@ def _different_layouts(problem: DesignProblem, count: int) -> Iterator[tuple[str
 
 
 def _layouts_of_file(path: Path, problem: DesignProblem) -> NamedLayouts:
-    document = read_document(path, if_empty="it must have layouts, each a name with places")
+    document = read_document(
+        path, if_empty="it must have layouts, each with a name and its positions"
+    )
     validation = Validation(document, _LayoutsSection)
     plate, found = problem.rig.plate, {}
     for name, places in validation.finish().layouts.items():

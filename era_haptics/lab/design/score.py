@@ -1,27 +1,28 @@
-"""A fast score of layouts, and the search for the places of ERAs by it.
+"""Fast score of layouts, and a search for ERA positions that maximises it.
 
-The score is the expected contrast over sampled contact sets, found as answers are
+The score is the expected contrast over sampled contact sets, computed like answers
 (`model.ensemble.touched_plate`, `model.drive_modes`), at a few frequencies, from the receptances of
-the free plate. Each finger loads the plate where it rests; what it changes at the others is left
-out, so that all is computed once for each finger. With ERAs e of dynamic stiffness Z on the plate,
-a finger f of dynamic stiffness D and its points p:
+the free plate. Each finger loads the plate at its own position; its effect on the other fingers is
+neglected, so everything is computed once per finger. With ERAs e of dynamic stiffness Z on the
+plate, a finger f of dynamic stiffness D and its points p:
 
     K = (1 + Z A_ee)^-1,  G = A_pe K,  L = A_pf - G Z A_ef,  M = D / (1 + D L_f)
     t_e = G_p - L_p M G_f,  h = -w² t_e z stroke,  r_e = stroke - u_e,  r_f = -u_f
     R = mean_p {h* h^T + dh* dh^T + dc* dc^T + sum_j |s_j w² t_j|² r_j* r_j^T + sigma² diag |h|²}
         + field² mean_plate diag |h|²
 
-with dh of the plates thicker and thinner by a standard deviation, each solved exactly and counting
-half, dc by the ERAs' damping, s_j of each ERA's stiffness and the finger's load, and the last over
-the plate without fingers, as `LocalizationTable.error_power`. The score of a set is |h_t w|² /
-max_q w^H R_q w of the best weights w at the best frequency, less a tenth of what they miss the
-wanted level by: an answer that has to reach it loses little. For several contents it is the worst
-one's, with all other fingers quiet: their foreign levels add to little more than the highest.
-Each is searched at as many times the level, since they share the stroke.
+where dh comes from the plates thicker and thinner by one standard deviation, each solved exactly
+with half weight, dc from the ERAs' damping, and s_j from each ERA's stiffness and the finger's
+load. The last term is over the plate without fingers, as in `LocalizationTable.error_power`. The
+score of a set is |h_t w|² / max_q w^H R_q w of the best weights w at the best frequency, minus a
+tenth of the shortfall from the wanted level, since an answer that has to reach the level loses
+little contrast. With several contents it is the score of the worst one, with all other fingers
+quiet, because their crosstalk sums to little more than the highest. Each content is then searched
+at a multiple of the level, since they share the stroke.
 
-The search adds the candidate that raises the score most, one ERA after the other; then exchanges
-move one ERA at a time to the best candidate until none gains; then every ERA is moved by ever
-smaller steps, no longer bound to the candidates. A list of layouts is a search without steps.
+The search adds, one ERA after the other, the candidate that raises the score most. Exchanges then
+move one ERA at a time to the best candidate until none improves. Finally every ERA is moved by ever
+smaller steps, independently of the candidates. A list of layouts is a search without steps.
 """
 
 import math
@@ -48,7 +49,7 @@ from model.structure.attachments import coupled_forces
 from model.structure.exciter import Actuator
 
 _LEVEL_RESERVE = 1.2
-"""Factor on the wanted level for what nine of ten plates need beyond the nominal plate."""
+"""Factor on the wanted level, as 90 % of plates need more than the nominal plate."""
 
 BEST_FREQUENCIES = 3
 """Frequencies of each set at which the maximum over the quiet fingers is minimised."""
@@ -56,7 +57,8 @@ BEST_FREQUENCIES = 3
 _LAWSON_STEPS = 2
 
 LEVEL_PENALTY = 0.1
-"""Decibels of score for one of level: with 1 in place of 0 to 0.15 scores follow answers less."""
+"""Score penalty per dB of missing level; with 1 instead of 0 to 0.15, scores predict answers
+worse."""
 
 _LEAST = np.float32(1e-30)
 
@@ -64,18 +66,18 @@ MAX_SWEEPS = 4
 """Exchanges of every ERA."""
 
 FINEST_STEP = 0.001
-"""Last step [m] of freely moved places."""
+"""Last step of freely moved positions [m]."""
 
-_GAIN = 0.01  # dB; smaller ones are not worth a move
-_UNSUPPORTED = -100.0  # dB; below every layout that supports the plate
+_GAIN = 0.01  # dB; smaller gains do not justify a move
+_UNSUPPORTED = -100.0  # dB; below the score of every layout that supports the plate
 
 
 @dataclass(frozen=True, eq=False)
 class PlaceReceptances:
-    """Receptances [m/N] from c places of plates of v thicknesses, the modelled one first.
+    """Receptances [m/N] of c positions on plates of v thicknesses, the nominal one first.
 
     at (c, 2) [m]; between (v, f, c, c); to_tips (v, f, m p, c): at the points of m fingertips;
-    to_plate (f, g, c): over the modelled plate, at no point where the rig's field is certain.
+    to_plate (f, g, c): over the nominal plate, empty if the rig's field has no uncertainty.
     """
 
     at: FloatArray
@@ -85,10 +87,10 @@ class PlaceReceptances:
 
 
 class Scorer:
-    """Scores layouts on a rig's plate, solved once, with contact sets on it.
+    """Score layouts on a rig's plate, solved once, with given contact sets.
 
-    frequencies (f,) [Hz]; sets: contacts (fingers, 2) [m] of each, those with contents first;
-    eras: those of every layout, wherever they stand there, further ones like the last.
+    frequencies (f,) [Hz]; sets: contacts (fingers, 2) [m] of each set, those with contents first;
+    eras: ERAs of every layout in order, at any positions; additional ones equal the last.
     """
 
     def __init__(
@@ -103,7 +105,7 @@ class Scorer:
         self._rig = rig
         self._frequencies, self._omega = frequencies, 2 * np.pi * frequencies
         uncertainty = rig.uncertainty
-        std = uncertainty.frequency  # a modulus moves resonances as a thickness does
+        std = uncertainty.frequency  # a modulus shifts resonances like a thickness
         self._thicknesses = np.array([1.0, 1 + std, 1 - std] if std > 0 else [1.0])
         self._mounts = mounts_of(eras, (), self._omega, uncertainty)
         tip = rig.fingertip
@@ -119,24 +121,24 @@ class Scorer:
             centres, length=rig.plate.length, width=rig.plate.width, rule=FIVE_POINTS
         )
         self._points = points.reshape(-1, 2)
-        self._weights: Float32Array = weights.astype(np.float32)  # (m, p), of the centre first
+        self._weights: Float32Array = weights.astype(np.float32)  # (m, p), the centre first
         self._cells = np.empty((0, 2))
         if uncertainty.field > 0:
             self._cells = Grid(12, 9).centres(rig.plate)
-        # The sets of each size are one array (s, k).
+        # Sets of equal size form one array (s, k).
         sizes = [len(each) for each in sets]
         first = np.cumsum(sizes) - sizes
         self._groups = tuple(
             numbers.ravel()[first[np.equal(sizes, size)][:, None] + np.arange(size)]
             for size in np.unique(sizes).tolist()
         )
-        # Of a fingertip's points from its centre, (v, f, m, p).
+        # From a fingertip's centre to its points, (v, f, m, p).
         every, tips = np.arange(len(centres)), self._solved(centres).to_tips
         tips = tips.reshape(*tips.shape[:2], *weights.shape, -1)
         self._own = np.moveaxis(tips[:, :, every, :, every], 0, 2)
 
     def places(self, at: FloatArray) -> PlaceReceptances:
-        """Solve for ERAs at places [m] (c, 2)."""
+        """Solve for ERAs at positions [m] (c, 2)."""
         return self._solved(np.column_stack([at, np.full(len(at), self._rig.eras[0].foot)]))
 
     def _solved(self, footprints: FloatArray) -> PlaceReceptances:
@@ -157,7 +159,8 @@ class Scorer:
         )
 
     def mean(self, places: PlaceReceptances, chosen: IntArray) -> float:
-        """Mean score [dB] of ERAs at chosen places (n,), each number of fingers counting alike."""
+        """Return the mean score [dB] of ERAs at chosen positions (n,), equal weight per number of
+        fingers."""
         target, power = self._forms(places, chosen)
         scores = [self._of_sets(target, power, fingers).mean() for fingers in self._groups]
         return float(np.mean(scores))
@@ -165,7 +168,7 @@ class Scorer:
     def _of_sets(
         self, target: Complex64Array, power: Complex64Array, fingers: IntArray
     ) -> FloatArray:
-        """Score [dB] of the worst content of sets (s, k) of fingers, (s,)."""
+        """Return the score [dB] of the worst content for sets (s, k) of fingers, (s,)."""
         each = [
             self._score(target, power, np.roll(fingers, -number, axis=1))
             for number in range(self._contents)
@@ -175,7 +178,8 @@ class Scorer:
     def _forms(
         self, places: PlaceReceptances, chosen: IntArray
     ) -> tuple[Complex64Array, Complex64Array]:
-        """Mean fields (f, m, n) [m/s²] at the fingertips, and expected power there (f, m, n, n)."""
+        """Return mean fields (f, m, n) [m/s²] at the fingertips, and expected power there (f, m, n,
+        n)."""
         uncertainty, weights, D = self._rig.uncertainty, self._weights, self._finger
         m, p = weights.shape
         n, mounts = len(chosen), self._mounts
@@ -191,14 +195,14 @@ class Scorer:
             )
         )
         minus_omega2 = mounts.minus_omega2[:, None, None]
-        # The plates on the ERAs, without fingers; those of other thickness come first.
+        # Plates on the ERAs, without fingers; those of other thickness come first.
         A = places.between[:, :, chosen[:, None], chosen]
         E = places.to_tips[:, :, :, chosen]
         v, f = A.shape[:2]
         K = coupled_forces(A, Z, np.eye(n, dtype=np.complex64))
         G = E @ K
 
-        # The finger, where it rests.
+        # Add the finger at its position.
         G_f = G[:, :, ::p]
         held = (E[:, :, ::p] * Z[:, None])[..., None, :] * G.reshape(v, f, m, p, n)
         L = self._own - held.sum(axis=-1)
@@ -209,7 +213,7 @@ class Scorer:
         fields = t * scale[:, None]
         h = fields[0]
 
-        # Changes of the nominal plate.
+        # Sensitivities of the nominal plate.
         motion = -(A[0] @ (K[0] * force[:, None]))
         motion.reshape(f, -1)[:, :: n + 1] += stroke
         t, L, released, G_f = t[0], L[0], released[0], G_f[0]
@@ -234,7 +238,8 @@ class Scorer:
     def _score(
         self, target: Complex64Array, power: Complex64Array, fingers: IntArray
     ) -> FloatArray:
-        """Score [dB] of sets (s, k) of fingers, (s,), the first to feel what no other does."""
+        """Return the score [dB] for sets (s, k) of fingers, (s,); only the first finger has the
+        content."""
         f, _, n = target.shape
         s, q = len(fingers), fingers.shape[1] - 1
         quiet = fingers[:, 1:]
@@ -267,7 +272,7 @@ class Scorer:
     def _decibels(
         self, score: Float32Array, c: Complex64Array, w: Complex64Array, rows: IntArray
     ) -> Float32Array:
-        """Scores (f, s) of weights (f, s, n) less what their level misses."""
+        """Return scores (f, s) of weights (f, s, n), minus the penalty for missing level."""
         level = np.abs(np.vecdot(c, w)) / np.maximum(np.abs(w).max(axis=-1), _LEAST)
         missing = 20 * np.log10(np.maximum(level, _LEAST) / self._required[rows])
         return np.asarray(
@@ -276,25 +281,25 @@ class Scorer:
 
 
 def _mean_power(values: Complex64Array, weights: Float32Array) -> Float32Array:
-    """Mean of |values|² (f, m, p, n) over fingertips of weights (m, p), (f, m, n)."""
+    """Return the mean of |values|² (f, m, p, n) over fingertips with weights (m, p), (f, m, n)."""
     return np.asarray((weights[:, None] @ power_of(values))[:, :, 0])
 
 
 @dataclass(frozen=True, eq=False)
 class ScoredLayout:
-    """A layout: positions (n, 2) [m], those kept first, and its score [dB]."""
+    """Layout with positions (n, 2) [m], kept ones first, and its score [dB]."""
 
     positions: FloatArray
     score_db: float
 
     @property
     def is_supported(self) -> bool:
-        """Whether it supports the plate."""
+        """Return whether it supports the plate."""
         return self.score_db > _UNSUPPORTED
 
 
 class LayoutSearch:
-    """Searches layouts of one problem; scores are of contact sets drawn by its seed."""
+    """Searches layouts of one problem; its seed draws the contact sets for the scores."""
 
     def __init__(self, problem: DesignProblem) -> None:
         """Solve the plate for all candidates; raises InputError for an area without room."""
@@ -311,7 +316,8 @@ class LayoutSearch:
         self._places = self._scorer.places(np.vstack([kept, problem.candidates]))
 
     def path(self) -> Iterator[ScoredLayout]:
-        """Layouts of ever more ERAs, from those kept or as few as support the plate."""
+        """Yield layouts with increasing numbers of ERAs, starting with the kept or the minimum
+        number."""
         problem, positions = self.problem, self.problem.kept_positions
         while len(positions) < problem.count:
             positions = self.add(positions).positions
@@ -322,7 +328,7 @@ class LayoutSearch:
             yield self.refine(positions)
 
     def from_random(self, rng: np.random.Generator) -> ScoredLayout:
-        """The layout found from one at random; raises InputError where there is no room."""
+        """Search from a random layout; raises InputError if there is no room."""
         return self.refine(self.exchange(self.problem.random_layout(rng)))
 
     def add(self, positions: FloatArray) -> ScoredLayout:
@@ -345,14 +351,14 @@ class LayoutSearch:
         return best.positions
 
     def one_more(self, positions: FloatArray) -> ScoredLayout | None:
-        """Add the best candidate to positions (n, 2) [m], then move all; None without room."""
+        """Add the best candidate to positions (n, 2) [m], then move all ERAs; None without room."""
         try:
             return self.refine(self.add(positions).positions)
         except InputError:
             return None
 
     def refine(self, positions: FloatArray) -> ScoredLayout:
-        """Move positions (n, 2) [m] freely by ever smaller steps."""
+        """Refine positions (n, 2) [m] by ever smaller steps."""
         (best,) = self.scored([positions])
         step = self.problem.spacing / 2
         while step >= FINEST_STEP / 2:
@@ -369,7 +375,7 @@ class LayoutSearch:
         return best
 
     def scored(self, layouts: Sequence[FloatArray]) -> list[ScoredLayout]:
-        """The score of each of some layouts (n, 2) [m], as it is."""
+        """Score layouts (n, 2) [m] without changing them."""
         if not layouts:
             return []
         every = np.unique(np.vstack(layouts), axis=0)
@@ -378,7 +384,8 @@ class LayoutSearch:
         return [ScoredLayout(each, self._score_at(places, each)) for each in layouts]
 
     def sensitivities(self, positions: FloatArray, *, step: float) -> FloatArray:
-        """The most that the score [dB] changes by a step [m] of each ERA, per metre, (n,)."""
+        """Return the largest change of the score [dB] per metre for a step [m] of each ERA,
+        (n,)."""
         (own,) = self.scored([positions])
         changes = np.zeros(len(positions))
         for number, place in enumerate(positions):
@@ -388,7 +395,8 @@ class LayoutSearch:
         return changes
 
     def _steps(self, place: FloatArray, step: float) -> FloatArray:
-        """Steps of a place within the area, or of one outside it anywhere on the plate."""
+        """Return steps of a position within the area; anywhere on the plate if it is outside the
+        area."""
         area, plate = self.problem.area, self.problem.rig.plate
         if area.contains(place[None])[0]:
             found = area.moved(place, step)
@@ -397,7 +405,8 @@ class LayoutSearch:
         return area_of(ANYWHERE, plate).moved(place, step)
 
     def _score_at(self, places: PlaceReceptances, positions: FloatArray) -> float:
-        """Score [dB] of positions among places, far below 0 if they do not support the plate."""
+        """Return the score [dB] of positions among `places`, far below 0 if the plate is not
+        supported."""
         if len(positions) + self.problem.supports >= MIN_SUPPORTING:
             shortfall = self.problem.shortfall(positions)
             if shortfall > 0:
@@ -406,7 +415,8 @@ class LayoutSearch:
         return self._scorer.mean(places, numbers)
 
     def _open(self, positions: FloatArray) -> FloatArray:
-        """Candidates [m] far enough from positions (n, 2) [m]; raises InputError for none."""
+        """Return the candidates [m] far enough from positions (n, 2) [m]; raises InputError for
+        none."""
         return self.problem.candidates[self.problem.open_candidates(positions)]
 
 
@@ -415,6 +425,6 @@ def _score(found: ScoredLayout) -> float:
 
 
 def _replaced(positions: FloatArray, number: int, places: FloatArray) -> list[FloatArray]:
-    """Positions (n, 2) with that of one ERA at each of some places (m, 2)."""
+    """Return positions (n, 2) with one ERA moved to each of the places (m, 2)."""
     at = np.arange(len(positions))[:, None] == number
     return [np.where(at, place, positions) for place in places]

@@ -1,29 +1,29 @@
-"""An exciter by its electrical impedance, hanging free and glued, and its weight.
+"""Determine an exciter's parameters from its electrical impedance, free and glued, and its weight.
 
 The impedance is measured through a sound card, with one multisine and two voltages:
 
     output ──┬── exciter ──┬── resistor R ── ground
             V_1           V_2                         Z = R (V_1 / V_2 - 1)
 
-Delay, filters and gain of the two inputs are taken as the same; one input that is moved from the
-first place to the second has them the same, whatever they are.
+Delay, filters and gain of the two inputs are assumed to be equal. With a single input, moved from
+the first point to the second, they are equal by construction.
 
 A coil of resistance R_e and inductance L in a field Bl, on a suspension k, c, has
 
     Z = R_e + i w L + K sqrt(i w) + R_m / (1 + i Q (f / f_0 - f_0 / f)),    R_m = Bl² / c,
 
-K the semi-inductance of eddy currents, and w_0² = k / u, u the reduced mass of the two masses that
-move against each other: coil m and magnet M hanging free, m + B and M glued to a mass B. With the
-whole weight W = m + M and r = (f_g / f_f)² therefore
+where K is the semi-inductance of eddy currents, w_0² = k / u, and u is the reduced mass of the two
+masses that move against each other: coil m and magnet M when hanging free, m + B and M when glued
+to a mass B. With the total weight W = m + M and r = (f_g / f_f)²,
 
     m = r W / (1 + (1 - r) W / B),    k = u w_0²,    Bl² = R_m w_0 u / Q,    Q_es = Q R_e / R_m.
 
-A rig's resonance and Q are those of one mass m_0 on a held spring, the magnet where the coil was
-glued, otherwise the coil: f = f_0 sqrt(u / m_0), and Q sqrt(m_0 / u).
+A rig's resonance and Q are those of a single mass m_0 on a fixed spring (the magnet if the coil was
+glued, otherwise the coil): f = f_0 sqrt(u / m_0), and Q sqrt(m_0 / u).
 
-A resistor of s S instead of S, and a first input with g times the gain of the second, make
-(Z / s + S) g - S of Z: another circuit of this kind, so that the true values follow from the fitted
-ones.
+If the resistor is s S instead of S, and the first input has g times the gain of the second, the
+measured impedance is (Z / s + S) g - S. This is another circuit of the same kind, so the true
+values follow from the fitted ones.
 """
 
 from collections.abc import Callable
@@ -56,7 +56,7 @@ CIRCUIT_NAMES = (
 INDUCTANCE_AT = 300.0
 """Frequency [Hz] at which a semi-inductance is stated as an inductance."""
 
-_HALF_WIDTH = 1.645  # standard errors on either side that hold nine of ten values
+_HALF_WIDTH = 1.645  # standard errors to either side of a 90 % confidence interval
 _LEAST_LINES = 12
 _TRIED_Q = (0.4, 1.0, 2.5, 6.0, 15.0, 40.0)
 _EACH = 3  # line that is tried as a peak
@@ -66,12 +66,14 @@ _SAME = 0.1  # relative, of Bl² by either run
 
 @dataclass(frozen=True)
 class ImpedanceSetup:
-    """What is known beside the impedance.
+    """Known parameters of the setup.
 
-    weight, coil [kg]: of the whole exciter and of its coil, None if unknown; base [kg]: what it was
-    glued to; scale_error [kg]: standard error of weight and base; series [ohm]: the resistor;
-    series_error, input_error: bounds, relative, of the resistor's error and of the difference of
-    the inputs' gains, of which any value within is as likely (JCGM 100:2008, 4.3.7).
+    - weight, coil [kg]: of the whole exciter and of its coil, None if unknown.
+    - base [kg]: mass that it was glued to.
+    - scale_error [kg]: standard error of weight and base.
+    - series [ohm]: the resistor.
+    - series_error, input_error: relative bounds, uniformly distributed (JCGM 100:2008, 4.3.7), of
+      the resistor's error and of the difference between the inputs' gains.
     """
 
     weight: float | None = None
@@ -85,7 +87,7 @@ class ImpedanceSetup:
     def __post_init__(self) -> None:
         """Refuse masses that contradict each other."""
         if self.weight is None and (self.coil is not None or np.isfinite(self.base)):
-            raise InputError("--weight is missing; --coil-mass and --base count by it")
+            raise InputError("--weight is missing; --coil-mass and --base require it")
         if self.weight is not None and not (self.coil or 0.0) < self.weight:
             raise InputError(
                 f"--coil-mass must be below --weight, {1e3 * self.weight:g} g, got "
@@ -99,7 +101,7 @@ class ImpedanceSetup:
 
     @property
     def errors(self) -> FloatArray:
-        """Standard errors of these, (4,)."""
+        """Standard errors of the parameters, (4,)."""
         even = np.array([self.series_error, self.input_error]) / np.sqrt(3)
         return np.array([self.scale_error, self.scale_error / self.base**2, *even])
 
@@ -116,15 +118,15 @@ class Circuit:
     misfit: float
 
     def __getitem__(self, name: str) -> float:
-        """A value by its name."""
+        """Return a parameter by name."""
         return float(self.values[CIRCUIT_NAMES.index(name)])
 
 
 def fit_circuit(frequencies: FloatArray, impedance: ComplexArray, *, what: str) -> Circuit:
     """Fit the circuit to an impedance (f,) [ohm] at frequencies (f,) [Hz].
 
-    Errors are taken as relative, and their size from the misfit. what: names the run. Raises
-    InputError for what is no exciter: open, short, inputs exchanged, without a resonance.
+    Errors are assumed to be relative, with a size estimated from the misfit. what: names the run.
+    Raises InputError for an open or short circuit, exchanged inputs, or a missing resonance.
     """
     if len(frequencies) < _LEAST_LINES or not np.isfinite(impedance).all():
         raise InputError(
@@ -135,7 +137,7 @@ def fit_circuit(frequencies: FloatArray, impedance: ComplexArray, *, what: str) 
         raise InputError(
             f"{what}: the resistance must be that of a coil, 0.2 to 500 ohm, got "
             f"{np.median(impedance.real):.3g} ohm; check for an open or short circuit, --series, "
-            "and that the first input is before the resistor, the second one over it"
+            "and that the first input is before the exciter, the second one across the resistor"
         )
     found = _fit(frequencies, impedance)
     peak = CIRCUIT_NAMES.index("motional_resistance")
@@ -184,15 +186,17 @@ def _parts(values: ComplexArray) -> FloatArray:
 def exciter_values(
     free: Circuit | None, glued: Circuit | None, bench: ImpedanceSetup
 ) -> dict[str, tuple[float, float]]:
-    """The values of a rig's exciter that follow, each with half the interval of nine of ten.
+    """Derive the values of a rig's exciter, each with half its 90 % confidence interval.
 
-    Raises InputError for runs that are exchanged or not of one exciter.
+    Raises InputError for exchanged runs, or runs of different exciters.
     """
     runs = [each for each in (free, glued) if each is not None]
     if not runs:
-        raise InputError("--free or --glued is missing; measure one of them, or give its file")
+        raise InputError("--free or --glued is missing; measure one, or give its file")
     if len(runs) == 2 and bench.coil is not None:
-        raise InputError("--coil-mass follows from --free and --glued; remove it, or one of them")
+        raise InputError(
+            "--coil-mass is computed from --free and --glued; remove it, or one of them"
+        )
     x = np.concatenate([*(each.values for each in runs), bench.values])
     covariance = block_diag(*(each.covariance for each in runs), np.diag(bench.errors**2))
 
@@ -246,7 +250,7 @@ def exciter_values(
 
 
 def _check_pair(free: Circuit, glued: Circuit) -> None:
-    """Raise InputError for two runs that are not of one exciter."""
+    """Raise InputError for two runs of different exciters."""
     low, high = glued["resonance"], free["resonance"]
     if not low < high:
         raise InputError(
@@ -258,9 +262,9 @@ def _check_pair(free: Circuit, glued: Circuit) -> None:
     ratio = powers[0] / powers[1] * (low / high) ** 2
     if abs(ratio - 1) > _SAME:
         raise InputError(
-            "--free and --glued must be of one exciter, got a force factor squared that differs "
-            f"by {100 * abs(ratio - 1):.0f} %; glue the coil's side firmly to something heavy, and "
-            "let the exciter hang by its wires, touching nothing"
+            "--free and --glued must be of the same exciter, got a force factor squared that "
+            f"differs by {100 * abs(ratio - 1):.0f} %; glue the coil's side firmly to something "
+            "heavy, and let the exciter hang by its wires, touching nothing"
         )
 
 
@@ -282,10 +286,10 @@ def measured_impedance(
     periods: int,
     move: Callable[[str], None],
 ) -> tuple[FloatArray, ComplexArray]:
-    """Frequencies (f,) [Hz] and impedance (f,) [ohm] of what is in series with a resistor [ohm].
+    """Measure the impedance (f,) [ohm] in series with a resistor [ohm] at frequencies (f,) [Hz].
 
-    inputs: before and over the resistor, counted from 1, or one that is moved: move is then called
-    with where to, before each run. Raises InputError, LinkError.
+    inputs: before the exciter and across the resistor, counted from 1, or a single one that is
+    moved: `move` is then called with the next point before each run. Raises InputError, LinkError.
     """
     sines = Multisine(LINES, 1, card.rate, level)
     voltages = list[ComplexArray]()
@@ -294,7 +298,7 @@ def measured_impedance(
             move(place)
         if len(inputs) == 1 or not voltages:
             recorded = play_on_one(card, sines, 1, outputs=1, periods=periods)
-        check_levels(recorded, {at: f"what is {place}"})
+        check_levels(recorded, {at: f"the signal {place}"})
         voltages.append(sines.found(recorded[:, at - 1]))
     return sines.frequencies, np.asarray(series * (voltages[0] / voltages[1] - 1))
 
@@ -306,10 +310,10 @@ def write_impedance(path: Path, frequencies: FloatArray, impedance: ComplexArray
 
 
 def read_impedance(path: Path) -> tuple[FloatArray, ComplexArray]:
-    """Frequencies (f,) [Hz] and impedance (f,) [ohm] of a file, or of one of another program.
+    """Read frequencies (f,) [Hz] and impedance (f,) [ohm] from a file, also of another program.
 
-    That may have magnitude and phase (ZMA, LIMP, REW) or real and imaginary part, in other words
-    and units (`model.files.csv_file.read_lines`). Raises InputError.
+    It contains magnitude and phase (ZMA, LIMP, REW) or real and imaginary part, with any column
+    names and units that `model.files.csv_file.read_lines` knows. Raises InputError.
     """
     frequencies = []
     impedance = []

@@ -1,16 +1,16 @@
-"""A plate measured through a sound card, and what is wrong with a measurement.
+"""Measure a plate through a sound card, and detect errors in the measurement.
 
-A measurement is some runs of a multisine, of which responses are estimated and checked. The
-loop-back shows delay, converters, lost blocks, and whether inputs have the clock of the outputs.
-Two devices, or an aggregate of two, drift by 10 to 100 millionths: runs are then no longer
-orthogonal, and nothing else shows it where the loop-back has the right clock.
+A measurement consists of several runs of a multisine, from which responses are estimated and
+checked. The loop-back cable reveals delay, converter response, lost blocks, and inputs on another
+clock than the outputs. The clocks of two devices, or of an aggregate of two, drift by 10 to 100
+ppm. The runs are then no longer orthogonal, and no other check detects this if the loop-back has
+the right clock.
 
-One sensor may be moved from place to place, by a person at a terminal. Every place is a measurement
-of its own. Its phases are relative to the loop-back, so that places measured minutes apart agree;
-the sensor's gain is one. What is measured is written after each place, so that the rest can be
-measured another time.
+A single sensor can be moved from position to position by a person at a terminal. Every position is
+a separate measurement. Phases are relative to the loop-back, so that positions measured minutes
+apart agree. The file is written after each position, so that the measurement can be resumed.
 
-For identification one run is repeated at half the level and at the whole one.
+For identification, one run is repeated at half level and at full level.
 """
 
 import math
@@ -68,9 +68,9 @@ _SAME = 1e-3  # of periods; a lost block makes them differ by 0.8
 
 
 def has_all_blocks(periods: FloatArray, *, samples: int) -> bool:
-    """Whether all periods of the loop-back (n,) are alike: no block was lost between them.
+    """Return whether all periods of the loop-back (n,) are equal: no block was lost between them.
 
-    Not so where it is silent, which tells nothing.
+    False for a silent loop-back, which cannot show lost blocks.
     """
     each = periods.reshape(-1, samples)
     size = np.linalg.norm(each[0])
@@ -97,7 +97,7 @@ def latency(response: ComplexArray, frequencies: FloatArray) -> float:
     if np.abs(phase - slope * frequencies - first).max() > _STRAIGHT:
         raise LinkError(
             f"loop-back: its phase must be that of a delay up to {1e3 * _MAX_DELAY:g} ms; check "
-            "the cable, and that nothing else feeds this input"
+            "the cable, and that no other signal feeds this input"
         )
     return float(nearest - slope / (2 * np.pi))
 
@@ -114,8 +114,8 @@ def certain_drift(multisine: Multisine, runs: Sequence[FloatArray]) -> float:
     """Drift of an input's clock relative to the outputs', from whole periods of each run, (n,).
 
     Least squares of the phase 2 pi f t drift between the first and the last period, t apart,
-    weighted by the power of each line. 0 where that is within its error, or not all that makes
-    periods differ, as a lost block does.
+    weighted by the power of each line. 0 if the drift is within its error, or if it does not
+    explain the difference between the periods (a lost block does not drift).
     """
     n = multisine.samples
     first = np.array([multisine.found(each[:n]) for each in runs])
@@ -136,16 +136,16 @@ def certain_drift(multisine: Multisine, runs: Sequence[FloatArray]) -> float:
 
 _FULL = 0.999  # of full scale
 _LOOPED = 0.05  # of a sample that a loop-back brings back at least
-CROSSTALK = 0.02  # of it, that other outputs may
+CROSSTALK = 0.02  # of the loop-back, allowed for other outputs
 _COHERENT = 0.9  # in the median over frequencies
-_FAINT = 0.01  # of full scale: what converters themselves add is heard beside it
+_FAINT = 0.01  # of full scale; below it, converter noise is audible next to the signal
 _MOVED = 5.0  # times the noise, in the median over frequencies and the maximum over sensors
 
 
 def check_levels(recorded: FloatArray, named: Mapping[int, str]) -> None:
-    """Raise InputError for clipped inputs, LinkError for silent ones, of one run (n, inputs).
+    """Raise InputError for clipped inputs, LinkError for silent ones, in one run (n, inputs).
 
-    named: what the inputs have that are checked, by their number from 1.
+    named: what is connected to each input to be checked, by input number from 1.
     """
     clipped = [name for n, name in named.items() if np.abs(recorded[:, n - 1]).max() >= _FULL]
     if clipped:
@@ -156,8 +156,8 @@ def check_levels(recorded: FloatArray, named: Mapping[int, str]) -> None:
     silent = [n for n in named if np.sqrt((recorded[:, n - 1] ** 2).mean()) < SILENT]
     if len(silent) == len(named) > 1:
         raise LinkError(
-            "all inputs are silent: check that --device is the one that is wired, its outputs and "
-            "inputs not swapped, amplifier and sensor supply switched on"
+            "all inputs are silent: check that --device is the connected sound card, that outputs "
+            "and inputs are not swapped, and that amplifier and sensor supply are switched on"
         )
     if silent:
         inputs = ", ".join(f"{named[n]} (input {n})" for n in silent)
@@ -189,27 +189,28 @@ def check_wiring(found: ResponseEstimate, desk: Desk) -> None:
             "their cables"
         )
     if looped <= _LOOPED:
-        raise InputError(f"{what} {looped:.2g} of it; connect them by a cable")
+        raise InputError(f"{what} a gain of {looped:.2g}; connect them by a cable")
     if at not in back:
         raise InputError(f"{what} {other}, too; check mixers and monitoring of the sound card")
     for n in (each.input for each in desk.sensors if by_cable[each.input - 1] >= 0):
         raise InputError(
-            f"input {n} must have {named[n]}, got output {desk.sources[by_cable[n - 1]]} as by a "
-            "cable; check the plug of that sensor, Y cables and monitoring of the sound card"
+            f"input {n} must have {named[n]}, got output {desk.sources[by_cable[n - 1]]} as "
+            "through a cable; check the plug of that sensor, Y cables and monitoring of the sound "
+            "card"
         )
 
 
 def _check_clocks(multisine: Multisine, recorded: Sequence[FloatArray], desk: Desk) -> None:
     """Raise InputError for inputs with another clock than the outputs'; runs (n, inputs) each."""
     found = [
-        f"{1e6 * drift:.0f} millionths at {name} (input {n})"
+        f"{1e6 * drift:.0f} ppm at {name} (input {n})"
         for n, name in desk.named_inputs.items()
         if (drift := certain_drift(multisine, [each[:, n - 1] for each in recorded]))
     ]
     if found:
         raise InputError(
             f"inputs must have the clock of the outputs, got a drift of {', '.join(found)}; use "
-            "one sound card, or clock all of them by one (word clock, ADAT)"
+            "one sound card, or a common word clock or ADAT clock"
         )
 
 
@@ -220,10 +221,10 @@ def check_coherence(
     *,
     is_heard: bool = False,
 ) -> None:
-    """Raise LinkError for sensors that hear something else, and for ERAs that move nothing.
+    """Raise LinkError for sensors with other signals, and for ERAs that move no sensor.
 
-    found: of what was recorded, runs (n, inputs) each; is_heard: whether every ERA was heard at
-    another place.
+    found: estimated from recorded, runs of (n, inputs); is_heard: whether every ERA was detected at
+    another position.
     """
     coherence = np.median(found.coherence[:, desk.columns], axis=0)
     peaks = np.max([np.abs(each[:, desk.columns]).max(axis=0) for each in recorded], axis=0)
@@ -305,11 +306,14 @@ _LEVEL = 0.3
 
 @dataclass(frozen=True, eq=False)
 class MeasuredResponses:
-    """Responses with what is known of them.
+    """Responses with their uncertainty and quality.
 
-    coherence (f, sensors), std (f, sensors) relative to the root mean square of the sensor; latency
-    [s] through the sound card; even (sensors,): of a square law; repeated: runs played again since
-    blocks were lost; looped (f,): response of the loop-back.
+    - coherence (f, sensors).
+    - std (f, sensors): relative to the RMS of the sensor's responses.
+    - latency [s]: through the sound card.
+    - even (sensors,): even harmonics, which indicate a square law.
+    - repeated: number of runs repeated because of lost blocks.
+    - looped (f,): response of the loop-back.
     """
 
     responses: Measurement
@@ -321,7 +325,7 @@ class MeasuredResponses:
     looped: ComplexArray
 
     def quality(self, sensor: int) -> dict[str, float]:
-        """How well a sensor was heard, by its number, for programs."""
+        """Return quality figures of a sensor, by its number, for JSON."""
         return {
             "coherence_median": float(np.median(self.coherence[:, sensor])),
             "coherence_min": float(self.coherence[:, sensor].min()),
@@ -365,9 +369,10 @@ def measure(
 ) -> MeasuredResponses:
     """Play all runs of a multisine and estimate the responses.
 
-    periods: of each run that are analysed. progress: called with the runs done and all. is_heard:
-    whether every ERA was heard before, at another place of a sensor that is moved. Raises
-    InputError, LinkError for what is clipped, silent, swapped, incoherent, or lost three times.
+    periods: analysed periods per run. progress: called with the number of runs done and the total.
+    is_heard: whether every ERA was detected before, at another position of a moved sensor. Raises
+    InputError or LinkError for inputs that are clipped, silent, swapped or incoherent, and for
+    blocks lost three times in a row.
     """
     seconds = run_time(periods, settling=desk.settling)
     desk.check_times(seconds=seconds, slew=multisine.slew)
@@ -382,8 +387,7 @@ def measure(
         recorded.append(runs[-1].recorded)
         progress(len(recorded), multisine.sources)
     found = estimate(multisine, recorded)
-    # Another signal than the loop-back's, or another clock, looks like lost blocks; that is the
-    # cause to be told.
+    # A wrong loop-back signal, or another clock, looks like lost blocks; report the cause instead.
     check_wiring(found, desk)
     _check_clocks(multisine, recorded, desk)
     whole = [run.whole for run in runs]
@@ -445,7 +449,7 @@ def _rows(found: MeasuredResponses, *, rate: float) -> Iterator[str]:
 
 
 _REPEATED = 1  # the run: phases differ between ERAs, so that modes of every symmetry vibrate
-_COMPARED = 2  # lines of it
+_COMPARED = 2  # lines of the loop-back
 
 
 def measure_plate(
@@ -461,8 +465,8 @@ def measure_plate(
 ) -> MeasuredPlate:
     """Measure through a sound card, which plays and records.
 
-    level, frequencies, seed: as of `open_desk`; periods: of each run that count. Raises InputError,
-    LinkError, as `era measure` does.
+    level, frequencies, seed: see `open_desk`; periods: analysed periods per run. Raises InputError,
+    LinkError, like `era measure`.
     """
     desk = Desk(rig, read_sensors(sensors_file, rig.plate))
     with open_desk(desk, device, level=level, frequencies=frequencies, seed=seed) as opened:
@@ -472,9 +476,9 @@ def measure_plate(
 def measure_through(
     desk: Desk, card: SoundCard, multisine: Multisine, *, periods: int, progress: Progress
 ) -> MeasuredPlate:
-    """All runs; then one of them at half the level, and at the whole one again.
+    """Measure all runs, then repeat one of them at half level and at full level.
 
-    progress: called with the runs done and all.
+    progress: called with the number of runs done and the total.
     """
     started, runs = time.monotonic(), multisine.sources
     found = measure(
@@ -490,7 +494,7 @@ def measure_through(
         run = play_run(desk, card, again, _REPEATED, periods=periods, before=found.looped)
         repeats.append(_repeats(desk, found, again, run.whole))
         progress(runs + number, runs + 2)
-    # Responses with the usual error of readings, and the noise beside it.
+    # Responses with the usual reading error, in addition to the noise.
     plain = found.responses
     rms = np.sqrt((np.abs(plain.values) ** 2).mean(axis=(0, 2)))
     noise = (found.std * rms)[:, :, None] / np.sqrt(2)  # of each part
@@ -519,7 +523,7 @@ def measure_through(
 def _repeats(
     desk: Desk, found: MeasuredResponses, multisine: Multisine, recorded: FloatArray
 ) -> tuple[Repeat, ...]:
-    """The loudest lines of a run and what the responses make of them, all ERAs together."""
+    """Compare the strongest lines of a run with the response to all ERAs together."""
     full = [*desk.rig.full_levels.values()]
     bases = multisine.played(_REPEATED)[:, : len(full)] * full  # (f, eras)
     first = np.einsum("fse,fe->fs", found.responses.values, bases)
@@ -537,15 +541,15 @@ def _repeats(
 _MOVED_BY = 0.02  # of the response, or so many times its noise:
 _OF_NOISE = 3.0
 _APART = 5e-3  # m; nearer places may sound alike
-_AT = 5e-4  # m; places of a file are those of the sensors within that
+_AT = 5e-4  # m, tolerance between positions in a file and those of the sensors
 _NOISY = 0.03  # of the response
 
 
 @dataclass(eq=False)
 class PositionsFile:
-    """What is measured at places of a desk with a multisine, and the file that keeps it.
+    """Responses measured at the positions of a desk with one multisine, and their file.
 
-    values (f, eras) [1/s²] by the name of a place.
+    values (f, eras) [1/s²] by position name.
     """
 
     path: Path
@@ -566,7 +570,7 @@ class PositionsFile:
         return [place for place in self.desk.sensors if place.name not in self.values]
 
     def read(self) -> None:
-        """Go on from the file; raises InputError where it is of another measurement."""
+        """Resume from the file; raises InputError if it belongs to another measurement."""
         measured, played = read_measured(self.path), self.multisine.frequencies
         settings = {each.setting for each in measured} - {self.setting}
         if settings:
@@ -615,10 +619,10 @@ def measure_by_moving(
     periods: int,
     is_resumed: bool,
 ) -> tuple[list[str], dict[str, Any], bool]:
-    """Guide a person at a terminal through the places of a desk.
+    """Guide a person at a terminal through the positions of a desk.
 
-    Return the report, and whether all places are measured. Raises InputError, LinkError,
-    KeyboardInterrupt, having said what is kept.
+    Return the report, and whether all positions are measured. Raises InputError, LinkError,
+    KeyboardInterrupt, after printing what is saved.
     """
     if output.exists() != is_resumed:
         raise InputError(
@@ -634,7 +638,7 @@ def measure_by_moving(
         try:
             found = measure_positions(file, card, periods=periods)
         except KeyboardInterrupt:
-            card.close()  # silent before anything is said
+            card.close()  # silence the outputs before printing
             _tell(f"\nstopped; {file}")
             raise
         except DeviceLost as problem:
@@ -668,18 +672,18 @@ def measure_positions(
     prompt: Callable[[str], str] = _prompt,
     tell: Callable[[str], None] = _tell,
 ) -> dict[str, MeasuredResponses]:
-    """Guide a person through the missing places; returns what was measured now, by place.
+    """Guide a person through the missing positions; returns the new measurements by position.
 
-    prompt: shows what to do and returns what was typed, "q" at the end; tell: shows a line. A place
-    that fails a check is reported with its remedy, and asked for again. Raises DeviceLost, OSError;
-    what was measured before is in the file then.
+    prompt: shows an instruction and returns the input, "q" to stop; tell: prints a line. A position
+    that fails a check is reported with its remedy, and repeated. Raises DeviceLost, OSError;
+    earlier measurements are then in the file.
     """
     found: dict[str, MeasuredResponses] = {}
     todo = file.missing
     last: WiredSensor | None = None
     tell(
-        "Enter measures a place, r the one before again, s skips it, q stops; what is measured is "
-        "kept"
+        "Enter: measure this position; r: repeat the previous one; s: skip; q: stop. Measured "
+        "positions are saved"
     )
     while todo:
         place, places = todo[0], file.desk.sensors
@@ -720,7 +724,7 @@ def measure_positions(
 
 
 def _check_moved(file: PositionsFile, place: WiredSensor, found: MeasuredResponses) -> None:
-    """Raise InputError for a response that is that of another place."""
+    """Raise InputError for a response that matches another position."""
     own = found.responses.values[:, 0]
     limit = max(_MOVED_BY, _OF_NOISE * float(np.median(found.std)))
     for other in file.desk.sensors:

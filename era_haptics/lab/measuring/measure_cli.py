@@ -1,4 +1,4 @@
-"""`era measure` and `era outputs`: a plate, an exciter and the wiring of a sound card, measured."""
+"""`era measure` and `era outputs`: measure a plate, an exciter, and the wiring of a sound card."""
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
@@ -45,7 +45,7 @@ def measure(
     device: Annotated[
         str | None,
         typer.Option(
-            metavar="DEVICE", help="Sound card: jack, jack:CLIENT, or a device of PortAudio."
+            metavar="DEVICE", help="Sound card: jack, jack:CLIENT, or a PortAudio device."
         ),
     ] = None,
     source: Annotated[
@@ -53,28 +53,28 @@ def measure(
         typer.Option(
             "--from",
             metavar="FILE|DIR",
-            help="In place of --device: a stepped sine that was recorded, .wav, or measured, .csv.",
+            help="Instead of --device: recorded (.wav) or measured (.csv) stepped sine.",
         ),
     ] = None,
     is_simulated: Annotated[
         bool,
         typer.Option(
             "--simulated",
-            help="In place of --device: a plate that deviates from the rig's as --seed draws it.",
+            help="Instead of --device: simulate a plate drawn at random from the rig's tolerances.",
         ),
     ] = False,
     frequencies: Annotated[
         str | None,
         typer.Option(
             metavar="LO:HI:STEP",
-            help="Whole frequencies in Hz; default: odd ones, 10 apart, within the rig's limits.",
+            help="Integer frequencies in Hz; default: odd ones, 10 apart, within the rig's limits.",
         ),
     ] = None,
     level: Annotated[
         float | None,
         typer.Option(
-            help="Largest sample of each output, 1 is full scale; default: 0.3, or less by the "
-            "rig's limits."
+            help="Peak sample of each output, 1 is full scale; default: 0.3, or less if the "
+            "rig's limits require it."
         ),
     ] = None,
     periods: Annotated[
@@ -85,18 +85,18 @@ def measure(
         typer.Option(
             "--sensor-mass",
             metavar="G",
-            help="Mass of a sensor that is moved, in grams; default: column mass_g of --sensors.",
+            help="Mass of a moved sensor in grams; default: column mass_g of --sensors.",
             min=0,
         ),
     ] = None,
     resume: Annotated[
         bool,
-        typer.Option("--resume", help="One sensor is moved: go on from what --output has."),
+        typer.Option("--resume", help="Resume the measurement of a moved sensor from --output."),
     ] = False,
     y_cable: Annotated[
         bool,
         typer.Option(
-            "--y-cable", help="No output is left: that of the last ERA is the cable's, too."
+            "--y-cable", help="No free output: the loop-back shares the output of the last ERA."
         ),
     ] = False,
     seed: Annotated[
@@ -114,11 +114,12 @@ def measure(
 ) -> None:
     """Measure a plate through a sound card.
 
-    Play on all ERAs at once and record accelerometers. A cable leads from the output after those of
-    the ERAs, or beside the last of them (--y-cable), to the input after those of the sensors: it
-    tells the delay, and lost blocks, whose run is repeated. Where all lines of --sensors have one
-    input, one sensor is moved from line to line: the terminal says where to. The file is for era
-    calibrate, and for era rig identify --measured.
+    Plays on all ERAs simultaneously and records accelerometers. A loop-back cable leads from the
+    output after those of the ERAs (or from that of the last ERA, --y-cable) to the input after
+    those of the sensors. It reveals the delay and lost blocks; runs with lost blocks are repeated.
+    If all rows of --sensors have the same input, one sensor is moved from row to row, and the
+    terminal prompts for each move. The resulting file is for era calibrate and era rig identify
+    --measured.
     """
     from era_haptics.lab.measuring.measure import measure_at_once, open_desk
     from era_haptics.lab.measuring.sound_card import Desk, are_positions, read_sensors
@@ -134,12 +135,12 @@ def measure(
     is_moved = are_positions(desk.sensors)
     if (device is not None) + (source is not None) + is_simulated != 1:
         raise InputError(
-            "give --device, a sound card, or --from, what another has measured, or --simulated"
+            "give --device (a sound card), --from (a file from another program) or --simulated"
         )
     for option, is_wrong, needs in (
         ("--frequencies", source is not None and lines is not None, "--device"),
         ("--resume", device is None and resume, "--device"),
-        ("--resume", resume and not is_moved, "one sensor that is moved, one input in all lines"),
+        ("--resume", resume and not is_moved, "one moved sensor, with the same input in all rows"),
         ("--y-cable", device is None and y_cable, "--device"),
     ):
         if is_wrong:
@@ -184,7 +185,7 @@ def impedance(
         str | None,
         typer.Option(
             metavar="DEVICE",
-            help="Sound card: jack, jack:CLIENT, or of PortAudio; without it, files alone.",
+            help="Sound card: jack, jack:CLIENT, or a PortAudio device; without it, files only.",
         ),
     ] = None,
     output: Annotated[
@@ -197,9 +198,7 @@ def impedance(
     ] = None,
     glued_file: Annotated[
         Path | None,
-        typer.Option(
-            "--glued", metavar="GLUED.csv", help="Impedance of it glued to something heavy."
-        ),
+        typer.Option("--glued", metavar="GLUED.csv", help="Impedance when glued to a heavy base."),
     ] = None,
     weight: Annotated[
         float | None,
@@ -213,15 +212,13 @@ def impedance(
         typer.Option(
             "--coil-mass",
             metavar="G",
-            help="Of one run alone: grams of the coil, by its sheet.",
+            help="Coil mass in grams from the data sheet, if only one run is given.",
             min=0.01,
         ),
     ] = None,
     base: Annotated[
         float | None,
-        typer.Option(
-            metavar="GRAMS", help="Mass of what it is glued to; without it, heavy.", min=1
-        ),
+        typer.Option(metavar="GRAMS", help="Mass of the base; default: heavy.", min=1),
     ] = None,
     series: Annotated[
         float, typer.Option(metavar="OHM", help="Resistor in series with the exciter.", min=0.1)
@@ -234,31 +231,31 @@ def impedance(
         str,
         typer.Option(
             metavar="A,B",
-            help="Inputs before the exciter and over the resistor; one number: it is moved.",
+            help="Inputs before the exciter and across the resistor; a single number: it is moved.",
         ),
     ] = "1,2",
     input_error: Annotated[
         float,
         typer.Option(
             metavar="PERCENT",
-            help="Largest difference of the inputs' gains; none where one is moved.",
+            help="Largest difference between the inputs' gains; none for a moved input.",
             min=0,
             max=50,
         ),
     ] = 1.0,
     level: Annotated[
-        float, typer.Option(help="Largest sample of output 1, 1 is full scale.", min=1e-4, max=1.0)
+        float, typer.Option(help="Peak sample of output 1, 1 is full scale.", min=1e-4, max=1.0)
     ] = 0.1,
     periods: Annotated[
         int, typer.Option(metavar="N", help="Seconds that count.", min=2, max=60)
     ] = 4,
     as_json: JsonOption = False,
 ) -> None:
-    """Measure an exciter's impedance from 10 to 1000 Hz, and tell the parts of its circuit.
+    """Measure an exciter's impedance from 10 to 1000 Hz and derive its circuit.
 
-    Output 1 drives it in series with a resistor to ground. Once hanging free, once glued to
-    something heavy, and weighed: print the keys of a rig's exciter, each with the interval that
-    holds nine of ten.
+    Output 1 drives the exciter in series with a resistor to ground. Measure once hanging free and
+    once glued to a heavy base, and weigh it. Prints the exciter's rig-file keys, each with its 90 %
+    confidence interval.
     """
     from era_haptics.lab.measuring.impedance import (
         CIRCUIT_NAMES,
@@ -280,7 +277,7 @@ def impedance(
     }
     if (device is None) != (output is None):
         missing = "--device" if device is None else "--output"
-        raise InputError(f"{missing} is missing; a measurement needs both, files neither")
+        raise InputError(f"{missing} is missing; a measurement needs both, files need neither")
     taken = _inputs(inputs)
     bench = ImpedanceSetup(
         weight and 1e-3 * weight,
@@ -295,13 +292,15 @@ def impedance(
         check_place(output, example="free.csv")
         check_ending(output, ".csv", what="an impedance")
         if len(circuits) == 2:
-            raise InputError("--free and --glued are both given; omit the one that is measured")
+            raise InputError("--free and --glued are both given; omit the one to be measured")
         name = {"glued": "free", "free": "glued"}.get("".join(circuits), "measured")
         with closing(open_card(device, outputs=1, inputs=max(taken), limit=level)) as card:
             found = measured_impedance(
                 card, inputs=taken, series=series, level=level, periods=periods, move=_moved
             )
-        circuits[name] = fit_circuit(*found, what=device)  # what is no exciter is not written
+        circuits[name] = fit_circuit(
+            *found, what=device
+        )  # do not write an impedance that is not an exciter's
         write_impedance(output, *found)
     runs = circuits.get("free", circuits.get("measured")), circuits.get("glued")
     values = exciter_values(*runs, bench)
@@ -360,7 +359,7 @@ _UNITS = {
     "coil_mass": (1e3, "g"),
     "weight": (1e3, "g"),
 }
-"""Keys of an exciter in a rig file, and the units in which they are printed."""
+"""Exciter keys of a rig file, and the units in which they are printed."""
 
 _BY_BASE = ("resonance", "coil_mass", "stiffness", "force_factor")
 
@@ -373,10 +372,10 @@ def _rows(
     for name, each in circuits.items():
         yield (
             f"{name}: resonance {each['resonance']:.4g} Hz, Q_ms {each['q']:.3g}, R "
-            f"{each['resistance']:.4g} ohm; the circuit explains all but {100 * each.misfit:.2g} %"
+            f"{each['resistance']:.4g} ohm; misfit of the circuit {100 * each.misfit:.2g} %"
         )
     yield (
-        f"Q_es {values['q_es'][0]:.3g}; keys of an exciter, with what holds nine of ten, of a "
+        f"Q_es {values['q_es'][0]:.3g}; exciter keys with 90 % confidence intervals, for a "
         f"resistor within {100 * bench.series_error:g} % and inputs within "
         f"{100 * bench.input_error:g} %:"
     )
@@ -400,24 +399,24 @@ def _warnings(
         if "glued" not in circuits:
             yield (
                 "resonance is that of coil and magnet, which both move; a rig's is lower, of the "
-                "coil alone: the root of the magnet's share in the weight"
+                "coil alone: by the square root of the magnet's fraction of the weight"
             )
     if by_light:
         changes = ", ".join(
             f"{name} {100 * by_light[name]:+.2g} %" for name in _BY_BASE if name in by_light
         )
-        yield f"taken as glued to something heavy; by --base {_LIGHT:g} grams: {changes}"
+        yield f"assumes a heavy base; with --base {_LIGHT:g} grams: {changes}"
 
 
 class MeasureCommand(TyperCommand):
-    """`era measure`; with a flag it is another command, with options of its own."""
+    """`era measure`; a flag selects another command with its own options."""
 
     variants: ClassVar = {FLAG: get_command(app)}
 
     def make_context(
         self, info_name: str | None, args: list[str], parent: Any = None, **extra: Any
     ) -> Any:
-        """The context of this command, or of the one that a flag asks for."""
+        """Return the context of this command, or of the one selected by a flag."""
         for flag, variant in self.variants.items():
             if flag in args:
                 return variant.make_context(info_name, args, parent, **extra)
@@ -432,14 +431,14 @@ def outputs(
     device: Annotated[
         str,
         typer.Option(
-            metavar="DEVICE", help="Sound card: jack, jack:CLIENT, or a device of PortAudio."
+            metavar="DEVICE", help="Sound card: jack, jack:CLIENT, or a PortAudio device."
         ),
     ],
     beside: Annotated[
         int | None,
         typer.Option(
             metavar="INPUT",
-            help="Listen with an accelerometer on this input, put beside each actuator in turn.",
+            help="Input of an accelerometer that you place next to each actuator in turn.",
             min=1,
         ),
     ] = None,
@@ -449,30 +448,34 @@ def outputs(
             "--output",
             "-o",
             metavar="RIG.wired.yaml",
-            help="Write these channels beside the rig, as fits do.",
+            help="Write a fitted rig with these channels.",
         ),
     ] = None,
     count: Annotated[
         int | None,
         typer.Option(
-            "--outputs", metavar="N", help="Test the first N outputs; default: of the rig.", min=1
+            "--outputs",
+            metavar="N",
+            help="Number of outputs to test; default: that of the rig.",
+            min=1,
         ),
     ] = None,
     level: Annotated[
-        float, typer.Option(help="Largest sample of each output, 1 is full scale.")
+        float, typer.Option(help="Peak sample of each output, 1 is full scale.")
     ] = 0.1,
     frequency: Annotated[
         float | None,
-        typer.Option(metavar="HZ", help="Tone that is felt; default: nearest to 160 Hz."),
+        typer.Option(
+            metavar="HZ", help="Frequency of the tone to feel in Hz; default: nearest to 160."
+        ),
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Find which output drives which actuator.
 
-    Play a soft tone on one output after the other, and ask which actuator moved. Or listen with an
-    accelerometer, whose sensitivity does not matter, which also tells what is dead, loose or wired
-    backwards. Exit status 1 for those, and for channels that are not those of the rig and not
-    written.
+    Plays a soft tone on one output after the other, and asks which actuator moved. With --beside,
+    an accelerometer (of any sensitivity) detects this, and also dead, loose or reversed actuators.
+    Exits with status 1 for those, and if channels differ from the rig's and are not written.
     """
     from era_haptics.lab.measuring.outputs import find_outputs
 

@@ -1,10 +1,10 @@
-"""Which output of a sound card drives which actuator: one output plays after the other.
+"""Find which sound-card output drives which actuator by playing on one output after the other.
 
-A person feels or sees a soft tone. Or an accelerometer is put beside each actuator in turn, which
-works for a plate that is hardly known, too: an actuator moves its own place more than others do,
-and by the velocity there it gives power to the plate. Responses at all places are compared with
-those of the rig's model, each frequency normalised. The unknown delay of the sound card is taken as
-the one by which all outputs together fit best; polarities are relative to the majority.
+Either a person feels or sees a soft tone, or an accelerometer is placed next to each actuator in
+turn. The latter also works for a poorly known plate: an actuator moves its own position more than
+the others do, and the velocity there determines the power it gives to the plate. Responses at all
+positions are compared with those of the rig's model, normalised per frequency. The unknown delay of
+the sound card is fitted jointly for all outputs. Polarities are relative to the majority.
 """
 
 import math
@@ -48,7 +48,7 @@ BURST, PAUSE = 0.4, 0.2
 
 _BURSTS = 3
 _OCTAVES = 4.0  # highest over lowest line
-_STEP = 20  # Hz; of lines one above its multiples, so that sums of two are beside lines
+_STEP = 20  # Hz; lines are one above its multiples, so that sums of two fall between lines
 _PERIODS = 2
 _DELAYS = np.arange(0, 0.05, 1e-4)  # s
 _MOVED = 5.0  # times the noise, in the median over frequencies
@@ -80,10 +80,10 @@ def tone(
 
 @dataclass(frozen=True)
 class OutputFinding:
-    """What is known of an output, counted from 1; era: that it drives, None for none.
+    """Finding for one output, counted from 1; era: the ERA it drives, None for none.
 
-    polarity, 1 or -1, and relative_level, to the median and to the model: None where nothing
-    listens; verdict: what is wrong, and its remedy.
+    polarity (1 or -1) and relative_level (relative to the median and to the model) are None without
+    an accelerometer; verdict: the problem and its remedy.
     """
 
     output: int
@@ -102,11 +102,11 @@ def listen_to_outputs(
     level: float,
     move: Callable[[str], None],
 ) -> list[OutputFinding]:
-    """Play on each output for a few seconds at each place, and tell what it drives.
+    """Play on each output for a few seconds at each position, and return what each output drives.
 
-    beside: input, counted from 1, of the accelerometer that is put beside each actuator; move:
-    called with the name of the next one. Raises InputError, LinkError for an input that is clipped
-    or silent; InputError where outputs are not told apart.
+    beside: input, counted from 1, of the accelerometer that is placed next to each actuator; move:
+    called with the name of the next actuator. Raises InputError or LinkError for a clipped or
+    silent input, InputError if outputs cannot be distinguished.
     """
     limits = desk.rig.limits
     low, high = limits.frequency_min, min(limits.frequency_max, _OCTAVES * limits.frequency_min)
@@ -120,7 +120,7 @@ def listen_to_outputs(
             play_on_one(card, sines, output, outputs=outputs, periods=_PERIODS)
             for output in range(1, outputs + 1)
         ]
-        check_levels(np.concatenate(runs), {beside: f"sensor beside {era.name}"})
+        check_levels(np.concatenate(runs), {beside: f"sensor next to {era.name}"})
         found.append([estimate(sines, [run[:, [beside - 1]]]) for run in runs])
     return _judged(desk.rig, sines.frequencies, found)
 
@@ -128,9 +128,9 @@ def listen_to_outputs(
 def _judged(
     rig: Rig, frequencies: FloatArray, found: Sequence[Sequence[ResponseEstimate]]
 ) -> list[OutputFinding]:
-    """What each output drives, by the responses beside each actuator at frequencies (f,) [Hz].
+    """Assign outputs to actuators by the responses next to each actuator at frequencies (f,) [Hz].
 
-    found: by actuator and output. Raises InputError where outputs are not told apart.
+    found: by actuator and output. Raises InputError if outputs cannot be distinguished.
     """
     points = np.array([[era.x, era.y] for era in rig.eras])
     free = solve_free_plate(rig.plate, rig.mesh, frequency_max=rig.limits.frequency_max)
@@ -154,7 +154,7 @@ def _judged(
 
 
 def _verdict(beside: ResponseEstimate, *, sign: int, level: float) -> str:
-    """What is wrong with an output that moves the plate."""
+    """Return the verdict on an output that moves the plate."""
     if beside.even[0] > _RATTLE or np.median(beside.coherence) < _COHERENT:
         return "loose: it rattles; fasten it"
     if level < _WEAK:
@@ -179,9 +179,9 @@ def matched(
         without[:, row, era] = 0
         if best - _assigned(without)[0] < _MARGIN * len(rows):
             raise InputError(
-                "outputs must differ beside their actuators, got two assignments that fit nearly "
-                "as well; check that the accelerometer was moved each time, or omit --beside and "
-                "say which moved"
+                "outputs must differ next to their actuators, got two assignments that fit nearly "
+                "equally well; check that the accelerometer was moved each time, or omit --beside "
+                "and enter which actuator moved"
             )
     signs = np.sign(alike[moment, rows, eras])
     return rows, eras, np.asarray(signs * (1 if signs.sum() >= 0 else -1), dtype=int)
@@ -201,7 +201,7 @@ def _size(values: ComplexArray) -> FloatArray:
 
 
 def _even(values: ComplexArray) -> ComplexArray:
-    """Responses (n, f, s) of one size, to which each frequency contributes as much."""
+    """Scale responses (n, f, s) so that all have one norm and all frequencies weigh the same."""
     scaled = values / np.sqrt((np.abs(values) ** 2).mean(axis=(0, 2)))[:, None]
     return np.asarray(scaled / _size(scaled)[:, None, None])
 
@@ -219,10 +219,10 @@ def find_outputs(
     level: float,
     frequency: float | None,
 ) -> tuple[list[str], dict[str, Any], bool]:
-    """Find which of so many outputs drives which actuator; return the report, and if all is right.
+    """Find which output drives which actuator; return the report, and whether all are correct.
 
-    beside: input of an accelerometer, None to ask on the terminal; output: rig to write; frequency
-    [Hz]: of the tone that is felt. Raises InputError, LinkError.
+    beside: input of an accelerometer, None to ask on the terminal; output: rig file to write;
+    frequency [Hz]: of the audible tone. Raises InputError, LinkError.
     """
     rig = load_rig(rig_file)
     if output is not None:
@@ -265,14 +265,14 @@ def find_outputs(
 
 def _moved(name: str) -> None:
     typer.prompt(
-        f"Put the accelerometer beside {name}, and press Enter", "", show_default=False, err=True
+        f"Put the accelerometer next to {name}, and press Enter", "", show_default=False, err=True
     )
 
 
 def _requested(
     desk: Desk, card: SoundCard, count: int, *, level: float, frequency: float | None
 ) -> list[OutputFinding]:
-    """What each output drives, as is said on the terminal."""
+    """Ask on the terminal what each output drives."""
     names, found = {name.lower(): name for name, _ in desk.eras}, list[OutputFinding]()
     for number in range(1, count + 1):
         played = tone(desk, number, outputs=count, rate=card.rate, level=level, frequency=frequency)
@@ -284,7 +284,7 @@ def _requested(
             while (said := typer.prompt(question, err=True).strip().lower()) not in {
                 *names, _NONE, _AGAIN
             }:  # fmt: skip
-                typer.echo(f"{said!r} is none of {left}; {did_you_mean(said, names)}", err=True)
+                typer.echo(f"{said!r} must be one of {left}; {did_you_mean(said, names)}", err=True)
         era = names.pop(said, None)
         found.append(OutputFinding(number, era, verdict="ok" if era else "moves nothing"))
     return found
@@ -311,7 +311,7 @@ def _rows(
     if missing:
         yield f"on no output: {', '.join(missing)}; check cables and amplifier, or --outputs"
     elif channels == own:
-        yield "channels are as in the rig"
+        yield "channels match the rig"
     else:
         yield "eras:"
         yield from (f"  {name}: {{channel: {channel}}}" for name, channel in channels.items())

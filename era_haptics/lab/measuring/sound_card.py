@@ -1,13 +1,13 @@
-"""A rig at a sound card: how it is wired, multisines, and runs that play and record at once.
+"""Sound card connected to a rig: wiring, multisines, and runs that play and record simultaneously.
 
-A sound card plays one array from memory and records into another by a callback in C: Python is not
-in the path of the sound, and lost blocks are counted.
+The sound card plays one array from memory and records into another through a callback in C. Python
+is not in the audio path, and lost blocks are counted.
 
-Multisines play on all outputs at once. In run e the phase of source i is turned by 2 pi e i / S, S
-the number of sources and of runs: at every line the S runs are orthogonal (the matrix of the
-discrete Fourier transform), so that the response to each source follows from all runs, with the
-full amplitude of all sources. Lines are odd multiples of the lowest: a square law shows in the
-empty even ones. Amplitudes fall with frequency, since accelerations grow.
+Multisines play on all outputs simultaneously. In run e the phase of source i is rotated by 2 pi e i
+/ S, where S is the number of sources and of runs. At every line the S runs are orthogonal (discrete
+Fourier transform matrix), so the response to each source follows from all runs, with the full
+amplitude of all sources. Lines are odd multiples of the lowest, so a square law shows in the empty
+even lines. Amplitudes decrease with frequency because accelerations increase.
 """
 
 import ctypes
@@ -44,7 +44,7 @@ from sim.soft_amp.output import portaudio_device, portaudio_stream, sounddevice
 PERIOD = 1.0
 """s; lines are whole numbers of hertz."""
 
-_DRAWS = 20  # of phases; the lowest crest of them is 3.1 to 3.6
+_DRAWS = 20  # random phases; the lowest crest factor among them is 3.1 to 3.6
 _RAMP = 0.02  # s
 _STEP = 10  # Hz
 
@@ -133,7 +133,7 @@ class Multisine:
 
 
 def ramped(samples: FloatArray, count: int) -> FloatArray:
-    """Samples (n, sources), ramped along squared sines over so many of them at both ends."""
+    """Samples (n, sources) with squared-sine ramps of `count` samples at both ends."""
     ramp = np.sin(np.linspace(0, np.pi / 2, count)) ** 2
     shape = np.ones((len(samples), 1))
     shape[:count, 0] = ramp
@@ -155,11 +155,12 @@ _AROUND = 4  # lines of a period on either side, from which noise is taken
 
 @dataclass(frozen=True, eq=False)
 class ResponseEstimate:
-    """Responses (f, inputs, sources) of samples to samples, H1 over all runs.
+    """Sample-to-sample responses (f, inputs, sources), H1 estimate over all runs.
 
-    std (f, inputs): standard deviation of each response's modulus; coherence (f, inputs): share of
-    the power that comes from the sources; even (inputs,): what came back at even lines, which
-    nobody played, relative to the lines played, amplitudes, noise taken off.
+    - std (f, inputs): standard deviation of each response's modulus.
+    - coherence (f, inputs): fraction of the power that comes from the sources.
+    - even (inputs,): amplitude at even lines, which are not played, relative to the played lines,
+      minus noise.
     """
 
     values: ComplexArray
@@ -171,8 +172,9 @@ class ResponseEstimate:
 def estimate(multisine: Multisine, recorded: Sequence[FloatArray]) -> ResponseEstimate:
     """Estimate responses from whole periods of each run, (periods x samples, inputs).
 
-    Two periods or more: between the lines of a period the spectrum of several has nothing but
-    noise. Least squares of Y = U H^T at each line, U the amplitudes played (runs, sources).
+    Requires at least two periods: between the lines of one period, the spectrum of several contains
+    only noise. Solves Y = U H^T at each line by least squares, with U the amplitudes played (runs,
+    sources).
     """
     n = multisine.samples
     periods = len(recorded[0]) // n
@@ -198,7 +200,7 @@ def estimate(multisine: Multisine, recorded: Sequence[FloatArray]) -> ResponseEs
 
 
 def _even(spectra: ComplexArray, lines: IntArray, periods: int, noise: FloatArray) -> FloatArray:
-    """Amplitude at the even lines beside the odd ones, relative to those, (inputs,)."""
+    """Amplitude at the even lines next to the odd ones, relative to these, (inputs,)."""
     beside = lines + periods
     power = (np.abs(spectra[:, beside]) ** 2).mean(axis=0) - noise
     played = (np.abs(spectra[:, lines]) ** 2).mean(axis=0).sum(axis=0)
@@ -252,10 +254,10 @@ _BLOCK = 512  # frames; late samples are worse than a delay, which is measured
 
 
 class SoundCard:
-    """An open device with some outputs and inputs, the first ones that it has.
+    """Open device with its first outputs and inputs.
 
-    limit: no sample played is larger, since nothing behind this checks it. Its stream runs until
-    `close`, so that the delay through it stays the same.
+    limit: largest sample allowed, since nothing downstream checks it. The stream runs until
+    `close`, so that its delay stays constant.
     """
 
     name: str
@@ -275,7 +277,7 @@ class SoundCard:
 
     @property
     def given(self) -> int:
-        """The address of what the callbacks are to be given."""
+        """Address of the data for the callbacks."""
         return ctypes.addressof(self._transfer)
 
     def play_through(self, client: JackClient) -> None:
@@ -317,13 +319,13 @@ class SoundCard:
         return found
 
     def start(self, played: FloatArray) -> Float32Array:
-        """Play samples (n, outputs); return at once what is recorded meanwhile (n, inputs).
+        """Start playing samples (n, outputs); return the array (n, inputs) that is being recorded.
 
         Raises ValueError for samples beyond the limit.
         """
         transfer = self._transfer
         out = np.ascontiguousarray(played, dtype=np.float32)
-        if not (np.abs(out) <= self._limit).all():  # neither is what is no number
+        if not (np.abs(out) <= self._limit).all():  # also rejects NaN
             raise ValueError(f"samples must be at most {self._limit:g}, got {np.abs(out).max():g}")
         found = np.zeros((len(out), transfer.inputs), dtype=np.float32)
         self._memory = out, found  # kept, since the callback uses it
@@ -338,16 +340,16 @@ class SoundCard:
         return int(self._transfer.position)
 
     def close(self) -> None:
-        """Stop at once, and leave the device."""
+        """Stop immediately and release the device."""
         self._close()
 
 
 def open_card(device: str, *, outputs: int, inputs: int, limit: float) -> SoundCard:
-    """Open `jack`, `jack:CLIENT`, or a device of PortAudio by its name or number.
+    """Open `jack`, `jack:CLIENT`, or a PortAudio device by its name or number.
 
-    PortAudio has one stream in both directions, of one device: two devices would have two clocks.
-    limit: of the samples played, in full scale. Raises InputError for a device that does not suit;
-    LinkError where it is busy or gone.
+    A PortAudio stream runs in both directions on one device, because two devices would have two
+    clocks. limit: largest sample, relative to full scale. Raises InputError for an unsuitable
+    device, LinkError for one that is busy or gone.
     """
     card = SoundCard(outputs=outputs, inputs=inputs, limit=limit)
     kind, _, other = device.partition(":")
@@ -390,10 +392,10 @@ _LEFT = 0.01  # of a free vibration
 
 
 def converters(response: ComplexArray) -> ComplexArray:
-    """The loop-back's complex response (f,) with a modulus of 1 in the median.
+    """Complex loop-back response (f,), normalised to a median modulus of 1.
 
-    Dividing by it takes out the delay, fractions of a sample included, and the shape of filters;
-    gains are left, since those of a level and of a sensitivity are stated.
+    Dividing by it removes the delay, including fractions of a sample, and the shape of filters.
+    Gains remain, since levels and sensitivities are stated separately.
     """
     return np.asarray(response / np.median(np.abs(response)))
 
@@ -410,21 +412,21 @@ class WiredSensor:
     sensitivity: float
     """Samples, in full scale, by acceleration [1/(m/s²)]."""
     mass: float = 0.0
-    """Mass [kg] of one that is moved, as `model.estimate.forward.Sensor.mass`."""
+    """Mass of a moved sensor [kg], like `model.estimate.forward.Sensor.mass`."""
 
     @property
     def place(self) -> Sensor:
-        """The sensor on the plate, whatever it is wired to."""
+        """The sensor on the plate, without its wiring."""
         return Sensor(self.name, x=self.x, y=self.y, mass=self.mass)
 
 
 def read_sensors(
     path: Path, plate: Plate, *, mass: float | None = None, may_move: bool = False
 ) -> tuple[WiredSensor, ...]:
-    """Read the accelerometers of a plate, or the places of one that is moved.
+    """Read the accelerometers of a plate, or the positions of one that is moved.
 
-    mass [g]: of the sensor, in place of the file's; may_move: whether one that is moved will do.
-    Raises InputError with file and line.
+    mass [g]: of the sensor, overrides the file; may_move: whether a moved sensor is allowed. Raises
+    InputError with file and line.
     """
     sensors: list[WiredSensor] = []
     columns = (*PLACE_COLUMNS, *INPUT_COLUMNS[:2])
@@ -434,14 +436,14 @@ def read_sensors(
         sensors.append(_sensor(line, sensors, plate, mass=mass, moves=moves))
     if not moves and len(sensors) > 1 and any(sensor.mass for sensor in sensors):
         raise InputError(
-            f"{path}: mass_g must be of one sensor that is moved, got several sensors, which weigh "
-            "on the plate together; leave it out, and give them in the rig as masses"
+            f"{path}: mass_g must be given for a single moved sensor, got several sensors, which "
+            "all load the plate; leave it out, and give them in the rig as masses"
         )
     return tuple(sensors)
 
 
 def are_positions(sensors: Sequence[WiredSensor]) -> bool:
-    """Whether the sensors are places of one that is moved."""
+    """Return whether the sensors are positions of one moved sensor."""
     return len(sensors) > 1 and len({sensor.input for sensor in sensors}) == 1
 
 
@@ -455,7 +457,7 @@ def _sensor(
     if channel != int(channel) or channel < 1 or is_taken:
         raise InputError(
             f"{place}: input must be a number from 1 that no other sensor has, got {channel:g}; "
-            "one that is moved from place to place is for era measure, alone in its file"
+            "a sensor moved between positions requires era measure, and a file of its own"
         )
     gain, full_scale, own = (line.number(column, default) for column, default in _OPTIONAL.items())
     for column, value in (("gain", gain), ("full_scale_v", full_scale)):
@@ -478,10 +480,10 @@ _OPTIONAL = dict(zip(INPUT_COLUMNS[2:], (1.0, 1.0, 0.0), strict=True))
 
 @dataclass(frozen=True)
 class Desk:
-    """How a rig is wired to a sound card: its ERAs by their channels, counted from 1; a loop-back.
+    """Wiring of a rig to a sound card: ERAs by channel, counted from 1, and a loop-back.
 
-    The loop-back is a cable from the output after those of the ERAs to the input after those of
-    the sensors; or, where a card has no output left, it has that of the last ERA (is_shared).
+    The loop-back is a cable from the output after those of the ERAs to the input after those of the
+    sensors. If the card has no free output, it shares the output of the last ERA (is_shared).
     """
 
     rig: Rig
@@ -516,7 +518,7 @@ class Desk:
 
     @property
     def named_inputs(self) -> dict[int, str]:
-        """What each input has, the loop-back included."""
+        """What is connected to each input, including the loop-back."""
         named = {sensor.input: f"sensor {sensor.name}" for sensor in self.sensors}
         return named | {self.input: f"the loop-back of output {self.output}"}
 
@@ -533,9 +535,10 @@ class Desk:
     def responses(
         self, frequencies: FloatArray, values: ComplexArray, looped: ComplexArray
     ) -> Measurement:
-        """Accelerations per base displacement [1/s²] from those of samples (f, inputs, sources).
+        """Convert responses of samples (f, inputs, sources) to acceleration per base displacement
+        [1/s²].
 
-        looped (f,): of the loop-back.
+        looped (f,): response of the loop-back.
         """
         full = np.array([*self.rig.full_levels.values()])
         plain = values[:, self.columns, : len(self.eras)] / converters(looped)[:, None, None]
@@ -570,7 +573,7 @@ class Desk:
 
     @property
     def highest(self) -> float:
-        """The highest level that the rig's limits allow on all ERAs at once."""
+        """Highest level that the rig's limits allow on all ERAs simultaneously."""
         limits = self.rig.limits
         return min(limits.level, float(np.sqrt(limits.power / len(self.rig.eras))), 1.0)
 
@@ -599,8 +602,8 @@ class Desk:
         ):
             if not is_kept:
                 raise InputError(
-                    f"limits.{key} must allow what a sound card plays from memory, {played}, got "
-                    f"{getattr(limits, key):g}; check whether the ERAs bear it, and widen it"
+                    f"limits.{key} must allow the signals of a sound card, {played}, got "
+                    f"{getattr(limits, key):g}; check that the ERAs withstand them, and widen it"
                 )
 
     def check_frequencies(self, frequencies: FloatArray, *, what: str) -> None:
@@ -622,9 +625,9 @@ _TAIL = 0.05  # s; longer than the ramp
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """What was recorded of a run, (n, inputs).
+    """Recording of a run, (n, inputs).
 
-    is_whole: whether no block was lost, in the last attempt; repeated: attempts before it.
+    is_whole: whether the last attempt lost no block; repeated: number of attempts before it.
     """
 
     recorded: FloatArray
@@ -633,7 +636,7 @@ class Run:
 
     @property
     def whole(self) -> FloatArray:
-        """What was recorded; raises LinkError where blocks were lost in each attempt."""
+        """Return the recording; raises LinkError if every attempt lost blocks."""
         if self.is_whole:
             return self.recorded
         raise LinkError(
@@ -643,7 +646,7 @@ class Run:
 
 
 def run_time(periods: int, *, settling: float = MIN_SETTLING) -> float:
-    """Time [s] of a run of which so many periods are analysed, after it has settled."""
+    """Duration of a run [s] with `periods` analysed periods after settling."""
     return settling + PERIOD * periods + _TAIL
 
 
@@ -656,9 +659,10 @@ def play_and_record(
     is_whole: Callable[[FloatArray], bool],
     tries: int = TRIES,
 ) -> Run:
-    """Play samples (n, outputs), and keep some seconds behind the settling [s].
+    """Play samples (n, outputs), and keep `seconds` of the recording after `settling` [s].
 
-    is_whole: whether no block was lost in what is kept (n, inputs); the run is repeated otherwise.
+    is_whole: checks the kept recording (n, inputs) for lost blocks; if it fails, the run is
+    repeated.
     """
     start, count = round(settling * card.rate), round(seconds * card.rate)
     for repeated in range(tries):
@@ -673,8 +677,8 @@ def play_on_one(
 ) -> FloatArray:
     """Play a multisine on one output, counted from 1, without a loop-back.
 
-    Return what was recorded (n, inputs), whole periods; again where the device reports gaps. Raises
-    LinkError after three times.
+    Return whole periods of the recording (n, inputs); repeats if the device reports gaps. Raises
+    LinkError after three attempts.
     """
     signal = sines.signal(0, periods=run_time(periods) / PERIOD)
     return play_and_record(

@@ -240,9 +240,9 @@ def test_run_that_lost_a_block_is_played_again(
         ({"gain": 0.0}, LinkError, "all inputs are silent"),
         ({"on_inputs": [0, 1, 2, 2]}, InputError, "input 4 must bring back .* by a cable"),
         ({"noise": 1.5}, LinkError, "coherence"),
-        ({"drifts": {4: 50e-6}}, InputError, r"clock.* 50 millionths at the loop-back"),
+        ({"drifts": {4: 50e-6}}, InputError, r"clock.* 50 ppm at the loop-back"),
         ({"drifts": dict.fromkeys((1, 2, 3, 4), -9e-6)}, InputError, r"clock.* -9 .*loop-back"),
-        ({"drifts": {2: 20e-6}}, InputError, r"clock.* 20 millionths at sensor P2 \(input 2\)"),
+        ({"drifts": {2: 20e-6}}, InputError, r"clock.* 20 ppm at sensor P2 \(input 2\)"),
     ],
 )
 def test_wrong_desks_are_refused_with_their_cause(
@@ -264,7 +264,7 @@ WIRED = np.array([[0.02, 0.03, 0.02, 0.03, 0.0]] * 3 + [[0.0, 0.0, 0.0, 0.0, 0.9
 @pytest.mark.parametrize(
     ("at", "gains", "cause"),
     [
-        (4, [0, 0, 0, 0, 0], r"output 5 alone, as the loop-back, got 0 of it; connect them"),
+        (4, [0, 0, 0, 0, 0], r"output 5 alone, as the loop-back, got a gain of 0; connect them"),
         pytest.param(
             4,
             [0, 0.03, 0, 0, 0.9],

@@ -10,12 +10,12 @@ faults of the measurement: noise, one sensor whose scale is wrong, one that is d
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from model.arrays import FloatArray
+from model.arrays import ComplexArray, FloatArray
 from model.estimate.measurement import (
     Measurement,
     sensors_at,
@@ -28,8 +28,25 @@ from model.rig.rig_file import load_rig
 from model.structure.attachments import footprints_of
 from model.structure.plate import Plate
 from model.transients.base_motion import Term
-from sim.plant.fingers import Accelerometer, fit_tones, positions, readings
 from sim.plant.plant import Plant
+
+
+@dataclass(frozen=True)
+class Accelerometer:
+    """A sensor at x, y [m].
+
+    noise_density [m/s²/sqrt(Hz)]; reach: range, plus or minus [m/s²]; resolution: step [m/s²], 0
+    for none; scale: reading per acceleration.
+    """
+
+    name: str
+    x: float
+    y: float
+    noise_density: float = 0.0
+    reach: float = math.inf
+    resolution: float = 0.0
+    scale: float = 1.0
+
 
 FREQUENCIES = np.arange(40.0, 501.0, 10.0)
 SEED = 1
@@ -72,6 +89,31 @@ def true_rig(rig: Rig) -> Rig:
     return replace(rig, plate=plate, eras=tuple(eras))
 
 
+def readings(
+    sensors: Sequence[Accelerometer], accelerations: FloatArray, rng: np.random.Generator
+) -> FloatArray:
+    """Readings (n, s) [m/s²] of sensors for accelerations (n, s) [m/s²]."""
+    noise = rng.standard_normal(accelerations.shape)
+    columns = []
+    for number, sensor in enumerate(sensors):
+        # White noise of this density up to half the sampling rate has this standard deviation.
+        deviation = sensor.noise_density * math.sqrt(RATE / 2)
+        column = sensor.scale * accelerations[:, number] + deviation * noise[:, number]
+        clipped = np.clip(column, -sensor.reach, sensor.reach)
+        if sensor.resolution > 0:
+            clipped = sensor.resolution * np.round(clipped / sensor.resolution)
+        columns.append(clipped)
+    return np.stack(columns, axis=1)
+
+
+def fit_tone(times: FloatArray, samples: FloatArray, frequency: float) -> ComplexArray:
+    """Complex amplitudes a (s,) of Im[a exp(i omega t)] in samples (n, s), with an offset."""
+    angle = 2 * np.pi * frequency * times
+    basis = np.column_stack([np.sin(angle), np.cos(angle), np.ones(len(times))])
+    sine, cosine, _ = np.linalg.lstsq(basis, samples, rcond=None)[0]
+    return np.asarray(sine + 1j * cosine)
+
+
 def scanning_grid(plate: Plate, nx: int, ny: int, *, like: Accelerometer) -> list[Accelerometer]:
     """nx by ny equal sensors in the centres of as many cells; P1 is nearest the origin, x first."""
     return [
@@ -99,7 +141,8 @@ def record_responses(
         footprints_of(rig.eras, rig.masses),
         frequency_max=max(float(frequencies.max()), 200.0),
     )
-    shapes = reduced.at(positions(sensors))
+    points = np.array([[sensor.x, sensor.y] for sensor in sensors])
+    shapes = reduced.at(points)
     plant = Plant(reduced, rig.eras, loads=rig.masses)
     rng = np.random.default_rng(seed)
     values = np.empty((len(frequencies), len(sensors), len(rig.eras)), dtype=complex)
@@ -111,11 +154,11 @@ def record_responses(
             plant.set_input(number, [tone])
             plant.skip(start + SETTLE)
             times, truth = plant.advance(start + SETTLE + RECORD, sample_rate=RATE, shapes=shapes)
-            read = readings(sensors, truth, sample_rate=RATE, rng=rng)
-            values[row, :, number] = fit_tones(times, read, [frequency], with_offset=True)[0] / base
+            read = readings(sensors, truth, rng)
+            values[row, :, number] = fit_tone(times, read, frequency) / base
         plant.set_input(number, [])
     names = tuple(sensor.name for sensor in sensors)
-    places = sensors_at(positions(sensors), names)
+    places = sensors_at(points, names)
     return Measurement(places, np.asarray(frequencies, dtype=float), values)
 
 

@@ -14,7 +14,6 @@ from sim.soft_amp.soft_amp_cli import port_option, soft_amp
 
 if TYPE_CHECKING:
     from sim.far_ends.wire_assignment import SimulatedWire
-    from sim.plant.fingers import Accelerometer
     from sim.simulation import Simulation
 
 app = typer.Typer(pretty_exceptions_enable=False)
@@ -88,16 +87,6 @@ def sim(
     ] = None,
     exact: ExactOption = False,
     seed: SeedOption = None,
-    sensor: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="NAME=X,Y",
-            help="Place an accelerometer at this position in metres (repeatable).",
-        ),
-    ] = None,
-    rate: Annotated[
-        float, typer.Option(metavar="HZ", help="Sampling rate of sensors and fingers in Hz.")
-    ] = 10_000.0,
     control: Annotated[
         Path | None, typer.Option(metavar="PATH", help="Serve the control socket at this path.")
     ] = None,
@@ -148,7 +137,6 @@ def sim(
         if virtual_time and control is None:
             raise InputError("--virtual-time needs --control PATH, which advances the time")
         loaded = load_rig(rig)
-        _check_rate(rate, frequency_max=loaded.limits.frequency_max)
         if firmware and (common is not None or wire or line or faults or virtual_time):
             raise InputError(
                 "--firmware has a serial line, real time and a plate that does not move; omit the "
@@ -172,8 +160,6 @@ def sim(
             imperfections=(
                 Imperfections() if drawn is None else draw_imperfections(loaded, seed=drawn)
             ),
-            sensors=[_sensor(text) for text in sensor or []],
-            sample_rate=rate,
             control=control,
             until_eof=until_eof,
             firmware=programs,
@@ -196,25 +182,6 @@ def _common_wire(
             "--wire main=serial --wire side=slcan"
         )
     return next((replace(defaults, kind=kind, port=port) for kind, port in given.items()), None)
-
-
-def _check_rate(rate: float, *, frequency_max: float) -> None:
-    least = 2.5 * frequency_max
-    if not least <= rate <= 1e6:
-        raise InputError(
-            f"--rate must be {least:g} to 1e+06 Hz for a plate driven at up to "
-            f"{frequency_max:g} Hz, got {rate:g}"
-        )
-
-
-def _sensor(text: str) -> "Accelerometer":
-    from model.config.units import parse_point
-    from sim.plant.fingers import Accelerometer
-
-    name, equals, position = text.partition("=")
-    if not (name and equals):
-        raise InputError(f"--sensor must be NAME=X,Y, as in P1=0.10,0.08, got {text}")
-    return Accelerometer(name, *parse_point(position, what="--sensor"))
 
 
 def _run(simulation: "Simulation", *, virtual_time: bool) -> None:

@@ -1,7 +1,7 @@
 """Control of a running simulation: its context, and JSON lines over a Unix socket, version 3.
 
 Only the owner of the socket may open it. One JSON object per line in each direction; keys that a
-request does not know are ignored, except by `sensors` and `plate`.
+request does not know are ignored.
 
     {"op": "hello"}                            {"protocol": "era-sim-control", "version": 3,
                                                 "clock": "wall" or "virtual", "ops": [...],
@@ -23,29 +23,14 @@ request does not know are ignored, except by `sensors` and `plate`.
                           "amplitude_m_s2": [[one per point], one row per frequency],
                           "peak_m_s2": [one per point]}}}
 
-    sensors
-    {"op": "sensors", "sensors": {NAME: {"at_m": [x, y], "noise_m_s2_rthz", "reach_m_s2",
-                                         "resolution_m_s2", "scale"}}}
-                                                       replace all sensors; only at_m is required
-    {"op": "signals", "since_s": t0, "until_s": t1}    {"sample_rate_hz", "start_s",
-                                                        "sensors": {NAME: {"at_m", "m_s2": [...]}}}
-    {"op": "tones", "since_s", "until_s", "frequencies_hz": [f, ...]}
-        {"sensors": {NAME: {"at_m", "real_m_s2": [one per frequency], "imag_m_s2": [...]}}}
-        least squares over the signals; Im[a exp(i omega t)], t on the simulation's clock
-
-    {"op": "plate", "modulus": factor, "stiffness": {ERA: factor}, "masses": [[x, y, kg], ...]}
-                                               change the plate as it was at first, at rest; a key
-                                               left out is as at first: {"ok": true, "time_s"}
-
     {"op": "inject_fault", "fault": ..., "lasts": ..., ...}   keys as in a fault file, begins now
     {"op": "faults"}                                   {"faults": {NAME: [{"fault", "begin_s",
                                                            "end_s" or null, "is_on"}]}}
     {"op": "recover", "amplifier": NAME}               end all faults; of all without a name
     {"op": "step", "seconds": s}                       advance virtual time: {"time_s": t}
 
-Times are seconds of the simulation's clock: time.monotonic(), or virtual time from 0. Felt, signals
-and tones cover the last ten seconds. An invalid request returns {"error": TEXT} and changes
-nothing.
+Times are seconds of the simulation's clock: time.monotonic(), or virtual time from 0. `felt` covers
+the last ten seconds. An invalid request returns {"error": TEXT} and changes nothing.
 """
 
 import asyncio
@@ -64,7 +49,7 @@ from collections.abc import (
     Sequence,
 )
 from contextlib import asynccontextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from inspect import signature
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeAlias
@@ -72,38 +57,20 @@ from typing import Annotated, Any, Literal, TypeAlias
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError
 
 from drivers.errors import LinkError
-from model.answer.stimulus import check_on_plate
 from model.arrays import Point
 from model.errors import InputError
-from model.structure.attachments import PointLoad
 from registry import threads
 from registry.wording import first_problem
 from sim.bench.amplifier_device import AmplifierDevice
 from sim.bench.bench import Bench
 from sim.faults import parse_fault
-from sim.plant.fingers import Accelerometer, measure_vibration
-from sim.plant.imperfections import PlateErrors
-from sim.sensors import Accelerometers, Recording
+from sim.plant.fingers import measure_vibration
 
 _MAX_STEP = 3600.0  # s of virtual time in one request
-_MAX_TONES = 64
 _MAX_KEY = 60  # characters of a key in an error
 _At = Annotated[tuple[FiniteFloat, FiniteFloat], Field(strict=False)]  # [x, y] in m
 _Positive = Annotated[FiniteFloat, Field(gt=0)]
 _Finger = Annotated[str, Field(min_length=1, max_length=40)]  # its id
-_Mass = Annotated[tuple[FiniteFloat, FiniteFloat, _Positive], Field(strict=False)]
-
-
-class SensorPlacement(BaseModel):
-    """A place, and fields of an `Accelerometer`; nothing else."""
-
-    model_config = ConfigDict(frozen=True, strict=True, extra="forbid")
-
-    at_m: _At
-    noise_density: FiniteFloat = Field(0.0, alias="noise_m_s2_rthz")
-    reach: FiniteFloat = Field(0.0, alias="reach_m_s2")
-    resolution: FiniteFloat = Field(0.0, alias="resolution_m_s2")
-    scale: FiniteFloat = 1.0
 
 
 @dataclass
@@ -117,14 +84,7 @@ class SimulationContext:
     devices: Mapping[str, AmplifierDevice] = field(default_factory=dict)
     urls: Mapping[str, str] = field(default_factory=dict)
     step: Callable[[float], Coroutine[Any, Any, None]] | None = None
-    accelerometers: Accelerometers = field(init=False)
-    first_plate: PlateErrors = field(init=False)
     _solving: asyncio.Task[None] | None = field(init=False, default=None)
-
-    def __post_init__(self) -> None:
-        """Start without sensors, from the plate as it is."""
-        self.accelerometers = Accelerometers(self.bench)
-        self.first_plate = self.bench.imperfections.plate
 
     def start_solving(self) -> None:
         """Solve the plate under the newest fingers in a thread, so that amplifiers go on replying.
@@ -166,7 +126,7 @@ OPERATIONS: dict[str, tuple[type[BaseModel], _Function]] = {}
 
 
 def operation(
-    *names: str, extra: Literal["allow", "ignore", "forbid"] = "ignore"
+    *names: str, extra: Literal["allow", "ignore"] = "ignore"
 ) -> Callable[[_Function], _Function]:
     """Register a function as the operations of these names; extra: what other keys are.
 
@@ -187,11 +147,6 @@ def operation(
         return function
 
     return register
-
-
-def _check_window(since_s: float, until_s: float) -> None:
-    if since_s >= until_s:
-        raise InputError("since_s must be less than until_s")
 
 
 _VERSION = 3
@@ -289,8 +244,9 @@ def _placed(
 async def _felt(
     context: SimulationContext, now: float, *, since_s: FiniteFloat, until_s: FiniteFloat
 ) -> _Response:
-    _check_window(since_s, until_s)
-    # In a thread, as the fits below: amplifiers must go on replying.
+    if since_s >= until_s:
+        raise InputError("since_s must be less than until_s")
+    # The fits run in threads, so that amplifiers go on replying.
     await context.solved(until_s)
     context.bench.advance(now)
     records, frequencies = context.bench.records(since_s, until_s)
@@ -310,92 +266,6 @@ async def _felt(
             for id, one in felt.items()
         }
     }
-
-
-@operation("sensors")
-async def _sensors(
-    context: SimulationContext, now: float, *, sensors: dict[str, SensorPlacement]
-) -> _Response:
-    placed = [
-        Accelerometer(name, *each.at_m, **each.model_dump(exclude={"at_m"}, exclude_unset=True))
-        for name, each in sensors.items()
-    ]
-    context.bench.advance(now)
-    context.accelerometers.place(placed)
-    return {"ok": True, "time_s": context.bench.time}
-
-
-@operation("signals")
-async def _signals(
-    context: SimulationContext, now: float, *, since_s: FiniteFloat, until_s: FiniteFloat
-) -> _Response:
-    recording = _recorded(context, now, since_s, until_s)
-    columns = zip(
-        recording.names, recording.points.tolist(), recording.samples.T.tolist(), strict=True
-    )
-    return {
-        "sample_rate_hz": recording.sample_rate,
-        "start_s": recording.start,
-        "sensors": {name: {"at_m": at, "m_s2": samples} for name, at, samples in columns},
-    }
-
-
-@operation("tones")
-async def _tones(
-    context: SimulationContext,
-    now: float,
-    *,
-    since_s: FiniteFloat,
-    until_s: FiniteFloat,
-    frequencies_hz: Annotated[list[_Positive], Field(min_length=1, max_length=_MAX_TONES)],
-) -> _Response:
-    _check_window(since_s, until_s)
-    nyquist = context.bench.sample_rate / 2
-    if len(set(frequencies_hz)) < len(frequencies_hz) or max(frequencies_hz) >= nyquist:
-        raise InputError(f"frequencies_hz must be different ones below {nyquist:g} Hz")
-    recording = _recorded(context, now, since_s, until_s)
-    # In a thread: a long fit must not delay the amplifiers' replies.
-    phasors = await asyncio.to_thread(recording.tones, frequencies_hz)
-    columns = zip(recording.names, recording.points.tolist(), phasors.T, strict=True)
-    return {
-        "sensors": {
-            name: {"at_m": at, "real_m_s2": a.real.tolist(), "imag_m_s2": a.imag.tolist()}
-            for name, at, a in columns
-        }
-    }
-
-
-def _recorded(context: SimulationContext, now: float, since_s: float, until_s: float) -> Recording:
-    _check_window(since_s, until_s)
-    context.bench.advance(now)
-    return context.accelerometers.read(since_s, until_s)
-
-
-@operation("plate", extra="forbid")
-async def _plate(
-    context: SimulationContext,
-    now: float,
-    *,
-    op: str,
-    modulus: _Positive = 1.0,
-    stiffness: Annotated[dict[str, _Positive], Field(default_factory=dict)],
-    masses: Annotated[list[_Mass], Field(default_factory=list)],
-) -> _Response:
-    first, rig = context.first_plate, context.bench.rig
-    names = [era.name for era in rig.eras]
-    if not stiffness.keys() <= set(names):
-        raise InputError(f"stiffness must be an object of factors by ERA ({', '.join(names)})")
-    check_on_plate("a mass", [(x, y) for x, y, _ in masses], rig.plate)
-    changed = replace(
-        first,
-        modulus=first.modulus * modulus,
-        stiffness={
-            name: first.stiffness.get(name, 1.0) * stiffness.get(name, 1.0) for name in names
-        },
-        masses=(*first.masses, *(PointLoad(x, y, mass=mass) for x, y, mass in masses)),
-    )
-    context.bench.change_plate(changed, now=now)
-    return {"ok": True, "time_s": context.bench.time}
 
 
 @operation("inject_fault", extra="allow")

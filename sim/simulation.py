@@ -14,7 +14,7 @@ import os
 import selectors
 import signal
 import threading
-from collections.abc import AsyncIterator, Callable, Mapping, Sequence
+from collections.abc import AsyncIterator, Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -29,9 +29,7 @@ from sim.bench.bench import Bench, keep_time
 from sim.control import SimulationContext, control_socket, in_background
 from sim.far_ends.wire_assignment import SimulatedWire, open_wires
 from sim.faults import FaultFile
-from sim.plant.fingers import Accelerometer
 from sim.plant.imperfections import Imperfections
-from sim.plant.plant import PLANT_SAMPLE_RATE
 from sim.transport.far_end import linked_urls
 
 FIRMWARE_FOLDER = Path(__file__).parents[1] / "out" / "firmware"
@@ -111,9 +109,9 @@ class Simulation:
     """A rig and the wires of its amplifiers, by name.
 
     faults: with times from when the URLs are printed; fingers: initial positions [m];
-    imperfections: in what the bench differs from the rig; sample_rate [Hz]: of sensors and fingers;
-    control: path of the control socket; until_eof: end with standard input; firmware: in the place
-    of the simulated amplifiers; links: to their pseudo-terminals.
+    imperfections: in what the bench differs from the rig; control: path of the control socket;
+    until_eof: end with standard input; firmware: in the place of the simulated amplifiers;
+    links: to their pseudo-terminals.
     """
 
     rig: Rig
@@ -121,8 +119,6 @@ class Simulation:
     faults: FaultFile = field(default_factory=lambda: FaultFile(faults=[]))
     fingers: Mapping[str, Point] = field(default_factory=dict)
     imperfections: Imperfections = field(default_factory=Imperfections)
-    sensors: Sequence[Accelerometer] = ()
-    sample_rate: float = PLANT_SAMPLE_RATE
     control: Path | None = None
     until_eof: bool = False
     firmware: Path | None = None
@@ -157,14 +153,12 @@ async def run_simulation(
         Bench,
         simulation.rig,
         now=threads.now(),
-        sample_rate=simulation.sample_rate,
         imperfections=simulation.imperfections,
     )
     if ended.is_set():
         return
     bench.place_fingers(simulation.fingers, now=threads.now())
     context = SimulationContext(bench, step=loop.step if isinstance(loop, SteppedLoop) else None)
-    context.accelerometers.place(simulation.sensors)
     await _serve(simulation, context, ended=ended, ready=ready)
 
 

@@ -12,17 +12,16 @@ import asyncio
 import math
 from collections import deque
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import replace
 from functools import lru_cache, partial
 from types import MappingProxyType
-from typing import Protocol, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 
 from drivers.playing import Voice
 from drivers.protocol.definition import CLOCK_TURN
 from drivers.protocol.records import Values
-from model.arrays import FloatArray, Point
+from model.arrays import Point
 from model.fem import Mesh
 from model.reduction.reduced_plate import ReducedPlate, reduce_plate
 from model.rig.rig import Rig
@@ -47,7 +46,7 @@ from sim.plant.fingers import (
     PlateFingers,
     measure_vibration,
 )
-from sim.plant.imperfections import Imperfections, PlateErrors, motion_of, realised
+from sim.plant.imperfections import Imperfections, motion_of, realised
 from sim.plant.plant import PLANT_SAMPLE_RATE, FingerPlacement, LoadedPlate, Plant
 
 WRONG = 0.5e-6
@@ -107,35 +106,19 @@ def _behind(known: StraightClock, now: StraightClock) -> float:
     return math.remainder(now.shown - known.at(now.time), CLOCK_TURN)
 
 
-class Probe(Protocol):
-    """A listener to the plate at fixed points, by their reduced shapes (p, r)."""
-
-    @property
-    def shapes(self) -> FloatArray:
-        """Shapes at its points."""
-
-    def record(self, times: FloatArray, accelerations: FloatArray) -> None:
-        """Take samples: times (n,) [s], one at least, accelerations (n, p) [m/s²].
-
-        Calls are contiguous.
-        """
-
-
 _TICK = 0.01  # s; of `keep_time`
 _MAX_BEHIND = 0.1  # s; of the plate behind the amplifiers, once time goes on
 _MAX_STEP = 1.0  # s; sampled at once
-_MAX_SHAPES = 16  # sets of points
 
 Voices: TypeAlias = tuple[Voice, ...]
 """What a channel plays."""
 
 
 class Bench:
-    """A simulated rig at rest at time now [s]; sample_rate [Hz]: of sensors and fingers.
+    """A simulated rig at rest at time now [s]; sample_rate [Hz]: of fingers.
 
-    Fingers load the plate as the rig's fingertip. probes: listeners beside them; imperfections: in
-    what the bench differs from the rig. Raises
-    InputError for unknown channels.
+    Fingers load the plate as the rig's fingertip. imperfections: in what the bench differs from the
+    rig. Raises InputError for unknown channels.
     """
 
     def __init__(
@@ -152,14 +135,12 @@ class Bench:
         self.imperfections = imperfections
         self.real = imperfections.plate.realised(rig)
         """The rig with the errors of plate and ERAs: what moves, and where feet stand."""
-        self._probes: list[Probe] = []
         self.time = now
         """The present time [s]."""
         # Behind the amplifiers, and advanced in few large steps: nothing acts back on them.
         self._plant = _plant_of(self.real, now)
-        self._sampled_until = now  # up to when [s] fingers and probes have samples
+        self._sampled_until = now  # up to when [s] fingers have samples
         self._fingers = PlateFingers(self._plant.reduced)
-        self._is_sampling = False
         # Fingers that are not on the plate in time yet; the newest, and those that load the plate.
         self._placements: deque[FingerPlacement] = deque()
         self.positions: Mapping[str, Point] = {}
@@ -183,9 +164,6 @@ class Bench:
         self._applied_outputs: list[Voices] = [()] * len(rig.eras)
         self._delays = [imperfections.delays.get(one.amplifier, 0.0) for one in self._wired]
         self._errors = [imperfections.errors_of(era.name, rig) for era in rig.eras]
-        self._shapes_at = lru_cache(_MAX_SHAPES)(
-            lambda points: self._plant.reduced.at(np.frombuffer(points).reshape(-1, 2))
-        )
         # Voices that moved the base of an ERA, with the time of their end [s].
         self._played: deque[tuple[int, Voices, float]] = deque()
 
@@ -195,12 +173,6 @@ class Bench:
         self._sample_plate()
         return self._fingers
 
-    @property
-    def probes(self) -> list[Probe]:
-        """The listeners beside the fingers, which have all samples up to the present time."""
-        self._sample_plate()
-        return self._probes
-
     def advance(self, now: float) -> None:
         """Advance to a time [s]; each event happens at its own time."""
         self._advance(now)
@@ -208,8 +180,8 @@ class Bench:
             self._sample_what_is_solved()
 
     def _advance(self, now: float) -> None:
-        """Advance the amplifiers to a time [s], and the plate with them if probes listen."""
-        if now - self.time > HISTORY_DURATION and not self._probes:  # older samples are not kept
+        """Advance the amplifiers to a time [s]; the plate may stay behind."""
+        if now - self.time > HISTORY_DURATION:  # older samples are not kept
             self._sample_plate()
             self._advance_amplifiers(now - HISTORY_DURATION)
             self._sampled_until = self.time
@@ -219,17 +191,10 @@ class Bench:
             self._sample_plate()
         self._advance_amplifiers(now)
         behind = self.time - self._sampled_until
-        if self._probes or behind > HISTORY_DURATION:
+        if behind > HISTORY_DURATION:
             self._sample_plate()
         elif behind > _MAX_STEP:
             self._sample_what_is_solved()
-
-    def shapes_at(self, points: FloatArray) -> FloatArray:
-        """Reduced shapes (p, r) at points (p, 2) [m].
-
-        Valid until fingers that load the plate change.
-        """
-        return self._shapes_at(points.tobytes())
 
     def exchange(self, amplifier: str, name: str, values: Values, *, now: float) -> Values:
         """Return the values of an amplifier's reply to a request at a time [s]; raises Refusal."""
@@ -289,23 +254,6 @@ class Bench:
         """The first of the fingers that are to be placed whose plate is not solved, if any."""
         return next((one for one in self._placements if not one.is_solved), None)
 
-    def change_plate(self, errors: PlateErrors, *, now: float) -> None:
-        """Replace plate and ERAs by those of these errors, at rest; what plays drives them on.
-
-        Raises InputError for ERAs that do not support the plate, which changes nothing.
-        """
-        self.advance(now)
-        self._sample_plate()
-        real = errors.realised(self.rig)
-        plant = _plant_of(real, self.time)
-        plant.set_contacts(self._plant.contacts)
-        for index, playing in enumerate(self._applied_outputs):
-            plant.set_input(index, self._motion(index, playing, self._clock_of(index)))
-        self.imperfections = replace(self.imperfections, plate=errors)
-        self.real, self._plant = real, plant
-        self._shapes_at.cache_clear()
-        self._fingers.place(self._fingers.layout.positions, reduced=plant.reduced)
-
     def records(self, since: float, until: float) -> tuple[dict[str, FingerRecord], list[float]]:
         """The record of each finger in a window of the last ten seconds [s], by id.
 
@@ -361,7 +309,7 @@ class Bench:
         solves: fingers that are unsolved by then; otherwise to the first of them.
         """
         end = min(until, self.time)
-        while self._placements and self._placements[0].time <= end and not self._is_sampling:
+        while self._placements and self._placements[0].time <= end:
             if not (solves or self._placements[0].is_solved):
                 end = self._placements[0].time
                 break
@@ -375,37 +323,23 @@ class Bench:
     def _place(self, placement: FingerPlacement) -> None:
         """Advance the plate to the time of a placement, and put its fingers on it."""
         self._sample_until(placement.time)
-        before = self._plant.reduced
         self._plant.set_contacts(placement.contacts, loaded=placement.solved())
-        if self._plant.reduced is not before:
-            self._shapes_at.cache_clear()
         self._fingers.place(placement.positions, reduced=self._plant.reduced)
 
     def _sample_until(self, end: float) -> None:
-        """Advance the plate to a time [s], sampled if there are fingers or probes."""
-        if self._sampled_until >= end or self._is_sampling:  # probes look at the fingers
+        """Advance the plate to a time [s], sampled if there are fingers."""
+        if self._sampled_until >= end:
             return
-        self._is_sampling = True
-        try:
-            self._sampled_until = end
-            if not (self._fingers.layout.positions or self._probes):
-                self._plant.skip(end)
-                return
-            shapes = [self._fingers.layout.shapes, *(probe.shapes for probe in self._probes)]
-            times, felt = self._plant.advance(
-                end,
-                sample_rate=self.sample_rate,
-                shapes=np.concatenate(shapes),
-                precision=np.float64 if self._probes else np.float32,  # of what fingers keep
-            )
-            if len(times):
-                ends = np.cumsum([len(each) for each in shapes])[:-1]
-                under_fingers, *others = np.split(felt, ends, axis=1)
-                self._fingers.record(times, under_fingers)
-                for probe, part in zip([*self._probes], others, strict=True):
-                    probe.record(times, part)
-        finally:
-            self._is_sampling = False
+        self._sampled_until = end
+        layout = self._fingers.layout
+        if not layout.positions:
+            self._plant.skip(end)
+            return
+        times, accelerations = self._plant.advance(
+            end, sample_rate=self.sample_rate, shapes=layout.shapes, precision=np.float32
+        )
+        if len(times):
+            self._fingers.record(times, accelerations)
 
     def _update_plant(self) -> None:
         """Pass on to the plant what channels play, and by which clock, after their delay."""

@@ -1,12 +1,8 @@
-"""Sensors on the plate: fingertips, whose samples are kept for ten seconds, and accelerometers.
+"""Fingertips on the plate, whose samples are kept for ten seconds.
 
-The load of a finger on the plate is in `sim.plant.plant`. A reading of an accelerometer is the
-acceleration times its scale, plus white noise up to half the sampling rate, clipped to its range
-and rounded to its resolution. Not modelled: its mass, resonance, anti-alias filter, cross-axis
-sensitivity and delay.
+The load of a finger on the plate is in `sim.plant.plant`.
 """
 
-import math
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -178,74 +174,13 @@ def felt_peaks(times: FloatArray, samples: FloatArray) -> FloatArray:
     return np.asarray(np.abs(felt_part(samples, round(rate, 3))).max(axis=0))
 
 
-def fit_tones(
-    times: FloatArray,
-    samples: FloatArray,
-    frequencies: Sequence[float],
-    *,
-    with_offset: bool = False,
-) -> ComplexArray:
+def fit_tones(times: FloatArray, samples: FloatArray, frequencies: Sequence[float]) -> ComplexArray:
     """Complex amplitudes a (f, p) of Im[a exp(i omega t)] in samples (n, p), by least squares.
 
-    frequencies [Hz]; with_offset: fit a constant, too.
+    frequencies [Hz].
     """
     angles = 2 * np.pi * np.outer(times, np.asarray(frequencies, dtype=float))
-    offset = np.ones((len(times), int(with_offset)))
-    basis = np.hstack([np.sin(angles), np.cos(angles), offset])
+    basis = np.hstack([np.sin(angles), np.cos(angles)])
     fit = np.linalg.lstsq(basis, samples, rcond=None)[0]
     count = len(frequencies)
-    return np.asarray(fit[:count] + 1j * fit[count : 2 * count])
-
-
-@dataclass(frozen=True)
-class Accelerometer:
-    """A sensor at x, y [m].
-
-    noise_density [m/s²/sqrt(Hz)]; reach: range, plus or minus [m/s²]; resolution: step [m/s²], 0
-    for none; scale: reading per acceleration.
-    """
-
-    name: str
-    x: float
-    y: float
-    noise_density: float = 0.0
-    reach: float = math.inf
-    resolution: float = 0.0
-    scale: float = 1.0
-
-    def __post_init__(self) -> None:
-        """Check the ranges."""
-        for key in ("x", "y", "noise_density", "resolution", "scale"):
-            if not math.isfinite(getattr(self, key)):
-                raise InputError(
-                    f"sensor {self.name}: {key} must be finite, got {getattr(self, key)}"
-                )
-        if self.noise_density < 0 or self.resolution < 0 or not self.reach > 0:
-            raise InputError(
-                f"sensor {self.name}: noise density and resolution must be >= 0, reach > 0, got "
-                f"{self.noise_density:g}, {self.resolution:g}, {self.reach:g}"
-            )
-
-
-def positions(sensors: Sequence[Accelerometer]) -> FloatArray:
-    """Positions of sensors [m], (s, 2)."""
-    return np.array([[sensor.x, sensor.y] for sensor in sensors], dtype=float).reshape(-1, 2)
-
-
-def readings(
-    sensors: Sequence[Accelerometer],
-    accelerations: FloatArray,
-    *,
-    sample_rate: float,
-    rng: np.random.Generator,
-) -> FloatArray:
-    """Readings (n, s) [m/s²] of sensors for accelerations (n, s) [m/s²]."""
-    density = np.array([one.noise_density for one in sensors])
-    reach = np.array([one.reach for one in sensors])
-    resolution = np.array([one.resolution for one in sensors])
-    found = accelerations * [one.scale for one in sensors]
-    # White noise of this density up to half the sampling rate has this standard deviation.
-    found += density * math.sqrt(sample_rate / 2) * rng.standard_normal(found.shape)
-    found = np.clip(found, -reach, reach)
-    step = np.where(resolution > 0, resolution, 1.0)
-    return np.where(resolution > 0, step * np.round(found / step), found)
+    return np.asarray(fit[:count] + 1j * fit[count:])

@@ -24,7 +24,7 @@ from model.errors import InputError
 from model.rig.rig import Channel, Rig
 from model.rig.rig_file import mesh_of
 from model.spectral.modes import PlateMesh
-from model.structure.attachments import Fingertip, FingertipLoad, PointLoad, fingertip_loads
+from model.structure.attachments import Fingertip, FingertipLoad, fingertip_loads
 from model.structure.exciter import Actuator
 from model.study.verification import draw_plates
 from model.transients.base_motion import BaseEnvelope, Motion, Term, along_lines, raised_cosine
@@ -65,9 +65,9 @@ class PlateErrors:
     """A plate on its ERAs relative to the rig's: factors, by default 1.
 
     stiffness: by ERA; places [m]: by ERA, by how far it is off; era_damping: of all ERAs; feet: of
-    the stiffness of each foot, by its number among the rig's masses; masses: on the plate beside
-    the rig's; mesh: on which it is solved, None for the rig's; modes: eigenvalue and squared size
-    (2, m) of each of the lowest elastic modes.
+    the stiffness of each foot, by its number among the rig's masses; mesh: on which it is solved,
+    None for the rig's; modes: eigenvalue and squared size (2, m) of each of the lowest elastic
+    modes.
     """
 
     thickness: float = 1.0
@@ -77,7 +77,6 @@ class PlateErrors:
     stiffness: Mapping[str, float] = field(default_factory=dict)
     places: Mapping[str, Point] = field(default_factory=dict)
     feet: Mapping[int, float] = field(default_factory=dict)
-    masses: tuple[PointLoad, ...] = ()
     mesh: PlateMesh | None = None
     modes: Sequence[Sequence[float]] = field(default_factory=lambda: [[], []])
 
@@ -116,7 +115,7 @@ class PlateErrors:
             rig,
             plate=plate,
             eras=tuple(map(of, rig.eras)),
-            masses=(*masses, *self.masses),
+            masses=tuple(masses),
             mesh=self.mesh or rig.mesh,
         )
 

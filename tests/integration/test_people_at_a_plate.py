@@ -38,7 +38,7 @@ from controller.daemon.daemon import check_daemon
 from controller.demo.demonstration import Scene, example_scenes, run_demo
 from controller.effects.layout import load_layout
 from controller.sources.tuio import read_capture
-from examples.make_measured import record_responses, scanning_grid
+from examples.make_measured import Accelerometer, record_responses, scanning_grid
 from kit.clock import in_virtual_time, run_virtual
 from kit.desk_plate import DeskModel, draw_truth
 from kit.fingers import write_schedule
@@ -76,7 +76,6 @@ from processes.floods import flood
 from processes.gateways import TOKEN, gateway_process, real_daemon, wait_for
 from processes.patient_daemon import RESTING, wait_long
 from processes.sound_cards import SoftAmp, capture_on, jack_server
-from sim.plant.fingers import Accelerometer
 
 EXAMPLES = Path(model.__file__).parents[1] / "examples"
 

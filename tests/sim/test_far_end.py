@@ -1,10 +1,8 @@
-"""Parts of a far end: terminals, delays of lines, programs of the firmware, recordings.
+"""Parts of a far end: terminals, delays of lines, programs of the firmware.
 
-Delays are by the numbers of their standards and data sheets; recordings of accelerometers and of
-fingers are written to files and read back.
+Delays are by the numbers of their standards and data sheets.
 """
 
-import math
 import os
 import signal
 import statistics
@@ -14,55 +12,14 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from drivers.playing import AmplifierTone
 from model.errors import InputError
 from registry import threads
 from sim import simulation
-from sim.plant.fingers import Accelerometer, readings
-from sim.sensors import Recording
 from sim.transport.far_end import linked_urls, links_by_amplifier
 from sim.transport.simulated_line import LINE_KINDS, Latency, LineKind
-
-RATE = 5000.0
-
-
-def recording(samples: np.ndarray, *, start: float = 0.0) -> Recording:
-    """A recording of sensors P1, P2, ... somewhere."""
-    names = tuple(f"P{n + 1}" for n in range(samples.shape[1]))
-    return Recording(names, np.zeros((samples.shape[1], 2)), RATE, start, samples)
-
-
-def test_accelerometer_noise_is_white_and_has_its_density() -> None:
-    """White noise of 0.002 m/s²/sqrt(Hz) over 2500 Hz is 0.1 m/s² rms, and flat."""
-    sensor = Accelerometer("P1", 0, 0, noise_density=0.002)
-    rng = np.random.default_rng(1)
-    read = readings([sensor], np.zeros((200_000, 1)), sample_rate=RATE, rng=rng)
-    assert read.std() == pytest.approx(0.002 * math.sqrt(2500), rel=0.01)
-    power = np.abs(np.fft.rfft(read[:, 0])) ** 2
-    low, high = power[1:50_000].mean(), power[50_000:].mean()
-    assert low == pytest.approx(high, rel=0.03)
-
-
-def test_accelerometer_applies_scale_range_and_resolution() -> None:
-    """A reading is scaled, clipped and rounded."""
-    sensor = Accelerometer("P1", 0, 0, reach=5.0, resolution=0.25, scale=2.0)
-    truth = np.array([[0.1], [0.2], [1.06], [40.0], [-40.0]])
-    read = readings([sensor], truth, sample_rate=RATE, rng=np.random.default_rng(0))
-    assert read[:, 0].tolist() == [0.25, 0.5, 2.0, 5.0, -5.0]
-
-
-def test_tones_are_told_apart_with_their_phases() -> None:
-    """Two tones 10 Hz apart and an offset, at a late time."""
-    t = 4321.7 + np.arange(1000) / RATE
-    signal = 2 * np.sin(2 * np.pi * 110 * t + 0.7) + 0.3 * np.sin(2 * np.pi * 120 * t - 2) + 5
-    found = recording(signal[:, None], start=4321.7).tones([110.0, 120.0])
-    np.testing.assert_allclose(found[:, 0], [2 * np.exp(0.7j), 0.3 * np.exp(-2j)], atol=1e-6)
-    with pytest.raises(InputError, match="4"):
-        recording(signal[:4, None]).tones([110.0, 120.0])
-
 
 HALF_STROKE = AmplifierTone(0, 110.0, 0.5)
 

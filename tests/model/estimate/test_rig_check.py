@@ -21,7 +21,7 @@ from cases import read_yaml, shortly
 from controller.cli import rig_cli
 from era_haptics.command import run_era
 from era_haptics.lab.measuring import measure_cli as measure_cli  # sets `measure_by_card`
-from examples.make_measured import record_responses, scanning_grid
+from examples.make_measured import Accelerometer, record_responses, scanning_grid
 from kit.plates import (
     DISTORTIONS,
     as_sold,
@@ -65,7 +65,6 @@ from model.rig.rig_file import example_rig_path, load_rig, parse_rig
 from model.rig.rig_writing import change_rig
 from model.spectral.direct_solution import direct_spectral_acceleration
 from model.spectral.modes import SpectralMesh
-from sim.plant.fingers import Accelerometer
 
 TONES = np.arange(91.0, 300.0, 20.0)
 NAMES = ("NE", "NW", "SW", "SE")

@@ -47,9 +47,8 @@ from sim.amplifier.readings import AmplifierSummary
 from sim.amplifier.simulated_amplifier import SimulatedAmplifier
 from sim.far_ends.wire_assignment import SimulatedWire
 from sim.faults import FaultKind, FaultWindow
-from sim.plant.fingers import Accelerometer, FeltVibration
+from sim.plant.fingers import FeltVibration
 from sim.plant.imperfections import Imperfections, draw_imperfections
-from sim.sensors import Accelerometers, Recording
 
 Position = tuple[float, float]
 Finger = tuple[int, float, float]
@@ -511,6 +510,14 @@ ONSET = 0.1  # s; over which an onset is judged
 
 
 @dataclass(frozen=True)
+class Recording:
+    """Accelerations of all sensors: times (n,) [s], samples (n, s) [m/s²]."""
+
+    times: FloatArray
+    samples: FloatArray
+
+
+@dataclass(frozen=True)
 class Heard:
     """A situation as it was on the plate, from start to end [s].
 
@@ -582,16 +589,14 @@ def play_stream(
 
 @dataclass
 class Streamed(Chain):
-    """A chain with sensors, to which a stream is sent."""
+    """A chain with sensors, to which a stream is sent; sensors are fingers that load nothing."""
 
     def __post_init__(self) -> None:
-        """Place the sensors."""
+        """Note how far off the clocks are."""
         super().__post_init__()
         self.is_felt = False
         self._counted: list[tuple[float, Mapping[str, float]]] = []
         self.controller.cycle.observers.reported.append(self._note_clocks)
-        self._sensors = Accelerometers(self.far.bench)
-        self._sensors.place([Accelerometer(name, *at) for name, at in SENSORS.items()])
 
     async def send(self, stream: Stream) -> list[float]:
         """Deliver a stream at its pace; return the times of its changes [s]."""
@@ -608,25 +613,36 @@ class Streamed(Chain):
         bench.advance(threads.now())
         heard = Heard(situation, begin, end)
         if situation.target is None:
-            return replace(heard, fading=self._sensors.read(begin, end))
+            return replace(heard, fading=self._recorded(begin, end))
         applied = [each for each in self.applied if begin <= each.time < end]
-        steady = bench.felt(end - STEADY, end)
+        steady = self._felt(end - STEADY, end)
         heard = replace(
             heard,
             patterns=tuple(map(_pattern, applied)),
             clocks=next((each for time, each in reversed(self._counted) if time < end), {}),
             steady=steady,
             phasors=_phasors(
-                self._sensors.read(end - STEADY, end),
+                self._recorded(end - STEADY, end),
                 np.array(next(iter(steady.values())).frequencies),
             ),
         )
         if not situation.from_rest:
             return heard
-        first = self._sensors.read(begin, begin + 2 * ONSET)
+        first = self._recorded(begin, begin + 2 * ONSET)
         motion = np.abs(first.samples).max(axis=1)
         onset = float(first.times[np.argmax(motion > 1e-3 * motion.max())])
-        return replace(heard, onset=bench.felt(onset, onset + ONSET))
+        return replace(heard, onset=self._felt(onset, onset + ONSET))
+
+    def _felt(self, since: float, until: float) -> dict[str, FeltVibration]:
+        """Vibration at each finger in a window [s], by place."""
+        vibrations = self.far.bench.felt(since, until)
+        return {place: felt for place, felt in vibrations.items() if place not in SENSORS}
+
+    def _recorded(self, since: float, until: float) -> Recording:
+        """Readings of the sensors in a window [s]."""
+        records = self.far.bench.fingers.felt(since, until)
+        centres = [records[name].accelerations[:, 0] for name in SENSORS]
+        return Recording(records["P1"].times, np.stack(centres, axis=1))
 
     def _note_clocks(self, applied: PlayReport) -> None:
         """Keep how far off clocks are counted in what has just begun to play."""
@@ -636,8 +652,9 @@ class Streamed(Chain):
     def _touch(self, stream: Stream, fingers: Mapping[int, str]) -> None:
         """Rest fingers on places; at the others they only feel."""
         self.at = {id: stream.places[name] for id, name in fingers.items()}
-        observers = stream.places.keys() - {*fingers.values()}
-        self.far.bench.place_fingers(stream.places, now=threads.now(), observers=observers)
+        positions = {**stream.places, **SENSORS}
+        observers = positions.keys() - {*fingers.values()}
+        self.far.bench.place_fingers(positions, now=threads.now(), observers=observers)
 
 
 def _pattern(applied: PlayReport) -> Mapping[str, Any]:

@@ -39,7 +39,7 @@ from era_haptics.lab.measuring.sound_card import (
     WiredSensor,
     multisine_frequencies,
 )
-from examples.make_measured import record_responses
+from examples.make_measured import Accelerometer, record_responses
 from kit.desk_plate import Converters, DeskModel, DeskPlate, Truth
 from kit.plates import exciter_rig_text
 from model.arrays import Float32Array, FloatArray
@@ -49,7 +49,6 @@ from model.rig.rig import Rig, Uncertainty
 from model.rig.rig_file import example_rig_path, load_rig, parse_rig
 from model.structure.attachments import PointLoad
 from processes.sound_cards import DeskCard, ExciterCircuit
-from sim.plant.fingers import Accelerometer
 from sim.soft_amp.engine import callback_address
 
 PLACES = ((0.03, 0.05), (0.20, 0.11))

@@ -24,7 +24,7 @@ from registry.streams import protect_streams
 from registry.wording import reworded
 
 SECTIONS = {
-    "Try": ("demo", "sim", "figure"),
+    "Try": ("demo", "sim"),
     "Plate": (
         "config",
         "plate",

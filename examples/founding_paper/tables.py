@@ -15,17 +15,18 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-
-from era_haptics.lab.paper_figures import (
+from paper_figures import (
     SWEEP,
     PaperFigure,
+    diagonal_pair,
     pair_map,
     paper_figures,
     with_stiffness,
 )
+
 from model.fem import Mesh
 from model.reduction.free_plate import solve_free_plate
-from model.rig.rig import Rig, diagonal_pair
+from model.rig.rig import Rig
 from model.rig.rig_file import load_rig
 from model.structure.plate import Plate
 from model.vibration import NULL_SHARE, G, find_nulls, natural_modes

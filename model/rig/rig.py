@@ -10,21 +10,20 @@ import hashlib
 import json
 import math
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
-from itertools import combinations
 from numbers import Real
 from typing import Any
 
 import numpy as np
 
-from model.arrays import FloatArray, best_of
+from model.arrays import FloatArray
 from model.config.document import Document
 from model.errors import InputError, expect_between
 from model.finger import DEFAULT_THRESHOLD, FINGERTIP_RADIUS, THRESHOLDS
 from model.spectral.modes import PlateMesh
-from model.structure.attachments import FEET_DEVIATE, Fingertip, PointLoad, Source, feet_of
+from model.structure.attachments import FEET_DEVIATE, Fingertip, PointLoad, feet_of
 from model.structure.exciter import Actuator, OneKind
 from model.structure.plate import Laminate, Plate
 from registry.limits import GuardLimits
@@ -456,35 +455,3 @@ def alike(era: OneKind, positions: FloatArray) -> tuple[OneKind, ...]:
         replace(era, name=f"E{number}", x=float(x), y=float(y))
         for number, (x, y) in enumerate(positions, start=1)
     )
-
-
-def edge_pair(eras: Sequence[Source]) -> tuple[int, int]:
-    """Two ERAs side by side along the plate's x axis: most alike in y, then furthest apart in x."""
-
-    def order(pair: tuple[int, int]) -> tuple[float, float]:
-        across, along = abs(_apart(eras, pair))[::-1]
-        return _rounded(across), -_rounded(along)
-
-    return min(_pairs(eras), key=order)
-
-
-def diagonal_pair(eras: Sequence[Source]) -> tuple[int, int]:
-    """The two ERAs that are furthest apart; the first of several such pairs."""
-    pairs = _pairs(eras)
-    return pairs[best_of([np.hypot(*_apart(eras, pair)) for pair in pairs])]
-
-
-def _pairs(eras: Sequence[Source]) -> list[tuple[int, int]]:
-    if len(eras) < 2:
-        raise InputError(f"ERAs of the rig must be at least two to drive a pair, got {len(eras)}")
-    return list(combinations(range(len(eras)), 2))
-
-
-def _apart(eras: Sequence[Source], pair: tuple[int, int]) -> FloatArray:
-    first, second = (eras[index] for index in pair)
-    return np.array([second.x - first.x, second.y - first.y])
-
-
-def _rounded(distance: float) -> float:
-    """A distance [m] without the rounding errors that would decide between equal pairs."""
-    return round(float(distance), 9)

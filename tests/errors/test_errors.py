@@ -22,7 +22,6 @@ from era_haptics.command import run_era
 from era_haptics.lab.design.problem import (
     area_of,
 )
-from era_haptics.lab.paper_figures import paper_figures
 from kit.outside_files import READERS, RIG
 from model.config.document import read_document
 from model.config.units import parse_frequencies
@@ -108,7 +107,6 @@ WRITING = {
     "table export table.npz --format mat -o out.mat": "model.study.overview.export_mat",
     "plate map rig.yaml --drive SW=110 -o out.png": "model.vibration.plate_map",
     "calibrate rig.yaml measured.csv -o out.yaml": "model.estimate.calibrate.calibrate",
-    "figure 10 rig.yaml -o figures": "era_haptics.lab.paper_figures.paper_figures",
     "design rig.yaml -o design --layouts random:2": (
         "era_haptics.lab.design.design_run.rank_layouts"
     ),
@@ -226,7 +224,6 @@ PARSERS: dict[str, Callable[[str], object]] = {
     "frequencies": parse_frequencies,
     "scheduler": lambda text: [*on_cluster(text, divmod, 1, {0: 1})],
     "material": material,
-    "figure": lambda text: [*paper_figures(RIG, text)],
     "mesh": lambda text: mesh_of(text, RIG.plate, frequency_max=500.0),
     "mesh of ten metres": lambda text: mesh_of(text, TEN_METRES, frequency_max=500.0),
     "wire": lambda text: simulated(URL, *text.split()),

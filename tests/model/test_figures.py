@@ -9,10 +9,10 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+from paper_figures import PaperFigure, paper_figures
 from tables import claims, stiffness_study, tables
 
 from era_haptics.command import run_era
-from era_haptics.lab.paper_figures import PaperFigure, paper_figures
 from kit.plates import make_paper_rig, small_table, with_strokes, write_rig
 from model.figures import answer_figure, levels_figure
 from model.rig.rig_file import load_rig

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from paper_figures import diagonal_pair, edge_pair
 
 from controller.rig_file_check import check_rig
 from era_haptics.command import run_era
@@ -25,7 +26,7 @@ from model.fem import assemble
 from model.reduction.free_plate import solve_free_plate
 from model.reduction.reduced_plate import reduce_plate
 from model.rig import rig_writing
-from model.rig.rig import FOUR_ERA_LAYOUTS, Channel, Rig, Uncertainty, diagonal_pair, edge_pair
+from model.rig.rig import FOUR_ERA_LAYOUTS, Channel, Rig, Uncertainty
 from model.rig.rig_file import load_rig, parse_mesh, parse_rig
 from model.rig.rig_summary import gain_notes
 from model.rig.rig_writing import (

@@ -1,14 +1,18 @@
-"""`era figure`: the figures of the founding paper for any rig, with the numbers drawn.
+"""Draw the figures of the founding paper for any rig, each with a CSV file of its numbers.
 
-Frequencies, layouts and stiffnesses are the paper's; `examples/founding_paper` compares the numbers
-with those in the paper.
+    python examples/founding_paper/paper_figures.py RIG DIR
+
+Frequencies, layouts and stiffnesses are the paper's; `tables.py` compares the numbers with the
+paper's claims.
 """
 
 import math
+import sys
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import combinations
+from pathlib import Path
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -16,11 +20,12 @@ from matplotlib.patches import Rectangle
 
 from model.arrays import FloatArray, best_by, best_of, lattice
 from model.errors import InputError
-from model.figures import MapPanel, draw_eras, label_plate, maps_figure, raster
-from model.files.csv_file import Columns
+from model.figures import MapPanel, draw_eras, label_plate, maps_figure, raster, save_figure
+from model.files.csv_file import Columns, write_columns
 from model.finger import Grid
 from model.reduction.free_plate import FreePlate, solve_free_plate
-from model.rig.rig import FOUR_ERA_LAYOUTS, Rig, alike, diagonal_pair, edge_pair
+from model.rig.rig import FOUR_ERA_LAYOUTS, Rig, alike
+from model.rig.rig_file import load_rig
 from model.structure.exciter import Actuator
 from model.structure.plate import Plate
 from model.vibration import G, Tone, natural_modes, plate_map
@@ -205,6 +210,38 @@ def _stiffnesses(rig: Rig, free: FreePlate) -> PaperFigure:
     return _maps("figure_13_maps", panels, columns=2, caption=f"{names} at 250 Hz")
 
 
+def edge_pair(eras: Sequence[Actuator]) -> tuple[int, int]:
+    """Two ERAs side by side along the plate's x axis: most alike in y, then furthest apart in x."""
+
+    def order(pair: tuple[int, int]) -> tuple[float, float]:
+        across, along = abs(_apart(eras, pair))[::-1]
+        return _rounded(across), -_rounded(along)
+
+    return min(_pairs(eras), key=order)
+
+
+def diagonal_pair(eras: Sequence[Actuator]) -> tuple[int, int]:
+    """The two ERAs that are furthest apart; the first of several such pairs."""
+    pairs = _pairs(eras)
+    return pairs[best_of([np.hypot(*_apart(eras, pair)) for pair in pairs])]
+
+
+def _pairs(eras: Sequence[Actuator]) -> list[tuple[int, int]]:
+    if len(eras) < 2:
+        raise InputError(f"ERAs of the rig must be at least two to drive a pair, got {len(eras)}")
+    return list(combinations(range(len(eras)), 2))
+
+
+def _apart(eras: Sequence[Actuator], pair: tuple[int, int]) -> FloatArray:
+    first, second = (eras[index] for index in pair)
+    return np.array([second.x - first.x, second.y - first.y])
+
+
+def _rounded(distance: float) -> float:
+    """A distance [m] without the rounding errors that would decide between equal pairs."""
+    return round(float(distance), 9)
+
+
 def with_stiffness(eras: Sequence[Actuator], stiffness: float) -> tuple[Actuator, ...]:
     """The same ERAs with another stiffness [N/m]; each keeps its damping ratio, c / sqrt(k_b)."""
     factors = [stiffness / era.stiffness for era in eras]
@@ -251,3 +288,18 @@ _FIGURES: dict[str, tuple[Callable[[Rig, FreePlate], PaperFigure], ...]] = {
     "12": (_switched,),
     "13": (_stiffnesses,),
 }
+
+
+def main() -> None:
+    """Draw all figures of a rig into a folder."""
+    rig_file, folder = map(Path, sys.argv[1:])
+    folder.mkdir(parents=True, exist_ok=True)
+    for made in paper_figures(load_rig(rig_file), "all"):
+        save_figure(made.figure, folder / f"{made.name}.png")
+        for suffix, columns in made.tables.items():
+            write_columns(folder / f"{made.name}{suffix}.csv", columns)
+        print(f"wrote {folder / made.name}.png")
+
+
+if __name__ == "__main__":
+    main()

@@ -99,22 +99,32 @@ export class PlateOverlay {
     return element("circle", { class: name, cx: x_m, cy: this.flip(y_m), r: radius });
   }
 
+  // Left edge of a text centred at x, moved so that the text lies within the plate.
+  textLeft(x, text) {
+    const width = textWidth(text) * this.px;
+    return Math.max(0, Math.min(this.rig.length_m - width, x - width / 2));
+  }
+
   label([x, y], text, name = "label") {
     const size = TEXT_PX * this.px;
-    const room = textWidth(text) * this.px;
-    const anchor = x < room / 2 ? "start" : x > this.rig.length_m - room / 2 ? "end" : "middle";
+    const width = textWidth(text) * this.px;
+    const left = this.textLeft(x, text);
+    const right = left + width;
+    // The width is an estimate: a text at an edge of the plate starts or ends exactly there.
+    let [anchorX, anchor] = [x, "middle"];
+    if (left === 0) [anchorX, anchor] = [0, "start"];
+    else if (left < x - width / 2) [anchorX, anchor] = [right, "end"];
     const height = Math.min(this.rig.width_m - size / 2, Math.max(size, y));
-    const left = x - { start: 0, middle: room / 2, end: room }[anchor];
     const top = name === "label" ? height - size : height;  // names are aligned at their top
-    if (text) this.occupied.push([left, top, left + room, top + 1.2 * size]);
-    return element("text", { class: name, x, y: height, "font-size": size, "text-anchor": anchor }, text);
+    if (text) this.occupied.push([left, top, right, top + 1.2 * size]);
+    return element("text", { class: name, x: anchorX, y: height, "font-size": size, "text-anchor": anchor }, text);
   }
 
   // First of several positions where a text covers nothing.
   firstFree(positions, text, isTopAligned = false) {
     const [room, size] = [textWidth(text) * this.px, TEXT_PX * this.px];
     return positions.find(([x, y]) => {
-      const left = Math.min(this.rig.length_m - room, Math.max(0, x - room / 2));
+      const left = this.textLeft(x, text);
       const top = isTopAligned ? y : y - size;
       const isInside = top >= 0 && top + size <= this.rig.width_m;
       return isInside && this.occupied.every((box) => left >= box[2] || left + room <= box[0] || top >= box[3] || top + size <= box[1]);

@@ -161,7 +161,8 @@ def _check_npy_header(
         raise ValueError(f"{name}: type must be {expected}, got {shown(dtype.str)}")
     # A dimension of an array without values could be any number.
     if any(type(count) is not int or not 0 <= count <= member_bytes for count in shape):
-        raise ValueError(f"{name}: dimensions must be whole numbers from 0 to {member_bytes}, got {shown(str(shape))}")
+        rule = f"dimensions must be whole numbers from 0 to {member_bytes}"
+        raise ValueError(f"{name}: {rule}, got {shown(str(shape))}")
     size = dtype.itemsize * math.prod(shape)  # Python integers: no overflow
     if size + stream.tell() != member_bytes:
         raise ValueError(f"{name}: size must be that of the member, got {size} bytes")

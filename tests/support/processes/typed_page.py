@@ -517,14 +517,18 @@ class Reader:
     def _wait_for(self, line: int, terminal: str, shown: str) -> None:
         process, output = self._terminals[terminal]
         latest = time.monotonic() + READER_PATIENCE
+        # Lines without numbers or names match nothing at all, so the lines are counted too.
+        shown_lines = [line for line in shown.splitlines() if line.strip() not in ("", GAP)]
         while True:
             ended = process.poll() is not None or time.monotonic() > latest
             printed = output.read_text(encoding="utf-8")
             wanted = self._with_its_terminal(shown.rstrip("\n") + "\n...", printed)
-            if difference(wanted, printed) is None:
+            is_complete = len(printed.splitlines()) >= len(shown_lines)
+            if is_complete and difference(wanted, printed) is None:
                 return
-            if ended:  # and whatever it has printed until then has been read since
+            if ended:  # everything printed until then has been read
                 _compare(line, wanted, printed)
+                raise PageError(f"line {line}: {len(shown_lines)} lines shown, printed:\n{printed}")
             time.sleep(LOOK_AGAIN)
 
     def _with_its_terminal(self, shown: str, printed: str) -> str:

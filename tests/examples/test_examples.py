@@ -614,7 +614,9 @@ async def test_connection_is_made_again_with_topics_and_lease(tmp_path: Path) ->
             b"TypeError y_m must be a finite number, got Infinity\n",
         }
         while awaited:
-            awaited -= {await asyncio.wait_for(process.stdout.readline(), PATIENCE)}
+            line = await asyncio.wait_for(process.stdout.readline(), PATIENCE)
+            assert line, (await process.stderr.read()).decode()  # else the program has ended
+            awaited.discard(line)
         for connection in list(bench.daemon._server.clients):
             connection.abort()
         await asyncio.sleep(4)  # longer than the lease

@@ -6,7 +6,8 @@ own, or an `edit` of the prepared ones; what happens `before`; the exit `status`
 `make test-long` takes. Entries under `variants` share their command line. A case that names
 era.sock finds a daemon there.
 
-Those `shown` are quoted in docs/reference/errors.md; `make pages` writes these quotations.
+Cases with `shown` are quoted in docs/reference/errors.md. `make pages` writes these quotations,
+between `<!-- begin: cases of tests/errors -->` and `<!-- end -->`.
 """
 
 import contextlib
@@ -268,7 +269,7 @@ class Quotation:
 def quotations(page: str) -> list[Quotation]:
     """The errors of the page in their order, each with the exit status of its section.
 
-    Blank lines part those of a section; a first line of words says what the message does not.
+    Blank lines separate the errors of a block.
     """
     found, status = [], -1
     for section in page.split("\n## ")[1:]:

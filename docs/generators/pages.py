@@ -22,6 +22,7 @@ from amplifier_json import json_text
 from api_page import api_reference
 from client_stub import summaries
 from command_page import command_reference
+from conformance_page import checks
 from findings_page import finding_kinds
 from firmware_header import header
 from firmware_records import records_header
@@ -80,6 +81,7 @@ WRITTEN: Mapping[str, Sequence[Writer]] = {
     },
     "examples/javascript/api.d.ts": [whole(messages)],
     "examples/javascript/package.json": [with_version],
+    "docs/reference/conformance.md": [part("docs/generators/conformance_page.py", checks)],
     "firmware/core/protocol.h": [whole(header)],
     "firmware/core/records.h": [whole(records_header)],
     "docs/reference/amplifier.dbc": [whole(dbc_text)],

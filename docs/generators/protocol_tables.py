@@ -1,4 +1,4 @@
-"""The tables of docs/reference/{protocol,modbus,can}.md, from `drivers.protocol.definition`."""
+"""Tables of docs/reference/{protocol,modbus,can,metrics}.md, from `drivers.protocol.definition`."""
 
 import textwrap
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -50,9 +50,9 @@ _OTHERS: Mapping[str, Record] = {
     **{f"Event, {EVENT}": EVENT_RECORD, f"Nak, {NAK}": NAK_RECORD, "Identity": IDENTITY},
 }
 _MEANINGS = {
-    **{"NOT_READY": "starting, replies if it can"},
+    **{"NOT_READY": "starting; replies if it can"},
     **{"SWITCH_ON_DISABLED": "**disarmed**, high voltage off"},
-    **{"READY_TO_SWITCH_ON": "passed at once"},
+    **{"READY_TO_SWITCH_ON": "passed through immediately"},
     **{"SWITCHED_ON": "high voltage on, falling silent after a Disarm"},
     **{"OPERATION_ENABLED": "**armed**: plays, watchdog running"},
     **{"QUICK_STOP_ACTIVE": "**stopped**, latched; high voltage off once silent"},
@@ -61,24 +61,74 @@ _MEANINGS = {
     **{"NONE": "", "WATCHDOG": "not fed in time", "OVER_TEMPERATURE": "", "OVER_VOLTAGE": ""},
     **{"ARC": "", "CHANNEL": "one channel failed; all fall silent", "INTERNAL": ""},
     **{"INTERLOCK": "opened in 3, 4 or 5; gone once closed", "OVER_CURRENT": ""},
-    **{"UNKNOWN_TYPE": "no such message, or a feature that is not there"},
-    **{"BAD_LENGTH": "words are missing or too many"},
-    **{"BAD_VALUE": "a number out of range, or a bit that must be 0"},
-    **{"BAD_CHANNEL": "no such channel, or twice in a layer"},
-    **{"WRONG_STATE": "not in this state, or Arm with the interlock open"},
+    **{"UNKNOWN_TYPE": "unknown message, or its feature is missing"},
+    **{"BAD_LENGTH": "missing or extra words"},
+    **{"BAD_VALUE": "number out of range, or a bit that must be 0"},
+    **{"BAD_CHANNEL": "channel does not exist, or comes twice in a layer"},
+    **{"WRONG_STATE": "not allowed in this state, or Arm with the interlock open"},
     **{"BAD_TOKEN": "0, not newer, or not staged"},
     **{"BUSY": "the host repeats the request after 5 ms, at most twice"},
-    **{"UNSUPPORTED_VERSION": "of the frame: serial lines alone"},
-    **{"WRONG_SESSION": "another's, or one that has ended"},
-    **{"WRONG_LATCH": "Clear names another stop or fault than the last"},
-    **{"INCOMPLETE": "of a set under Commit"},
-    **{"output": "full level is a linear amplifier's output, not the stroke of a motion"},
-    **{"events": "it sends Events on this wire"},
-    **{"levels_measured": "the levels of Status are measured, not computed"},
-    **{"interlock": "it has an interlock", "electrical": "GetMeasured"},
+    **{"UNSUPPORTED_VERSION": "version of the frame, on serial lines only"},
+    **{"WRONG_SESSION": "session of another host, or one that has ended"},
+    **{"WRONG_LATCH": "Clear does not specify the last stop or fault"},
+    **{"INCOMPLETE": "Commit of a set with missing parts"},
+    **{"output": "full level is the output of a linear amplifier, not the amplitude of a motion"},
+    **{"events": "sends Events on this wire"},
+    **{"levels_measured": "levels in Status are measured, not computed"},
+    **{"interlock": "has an interlock", "electrical": "GetMeasured"},
     **{"address": "SetAddress", "mark": "Mark"},
-    **{"high_voltage": "", "interlock_open": ""},
-    **{"limited": "a sum was limited since the last Status"},
+    **{"high_voltage": "on in 3 and 4, in 5 until silent, in 6 at most until silent"},
+    **{"interlock_open": "", "limited": "a sum was limited since the last Status"},
+}
+_PURPOSES = {
+    "Hello": "returns the identity",
+    "GetCaps": "returns the capabilities",
+    "Arm": "begins a session, starts the watchdog, switches the high voltage on",
+    "Disarm": "fades all voices, then switches the high voltage off",
+    "Set": "transfers one part of a set",
+    "Commit": "starts the staged set",
+    "Silence": "fades all voices, stays armed",
+    "Stop": "fades all voices and latches",
+    "GetStatus": "returns the present state",
+    "GetFaults": "returns past faults",
+    "Clear": "acknowledges a stop or a fault",
+    "Ping": "feeds the watchdog, steers the clock",
+    "GetAchieved": "returns the commands of a layer as played",
+    "GetMeasured": "returns voltages and currents",
+    "SetAddress": "changes the address",
+    "Mark": "stores the clock",
+}
+_CAPABILITY_MEANINGS = {
+    "channels, layers": "numbers of channels and layers",
+    "voices": "voices that each channel can play; at least the number of layers",
+    "set_words": "longest stream of a set, in words",
+    "knots": "most knots of an envelope",
+    "features": "bits, listed above",
+    "frequency_min, frequency_max, level_max": "limits of the whole amplifier; "
+    "they enclose those of its channels",
+    "frequency_step, level_step, phase_step": "resolution with which it plays",
+    "ramp_max": "longest ramp",
+    "slew": "fastest change of amplitude. A steeper change is played at this slope and arrives "
+    "later; no host requests one. 0: no limit",
+    "watchdog_min, watchdog_max": "limits of the watchdog time",
+    "envelope_step_min, envelope_step_max": "limits of the step of an envelope",
+    "clock_error": "largest error of a reading of the clock, or of the output relative to the "
+    "clock, beyond a constant that all amplifiers of a product share; 65535: unknown, or the "
+    "clock cannot be steered",
+    "limits": "limits of each channel; sets are checked against these only",
+}
+_STATUS_MEANINGS = {
+    "state, fault": "fault is NONE except in the states 6 and 7",
+    "flags": "bits, listed above",
+    "latch": "number of the last stop or fault",
+    "watchdog_left": "time until the watchdog expires; 0 unless armed",
+    "temperature": "measured; 25 °C if it cannot be",
+    "high_voltage": "measured, so it falls gradually; 0 if it cannot be",
+    "clock": "see [the clock](#the-clock)",
+    "token": "committed last since Arm; 0: none",
+    "channels, layers": "as in Capabilities",
+    "levels": "amplitude that each channel may have at `clock`, or up to 0.2 ms earlier",
+    "tokens": "token of the set that each layer plays; 0: the layer is over",
 }
 
 
@@ -127,21 +177,36 @@ def messages() -> str:
     """Return the messages with the words of their requests."""
 
     def rows() -> Iterator[Sequence[object]]:
-        yield "Hello", HELLO, "–", "Identity", "", ""
+        yield "Hello", HELLO, _PURPOSES["Hello"], "–", "Identity", "", ""
         for each in MESSAGES.values():
             reply = next(name for name, record in _REPLIES.items() if record is each.reply)
             marks = ["yes" if mark else "" for mark in (each.feeds, each.is_broadcast)]
-            yield each.name, each.number, layout(each.request) or "–", reply, *marks
+            words = layout(each.request) or "–"
+            yield each.name, each.number, _PURPOSES[each.name], words, reply, *marks
 
-    return _table(
-        ("message", "number", "words of the request", "reply", "feeds", "broadcast"), rows()
-    )
+    head = ("message", "number", "purpose", "words of the request", "reply", "feeds", "broadcast")
+    return _table(head, rows())
 
 
 def records() -> str:
     """Return the words of replies and of the parts of a set."""
     rows = ((name, layout(record)) for name, record in {**_OTHERS, **_REPLIES}.items())
     return _table(("record", "words"), rows)
+
+
+def fields(record: Record, meanings: Mapping[str, str]) -> str:
+    """Return the fields of a record with their meanings; raises ValueError if one has none."""
+    explained = [name for names in meanings for name in names.split(", ")]
+    names = list[str]()
+    for field in record.fields:
+        names += dict(field.parts) if isinstance(field, Bits) else [field.name]
+    if sorted(explained) != sorted(names):
+        raise ValueError(f"fields must be {', '.join(names)}, got {', '.join(explained)}")
+    rows = []
+    for names_of_row, text in meanings.items():
+        marked = [f"`{name}`" for name in names_of_row.split(", ")]
+        rows.append((", ".join(marked), text))
+    return _table(("field", "meaning"), rows)
 
 
 def readings() -> str:
@@ -251,6 +316,8 @@ TABLES: Mapping[str, Mapping[str, Callable[[], str]]] = {
         "messages": lambda: _blocks(
             messages(), records(), _lists({**_LISTS, "Codes of a Nak": REFUSALS})
         ),
+        "capabilities": lambda: fields(MESSAGES["GetCaps"].reply, _CAPABILITY_MEANINGS),
+        "status": lambda: fields(STATUS, _STATUS_MEANINGS),
         "states": lambda: _blocks(transitions(), _lists({"States": STATES, "Faults": FAULTS})),
     },
     "metrics": {"readings": readings},

@@ -171,6 +171,13 @@ _Waiting: TypeAlias = tuple[Interval, int, tuple[LayerSet, ...], bool]
 """A committed set: its start, token and layers, and whether it plays without rounding."""
 
 
+def request_text(name: str, values: Values) -> str:
+    """Return a request with its values, as reasons name it, without the words of a set."""
+    fields = [field for field in MESSAGES[name].request.names if field in values]
+    shown = [f"{field} {values[field]}" for field in fields if field != "stream"]
+    return f"{name} ({', '.join(shown)})" if shown else name
+
+
 class ExpectedAmplifier:
     """Expected state of one amplifier; state, latch, token and session are None if unknown; times
     [s].
@@ -299,7 +306,7 @@ class ExpectedAmplifier:
             self.report(
                 rule,
                 time,
-                f"answer to {name} in {self._name_of(self.state)}",
+                f"reply to {name} in {self._name_of(self.state)}",
                 must="WRONG_STATE",
                 seen="carried out",
             )
@@ -307,7 +314,7 @@ class ExpectedAmplifier:
     def carry_out(self, name: str, values: Values, shown: Values, when: Interval) -> None:
         """Apply a request carried out in an interval, as its reply or a later status shows."""
         ramp = min(values.get("ramp", 0), self.can.get("ramp_max", math.inf)) / 1000
-        cause = f"{name} {values}"
+        cause = request_text(name, values)
         has_expired = self.is_enabled and shown.get("fault") == FAULTS["WATCHDOG"]
         if name in ("Stop", "Disarm") and has_expired and when[1] >= self.expiry[0]:
             self._trip(FAULTS["WATCHDOG"], self._expired_by(when[1]), "the watchdog")  # first

@@ -350,7 +350,8 @@ class ExpectedOutputs:
                 self._unknown[number] = min(self._unknown[number], fade)
             self._unknown[number] = max(self._unknown[number], shortened_by)
         self._plays.commit(layers, token, (start, end))
-        self.began, self.cause = when, f"set {token} of layers {[one.layer for one in layers]}"
+        numbers = ", ".join(str(each.layer) for each in layers)
+        self.began, self.cause = when, f"set {token} (layers: {numbers or 'none'})"
         self._has_floor, self.is_exact = True, self.is_exact and is_exact
         self._highest = max(self._highest, self._peak(start))
 
@@ -466,7 +467,7 @@ class ExpectedOutputs:
             if level > high or (is_low and not can_be_low):
                 report = report_low if is_low and report_low is not None else self._report
                 what = f"level of channel {channel}, {self._since(when)}"
-                must = f"{low:.6g} to {high:.6g}"
+                must = f"{max(low, 0.0):.4g} to {high:.4g}"
                 report(self._rule(channel, level, when), when[1], what, must=must, seen=level)
         return largest
 

@@ -1,8 +1,9 @@
-"""`era amp conformance`: whether an amplifier fulfils the contract of protocol 4."""
+"""`era amp conformance`: check an amplifier against protocol 4."""
 
 import json
 import shlex
 import sys
+import textwrap
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -12,6 +13,9 @@ from drivers.errors import LinkError
 
 if TYPE_CHECKING:
     from era_haptics.lab.conformance.contract import CheckResult
+
+_INDENT = " " * 9
+_WIDTH = 100
 
 
 def conformance(
@@ -42,19 +46,21 @@ def conformance(
     if not write and not json_ and sys.stdin.isatty():
         write = typer.confirm(
             f"{report.left} more checks arm the amplifier and drive its channels at {level:.0%} of "
-            "full level. Other addresses of the line are only asked whether they reply; if one "
-            "does, what is for all is left out. Continue?"
+            "full level. If another amplifier on the line replies, checks of broadcasts are "
+            "skipped. Continue?"
         )
     if write:
         more = judge(url, drives=True, level=level, on_result=show, before=report)
         try:
             report = run(more, trace)
         except (KeyboardInterrupt, LinkError):
-            print(f"era: ended: {run(leave(url), None)}", file=sys.stderr)
+            print(f"era: run ended early: {run(leave(url), None)}", file=sys.stderr)
             raise
     if json_:
         print(json.dumps(report.to_json()))
     else:
+        if report.fix_first:
+            print(f"Fix first: {'; '.join(report.fix_first)}")
         print(report.summary)
         if report.left and report.overall != "failed":
             print(f"Next: era amp conformance {shlex.quote(url)} --write")
@@ -66,9 +72,16 @@ def conformance(
 
 def _show_result(result: "CheckResult") -> None:
     mark = result.result.value.replace("_", " ")
-    print(f"{mark.upper() if mark == 'failed' else mark:<7}  It {result.check.requirement}.")
+    is_failed = mark == "failed"
+    print(f"{mark.upper() if is_failed else mark:<7}  {result.check.title}")
     if result.reason:
-        print(f"         {result.reason} ({result.check.place})")
-    for name in ("sent", "came"):
-        if text := getattr(result.finding, name):
-            print(f"         {name}: {text}")
+        print(f"{_INDENT}{result.reason}")
+    if is_failed:
+        place, remedy = result.advice
+        text = f"remedy: {remedy}"
+        print(f"{_INDENT}rule: docs/reference/{place} (check {result.check.name})")
+        print(textwrap.fill(text, _WIDTH, initial_indent=_INDENT, subsequent_indent=_INDENT))
+    if result.finding.sent:
+        print(f"{_INDENT}last set sent: {result.finding.sent}")
+    if result.finding.came:
+        print(f"{_INDENT}last bytes received: {result.finding.came}")

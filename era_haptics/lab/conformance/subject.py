@@ -48,7 +48,7 @@ from era_haptics.lab.conformance.judge_client import (
     stage,
     verify,
 )
-from era_haptics.lab.expected_amplifier import OFF
+from era_haptics.lab.expected_amplifier import OFF, request_text
 from era_haptics.lab.expected_output import SAMPLE
 from registry import threads
 
@@ -117,7 +117,7 @@ class Subject:
         """Level of driven channels; NotApplicable if no level step is that low."""
         limits, step = [self.can, *self.can["limits"]], self.can["level_step"] / FULL
         level: float = min(self._level, *(one["level_max"] / FULL for one in limits))
-        require(level >= step, f"its level_max of {level:g} is below its level_step of {step:g}")
+        require(level >= step, f"level_max of {level:g} is below level_step of {step:g}")
         return level
 
     @cached_property
@@ -125,7 +125,7 @@ class Subject:
         """Lowest frequency common to all channels, in steps; NotApplicable if there is none."""
         limits = [self.can, *self.can["limits"]]
         lowest = max(one["frequency_min"] for one in limits)
-        require(lowest <= self.highest, "its channels have no frequency in common")
+        require(lowest <= self.highest, "the channels have no frequency in common")
         return int(lowest)
 
     @cached_property
@@ -151,11 +151,11 @@ class Subject:
 
     def require(self, feature: str) -> None:
         """Raise NotApplicable unless it states a feature."""
-        require(self.has(feature), f"it states no {feature}")
+        require(self.has(feature), f"the feature {feature} is not stated")
 
     def require_knots(self) -> None:
         """Raise NotApplicable unless its envelopes have knots."""
-        require(self.can["knots"] > 0, "it has no knots")
+        require(self.can["knots"] > 0, "the stated number of knots is 0")
 
     def tone(
         self,
@@ -175,7 +175,7 @@ class Subject:
         level, step = round(fraction * self.level * FULL), self.can["level_step"]
         require(
             not 0 < level < step,
-            f"its steps of level are coarser than {level / FULL:g}; see --level",
+            f"level_step is coarser than {level / FULL:g}; raise --level",
         )
         numbers = frequency or self.frequency, level, QUANTITIES["phase"].to_wire(phase)
         return Command(channel, *numbers, keep, onset=onset, ending=ending)
@@ -286,19 +286,18 @@ class Subject:
             answer = await self.answer(name, row.raw, **values)
             if not _has_reply(name, row.raw, values):
                 continue
-            brief = {each: value for each, value in values.items() if each != "stream"}
-            what = f"{name} {row.raw or brief}"
+            what = raw_text(name, row.raw) if row.raw else request_text(name, values)
             is_of_set = name == "Set" or (name == "Commit" and answer.code != "")
             if is_of_set and self.expected is not None and self.shown.sets.has_expired:
                 require_in_time((answer.code or _DONE) in codes, f"a set expired before {name}")
             # Check this first: a message that is too short lacks some of its values.
-            expect_one_of(answer.code or _DONE, codes, f"answer to {what}")
+            expect_one_of(answer.code or _DONE, codes, f"reply to {what}")
             if answer.code:
                 break
             answer = await self._carried_out(name, self.filled(values), answer)
         is_named = self.client.kind not in ("rtu", "tcp") or answer.code not in _BY_EXCEPTION
         if answer.code and is_named:
-            expect_one_of(answer.channel, row.channels, f"channel of the refusal of {what}")
+            expect_one_of(answer.channel, row.channels, f"channel in the Nak to {what}")
         return answer
 
     async def answer(
@@ -378,7 +377,7 @@ class Subject:
         record = STATED if name == "GetCaps" else MESSAGES[name].reply
         shown = read_as(f"reply to {name}", record.unpack, answer.words, is_strict=False)
         if name == "GetCaps":
-            expect_equal(shown, self.can, "capabilities, read again")
+            expect_equal(shown, self.can, "capabilities, read a second time")
         if "levels" in shown:
             for each in ("channels", "layers"):
                 expect_equal(shown[each], self.can[each], f"number of {each} in Status")
@@ -516,7 +515,7 @@ class Subject:
     def require_alone(self) -> None:
         """Raise NotApplicable if a broadcast would reach other amplifiers."""
         where = ", ".join(map(str, sorted(self.client.neighbours)))
-        require(not where, f"skipped: a broadcast would reach others ({where})")
+        require(not where, f"a broadcast would reach other amplifiers on the line ({where})")
 
     async def watch(self) -> None:
         """Judge all replies from now on, by the status as it is."""
@@ -575,7 +574,7 @@ class Subject:
         """
         await self.send(stage(*layers))
         await self.commit_in(self._until_moment + apart if apart else lead)
-        require_in_time(self._until_moment > HIGH_TIME, "a Commit came behind its moment")
+        require_in_time(self._until_moment > HIGH_TIME, "a Commit arrived after its moment")
         await self.past_moment()
 
     async def past_moment(self, duration: float = 0.0) -> None:
@@ -642,7 +641,7 @@ class Subject:
         """Raise NotApplicable unless a ramp can last for `duration` [s], or for a few exchanges."""
         duration = max(duration, 0.03 + 2 * min(self.exchange_time, 1.0))
         require(
-            self.can["ramp_max"] >= 1000 * duration, f"its ramps are shorter than {duration:.2g} s"
+            self.can["ramp_max"] >= 1000 * duration, f"ramp_max is shorter than {duration:.2g} s"
         )
 
     @property
@@ -700,7 +699,7 @@ class Subject:
             seen += is_narrow
             await asyncio.sleep(pause * is_narrow)
         needed = max(min(_SAMPLES / 3, time / _EACH, time / (4 * self.exchange_time)), 2)
-        require_in_time(seen >= needed, f"only {seen} statuses were in time")
+        require_in_time(seen >= needed, f"only {seen} Status replies were in time")
 
     async def in_time(self, case: Callable[[], Awaitable[object]]) -> None:
         """Try a case, each time from rest, until this machine was in time."""
@@ -723,9 +722,14 @@ class Subject:
         await self.play(*map(layer, range(2)))
         require(
             level <= 0.75 * self.level * FULL,  # phases may be rounded
-            "its levels do not show that tones of one frequency interfere",
+            "the levels do not show that tones of one frequency interfere",
         )
         self.shown.outputs.interferes = True
+
+
+def raw_text(name: str, words: Sequence[int]) -> str:
+    """Return a request with its raw words, as reasons name it."""
+    return f"{name} with the words {' '.join(f'{word:04X}' for word in words)}"
 
 
 def _has_reply(name: str, raw: Sequence[int] | None, values: Values) -> bool:

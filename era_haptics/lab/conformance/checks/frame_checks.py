@@ -198,9 +198,6 @@ class CanClient(JudgeClient):
         return [frame.data for frame in self.frames if frame.id == can_id]
 
 
-_CAN_PLACE = "can.md#messages-as-frames"
-_MODBUS_PLACE = "modbus.md#registers"
-_SERIAL_PLACE = "protocol.md#checks-in-this-order"
 _PING, _SET, _STATUS, _COMMIT, _CAPS, _ACHIEVED, _STOP = (
     MESSAGES[name].number
     for name in ("Ping", "Set", "GetStatus", "Commit", "GetCaps", "GetAchieved", "Stop")
@@ -209,9 +206,13 @@ _LIFE, _FORGOTTEN = 0.09, 0.12  # s; for which a number is kept, after which any
 _FAST = 0.015  # s; exchanges that are quick enough to see for how long a number is kept
 
 
-@driving(_CAN_PLACE, "can")
+@driving("can.md#messages-as-frames", "can")
 async def numbers(subject: Subject) -> None:
-    """It takes newer numbers only, each message once, its frames in any order."""
+    """Frames in any order: one reply to each newer number, none to an older one.
+
+    Collect frames by message number and index, compare numbers modulo 255, and forget the last
+    number after 0.1 s of silence.
+    """
     client = cast(CanClient, subject.client)
     require(
         subject.exchange_time <= _FAST, "the line is too slow to see for how long it keeps a number"
@@ -405,9 +406,13 @@ _TOO_LONG, _BEYOND = (REFUSALS[name] << 8 | NO_CHANNEL for name in ("BAD_LENGTH"
 _NO_WORDS = (0,) * (AREA - HEAD)
 
 
-@reading(_MODBUS_PLACE, "rtu", "tcp")
+@reading("modbus.md#registers", "rtu", "tcp")
 async def areas(subject: Subject) -> None:
-    """It keeps each reply under its tag, zeros behind it, and shows the present without a write."""
+    """Reading a reply area: tag, result, words, zeros; three areas work without a write.
+
+    Keep an area of 122 registers for each message and fill it with zeros behind the words. Rebuild
+    those of GetCaps, GetStatus and GetFaults at every read.
+    """
     client = cast(ModbusClient, subject.client)
 
     async def write(number: int, tag: int, *words: int) -> None:
@@ -454,9 +459,12 @@ async def areas(subject: Subject) -> None:
     expect_equal(part, texts[2:18], "part of the identity")
 
 
-@driving(_MODBUS_PLACE, "rtu", "tcp")
+@driving("modbus.md#registers", "rtu", "tcp")
 async def present_areas(subject: Subject) -> None:
-    """It shows the status of the moment at every read, and other replies as they were."""
+    """Status area: the present at every read; other areas: unchanged since their last write.
+
+    Rebuild only GetCaps, GetStatus and GetFaults at a read. A broadcast changes no reply area.
+    """
     client = cast(ModbusClient, subject.client)
     await client.look_around()
     await subject.run([subject.arm, subject.one(), subject.ping])
@@ -520,7 +528,11 @@ def _bad_pdus(client: ModbusClient, ping: bytes) -> Iterator[tuple[str, bytes, i
 
 @driving("modbus.md#functions-and-exceptions", "rtu", "tcp")
 async def exceptions(subject: Subject) -> None:
-    """It raises exceptions for what Modbus defines, which change and feed nothing."""
+    """Invalid function, register or count: the listed exception, no effect, not fed.
+
+    Check the count first, then the registers, and do nothing else for a request that gets an
+    exception.
+    """
     client = cast(ModbusClient, subject.client)
     await subject.arm()
     await subject.play(subject.one())
@@ -537,7 +549,11 @@ async def exceptions(subject: Subject) -> None:
 
 @reading("modbus.md#the-line", "rtu", "tcp")
 async def pieces(subject: Subject) -> None:
-    """It takes a frame in pieces, gives half a frame up after a pause, and loses none behind it."""
+    """Frame in pieces: reply; frame broken off by a pause: discarded, reply to the next one.
+
+    Collect bytes until the frame is complete. Drop an incomplete frame after 20 ms (RTU) or 1 s
+    (TCP), and keep the bytes that follow a complete one.
+    """
     client = cast(ModbusClient, subject.client)
     pause, limit = (0.012, 0.02) if client.is_rtu else (0.2, 1.0)  # s; within a frame
 
@@ -668,9 +684,12 @@ def _framed(content: bytes) -> bytes:
     return b"\0" + stuffed + b"\0"
 
 
-@driving(_SERIAL_PLACE)
+@driving("protocol.md#order-of-checks")
 async def damaged_frames(subject: Subject) -> None:
-    """It takes no damaged frame, nor one for others: it neither plays, replies nor is fed."""
+    """Damaged frame, or frame for another address: no reply, no effect, not fed.
+
+    Check length, checksum and address before anything else, and discard the frame silently.
+    """
     client = subject.client
     await client.look_around()
     own = client.address
@@ -689,9 +708,12 @@ async def damaged_frames(subject: Subject) -> None:
             await subject.request("GetStatus")
 
 
-@driving(_SERIAL_PLACE)
+@driving("protocol.md#sets")
 async def doubled_frames(subject: Subject) -> None:
-    """It carries a frame that comes twice, or late, out as one of its token, or not at all."""
+    """Frame that comes twice or late: treated as a repetition of its token.
+
+    Decide by the token whether a set is new, not by the sequence number of the frame.
+    """
     await subject.arm()
     sets = [layer(0, subject.tone(0, each), valid_for=250) for each in (0.5, 1.0)]
     made = [subject.words_of(each) for each in sets]
@@ -707,7 +729,10 @@ async def doubled_frames(subject: Subject) -> None:
 
 @driving("serial.md#receiving", "serial")
 async def discarded_frames(subject: Subject) -> None:
-    """It discards Events, and what is for all in another version, without a reply."""
+    """Event, or broadcast of another version: discarded without a reply.
+
+    Ignore frames with bit 7 set and Events, and check the version of a broadcast.
+    """
     client = cast(SerialClient, subject.client)
     await client.look_around()
     subject.require_alone()
@@ -731,7 +756,11 @@ async def discarded_frames(subject: Subject) -> None:
 
 @driving("serial.md#receiving", "serial")
 async def tolerated_frames(subject: Subject) -> None:
-    """It finds frames in noise, in pieces, and back to back, and replies to each."""
+    """Frame in noise, in pieces or back to back: one reply to each.
+
+    Resynchronise at every zero byte, accept a zero shared by two frames, and buffer the next frame
+    while you reply.
+    """
     client = cast(SerialClient, subject.client)
 
     def ping() -> bytes:

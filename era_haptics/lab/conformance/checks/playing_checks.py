@@ -39,7 +39,6 @@ from era_haptics.lab.conformance.subject import RATE_STEP, Subject
 from era_haptics.lab.expected_output import DRIFT
 from registry import threads
 
-_PLACE, _SETS = "protocol.md#what-a-channel-plays", "protocol.md#sets"
 _SLOW = 400  # steps of frequency: 20 Hz, whose periods are long against an exchange
 _LONG = 1.0  # s; in which errors of a phase add up
 _MAX_VOICES = 24  # that are tried
@@ -50,26 +49,36 @@ _BIT_15 = 1 << 15  # ms
 _AMID = 0.15  # s; in which a sum comes to its peak
 
 
-@driving(_SETS)
+@driving("protocol.md#sum-of-a-channel")
 def layers_add(subject: Subject) -> RequestRows:
-    """It plays the sum of its layers, each with its own token, and those not named play on."""
+    """Several layers on a channel: levels add, each layer shows its token.
+
+    Keep voices and tokens for each layer, and add all voices of a channel.
+    """
     share, last = 1 / len(subject.layers), len(subject.layers) - 1
     filled = [layer(each, subject.beside(each, share)) for each in reversed(subject.layers)]
     emptied = map(layer, subject.layers[:-1])
     return [subject.arm, *filled, *emptied, play_now(filled[-1], layer(last))]
 
 
-@driving(_SETS)
+@driving("protocol.md#layers")
 def layers_play_on(subject: Subject) -> RequestRows:
-    """It lets ramps, onsets and ends of layers that a set does not name go on as they were."""
+    """Set for one layer: ramps, onsets and ends of other layers continue.
+
+    Change only the layers that the set names.
+    """
     first = subject.one(level=0.75, ramp=subject.ramp, valid_for=subject.ramp + 100)
     loud, quiet = (layer(1, subject.beside(1, each)) for each in (0.25, 0.125))
     return [(first, 0.02, loud, quiet, loud)]
 
 
-@driving(_SETS)
+@driving("protocol.md#layers")
 def valid_for(subject: Subject) -> RequestRows:
-    """It ends a layer after its valid_for, along its ramp, and stays armed; 0 and 60 s last."""
+    """After valid_for: the layer ends along its ramp, state stays armed.
+
+    Count valid_for in real time from the start of the layer, in milliseconds of 16 bits; 0 is no
+    end.
+    """
     ramp, short = min(100, subject.can["ramp_max"]), subject.lasting(100)
     half, pause = subject.one(level=0.5, valid_for=short), 0.12 * subject.slowness
     lasting = layer(1, subject.beside(1, 0.25), valid_for=60_000)
@@ -83,9 +92,13 @@ def valid_for(subject: Subject) -> RequestRows:
     ]
 
 
-@driving(_SETS)
+@driving("protocol.md#layers")
 def renew(subject: Subject) -> RequestRows:
-    """It starts valid_for anew by a renewal, and changes nothing else."""
+    """Renewal of a layer: valid_for restarts, nothing else changes.
+
+    In a renewal, set the end of the layer and leave token, ramp, voices and waiting commands alone.
+    A layer that is over stays over.
+    """
     first, second = (
         subject.one(level=0.5, ramp=40, valid_for=subject.lasting(200)),
         layer(1, subject.beside(1, 0.25)),
@@ -102,9 +115,13 @@ def renew(subject: Subject) -> RequestRows:
     ]
 
 
-@driving(_SETS)
+@driving("protocol.md#layers")
 def after(subject: Subject) -> RequestRows:
-    """It starts commands with *after* once the onsets of the layer have ended, at once without."""
+    """Set with `after`: starts when the onset of its layer has arrived, or immediately.
+
+    Keep the commands of the layer until then; a newer `after` replaces them, and every other set
+    for this layer or Silence drops them.
+    """
     first = subject.one(subject.tone(onset=subject.long_onset))
     waiting = layer(0, subject.tone(0, 0.25, frequency=subject.other), after=True)
     newer, over = layer(0, subject.tone(0, 0.75), after=True), _passed(subject, 3)
@@ -131,9 +148,13 @@ def _passed(subject: Subject, sets: int) -> float:
     return max(duration + 0.02 - sets * subject.exchange_time, 0.0)
 
 
-@driving(_SETS)
+@driving("protocol.md#layers")
 def after_the_last_onset(subject: Subject) -> RequestRows:
-    """It waits for the last onset with knots of this layer on any channel, and for nothing else."""
+    """Set with `after`, several onsets: waits for the last with knots in its layer.
+
+    Wait for voices of this layer that are not released and follow an onset with knots; ignore
+    ramps, other layers and empty onsets.
+    """
     long = subject.long_onset
     short = subject.envelope(min(max(0.02, 2 * subject.exchange_time), 0.1), 0.5)
     last = len(subject.channels) - 1
@@ -159,9 +180,13 @@ def after_the_last_onset(subject: Subject) -> RequestRows:
     ]
 
 
-@driving(_SETS)
+@driving("protocol.md#layers")
 def what_waits_for_an_onset(subject: Subject) -> RequestRows:
-    """It plays what waited from its start: its own time, kept amplitudes, of several layers."""
+    """Waiting commands start: valid_for counts from there, kept voices continue.
+
+    Start what waits before you remove voices at amplitude 0, and let an earlier end of the layer
+    drop it.
+    """
     long, short, lasts = subject.long_onset, subject.envelope(0.04, 1.0), subject.lasting(70)
     half = subject.one(subject.tone(0, 0.5, onset=long))
     other = layer(1, replace(subject.beside(1, 0.5), onset=subject.long_onset))
@@ -186,9 +211,12 @@ def what_waits_for_an_onset(subject: Subject) -> RequestRows:
     ]
 
 
-@driving(_PLACE)
+@driving("protocol.md#ramps-and-envelopes")
 def ramps(subject: Subject) -> RequestRows:
-    """It rises and falls along the ramp of a layer, a raised cosine, on every channel."""
+    """Ramp up and down on every channel: Status follows the raised cosine.
+
+    Use (1 - cos(pi s)) / 2 between the amplitude found and the new one, over the ramp of the layer.
+    """
     whole, ramp_max = subject.whole(), subject.can["ramp_max"]
     part = partial(subject.follow, 0.4 * ramp_max / 1000)
     return [
@@ -198,9 +226,13 @@ def ramps(subject: Subject) -> RequestRows:
     ]
 
 
-@driving(_PLACE)
+@driving("protocol.md#ramps-and-envelopes")
 def cross_fades(subject: Subject) -> RequestRows:
-    """It cross-fades tones, each along its own raised cosine, continued where it is interrupted."""
+    """New tone without keep_phase: the old voice and the new one follow their own ramps.
+
+    Begin a new voice at amplitude 0 and fade the old one, each from the amplitude found at the
+    change.
+    """
     ramp, part = subject.ramp, 0.4 * subject.ramp / 1000
     half, other = subject.one(level=0.5), subject.tone(0, 0.5, frequency=subject.other)
     fade = layer(0, other, ramp=ramp)
@@ -212,9 +244,13 @@ def cross_fades(subject: Subject) -> RequestRows:
     ]
 
 
-@driving(_SETS)
+@driving("protocol.md#layers")
 def kept_phase(subject: Subject) -> RequestRows:
-    """It leads a tone whose phase is kept from its present amplitude to the new one."""
+    """keep_phase with the same frequency: the voice goes on from its present amplitude.
+
+    Continue a voice of the same layer, channel and frequency that is not released; otherwise begin
+    a new one.
+    """
     tones = [
         subject.tone(0, fraction, phase, keep=True, frequency=frequency)
         for fraction, phase, frequency in (
@@ -238,9 +274,13 @@ def kept_phase(subject: Subject) -> RequestRows:
     ]
 
 
-@driving(_PLACE)
+@driving("protocol.md#ramps-and-envelopes")
 def onsets(subject: Subject) -> RequestRows:
-    """It leads an onset along straight lines in the complex plane, from 0 or what it keeps."""
+    """Onset: straight lines in the complex plane from knot to knot.
+
+    Interpolate real and imaginary parts, not level and phase, beginning at 0 or at the amplitude of
+    the kept voice, with knots + 1 steps.
+    """
     subject.require_knots()
     shapes = [
         subject.envelope(0.04, *fractions)
@@ -253,9 +293,13 @@ def onsets(subject: Subject) -> RequestRows:
     return [*alone, (subject.one(), kept), (*rising, kept), (subject.one(), again)]
 
 
-@driving(_PLACE)
+@driving("protocol.md#layers")
 def endings(subject: Subject) -> RequestRows:
-    """It leads a tone to silence by its ending: without a command, at level 0, at its end."""
+    """Layer without a new command, or at its end: each voice follows its ending to zero.
+
+    Store the ending with its voice. Use it for a command left out, for level 0 and for valid_for;
+    use the ramp if a new command drives or skip_ending is set.
+    """
     subject.require_knots()
     last, ramp = len(subject.channels) - 1, subject.ramp
     tone = subject.tone(last, 1.0, 90.0, ending=subject.envelope(0.03, 0.25j, 0.75, 0.5))
@@ -275,9 +319,13 @@ def endings(subject: Subject) -> RequestRows:
     ]
 
 
-@driving(_PLACE)
+@driving("protocol.md#layers")
 def endings_amid(subject: Subject) -> RequestRows:
-    """It begins an ending at the present amplitude, plays it once, and lets nothing prolong it."""
+    """Ending during an onset or fade: starts at the present amplitude, once.
+
+    Begin an ending at the amplitude found, never restart it, and let a later fade shorten it but
+    not prolong it.
+    """
     subject.require_knots()
     slowest = min(subject.exchange_time, 0.1)
     knots = 1 if subject.slowness == 1 else math.ceil(slowest / 0.01)
@@ -300,9 +348,12 @@ def endings_amid(subject: Subject) -> RequestRows:
     ]
 
 
-@driving(_PLACE)
+@driving("protocol.md#ramps-and-envelopes")
 def extreme_envelopes(subject: Subject) -> RequestRows:
-    """It plays as many knots as it states, along its shortest and longest step."""
+    """Envelope with the most knots, the shortest and the longest step: followed exactly.
+
+    State only the knots and steps that you can play.
+    """
     subject.require_knots()
     count = range(subject.can["knots"])
     levels = [(0.2 + 0.8 * (at % 5) / 4) * (1 if at % 3 else -1) for at in count]
@@ -312,9 +363,13 @@ def extreme_envelopes(subject: Subject) -> RequestRows:
     return [[subject.one(subject.tone(0, 0.5, onset=shape))] for shape in shapes]
 
 
-@driving(_PLACE)
+@driving("protocol.md#the-clock")
 async def phases(subject: Subject) -> None:
-    """It counts phases on its clock: tones of one frequency interfere alike whenever they began."""
+    """Two tones at the same frequency: they add by phase, whenever each began.
+
+    Compute the angle as n times clock modulo 2^32 at every sample; do not start a phase at the
+    commit, and do not accumulate rounded steps.
+    """
     await subject.arm()
     await subject.require_interference()
     first = layer(0, *(subject.tone(each, 0.5, 30.0) for each in subject.channels))
@@ -354,9 +409,13 @@ async def _expect_alike(subject: Subject, phase: float, time: float) -> None:
     await subject.run([first, time, renewed, second, time, first, time, subject.status])
 
 
-@driving(_PLACE)
+@driving("protocol.md#voices")
 def voices(subject: Subject) -> RequestRows:
-    """It has all its voices on each channel, and cuts no more, by 2 ms, than what fades longest."""
+    """More voices than `voices` on a channel: the oldest fades end within 2 ms, no refusal.
+
+    Count only voices that last longer than 2 ms, keep a spare voice for each layer, and shorten
+    released voices in the order in which their ways began.
+    """
     channels, last = sorted({0, subject.channels[-1]}), subject.layers[-1]
     count = min(subject.can["voices"], _MAX_VOICES)
     fades = count - last
@@ -415,9 +474,13 @@ def voices(subject: Subject) -> RequestRows:
     ]
 
 
-@driving(_PLACE)
+@driving("protocol.md#sum-of-a-channel")
 async def limited(subject: Subject) -> None:
-    """It limits the sum of its layers to full level, and says once that it was limited."""
+    """Sum above full level: cut off, and flagged once.
+
+    Note every sample whose sum exceeds full level by more than a step of level, show the flag in
+    the next Status, then clear it.
+    """
     require(subject.level * 2 > 1.0, "tried above half of full level only; see --level")
     require(
         abs(subject.other - subject.frequency) >= subject.can["frequency_step"],
@@ -446,7 +509,6 @@ async def limited(subject: Subject) -> None:
     await unseen("Stop", ramp=0)
 
 
-_CLOCKS_PLACE = "protocol.md#the-clock"
 _LOWEST, _HIGHEST = QUANTITIES["rate"].minimum, QUANTITIES["rate"].maximum
 _READINGS, _APART = 8, 0.03  # of one state; s between two at most
 _MAX_DURATION = 8.0  # s; in which a rate must show
@@ -469,23 +531,35 @@ async def _read(subject: Subject, otherwise: type[ContractViolation] = ContractV
     verify(is_coarse or len(low) > 1, "low word of the clock", expected="any", seen=low)
 
 
-@reading(_CLOCKS_PLACE)
+@reading("protocol.md#the-clock")
 async def clock_goes_on(subject: Subject) -> None:
-    """It shows a clock that goes on by the time between two statuses: all else rests on that."""
+    """Two GetStatus: the clock advances by the time between them.
+
+    Derive the clock from the sample count, and add the time since the last sample by a timer.
+    Nothing is driven until this check passes, because all times are judged by this clock.
+    """
     _require_known(subject)
     await _read(subject, UntimedClock)
 
 
-@driving(_CLOCKS_PLACE)
+@driving("protocol.md#the-clock")
 def clock_readings(subject: Subject) -> RequestRows:
-    """It shows its clock as it is between request and reply, armed too, for ever on."""
+    """Status while armed: its clock is of a moment between request and reply.
+
+    Read the clock when you build the reply, between samples too, without a constant or growing
+    error above clock_error.
+    """
     _require_known(subject)
     return [subject.arm, subject.one(), partial(_read, subject)]
 
 
-@driving(_CLOCKS_PLACE)
+@driving("protocol.md#the-clock")
 def clock_shifts(subject: Subject) -> RequestRows:
-    """It moves its clock on by the shift of an Arm, not with the session that it holds."""
+    """Arm with a shift: the clock moves by this shift; with the session held: no shift.
+
+    Add shift times 65536 to the clock, modulo 2^32, before you build the reply, and only if the
+    session is new.
+    """
     _require_known(subject)
     again = send("Arm", watchdog=subject.can["watchdog_max"], shift=_SHIFTS[1])
 
@@ -499,9 +573,13 @@ def clock_shifts(subject: Subject) -> RequestRows:
     return [shift]
 
 
-@driving(_CLOCKS_PLACE)
+@driving("protocol.md#the-clock")
 async def clock_rate(subject: Subject) -> None:
-    """It runs faster by the rate of a Ping until the next, and by none unless it is armed."""
+    """Ping with a rate: the clock keeps this rate until the next Ping; unarmed: rate 0.
+
+    Scale the increment of the clock only. Times such as valid_for, ramps and the watchdog stay real
+    time; leaving OPERATION_ENABLED resets the rate.
+    """
     _require_known(subject)
     await subject.request("GetStatus")  # whose exchanges all rests on
     duration = max(0.35, 1.5 * subject.read_time / (_HIGHEST * RATE_STEP - DRIFT))
@@ -555,9 +633,12 @@ async def clock_rate(subject: Subject) -> None:
     )
 
 
-@driving("protocol.md#messages")
+@driving("protocol.md#readings")
 async def measured(subject: Subject) -> None:
-    """It measures voltage and current of every channel, armed or not, more where more plays."""
+    """GetMeasured: a row for every channel, more voltage on a channel that plays.
+
+    Measure rms values over at least one period, on every channel, armed or not.
+    """
     subject.require("electrical")
 
     async def voltages() -> list[int]:

@@ -67,18 +67,25 @@ _FEATURE_OF = {
 }
 
 
-@reading("protocol.md#messages", greets=True)
+@reading("protocol.md#identity-and-capabilities", greets=True)
 async def identity(client: JudgeClient) -> None:
-    """It says who it is, always the same, and that it speaks version 4."""
+    """Hello, sent twice: the same identity with all four texts, and version 4 supported.
+
+    Return constant texts for vendor, product, serial number and firmware, and set bit 4 of
+    versions.
+    """
     first = await greeted(client)
     for name in ("vendor", "product", "serial_number", "firmware"):
         verify(bool(first[name]), name, expected="a text", seen="none")
     expect_equal(await client.hello(), first, "identity, read again")
 
 
-@reading("protocol.md#messages")
+@reading("protocol.md#identity-and-capabilities")
 async def capabilities(subject: Subject) -> None:
-    """It states capabilities within their ranges, always the same."""
+    """GetCaps, sent twice: the same capabilities, each within its range.
+
+    Correct the number named above. Checks that need this capability are not run until it is right.
+    """
     must, seen = (
         "; ".join(f"{name} {each[at]}" for name, each in subject.can.wrong.items()) for at in (0, 1)
     )
@@ -88,7 +95,11 @@ async def capabilities(subject: Subject) -> None:
 
 @reading("protocol.md#states")
 async def starts_disarmed(subject: Subject) -> None:
-    """It is disarmed and silent unless it was armed, and shows what it has only."""
+    """GetStatus before Arm: disarmed and silent, flags of stated features only.
+
+    Power up in SWITCH_ON_DISABLED, and set interlock_open only if you state the feature interlock.
+    If another host has armed the amplifier, stop that host first.
+    """
     status = (await subject.request("GetStatus")).values
     if status["state"] == ENABLED:
         raise AlreadyArmed("state before Arm", expected="disarmed", seen="OPERATION_ENABLED")
@@ -101,14 +112,21 @@ async def starts_disarmed(subject: Subject) -> None:
 
 @reading("protocol.md#times")
 async def replies_in_time(subject: Subject) -> None:
-    """It begins each reply within 10 ms."""
+    """GetStatus, GetCaps and GetFaults: each reply begins within 10 ms.
+
+    Reply from memory, without waiting for a converter, for flash or for the next block of samples.
+    """
     for name in ("GetStatus", "GetCaps", "GetFaults"):
         await _expect_prompt(subject, name, partial(subject.request, name))
 
 
 @driving("protocol.md#times")
 async def obeys_in_time(subject: Subject) -> None:
-    """It begins each reply to what feeds, plays and silences within 10 ms."""
+    """Requests that arm, feed, play or silence: each reply begins within 10 ms.
+
+    Reply before slow work: do not wait for the high voltage, for a block of samples or for a ramp
+    to end.
+    """
     refused = send("Ping", session=77, code="WRONG_SESSION")
     requests: dict[str, Callable[[], Awaitable[object]]] = {
         "refusals": partial(subject.send, refused),
@@ -145,9 +163,13 @@ async def _expect_prompt(
     )
 
 
-@reading("protocol.md#messages")
+@reading("protocol.md#order-of-checks")
 async def unknown_types(subject: Subject) -> None:
-    """It refuses messages that it does not know, and those of what it does not have."""
+    """Unknown message, or message of a feature that is not stated: UNKNOWN_TYPE.
+
+    Check the type before the length. Reject every number that is not in the table, including 16 to
+    18.
+    """
     for number in _UNKNOWN:
         answer = await subject.client.exchange(number, ())
         expect_equal(answer.code, "UNKNOWN_TYPE", f"refusal of message {number}")
@@ -155,9 +177,13 @@ async def unknown_types(subject: Subject) -> None:
     await subject.run([send(each, raw=_shortest(each), code="UNKNOWN_TYPE") for each in missing])
 
 
-@driving("protocol.md#checks-in-this-order")
+@driving("protocol.md#order-of-checks")
 def lengths(subject: Subject) -> RequestRows:
-    """It refuses messages that are a word too short or too long."""
+    """Request one word short or one word long: BAD_LENGTH.
+
+    Read the words in order and reject at the first error: a missing word, a token of 0, a number
+    out of range. Reject extra words only after that.
+    """
     known = [name for name in MESSAGES if subject.has(_FEATURE_OF.get(name, ""))]
     shorter = [(name, words[:-1]) for name in known if (words := _shortest(name))]
     longer = [(name, [*_shortest(name), 0]) for name in known if name != "Set"]
@@ -167,9 +193,13 @@ def lengths(subject: Subject) -> RequestRows:
     return [partial(subject.send_all, each) for each in in_batches(rows, _AT_ONCE)]
 
 
-@reading("protocol.md#messages")
+@reading("protocol.md#readings")
 async def reading_changes_nothing(subject: Subject) -> None:
-    """It shows the achieved tones of every layer, none while disarmed, and its faults."""
+    """GetAchieved while disarmed: no command in any layer, BAD_VALUE beyond the last layer.
+
+    For a layer that plays nothing, return its number and 0 in every other field. In GetFaults, name
+    a channel that exists, or 255.
+    """
     beyond = range(len(subject.layers), 16)
     await subject.run([send("GetAchieved", layer=each, code="BAD_VALUE") for each in beyond])
     await subject.run([send("GetAchieved", layer=number) for number in subject.layers])
@@ -179,9 +209,13 @@ async def reading_changes_nothing(subject: Subject) -> None:
     await subject.status()
 
 
-@reading("serial.md#receiving", "serial")
+@reading("serial.md#hello", "serial")
 async def hello_for_ever(subject: Subject) -> None:
-    """It answers a Hello of any version and length, and no other version of anything else."""
+    """Hello of any version and length: Identity; other messages: UNSUPPORTED_VERSION.
+
+    Handle Hello before the version check, ignore its payload and reply in version 0. Reject half a
+    word with BAD_LENGTH.
+    """
     client = cast(SerialClient, subject.client)
     for payload, version in ((b"", 3), (b"\1\2\3", 0), (b"\1", 77), (b"", 2)):
         shown = await client.hello(payload, version)
@@ -230,9 +264,13 @@ _MOVED = 0.1  # s; until an amplifier has taken its address
 _SURE = 3  # tries
 
 
-@driving("protocol.md#states")
+@driving("protocol.md#events")
 async def events(subject: Subject) -> None:
-    """It sends one Event of every change of state, before the reply to its cause."""
+    """Change of state: one Event, before the reply to its cause.
+
+    Send one Event for each change of state and for nothing else, with state, fault and latch; none
+    if the feature is not stated.
+    """
     client = subject.client
     require(client.has_events, "this wire carries no Events")
     await client.look_around()
@@ -299,9 +337,13 @@ async def events(subject: Subject) -> None:
     expect_equal(channels - {NO_CHANNEL}, set(), "channels of Events")
 
 
-@driving("protocol.md#what-a-host-does-and-may-rely-on", "serial", "rtu", "can")
+@driving("protocol.md#broadcasts", "serial", "rtu", "can")
 async def broadcasts(subject: Subject) -> None:
-    """It obeys a Commit or Stop that is for all, without a reply, and no other broadcast."""
+    """Broadcast Commit or Stop: carried out without a reply; other broadcasts: ignored.
+
+    Accept Commit, Stop, SetAddress and Mark at the broadcast address, check them as usual, and send
+    no reply, not even a Nak.
+    """
     client = subject.client
     await client.look_around()
     subject.require_alone()
@@ -358,7 +400,11 @@ async def broadcasts(subject: Subject) -> None:
 
 @driving("protocol.md#the-clock")
 async def mark(subject: Subject) -> None:
-    """It keeps the clock of a Mark, alone or for all, and its next status shows that alone."""
+    """Mark: the next Status shows the clock of the Mark, the one after it the present.
+
+    Store the clock in the interrupt of the last byte of the Mark, show it in one Status, then
+    discard it.
+    """
     subject.require("mark")
     client = subject.client
     if client.has_broadcasts:
@@ -375,9 +421,13 @@ async def mark(subject: Subject) -> None:
         expect_equal(len(client.heard), 0, "replies to a Mark for all")
 
 
-@driving("protocol.md#messages")
+@driving("protocol.md#addresses")
 async def addresses(subject: Subject) -> None:
-    """It takes a new address by its serial number while it is disarmed, and replies there alone."""
+    """SetAddress with the serial number, while disarmed: replies at the new address only.
+
+    Compare the whole serial number, reply from the old address, then move and store the new one.
+    Reject another serial number with BAD_VALUE.
+    """
     subject.require("address")
     client, own = subject.client, subject.client.address
     serial = str(subject.identity["serial_number"])
@@ -505,7 +555,11 @@ async def read_object(client: CanClient, index: int, subindex: int = 0, *, code:
 
 @driving("can.md#network-management", "can")
 async def network_management(subject: Subject) -> None:
-    """It replies while operational only, and stops what plays when it is taken out of operation."""
+    """NMT command: replies only while OPERATIONAL; leaving it while armed is a Stop.
+
+    Run a Stop along 5 ms whenever NMT takes the node out of OPERATIONAL, and reset object 1017 and
+    the numbers after a reset.
+    """
     client = cast(CanClient, subject.client)
     await client.look_around()
     for_all = None if client.neighbours else 0
@@ -561,7 +615,11 @@ async def network_management(subject: Subject) -> None:
 
 @driving("can.md#network-management", "can")
 async def heartbeats(subject: Subject) -> None:
-    """It sends its state in the interval of object 1017, and emergencies of faults."""
+    """Object 1017: heartbeats at its interval; fault and Clear: their emergencies.
+
+    Send the NMT state at the interval of object 1017, none for 0, and an emergency on entering 6,
+    on entering 7 and on leaving 7.
+    """
     client = cast(CanClient, subject.client)
 
     async def expect_objects(error_register: int, state: int) -> None:
@@ -597,7 +655,10 @@ async def heartbeats(subject: Subject) -> None:
 
 @driving("can.md#network-management", "can")
 async def emergencies(subject: Subject) -> None:
-    """It sends the emergency of a fault while it is PRE-OPERATIONAL, too."""
+    """Fault while PRE-OPERATIONAL: its emergencies are sent.
+
+    Send emergencies in PRE-OPERATIONAL as well; only messages and Events stop there.
+    """
     require(
         subject.exchange_time <= _QUICK,
         "the line is too slow to take it out of operation in the 5 ms of a fault",
@@ -630,7 +691,11 @@ async def _fails_unheard(subject: Subject) -> None:
 
 @reading("can.md#objects", "can")
 async def objects(subject: Subject) -> None:
-    """It shows identity, capabilities and status as objects, of which 1017 alone can be written."""
+    """SDO of every object: its value and size; of any other object or size: the listed abort.
+
+    Serve every object of the table in its size, allow writes to object 1017 only, and check for
+    aborts in the order of the page.
+    """
     client, caps = cast(CanClient, subject.client), (await subject.request("GetCaps")).words
     reply = await subject.request("GetStatus")
     status, still = reply.words, {STATUS.places[name] for name in _STILL}

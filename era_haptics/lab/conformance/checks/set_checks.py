@@ -47,16 +47,19 @@ from era_haptics.lab.conformance.subject import Subject
 from era_haptics.lab.expected_output import CLOCK_DRIFT
 from registry import threads
 
-_PLACE = "protocol.md#sets"
 _SCANNED = 8
 _AT_ONCE = 6  # sets that are refused, before a look at the status
 _LEVEL, _PHASE = QUANTITIES["level"].maximum, QUANTITIES["phase"]
 _TONE = "frequency", "level", "phase"
 
 
-@driving(_PLACE)
+@driving("protocol.md#layers")
 def every_channel(subject: Subject) -> RequestRows:
-    """It plays every channel at its own level, and silences those that a set does not name."""
+    """Set for several channels: each at its own level, channels left out fall silent.
+
+    Use the channel number of the command, not its position in the set, and release the voices of a
+    named layer that get no new command.
+    """
     tones = [subject.tone(channel, 1 - 0.05 * channel) for channel in subject.channels]
     reverse = [replace(tones[-1 - at], channel=at) for at in reversed(subject.channels)]
     but_one = reverse[: max(len(tones) - 1, 1)]
@@ -64,9 +67,13 @@ def every_channel(subject: Subject) -> RequestRows:
     return [subject.arm, *alone, *(layer(0, *each) for each in (tones, reverse, but_one, []))]
 
 
-@driving(_PLACE)
+@driving("protocol.md#readings")
 def levels_of_every_frequency(subject: Subject) -> RequestRows:
-    """It plays the level that was asked for at its lowest and its highest frequency."""
+    """Tone at the lowest and highest frequency of a channel: Status shows its level.
+
+    Show the amplitude in full levels, whatever the frequency and the voltage that it takes, and
+    accept both ends of the range.
+    """
     ends = [
         (number, limits[end])
         for number, limits in enumerate(subject.can["limits"])
@@ -75,9 +82,13 @@ def levels_of_every_frequency(subject: Subject) -> RequestRows:
     return [subject.arm, *(layer(0, subject.tone(at, frequency=each)) for at, each in ends)]
 
 
-@driving("protocol.md#messages")
+@driving("protocol.md#readings")
 async def achieved(subject: Subject) -> None:
-    """It says what each layer plays within half a step, and *exact* where that was asked."""
+    """GetAchieved: every command within half a step; Taken: exact only if all are equal.
+
+    Return the values that are really played with token, ramp and valid_for of their set, leave out
+    released voices, and set exact only if nothing is rounded.
+    """
     await subject.arm()
     shape = subject.envelope(0.0001)
     for number, first in product(subject.layers, (0.5, 0.98765)):
@@ -106,9 +117,12 @@ async def achieved(subject: Subject) -> None:
     await subject.request("GetAchieved", layer=0)
 
 
-@driving("protocol.md#messages")
+@driving("protocol.md#identity-and-capabilities")
 async def steps_as_stated(subject: Subject) -> None:
-    """It rounds to the steps that it states."""
+    """Values within one step: rounded to at most two achieved values.
+
+    State the frequency_step, level_step and phase_step with which you really play.
+    """
     base = subject.tone(0)
     coarse = [name for name in _TONE if subject.can[f"{name}_step"] > 3]
     require(bool(coarse), "its steps are about those of the wire")
@@ -228,9 +242,13 @@ def _flawed_sets(subject: Subject) -> Iterator[Send]:
         yield _part([*words[: LAYER.words], *loud, *then], "BAD_VALUE", 0)
 
 
-@driving(_PLACE)
+@driving("protocol.md#parts-of-a-set")
 def all_or_nothing(subject: Subject) -> RequestRows:
-    """It refuses a set as a whole, says why and names the channel; what plays and waits stays."""
+    """Set with one error: rejected whole with code and channel, playback unchanged.
+
+    Validate the whole stream before you change anything, in the order of the page: length, layers,
+    then each command with its onset and its ending.
+    """
     flawed = [
         row
         for token, each in enumerate(_flawed_sets(subject), 2)
@@ -252,9 +270,12 @@ def all_or_nothing(subject: Subject) -> RequestRows:
     ]
 
 
-@driving("protocol.md#messages")
+@driving("protocol.md#identity-and-capabilities")
 def accepts_its_ranges(subject: Subject) -> RequestRows:
-    """It takes what is just within its ranges, and any frequency of a silent channel."""
+    """Values at the ends of the stated ranges: accepted, also any frequency at level 0.
+
+    Treat limits as inclusive, and check the frequency only of commands that drive.
+    """
     can, quiet = subject.can, round(subject.level * FULL)
     shapes = [
         Envelope(can[f"envelope_step_{end}"], ((quiet, _PHASE.maximum),) * count)
@@ -329,9 +350,13 @@ def _with(row: Send, *, code: str = "", **changed: Any) -> Send:
     return replace(row, values={**row.values, **changed}, codes=(code,))
 
 
-@driving(_PLACE)
+@driving("protocol.md#parts-of-a-set")
 def parts_of_sets(subject: Subject) -> RequestRows:
-    """It takes parts in any order and again, and replies to the last alone: once whole, to it."""
+    """Parts in any order, repeated or missing: Taken for the last only; Commit: INCOMPLETE.
+
+    Collect parts by index, reply only to the last part, and report the first missing index in
+    Taken.
+    """
     _require_quick(subject)
     made = long_set(subject)
 
@@ -363,9 +388,13 @@ def parts_of_sets(subject: Subject) -> RequestRows:
     ]
 
 
-@driving(_PLACE)
+@driving("protocol.md#parts-of-a-set")
 def parts_that_are_dropped(subject: Subject) -> RequestRows:
-    """It drops a part of what it cannot keep without a word, and the set under way stays."""
+    """Part that must not be kept: no reply, the set being collected stays.
+
+    Compare session, token and number of parts before you store a part; drop it silently if one is
+    wrong.
+    """
     _require_quick(subject)
     made = long_set(subject)
     first, second, *others, last = _cut(subject, *made, token=9)
@@ -411,9 +440,13 @@ def parts_that_are_dropped(subject: Subject) -> RequestRows:
     ]
 
 
-@driving(_PLACE)
+@driving("protocol.md#parts-of-a-set")
 def parts_again(subject: Subject) -> RequestRows:
-    """It replaces a part by one that comes again, and confirms a whole set without a look."""
+    """Part sent again: replaces the first copy; last part of a whole set: confirmed unread.
+
+    Overwrite a stored part with its repetition. Once a set is staged or played, confirm its token
+    without looking at the stream.
+    """
     _require_quick(subject)
     first, *others, last = _cut(subject, *long_set(subject), token=2)
     nonsense = [0xFFFF] * 3
@@ -433,9 +466,12 @@ def parts_again(subject: Subject) -> RequestRows:
     ]
 
 
-@driving(_PLACE)
+@driving("protocol.md#parts-of-a-set")
 def refused_parts(subject: Subject) -> RequestRows:
-    """It drops the parts of a set that is refused whole, and of no other."""
+    """Set rejected as a whole: its parts are dropped, other sets stay.
+
+    On a rejection, free only the parts collected under that token.
+    """
     _require_quick(subject)
     flawed = layer(len(subject.layers) - 1, subject.tone(), subject.tone())
     half, quarter = subject.one(level=0.5), subject.one(level=0.25)
@@ -468,9 +504,12 @@ def refused_parts(subject: Subject) -> RequestRows:
     ]
 
 
-@driving(_PLACE)
+@driving("protocol.md#sets")
 def empty_sets(subject: Subject) -> RequestRows:
-    """It takes parts without words, and a set without any, which changes nothing."""
+    """Part or set without words: accepted, changes nothing.
+
+    Accept parts of length 0, up to 127 parts, and a set without layers.
+    """
     one, half = subject.one(valid_for=subject.lasting(300)), subject.one(level=0.5)
     first, *_, last = _cut(subject, half, token=4)
     empty = [_with(first, index=at, parts=4, stream=[]) for at in (0, 2)]
@@ -493,9 +532,12 @@ def empty_sets(subject: Subject) -> RequestRows:
     ]
 
 
-@driving(_PLACE)
+@driving("protocol.md#sets")
 def max_set(subject: Subject) -> RequestRows:
-    """It takes a set of as many words as it states, and refuses a longer one."""
+    """Set of set_words words: accepted; longer: BAD_LENGTH.
+
+    Provide memory for the set_words that you state, and check the length before the contents.
+    """
     room = min(subject.can["set_words"], _MAX_TRIED)
     longer = set_of(subject, room + 2)
     is_longer = len(pack_layers(longer)) > subject.can["set_words"]
@@ -504,9 +546,12 @@ def max_set(subject: Subject) -> RequestRows:
     return [subject.arm, stage(*set_of(subject, room)), send("Commit", token=1), *refused]
 
 
-@driving(_PLACE)
+@driving("protocol.md#parts-of-a-set")
 def sets_expire(subject: Subject) -> RequestRows:
-    """It discards a set that is not committed, or not complete, 1 s after its first part."""
+    """Set not committed within 1 s of its first part: discarded.
+
+    Start a timer of 1 s with the first part that is kept; repetitions do not restart it.
+    """
     _require_quick(subject)
     first, *others, last = _cut(subject, *long_set(subject), token=3)
     part, began = 0.45 * STAGED_LIFE - 3.5 * min(subject.exchange_time, 0.1), 0.0
@@ -552,9 +597,13 @@ _SLOWEST, _FASTEST = QUANTITIES["rate"].minimum, QUANTITIES["rate"].maximum
 _STAGING_LONG, _BEHIND = 0.2, 0.02
 
 
-@driving(_PLACE)
+@driving("protocol.md#start-of-a-set")
 def stage_and_commit(subject: Subject) -> RequestRows:
-    """It plays a staged set by the commit of its token only, once, and confirms it again."""
+    """Commit with the staged token: plays once, repeats confirmed; other tokens: BAD_TOKEN.
+
+    Compare all 16 bits of the token. Confirm the token committed last, and reject every token that
+    is not staged.
+    """
     both = layer(0, subject.tone(0, 0.5), ramp=50), layer(1, subject.beside(1, 0.25))
     again = send("Commit", token=2), stage(*both, token=2), play_now(*both, token=2)
     others = (send("Commit", token=other, code=_OLD) for other in (3, 302, 2 ^ 0x100, 0))
@@ -575,17 +624,24 @@ def stage_and_commit(subject: Subject) -> RequestRows:
     ]
 
 
-@driving(_PLACE)
+@driving("protocol.md#start-of-a-set")
 def repeats_change_nothing(subject: Subject) -> RequestRows:
-    """It starts nothing anew by a commit or set that comes again, even if its vibration ended."""
+    """Commit or Set of the committed token, again: confirmed, nothing restarts.
+
+    Compare the token with that committed last before you play anything, even if its vibration is
+    over.
+    """
     one, commit = subject.one(valid_for=300), send("Commit", token=1)
     again = commit, play_now(one, token=1)
     return [subject.arm, stage(one), commit, 0.2, *again, 0.13, *again]
 
 
-@driving(_PLACE)
+@driving("protocol.md#sets")
 def tokens_wrap(subject: Subject) -> RequestRows:
-    """It takes tokens that are newer by 1 to 32767 modulo 65536, and no others (RFC 1982)."""
+    """Token newer by 1 to 32767 modulo 65536: accepted; others: BAD_TOKEN.
+
+    Compute (a - b) modulo 65536 in 16 bits and compare it with 1 to 32767.
+    """
     rows: list[RequestRows] = [
         [
             play_now(subject.one(level=0.5), token=newer),
@@ -604,9 +660,13 @@ def tokens_wrap(subject: Subject) -> RequestRows:
     ]
 
 
-@driving(_PLACE)
+@driving("protocol.md#parts-of-a-set")
 def newer_sets_replace(subject: Subject) -> RequestRows:
-    """It keeps the newest staged set alone, and plays what comes with *now* at once."""
+    """New staged set, `now`, Silence or Disarm: the set staged before is dropped.
+
+    Keep one staged set. Drop it when a newer set is staged or played and when the amplifier falls
+    silent.
+    """
     half, quarter = subject.one(level=0.5), subject.one(level=0.25)
     dropped = partial(send, "Commit", code=_OLD)
     return [
@@ -630,18 +690,25 @@ def newer_sets_replace(subject: Subject) -> RequestRows:
     ]
 
 
-@driving(_PLACE)
+@driving("protocol.md#start-of-a-set")
 def committed_together(subject: Subject) -> RequestRows:
-    """It starts all layers and channels of a set at one moment."""
+    """Commit of a set with all layers and channels: all start with one sample.
+
+    Apply a whole set between two samples, not layer by layer across several.
+    """
     tones = [subject.tone(each, 1 / len(subject.layers)) for each in subject.channels]
     room = subject.can["set_words"] // (LAYER.words + COMMAND.words * len(tones))
     layers = [layer(each, *tones, ramp=subject.ramp) for each in subject.layers[:room]]
     return [[stage(*layers), send("Commit", token=1)]]
 
 
-@driving(_PLACE)
+@driving("protocol.md#start-of-a-set")
 async def starts_at_its_moment(subject: Subject) -> None:
-    """It starts a set as its clock comes to the moment of its Commit, at once beyond 0.5 s."""
+    """Commit with a moment up to 0.5 s ahead: starts there; otherwise immediately.
+
+    Compare the high word of the clock modulo 65536, and start with the first sample at or behind
+    the moment.
+    """
     soon = min(0.1 * subject.slowness, 0.4)
     beyond = 1.01 * MAX_AHEAD + 2 * min(subject.exchange_time, 1.0)
     for duration in (soon, 0.99 * MAX_AHEAD, beyond, -0.1, 0.0):
@@ -683,9 +750,13 @@ async def _starts(subject: Subject, duration: float, *, shift: int = 0) -> None:
     await subject.run([subject.follow])
 
 
-@driving(_PLACE)
+@driving("protocol.md#start-of-a-set")
 def what_waits_for_its_moment(subject: Subject) -> RequestRows:
-    """It starts what waits before a newer Commit or *now*, and drops it with all that silences."""
+    """Set waiting for its moment: started by a newer one, dropped by what silences.
+
+    Before a newer Commit or `now` that you accept, start the set that waits. Drop it in Silence,
+    Stop, Disarm, faults and an Arm with a new session.
+    """
     half = layer(1, subject.beside(1, 0.5))
     left = min(0.1 * subject.slowness, 0.4)
     waiting = stage(subject.one(level=0.25))

@@ -21,16 +21,19 @@ from era_haptics.lab.conformance.judge_client import (
 from era_haptics.lab.conformance.subject import Subject
 from registry import threads
 
-_STATES, _SESSIONS = "protocol.md#states", "protocol.md#sessions-and-the-watchdog"
 _WRONG = "WRONG_STATE"
 _DENSE, _NEAR = 0.003, 0.0003  # s; between statuses at most; from samples to the clock
 _ROUGH = 20  # steps of level
 _READINGS = {"mark": "Mark", "electrical": "GetMeasured"}  # by their features
 
 
-@driving(_STATES)
+@driving("protocol.md#states")
 def plays_nothing_disarmed(subject: Subject) -> RequestRows:
-    """It plays nothing before it is armed."""
+    """Set, Commit or Silence while disarmed: WRONG_STATE.
+
+    Check the state before the session, the capabilities and the stream. Accept Ping and Disarm in
+    this state.
+    """
     return _unarmed(subject)
 
 
@@ -51,9 +54,12 @@ def _latched(subject: Subject) -> list[Row]:
     return [arm, *moves * subject.has("address"), *_unarmed(subject)]
 
 
-@driving(_STATES)
+@driving("protocol.md#states")
 def arming(subject: Subject) -> RequestRows:
-    """It is silent once armed, with high voltage on, and forgets what was played and staged."""
+    """Arm after Disarm: silent, high voltage on, earlier sets and tokens forgotten.
+
+    In Arm, drop collected and staged sets and reset the committed token to 0.
+    """
     return [
         subject.arm,
         play_now(subject.one(), token=40_000),
@@ -66,9 +72,12 @@ def arming(subject: Subject) -> RequestRows:
     ]
 
 
-@driving(_STATES)
+@driving("protocol.md#sessions-and-the-watchdog")
 async def watchdog_ranges(subject: Subject) -> None:
-    """It arms with its shortest watchdog, which trips, its longest, and with none beyond."""
+    """Arm with watchdog_min or watchdog_max: accepted, trips on time; beyond: BAD_VALUE.
+
+    Compare the time with your stated limits, both inclusive, and count it in real time.
+    """
     low, high = subject.can["watchdog_min"], subject.can["watchdog_max"]
     outer = QUANTITIES["watchdog"]
     times = low - 1, high + 1, outer.minimum - 1, outer.maximum + 1, 0, 0xFFFF
@@ -83,9 +92,13 @@ async def watchdog_ranges(subject: Subject) -> None:
     await subject.run([send("Disarm", ramp=0)])
 
 
-@driving(_STATES)
+@driving("protocol.md#states")
 def arms_again(subject: Subject) -> RequestRows:
-    """It takes the same Arm again as a restart of the watchdog with its time, and plays on."""
+    """Arm with the session held: the watchdog restarts with its time, playback goes on.
+
+    If the session is the one held, only store the new watchdog time and restart the count; keep
+    voices, staged sets and the token.
+    """
     low, high = subject.shortest_watchdog, subject.can["watchdog_max"]
     return [
         partial(subject.arm, high / 1000),
@@ -97,9 +110,13 @@ def arms_again(subject: Subject) -> RequestRows:
     ]
 
 
-@driving(_SESSIONS)
+@driving("protocol.md#sessions-and-the-watchdog")
 def sessions(subject: Subject) -> RequestRows:
-    """It obeys the session that armed it, of 16 bits, and no other; an ended one arms no more."""
+    """Request with another session, or Arm with an ended session: WRONG_SESSION.
+
+    Compare all 16 bits of the session, right after the state. Remember the last session after
+    Disarm, Stop and faults, and reject an Arm that repeats it.
+    """
     subject.client.session, own = 0x1233, 0x1234
     quarter, maximum = subject.one(level=0.25), subject.can["watchdog_max"]
     outer = QUANTITIES["watchdog"]
@@ -146,18 +163,25 @@ async def _arm_as(subject: Subject, session: int) -> None:
     await subject.arm()
 
 
-@driving(_STATES)
+@driving("protocol.md#states")
 def arming_ends_fades(subject: Subject) -> RequestRows:
-    """It is silent 5 ms after an Arm amid a Disarm's fade, refused with the session of before."""
+    """Arm during the fade of a Disarm: silent within 5 ms.
+
+    In Arm, shorten every running fade to 5 ms, and keep rejecting the session that Disarm ended.
+    """
     disarm = send("Disarm", ramp=subject.can["ramp_max"])
     ended = send("Arm", watchdog=subject.can["watchdog_max"], code="WRONG_SESSION")
     fades = partial(subject.follow, 0.02)
     return [subject.arm, subject.one(), disarm, ended, subject.arm, fades, subject.one()]
 
 
-@driving(_STATES)
+@driving("protocol.md#states")
 def stop(subject: Subject) -> RequestRows:
-    """It stops at once, latched and numbered, plays no more, and arms only once it is cleared."""
+    """Stop with ramp 0: every channel silent, latched; nothing plays or arms before Clear.
+
+    Remove every voice, drop collected, staged and waiting sets, enter QUICK_STOP_ACTIVE with a new
+    latch, and answer WRONG_STATE to Arm, Set, Commit and Silence.
+    """
     return [
         subject.arm,
         subject.whole(),
@@ -170,9 +194,13 @@ def stop(subject: Subject) -> RequestRows:
     ]
 
 
-@driving(_STATES)
+@driving("protocol.md#states")
 def stop_ramps(subject: Subject) -> RequestRows:
-    """It falls silent along the ramp of Stop or Disarm, a raised cosine; the sooner of both."""
+    """Stop or Disarm with a ramp: raised cosine to zero; a second one only shortens it.
+
+    Lead every voice from its present amplitude along the raised cosine. Treat a ramp above ramp_max
+    as ramp_max, and keep the earlier of two ends.
+    """
     whole, fading = subject.whole(), _unarmed(subject, 0xFFFF)
     amid = partial(subject.follow, 0.2 * subject.slowness)
     (stop, slowest_stop), (disarm, slowest_disarm) = (
@@ -188,9 +216,12 @@ def stop_ramps(subject: Subject) -> RequestRows:
     ]
 
 
-@driving(_STATES)
+@driving("protocol.md#layers")
 def silence_never_later(subject: Subject) -> RequestRows:
-    """It is silent by the sooner of two Stops; a later one prolongs nothing, nor does a fault."""
+    """Second Stop during a fade: silent at the earlier of both ends.
+
+    Compare the time left of the running fade with the new ramp, and keep the fade that ends first.
+    """
     subject.require_ramp()
     slow, quick = send("Stop", ramp=min(400, subject.can["ramp_max"])), send("Stop", ramp=50)
     fading = layer(0, ramp=50)
@@ -203,17 +234,25 @@ def silence_never_later(subject: Subject) -> RequestRows:
     ]
 
 
-@driving(_STATES)
+@driving("protocol.md#states")
 def stop_ends_all(subject: Subject) -> RequestRows:
-    """It ends fades, onsets, endings, waiting sets and all layers by Stop, skipping endings."""
+    """Stop during fades, onsets, endings and waiting sets: all end along its ramp.
+
+    Fade every voice of every layer, released or not, skip endings, and drop what waits.
+    """
     subject.require_ramp()
     stopped = send("Stop", ramp=10)
     return [(*rows, stopped) for rows in subject.transitions(subject.can["ramp_max"])]
 
 
-@driving(_STATES)
+@driving("protocol.md#states")
 def stops_are_numbered(subject: Subject) -> RequestRows:
-    """It numbers every Stop, also of one disarmed; Clear names the last, else changes nothing."""
+    """Every Stop: the next latch number; Clear with another number: WRONG_LATCH.
+
+    Give every Stop and every fault the next 16-bit number, 1 to 65535 and then 1, also while
+    disarmed or stopped. Compare all 16 bits in Clear, and change nothing if there is nothing to
+    clear.
+    """
     latch = token_after(token_after(token_after(subject.latch)))
     others = (latch - 1) % 0x10000, (latch + 1) % 0x10000, latch ^ 0x100
     return [
@@ -230,18 +269,26 @@ def stops_are_numbered(subject: Subject) -> RequestRows:
     ]
 
 
-@driving(_STATES)
+@driving("protocol.md#states")
 def clear_too_early(subject: Subject) -> RequestRows:
-    """It stays stopped by a Clear amid its fade."""
+    """Clear during the fade of a Stop: the state stays.
+
+    Leave QUICK_STOP_ACTIVE only when no voice lasts; until then, answer Clear with the present
+    Status.
+    """
     subject.require_ramp()
     ramp = subject.ramp
     slow, last = send("Stop", ramp=ramp), layer(0, subject.tone(subject.channels[-1]))
     return [subject.arm, last, slow, subject.clear, ramp / 1000 + 0.02, subject.clear]
 
 
-@driving("protocol.md#sets")
+@driving("protocol.md#start-of-a-set")
 def silence(subject: Subject) -> RequestRows:
-    """It silences all layers along the ramp of Silence, drops what is staged, and stays armed."""
+    """Silence: all layers fade along its ramp, staged sets are dropped, state stays armed.
+
+    Fade every voice, drop collected, staged and waiting sets, and stay in OPERATION_ENABLED. Reject
+    a ramp above ramp_max with BAD_VALUE.
+    """
     ending = subject.envelope(0.1, 1, 1)
     several = play_now(
         layer(0, subject.tone(0, 0.5, ending=ending)),
@@ -293,32 +340,47 @@ async def _trips_for_good(subject: Subject, time: int) -> None:
     )
 
 
-@driving(_SESSIONS)
+@driving("protocol.md#sessions-and-the-watchdog")
 async def watchdog(subject: Subject) -> None:
-    """It falls silent along 5 ms when its watchdog time has passed, and the fault is latched."""
+    """Watchdog not fed: every channel reaches zero along 5 ms, fault latched until Clear.
+
+    When the count reaches zero, fade all voices along 5 ms, beginning at most 5 ms late, latch
+    WATCHDOG, and answer WRONG_STATE to Arm.
+    """
     for time in (subject.shortest_watchdog, subject.can["watchdog_max"]):
         await subject.in_time(partial(_trips_for_good, subject, time))
 
 
-@driving(_SESSIONS)
+@driving("protocol.md#sessions-and-the-watchdog")
 async def trips_amid_fades(subject: Subject) -> None:
-    """It trips at its time and is silent 5 ms later, whatever plays, fades, ends or waits."""
+    """Watchdog expiry during fades, onsets, endings, waiting sets: silent 5 ms later.
+
+    In a fault, shorten every way to zero that would end later than 5 ms from now, released voices
+    and endings included.
+    """
     time = subject.shortest_watchdog
     for sets in subject.transitions(min(3 * time, subject.can["ramp_max"])):
         await subject.in_time(partial(_trips, subject, time / 1000, *sets))
 
 
-@driving(_SESSIONS)
+@driving("protocol.md#sessions-and-the-watchdog")
 async def watchdog_unread(subject: Subject) -> None:
-    """It trips at its time though nothing is asked of it, and lists the fault with its age."""
+    """Watchdog not fed, no request at all: trips on time, fault listed with its age.
+
+    Run the count from a timer or with the samples, not in the handler of requests.
+    """
     await subject.run([partial(subject.arm, 0.0), subject.one(), subject.starve])
     await asyncio.sleep(subject.shown.watchdog + 0.03)
     await subject.run([send("GetFaults")])
 
 
-@driving(_SESSIONS)
+@driving("protocol.md#sessions-and-the-watchdog")
 def what_feeds(subject: Subject) -> RequestRows:
-    """It is fed by Arm, Ping, Set, Commit and Silence of its session, and counts the time left."""
+    """Arm, Ping, Set, Commit or Silence of the session: watchdog_left restarts.
+
+    Restart the count for every accepted request that feeds, also a repeated Commit, a part that is
+    kept and a last part that gets Taken.
+    """
     first, *_, last = subject.parts(*long_set(subject), token=3, now=0, count=3)
     feeds = (
         subject.ping,
@@ -336,9 +398,12 @@ def what_feeds(subject: Subject) -> RequestRows:
     return [partial(subject.arm, 0.5), *(row for feed in feeds for row in (apart, feed))]
 
 
-@driving(_SESSIONS)
+@driving("protocol.md#sessions-and-the-watchdog")
 async def what_does_not_feed(subject: Subject) -> None:
-    """It is fed by nothing else: no reading, nothing that it refuses, no other session."""
+    """Readings, rejected requests, other sessions, dropped parts: watchdog_left runs down.
+
+    Restart the count only after all checks of the request have passed.
+    """
     (part,) = subject.parts(subject.one(), token=7)
     flawed = {**part, "stream": [0xFFFF, 0, 0]}
     made = long_set(subject)
@@ -380,9 +445,12 @@ async def what_does_not_feed(subject: Subject) -> None:
     await subject.run([*collected, *staged])
 
 
-@driving(_SESSIONS)
+@driving("protocol.md#sessions-and-the-watchdog")
 async def trips_amid_other_requests(subject: Subject) -> None:
-    """It trips at its time amid requests that do not feed it."""
+    """Requests that do not feed, without a pause: the watchdog trips on time.
+
+    Do not let the reception of frames restart or delay the count.
+    """
     await subject.run([partial(subject.arm, 0.0), subject.one(), subject.starve])
     others: RequestRows = (
         send("GetFaults"),
@@ -399,9 +467,13 @@ async def trips_amid_other_requests(subject: Subject) -> None:
     await subject.settle()
 
 
-@driving("protocol.md#messages")
+@driving("protocol.md#readings")
 async def fault_list(subject: Subject) -> None:
-    """It lists faults, the newest first, by their ages, also after they were cleared."""
+    """GetFaults after two faults: newest first with ages, kept by Clear.
+
+    Store at least two faults with the time of each, newest first, and keep them until power-down.
+    Channel 255 if no channel is at fault.
+    """
 
     async def listed() -> list[tuple[int, int]]:
         rows = (await subject.request("GetFaults"))["faults"]

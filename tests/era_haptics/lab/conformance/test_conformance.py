@@ -248,7 +248,7 @@ def test_amplifier_that_is_not_identified_fails_once(
     assert failed.result is Result.FAILED
     assert re.fullmatch(reason, failed.reason), failed.reason
     after = {(each.result, each.reason) for each in others}
-    assert after == {(Result.NOT_RUN, f"{failed.check.name} failed")}
+    assert after == {(Result.NOT_RUN, f"not run because {failed.check.name} failed")}
     assert (
         ConformanceReport("x", 0.2, tuple(found), 0).to_json()["level"] == 0
     )  # nothing was driven
@@ -317,7 +317,9 @@ async def test_machine_that_is_always_late_has_no_verdict() -> None:
     assert isinstance(late.finding, TooLate)
     assert ConformanceReport("x", 0.2, (late, good), 0).overall == "incomplete"
     assert isinstance(last.finding, TooLate)
-    assert last.reason.startswith("no verdict since the time of the run is used up: "), last.reason
+    assert last.reason.startswith("no verdict because the time for repetitions is used up: "), (
+        last.reason
+    )
 
 
 def obey_late(monkeypatch: pytest.MonkeyPatch, delay: float) -> None:
@@ -475,6 +477,7 @@ async def test_verdict_over_a_real_port(tmp_path: Path) -> None:
         "attempts",
         "sent",
         "came",
+        "remedy",
     ]
     assert shown["not_run"] == sum(check.drives for _, check in of_kind("serial"))
 
@@ -496,14 +499,39 @@ def test_report_says_the_worst() -> None:
     assert "driven at up to 20%" in report.summary
 
 
-def test_every_check_says_what_it_requires() -> None:
-    """Once, in a sentence, beside the place of the rule: the anchor of a heading of a page.
+def failed_with(check: ConformanceCheck, reason: str) -> CheckResult:
+    """A check that failed with a reason."""
+    return CheckResult(check, 1, Result.FAILED, reason)
 
-    The page on writing an amplifier counts all of a serial line, where of the firmware none fails.
+
+def test_report_names_first_a_value_that_several_checks_found_wrong() -> None:
+    """A latch that two checks report, with its rule; not a token of a single check."""
+    reasons = ("latch after Stop must be 2, got 0", "latch after Clear must be 3, got 1")
+    failed = [*map(failed_with, CHECKS, (*reasons, "token after Arm must be 0, got 1"))]
+    report = ConformanceReport("x", 0.2, tuple(failed), 0)
+    assert report.fix_first == ["latch in 2 checks (protocol.md#states)"]
+
+
+def test_failure_has_the_remedy_of_the_rule_that_is_violated() -> None:
+    """Of the check, but of the watchdog if a check of Stop found that wrong."""
+    own = failed_with(state_checks.stop, "latch after Stop must be 2, got 0")
+    other = failed_with(state_checks.stop, "watchdog_left after Arm must be 0.5, got 0.6")
+    assert own.advice == (state_checks.stop.place, state_checks.stop.remedy)
+    assert other.advice[0] == "protocol.md#sessions-and-the-watchdog"
+    assert other.to_json()["remedy"] == other.advice[1] != state_checks.stop.remedy
+
+
+def test_every_check_has_a_title_a_remedy_and_a_rule() -> None:
+    """Each title is a stimulus, a colon and a reaction; each rule is a heading of a page.
+
+    The page on writing an amplifier counts all checks of a serial line.
     """
     names = [check.name for check in CHECKS]
     assert len({*names}) == len(names)
-    assert all(check.requirement for check in CHECKS)
+    for check in CHECKS:
+        assert re.fullmatch(r"[^:]+: [^.]+", check.title), check.title
+        assert len(check.title) <= 90, check.title
+        assert check.remedy.endswith("."), check.name
     for place in {check.place for check in CHECKS}:
         page, anchor = place.split("#")
         titles = re.findall(r"^#+ (.*)$", (PAGES / page).read_text("utf-8").lower(), re.MULTILINE)

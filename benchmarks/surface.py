@@ -2,7 +2,7 @@
 
     python -m benchmarks.surface [--solver calculix] [--sets N] [--wire] [--page]
 
-Prints the tables in the section How well of docs/how-to/surface.md; --page writes them there.
+Prints the tables in the section Accuracy of docs/how-to/surface.md; --page writes them there.
 
 The paper's plate is exported as another program would, by its modes at 25 x 19 nodes up to
 1.5, 3 and 5 times the highest frequency of its limits, and imported as a surface. Compared with the

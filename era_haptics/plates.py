@@ -179,7 +179,7 @@ class SolvedPlate:
           full stroke), which determines the duration and the sampling of the records.
 
         A layer starts with its onset or its ramp, drives with a 40 ms ramp. The plate is solved
-        exactly in time, without time steps (`docs/concepts/plant.md`). Raises InputError for
+        exactly in time, without time steps (`docs/concepts/plate-model.md`). Raises InputError for
         fingers off the plate, a duration in which the slowest vibration does not decay to 5 %, and
         drives that an ERA cannot play.
 

@@ -1,9 +1,9 @@
-"""The table of docs/how-to/rig-check.md: every kind of finding, and when it is found."""
+"""The table of docs/how-to/measure-your-plate.md: every kind of finding and its criterion."""
 
 from model.estimate.findings import FINDING_KINDS
 
 
 def finding_kinds() -> str:
-    """Return each kind, what it is about, and its criterion."""
-    rows = [f"| {name} | {each.about} | {each.criterion} |" for name, each in FINDING_KINDS.items()]
-    return "\n".join(["| finding | of | criterion |", "|---|---|---|", *rows])
+    """Return one row for each kind: its name, its subject and its criterion."""
+    rows = [f"| {name} | {kind.about} | {kind.criterion} |" for name, kind in FINDING_KINDS.items()]
+    return "\n".join(["| finding | about | reported if |", "|---|---|---|", *rows])

@@ -92,7 +92,7 @@ WRITTEN: Mapping[str, Sequence[Writer]] = {
         for page in ("protocol", "serial", "modbus", "can")
     },
     "docs/pictures/weekend_wiring.svg": [whole(wiring)],
-    "docs/how-to/rig-check.md": [part("docs/generators/findings_page.py", finding_kinds)],
+    "docs/how-to/measure-your-plate.md": [part("docs/generators/findings_page.py", finding_kinds)],
     "docs/reference/api.md": [part("docs/generators/api_page.py", api_reference)],
     "docs/reference/commands.md": [part("docs/generators/command_page.py", command_reference)],
     "docs/reference/metrics.md": [

@@ -1,14 +1,14 @@
-"""What a rig check finds: kinds of finding with their texts, and what judges each of them.
+"""Findings of a rig check: their kinds and texts, and the functions that detect them.
 
-A kind is an entry of `FINDING_KINDS`, from which `docs/how-to/rig-check.md` is written, too, and a
-function here. What a file says the wrong way round (places, grain, resonances) is another plate,
-for which no fit of values makes up: functions of a plate and its shapes find it, and put it right.
-Shapes show it: those of boards as bought leave a quarter of the response unexplained with the right
-side, half to nine tenths with the other. All else follows from a `Verdict` whose plate and channels
-are matched.
+A kind is an entry of `FINDING_KINDS`, which is also the source of a table in
+`docs/how-to/measure-your-plate.md`, and a function in this module. Reversed entries of a file
+(positions, grain, resonances) describe another plate, which no fit of values can replace. They
+are detected from response shapes and corrected first: on boards as bought, a fit with the right
+entry leaves a quarter of the response unexplained, with the reversed one half to nine tenths. All
+other findings follow from a `Verdict` whose plate and channels are matched.
 
-A new kind of fault is an entry of `FINDING_KINDS`, and a function that yields findings of a verdict
-and is called by `with_findings`.
+To add a kind of fault, add an entry to `FINDING_KINDS` and a function that yields findings from a
+verdict, and call it in `with_findings`.
 """
 
 import math
@@ -87,176 +87,172 @@ class FindingKind:
 
 FINDING_KINDS = {
     "mirrored": FindingKind(
-        "PLACES: places of sensors must be from the corner from which those of ERAs are, "
-        "got ones mirrored in {of}: {coarse}; correct the positions of all{or_plugs}",
-        "places from the other corner, or from another edge: a coarse fit with them leaves "
-        "less than 0.6 of what the file's leave unexplained; they are put right, and all else "
-        "is judged then",
+        "PLACES: sensor positions must be measured from the same corner as ERA positions, "
+        "got positions mirrored in {of}: {coarse}; correct all sensor positions{or_plugs}",
+        "a coarse fit with mirrored sensor positions leaves less than 0.6 times as much of the "
+        "responses unexplained; the check continues with the mirrored positions",
         "file",
     ),
     "reversed": FindingKind(
-        "PLACES: frequencies must be those of their responses, got reversed ones: {coarse}",
-        "the same with the frequencies backwards",
+        "PLACES: frequencies must be those of their responses, got reversed order: {coarse}",
+        "as for `mirrored`, with the frequencies in reverse order",
         "file",
     ),
     "exchanged": FindingKind(
-        "PLACES: sensors must be at their places, got responses that fit exchanged ones: "
-        "{of}; correct their positions or names",
-        "sensors whose responses fit the place of another one (coherence above 0.9, at their "
-        "own below 0.8), and that one's do not fit there: they are put right, and all else is "
-        "judged then",
+        "PLACES: sensors must be at their stated positions, got exchanged positions: "
+        "{of}; correct the positions or names",
+        "responses fit the position of another sensor (coherence above 0.9; below 0.8 at their "
+        "own position); the check continues with the positions corrected",
         "file",
     ),
     "grain": FindingKind(
-        "GRAIN: plate.grain must be {along}, got {as_written}: with the grain along its {along} a "
-        "coarse fit leaves {percent} of the responses unexplained, along its {as_written} "
-        "{percent_as_written}; look at the veneer of its faces, and correct the rig",
-        "coarse fits of a board with its grain along either side: the other one leaves less "
-        "than 0.6 of what the rig's leaves unexplained; channels are then judged on that board",
+        "GRAIN: plate.grain must be {along}, got {as_written}: a coarse fit leaves {percent} of "
+        "the responses unexplained with the grain along the {along}, {percent_as_written} with "
+        "the grain along the {as_written}; look at the veneer of its faces, and correct the rig",
+        "a coarse fit with the grain along the other side leaves less than 0.6 times as much of "
+        "the responses unexplained; the check continues with that grain",
         "file",
     ),
     "resonance": FindingKind(
-        "RESONANCE: resonance_is of {of} must be {which}, got {as_written}: with it "
-        "{which} a glued magnet resonates at {value:.0f} Hz, and gains vary by a factor of "
-        "{factor:.2g} over frequency, as written by {factor_as_written:.2g}; correct the rig",
-        "of exciters, the same with the resonance of the file as the other of `free` and "
-        "`mounted`, where gains vary over frequency more than a drive's (0.8, standard "
-        "deviation of their logarithms): the other one leaves less than half of that; channels "
-        "are then judged by it",
+        "RESONANCE: resonance_is of {of} must be {which}, got {as_written}: if {which}, "
+        "a glued magnet resonates at {value:.0f} Hz and gains vary by a factor of "
+        "{factor:.2g} over frequency; if {as_written}, by {factor_as_written:.2g}; correct the rig",
+        "gains of exciters vary too much over frequency (standard deviation of their logarithm "
+        "above 0.8), and less than half as much if the resonance in the file is the other one of "
+        "`free` and `mounted`; the check continues with that one",
         "file",
     ),
     "swapped": FindingKind(
         "SWAPPED: {one} drives ERA {second}, and {other} drives ERA {first} (confidence "
         "{confidence:.3f}): exchange the two plugs, or the channels in the rig",
-        "two channels drive each other's ERA, as of `other ERA`",
+        "two channels drive each other's ERA (criterion: `other ERA`)",
     ),
     "cycle": FindingKind(
         "SWAPPED in a cycle: the channels of {of} each drive the next one's ERA (confidence "
         "{confidence:.3f}): correct the plugs",
-        "three or more do so in a circle",
+        "three or more channels drive each other's ERAs in a cycle",
     ),
     "all strong or weak": FindingKind(
         "{state}: the channels of {of} play {least:.2f} to {value:.2f} of the "
-        "commanded amplitude: check the sensors' sensitivity first, which makes all of them so "
-        "together; then the amplifier's volume",
-        "three quarters of the channels are strong, or weak",
+        "commanded amplitude: check the sensors' sensitivity first, which affects all of them "
+        "alike; then the amplifier's volume",
+        "three quarters of the channels are strong, or three quarters are weak",
     ),
     "all inverted": FindingKind(
-        "INVERTED: all channels have the sign that is opposite to the sensors': turn "
+        "INVERTED: all channels have the opposite sign of the sensors: turn "
         "the sensors over, swap the two wires of every ERA, or check the sign convention of phases",
         "all channels are inverted",
     ),
     "dead": FindingKind(
         "DEAD: {wiring} does not move the plate: check its supply, its cable and the "
         "amplifier's channel",
-        "its response is below 3 % of the predicted one, or faint and unlike that of any ERA",
+        "the response is below 3 % of the prediction, or faint and unlike the prediction for any "
+        "ERA",
     ),
     "loose": FindingKind(
-        "LOOSE: {wiring} acts on the plate with a part of its contact only, as an exciter "
-        "whose glue is off: press it on or glue it anew, and measure again",
-        "of a plate that does not match, an exciter is what is farthest off, or explains it, "
-        "with less than 0.7 of its stiffness or weight; of any, its gain rises with frequency, "
-        "against those of the other channels, as behind a spring of glue",
+        "LOOSE: {wiring} acts on the plate with only part of its contact, such as an exciter "
+        "whose glue has come off: press it on or glue it again, and measure again",
+        "the plate does not match, and the parameter farthest off is an exciter with less than "
+        "0.7 of its stiffness or weight; or a channel's gain rises with frequency relative to "
+        "the other channels",
     ),
     "weak": FindingKind(
         "WEAK: {wiring} plays {value:.2f} of the commanded amplitude: check its voltage, "
         "volume and mounting, or measure its gain with `era calibrate`",
-        "gain, relative to the rig's `gains` if it has some, below 0.8, or beyond 3.5 standard "
-        "deviations of what the rig's `uncertainty` states of gains (and of an exciter's force "
-        "factor, by `stiffness`) if that is more",
+        "the gain is below 0.8 of the rig's, or beyond 3.5 standard deviations of the `gain` "
+        "(for exciters also `stiffness`) in the rig's `uncertainty` if that is more",
     ),
     "strong": FindingKind(
         "STRONG: {wiring} plays {value:.2f} of the commanded amplitude: lower its voltage or "
         "volume, or correct its stroke or gains in the rig",
-        "the same above 1.25",
+        "as for `weak`, above 1.25",
     ),
     "other ERA": FindingKind(
         "WRONG ERA: {wiring} drives ERA {drives} instead of {of} (MAC {mac_found:.3f}, with its "
         "own ERA {mac_own:.3f}; confidence {confidence:.3f}): correct the plug, or the rig's "
         "channels",
-        "over the sensors its shape is that of another ERA (MAC over the frequencies; a t-test "
-        "gives the confidence), and the whole plate is explained better in this way",
+        "the response shape over the sensors fits another ERA (MAC over the frequencies; "
+        "confidence from a t-test), and this explains the whole plate better",
     ),
     "inverted": FindingKind(
         "INVERTED: {wiring} has the opposite sign of the others: swap its two wires",
-        "its phase relative to the drive is off by 90° or more",
+        "the phase relative to the drive is off by 90° or more",
     ),
     "out of phase": FindingKind(
         "OUT OF PHASE: {wiring} is off by {phase:+.0f}°: measure its gains with `era calibrate`",
-        "by more than 45°",
+        "the phase is off by more than 45°",
     ),
     "silent": FindingKind(
-        "SENSOR {of} reads nothing: left out",
-        "no signal of any channel; it is left out",
+        "SENSOR {of} has no signal: left out",
+        "no signal from any channel; the sensor is left out",
         "sensor",
         is_fault=False,
     ),
     "mute": FindingKind(
-        "SENSOR {of} reads {value:.2f} of what the others say: check that it is where its line "
-        "says, and its cable: left out",
-        "a tenth of what the others say, or less; left out, too",
+        "SENSOR {of} reads {value:.2f} times the value implied by the other sensors: check its "
+        "position and its cable: left out",
+        "at most a tenth of the value implied by the other sensors; left out",
         "sensor",
         is_fault=False,
     ),
     "upside down": FindingKind(
-        "SENSOR {of} is upside down (reads {value:.2f} of what the others say): turn it "
-        "over: left out",
-        "the opposite sign of what the others say, at half of it or more; left out, too",
+        "SENSOR {of} is upside down (reads {value:.2f} times the value implied by the other "
+        "sensors): turn it over: left out",
+        "opposite sign, and at least half of the value implied by the other sensors; left out",
         "sensor",
         is_fault=False,
     ),
     "off scale": FindingKind(
-        "SENSOR {of} reads {value:.2f} of what the others say: left out",
-        "less than 0.7 or more than 1.4 of what the others say; left out, too",
+        "SENSOR {of} reads {value:.2f} times the value implied by the other sensors: left out",
+        "less than 0.7 or more than 1.4 times the value implied by the other sensors; left out",
         "sensor",
         is_fault=False,
     ),
     "plate": FindingKind(
         "PLATE: the rig does not match the plate: {why}\n{hypotheses}",
-        "no plate within the tolerances of the rig explains the measurement",
+        "no plate within the rig's tolerances explains the measurement",
         "plate",
     ),
     "detached": FindingKind(
         "DETACHED: ERA {of} holds the plate with {value:.2f} of its stiffness: tighten its bolt, "
         "or look for a spring that came off",
-        "an ERA whose stiffness, less than a tenth of the rig's, explains the plate best",
+        "the plate is best explained by an ERA with less than a tenth of its stiffness",
         "plate",
     ),
     "outliers": FindingKind(
         "OUTLIERS: {count} left out, {value} of them of sensor {of}: check for loose "
         "contacts if they are many",
-        "values that a calibration would leave out, up to 5 % of all; they judge nothing",
+        "values that a calibration would leave out, up to 5 % of all",
         "plate",
         is_fault=False,
     ),
     "mass": FindingKind(
         "MASS: {grams} at ({x_m:.2f}, {y_m:.2f}) m: remove it, or write it to the rig's masses",
-        "one mass or two, together 2 % of the plate's or more, each with its place and weight",
+        "one or two additional masses, together at least 2 % of the plate's mass",
         "load",
     ),
     "finger": FindingKind(
-        "FINGER: the plate is touched at ({x_m:.2f}, {y_m:.2f}) m: take away what rests "
+        "FINGER: the plate is touched at ({x_m:.2f}, {y_m:.2f}) m: remove the object "
         "there, and measure again",
-        "something rests there that is soft and damps, as a fingertip does",
+        "a soft, damped load, such as a fingertip",
         "load",
     ),
     "thickness": FindingKind(
-        "THICKNESS: the plate is {along_x} thicker at the end of x and {along_y} at that "
-        "of y than in its middle, by what its sensors read: check it, or the sensors' scales",
-        "the plate is thicker at one end than at the other, or the sensors' scales rise along it",
+        "THICKNESS: according to its sensors, the plate is {along_x} thicker at the end of x and "
+        "{along_y} at the end of y than in its middle: check it, or the sensors' scales",
+        "the plate is thicker at one end, or the sensors' scales rise towards it",
         "form",
     ),
     "unnamed": FindingKind(
-        "UNNAMED: the plate is as written, but for something that has no name here: {said}; "
+        "UNNAMED: values match the rig, but something else differs: {said}; "
         "check its thickness, what is bonded to it and the sensors' scales, and measure for `era "
         "calibrate`",
-        "as written, but for something that has no name here: form errors as less than one "
-        "plate in a hundred has them, such as modes moved by a bonded frame, or more than 5 % "
-        "unexplained",
+        "form errors larger than on 99 % of plates, such as modes shifted by a bonded "
+        "frame, or more than 5 % unexplained",
         "form",
     ),
     "promise": FindingKind(
-        "PROMISE: half of the answers of the rig's table miss the contrast that it promises "
+        "PROMISE: half of the answers of the rig's table miss their promised contrast "
         "by {value:.1f} dB or more",
         "half of the answers of the rig's table miss their promise by 1 dB or more",
         "plate",

@@ -1,7 +1,7 @@
 """Report of a calibration and of an identification: one table, lines for people, and JSON.
 
-The table has what was found, its standard error, what was known before, and what each value is
-hardly told apart from.
+The table has the fitted value, its standard error, the value before, and the parameter whose error
+is most correlated with this one.
 """
 
 import math
@@ -21,15 +21,15 @@ from model.quantities import counted, in_display_unit, percent, with_error
 from model.rig.rig import Rig, Uncertainty
 from model.study.verification import ExpectedContrast
 
-_ALIKE = 0.9  # of a correlation of errors: beyond it two values are hardly told apart
+_ALIKE = 0.9  # smallest correlation of two errors that is reported
 _MISTAKEN = 0.01  # unexplained, beyond which a plate differs from the rig by more than parameters
 _LISTED_STDS = 2.0  # from the rig's value, beyond which a parameter is listed
 
 
 def confusions(names: Sequence[str], covariance: FloatArray) -> list[str]:
-    """Name what each of some parameters is hardly told apart from, "" where it is from all others.
+    """Name the parameter whose error is most correlated with that of each parameter.
 
-    By the largest correlation of the errors of a covariance (p, p).
+    The name is empty if the correlation is at most 0.9. covariance: of the errors, (p, p).
     """
     std = np.sqrt(np.diagonal(covariance))
     std = np.where(std > 0, std, np.inf)
@@ -42,8 +42,8 @@ def confusions(names: Sequence[str], covariance: FloatArray) -> list[str]:
 
 
 def estimate_table(rows: Sequence[tuple[str, str, str, str, str]]) -> list[str]:
-    """Table of what was found: name, value, standard error, what was known before, and a note."""
-    cells = [("", "found", "standard error", "before", "note"), *rows]
+    """Table of fitted values: name, value, standard error, value before, and a note."""
+    cells = [("", "fitted", "standard error", "before", "note"), *rows]
     widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
     return ["  ".join(map(str.ljust, row, widths)).rstrip() for row in cells]
 
@@ -202,7 +202,7 @@ def _millimetres(place: Point) -> str:
 
 
 def _estimate(fitted: Parameter, alike: str) -> tuple[str, str, str, str, str]:
-    """Row of `estimate_table` of a value; alike: name of what it is hardly told apart from."""
+    """Row of `estimate_table` of a value; alike: name of the correlated parameter."""
     before = in_display_unit(fitted.before, fitted.unit, digits=5)
     if fitted.standard_error is None:
         return fitted.name, "", "", before, "not identified"
@@ -212,7 +212,7 @@ def _estimate(fitted: Parameter, alike: str) -> tuple[str, str, str, str, str]:
     notes = [
         f"{100 * (fitted.value / fitted.before - 1):+.1f} %" if fitted.before else "",
         "at its bound" if fitted.at_bound else "",
-        f"hardly told apart from {alike}" if alike else "",
+        f"correlated with {alike}" if alike else "",
     ]
     return fitted.name, value + "".join(unit), f"± {error}", before, ", ".join(filter(None, notes))
 
@@ -294,7 +294,7 @@ def parameter_rows(found: Identification) -> list[str]:
             unit = each.unit if each.unit in ("", "°") else f" {each.unit}"
             value, _, error = with_error(each.value, each.standard_error, sign="+").partition(" ± ")
             other = confused[each.name]
-            note = f"hardly told apart from {other}" if other else ""
+            note = f"correlated with {other}" if other else ""
             if each.kind == "supports" and each.standard_error > MAX_GUESSED * each.prior:
                 note = "not identified"
             before = f"± {float(f'{each.prior:.2g}'):g}{unit}"
@@ -304,14 +304,14 @@ def parameter_rows(found: Identification) -> list[str]:
 
 
 def contrast_rows(expected: Sequence[ExpectedContrast]) -> list[str]:
-    """Lines of the contrast to expect before and after, and of what is promised."""
+    """Lines of the expected contrast before and after, and of the promised contrast."""
     if not expected:
         return ["contrast: nothing is promised"]
     return [
         "contrast on plates like this one, median over random fingers:",
         *(
-            f"  {each.quiet} quiet: as written {each.before:.1f} dB, identified {each.after:.1f} "
-            f"dB; nine of ten plates {each.promised:.1f} dB"
+            f"  {each.quiet} quiet: rig file {each.before:.1f} dB, identified {each.after:.1f} "
+            f"dB; promised {each.promised:.1f} dB"
             for each in expected
         ),
     ]

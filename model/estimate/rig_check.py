@@ -507,12 +507,12 @@ def difference_rows(verdict: Verdict) -> list[str]:
         for kind, change in verdict.changes.items()
         if abs(change) >= _MIN_CHANGE
     )
-    within = "within tolerances, but not as written: " if verdict.plate_matches else ""
+    within = "within tolerances, but off its nominal values: " if verdict.plate_matches else ""
     if verdict.about("form"):
-        within, changes = "", "by what has no name"
+        within, changes = "", "in a way that no parameter describes"
     return [
         f"PLATE DIFFERS: {within}{changes or 'single ERAs or bolts'}; it keeps "
-        f"{percent(kept)} of what the rig's table promises: calibrate it with "
+        f"{percent(kept)} of the promises of the rig's table: calibrate it with "
         "`era calibrate`"
     ]
 

@@ -172,9 +172,9 @@ class ActuatorSection(Section):
     """
 
     gains: Annotated[list[GainRow], Field(max_length=2000), GAINS] | None = None
-    """`[[frequency in Hz, magnitude, phase in degrees], ...]`: its drive by a level, in full
-    levels, measured by `era calibrate` ([calibration](../how-to/calibration.md)); linear in
-    between, constant outside, 1 without rows.
+    """`[[frequency in Hz, magnitude, phase in degrees], ...]`: its response to a level, in full
+    levels, as [measured](../how-to/measure-your-plate.md); interpolated linearly, constant outside,
+    1 without rows.
 
     Limits: rows by ascending frequency
     """

@@ -257,7 +257,7 @@ NAMES = [
 ]
 WITH_CONFORMANCE = ["write-an-amplifier"]
 """It runs the whole of it."""
-WITHOUT_CODE = ["identify-a-plate"]
+WITHOUT_CODE = ["design-a-plate", "measure-your-plate"]
 """Commands alone, without a file of the examples."""
 SHORT = "plug-ins"
 """Executed by every run of the tests; the others by `make test-long`, and when they change."""

@@ -122,7 +122,7 @@ def _cost_notes(rig: Rig) -> Iterator[str]:
             "foreign_mass",
             what=f"uncertainty.foreign_mass: with {1e3 * known.foreign_mass:.3g} g anywhere on the "
             "plate",
-            remedy="what always lies at one place belongs under masses",
+            remedy="list permanent loads under masses",
         )
     if known.weather:
         yield from _uncertainty_note(
@@ -130,7 +130,7 @@ def _cost_notes(rig: Rig) -> Iterator[str]:
             "weather",
             what="plate: temperature and humidity change its modulus by "
             f"{100 * known.weather:.2g} %, one standard deviation;",
-            remedy="narrow the range, or measure anew when the season has changed",
+            remedy="narrow the range, or measure again when the season changes",
         )
         return
     plate_keys: Any = rig.document.data.get("plate", {}) if rig.document else {}
@@ -152,7 +152,7 @@ def _uncertainty_note(rig: Rig, key: str, *, what: str, remedy: str) -> Iterator
 def _span_notes(rig: Rig) -> Iterator[str]:
     """Yield a warning where ERAs span a small part of the plate.
 
-    It compares the promised contrast with that of ERAs in the corners. None for ERAs in one line
+    Compares the promised contrast with that of ERAs in the corners. No warning for ERAs in one line
     along a side.
     """
     positions = np.array([[era.x, era.y] for era in rig.eras])
@@ -220,7 +220,7 @@ def clock_costs(rig: Rig, urls: Mapping[str, str]) -> tuple[str, list[str], dict
 
 
 def _urls(document: Document) -> dict[str, str]:
-    """URLs of amplifiers by name; those that are no text are reported with the rig's keys."""
+    """Return the URLs of amplifiers by name; invalid types are reported with the rig's keys."""
     amplifiers = document.data.get("amplifiers")
     if not isinstance(amplifiers, dict):
         return {}

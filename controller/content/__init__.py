@@ -1,1 +1,1 @@
-"""Content that people have: files of other programs, read into one form and made stimuli of."""
+"""Import haptic content (AHAP, .haptic, HJIF, WAV) and convert it to stimuli."""

@@ -1,23 +1,23 @@
-"""Formats of content by the ending of a file, and the named contents that come with the project.
+"""Content formats by file extension, and the built-in contents.
 
-AHAP: the haptic and audio patterns of Apple, version 1. Missing values have their defaults, those
-out of range are clamped, unknown keys are ignored, and trailing commas pass; the remarks say what
-was clamped, ignored or left out. Sources: Apple, "Representing haptic patterns in AHAP files", and
-the header CHHapticParameter.h. Apple publishes neither the defaults of HapticIntensity and
-HapticSharpness, here 1 (no attenuation) and 0.5, nor AttackTime, DecayTime and ReleaseTime in
+AHAP: Apple's haptic and audio patterns, version 1. Missing values have their defaults, values out
+of range are clamped, unknown keys are ignored, and trailing commas are allowed; the remarks list
+everything clamped, ignored or left out. Sources: Apple, "Representing haptic patterns in AHAP
+files", and the header CHHapticParameter.h. Apple publishes neither the defaults of HapticIntensity
+and HapticSharpness, here 1 (no attenuation) and 0.5, nor AttackTime, DecayTime and ReleaseTime in
 seconds, here 10 ms times 100 to that power, and 0 s for 0.
 
-.haptic: the files of Haptics Studio and NiceVibrations, version 1. Intensity is the root of an
-amplitude, and the sharpness of what lasts the root of a frequency, as in the format's own converter
-to AHAP (NiceVibrations, core/datamodel/src/ios/v1.rs); files that it refuses are refused here.
-Unknown keys, of later minor versions, are ignored.
+.haptic: files of Haptics Studio and NiceVibrations, version 1. Intensity is the square root of an
+amplitude, and the sharpness of a continuous event the square root of a frequency, as in the
+format's own converter to AHAP (NiceVibrations, core/datamodel/src/ios/v1.rs); files that the
+converter rejects are rejected here. Unknown keys of later minor versions are ignored.
 
-HJIF: the interchange format of ISO/IEC 23090-31 (MPEG haptics), of 2023. The bands Transient,
-VectorialWave and Curve of profile Main are read, of one channel of vibration; bands of wavelets are
-refused. Intensity is the amplitude, as the reference encoder writes that of AHAP; a wave other than
-a sine counts by its root mean square.
+HJIF: the interchange format of ISO/IEC 23090-31 (MPEG haptics), 2023. Reads the bands Transient,
+VectorialWave and Curve of profile Main, for one vibration channel; wavelet bands are rejected.
+Intensity is the amplitude, as the reference encoder writes it for AHAP; waveforms other than sines
+are converted by their root mean square.
 
-WAV is in `reading`; installed packages add formats of their own.
+WAV is in `reading`; installed packages can add formats.
 """
 
 import math
@@ -85,9 +85,9 @@ _PARAMETERS = (*_EVENT, *_CONTROL)
 _PHASES = ("AttackTime", "DecayTime", "ReleaseTime")
 _LASTING = (*_PHASES, "Sustained")  # without effect on a transient
 
-_AUDIO = "Audio"  # what the names of parameters and events of sound begin with
+_AUDIO = "Audio"  # prefix of the names of audio parameters and events
 
-_MAX_TIME = 1e6  # s; of a parameter that comes after all events
+_MAX_TIME = 1e6  # s; of a parameter after all events
 
 _Control: TypeAlias = tuple[list[float], list[float]]
 
@@ -135,7 +135,7 @@ class Ahap(ContentFormat):
     ending = "ahap"
 
     def read(self, content: bytes, source: str, channel: int) -> Pattern:
-        """Return its haptic events under their dynamic parameters and curves."""
+        """Return the haptic events, with dynamic parameters and curves applied."""
         document = read_json(content, source, has_trailing_commas=True)
         validation = Validation(document, _Ahap)
         file = validation.finish()
@@ -160,7 +160,7 @@ class Ahap(ContentFormat):
 
 
 class _AhapReading:
-    """Collects the events and parameters of a file, and counts those clamped or left out."""
+    """Collects the events and parameters of a file, and counts clamped or skipped ones."""
 
     def __init__(self) -> None:
         self.end = 0.0  # s, of the events so far
@@ -244,7 +244,7 @@ class _AhapReading:
         return min(max(value, low), high)
 
     def result(self, source: str) -> tuple[Curve, Curve, tuple[Transient, ...]]:
-        """Return the intensity and sharpness of what lasts, and the transients in order."""
+        """Return intensity and sharpness of the continuous part, and the transients in order."""
         controls = {name: _joined(self._controls[name], _CONTROL[name][2]) for name in _CONTROL}
         segments: list[Segment] = []
         transients = []
@@ -289,7 +289,7 @@ class _AhapReading:
 
 
 def _span(values: Sequence[float]) -> str:
-    """Format the least and the greatest of values, or one value."""
+    """Format the range of values, or a single value."""
     least, greatest = min(values), max(values)
     return f"{least:g}" if least == greatest else f"{least:g} to {greatest:g}"
 
@@ -316,12 +316,12 @@ def _segments(values: dict[str, float], controls: dict[str, _Control]) -> list[S
 
 
 def _seconds(value: float) -> float:
-    """Return the time [s] that an attack, decay or release value stands for."""
+    """Convert an attack, decay or release value to a time [s]."""
     return 0.01 * 100.0 ** min(value, 1.0) if value > 0 else 0.0
 
 
 def _joined(pieces: list[Curve], default: float) -> _Control:
-    """Return one curve of pieces, each of which goes on until the next begins."""
+    """Join pieces to one curve; each piece lasts until the next one starts."""
     times, values = [0.0], [default]
     for piece in sorted(pieces, key=lambda each: each[0][0]):
         start = piece[0][0]
@@ -399,7 +399,7 @@ class Haptic(ContentFormat):
     ending = "haptic"
 
     def read(self, content: bytes, source: str, channel: int) -> Pattern:
-        """Return its envelopes as curves, and its emphases as transients."""
+        """Return the envelopes as curves, and the emphases as transients."""
         document = read_json(content, source)
         start = Validation(document, _HapticVersion)
         version = start.finish().version
@@ -448,11 +448,11 @@ def _check_order(
     path: KeyPath,
     times: list[float],
 ) -> None:
-    """Check that no time is before the one ahead of it."""
+    """Check that times are in ascending order."""
     before = 0.0
     for index, time in enumerate(times):
         if time < before:
-            message = f"must be at least that of the point before, {before:g}, got {time:g}"
+            message = f"must be at least {before:g}, as at the previous point, got {time:g}"
             validation.add((*path, index, "time"), message)
             return
         before = time
@@ -460,9 +460,9 @@ def _check_order(
 
 _VIBRATION = ("Other", "Acceleration", "Vibration", "Vibrotactile", "Vibrotactile Texture")
 _RATE = 2000  # Hz, at which a curve is sampled
-_MAX_CURVES = 600.0  # s; of all curves of a file together, each a second longer
+_MAX_CURVES = 600.0  # s; total of all curves of a file, each a second longer
 _TRANSIENT_HZ = 90.0
-"""Frequency of a transient that has none, as the reference encoder has it [Hz]."""
+"""Frequency [Hz] of a transient without one, from the reference encoder."""
 
 _RMS = {
     "Sine": 1.0,
@@ -471,7 +471,7 @@ _RMS = {
     "SawToothUp": math.sqrt(2 / 3),
     "SawToothDown": math.sqrt(2 / 3),
 }
-"""Root mean square of a wave over that of a sine."""
+"""Root mean square of a waveform, relative to a sine."""
 
 _NOT_FELT = {
     "actuator_resolution",
@@ -491,7 +491,7 @@ _NOT_FELT = {
     "reference_devices",
     "semantic_keywords",
 }
-"""Keys of the standard without an effect on how the vibration of one channel feels."""
+"""Keys of the standard that do not affect the vibration of one channel."""
 
 _Ticks = Annotated[float, Field(ge=0)]
 _Hz = Annotated[float, Field(ge=0, le=1e6)]
@@ -603,13 +603,13 @@ class _HjifReading:
         self._remarks: tuple[str, ...] = ()
 
     def add(self, band: _Band, path: KeyPath) -> None:
-        """Add a band, or its first problem to those of the file."""
+        """Add a band, or report its first problem."""
         if band.band_type == "WaveletWave":
             self._validation.add(
                 (*path, "band_type"),
-                "bands of wavelets are not read; make WAV of the file with the MPEG reference "
-                "software, `Synthesizer -f FILE.hjif -o FILE.wav`, or HJIF without wavelets of "
-                "what it was made of",
+                "wavelet bands are not supported; convert the file to WAV with the MPEG reference "
+                "software, `Synthesizer -f FILE.hjif -o FILE.wav`, or export its source as HJIF "
+                "without wavelets",
             )
             return
         for index, placed in enumerate(band.effects):
@@ -673,7 +673,7 @@ class _HjifReading:
         )
 
     def _add_curve(self, band: _Band, effect: _Effect, times: list[float]) -> None:
-        """Add the vibration of a waveform between its keyframes, at which it is level."""
+        """Add the vibration of a waveform between its keyframes, with zero slope at each."""
         from scipy.interpolate import CubicHermiteSpline  # slow to import
 
         knots, first = np.unique(times, return_index=True)
@@ -717,14 +717,14 @@ class _HjifReading:
 def _course(
     times: list[float], effect: _Effect, name: str, knots: FloatArray, default: float
 ) -> FloatArray:
-    """Return a modulation (2, n) at both ends of each stretch between knots."""
+    """Return a modulation (2, n) at both ends of each interval between knots."""
     values: list[Any] = [getattr(each, name) for each in effect.keyframes]
     curve = [(t, v) for t, v in zip(times, values, strict=True) if v is not None]
     return stretches_between(tuple(curve) or ((0.0, default),), knots)
 
 
 BUILT_IN_FORMATS: tuple[type[ContentFormat], ...] = (Ahap, Haptic, Hjif, Wav)
-"""Formats of the project itself."""
+"""Built-in formats."""
 
 _FORMATS: PluginRegistry[type[ContentFormat]] = PluginRegistry(
     "format of content",
@@ -737,7 +737,7 @@ _FORMATS: PluginRegistry[type[ContentFormat]] = PluginRegistry(
 
 _REFUSED = {
     "vij": "is version 0 of the .haptic format; export the content as .haptic, version 1",
-    "hmpg": "is the binary form of HJIF; make HJIF of it with the MPEG reference software, "
+    "hmpg": "is the binary form of HJIF; convert it to HJIF with the MPEG reference software, "
     "`Decoder -f FILE.hmpg -o FILE.hjif`, or WAV, `Synthesizer -b -f FILE.hmpg -o FILE.wav`",
 }
 
@@ -745,12 +745,12 @@ _NAMED = Path(__file__).with_name("named")
 
 
 def content_formats() -> tuple[str, ...]:
-    """Return the endings of all formats, those of the project first; loads no plug-in."""
+    """Return the extensions of all formats, built-in formats first; loads no plug-in."""
     return _FORMATS.names()
 
 
 def content_format(ending: str, *, within: str = "") -> type[ContentFormat]:
-    """Return the format of an ending; raises InputError if it is unknown or its plug-in fails.
+    """Return the format of an extension; raises InputError if unknown or if its plug-in fails.
 
     within: the file's name, for the error.
     """
@@ -758,9 +758,9 @@ def content_format(ending: str, *, within: str = "") -> type[ContentFormat]:
 
 
 def read_content(path: Path, channel: int | None = None) -> Pattern:
-    """Read a file of content; raises InputError, with line and key, for one that cannot be read.
+    """Read a content file; raises InputError, with line and key, if it cannot be read.
 
-    channel: which one, counted from 1, of a format that has several; None for the first.
+    channel: counted from 1, for formats with several channels; None for the first.
     """
     source, name = str(path), path.name.lower()
     known = [each for each in content_formats() if name.endswith(f".{each}")]
@@ -785,12 +785,12 @@ def read_content(path: Path, channel: int | None = None) -> Pattern:
 
 
 def named_contents() -> tuple[str, ...]:
-    """Return the names of the contents that come with the project."""
+    """Return the names of the built-in contents."""
     return tuple(sorted(each.stem for each in _NAMED.iterdir()))
 
 
 def named_content(name: str) -> Path:
-    """Return the file of a named content; raises InputError for an unknown name."""
+    """Return the file of a built-in content; raises InputError for an unknown name."""
     for each in _NAMED.iterdir():
         if each.stem == name:
             return each

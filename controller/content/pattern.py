@@ -1,7 +1,7 @@
-"""Patterns: the one form into which all content is read, from files and from points of a program.
+"""Patterns: the common form of all content, from files and from points that a program sends.
 
-A pattern has curves over time, as AHAP, HJIF and their relatives: the intensity and sharpness of
-what lasts, and transients beside it. Sharpness, 0 to 1, stands for frequencies.
+Like AHAP and HJIF, a pattern has curves over time (intensity and sharpness of its continuous part)
+and transients. Sharpness, 0 to 1, represents a frequency.
 """
 
 from array import array
@@ -25,9 +25,9 @@ times are equal."""
 
 
 class CurvePoints(Sequence[_Point]):
-    """The points of a curve in two arrays, since tuples take three objects and 112 bytes a point.
+    """Points of a curve, stored in two arrays: tuples would take 112 bytes per point.
 
-    The interpreter is held while objects are freed: 0.1 s for the tuples of 300 long files.
+    Freeing the tuples of 300 long files would also block the interpreter for 0.1 s.
     """
 
     def __init__(self, curve: Curve) -> None:
@@ -85,15 +85,15 @@ class Pattern:
     duration: float
     """[s]"""
     intensity: Curve = ()
-    """Of what lasts; 0 outside the curve."""
+    """Intensity of the continuous part; 0 outside the curve."""
     sharpness: Curve = ()
-    """Of what lasts; as at its ends outside the curve."""
+    """Sharpness of the continuous part; constant beyond the ends of the curve."""
     transients: tuple[Transient, ...] = ()
     """Ascending in time."""
     remarks: tuple[str, ...] = ()
-    """What was changed or left out of the file."""
+    """Changes to the file's content, and omissions."""
     out_of_band_share: float = 0.0
-    """Share of the energy of a sampled signal that was left out, 0 to 1."""
+    """Omitted share of the energy of a sampled signal, 0 to 1."""
 
     def __post_init__(self) -> None:
         """Hold both curves in arrays."""
@@ -102,7 +102,7 @@ class Pattern:
 
 
 def misfit(pattern: Pattern) -> str:
-    """Return the first problem of a pattern that a format has made, or ""."""
+    """Return the first problem of a pattern made by a format, or ""."""
     if not pattern.duration >= 0:  # also for NaN
         return f"must last 0 s or longer, got {pattern.duration:g} s"
     taps = pattern.transients
@@ -124,13 +124,13 @@ def misfit(pattern: Pattern) -> str:
 
 
 def curve_at(curve: Curve, times: FloatArray, *, beyond: float | None = None) -> FloatArray:
-    """Return a curve at times [s]; beyond: its value outside, by default that of its ends."""
+    """Return a curve at times [s]; beyond: value outside the curve, by default as at its ends."""
     moments, values = np.array(curve or ((0.0, 0.0),)).T
     return np.asarray(np.interp(times, moments, values, left=beyond, right=beyond))
 
 
 MIN_HZ, MAX_HZ = 65.0, 300.0
-"""Frequencies of sharpness 0 and 1 [Hz], as the MPEG reference encoder reads AHAP."""
+"""Frequencies [Hz] of sharpness 0 and 1, as in the MPEG reference encoder for AHAP."""
 
 
 def sharpness_of(hertz: FloatArray) -> FloatArray:
@@ -144,7 +144,7 @@ def hertz_of(sharpness: FloatArray) -> FloatArray:
 
 
 MAX_GIVEN = 500
-"""Most points and taps together: the bound of OpenXR; Android guarantees 16."""
+"""Maximum number of points and taps together, as in OpenXR; Android guarantees 16."""
 
 Given: TypeAlias = Sequence[Sequence[float]]
 """`[time_s, intensity, sharpness]` of each, in order of time."""
@@ -153,7 +153,7 @@ _Row: TypeAlias = tuple[float, float, float]
 
 
 def pattern_of_points(points: Given, taps: Given = ()) -> Pattern:
-    """Return the pattern of straight lines between points, and of taps beside them.
+    """Return a pattern with straight lines between points, and with taps.
 
     Raises InputError, with the index of the first invalid point or tap.
     """

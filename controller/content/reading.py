@@ -1,12 +1,12 @@
-"""Reading of content: the base of all formats, strict JSON, mixed vibrations, and WAV files.
+"""Read content: the base class of all formats, strict JSON, mixing of vibrations, and WAV files.
 
-JSON files are bounded before they are parsed; lines of keys are found where there is an error.
-Vibrations that last at the same time are mixed into one curve of intensity and one of sharpness.
+The size of JSON files is checked before they are parsed; line numbers are determined only for
+errors. Simultaneous continuous vibrations are mixed into one intensity and one sharpness curve.
 
-A WAV signal is felt by the strength of its vibration, not by its waveform: it is split into two
-bands, below and above 140 Hz. Intensity is the amplitude of both together, 1 for a sine of full
-scale, and sharpness that of the stronger band. Parts outside the frequencies that a sharpness can
-stand for are left out, with a remark in dB.
+A WAV signal is felt by the strength of its vibration, not by its waveform. It is split into two
+bands, below and above 140 Hz. Intensity is the total amplitude of both bands, 1 for a full-scale
+sine; sharpness is that of the stronger band. Components outside the frequency range of sharpness
+are left out, with a remark in dB.
 """
 
 import json
@@ -41,49 +41,49 @@ MAX_SIZE = 4 << 20
 """Largest file [bytes]."""
 
 _MAX_POINTS = 20_000
-"""Most points of a file: breakpoints, keyframes, events, or what one of them is made of."""
+"""Maximum number of points in a file: breakpoints, keyframes, or events and their parts."""
 
 
 def refusal(source: str, message: str, *, line: int | None = None, key: str = "") -> ConfigError:
-    """Return the error of a whole file, or of a key on a line."""
+    """Return an error for a whole file, or for a key on a line."""
     return ConfigError(source, [ConfigProblem(line, key, message)])
 
 
 def too_much(end: float, count: int) -> str:
-    """Return why content with an end [s] and a number of points is too much, or ""."""
+    """Return the problem of content with too late an end [s] or too many points, or ""."""
     if end > MAX_CONTENT_DURATION:
         return f"must end within {MAX_CONTENT_DURATION:g} s, got {end:g} s; shorten it"
     return f"has more than {_MAX_POINTS} points; leave some out" if count > _MAX_POINTS else ""
 
 
 class ContentFormat(ABC):
-    """A format of content, with the ending of its files as its name."""
+    """A content format, named after the extension of its files."""
 
     ending: ClassVar[str]
-    """What a file's name ends with after the dot, in lower case."""
+    """File extension without the dot, in lower case."""
 
     has_channels: ClassVar[bool] = False
-    """Whether a file may hold several channels, of which one is read."""
+    """Whether a file can have several channels; one of them is read."""
 
     @abstractmethod
     def read(self, content: bytes, source: str, channel: int) -> Pattern:
         """Return the pattern of a file.
 
         content: all bytes of the file; source: its name, for errors; channel: counted from 1.
-        Raises InputError for an invalid file, with line and key if there are any. Nothing that a
-        file names may be executed or read.
+        Raises InputError for an invalid file, with line and key if available. Must not execute or
+        read anything that the file refers to.
         """
 
 
 _MAX_SIZE = 2 << 20  # bytes
 _MAX_LEVELS = 20
-_MAX_VALUES = 5 * _MAX_POINTS  # a keyframe of HJIF is four, an event of AHAP thirteen
+_MAX_VALUES = 5 * _MAX_POINTS  # an HJIF keyframe has four, an AHAP event thirteen
 _MAX_QUOTED = 50  # characters in errors
 _MAX_NAMED = 5  # unknown names in a remark
-_MAX_NAME = 40  # characters of a name that is compared with known ones
+_MAX_NAME = 40  # characters of a name to compare with known names
 _EMPTY: tuple[object, ...] = (None, "", [], {})
 
-_STRING = r'"[^"\\]*+(?:\\.?+[^"\\]*+)*+"?'  # one without an end, too: no text is read twice
+_STRING = r'"[^"\\]*+(?:\\.?+[^"\\]*+)*+"?'  # or an unterminated one: no text is read twice
 _STRINGS = re.compile(_STRING, re.DOTALL)
 _TRAILING_COMMA = re.compile(rf"({_STRING})|,(?=[ \t\n\r]*[\]}}])", re.DOTALL)
 _TOKENS = re.compile(rf"{_STRING}|[{{}}\[\],:]|[^\s{{}}\[\],:\"]+", re.DOTALL)
@@ -92,9 +92,9 @@ _T = TypeVar("_T")
 
 
 class _FirstOfMany:
-    """Annotation of a list of which only the first invalid entry is reported.
+    """Annotation of a list: report only the first invalid entry.
 
-    pydantic's own, FailFast, cannot be in a union.
+    pydantic's FailFast does not work in a union.
     """
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> Any:
@@ -102,11 +102,11 @@ class _FirstOfMany:
 
 
 Entries: TypeAlias = Annotated[list[_T], _FirstOfMany()]
-"""A list of which the first invalid entry is reported."""
+"""A list that reports only its first invalid entry."""
 
 
 class ContentSection(Section):
-    """An object in a file of content: strict types, finite numbers; unknown keys are ignored."""
+    """An object in a content file: strict types, finite numbers; unknown keys are ignored."""
 
     model_config = ConfigDict(extra="allow", strict=True, frozen=True, allow_inf_nan=False)
 
@@ -129,7 +129,7 @@ def read_json(content: bytes, source: str, *, has_trailing_commas: bool = False)
         return given
 
     try:
-        # Whole numbers become floats: those of many digits are refused by their size, as 1e999 is.
+        # Integers become floats, so that huge ones are rejected by their size, like 1e999.
         data = json.loads(text, parse_int=float, object_pairs_hook=unique)
     except json.JSONDecodeError as error:
         raise refusal(source, _why_unparsed(text, error), line=error.lineno) from error
@@ -144,7 +144,7 @@ def _why_unparsed(text: str, error: json.JSONDecodeError) -> str:
     if error.msg == "Extra data":
         surplus = shown(text[error.pos : error.pos + _MAX_QUOTED])
         return (
-            f"nothing may stand behind the end of the content, got {surplus} in column "
+            f"nothing must follow the end of the content, got {surplus} in column "
             f"{error.colno}; remove it"
         )
     is_cut = not text.rstrip().endswith("}")
@@ -153,9 +153,9 @@ def _why_unparsed(text: str, error: json.JSONDecodeError) -> str:
 
 
 def unknown_keys(section: ContentSection, but: Collection[str] = ()) -> tuple[str, ...]:
-    """Return a remark on the unknown keys of a file, the first ones by name, if it has any.
+    """Return a remark listing the first unknown keys of a file, if any.
 
-    but: keys without an effect on what is felt; empty ones do not count either.
+    but: keys that do not affect the vibration; empty keys are ignored too.
     """
     names = Counter(name for name in _extra(section) if name not in but)
     return names_remark("unknown key", names, verb="ignored")
@@ -164,9 +164,9 @@ def unknown_keys(section: ContentSection, but: Collection[str] = ()) -> tuple[st
 def names_remark(
     thing: str, names: Counter[str], *, verb: str = "left out", known: Collection[str] = ()
 ) -> tuple[str, ...]:
-    """Return a remark on names in a file that have no effect, the first ones by name, if any.
+    """Return a remark listing the first names in a file without an effect, if any.
 
-    known: names that may have been meant.
+    known: valid names, for suggestions.
     """
     if not names:
         return ()
@@ -177,7 +177,7 @@ def names_remark(
 
 
 def _suggested(name: str, known: Collection[str]) -> str:
-    """Format a name of a file, with the known name that it resembles."""
+    """Format a name from a file, suggesting a similar known name."""
     named = key_name((name,))
     suggestion = did_you_mean(name[:_MAX_NAME], known).strip()
     return f"{named} ({suggestion})" if suggestion else named
@@ -222,7 +222,7 @@ def _lines_of(source: str, text: str) -> dict[KeyPath, int]:
 
 
 def _check_size(source: str, text: str) -> None:
-    """Refuse text that is nested too deep, or has too many values, before it is parsed."""
+    """Reject text with too deep nesting or too many values before parsing it."""
     bare = _STRINGS.sub("", text)
     codes = np.frombuffer(bare.encode("utf-32-le", "surrogatepass"), np.uint32)
     opened = (codes == ord("{")) | (codes == ord("["))
@@ -241,9 +241,9 @@ def _line(text: str, at: int) -> int:
 Segment: TypeAlias = tuple[float, float, float, float, float, float]
 """Start and end [s], intensity at both, sharpness at both; straight lines between."""
 
-_STEP = 0.005  # s; products and sums of straight lines are straight lines within it
-_DIGITS = 9  # times are of whole nanoseconds, so that none are all but the same
-_MAX_OVERLAP = 1_000_000  # parts of segments
+_STEP = 0.005  # s; within it, products and sums of straight lines count as straight
+_DIGITS = 9  # times are rounded to nanoseconds, so that none are almost equal
+_MAX_OVERLAP = 1_000_000  # segment parts
 
 
 def mixed(
@@ -255,8 +255,8 @@ def mixed(
 ) -> tuple[Curve, Curve]:
     """Return intensity and sharpness of segments that may overlap.
 
-    Intensities add as powers, up to 1; the sharpness is that of the strongest. factor, addend: of
-    all intensities and sharpnesses over time. source: the file, for the error of too many.
+    Intensities add as powers, up to 1; the strongest segment determines the sharpness. factor,
+    addend: applied to all intensities and sharpnesses over time. source: file name, for errors.
     """
     rows = np.array(segments).reshape(-1, 6)
     rows[:, :2] = rows[:, :2].round(_DIGITS)
@@ -284,14 +284,16 @@ def mixed(
     power = np.stack([np.bincount(at, level**2, minlength=count) for level in levels])
     order = np.argsort(levels.sum(axis=0), kind="stable")
     sharpness = np.full((2, count), np.nan)
-    sharpness[:, at[order]] = sharps[:, order]  # of equal places the last, the strongest, stays
+    sharpness[:, at[order]] = sharps[
+        :, order
+    ]  # for equal indices the last one, the strongest, is kept
     intensity = np.sqrt(power) * stretches_between(factor, knots)
     sharpness += stretches_between(addend, knots)
     return _curve(knots, np.clip(intensity, 0, 1)), _curve(knots, np.clip(sharpness, 0, 1))
 
 
 def stretches_between(curve: Curve, knots: FloatArray) -> FloatArray:
-    """Return a curve (2, n) after and before the ends of each stretch between knots."""
+    """Return a curve (2, n) just inside both ends of each interval between knots."""
     times, values = np.array(curve).T
     times = times.round(_DIGITS)
     width = np.diff(knots)
@@ -300,7 +302,7 @@ def stretches_between(curve: Curve, knots: FloatArray) -> FloatArray:
 
 
 def _curve(knots: FloatArray, values: FloatArray) -> Curve:
-    """Return the points that a curve needs; values (2, n) at both ends of each stretch."""
+    """Return the points of a curve; values (2, n) at both ends of each interval."""
     times = np.stack([knots[:-1], knots[1:]], axis=1).ravel()
     course = values.T.ravel()
     is_given = ~np.isnan(course)
@@ -308,7 +310,7 @@ def _curve(knots: FloatArray, values: FloatArray) -> Curve:
 
 
 def _thinned(times: FloatArray, values: FloatArray) -> Curve:
-    """Return a curve without the points that repeat another or lie on the line between two."""
+    """Remove points that repeat another or are on the line between their neighbours."""
     is_new = np.ones(len(times), bool)
     is_new[1:] = (np.diff(times) > 0) | (abs(np.diff(values)) > 1e-12)
     times, values = times[is_new], values[is_new]
@@ -328,7 +330,7 @@ _RATE = 200  # points a second, or a little more
 _PER_POINT = 10  # samples of the analytic signal
 _SPLIT = (110.0, 178.0)  # Hz; half an octave on both sides of the split fades over
 _OUTER_LOW, _OUTER_HIGH = (45.0, MIN_HZ), (MAX_HZ, 430.0)  # Hz; faded out beyond
-_FLOOR = 0.03  # of the highest intensity; what rings beside a burst in the bands lies below
+_FLOOR = 0.03  # of the highest intensity; ringing of the band filters around a burst is below
 _MIN_RATE, _MAX_RATE = 1000, 192_000
 _MIN_LOST = 0.01  # of the energy
 
@@ -383,7 +385,7 @@ def course_of(signal: FloatArray, rate: int) -> SignalCourse:
     import scipy.fft
 
     duration = len(signal) / rate
-    # A second longer at least: its end does not come round to its beginning.
+    # At least a second longer, so that the end does not wrap around to the start.
     length = scipy.fft.next_fast_len(len(signal) + rate, real=True)
     cycle = length / rate  # s
     spectrum = scipy.fft.rfft(signal, length)[1:] / length
@@ -429,12 +431,12 @@ def _out_of_band_share(spectrum: Any, outer: FloatArray) -> float:
 
 
 def _signal_remarks(out_of_band_share: float, intensity: FloatArray) -> Iterator[str]:
-    """Yield a remark for each way in which the course of a signal differs from it."""
+    """Yield a remark for each loss in the conversion of a signal."""
     if out_of_band_share > _MIN_LOST:
         level_db = 10 * math.log10(out_of_band_share)
         yield (
             f"{percent(out_of_band_share)} of its energy ({level_db:.1f} dB) "
-            f"lies outside {MIN_HZ:g} to {MAX_HZ:g} Hz and is left out"
+            f"is outside {MIN_HZ:g} to {MAX_HZ:g} Hz and left out"
         )
     is_clamped = intensity > 1
     if is_clamped.any():
@@ -442,9 +444,9 @@ def _signal_remarks(out_of_band_share: float, intensity: FloatArray) -> Iterator
 
 
 def _band(spectrum: Any, points: int, step: float, count: int) -> tuple[FloatArray, FloatArray]:
-    """Return the amplitude and the centre frequency [Hz] of a band at the first points.
+    """Return amplitude and centre frequency [Hz] of a band at the first points.
 
-    points: of the whole cycle, a step [s] apart.
+    points: number in the whole cycle, a step [s] apart.
     """
     bins = np.zeros(points * _PER_POINT, complex)
     bins[1 : len(spectrum) + 1] = 2 * spectrum
@@ -455,7 +457,7 @@ def _band(spectrum: Any, points: int, step: float, count: int) -> tuple[FloatArr
 
 
 def _rise(frequencies: FloatArray, low: float, high: float) -> FloatArray:
-    """Return 0 below and 1 above two frequencies; powers of a rise and a fall between add to 1."""
+    """Return a fade from 0 to 1 between two frequencies; with its mirror, powers add to 1."""
     share = np.log(frequencies / low) / math.log(high / low)
     return np.asarray(np.sin(share.clip(0, 1) * math.pi / 2))
 

@@ -1,6 +1,6 @@
-"""Renditions: a pattern as stimuli of one finger at a level, whatever other fingers feel.
+"""Renditions: a pattern as stimuli of one finger at a level, independent of other fingers.
 
-The reasons are in docs/how-to/play-content.md.
+docs/how-to/play-content.md gives the reasons.
 """
 
 from array import array
@@ -26,17 +26,19 @@ CLICK_DURATION = 0.040
 """Duration of a transient [s]."""
 
 DUCKING = 0.030
-"""Time [s] in which what lasts fades before a transient, and returns after it."""
+"""Fade time [s] of the continuous part before and after a transient."""
 
 SMOOTHING = 0.020
-"""Width at half height [s] of the raised cosine over which courses beside others are averaged."""
+"""Half-height width [s] of the raised cosine that averages envelopes with other fingers present."""
 
 _BAND = 0.1  # on each side of a frequency
-_WIDER = 2 ** (1 / 3) / (1 + _BAND)  # beside others: to a third of an octave on each side
-_MIN_FREQUENCIES = 3  # of a table in a band: an exact one costs 10 dB of contrast on four ERAs
-_MENTIONED = 0.05  # share of what lasts whose sharpness may be lost without a word
-_ROUNDING = 1e-9  # of times [s], and of counts of steps
-_TEXTURE = 3.0  # Hz; on each side of a modulation, of which it is
+_WIDER = 2 ** (1 / 3) / (1 + _BAND)  # with other fingers: a third of an octave on each side
+_MIN_FREQUENCIES = (
+    3  # of the table in a band: one exact frequency costs 10 dB of contrast on four ERAs
+)
+_MENTIONED = 0.05  # share of the continuous part whose sharpness can be lost without a remark
+_ROUNDING = 1e-9  # of times [s] and step counts
+_TEXTURE = 3.0  # Hz; on each side of a modulation frequency, counted with it
 
 
 @dataclass(frozen=True)
@@ -50,30 +52,30 @@ class Tap:
 
 @dataclass(frozen=True)
 class Rendition:
-    """A pattern as stimuli of one finger."""
+    """A pattern as stimuli for one finger."""
 
     duration: float
     """[s]"""
     course: Course | None
-    """Of what lasts, ducked around the clicks; None if nothing lasts."""
+    """Envelope of the continuous part, ducked around clicks; None without a continuous part."""
     level_db_sl: float
-    """Where the share of the course is 1."""
+    """Level [dB SL] where the envelope is 1."""
     band: Band
-    """Of the carrier of the course [Hz]."""
+    """Band of the carrier [Hz]."""
     modulation_hz: float | None
-    """Frequency [Hz] at which the course comes and goes, if that is most of its change."""
+    """Modulation frequency [Hz] of the envelope, if it is most of its variation."""
     clicks: tuple[Tap, ...]
     """Ascending in time, at least 60 ms apart."""
     remarks: tuple[str, ...]
-    """What was changed or lost."""
+    """Changes and losses."""
     sharpness_kept: float = 1.0
-    """Share of what lasts, by its energy, whose frequency is in the band of the carrier."""
+    """Share of the continuous part's energy with frequencies in the band of the carrier."""
 
     def smoothed(self) -> "Rendition":
-        """Return the rendition beside other fingers: its course averaged over 20 ms.
+        """Return the rendition with other fingers present: its envelope averaged over 20 ms.
 
-        Its modulation stays. The course starts and ends at rest. Bands reach a third of an octave
-        to each side, which fingers hardly notice, for 1 dB of contrast.
+        Modulation is kept. The envelope starts and ends at zero. Bands are widened to a third of an
+        octave on each side, hardly noticeable, to gain 1 dB of contrast.
         """
         clicks = tuple([replace(each, band=_wider(each.band)) for each in self.clicks])
         among = replace(self, band=_wider(self.band), clicks=clicks)
@@ -92,10 +94,10 @@ class Rendition:
 
 
 def requested_level(pattern: Pattern, level_db_sl: float, times: FloatArray) -> FloatArray:
-    """Return the levels [dB SL] of a pattern at times [s] (n,), before anything of it is lost.
+    """Return the levels [dB SL] of a pattern at times [s] (n,), before any losses.
 
-    level_db_sl: of intensity 1. Transients last 40 ms each, and what lasts fades around them; -inf
-    where nothing is felt.
+    level_db_sl: level of intensity 1. Transients last 40 ms each, and the continuous part fades
+    around them; -inf during silence.
     """
     taps = [each for each in pattern.transients if each.intensity > 0]
     starts = np.array([each.time for each in taps])
@@ -104,12 +106,12 @@ def requested_level(pattern: Pattern, level_db_sl: float, times: FloatArray) -> 
 
 
 def rendered(pattern: Pattern, level_db_sl: float, frequencies: FloatArray) -> Rendition:
-    """Map a pattern to stimuli of a level [dB SL] at intensity 1, on a table's frequencies [Hz].
+    """Map a pattern to stimuli; level_db_sl: level of intensity 1; frequencies: of the table [Hz].
 
-    Intensity i is 10 + i (level - 10) dB SL, and 0 is silent; sharpness is a frequency in a band of
-    10 % on each side, or of the table's nearest three. What lasts has one band, where most of its
-    energy is. Transients are clicks; of those too close together the strongest is one, and the
-    others are left to what lasts.
+    Intensity i is 10 + i (level - 10) dB SL, and 0 is silent. Sharpness is a frequency with a band
+    of 10 % on each side, or of the table's nearest three frequencies. The continuous part has one
+    band, around most of its energy. Transients become clicks; of several close ones, the strongest
+    becomes a click and the others are added to the continuous part.
     """
     pattern = _as_tap(pattern)
     taps = _apart(pattern)
@@ -157,14 +159,14 @@ def _level_of(intensity: FloatArray, level_db_sl: float) -> FloatArray:
 
 
 def _lasting(pattern: Pattern, level_db_sl: float, times: FloatArray) -> FloatArray:
-    """Return the levels [dB SL] of what lasts at times [s]."""
+    """Return the levels [dB SL] of the continuous part at times [s]."""
     return _level_of(curve_at(pattern.intensity, times, beyond=0.0), level_db_sl)
 
 
 def _with_taps(
     level: FloatArray, taps: Sequence[Transient], level_db_sl: float, times: FloatArray
 ) -> FloatArray:
-    """Return levels [dB SL] at times [s], or those of taps, 40 ms each, where they are higher."""
+    """Return levels [dB SL] at times [s], raised to the level of taps, 40 ms each."""
     starts = np.array([each.time for each in taps])
     levels = _level_of(np.array([each.intensity for each in taps]), level_db_sl)
     first, last = np.searchsorted(times, [starts, starts + CLICK_DURATION])
@@ -175,7 +177,7 @@ def _with_taps(
 
 
 def _band(hertz: float, frequencies: FloatArray) -> Band:
-    """Return a band about a frequency [Hz] that has enough frequencies of a table."""
+    """Return a band around a frequency [Hz] with enough frequencies of a table."""
     nearest = frequencies[np.argsort(np.abs(np.log(frequencies / hertz)))[:_MIN_FREQUENCIES]]
     return (
         min((1 - _BAND) * hertz, float(nearest.min())),
@@ -184,12 +186,12 @@ def _band(hertz: float, frequencies: FloatArray) -> Band:
 
 
 def _wider(band: Band) -> Band:
-    """Return a band as it is beside other fingers."""
+    """Return a band widened for other fingers."""
     return band[0] / _WIDER, band[1] * _WIDER
 
 
 def _as_tap(pattern: Pattern) -> Pattern:
-    """Return a pattern too short for a plate to follow as a transient; any other as it is."""
+    """Convert a pattern too short for a plate to a transient; return others unchanged."""
     moments, values = np.array(pattern.intensity or ((0.0, 0.0),)).T
     sounds = np.maximum(values[1:], values[:-1]) > 0
     length = float(np.diff(moments)[sounds].sum())
@@ -197,7 +199,7 @@ def _as_tap(pattern: Pattern) -> Pattern:
         return pattern
     start = float(moments[np.flatnonzero(values)[0]])
     sharpness = float(curve_at(pattern.sharpness, np.array([start]))[0])
-    lost = f"{1000 * length:.0f} ms, less than a plate follows: played as a tap"
+    lost = f"{1000 * length:.0f} ms, too short for a plate: played as a tap"
     return replace(
         pattern,
         intensity=(),
@@ -207,7 +209,7 @@ def _as_tap(pattern: Pattern) -> Pattern:
 
 
 def _apart(pattern: Pattern) -> list[Transient]:
-    """Return the transients that become clicks, ascending; of those too close the strongest."""
+    """Return the transients that become clicks, in order: the strongest of close ones."""
     kept, times = list[Transient](), list[float]()
     for tap in sorted(pattern.transients, key=lambda each: -each.intensity):
         at = bisect_left(times, tap.time)
@@ -220,7 +222,7 @@ def _apart(pattern: Pattern) -> list[Transient]:
 
 
 def _beside(starts: FloatArray, times: FloatArray) -> FloatArray:
-    """Return the share left of what lasts at times [s] beside clicks from starts [s] on."""
+    """Return the factor for the continuous part at times [s], ducked around click starts [s]."""
     bounded = np.concatenate([[-np.inf], starts, [np.inf]])
     number = np.searchsorted(starts, times, side="right")
     away = np.minimum(times - bounded[number] - CLICK_DURATION, bounded[number + 1] - times)
@@ -240,7 +242,7 @@ def _carrier(hertz: FloatArray, energy: FloatArray) -> float:
 
 
 def _lost(hertz: FloatArray, sharpness_kept: float, clicks: Sequence[Tap]) -> Iterator[str]:
-    """Yield a remark for each way in which what lasts differs from the file.
+    """Yield a remark for each difference between the continuous part and the file.
 
     hertz: its frequencies [Hz] wherever it is felt.
     """
@@ -255,7 +257,7 @@ def _lost(hertz: FloatArray, sharpness_kept: float, clicks: Sequence[Tap]) -> It
 
 
 def _modulation(times: FloatArray, shares: FloatArray) -> float | None:
-    """Return the frequency [Hz] at which shares come and go, if that is most of their change."""
+    """Return the modulation frequency [Hz] of an envelope, if it is most of its variation."""
     hertz = np.fft.rfftfreq(len(shares), times[1])
     power = np.abs(np.fft.rfft(shares - shares.mean())) ** 2
     is_texture = (hertz >= MIN_MODULATION) & (hertz <= MAX_MODULATION)
@@ -265,7 +267,7 @@ def _modulation(times: FloatArray, shares: FloatArray) -> float | None:
 
 
 def averaged(values: FloatArray, step: float, width: float) -> FloatArray:
-    """Average values a step [s] apart by a raised cosine of a width [s] at half its height."""
+    """Average values, a step [s] apart, by a raised cosine with a half-height width [s]."""
     count = max(int(np.ceil(width / step - _ROUNDING)) - 1, 0)
     kernel = np.cos(np.pi / 2 * step / width * np.arange(-count, count + 1)) ** 2
     return np.convolve(values, kernel / kernel.sum())[count : count + len(values)]

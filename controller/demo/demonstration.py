@@ -74,9 +74,9 @@ _THREE = {"left": (70, 110), "middle": (180, 220), "right": (250, 300)}  # Hz
 
 @dataclass(frozen=True)
 class Scene:
-    """Recorded touches, whose places are shares of the plate.
+    """Recorded touches, with positions relative to the size of the plate.
 
-    layout: as in a layout's file; by default the newest finger feels a vibration and no other.
+    layout: content of a layout file; by default only the newest finger feels a vibration.
     """
 
     touches: Sequence[RecordedDatagram]
@@ -124,7 +124,7 @@ def layout_of_people(
 
 
 def example_touches_path(name: str) -> Path:
-    """A recording of the demonstration: installed with this package, or in a checkout."""
+    """Return a recording of the demonstration, from the package or a checkout."""
     file = f"{name}.tuio"
     package = Path(__file__).parents[1]
     installed = package / "data" / file
@@ -132,17 +132,17 @@ def example_touches_path(name: str) -> Path:
 
 
 SIM = "sim"
-"""The wire to amplifiers in this process, the only one that virtual time has."""
+"""The wire to amplifiers in this process, the only one in virtual time."""
 WIRES = (SIM, *SIM_OPTIONS)
 
 _CONTACT_TIMEOUT = 2.0
-"""Time [s] after which a recorded finger without news is lifted, for a machine that is busy."""
+"""Time [s] without frames until a recorded finger is lifted, long enough for a busy machine."""
 
 DECAY = 0.1
 """Time [s] for the plate to ring down after the last touch."""
 
 _RECOVERY = 30.0
-"""Time [s] within which the daemon must be armed, also anew after a fault."""
+"""Time [s] within which the daemon must be armed, also again after a fault."""
 
 _RIG_FILE = "rig.yaml"
 _RECORDER = ("127.0.0.1", 3333)  # host and port of the sender of recorded touches
@@ -313,7 +313,7 @@ async def _on_simulated_plate(
 ) -> AsyncIterator[tuple[DaemonConfig, SocketLock, SimulatedPlate]]:
     """Configuration and socket of a daemon of a rig, and the plate that it drives.
 
-    more: keys of the daemon's file besides the rig; layouts: what its layouts contain.
+    more: keys of the daemon file other than the rig; layouts: contents of its layouts.
     """
     async with contextlib.AsyncExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="era-")))
@@ -360,7 +360,7 @@ def check_page(address: str) -> None:
 
 
 async def keep_armed(daemon: Daemon, path: Path, recorder: TouchRecorder) -> None:
-    """Arm a daemon at a socket, and again after every fault, as of a machine that stalled.
+    """Arm a daemon at a socket, and again after every fault, such as a stalled machine.
 
     Raises LinkError if that takes too long.
     """
@@ -407,7 +407,7 @@ async def play_scenes(
         async with await AsyncClient.connect(path, name="era demo", timeout=_TIMEOUT) as era:
             await era.layout(_layout_name(number))
         await touches.play(scene.touches)
-        while recorder.touches:  # noqa: ASYNC110  nobody else waits for this
+        while recorder.touches:  # noqa: ASYNC110  nothing else waits for this
             await asyncio.sleep(DECAY)
     await asyncio.sleep(DECAY)
     if recorder.fault is not None:
@@ -424,7 +424,7 @@ MAX_PANELS = 6
 
 @dataclass(frozen=True)
 class Pictures:
-    """Files that were written; omitted: for each other picture, why there is none."""
+    """Files written; omitted: the reason for each missing picture."""
 
     files: list[Path]
     omitted: list[str]
@@ -446,7 +446,7 @@ def write_pictures(table: LocalizationTable, rows: list[TouchRow], folder: Path)
     elif with_several:
         omitted.append("no contents.png: no touch with several contents was measured")
     else:
-        omitted.append("no contents.png: no two fingers had vibrations of their own at one time")
+        omitted.append("no contents.png: no two fingers had their own vibrations simultaneously")
     folder.mkdir(parents=True, exist_ok=True)
     files = []
     for name, figure in figures.items():
@@ -457,7 +457,7 @@ def write_pictures(table: LocalizationTable, rows: list[TouchRow], folder: Path)
 
 
 def _several_contents_figure(table: LocalizationTable, rows: Sequence[TouchRow]) -> Figure:
-    """Draw the row of most contents, with what was measured at its fingers."""
+    """Draw the row with the most contents, with the measurements at its fingers."""
     row = max(rows, key=lambda row: len(row.contents))
     frequencies = [layer.frequency for layer in row.contents]
     sensations = []
@@ -523,7 +523,7 @@ def _draw_touch(axes: Axes, table: LocalizationTable, row: TouchRow) -> None:
     for id, position in row.quiet.items():
         draw_fingertip(axes, position, felt=False, level_db_sl=row.levels_db_sl.get(id))
     contrast, promised = row.measured_contrast_db, row.promised_contrast_db
-    title = "one finger alone" if contrast is None else f"felt contrast {contrast:.1f} dB"
+    title = "single finger" if contrast is None else f"felt contrast {contrast:.1f} dB"
     if promised is not None:
         title += f", promised {promised:.1f}"
     axes.set_title(title, fontsize=11, pad=20)

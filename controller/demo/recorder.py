@@ -2,8 +2,8 @@
 
 `simulated_plate` starts amplifiers in a process of their own behind a real wire. The controller
 reaches them over the wire only; `SimulatedPlate` places the fingers and reads their vibration over
-the control socket. `TouchRecorder` observes the control loop and makes a `TouchRow` of each touch:
-what was predicted for it and what was measured.
+the control socket. `TouchRecorder` observes the control loop and makes a `TouchRow` of each touch,
+with predicted and measured values.
 """
 
 import asyncio
@@ -40,12 +40,12 @@ from registry.wording import first_problem
 _Position: TypeAlias = tuple[float, float]
 
 _SAME_FREQUENCY = 1.0
-"""Difference [Hz] within which a tone is that of a content, as its amplifier has rounded it."""
+"""Difference [Hz] within which a tone belongs to a content, due to rounding by the amplifier."""
 
 
 @dataclass(frozen=True)
 class FingerVibration:
-    """Measured vibration of one fingertip over a window, at p points of the tip."""
+    """Measured vibration of a fingertip over a time window, at p points of the tip."""
 
     frequencies: FloatArray
     """Frequencies (f,) [Hz]."""
@@ -75,7 +75,7 @@ class FingerVibration:
         return float(sensation_level(self.frequencies, self.amplitudes, threshold).max())
 
     def parted(self, frequency: float) -> tuple["FingerVibration", "FingerVibration"]:
-        """Return the part of a content's frequency [Hz], and that of all others."""
+        """Split into the part at a content's frequency [Hz] and the rest."""
         is_own = np.abs(self.frequencies - frequency) < _SAME_FREQUENCY
         own, others = (
             replace(self, frequencies=self.frequencies[some], amplitudes=self.amplitudes[some])
@@ -86,10 +86,10 @@ class FingerVibration:
 
 @dataclass(frozen=True, kw_only=True)
 class FingerRow:
-    """A finger among several contents: its frequency and verdict, what was promised and measured.
+    """A finger among several contents: frequency, verdict, and promised and measured values.
 
-    Contrasts are those of its own level above that of the power of all others' contents here.
-    Measured ones are None where nothing of its own, or nothing else, was measured.
+    A contrast is its own level above the level of all other contents' total power here. Measured
+    contrasts are None without a measured own or other content.
     """
 
     at_m: _Position
@@ -102,17 +102,22 @@ class FingerRow:
 
 @dataclass(frozen=True, kw_only=True)
 class TouchRow:
-    """A touch from down to up, with its last steady pattern of most contents.
+    """A touch from touch-down to lift, with its last steady pattern with the most contents.
 
-    Its fields are the keys of `era demo --json`, but for those that `_OWN` names: quiet: other
-    fingertips by id [m]; pattern; levels_db_sl by id: of the target the mean over its tip, of any
-    other finger its loudest point, whose least difference is the contrast. Contrasts are None for
-    a finger alone, and measured ones if the pattern was too short: predicted ones are of the
-    table's plate, promised ones what nine of ten plates within the uncertainty give, in levels.
-    drive: as the amplifiers achieved it, by ERA; latency_ms: from touch frame to last byte on the
-    wire, None in virtual time, in which computing takes none; reason: why nothing played, if so.
-    fingers: of several contents, each; contrasts are then to the contents of others at this finger;
-    contents: their patterns, in the order of layers.
+    Its fields are the keys of `era demo --json`, except those in `_OWN`:
+
+    - quiet: other fingertips by id [m].
+    - pattern, levels_db_sl: levels by id: for the target the mean over its tip, for other fingers
+      the loudest point. The smallest difference is the contrast.
+    - Contrasts are None for a single finger; measured ones also if the pattern was too short.
+      Predicted values are for the table's plate; 90 % of plates within the tolerances reach the
+      promised levels.
+    - drive: as achieved by the amplifiers, by ERA.
+    - latency_ms: from touch frame to last byte on the wire; None in virtual time.
+    - reason: why nothing played, if so.
+    - fingers: one for each of several contents; contrasts are then relative to the other contents
+      at this finger.
+    - contents: their patterns, in the order of layers.
     """
 
     target_id: str
@@ -177,7 +182,7 @@ SIMULATED_WATCHDOG = 2.0
 STARTUP_TIMEOUT = 120.0  # s; solving the plate takes long on a busy machine
 EXIT_TIMEOUT = 3.0  # s
 _REPLY_TIMEOUT = 30.0  # s; long enough for a busy machine
-_MAX_REPLY = 1 << 20  # bytes; what ten fingers feel takes a fiftieth of it
+_MAX_REPLY = 1 << 20  # bytes; a reply for ten fingers takes a fiftieth of this
 _REMEDY = "see its output above and start the demonstration again"
 
 SIM_OPTIONS: Mapping[str, Sequence[str]] = {
@@ -231,7 +236,7 @@ class SimulatedPlate:
         }
 
     async def _request(self, op: str, **values: object) -> "_Reply":
-        """The reply to a request; raises LinkError if there is none or it is an error."""
+        """Return the reply to a request; raises LinkError without a reply or for an error."""
         try:
             async with asyncio.timeout(_REPLY_TIMEOUT):
                 path = str(self._control)
@@ -239,7 +244,7 @@ class SimulatedPlate:
                 with contextlib.closing(writer):
                     writer.write(json.dumps({"op": op, **values}).encode() + b"\n")
                     reply = _Reply.model_validate_json(await reader.readline())
-        except (OSError, ValueError) as error:  # no line, or half of one, is no JSON
+        except (OSError, ValueError) as error:  # a missing or incomplete line is not JSON
             why = str(error) or "it took too long"
             if isinstance(error, ValidationError):
                 why = " ".join(first_problem(error))
@@ -260,7 +265,7 @@ class _FingerRecord(BaseModel):
 
 
 class _Reply(BaseModel):
-    """What is read of a reply of the control socket."""
+    """The fields used from a reply of the control socket."""
 
     error: str | None = None
     fingers: dict[str, _FingerRecord] = {}
@@ -378,7 +383,7 @@ class _Touch:
 
 @dataclass(eq=False)
 class _PlayedPattern:
-    """What plays from its commit to the next command [s], with its measurements."""
+    """A pattern from its commit to the next command [s], with its measurements."""
 
     applied: PlayReport
     touches: Sequence[_Touch]
@@ -409,11 +414,11 @@ class TouchRecorder:
     ) -> None:
         self.rows: list[TouchRow] = []
         self.touches: dict[ContactKey, _Touch] = {}
-        """Those that are down."""
+        """Current touches."""
         self.fault: str | None = None
-        """Why the plate is armed no longer; None while it is, and before."""
+        """Why the plate is no longer armed; None while armed, and before."""
         self.faults: list[str] = []
-        """Every cause so far for which the plate was armed no longer."""
+        """Every cause of disarming so far."""
         self.rejected_sets = 0
         """Number of sets that an amplifier or its ledger has rejected."""
         self.worst_delay = 0.0
@@ -429,13 +434,13 @@ class TouchRecorder:
         self._loads: dict[str, float] = {}
 
     def observe(self, loop: Observers) -> None:
-        """Observe what the control loop reports."""
+        """Observe the reports of the control loop."""
         loop.contacts_changed.append(self._contacts_changed)
         loop.reported.append(self._reported)
         loop.refused.append(self._set_rejected)
 
     def why_void(self) -> str | None:
-        """Return why the figures of a run in real time do not count; None if they do."""
+        """Return why a real-time run is void; None if it is valid."""
         if self.faults:
             return f"the amplifiers stopped ({self.faults[0]})"
         if self.worst_delay > _MAX_DELAY:
@@ -565,10 +570,10 @@ class TouchRecorder:
 
 
 async def _played(touch: _Touch, row: TouchRow) -> TouchRow:
-    """The row with the last steady pattern of most contents, or the longest of them.
+    """Complete a row with the last steady pattern with the most contents, or the longest of them.
 
-    It is the same pattern for all fingers that it serves, so that their rows are of one moment.
-    Latency is of the touch's first pattern.
+    All fingers of a pattern use the same pattern, so that their rows refer to the same moment. The
+    latency is that of the touch's first pattern.
     """
     main_part = max(touch.patterns, key=_significance)
     latency = touch.patterns[0].applied.latency
@@ -577,7 +582,7 @@ async def _played(touch: _Touch, row: TouchRow) -> TouchRow:
     key = touch.contact.key
     applied = main_part.applied
     predicted = next(felt for felt in applied.targets if felt.contact.key == key)
-    played = next(  # its own content, or the one that it shares
+    played = next(  # its own content, or the content it shares
         each
         for each in applied.contents.values()
         if any(contact.key == key for contact, _ in each.content.targets)
@@ -630,7 +635,7 @@ def _significance(pattern: _PlayedPattern) -> tuple[int, float, float]:
 
 
 def _finger_row(felt: FingerSensation, vibration: Mapping[str, FingerVibration]) -> FingerRow:
-    """What a finger feels among several contents."""
+    """Make the row of a finger among several contents."""
     level = contrast = None
     measured = vibration.get(_id(felt.contact))
     if measured is not None and felt.frequency is not None:
@@ -651,7 +656,7 @@ def _finger_row(felt: FingerSensation, vibration: Mapping[str, FingerVibration])
 def _fingers(
     vibration: Mapping[str, FingerVibration], felt: FingerSensation, others: Sequence[Contact]
 ) -> tuple[FingerVibration | None, list[FingerVibration]]:
-    """Vibration of the target and of the quiet fingers; no target unless all were measured."""
+    """Return the vibration of target and quiet fingers; no target unless all were measured."""
     target = vibration.get(_id(felt.contact))
     quiet = [vibration[_id(each)] for each in others if _id(each) in vibration]
     if target is None or not len(target.frequencies) or len(quiet) < len(others):

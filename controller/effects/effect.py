@@ -1,4 +1,4 @@
-"""Effects: their parameters in a layout, their runs at one finger, and the regions they play in."""
+"""Effects: layout parameters, runs at one finger, and the regions that contain them."""
 
 import math
 from abc import ABC, abstractmethod
@@ -22,32 +22,32 @@ ON_PRESS, ON_MOVE, ON_RELEASE = USES = ("on_press", "on_move", "on_release")
 
 @dataclass(frozen=True)
 class Region:
-    """A region of the plate and the names of its effects; a finger that lifts feels none."""
+    """A region of the plate and the names of its effects."""
 
     name: str
     shape: RegionShape
     on_press: str | None = None
     """Effect when a finger comes down or slides in."""
     on_move: str | None = None
-    """Effect while it moves within."""
+    """Effect while a finger moves inside."""
     on_release: str | None = None
-    """Effect when it slides out."""
+    """Effect when a finger slides out."""
     level_db_sl: float | None = None
     """Replaces the level of the effects if has_level."""
     has_level: bool = False
     priority: int = 0
-    """Effects of lower priority give way first."""
+    """Effects of lower priority yield first."""
     band: Band | None = None
     """Replaces the band of the effects unless None."""
     is_own: bool = False
-    """Whether a finger in it feels its own content or none."""
+    """Whether a finger here feels either its own content or nothing."""
     may_share: bool = False
-    """Whether it may also feel the content of any other finger that may share."""
+    """Whether a finger here can share the content of another finger that can share."""
     is_protected: bool = False
-    """Whether no content is played elsewhere that a finger in it would notice."""
+    """Whether to play nothing elsewhere that a finger here would notice."""
 
     def as_json(self) -> dict[str, Any]:
-        """Return it as the API describes it."""
+        """Return the region in the format of the API."""
         return {
             "name": self.name,
             **self.shape.as_json(),
@@ -63,10 +63,10 @@ class Region:
 
 
 NEIGHBOURS: Literal["neighbours"] = "neighbours"
-"""The level `as strong as the neighbours allow`."""
+"""Level name: as strong as the neighbours allow."""
 
 MIN_DB_SL, DEFAULT_MAX_DB_SL = -20.0, 40.0
-"""Lowest level of an effect, and highest of a layout that does not raise it [dB SL]."""
+"""Lowest level of an effect, and default maximum of a layout [dB SL]."""
 
 DB_SL = Quantity(LEVEL, at_least=MIN_DB_SL, at_most=MAX_LEVEL_DB_SL)
 """A level of an effect."""
@@ -87,27 +87,27 @@ Level: TypeAlias = Annotated[float | Literal["neighbours"], replace(DB_SL, word=
 
 @dataclass(frozen=True, slots=True)
 class EffectStimulus:
-    """What one finger shall feel of an effect from now on."""
+    """Stimulus of an effect at one finger, from now on."""
 
     level_db_sl: float | None
     """None for as strong as the neighbours allow."""
     until: float | None = None
-    """When [s] the stimulus may change though the finger does nothing; None for never."""
+    """Time [s] when the stimulus can change without the finger moving; None for never."""
     pulse: Pulse | None = None
-    """Set for a vibration of limited duration, which the amplifiers end by themselves."""
+    """Set for a vibration of limited duration, which the amplifiers end on their own."""
     modulation_hz: float | None = None
-    """Frequency [Hz] at which its strength comes and goes, 10 to 30; None for a steady one. Pulses
-    below 0.2 s are steady."""
+    """Modulation frequency [Hz], 10 to 30; None for a steady vibration. Pulses below 0.2 s are
+    steady."""
     course: Course | None = field(default=None, repr=False)
-    """Course of its strength, again and again over the pulse; the level is felt where it is 1."""
+    """Envelope, repeated over the pulse; the level is felt where it is 1."""
     band: Band | None = None
-    """Its own frequencies, where the layout gives none."""
+    """Its own frequencies, if the layout gives none."""
     click: "EffectStimulus | None" = None
-    """Short pulse that is felt beside it."""
+    """Short pulse felt in addition."""
     is_absolute: bool = False
-    """Whether a short pulse has the level given here whatever lasts at the finger."""
+    """Whether a short pulse keeps this level regardless of a continuous effect at the finger."""
     among_others: "EffectStimulus | None" = None
-    """Replaces it while other fingers are on the plate; None: nothing does."""
+    """Replacement while other fingers are on the plate; None: unchanged."""
 
     def target(
         self,
@@ -121,8 +121,8 @@ class EffectStimulus:
     ) -> Target:
         """Return the target of a finger that feels it in a region, or outside of all.
 
-        effect: name of the effect; band: given by the layout, None for its own; above_db: least
-        level of a short pulse over what lasts there.
+        effect: name of the effect; band: given by the layout, None for its own; above_db: minimum
+        level of a short pulse above a continuous effect there.
         """
         is_raised = self.is_short and self.pulse is not None and self.pulse.is_raised
         return Target(
@@ -141,13 +141,13 @@ class EffectStimulus:
 
     @property
     def is_short(self) -> bool:
-        """Whether it is a short pulse, which is felt beside a stimulus that lasts."""
+        """Whether it is a short pulse, felt in addition to a continuous stimulus."""
         return self.pulse is not None and self.pulse.is_short and self.course is None
 
 
 @dataclass(frozen=True, slots=True)
 class NoStimulus:
-    """Silence at one finger; until as in `EffectStimulus`."""
+    """Silence at one finger; until: see `EffectStimulus`."""
 
     until: float | None = None
 
@@ -157,15 +157,15 @@ class EffectRun(ABC):
 
     @abstractmethod
     def feel(self, contact: Contact, now: float) -> EffectStimulus | NoStimulus | None:
-        """Return what the finger shall feel at a time [s]; None once the run is over.
+        """Return the stimulus of the finger at a time [s]; None once the run is over.
 
-        Called in order of time: at every change of the contact and when `until` is reached.
+        Called in order of time: after every change of the contact, and at `until`.
         """
 
 
 @dataclass(frozen=True)
 class SteadyRun(EffectRun):
-    """A steady level for one pulse, or as long as the finger stays if that is None."""
+    """A steady level for one pulse; without a pulse, as long as the finger stays."""
 
     level_db_sl: float | None
     pulse: Pulse | None
@@ -185,7 +185,7 @@ _FREQUENCY = Annotated[float, Quantity(FREQUENCY, at_least=10, at_most=1000)]
 
 
 class TunedSection(Section):
-    """A section that may fix a frequency or a band."""
+    """A section with an optional frequency or band."""
 
     frequency: _FREQUENCY | None = None
     band: Annotated[tuple[_FREQUENCY, _FREQUENCY], Strict(strict=False)] | None = None
@@ -205,7 +205,7 @@ class TunedSection(Section):
 
     @property
     def tuned_band(self) -> Band | None:
-        """The band of its frequency; None where it is free."""
+        """The band, also that of a frequency; None if unrestricted."""
         return self.band if self.frequency is None else (self.frequency, self.frequency)
 
 
@@ -215,51 +215,50 @@ class Effect(TunedSection, ABC):
     kind: ClassVar[str]
     """Its name in layouts."""
     is_for_motion: ClassVar[bool]
-    """Whether it follows a moving finger and belongs under `on_move`; else it runs by itself."""
+    """Whether it follows a moving finger and belongs under `on_move`."""
     needs_region: ClassVar[bool] = False
-    """Whether it is felt in regions only."""
+    """Whether it works only in regions."""
     needs_entry: ClassVar[bool] = True
-    """Whether a layout must define it; kinds of the project that need no entry are in every
-    layout."""
+    """Whether a layout must define it; built-in kinds that need no entry are in every layout."""
 
     level: Level = STRONG_DB_SL
 
     @abstractmethod
     def start(self, contact: Contact, now: float, *, level_db_sl: float | None) -> EffectRun:
-        """Start a run at a finger, at a time [s]; level None: as strong as the neighbours allow."""
+        """Start a run at a finger at a time [s]; level None: as strong as the neighbours allow."""
 
     def start_in(
         self, region: Region | None, contact: Contact, now: float, *, level_db_sl: float | None
     ) -> EffectRun:
-        """Start a run in a region, or outside of all; overridden by kinds that depend on it."""
+        """Start a run in a region, or outside all; overridden by kinds that need the region."""
         return self.start(contact, now, level_db_sl=level_db_sl)
 
     def read(self, folder: Path) -> None:
-        """Read the files that it names, from the folder of its layout; raises InputError."""
+        """Read its files from the folder of its layout; raises InputError."""
 
     def for_table(self, frequencies: FloatArray) -> Self:
-        """Return the effect as it is played at the frequencies of a table [Hz]."""
+        """Return the effect for the frequencies of a table [Hz]."""
         return self
 
     def is_prepared(self, level_db_sl: float | None) -> bool:
-        """Whether a start at a level takes no time; else it is prepared first."""
+        """Whether a start at a level takes no time; otherwise, `prepare` it first."""
         return True
 
     def prepare(self, level_db_sl: float | None) -> object:
-        """Prepare a start at a level that would take time; called outside of the control loop."""
+        """Prepare a slow start at a level; called outside the control loop."""
 
     def gives_level_in(self, region: Region | None) -> bool:
-        """Whether its layout gives it a level of its own, in a region or outside of all."""
+        """Whether its layout sets its level, in a region or outside all."""
         is_given = region is not None and region.has_level
         return is_given or "level" in self.model_fields_set
 
     def band_in(self, region: Region | None) -> Band | None:
-        """Return its band [Hz] in a region, or outside of all; None: any."""
+        """Return its band [Hz] in a region, or outside all; None: any."""
         return self.tuned_band if region is None or region.band is None else region.band
 
     @property
     def has_end(self) -> bool:
-        """Whether it ends by itself, so that it can be played where nothing else would end it."""
+        """Whether it ends on its own, so that it can be played without another end."""
         return True
 
     @property

@@ -1,4 +1,4 @@
-"""Kinds of effects by name: `BUILT_IN_EFFECTS`, and those of installed packages.
+"""Kinds of effects by name: `BUILT_IN_EFFECTS`, and effects of installed packages.
 
 Each kind is a section of a layout with its parameters, and a run that follows one finger.
 """
@@ -55,7 +55,7 @@ class Buzz(Effect):
     """None: as long as the finger stays."""
 
     modulation: Modulation = None
-    """How often a second it comes and goes; none: steady."""
+    """Modulation frequency; none: steady."""
 
     def start(self, contact: Contact, now: float, *, level_db_sl: float | None) -> EffectRun:
         """Start a steady vibration."""
@@ -89,7 +89,8 @@ _HYSTERESIS = 0.0005  # m; a finger has passed a detent once it is this far beyo
 class NotchesRun(EffectRun):
     """Clicks of a duration [s] at equal distances along a coordinate of one finger.
 
-    The finger starts halfway between two notches; it has passed one when it is hysteresis beyond.
+    The finger starts halfway between two notches, and passes a notch once it is beyond it by the
+    hysteresis.
     """
 
     def __init__(
@@ -111,7 +112,7 @@ class NotchesRun(EffectRun):
         self._pulse: Pulse | None = None  # of the last notch
 
     def feel(self, contact: Contact, now: float) -> EffectStimulus | NoStimulus:
-        """Return a click from each passing on; several notches passed at once are one click."""
+        """Return a click after each passed notch; several in one step are one click."""
         away = self._coordinate(contact) - self._middle
         passed = math.floor((abs(away) - self._hysteresis) / self._spacing + 0.5)
         if passed > 0:
@@ -139,7 +140,7 @@ class Detents(Effect):
     """Distance between detents."""
 
     along: Literal["x", "y"] = "x"
-    """Direction in which they are spaced."""
+    """Direction of the spacing."""
 
     duration: Annotated[float, Quantity(TIME, at_least=MIN_EFFECT_DURATION, at_most=0.2)] = 0.030
     """Duration of each click."""
@@ -156,15 +157,15 @@ class Detents(Effect):
         )
 
 
-_ANGLE_HYSTERESIS = 0.02  # rad; of a detent, or _HYSTERESIS along the circle where that is more
-_DEGREES_15 = 0.26179938779914946  # rad; as the units of a file convert it
-_CENTRE_RADIUS = 0.006  # m; nearer to the centre the angle of a finger is noise
+_ANGLE_HYSTERESIS = 0.02  # rad; of a detent, or _HYSTERESIS along the circle if that is more
+_DEGREES_15 = 0.26179938779914946  # rad; as converted from a file
+_CENTRE_RADIUS = 0.006  # m; closer to the centre, the angle of a finger is noise
 
 
 class Dial(Effect):
     """A click at each detent that the finger passes in angle about the centre of its region.
 
-    The finger comes down halfway between two of them. Near the centre it turns nothing.
+    The finger comes down halfway between two detents. Near the centre nothing is felt.
     """
 
     kind: ClassVar[str] = "dial"
@@ -178,7 +179,7 @@ class Dial(Effect):
     """Duration of each click."""
 
     def start(self, contact: Contact, now: float, *, level_db_sl: float | None) -> EffectRun:
-        """Start outside of all regions: nothing is felt."""
+        """Start outside all regions: nothing is felt."""
         return self.start_in(None, contact, now, level_db_sl=level_db_sl)
 
     def start_in(
@@ -189,7 +190,7 @@ class Dial(Effect):
 
 
 class _DialRun(EffectRun):
-    """Follows the angle of one finger about a centre, turn after turn; without one, nothing."""
+    """Clicks by the angle of one finger around a centre; none without a centre."""
 
     def __init__(
         self, dial: Dial, centre: tuple[float, float] | None, level_db_sl: float | None
@@ -197,18 +198,18 @@ class _DialRun(EffectRun):
         self._dial = dial
         self._centre = centre
         self._level = level_db_sl
-        self._angle = 0.0  # [rad], with its turns
+        self._angle = 0.0  # [rad], including full turns
         self._last: float | None = None  # [rad] within one turn; None before the first
         self._notches: NotchesRun | None = None
 
     def feel(self, contact: Contact, now: float) -> EffectStimulus | NoStimulus | None:
-        """Return a click from each passing on."""
+        """Return a click after each passed notch."""
         if self._centre is None:
             return NoStimulus()
         x, y = contact.x - self._centre[0], contact.y - self._centre[1]
         radius = math.hypot(x, y)
         if radius < _CENTRE_RADIUS:
-            self._last = None  # it may come out at any angle
+            self._last = None  # the finger can leave the centre at any angle
             return NoStimulus() if self._notches is None else self._notches.resting(now)
         angle = math.atan2(y, x)
         if self._last is not None:
@@ -231,22 +232,22 @@ RAMP_STEP_DB = 2.0
 
 
 class Ramp(Effect):
-    """From one level to another in steps of 2 dB; then over, or held at the last."""
+    """A change from one level to another in steps of 2 dB, optionally held at the end."""
 
     kind: ClassVar[str] = "ramp"
     is_for_motion: ClassVar[bool] = False
 
     start_level: Annotated[float, DB_SL] = 6.0
-    """First level, in dB SL; the last is `level`."""
+    """First level, in dB SL; the last one is `level`."""
 
     duration: Annotated[float, Quantity(TIME, at_least=0.1, at_most=MAX_EFFECT_DURATION)] = 1.0
-    """From the first level to the last."""
+    """Time from the first level to the last."""
 
     hold: bool = False
-    """Whether it holds the last level."""
+    """Whether to hold the last level."""
 
     def start(self, contact: Contact, now: float, *, level_db_sl: float | None) -> EffectRun:
-        """Start at the first level, in steps of 2 dB, or larger ones where these are too short."""
+        """Start at the first level, with steps of 2 dB, or larger ones if these were too short."""
         end = STRONG_DB_SL if level_db_sl is None else level_db_sl
         span = end - self.start_level
         count = max(
@@ -269,7 +270,7 @@ class Ramp(Effect):
 
 @dataclass(frozen=True)
 class _RampRun(EffectRun):
-    """Levels [dB SL] for equal steps of time [s] from the start; the last one may be held."""
+    """Levels [dB SL] in equal time steps [s] from the start; the last one can be held."""
 
     pulse: Pulse
     levels: tuple[float | None, ...]
@@ -288,16 +289,16 @@ class _RampRun(EffectRun):
         return EffectStimulus(self.levels[index], until, pulse=pulse)
 
 
-_SPEED_WINDOW = 0.060  # s; over which speed is measured: panels report 60 to 200 times a second
-_REST_TIMEOUT = 0.080  # s; a finger without movement for so long is at rest
-_LEVEL_STEP = 2.0  # dB; between levels, so that not every report is another command
-_LEVEL_HYSTERESIS = 1.5  # dB; the level changes when the speed gives one this far from it
+_SPEED_WINDOW = 0.060  # s; averaging time of the speed: panels report 60 to 200 times a second
+_REST_TIMEOUT = 0.080  # s; after this time without movement a finger is at rest
+_LEVEL_STEP = 2.0  # dB; between levels, so that not every touch report causes a command
+_LEVEL_HYSTERESIS = 1.5  # dB; the level changes when the speed calls for a level this far away
 _MIN_REPORT_INTERVAL = 0.002  # s; no panel is faster
 _NOISE = 0.0002  # m; movement below it is sensor noise
 
 
 class Texture(Effect):
-    """The faster the finger, the stronger, proportional to the logarithm of the speed.
+    """A vibration that grows with the logarithm of the finger's speed.
 
     Nothing is felt at rest.
     """
@@ -306,16 +307,16 @@ class Texture(Effect):
     is_for_motion: ClassVar[bool] = True
 
     slow: Annotated[float, Quantity(SPEED, above=0, at_most=1)] = 0.01
-    """Nothing is felt below it."""
+    """Speed below which nothing is felt."""
 
     fast: Annotated[float, Quantity(SPEED, above=0, at_most=5)] = 0.20
-    """`level` is reached at it; above `slow`."""
+    """Speed that reaches `level`; above `slow`."""
 
     range: Annotated[float, Quantity(LEVEL, at_least=0, at_most=40)] = 14.0
-    """How many dB below `level` at `slow`."""
+    """Attenuation in dB below `level` at `slow`."""
 
     modulation: Modulation = None
-    """Modulation, as of `buzz`."""
+    """Modulation frequency, same as for `buzz`."""
 
     @model_validator(mode="after")
     def _check_speeds(self) -> Self:
@@ -331,7 +332,7 @@ class Texture(Effect):
 
 
 class _TextureRun(EffectRun):
-    """Follows the path of one finger."""
+    """Level from the speed of one finger along its path."""
 
     def __init__(
         self, texture: Texture, contact: Contact, now: float, level_db_sl: float | None
@@ -342,10 +343,10 @@ class _TextureRun(EffectRun):
         self._attenuation: float | None = None  # below the level at `fast` [dB]
 
     def feel(self, contact: Contact, now: float) -> EffectStimulus | NoStimulus | None:
-        """Return the level of the speed over the last 60 ms."""
+        """Return the level for the mean speed over the last 60 ms."""
         before, *position = self._path[-1]
         if math.dist((contact.x, contact.y), position) >= _NOISE:
-            if now - before >= _REST_TIMEOUT:  # it was at rest there until now
+            if now - before >= _REST_TIMEOUT:  # at rest at this position until now
                 self._path = deque([(now - _SPEED_WINDOW, position[0], position[1])])
             self._path.append((now, contact.x, contact.y))
         while len(self._path) > 2 and now - self._path[1][0] >= _SPEED_WINDOW:
@@ -384,38 +385,38 @@ _FREQUENCIES = tuple(float(each) for each in range(40, 501, 10))  # Hz; until a 
 
 
 class File(Effect):
-    """A file beside the layout, or a content by its name, once or over and over."""
+    """A file in the layout's folder, or a built-in content, played once or in a loop."""
 
     kind: ClassVar[str] = "file"
     is_for_motion: ClassVar[bool] = False
 
     file: Annotated[str, Field(min_length=1, max_length=255)]
-    """Its path from the folder of the layout, in which it must be, or the name of a content."""
+    """Path inside the layout's folder, or the name of a built-in content."""
 
     loop: bool = False
-    """Whether it begins anew at its end, as long as the finger stays."""
+    """Whether to repeat it for as long as the finger stays."""
 
     channel: Annotated[int, Field(ge=1, le=64)] | None = None
-    """Channel of a file that has several; the first by default."""
+    """Channel of a file with several channels; the first by default."""
 
     _pattern: Pattern = PrivateAttr(default=Pattern(0.0))
     _frequencies: tuple[float, ...] = PrivateAttr(default=_FREQUENCIES)
 
     @classmethod
     def of(cls, pattern: Pattern, *, name: str, level_db_sl: float, loop: bool = False) -> Self:
-        """Make one of a pattern that has been read."""
+        """Make an effect from a pattern."""
         effect = cls.model_construct({"level"}, file=name, level=level_db_sl, loop=loop)
         effect._pattern = pattern
         return effect
 
     def read(self, folder: Path) -> None:
-        """Read the file; raises InputError, also for one outside of the folder."""
+        """Read the file; raises InputError, also for a file outside the folder."""
         if self.file in named_contents():
             self._pattern = _named(self.file)
             return
         try:
             path = (folder / self.file).resolve()
-        except (OSError, RuntimeError, ValueError) as error:  # links in a circle, no name of a file
+        except (OSError, RuntimeError, ValueError) as error:  # circular links, or not a file name
             raise InputError(f"file must name a file, got {self.file!a}: {error}") from error
         if not path.is_relative_to(folder.resolve()):
             raise InputError(
@@ -424,14 +425,14 @@ class File(Effect):
         self._pattern = read_content(path, self.channel) if path.suffix else _named(self.file)
 
     def for_table(self, frequencies: FloatArray) -> Self:
-        """Return it for the frequencies of a table [Hz]; nothing is prepared of it."""
+        """Return an unprepared copy for the frequencies of a table [Hz]."""
         effect = self.model_copy()
         effect._frequencies, effect._rendered = tuple(frequencies.tolist()), {}
         return effect
 
     @cached_property
     def _rendered(self) -> dict[float | None, tuple[Rendition, Rendition]]:
-        """Renditions by level: no part of what is compared."""
+        """Renditions by level; excluded from comparisons."""
         return {}
 
     def is_prepared(self, level_db_sl: float | None) -> bool:
@@ -439,9 +440,9 @@ class File(Effect):
         return level_db_sl in self._rendered
 
     def prepare(self, level_db_sl: float | None) -> tuple[Rendition, Rendition]:
-        """Render it at a level, for a finger that is alone, and for one among others.
+        """Render it at a level, for a single finger and for one among others.
 
-        Not by scaling another rendition: the faintest intensity has the same level in each.
+        Renditions cannot be scaled: the faintest intensity has the same level in all of them.
         """
         if level_db_sl not in self._rendered:
             level = MAX_DB_SL if level_db_sl is None else level_db_sl
@@ -450,13 +451,13 @@ class File(Effect):
         return self._rendered[level_db_sl]
 
     def start(self, contact: Contact, now: float, *, level_db_sl: float | None) -> EffectRun:
-        """Start at its beginning."""
+        """Start at the beginning."""
         alone, among = self.prepare(level_db_sl)
         return _FileRun(alone, among, now, loop=self.loop, is_limit=level_db_sl is None)
 
     @property
     def has_end(self) -> bool:
-        """True unless it begins anew."""
+        """True unless it repeats."""
         return not self.loop
 
 
@@ -473,7 +474,7 @@ def _named(name: str) -> Pattern:
 
 
 class _FileRun(EffectRun):
-    """A rendition from a time [s] on: what lasts of it, and its clicks in their turn."""
+    """A rendition played from a time [s]: its continuous part, and its clicks in order."""
 
     def __init__(
         self, alone: Rendition, among: Rendition, now: float, *, loop: bool, is_limit: bool
@@ -482,7 +483,7 @@ class _FileRun(EffectRun):
         self._alone, self._among, self._is_limit = alone, among, is_limit
         among_others = self._lasting_of(among, None)
         self._lasting = self._lasting_of(alone, among_others)
-        self._started = 0  # clicks
+        self._started = 0  # number of clicks
         self._click: EffectStimulus | None = None
 
     def _lasting_of(
@@ -510,7 +511,7 @@ class _FileRun(EffectRun):
         )
 
     def feel(self, contact: Contact, now: float) -> EffectStimulus | NoStimulus | None:
-        """Return what lasts, and the click that is due, if any."""
+        """Return the continuous part, and the click that is due, if any."""
         if now >= self._pulse.end:
             return None
         while now >= self._next_click():
@@ -531,7 +532,7 @@ class _FileRun(EffectRun):
         return NoStimulus(wakes) if self._click is None else replace(self._click, until=wakes)
 
     def _next_click(self) -> float:
-        """When [s] the next click starts; infinite for none."""
+        """Start time [s] of the next click; infinite for none."""
         found, count = self._alone, len(self._alone.clicks)
         if not count or (self._started >= count and self._pulse.duration < math.inf):
             return math.inf
@@ -540,7 +541,7 @@ class _FileRun(EffectRun):
 
 
 BUILT_IN_EFFECTS: tuple[type[Effect], ...] = (Buzz, Click, Detents, Dial, File, Ramp, Texture)
-"""The kinds of the project itself."""
+"""Built-in kinds of effects."""
 
 _KINDS: PluginRegistry[type[Effect]] = PluginRegistry(
     "kind of effect",
@@ -553,10 +554,10 @@ _KINDS: PluginRegistry[type[Effect]] = PluginRegistry(
 
 
 def effect_kinds() -> tuple[str, ...]:
-    """Return the names of all kinds, those of the project first, without loading any plug-in."""
+    """Return the names of all kinds, built-in kinds first, without loading any plug-in."""
     return _KINDS.names()
 
 
 def effect_kind(name: str) -> type[Effect]:
-    """Return the kind of a name; raises InputError if it is unknown or its plug-in fails."""
+    """Return the kind of this name; raises InputError if unknown or if its plug-in fails."""
     return _KINDS.find(name)

@@ -1,7 +1,7 @@
-"""Surface layouts: which regions of the plate have which effects, and the files that say so.
+"""Surface layouts: regions of the plate, their effects, and the files that define them.
 
-A file is read and checked as a whole, with every problem; `LAYOUT` makes it a kind of configuration
-for `era config`.
+Reading a file reports all of its problems. `LAYOUT` makes layouts a kind of configuration for
+`era config`.
 """
 
 import math
@@ -41,11 +41,11 @@ BUZZ = "buzz"
 """Name of the effect that plays without a layout."""
 
 ELSEWHERE = "elsewhere"
-"""Key of the effect outside of all regions, and what reports call the plate there."""
+"""Key of the effect outside all regions, and name of that area in reports."""
 
 
 def default_effects(level_db_sl: float = STRONG_DB_SL) -> dict[str, Effect]:
-    """Return the effects that every layout has without defining them, at a level."""
+    """Return the default effects of every layout, at a level."""
     effects = [each for each in BUILT_IN_EFFECTS if not each.needs_entry]
     plain = {each.kind: each.model_construct(set(), level=level_db_sl) for each in effects}
     return {**named_effects(level_db_sl), **plain}
@@ -58,7 +58,7 @@ class SurfaceLayout:
     regions: tuple[Region, ...] = ()
     effects: Mapping[str, Effect] = field(default_factory=default_effects)
     elsewhere: str | None = BUZZ
-    """Effect outside of all regions, felt by the newest finger there."""
+    """Effect outside all regions, felt by the newest finger there."""
 
     def region_at(self, x: float, y: float) -> Region | None:
         """Return the topmost region at a position [m], or None."""
@@ -68,7 +68,7 @@ class SurfaceLayout:
         return None
 
     def uses(self) -> Iterator[tuple[Region | None, str, str]]:
-        """Yield every effect of every region: the region, None outside of all, key and name."""
+        """Yield every effect of every region: the region (None outside all), key and name."""
         for region in self.regions:
             for on in USES:
                 if (name := getattr(region, on)) is not None:
@@ -87,7 +87,7 @@ class SurfaceLayout:
 
     @property
     def max_db_sl(self) -> float:
-        """The highest level of all effects; infinite for what the neighbours allow."""
+        """Highest level of all effects; infinite for a level that the neighbours limit."""
         levels = [effect.max_db_sl(effect.level_db_sl) for effect in self.effects.values()]
         levels += [
             self.effects[name].max_db_sl(self.level_of(name, region))
@@ -97,7 +97,7 @@ class SurfaceLayout:
         return max(levels, default=-math.inf)
 
     def level_of(self, name: str, region: Region | None) -> float | None:
-        """Return the level [dB SL] of an effect, by name, in a region or outside of all.
+        """Return the level [dB SL] of an effect, by name, in a region or outside all.
 
         None for as strong as the neighbours allow.
         """
@@ -106,7 +106,7 @@ class SurfaceLayout:
         return self.effects[name].level_db_sl
 
     def band_problems(self, frequencies: FloatArray) -> list[str]:
-        """Return what a table of frequencies [Hz] plays instead of bands that it lacks."""
+        """Describe the table frequencies [Hz] played for bands without a table frequency."""
         problems = [
             f"{ELSEWHERE if region is None else region.name}: {problem}"
             for region, _, name in self.uses()
@@ -116,14 +116,14 @@ class SurfaceLayout:
         return [*dict.fromkeys(problems)]
 
     def as_json(self) -> dict[str, Any]:
-        """Return it as the API describes it."""
+        """Return the layout in the format of the API."""
         return {
             "regions": [region.as_json() for region in self.regions],
             "elsewhere": self.elsewhere,
         }
 
 
-_MAX_REGIONS, _MAX_EFFECTS = 256, 64  # those beyond are one problem, and not checked
+_MAX_REGIONS, _MAX_EFFECTS = 256, 64  # any further ones are one problem, and not checked
 
 _HighestLevel = Annotated[
     float, Quantity(LEVEL, at_least=DEFAULT_MAX_DB_SL, at_most=MAX_LEVEL_DB_SL)
@@ -175,7 +175,7 @@ def load_layout(
 def layout_of(
     document: Document, plate: Plate | None, *, level_db_sl: float = STRONG_DB_SL
 ) -> SurfaceLayout:
-    """Make the layout of a document; arguments and errors as of `load_layout`."""
+    """Make the layout of a document; arguments and errors: see `load_layout`."""
     if not is_layout_document(document) and document.data.keys() & {"plate", "surface", "rig"}:
         kind = "a daemon file" if "rig" in document.data else "a rig"
         raise InputError(
@@ -274,7 +274,8 @@ def _check_region(
                 )
     if region.own and region.may_share:
         validation.add(
-            (*path, "may_share"), "must not be true beside own: its content is shared; remove one"
+            (*path, "may_share"),
+            "must not be true together with own: content is shared; remove one",
         )
     for key in USES:
         name = getattr(region, key)
@@ -334,7 +335,7 @@ def _check_use(
         return
     if is_for_motion is None:
         if effect.needs_region:
-            validation.add(path, f"{name} is felt in regions only; put it under on_move of one")
+            validation.add(path, f"{name} works only in regions; put it under on_move of a region")
         return
     if effect.is_for_motion and not is_for_motion:
         validation.add(path, f"{name} is for motion; put it under on_move")
@@ -347,7 +348,7 @@ def _check_use(
 
 
 def _checked(document: Document) -> CheckedFile:
-    """Read a layout; raises ConfigError. Its fit on a plate shows in the daemon's file."""
+    """Read a layout; raises ConfigError. Only a daemon file shows whether it fits a plate."""
     layout = layout_of(document, None)
     unused = default_effects().keys() - {name for _, _, name in layout.uses()}
     return CheckedFile(

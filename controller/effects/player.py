@@ -1,5 +1,4 @@
-"""The player of a surface layout: from contacts to a haptic intent, which finger feels which
-effect."""
+"""Player of a surface layout: converts contacts to a haptic intent, the effect of each finger."""
 
 import math
 from collections.abc import Collection, Sequence
@@ -14,20 +13,20 @@ from controller.sources.touch import Contact, ContactKey
 from model.transients.excursions import CLICKS_APART
 from registry.plugins import WrongResultError
 
-# A finger on the edge of a region must not flip between regions with sensor noise: it stays in one
-# until it is this far [m] from where it entered.
+# Sensor noise must not make a finger on the edge of a region flip between regions: it stays in a
+# region until it is this far [m] from the point of entry.
 _NOISE = 0.001
 
 REQUESTED_PRIORITY = 1_000_000
 """Priority of an effect requested by name, above all regions."""
 
 CLICK_ABOVE_DB = 6.0
-"""Level [dB] of a short pulse above what lasts at its finger, where a layout gives it none."""
+"""Default level [dB] of a short pulse above a continuous effect at its finger."""
 
 NOTICED_ABOVE_DB = 3.0
-"""Level [dB] above what lasts from which on a short pulse is noticed."""
+"""Level [dB] above a continuous effect at which a short pulse becomes noticeable."""
 
-# A short pulse that would have to wait longer [s], two turns with rounding, is left out.
+# A short pulse that would wait longer [s], two turns plus rounding, is left out.
 _MAX_WAIT = 2 * CLICKS_APART + 0.005
 
 
@@ -42,13 +41,13 @@ class _Play:
     priority: int
     band: Band | None
     region: Region | None
-    is_elsewhere: bool  # the effect outside of all regions
-    above_db: float | None  # as of targets
+    is_elsewhere: bool  # whether it is the effect outside all regions
+    above_db: float | None  # see `Target`
     player: str | None = None  # client that requested it
 
     @property
     def outlasts_its_layout(self) -> bool:
-        """Whether it was requested, or is a press that ends by itself."""
+        """Whether it was requested, or is a press effect of limited duration."""
         is_press = self.effect.has_end and not self.effect.is_for_motion
         return is_press or self.priority == REQUESTED_PRIORITY
 
@@ -59,19 +58,19 @@ class _Finger:
 
     since: float  # s; when it came down
     region: Region | None
-    entered: tuple[float, float]  # m; where it entered the region
+    entered: tuple[float, float]  # m; point of entry into the region
     plays: list[_Play] = field(default_factory=list)
-    ended: str = ""  # name of the effect that ended last
+    ended: str = ""  # name of the effect that ended most recently
 
 
 class EffectPlayer:
     """Plays the effects of a layout; times are arguments.
 
-    Every finger feels its newest play that lasts; when that is over, the one before continues.
-    Beside it the finger feels its newest short pulse, 6 dB above it where no level is given. The
-    effect outside of all regions is felt by the newest finger there alone. Short pulses of two
-    fingers are 60 ms apart: the newest of each finger waits its turn, for 0.12 s at most. A play
-    without a stimulus at the moment (no detent passed, no movement) does not count.
+    Every finger feels its newest continuous play; when that ends, the previous one continues. It
+    also feels its newest short pulse, by default 6 dB above the continuous play. Only the newest
+    finger outside all regions feels the effect there. Short pulses of different fingers are 60 ms
+    apart: the newest pulse of each finger waits for its turn, at most 0.12 s. A play without a
+    current stimulus (no detent passed, no movement) does not count.
     """
 
     def __init__(self, layout: SurfaceLayout, strengths: Strengths | None = None) -> None:
@@ -80,11 +79,11 @@ class EffectPlayer:
         self._fingers: dict[ContactKey, _Finger] = {}
         self._number = 0
         self._last_click: tuple[ContactKey, Pulse] | None = None
-        self._waiting: dict[ContactKey, Pulse] = {}  # short ones before their turn
-        self._sensing = self._targets = self._felt = set[ContactKey]()  # of the last intent
+        self._waiting: dict[ContactKey, Pulse] = {}  # short pulses waiting for their turn
+        self._sensing = self._targets = self._felt = set[ContactKey]()  # of the latest intent
 
     def intent(self, contacts: Sequence[Contact], now: float) -> HapticIntent:
-        """Return which contacts shall feel what at a time [s]."""
+        """Return the stimuli of all contacts at a time [s]."""
         self._update_regions(contacts, now)
         if not contacts:
             return HapticIntent((), NO_CONTACTS)
@@ -137,30 +136,30 @@ class EffectPlayer:
         )
 
     def why_not(self, key: ContactKey) -> str:
-        """Return why a finger feels nothing by the last intent; "" if it feels something."""
+        """Return why a finger feels nothing in the latest intent; "" if it feels something."""
         finger = self._fingers.get(key)
         if finger is None or key in self._felt:
             return ""
         name = finger.plays[-1].name if finger.plays else ""
         if key in self._waiting:
-            return f"{name} waits for its turn after those of other fingers"
+            return f"{name} waits for the short effects of other fingers"
         if key in self._targets:
-            return f"{name} came too soon after those of other fingers; touch there again"
+            return f"{name} came too soon after short effects of other fingers; touch there again"
         if key in self._sensing:
-            return f"{name} is felt by the newest finger outside of all regions; lift that one"
+            return f"{name} is felt only by the newest finger outside all regions; lift that finger"
         if name and finger.plays[-1].effect.is_for_motion:
             return f"{name} is not felt at rest; move the finger"
         if name:
-            return f"{name} pauses; it goes on by itself"
+            return f"{name} pauses; it continues on its own"
         if finger.ended:
             return f"{finger.ended} ended; touch there again"
-        return "no effect plays there; touch again, in a region that has one"
+        return "no effect plays there; touch again in a region with an effect"
 
     def replace(self, layout: SurfaceLayout) -> None:
-        """Play another layout from now on; fingers on the plate feel no press of it.
+        """Switch to another layout; fingers already on the plate feel none of its press effects.
 
-        Requested effects, and those that end by themselves, go on to their ends. At these fingers
-        only effects for motion or without an end of the new layout start.
+        Requested effects and effects of limited duration continue to their end. At these fingers,
+        only motion effects and endless effects of the new layout start.
         """
         self.layout = layout
         self._already_pressed |= self._fingers
@@ -183,8 +182,8 @@ class EffectPlayer:
     ) -> None:
         """Start a named effect at a finger, in place of an earlier request of that name.
 
-        level_db_sl: replaces the level of the effect unless None; player: client whose strength it
-        has; effect: replaces that of the layout. Raises KeyError for an unknown effect.
+        level_db_sl: replaces the level of the effect unless None; player: client whose strength
+        applies; effect: replaces the layout's effect. Raises KeyError for an unknown effect.
         """
         effect = effect or self.layout.effects[name]
         level = effect.level_db_sl if level_db_sl is None else level_db_sl
@@ -214,7 +213,7 @@ class EffectPlayer:
         if self._waiting.get(key) is not pulse:
             return math.isinf(pulse.due_at)
         if self._last_click is not None and self._last_click[0] != key:
-            # It may have started later than it was due.
+            # It can have started later than it was due.
             pulse.due_at = max(pulse.due_at, self._last_click[1].start + CLICKS_APART)
         if now < pulse.due_at:
             ends.append(pulse.due_at)
@@ -224,7 +223,7 @@ class EffectPlayer:
         return False
 
     def _line_up(self, key: ContactKey, pulse: Pulse) -> None:
-        """Give a short pulse its turn: that of its finger's pulse that waits, or the last."""
+        """Schedule a short pulse in the slot of its finger's waiting pulse, or in the last slot."""
         before = self._waiting.get(key)
         if before is None:
             others = [each.due_at for each in self._waiting.values()]
@@ -244,7 +243,7 @@ class EffectPlayer:
         for contact in contacts:
             since[contact.key] = contact.since
         for key, one in [*self._fingers.items()]:
-            # One that came down again with the same id, perhaps between two intents, is another.
+            # A finger that came down again with the same id is a new one.
             if since.get(key) != one.since:
                 del self._fingers[key]
         if pressed := self._already_pressed.items():
@@ -276,16 +275,16 @@ class EffectPlayer:
         self._enter(finger, contact, now)
         if (before := self._already_pressed.pop(contact.key, None)) is not None:
             kept = [each for each in before.plays if each.outlasts_its_layout]
-            for each in kept:  # felt before what starts, here and among other fingers
+            for each in kept:  # older than the plays that start now
                 self._number += 1
                 each.number = self._number
             finger.plays = [each for each in finger.plays if not each.outlasts_its_layout] + kept
         return finger
 
     def _enter(self, finger: _Finger, contact: Contact, now: float) -> None:
-        """Start the effects of the region that a finger enters, or those outside of all."""
+        """Start the effects of the region that a finger enters, or the effect outside all."""
         region = finger.region
-        # The effect for motion starts first: the press is felt, then the movement after it.
+        # The motion effect starts first, so that the newer press effect is felt before it.
         names = (region.on_move, region.on_press) if region else (self.layout.elsewhere,)
         for name in names:
             if name is not None:
@@ -294,7 +293,7 @@ class EffectPlayer:
     def _start_in(
         self, finger: _Finger, region: Region | None, name: str, contact: Contact, now: float
     ) -> None:
-        """Start an effect of a region, or that outside of all."""
+        """Start an effect of a region, or the effect outside all."""
         level = self.layout.level_of(name, region)
         priority = 0 if region is None else region.priority
         effect = self.layout.effects[name]
@@ -312,7 +311,7 @@ class EffectPlayer:
         level: float | None,
         priority: int,
     ) -> None:
-        """Start an effect in a region, or outside of all."""
+        """Start an effect in a region, or outside all."""
         self._number += 1
         run = effect.start_in(region, contact, now, level_db_sl=level)
         if not isinstance(run, EffectRun):
@@ -327,9 +326,9 @@ class EffectPlayer:
     def _current_stimuli(
         self, finger: _Finger, contact: Contact, now: float, ends: list[float]
     ) -> Collection[tuple[_Play, EffectStimulus]]:
-        """Return what a finger feels: the newest play that lasts, and the newest short pulse.
+        """Return the newest continuous play and the newest short pulse of a finger.
 
-        Adds every `until` to ends. All plays are called, since those for motion follow the finger.
+        Adds every `until` to ends. Calls all plays, because motion effects follow the finger.
         """
         felt: dict[bool, tuple[_Play, EffectStimulus]] = {}
         lasting: list[_Play] = []
@@ -346,7 +345,7 @@ class EffectPlayer:
             if isinstance(result, EffectStimulus):
                 felt[result.is_short] = play, result
                 if not result.is_short and True in felt and felt[True][1].is_absolute:
-                    del felt[True]  # of a file before
+                    del felt[True]  # of an earlier file
                 if result.click is not None:
                     felt[True] = play, result.click
         finger.plays = lasting

@@ -1,6 +1,6 @@
-"""Strengths: gains on what a touch source or client brings, or a region has, kept by name.
+"""Strengths: gains of touch sources, clients and regions, stored by name.
 
-The types of names and gains bound them, over the API as in the file that keeps them.
+The types of names and gains check their bounds, both in the API and in the file.
 """
 
 import json
@@ -17,72 +17,71 @@ from model.errors import InputError, shown
 from model.files.array_file import whole_or_nothing
 
 SourceName: TypeAlias = Annotated[str, Field(min_length=1, max_length=2048)]
-"""Type of a name that has a strength; names of senders are escaped, and so may be long."""
+"""Type of a name with a strength; escaped sender names can be long."""
 
 GainDb: TypeAlias = Annotated[float, Field(ge=-40, le=0)]
 """Type of the gain [dB] of a name."""
 
 MAX_NAMES = 64
-"""Most touch sources that are remembered, and most names with a gain."""
+"""Maximum number of remembered touch sources, and of names with a gain."""
 
 UNNAMED = re.compile(r"gateway|era|web:\d+ .*|http .*")
 """Pattern of clients without a strength: commands, and browsers without a name."""
 
-_MAX_SIZE = 1 << 21  # bytes; of as many names of the greatest length, each character escaped
+_MAX_SIZE = 1 << 21  # bytes; for this many names of maximum length, with every character escaped
 _Gains = Annotated[dict[SourceName, GainDb], Field(max_length=MAX_NAMES)]
 _GAINS = TypeAdapter(_Gains, config=ConfigDict(allow_inf_nan=False))
 
 
 class Strengths:
-    """Gains [dB] by name, 0 at most and by default.
+    """Gains [dB] by name, at most 0, default 0.
 
-    A name is that of a touch input of the configuration, of a sender there
-    (`table:tuio:10.0.0.2/left`), of a touch source as its client calls it, of a client, or of a
-    region of a layout. At a finger the gains of its names, of its region and of the client that
-    plays its effect add up, each once.
+    A name refers to a configured touch input, a sender there (`table:tuio:10.0.0.2/left`), a touch
+    source as named by its client, a client, or a region of a layout. At a finger, the gains of its
+    names, of its region and of the client that plays its effect add up, each once.
     """
 
     def __init__(self, gains_db: Mapping[str, float] | None = None) -> None:
         self.gains_db = gains_db or {}
-        """Gains that were set, by name; also to 0."""
+        """Gains that were set, by name, including 0."""
         self.clients: Sequence[tuple[str, str]] = ()
-        """For each client, the prefix of its sources' keys, and its name.
+        """Prefix of the source keys and name of each client.
 
-        The API sets this value whenever it changes, so the control loop calls no code of the API.
+        The API updates it, so that the control loop calls no API code.
         """
         self.sources: Sequence[str] = ()
         """Names of touch sources that had fingers."""
 
     def note(self, source: str) -> None:
-        """Note that a touch source has a finger."""
+        """Record that a touch source has a finger."""
         name, _ = self._names_of(source)
         self.sources = [*dict.fromkeys([*self.sources, name])][-MAX_NAMES:]
 
     def gain_db(self, source: str, player: str | None = None, region: str | None = None) -> float:
         """Return the gain [dB] at a finger of a source.
 
-        player: the client that plays its effect; region: where the effect is felt.
+        player: the client that plays its effect; region: the region of the effect.
         """
         names = {*self._names_of(source), player, region} if self.gains_db else ()
         return sum([gain for name, gain in self.gains_db.items() if name in names])
 
     def set(self, name: str, gain_db: float) -> None:
-        """Set the gain [dB] of a name from now on.
+        """Set the gain [dB] of a name.
 
-        Beyond the most names the oldest with a gain of 0 is removed; without any raises InputError.
+        With too many names, removes the oldest with a gain of 0, or raises InputError if none has.
         """
         gains = {**self.gains_db, name: gain_db}
         if len(gains) > MAX_NAMES:
             gains.pop(next((each for each, gain in gains.items() if not gain), name))
         if gain_db and name not in gains:
             raise InputError(
-                f"strengths must be of at most {MAX_NAMES} names, got one more; set that of "
-                "another to 0 dB first"
+                f"strengths must have at most {MAX_NAMES} names, got one more; set another one "
+                "to 0 dB first"
             )
         self.gains_db = gains
 
     def save(self, file: Path) -> None:
-        """Write the gains that are set, atomically; raises OSError."""
+        """Write all gains atomically; raises OSError."""
         with whole_or_nothing(file) as stream:
             stream.write(json.dumps(self.gains_db, indent=1).encode())
 
@@ -94,12 +93,12 @@ class Strengths:
 
 
 def read_strengths(file: Path | None) -> Mapping[str, float]:
-    """Read the gains [dB] of a file, by name; without a file there are none. Raises InputError."""
+    """Read gains [dB] by name from a file; a missing file is empty. Raises InputError."""
     if file is None or not os.path.lexists(file):
         return {}
     text = read_bytes(file, _MAX_SIZE, is_for="remove it", give="a file of strengths")
     try:
-        # A number of many digits becomes infinite, and is refused as such.
+        # A number with many digits becomes infinite, and is then rejected.
         gains = json.loads(text, object_pairs_hook=_unique, parse_int=float)
         return _GAINS.validate_python(gains, strict=True)
     except InputError as error:

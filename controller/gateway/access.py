@@ -42,11 +42,11 @@ _CORS = {
 
 
 class Access:
-    """Refuses requests that are not allowed, and protects responses.
+    """Rejects requests that are not allowed, and protects responses.
 
     Everything under /api except the OpenAPI description needs the token, and so do the metrics
     outside the loopback: `Authorization: Bearer TOKEN`, or for a WebSocket, where browsers cannot
-    set headers, the subprotocol `era-haptics.token.TOKEN` beside `era-haptics.v1`.
+    set headers, the subprotocol `era-haptics.token.TOKEN` in addition to `era-haptics.v1`.
     """
 
     def __init__(self, settings: GatewaySettings) -> None:
@@ -55,7 +55,7 @@ class Access:
         self._origins = settings.allowed_origins
 
     def check(self, request: web.Request) -> None:
-        """Check who requests, before anything of the body; raises web.HTTPException."""
+        """Check the origin of a request before reading its body; raises web.HTTPException."""
         headers = request.headers
         # Routes would take an escaped line feed for another path, and ignore the host in a URL.
         if _CONTROL.search(request.path) or not request.raw_path.startswith("/"):
@@ -86,14 +86,14 @@ class Access:
         return True
 
     def check_form(self, request: web.Request) -> None:
-        """Check how a request is sent, before anything of the body; raises web.HTTPException."""
+        """Check the form of a request before reading its body; raises web.HTTPException."""
         if request.version not in VERSIONS:
             raise web.HTTPVersionNotSupported(text="use HTTP/1.1")
         if "Transfer-Encoding" in request.headers:  # small chunks would take the time of others
             raise web.HTTPLengthRequired(text="send a Content-Length")
 
     async def preflight(self, _: web.Request) -> web.Response:
-        """Answer what a page of another, allowed origin may do (CORS): what `protect` adds."""
+        """Respond to a CORS preflight of an allowed origin; `protect` adds the headers."""
         return web.Response(headers={"Allow": "OPTIONS, POST"})
 
     async def protect(self, request: web.Request, response: web.StreamResponse) -> None:

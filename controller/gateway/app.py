@@ -124,7 +124,7 @@ def openapi() -> dict[str, Any]:
 
 
 def _operation(name: str, method: Method, references: Any) -> dict[str, Any]:
-    """Request and responses of one method."""
+    """Return the request and responses of a method."""
     errors = dict(_GATEWAY_ERRORS)
     for code, status in HTTP_STATUS.items():
         errors[status] = "; ".join(filter(None, (errors.get(status), ERROR_MEANINGS[code])))
@@ -148,18 +148,18 @@ def _operation(name: str, method: Method, references: Any) -> dict[str, Any]:
 
 
 MAX_BODY = 1 << 16  # bytes
-MAX_REQUESTS = 256  # to the daemon at once
+MAX_REQUESTS = 256  # simultaneous, to the daemon
 MAX_SESSIONS = 24  # WebSockets; the daemon has 32 connections, and some for stops
-_METRICS_TIME = 0.5  # s; for which the same metrics are given
-_MAX_DISARMS = 8  # at once, so that the daemon always reads a stop that comes behind them
-_STOP_DELAY = 0.01  # s; at most, in which a body may name the client that stops
-_HEARTBEAT = 10.0  # s; without a frame of a browser, after which it is asked for one
+_METRICS_TIME = 0.5  # s; for which metrics are cached
+_MAX_DISARMS = 8  # simultaneous, so that the daemon always reads a stop that follows
+_STOP_DELAY = 0.01  # s; maximum wait for a body with the name of the stopping client
+_HEARTBEAT = 10.0  # s; without a frame from a browser, until a ping is sent
 _CLOSE_TIMEOUT = 0.3  # s; for a browser to close its side
 _PAGE = Path(__file__).parent / "page"
 
 
 class Gateway:
-    """State shared by the routes; `field.run` and `keep_connected` are to be run beside `app`."""
+    """State shared by the routes; run `field.run` and `keep_connected` concurrently with `app`."""
 
     def __init__(self, settings: GatewaySettings) -> None:
         self.field = DrawnField(settings.socket)
@@ -168,7 +168,7 @@ class Gateway:
         self._sessions: set[BrowserSocket] = set()
         self._places = asyncio.Semaphore(MAX_REQUESTS)
         self._connections = Connections(settings.socket)
-        # For what must not wait for a new connection, which the daemon may refuse.
+        # For requests that must not wait for a new connection, which the daemon may reject.
         self._own = AsyncClient(settings.socket, name="gateway", timeout=RESPONSE_TIMEOUT)
         self._disarms = asyncio.Semaphore(_MAX_DISARMS)
         self._reading = asyncio.Lock()
@@ -192,18 +192,18 @@ class Gateway:
         self.app.on_shutdown.append(self._end_sessions)
 
     def connection(self, make_server: Callable[[], web.RequestHandler]) -> ClientConnection:
-        """A connection that is served by the web server's protocol for it."""
+        """Make a connection with the web server's protocol."""
         return ClientConnection(make_server, self._connections)
 
     async def keep_connected(self) -> None:
-        """Connect to the daemon again after every loss, so that no stop has to wait for it."""
+        """Reconnect to the daemon after every loss, so that no stop has to wait for that."""
         while True:
             with contextlib.suppress(RpcError, Unreachable):
-                await self._own.next_event()  # it subscribes to none
+                await self._own.next_event()  # without subscriptions
 
     @web.middleware
     async def _answer(self, request: web.Request, handler: Handler) -> web.StreamResponse:
-        """Check a request and answer it. Its client may have left: its stop is carried out."""
+        """Check a request and respond. A stop is carried out even if its client has left."""
         connection = CONNECTION.get()
         connection.start_request(request)
         try:
@@ -236,7 +236,7 @@ class Gateway:
         )
 
     async def _metrics(self, _: web.Request) -> web.Response:
-        """The daemon's status for Prometheus, read once for all who need it: it needs no token."""
+        """Return the daemon's status for Prometheus, cached because it needs no token."""
         async with self._reading:
             if time.monotonic() >= self._read_at + _METRICS_TIME:
                 try:
@@ -253,7 +253,9 @@ class Gateway:
             if method not in HTTP_METHODS:
                 raise unknown_method(method, HTTP_METHODS)
             if self._places.locked():
-                raise web.HTTPServiceUnavailable(text="too many requests at once; try again later")
+                raise web.HTTPServiceUnavailable(
+                    text="too many simultaneous requests; try again later"
+                )
             async with self._places:
                 _check_media(request)
                 params = _read_params(method, await _read_body(request))
@@ -263,14 +265,14 @@ class Gateway:
             return _failure(error)
 
     async def _silence(self, request: web.Request, method: str) -> web.Response:
-        """Call a method that silences, then report what is wrong with the request.
+        """Call a method that silences, then report the errors of the request.
 
-        Over the own connection to the daemon. Only who may request it was checked before.
+        Uses the gateway's own connection to the daemon. Only access was checked before.
         """
         reading = asyncio.create_task(self._read(request))
         try:
-            # A stop does not wait for its body, which only names the client. That of a disarm may
-            # restrict it to a lease.
+            # A stop does not wait for its body, which only names the client. The body of a disarm
+            # can restrict it to a lease.
             await asyncio.wait({reading}, timeout=_STOP_DELAY if method == "stop" else None)
             result = await self._request_silence(method, _given(reading))
             if request.method != "POST":
@@ -289,7 +291,7 @@ class Gateway:
         return await _read_body(request)
 
     async def _request_silence(self, method: str, given: object) -> Any:
-        """The daemon's result, by the parameters that can be read of those given."""
+        """Return the daemon's result, for the readable parameters."""
         params = readable_params(method, given)
         if getattr(params, "client", None) is None:
             params = params.model_copy(update={"client": f"http {CONNECTION.get().address}"})
@@ -304,7 +306,7 @@ class Gateway:
             compress=False,  # no decompression bombs
             heartbeat=_HEARTBEAT,
             max_msg_size=MAX_READ_FRAME,
-            decode_text=False,  # invalid text is refused after it was searched for what silences
+            decode_text=False,  # invalid text is first searched for requests that silence
             timeout=_CLOSE_TIMEOUT,
             autoclose=False,  # by the bridge
         )
@@ -335,7 +337,7 @@ class Gateway:
         return socket
 
     async def _end_sessions(self, _: web.Application) -> None:
-        with contextlib.suppress(TimeoutError):  # one may not read
+        with contextlib.suppress(TimeoutError):  # a client may not read
             async with asyncio.timeout(_CLOSE_TIMEOUT):
                 await asyncio.gather(
                     *(each.close(code=WSCloseCode.SERVICE_RESTART) for each in self._sessions),
@@ -403,9 +405,9 @@ def _failure(problem: RpcError | Unreachable) -> web.Response:
 _MAX_LINE = 1 << 13  # bytes; of the head of a request
 _MAX_LINES = 64
 _QUEUE = 512  # connections that wait to be accepted
-_ACCEPTED = 4  # of them in an iteration of the event loop
+_ACCEPTED = 4  # connections per iteration of the event loop
 _NICENESS = 10  # added, so that the daemon's control loop has priority
-_SHUTDOWN_TIMEOUT = 0.3  # s; for requests to end by themselves
+_SHUTDOWN_TIMEOUT = 0.3  # s; for requests to finish
 
 
 async def serve(settings: GatewaySettings, *, announce: Callable[[int], None]) -> None:
@@ -435,17 +437,17 @@ async def serve(settings: GatewaySettings, *, announce: Callable[[int], None]) -
     over = asyncio.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         asyncio.get_running_loop().add_signal_handler(number, over.set)
-    # It never ends by itself: a part that fails ends the process, which then says why.
+    # Runs forever: a failing part ends the process, which then reports the reason.
     own = asyncio.gather(gateway.field.run(), gateway.keep_connected())
     own.add_done_callback(lambda _: over.set())
     make_server = runner.server
-    # asyncio accepts as many in an iteration as it lets wait.
+    # asyncio accepts as many connections per iteration as its backlog holds.
     serving = await asyncio.get_running_loop().create_server(
         lambda: gateway.connection(make_server), sock=listening, backlog=_ACCEPTED
     )
     listening.listen(_QUEUE)
     announce(listening.getsockname()[1])
-    with no_long_collections():  # of connections that a storm leaves, nothing else is visited
+    with no_long_collections():  # only connections left by a request storm need collection
         await over.wait()
     await stop_accepting(serving)
     await runner.cleanup()
@@ -455,13 +457,13 @@ async def serve(settings: GatewaySettings, *, announce: Callable[[int], None]) -
 
 
 def _is_own_failure(record: logging.LogRecord) -> bool:
-    """Whether it is not of a client, which has left or sends what is not HTTP."""
+    """Whether an error is not caused by a client that left or sends invalid HTTP."""
     error = record.exc_info[1] if record.exc_info else None
     return not isinstance(error, OSError | HttpProcessingError)
 
 
 def listening_socket(settings: GatewaySettings) -> socket.socket:
-    """Listen on a socket of its own; raises InputError."""
+    """Listen on a new socket; raises InputError."""
     family = socket.AF_INET6 if ":" in settings.host else socket.AF_INET
     try:
         listening = socket.create_server(
@@ -474,6 +476,6 @@ def listening_socket(settings: GatewaySettings) -> socket.socket:
         raise InputError(
             f"cannot listen on {settings.host} port {settings.port} "
             f"({os.strerror(error.errno or 0)}); stop the other program or give another port "
-            "(--listen; of a daemon --dashboard, or dashboard in its file)"
+            "(--listen; for a daemon --dashboard, or dashboard in its file)"
         ) from error
     return listening

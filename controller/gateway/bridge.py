@@ -1,7 +1,7 @@
 """The bridge between a browser's WebSocket and the daemon: it passes on lines of the API.
 
-Frames that silence are passed on before all others, whatever is wrong with them, and also if the
-browser has left.
+Frames that silence are passed on before all others, even if they are invalid or the browser has
+left.
 """
 
 import asyncio
@@ -27,7 +27,7 @@ BrowserSocket: TypeAlias = "web.WebSocketResponse[Literal[False]]"
 MAX_FRAME = 1 << 16  # bytes
 MAX_READ_FRAME = 1 << 20  # bytes; a longer frame than MAX_FRAME is rejected, unless it silences
 SEND_TIMEOUT = 5.0  # s; for one frame
-NO_DAEMON = 4001  # close code, one of those for private use; the page then connects again
+NO_DAEMON = 4001  # close code for private use; the page then reconnects
 
 _NEXT_FRAME_TIMEOUT = 0.1  # s; for the next frame of a browser whose bridge ends
 _LAST_FRAMES_TIMEOUT = 1.0  # s; for all frames of such a browser
@@ -48,8 +48,8 @@ async def bridge(
     client: address of the browser; daemon: its socket; field: vibration to be sent as pictures,
     None for none; turns: of frames that do not silence.
     The first frame that the browser gets is the daemon's reply to a hello, whose id is the
-    browser's name in the daemon's log. When the browser leaves, the daemon carries out what it was
-    sent before, and lifts the browser's fingers.
+    browser's name in the daemon's log. When the browser leaves, the daemon carries out all
+    earlier requests, and lifts the browser's fingers.
     """
     try:
         link = await DaemonLink.open(daemon, f"web:{next(_browser_numbers)} {client}")

@@ -1,9 +1,9 @@
 """Clients' connections to the gateway, with the bounds that aiohttp lacks.
 
-Left to itself, aiohttp parses up to 32 requests of a connection ahead. A `ClientConnection` stands
-between the transport and aiohttp, and hands on one request at a time, each in its turn
-(`controller.gateway.turns`). `RequestInput` cuts what it receives into requests. A request that
-silences takes no turn.
+By itself, aiohttp parses up to 32 requests of a connection ahead. A `ClientConnection` between the
+transport and aiohttp passes on one request at a time, each in its turn
+(`controller.gateway.turns`). `RequestInput` splits the received bytes into requests. A request that
+silences does not wait for a turn.
 
 `Connections` closes a connection that waits too long for its next request, and the oldest of too
 many that wait. The time counts from the last response, so that sending byte by byte gains nothing.
@@ -134,8 +134,8 @@ class Connections:
     async def _close_oldest(self) -> None:
         """Close the oldest of too many connections that wait.
 
-        First their input is read, which may be a stop. Connections that were answered come before
-        new ones: a new client may be the one that stops.
+        First reads their input, which may contain a stop. Closes connections with earlier responses
+        before new ones: a new client may be about to stop.
         """
         for _ in range(_ITERATIONS):
             await asyncio.sleep(0)
@@ -215,7 +215,7 @@ class ClientConnection(asyncio.BufferedProtocol):
         return True
 
     def connection_lost(self, error: Exception | None) -> None:
-        """Close the client of the daemon, once it has carried out what it was sent."""
+        """Close the client of the daemon, once its requests are carried out."""
         self._shared.stop_waiting(self)
         if self._permit is not None:
             self._permit.cancel()
@@ -327,7 +327,7 @@ class ClientConnection(asyncio.BufferedProtocol):
             self._transport.close()
 
     def _hand_on_body(self) -> None:
-        """Hand on what was received of the present request's body, or of WebSocket frames."""
+        """Pass on the received part of the current request's body, or of WebSocket frames."""
         part = self._input.take_all() if self._is_websocket else self._input.take_body()
         if part and self._server is not None:
             self._server.data_received(part)

@@ -1,4 +1,4 @@
-"""The plate's vibration for drawing, as the daemon reports that it plays."""
+"""Compute the plate's vibration for drawing, from the daemon's reports."""
 
 import asyncio
 import json
@@ -35,7 +35,7 @@ _logger = logging.getLogger(__name__)
 
 
 class FieldSolver:
-    """Draws the vibration of one rig's plate, which is solved once, and once per frequency."""
+    """Computes the vibration of a rig's plate; solves the plate once, and once per frequency."""
 
     def __init__(self, rig: Rig) -> None:
         self._rig = rig
@@ -53,10 +53,10 @@ class FieldSolver:
     def frame(self, layers: Mapping[int, Mapping[str, PlayedTone]]) -> bytes:
         """The complex acceleration of each layer under its drive by ERA, as a frame.
 
-        A field is what one layer moves at one frequency. Little-endian: u16 columns, u16 rows, u16
-        fields, u16 zero; f32 scale [m/s²]; f32 per field, its frequency [Hz]; f32 per field, the
-        threshold of feeling there [m/s²]; u16 per field, its layer; then i16 per field, row from
-        the south and column from the west: real and imaginary part, of 32767 as the scale. Raises
+        A field is the vibration of one layer at one frequency. Little-endian: u16 columns, u16
+        rows, u16 fields, u16 zero; f32 scale [m/s²]; per field f32 frequency [Hz]; per field f32
+        detection threshold [m/s²]; per field u16 layer; then, per field, row from the south and
+        column from the west, real and imaginary part as i16, where 32767 is the scale. Raises
         InputError.
         """
         names = [era.name for era in self._rig.eras]
@@ -127,7 +127,7 @@ class DrawnField:
                 await asyncio.sleep(_RETRY_INTERVAL)
 
     async def _follow(self) -> None:
-        """Have what plays drawn until the daemon disconnects; raises RpcError and Unreachable."""
+        """Draw the playback until the daemon disconnects; raises RpcError and Unreachable."""
         link = await DaemonLink.open(self._daemon, "gateway")
         try:
             rig_text = json.loads(link.hello)["result"]["rig_text"]
@@ -147,7 +147,7 @@ class DrawnField:
         self._due.set()
 
     async def _draw(self) -> None:
-        """Draw what plays whenever it changes: in a thread, for the first takes a while."""
+        """Draw the playback after each change, in a thread because the first time takes a while."""
         loop, thread = asyncio.get_running_loop(), ThreadPoolExecutor(1)
         while True:
             await self._due.wait()
@@ -157,13 +157,13 @@ class DrawnField:
                 if self._plays is not None:
                     frame = await loop.run_in_executor(thread, self._drawn, *self._plays)
             except Exception as error:
-                self._note("field of the plate not drawn", error)
+                self._note("field of the plate: not drawn", error)
             self._frame = frame
             self._changed.set()
             self._changed = asyncio.Event()
 
     def _drawn(self, rig_text: str, layers: Mapping[str, Any]) -> bytes:
-        """The frame of what plays, without what a later daemon may add to it."""
+        """Return the playback as a frame, ignoring additions of a later daemon."""
         return self._solver(rig_text).frame(_LAYERS.validate_python(layers, extra="ignore"))
 
     def _note(self, what: str, error: Exception) -> None:

@@ -1,6 +1,6 @@
-"""Settings of the gateway: where it listens, and who may use it; unsafe ones are refused.
+"""Settings of the gateway: its address and its access rules; unsafe settings are rejected.
 
-It loads no library of the gateway, as the daemon and the command line check for these here.
+Imports no gateway library, because the daemon and the command line check for these here.
 """
 
 import ipaddress
@@ -40,9 +40,9 @@ class GatewaySettings:
     token: str = field(default_factory=lambda: secrets.token_urlsafe(32), repr=False)
     """Gives full access to the API; random by default."""
     extra_hosts: tuple[str, ...] = ()
-    """Allowed Hosts without port, besides those of the loopback."""
+    """Allowed Hosts without port, in addition to the loopback hosts."""
     origins: tuple[str, ...] = ()
-    """Allowed Origins besides the gateway's own."""
+    """Allowed Origins in addition to the gateway's own."""
     is_token_user_supplied: bool = False
 
     def __post_init__(self) -> None:
@@ -115,10 +115,10 @@ class GatewaySettings:
 
 
 def sent_host(name: str) -> str:
-    """Return a host as browsers send it, or "" for what is none.
+    """Return a host as browsers send it, or "" if it is invalid.
 
-    In lower case, an international name in its ASCII form, an IPv6 address in brackets and in its
-    shortest form. Names whose ASCII form depends on the edition of IDNA are none: give that form.
+    Lower case; international names in ASCII form; IPv6 addresses in brackets and in their shortest
+    form. Names whose ASCII form depends on the edition of IDNA are invalid: give the ASCII form.
     """
     try:
         if name.startswith("[") and name.endswith("]") and "%" not in name:
@@ -132,7 +132,7 @@ def sent_host(name: str) -> str:
 
 
 def sent_origin(text: str) -> str:
-    """Return an origin as browsers send it, without the scheme's own port; "" for what is none."""
+    """Return an origin as browsers send it, without a default port; "" if it is invalid."""
     match = _ORIGIN.fullmatch(text)
     host = sent_host(match[2]) if match else ""
     if match is None or not host:

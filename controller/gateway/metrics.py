@@ -25,7 +25,7 @@ from drivers.host.clock import ReportKind
 from drivers.protocol.definition import READINGS
 
 _Row: TypeAlias = tuple[str, str, Mapping[Any, float | None], tuple[str, ...]]
-"""Name, meaning, values by what the labels are, and labels of a metric."""
+"""Name, meaning, values by label values, and label names of a metric."""
 
 _AMPLIFIER_GAUGES: tuple[tuple[str, str, Callable[[AmplifierStatus], float | None]], ...] = (
     ("degraded", "Whether it does not reply but may still play.", lambda a: a.degraded),
@@ -43,7 +43,7 @@ _AMPLIFIER_GAUGES: tuple[tuple[str, str, Callable[[AmplifierStatus], float | Non
     ("reply_age_seconds", "Time since the last reply.", lambda a: a.reply_age_s),
     (
         "clock_skew_seconds",
-        "RMS error of its clock against those of the others.",
+        "RMS error of its clock relative to the others.",
         lambda a: None if a.clock_skew_us is None else a.clock_skew_us / 1e6,
     ),
     (
@@ -67,12 +67,12 @@ _LINK_COUNTERS = {
 
 @dataclass
 class _Metrics(Collector):
-    """Metrics of one status."""
+    """Metrics of a status."""
 
     status: StatusResult | None
 
     def collect(self) -> Iterator[Metric]:
-        """All of which a value is known."""
+        """Yield all metrics with a known value."""
         yield GaugeMetricFamily(
             "era_up", "Whether the daemon responds.", value=float(self.status is not None)
         )
@@ -113,7 +113,7 @@ def _gauges(status: StatusResult) -> list[_Row]:
         ("uptime_seconds", "Time since the daemon started.", {(): status.uptime_s}, ()),
         (
             "promised_contrast_decibels",
-            "Felt contrast that nine of ten plates within the rig's uncertainty give.",
+            "Felt contrast that 90 % of plates within the rig's tolerances reach.",
             {(): status.promised_contrast_db},
             (),
         ),
@@ -143,7 +143,7 @@ def _gauges(status: StatusResult) -> list[_Row]:
         ),
         (
             "amplifier_report",
-            "1 for what it has reported lately.",
+            "1 for each of its recent reports.",
             {
                 (each.name, kind): kind in {report.kind for report in each.reports}
                 for each in status.amplifiers

@@ -49,7 +49,7 @@ def fault_remedy(cause: str) -> str:
 
 
 class DaemonState(StrEnum):
-    """State of the daemon: those of CiA 402, and COMM_LOST."""
+    """State of the daemon: the states of CiA 402, and COMM_LOST."""
 
     NOT_READY = "NOT_READY"
     SWITCH_ON_DISABLED = "SWITCH_ON_DISABLED"
@@ -127,11 +127,11 @@ class DaemonEvent:
     """For the user; the remedy of a fault follows from its cause instead."""
     lease: Lease | None = None
     amplifiers: tuple[str, ...] = ()
-    """Names of those that are lost, or do not reply."""
+    """Names of the amplifiers that are lost or do not reply."""
 
 
 class Loss(NamedTuple):
-    """A loss of amplifiers, because of which all others were closed."""
+    """A loss of amplifiers, after which all others were closed."""
 
     at: float
     """[s]"""
@@ -235,7 +235,7 @@ TRANSITIONS: dict[tuple[DaemonState, Trigger], Transition] = {
         Action.STOP,
         Action.RECONNECT,
     ),
-    # Read back as silent: a stop would latch an amplifier that is back at once.
+    # Read back as silent; a stop would latch an amplifier that returns immediately.
     **_from(
         [DaemonState.READY_TO_SWITCH_ON, DaemonState.COMM_LOST],
         Trigger.LINK_LOST,
@@ -331,10 +331,10 @@ _logger = logging.getLogger(__name__)
 
 
 class DeferredCalls:
-    """Calls callbacks a moment later, one per iteration of the event loop, in order.
+    """Calls callbacks in order, one per iteration of the event loop.
 
-    An exception of one is logged and affects no other. Beyond 256 pending calls the oldest are
-    dropped.
+    An exception in a callback is logged and does not affect others. Above 256 pending calls, the
+    oldest are dropped.
     """
 
     def __init__(self) -> None:
@@ -389,7 +389,7 @@ def is_any_armed(statuses: Mapping[str, Values]) -> bool:
 
 
 def find_problem(statuses: Mapping[str, Values], amplifiers: Mapping[str, Amplifier]) -> str | None:
-    """Return what is wrong with the first amplifier that is armed, in a fault or not silent."""
+    """Describe the first amplifier that is armed, in a fault or not silent; None without one."""
     for name, status in statuses.items():
         if status["state"] != _DISARMED or status["fault"]:
             fault = f", fault {name_of(FAULTS, status['fault'])}" if status["fault"] else ""

@@ -1,7 +1,7 @@
-"""The supervisor of a plate: its operation, its links, and what is done about faults and losses.
+"""Supervisor of a plate: its operation, its links, and the handling of faults and losses.
 
-The supervisor alone owns the operation. An event changes it (`step`), the actions that follow are
-carried out by the controller, and the outcome of each at the amplifiers is the next event. Actions
+Only the supervisor changes the operation. An event changes it (`step`), the controller carries out
+the resulting actions, and the outcome of each action at the amplifiers is the next event. Actions
 come before observers, which are called a moment later, each guarded (`DeferredCalls`).
 
 The supervisor also runs the control loop, polls disarmed amplifiers, and opens lost ones again.
@@ -56,9 +56,9 @@ from registry.plugins import failure_text
 from registry.threads import pauses
 
 STATUS_INTERVAL = 0.5  # s; between status requests to disarmed amplifiers
-_RECHECK = 0.05  # s; of whether the watchdog of a lost amplifier has passed
+_RECHECK = 0.05  # s; between checks of the watchdog of a lost amplifier
 _MAX_READ_BACKS = 15
-_EPOCHS = 2**31  # a daemon begins at one of these by chance; all are exact as numbers of JSON
+_EPOCHS = 2**31  # a daemon starts at a random one; all are exact as JSON numbers
 
 LEASE_OVER = DaemonEvent(Trigger.DISARM, "the arming lease was not renewed", "arm again")
 _REOPENING = "the daemon reconnects by itself and stays disarmed"
@@ -84,13 +84,13 @@ class Supervisor:
     before any other observer. An unexpected exception in a transition or action stops all
     amplifiers and ends in FAULT.
 
-    state_changed: called a moment after every change of the state or its epoch; link_changed:
-    receives the kind of change, the amplifiers concerned where they are known, and a message;
+    state_changed: called shortly after every change of the state or its epoch.
+    link_changed: receives the kind of change, the affected amplifiers, if known, and a message.
     alive: called after each cycle of the control loop, which runs in every state.
     """
 
     controller: Controller
-    """Opens, arms and stops the amplifiers; to be set first, since it is made with `connected`."""
+    """Opens, arms and stops the amplifiers; set it first, because it is made with `connected`."""
 
     def __init__(
         self,
@@ -109,7 +109,7 @@ class Supervisor:
         self._reports = DeferredCalls()
         self._tasks: set[asyncio.Task[Any]] = set()
         self._loss_lock = asyncio.Lock()  # held until the lost amplifiers are closed
-        self._clears: list[int] = []  # epochs of those in progress
+        self._clears: list[int] = []  # epochs of clears in progress
         self._lease_timer: asyncio.TimerHandle | None = None
 
     def observe(self, loop: Observers) -> None:
@@ -168,7 +168,7 @@ class Supervisor:
             raise
 
     def post(self, event: DaemonEvent) -> None:
-        """Apply an event at once and carry out its actions in a task."""
+        """Apply an event immediately and carry out its actions in a task."""
         self._spawn(self._in_background(self._applied(event)))
 
     def stop(self, cause: str, remedy: str | None = None) -> Awaitable[Mapping[str, StopOutcome]]:
@@ -361,8 +361,8 @@ class Supervisor:
         """Raise Preempted if a stop, fault or other clear came after the request."""
         if epoch != self.operation.epoch:
             raise Preempted(
-                "not cleared: a stop, fault or other clear came after the request; find the cause "
-                "of what is latched, then clear again"
+                "not cleared: a stop, fault or other clear came after the request; check the "
+                "status, then clear again"
             )
 
     async def _read_back(self, epoch: int, *, clears: bool = False) -> str | None:
@@ -424,8 +424,8 @@ class Supervisor:
             await self._pause(pause)
         while self.assume_energised(threads.now()) and not self._closing.is_set():
             await self._pause(_RECHECK)
-            await self.controller.group.statuses()  # what was loud may be silent by now
-        if self.controller.group.is_open:  # none was lost again
+            await self.controller.group.statuses()  # loud amplifiers can be silent by now
+        if self.controller.group.is_open:  # no further loss
             await self.handle(DaemonEvent(Trigger.RECONNECTED))
 
     async def _reopen(self) -> bool:
@@ -458,7 +458,7 @@ class Supervisor:
         return lost
 
     async def _pause(self, duration: float) -> None:
-        """Wait for a time [s]; `close` or a stop, which opens lines at once, ends it."""
+        """Wait for a time [s]; `close`, or a stop, which reopens lines, ends the wait."""
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(duration):
                 await self._changed.wait()
@@ -530,16 +530,16 @@ class Supervisor:
             self.post(DaemonEvent(Trigger.FAULT, cause))
 
     def _check_degraded(self) -> None:
-        """Report that armed amplifiers have ceased to reply, or that all reply again."""
+        """Report that armed amplifiers have stopped replying, or that all reply again."""
         group, operation = self.controller.group, self.operation
         degraded = group.members.degraded
         is_said = bool(degraded) is bool(operation.degraded)
         if operation.state is not DaemonState.OPERATION_ENABLED or is_said or group.members.lost_by:
-            return  # of one that is lost the next heartbeat says so
+            return  # the next heartbeat reports a lost amplifier
         change: LinkChange = "restored"
         remedy: str | None
         level, remedy = logging.INFO, None
-        cause = "all amplifiers reply again and play what they should"
+        cause = "all amplifiers reply again and play correctly"
         if degraded:
             change, level, remedy = "degraded", logging.WARNING, "check cables and supply"
             why = group.amplifiers[degraded[0]].silence_cause

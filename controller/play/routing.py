@@ -1,19 +1,20 @@
-"""Playback on the amplifiers of a rig: what they can play together, and the sets for each layer.
+"""Playback on the amplifiers of a rig: their joint capabilities, and the sets for each layer.
 
-Capabilities of the open amplifiers are stated in the terms of the table. A set takes its onset with
-it, so a touch waits for that; its ending follows in a set of its own, which takes no longer. The
-knots that the wires carry in time are counted once, when the amplifiers are open. Errors of their
-clocks are counted anew where one is worse than counted, or where all have become far better.
+The capabilities of the open amplifiers are given in the terms of the table. A set includes its
+onset, so a touch waits for that; its ending follows in a separate set, which takes no longer. The
+number of knots that the wires carry in time is computed once, when the amplifiers are opened. The
+assumed clock errors are updated if a clock is worse than assumed, or all are far better.
 
-A course is played in pieces. An amplifier plays a piece along straight lines between its knots, and
-holds one more that waits for the end of the first: so pieces follow each other without a gap though
-the host is late, by half a piece at most. The first is short, since a touch waits for it.
+An envelope of a continuous effect is played in pieces. An amplifier plays a piece along straight
+lines between its knots, and holds a second piece that waits for the end of the first. So pieces
+follow each other without a gap if the host is late by at most half a piece. The first piece is
+short, because a touch waits for it.
 
 Excitations [m, rad] become tones of channels by the wiring of the rig, and envelopes integers of
 the wire; `sim/bench` translates back by the same wiring. An onset of fewer knots follows the same
 curve in longer steps, which keeps quiet fingers quieter than a ramp does down to a single knot; an
-ending is sent whole or not at all. The last value of an envelope, the pattern itself or silence, is
-that of the command and not among the knots on the wire.
+ending is sent whole or not at all. The last value of an envelope, the pattern itself or silence,
+is in the command and not among the knots on the wire.
 """
 
 import logging
@@ -51,51 +52,51 @@ MAX_SET_TIME = 0.010
 """Longest time [s] of a set on its wire, so that its onset does not delay a touch."""
 
 MAX_PIECE_TIME = 0.020
-"""The same [s] of a set that continues a course, for which a touch may have to wait."""
+"""Longest time [s] of a set that continues an envelope; a touch may have to wait for it."""
 
 BESIDE_CLICK = 0.100
-"""Fade-out [s] beside a short pulse; a shorter one would be felt with it."""
+"""Fade-out [s] next to a short pulse; a shorter one would be felt with the pulse."""
 
 PLAIN_STEP = 0.050
-"""Time [s] of the ramps in which a course is played on amplifiers without knots, a set for each."""
+"""Time [s] of each ramp, and set, that replaces knots on amplifiers without them."""
 
 HELD = 0.1
-"""Time [s] for which a layer lasts beyond its last piece: without another it ends by itself."""
+"""Time [s] after its last piece at which a layer ends on its own."""
 
-_FIRST, _NEXT, _SHORTEST = 0.16, 0.32, 0.12  # s; of pieces, the last one where knots are few
+_FIRST, _NEXT, _SHORTEST = 0.16, 0.32, 0.12  # s; of pieces; the last is used with few knots
 _AMID = 0.020  # s; between knots of a first piece that leads there from something else
 
 MAX_STEP = _SHORTEST / 2
-"""Time [s] between knots where an envelope has one."""
+"""Time [s] between the knots of an envelope with one knot."""
 
 MARGIN = 1.25
-"""Factor by which more error of a clock is counted than is known."""
+"""Safety factor of the assumed clock errors."""
 
 SETTLED = 10.0
-"""Time [s] for which a clock is held before that is logged, with how often it was not."""
+"""Time [s] that a clock is synchronised before this is logged, with the number of losses."""
 
-_FAR_BETTER = 2.0  # times what is counted
+_FAR_BETTER = 2.0  # ratio to the assumed error
 
 _FREQUENCY, _LEVEL, _PHASE = (QUANTITIES[name] for name in ("frequency", "level", "phase"))
 _RAMP, _STEP = QUANTITIES["ramp"], QUANTITIES["envelope_step"]
 _PHASE_STEP = QUANTITIES["phase_step"]
 _LAYER_WORDS, _COMMAND_WORDS, _ENVELOPE_WORDS, _KNOT_WORDS = 3, 4, 2, 2
-_PART_WORDS = 3  # of a message: session, token, part
-_DIGITS = 6  # of a step of the wire
+_PART_WORDS = 3  # words of a message: session, token, part
+_DIGITS = 6  # decimals of a step on the wire
 _ROUNDING = 1e-9  # s
 
 Drive = Mapping[str, AmplifierTone]
-"""Tones that play, by ERA; without silent ones."""
+"""Tones by ERA, without silent ones."""
 
 PlateLayer = Mapping[str, AmplifierLayer]
-"""The contents of one layer on every amplifier, by name."""
+"""Contents of one layer on all amplifiers, by amplifier name."""
 
 _logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
 class EnvelopeSupport:
-    """Envelopes that every channel may have."""
+    """Envelopes supported by every channel."""
 
     onset_knots: int
     """Knots of an onset; 0: ramps."""
@@ -147,12 +148,12 @@ class PlaybackCapabilities:
     ramp_max: float = math.inf
     """Longest ramp [s]."""
     layers: int = 1
-    """How many contents can play at once."""
+    """Maximum number of simultaneous contents."""
     course_knots: int = 0
-    """Knots of a piece of a course; 0: ramps."""
+    """Knots of a piece of an envelope; 0: ramps."""
 
     def left_by(self, layers: Sequence[answer.Layer], table: LocalizationTable) -> Self:
-        """Return the capabilities with what layers leave of the limits if their peaks coincide."""
+        """Return the capabilities with the limits that remain if all layers peak simultaneously."""
         drives = [each for layer in layers for each in layer.drives]
         taken, strokes = amplitudes_of([each for each, _ in drives]), table.full_levels
         levels = [amplitude / strokes[name] for name, amplitude in taken.items()]
@@ -194,8 +195,8 @@ def playback_capabilities(
     playable = tuple(name for name in DRIVE_MODES if all(name in modes for modes in each))
     if drive_mode is not None and drive_mode not in playable:
         raise InputError(
-            f"drive mode must be one that all amplifiers play ({', '.join(playable)}), got "
-            f"{drive_mode}; leave it out for the best"
+            f"drive mode must be supported by all amplifiers ({', '.join(playable)}), got "
+            f"{drive_mode}; leave it out for the best mode"
         )
     return PlaybackCapabilities(
         drive_mode=drive_mode or playable[-1],
@@ -211,7 +212,7 @@ def playback_capabilities(
 
 
 def limits_of(rig: Rig, amplifiers: Mapping[str, Amplifier]) -> Limits:
-    """Return the limits of the amplifiers of a rig, by name, as they were identified last."""
+    """Return the limits of a rig's amplifiers by name, as last identified."""
     limits = {name: one.ledger.limits for name, one in amplifiers.items()}
     levels = {name: _LEVEL.from_wire(one.level) for name, one in limits.items()}
     return Limits(
@@ -238,9 +239,9 @@ def _knots(
     within: float = MAX_SET_TIME,
     step: float = base_motion.KNOT_STEP,
 ) -> int:
-    """Return how many knots all open amplifiers play and their wires carry within a time [s].
+    """Return the number of knots that all open amplifiers and wires support within a time [s].
 
-    step: longest time [s] between two of them.
+    step: longest time [s] between two knots.
     """
     wired: dict[str, int] = defaultdict(int)
     for channel in rig.wiring.values():
@@ -260,9 +261,9 @@ def _knots(
 
 
 def _knots_of(amplifier: Amplifier, max_step: float) -> int:
-    """Return how many knots an envelope of an amplifier may have; 0 without the steps needed.
+    """Return the maximum number of knots in an amplifier's envelope; 0 without the required steps.
 
-    The steps needed range from that of the model to max_step [s].
+    The required steps range from the model's step to max_step [s].
     """
     capabilities = amplifier.ledger.capabilities
     low, high = (_STEP.from_wire(capabilities[f"envelope_step_{end}"]) for end in ("min", "max"))
@@ -270,9 +271,9 @@ def _knots_of(amplifier: Amplifier, max_step: float) -> int:
 
 
 def _knots_on(line: Line, channels: list[int], within: float) -> int:
-    """Return how many knots of each channel a line carries within a time [s].
+    """Return the number of knots per channel that a line carries within a time [s].
 
-    channels: numbers of channels of its amplifiers, each of which gets a set.
+    channels: number of channels of each of its amplifiers; each amplifier gets a set.
     """
     takes = line.wire.transit(MAX_WORDS)
     if takes <= 0:
@@ -281,7 +282,7 @@ def _knots_on(line: Line, channels: list[int], within: float) -> int:
 
 
 def _knots_in(words: int, channels: list[int]) -> int:
-    """Return the knots of each channel for which a number of words suffices."""
+    """Return the number of knots per channel that fit into a number of words."""
     parts = -(-words // MAX_WORDS)
     heads = len(channels) * _LAYER_WORDS + max(parts, len(channels)) * _PART_WORDS
     each = _COMMAND_WORDS + _ENVELOPE_WORDS
@@ -298,22 +299,22 @@ class CountedClocks:
         self._rig, self._now = rig, now
         self._names = sorted(rig.channel_counts)
         self._counted = EXACT_CLOCKS
-        self._losses = dict.fromkeys(self._names, 0)  # since it was last said to be held
-        self._held_since: dict[str, float] = {}  # not said yet
+        self._losses = dict.fromkeys(self._names, 0)  # since last logged as synchronised
+        self._held_since: dict[str, float] = {}  # not logged yet
         self.errors: dict[str, float] = {}
-        """Counted errors by name, rms [s]; empty where all ERAs are on one amplifier."""
+        """Assumed RMS errors [s] by name; empty if all ERAs are on one amplifier."""
 
     @property
     def known(self) -> Mapping[str, float]:
-        """The present errors by name, rms [s]; empty where none are counted."""
+        """Current RMS errors [s] by name; empty if none are assumed."""
         return self._now() if self.errors else {}
 
     def counted_by(
         self, table: LocalizationTable, known: Mapping[str, float] | None = None
     ) -> LocalizationTable:
-        """Return the table with the clocks as they are counted now; takes no time.
+        """Return the table with the currently assumed clock errors; takes no time.
 
-        known: the present errors, if they were looked up.
+        known: the current errors, if already read.
         """
         if len(self._names) < 2:
             return table
@@ -384,8 +385,8 @@ def piece_of(
 ) -> tuple[float, list[float]]:
     """Return the piece of a course that is played from a time [s] after the start of its pulse on.
 
-    A piece is a step [s] and shares, the first one a step after its start; a single one is a ramp.
-    The course begins anew until the pulse ends, at 0. knots: most of an envelope, 0 for ramps;
+    A piece is a step [s] and values, the first a step after its start; a single value is a ramp.
+    The envelope repeats until the pulse ends, at 0. knots: maximum of an envelope, 0 for ramps;
     is_first: whether the piece is the first of its layer.
     """
     if not knots:
@@ -419,10 +420,10 @@ def route(
     Every wired channel has a tone: level = amplitude / stroke, phase in degrees within half a turn,
     level 0 for an ERA that is not driven. ramp [s]: lengthened to the rig's slew limit, on all
     amplifiers alike. playing: tones in this layer now, by ERA (`tones_by_era`). restarted:
-    frequencies that do not keep their phase; by default those that not all their ERAs play yet.
-    valid_for [s]: of the layers. onset, ending: by ERA; an onset may lead an ERA that is not driven
-    to silence. All other limits belong to the ledgers of the amplifiers. Raises InputError for an
-    ERA that the rig does not have.
+    frequencies that do not keep their phase; by default, frequencies not yet played by all their
+    ERAs. valid_for [s]: of the layers. onset, ending: by ERA; an onset can lead an undriven ERA to
+    silence. The ledgers of the amplifiers check all other limits. Raises InputError for an unknown
+    ERA.
     """
     unknown = sorted(excitation.keys() - rig.wiring.keys())
     if unknown:
@@ -470,7 +471,7 @@ def route(
 def restarted_by(excitation: physics.Excitation, playing: Drive) -> set[float]:
     """Return the frequencies [Hz] that restart at the commit because an ERA joins them.
 
-    All ERAs of one frequency must count its phase from one moment, or their field differs.
+    All ERAs of one frequency must count its phase from the same moment, or their field changes.
     """
     return {
         tone.frequency
@@ -480,9 +481,9 @@ def restarted_by(excitation: physics.Excitation, playing: Drive) -> set[float]:
 
 
 def thinned(envelopes: Envelopes, *, knots: int) -> Envelopes:
-    """Return envelopes, by ERA, with a limited number of knots beside the last value.
+    """Return envelopes, by ERA, with a limited number of knots before the last value.
 
-    They take the same time, in whole steps of the wire; all have the same step and number of knots.
+    They take the same time, in whole steps of the wire, with equal step and number of knots.
     """
     first = next(iter(envelopes.values()))
     count, steps = len(first.knots), knots + 1

@@ -1,8 +1,8 @@
 """Child processes that end with their parent: `python -m controller.process.child PARENT MODULE`.
 
 PARENT is the process number of the starting process. On Linux the kernel terminates the module when
-that process exits, however it exits. Signals to the daemon that reach its children as well, as
-those of `systemctl kill` do, have no effect on them.
+that process exits, however it exits. Signals to the daemon that also reach its children, such
+as those of `systemctl kill`, have no effect on them.
 """
 
 import asyncio
@@ -24,7 +24,7 @@ def child_command(module: str, *arguments: str) -> list[str]:
 
 
 async def ended(process: asyncio.subprocess.Process, timeout: float) -> None:
-    """Wait for the end of a process that was asked to end; kill it after a time [s]."""
+    """Wait for the end of a terminated process; kill it after a timeout [s]."""
     with contextlib.suppress(TimeoutError):
         async with asyncio.timeout(timeout):
             await process.wait()
@@ -34,7 +34,7 @@ async def ended(process: asyncio.subprocess.Process, timeout: float) -> None:
 
 
 def end_with_parent(parent: int, number: int = signal.SIGTERM) -> None:
-    """Let the kernel signal this process when its parent exits, on Linux; end where it has.
+    """Let the kernel signal this process when its parent exits (Linux); exit if it already has.
 
     parent: its process number; number: of the signal.
     """

@@ -23,7 +23,7 @@ class ServiceManager:
 
     def __init__(self, environment: Mapping[str, str] = os.environ) -> None:
         self._address = environment.get("NOTIFY_SOCKET", "")
-        # Opened at once: the watchdog is to be fed when no descriptor is left, too.
+        # Opened now, so that the watchdog can be fed even if no descriptors are left.
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) if self._address else None
         self._watchdog_interval = _watchdog_interval(environment)
         self._last_alive = float("-inf")
@@ -70,7 +70,7 @@ _REMEDY = "set another socket: in the daemon's file"
 
 
 def check_socket_path(path: Path) -> None:
-    """Raise InputError where no socket can be."""
+    """Raise InputError for an invalid socket path."""
     length = len(os.fsencode(path))
     if length > _MAX_PATH:
         raise InputError(
@@ -83,7 +83,7 @@ def check_socket_path(path: Path) -> None:
 class SocketLock:
     """Reserves a socket path for this process until `release`.
 
-    The lock is held on a file beside the socket, so that the kernel releases it when the process
+    The lock is held on a file next to the socket, so that the kernel releases it when the process
     exits, however it exits. Raises InputError if a daemon is running already or no socket can be
     created.
     """

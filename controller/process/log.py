@@ -1,8 +1,8 @@
 """The daemon's log, in JSON lines, written by a thread (`QueueListener`).
 
 Logging never blocks: lines go into a bounded queue; lines that do not fit or cannot be written are
-lost. Each logging call in the code is limited to a few lines a second; the next line says how many
-were skipped. JSON escapes control characters, so that messages cannot forge lines.
+lost. Each logging call in the code is limited to a few lines a second; the next line reports the
+number of skipped lines. JSON escapes control characters, so that messages cannot forge lines.
 
 `RateLimiter` is a token bucket, which the API's server uses, too.
 """
@@ -49,7 +49,7 @@ class RateLimiter:
 
 
 _MAX_QUEUED = 2000  # lines
-_BURST = 5  # lines of one logging call at once
+_BURST = 5  # lines of one logging call in a burst
 _RATE = 1.0  # 1/s after a burst
 _MAX_MESSAGE = 2000  # characters
 _CLOSE_TIMEOUT = 0.3  # s; a hanging disk must not delay the exit
@@ -92,7 +92,7 @@ def open_log_file(file: Path) -> FileIO:
 class RateLimitFilter(logging.Filter):
     """Limits the rate of records per logging call; clock [s].
 
-    State transitions, marked by their topic, are rare by nature and not limited.
+    State transitions, marked by a topic, are naturally rare and not limited.
     """
 
     def __init__(self, *, clock: Callable[[], float] = time.monotonic) -> None:
@@ -119,7 +119,7 @@ class RateLimitFilter(logging.Filter):
 class LineWriter(logging.Handler):
     """Appends each record's message to a file, or to standard error, as a whole line or not at all.
 
-    file: opened for each line, whatever has become of it; None for standard error.
+    file: opened again for each line, so it can be moved or deleted; None for standard error.
     """
 
     def __init__(self, file: Path | None) -> None:

@@ -3,8 +3,8 @@
 Panels use multi-touch protocol type B, with contacts in slots; one for a single finger is treated
 as one with a single slot (`as_slot_event`). Events are described in the kernel's
 Documentation/input/multi-touch-protocol.rst, with the numbers of its input-event-codes.h. Requests
-and structures are those of include/uapi/linux/input.h, with the layout of request numbers that x86,
-Arm and RISC-V share (asm-generic/ioctl.h).
+and structures are from include/uapi/linux/input.h, with the layout of request numbers shared by
+x86, Arm and RISC-V (asm-generic/ioctl.h).
 """
 
 import asyncio
@@ -64,7 +64,7 @@ _GRAVITY = 9.81  # m/s²
 
 
 def as_slot_event(event: InputEvent) -> InputEvent:
-    """Return an event of a panel for a single finger as that of a panel with one slot."""
+    """Convert an event of a single-finger panel to one of a panel with one slot."""
     time, kind, code, value = event
     id_or_value = value - 1 if kind == EV_KEY else value  # pressed is 1, released 0
     return (time, *_OF_ONE_FINGER.get((kind, code), (kind, code)), id_or_value)
@@ -261,8 +261,8 @@ class InputDevice:
         except OSError as error:
             raise InputError(f"touch source {path}: {_advice(error, path)}") from error
         try:
-            self._axis_codes: dict[int, int] = {}  # of axes with other codes than those of slots
-            if self._axis(ABS_MT_POSITION_X)[1:3] == (0, 0):  # it does not have it
+            self._axis_codes: dict[int, int] = {}  # codes of axes outside the slots
+            if self._axis(ABS_MT_POSITION_X)[1:3] == (0, 0):  # the axis is missing
                 self._axis_codes = SINGLE_TOUCH_AXES
             self.ranges = {
                 axis: self._range(axis) for axis in (ABS_MT_POSITION_X, ABS_MT_POSITION_Y)
@@ -326,7 +326,7 @@ class InputDevice:
         os.close(self._descriptor)
 
     def _axis(self, axis: int) -> tuple[int, int, int, int]:
-        """Return value, minimum, maximum and resolution of an axis; zeros if it has none."""
+        """Return value, minimum, maximum and resolution of an axis; zeros if it is missing."""
         request = eviocgabs(self._axis_codes.get(axis, axis))
         raw = fcntl.ioctl(self._descriptor, request, bytes(_AXIS.size))
         value, low, high, _, _, resolution = _AXIS.unpack(raw)
@@ -362,7 +362,7 @@ def _advice(error: OSError, path: str) -> str:
             "`sudo usermod -aG input $USER`, then log in again) or install a udev rule"
         )
     if error.errno == errno.ENOENT:
-        return "no such device; `ls -l /dev/input/by-id` lists those that are plugged in"
+        return "no such device; `ls -l /dev/input/by-id` lists the connected devices"
     return f"{path} cannot be opened: {error.strerror}"
 
 
@@ -377,8 +377,8 @@ class EvdevSource(TouchSource):
     `light_pressure=VALUE`, `light_major=VALUE`: of its axes under a finger that presses lightly.
 
     A panel is silent while fingers rest, so the kernel's slots are polled every 50 ms, which also
-    detects an unplugged panel at once. Raises InputError for any other URL, and in `run` if there
-    is no panel, or none any more.
+    detects an unplugged panel immediately. Raises InputError for any other URL, and in `run` if the
+    panel is missing or unplugged.
     """
 
     def __init__(self, url: str, *, open_panel: Callable[..., InputDevice] = InputDevice) -> None:

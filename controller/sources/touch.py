@@ -1,17 +1,17 @@
-"""Touches: sources and their frames, calibration to the plate, and the contacts that follow.
+"""Touches: sources and their frames, calibration to the plate, and tracking of contacts.
 
-A source delivers frames of all its touches at one moment. A calibration is an affine map from
-coordinates of a sensor to those of the plate: x' = a x + b y + c, y' = d x + e y + f on coordinates
-0..1 from the top left corner. A tracker follows the contacts on the plate through any sequence of
-frames, and decides which gives way where there are as many as a plate can have.
+A source delivers frames with all of its touches at one moment. A calibration is an affine map from
+sensor to plate coordinates: x' = a x + b y + c, y' = d x + e y + f, with coordinates 0..1 from the
+top left corner. A tracker follows the contacts on the plate through any sequence of frames, and
+decides which contact to drop if there are more than the plate supports.
 
-The load of a finger is relative to the rig's `fingertip`, a finger that presses lightly, and grows
-with the area of contact (`Fingertip.scaled`). Area grows as the force to the power of two thirds
-(Hertz), and so does the load: between the third of Hertz's stiffness and the first power of a pulp
-that stiffens exponentially. docs/concepts/people.md has the sources, and how well this is known.
+The load of a finger is relative to the rig's `fingertip`, a lightly pressing finger, and grows with
+the contact area (`Fingertip.scaled`). Area, and so load, grows with the force to the power of 2/3
+(Hertz); this is between 1/3, the exponent of Hertz's stiffness, and 1, that of a pulp with
+exponential stiffening. docs/concepts/people.md gives the sources and their uncertainty.
 
-The velocity of a finger is the slope of its places over time by least squares, over the last 60 ms.
-Reported places have errors of a millimetre: a finger whose places differ by less than 3 mm in that
+The velocity of a finger is the least-squares slope of its positions over the last 60 ms. Reported
+positions have errors of a millimetre: a finger whose positions differ by less than 3 mm in that
 time counts as resting.
 """
 
@@ -53,14 +53,14 @@ class RejectCounter:
     ) -> None:
         self.counts: Counter[str] = Counter()
         self.examples: dict[str, str] = {}
-        """The newest detail of each reason, printable."""
+        """Printable detail of the newest rejection for each reason."""
         self._logger = logger
         self._clock = clock
         self._unlogged = 0
         self._logged_at = -math.inf
 
     def count(self, reason: str, detail: str) -> None:
-        """Count one rejection; log its detail if the reason is new or the last line long ago."""
+        """Count a rejection; log its detail if the reason is new or was not logged recently."""
         self.counts[reason] += 1
         self.examples[reason] = detail if detail.isprintable() else ascii(detail)
         self._unlogged += 1
@@ -80,20 +80,20 @@ class RejectCounter:
 
 @dataclass(frozen=True, slots=True)
 class Touch:
-    """One finger as reported by its source, not validated: coordinates may be NaN."""
+    """One finger as reported by its source, not validated: coordinates can be NaN."""
 
     id: int
-    """Constant from down to up."""
+    """Constant from touch-down to lift."""
     x: float
-    """0..1 across the sensor from its top left corner, as in TUIO and most panels."""
+    """0..1 across the sensor from its top left corner, as for TUIO and most panels."""
     y: float
     """0..1 downwards."""
     load: float | None = None
-    """Load on the plate relative to the rig's fingertip, above MAX_FINGER_LOAD of a hand that
-    rests (HAND_LOAD where its size is unknown); None where nothing is reported."""
+    """Load relative to the rig's fingertip, above MAX_FINGER_LOAD for a resting hand (HAND_LOAD if
+    its size is unknown); None if not reported."""
     size: tuple[float, float] | None = None
-    """Width and height of the contact relative to the sensor's, from which its load follows where
-    none is reported; None where they are unknown."""
+    """Width and height of the contact relative to the sensor; gives the load if none is reported.
+    None if unknown."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,28 +102,28 @@ class TouchFrame:
 
     source: str
     time: float
-    """When it arrived [s], by the event loop's clock."""
+    """Arrival time [s] on the event loop's clock."""
     touches: tuple[Touch, ...]
     timeout: float | None = None
     """Time [s] without a frame of the source after which its touches are lifted; None:
     CONTACT_TIMEOUT."""
     origin: str | None = None
-    """Host or client, which may have several sources; None: the source itself."""
+    """Host or client, which can have several sources; None: the source itself."""
 
     @property
     def expiry(self) -> float:
-        """When [s] its touches are lifted unless another frame of the source arrives."""
+        """Time [s] when its touches are lifted, unless another frame of the source arrives."""
         stated = self.timeout
         is_valid = stated is not None and 0 < stated <= MAX_CONTACT_TIMEOUT  # NaN is not
         return self.time + (stated if stated is not None and is_valid else CONTACT_TIMEOUT)
 
 
 MAX_FRAME_AGE = 1.0
-"""Age [s] beyond which the time of a frame is that of another clock, or of one that was set."""
+"""Age [s] of a frame beyond which its timestamp comes from another or an adjusted clock."""
 
 
 def frame_moment(stated: float, now: float) -> float:
-    """Return when [s] a frame happened: as stated, or now where that is of another clock."""
+    """Return the time [s] of a frame: its timestamp, or now if that is from another clock."""
     return stated if now - MAX_FRAME_AGE <= stated <= now else now
 
 
@@ -140,7 +140,7 @@ class TouchSource(ABC):
 
     @property
     def problem(self) -> str | None:
-        """Why a running source delivers no touches, and the remedy; None if nothing is wrong."""
+        """Why a running source delivers no touches, and the remedy; None if it works."""
         return None
 
     @abstractmethod
@@ -153,7 +153,7 @@ class TouchSource(ABC):
 
 
 def number_option(options: str, name: str, *, default: float) -> float:
-    """Return the number of an option that must be the only one; NaN for anything else."""
+    """Return the numeric value of the only allowed option; NaN for anything else."""
     given = dict(parse_qsl(options, keep_blank_values=True))
     text = given.pop(name, str(default))
     try:
@@ -177,14 +177,14 @@ _SOURCES: PluginRegistry[Callable[[str], TouchSource]] = PluginRegistry(
 
 
 def source_schemes() -> tuple[str, ...]:
-    """Schemes of the URLs of touch sources, those of plug-ins last."""
+    """URL schemes of touch sources, plug-ins last."""
     return _SOURCES.names()
 
 
 def open_source(url: str) -> TouchSource:
     """Create the touch source of a URL such as `tuio:127.0.0.1:3333` or `evdev:/dev/input/event5`.
 
-    Raises InputError for an unknown scheme, a failing plug-in or a URL that it refuses.
+    Raises InputError for an unknown scheme, a failing plug-in or an invalid URL.
     """
     return _SOURCES.make(url)
 
@@ -193,10 +193,9 @@ _Row: TypeAlias = tuple[float, float, float]
 _Point: TypeAlias = tuple[float, float]
 
 MAX_RESIDUAL = 0.005
-"""Largest residual [m] of a point that was touched where it should be: less than the radius of a
-fingertip, 6.5 mm."""
+"""Largest residual [m] of a correctly touched point: less than a fingertip's radius of 6.5 mm."""
 
-_MIN_DETERMINANT = 1e-3  # below it the points on the plate lie nearly on a line
+_MIN_DETERMINANT = 1e-3  # below it, the points on the plate are almost collinear
 
 _ROTATIONS: dict[int, tuple[_Row, _Row]] = {
     0: ((1, 0, 0), (0, 1, 0)),
@@ -208,7 +207,7 @@ _ROTATIONS: dict[int, tuple[_Row, _Row]] = {
 
 @dataclass(frozen=True)
 class TouchCalibration:
-    """Map from sensor to plate: the rows of x' and y'."""
+    """Map from sensor to plate: the rows for x' and y'."""
 
     matrix: tuple[_Row, _Row] = _ROTATIONS[0]
 
@@ -225,7 +224,7 @@ class TouchCalibration:
 
 
 ALIGNED = TouchCalibration()
-"""Of a sensor whose coordinates are those of the plate."""
+"""Calibration of a sensor aligned with the plate."""
 
 
 def turned(degrees: int = 0, *, mirror: str | None = None) -> TouchCalibration:
@@ -272,36 +271,36 @@ def fit_touch_calibration(
 
 
 LIGHT_FORCE = 0.5
-"""Force [N] of a finger that presses lightly: the mean of a tap on a touch screen."""
+"""Force [N] of a lightly pressing finger: mean of taps on touch screens."""
 
 LIGHT_MAJOR = 9.4
-"""Longer axis [mm] of its contact: the mean of index fingers on touch screens."""
+"""Longer axis [mm] of its contact: mean of index fingers on touch screens."""
 
 MIN_REPORTED, MAX_REPORTED = 0.4, 2.5
 """Bounds of a reported load: contacts of 6 to 15 mm, forces of 0.13 to 2 N.
 
-They are two standard deviations of the rig's default `uncertainty` of a load. Reports beyond them
-say more about the panel than about the finger.
+They are two standard deviations of the rig's default `uncertainty` of a load. Values outside are
+due to the panel rather than the finger.
 """
 
 MAX_FINGER_MAJOR, HAND_MAJOR = 25.0, 50.0
-"""Longer axis [mm] of a contact beyond which it is a hand, and of one with `HAND_LOAD`: the largest
-of fingers have 20 mm, and 50 mm are a circle of 20 cm²."""
+"""Longer axis [mm] above which a contact is a hand (the largest fingers have 20 mm), and that of a
+hand with `HAND_LOAD` (50 mm: a circle of 20 cm²)."""
 
 LANDING = 0.1
-"""Time [s] after which a finger that lands has its area of contact; loads before it are ignored."""
+"""Time [s] until the contact area of a landing finger is stable; earlier loads are ignored."""
 
 MIN_CHANGE = 1.5
-"""Factor by which a reported load must differ from a contact's before that changes."""
+"""Minimum factor between a reported and the current load of a contact for a change."""
 
 _BY_FORCE, _BY_SIZE = 2 / 3, 2.0  # exponents of the load
 
 
 @dataclass(frozen=True)
 class LightPress:
-    """Values of a panel's axes under a finger that presses lightly.
+    """Values of a panel's axes under a lightly pressing finger.
 
-    None for an axis that the panel does not have, or whose unit it does not state.
+    None for an axis that the panel lacks, or whose unit it does not report.
     """
 
     pressure: float | None = None
@@ -310,8 +309,8 @@ class LightPress:
     def load(self, *, touch_major: float, pressure: float = 0.0) -> float | None:
         """Return the load of a contact with these values; force is preferred.
 
-        None without a positive value of an axis. What is larger than a finger has a load of
-        HAND_LOAD or more, as a hand of its size; a finger has at most MAX_FINGER_LOAD.
+        None without a positive value of an axis. A contact larger than a finger has the load of a
+        hand of its size, at least HAND_LOAD; a finger has at most MAX_FINGER_LOAD.
         """
         size = touch_major / (self.touch_major or math.inf)
         if size > MAX_FINGER_MAJOR / LIGHT_MAJOR:
@@ -322,11 +321,11 @@ class LightPress:
 
 
 IN_MM = LightPress(touch_major=LIGHT_MAJOR)
-"""What the longer axis [mm] of a contact says of its load."""
+"""Return the load for the longer axis [mm] of a contact."""
 
 
 def followed(known: float, reported: float) -> float:
-    """Return the load of a contact: the known, or the reported (bounded) if it differs enough."""
+    """Return the load of a contact: the reported one, bounded, if it differs enough."""
     if not reported > 0:  # NaN is not
         return known
     bounded = min(max(reported, MIN_REPORTED), MAX_REPORTED)
@@ -334,27 +333,27 @@ def followed(known: float, reported: float) -> float:
 
 
 OVER = 0.060
-"""Time [s] over which a velocity is found; older frames do not count."""
+"""Time window [s] of a velocity; older frames are ignored."""
 
 _LEAST_TIME, _LEAST_WAY = 0.020, 0.003  # s, m; of a velocity
 
 
 @dataclass(frozen=True, slots=True)
 class FingerMotion:
-    """The recent way of a finger."""
+    """The recent path of a finger."""
 
     places: tuple[tuple[float, float, float], ...] = ()
-    """Time [s], x and y [m] of each place; the last one is where the finger is."""
+    """Time [s], x and y [m] of each position; the last one is the current position."""
 
     def followed(self, time: float, x: float, y: float) -> "FingerMotion":
-        """Return the way with another place at a time [s]."""
+        """Return the path with another position at a time [s]."""
         since = time - OVER
         return FingerMotion(
             (*[each for each in self.places if since < each[0] < time], (time, x, y))
         )
 
     def velocity(self, now: float) -> tuple[float, float]:
-        """Return the velocity [m/s] at a time [s]; zero for a finger that rests."""
+        """Return the velocity [m/s] at a time [s]; zero for a resting finger."""
         places = [each for each in self.places if each[0] > now - OVER]
         if not places or places[-1][0] - places[0][0] < _LEAST_TIME:
             return 0.0, 0.0
@@ -367,20 +366,20 @@ class FingerMotion:
 
     @property
     def is_under_way(self) -> bool:
-        """Whether it moved when its last place was reported."""
+        """Whether it moved at its last report."""
         return len(self.places) > 0 and any(self.velocity(self.places[-1][0]))
 
 
 AT_REST = FingerMotion()
-"""Of a finger whose way is unknown."""
+"""Motion of a finger with unknown path."""
 
 
 def to_evict(sources: Sequence[str], newcomer: str, origins: Mapping[str, str]) -> int | None:
-    """Return the number of the contact to lift for one of a newcomer's source, or None.
+    """Return the index of the contact to lift for a new contact of a source, or None.
 
-    It is the newest contact of the input, then the origin, then the source with most contacts, if
-    that has at least two more than the newcomer's. sources: of all contacts in order of arrival;
-    origins: by source.
+    This is the newest contact of the input, then the origin, then the source with the most
+    contacts, if it has at least two more than the new contact's. sources: sources of all contacts
+    in order of arrival; origins: by source.
     """
     groupings: tuple[Callable[[str], str], ...] = (_input_of, origins.__getitem__, str)
     left: list[int] = [*range(len(sources))]
@@ -397,36 +396,36 @@ def to_evict(sources: Sequence[str], newcomer: str, origins: Mapping[str, str]) 
 
 
 def _input_of(source: str) -> str:
-    """Return the beginning of the name of a source: its input, or its kind where it has none."""
+    """Return the first part of a source name: its input, or else its kind."""
     return source.partition(":")[0]
 
 
 RIM = 0.0065
-"""How far beyond the plate's edge [m] a finger counts as on it: a fingertip's radius.
+"""Distance [m] beyond the plate's edge where a finger still counts as on it: a fingertip's radius.
 
-Where cameras and frames report a finger on the edge depends on noise and calibration.
+The position that cameras and frames report for a finger on the edge depends on noise and
+calibration.
 """
 
 CONTACT_TIMEOUT = 0.150
-"""Default contact timeout [s]: a contact that is not confirmed must not be driven.
+"""Default contact timeout [s]: an unconfirmed contact must not be driven.
 
 Most sources repeat their frames at least every 100 ms; others state their own timeout.
 """
 
 MAX_CONTACT_TIMEOUT = 60.0
-"""Longest time [s] for which a sensor may be silent under a resting finger."""
+"""Longest silence [s] of a sensor under a resting finger."""
 
 MAX_GLIMPSE = 0.005
-"""A contact that ends within this time [s] was longer on the plate: its frames were held up and
-came together."""
+"""A contact shorter than this [s] was really longer: its frames were delayed and came together."""
 
 TAP_TIME = 0.060
-"""Such a contact is kept for this time [s], so that a click is decided, loaded and felt."""
+"""Such a contact is kept for this time [s], so that a click can be selected, loaded and felt."""
 
 
-HAND_FEELS_NOTHING = "a hand that rests feels no effect; lift it, and touch with a finger"
+HAND_FEELS_NOTHING = "a resting hand feels no effect; lift it, and touch with a finger"
 
-SURPLUS = "more fingers are on the plate than may feel effects (max_fingers); lift another one"
+SURPLUS = "more fingers are on the plate than can feel effects (max_fingers); lift another one"
 
 
 class ContactKey(NamedTuple):
@@ -446,36 +445,36 @@ class Contact:
     y: float
     """[m]"""
     since: float
-    """When [s] it came down."""
+    """Time [s] of its touch-down."""
     load: float = 1.0
-    """Relative to the rig's fingertip, bounded and in steps; 1 where nothing is reported."""
+    """Load relative to the rig's fingertip, bounded and in steps; 1 if not reported."""
     motion: FingerMotion = field(default=AT_REST, compare=False)
-    """Its recent way."""
+    """Its recent path."""
     is_surplus: bool = False
-    """Whether as many fingers as may feel effects came before it."""
+    """Whether max_fingers other fingers came before it."""
 
     @property
     def is_hand(self) -> bool:
-        """Whether it is a hand that rests: its load is on the plate, and it feels nothing."""
+        """Whether it is a resting hand, which loads the plate and feels nothing."""
         return self.load > MAX_FINGER_LOAD
 
     @property
     def why_load_alone(self) -> str | None:
-        """Why nothing but its load counts; None for a finger that may feel effects."""
+        """Why only its load counts; None for a finger that can feel effects."""
         return HAND_FEELS_NOTHING if self.is_hand else SURPLUS if self.is_surplus else None
 
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """Contacts that have changed, each as it is or was."""
+    """Changed contacts, in their current or last state."""
 
     down: tuple[Contact, ...] = ()
     moved: tuple[Contact, ...] = ()
     pressed: tuple[Contact, ...] = ()
-    """Contacts with another load, or that have become surplus, or fingers again."""
+    """Contacts whose load has changed, or which have become surplus or fingers again."""
     up: tuple[Contact, ...] = ()
     rejected: tuple[str, ...] = ()
-    """A reason for each touch that was not accepted."""
+    """Reason of each rejected touch."""
 
     def __bool__(self) -> bool:
         """Whether any contact changed."""
@@ -485,30 +484,29 @@ class Change:
 class ContactTracker:
     """Follows the contacts on one plate; times are arguments.
 
-    x = X L and y = (1 - Y) W, since touch sensors count Y downwards. A touch outside the plate
-    (0..1) by up to the radius of a fingertip is moved to the edge. Touches that are farther off,
-    have non-finite coordinates or repeat an id within a frame (the last one counts) are rejected; a
-    contact whose touch is rejected is lifted. Beyond the maximum number of contacts, the newest
-    contact of the source with the most contacts is lifted for the new one, or the new one is
-    rejected. Contacts beyond max_fingers are surplus until a finger lifts or turns out to be a
-    hand.
+    x = X L and y = (1 - Y) W, because touch sensors count Y downwards. A touch up to a fingertip's
+    radius outside the plate (0..1) is moved to the edge. Touches farther away, with non-finite
+    coordinates, or with a repeated id in a frame (the last one counts) are rejected; a contact
+    whose touch is rejected is lifted. Above the maximum number of contacts, the newest contact of
+    the source with the most contacts is lifted for the new one, or the new one is rejected.
+    Contacts beyond max_fingers are surplus until a finger lifts or turns out to be a hand.
     """
 
     def __init__(self, plate: "Plate", *, max_fingers: int = MAX_FINGERS) -> None:
         self._plate, self.max_fingers = plate, max_fingers
         self._contacts: dict[ContactKey, Contact] = {}
-        self._sources: dict[str, TouchFrame] = {}  # their last frames
-        self._taps: dict[ContactKey, float] = {}  # s; when contacts end that are lifted already
+        self._sources: dict[str, TouchFrame] = {}  # last frame of each source
+        self._taps: dict[ContactKey, float] = {}  # s; end times of contacts already lifted
         self._newest = -math.inf  # s; time of the newest frame
         self.contacts: tuple[Contact, ...] = ()
-        """All contacts in order of arrival; the newest is the last."""
+        """All contacts in order of arrival, newest last."""
         self.next_expiry = math.inf
-        """When [s] the first contacts are lifted unless a frame of their source arrives."""
+        """Time [s] when the next contacts are lifted, unless a frame of their source arrives."""
         self.changed: dict[ContactKey | None, float] = {}
-        """When [s] contacts first changed that no set has answered; None: the first that lifted."""
+        """Time [s] of each contact's first change not yet answered by a set; None: of lifts."""
 
     def expiry_of(self, key: ContactKey) -> float:
-        """Return when [s] a contact is lifted unless a frame arrives; -inf without that contact."""
+        """Return the time [s] when a contact is lifted unless a frame arrives; -inf if unknown."""
         if key not in self._contacts:
             return -math.inf
         return min(self._sources[key.source].expiry, self._taps.get(key, math.inf))
@@ -520,7 +518,7 @@ class ContactTracker:
     def update(self, frame: TouchFrame, *, keeps_taps: bool = False) -> Change:
         """Apply a frame, which replaces the previous one of its source.
 
-        keeps_taps: whether a contact whose lift comes together with it is kept for a while.
+        keeps_taps: whether to keep a contact for a while if its lift arrives together with it.
         """
         rejected: list[str] = []
         touches: dict[ContactKey, Touch] = {}
@@ -562,18 +560,18 @@ class ContactTracker:
         return self._change(before, up, now)
 
     def wait_again(self, answered: Mapping[ContactKey | None, float]) -> None:
-        """Note contacts as changed since times [s] whose answer has not been played after all."""
+        """Mark contacts as changed since these times [s]: their answer was not played."""
         for key, at in answered.items():
-            waiting = key if key in self._contacts else None  # it has lifted meanwhile
+            waiting = key if key in self._contacts else None  # lifted meanwhile
             self.changed[waiting] = min(at, self.changed.get(waiting, at))
 
     def _contact(
         self, key: ContactKey, touch: Touch, known: Contact | None, time: float
     ) -> Contact:
-        """Return the contact of a touch, down since a time [s] unless it is known.
+        """Return the contact of a touch; a new contact is down since a time [s].
 
-        One whose panel stops reporting loads keeps its own; a hand is one until it is lifted, of
-        the largest size so far, so that what is left of it as it lifts is no finger.
+        A contact keeps its load if the panel stops reporting loads. A hand stays a hand until it is
+        lifted, at its largest size so far, so that its last remains are not taken for a finger.
         """
         length, width = self._plate.length, self._plate.width
         since, load = (time, 1.0) if known is None else (known.since, known.load)
@@ -590,7 +588,7 @@ class ContactTracker:
         return Contact(key, x, y, since, load, motion.followed(time, x, y))
 
     def _keep_taps(self, frame: TouchFrame) -> None:
-        """Keep contacts that have just come down and are missing in a frame."""
+        """Keep contacts that have just come down and are missing from a frame."""
         ids = {touch.id for touch in frame.touches}
         for key, contact in self._contacts.items():
             is_lifted = key.source == frame.source and key.id not in ids
@@ -611,9 +609,9 @@ class ContactTracker:
         time: float,
         rejected: Sequence[str] = (),
     ) -> Change:
-        """Tell surplus contacts from fingers, and note at a time [s] what differs from before.
+        """Determine surplus contacts, and return the changes at a time [s].
 
-        up: contacts that have lifted since. Sources without contacts are forgotten.
+        up: contacts lifted since. Sources without contacts are forgotten.
         """
         down, moved, pressed, count = list[Contact](), list[Contact](), list[Contact](), 0
         for contact in up:  # for the last time
@@ -648,7 +646,7 @@ class ContactTracker:
 def _valid_touches(
     frame: TouchFrame, plate: "Plate", rejected: list[str]
 ) -> dict[ContactKey, Touch]:
-    """Return the touches that can be contacts; add a reason for each of the others."""
+    """Return the valid touches; add a reason for each rejected one."""
     last: dict[int, Touch] = {}
     for touch in frame.touches:
         last[touch.id] = touch

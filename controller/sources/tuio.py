@@ -1,21 +1,20 @@
 """TUIO 1.1 cursors and blobs (/tuio/2Dcur, /tuio/2Dblb) over UDP, as touch tables send them.
 
-A bundle has the name of its sender (source), the session ids that are down (alive), the positions
-of those that changed (set) and a sequence number (fseq), each of one profile; see tuio.org, "TUIO
-1.1 Protocol Specification". A blob also has a width and a height, each relative to the sensor's,
-which tell a hand from a finger. Numbers count by their value, whatever their type, and further
-arguments are ignored. A malformed message is counted, and the others of its bundle are read.
-Messages are those of Open Sound Control 1.0 (opensoundcontrol.stanford.edu/spec-1_0.html), from
-untrusted datagrams.
+A bundle contains the name of its sender (source), the active session ids (alive), the changed
+positions (set) and a sequence number (fseq), each for one profile; see tuio.org, "TUIO 1.1 Protocol
+Specification". A blob also has a width and a height, relative to the sensor, which distinguish a
+hand from a finger. Numbers of any type are accepted, and additional arguments are ignored. A
+malformed message is counted, and the rest of its bundle is read. Messages use Open Sound Control
+1.0 (opensoundcontrol.stanford.edu/spec-1_0.html) and come in untrusted datagrams.
 
-A capture is a text file with the datagrams of a sender and their times, to be replayed:
+A capture is a text file with the datagrams of a sender and their times, for replay:
 
     # era-haptics TUIO capture 1
     0.000000 2362756e646c6500...
     0.016667 2362756e646c6500...
 
-Seconds from the start and the datagram in hexadecimal; further lines that start with # are
-comments. Malformed datagrams are kept as received.
+Each line has the seconds from the start and the datagram in hexadecimal; other lines starting
+with # are comments. Malformed datagrams are kept as received.
 """
 
 import math
@@ -38,23 +37,23 @@ from registry.files import LineTooLong, lines_of, open_regular
 from registry.limits import MAX_CONTACTS
 
 Argument: TypeAlias = str | int | float | None
-"""Argument of a message; None for a blob, and for true, false, nil and impulse."""
+"""Argument of a message; None for a blob, true, false, nil and impulse."""
 
 _BUNDLE = b"#bundle\0"
 _BUNDLE_HEADER = len(_BUNDLE) + 8  # the time tag is ignored: touches are current
-_MAX_DEPTH = 8  # of bundles in bundles
+_MAX_DEPTH = 8  # of nested bundles
 _ADDRESS = re.compile(rb"/[!-~]*")
 _RUNS = re.compile(rb"[sS]|b|[TFNI]+|[ifdhtcrm]+")
-_CODES = bytes.maketrans(b"htcrm", b"qQiII")  # of struct, which has those of i, f and d
+_CODES = bytes.maketrans(b"htcrm", b"qQiII")  # codes of `struct`, which already has i, f and d
 
 
 def osc_messages(datagram: bytes, *, limit: int) -> list[bytes]:
-    """Return the encoded messages of a datagram in order, for `read_message`; so many at most.
+    """Return the encoded messages of a datagram in order, for `read_message`; up to a limit.
 
-    What is neither a message nor a bundle is among them; what follows an element whose size exceeds
-    its bundle is one such element.
+    Elements that are neither message nor bundle are included; after an element whose size exceeds
+    its bundle, the rest is one such element.
     """
-    found, ends = list[bytes](), list[int]()  # of the bundles that enclose an element
+    found, ends = list[bytes](), list[int]()  # of the bundles around an element
     at, end, is_whole = 0, len(datagram), True
     while len(found) < limit:
         is_bundle = end - at >= _BUNDLE_HEADER and datagram.startswith(_BUNDLE, at)
@@ -74,15 +73,15 @@ def osc_messages(datagram: bytes, *, limit: int) -> list[bytes]:
     return found
 
 
-# Most messages of a panel repeat: its name, the contacts that are alive, resting fingers.
+# Most messages of a panel repeat: its name, active contacts, resting fingers.
 @lru_cache(maxsize=256)
 def read_message(message: bytes) -> tuple[str, tuple[Argument, ...]]:
     """Return the address and the arguments of an encoded message; raises InputError.
 
-    Bytes of a text that are not UTF-8 are written as \\xNN.
+    Bytes of a text that are not valid UTF-8 are written as \\xNN.
     """
     address = message.partition(b"\0")[0]
-    at = len(address) // 4 * 4 + 4  # texts are padded by one to four zeros
+    at = len(address) // 4 * 4 + 4  # strings are padded with one to four zeros
     tags = message[at:].partition(b"\0")[0]
     runs = _RUNS.findall(tags)
     if not (_ADDRESS.fullmatch(address) and tags.startswith(b",")):
@@ -92,7 +91,7 @@ def read_message(message: bytes) -> tuple[str, tuple[Argument, ...]]:
     arguments: list[Argument] = []
     at += len(tags) // 4 * 4 + 4
     try:
-        for run in runs:  # numbers that follow each other at once
+        for run in runs:  # consecutive numbers in one step
             if run in (b"s", b"S"):
                 end = message.index(b"\0", at)
                 arguments.append(message[at:end].decode(errors="backslashreplace"))
@@ -117,36 +116,36 @@ CURSORS, BLOBS = SERVED = "/tuio/2Dcur", "/tuio/2Dblb"
 _Key: TypeAlias = tuple[str, int]
 """Profile and session id of a contact."""
 
-_NEAR = 0.02  # of the sensor: a cursor so near to the middle of a small blob is the same contact
-_PARTED = 4.0  # times as far they are two again, which one that moves quickly is not
-_APART_IDS = 1 << 32  # added to the id of a contact that another has, beyond those of senders
+_NEAR = 0.02  # of the sensor: a cursor this close to the centre of a small blob is the same contact
+_PARTED = 4.0  # at this multiple of the distance they separate again; fast movement stays below it
+_APART_IDS = 1 << 32  # added to the id of a contact with a duplicate id, above all ids of senders
 
-# What is not served, of TUIO 1.1 and 2.0; a custom profile is another address.
+# Unsupported addresses of TUIO 1.1 and 2.0; custom profiles have other addresses.
 _PROFILE = re.compile(r"/(?:tuio/)?(tuio2|(?:2|25|3)D(?:cur|obj|blb))(?=/|$)")
 _IDLE_ADDRESSES = ("/tuio2/frm", "/tuio2/alv")  # without a position
 
-_MAX_MESSAGES = 256  # of a datagram: some 4 ms, and ten times as many cursors as there are contacts
+_MAX_MESSAGES = 256  # per datagram: some 4 ms, and ten times the maximum number of contacts
 _MAX_NAME = 100  # characters; the rest is cut off
 _MAX_SENDERS = 16
 _SOURCE = b"source\0\0"  # OSC string, NUL-padded
-# Like the reference client, a sequence number that falls by more than 100 is a restarted sender. A
-# restart within the first 100 frames shows by the pause: reordered frames are never this late.
+# As in the reference client, a sequence number that drops by more than 100 is a restarted sender.
+# A pause reveals a restart within the first 100 frames: reordered frames are never this late.
 _LATE_FRAMES = 100
 # Senders such as the reference implementation are silent while fingers rest; some repeat the alive
 # message once a second.
 DEFAULT_TIMEOUT = 3.0  # s
 RESTART_PAUSE = 0.5
-"""Time [s] without a datagram after which a sender at another port is the one of before."""
+"""Time [s] without a datagram after which a sender at another port counts as the same sender."""
 
 MUTE_AFTER = 10.0
-"""Time [s] without cursors after which a sender that should be heard is mute."""
+"""Time [s] without cursors after which a sender that should send counts as mute."""
 
-_MIN_REPEATS = 20  # frames without cursors in a row, of a sender that repeats itself at rest
+_MIN_REPEATS = 20  # consecutive frames without cursors, of a sender that repeats frames at rest
 
 
 @dataclass
 class _Profile:
-    """The contacts of one profile: those of a bundle, or all that are known of a sender."""
+    """Contacts of one profile, from a bundle or from all bundles of a sender."""
 
     alive: tuple[int, ...] | None = None  # until stated
     touches: dict[int, Touch] = field(default_factory=dict)  # by session id
@@ -157,30 +156,32 @@ class _Profile:
 
 @dataclass
 class _Bundle:
-    """The messages of one bundle."""
+    """Parsed messages of a bundle."""
 
     source: str | None = None
     profiles: dict[str, _Profile] = field(default_factory=dict)  # by address
-    malformed: list[str] = field(default_factory=list)  # why messages were refused
-    others: dict[str, bool] = field(default_factory=dict)  # unserved addresses; if with touches
+    malformed: list[str] = field(default_factory=list)  # reasons of rejected messages
+    others: dict[str, bool] = field(
+        default_factory=dict
+    )  # unsupported addresses; whether they carry touches
 
 
 @dataclass
 class _Sender:
-    """The state of one sender."""
+    """State of a sender."""
 
     last_heard: float
     peer: Peer  # its host and port
-    former: Peer | None = None  # those before
+    former: Peer | None = None  # its previous address
     profiles: dict[str, _Profile] = field(default_factory=dict)  # by address
-    ids: dict[_Key, int] = field(default_factory=dict)  # of its contacts, where there are blobs
-    resting: int = 0  # frames in a row without contacts
+    ids: dict[_Key, int] = field(default_factory=dict)  # of its contacts, if it sends blobs
+    resting: int = 0  # consecutive frames without contacts
 
     def touches(self, *, since: float) -> tuple[Touch, ...]:
-        """Return the contacts of profiles that were heard since a time [s].
+        """Return the contacts of profiles received since a time [s].
 
-        One that is both a cursor and a blob is a cursor of that size, and keeps its id as long as
-        any of the two is alive.
+        A contact that is both a cursor and a blob is a cursor with the blob's size, and keeps its
+        id as long as either of them is alive.
         """
         known = {
             (address, number): touch
@@ -204,9 +205,9 @@ class _Sender:
 
 
 def _paired(known: Mapping[_Key, Touch], before: Mapping[_Key, int]) -> dict[_Key, _Key]:
-    """Return which blob is the contact of which cursor: first as before, then the nearest ones.
+    """Match blobs to cursors: first the previous matches, then the nearest ones.
 
-    before: ids of contacts. No more are compared than there may be contacts.
+    before: ids of contacts. Compares at most the maximum number of contacts.
     """
     near, pairs = list[tuple[bool, float, _Key, _Key]](), dict[_Key, _Key]()
     few = [[each for each in known if each[0] == of][:MAX_CONTACTS] for of in SERVED]
@@ -226,11 +227,12 @@ def _paired(known: Mapping[_Key, Touch], before: Mapping[_Key, int]) -> dict[_Ke
 class TuioSource(UdpSource):
     """Listens for TUIO at `tuio:HOST:PORT`, `tuio:PORT` or `tuio:` (127.0.0.1:3333).
 
-    Senders are distinguished by the name in their source message and their host, or without a name
-    by host and port, as are programs that send under one name by turns. Beyond the most senders,
-    one of the busiest peer is dropped. Every bundle with contacts or an alive message confirms all
-    contacts of its profile and sender for the timeout [s]. If a sender never states which are
-    alive, those of a bundle are. Reading never raises: unusable input is counted in `rejects`.
+    Senders are distinguished by the name in their source message and by host; without a name, or if
+    programs send alternately under the same name, by host and port. Above the maximum number of
+    senders, one of the busiest peer is dropped. Every bundle with contacts or an alive message
+    confirms all contacts of its profile and sender for the timeout [s]. If a sender never sends
+    alive messages, the contacts of a bundle are alive. Reading never raises: unusable input is
+    counted in `rejects`.
     """
 
     default_port = "3333"  # registered for TUIO
@@ -238,25 +240,25 @@ class TuioSource(UdpSource):
 
     def __init__(self, url: str) -> None:
         super().__init__(url)
-        self._others: set[str] = set()  # profiles that were received and are not served
+        self._others: set[str] = set()  # unsupported profiles received
         self._senders: dict[str, _Sender] = {}
 
     @property
     def problem(self) -> str | None:
-        """Why no contacts come although the port is bound, and what to do."""
+        """Why no contacts arrive although the port is bound, and the remedy."""
         if not self.is_mute(since=self.opened, now=threads.now()):
             return None
         others = ", ".join(sorted(self._others))
         return (
             f"no {' or '.join(SERVED)} on UDP {self.host}:{self.port} for {MUTE_AFTER:g} s"
-            f"{f' ({others} arrives instead)' if others else ''}; start the sender, and let it "
-            "send TUIO 1.1 cursors or blobs to this address"
+            f"{f' ({others} arrives instead)' if others else ''}; start the sender, and "
+            "configure it to send TUIO 1.1 cursors or blobs to this address"
         )
 
     def read(self, datagram: bytes, peer: Peer, arrived: float) -> TouchFrame | None:
-        """Return the frame that a datagram completes when it arrives [s], or None.
+        """Return the frame that a datagram, arriving at a time [s], completes, or None.
 
-        A contact that is alive but was never set is omitted; positions may be NaN.
+        A contact that is alive but was never set is omitted; positions can be NaN.
         """
         bundle = _read_bundle(datagram)
         self._count(bundle, f"{peer[0]}:{peer[1]}")
@@ -283,10 +285,10 @@ class TuioSource(UdpSource):
         return TouchFrame(name, arrived, touches, self.timeout, origin=origin)
 
     def drop_superseded(self, waiting: Sequence[Datagram]) -> list[Datagram]:
-        """Return waiting datagrams without those that the newest bundle of their kind supersedes.
+        """Return the waiting datagrams, except those superseded by a newer bundle of their kind.
 
-        Of one kind are bundles of one sender with the same profiles. One supersedes older ones if
-        it is complete: it has all contacts that are alive, with their positions.
+        Bundles of one sender with the same profiles are of the same kind. A bundle supersedes older
+        ones if it is complete: it has all active contacts, with their positions.
         """
         is_complete: dict[tuple[object, ...], bool] = {}
         kept = []
@@ -309,9 +311,9 @@ class TuioSource(UdpSource):
         return kept[::-1]
 
     def is_mute(self, *, since: float, now: float) -> bool:
-        """Whether nothing was read since a time [s] though it should have been.
+        """Whether nothing was received since a time [s] although it should have been.
 
-        That is no sender at all, or no more frames of one that has repeated itself without cursors.
+        Either no sender exists, or a sender that repeats frames without cursors has stopped.
         """
         if not self._senders:
             return now - since >= MUTE_AFTER
@@ -319,7 +321,7 @@ class TuioSource(UdpSource):
         return last.resting >= _MIN_REPEATS and now - last.last_heard >= MUTE_AFTER
 
     def _count(self, bundle: _Bundle, place: str) -> None:
-        """Count the unusable messages of a bundle from a place: other profiles, malformed ones."""
+        """Count the unusable messages of a bundle from a sender: other profiles, malformed ones."""
         for address, has_touches in bundle.others.items():
             profile = _PROFILE.match(address)
             if profile:
@@ -335,10 +337,9 @@ class TuioSource(UdpSource):
     def _name(self, bundle: _Bundle, peer: Peer, now: float) -> str:
         """Return the name of a sender: host and source, and the port where these are not unique.
 
-        A name that comes from another port is that of a program that was restarted, or that takes
-        another port for each datagram and goes on counting its frames. It is that of a second
-        program if its frames do not follow those that came just before, or the former port is
-        heard again.
+        A known name from another port is a restarted program, or a program that uses another port
+        for each datagram and continues its frame numbers. It is a second program if its frame
+        numbers do not continue the latest ones, or if the former port is heard again.
         """
         own = f"tuio:{peer[0]}:{peer[1]}"
         if bundle.source is None:
@@ -376,7 +377,7 @@ class TuioSource(UdpSource):
     def _sender_to_evict(self, peer: Peer, now: float) -> str | None:
         """Return the sender to drop for a new sender of this peer, or None.
 
-        It is the one not heard from for longest if that has been idle, or else of the busiest peer.
+        This is the sender silent for longest, if it is idle, or else one of the busiest peer.
         """
 
         def oldest(names: Iterable[str]) -> str:
@@ -392,9 +393,9 @@ class TuioSource(UdpSource):
         return oldest(name for name, sender in self._senders.items() if sender.peer == busiest)
 
     def _added(self, new: _Profile, known: _Profile, name: str, now: float) -> _Profile | None:
-        """Return a profile of a sender with that of a bundle, None if a newer frame came before.
+        """Update a profile of a sender from a bundle; None if a newer frame came before.
 
-        Bundles without a number and redundant ones (-1) are never late; a frame split over
+        Bundles without a number and redundant bundles (-1) are never late; a frame split over
         several bundles repeats its number.
         """
         sequence, numbered_at = known.sequence, known.numbered_at
@@ -403,7 +404,7 @@ class TuioSource(UdpSource):
                 if sequence - new.sequence <= _LATE_FRAMES and now - numbered_at < RESTART_PAUSE:
                     self.rejects.count("late", f"frame {new.sequence} of {name} after {sequence}")
                     return None
-                known = _Profile()  # of a restarted sender
+                known = _Profile()  # the sender was restarted
             sequence, numbered_at = new.sequence, now
         alive = known.alive if new.alive is None else tuple(dict.fromkeys(new.alive))
         touches = known.touches | new.touches
@@ -436,7 +437,7 @@ def _read_bundle(datagram: bytes) -> _Bundle:
 
 
 def _read_contacts(bundle: _Bundle, address: str, arguments: tuple[Argument, ...]) -> None:
-    """Add a message of a profile, by its arguments, to a bundle; raises InputError."""
+    """Add a message of a profile to a bundle; raises InputError."""
     profile = bundle.profiles.setdefault(address, _Profile())
     match arguments:
         case ("source", str(name), *_):
@@ -460,11 +461,11 @@ def _read_contacts(bundle: _Bundle, address: str, arguments: tuple[Argument, ...
         case ("fseq", number, *_):
             profile.sequence = _whole(number)
         case _:
-            raise InputError(f"arguments must be those of TUIO 1.1, got {arguments!s:.80}")
+            raise InputError(f"arguments must be as in TUIO 1.1, got {arguments!s:.80}")
 
 
 def _whole(value: Argument) -> int:
-    """Return the value of a whole number of any type; raises InputError."""
+    """Convert a whole number of any type; raises InputError."""
     if not isinstance(value, int | float) or value % 1 != 0:  # NaN and infinity are not
         raise InputError(f"session ids and frame numbers must be whole, got {value!r:.40}")
     return int(value)
@@ -472,8 +473,8 @@ def _whole(value: Argument) -> int:
 
 HEADER = "# era-haptics TUIO capture 1"
 _LINE = re.compile(r"(\d{1,9}(?:\.\d{1,9})?) ((?:[0-9a-f]{2})+)", re.ASCII | re.IGNORECASE)
-_MAX_LINE = 1 << 18  # characters; a datagram is of up to 64 KiB, two digits a byte
-MAX_BYTES = 16 << 20  # 100 s of ten fingers at 100 Hz; of one finger a quarter of an hour
+_MAX_LINE = 1 << 18  # characters; a datagram has up to 64 KiB, two digits per byte
+MAX_BYTES = 16 << 20  # 100 s of ten fingers at 100 Hz; a quarter of an hour of one finger
 
 
 @dataclass(frozen=True, slots=True)
@@ -481,7 +482,7 @@ class RecordedDatagram:
     """A datagram of a capture."""
 
     time: float
-    """When it was sent [s] from the start."""
+    """Time sent [s] from the start."""
     payload: bytes
 
 

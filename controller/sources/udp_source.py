@@ -1,8 +1,8 @@
 """Touch sources over UDP: their URLs, and datagrams with their times of arrival.
 
-The event loop's own endpoint reads one datagram per iteration and knows only when it did so:
-touches would be outdated and the queueing delay unmeasured. Here one iteration reads all that has
-arrived and delivers the backlog in slices of at most 0.25 ms. On Linux the kernel timestamps each
+The event loop's own endpoint reads one datagram per iteration and timestamps only the read: touches
+would be outdated and the queueing delay unmeasured. Here one iteration reads all waiting datagrams
+and delivers the backlog in slices of at most 0.25 ms. On Linux the kernel timestamps each
 datagram. In a flood the newest are kept; the kernel would keep the oldest.
 """
 
@@ -49,7 +49,7 @@ class Datagram(NamedTuple):
 
 
 DropSuperseded: TypeAlias = Callable[[Sequence[Datagram]], Iterable[Datagram]]
-"""Returns those of the waiting datagrams, in order, that no later one supersedes."""
+"""Returns the waiting datagrams, in order, that no later one supersedes."""
 
 _TIMESTAMPS = 35  # SO_TIMESTAMPNS and SCM_TIMESTAMPNS of Linux, which Python does not name
 _TIMESPEC = struct.Struct("@ll")
@@ -72,7 +72,7 @@ class Datagrams:
         self._drop_superseded = drop_superseded
         self._waiting: deque[Datagram] = deque(maxlen=_MAX_WAITING)
         self._is_due = False
-        self._buffer_size = max_size + 1  # so that a larger one shows by its size
+        self._buffer_size = max_size + 1  # so that the size reveals a larger datagram
         self._loop = asyncio.get_running_loop()
         self._latest = self._loop.time()
         if sys.platform == "linux":
@@ -91,7 +91,7 @@ class Datagrams:
         self._socket.close()
 
     def _readable(self) -> None:
-        """Read what has arrived; reading costs a tenth of decoding."""
+        """Read all waiting datagrams; reading costs a tenth of decoding."""
         offset = _clock_offset(self._loop.time)
         for _ in range(_MAX_WAITING):
             try:
@@ -214,7 +214,7 @@ class UdpSource(TouchSource):
         """
 
     def drop_superseded(self, waiting: Sequence[Datagram]) -> Iterable[Datagram]:
-        """Return those of many waiting datagrams, in order, that no later one supersedes."""
+        """Return the waiting datagrams, in order, that no later one supersedes."""
         return waiting
 
     async def run(self, deliver: Callable[[TouchFrame], None]) -> None:

@@ -67,8 +67,8 @@ def test_intensity_is_the_root_of_amplitude(read: Read) -> None:
         (haptic({"time": 0, "amplitude": 1.5}), r"amplitude\[0\]\.amplitude: must be at most 1"),
         (
             haptic({"time": 0.2, "amplitude": 0}, {"time": 0.1, "amplitude": 0}),
-            r":16: signals\.continuous\.envelopes\.amplitude\[1\]\.time: must be at least that of "
-            r"the point before, 0\.2, got 0\.1",
+            r":16: signals\.continuous\.envelopes\.amplitude\[1\]\.time: must be at least 0\.2, "
+            r"as at the previous point, got 0\.1",
         ),
         (
             haptic({"time": 0, "amplitude": 0.5, "emphasis": {"amplitude": 0.4, "frequency": 0.5}}),
@@ -213,8 +213,8 @@ def test_level_over_time_is_that_of_the_wave(read: Read, seed: int) -> None:
         (hjif(), r"has no channel of vibration"),
         (
             hjif([band("WaveletWave")]),
-            r":\d+: perceptions\[1\]\.channels\[0\]\.bands\[0\]\.band_type: bands of wavelets are "
-            r"not read; .*Synthesizer",
+            r":\d+: perceptions\[1\]\.channels\[0\]\.bands\[0\]\.band_type: wavelet bands are "
+            r"not supported; .*Synthesizer",
         ),
         (
             hjif([band("Transient", {"effect_type": "Reference", "id": 5})]),
@@ -578,12 +578,12 @@ def test_named_contents_are_felt(tmp_path: Path) -> None:
         (
             "ahap",
             '{"Pattern": []}\0\0',
-            r":1: nothing may stand behind the end .* got '\\x00\\x00'",
+            r":1: nothing must follow the end .* got '\\x00\\x00'",
         ),
         (
             "hjif",
             '{"a": 1}\n# end\n',
-            r":2: nothing may stand behind the end .* got '# end\\n' in column 1; remove it",
+            r":2: nothing must follow the end .* got '# end\\n' in column 1; remove it",
         ),
         ("ahap", '{"Pattern": [', ":1: is not valid JSON: .*; its end is missing: export it again"),
         ("haptic", b" " * (2 << 20) + b"{}", "is larger than 2 MiB; shorten the content"),

@@ -70,9 +70,7 @@ def test_two_bands_and_what_lies_outside(read: Read) -> None:
     assert intensity == pytest.approx(0.45**0.5, abs=0.01)
     assert sharpness == pytest.approx(25 / 235, abs=0.01)
     assert pattern.out_of_band_share == pytest.approx(0.5, abs=0.01)
-    assert pattern.remarks == (
-        "50 % of its energy (-3.0 dB) lies outside 65 to 300 Hz and is left out",
-    )
+    assert pattern.remarks == ("50 % of its energy (-3.0 dB) is outside 65 to 300 Hz and left out",)
 
 
 @pytest.mark.parametrize(

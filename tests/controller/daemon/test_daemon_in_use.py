@@ -254,7 +254,7 @@ async def test_names_with_a_strength_are_bounded(tmp_path: Path) -> None:
             await era.touch([PLACE], source=name)
             await asyncio.sleep(0.01)
             if name is names[-1]:
-                with pytest.raises(RpcError, match=r"^strengths must be of at most 64 names"):
+                with pytest.raises(RpcError, match=r"^strengths must have at most 64 names"):
                     await era.strength(name=name, gain_db=-1)
                 await era.strength(name=names[0], gain_db=0)
             await era.strength(name=name, gain_db=-1)

@@ -26,11 +26,11 @@ class LinkError(DriverError, ConnectionError):
     """The wire, the adapter or the amplifier on it cannot be reached."""
 
     lost: tuple[str, ...] = ()
-    """Names of the amplifiers that are lost, where several are driven and these are known."""
+    """Names of the lost amplifiers, if several are driven and these are known."""
 
 
 class WrongAmplifier(LinkError):
-    """What replies is not the expected amplifier, or not this host's; the text says what to do."""
+    """Another amplifier, or one driven by another host, replies; the text has the remedy."""
 
 
 class LinkTimeout(LinkError, TimeoutError):
@@ -49,10 +49,10 @@ class FrameError(DriverError):
 
 
 class CommandRefused(DriverError):
-    """The guard or the amplifier refused a request; nothing of it was applied.
+    """The guard or the amplifier rejected a request; no part of it was applied.
 
-    channel: the one at fault, if any; until: time [s] from which the same request is allowed, if
-    only its time is wrong. may_play: whether it may have been carried out all the same, since an
+    channel: the channel at fault, if any; until: time [s] from which the same request is allowed,
+    if only its time is wrong. may_play: whether it may have been carried out nevertheless, since an
     earlier attempt had no reply. is_disarmed: whether the amplifier is not armed by this host any
     more.
     """
@@ -78,7 +78,7 @@ class Preempted(CommandRefused):
 
 
 class Overtaken(Preempted):
-    """A set that was preempted before any amplifier was to play it: what plays goes on."""
+    """A set that was preempted before any amplifier played it: current playback continues."""
 
 
 class CommandError(DriverError, ValueError):

@@ -1,4 +1,4 @@
-"""Opens lines and the amplifiers on them, of protocol 4, by their URLs."""
+"""Open lines and their amplifiers (protocol 4) by URL."""
 
 import asyncio
 from collections.abc import Mapping
@@ -19,7 +19,7 @@ class _OpenLine:
     settings: Mapping[str, object]
 
     async def close(self) -> None:
-        """Close it; what waits on the line fails."""
+        """Close the line; waiting requests fail."""
         try:
             if self.line.loss is None:
                 self.line.lose(f"{self.line.name} was closed")
@@ -31,13 +31,13 @@ class _OpenLine:
 class Lines:
     """The open lines of a host; amplifiers at one port, connection or bus share a line.
 
-    before: those that it has closed, whose numbers of requests it goes on with.
+    before: earlier lines of the host, now closed; their request numbers are continued.
     """
 
     def __init__(self, before: "Lines | None" = None) -> None:
         self._wires: dict[str, Wire] = {} if before is None else before._wires
         self.is_closing = False
-        """Whether their owner is closing them: what it opens meanwhile is opened by others."""
+        """Whether their owner is closing them: lines opened meanwhile belong to others."""
         self._opened: dict[str, _OpenLine] = {}
         self._changing: dict[str, asyncio.Lock] = {}  # held while a line is opened
         self._closing: set[asyncio.Task[None]] = set()
@@ -53,9 +53,9 @@ class Lines:
     ) -> Amplifier:
         """Return the amplifier of a URL, its line open, nothing sent; see `Amplifier`.
 
-        A line that was lost is opened anew; amplifiers of the lost one stay lost. Raises
-        CommandError for text that is no URL, LinkError for a line that cannot be opened, or an
-        address that is taken by one of another name; one of this name gives way.
+        A lost line is opened again; the amplifiers on the lost line stay lost. Raises CommandError
+        for an invalid URL, LinkError for a line that cannot be opened or an address in use by an
+        amplifier of another name; an amplifier of this name is replaced.
         """
         address, before = address_of(url), self._opened
         async with self._changing.setdefault(address.line, asyncio.Lock()):

@@ -1,17 +1,17 @@
-"""Tones and layers of an amplifier, and what its channels play at a time.
+"""Tones and layers of an amplifier, and the output of its channels over time.
 
 The host states `AmplifierLayer`s in physical units; the ledger (`drivers.host.ledger`) checks them
-and rounds them to the integers of the wire. `Playback` follows from these sets and their commits
-alone. A channel plays the sum of its voices. A voice is one tone of one layer until it has faded:
+and rounds them to the integers of the wire. `Playback` depends only on these sets and their
+commits. A channel plays the sum of its voices. A voice is one tone of one layer until it has faded:
 
     Im[A(t) exp(2 pi i n clock(t) / 2^32)], A(t) along its transition, in full levels
 
-The angle is that of the amplifier's clock (`drivers.protocol.definition`) times the frequency word
-n, so it does not depend on when the voice began. The simulated amplifier computes samples from
-this, the ledger the worst case, and the conformance checks what they expect.
+The angle is the amplifier's clock (`drivers.protocol.definition`) times the frequency word n, so it
+does not depend on the start of the voice. The simulated amplifier computes samples from this, the
+ledger the worst case, and the conformance checks the expected output.
 
-Amplitudes are complex, in full levels. Times [s] are of any one clock, and never go back. Loops are
-plain and make few calls, because both host and far end play every set.
+Amplitudes are complex, in full levels. Times [s] refer to one arbitrary clock and never decrease.
+Loops are plain and make few calls, because both host and far end play every set.
 """
 
 import cmath
@@ -60,24 +60,24 @@ def peak_of(envelope: Envelope | None) -> float:
 
 @dataclass(slots=True)  # not frozen, which would take three times as long to make
 class VoiceTransition:
-    """The way of a voice from one complex amplitude to another.
+    """Transition of a voice from one complex amplitude to another.
 
-    It follows straight lines through its knots, or without knots a raised cosine of one step.
+    Follows straight lines through its knots or, without knots, a raised cosine of one step.
     """
 
     start: float
-    """When it begins [s]."""
+    """Start time [s]."""
     step: float
-    """Time between two knots, or of the raised cosine [s]; 0 changes at once."""
+    """Time between two knots, or duration of the raised cosine [s]; 0 changes immediately."""
     first: complex
     last: complex
     end: float
-    """When it has reached the last amplitude [s]."""
+    """End time [s], when it reaches the last amplitude."""
     knots: tuple[complex, ...] = ()
     half: float = 0.0
-    """By how much its start may differ [s], see `era_haptics.lab.expected_output`."""
+    """Tolerance of its start [s], see `era_haptics.lab.expected_output`."""
     radius: float = 0.0
-    """By how much its first amplitude may differ."""
+    """Tolerance of its first amplitude."""
 
     def at(self, time: float) -> complex:
         """Return the amplitude at a time [s]; before the start it is the first one."""
@@ -104,7 +104,7 @@ class VoiceTransition:
     def points(self, since: float, until: float = math.inf) -> tuple[complex, ...]:
         """Return the amplitudes at two times [s] and at the knots between them.
 
-        All other amplitudes between these times lie between two of them.
+        All other amplitudes between these times are between two of them.
         """
         between = []
         for number, knot in enumerate(self.knots, 1):
@@ -285,7 +285,7 @@ def _cut_short(voice: Voice, time: float, slew: float) -> Voice:
 
 @dataclass(frozen=True, slots=True)
 class AmplifierTone:
-    """What a channel plays in a layer."""
+    """Tone of a channel in a layer."""
 
     channel: int
     frequency: float
@@ -306,14 +306,14 @@ class AmplifierTone:
 
 @dataclass(frozen=True, slots=True)
 class AmplifierLayer:
-    """What one layer is to play; channels without a tone are silent in it."""
+    """Content of a layer; channels without a tone are silent in it."""
 
     number: int
     tones: tuple[AmplifierTone, ...] = ()
     ramp: float = 0.02
     """Duration of all changes [s]."""
     valid_for: float = 0.0
-    """Time after which the layer ends by itself [s]; 0 for never."""
+    """Time after which the layer ends on its own [s]; 0 for never."""
     after: bool = False
     """Whether the tones start only when the onsets that the layer plays have ended."""
     renew: bool = False
@@ -329,7 +329,7 @@ _PER_RAMP, _PER_VALID_FOR = QUANTITIES["ramp"].per_unit, QUANTITIES["valid_for"]
 
 @dataclass
 class _Layer:
-    """What a layer plays."""
+    """Playback state of a layer."""
 
     token: int = 0
     ramp: int = 0  # in units of the wire
@@ -396,7 +396,7 @@ class Playback:
         self._note_changes()
 
     def silence(self, time: float, ramp: float) -> None:
-        """Fade all layers along a ramp [s] without their endings, and drop the sets that wait."""
+        """Fade all layers along a ramp [s] without their endings, and drop waiting sets."""
         self.advance(time)
         self._layers.clear()
         self.all_voices = [
@@ -406,7 +406,7 @@ class Playback:
         self._note_changes()
 
     def advance(self, time: float) -> None:
-        """Carry out what is due by a time [s]: ends of layers, starts of sets, faded voices."""
+        """Carry out everything due by a time [s]: ends of layers, starts of sets, faded voices."""
         if time < self.changes_at:
             return
         while self.next_due <= time:
@@ -417,8 +417,8 @@ class Playback:
     def carry_out(self, at: float, number: int) -> None:
         """End a layer at a time [s], or start its waiting set; other layers may be due sooner."""
         layer = self._layers[number]
-        # Voices that have faded before this are dropped. One that fades just now stays, because a
-        # set that waited for its end may continue it.
+        # Voices that faded earlier are dropped. A voice that fades right now is kept, because a set
+        # that waited for its end can continue it.
         self._drop_faded(math.nextafter(at - self.uncertainty, -math.inf), number)
         if layer.waiting is not None and layer.waiting[0] <= at:
             _, one, token = layer.waiting
@@ -429,7 +429,7 @@ class Playback:
         self._note_changes()
 
     def _drop_faded(self, time: float, layer: int | None = None) -> None:
-        """Drop the voices that are silent from a time [s] on; layer: of which, None for all."""
+        """Drop voices that are silent from a time [s]; layer: only its voices, None for all."""
         for channel, voices in enumerate(self.all_voices):
             kept = []
             for voice in voices:
@@ -440,7 +440,7 @@ class Playback:
                 self.all_voices[channel] = tuple(kept)
 
     def _note_changes(self) -> None:
-        """Note what plays, and when the next voice has faded or the next layer ends or starts."""
+        """Update the voices, and the time of the next fade, end or start."""
         first, settles, waiting = math.inf, -math.inf, []
         for layer in self._layers.values():
             first = min(first, layer.ends)
@@ -473,7 +473,7 @@ class Playback:
             self.all_voices[channel] = (*voices, *ends)
 
     def correct(self, one: LayerSet, token: int) -> None:
-        """Let a layer lead to what an amplifier says it plays of the set with this token."""
+        """Correct a layer to the playback reported by an amplifier for the set with this token."""
         if one.layer not in self._layers or self._layers[one.layer].token != token:
             return
         commands = {command.channel: command for command in one.commands}
@@ -498,7 +498,7 @@ class Playback:
         self._note_changes()
 
     def playing(self, layer: int) -> LayerSet:
-        """Return the set that the voices of a layer lead to, without envelopes; empty if silent."""
+        """Return the target set of a layer's voices, without envelopes; empty if silent."""
         commands = tuple(
             Command(
                 channel,
@@ -514,7 +514,7 @@ class Playback:
         return LayerSet(layer, known.ramp, known.valid_for, commands)
 
     def level(self, channel: int, time: float) -> float:
-        """Return the largest amplitude of a channel; voices of one frequency interfere."""
+        """Return the largest amplitude of a channel; voices of equal frequency interfere."""
         sums: dict[float, complex] = {}
         for voice in self.all_voices[channel]:
             amplitude = voice.transition.at(time)
@@ -526,7 +526,7 @@ class Playback:
         return sum(abs(voice.transition.last) for voice in self.all_voices[channel])
 
     def next_tokens(self, layer: int) -> set[int]:
-        """Return the tokens that a layer may have now, or after what is due of it."""
+        """Return the possible tokens of a layer, now or after its due changes."""
         known = self._layers.get(layer)
         waiting = () if known is None or known.waiting is None else known.waiting[2:]
         return {0, self.tokens.get(layer, 0), *waiting}
@@ -588,7 +588,7 @@ class Playback:
 
     @property
     def dues(self) -> list[tuple[float, int]]:
-        """When each layer next ends by itself or starts its waiting set [s], and its number."""
+        """Time [s] when each layer next ends or starts its waiting set, and its number."""
         dues = []
         for number, layer in self._layers.items():
             due = layer.ends if layer.waiting is None else min(layer.ends, layer.waiting[0])
@@ -597,7 +597,7 @@ class Playback:
         return dues
 
     def onsets_end(self, layer: int, time: float) -> float:
-        """Return when the onsets with knots of a layer have ended [s]; `time` if there are none."""
+        """Return the end [s] of a layer's onsets with knots; `time` without any."""
         ends = (
             voice.transition.end
             for voices in self.all_voices

@@ -29,7 +29,7 @@ from registry.threads import close_in_thread, in_thread
 
 
 class OpenPort(Protocol):
-    """What a line needs of an open port, which reports data and loss to it."""
+    """Interface of an open port to its line; the port reports data and its loss."""
 
     @property
     def is_blocked(self) -> bool:
@@ -38,8 +38,8 @@ class OpenPort(Protocol):
     def write(self, data: bytes) -> None:
         """Send bytes as soon as the device takes them, without waiting.
 
-        They replace those that were not sent yet. Raises LinkError if the port is lost, LinkTimeout
-        if it stays blocked.
+        They replace bytes not sent yet. Raises LinkError if the port is lost, LinkTimeout if it
+        stays blocked.
         """
 
     def poll(self) -> None:
@@ -59,24 +59,24 @@ class Port(OpenPort, Protocol):
 PortOpener: TypeAlias = Callable[
     [str, Callable[[bytes], None], Callable[[str], None]], Awaitable[Port]
 ]
-"""A function that opens a serial port: by its name, and the callbacks of data and of a loss.
+"""A function that opens a serial port by name, with callbacks for data and loss.
 
-It raises LinkError.
+Raises LinkError.
 """
 
 PORT_OPENER: ContextVar[PortOpener | None] = ContextVar("PORT_OPENER", default=None)
-"""Opens serial ports in this context; None: the machine itself does."""
+"""Opener of serial ports in this context; None: those of the machine."""
 
 FAILURES: tuple[type[Exception], ...] = (OSError, ValueError, TypeError)
-"""What a device raises once it is gone; pyserial raises TypeError if it is closed during a read."""
+"""Errors of a lost device; pyserial raises TypeError if closed during a read."""
 
 
 class DevicePort(ABC):
     """A device, which may hang; implements `Port`.
 
-    name: of the device. descriptor: the one that the event loop watches; None if a thread must read
-    the device, because reading may block. on_data: is called with received bytes. on_loss: is
-    called once with the cause of a loss. shut: closes the device, even if it is lost.
+    name: name of the device. descriptor: watched by the event loop; None if a thread must read the
+    device, because reading may block. on_data: called with received bytes. on_loss: called once
+    with the cause of a loss. shut: closes the device, even if it is lost.
     """
 
     kind: ClassVar[str]
@@ -184,14 +184,14 @@ class DevicePort(ABC):
 
 
 NETWORK_DELAY = 1.0
-"""Time [s] after which a port gives up a connection that does not take what was sent.
+"""Time [s] after which a port closes a connection that does not accept sent data.
 
-Delivery by a broken network after that time is not accounted for.
+Later delivery by a broken network is not considered.
 """
 _CONNECT_TIMEOUT = 1.0  # s; a hundred times the delay within a building
-_NEXT_AFTER = 0.25  # s; RFC 8305, section 5; if an address refuses, the next follows at once
+_NEXT_AFTER = 0.25  # s; RFC 8305, section 5; after a refusal, the next address follows immediately
 _NUMERIC = socket.NI_NUMERICHOST | socket.NI_NUMERICSERV
-_READ_MAX = 4096  # bytes at once, so that other connections have their turn
+_READ_MAX = 4096  # bytes per read, so that other connections get their turn
 _UNSENT_MAX = 4096  # bytes; sixteen unsent frames mean a blocked connection
 
 
@@ -211,7 +211,7 @@ async def open_connection(
     except OSError as error:
         raise LinkError(
             f"{endpoint}: connection refused; check the address and the port, and that the "
-            f"amplifier is switched on (the system says: {system_message(error)})"
+            f"amplifier is switched on (system error: {system_message(error)})"
         ) from error
 
 
@@ -229,10 +229,10 @@ class _Connection(asyncio.BufferedProtocol):
         self._transport: asyncio.Transport  # set when connected
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """Set the connection to send small frames at once, and to be given up if they do not pass.
+        """Configure the connection to send small frames immediately, and to fail if it is broken.
 
-        Otherwise a frame may wait 40 ms for the acknowledgement of the one before, and a broken
-        network may deliver frames minutes later.
+        Otherwise a frame could wait 40 ms for the acknowledgement of the previous one, and a broken
+        network could deliver frames minutes later.
         """
         self._transport, self.is_made = cast(asyncio.Transport, transport), True
         connection = transport.get_extra_info("socket")
@@ -274,13 +274,13 @@ class _Connection(asyncio.BufferedProtocol):
         self._transport.abort()  # discards unsent bytes
 
     async def wait_closed(self) -> None:
-        """Return at once, because `abort` does not block."""
+        """Return immediately, because `abort` does not block."""
 
 
 async def _first_to_accept(host: str, port: int, connection: _Connection) -> Port:
     """Connect to the first address of a host that accepts (RFC 8305); raises OSError."""
     connect = asyncio.get_running_loop().create_connection
-    take = [connection].pop  # the first address that accepts gets it, any other an IndexError
+    take = [connection].pop  # the first accepting address gets it, the others an IndexError
     attempts = [partial(connect, take, each, port) for each in await host_addresses(host)]
     try:
         _, index, failures = await staggered_race(attempts, _NEXT_AFTER)
@@ -342,7 +342,7 @@ async def open_port(
         )
     except (OSError, ValueError, termios.error) as error:  # of pyserial
         raise LinkError(
-            f"serial port {name} cannot be opened: {remedy_of(error)} (the system says: "
+            f"serial port {name} cannot be opened: {remedy_of(error)} (system error: "
             f"{system_message(error)})"
         ) from error
     return SerialPort(port, name, on_data, on_loss)
@@ -352,7 +352,7 @@ def open_device(place: Endpoint) -> serial.Serial:
     """Open a serial port or pseudo-terminal exclusively; raises errors of pyserial."""
     import termios
 
-    # A pseudo-terminal has no parity and may refuse all settings if one is given.
+    # A pseudo-terminal has no parity and may reject all settings if parity is given.
     is_pseudo = os.path.realpath(place.device).startswith("/dev/pts/")
     port = serial.Serial(
         place.device,
@@ -362,11 +362,11 @@ def open_device(place: Endpoint) -> serial.Serial:
         exclusive=True,
     )
     try:
-        # USB adapters delay bytes by 16 ms unless low latency is set, which most of them support.
+        # USB adapters delay bytes by 16 ms unless low latency is set; most of them support it.
         with contextlib.suppress(OSError, ValueError, AttributeError, NotImplementedError):
             port.set_low_latency_mode(True)
-        # DTR stays set when the port is closed, so that a board that is restarted by DTR restarts
-        # at the first opening only.
+        # DTR stays set when the port is closed, so that a board reset by DTR restarts only when
+        # the port is first opened.
         settings = termios.tcgetattr(port.fileno())
         settings[2] &= ~termios.HUPCL
         termios.tcsetattr(port.fileno(), termios.TCSANOW, settings)
@@ -378,7 +378,7 @@ def open_device(place: Endpoint) -> serial.Serial:
 
 
 def remedy_of(error: BaseException | None) -> str:
-    """Return the remedy for an error of opening, by its error code or that of its cause."""
+    """Return the remedy for an error of opening, based on its error code or its cause's."""
     while error is not None:
         code = getattr(error, "errno", None)
         if code is not None:
@@ -423,7 +423,7 @@ class SerialPort(DevicePort):
         super().close()
 
     def read_watched(self) -> bytes:
-        """Return what has come; OSError for the end, which an empty read of a terminal is not."""
+        """Return received bytes; OSError at the end, which an empty read of a terminal is not."""
         if self.descriptor is None:
             return b""
         try:
@@ -432,13 +432,13 @@ class SerialPort(DevicePort):
             return b""
         if not data:
             state = select.poll()
-            state.register(self.descriptor, 0)  # a hang-up is reported all the same
+            state.register(self.descriptor, 0)  # a hang-up is still reported
             if state.poll(0):
                 raise OSError("end of file")
         return data
 
     def _send(self) -> None:
-        """Write what the descriptor takes; raises LinkError."""
+        """Write as much as the descriptor accepts; raises LinkError."""
         if self.descriptor is None:
             raise self.lose(OSError("it is closed"))
         try:
@@ -449,7 +449,7 @@ class SerialPort(DevicePort):
             raise self.lose(error) from error
 
     def _send_rest(self) -> None:
-        """Send the rest as soon as there is room; a newer frame may have replaced it."""
+        """Send the rest once there is room; a newer frame may have replaced it."""
         with contextlib.suppress(LinkError):  # reported as a loss
             self._send()
         if not self._unsent and self.descriptor is not None:

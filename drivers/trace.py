@@ -37,7 +37,7 @@ class Direction(StrEnum):
 
 
 is_active = _writers.__len__
-"""How many traces are written; ask it where the bytes of a frame must be made first."""
+"""Number of active traces; check it before making the bytes of a frame."""
 
 
 def frame(direction: Direction, data: bytes, where: str, decode: Callable[[], str]) -> None:
@@ -96,14 +96,14 @@ class TraceWriter:
         self._thread.start()
 
     def add(self, kind: str, text: Callable[[], str]) -> None:
-        """Queue a line of a kind, whose text is made when it is written."""
+        """Queue a line of a kind; its text is made when it is written."""
         if len(self._pending) < _MAX_PENDING:
             self._pending.append((datetime.now(UTC), kind, text))
         else:
             self.dropped += 1
 
     def close(self) -> None:
-        """Write what is pending and close the file; waits for a slow one for at most a second."""
+        """Write pending lines and close the file; waits for a slow file for at most a second."""
         self._ending.set()
         self._thread.join(1.0)
 

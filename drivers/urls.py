@@ -1,4 +1,4 @@
-"""URLs of amplifiers: their parts, and how closely a clock is held over the line that they name.
+"""URLs of amplifiers: their parts, and the synchronisation error of clocks over their lines.
 
 A URL is SCHEME://PLACE?NAME=VALUE&...#NUMBER. Each wire (`drivers.wires`) takes the parts that it
 has. The kinds of lines have the names of the simulated ones (`sim.transport.simulated_line`).
@@ -54,7 +54,7 @@ UNKNOWN_KIND: Final = "usb-full-speed"
 
 
 def line_kind_of(url: str) -> str:
-    """Return the kind of line of an amplifier's URL, a key of `CLOCK_ERRORS` where it is valid."""
+    """Return the kind of line of an amplifier's URL; a key of `CLOCK_ERRORS` if it is valid."""
     scheme, _, rest = url.partition("://")
     scheme = scheme.lower()
     query = rest.partition("?")[2].partition("#")[0]
@@ -68,24 +68,24 @@ def line_kind_of(url: str) -> str:
 
 
 ADDRESS: Final = 1
-"""Address, unit or node of an amplifier as it is made."""
+"""Factory default of an amplifier's address, unit or node."""
 BAUD: Final = 921_600
-"""Of a serial line whose URL names none [baud]; 8 data bits, no parity, 1 stop bit."""
+"""Default of a serial line [baud]; 8 data bits, no parity, 1 stop bit."""
 RTU_BAUD: Final = 115_200
 """Of a Modbus line whose URL names none [baud]; 8 data bits, even parity, 1 stop bit."""
 ADDRESS_MAX: Final = 247
 """Of a unit, and of an address on a serial line, so that one label serves both."""
 
 _BAUD_MAX = 12_000_000  # the fastest USB adapters
-_DIGITS_MAX = 9  # more are out of every range, and int() refuses thousands of them
+_DIGITS_MAX = 9  # more are out of every range, and int() rejects thousands of digits
 
 
 @dataclass(frozen=True)
 class Endpoint:
     """What carries bytes: a serial device of this machine, or a port of the network.
 
-    baud, parity (as named by pyserial) and stop bits are those of the device, or of the line behind
-    a gateway; baud is 0 if unknown.
+    baud, parity (as named by pyserial) and stop bits belong to the device, or to the line behind a
+    gateway; baud is 0 if unknown.
     """
 
     device: str = ""
@@ -107,10 +107,10 @@ class Endpoint:
 
 
 class AmplifierUrl:
-    """A URL, from which a wire takes the parts that it has; CommandError for an invalid one.
+    """A URL, from which a wire takes its parts; CommandError for an invalid one.
 
-    form: valid URLs, for messages; known: names of the options, besides `line`, which every URL may
-    have: the kind of what is between host and amplifier, a key of `CLOCK_ERRORS`.
+    form: valid URLs, for messages; known: names of its options. Every URL can also have `line`: the
+    kind of link between host and amplifier, a key of `CLOCK_ERRORS`.
     """
 
     def __init__(self, url: str, form: str, known: Collection[str] = ()) -> None:
@@ -150,7 +150,7 @@ class AmplifierUrl:
             raise self.refused(why)
 
     def whole(self, text: str, name: str, high: int, *, low: int = 1) -> int:
-        """Parse an integer of a range, as which a part of the URL stands."""
+        """Parse a part of the URL as an integer in a range."""
         is_number = text.isascii() and text.isdigit() and len(text) <= _DIGITS_MAX
         self.require(
             is_number and low <= int(text) <= high,
@@ -163,7 +163,7 @@ class AmplifierUrl:
         return self.whole(self.options.get(name, str(default)), name, high, low=low)
 
     def device(self, baud: int) -> Endpoint:
-        """Return the serial device that the path names; baud: where no option names it."""
+        """Return the serial device in the path; baud: default."""
         self.require(
             not self.place, f"path of the port must follow three slashes, got {self.place!r}"
         )

@@ -128,10 +128,10 @@ async def stop(url: str) -> dict[str, Any]:
 
 
 async def _stop(amplifier: Amplifier) -> str:
-    """Stop an amplifier at once, then until that is confirmed; returns why it is not."""
+    """Stop an amplifier immediately and until silence is confirmed; returns why it is not."""
     cause, until = "", threads.now() + BOOT_TIME
     identifying: asyncio.Future[Any] | None = None
-    while identifying is None or not identifying.done():  # for long where a board may restart
+    while identifying is None or not identifying.done():  # takes long if a board may restart
         with contextlib.suppress(DriverError):
             if threads.now() < until:
                 values = {"ramp": amplifier.wire_ramp(STOP_RAMP)}
@@ -140,7 +140,7 @@ async def _stop(amplifier: Amplifier) -> str:
         await asyncio.wait([identifying], timeout=_STOP_INTERVAL)
     try:
         identifying.result()
-    except DriverError as error:  # its channels are unknown, but the stop goes on
+    except DriverError as error:  # its channels are unknown, but the stop continues
         cause = str(error)
     stopped = await amplifier.stop(timeout=_STOP_TIMEOUT)
     if stopped.is_confirmed:
@@ -149,7 +149,7 @@ async def _stop(amplifier: Amplifier) -> str:
 
 
 async def set_address(url: str, address: int, serial_number: str | None) -> dict[str, Any]:
-    """Give the amplifier at a URL, or that of a serial number, another address on its line."""
+    """Change the address of the amplifier at a URL, or of the one with a serial number."""
     moved = with_address(url, address)
     if serial_number is None:
         async with identified(url) as amplifier:
@@ -162,7 +162,7 @@ async def set_address(url: str, address: int, serial_number: str | None) -> dict
             await _set_address(amplifier, address, serial_number)
     else:
         async with reached(url) as amplifier:
-            # Of several at this address one that is not meant may reply first.
+            # With several at this address, the wrong one may reply first.
             with contextlib.suppress(CommandRefused, LinkError):
                 await _set_address(amplifier, address, serial_number)
     await asyncio.sleep(_TAKING_ADDRESS)
@@ -231,8 +231,8 @@ async def drive(
             achieved = await amplifier.request("GetAchieved", {"layer": layer.number})
             await keep_alive(amplifier, duration, watchdog / 5)
         finally:
-            # An amplifier that cannot be reached is stopped by its watchdog.
-            if amplifier.may_be_armed:  # another host's is left alone
+            # The watchdog stops an amplifier that cannot be reached.
+            if amplifier.may_be_armed:  # leave the amplifier of another host alone
                 with contextlib.suppress(DriverError):
                     await amplifier.disarm(_RAMP)
         after = await amplifier.read_status()
@@ -318,10 +318,10 @@ class BlockingAmplifier:
         return status_rows(self._wait(self._amplifier.request("Ping", values, Priority.HEARTBEAT)))
 
     def apply(self, layers: Sequence[AmplifierLayer]) -> StagedSet:
-        """Play these layers from now on, all else silent; returns them as on the wire.
+        """Play only these layers from now on; returns them as on the wire.
 
-        Raises CommandError for levels or phases between the amplifier's steps where these are
-        coarse: full level or nothing, or phases that would be off by more than 5 degrees.
+        Raises CommandError for levels or phases between coarse steps of the amplifier: full level
+        or nothing, or phases that would be off by more than 5 degrees.
         """
         return self._wait(self._applied(layers))
 
@@ -374,7 +374,7 @@ def _check_steps(layer: AmplifierLayer, capabilities: Values) -> None:
         rounded_away = abs(math.remainder(difference, phase_step)) if phase_step else 0.0
         if tone.level and rounded_away > _MAX_PHASE_ERROR:
             raise CommandError(
-                f"phase {where} must differ from that of channel {first.channel} by a multiple of "
+                f"phase {where} must differ from channel {first.channel} by a multiple of "
                 f"{phase_step:g} degrees, the amplifier's step, got {difference:.0f}; compute "
                 "answers with drive_mode='switched', which needs no phases"
             )

@@ -97,7 +97,7 @@ def discover(
         print(json.dumps(result))
     else:
         _show_discovered(result, problems)
-    for problem in problems.values():  # the first decides, as where one URL is given
+    for problem in problems.values():  # the first one decides, as for a single URL
         kind = next(kind for kind in EXIT_STATUS if isinstance(problem, kind))
         raise typer.Exit(EXIT_STATUS[kind])
 
@@ -153,7 +153,7 @@ def drive(
 
 @amp.command()
 def stop(url: Url, trace: Trace = None, json_: Json = False) -> None:
-    """Stop all channels at once. Latched until cleared.
+    """Stop all channels immediately. Latched until cleared.
 
     Exit status 0 only if the amplifier confirms that it is silent, else 3.
     """

@@ -1,7 +1,7 @@
-"""Amplifiers by URL: reaching one, discovering all, and checking those of a configuration.
+"""Amplifiers by URL: connect to one, discover all, and check those of a configuration.
 
 Discovery lists the serial ports and CAN interfaces of this machine. It sends nothing before it
-probes, but for `with_slcan`: that sends V and CR to serial ports and opens CAN adapters in
+probes, except `with_slcan`, which sends V and CR to serial ports and opens CAN adapters in
 listen-only mode, so that nothing is sent on their bus. The checks of a configuration open nothing.
 Messages become rows for reading, with units in the names of keys.
 """
@@ -52,7 +52,7 @@ from registry.limits import GuardLimits
 
 
 def in_units(record: Record, values: Values) -> dict[str, Any]:
-    """Return the numbers of a record, and those of its rows, in their units."""
+    """Return the numbers of a record and its rows in their units."""
     rows: dict[str, Any] = {}
     for field in record.fields:
         if isinstance(field, Number):
@@ -63,20 +63,20 @@ def in_units(record: Record, values: Values) -> dict[str, Any]:
 
 
 def names_of_bits(names: Mapping[str, int], value: int) -> list[str]:
-    """Return the names of the bits that are set; of an unknown one its value."""
+    """Return the names of the set bits; for an unknown bit its value."""
     known = {bit: name for name, bit in names.items()}
     return [known.get(bit, f"{1 << bit:#06x}") for bit in bits_of(value)]
 
 
 def capability_rows(capabilities: Values) -> dict[str, Any]:
-    """Return capabilities for reading; features: what is there besides the contract."""
+    """Return capabilities in readable form; features: optional ones."""
     rows = in_units(MESSAGES["GetCaps"].reply, capabilities)
     rows["channel_limits"] = rows.pop("limits")
     return {**rows, "features": names_of_bits(FEATURES, capabilities["features"])}
 
 
 def fault_rows(faults: Values) -> list[dict[str, Any]]:
-    """Return latched and past faults for reading, newest first."""
+    """Return latched and past faults in readable form, newest first."""
     return [
         {
             "fault": name_of(FAULTS, row["fault"]),
@@ -88,7 +88,7 @@ def fault_rows(faults: Values) -> list[dict[str, Any]]:
 
 
 def status_rows(status: Values) -> dict[str, Any]:
-    """Return a status for reading."""
+    """Return a status in readable form."""
     flags = names_of_bits(STATUS_FLAGS, status["flags"])
     others = [name for name in flags if name not in STATUS_FLAGS]
     numbers = {
@@ -113,7 +113,7 @@ def status_rows(status: Values) -> dict[str, Any]:
 
 
 CEILINGS = GuardLimits(FREQUENCY_FLOOR, QUANTITIES["frequency"].high, 1.0)
-"""Limits where no rig states any."""
+"""Limits without a rig."""
 _SESSION = QUANTITIES["session"]
 
 
@@ -137,7 +137,7 @@ async def reached(
 
 @asynccontextmanager
 async def identified(url: str, *, serial_number: str | None = None) -> AsyncIterator[Amplifier]:
-    """Open the line of an amplifier and identify it; what it plays goes on."""
+    """Open the line of an amplifier and identify it; its playback continues."""
     async with reached(url, serial_number=serial_number) as amplifier:
         await amplifier.identify()
         yield amplifier
@@ -157,7 +157,7 @@ def random_session() -> int:
 
 
 def wire_rows(amplifier: Amplifier) -> dict[str, Any]:
-    """Return limits by the wire's speed; empty where that is unknown."""
+    """Return the limits due to the wire's speed; empty if it is unknown."""
     takes = amplifier.exchange_time("Set")
     if not takes:
         return {}
@@ -202,7 +202,7 @@ def candidates() -> list[Candidate]:
 def with_slcan(candidate: Candidate) -> Candidate:
     """Turn a serial port into a CAN adapter if it replies as one.
 
-    Blocks; the module describes what is sent. Its amplifiers are not identified.
+    Blocks; the module docstring lists the bytes sent. Its amplifiers are not identified.
     """
     if not candidate.is_serial:
         return candidate
@@ -292,7 +292,7 @@ def _can_interfaces() -> Iterator[Candidate]:
 
 
 Found = Mapping[str, Values | DriverError]
-"""By URL the identity of the amplifier there, or what is wrong."""
+"""Identity of each amplifier, or its problem, by URL."""
 
 
 async def identify_all(urls: Iterable[str]) -> Found:
@@ -379,7 +379,7 @@ def check_links(
             continue
         other = by_place.setdefault((address.line, address.number), name)
         if other != name:
-            errors[name] = f"URL must be unique, got {url!r}, where amplifier {other} is"
+            errors[name] = f"URL must be unique, got {url!r}, already used by amplifier {other}"
             continue
         addresses[name] = address
     used = {name: address for name, address in addresses.items() if channels.get(name)}
@@ -391,13 +391,13 @@ def check_links(
 
 
 def _ceiling_warnings(limits: GuardLimits) -> list[str]:
-    """Warn of limits beyond what is played whatever the configuration says."""
+    """Warn of limits beyond the fixed range of playback."""
     low, high = limits.frequency_min, limits.frequency_max
     if low >= FREQUENCY_FLOOR and high <= _CEILING:
         return []
     return [
         f"limits.frequency should be within {FREQUENCY_FLOOR:g} to {_CEILING:g} Hz, got {low:g} to "
-        f"{high:g} Hz; frequencies beyond are never played"
+        f"{high:g} Hz; frequencies outside are never played"
     ]
 
 
@@ -424,22 +424,22 @@ def _late_loss_warnings(
     return warnings
 
 
-_ONE_BUS = "one bus for all of them"
+_ONE_BUS = "one bus for all amplifiers"
 _REMEDIES = {
     **dict.fromkeys(("usb-full-speed", "ftdi-low-latency"), f"a high-speed adapter, or {_ONE_BUS}"),
     "ftdi": "the latency timer of the FTDI chip at 1 ms, or a high-speed adapter",
     "can-usb": "an adapter of high speed",
     "ethernet": _ONE_BUS,
 }
-"""What is better than lines of a kind, each its own; nothing much for others."""
+"""Better alternatives to separate lines of a kind."""
 _CLOCKS = "clocks of a smaller clock_error"
 
 
 @dataclass(frozen=True)
 class Arrangement:
-    """Amplifiers with ERAs; lines: over which they are reached; errors: of their clocks, rms [s].
+    """Amplifiers with ERAs, by name; lines: their lines; errors: RMS errors of their clocks [s].
 
-    By name; remedy: how they would be held closer, empty where they are as close as it gets.
+    remedy: how to synchronise them better; empty if that is impossible.
     """
 
     lines: str
@@ -450,10 +450,10 @@ class Arrangement:
 def arrangement_of(
     urls: Mapping[str, str], *, channels: Mapping[str, int], stated: Mapping[str, float]
 ) -> Arrangement | None:
-    """Arrangement of the amplifiers that have ERAs; None of one alone.
+    """Return the arrangement of the amplifiers with ERAs; None for a single one.
 
-    urls, channels: as of `check_links`; stated: of each clock, by how much it may be wrong [s],
-    infinite for one that cannot be steered. URLs that are invalid have no arrangement.
+    urls, channels: see `check_links`; stated: specified error of each clock [s], infinite if it
+    cannot be steered. Invalid URLs have no arrangement.
     """
     addresses: dict[str, WireAddress] = {}
     for name, url in urls.items():

@@ -1,4 +1,4 @@
-"""One amplifier of protocol 4 on any wire: what it was sent, what it replied, and its stops.
+"""One amplifier of protocol 4 on any wire: its requests, replies and stops.
 
 `Amplifier` identifies, arms, plays, silences, disarms and stops one amplifier. It keeps session,
 latch, status and ledger, and raises CommandRefused once replies contradict the requests.
@@ -97,14 +97,14 @@ from registry.limits import GuardLimits
 WATCHDOG = 0.25  # s; five heartbeats of 50 ms
 DISARM_RAMP = 0.05  # s; long enough to avoid a click
 OPEN_TIMEOUT = 0.5  # s; for each reply while an amplifier is opened, also on a busy machine
-_ARM_WITHIN = 3.0  # s; an Arm that is sent later than this after it was asked for is too late
+_ARM_WITHIN = 3.0  # s; an Arm sent later than this after its request is too late
 CONFIRM_TIMEOUT = 0.3  # s; three replies of the slowest wire
 LISTENING = 0.3  # s; how long the host listens for another one if it finds an armed amplifier
 SECOND_REPLY = 0.02  # s; how long it waits for a second amplifier at the same address
 _INTERVAL = 0.005  # s; between two attempts to stop, in addition to the ramp
 _RAMP, _WATCHDOG = QUANTITIES["ramp"], QUANTITIES["watchdog"]
 _ENERGISED = (STATES["SWITCHED_ON"], ENABLED)
-_WIRE_ROUNDING = 0.5  # steps of the wire, beside half a step of the amplifier
+_WIRE_ROUNDING = 0.5  # steps of the wire, in addition to half a step of the amplifier
 MAX_CONTRADICTIONS = 2
 """So many contradictions in a row are a fault; a single one may be a moment between two sets."""
 _SAME_MOMENT = 0.01  # s; contradictions of statuses closer to each other than this count once
@@ -119,7 +119,7 @@ COMMITTING = 0.1
 """Time [s] within which a commit arrives and is carried out."""
 _CHECKED_FOR = 0.005  # s; a check holds for so long unless anything is sent or received
 IsPreempted: TypeAlias = Callable[[], bool]
-"""Tells whether something more urgent waits, so that a set that does not play yet is dropped."""
+"""Whether something more urgent waits, so that a set that does not play yet is dropped."""
 _Checked: TypeAlias = tuple[tuple[LayerSet, ...], list[int]]
 _UNCHECKED: tuple[Sequence[AmplifierLayer] | None, float, float, _Checked] = (
     None,
@@ -133,9 +133,9 @@ _logger = logging.getLogger(__name__)
 class Amplifier:
     """An amplifier on an open line, and the exchanges with it.
 
-    limits: the configured ones. serial_number: the expected one; None for any. is_output: what full
-    level means by the rig: True for the output of a linear amplifier, False for the motion of a
-    stiff source, None for either.
+    limits: configured limits. serial_number: expected serial number; None for any. is_output: the
+    meaning of full level in the rig: True for the output of a linear amplifier, False for the
+    motion of a stiff source, None for either.
     """
 
     def __init__(
@@ -150,7 +150,7 @@ class Amplifier:
     ) -> None:
         self.line, self.address, self.name = line, address, name
         self.capabilities: Values = {}
-        """Values of its capabilities record; empty until it is identified, or if several reply."""
+        """Values of its capabilities record; empty until identified, or if several reply."""
         self.session = 0
         self.may_be_armed = False
         """Whether it may have carried out an Arm of this host since it was last disarmed."""
@@ -167,18 +167,18 @@ class Amplifier:
         self.reported_at: dict[ReportKind, float] = {}
         """When a status last had a report of each kind [s]."""
         self.played_at = -math.inf
-        """When the set that was sent last starts at the soonest, or when silence was sent [s]."""
+        """Earliest start [s] of the last set sent, or the time when silence was sent."""
         self.starts = -math.inf
-        """When the staged set starts if it is committed next [s]; a time in the past: at once."""
-        self._may_wait_until = -math.inf  # s; the last set may start so late by a poor clock
-        self._is_start_known = True  # well enough that statuses can be compared with what was sent
+        """Start time [s] of the staged set if committed next; a time in the past: immediately."""
+        self._may_wait_until = -math.inf  # s; latest start of the last set, with a poor clock
+        self._is_start_known = True  # well enough to compare statuses with the sent sets
         self.committed = 0
         """Token of the set that it committed last; 0 if it committed none since it was armed."""
         self.feeding = Feeding(line.wire.delay, line.wire.is_kept)
         self.known = UNREACHED
-        """What it may play, apart from what its statuses and its watchdog tell."""
+        """Its possible output, apart from the evidence of statuses and watchdog."""
         self.clock = HeldClock()
-        """Its clock, which is held to that of the line."""
+        """Its clock, synchronised with the line's clock."""
         self.counts = LinkStatistics()
         self.exchange_time = cache(self._exchange_time)  # cleared when it is identified
         self.silence_cause: str | None = None
@@ -231,7 +231,7 @@ class Amplifier:
         priority: Priority = Priority.SET,
         is_preempted: IsPreempted | None = None,
     ) -> StagedSet:
-        """Stage a set under a token, or play it at once if `now`.
+        """Stage a set under a token, or play it immediately if `now`.
 
         The ledger admits it when its turn on the line comes, unless it is preempted then. Raises
         CommandRefused with the reason; Preempted if a stop came first; FrameError if two replies in
@@ -257,7 +257,7 @@ class Amplifier:
                 break
         else:
             problem = f"a set with token {token} must be taken, got token {taken['token']}"
-            # This is no refusal: the group stops all amplifiers for it.
+            # This is not a rejection: the group stops all amplifiers.
             raise FrameError(str(contradicted(self.name, problem)))
         if not (taken["played"] or (taken["staged"] and not now and self._admitted is staged)):
             raise Preempted(f"amplifier {self.name}: set {token} was not staged")
@@ -307,7 +307,7 @@ class Amplifier:
         """Play the staged set; returns a future of the status, which shows the tokens.
 
         at: high word of the amplifier's clock at which it starts. The future raises Preempted if a
-        stop or disarm came first, CommandRefused if it is too late for what the ledger admitted.
+        stop or disarm came first, CommandRefused if it is too late for the ledger's admission.
         """
         values = {"session": self.session, "token": token, "at": at}
         return self.line.submit(self, Priority.SET, "Commit", values)
@@ -357,7 +357,7 @@ class Amplifier:
         """Note a request that is sent now; `arrives`: when it arrives [s] unless it is delayed."""
         self._checked = _UNCHECKED
         if name != "Set":  # the reply to a Set shows no clock
-            # What was sent before may be lost, so this may arrive as soon as its bits have passed.
+            # Earlier requests may be lost, so this may arrive as soon as its bits have passed.
             self.clock.sent(name, values, now, now + self.line.wire.takes)
         if name == "Hello":
             return
@@ -399,7 +399,7 @@ class Amplifier:
     def note_reply(self, name: str, values: Values, reply: Values, sent_at: float) -> None:
         """Note the reply to a request that was sent at a time [s].
 
-        Raises CommandRefused if two statuses in a row contradict what was sent.
+        Raises CommandRefused if two consecutive statuses contradict the requests sent.
         """
         now, self._checked = self._time(), _UNCHECKED
         self.counts.last_round_trip = now - sent_at
@@ -420,8 +420,8 @@ class Amplifier:
         ):
             self.latch = latch
         self.status, self.status_at = reply, now
-        # The status of a Commit tells no more than those of heartbeats, except where it may show a
-        # Mark, or that the amplifier is not armed any more.
+        # The status of a Commit adds nothing to those of heartbeats, unless it may show a Mark, or
+        # that the amplifier is no longer armed.
         if name != "Commit" or len(self.line.members) > 1 or reply["state"] != ENABLED:
             self.clock.replied(name, values, reply, now)
         for kind in reports_of(reply, self.clock.problem(now)):
@@ -494,18 +494,18 @@ class Amplifier:
         return min(_RAMP.to_wire(min(max(ramp, 0.0), _RAMP.high)), int(highest))
 
     def is_silent(self, status: Values) -> bool:
-        """Whether a status shows the levels of all channels, and all of them are zero."""
+        """Whether a status shows the levels of all channels, all zero."""
         known = self.capabilities.get("channels")
         return known == len(status["levels"]) and not any(status["levels"])
 
     def what_may_play(self, cause: str = "") -> StopOutcome:
-        """Return until when it may play, by all that is known of it.
+        """Return how long it may still play.
 
-        cause: why no more is known; by default the reason why it is mute, or its line lost. An
-        amplifier that confirmed a stop, and was sent neither Clear nor Arm since, is silent. Else
-        the watchdog ends what plays; one that was never fed is silent once a status has shown it.
-        If it plays although it has confirmed silence, or although its watchdog must have silenced
-        it, another host feeds it or it is broken: then nothing is known to silence it.
+        cause: why its state is unknown; by default the reason why it is mute or its line lost. An
+        amplifier that confirmed a stop, and received neither Clear nor Arm since, is silent.
+        Otherwise the watchdog ends playback; an amplifier never fed is silent once a status has
+        shown it. If it plays although it has confirmed silence, or although its watchdog must have
+        silenced it, another host feeds it or it is broken: nothing is certain to silence it.
         """
         status, at, until = self.status, self.status_at, self.known.may_play_until
         if not self.known.is_confirmed:
@@ -533,7 +533,7 @@ class Amplifier:
             self._admitted = None
 
     def go_on_from(self, before: "Amplifier") -> None:
-        """Adopt what was known of the same amplifier before its line was opened again."""
+        """Adopt the state of the same amplifier from before its line was reopened."""
         self.known = replace(before.what_may_play(), is_confirmed=before.known.is_confirmed)
         self.may_be_armed = before.may_be_armed
 
@@ -551,8 +551,8 @@ class Amplifier:
     async def identify(self, *, timeout: float = OPEN_TIMEOUT) -> Values:
         """Read identity and capabilities, and return the status; raises LinkError.
 
-        timeout: for each reply [s]. The newest latch is then that of this status, since the
-        amplifier may have lost its supply before.
+        timeout: for each reply [s]. The newest latch is then the one in this status, because the
+        amplifier may have lost power before.
         """
         self._are_several = False
         try:
@@ -562,7 +562,7 @@ class Amplifier:
             self._check_alone()
             raise
         self._check_alone()
-        # Until it is identified it may be another amplifier, whose silence confirms nothing.
+        # Until identified, it may be another amplifier, whose silence confirms nothing.
         shown, self.capabilities = self.capabilities, {}
         check_identity(identity, self.name, self._serial_number)
         self.capabilities = shown
@@ -581,7 +581,7 @@ class Amplifier:
         return await self.read_status()
 
     def _check_alone(self) -> None:
-        """Raise LinkError if several amplifiers replied: the silence of one confirms nothing."""
+        """Raise LinkError if several amplifiers replied: silence of one confirms nothing."""
         if self._are_several:
             self.capabilities = {}
             raise WrongAmplifier(
@@ -592,7 +592,7 @@ class Amplifier:
     def arm(self, session: int, watchdog: float = WATCHDOG) -> Coroutine[Any, Any, Values]:
         """Switch the high voltage on at level zero, and return the status; watchdog [s].
 
-        The amplifier is identified anew, since it may have lost its supply and come back with other
+        Identifies the amplifier again, because it may have lost power and returned with other
         limits. A stop or disarm that comes after this call goes first, even before it is awaited.
         """
         self.arming = self.silences, threads.now() + _ARM_WITHIN
@@ -628,7 +628,7 @@ class Amplifier:
         return status
 
     async def read_achieved(self, one: LayerSet, token: int) -> LayerSet:
-        """Read what the amplifier plays of a layer of the set with this token.
+        """Read how the amplifier plays a layer of the set with this token.
 
         The ledger uses the result from then on. A layer that continues an earlier set is returned
         as it was sent. Raises CommandRefused if the amplifier contradicts two sets in a row.
@@ -691,7 +691,7 @@ class Amplifier:
     async def clear(self) -> Values:
         """Acknowledge the newest stop or fault that the amplifier has shown.
 
-        The amplifier is identified anew: if it has lost its supply it counts latches from 1 again.
+        Identifies the amplifier again: after a loss of power it counts latches from 1.
         """
         before, shown = self.silences, self.latch
         status = await self.identify(timeout=REPLY_TIMEOUT)
@@ -747,7 +747,7 @@ class Amplifier:
                                 return self.known
                             await asyncio.sleep(_INTERVAL)
                             status = await self.read_status(Priority.STOP)
-                    except Exception as error:  # the stop goes on, whatever has failed
+                    except Exception as error:  # the stop continues after any failure
                         cause = str(error) or type(error).__name__
                     await asyncio.sleep(pause)
         except TimeoutError:

@@ -1,13 +1,13 @@
-"""Limits of one amplifier, and how close a set comes to them in the worst case.
+"""Limits of one amplifier, and the worst case of a set relative to them.
 
 `wire_limits` combines the limits of the rig, the amplifier, its channels and this module to the
-least of each. `Rounding` turns layers into integers of the wire: levels, frequencies and phases to
-the nearest step, ramps upward, and `valid_for` never to 0, which would mean without end. It refuses
-what the wire cannot carry or the limits forbid. `Budget` keeps rate, on-time and duty.
+lowest of each. `Rounding` converts layers to wire integers: levels, frequencies and phases to the
+nearest step, ramps upward, and `valid_for` never to 0, which would mean endless. It rejects values
+that the wire cannot carry or the limits forbid. `Budget` enforces rate, on-time and duty.
 
 `Bounds` gives the largest level, power and rise over all layers. A set starts at an unknown moment
-within the next tenth of a second, so the voices are those of `drivers.playing` after a commit that
-is so uncertain. The magnitude of an amplitude that moves along a straight line in the complex plane
+within the next tenth of a second, so the voices are taken from `drivers.playing` after a
+commit with that uncertainty. The magnitude of an amplitude moving on a line in the complex plane
 is a convex function; therefore sums are largest where each transition is at one of its points.
 """
 
@@ -48,11 +48,11 @@ class _Course(NamedTuple):
 
     voice: Voice
     starts: Sequence[complex]
-    """Amplitudes from which it may set out."""
+    """Possible starting amplitudes."""
     sets: Sequence[LayerSet] = ()
     """Sets of its layer; empty once the voice has ended."""
     is_new: bool = True
-    """Whether one of these sets changes it."""
+    """Whether any of these sets changes it."""
     is_late: bool = False
     """Whether that set waits for another one to end."""
     goes_on: bool = False
@@ -149,7 +149,7 @@ class Bounds:
         return [*map(max, levels)], power
 
     def rise(self, channel: int) -> float:
-        """Return the steepest rise of a level [full levels/s]; voices of one frequency may beat."""
+        """Return the steepest rise of a level [full levels/s]; equal frequencies may beat."""
         rises: dict[float, list[tuple[float, float]]] = {}  # by frequency: rise, change
         for course in self._courses[channel]:
             of_voice = rises.setdefault(course.voice.frequency, [])
@@ -207,7 +207,7 @@ def _of_several_ways(ways: Sequence[VoiceTransition], times: Sequence[float]) ->
 
 
 def _steepest_of(starts: Sequence[complex], way: VoiceTransition) -> tuple[float, float]:
-    """Return the steepest rise and the fastest change along a way from any of these amplitudes."""
+    """Return the steepest rise and the fastest change of a transition from these amplitudes."""
     course = (*way.knots, way.last)
     ways = (*product(starts, course[:1]), *pairwise(course))
     return steepest(ways, way.step, is_cosine=not way.knots)
@@ -230,9 +230,9 @@ VibrationSpan: TypeAlias = tuple[float | None, float]
 
 @dataclass(frozen=True, slots=True)
 class WireLimits:
-    """What a set may contain: frequencies and levels in integers of the wire, slew, and power.
+    """Limits of a set: frequencies and levels in wire integers, slew, and power.
 
-    slew and power are those of `GuardLimits`.
+    slew and power: see `GuardLimits`.
     """
 
     frequency_min: int
@@ -243,10 +243,10 @@ class WireLimits:
 
 
 def wire_limits(configured: GuardLimits, capabilities: Values) -> WireLimits:
-    """Combine configured limits with those of an amplifier and its channels.
+    """Combine configured limits with the limits of an amplifier and its channels.
 
-    If the channels differ, the least limit holds for all of them, since a pattern needs all. Raises
-    CommandError for limits that are no numbers, or that leave nothing to play.
+    If the channels differ, the lowest limit applies to all, because a pattern needs all channels.
+    Raises CommandError for non-numeric limits, or limits that leave nothing to play.
     """
     for name in ("frequency_min", "frequency_max", "level"):
         if not math.isfinite(value := getattr(configured, name)):
@@ -289,7 +289,7 @@ def _whole_steps(value: float, quantity: WireQuantity) -> int:
 
 
 TOLERANCE = 1 + 1e-9
-"""Factor by which a sum of floats may exceed a limit."""
+"""Tolerance factor of a limit for rounding of sums."""
 _LEVEL, _PHASE = QUANTITIES["level"], QUANTITIES["phase"]
 _RAMP, _VALID_FOR = QUANTITIES["ramp"], QUANTITIES["valid_for"]
 _FREQUENCY = QUANTITIES["frequency"]

@@ -1,24 +1,24 @@
-"""The clock of one amplifier: how the host reads and steers it, and what its statuses report.
+"""The clock of one amplifier: reading and steering it, and the reports in statuses.
 
 Reading. An amplifier reads its clock for a Status between the last bit of the request and the first
-bit of the reply. The *lead* of a reading is what the clock shows less the time at which the request
-arrives at the soonest. USB frames, other traffic and operating systems delay a request and never
+bit of the reply. The *lead* of a reading is the clock's value minus the earliest arrival of the
+request. USB frames, other traffic and operating systems delay a request and never
 speed it up, so a reading shows at least the true lead, and the lowest readings are nearly right.
-The way back, with its latency timers, plays no part. The time that counts is divided into parts of
-at most a quarter of a second, the lowest reading of each part is kept, and a line is fitted by
-least squares to the lower half of these. (The lowest readings alone are best where frames delay
-requests; their mean is best where the operating system does.) Readings above the line show how late
-they may be. The shift and rate that the host has sent are subtracted before, so that steering does
-not feed back into the measurement.
+The way back, with its latency timers, has no influence. The time window is divided into parts of at
+most a quarter of a second, the lowest reading of each part is kept, and a line is fitted by least
+squares to the lower half of these. (The lowest readings alone are best if frames delay requests;
+their mean is best if the operating system does.) Readings above the line show the possible delay.
+The shift and rate sent by the host are subtracted first, so that steering does not feed back into
+the measurement.
 
 Steering. The shift is sent with Arm, to the nearest step of 305 us. The rate is sent with each
 Ping: it cancels the rate of the crystal and leads the remaining lead to zero, fast while nothing
 plays, and otherwise too slowly to be felt. A clock that cannot be steered or trusted has an
 infinite error, and stops nothing.
 
-Comparing. At a Mark all amplifiers of a line note their clocks at the same byte, whatever delays
-it, so the differences between the clocks are known as exactly as the amplifiers state them. One
-clock of the line is held to the host's, and the others are held to that one.
+Comparing. At a Mark all amplifiers of a line record their clocks at the same byte, independent of
+its delay, so the differences between the clocks are as accurate as the amplifiers specify. One
+clock of the line follows the host's clock, and the others follow that one.
 """
 
 import math
@@ -42,15 +42,15 @@ from drivers.protocol.definition import (
 )
 from drivers.protocol.records import Values
 
-_HOT = 70.0  # °C; a hotter amplifier is reported, and stops itself with a fault if it must
+_HOT = 70.0  # °C; a hotter amplifier is reported, and stops itself with a fault if necessary
 REPORT_LIFE = 10.0
-"""How long a report is shown after the last status that had it [s]."""
+"""Time for which a report is shown after the last status with it [s]."""
 _PER_DEGREE = QUANTITIES["temperature"].per_unit
 _LIMITED, _OPEN = 1 << STATUS_FLAGS["limited"], 1 << STATUS_FLAGS["interlock_open"]
 _HIGH_VOLTAGE = 1 << STATUS_FLAGS["high_voltage"]
 
 CLOCK_SETTLING = 3.0
-"""Time within which a clock must follow [s]; one that has jumped is not trusted for as long."""
+"""Time within which a clock must follow [s]; a clock that jumped is distrusted for as long."""
 MAX_CLOCK_RATE = 2e-4
 """Largest rate of a crystal against the host's; a faster or slower one is broken."""
 
@@ -68,29 +68,29 @@ REPORTS: dict[ReportKind, tuple[str, str]] = {
         "let it cool, and check its fan and its load; it may play less, or stop with a fault",
     ),
     "clock_not_steered": (
-        "its clock cannot be steered: its ERAs are not held together with those of others",
-        "update its firmware, or exchange it",
+        "its clock cannot be steered: its ERAs are not synchronised with those of others",
+        "update its firmware, or replace it",
     ),
     "clock_jumped": (
-        "its clock jumps, stands still, has a wrong rate, or is read wrong by more than it states",
-        "check its clock and clock_error: era amp conformance; beside others less is promised",
+        "its clock jumps, stops, has a wrong rate, or has a larger reading error than specified",
+        "check its clock and clock_error: era amp conformance; with others less is promised",
     ),
     "clock_rate": (
         f"its clock is more than {MAX_CLOCK_RATE * 1e6:g} ppm too fast or too slow",
-        "check its crystal, and what its clock counts; less is promised meanwhile",
+        "check its crystal and its clock's units; less is promised meanwhile",
     ),
     "clock_unsettled": (
         f"its clock does not follow the host's within {CLOCK_SETTLING:g} s",
         "check that it obeys shift and rate: era amp conformance; less is promised meanwhile",
     ),
 }
-"""Cause and remedy of each kind of report: what a status shows that is no fault."""
+"""Cause and remedy of each kind of report: a condition in a status that is not a fault."""
 
 
 def reports_of(status: Values, of_clock: ClockProblem | None = None) -> Sequence[ReportKind]:
     """Return the kinds of reports of a status; of_clock: the problem of its clock.
 
-    It makes few calls, since it runs with every heartbeat.
+    Makes few calls, because it runs with every heartbeat.
     """
     kinds: list[ReportKind] = [] if of_clock is None else [of_clock]
     if status["flags"] & _LIMITED:
@@ -103,10 +103,10 @@ def reports_of(status: Values, of_clock: ClockProblem | None = None) -> Sequence
 
 
 def armed_problem(status: Values, latch: int | None) -> str | None:
-    """Say what a status shows that no armed amplifier may report; None if nothing.
+    """Describe a value in a status that an armed amplifier must not report; None without one.
 
-    latch: the one in the reply to Arm, or None before that; a newer stop or fault would have
-    disarmed the amplifier.
+    latch: from the reply to Arm, or None before that; a newer stop or fault would have disarmed the
+    amplifier.
     """
     if not status["flags"] & _HIGH_VOLTAGE:
         return "high voltage must be on, got off"
@@ -120,45 +120,45 @@ def armed_problem(status: Values, latch: int | None) -> str | None:
 
 
 _WINDOW = 8.0
-"""Readings count for so long [s]: fewer are noisier, and over longer a warming crystal bends."""
+"""Time window of readings [s]: fewer are noisier; over a longer time a warming crystal drifts."""
 _PARTS, _MIN_PART = 32, 2.0**-8
-"""Parts of that time, of each of which the lowest reading is kept; shortest length of one [s]."""
+"""Parts of that window, with one reading kept per part; shortest length of a part [s]."""
 _MARKED = 1.0
-"""Marks count for so long [s] where clocks are compared: over more a crystal bends."""
+"""Time window of Marks [s] for comparing clocks: over a longer time a crystal drifts."""
 _AGREEING = 3
-"""Fewest Marks by which clocks are compared: of two that differ, either may be false."""
+"""Minimum number of Marks for a comparison: if only two differ, either can be false."""
 _ROUNDS = 3
-"""How often a line is fitted and the readings that it goes through are chosen anew."""
+"""Iterations of fitting a line and selecting the readings it passes through."""
 _RECENT = 8
-"""Latest readings. The line may be wrong by as much as all of these lie above it; where they lie
-far above it, the clock was moved."""
+"""Number of latest readings. The line may be wrong by as much as all of them are above it; if they
+are far above it, the clock was moved."""
 _BULK, _FAR_OUT = 64, 2.0
-"""Latest readings of any height. Without the highest and lowest eighth of them they span a height;
-readings that lie further below them than so many times that height are few and doubtful."""
+"""Number of latest readings, and factor of their range without the highest and lowest eighth;
+readings further below them than this multiple of the range are few and doubtful."""
 _ERRORS = 1.4
 """Factor of a standard error, from a simulation: the lowest of several readings are correlated."""
 _EXPECTED_RATE = 50e-6
-"""Expected rate of a crystal against the host's; a greater one must be measured well."""
+"""Expected rate of a crystal relative to the host's; a larger rate needs a good measurement."""
 _MAX_CRYSTAL = 0.01
-"""Rate that no oscillator has: beyond it a clock stands still, or runs backwards."""
+"""Rate impossible for an oscillator: beyond it, a clock has stopped or runs backwards."""
 _EXPECTED_BEND = 2e-7
 """Half of the expected change of a crystal's rate [1/s] while it warms up."""
 _LEAST = 5e-7
-"""Least error [s] of a reading, and of the time that this process reads."""
+"""Minimum error [s] of a reading, and of the time that this process reads."""
 _FAR, _FAR_ERRORS = 100e-6, 10.0
 """A reading that is further off, in seconds plus standard errors, shows a clock that was moved."""
 _TOO_FAST = 1e-3
-"""What a clock may gain [s] beside its crystal, since readings are a little wrong."""
+"""Tolerance [s] of a clock's gain beyond its crystal, due to reading errors."""
 _GENTLE = 0.5, 1e-4
-"""Time [s] in which an error is led to zero, and the highest rate for it, which is not felt."""
+"""Time [s] in which an error is steered to zero, and the maximum rate, which is not felt."""
 _FAST = 0.2, 2.8e-3
 """The same while nothing plays: four Pings, since lost ones would overshoot; a Ping's highest."""
 _TOGETHER = 0.5, 5e-4
-"""The same of all clocks of a line, whose Pings go one after another: faster they would part."""
+"""The same for all clocks of a line, whose Pings are sequential: faster they would diverge."""
 _NEAR = 20e-6
-"""A clock is led to zero where it is within so much [s], or within its error."""
+"""A clock is steered to zero within this error [s], or within its own error."""
 _SURELY = 4.0
-"""Standard errors beyond which a difference is no chance."""
+"""Number of standard errors beyond which a difference is significant."""
 _STEP = CLOCK_TURN / SPAN
 """Step [s] of a clock on the wire."""
 _PER_RATE, _PER_ERROR = QUANTITIES["rate"].per_unit, QUANTITIES["clock_error"].per_unit
@@ -197,15 +197,15 @@ class HeldClock:
         self.identified(CLOCK_UNKNOWN, bits=0.0)
         self._promptest = math.inf  # s; the shortest exchange, less its bits
         self.is_alone = True
-        """Whether there is no other clock to hold it together with; then it is hardly read."""
-        self._other: HeldClock | None = None  # the clock that it is held to, see `compare`
-        self._is_first = False  # whether others are held to it
+        """Whether there is no other clock to synchronise with; then it is rarely read."""
+        self._other: HeldClock | None = None  # the clock it follows, see `compare`
+        self._is_first = False  # whether others follow it
         self._pace = 0.0  # s/s; by the rate of the last Ping
         # When the request for a Status was sent, and when it arrives at the soonest [s].
         self._requested = 0.0, 0.0
-        # What a clock that is alone has shown last, and the times [s] between which it did.
+        # Last value of a clock that is alone, and the times [s] around its reading.
         self._shown = 0, -math.inf, 0.0
-        self._marks = 0  # sent since the last Status; the next one may show any of them
+        self._marks = 0  # sent since the last Status; the next Status can show any of them
         # When the first and the last Ping without reply arrive [s]; None without one.
         self._pinged: tuple[float, float] | None = None
         self._arming = 0  # the shift of an Arm that has no reply yet
@@ -274,11 +274,11 @@ class HeldClock:
         return math.inf if self._is_doubted else self._seen(time).error
 
     def error(self, time: float, *, off: float | None = None, is_common: bool = False) -> float:
-        """Return its error [s rms], which includes what the amplifier states; infinite if unknown.
+        """Return its error [s rms], including the amplifier's specified error; infinite if unknown.
 
-        off: how far it is ahead of the others [s]; None: of the host's clock. This counts only
-        while it is armed, since it is led to zero. is_common: whether the error is wanted against
-        others of its line that are held to the same clock.
+        off: its lead over the others [s]; None: over the host's clock. This counts only while it is
+        armed, because it is steered to zero. is_common: whether the error is relative to others of
+        its line that follow the same clock.
         """
         if not self.can_be_steered or self.problem(time) in ("clock_jumped", "clock_unsettled"):
             return math.inf
@@ -289,7 +289,7 @@ class HeldClock:
         return math.hypot(self.stated / _PER_ERROR / math.sqrt(3), seen, lead)
 
     def problem(self, time: float) -> ClockProblem | None:
-        """Return what is wrong with it at a time [s]; None if nothing is."""
+        """Return its problem at a time [s]; None if it is fine."""
         has_jumped = time - self._jumped_at < CLOCK_SETTLING
         if self.is_alone:
             return "clock_jumped" if has_jumped else None
@@ -377,11 +377,11 @@ class HeldClock:
             lead = self._read(status["clock"], time, time - sent, late, is_reported=is_reported)
             if is_kept and marks:
                 self._compare(time, lead)
-            if not is_kept:  # this reading stands only until the first one that counts
+            if not is_kept:  # this reading is used only until the first valid one
                 self._lowest.clear()
         if name == "Ping" or not self._is_armed:
             pace = values["rate"] / _PER_RATE if self._is_armed else 0.0
-            since = sum(self._pinged or (time, time)) / 2  # any of them may be the first heard
+            since = sum(self._pinged or (time, time)) / 2  # any of them may be the first to arrive
             self._added += (self._pace - pace) * since
             self._pace, self._pinged = pace, None
 
@@ -460,8 +460,8 @@ class HeldClock:
         self._marked[time] = lead
         others = {} if self._other is None else self._other._marked
         both = [(at, each - others[at]) for at, each in self._marked.items() if at in others]
-        # If a Mark or the reply that showed it was lost, the clock of another moment is shown. Only
-        # differences near the median count.
+        # If a Mark or its reply was lost, the clock of another moment is shown. Only differences
+        # near the median count.
         rate, near = self._beside.rate, _NEAR + 2 * self.stated / _PER_ERROR
         level, middle = median_low([(each - rate * at, at) for at, each in both] or [(0.0, time)])
         both = [
@@ -516,7 +516,7 @@ class HeldClock:
             warp = (curve - bend * error / _EXPECTED_BEND**2) / wide
             rate, bend = rate + tilt + 2 * warp * middle, bend + warp
             lead = mean + tilt * middle + warp * square
-        # Readings may lie on a line by chance; the next one above it shows how late they may be.
+        # Readings can be on a line by chance; the next one above it shows their possible delay.
         scatter = (above[min(count, len(aged) - 1)][0] - mean) ** 2 + least
         errors = _ERRORS + min(_RECENT / len(aged), 1.0)
         rate_error = errors * math.sqrt(scatter * (1 / breadth + (2 * middle) ** 2 / wide))
@@ -525,13 +525,13 @@ class HeldClock:
             (high + (rate - bend * age) * age - lead, late - self._promptest - self._bits)
             for age, high, late in aged[-_RECENT:]
         ]
-        # If even the recent readings that cannot be late lie far above the line, the clock was
+        # If even the recent readings that cannot be late are far above the line, the clock was
         # moved, and the older readings are dropped.
         if min([off - late for off, late in recent]) > _FAR / 2:
             del self._lowest[:-_RECENT]
         error = max(error, min(recent)[0])
-        # A few readings far below most: either most are late, or the few are wrong. The line goes
-        # through the middle, and its error includes half the gap.
+        # A few readings far below most: either most are late, or the few are wrong. The line
+        # passes through the middle, and its error includes half the gap.
         bulk = sorted([each + (rate - bend * (time - at)) * (time - at) for at, each in self._all])
         eighth = len(bulk) // 8
         low, high = above[0][0], bulk[eighth]

@@ -1,12 +1,13 @@
 """All amplifiers of a plate: they play together or not at all, and their watchdogs are fed here.
 
-`Group` holds the state of all amplifiers: a failure of one stops all, and nothing arms by itself.
+`Group` holds the state of all amplifiers: a failure of one stops all, and nothing arms
+automatically.
 
-`Heartbeats` alone decides which amplifier is fed, when, and by which request. A status that is read
-just before a heartbeat shows that the watchdog runs down, and so would silence its amplifier. Such
-a status is read five times a second, less often on a slow wire or where replies come late. Where
-replies are so late that one exchange takes a third of a watchdog, all amplifiers of a line are fed
-before each request to one of them.
+Only `Heartbeats` decides which amplifier is fed, when, and by which request. A status read just
+before a heartbeat shows that the watchdog is running down, and so would silence its amplifier. Such
+a status is read five times a second, less often on a slow wire or with late replies. If replies are
+so late that one exchange takes a third of a watchdog, all amplifiers of a line are fed before each
+request on that line.
 """
 
 import asyncio
@@ -47,10 +48,10 @@ from registry import threads
 
 _STATUS_INTERVAL = 0.19  # s; at least, between two statuses that show whether the watchdog runs
 _MAX_STATUS_LOAD = 0.05  # share of the line's time that these statuses may take
-_UNFED = 1.5 * HEARTBEAT  # s; longest time without feeding, beside a set to each amplifier
+_UNFED = 1.5 * HEARTBEAT  # s; longest time without feeding, in addition to a set to each amplifier
 
 Feed: TypeAlias = Callable[[], Awaitable[object]]
-"""A function that sends the request by which an amplifier is fed."""
+"""A function that sends the request that feeds an amplifier."""
 
 
 class Heartbeats:
@@ -65,7 +66,7 @@ class Heartbeats:
         self._readings: dict[Amplifier, asyncio.Future[Values]] = {}  # of mute amplifiers
 
     def follow(self) -> None:
-        """Have all amplifiers of each shared line fed before a set to one of them."""
+        """Make each shared line feed all its amplifiers before a set to one of them."""
         every = self._members.amplifiers.values()
         for line in self._members.lines:
             of_line = [each for each in every if each.line is line]
@@ -85,7 +86,7 @@ class Heartbeats:
         mute: set[Line] = set()
         for each in self._members.by_need:
             if (each.silence_cause or each.line.loss) and is_lost(each):
-                # This is raised before the others are awaited, so that they are stopped at once.
+                # Raised before awaiting the others, so that they are stopped immediately.
                 raise LinkTimeout(each.line.loss or each.silence_cause)
             by_line.setdefault(each.line, []).append(each)
             if each.silence_cause is not None:
@@ -151,11 +152,11 @@ class Heartbeats:
     def _ahead(
         self, line: Line, of_line: Sequence[Amplifier], name: str, priority: Priority
     ) -> Make | None:
-        """Return what feeds all amplifiers of a line before a request to one; None if not needed.
+        """Return a function that feeds a line before a request to an amplifier; None if not needed.
 
-        It is needed if one of them was surely fed only long ago. It commits the newest token again,
-        which changes nothing on those that have committed it, and is due on the others anyway.
-        Nothing is fed before a status, which would then not show how a watchdog runs down.
+        Needed if the last certain feeding of an amplifier was long ago. It commits the newest token
+        again, which changes nothing on amplifiers that have committed it, and is due on the others
+        anyway. Nothing is fed before a status, which would then not show the watchdog running down.
         """
         if priority not in (Priority.HEARTBEAT, Priority.SET) or name == "GetStatus":
             return None
@@ -203,12 +204,12 @@ class GroupState(Enum):
 
 
 class Group:
-    """Amplifiers by name, on open lines. A failure of one stops all; nothing arms by itself.
+    """Amplifiers by name, on open lines. A failure of one stops all; nothing arms automatically.
 
     A stop runs to completion even if its caller is cancelled. watchdog: of armed amplifiers [s].
-    restored: is called when an amplifier that did not reply does so again; its watchdog has run
-    down meanwhile. draw: draws session numbers and the first token at random, so that those of an
-    earlier host are not repeated.
+    restored: called when a mute amplifier replies again; its watchdog has run down meanwhile.
+    draw: draws random session numbers and the first token, so that values of an earlier host are
+    not repeated.
     """
 
     def __init__(
@@ -221,10 +222,10 @@ class Group:
     ) -> None:
         self.state = GroupState.CLOSED
         self.members = Members(amplifiers)
-        """Knows which amplifiers reply, and which are lost."""
+        """Tracks which amplifiers reply, and which are lost."""
         self.amplifiers = self.members.amplifiers
         self.sets = JointSets(self.members, draw(_TOKEN.minimum, _TOKEN.maximum))
-        """Lets them play together."""
+        """Makes them play together."""
         self._clocks = Clocks(self.members)
         self._heartbeats = Heartbeats(self.members, self.sets, self._clocks, restored)
         self._watchdog, self._draw = watchdog, draw
@@ -274,10 +275,10 @@ class Group:
         async with self._arming:
             if not self.is_open:
                 raise CommandError(
-                    f"amplifiers must be open to be armed, got {self.state.name}; close and open "
-                    "all of them again"
+                    f"amplifiers must be open to be armed, got {self.state.name}; close and reopen "
+                    "all amplifiers"
                 )
-            if self.state is GroupState.STOPPED:  # an amplifier that restarted has forgotten it
+            if self.state is GroupState.STOPPED:  # a restarted amplifier has lost its latch
                 raise CommandRefused("a stop must be cleared before arming; clear, then arm again")
             if members.silencing:  # otherwise the order of frames would decide the result
                 raise CommandRefused(
@@ -313,7 +314,7 @@ class Group:
                 await members.silence(self._disarm_armed, arming)
                 if isinstance(error, DriverError):
                     members.check_none_since(before)
-                self._note(error)  # only now: one that has replied to the disarm is not lost
+                self._note(error)  # only now: an amplifier that replied to the disarm is not lost
                 if members.is_degraded_only(error):
                     raise LinkDegraded(str(error)) from error
                 if members.lost_by:
@@ -355,8 +356,8 @@ class Group:
         Raises Preempted if a stop, disarm or `abort_exchange` came first, and LinkDegraded if an
         amplifier does not reply, so that it is unknown whether the set plays. Any other failure
         stops all amplifiers before it is raised.
-        is_preempted: is asked before a set is sent, and again before it is committed; if it returns
-        True, Overtaken is raised and what plays goes on.
+        is_preempted: called before a set is sent, and again before it is committed; if it returns
+        True, Overtaken is raised and the current playback continues.
         """
         return self._exchange(partial(self.sets.play, layers, is_preempted))
 
@@ -431,8 +432,8 @@ class Group:
     ) -> Coroutine[Any, Any, Mapping[str, StopOutcome]]:
         """Stop every amplifier along a ramp [s], lost ones too; latched until `clear`.
 
-        The requests are queued when this returns. It is awaited for the outcome of each amplifier
-        by name; waits_for: the names of those that are awaited, None for all. It runs to completion
+        The requests are queued when this returns. Await it for the outcome of each amplifier by
+        name; waits_for: names of the amplifiers to await, None for all. It runs to completion even
         if its caller is cancelled.
         """
         self._leave_armed()
@@ -440,22 +441,22 @@ class Group:
             self.state = GroupState.STOPPED
         members, stops = self.members, dict[str, asyncio.Future[StopOutcome]]()
         for line in members.lines:
-            if len(line.members) > 1:  # so that none waits for the reply of another
+            if len(line.members) > 1:  # so that no amplifier waits for the reply of another
                 try:
                     members.broadcast_stop(line, ramp)
-                except Exception:  # each amplifier is also stopped by a request of its own
+                except Exception:  # each amplifier is also stopped by its own request
                     _logger.exception("%s: the broadcast of a stop failed", line.name)
         for name, amplifier in self.amplifiers.items():
             try:
                 stops[name] = amplifier.stop(ramp)
-            except Exception as error:  # the others are stopped all the same
+            except Exception as error:  # the others are still stopped
                 stops[name] = asyncio.get_running_loop().create_future()
                 stops[name].set_exception(error)
         names = stops if waits_for is None else waits_for
         return members.silence(members.stopped, {name: stops[name] for name in names})
 
     async def clear(self) -> None:
-        """Acknowledge stops, and faults whose cause has gone.
+        """Acknowledge stops, and faults that no longer exist.
 
         Raises Preempted while amplifiers are being stopped or disarmed.
         """
@@ -468,7 +469,7 @@ class Group:
             await self.stop()
             raise
         except CommandRefused as error:
-            if self.members.epoch != before:  # the stop of now is another one
+            if self.members.epoch != before:  # there is a newer stop
                 raise Preempted("a stop came first; find the cause, then clear again") from error
             raise
         if self.members.epoch == before and self.state is GroupState.STOPPED:
@@ -521,7 +522,7 @@ class Group:
             self.state = GroupState.DISARMED
 
     def _lose(self) -> None:
-        """Enter the state LOST, in which nothing is played."""
+        """Enter the state LOST, which plays nothing."""
         if self.state is not GroupState.CLOSED:
             self.state = GroupState.LOST
 

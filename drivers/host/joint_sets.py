@@ -3,16 +3,16 @@
 A set is staged on all amplifiers that it names, and then committed on all or on none: by one
 broadcast if they share a line, or on several lines for a moment that leaves enough time for the
 slowest line. A set for one amplifier plays with its last part. A token is newer than another one if
-it is ahead by less than half of 2^16 (RFC 1982); so an amplifier that was left out of 40 000 sets
-would take the next one for an old one. It commits an empty set before that.
+it is ahead by less than half of 2^16 (RFC 1982); so an amplifier left out of 40 000 sets would
+mistake the next one for an old set. It commits an empty set before that.
 
-`Members` tells which amplifiers reply and which are lost, and which of several errors counts. Stops
-and disarms begin at once and run to completion.
+`Members` tracks which amplifiers reply and which are lost, and selects the most severe of several
+errors. Stops and disarms start immediately and run to completion.
 
-`Clocks` compares the clocks of all amplifiers. Where heartbeats do not show them well enough, as on
-full-speed USB or in a busy network, it reads statuses between the heartbeats, less often the better
-a clock is known; any other request preempts these. On a line that several amplifiers share, a Mark
-makes all of them note the clock at the same byte.
+`Clocks` compares the clocks of all amplifiers. If heartbeats do not measure them well enough, for
+instance on full-speed USB or a busy network, it reads statuses between the heartbeats, less often
+for well-known clocks; any other request preempts these. On a line shared by several amplifiers, a
+Mark makes all of them record the clock at the same byte.
 """
 
 import asyncio
@@ -76,12 +76,12 @@ class Members:
 
     @property
     def lines(self) -> tuple[Line, ...]:
-        """Each of their lines once, in the order of the amplifiers: so runs are reproducible."""
+        """Each line once, in the order of the amplifiers, so that runs are reproducible."""
         return tuple(dict.fromkeys([each.line for each in self.amplifiers.values()]))
 
     @property
     def by_need(self) -> list[Amplifier]:
-        """All amplifiers; the one that was fed longest ago is first, since replies may be late."""
+        """All amplifiers; the least recently fed is first, because replies may be late."""
         return sorted(self.amplifiers.values(), key=need)
 
     @property
@@ -119,7 +119,7 @@ class Members:
             )
 
     def is_degraded_only(self, error: BaseException) -> bool:
-        """Whether an error only says that an amplifier does not reply for the moment."""
+        """Whether an error only means that an amplifier currently does not reply."""
         return isinstance(error, LinkTimeout) and not self.lost_by
 
     async def all(self, requests: Sequence[Awaitable[_T]]) -> list[_T]:
@@ -138,12 +138,12 @@ class Members:
     def _severity(self, error: BaseException) -> int:
         if self.is_degraded_only(error):
             return 3
-        if isinstance(error, Preempted):  # what preempted it is the error that people should see
+        if isinstance(error, Preempted):  # the user should see the error that preempted it
             return 2
         return 0 if isinstance(error, LinkError) else 1
 
     async def retried(self, amplifier: Amplifier, request: Callable[[], Awaitable[_T]]) -> _T:
-        """Repeat a request until it is answered, the amplifier is lost, or all is being closed."""
+        """Repeat a request until it has a reply, the amplifier is lost, or everything is closed."""
         while True:
             try:
                 return await request()
@@ -155,8 +155,8 @@ class Members:
     def silence(
         self, work: Callable[_P, Coroutine[Any, Any, _T]], *args: _P.args, **kwargs: _P.kwargs
     ) -> Coroutine[Any, Any, _T]:
-        """Start a stop or disarm, which runs to completion whatever is cancelled meanwhile."""
-        task = asyncio.ensure_future(work(*args, **kwargs))  # it starts even if it is not awaited
+        """Start a stop or disarm, which runs to completion in spite of cancellation."""
+        task = asyncio.ensure_future(work(*args, **kwargs))  # starts even if not awaited
         self.silencing.add(task)
         task.add_done_callback(self.silencing.discard)
         return _to_completion(task)
@@ -174,7 +174,7 @@ class Members:
     async def stopped(
         self, stops: Mapping[str, "asyncio.Future[StopOutcome]"]
     ) -> Mapping[str, StopOutcome]:
-        """Await stops by name; the outcome of one that failed is what its amplifier may play."""
+        """Await stops by name; a failed stop gives the possible output of its amplifier."""
         said: dict[str, StopOutcome] = {}
         for name, result in zip(stops, await outcomes([*stops.values()]), strict=True):
             if isinstance(result, BaseException):
@@ -231,9 +231,9 @@ def _words_of(moment: float, amplifiers: Sequence[Amplifier]) -> dict[Amplifier,
 
 
 def word_passed_by_all(now: float, amplifiers: Sequence[Amplifier]) -> int:
-    """Return a high word that is no moment ahead by the clocks of amplifiers, now [s] and soon.
+    """Return a high word in the past of all amplifiers' clocks, now [s] and soon.
 
-    A commit with it starts at once.
+    A commit with it starts immediately.
     """
     at = word_passed(now)
     others = [each for each in amplifiers if not each.clock.can_be_steered]
@@ -246,7 +246,7 @@ def word_passed_by_all(now: float, amplifiers: Sequence[Amplifier]) -> int:
 
 
 def _shown(amplifier: Amplifier, time: float) -> float:
-    """Return what the clock of an amplifier shows at a time [s], to the nearest high word."""
+    """Return the clock of an amplifier at a time [s], rounded to a high word."""
     return time + amplifier.clock.lead(time) + HIGH_TIME / 2
 
 
@@ -258,17 +258,17 @@ _SPAN = 1 << 16
 
 @dataclass(frozen=True)
 class PlayedSet:
-    """A set that amplifiers play."""
+    """A set in playback."""
 
     token: int
     layers: Mapping[str, tuple[LayerSet, ...]]
-    """What each amplifier plays, by name, as it has achieved it."""
+    """Achieved playback of each amplifier, by name."""
     starts_at: float
-    """When the last of them starts at the soonest [s]."""
+    """Earliest start [s] of the last amplifier."""
 
 
 class JointSets:
-    """The sets of the amplifiers of a group; token: the one before the first set's."""
+    """The sets of a group's amplifiers; token: the token before the first set."""
 
     def __init__(self, members: Members, token: int) -> None:
         self._members = members
@@ -336,7 +336,7 @@ class JointSets:
             refusal = _merged(refusals)
             return await self._silenced(refusal, amplifiers, began) if is_now else refusal
         try:
-            if refusals:  # a worse failure of another amplifier is raised in place of them
+            if refusals:  # a worse failure of another amplifier is raised instead
                 several = zip(amplifiers, results, strict=True)
                 self._members.checked([one for each, one in several if each.name not in refusals])
             staged = dict(zip(amplifiers, self._members.checked(results), strict=True))
@@ -369,9 +369,9 @@ class JointSets:
     async def _silenced(
         self, refusal: CommandRefused, amplifiers: Sequence[Amplifier], began: float
     ) -> CommandRefused:
-        """Silence a set that came too late if it may play; returns the error that says why.
+        """Silence a set that came too late, if it may play; returns the error with the reason.
 
-        began: when it was begun to be sent [s].
+        began: start of sending [s].
         """
         if refusal.until is None or not any(each.played_at >= began for each in amplifiers):
             self.is_incomplete = False
@@ -381,7 +381,7 @@ class JointSets:
 
     async def silence(self, ramp: float) -> None:
         """Let all layers of all amplifiers fall silent along a ramp [s]; they stay armed."""
-        # Those that do not reply come last, so that no other one on the same line waits for them.
+        # Mute amplifiers come last, so that no other amplifier on the same line waits for them.
         amplifiers = self._members.by_need
         amplifiers.sort(key=lambda each: each.silence_cause is not None)
         await self._members.all([each.silence(ramp) for each in amplifiers])
@@ -396,7 +396,7 @@ class JointSets:
         for each in staged:
             by_line.setdefault(each.line, []).append(each)
         token = self.token
-        moment: float | None = None  # None: at once
+        moment: float | None = None  # None: immediately
         if len(by_line) > 1:
             await _freed([*by_line], until=min([one.until for one in staged.values()]))
             moment = moment_behind(max([line.commit_arrives() for line in by_line]))
@@ -411,14 +411,14 @@ class JointSets:
         for line, sharing in by_line.items():
             at = words[sharing[0]]
             if len(sharing) == 1 or any(words[each] != at for each in sharing):
-                for each in sharing:  # it is alone on the line, or a clock is not steered
+                for each in sharing:  # alone on the line, or a clock is not steered
                     requests[each] = each.commit(token, words[each])
                 continue
             make = partial(_commit_of, sharing, token, at)
             broadcasts.append(line.submit(None, Priority.SET, "Commit", make))
             for each in sharing:  # a heartbeat confirms it, and feeds the watchdog meanwhile
                 requests[each] = each.ping()
-        # The broadcasts are awaited too: one that is still queued is not sent if this is given up.
+        # The broadcasts are awaited too: a queued one is not sent if this is cancelled.
         statuses = await self._members.all([*requests.values(), *broadcasts])
         for each, status in zip(requests, statuses, strict=False):
             if status["token"] != token or status["state"] in LATCHED:
@@ -431,13 +431,13 @@ class JointSets:
             for each in self._members.amplifiers.values()
             if each.committed > 0 and (self.token - each.committed) % _SPAN > _MAX_GAP
         ]
-        if behind:  # those that have committed nothing take any token for a newer one
+        if behind:  # amplifiers without a committed token accept any token as newer
             self.token = token_after(self.token)
             await self._members.all([each.stage(self.token, (), now=True) for each in behind])
 
 
 async def _freed(lines: Sequence[Line], *, until: float) -> None:
-    """Wait until a commit can be sent on all lines at once, or until a time [s]."""
+    """Wait until a commit can be sent on all lines simultaneously, or until a time [s]."""
     while threads.now() < until and (
         busy := [line.current.result for line in lines if line.current is not None]
     ):
@@ -445,7 +445,7 @@ async def _freed(lines: Sequence[Line], *, until: float) -> None:
 
 
 def _merged(refusals: Mapping[str, CommandRefused]) -> CommandRefused:
-    """Join refusals by amplifier; `until` is known only if all of them end by themselves."""
+    """Join rejections by amplifier; `until` is known only if all of them are temporary."""
     known = [each.until for each in refusals.values() if each.until is not None]
     return CommandRefused(
         "; ".join(f"{name}: {refusal}" for name, refusal in refusals.items()),
@@ -455,7 +455,7 @@ def _merged(refusals: Mapping[str, CommandRefused]) -> CommandRefused:
 
 
 def _commit_of(several: Sequence[Amplifier], token: int, at: int) -> list[Values]:
-    """Return a commit for several amplifiers of a line; raises unless all of them may have it."""
+    """Return a commit for several amplifiers of a line; raises unless it is allowed for all."""
     values = {"session": several[0].session, "token": token, "at": at}
     for amplifier in several:
         amplifier.next_request("Commit", values, Priority.SET)
@@ -479,17 +479,17 @@ async def _check_plays(amplifier: Amplifier, status: Values, token: int) -> None
 
 
 async def _achieved(amplifier: Amplifier, staged: StagedSet) -> tuple[LayerSet, ...]:
-    """Read how an amplifier has achieved the layers of a set that it plays."""
+    """Read how an amplifier achieved the layers of the set it plays."""
     return tuple([await amplifier.read_achieved(one, staged.token) for one in staged.layers])
 
 
-# Errors of a clock [s]: a good one costs nothing of a promise, a fair one a tenth of a dB.
+# Errors of a clock [s]: a good clock does not lower a promise, a fair one by a tenth of a dB.
 _GOOD, _FAIR, _POOR = 5e-6, 8e-6, 12e-6
-_MAX_LOAD = 0.2  # share of the line's time for readings beside heartbeats
+_MAX_LOAD = 0.2  # share of the line's time for readings between heartbeats
 _INTERVAL = 0.01  # s; between readings of a fair clock; half for a poor one, more for a better
 _SETTLING = 0.2  # s; at most, for readings before clocks are needed
-_FRAME = 1e-3  # s; a frame of USB, at all phases of which readings shall come
-_GOLDEN = (math.sqrt(5) - 1) / 2  # its multiples fill a circle evenly
+_FRAME = 1e-3  # s; a USB frame; readings should cover all of its phases
+_GOLDEN = (math.sqrt(5) - 1) / 2  # its multiples cover a circle evenly
 
 
 class Clocks:
@@ -497,15 +497,15 @@ class Clocks:
 
     def __init__(self, members: Members) -> None:
         self._members, self._amplifiers = members, members.amplifiers
-        self._are_alike = True  # the amplifiers, and so are their lines
+        self._are_alike = True  # whether all amplifiers and lines are alike
         self._dither = 0.0
         self._readings: dict[Amplifier, asyncio.Future[Any]] = {}
         self._turns: dict[Line, Iterator[Amplifier]] = {}
-        self._marked: set[Line] = set()  # lines of several amplifiers, all of which know Mark
-        self._firsts: dict[Line, HeldClock | None] = {}  # the clock that the others are held to
+        self._marked: set[Line] = set()  # lines of several amplifiers that all support Mark
+        self._firsts: dict[Line, HeldClock | None] = {}  # the clock that the others follow
 
     def follow(self) -> None:
-        """Adopt the amplifiers and lines as they were identified just now."""
+        """Adopt the amplifiers and lines as just identified."""
         every = self._amplifiers.values()
         self._are_alike = len({_kind(each) for each in every}) == 1
         for line in self._members.lines:
@@ -519,11 +519,11 @@ class Clocks:
 
     @property
     def errors(self) -> Mapping[str, float]:
-        """Errors of the clocks against each other [s rms] by amplifier; infinite where not held.
+        """Relative errors of the clocks [s rms] by amplifier; infinite if not synchronised.
 
-        Each is made up of what the amplifier states, of what is seen of its clock, and, where lines
-        or amplifiers differ, of half of the shortest exchange less its bits: no exchange shows how
-        that time is shared by the two ways. A single amplifier has 0.
+        Each error combines the amplifier's specified error, the measured error of its clock and, if
+        lines or amplifiers differ, half of the shortest exchange without its bits, because no
+        exchange shows how that time is split between the two directions. A single amplifier has 0.
         """
         every = self._amplifiers
         if len(every) < 2:
@@ -534,7 +534,7 @@ class Clocks:
         is_common &= sum(not each.clock.is_compared for each in held) == 1
         leads = {each: each.clock.lead(now) for each in every.values()}
         common = median([leads[each] for each in held] or [0.0])
-        # With this factor the rms of the errors is no less than that of their differences.
+        # With this factor the RMS of the errors is at least the RMS of their differences.
         wider = math.sqrt(len(held) / max(len(held) - 1, 1))
         return {
             name: math.hypot(
@@ -578,7 +578,7 @@ class Clocks:
                 await asyncio.sleep(self.later())
 
     def _compare(self, of_line: Sequence[Amplifier], now: float) -> None:
-        """Hold the clocks of a line to one of them: the same as before, or else the best known."""
+        """Make the clocks of a line follow one of them: as before, or else the best known."""
         line = of_line[0].line
         before = self._firsts.get(line)
 

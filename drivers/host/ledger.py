@@ -1,10 +1,9 @@
-"""What one amplifier was sent, has confirmed and may play: its ledger, its watchdog, its stops.
+"""Ledger of one amplifier (sets sent, confirmed and possibly playing), its watchdog and stops.
 
-Only the ledger makes the sets that go over the wire. It checks a set when its turn on the line
-comes, as the wire rounds it, together with all that plays then. A set that was sent and is not
-confirmed yet is a doubt: until it is resolved, only silence is admitted. `Feeding` follows the
-watchdog: when it was fed, and when it must have silenced the amplifier. All times [s] are those of
-one clock, which may be any.
+Only the ledger makes the sets sent over the wire. It checks a set when its turn on the line comes,
+with the rounding of the wire, together with the current playback. A set sent but not yet confirmed
+is a doubt: until it is resolved, only silence is admitted. `Feeding` tracks when the watchdog was
+fed, and when it must have silenced the amplifier. All times [s] refer to one arbitrary clock.
 """
 
 import asyncio
@@ -42,7 +41,7 @@ from registry.limits import GuardLimits
 _LEVEL, _STEP = QUANTITIES["level"], QUANTITIES["envelope_step"]
 _RAMP, _VALID_FOR = QUANTITIES["ramp"], QUANTITIES["valid_for"]
 _FREQUENCY = QUANTITIES["frequency"]
-_STEPS = 2  # steps of levels by which a status may differ
+_STEPS = 2  # tolerance of levels in a status, in steps
 _MEASURING_ERROR = 0.002  # of full level, if the amplifier measures its levels
 _WEAK = 0.25  # largest measuring error, as a share of a weak level
 _logger = logging.getLogger(__name__)
@@ -80,10 +79,10 @@ class Feeding:
 
     @property
     def lost_from(self) -> float:
-        """When an amplifier that does not reply must be silent by its watchdog, and is lost [s].
+        """Time [s] when a mute amplifier must be silent due to its watchdog, and is lost.
 
-        A request without reply may still be under way. One with a reply arrived before that reply,
-        but perhaps later than the line takes, since a busy machine may have held it.
+        A request without reply may still be under way. A request with a reply arrived before that
+        reply, but possibly later than the line takes, because a busy machine may have delayed it.
         """
         is_confirmed = self.plays <= self.since
         arrival = self.confirmed_at if is_confirmed else self.arrives + self.delay
@@ -91,21 +90,21 @@ class Feeding:
 
     @property
     def may_play_until(self) -> float:
-        """When the watchdog must have silenced it even if a kept request feeds it once more [s].
+        """Time [s] when the watchdog must have silenced it, even after a buffered request.
 
-        An adapter may deliver all that it has kept at any time; after the watchdog has expired this
-        has no effect. Of several attempts without reply one may have arrived and the next been
-        kept.
+        An adapter may deliver buffered requests at any time; after the watchdog has expired, they
+        have no effect. Of several attempts without reply, one may have arrived and the next one may
+        be buffered.
         """
         may_be_fed_again = self.is_kept and self.plays > self.since
         return self.lost_from + (self.watchdog if may_be_fed_again else 0.0)
 
     def tells(self, sent_at: float) -> bool:
-        """Whether a status that is requested at a time [s] shows if the watchdog runs down."""
+        """Whether a status requested at a time [s] shows if the watchdog is running down."""
         return self.may <= self.since and sent_at - self.confirmed_at > REACTION
 
     def problem(self, left: float, sent_at: float, now: float) -> str | None:
-        """Say what is wrong with the watchdog's time left [s] in a status; None if it is possible.
+        """Describe an impossible remaining watchdog time [s] in a status; None if it is possible.
 
         sent_at: when the request for the status went out, which does not feed; now: when the status
         came.
@@ -131,7 +130,7 @@ class StopOutcome:
     """Why no more is known."""
 
     def rows(self, now: float) -> dict[str, Any]:
-        """Return `silence`, `may_play_for_s` and `cause` as the API has them; now [s]."""
+        """Return the API fields `silence`, `may_play_for_s` and `cause`; now [s]."""
         left = self.may_play_until - now
         silence = "may_play" if left > 0 else "watchdog_elapsed"
         is_bounded = not self.is_confirmed and left < math.inf
@@ -143,20 +142,20 @@ class StopOutcome:
 
 
 UNREACHED = StopOutcome(False, math.inf, "it has not replied since the start")
-"""What is known of an amplifier before its first reply."""
+"""State of an amplifier before its first reply."""
 
 
 @dataclass(frozen=True, slots=True)
 class StagedSet:
-    """A set that an amplifier has staged, or plays at once."""
+    """A set that an amplifier has staged, or plays immediately."""
 
     token: int
     layers: tuple[LayerSet, ...]
     """Its layers in integers of the wire."""
     is_exact: bool
-    """Whether the amplifier plays exactly these integers, and not others near them."""
+    """Whether the amplifier plays exactly these integers, without further rounding."""
     until: float
-    """When it must have been committed [s]."""
+    """Deadline of its commit [s]."""
 
 
 @dataclass(eq=False, slots=True)
@@ -166,14 +165,14 @@ class PendingStop:
     ramp: int
     """In units of the wire."""
     timeout: float
-    """How long it is repeated after the first request has gone out [s]."""
+    """Time for which it is repeated after the first request [s]."""
     ends: float
-    """When the timeout passes [s]."""
+    """Time of the timeout [s]."""
     is_sent: bool = False
-    """Whether the first request has gone out; what is played later needs a stop of its own."""
+    """Whether the first request has been sent; later playback needs another stop."""
     limit: asyncio.Timeout | None = None
     requested: "asyncio.Future[Values] | None" = None
-    """The first request, which is queued as soon as the stop is asked for."""
+    """The first request, queued as soon as the stop is requested."""
     latch: int | None = None
     """The newest latch that was known when the last request was made."""
     result: "asyncio.Future[StopOutcome]" = field(init=False)
@@ -210,7 +209,7 @@ def check_identity(identity: Values, name: str, serial_number: str | None) -> No
 def check_capabilities(can: Values, name: str, *, is_output: bool | None) -> None:
     """Raise LinkError for capabilities that no amplifier can have, or that contradict the rig.
 
-    is_output: as of `Amplifier`; None also where there is no rig.
+    is_output: see `Amplifier`; None also without a rig.
     """
     for each, low, stated, high in capability_ranges(can):
         if not low <= stated <= high:
@@ -235,9 +234,9 @@ class Doubt(NamedTuple):
 
 
 class Ledger:
-    """The ledger of one amplifier, which is silent at first.
+    """The ledger of one amplifier, initially silent.
 
-    limits: the configured ones; capabilities: values of the amplifier's record. Raises CommandError
+    limits: configured limits; capabilities: values of the amplifier's record. Raises CommandError
     if the limits leave nothing to play.
     """
 
@@ -258,9 +257,9 @@ class Ledger:
         # An amplifier may cut fades short, depending on when it plays. Upper bounds assume that it
         # cuts none.
         self.playback = Playback(self.capabilities["channels"], voices=sys.maxsize)
-        self.lag = 0.0  # s; the amplifier may be later than `playback` by this
+        self.lag = 0.0  # s; the amplifier may lag behind `playback` by this
         self._starts, self._start_error = -math.inf, 0.0  # s; the moment of the last commit
-        self._advanced_to = -math.inf  # s; what was due by then has been carried out
+        self._advanced_to = -math.inf  # s; everything due by then has been carried out
         self.may_be_silent = set[int]()
         """Layers that may be silent, after a silence without a reply or a renewal that was late."""
         self.doubt: Doubt | None = None
@@ -275,10 +274,10 @@ class Ledger:
     def admit(
         self, layers: Sequence[AmplifierLayer], now: float, *, delay: float = COMMIT_DELAY
     ) -> tuple[LayerSet, ...]:
-        """Return layers in integers of the wire, with `valid_for` cut to the time that is left.
+        """Return layers in wire integers, with `valid_for` cut to the remaining time.
 
-        delay: time within which they are committed [s]. Raises CommandRefused with channel and
-        reason, whatever fails in the checks; nothing changes then.
+        delay: maximum time until they are committed [s]. Raises CommandRefused with channel and
+        reason for any failure of the checks; nothing changes in that case.
         """
         try:
             requested = self._rounding.layers(layers)
@@ -322,9 +321,9 @@ class Ledger:
     ) -> None:
         """Note that a set was committed, so that it may play from now on and is in doubt.
 
-        starts: the moment that its commit names [s]; None for at once. error: largest error of that
-        moment by the amplifier's clock [s]. If a commit is repeated, the set may have played since
-        the first one, even if a status has said that it did not: the status may be older.
+        starts: start time in its commit [s]; None for an immediate start. error: largest error of
+        that time on the amplifier's clock [s]. If a commit is repeated, the set may have played
+        since the first one, even if a status contradicts this: the status may be older.
         """
         if self.doubt is not None and self.doubt.token == token:
             return
@@ -385,7 +384,7 @@ class Ledger:
             self._budget.confirm(sent_at, now, end=self.playback.ends_by + self.lag)
 
     def problem_of(self, status: Values, sent_at: float, now: float) -> str | None:
-        """Say what the status of an armed amplifier contradicts; None if it agrees.
+        """Describe a contradiction in the status of an armed amplifier; None if it agrees.
 
         sent_at, now: when the request for it went out, and when it came [s]. Levels of voices that
         change have only an upper bound, since it is not known exactly when they were committed.
@@ -437,7 +436,7 @@ class Ledger:
         return None
 
     def _advance(self, time: float) -> None:
-        """Carry out what is due by a time [s]."""
+        """Carry out everything due by a time [s]."""
         if time >= self.playback.changes_at:
             self.playback.advance(time)
             self._advanced_to = time
@@ -497,7 +496,7 @@ class Ledger:
         if power > self.limits.power * TOLERANCE:
             return CommandRefused(
                 f"sum of squared levels must be at most {self.limits.power:g}, got {power:g}; "
-                "lower the levels or drive fewer channels at once"
+                "lower the levels or drive fewer channels simultaneously"
             )
         return None
 
@@ -509,12 +508,12 @@ class Ledger:
         return max(ends, default=now) - now
 
     def _is_within_at_most(self, layers: Sequence[LayerSet], late: float, until: float) -> bool:
-        """Whether the limits hold even if all that may play has its largest level at once.
+        """Whether the limits hold even if all possible voices peak simultaneously.
 
-        This quick check decides in nearly all cases. Within a layer, a tone that rises along the
-        ramp and the one that falls along it are together at most as large as the larger of both,
-        unless the new one has an ending, which may begin during the ramp. A tone that waits and
-        keeps its phase continues the voice that it waits for.
+        This quick check is sufficient in nearly all cases. Within a layer, the sum of a rising and
+        a falling tone on the same ramp is at most the larger of the two, unless the new tone has an
+        ending, which can begin during the ramp. A waiting tone that keeps its phase continues the
+        voice it waits for.
         """
         playback, full = self.playback, _LEVEL.per_unit
         levels, rising = [0.0] * playback.channels, dict[tuple[int, int], float]()

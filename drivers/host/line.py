@@ -1,10 +1,10 @@
 """One physical line: the requests of all amplifiers on it, one at a time, by priority.
 
 `Line.pump` is called with each submission, arrival and timer; no request has a task of its own. The
-values of a request are made when its turn comes, so that they are checked once, against what really
-went out before. The parts of a set are sent without a pause between them; only the last part has a
-reply, and only that one is repeated. Requests of the stop class preempt and supersede all others.
-Times [s] are those of the event loop's clock.
+values of a request are made when its turn comes, so that they are checked once, against the
+requests really sent before. The parts of a set are sent without a pause; only the last part has a
+reply, and only that part is repeated. Stop-class requests preempt and supersede all others. Times
+[s] refer to the event loop's clock.
 """
 
 import asyncio
@@ -53,8 +53,8 @@ from drivers.wires.wire import (
 
 _NOT_ARMED = ("WRONG_STATE", "WRONG_SESSION")
 _REMEDIES = {
-    "WRONG_SESSION": "; another host has armed it, or did last: disarm, then arm anew",
-    "WRONG_STATE": "; see what ails it by `era amp status`, then clear and arm again",
+    "WRONG_SESSION": "; another host has armed it, or armed it last: disarm, then arm again",
+    "WRONG_STATE": "; find the cause with `era amp status`, then clear and arm again",
 }
 
 
@@ -83,16 +83,16 @@ def no_reply(
     opened just now, else 0.
     """
     if not remark and before > timeout:
-        remark = f"the reply before took {1e3 * before:.0f} ms: check what delays frames on the way"
+        remark = f"the previous reply took {1e3 * before:.0f} ms: find the cause of the delay"
     hint = "check that the amplifier is switched on"
-    if name == "GetCaps":  # which comes behind an answered Hello
+    if name == "GetCaps":  # sent after a reply to Hello
         hint = "it answered Hello, but not GetCaps"
     came = f", but {remark}" if remark else f"; {hint}"
     cause = f"{where}: no reply within {1e3 * timeout:g} ms{came}"
     if boot_time:
         cause += (
             f". A board that restarts when its port is opened must reply within {boot_time:g} s; "
-            "set one that takes longer not to restart"
+            "if it takes longer, disable the restart"
         )
     return cause
 
@@ -165,17 +165,17 @@ class LinkStatistics(WireCounters):
     refusals: int = 0
     """Number of requests that the amplifier refused by a Nak."""
     last_round_trip: float | None = None
-    """Time from the last request that was answered to its reply [s]."""
+    """Time from the last request with a reply to that reply [s]."""
 
 
 class Member(Protocol):
-    """An amplifier as its line sees it: it notes what is sent to it and what it sends."""
+    """Interface of an amplifier to its line: records requests and replies."""
 
     name: str
     address: int
     counts: LinkStatistics
     silence_cause: str | None
-    """Why the amplifier counts as mute, by a request without reply; None if it does not."""
+    """Why the amplifier counts as mute, after a request without reply; None if it replies."""
 
     def next_request(self, name: str, values: Values, priority: Priority) -> float:
         """Return how long a request and its reply take on the wire [s].
@@ -216,16 +216,16 @@ class Job:
     reached: int = 0
     """Index of the first part that was missing when the last reply came."""
     attempts: int = ATTEMPTS
-    """How many more times it may be sent."""
+    """Remaining number of attempts."""
     is_pausing: bool = False
     sent_at: float = 0.0
-    """When it was last handed to the port [s]."""
+    """Time of the last transfer to the port [s]."""
     started_at: float = 0.0
-    """When its first bit was last on the wire [s], behind what was sent before it."""
+    """Time [s] of its first bit on the wire at the last attempt, after earlier requests."""
     due: float = 0.0
-    """When it is given up if there is no reply [s]."""
+    """Deadline of the reply [s]."""
     takes: float = 0.0
-    """How long it and its reply take on the wire [s]."""
+    """Duration of request and reply on the wire [s]."""
     delays: int = 0
     """How often this process was delayed while the reply was awaited."""
     is_last_look: bool = False
@@ -268,12 +268,12 @@ class Job:
 
 
 class JobQueue(list[Job]):
-    """The requests that wait for one line, in the order in which they were queued.
+    """The requests waiting for a line, in the order of queueing.
 
-    Those of one rank are sent in it.
+    Requests of equal rank are sent in this order.
     """
 
-    _had_waited = False  # whether the job that was taken last had waited for long
+    _had_waited = False  # whether the last job taken had waited for long
 
     def take(self, job: Job, now: float) -> None:
         """Remove the job whose turn it is."""
@@ -296,7 +296,7 @@ class JobQueue(list[Job]):
         return first is not None and self._rank(first, now) < self._rank(job, now)
 
     def next(self, now: float) -> Job | None:
-        """Return the job whose turn it is, or None while all of them pause, or a stop does."""
+        """Return the next job, or None while all jobs, or a stop, are pausing."""
         first: Job | None = self[0]
         if len(self) > 1:
             ready = [job for job in self if job.is_stop_class or not job.is_pausing]
@@ -306,14 +306,14 @@ class JobQueue(list[Job]):
 
 GRACE = 0.008  # s; how long a stop waits for the reply to another request
 BUSY_PAUSE = 0.005  # s; before a request is repeated to a busy amplifier
-_AHEAD = 0.005  # s; the next part of a set is written so early; a stop waits for what is under way
-_FULL_PAUSE = 0.0005  # s; before a blocked port is looked at again
-_LOOK_INTERVAL = 0.01  # s; between two looks, each of which would notice a delay of this process
+_AHEAD = 0.005  # s; lead for writing the next part of a set; a stop waits for bytes already sent
+_FULL_PAUSE = 0.0005  # s; before checking a blocked port again
+_LOOK_INTERVAL = 0.01  # s; between checks, each of which would detect a delay of this process
 _LATE = 0.005  # s; if a timer fires later than this, this process was delayed
 _MAX_LATE = 0.032
-"""How much longer [s] a reply is awaited at most where replies have come late.
+"""Maximum extra time [s] to await a reply after late replies.
 
-An adapter may hold what passes for 16 ms, each way.
+An adapter can delay data by 16 ms in each direction.
 """
 _LATE_DECAY = 0.9  # of the lateness of replies, with each reply
 _MAX_COMMIT_LATE = 0.003  # s; one frame of full-speed USB, 1 ms, for each of port, hub and adapter
@@ -348,10 +348,10 @@ class Line:
         """The clock of the line [s]."""
         self._boot_time, self._boots_until = boot_time, -math.inf
         self._is_pumping = False
-        self._sent_until = 0.0  # s; until then what was sent is still under way
+        self._sent_until = 0.0  # s; until then, sent bytes are still under way
         self._free_at = 0.0  # s; until then a reply may still occupy the line
         self.late = 0.0
-        """Delay of replies [s] beyond what the wire alone explains, at most `_MAX_LATE`."""
+        """Delay of replies [s] beyond the time on the wire, at most `_MAX_LATE`."""
 
     def open(self, port: OpenPort) -> None:
         """Use this open port from now on."""
@@ -417,7 +417,7 @@ class Line:
             job = self.current
             if job is None or (member := job.member) is None:  # no broadcast is on the line
                 continue
-            self._sent_until = 0.0  # a request that has a reply has arrived
+            self._sent_until = 0.0  # a request with a reply has arrived
             if isinstance(arrival, Continuation):
                 self.late = max(self.late, min(self.time() - self._free_at, _MAX_LATE))
                 if self._queue and self._must_yield(job):
@@ -453,7 +453,7 @@ class Line:
         if self._queue:
             self.pump()
         elif self.current is None and self._timer is not None:
-            self._timer.cancel()  # no reply is awaited, so that nothing needs to be looked at
+            self._timer.cancel()  # no reply is awaited, so there is nothing to check
             self._timer = None
 
     def lose(self, cause: str) -> None:
@@ -484,10 +484,10 @@ class Line:
             self._is_pumping = False
 
     def _start(self, job: Job, rest: bytes = b"", *, is_present: bool = False) -> None:
-        """Make a request and send it, and note it for each amplifier that it reaches.
+        """Make and send a request, and record it for each amplifier that receives it.
 
-        Nothing is sent in another way. rest: what is still to be sent of the request that is on the
-        line. is_present: whether the amplifier acts on the request with that.
+        This is the only way of sending. rest: unsent bytes of the current request. is_present:
+        whether these bytes complete the request for the amplifier.
         """
         member, data = job.member, rest
         address = BROADCAST if member is None else member.address
@@ -508,7 +508,7 @@ class Line:
                 has_reply = member is not None and job.part >= len(job.parts) - 1
                 data = self.wire.request(address, job.name, job.values, has_reply=has_reply)
             now = self.time()
-            begins = max(now, self._sent_until)  # behind what is still under way
+            begins = max(now, self._sent_until)  # after bytes still under way
             if not rest:
                 job.sent_at, job.started_at, job.due = now, begins, 0.0
                 for each in self.members.values():
@@ -537,9 +537,9 @@ class Line:
             job.result.set_result({})
             return
         if not rest:
-            # On a slow wire one attempt less is made, so that an amplifier counts as degraded as
-            # soon as on others. A set of several parts keeps its attempts, since each part may be
-            # lost; the heartbeats between the parts find an amplifier that is mute.
+            # On a slow wire there is one attempt less, so that an amplifier counts as degraded as
+            # soon as on other wires. A set of several parts keeps its attempts, because each part
+            # can be lost; heartbeats between the parts detect a mute amplifier.
             is_cut = job.takes > FAST and job.attempts == ATTEMPTS and len(job.parts) < 2
             job.attempts -= 2 if is_cut else 1
         # On Modbus each of the two responses may begin late.
@@ -576,7 +576,7 @@ class Line:
             self._start(job)
 
     def _must_yield(self, job: Job) -> bool:
-        """Whether a request must give way to one that silences."""
+        """Whether a request must yield to a request that silences."""
         return not job.is_stop_class and any(other.is_stop_class for other in self._queue)
 
     def _refused(self, job: Job, member: Member, arrival: Nak | BrokenReply) -> None:
@@ -595,12 +595,12 @@ class Line:
         if any(job.is_superseded_by(other.priority, other.member) for other in self._queue):
             self._fail(job, Preempted(SUPERSEDED))
             return False
-        # It goes behind those of its priority, so that a mute amplifier does not delay others.
+        # Last within its priority, so that a mute amplifier does not delay others.
         self._queue.append(job)
         return True
 
     def _repeat(self, job: Job, member: Member, *, pause: float = 0.0) -> None:
-        """Queue a request once more, to be sent after a pause [s] when its turn comes."""
+        """Queue a request again, to be sent in its turn after a pause [s]."""
         if self._queue_again(job):
             member.counts.retries += 1
             if pause:

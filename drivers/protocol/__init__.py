@@ -1,1 +1,1 @@
-"""The amplifier protocol: messages and numbers, whatever the wire."""
+"""The amplifier protocol: messages and numbers, independent of the wire."""

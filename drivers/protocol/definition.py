@@ -33,13 +33,13 @@ HELLO: Final = 1
 BROADCAST: Final = 0
 """The address of all amplifiers on a line."""
 MAX_WORDS: Final = 120
-"""Largest number of words of a message: those of one serial frame, or one write of Modbus."""
+"""Maximum words per message, given by a serial frame and a Modbus write."""
 CLOCK_TURN: Final = 20.0
-"""Seconds in which the clock of an amplifier, of 32 bits, goes round once."""
+"""Seconds until the 32-bit clock of an amplifier wraps around."""
 CLOCK_UNKNOWN: Final = 0xFFFF
-"""`clock_error` of an amplifier that does not know it, or has no clock that can be steered."""
+"""`clock_error` of an amplifier with an unknown error, or without a steerable clock."""
 AHEAD_MAX: Final = 1638
-"""Steps of the high word of the clock by which a Commit may name a moment ahead: 0.5 s."""
+"""Maximum lead of the time in a Commit, in steps of the clock's high word: 0.5 s."""
 STAGED_LIFE: Final = 1.0
 """Seconds from the first part of a set after which it is discarded if it was not committed."""
 REACTION: Final = 0.01
@@ -156,7 +156,7 @@ _QUANTITIES = (
     _word("clock_error", 0, 65535, 10000000, "s"),
 )
 QUANTITIES: dict[str, WireQuantity] = {each.name: each for each in _QUANTITIES}
-"""By name, with those of the readings below."""
+"""Quantities by name, including those of the readings below."""
 
 
 def _numbers(*names: str) -> tuple[Number, ...]:
@@ -177,10 +177,10 @@ def status_reading(
 ) -> Number:
     """Return a field of Status that is a reading, with a quantity of its own.
 
-    meaning: what it is of, behind its name. `era amp status`, the API and the metrics have it under
-    its name and unit, with the decimals of a step; low, high: in steps; views: what else shows it.
-    A range from 0 or below is sent from 1 on where it is added, since 0 is not stated there; raises
-    ValueError for one that fills a word, which would so become two.
+    meaning: completes its name. `era amp status`, the API and the metrics show it under its name
+    and unit, with the decimals of a step; low, high: in steps; views: additional places that show
+    it. An added reading with a range from 0 or below is sent shifted to start at 1, because 0 means
+    "not reported" there; raises ValueError if the shifted range exceeds a word.
     """
     zero = 1 - low if is_added and low < 1 else 0
     if high < WORD <= high + zero:
@@ -212,10 +212,10 @@ STATUS = Record(
     Bits((("channels", 8), ("layers", 8))),
     Numbers("levels", "channels", QUANTITIES["level"]),
     Numbers("tokens", "layers", QUANTITIES["played_token"]),
-    # Later readings: reading(..., "status", "page", is_added=True), the views where it is shown.
+    # Later readings: reading(..., "status", "page", is_added=True), with the views that show it.
 )
 READINGS = [each for each in STATUS.fields if isinstance(each, Number) and each.meaning]
-"""Fields of Status that are values in a unit for people."""
+"""Fields of Status with values in physical units."""
 QUANTITIES |= {each.name: each.quantity for each in READINGS}
 
 
@@ -263,7 +263,7 @@ TEXTS = [field for field in IDENTITY.fields if isinstance(field, Text)]
 _MESSAGES = (
     Message("GetCaps", 2, Record(), _CAPABILITIES),
     Message("Arm", 3, Record(*_numbers("session", "watchdog", "shift")), STATUS, feeds=True),
-    # A longer ramp than the longest counts as that one: nothing keeps an amplifier from silence.
+    # A ramp above the maximum counts as the maximum: nothing keeps an amplifier from silence.
     Message("Disarm", 4, Record(*_numbers("ramp:any_ramp")), STATUS),
     Message(
         "Set",
@@ -316,7 +316,7 @@ RESERVED_MESSAGES: Final = (16, 17, 18)
 """Numbers of former messages, with feature bit 5; must not be reused."""
 BY_NUMBER: Mapping[int, Message] = {message.number: message for message in _MESSAGES}
 REQUESTS: Mapping[str, Message] = {"Hello": Message("Hello", HELLO, Record(), IDENTITY), **MESSAGES}
-"""Requests by name: Hello, which every version has, and those of this version."""
+"""Requests by name: Hello, common to all versions, and the requests of this version."""
 REQUEST_NAMES: Mapping[int, str] = {each.number: name for name, each in REQUESTS.items()}
 """Names of requests by number."""
 
@@ -336,7 +336,7 @@ def nak_of(refusal: Refusal, number: int) -> list[int]:
 
 
 def capability_ranges(can: Values) -> Iterator[tuple[str, int, int, int]]:
-    """Yield name, least, value and most of capabilities, beside the ranges of their quantities."""
+    """Yield name, minimum, value and maximum of capabilities with additional bounds."""
     for name in ("frequency_step", "level_step", "phase_step", "level_max"):
         yield name, 1, can[name], WORD - 1
     yield "voices", can["layers"], can["voices"], WORD - 1
@@ -345,7 +345,7 @@ def capability_ranges(can: Values) -> Iterator[tuple[str, int, int, int]]:
 
 
 def has_feature(capabilities: Values, name: str) -> bool:
-    """Whether capabilities state a feature, of FEATURES."""
+    """Whether capabilities include a feature of FEATURES."""
     return bool(capabilities["features"] >> FEATURES[name] & 1)
 
 
@@ -361,18 +361,18 @@ def name_of(names: Mapping[str, int], number: int) -> str:
 
 SPAN = 1 << 32
 HIGH_STEPS = 1 << 16
-"""Steps of the clock in one of its high word, of which shifts and moments are whole numbers."""
+"""Clock steps per step of the high word; shifts and moments are multiples of it."""
 HIGH_WORDS = SPAN // HIGH_STEPS
 HIGH_TIME = CLOCK_TURN / HIGH_WORDS
 """Seconds of a step of the high word."""
 MAX_AHEAD = AHEAD_MAX * HIGH_TIME
-"""Seconds by which a Commit may name a moment ahead."""
+"""Maximum lead of the time in a Commit [s]."""
 _PER_SECOND = SPAN / CLOCK_TURN
 _PASSED = 0.25  # s
 
 
 def clock_at(seconds: float) -> int:
-    """Return what a clock shows that many seconds after it showed 0."""
+    """Return the value of a clock this many seconds after 0."""
     return round(seconds % CLOCK_TURN * _PER_SECOND) % SPAN
 
 
@@ -395,7 +395,7 @@ def moment_behind(seconds: float) -> float:
 
 
 def moment_of(at: int, seconds: float) -> float | None:
-    """Return the moment [s] that a Commit names which is sent at a time; None for at once.
+    """Return the start time [s] in a Commit sent at a time; None for an immediate start.
 
     at: the high word of a clock of `clock_at`.
     """
@@ -410,11 +410,11 @@ def high_word(clock: int) -> int:
 
 
 BOOT_TIME = 6.0
-"""For the first reply on a line [s], of a board that restarts when its port is opened."""
+"""Timeout [s] of the first reply on a line, for boards that restart when the port is opened."""
 REPLY_TIMEOUT = 0.030
-"""For a reply [s], on a wire that is fast; a heartbeat and three of these are less than 150 ms."""
+"""Timeout [s] of a reply on a fast wire; with a heartbeat, three of these are below 150 ms."""
 FAST = REPLY_TIMEOUT - REACTION
-"""Longest exchange [s] whose reply is here by then."""
+"""Longest exchange [s] with a reply within that timeout."""
 ATTEMPTS = 3
 """Number of times that a request is sent; one less on a slow wire."""
 STOP_RAMP = 0.005
@@ -446,10 +446,10 @@ def check_watchdog(watchdog: float, round_trip: float) -> None:
 
 
 def loss_detection_time(round_trips: Iterable[float]) -> float:
-    """Return the longest time until silent amplifiers on one line are known to be so.
+    """Return the maximum time until mute amplifiers on a line are detected.
 
-    At the worst all fall silent right after a reply, and each is sent a set next, one after the
-    other, with all attempts: one less where it takes long. round_trips: of the longest set to each.
+    In the worst case all become mute right after a reply, and each is then sent a set, one after
+    the other, with all attempts (one less on a slow wire). round_trips: of the longest set to each.
     """
     detected = HEARTBEAT
     for round_trip in round_trips:

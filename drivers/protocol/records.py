@@ -1,9 +1,9 @@
-"""Messages as rows of 16-bit words: numbers, fields, records, and the conversion between both ends.
+"""Messages as rows of 16-bit words: numbers, fields, records, and their conversion.
 
-Values are the integers of the wire (see `WireQuantity.to_wire`); only type f32 is a float, and a
-text a str. Requests are read strictly, by the amplifier: `Refusal` for a word that is missing, too
-many or out of range. Replies may grow at their end: what follows the fields of a record is ignored,
-and a number that `is_added` is None in the reply of an amplifier that does not state it.
+Values are wire integers (see `WireQuantity.to_wire`), except f32 (a float) and texts (str). The
+amplifier reads requests strictly: `Refusal` for a missing, additional or out-of-range word. Replies
+can grow at their end: words after the fields of a record are ignored, and a number that `is_added`
+is None in the reply of an amplifier without it.
 """
 
 import math
@@ -18,7 +18,7 @@ from drivers.errors import CommandError, FrameError
 
 WORD = 0x10000
 _CODES = {"channel": "BAD_CHANNEL", "token": "BAD_TOKEN"}
-"""Of Naks, by quantity; others are BAD_VALUE."""
+"""Nak codes by quantity; all others are BAD_VALUE."""
 TEXT_MAX = 32  # bytes
 _TOLERANCE = 1e-3  # of a step; sums of floats may exceed a range by rounding
 
@@ -50,7 +50,7 @@ class WireQuantity:
     """A kind of number on the wire: an integer of `per_unit` steps per unit, within a range.
 
     wire: u16, u32 or i16; minimum, maximum: as integers; wraps: an angle, modulo 360; zero: the
-    integer that stands for 0 of the unit.
+    integer for 0 of the unit.
     """
 
     name: str
@@ -116,17 +116,17 @@ class WireQuantity:
         return (integer - self.zero) / self.per_unit
 
     def quantise(self, value: float) -> float:
-        """Return the value [unit] that arrives when this one is sent."""
+        """Return the value [unit] after transmission, with its rounding."""
         return self.from_wire(self.to_wire(value))
 
 
 def bits_of(word: int) -> list[int]:
-    """Return the numbers of the bits of a word that are set, as of versions and features."""
+    """Return the indices of the set bits of a word, such as versions or features."""
     return [bit for bit in range(16) if word >> bit & 1]
 
 
 class Refusal(FrameError):
-    """Words that no message can have; code: that of an amplifier's Nak, channel: at fault."""
+    """Invalid words of a message; code: of the amplifier's Nak; channel: the invalid one."""
 
     def __init__(self, text: str, code: str = "BAD_VALUE", channel: int | None = None) -> None:
         super().__init__(text)
@@ -138,10 +138,9 @@ class Refusal(FrameError):
 class Number:
     """An integer of a quantity: one word, or two with the high one first for u32.
 
-    is_added: later than the first edition of its record, at whose end it stands. Amplifiers need
-    not state it: their reply ends before it, or has 0 there as the registers of Modbus do.
-    meaning: of a reading, which completes its label; views: what shows it beside `era amp status`,
-    the API and the metrics.
+    is_added: added to the end of its record after the first edition. Amplifiers can omit it: their
+    reply ends before it, or has 0 there, as in Modbus registers. meaning: of a reading, completes
+    its label; views: places that show it in addition to `era amp status`, the API and the metrics.
     """
 
     name: str
@@ -180,11 +179,11 @@ class Number:
 
     @property
     def decimals(self) -> int:
-        """How many decimals people see: those of a step."""
+        """Number of decimals to display, given by a step."""
         return math.ceil(math.log10(self.quantity.per_unit))
 
     def in_unit(self, values: Values) -> float | None:
-        """Return its value in the unit, an int without one; None where it is not stated."""
+        """Return its value in the unit, an int without one; None if it is not reported."""
         value: int | None = values[self.name]
         if value is None:
             return None
@@ -226,12 +225,12 @@ class Text:
         return end
 
     def encoded(self, values: Mapping[str, Any]) -> bytes:
-        """Return the bytes of the text, cut at its longest length between two characters."""
+        """Return the bytes of the text, cut to the maximum length at a character boundary."""
         text: str = values[self.name]
         return text.encode()[:TEXT_MAX].decode(errors="ignore").encode()
 
     def read(self, raw: bytes, length: int, values: Values) -> None:
-        """Read the text from its bytes, of which there must be a number."""
+        """Read the text from its bytes, of the given length."""
         if length != len(raw) or length > TEXT_MAX:
             raise Refusal(f"{self.name} must have at most {TEXT_MAX} bytes", "BAD_LENGTH")
         try:
@@ -244,7 +243,7 @@ class Text:
 
 @dataclass(frozen=True, slots=True)
 class Numbers:
-    """Integers of one quantity, a word each; count: the name of the value that says how many."""
+    """Integers of one quantity, one word each; count: name of the value with their number."""
 
     name: str
     count: str
@@ -264,7 +263,7 @@ class Numbers:
 
 @dataclass(frozen=True, slots=True)
 class Rows:
-    """Records that follow each other; count: how many, or the name of the value that says it."""
+    """Consecutive records; count: their number, or the name of the value with it."""
 
     name: str
     count: str | int
@@ -304,10 +303,10 @@ Field = Number | Bits | Text | Numbers | Rows | Rest
 
 
 class Record:
-    """Fields that follow each other in words; those that are added stand at its end.
+    """Consecutive fields in words, added fields last.
 
-    places: the word of each value by its name, as far as none before varies in length; words: how
-    many these are.
+    places: word index of each value by name, up to the first field of variable length; words: their
+    number.
     """
 
     def __init__(self, *fields: Field) -> None:
@@ -337,10 +336,10 @@ class Record:
     def append(self, words: list[int], *rows: Mapping[str, Any]) -> list[int]:
         """Append the words of values, by row, and return all.
 
-        ValueError for one out of range, KeyError for none. What is added and not stated is left out
-        at the end, and 0 before a field that is stated.
+        ValueError for a value out of range, KeyError for a missing one. Added values without a
+        value are left out at the end, and 0 before a field with a value.
 
-        Numbers and words, nearly all, without a call: every set has dozens of them.
+        Single-word numbers, nearly all, are packed without a call: every set has dozens of them.
         """
         if self.added:
             unstated = dict.fromkeys(each.name for each in self.added)
@@ -378,7 +377,7 @@ class Record:
         return self.append([], values)
 
     def read(self, words: Sequence[int], at: int = 0) -> tuple[Values, int]:
-        """Read the values from an index on, and the index behind them; raises Refusal."""
+        """Read the values from an index, and return the index after them; raises Refusal."""
         values: Values = {}
         end_of_words = len(words)
         if self.added:
@@ -405,7 +404,7 @@ class Record:
                         values[name] = word & (1 << bits) - 1
                         word >>= bits
                     if word:
-                        raise Refusal(f"unused bits beside {field.parts[0][0]} must be 0")
+                        raise Refusal(f"unused bits next to {field.parts[0][0]} must be 0")
                     at += 1
                 elif isinstance(field, Numbers):
                     quantity, end = field.quantity, at + int(values[field.count])

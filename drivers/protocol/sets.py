@@ -1,8 +1,8 @@
-"""Sets as streams of words: their layers, parts and tokens, and what an amplifier achieves of them.
+"""Sets as streams of words: layers, parts and tokens, and the achieved playback.
 
-All numbers are integers of the wire. A stream has the layers that a set changes, one after the
-other; a part is the values of one Set message, and the far end collects parts in an `Assembly`.
-`achieved_problem` compares the reply to GetAchieved with what a layer must play.
+All numbers are wire integers. A stream contains the layers changed by a set, one after the other; a
+part is the values of one Set message, and the far end collects parts in an `Assembly`.
+`achieved_problem` compares the reply to GetAchieved with the required playback of a layer.
 """
 
 import math
@@ -51,7 +51,7 @@ _WIDEST: Values = {
         }
     ],
 }
-"""Capabilities of an amplifier to which the table alone sets limits, as far as sets have some."""
+"""Capabilities of an amplifier limited only by the table, for sets."""
 
 
 def token_after(number: int) -> int:
@@ -103,16 +103,16 @@ class Command:
 
     @property
     def peak(self) -> int:
-        """The highest level that it has, its onset and ending included."""
+        """Highest level, including onset and ending."""
         shapes = [each for each in (self.onset, self.ending) if each is not None]
         return max(self.level, *(each.peak for each in shapes)) if shapes else self.level
 
 
 @dataclass(frozen=True, slots=True)
 class LayerSet:
-    """What one layer is to play: without commands it is silenced, or with renew prolonged.
+    """Content of one layer: without commands it is silenced, or with renew prolonged.
 
-    after: the commands start when the onsets that the layer plays have ended.
+    after: the commands start when the current onsets of the layer have ended.
     """
 
     layer: int
@@ -161,9 +161,9 @@ def pack_layers(layers: Iterable[LayerSet]) -> list[int]:
 
 
 def unpack_layers(words: Sequence[int], can: Values = _WIDEST) -> tuple[LayerSet, ...]:
-    """Return the layers of a stream; raises Refusal for what is found first of what is wrong.
+    """Return the layers of a stream; raises Refusal for the first error.
 
-    can: capabilities that it must keep to, those of the table unless others are given.
+    can: capabilities that limit the layers; by default the limits of the table.
     """
     layers: list[LayerSet] = []
     at = 0
@@ -263,12 +263,12 @@ def parts(
 
 
 def is_last(part: Values) -> bool:
-    """Whether a part is the last of its set, which alone is replied to."""
+    """Whether a part is the last of its set, the only one with a reply."""
     return bool(part["index"] >= part["parts"] - 1)
 
 
 def is_earlier_part(number: int, words: Sequence[int]) -> bool:
-    """Whether words of a message are a part but the last, whatever else is wrong with them."""
+    """Whether words of a message are an earlier part of a set, even if they are invalid."""
     message = MESSAGES["Set"]
     at = message.request.places["index"]
     is_headed = number == message.number and len(words) > at
@@ -277,9 +277,9 @@ def is_earlier_part(number: int, words: Sequence[int]) -> bool:
 
 @dataclass
 class Assembly:
-    """Parts of one set but the last, as they arrive, in any order and repeatedly.
+    """Earlier parts of a set, received in any order and possibly repeatedly.
 
-    began [s]: when the first came. It is discarded `STAGED_LIFE` later, or for another token.
+    began: arrival of the first part [s]. It is discarded `STAGED_LIFE` later, or for another token.
     """
 
     token: int = 0
@@ -297,7 +297,7 @@ class Assembly:
         return bool(count == self.count)
 
     def whole(self, last: Values) -> list[int] | int:
-        """Return the stream of the set with this last part, or the first part that is missing."""
+        """Return the stream of the set with this last part, or the first missing part."""
         others = self.collected if last["token"] == self.token else {}
         indices = range(last["parts"] - 1)
         missing = next((index for index in indices if index not in others), None)
@@ -308,11 +308,11 @@ class Assembly:
 
 TONE = "frequency", "level", "phase"
 FLAGS = "after", "renew", "keep_phase", "skip_ending", "onset", "ending"
-"""Of layers and commands, which a GetAchieved does not have."""
+"""Fields of layers and commands that GetAchieved does not have."""
 Problem: TypeAlias = tuple[str, str, object, object]
-"""A rule that is broken: what must be what, and what was seen."""
-_TURN = 36_000  # of the wire; phases are modulo this
-_DERATED = 0.01  # by which the shares of a derated set may differ
+"""A broken rule: subject, property, required value and received value."""
+_TURN = 36_000  # wire units; phases are modulo this
+_DERATED = 0.01  # tolerance of the ratios in a derated set
 
 
 def achieved_problem(
@@ -324,10 +324,10 @@ def achieved_problem(
     can_scale: bool = False,
     slack: float = 0.0,
 ) -> Problem | None:
-    """Return what is wrong with how a layer plays by a reply; None if it is within half a step.
+    """Describe an error in a layer's achieved playback; None if it is within half a step.
 
-    can: capabilities. is_exact: to the word; can_scale: all levels may be lower by one factor;
-    slack: in steps of the wire, beside the steps of the amplifier.
+    can: capabilities. is_exact: equal to the word; can_scale: all levels can be lower by a common
+    factor; slack: in steps of the wire, in addition to the steps of the amplifier.
     """
     found = {each["channel"]: each for each in reply["commands"]}
     shares: dict[int, float] = {}
@@ -358,10 +358,10 @@ def achieved_problem(
 
 
 def achieved_layer(one: LayerSet, reply: Values, can: Values) -> LayerSet:
-    """Return a layer as it plays by a reply: other levels, frequencies and phases.
+    """Return a layer with the levels, frequencies and phases of a reply.
 
-    can: capabilities. A tone at level 0, to which an onset may lead, stays as it is where its
-    frequency is no rounding of it: an amplifier may say any.
+    can: capabilities. A tone at level 0, possibly the target of an onset, stays unchanged if the
+    reported frequency is not its rounded value: an amplifier can report any.
     """
     found = {each["channel"]: {name: each[name] for name in TONE} for each in reply["commands"]}
     commands = []

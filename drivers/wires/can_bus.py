@@ -6,8 +6,7 @@
     can+socketcand://HOST:PORT/can0#NODE
 
 Requests are frames of words, matched by node and sequence number. Ports carry packed frames
-(`drivers.wires.can_frames`): `BusPort` those of python-can, `TextPort` those of slcan and
-socketcand.
+(`drivers.wires.can_frames`): `BusPort` for python-can, `TextPort` for slcan and socketcand.
 """
 
 import asyncio
@@ -164,7 +163,7 @@ class CanWire(Wire):
         return []  # of other devices, or an echo
 
     def _remark_other(self, node: int) -> None:
-        """Note a frame of a node that is no reply; what its amplifier sends says the most."""
+        """Record a frame of a node that is not a reply; frames of its own amplifier matter most."""
         if node == self._requested or not self.counters.remark:
             self.counters.remark = (
                 f"frames of node {node} came in place of a reply of node {self._requested}: check "
@@ -201,24 +200,24 @@ class CanWire(Wire):
         return [Reply({"versions": versions})]
 
     def _from_host(self, node: int, data: bytes) -> list[Arrival]:
-        """Note a frame of another host; one that reads or stops does not drive the amplifier."""
+        """Record a frame of another host; reading and stopping do not count as driving."""
         self.counters.frames_in += 1
         if len(data) != BLOCK or data[1] != 0:
             return []
         self.counters.unexpected_frames += 1
-        self._numbers[node] = data[0]  # the amplifier discards what is older
+        self._numbers[node] = data[0]  # the amplifier discards older frames
         message = BY_NUMBER.get(data[2])
         return [OtherHost(node)] if message is not None and message.feeds else []
 
 
 _WATCHED = ("socketcan", "udp_multicast")
-"""Interfaces whose file descriptor the event loop watches: `recv` of the others may block."""
+"""Interfaces with a file descriptor for the event loop: `recv` of the others may block."""
 
 _SENDS_AT_ONCE = ("socketcan",)
 """Interfaces whose `send` never blocks without a timeout."""
 
 _READ_TIMEOUT = 0.05  # s; interval in which a reader thread notices its end
-_READS = 64  # frames at once, so that a flood does not keep the event loop
+_READS = 64  # frames per iteration, so that a flood does not block the event loop
 _BUS_OFF = 0x40  # error class of SocketCAN
 _FULL = "Transmit buffer full"  # of python-can, if the socket's buffer is full
 _FULL_PAUSE = 0.0005  # s; before frames are sent again to a full transmit queue
@@ -246,8 +245,7 @@ async def open_bus(
                 f"{bus['channel']} up type can bitrate {bus['bitrate']}"
             )
         raise LinkError(
-            f"CAN bus {name} cannot be opened: {remedy} (the system says: "
-            f"{system_message(problem)})"
+            f"CAN bus {name} cannot be opened: {remedy} (system error: {system_message(problem)})"
         ) from problem
     interface = bus["interface"]
     return BusPort(
@@ -435,8 +433,7 @@ class BusPort(DevicePort):
 def _frames(message: can.Message) -> list[CanFrame]:
     """Return the data frame with an 11-bit identifier that a message is, if it is one.
 
-    Of an error frame its class is reported; OSError for one that says that the adapter is off the
-    bus.
+    For an error frame, its class is reported; OSError if the adapter is off the bus.
     """
     if message.is_error_frame and message.arbitration_id & _BUS_OFF:
         raise OSError("the adapter went bus-off; check wiring, termination and bit rate")
@@ -458,9 +455,9 @@ _NODE = "node must be given as #{}"
 
 
 class CanAddress(WireAddress):
-    """A node on a CAN bus; its kinds differ in how the bus is opened.
+    """A node on a CAN bus; subclasses open the bus in different ways.
 
-    line: name of the bus; delay [s]: of a network on the way to it; settings: besides the bit rate.
+    line: name of the bus; delay: of a network in between [s]; settings: other than the bit rate.
     """
 
     def __init__(
@@ -496,7 +493,7 @@ _OPTIONS = {  # of python-can, passed on as they are: which of several adapters 
 
 
 class PythonCanAddress(CanAddress):
-    """A node on a bus of one of python-can's interfaces.
+    """A node on a bus of a python-can interface.
 
     bus: arguments of `can.Bus`.
     """
@@ -547,12 +544,12 @@ _SILENCE = 1.0  # s; twenty heartbeats of an amplifier
 
 @final
 class TextPort(PortAbove):
-    """A port of frames on one of text, below; implements `Port`.
+    """A port of frames on top of a port of text; implements `Port`.
 
-    on_data: called with packed frames, and with an error where text ends in BEL or is no text;
-    on_other: with other text; hello: goes before frames while none has come for a second, since an
-    adapter may have restarted, as by the opening of its port; cut_off: ends a line of which a port
-    that was blocked has dropped the rest; goodbye: sent before it is closed.
+    on_data: called with packed frames, and with an error if text ends in BEL or is invalid.
+    on_other: called with other text. hello: sent before frames if none was received for a second,
+    because an adapter may have restarted, for instance when its port was opened. cut_off: ends a
+    line whose rest a blocked port has dropped. goodbye: sent before closing.
     """
 
     def __init__(
@@ -595,7 +592,7 @@ class TextPort(PortAbove):
 _SLCAN_FORM = "can+slcan:///dev/ttyACM0?bitrate=500000#NODE or can+slcan://HOST:PORT#NODE"
 _BAUD = 115_200  # of the adapter's serial port
 _CLOSE, _BELL = b"\rC\r", b"\x07"
-# Nothing, of what was sent, version and number, status, and frames that are not of this protocol.
+# Ignored: empty lines, echoes, version and number, status, and frames of other protocols.
 _SLCAN_REPLY = re.compile(rb"[zZ]?\Z|[VvNF][0-9A-Za-z]{2,}\Z|[TrRdDbB][0-9A-Fa-f]+\Z")
 
 

@@ -2,8 +2,8 @@
 
 Byte 0 of a frame is the sequence number, 0 in broadcasts and events, byte 1 the index of the frame.
 Frame 0 continues with type, number of words and two words, the others with three words each, low
-byte first. Unused words are 0 and ignored. `CANOPEN` has the numbers of CANopen (CiA 301) that
-amplifiers and hosts agree on. Text is that of slcan adapters and socketcand servers.
+byte first. Unused words are 0 and ignored. `CANOPEN` has the numbers of CANopen (CiA 301) shared by
+amplifiers and hosts. Text frames are for slcan adapters and socketcand servers.
 """
 
 import math
@@ -21,9 +21,9 @@ _FRAME_BITS = 47 + 8 * BLOCK
 _STUFFED_MAX = (33 + 8 * BLOCK) // 4  # one stuff bit per four at worst
 
 ERROR_ID: Final = 0x800
-"""Above all identifiers of frames: what an adapter reports in place of one, its code as data."""
+"""Above all frame identifiers: a report of the adapter, with its code as data."""
 BITRATE: Final = 500_000
-"""Of a bus whose URL names none [bit/s]."""
+"""Default bit rate of a bus [bit/s]."""
 
 CANOPEN: Mapping[str, Any] = {
     "heartbeat_ms": 50,  # of the amplifier
@@ -136,12 +136,12 @@ def unpack_frames(data: bytes) -> list[CanFrame]:
 
 
 class Assembler:
-    """Messages of one sender from their frames, in any order.
+    """Assembles the messages of one sender from frames in any order.
 
-    A frame whose number is older than the last, or whose message is complete, is discarded; one
-    of a newer number discards what is incomplete. Without numbers (is_numbered) frame 0 begins a
-    message. Two frames of one place that differ are of two senders: the message is discarded.
-    Whole messages that are discarded count as unexpected, by their frames 0.
+    Frames with an older number than the last, or of a complete message, are discarded; a newer
+    number discards an incomplete message. Without numbers (is_numbered) frame 0 begins a message.
+    Two different frames at the same index come from two senders: the message is discarded.
+    Discarded messages count as unexpected, by their frame 0.
 
     began: when the first frame of the last message came [s]; given_up: number and begin of a
     message that another one ended before it was whole, until that is taken.
@@ -178,7 +178,7 @@ class Assembler:
         return self._whole()
 
     def contradicts(self, data: bytes) -> bool:
-        """Whether the data of a frame differ from those of the same number and index before."""
+        """Whether a frame's data differ from an earlier frame of the same number and index."""
         known = self._frames.get(data[1]) if len(data) == BLOCK else None
         return known is not None and known[0] == data[0] and known != data
 
@@ -221,10 +221,10 @@ _SENT = re.compile(rb"< *send ([0-7]?[0-9A-Fa-f]{1,2}) ([0-8])((?: [0-9A-Fa-f]{1
 
 
 class TextFormat(NamedTuple):
-    """How frames are written: what ends each text, a frame as text to an adapter, and text as one.
+    """Text format of frames: the terminator, and the conversion of a frame to text and back.
 
-    decode: text of an adapter; decode_sent: text to it; None for what is no data frame with an
-    11-bit identifier.
+    decode: text from an adapter; decode_sent: text to it; None for anything but a data frame with
+    an 11-bit identifier.
     """
 
     end: re.Pattern[bytes]
@@ -281,7 +281,7 @@ class TextReader:
     ) -> None:
         self._form, self._on_other = form, on_other
         self.rest = b""
-        """What may be the beginning of a text."""
+        """Possible beginning of a text."""
 
     def feed(self, data: bytes) -> Iterator[CanFrame]:
         """Yield the frames that these bytes complete."""

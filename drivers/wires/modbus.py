@@ -67,8 +67,8 @@ class SilentPort(PortAbove):
 
     byte_time: of a byte on the line [s]; on_data: is called with received bytes. A frame always
     waits for the last frame of this port, and for others no longer than the longest one takes, so
-    that noise does not delay a stop. A newer frame replaces an older one that still waits, because
-    the request of that one was given up; broadcasts have no reply, and are all sent.
+    that noise does not delay a stop. A newer frame replaces an older waiting one, because its
+    request has timed out; broadcasts have no reply, and are all sent.
     """
 
     def __init__(self, silence: float, byte_time: float, on_data: Callable[[bytes], None]) -> None:
@@ -297,7 +297,7 @@ class ModbusWire(Wire):
         return self._sent(message, tag, write)
 
     def _count_damaged(self, data: bytes) -> None:
-        """Count bytes that are no frame; all that come between two frames count once."""
+        """Count invalid bytes; all bytes between two frames count once."""
         self.counters.invalid_frames += not self._damaged
         self._damaged_size = len(data) + (self._damaged_size if self._damaged else 0)
         self._damaged = (self._damaged + data[: RTU_MAX + 5])[: RTU_MAX + 5]
@@ -308,9 +308,9 @@ class ModbusWire(Wire):
         self.counters.remark = f"{what}: check {_RTU_CHECKS if self._is_rtu else _TCP_CHECKS}"
 
     def _arrival(self, request: _Request, response: Response) -> Arrival | None:
-        """Return what a response to the transaction on the wire means; None: it does not count."""
+        """Interpret a response to the transaction on the wire; None: ignore it."""
         unit, is_hello = request.pdu.dev_id, request.message.name == "Hello"
-        if response.exception in _GATEWAY:  # it counts as no response
+        if response.exception in _GATEWAY:  # counts as no response
             self.counters.remark = (
                 f"the gateway has no {_GATEWAY[response.exception]} unit {unit} "
                 f"(exception {response.exception}): check the unit, its supply and its line"
@@ -325,7 +325,7 @@ class ModbusWire(Wire):
                 )
         elif not is_hello and response.registers[0] != request.tag:
             self.counters.unexpected_frames += 1
-            self.counters.remark = "a reply to another master came: end that one"
+            self.counters.remark = "a reply to another master came: stop that master"
             return None
         else:
             self._request, self._last, self._replied = None, request, response

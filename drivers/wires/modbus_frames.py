@@ -1,8 +1,9 @@
 """Modbus for both ends, without I/O: pymodbus's frames and messages, and registers of messages.
 
-pymodbus makes and reads ADUs, checksums, requests and responses, and says how long they are. Where
-a frame begins and which response answers what is decided here. Its readers of streams are not used,
-and what it raises for damaged bytes, or logs, stays here: such bytes are no frame.
+pymodbus makes and parses ADUs, checksums, requests and responses, and computes their length. This
+module finds the start of a frame and matches responses to requests. It does not use pymodbus's
+stream readers, and keeps its exceptions and logs for damaged bytes to itself: such bytes are not a
+frame.
 
 Message n is written from register 256 n on (tag, words), its reply read from 256 n + 128 on (tag,
 result, words).
@@ -36,13 +37,13 @@ from drivers.protocol.definition import (
 )
 from drivers.protocol.records import TEXT_MAX, Refusal, Values
 
-# It calls exceptions errors of the program; pymodbus_apply_logging_config still shows its log.
+# pymodbus logs Modbus exceptions as program errors; pymodbus_apply_logging_config shows its log.
 logging.getLogger("pymodbus").setLevel(logging.CRITICAL + 1)
 
 READS, READ, WRITE = (3, 4), 4, 16
-"""Functions that read registers, the one of a host, and the one that writes them."""
+"""Function codes that read registers, the one used by hosts, and the one that writes."""
 EXCEPTION = 0x80
-"""Bit of the function in a response that is an exception."""
+"""Bit of the function code that marks an exception response."""
 WRITE_SIZE, ECHO_SIZE, READ_SIZE, RESPONSE_SIZE = 9, 8, 8, 5
 """Bytes on RTU of a write and its response, of a read and its response; registers not counted."""
 
@@ -53,18 +54,18 @@ AREA = HEAD + MAX_WORDS
 IDENTITY_REGISTER, IDENTITY_COUNT = 1065, 2 + len(TEXTS) * TEXT_MAX // 2
 """First register of the identity (tag 0, versions, texts padded with zeros), and their number."""
 PRESENT = ("GetCaps", "GetStatus", "GetFaults")
-"""Messages whose replies are of the moment at which they are read, written before or not."""
+"""Messages whose reply is made at the time of reading, without a previous write."""
 EXCEPTIONS: Mapping[int, str] = {
     **dict.fromkeys((1, 2), "UNKNOWN_TYPE"),
     3: "BAD_LENGTH",
     **dict.fromkeys((5, 6), "BUSY"),
 }
-"""Refusals that exceptions stand for."""
+"""Nak codes by Modbus exception."""
 
 RTU_MAX = 256
 """Bytes of the longest frame over RTU."""
 _RTU_MIN = 4  # bytes; unit, function and CRC
-_TRIES_MAX = 512  # places at which a frame is looked for at once; noise has no end
+_TRIES_MAX = 512  # positions to search for a frame in one step; noise can be endless
 _MBAP = struct.Struct(">HHHB")  # transaction, protocol, length, unit
 _LENGTH_MAX = 254  # unit and PDU
 _COUNT_MAX = {3: 125, 4: 125, WRITE: 123}  # registers by function
@@ -89,9 +90,9 @@ Read, Write = ReadInputRegistersRequest, WriteMultipleRegistersRequest
 
 
 class Adu(NamedTuple):
-    """A PDU for a unit, or of it; transaction: of TCP, 0 over RTU; raw: the whole frame.
+    """A PDU to or from a unit; transaction: of TCP, 0 over RTU; raw: the whole frame.
 
-    Without a PDU raw are bytes that are no frame.
+    Without a PDU, raw contains bytes that are not a frame.
     """
 
     unit: int
@@ -118,7 +119,7 @@ def pdu_of(message: Pdu) -> bytes:
 
 
 def read_pdu(address: int, count: int, *, function: int = READ) -> bytes:
-    """Return the PDU that reads registers, of which there are 1 to 125."""
+    """Return the PDU that reads 1 to 125 registers."""
     return pdu_of(_REQUEST_KINDS[function](address=address, count=count))
 
 
@@ -155,14 +156,14 @@ def parse_request(adu: Adu) -> Pdu | None:
 
 
 def message_written(request: Pdu) -> Message | None:
-    """Return the message that a request writes, None where it writes none."""
+    """Return the message that a request writes, or None."""
     number, offset = divmod(request.address, BOX)
     is_write = request.function_code == WRITE and request.count <= MAX_WORDS + 1
     return BY_NUMBER.get(number) if is_write and offset == 0 else None
 
 
 def message_shown(request: Pdu) -> Message | None:
-    """Return the message from whose reply area a request reads, None where it reads another."""
+    """Return the message whose reply area a request reads, or None."""
     number, offset = divmod(request.address, BOX)
     is_read = request.function_code in READS
     return BY_NUMBER.get(number) if is_read and offset >= REPLY_OFFSET else None
@@ -188,10 +189,10 @@ def response_to(request: Pdu | None, adu: Adu) -> Response | None:
 
 
 def reply_in(number: int, response: Response) -> tuple[int, Sequence[int]]:
-    """Return type and words of the message that replies to one by its number, as on other wires.
+    """Return type and words of the reply to a message number, as on other wires.
 
-    A result or an exception that is a refusal becomes a Nak. Raises Refusal for an identity that
-    cannot be read, and for an exception that stands for no refusal.
+    A result or exception that means a rejection becomes a Nak. Raises Refusal for an unreadable
+    identity, and for any other exception.
     """
     if response.exception:
         if response.exception not in EXCEPTIONS:
@@ -204,13 +205,13 @@ def reply_in(number: int, response: Response) -> tuple[int, Sequence[int]]:
 
 
 class AduReader:
-    """Splits a stream of requests, or of responses, into ADUs; bytes that are none have no PDU.
+    """Splits a stream of requests or responses into ADUs; invalid bytes have no PDU.
 
-    Over TCP each header says where the next begins. Over RTU a frame begins where the length that
-    is in it has a valid CRC. Damaged bytes may look like one: an amplifier (waits) looks for no
-    other within a frame that may become whole, or that is of an unknown function, which ends with a
-    pause; a host (is_host) takes none behind them but the response that it waits for. rest: what
-    may become a frame.
+    Over TCP each header gives the start of the next. Over RTU a frame starts wherever the length
+    given in it leads to a valid CRC. Damaged bytes can look like a frame: an amplifier (waits) does
+    not search inside a frame that may become complete, or one with an unknown function, which ends
+    with a pause; a host (is_host) accepts only the awaited response after them. rest: a possible
+    beginning of a frame.
     """
 
     def __init__(
@@ -241,7 +242,7 @@ class AduReader:
         return found
 
     def end(self) -> list[Adu]:
-        """Return what the rest is, which a pause has ended."""
+        """Return the ADUs of the rest, ended by a pause."""
         data, found = self.rest, list[Adu]()
         if self._is_rtu and data:
             whole = checked_adu(data)
@@ -252,7 +253,7 @@ class AduReader:
 
     def _split_rtu(self, data: bytes, request: Pdu | None, *, waits: bool) -> list[Adu]:
         found: list[Adu] = []
-        start, rest = 0, -1  # where a frame is looked for, and where one may become whole
+        start, rest = 0, -1  # search position, and start of a possibly incomplete frame
         tries = 0
         while start < len(data):
             size = self._size(data[start : start + RTU_MAX])
@@ -282,7 +283,7 @@ class AduReader:
         return found
 
     def _size(self, data: bytes) -> int:
-        """Return the size of the RTU frame that begins here; 0 where none can, the most if open."""
+        """Return the size of an RTU frame here; 0 if impossible, the maximum if unknown."""
         if len(data) < _RTU_MIN:
             return RTU_MAX
         try:

@@ -2,11 +2,11 @@
 
     0x00  COBS( type u8 · version u8 · address u8 · sequence u16 · payload · CRC-32 u32 )  0x00
 
-Every integer is little-endian. Bit 7 of the type is set in replies. The CRC is that of zlib and
+Every integer is little-endian. Bit 7 of the type is set in replies. The CRC is the one of zlib and
 Ethernet, over everything before it. COBS leaves no zero inside a frame, so a reader resynchronizes
 at the next zero. The leading zero ends preceding noise; empty frames are ignored.
 
-Payloads are words, but those of Hello and its reply keep their bytes in every version of the
+Payloads are words, except those of Hello and its reply, which are the same in every version of the
 protocol: versions u16 · vendor · product · serial number · firmware, each a length u8 and UTF-8.
 """
 
@@ -84,7 +84,7 @@ class FrameReader:
     def __init__(self, *, on_invalid: Callable[[bytes], None] = lambda piece: None) -> None:
         self._on_invalid = on_invalid
         self.rest = b""
-        """What may be the beginning of a frame."""
+        """Possible beginning of a frame."""
         self._is_skipping = False  # to the end of an overlong piece
 
     def feed(self, data: bytes) -> list[Frame]:
@@ -128,7 +128,7 @@ def unpack_words(payload: bytes) -> tuple[int, ...]:
 def words_of(frame: Frame) -> Sequence[int]:
     """Return the words of a frame; Refusal for half a word.
 
-    A Hello has none. The reply to it has those of its record, as far as its texts go.
+    A Hello has none. Its reply has the words of its record, up to the end of its texts.
     """
     if frame.kind == HELLO:
         return ()

@@ -4,8 +4,8 @@ A wire carries one request at a time and matches what arrives with it: a reply t
 counts as unexpected, damaged bytes as invalid. `WireAddress` is an amplifier's URL on a kind of
 wire, `PortAbove` a port that changes or delays the bytes of another one.
 
-Wires are found by the scheme of a URL: those of this project, and entry points of installed
-packages. Entry points are of the group `era_haptics.wires`, named by scheme; each is a class
+Wires are found by URL scheme: built-in wires, and entry points of installed packages. Entry points
+are in the group `era_haptics.wires`, named by scheme; each is a class
 derived from `WireAddress`, and made with the URL.
 """
 
@@ -187,13 +187,13 @@ class Wire(Protocol):
 
     counters: WireCounters
     delay: float
-    """How much later a frame may arrive than its bits take [s]; `NETWORK_DELAY` over a network."""
+    """Maximum delay of a frame beyond its bits [s]; `NETWORK_DELAY` over a network."""
     is_kept: bool = False
-    """Whether a frame is repeated until another node takes it, as by an adapter on a CAN bus."""
+    """Whether a frame is repeated until another node accepts it, as on a CAN bus."""
     takes: float = 0.0
-    """How long the request that was sent last takes to arrive [s]; 0 over a network."""
+    """Transmission time of the last request [s]; 0 over a network."""
     blocked: str = "the port takes no bytes: check flow control and the adapter"
-    """What it means if the port is blocked, and what to check."""
+    """Meaning of a blocked port, and what to check."""
     confirms_parts: bool = False
     """Whether each part of a set has a response, after which the next part is sent."""
     busy: float = 0.0
@@ -202,7 +202,7 @@ class Wire(Protocol):
     def request(self, address: int, name: str, values: Values, *, has_reply: bool = True) -> bytes:
         """Return the bytes of a request, which counts as sent; address 0: a broadcast.
 
-        has_reply: whether a reply is awaited; a broadcast and an earlier part of a set have none.
+        has_reply: whether to await a reply; broadcasts and earlier parts of a set have none.
         """
 
     def received(self, data: bytes) -> list[Arrival]:
@@ -223,7 +223,7 @@ class Wire(Protocol):
         """Return how long a request with this number of words takes to arrive [s]."""
 
     def exchange_time(self, words: int, reply: int) -> float:
-        """Return how long a request and a reply of these numbers of words take [s]; 0: unknown."""
+        """Return the duration [s] of a request and a reply of these word counts; 0: unknown."""
         return self.transit(words) + self.transit(reply)
 
 
@@ -248,7 +248,7 @@ class WireAddress(ABC):
         """Make the host's side of the wire, without I/O."""
 
     def check_agrees(self, settings: Mapping[str, object]) -> None:
-        """Raise LinkError unless its settings are those of the other amplifiers on its line."""
+        """Raise LinkError unless its settings match the other amplifiers on its line."""
         for setting, value in settings.items():
             if (got := self.settings.get(setting)) != value:
                 raise LinkError(
@@ -268,7 +268,7 @@ class WireAddress(ABC):
 
 
 class PortAbove:
-    """A port that passes on to another one, below it, what it does not change; see `Port`."""
+    """A port on top of another one; passes on everything it does not change; see `Port`."""
 
     below: Port
     """The other port, which is set once it is open."""
@@ -314,7 +314,7 @@ _WIRES: PluginRegistry[Callable[[str], WireAddress]] = PluginRegistry(
 
 
 def schemes() -> tuple[str, ...]:
-    """Schemes of the URLs of amplifiers, those of plug-ins last."""
+    """URL schemes of amplifiers, plug-ins last."""
     return _WIRES.names()
 
 

@@ -47,10 +47,6 @@ def _commands(
             yield from _commands(command, inner)
             continue
         yield _described(command, inner)
-        for flag, variant in getattr(command, "variants", {}).items():
-            yield _described(
-                variant, typer.Context(variant, info_name=f"{name} {flag}", parent=context)
-            )
 
 
 def _described(command: Any, context: typer.Context) -> tuple[str, str, str, _Records]:

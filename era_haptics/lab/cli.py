@@ -10,7 +10,7 @@ from era_haptics.lab.checks.content_cli import content_app, play
 from era_haptics.lab.checks.layout_cli import layout_app
 from era_haptics.lab.conformance.conformance_cli import conformance
 from era_haptics.lab.design.design_cli import design_app
-from era_haptics.lab.measuring.measure_cli import MeasureCommand, measure, outputs
+from era_haptics.lab.measuring.measure_cli import measure, outputs
 from model.errors import InputError
 
 
@@ -55,6 +55,5 @@ app.add_typer(amp, name="amp")
 app.add_typer(content_app, name="content")
 app.add_typer(layout_app, name="layout")
 app.add_typer(design_app)
-for _command in (play, report, outputs):
+for _command in (play, report, measure, outputs):
     app.command()(_command)
-app.command(cls=MeasureCommand)(measure)

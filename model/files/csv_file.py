@@ -1,13 +1,12 @@
 """CSV files: columns of numbers as one and as a pandas DataFrame, and lines of named columns."""
 
-import cmath
 import csv
 import io
 import logging
 import math
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from importlib import import_module
 from itertools import chain
 from pathlib import Path
@@ -28,26 +27,7 @@ _MAX_LINE = 1 << 16  # characters
 _MAX_ABOVE = 1000  # lines above the first of values
 _POINT = re.compile(r'[;\t"\n][-+]?\d+\.\d+(?:[eE][-+]?\d+)?[;\t"\n]')  # a number with one
 _BLANK = "\n ,;\t"  # of lines without content
-_MAX_DB = 200.0
 _REMARK = re.compile(r"\s*(?:[*#!]|//)[*#!/\s]*")
-_NUMERIC = re.compile(r"\s*[-+.]?\d[-+.,;\d\seE]*$")  # a line of numbers alone
-_SPACED = re.compile(r"\d[ \t]+[-+.\d]")
-_MEANINGS = {
-    column: re.compile(pattern, re.IGNORECASE)
-    for column, pattern in {
-        "frequency_hz": r"\b(f|fre[qk]\w*|[kM]?hz)\b",
-        "phase_deg": r"\b(ph|pha\w*|deg\w*|rad|theta|angle|arg|winkel)\b|[°φθ]",
-        "imag": r"\b(im|ima\w*|xs?|reactance)\b",
-        "real": r"\b(re|real\w*|rs?|resist\w*)\b",
-        "magnitude_db": r"\bdB\b",
-        "magnitude": r"\b(z|mag\w*|mod\w*|abs\w*|amp\w*|imped\w*|betrag|[km]?ohms?)\b"
-        r"|[\u03a9\u2126]",
-    }.items()
-}
-"""What programs that measure call their columns, by ours: the first that is in a name."""
-
-_UNIT = re.compile(r"([kKmM]?)(?:[hH][zZ]|[oO]hms?|[\u03a9\u2126])")
-_PREFIXES = {"": 1.0, "k": 1e3, "K": 1e3, "m": 1e-3, "M": 1e6}
 
 _logger = logging.getLogger(__name__)
 
@@ -100,9 +80,6 @@ class CsvLine:
     has_decimal_comma: bool = False
     """Whether numbers may have a comma in place of a point."""
 
-    factors: Mapping[str, float] = field(default_factory=dict)
-    """Factors of the numbers of columns in other units, by column."""
-
     def number(
         self,
         column: str,
@@ -123,7 +100,6 @@ class CsvLine:
             value = float(text.replace(",", ".") if self.has_decimal_comma else text)
         except ValueError:
             value = math.nan
-        value *= self.factors.get(column, 1.0)
         if not at_least <= value <= at_most:
             form = "; write all with a decimal point, or all with a comma" if "," in text else ""
             lower = f" from {at_least:g}" if at_least > -MAX_VALUE else ""
@@ -134,25 +110,6 @@ class CsvLine:
             )
         return value
 
-    def complex_number(self) -> complex:
-        """The number of real and imag, or of magnitude or magnitude_db with phase_deg.
-
-        Raises InputError where the file has neither.
-        """
-        given = self.cells.keys()
-        if {"real", "imag"} <= given:
-            return complex(self.number("real"), self.number("imag"))
-        if "phase_deg" in given and ("magnitude" in given or "magnitude_db" in given):
-            if "magnitude" in given:
-                size = self.number("magnitude", at_least=0)
-            else:
-                size = 10 ** (self.number("magnitude_db", at_most=_MAX_DB) / 20)
-            return cmath.rect(size, math.radians(self.number("phase_deg")))
-        raise InputError(
-            f"{self.place}: columns must have magnitude or magnitude_db with phase_deg, or real "
-            f"with imag, got {', '.join(name[:30] for name in given)}"
-        )
-
 
 def read_lines(
     path: Path,
@@ -160,33 +117,31 @@ def read_lines(
     *,
     optional: Sequence[str] = (),
     instead: Sequence[str] = (),
-    unnamed: Sequence[str] = (),
 ) -> Iterator[CsvLine]:
     """Yield the lines of a file whose first line names its columns, in any order.
 
-    Columns are separated by commas, semicolons, tabs or spaces; but for commas a decimal comma is
-    read as well, unless another number has a decimal point: it may separate thousands. Empty lines,
-    remarks above the names (with *, #, ! or // before them), empty cells behind the last column and
-    further columns are skipped. instead: columns in place of the last ones, of a file that has the
-    first of them. unnamed: columns of a file that has numbers alone, as programs that measure write
-    it; then names of quantities and units are read by their meaning, also from a remark.
+    Columns are separated by commas, semicolons or tabs. With semicolons and tabs a decimal comma is
+    accepted unless some number has a decimal point: the comma may then separate thousands. Empty
+    lines, remarks above the names (after *, #, ! or //), empty cells behind the last column and
+    unknown columns are skipped. instead: columns that replace the last ones if the file has the
+    first of them.
 
     The file is read line by line: one that is damaged takes no more memory than its first lines.
     Raises InputError with file and line for missing and repeated columns, names that may be
     misspelt, lines of another length, and a file without any.
     """
-    head = _head_of(path, unnamed)
-    has_decimal_comma = head.separator != "," and not _has_points(path, head)
+    skipped, separator = _head_of(path)
+    has_decimal_comma = separator != "," and not _has_points(path, skipped)
     rows = csv.reader(
-        (f"{row}\n" for row in _plain_rows(path, head)),
+        (f"{row}\n" for row in _rows_from(path, skipped)),
         strict=True,
         skipinitialspace=True,
-        delimiter=head.separator,
+        delimiter=separator,
     )
     filled = (row for row in rows if any(map(str.strip, row)))
     count = 0
     try:
-        header = list(head.names) or [name.strip() for name in next(filled, ())]
+        header = [name.strip() for name in next(filled, ())]
         place = f"{path}:{rows.line_num or 1}"
         while header and not header[-1]:
             del header[-1]
@@ -195,9 +150,6 @@ def read_lines(
                 f"{place}: line must have up to {_MAX_COLUMNS} columns, got {len(header)}; give a "
                 "CSV file"
             )
-        factors: Mapping[str, float] = {}
-        if unnamed:
-            header, factors = _meant(header, (*columns, *optional))
         if instead and instead[0] in header:
             columns = (*columns[: -len(instead)], *instead)
         _check_header(place, header, columns, optional)
@@ -212,7 +164,7 @@ def read_lines(
                 )
             cells = dict(zip(header, map(str.strip, row), strict=True))
             count += 1
-            yield CsvLine(place, cells, has_decimal_comma, factors)
+            yield CsvLine(place, cells, has_decimal_comma)
     except csv.Error as error:
         raise InputError(
             f"{path}:{rows.line_num}: invalid CSV ({error}); check quotes and the end of the file"
@@ -221,82 +173,37 @@ def read_lines(
         raise InputError(f"{path}:1: at least one line of values must follow, got none")
 
 
-@dataclass(frozen=True)
-class _Head:
-    """How the rows of a file are read."""
+def _head_of(path: Path) -> tuple[int, str]:
+    """Return the number of rows above the names of columns, and the separator of columns.
 
-    skipped: int
-    """Number of rows before the first that is read."""
-
-    separator: str
-    is_spaced: bool
-    """Whether spaces separate its columns."""
-
-    has_remarks: bool
-    """Whether remarks may stand between its rows."""
-
-    names: Sequence[str]
-    """Columns; empty if the first row that is read names them."""
-
-
-def _head_of(path: Path, unnamed: Sequence[str]) -> _Head:
-    """Find where a file begins, and how its columns are separated; raises InputError."""
-    above: list[str] = []
-    first_row = first_filled = ""
+    Raises InputError for a file without names.
+    """
     is_empty = True
-    skipped = 0
     for number, row in enumerate(_text_rows(path)):
-        if number > _MAX_ABOVE and not first_filled:
+        if number > _MAX_ABOVE:
             raise InputError(
                 f"{path}: columns must be named in the first {_MAX_ABOVE} lines, got none; give a "
                 "CSV file"
             )
-        if number > _MAX_ABOVE:
-            break
         is_empty = is_empty and not row.strip()
         is_remark = _REMARK.match(row) is not None
-        if unnamed and not is_remark and _NUMERIC.match(row):
-            first_row, skipped = row, number
-            break
-        if not first_filled and not is_remark and row.strip(_BLANK):
-            first_filled = row
-        # Below names a line may begin with the name of a sensor, such as #1.
-        if not unnamed and row and not is_remark:
-            skipped = number
-            if first_filled:
-                break
-        above.append(row)
+        if row.strip(_BLANK) and not is_remark:
+            separator = next((sign for sign in "\t;" if sign in row), ",")
+            return number, separator
     if is_empty:
         raise InputError(f"{path}: file is empty; export the measurement again")
-    first = first_row or first_filled
-    is_spaced = _SPACED.search(first) is not None and not (";" in first or "\t" in first)
-    plain = "\t".join(first.split()) if is_spaced else first
-    separator = "\t" if is_spaced else next((sign for sign in "\t;" if sign in first), ",")
-    names: Sequence[str] = ()
-    if first_row:
-        count = len([cell for cell in plain.split(separator) if cell.strip()])
-        heads = [_REMARK.sub("", row).strip(_BLANK) for row in above]
-        split = [_columns(row, separator, count) for row in heads if row]
-        default = [f"column {number + 1}" for number in range(count)]
-        names = unnamed if count == len(unnamed) else default
-        names = next((row for row in reversed(split) if len(row) == count), names)
-    return _Head(skipped, separator, is_spaced, bool(unnamed), names)
+    return 0, ","
 
 
-def _has_points(path: Path, head: _Head) -> bool:
+def _has_points(path: Path, skipped: int) -> bool:
     """Whether a number of a file has a decimal point."""
-    return any(_POINT.search(f"\n{row}\n") for row in _plain_rows(path, head))
+    return any(_POINT.search(f"\n{row}\n") for row in _rows_from(path, skipped))
 
 
-def _plain_rows(path: Path, head: _Head) -> Iterator[str]:
-    """All rows of a file in turn: skipped ones and remarks as empty ones."""
+def _rows_from(path: Path, skipped: int) -> Iterator[str]:
+    """All rows of a file; the skipped ones are empty, so that lines keep their numbers."""
     for number, row in enumerate(_text_rows(path)):
-        if number < head.skipped or (head.has_remarks and _REMARK.match(row)):
-            yield ""
-        elif head.is_spaced:
-            yield "\t".join(row.split())
-        else:
-            yield row
+        yield "" if number < skipped else row
 
 
 def _text_rows(path: Path) -> Iterator[str]:
@@ -315,30 +222,6 @@ def _text_rows(path: Path) -> Iterator[str]:
             raise InputError(f"{path}: text must be UTF-8; save it as such") from error
         except LineTooLong as error:
             raise InputError(f"{path}:{error.line}: {error}; give a CSV file") from error
-
-
-def _columns(row: str, separator: str, count: int) -> list[str]:
-    """Names in a line above numbers, which may be separated otherwise than these."""
-    tried = (row.split(separator), row.split(","), re.split(r"\t| {2,}", row), row.split())
-    found = next((each for each in tried if len(each) == count), [])
-    return [name.strip() for name in found]
-
-
-def _meant(header: Sequence[str], known: Sequence[str]) -> tuple[list[str], dict[str, float]]:
-    """Columns by what their names mean, where one is known, and factors of their units."""
-    found, factors = list[str](), dict[str, float]()
-    for name in header:
-        words = name.replace("_", " ")
-        meant = (each for each, pattern in _MEANINGS.items() if pattern.search(words))
-        column = name if name in known else next(meant, name)
-        if column in found or column not in known:
-            column = name
-        elif unit := _UNIT.search(words):
-            factors[column] = _PREFIXES[unit[1]]
-        elif re.search(r"\brad", words):
-            factors[column] = math.degrees(1)
-        found.append(column)
-    return found, factors
 
 
 def _check_header(

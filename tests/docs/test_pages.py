@@ -153,8 +153,6 @@ def commands(group: TyperGroup, name: str = "era") -> Iterator[tuple[str, TyperC
             yield from commands(command, full)
         else:
             yield full, command
-            for flag, variant in getattr(command, "variants", {}).items():
-                yield f"{full} {flag}", variant
 
 
 def test_page_lists_every_command_with_its_options() -> None:

@@ -25,9 +25,7 @@ READ: dict[str, set[str]] = {
     "measured.csv": {"UTF-16", "cut in half"},
     "measured.uff": {*_BETWEEN_DATASETS, "zero bytes inside"},  # in a description
     "modes.uff": _BETWEEN_DATASETS,
-    **dict.fromkeys(
-        ("places.csv", "sensors.csv", "moved.csv", "free.zma", "P1-1.csv", "modes.csv"), _IN_UTF_16
-    ),
+    **dict.fromkeys(("places.csv", "sensors.csv", "moved.csv", "modes.csv"), _IN_UTF_16),
 }
 """By the name of a file the variants that its reader may read."""
 

@@ -28,9 +28,7 @@ from era_haptics.lab.design.problem import (
     contact_rule,
     layouts_of,
 )
-from era_haptics.lab.measuring.impedance import read_impedance
-from era_haptics.lab.measuring.other_sources import read_stepped
-from era_haptics.lab.measuring.sound_card import Desk, WiredSensor, read_sensors
+from era_haptics.lab.measuring.sound_card import read_sensors
 from kit.plates import small_table
 from model.config.document import parse_document
 from model.errors import InputError
@@ -45,7 +43,6 @@ EXAMPLES = Path(__file__).parents[3] / "examples"
 
 RIG = load_rig(example_rig_path())
 DESIGN = DesignProblem(RIG, 4, area_of("edge", RIG.plate), anywhere(RIG.plate))
-DESK = Desk(RIG, (WiredSensor("P1", 0.1, 0.1, 1, 1.0),))
 
 
 def _run_command(words: str, path: Path) -> str:
@@ -94,9 +91,6 @@ READERS: Mapping[str, Callable[[Path], object]] = {
     "places.csv": lambda path: read_places(path, RIG.plate),
     "sensors.csv": lambda path: read_sensors(path, RIG.plate),
     "moved.csv": lambda path: read_sensors(path, RIG.plate, may_move=True),
-    "free.zma": read_impedance,
-    "P1-1.wav": lambda path: read_stepped(path, DESK),
-    "P1-1.csv": lambda path: read_stepped(path, DESK),
     "modes.npz": lambda path: read_modes(path, read_measured_bytes(path)),
     "modes.uff": lambda path: read_modes(path, read_measured_bytes(path)),
     "modes.csv": lambda path: read_modes(path, read_measured_bytes(path)),
@@ -131,14 +125,6 @@ def _tone() -> bytes:
     times = np.arange(8000) / 8000
     samples = (0.5 * 32767 * np.sin(2 * np.pi * 200 * times)).astype("<i2")
     return wav(samples.tobytes(), code=1, channels=1, rate=8000, bits=16)
-
-
-def _stepped() -> bytes:
-    """Two seconds of a sensor beside the reference of one output, as PCM of 16 bits."""
-    times = np.arange(2 * 8000) / 8000
-    tone = 0.5 * 32767 * np.sin(2 * np.pi * 200 * times)
-    samples = np.column_stack([tone, tone]).astype("<i2")
-    return wav(samples.tobytes(), code=1, channels=2, rate=8000, bits=16)
 
 
 def _shapes() -> dict[str, np.ndarray[tuple[int, ...], np.dtype[np.float64]]]:
@@ -225,9 +211,6 @@ SAMPLES: Mapping[str, Callable[[], bytes]] = {
     "moved.csv": lambda: (
         b"sensor,x_m,y_m,input,mv_per_m_s2,mass_g\nP1,0.1,0.1,1,10.0,2.5\nP2,0.2,0.1,1,10.0,2.5\n"
     ),
-    "free.zma": lambda: b"10.0 4.0 1.0\n20.0 5.0 2.0\n30.0 6.0 3.0\n",
-    "P1-1.wav": _stepped,
-    "P1-1.csv": lambda: b"frequency_hz,real,imag\n61.0,1.0,0.5\n71.0,1.0,0.5\n",
     "modes.npz": _modes_npz,
     "modes.uff": _modes_uff,
     "modes.csv": _modes_csv,

@@ -1,1 +1,1 @@
-"""Estimates of a plate: which one it is, and how sure that is, from responses."""
+"""Estimate plate parameters and their uncertainty from measured responses."""

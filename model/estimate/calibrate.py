@@ -1,14 +1,14 @@
-"""Calibration of a rig: fit it to measured responses, check it at held-out sensors, and report it.
+"""Calibrate a rig: fit it to measured responses, validate it at held-out sensors, and report it.
 
     d_fsn = g_fn a_fsn(x) + noise
 
-d are measured values at frequency f of sensor s and ERA n, a those of the model as sensors of some
-scales read them, g a complex gain of every frequency and ERA. x has the values of the rig and the
-plate's form errors, in standard deviations of what data sheets and tolerances leave.
+d are measured values at frequency f, sensor s and ERA n; a are those of the model, multiplied by
+the sensors' scales; g is a complex gain per frequency and ERA. x contains the rig's values and the
+plate's form errors, in standard deviations of data sheets and tolerances.
 
-`check_consistency` is the gate before it: it refuses responses that are not what they claim to be.
-Dead channels and outliers are left out. The rig of a fit has what a rig file can express, and
-states how well it is then known.
+`check_consistency` comes first: it rejects responses that contradict their metadata. Dead channels
+and outliers are left out. The fitted rig contains only what a rig file can express, with the
+remaining uncertainty.
 """
 
 import math
@@ -57,52 +57,51 @@ MAX_PREDICTION_ERROR = 0.25
 """Largest relative error at held-out sensors of an acceptable fit."""
 
 MAX_OUTLIERS = 0.1
-"""Largest share of values left out of an acceptable fit."""
+"""Largest fraction of values left out of an acceptable fit."""
 
-_MAX_FREQUENCIES = 16  # ample for every check before a calibration
+_MAX_FREQUENCIES = 16  # enough for every check before a calibration
 _LEAST = 1e-4  # of an uncertainty; no fit is exact
 
-# Relative error of values by idealisations of the model, of any but the loss factor, and of that:
-# what form errors leave unexplained widens resonances by 0.4 % (root mean square over plates
-# without noise).
+# Relative model errors: of all values except the loss factor, and of the loss factor. Unmodelled
+# form errors widen resonances by 0.4 % (RMS over plates without noise).
 _MODEL_ERROR, _LOSS_ERROR = 2e-3, 4e-3
 _FOREIGN_MASS = PARAMETER_KINDS["foreign_mass"].std * math.sqrt(
     MASS_CELLS.cell_count
 )  # of the plate's
 
-_UNKNOWN = 100.0  # standard deviations of what no prior holds
-_AT_BOUND = 1e-6  # standard deviations
+_UNKNOWN = 100.0  # standard deviations, for parameters without a prior
+_AT_BOUND = 1e-6  # standard deviations from the bound
 _WRONG_SCALE = 0.02  # common tolerance of sensors
 _SIGNIFICANCE = 4.0  # standard errors
-_CLEAR = 3.0  # standard errors of a clear deviation
-_MAX_GAIN = 5.0  # of a drive at a frequency relative to its median, either way
-_MAX_SIDE = 4.0  # tolerances by which a side of the plate may be off
+_CLEAR = 3.0  # standard errors of a significant difference
+_MAX_GAIN = 5.0  # of a drive at one frequency relative to its median, up or down
+_MAX_SIDE = 4.0  # tolerances by which a side of the plate can be off
 
 
 @dataclass(frozen=True, eq=False)
 class Screening:
-    """Result of a check of responses, for a fit to them."""
+    """Result of checking responses before a fit."""
 
     dead_eras: NDArray[np.bool_]
     """Mask (e,) of the ERAs that do not move the plate."""
     dead_sensors: NDArray[np.bool_]
-    """Mask (s,) of the sensors that hear next to nothing."""
+    """Mask (s,) of the sensors with almost no signal."""
     start: FloatArray
-    """Fitted values (n,) of the most likely plate, as `SensedPlate.numbers` are in its space."""
+    """Fitted values (n,) of the most likely plate, in the order of `SensedPlate.numbers`."""
 
     def live(self, measured: Measurement) -> Measurement:
-        """Responses of the sensors and ERAs that are not dead."""
+        """Return the responses of the sensors and ERAs that are not dead."""
         live = measured.without(self.dead_sensors)
         return replace(live, values=np.where(self.dead_eras, np.nan, live.values))
 
 
 def check_consistency(rig: Rig, responses: Measurement) -> Screening:
-    """Check that responses are what they claim to be, and screen them for a fit.
+    """Check that responses agree with their metadata, and find dead channels.
 
-    A fit can absorb almost any error of a measurement: gains take wrong units, springs a swapped
-    plug, outlier rejection whole sensors. Raises InputError that names the cause: too few sensors
-    or frequencies, another quantity or unit, a grain along the other side, the other meaning of a
-    resonance, conjugated phases, sensors at swapped places, swapped or inverted channels.
+    A fit can absorb almost any measurement error: gains absorb wrong units, springs a swapped plug,
+    outlier rejection whole sensors. Raises InputError with the cause: too few sensors or
+    frequencies, wrong quantity or unit, grain along the other side, free and mounted resonance
+    confused, conjugated phases, sensors at swapped positions, swapped or inverted channels.
     """
     rows = np.unique(
         np.linspace(0, len(responses.frequencies) - 1, _MAX_FREQUENCIES).round().astype(int)
@@ -111,7 +110,7 @@ def check_consistency(rig: Rig, responses: Measurement) -> Screening:
     observation = replace(responses, frequencies=some, values=values, errors=None)
     if observation.count and not (np.abs(values) > 0).any():
         raise InputError("measured responses must not all be zero; check that ERAs were driven")
-    # Values of the plate that are off are what a calibration is for.
+    # A calibration corrects wrong plate values, so these are no reason to reject.
     verdict = diagnose(rig, observation, false_alarm=0.0, refuses=True)
     _check_wiring(verdict)
     best = verdict.hypotheses[0] if verdict.hypotheses else None
@@ -126,7 +125,7 @@ def check_consistency(rig: Rig, responses: Measurement) -> Screening:
 
 
 def _check_wiring(verdict: Verdict) -> None:
-    """Raise InputError for channels that drive another ERA or have the opposite sign."""
+    """Raise InputError for channels that drive another ERA or have inverted polarity."""
     for cycle in cycles(verdict.channels):
         raise InputError(
             "channels must drive the ERAs of the rig; the channels of "
@@ -143,9 +142,9 @@ def _check_wiring(verdict: Verdict) -> None:
     inverted = [channel.era for channel in verdict.channels if "inverted" in channel.states]
     if inverted:
         raise InputError(
-            f"signs must be upwards positive for sensors and ERAs, got opposite ones of "
-            f"{_joined(inverted)}; swap the two wires of these, or turn the sensors over if it is "
-            "all of them"
+            f"signs must be positive upwards for sensors and ERAs, got inverted signs for "
+            f"{_joined(inverted)}; swap their two wires, or turn the sensors over if all "
+            "are inverted"
         )
 
 
@@ -157,8 +156,8 @@ def _joined(names: Sequence[str]) -> str:
 class HeldOutSensors:
     """Prediction at sensors held out of the fit.
 
-    Errors are root mean squares over responses, each relative to all sensors' at its frequency and
-    ERA.
+    Errors are RMS values over responses, relative to the RMS of all sensors at the same frequency
+    and ERA.
     """
 
     sensors: tuple[str, ...]
@@ -169,28 +168,28 @@ class HeldOutSensors:
     median: float
     """Median error of the fitted rig."""
     unexplained: float
-    """Error of the fitted rig that neither noise nor tolerances of the sensors explain."""
+    """Error of the fitted rig that is explained neither by noise nor by sensor tolerances."""
 
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """A rig that was fitted to a measurement, and what is found about both."""
+    """A rig fitted to a measurement, with the diagnostics of both."""
 
     plate: SensedPlate
-    """The plate of the rig as it was, at the sensors of the fit."""
+    """Plate of the original rig, at the sensors of the fit."""
     fit: Fit
-    """The fit with form errors to the sensors with a signal."""
+    """Fit with form errors, to the sensors with a signal."""
     prior: tuple[FloatArray, FloatArray]
-    """What is known of the parameters beforehand: mean (p,) and covariance (p, p)."""
+    """Prior of the parameters: mean (p,) and covariance (p, p)."""
     dead_sensors: tuple[str, ...]
     """Sensors left out of the fit, without a signal."""
     dead_eras: tuple[str, ...]
     """ERAs left out of the fit, which do not move the plate."""
 
     def to_frame(self) -> Any:
-        """Parameters before and after, their units and errors, as a pandas DataFrame.
+        """Return parameters before and after, units and errors as a pandas DataFrame.
 
-        A row a parameter; needs pandas.
+        One row per parameter; requires pandas.
         """
         return as_frame(
             {
@@ -204,12 +203,12 @@ class Calibration:
 
     @property
     def is_good(self) -> bool:
-        """Whether the fit predicts held-out sensors; False where there are none."""
+        """Whether the fit predicts held-out sensors; False without held-out sensors."""
         return self.held_out is not None and self.held_out.after <= MAX_PREDICTION_ERROR
 
     @cached_property
     def rig(self) -> Rig:
-        """The calibrated rig: without form errors, with its gains and its uncertainty."""
+        """Calibrated rig: without form errors, with its gains and its uncertainty."""
         eras = []
         for era, gains in zip(self._fitted.eras, self._gains.T.tolist(), strict=True):
             rows = zip(self.measurement.frequencies.tolist(), gains, strict=True)
@@ -219,9 +218,9 @@ class Calibration:
 
     @cached_property
     def parameters(self) -> tuple[Parameter, ...]:
-        """The fitted values, with the errors of the fit, of the model and of the whole mass.
+        """Fitted values, with errors from the fit, the model and the total mass.
 
-        All that is fitted but losses scales with the whole mass, which no response tells.
+        All fitted values except losses scale with the total mass, which responses cannot determine.
         """
         plate, x, space = self.plate, self.fit.x, self.plate.model.space
         sides = PARAMETER_KINDS["side"].std / np.array(
@@ -254,7 +253,8 @@ class Calibration:
 
     @property
     def moved(self) -> dict[str, tuple[Point, Point]]:
-        """Places x, y [m] of the ERAs that clearly are not at the rig's, and standard errors."""
+        """Positions x, y [m] of ERAs that differ significantly from the rig's, and standard
+        errors."""
         errors = self.plate.model.space.values(self.fit.errors, "place").reshape(-1, 2)
         return {
             era.name: ((era.x, era.y), (float(error[0]), float(error[1])))
@@ -275,7 +275,7 @@ class Calibration:
 
     @property
     def scales(self) -> dict[str, tuple[float, float]]:
-        """Scale and standard error of sensors where it is wrong, or of all if requested.
+        """Scale and standard error of sensors whose scale is wrong, or of all sensors on request.
 
         Relative to the median of the others.
         """
@@ -301,12 +301,12 @@ class Calibration:
 
     @property
     def error(self) -> float:
-        """Error of the fit with its form errors, relative as in `HeldOutSensors`."""
+        """Relative error of the fit with form errors; see `HeldOutSensors`."""
         return self._relative_error(self.fit.predicted, self.measurement.known)
 
     @property
     def chi2(self) -> float:
-        """chi² of the fit by degree of freedom, about 1."""
+        """chi² per degree of freedom of the fit, about 1."""
         return self.fit.chi2
 
     @property
@@ -321,7 +321,7 @@ class Calibration:
 
     @property
     def before(self) -> ComplexArray:
-        """Responses of the rig as it was (f, s, eras) [1/s²]."""
+        """Responses of the original rig (f, s, eras) [1/s²]."""
         gains = np.array([era.gain(self.measurement.frequencies) for era in self.plate.rig.eras]).T
         return np.asarray(gains[:, None] * self.plate.responses())
 
@@ -334,8 +334,8 @@ class Calibration:
     def held_out(self) -> HeldOutSensors | None:
         """Fit without some of the sensors of known scale, and predict their responses.
 
-        The prediction is that of the rig as its file has it, without other form errors. None where
-        too few sensors are left to fit.
+        The prediction uses the rig as written to its file, without other form errors. None if too
+        few sensors remain for a fit.
         """
         count, space = len(self.measurement.names), self.plate.model.space
         candidates = np.flatnonzero(~self.is_rescaled | self.is_rescaled.all())
@@ -370,13 +370,13 @@ class Calibration:
 
     @property
     def sensor_scales(self) -> FloatArray:
-        """Scales of all sensors (s,), of unknown ones relative to their median."""
+        """Scales of all sensors (s,); unknown scales are relative to their median."""
         scales = 1 + self.plate.model.space.values(self.fit.x, "sensor_scale")
         return scales / self._common_scale
 
     @property
     def is_rescaled(self) -> NDArray[np.bool_]:
-        """Mask of the sensors whose scale no tolerance holds (s,)."""
+        """Mask of the sensors whose scale exceeds any tolerance (s,)."""
         own = self.plate.model.space.groups["sensor_scale"]
         return np.asarray(self.prior[1].diagonal()[own] > 1)
 
@@ -386,7 +386,7 @@ class Calibration:
         return self.fit.gains * self._common_scale
 
     def fitted_again(self, searched: NDArray[np.bool_], start: FloatArray) -> "Calibration":
-        """Fit the parameters of a mask (p,) from a start (p,) of all of them."""
+        """Fit the parameters of a mask (p,), starting from values of all parameters (p,)."""
         found = fit_to_noise(
             self.plate.model,
             self.measurement,
@@ -398,27 +398,29 @@ class Calibration:
 
     @property
     def _common_scale(self) -> float:
-        """Median of the scales where all are unknown: responses do not tell it from the gains."""
+        """Median scale if all scales are unknown, because responses cannot separate it from the
+        gains."""
         scales = 1 + self.plate.model.space.values(self.fit.x, "sensor_scale")
         return float(np.median(scales)) if self.is_rescaled.all() else 1.0
 
     def _relative_error(self, predicted: ComplexArray, which: NDArray[np.bool_]) -> float:
-        """Rms error at the values of a mask, relative to rows' rms; infinite for an empty mask."""
+        """RMS error at the values of a mask, relative to the RMS of rows; infinite for an empty
+        mask."""
         values = self.measurement.values
         error = np.abs(predicted - values) / row_rms(values)
         return rms(error[which]) if which.any() else math.inf
 
     @cached_property
     def is_clear(self) -> NDArray[np.bool_]:
-        """Mask of the parameters that deviate by several standard errors (p,)."""
+        """Mask of the parameters that differ from the rig by several standard errors (p,)."""
         return np.asarray(np.abs(self.fit.x) > _CLEAR * self.fit.errors)
 
     @cached_property
     def _plain(self) -> Fit:
-        """The fit of the plate without form errors, which a rig file does not have.
+        """Fit of the plate without form errors, which a rig file cannot express.
 
-        Form errors count as noise; their likeness to another modulus or loss factor returns to
-        these, as that of a longer side. ERAs stay where they clearly are.
+        Form errors count as noise. A form error that resembles another modulus or loss factor, such
+        as a longer side, is absorbed by these. ERAs stay at their significant positions.
         """
         space, x = self.plate.model.space, self.fit.x.copy()
         mine = space.of("modulus", "loss_added", "sensor_scale", "sensor_place")
@@ -429,7 +431,8 @@ class Calibration:
 
     @cached_property
     def _fitted(self) -> Rig:
-        """The rig without form errors, its ERAs where they clearly are, with the gains before."""
+        """Rig without form errors, with ERAs at their significant positions and the original
+        gains."""
         return self.plate.rig_at(self._plain.x, "place")
 
     @cached_property
@@ -441,22 +444,23 @@ class Calibration:
 
     @cached_property
     def _gains(self) -> ComplexArray:
-        """Gains of these responses that fit best (f, eras), NaN where not measured."""
+        """Best-fitting gains for these responses (f, eras), NaN if not measured."""
         return self._gains_for(self._fields * self.sensor_scales[:, None])
 
     def _gains_for(self, model: ComplexArray) -> ComplexArray:
-        """Gains (f, eras) of responses (f, s, eras) that fit best, NaN where not measured."""
+        """Best-fitting gains (f, eras) for responses (f, s, eras), NaN if not measured."""
         return gains_of(model, self.measurement.values, self.measurement.weight)
 
     @cached_property
     def _gain_changes(self) -> tuple[ComplexArray, FloatArray]:
-        """Relative changes of the gains by what is searched (f, eras, q); variances by noise."""
+        """Relative change of the gains per searched parameter (f, eras, q); variances due to
+        noise."""
         fit, space = self.fit, self.plate.model.space
         power = (np.abs(self.measurement.weight * fit.predicted) ** 2).sum(axis=1)
         with np.errstate(divide="ignore", invalid="ignore"):
             slopes = fit.gain_slopes / fit.gains[..., None]
             of_noise = np.where(power > 0, max(fit.chi2, 1.0) / power, np.nan)
-        # A force factor is found with the gain: their product is what moves the plate.
+        # A force factor and the gain are fitted together: only their product moves the plate.
         numbers = np.flatnonzero(fit.searched)
         for era, factor in enumerate(space.indices("force_factor")):
             slopes[:, era, numbers == factor] += space.std[factor]
@@ -464,7 +468,7 @@ class Calibration:
 
     @cached_property
     def _loss_error(self) -> float:
-        """Relative error of the loss factor by the model: its own, and by that of all dampers."""
+        """Relative model error of the loss factor, including the effect of all dampers."""
         plate, kinds = self.plate, np.array([row.kind for row in self.plate.rows])
         values = plate.values(self.fit.x) / plate.model.space.scale[plate.numbers]
         size = np.where(values > 0, values, np.inf)
@@ -479,19 +483,20 @@ class Calibration:
     def _uncertainty(self) -> Uncertainty:
         """Uncertainty of the calibrated rig, for its file.
 
-        It excludes the error of the whole mass, with which all values scale and no pattern changes.
-        Thickness stands for the plate's rigidity: 1 % of modulus shifts modes as 0.5 % of thickness
-        does. What is not identified keeps the value of the rig before.
+        Excludes the error of the total mass, which scales all values and changes no pattern.
+        Thickness represents the plate's rigidity: 1 % of modulus shifts modes like 0.5 % of
+        thickness. Values that are not identified keep the original uncertainty.
         """
         before, x = self.plate.rig.uncertainty, self.fit.x
-        # An exciter damps and pushes by its coil: the share of its suspension shows little alone.
+        # An exciter's coil both damps and drives; the contribution of its suspension hardly shows
+        # alone.
         coils = [row.name for row in self.plate.of_exciters if row.kind == "damping"]
         errors = self.plate.errors(x, self.fit.errors).tolist()
 
         def relative(
             kind: str, theory: float = _MODEL_ERROR, unidentified: float = math.inf
         ) -> float:
-            """Rms error of the values of a kind."""
+            """RMS error of the values of one kind."""
             shares = [
                 math.hypot(error / one.value, theory) if one.is_identified else unidentified
                 for one, error in zip(self.parameters, errors, strict=True)
@@ -511,12 +516,12 @@ class Calibration:
         }
         if not any(one.foot for one in self.parameters):
             del fitted["supports"]
-        # An error is hardly known better than to two digits.
+        # An error is rarely known to more than two digits.
         fitted = {key: float(f"{each:.2g}") for key, each in fitted.items() if each < math.inf}
         if "damping" in fitted:
             fitted["damping"] += 1
         if self.parameters[0].is_identified:
-            # The rig's modulus is that of frequencies with form errors, whatever part is theirs.
+            # The fitted modulus reproduces the frequencies, including the effect of form errors.
             plain, value = self._plain, self.plate.values(self._plain.x)[0]
             of_plain = self.plate.errors(plain.x, plain.errors)[0]
             of_modulus = math.hypot(of_plain / value, _MODEL_ERROR)
@@ -525,16 +530,17 @@ class Calibration:
 
     @property
     def _field_errors(self) -> dict[str, float]:
-        """Errors of gains and fields by keys of an uncertainty, none where an ERA has no gain.
+        """Errors of gains and fields by key of `uncertainty`; missing if an ERA has no gain.
 
-        Field is the part of the fit's fields that the rig lacks, since it cannot express form
-        errors, and at least what held-out sensors leave unexplained. Gain and phase are those of
-        the best gains for such fields, as the sensors read them: other errors move gains and fields
+        `field` is the part of the fitted fields that the rig cannot express (form errors), and at
+        least the unexplained error at held-out sensors. `gain` and `phase` are the errors of the
+        best gains for such fields, as measured by the sensors; other errors change gains and fields
         in opposite directions.
         """
         slopes, of_noise = self._gain_changes
         lacking, covariance = self._lacking, self.fit.covariance
-        # What else is searched changes gain and field the opposite ways: sensors read the product.
+        # Other fitted parameters change gain and field in opposite directions: sensors measure the
+        # product.
         reads = self.plate.model.space.of("sensor_scale", "sensor_place") & self.fit.searched
         slopes = slopes[..., reads[self.fit.searched]]
         common = np.nanmean(slopes, axis=(0, 1))
@@ -548,8 +554,8 @@ class Calibration:
             return {}
         left = self.held_out.unexplained if self.held_out else 0.0
         field = max(rms(lacking[known]), left)
-        # The best gain of a field that is off by so much at n sensors: but at resonances, masses
-        # and stiffness that are off change a field in phase with it.
+        # Error of the best gain if the field at n sensors has this error. Except at resonances,
+        # wrong masses and stiffness change a field in phase with it.
         off = field / np.sqrt(self.measurement.known.sum(axis=1)[known])
         turned = rms(np.hypot(math.sqrt(0.5) * off, phase[known]))
         return {
@@ -561,9 +567,9 @@ class Calibration:
 
     @property
     def _lacking(self) -> FloatArray:
-        """Part of the fit's responses that its rig lacks, relative (f, eras).
+        """Part of the fitted responses that the rig cannot express, relative (f, eras).
 
-        ERAs stay at the places of the fit, since a rig states the errors of places.
+        ERAs stay at their fitted positions, since a rig states position errors separately.
         """
         at_places = np.where(self.plate.model.space.of("place"), self.fit.x, self._plain.x)
         model, known = self.plate.responses(at_places), self.measurement.known
@@ -577,10 +583,10 @@ class Calibration:
 
     @property
     def _place_error(self) -> float:
-        """Root mean square error of the places of ERAs in the rig, along a side [m].
+        """RMS error of the ERA positions in the rig, per coordinate [m].
 
-        Where the fit does not clearly have another place, the error of the kept one counts; the
-        error of the rig before counts where the data determine a place less than its prior does.
+        If the fitted position is not significant, the error of the original position counts. If the
+        data determine a position less well than its prior, the original uncertainty counts.
         """
         space, kind = self.plate.model.space, PARAMETER_KINDS["place"]
         kept, error = (
@@ -599,15 +605,16 @@ def calibrate(
     all_scales: bool = False,
     progress: Progress = unseen,
 ) -> Calibration:
-    """Fit a rig to responses measured on it, once `check_consistency` has screened them.
+    """Fit a rig to responses measured on it, after checking them with `check_consistency`.
 
     all_scales: estimate the scale of every sensor, not only of wrong ones; progress: called with
-    the fits done and all. Raises InputError if fewer than three sensors have a signal, for a plate
-    of another size, for gains that no drive has, and for suspensions or feet at a bound.
+    the number of fits done and the total. Raises InputError if fewer than three sensors have a
+    signal, for a plate of another size, for impossible gains, and for suspensions or feet at a
+    bound.
     """
-    # All scales are unknown at first, so that a wrong one does not bias the fit.
+    # All scales are free at first, so that a wrong one does not bias the fit.
     found = _fitted_with_scales(rig, measured, check_consistency(rig, measured))
-    progress(1, 3)  # with all scales free, of what is identified, without held-out sensors
+    progress(1, 3)  # all scales free; identified parameters; without held-out sensors
     scales, space = found.sensor_scales, found.plate.model.space
     error = space.values(found.fit.errors, "sensor_scale")
     is_wrong = np.abs(scales - 1) > np.maximum(_WRONG_SCALE, _SIGNIFICANCE * error)
@@ -624,17 +631,17 @@ def calibrate(
         out, count = found.outlier_count, found.value_count
         raise InputError(
             f"outliers must be at most {100 * MAX_OUTLIERS:g} % of the values, got {out} of "
-            f"{count} ({100 * out / count:.0f} %); check that it is this plate, names and places "
-            "of sensors and ERAs, and loose contacts"
+            f"{count} ({100 * out / count:.0f} %); check that it is this plate, names and "
+            "positions of sensors and ERAs, and loose contacts"
         )
     for stated in ("held_out", "rig"):
-        getattr(found, stated)  # further fits, which progress counts
+        getattr(found, stated)  # more fits, counted by progress
     progress(3, 3)
     return found
 
 
 def _fitted_with_scales(rig: Rig, measured: Measurement, screened: Screening) -> Calibration:
-    """Fit with unknown scales of all sensors; leave out those of which most values are outliers."""
+    """Fit with free scales of all sensors; leave out sensors with mostly outliers."""
     while True:
         dead = screened.dead_sensors.copy()
         check_enough_sensors(~dead, measured)
@@ -671,11 +678,11 @@ def _fitted_with_scales(rig: Rig, measured: Measurement, screened: Screening) ->
 def _prior(
     plate: SensedPlate, start: FloatArray, is_unknown: NDArray[np.bool_]
 ) -> tuple[FloatArray, FloatArray]:
-    """Mean (p,) and covariance (p, p) of the parameters beforehand.
+    """Return the prior mean (p,) and covariance (p, p) of the parameters.
 
-    Nothing holds the rig's values but those of sheets and feet, nor the scales of a mask (s,)
-    of sensors beside those of a start (p,). Where all scales are unknown, responses do not tell
-    what they have in common from the gains: the median of good sensors is known beforehand.
+    Only data sheets and feet constrain the rig's values. Scales of sensors in a mask (s,) are free;
+    the others are constrained around a start (p,). If all scales are free, responses cannot
+    separate their common factor from the gains, so the median of good sensors is constrained.
     """
     space = plate.model.space
     own = np.arange(space.size)[space.groups["sensor_scale"]]
@@ -691,12 +698,12 @@ def _prior(
 
 
 def _identified(found: Calibration) -> Calibration:
-    """Fix parameters that the data determine less than their prior does, and fit again."""
+    """Fix parameters that the data determine less well than their prior, and fit again."""
     while True:
         plate, searched = found.plate, found.fit.searched.copy()
         errors = found.fit.errors[plate.numbers] / plate.largest_errors
         excess = np.where(searched[plate.numbers], errors, 0)
-        # Values of a plate that does not fit are meaningless.
+        # Values of a poorly fitting plate are meaningless.
         if not excess.max() > 1 or found.error > MAX_PREDICTION_ERROR:
             return found
         least, x = plate.numbers[best_of(excess)], found.fit.x.copy()
@@ -705,7 +712,7 @@ def _identified(found: Calibration) -> Calibration:
 
 
 def _check_sides(found: Calibration) -> None:
-    """Raise InputError where the responses fit a plate of another size better."""
+    """Raise InputError if a plate of another size fits the responses better."""
     if found.error > MAX_PREDICTION_ERROR:
         return
     plate, space = found.plate.rig.plate, found.plate.model.space
@@ -716,7 +723,7 @@ def _check_sides(found: Calibration) -> None:
 
 
 def _wrong_size(key: str, in_rig: float, measured: float) -> InputError:
-    """Error for a side [m] of the plate, by its key, where another size fits the responses."""
+    """Return the error for a side [m] of the plate, by key, if another size fits better."""
     rig_has, fits = (in_display_unit(side, "m", digits=4) for side in (in_rig, measured))
     return InputError(
         f"{key} must match the measured plate, got {rig_has} in the rig; the responses fit {fits}. "
@@ -725,7 +732,7 @@ def _wrong_size(key: str, in_rig: float, measured: float) -> InputError:
 
 
 def _check_gains(found: Calibration) -> None:
-    """Raise InputError for gains that no drive has: they would hide another plate."""
+    """Raise InputError for gains that no drive can have: they would hide another plate."""
     sizes, errors = np.abs(found.gains_of_fit), found.gains_error
     for number, era in enumerate(found.plate.rig.eras):
         measured = np.isfinite(errors[:, number])
@@ -737,14 +744,14 @@ def _check_gains(found: Calibration) -> None:
         if are_impossible(relative, math.log(_MAX_GAIN) + least_sure).any():
             raise InputError(
                 f"gains of ERA {era.name} must be within a factor of {_MAX_GAIN:g} of their median "
-                f"over frequency, got {relative.min():.2g} to {relative.max():.2g} of it, as no "
-                "drive has them; check that it is this plate, its material and the places of "
-                "sensors, and measure at more places"
+                f"over frequency, got {relative.min():.2g} to {relative.max():.2g} times the "
+                "median; check that the measurement is of this plate, its material and the "
+                "positions of sensors, and measure at more positions"
             )
 
 
 def _check_suspensions(found: Calibration) -> None:
-    """Raise InputError for exciters and feet with a stiffness at its bound, of another kind."""
+    """Raise InputError for exciters and feet with a fitted stiffness at its bound."""
     names = {row.era for row in found.plate.of_exciters}
     bound = [one for one in found.parameters if one.at_bound]
     exciters = [one for one in bound if one.kind == "stiffness" and one.era in names]
@@ -755,28 +762,28 @@ def _check_suspensions(found: Calibration) -> None:
 
     if exciters:
         raise InputError(
-            f"stiffness of {', '.join(one.era for one in exciters)} must be about that of the rig, "
-            f"got {factors(exciters)} times it, the bound of what is searched; check "
-            "resonance and resonance_is of these: whether free or mounted (era plate show prints "
-            "where the glued magnets resonate), and by era rig check that they are glued"
+            f"stiffness of {', '.join(one.era for one in exciters)} must be close to that of the "
+            f"rig, got {factors(exciters)} times it, the bound of the fit; check "
+            "their resonance and resonance_is (free or mounted; era plate show prints "
+            "where the glued magnets resonate), and check with era rig check that they are glued"
         )
     if feet:
         raise InputError(
-            f"stiffness of feet {', '.join(one.foot for one in feet)} must be about that of the "
-            f"rig, got {factors(feet)} times it, the bound of what is searched; check their "
-            "kind, their places and that all of them touch"
+            f"stiffness of feet {', '.join(one.foot for one in feet)} must be close to that of the "
+            f"rig, got {factors(feet)} times it, the bound of the fit; check their "
+            "kind, their positions and that all of them touch the plate"
         )
 
 
 def _variances(
     slopes: FloatArray, covariance: FloatArray, searched: NDArray[np.bool_]
 ) -> FloatArray:
-    """Variances (...) of functions of the parameters of a mask (p,), by slopes (..., q)."""
+    """Return variances (...) of functions of masked parameters (p,), from slopes (..., q)."""
     own = covariance[np.ix_(searched, searched)]
     return np.asarray(((slopes @ own) * slopes).sum(axis=-1))
 
 
 def calibration_errors(calibration: Calibration) -> dict[KeyPath, float]:
-    """Standard errors of the values that a rig's file states, by the path of their key."""
+    """Return standard errors of the values in a rig file, by key path."""
     found = calibration.parameters
     return errors_by_key(calibration.rig, ((each, each.standard_error) for each in found))

@@ -1,17 +1,17 @@
-"""The one fit of a plate to a measurement: the most likely parameters, and what they leave open.
+"""Fit plate parameters to a measurement: the most likely values and their covariance.
 
     d_fsn = g_fn a_fsn(x) + noise
 
-d are the values at frequency f, sensor s and drive n, a those of a forward model whose parameters
-x are normal with the deviations of its `Space` or a prior's. Gains g are 1, or free at every
-frequency and drive: then the best ones follow from any a, so that only x is searched, with the
-derivatives of gains and residuals by it (variable projection: Golub and Pereyra, SIAM J. Numer.
-Anal. 10, 1973). Outliers weigh less by a soft loss, or are left out by `fit_to_noise`, which also
-finds the noise from the residuals. Of hypotheses, each a model of its own, the one of least cost
-explains a measurement best.
+d are the values at frequency f, sensor s and drive n; a are those of a forward model whose
+parameters x have a normal prior (of its `Space`, or given). Gains g are 1, or free at every
+frequency and drive. Free gains follow from a by linear least squares, so that only x is searched,
+with the derivatives of gains and residuals with respect to x (variable projection: Golub and
+Pereyra, SIAM J. Numer. Anal. 10, 1973). Outliers are weighted down by a soft loss, or left out by
+`fit_to_noise`, which also estimates the noise from the residuals. Among several hypotheses, each
+with its own model, the one with the lowest cost is the most likely.
 
-A `SensedPlate` is a rig's plate at the sensors of a measurement, with the values of data sheets
-that a calibration and a rig check fit of it.
+A `SensedPlate` is a rig's plate with the sensors of a measurement, and with the data-sheet values
+that calibration and rig check fit.
 """
 
 import math
@@ -46,23 +46,23 @@ from model.structure.attachments import footprints_of
 from model.structure.modal_elasticity import check_is_plate
 
 HELD_OUT_FOLDS = 5
-"""One path or sensor in so many is held out."""
+"""One in this many paths or sensors is held out."""
 
-_CONVERGED = 1e-7  # of the cost and of x, relative
-_MIN_VARIANCE = 1e-14  # of a prior, relative to its largest
-_ROUNDS = 8  # of fits and estimates of the noise
-_SETTLED = 0.1  # of the noise between two rounds
-_MIN_NOISE_LEFT = 0.1  # of a value's noise: residuals with less do not show it
-_SMALLEST_NOISE = 1e-4  # of the response: what meshes and reduction are wrong by
-_MAX_DEVIATION = 5.0  # standard deviations; of 10 000 good complex values 0.04 lie beyond
-_MAX_GROUPS = 12  # of weak to strong rows, each with a noise of its own
+_CONVERGED = 1e-7  # relative, for the cost and for x
+_MIN_VARIANCE = 1e-14  # of a prior, relative to its largest variance
+_ROUNDS = 8  # fits and noise estimates
+_SETTLED = 0.1  # of the noise, between two rounds
+_MIN_NOISE_LEFT = 0.1  # of a value's noise; residuals with less do not show the noise
+_SMALLEST_NOISE = 1e-4  # of the response, the error of meshes and reduction
+_MAX_DEVIATION = 5.0  # standard deviations; exceeded by 0.04 of 10 000 good complex values
+_MAX_GROUPS = 12  # of rows by amplitude, each with its own noise
 
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """The most likely parameters of a model for a measurement, and the fit linearised there.
+    """Most likely parameters of a model for a measurement, and the linearised fit at that point.
 
-    Residuals and slopes are in standard deviations, softened by the loss that was asked for.
+    Residuals and slopes are in standard deviations, after applying the soft loss, if any.
     """
 
     model: ForwardModel
@@ -70,20 +70,20 @@ class Fit:
     x: FloatArray
     """All parameters (p,)."""
     cost: float
-    """Half the sum of squares: of residuals, and of what is searched by its prior."""
+    """Half the sum of squares of all residuals, including those of the prior."""
     searched: NDArray[np.bool_]
     """Mask (p,) of the q parameters that were searched."""
     residuals: FloatArray
     """Real parts of all m values, imaginary parts, then the q rows of the prior and the k of held
     gains (2 m + q + k,)."""
     slopes: FloatArray
-    """Derivatives of the residuals by what is searched (2 m + q + k, q)."""
+    """Derivatives of the residuals by the searched parameters (2 m + q + k, q)."""
     predicted: ComplexArray
-    """Values as the model and the gains predict them (f, s, n)."""
+    """Values predicted by model and gains (f, s, n)."""
     gains: ComplexArray
-    """Gains (f, n), 1 where they are not free, NaN where they are but nothing was measured."""
+    """Gains (f, n): 1 if fixed, NaN if free but not measured."""
     gain_slopes: ComplexArray
-    """Derivatives of the gains by what is searched (f, n, q)."""
+    """Derivatives of the gains by the searched parameters (f, n, q)."""
 
     @property
     def space(self) -> Space:
@@ -103,7 +103,7 @@ class Fit:
 
     @cached_property
     def information(self) -> FloatArray:
-        """J^T J with the prior, of what is searched (q, q)."""
+        """J^T J of the searched parameters, including the prior (q, q)."""
         return np.asarray(self.slopes.T @ self.slopes)
 
     @cached_property
@@ -117,24 +117,24 @@ class Fit:
 
     @cached_property
     def stated_covariance(self) -> FloatArray:
-        """Covariance of x by the errors that the measurement states (p, p), 0 of what is known."""
+        """Covariance of x from the stated measurement errors (p, p), 0 for fixed parameters."""
         found, own = np.zeros((len(self.x), len(self.x))), np.flatnonzero(self.searched)
         found[np.ix_(own, own)] = linalg.inv(self.information)
         return found
 
     @cached_property
     def covariance(self) -> FloatArray:
-        """Covariance of x (p, p), wider where the residuals exceed the stated errors."""
+        """Covariance of x (p, p), widened if the residuals exceed the stated errors."""
         return max(self.chi2, 1.0) * self.stated_covariance
 
     @cached_property
     def errors(self) -> FloatArray:
-        """Standard errors of x (p,), 0 of what was not searched."""
+        """Standard errors of x (p,), 0 for fixed parameters."""
         return np.asarray(np.sqrt(np.diag(self.covariance)))
 
     @cached_property
     def leverage(self) -> FloatArray:
-        """Share of each value's noise that what is searched takes up (m,)."""
+        """Fraction of each value's noise absorbed by the searched parameters (m,)."""
         root = linalg.cholesky(self.information, lower=True)
         taken = (linalg.solve_triangular(root, self.of_values[1].T, lower=True) ** 2).sum(axis=0)
         return np.asarray(taken.reshape(2, -1).mean(axis=0))
@@ -147,11 +147,11 @@ class Fit:
         std: float = 1.0,
         beside: NDArray[np.bool_] | None = None,
     ) -> list[tuple[int, float]]:
-        """Points (m, 2) [m] where a load alone explains most: number and size, best first.
+        """Find the points (m, 2) [m] where a single load explains most: index and size, best first.
 
-        factor (f,): effect of a load of size 1 relative to that of 1 kg, 1 by default; std: prior
-        standard deviation of the sizes, of which those above 0 count; beside: mask (p,) of the
-        parameters that follow the load, by default all that were searched.
+        factor (f,): effect of a load of size 1 relative to 1 kg, default 1; std: prior standard
+        deviation of the size, which must be positive to count; beside: mask (p,) of parameters
+        fitted together with the load, default all searched ones.
         """
         by_load = by_mass_at(self.plate, points)
         if factor is not None:
@@ -187,13 +187,15 @@ def fit(
 ) -> Fit:
     """Find the most likely parameters of a model for a measurement.
 
-    searched (p,): those to find, by default all that are uncertain; start (p,): where to begin, and
-    values of all others, by default zero; prior: mean (p,) and covariance (p, p) in place of the
-    deviations of the space; soft: standard deviations from which a residual counts as its
-    magnitude, not its square; evaluations: of the model, at most; inside: least distance of a start
-    from its bounds, at which a search begins with small steps.
+    - searched (p,): mask of the parameters to find; default: all uncertain ones.
+    - start (p,): start values, and values of all fixed parameters; default: zero.
+    - prior: mean (p,) and covariance (p, p) instead of the deviations of the space.
+    - soft: standard deviations above which a residual counts by its magnitude, not its square.
+    - evaluations: maximum number of model evaluations.
+    - inside: minimum distance of the start from its bounds; near a bound, a search takes small
+      steps.
     """
-    from scipy.optimize import least_squares  # a daemon reads what was fitted, but fits nothing
+    from scipy.optimize import least_squares  # a daemon reads fits without fitting
 
     space = model.space
     own = space.uncertain if searched is None else searched
@@ -203,7 +205,10 @@ def fit(
     if prior is not None:
         variances, axes = linalg.eigh(prior[1][np.ix_(own, own)])
         scaled = axes / np.sqrt(np.maximum(variances, _MIN_VARIANCE * variances[-1]))
-        mean, root = prior[0][own], np.asarray(scaled.T)  # R^T R = C^-1, though some are tiny
+        mean, root = (
+            prior[0][own],
+            np.asarray(scaled.T),
+        )  # R^T R = C^-1, though some eigenvalues are tiny
     last: dict[bytes, Fit] = {}
 
     def at(y: FloatArray) -> Fit:
@@ -246,9 +251,9 @@ def _linearised(
     prior: tuple[FloatArray, FloatArray],
     soft: float | None,
 ) -> Fit:
-    """Linearise a fit at x (p,), without its cost; own (p,): what is searched.
+    """Linearise a fit at x (p,), without its cost; own (p,): mask of the searched parameters.
 
-    prior: mean (q,) and root of the inverse covariance (q, q) of what is searched.
+    prior: mean (q,) and root of the inverse covariance (q, q) of the searched parameters.
     """
     plate, (mean, root) = model.at(x), prior
     responses = measurement.driven(plate.responses)
@@ -275,11 +280,11 @@ def _linearised(
 def best_gains(
     responses: ComplexArray, slopes: ComplexArray, measurement: Measurement
 ) -> tuple[ComplexArray, ComplexArray, ComplexArray, ComplexArray]:
-    """Take the best gains out of a model's responses (f, s, n) and their slopes (f, s, n, q).
+    """Eliminate the best gains from a model's responses (f, s, n) and their slopes (f, s, n, q).
 
-    Magnitudes of gains that a deviation holds are drawn towards 1.
+    Gains with a stated deviation are drawn towards magnitude 1.
 
-    Returns gains (f, n), their slopes (f, n, q), and of the m values the residuals in standard
+    Returns gains (f, n), their slopes (f, n, q), and for the m values the residuals in standard
     deviations (m,) with their slopes (m, q).
     """
     known, w, d = measurement.known, measurement.weight, measurement.filled
@@ -308,7 +313,7 @@ def best_gains(
 def _gain_residuals(
     gains: ComplexArray, by_gain: ComplexArray, std: float
 ) -> tuple[ComplexArray, ComplexArray]:
-    """Deviations of gains (f, n) from a magnitude of 1 (k,), and their derivatives (k, q)."""
+    """Return residuals (k,) of gains (f, n) from magnitude 1, and their derivatives (k, q)."""
     kept = np.isfinite(gains) & np.isfinite(std) & np.bool_(std > 0)
     size = np.abs(gains[kept])
     by_size = (gains[kept].conj()[:, None] * by_gain[kept]).real / size[:, None]
@@ -318,7 +323,7 @@ def _gain_residuals(
 def _softened(
     r: ComplexArray, slopes: ComplexArray, scale: float
 ) -> tuple[ComplexArray, ComplexArray]:
-    """Residuals (m,) whose squares are a soft L1 loss, and their derivatives (m, q)."""
+    """Return residuals (m,) whose squares are a soft L1 loss, and their derivatives (m, q)."""
     root = np.sqrt(1 + (np.abs(r) / scale) ** 2)
     weight = np.sqrt(2 / (1 + root))
     grown = (r.conj()[:, None] * slopes).real / (2 * scale**2 * root * (1 + root))[:, None]
@@ -333,9 +338,9 @@ def fit_to_noise(
     start: FloatArray | None = None,
     prior: tuple[FloatArray, FloatArray] | None = None,
 ) -> Fit:
-    """Fit with errors as the residuals show them, and without outliers.
+    """Fit with errors estimated from the residuals, and without outliers.
 
-    The measurement of the fit has these errors, infinite of outliers.
+    The measurement in the result has these errors, infinite for outliers.
     """
     found = fit(model, measurement, searched=searched, start=start, prior=prior)
     for _ in range(_ROUNDS):
@@ -357,10 +362,11 @@ def fit_to_noise(
 
 
 def without_outliers(values: ComplexArray, model: ComplexArray) -> tuple[FloatArray, FloatArray]:
-    """Find the outliers of values by a plate's responses, up to a gain of each row, (f, s, n).
+    """Find the outliers of values (f, s, n) relative to a plate's responses, up to a gain per row.
 
-    The worst of a row goes first, since each pulls the gain of its row. Returns the errors of each
-    part as the rest shows them, infinite of outliers (f, s, n), and the scales of the sensors (s,).
+    Removes the worst value of a row first, since each biases the row's gain. Returns the errors of
+    each part as estimated from the remaining values, infinite for outliers (f, s, n), and the
+    scales of the sensors (s,).
     """
     used, scales = np.isfinite(values), np.ones(values.shape[1])
     for _ in range(_ROUNDS):
@@ -371,7 +377,7 @@ def without_outliers(values: ComplexArray, model: ComplexArray) -> tuple[FloatAr
         scales = scales / np.median(scales)
         raw = np.abs(values - scales[:, None] * predicted)
         count = used.sum(axis=1, keepdims=True)
-        # A gain takes one of the row's values with it.
+        # The gain uses up one of the row's values.
         left = np.broadcast_to(1 - 1 / np.maximum(count, 2), values.shape)
         std = np.where(used, noise_of(part, raw, left), np.inf)
         deviation = np.where(used, raw / std / np.sqrt(2), 0.0)
@@ -386,7 +392,7 @@ def without_outliers(values: ComplexArray, model: ComplexArray) -> tuple[FloatAr
 def gains_of(
     model: ComplexArray, values: ComplexArray, weight: FloatArray | float = 1.0
 ) -> ComplexArray:
-    """Gains (f, n) of a model (f, s, n) that explain values best, NaN where none is known."""
+    """Return the gains (f, n) of a model (f, s, n) that fit values best, NaN if undetermined."""
     squares = np.where(np.isfinite(values), weight, 0.0) ** 2
     inner = (squares * model.conj() * np.where(squares > 0, values, 0)).sum(axis=1)
     power = (squares * np.abs(model) ** 2).sum(axis=1)
@@ -394,7 +400,7 @@ def gains_of(
 
 
 def row_rms(values: ComplexArray) -> FloatArray:
-    """Root mean square of values (f, s, n) over the sensors (f, 1, n), 1 without any."""
+    """Return the RMS of values (f, s, n) over the sensors (f, 1, n), 1 without any."""
     known = np.isfinite(values)
     power = np.where(known, np.abs(values) ** 2, 0).sum(axis=1, keepdims=True)
     rms = np.sqrt(power / np.maximum(known.sum(axis=1, keepdims=True), 1))
@@ -402,10 +408,11 @@ def row_rms(values: ComplexArray) -> FloatArray:
 
 
 def noise_of(values: ComplexArray, residuals: FloatArray, left: FloatArray) -> FloatArray:
-    """Error of each part of values (f, s, n): sqrt(a² + b² size²) by the size of their row.
+    """Return the error of each part of values (f, s, n): sqrt(a² + b² size²) with the size of its
+    row.
 
-    From the medians of residuals (f, s, n), over rows from weak to strong. left (f, s, n): share of
-    noise power that a fit leaves in each. Returns (f, 1, n).
+    Estimated from medians of residuals (f, s, n), over rows from weak to strong. left (f, s, n):
+    fraction of noise power that a fit leaves in each. Returns (f, 1, n).
     """
     from scipy.optimize import nnls
 
@@ -431,39 +438,42 @@ def noise_of(values: ComplexArray, residuals: FloatArray, left: FloatArray) -> F
 
 
 def likeliest_fit(found: Sequence[Fit]) -> Fit:
-    """The fit of least cost, the first of those that are nearly equal."""
+    """Return the fit with the lowest cost, the first of those that are nearly equal."""
     return best_by(found, lambda each: -each.cost)
 
 
-_LOWEST, _HIGHEST = 0.1, 1.2  # of modes that shift: of the lowest frequency, of the highest tone
+_LOWEST, _HIGHEST = (
+    0.1,
+    1.2,
+)  # limits for shifting modes: of the lowest frequency, of the highest tone
 
 _ADDED_KINDS = {"loss_factor": "loss_added", "damping": "damping_added"}
 
 
 @dataclass(frozen=True)
 class Parameter:
-    """A value of a rig that a fit finds, and how sure it is of it."""
+    """A fitted rig value with its uncertainty."""
 
     kind: str
-    """Kind of value: a key of `VALUE_UNITS`, or of `KINDS` where differences are reported."""
+    """Kind of value: a key of `VALUE_UNITS`, or of `KINDS` if differences are reported."""
     name: str
     """Name in reports."""
     unit: str
-    """Unit of its values in reports for people."""
+    """Unit of its values in printed reports."""
     era: str = ""
-    """Name of the ERA whose value it is, "" for another's."""
+    """Name of its ERA, "" if it belongs to none."""
     foot: str = ""
-    """Name of the foot whose value it is, "" for another's."""
+    """Name of its foot, "" if it belongs to none."""
     before: float = 0.0
-    """Value in the rig before the fit, 0 where the difference from it is reported."""
+    """Value in the original rig, 0 if the difference from it is reported."""
     value: float = math.nan
-    """Value that was found, NaN before a fit."""
+    """Fitted value, NaN before a fit."""
     standard_error: float | None = None
-    """Standard error of the value, None of one that is not identified and keeps the rig's."""
+    """Standard error of the value, None if it is not identified and keeps the rig's value."""
     prior: float = math.inf
-    """Standard deviation before the measurement, infinite where nothing held it."""
+    """Standard deviation before the measurement, infinite without a prior."""
     at_bound: bool = False
-    """Whether it is the largest or least of what was searched."""
+    """Whether it is at a bound of the search."""
 
     @property
     def is_identified(self) -> bool:
@@ -472,11 +482,11 @@ class Parameter:
 
     @property
     def is_factor(self) -> bool:
-        """Whether x is the logarithm of a factor on the rig's value, not what is added to it."""
+        """Whether x is the logarithm of a factor on the rig's value, not an addition to it."""
         return self.kind in ("modulus", "stiffness", "magnet_mass", "supports")
 
     def path(self, rig: Rig) -> KeyPath | None:
-        """Path of its key in a rig's file, None of what several layers have together."""
+        """Return the path of its key in a rig file, None for a value that several layers share."""
         if self.foot:
             return "supports", self.foot, "stiffness"
         if self.era:
@@ -489,7 +499,7 @@ class Parameter:
         return "plate", self.kind
 
     def of(self, rig: Rig) -> float:
-        """The value in a rig."""
+        """Return the value in a rig."""
         if self.era:
             era = rig.era(self.era)
             return float(getattr(era, era.fields[self.kind]))
@@ -503,7 +513,7 @@ class Parameter:
 def parameters_of(
     rig: Rig, of_plate: Sequence[str], of_eras: Sequence[str], feet: Sequence[str]
 ) -> tuple[Parameter, ...]:
-    """Values of a rig before a fit: of some kinds of its plate and of every ERA, and of feet."""
+    """Return a rig's values before a fit: the given kinds for its plate and every ERA, and feet."""
     plate = [(kind, f"plate {kind}", "", "") for kind in of_plate]
     eras = [
         (kind, f"{era.name} {era.fields[kind]}", era.name, "")
@@ -522,7 +532,7 @@ def parameters_of(
 def errors_by_key(
     rig: Rig, found: Iterable[tuple[Parameter, float | None]]
 ) -> dict[KeyPath, float]:
-    """Standard errors of the values that a rig's file states, by the path of their key."""
+    """Return standard errors of the values in a rig file, by key path."""
     by_path = ((parameter.path(rig), error) for parameter, error in found)
     return {path: float(error) for path, error in by_path if path and error}
 
@@ -530,27 +540,28 @@ def errors_by_key(
 def are_impossible(
     gains: ComplexArray, size: FloatArray | float, phase: float = math.inf
 ) -> NDArray[np.bool_]:
-    """Mask of gains that no drive and no sensor has, relative to what they should be.
+    """Return a mask of gains that no drive and no sensor can have, relative to their nominal
+    values.
 
-    size: largest logarithm of the magnitude, either way; phase: largest phase [rad].
+    size: largest logarithm of the magnitude, up or down; phase: largest phase [rad].
     """
     return np.asarray((np.abs(np.log(np.abs(gains))) > size) | (np.abs(np.angle(gains)) > phase))
 
 
 @dataclass(frozen=True, eq=False)
 class SensedPlate:
-    """A rig's plate with sensors at points, without the rig's gains, and the values fitted of it.
+    """A rig's plate with sensors at points, without the rig's gains, and its fitted values.
 
     Parameters z (p,) are those of the model's space, in standard deviations from the rig's values.
     """
 
     rig: Rig
     model: ForwardModel
-    """Its space has the n fitted values, and form errors if there are any; all else is known."""
+    """Its space has the n fitted values and, if enabled, form errors; all else is fixed."""
 
     @cached_property
     def rows(self) -> tuple[Parameter, ...]:
-        """The fitted values (n,): modulus and loss factor, those of every ERA and of every foot."""
+        """Fitted values (n,): modulus and loss factor, then those of every ERA and every foot."""
         of_eras = ("stiffness", "damping", "bolt_mass", "magnet_mass")
         feet = self.rig.foot_names if self.rig.uncertainty.supports else ()
         return parameters_of(self.rig, ("modulus", "loss_factor"), of_eras, feet)
@@ -559,7 +570,8 @@ class SensedPlate:
     def largest_errors(self) -> FloatArray:
         """Standard errors (n,), in deviations, beyond which a fitted value is not identified.
 
-        Infinite for an exciter's coil and magnet, which its sheet holds; a prior holds feet, too.
+        Infinite for an exciter's coil and magnet, given by its data sheet; a prior constrains feet,
+        too.
         """
         by_sheet = [each for each in self.of_exciters if each.kind in ("bolt_mass", "magnet_mass")]
         rows = self.rows
@@ -587,9 +599,9 @@ class SensedPlate:
         )
 
     def of(self, rig: Rig) -> "SensedPlate":
-        """The plate of a rig with another modulus, thickness, loss factor, ERAs and masses.
+        """Return the plate of a rig with another modulus, thickness, loss factor, ERAs and masses.
 
-        Its free plate is not solved again.
+        Reuses the solution of the free plate.
         """
         shifting = None
         if self.model.form is not None:
@@ -603,15 +615,15 @@ class SensedPlate:
         return SensedPlate(rig, replace(self.model, rig=replace(rig, eras=eras), space=space))
 
     def responses(self, z: FloatArray | None = None) -> ComplexArray:
-        """Acceleration per base displacement of each ERA at z (p,), by default the rig's values.
+        """Acceleration per base displacement of each ERA at z (p,), default the rig's values.
 
         Shape (f, s, eras) [1/s²].
         """
         return self.model.at(np.zeros(self.model.space.size) if z is None else z).responses
 
     def rig_at(self, z: FloatArray, *beside: str) -> Rig:
-        """The rig with the fitted values of z, and with those of further kinds."""
-        # A force factor is found with the damping beside it.
+        """Return the rig with the fitted values of z, and with those of the given other kinds."""
+        # A force factor is fitted together with the damping.
         own = self.model.space.of("force_factor", *beside)
         own[self.numbers] = True
         values = PlateValues(self.rig, self.model.space, np.where(own, z, 0.0))
@@ -623,10 +635,10 @@ class SensedPlate:
         return np.array([row.of(rig) for row in self.rows])
 
     def deviations(self, z: FloatArray) -> FloatArray:
-        """Deviations of the fitted values at z (n,), in standard deviations of rigs as written.
+        """Deviations of the fitted values at z (n,), in standard deviations of the original rig.
 
-        That is the larger of the uncertainty of data sheets and that of the rig. Losses vary by
-        factors: where they exceed the rig's, their logarithm counts.
+        The standard deviation is the larger of the data sheets' and the rig's. Losses vary by
+        factors: above the rig's loss, the logarithm counts.
         """
         stated, std = self.rig.uncertainty, self.model.space.std[self.numbers]
         factor = math.log(stated.damping)
@@ -648,13 +660,15 @@ class SensedPlate:
         return np.asarray(size / np.maximum(unit, of_rig))
 
     def errors(self, z: FloatArray, error: FloatArray) -> FloatArray:
-        """Standard errors of the fitted values at z in their units (n,), by those of z (p,)."""
+        """Convert standard errors of z (p,) to those of the fitted values at z in their units
+        (n,)."""
         is_factor = np.array([row.is_factor for row in self.rows])
         slopes = self.model.space.std[self.numbers] * np.where(is_factor, self.values(z), 1.0)
         return np.asarray(slopes * error[self.numbers])
 
     def moved(self, modulus: float, stiffness: float) -> FloatArray:
-        """Parameters z (p,) for logarithms of factors on the rig's modulus and stiffnesses."""
+        """Return parameters z (p,) for logarithms of factors on the rig's modulus and
+        stiffnesses."""
         space = self.model.space
         found = np.zeros(space.size)
         for kind, logarithm in (("modulus", modulus), ("stiffness", stiffness)):
@@ -665,12 +679,12 @@ class SensedPlate:
 def sensed_plate(
     rig: Rig, sensors: Sequence[Sensor], frequencies: FloatArray, *, has_form: bool = False
 ) -> SensedPlate:
-    """Solve a rig's free plate once, for sensors at points of it and frequencies (f,) [Hz].
+    """Solve a rig's free plate once, for sensors at points on it and frequencies (f,) [Hz].
 
-    has_form: whether the plate may have form errors. Raises InputError for frequencies too high for
-    its mesh.
+    has_form: whether to include form errors. Raises InputError for frequencies too high for its
+    mesh.
     """
-    check_is_plate(rig.plate, "a fit or a check by measurements")
+    check_is_plate(rig.plate, "a fit or check with measurements")
     rig.mesh.check_frequencies(rig.plate, frequencies)
     free = solve_free_plate(rig.plate, rig.mesh, frequency_max=float(max(frequencies.max(), 200.0)))
     form = None
@@ -682,5 +696,6 @@ def sensed_plate(
 
 
 def plate_of(rig: Rig, observation: Measurement, *, has_form: bool = False) -> SensedPlate:
-    """The plate of a rig at the sensors and frequencies of a measurement, as `sensed_plate`."""
+    """Return the plate of a rig at the sensors and frequencies of a measurement; see
+    `sensed_plate`."""
     return sensed_plate(rig, observation.sensors, observation.frequencies, has_form=has_form)

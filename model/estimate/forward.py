@@ -1,35 +1,34 @@
 """Forward model: responses of a rig's plate at its sensors for a vector of parameters.
 
 A is the receptance of the free plate between all attachments and sensors, Z the dynamic stiffness
-of what is attached there (0 at a sensor), and T = A (1 + Z A)^-1 the receptance of the plate on its
-attachments. ERA j, whose gain is g_j, drives a plate that is held by the force F_j g_j, which is
-(k_j + i w c_j) g_j for a moving base. Sensor s then reads
+of the attachments (0 at a sensor), and T = A (1 + Z A)^-1 the receptance of the plate with its
+attachments. ERA j with gain g_j drives a clamped plate by the force F_j g_j, which is (k_j + i w
+c_j) g_j for a moving base. Sensor s then measures
 
     Y_sj = -w² sigma_s l_s T_sj F_j g_j,    l_s = 1 / (1 - w² m_s T_ss),
 
-with its gain sigma_s. A sensor of mass m_s loads the plate only while it measures, like one that is
-moved from place to place.
+with its gain sigma_s. A sensor of mass m_s loads the plate only during its own measurement, like a
+sensor that is moved between positions.
 
-Losses are hysteretic: a loss factor that is the same at every frequency, (1 + i eta) K, which is
-not causal. At the other extreme they are viscous: each mode j of the plate on its supports loses in
-proportion to frequency, eta omega / omega_j. Both agree at the resonances alone, while most tones
-are beside them, so that a fit of the wrong law finds a loss factor that is off by more than noise
-and form errors explain. A plate with form errors has a parameter between both laws, 0 to 1.
+Losses are hysteretic: the loss factor is constant over frequency, (1 + i eta) K, which is not
+causal. The other extreme is viscous: the loss of each mode j of the supported plate is proportional
+to frequency, eta omega / omega_j. Both agree only at the resonances, while most tones are off
+resonance, so a fit with the wrong law finds a loss factor with an error larger than noise and form
+errors explain. A plate with form errors has a parameter between both laws, 0 to 1.
 
-With L = 1 - T Z, a change dA of the free receptance and dZ of what is attached change the
-receptance T of the plate on its attachments by L dA L^T - T dZ T. For a mode, a place or an
-attachment that is a change of rank one or two. A sensor of mass m that is on the plate while it
-measures adds l² w² m T_sj dT_ss to l dT_sj.
+With L = 1 - T Z, a change dA of the free receptance and dZ of the attachments change T by L dA L^T
+- T dZ T. For a mode, a position or an attachment this change has rank one or two. A sensor of mass
+m that is on the plate during its measurement adds l² w² m T_sj dT_ss to l dT_sj.
 
-A vector x has one number for each parameter, in standard deviations of what is known beforehand.
-`ParameterKind` defines how all parameters of a kind change the plate and its responses;
-`model.estimate.parameters` has one class for each kind. `Space` names the parameters of a rig,
-`PlateValues` has the values that they represent.
+A vector x has one number per parameter, in standard deviations of the prior. `ParameterKind`
+defines how all parameters of a kind change the plate and its responses; `model.estimate.parameters`
+has one class per kind. `Space` names the parameters of a rig, `PlateValues` contains the values
+that they represent.
 
-A plate may also have form errors, which a rig file does not describe: a cable glued to it, sides
-that are not cut to size. Left out, they bias fitted values by far more than noise does, and no
-residual shows by how much. They change stiffness and mass between the modes of the free plate, and
-so its mode shapes (`ReducedModes` of `model.reduction`).
+A plate can also have form errors, which a rig file does not describe, such as a cable glued to it,
+or inaccurately cut sides. If ignored, they bias fitted values far more than noise does, and no
+residual shows the bias. They change stiffness and mass between the modes of the free plate, and
+therefore its mode shapes (`ReducedModes` of `model.reduction`).
 """
 
 from abc import ABC, abstractmethod
@@ -63,30 +62,30 @@ from model.structure.modal_elasticity import (
 from model.structure.plate import LOSS_FREQUENCY
 
 SENSOR_FOOT = 5e-3
-"""Radius of the disc on which a sensor's mass acts [m]: under a point a plate is soft."""
+"""Radius of the disc on which a sensor's mass acts [m]; a plate is soft under a point."""
 
 MASS_CELLS = Grid(8, 6)
-"""Where foreign mass may lie."""
+"""Possible positions of foreign mass."""
 
 MIN_LOSS_FACTOR = 1e-9
-"""Least loss factor, so that there are derivatives by its logarithm."""
+"""Minimum loss factor, so that derivatives by its logarithm exist."""
 
 MODE_SHIFTS = 12
-"""Number of the lowest elastic modes with eigenvalues and loss factors of their own."""
+"""Number of lowest elastic modes with separate eigenvalues and loss factors."""
 
-_SLOWEST = 2 * np.pi  # rad/s; of slower modes the frequency of losses is taken as this
+_SLOWEST = 2 * np.pi  # rad/s; lower bound of a mode's frequency in its losses
 
 AnyArray: TypeAlias = NDArray[np.floating[Any]] | NDArray[np.complexfloating[Any, Any]]
 
 ParameterValues: TypeAlias = float | NDArray[np.floating[Any]]
-"""One number for all parameters of a kind, or one for each."""
+"""One number for all parameters of a kind, or one per parameter."""
 
 
 class Prior(NamedTuple):
     """Prior distribution of the parameters of a kind, in the unit of `PlateValues`."""
 
     std: ParameterValues
-    """Standard deviation, 0 if a parameter is known exactly."""
+    """Standard deviation, 0 for an exactly known parameter."""
     lower: ParameterValues = -np.inf
     """Lower bound."""
     upper: ParameterValues = np.inf
@@ -95,38 +94,38 @@ class Prior(NamedTuple):
 
 @dataclass(frozen=True)
 class Sensor:
-    """A sensor of acceleration, at the bolt of an ERA or at a point of the plate."""
+    """Acceleration sensor at the bolt of an ERA or at a point of the plate."""
 
     name: str
     era: str = ""
-    """Name of the ERA at whose bolt it is, "" for one at x, y [m]."""
+    """Name of the ERA at whose bolt it is, "" for a sensor at x, y [m]."""
     x: float = 0.0
     y: float = 0.0
     mass: float = 0.0
-    """Mass [kg] on the plate while this sensor measures, as of one that is moved."""
+    """Mass [kg] on the plate during its own measurement, for a moved sensor."""
 
 
 @dataclass(frozen=True, eq=False)
 class SearchScope:
-    """Parts of a rig with sensors that can differ; each `ParameterKind` takes its names from it."""
+    """Uncertain parts of a rig with sensors; each `ParameterKind` takes its names from it."""
 
     rig: Rig
     sensors: Sequence[str]
     """Names of the sensors."""
     uncertainty: Uncertainty
-    """How well the rig is known; none for one that data sheets alone describe."""
+    """Stated uncertainty of the rig; empty if only data sheets describe it."""
     drives_lag: bool = False
-    """Whether bases follow what is played with a lag that nothing states."""
+    """Whether bases follow their drive with an unknown lag."""
     masses: int = 0
     """Number of additional masses."""
     mode_count: int = MODE_SHIFTS
-    """Number of elastic modes that may shift."""
+    """Number of elastic modes that can shift."""
     form_of: int | None = None
-    """Number of sensors of a plate with form errors, None for a plate without form errors."""
+    """Number of sensors if the plate can have form errors, otherwise None."""
 
     @property
     def has_form_errors(self) -> bool:
-        """Whether the plate may have form errors."""
+        """Whether the plate can have form errors."""
         return self.form_of is not None
 
     @cached_property
@@ -146,29 +145,30 @@ class SearchScope:
 
 
 def values_of_eras(rig: Rig, kind: str) -> FloatArray:
-    """Values of a kind as a rig's ERAs have them in its file (n,), 0 where one has none."""
+    """Return the values of a kind from a rig file for all ERAs (n,), 0 if an ERA has none."""
     return np.array([getattr(era, era.fields.get(kind, ""), 0.0) for era in rig.eras])
 
 
 class ParameterKind(ABC):
     """Parameters of one kind, such as the stiffness of each ERA; see `model.estimate.parameters`.
 
-    Parameters are deviations from the rig, most of them logarithms of factors.
+    Parameters are deviations from the rig, usually logarithms of factors.
     """
 
     name: str
     """Key of the kind in `Space` and `PlateValues`."""
     std: float
-    """Standard deviation for a plate that was not measured, in the unit of `PlateValues`."""
+    """Standard deviation for a plate without a measurement, in the unit of `PlateValues`."""
     unit = "%"
-    """Unit in reports for people; logarithms of factors are written in per cent."""
+    """Unit in printed reports; logarithms of factors are printed in per cent."""
     per_unit = 100.0
     """Number of report units in one unit of `PlateValues`."""
     theory = 0.0
-    """Error of a fitted value because of the plate theory: its change with viscous losses and
-    without shear deformation, for plates of 1.5 mm."""
+    """Error of a fitted value from plate theory: its change with viscous losses and without shear
+    deformation, for plates of 1.5 mm."""
     stage = 2
-    """When an identification searches it: 0 at first, 1 with the positions of masses, 2 last."""
+    """Stage of an identification that searches it: 0 first, 1 with the positions of masses, 2
+    last."""
     is_listed = False
     """Whether the report of an identification always lists it."""
 
@@ -181,15 +181,15 @@ class ParameterKind(ABC):
         """Derivatives of the responses by all m parameters (f, s, n, m)."""
 
     def prior(self, scope: SearchScope) -> Prior:
-        """Prior for a rig that is measured in place."""
+        """Prior for an installed rig."""
         return Prior(self.std)
 
     def datasheet_prior(self, scope: SearchScope) -> Prior:
-        """Prior for a rig described by data sheets only; by default known exactly."""
+        """Prior for a rig described only by data sheets; default: known exactly."""
         return Prior(0.0)
 
     def value(self, values: "PlateValues") -> Any:
-        """The value of the rig that the parameters represent, by default their deviations."""
+        """Convert the parameters to the rig's value; default: the deviations themselves."""
         return values.deviations(self.name)
 
 
@@ -199,7 +199,7 @@ class Space:
 
     names: tuple[str, ...]
     std: FloatArray
-    """Standard deviations (p,) in the units of `PlateValues`, 0 where a parameter is known."""
+    """Standard deviations (p,) in the units of `PlateValues`, 0 for a known parameter."""
     lower: FloatArray
     """Lower bounds of x (p,)."""
     upper: FloatArray
@@ -207,7 +207,7 @@ class Space:
     groups: dict[str, slice]
     """Slice of the parameters of each kind."""
     kinds: Mapping[str, ParameterKind]
-    """All kinds by their names."""
+    """All kinds by name."""
 
     @classmethod
     def empty(cls, kinds: Mapping[str, ParameterKind]) -> "Space":
@@ -222,23 +222,23 @@ class Space:
 
     @cached_property
     def scale(self) -> FloatArray:
-        """Standard deviations (p,), 1 of what is known."""
+        """Standard deviations (p,), 1 for known parameters."""
         return np.where(self.std > 0, self.std, 1.0)
 
     @cached_property
     def uncertain(self) -> NDArray[np.bool_]:
-        """Mask (p,) of the parameters that are not known beforehand."""
+        """Mask (p,) of the parameters with a prior uncertainty."""
         return np.asarray(self.std > 0)
 
     def of(self, *kinds: str) -> NDArray[np.bool_]:
-        """Mask (p,) of the uncertain parameters of some kinds."""
+        """Return a mask (p,) of the uncertain parameters of some kinds."""
         chosen = np.zeros(self.size, dtype=bool)
         for kind in kinds:
             chosen[self.groups[kind]] = True
         return chosen & self.uncertain
 
     def extended(self, kind: ParameterKind, names: Sequence[str], prior: Prior) -> "Space":
-        """Append parameters of a kind."""
+        """Return the space with parameters of another kind appended."""
         std, lower, upper = (np.broadcast_to(each, len(names)) for each in prior)
         scale = np.where(std > 0, std, 1.0)
         return replace(
@@ -251,7 +251,7 @@ class Space:
         )
 
     def of_kinds(self, get: Callable[[ParameterKind], float]) -> FloatArray:
-        """A property of the kind of each parameter, in its unit (p,), 0 for known ones."""
+        """Return a property of the kind of each parameter, in its unit (p,), 0 for known ones."""
         properties = np.zeros(self.size)
         for kind, part in self.groups.items():
             properties[part] = get(self.kinds[kind])
@@ -259,27 +259,28 @@ class Space:
 
     @cached_property
     def as_built(self) -> "Space":
-        """The space of a plate that was not measured: that of kinds where the rig states less."""
+        """Space of a plate that was not measured, with the default deviations unless the rig states
+        its own."""
         return replace(self, std=np.maximum(self.std, self.of_kinds(lambda kind: kind.std)))
 
     def indices(self, kind: str) -> range:
-        """Numbers of the parameters of a kind."""
+        """Return the indices of the parameters of a kind."""
         return range(*self.groups[kind].indices(self.size))
 
     def values(self, x: FloatArray, kind: str) -> FloatArray:
-        """Deviations of the parameters of a kind from the rig, in their units, for x (p,)."""
+        """Return the deviations of a kind's parameters from the rig, in their units, for x (p,)."""
         part = self.groups[kind]
         return np.asarray(self.std[part] * x[part])
 
     def index(self, name: str) -> int:
-        """Number of the parameter of a name; raises ValueError for an unknown one."""
+        """Return the index of a parameter by name; raises ValueError for an unknown one."""
         return self.names.index(name)
 
 
 class PlateValues:
-    """Values of a rig's plate by the kinds of parameters x (p,) that change them.
+    """Values of a rig's plate for parameters x (p,), by kind.
 
-    `ParameterKind.value` defines each of them. Arrays have n ERAs, m additional masses or s
+    Each value is defined by `ParameterKind.value`. Arrays have n ERAs, m additional masses or s
     sensors.
     """
 
@@ -287,19 +288,20 @@ class PlateValues:
         self.rig, self.space, self.x = rig, space, x
 
     def deviations(self, kind: str) -> FloatArray:
-        """Deviations of all parameters of a kind from the rig, in their unit."""
+        """Return the deviations of all parameters of a kind from the rig, in their unit."""
         return self.space.values(self.x, kind)
 
     def factor(self, kind: str) -> float:
-        """Factor whose logarithm is the one parameter of a kind."""
+        """Return the factor whose logarithm is the only parameter of a kind."""
         return float(np.exp(self.deviations(kind)[0]))
 
     def __getitem__(self, kind: str) -> Any:
-        """The values of a kind, without the deviations of others that add to it elsewhere."""
+        """Return the values of a kind, without deviations of other kinds that are added
+        elsewhere."""
         return self.space.kinds[kind].value(self)
 
     def sources(self) -> tuple[Actuator, ...]:
-        """The rig's ERAs with their values, without gains."""
+        """The rig's ERAs with these values, without gains."""
         sources: list[Actuator] = []
         for number, era in enumerate(self.rig.eras):
             fields: dict[str, Any] = {
@@ -312,10 +314,11 @@ class PlateValues:
         return tuple(sources)
 
     def lag(self, frequencies: FloatArray) -> ComplexArray:
-        """Motion of each drive at frequencies (f,) [Hz] relative to a slow one, (f, n).
+        """Return the motion of each drive at frequencies (f,) [Hz] relative to low frequency, (f,
+        n).
 
-        1 / (1 - inertia f² + i drag f), f in kilohertz: of an actuator with a resonance at
-        1 / sqrt(inertia) and a damping ratio of drag / (2 sqrt(inertia)).
+        1 / (1 - inertia f² + i drag f), f in kilohertz: an actuator with a resonance at 1 /
+        sqrt(inertia) and a damping ratio of drag / (2 sqrt(inertia)).
         """
         f = 1e-3 * np.asarray(frequencies)[:, None]
         return np.asarray(1 / (1 - self["inertia"] * f**2 + 1j * self["drag"] * f))
@@ -325,7 +328,7 @@ class PlateValues:
 class ForwardModel:
     """A rig's plate on its attachments, with sensors, as a function of parameters.
 
-    Raises InputError for a plate that does not scale with a thickness or modulus that may differ.
+    Raises InputError for a plate that does not scale with an uncertain thickness or modulus.
     """
 
     rig: Rig
@@ -333,18 +336,18 @@ class ForwardModel:
     frequencies: FloatArray
     """Frequencies of the tones (f,) [Hz]."""
     space: Space
-    """Parameters, those that may differ from the rig's values among them."""
+    """Parameters, including the uncertain ones."""
     free: FreePlate
-    """The free plate, solved for the rig's thickness and modulus or for others."""
+    """Free plate, solved for the rig's thickness and modulus or for other values."""
     form: ReducedModes | None = None
-    """The plate in coordinates in which it may have form errors."""
+    """Plate in coordinates that allow form errors."""
     law: ComplexArray | None = None
-    """Change of the receptance (f, s, n) [m/N] where losses are viscous, None to leave it out."""
+    """Change of the receptance (f, s, n) [m/N] if losses are viscous, None to neglect it."""
     last_places: dict[bytes, AttachmentPoints] = field(default_factory=dict)
-    """The last solution for all attachments, by their footprints."""
+    """Latest solution for all attachments, by their footprints."""
 
     def __post_init__(self) -> None:
-        """Raise InputError for a plate whose responses and slopes would be wrong."""
+        """Raise InputError for a plate with wrong responses and slopes."""
         stds = (self.space.std[self.space.groups[kind]] for kind in ("thickness", "modulus"))
         check_scales(self.rig.plate, *(1 + std for std in stds), remedy=WITHOUT_PART)
 
@@ -369,17 +372,17 @@ class ForwardModel:
 
     @property
     def modes(self) -> Modes:
-        """The modes of the free plate, or its coordinates with form errors."""
+        """Modes of the free plate, or its coordinates with form errors."""
         return self.form or self.free.modes
 
     @cached_property
     def shifted_modes(self) -> IntArray:
-        """Numbers of the modes whose eigenvalues may shift, the lowest elastic ones, ascending."""
+        """Indices of the modes whose eigenvalues can shift, the lowest elastic ones, ascending."""
         return lowest_elastic(self.modes.eigenvalues, len(self.space.indices("mode_shifts")))
 
     @cached_property
     def elasticity(self) -> ModalElasticity:
-        """Eigenvalues and loss factors of the modes as the rig has them."""
+        """Eigenvalues and loss factors of the modes of the rig."""
         return ModalElasticity.of(
             self.free.plate,
             self.modes.eigenvalues,
@@ -400,7 +403,7 @@ class ForwardModel:
 
     @cached_property
     def drive_gains(self) -> ComplexArray:
-        """Gains of the rig's ERAs in its file, (f, eras)."""
+        """Gains of the rig's ERAs, (f, eras)."""
         return np.array([era.gain(self.frequencies) for era in self.rig.eras]).T
 
     @cached_property
@@ -415,13 +418,13 @@ class ForwardModel:
 
     @cached_property
     def sensor_inertia(self) -> FloatArray | None:
-        """omega² times the masses of the sensors (f, s) [N/m], None where they weigh nothing."""
+        """omega² times the masses of the sensors (f, s) [N/m], None if they are massless."""
         masses = np.array([each.mass for each in self.sensors])
         return self.omega[:, None] ** 2 * masses if masses.any() else None
 
     @cached_property
     def movable(self) -> IntArray:
-        """Numbers of the attachments that may move: ERAs, additional masses, sensors off ERAs."""
+        """Indices of the attachments that can move: ERAs, additional masses, sensors off ERAs."""
         if not self.space.of("place", "masses", "sensor_place").any():
             return np.array([], dtype=int)
         first = len(self.rig.eras) + len(self.rig.masses)
@@ -431,14 +434,14 @@ class ForwardModel:
         return np.array([*movable, *sensors], dtype=int)
 
     def at(self, x: FloatArray) -> "PlateAt":
-        """The plate for parameters x (p,)."""
+        """Return the plate for parameters x (p,)."""
         return PlateAt(self, x)
 
     def places(self, values: PlateValues) -> AttachmentPoints:
-        """Solve for all attachments at their places; the last solution is kept.
+        """Solve for all attachments at their positions; the latest solution is cached.
 
-        A plate with form errors is extrapolated from the rig's places by the slopes of its shapes,
-        since places may leave it.
+        A plate with form errors is extrapolated from the rig's positions by the slopes of its
+        shapes, since positions can leave the plate.
         """
         footprints = self._footprints(values)
         if self.form is not None:
@@ -476,9 +479,9 @@ class ForwardModel:
 
 
 class PlateAt:
-    """The plate of a forward model for one vector of parameters x (p,), with a attachments.
+    """Plate of a forward model for one vector of parameters x (p,), with `a` attachments.
 
-    further (f, r, r): stiffness [rad²/s²] between its r modes that is added to theirs.
+    further (f, r, r): additional stiffness [rad²/s²] between its r modes.
     """
 
     def __init__(
@@ -492,12 +495,12 @@ class PlateAt:
         """Shapes at all attachments."""
         w, values = model.omega[:, None], self.values
         self.sources = values.sources()
-        """The ERAs with their values."""
+        """ERAs with their values."""
         self.source_slopes = [each.slopes(model.omega) for each in self.sources]
-        """Changes of each ERA's dynamic stiffness and force with its values."""
+        """Derivatives of each ERA's dynamic stiffness and force by its values."""
         self.full_levels = np.array([each.full_level for each in self.sources])
         self.force = drive_forces(model.omega, self.sources) / self.full_levels
-        """Force of each ERA on a plate that is held, per unit of its drive, (f, n)."""
+        """Force of each ERA on a clamped plate, per unit of its drive, (f, n)."""
         fixed = model.fixed_stiffness.copy()
         fixed[:, list(model.rig.feet)] += (values["supports"] - 1) * model.springs
         held = [
@@ -507,10 +510,10 @@ class PlateAt:
             np.zeros((len(w), len(model.pads))),
         ]
         self.stiffness = Z = np.concatenate(held, axis=1)
-        """Dynamic stiffness of what is attached (f, a) [N/m]."""
+        """Dynamic stiffness of the attachments (f, a) [N/m]."""
         shapes, moved = self.located.shapes, self.solved(self.located.shapes)
         A = shapes @ moved + combined(self.functions.truncated(TERMS), self.located.truncated)
-        # Nothing holds the plate at the sensors, the last ones.
+        # The sensors, last in order, have no stiffness.
         count = Z.shape[1] - len(model.pads)
         forces = coupled_forces(A[:, :count, :count], Z[:, :count], np.eye(count, dtype=complex))
         reaction = A[:, :, :count] @ forces * Z[:, None, :count]
@@ -518,19 +521,19 @@ class PlateAt:
         self.left[:, :, :count] -= reaction
         """L = 1 - T Z (f, a, a)."""
         self.receptance = A - reaction @ A[:, :count]
-        """T, of the plate with its attachments (f, a, a) [m/N]."""
+        """T, receptance of the plate with its attachments (f, a, a) [m/N]."""
         self.free_receptance = A
-        """A, of the free plate (f, a, a) [m/N]."""
+        """A, receptance of the free plate (f, a, a) [m/N]."""
         self.moved = moved
-        """Coordinates of the free plate by a force at each attachment (f, r, a) [s²/kg]."""
+        """Coordinates of the free plate for a force at each attachment (f, r, a) [s²/kg]."""
 
     @cached_property
     def reach(self) -> ComplexArray:
-        """Motion of what is attached by a force on each free mode (f, a, r) [s²/kg]."""
+        """Motion of the attachments for a force on each free mode (f, a, r) [s²/kg]."""
         return self.left @ self.moved.swapaxes(1, 2)
 
     def solved(self, shapes: FloatArray) -> ComplexArray:
-        """Coordinates of the free plate by forces where shapes are (a, r), (f, r, a) [s²/kg]."""
+        """Return coordinates of the free plate for forces with shapes (a, r), (f, r, a) [s²/kg]."""
         functions = self.functions
         if self.bending is None:
             return np.asarray(functions.modal[:, :, None] * shapes.T)
@@ -543,12 +546,12 @@ class PlateAt:
 
     @cached_property
     def lag(self) -> ComplexArray:
-        """Motion of each drive relative to a slow one (f, n)."""
+        """Motion of each drive relative to low frequency (f, n)."""
         return self.values.lag(self.model.frequencies)
 
     @cached_property
     def drive(self) -> ComplexArray:
-        """Force of each drive on the plate per unit of what it plays, times -omega² (f, n)."""
+        """Force of each drive on the plate per unit of its input, times -omega² (f, n)."""
         values, model = self.values, self.model
         force = self.force * values["gain"] * model.drive_gains * self.lag
         return np.asarray(-(model.omega**2)[:, None] * force)
@@ -561,20 +564,22 @@ class PlateAt:
 
     @cached_property
     def loaded(self) -> ComplexArray:
-        """Receptance between sensors and ERAs, each sensor's mass on the plate (f, s, n) [m/N]."""
+        """Receptance between sensors and ERAs, with each sensor's mass on the plate (f, s, n)
+        [m/N]."""
         found = self.receptance[:, self.model.observed, : self.force.shape[1]]
         return np.asarray(found if self.lightness is None else self.lightness[:, :, None] * found)
 
     @cached_property
     def seen(self) -> ComplexArray:
-        """`loaded` with losses between hysteretic and viscous, as x has them (f, s, n) [m/N]."""
+        """`loaded` with losses between hysteretic and viscous, according to x (f, s, n) [m/N]."""
         if self.model.law is None:
             return self.loaded
         return np.asarray(self.loaded + self.values["loss_law"] * self.model.law)
 
     @cached_property
     def lightness(self) -> ComplexArray | None:
-        """Motion of the plate at each sensor relative to one without its mass, None where 1."""
+        """Motion of the plate at each sensor relative to that without its mass, None if
+        always 1."""
         inertia, at = self.model.sensor_inertia, self.model.observed
         if inertia is None:
             return None
@@ -582,9 +587,9 @@ class PlateAt:
 
     @cached_property
     def responses(self) -> ComplexArray:
-        """Acceleration at each sensor per unit of the drive of each ERA (f, s, n).
+        """Acceleration at each sensor per unit drive of each ERA (f, s, n).
 
-        [1/s²] of a base that moves, [m/s²/V] of an exciter.
+        [1/s²] for a moving base, [m/s²/V] for an exciter.
         """
         return np.asarray(self.scale * self.seen)
 
@@ -602,7 +607,8 @@ class PlateAt:
         rig, solved = model.rig.plate, model.free.plate
         thickness = values["thickness"] * rig.thickness / solved.thickness
         modulus = values["modulus"] * rig.material.E / solved.material.E
-        # Soft layers and air lose beside the plate's loss factor, and deviate with their mode.
+        # Soft layers and air lose energy in addition to the plate's loss factor, and vary with
+        # their mode.
         further = theory.losses.copy()
         further[modes] *= np.exp(values["mode_shifts"] + values["mode_losses"])
         own = loss * eigenvalues
@@ -613,14 +619,14 @@ class PlateAt:
             np.divide(1j * each, lossy, out=np.zeros(lossy.shape, dtype=complex), where=lossy != 0)
             for each in (own, own + further)
         )
-        """Change of the logarithm of each mode's stiffness with that of the plate's loss factor,
-        and with that of all that the mode loses (f, r)."""
+        """Derivatives of the logarithm of each mode's stiffness by the plate's loss factor, and by
+        the total loss of the mode (f, r)."""
         self.by_loss_of_rest = np.asarray(1j * eta / (1 + 1j * eta))
-        """The same of all but the modes, with the loss factor (f,)."""
+        """The same for the rest of the plate, by the loss factor (f,)."""
         self.eta = eta
         """Loss factor (f,)."""
         self.modulus = modulus
-        """Modulus relative to the solved plate's."""
+        """Modulus relative to that of the solved plate."""
         self.bending: ComplexArray | None = None
         """Stiffness between modes with form errors (f, r, r) [rad²/s²]; `added` is their mass."""
         if model.form is not None:
@@ -634,13 +640,14 @@ class PlateAt:
 
     @property
     def reach_of_modes(self) -> tuple[ComplexArray, ComplexArray]:
-        """`reach` of what is observed (f, s, r), and transposed of what is pushed (f, r, c)."""
+        """`reach` of the observed points (f, s, r), and the transpose for the driven points (f, r,
+        c)."""
         return self.reach[:, self.model.observed], self.reach[:, self.pushed].swapaxes(1, 2)
 
     def by_log_stiffness(
         self, of_modes: ComplexArray | float, of_rest: ComplexArray | float
     ) -> ComplexArray:
-        """Derivatives by a change of the log stiffness of modes (f, r) and of all else (f,)."""
+        """Derivatives by a change of the log stiffness of modes (f, r) and of the rest (f,)."""
         functions, seen, driven = self.functions, *self.reach_of_modes
         change = (seen * (of_modes * functions.elastic)[:, None]) @ driven
         if self.bending is not None:
@@ -651,7 +658,7 @@ class PlateAt:
 
     @cached_property
     def by_log_rigidity(self) -> ComplexArray:
-        """Derivatives by the logarithm of the stiffness of all of the plate."""
+        """Derivatives by the logarithm of the stiffness of the whole plate."""
         return self.by_log_stiffness(1.0, 1.0)
 
     @cached_property
@@ -660,21 +667,22 @@ class PlateAt:
         return self.by_log_stiffness(self.by_loss, self.by_loss_of_rest)
 
     def by_free(self, change: ComplexArray) -> ComplexArray:
-        """Change of T as `responding` takes it, by one of the free receptance (f, a, a)."""
+        """Change of T (for `responding`) due to a change of the free receptance (f, a, a)."""
         left = self.left
         return np.asarray(
             left[:, self.model.observed] @ change @ left[:, self.pushed].swapaxes(1, 2)
         )
 
     def by_modes(self, share: ComplexArray | float) -> ComplexArray:
-        """Derivatives by the log eigenvalue of each mode that shifts, times a share (f, r)."""
+        """Derivatives by the log eigenvalue of each shifting mode, times a factor (f, r)."""
         modes, functions = self.model.shifted_modes, self.functions
         reach = self.reach[:, :, modes]
         by_stiffness = -(functions.thickness**3) * functions.elastic
         return self.outer(reach, reach, (share * by_stiffness)[:, modes])
 
     def by_foreign_mass(self) -> ComplexArray:
-        """Derivatives by the share of the plate's mass in each cell, taken from all of it."""
+        """Derivatives by each cell's fraction of the plate's mass, which is taken from the whole
+        plate."""
         assert self.model.form is not None  # noqa: S101  there is foreign mass
         reach = self.reach @ self.model.form.cells.T
         share = self.model.rig.plate.mass * self.functions.thickness
@@ -682,7 +690,8 @@ class PlateAt:
         return np.asarray(by_mass - by_mass.mean(axis=-1, keepdims=True))
 
     def by_stretch(self, *numbers: int) -> ComplexArray:
-        """Derivatives by relative length, width and Poisson's ratio, by number, as modes couple."""
+        """Derivatives by relative length, width and Poisson's ratio, by index, through mode
+        coupling."""
         assert self.model.form is not None  # noqa: S101  sides differ
         factor, (seen, driven) = -(self.functions.q * self.functions.thickness), self.reach_of_modes
         return np.stack(
@@ -695,9 +704,9 @@ class PlateAt:
 
     @cached_property
     def by_places(self) -> ComplexArray:
-        """Derivatives by x and y of each attachment that may move, (f, s, n, 2 v).
+        """Derivatives by x and y of each movable attachment, (f, s, n, 2 v).
 
-        A place changes the receptance in its row and its column.
+        A position changes the receptance in its row and its column.
         """
         located, moved = self.located, np.repeat(self.model.movable, 2)
         rows = located.shape_slopes @ self.moved
@@ -707,7 +716,7 @@ class PlateAt:
         return self.outer(own, reach, ones) + self.outer(reach, own, ones)
 
     def by_sources(self, kind: str) -> ComplexArray:
-        """Derivatives by a value of each ERA, which also drives through it, (f, s, n, n)."""
+        """Derivatives by a value of each ERA, which also affects its force, (f, s, n, n)."""
         none = np.zeros((2, len(self.model.omega)), dtype=complex)
         slopes = np.array([each.get(kind, none) for each in self.source_slopes])
         (change, of_force), eras = slopes.transpose(1, 2, 0), np.arange(len(slopes))
@@ -736,25 +745,27 @@ class PlateAt:
         return np.asarray(self.responses[..., None] * np.eye(len(self.model.sensors))[:, None])
 
     def by_stiffness(self, at: IntArray, change: AnyArray) -> ComplexArray:
-        """Derivatives by changes (f, m) of the dynamic stiffness of attachments (m,)."""
+        """Derivatives by changes (f, m) of the dynamic stiffness of attachments with indices
+        (m,)."""
         columns = self.receptance[:, :, at]
         return self.outer(columns, columns, -change)
 
     def outer(self, u: AnyArray, v: AnyArray, factor: AnyArray) -> ComplexArray:
-        """Responses of T = factor u v^T, (f, s, n, m), of columns (f, a, m) and factors (f, m)."""
+        """Responses to T = factor u v^T, (f, s, n, m), for columns (f, a, m) and factors (f, m)."""
         left = u[:, self.model.observed] * factor[:, None]
         return self.responding(np.asarray(left[:, :, None] * v[:, None, self.pushed]))
 
     @property
     def pushed(self) -> slice | IntArray:
-        """Columns of T whose changes count: those of ERAs, then of sensors that load the plate."""
+        """Columns of T whose changes count: ERAs, then sensors that load the plate."""
         n = len(self.sources)
         if self.lightness is None:
             return slice(n)
         return np.concatenate([np.arange(n), self.model.observed])
 
     def responding(self, change: AnyArray) -> ComplexArray:
-        """Change of the responses (f, s, n, ...) by one of T (f, s, columns of `pushed`, ...)."""
+        """Change of the responses (f, s, n, ...) due to a change of T (f, s, columns of `pushed`,
+        ...)."""
         further = (1,) * (change.ndim - 3)
         n, at = len(self.sources), np.arange(change.shape[1])
         found = change[:, :, :n]
@@ -768,7 +779,7 @@ class PlateAt:
 
 
 def viscous_difference(model: ForwardModel, x: FloatArray) -> ComplexArray:
-    """Change of the receptance (f, s, n) [m/N] between sensors and ERAs where losses are viscous.
+    """Change of the receptance (f, s, n) [m/N] between sensors and ERAs if losses are viscous.
 
     For a plate with form errors, at parameters x (p,).
     """
@@ -781,13 +792,14 @@ def viscous_difference(model: ForwardModel, x: FloatArray) -> ComplexArray:
 
 
 def _lossy(plate: PlateAt) -> FloatArray:
-    """Stiffness between coordinates that loses by the plate's loss factor (r, r) [rad²/s²]."""
+    """Stiffness between coordinates to which the plate's loss factor applies (r, r) [rad²/s²]."""
     theory, rigidity = plate.model.elasticity, plate.modulus * plate.functions.thickness**2
     return np.diag(rigidity * theory.relative_loss * theory.eigenvalues)
 
 
 def _viscous(plate: PlateAt) -> FloatArray:
-    """Damping (r, r) [rad/s] by a loss factor of 1 of each supported mode at its resonance."""
+    """Damping (r, r) [rad/s] equivalent to a loss factor of 1 for each supported mode at
+    resonance."""
     values, model, shapes = plate.values, plate.model, plate.located.shapes
     rig, h = model.rig, plate.functions.thickness
     springs = [each.in_time.stiffness for each in plate.sources]
@@ -809,7 +821,7 @@ def _viscous(plate: PlateAt) -> FloatArray:
 def jacobian(plate: PlateAt, searched: NDArray[np.bool_] | None = None) -> ComplexArray:
     """Derivatives of the responses of a plate by x, (f, s, n, p).
 
-    searched (p,): those of interest; of kinds without any they are zero. By default all.
+    searched (p,): mask of the requested parameters, default all; kinds without any get zeros.
     """
     space = plate.model.space
     wanted = space.uncertain if searched is None else space.uncertain & searched

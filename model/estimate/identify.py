@@ -1,30 +1,32 @@
-"""Identification of a rig by responses measured in place, the contrast it gives, and its report.
+"""Identify a rig from responses measured in place, and report the contrast it gives.
 
-Fitting all parameters at once ends in wrong minima. So springs, damping, thickness and gains come
-first, from several thicknesses and with a noise that hides the rest; then one additional mass, from
-where it would explain most; then everything with the noise as measured. A second mass is added only
-where the first leaves something that it explains. A board with a grain is then fitted again with
-the moduli across and of shear that the shifts of its modes suggest: boards of one kind differ in
-each by 10 % and more. To first order shifts m (k,), in standard deviations s, with covariance C,
-follow from logarithms d of factors on the moduli, of prior variance D:
+Fitting all parameters simultaneously ends in wrong minima. Springs, damping, thickness and gains
+are therefore fitted first, from several thicknesses and with extra noise that hides the rest. Next
+come one additional mass, starting where it would explain most, and then all parameters with the
+measured noise. A second mass is added only if it explains part of the remaining error. For a board
+with a grain, the fit is then repeated with other transverse and shear moduli, which follow from the
+shifts of its modes; boards of one kind differ by 10 % and more in each modulus. To first order
+shifts m (k,), in standard deviations s, with covariance C, follow from logarithms d of factors on
+the moduli, with prior variance D:
 
     d = (J^T (1 - C) J + D^-1)^-1 J^T m,   J = (v^T dK v / lambda) / s,
 
-where the first column of J, all ones, stands for a modulus that is fitted anew.
+where the first column of J, all ones, represents a modulus that is fitted again.
 
-A response to a moving base does not change if mass, springs and dampers are scaled together, nor
-does a contrast if all drives are. Answers depend on each natural frequency, on each spring and
-damper relative to the plate's mass, on each gain relative to the others, and levels on the mean of
-the gains: responses give only its product with that of the sensors (`relevant`).
+A response to a moving base does not change if mass, springs and dampers are scaled together, and
+neither does a contrast if all drives are. Answers depend on each natural frequency, on each spring
+and damper relative to the plate's mass, and on each gain relative to the others. Levels depend on
+the mean of the gains, but responses determine only its product with the mean sensor gain
+(`relevant`).
 
-The fit is checked on paths from an ERA to a sensor that it was not shown, every fifth one, five
-times over; the reverse of a hidden path is hidden as well. Hidden paths show how far fields are off
-that are not measured; hidden tones would show whether a resonance was seen, which the covariance
-knows. Only the part of the error that neither noise nor uncertain parameters explain counts against
-the model. By that part parameters disagree between fits to different paths, beyond their covariance
-(a jackknife over groups: B. Efron, The Jackknife, the Bootstrap and Other Resampling Plans, SIAM
-1982, ch. 3). Where the measurement leaves a quantity unknown, `unknowns` names the tone and the
-sensor that would show it.
+The fit is validated on held-out paths from an ERA to a sensor, in five folds; the reverse of a
+held-out path is held out as well. Held-out paths show the error of fields that are not measured.
+Held-out tones would show only whether a resonance was measured, which the covariance shows already.
+Only the part of the error that neither noise nor uncertain parameters explain counts against the
+model. It also makes fits to different paths disagree in their parameters beyond their covariance (a
+jackknife over groups: B. Efron, The Jackknife, the Bootstrap and Other Resampling Plans, SIAM 1982,
+ch. 3). If the measurement leaves a quantity unknown, `unknowns` names the tone and the sensor that
+would determine it.
 """
 
 import math
@@ -61,30 +63,35 @@ from model.structure.modal_elasticity import check_is_plate, check_measurable, l
 from model.structure.plate import Plate
 
 MAX_CHI2 = 2.0
-"""Largest chi² of a model that explains a measurement, so that answers may be promised from it."""
+"""Largest chi² of a model that explains a measurement, so that answers can be promised from it."""
 
 MAX_MODE_SHIFT = 2.0
-"""Largest rms shift of the lowest modes, in standard deviations, of a plate that is known well:
-beyond it fields between the sensors are others, whatever these hear."""
+"""Largest RMS shift of the lowest modes, in standard deviations, for a well-known plate. Beyond it,
+fields between the sensors are wrong even if the sensors agree."""
 
-# Repeatability of a drive from one day to the next, which no measurement shows.
+# Day-to-day repeatability of a drive, which a single measurement cannot show.
 _DRIVE_GAIN, _DRIVE_PHASE_DEG = 0.01, 1.0
 
 _MIN_VALUES = 16
-_GAIN_STDS = 5.0  # beyond which a gain is wrong
-_GAIN_ALLOWED, _PHASE_ALLOWED = 0.3, math.radians(20)  # whatever the rig's uncertainty
-_LEVEL_ALLOWED = math.log(2.5)  # of all responses together: a g is 9.8 m/s², an inch 25.4 mm
+_GAIN_STDS = 5.0  # standard errors beyond which a gain is wrong
+_GAIN_ALLOWED, _PHASE_ALLOWED = (
+    0.3,
+    math.radians(20),
+)  # limits that apply even if the rig states a larger uncertainty
+_LEVEL_ALLOWED = math.log(
+    2.5
+)  # of the common factor of all responses; g is 9.8 m/s², an inch 25.4 mm
 
 
-_EXTRA_NOISE = 0.05  # of the rms at each frequency, in the first stages
-_THICKNESSES = (0.0, 1.5, -1.5)  # standard deviations from which the first stage starts
-_FREQUENCY_MARGIN = 1.02  # since layers do not stiffen all modes alike
-_GOOD = 0.5  # chi² with the extra noise that needs no further start
-_INWARDS = 0.6  # standard deviations by which places start from an edge
-_MASS_GRID = Grid(8, 6)  # where an additional mass is sought
+_EXTRA_NOISE = 0.05  # of the RMS at each frequency, in the first stages
+_THICKNESSES = (0.0, 1.5, -1.5)  # start values of the first stage, in standard deviations
+_FREQUENCY_MARGIN = 1.02  # because layers do not stiffen all modes equally
+_GOOD = 0.5  # chi² with the extra noise; below it no further start is tried
+_INWARDS = 0.6  # standard deviations; positions on an edge start this far inside
+_MASS_GRID = Grid(8, 6)  # start positions of an additional mass
 _MASS_STARTS = 4
 _MORE_MASS_BEYOND = 1.5  # chi²
-_MASS_GAINS = 25.0  # of the cost: five standard deviations
+_MASS_GAINS = 25.0  # of the cost, five standard deviations
 
 _SIMPLE, _LOCATED = (
     [name for name, kind in PARAMETER_KINDS.items() if kind.stage <= stage] for stage in (0, 1)
@@ -97,58 +104,66 @@ _THEORY = {
     "place": PARAMETER_KINDS["place"].theory,
 }
 
-_MAX_PREDICTION_STD = 0.1  # of the rms at a tone; less certain predictions are no test
+_MAX_PREDICTION_STD = 0.1  # of the RMS at a tone; less certain predictions prove nothing
 _MIN_PREDICTED = 16  # values
-_REFITTED = 8  # evaluations of a fit to the other paths
-_IN_COMMON = 2.0  # factor on standard deviations: what no path shows is wrong in all fits alike
+_REFITTED = 8  # evaluations of a fit to the remaining paths
+_IN_COMMON = 2.0  # factor on standard deviations, for errors that all fits share and no path shows
 
 _UNKNOWN = 0.5
-"""Share of its standard deviation beforehand, beyond which a quantity was not identified.
+"""Fraction of the prior standard deviation above which a quantity counts as not identified.
 
-The standard deviation is that of a plate that was not measured where the rig states less: answers
-need no more.
+If the rig states less, the prior is that of a plate that was not measured: answers need no more.
 """
 
-_SUSPENSION_FELT = 120.0  # Hz; above it a suspension that is 20 % off changes fields by under 5 %
+_SUSPENSION_FELT = (
+    120.0  # Hz; above it, a 20 % error of a suspension changes fields by less than 5 %
+)
 
-_ADVISED_STEP = 20.0  # Hz between the tones that may be advised
-_ADVISED_NOISE = 0.01  # of the rms of the responses at a tone
-_ADVISED_PLACES = (0.13, 0.5, 0.87)  # of the sides, where further sensors may be advised
+_ADVISED_STEP = 20.0  # Hz between candidate tones for advice
+_ADVISED_NOISE = 0.01  # of the RMS of the responses at a tone
+_ADVISED_PLACES = (
+    0.13,
+    0.5,
+    0.87,
+)  # of the sides, candidate positions of additional sensors for advice
 
-_GRAIN_PRIOR = 0.15  # standard deviation of the logarithms of a board's moduli by its kind
-_MIN_GRAIN_CHANGE = 3e-3  # of a logarithm, that is worth another fit
-_GRAIN_STARTS = (1.0, 0.85, 1.18)  # factors on the modulus across, since fits end in wrong minima
-_GRAIN_ROUNDS = 3  # fits from a start, each with the grain that the one before shows
-_GRAIN_GOOD = 1.0  # chi², and mean square of the shifts of modes, that need no further start
+_GRAIN_PRIOR = 0.15  # standard deviation of the logarithms of a board's moduli within its kind
+_MIN_GRAIN_CHANGE = 3e-3  # of a logarithm; smaller changes do not justify another fit
+_GRAIN_STARTS = (
+    1.0,
+    0.85,
+    1.18,
+)  # factors on the transverse modulus, since fits can end in wrong minima
+_GRAIN_ROUNDS = 3  # fits per start, each with the grain found by the previous one
+_GRAIN_GOOD = 1.0  # chi² and mean square mode shift below which no further start is tried
 
 
 @dataclass(frozen=True, eq=False)
 class HeldOutPaths:
-    """Errors of prediction at paths held out of a fit, rms relative to the responses at a tone."""
+    """Prediction errors at held-out paths, RMS relative to the responses at a tone."""
 
     total: float
-    """Without the part that noise explains."""
+    """Without the part explained by noise."""
     unexplained: float
-    """Without the part that noise and the uncertain parameters explain together."""
+    """Without the part explained by noise and uncertain parameters together."""
     disagreement: FloatArray
-    """Covariance (p, p) of x to add to that of the fit."""
+    """Covariance (p, p) of x, to be added to that of the fit."""
 
 
 @dataclass(frozen=True, eq=False)
 class Identification:
-    """A rig as its responses show it."""
+    """Rig identified from responses."""
 
     before: Rig
     """The rig as written."""
     rig: Rig
-    """The rig with identified values and, where the model explains the measurement, their
-    uncertainty."""
+    """Rig with identified values and, if the model explains the measurement, their uncertainty."""
     fitted: Fit
     """The most likely parameters."""
     covariance: FloatArray
-    """Covariance (p, p) of the parameters, wider by the disagreement of held-out paths."""
+    """Covariance (p, p) of the parameters, widened by the disagreement of held-out paths."""
     held_out: HeldOutPaths | None
-    """Prediction of unseen paths, None where there are too few."""
+    """Prediction of held-out paths, None if there are too few."""
 
     @property
     def chi2(self) -> float:
@@ -157,27 +172,28 @@ class Identification:
 
     @property
     def values(self) -> PlateValues:
-        """Values of the parameters, gains of sensors among them."""
+        """Values of the parameters, including sensor gains."""
         return self.fitted.plate.values
 
     @property
     def mode_shift(self) -> float:
-        """Rms by which the lowest modes had to shift, in standard deviations, 0 without any."""
+        """RMS shift of the lowest modes, in standard deviations, 0 without any."""
         return _mode_shift(self.fitted)
 
     @property
     def is_explained(self) -> bool:
-        """Whether the model explains the measurement, so that answers may rely on it."""
+        """Whether the model explains the measurement, so that answers can rely on it."""
         return self.chi2 <= MAX_CHI2 and self.is_known_well
 
     @property
     def is_known_well(self) -> bool:
-        """Whether the modes are those of the rig's plate, and with them fields between sensors."""
+        """Whether the modes match the rig's plate, and therefore also the fields between
+        sensors."""
         return self.mode_shift <= MAX_MODE_SHIFT
 
     @property
     def can_promise(self) -> bool:
-        """Whether contrasts may be promised: explained, and of paths that could be held out."""
+        """Whether contrasts can be promised: explained, with held-out paths."""
         return self.is_explained and self.held_out is not None
 
     @cached_property
@@ -186,7 +202,8 @@ class Identification:
         return np.asarray(self.fitted.space.std * np.sqrt(np.diagonal(self.covariance)))
 
     def stds(self) -> dict[str, FloatArray]:
-        """Standard deviations of what answers depend on, with the errors of the theory, by kind."""
+        """Standard deviations of the quantities that answers depend on, with model errors, by
+        kind."""
         space = self.fitted.space
         own = {kind: std_of(rows, space, self.covariance) for kind, rows in relevant(space).items()}
         own["place"] = self.std[space.groups["place"]]
@@ -196,18 +213,19 @@ class Identification:
         }
 
     def within(self, space: Space) -> tuple[FloatArray, FloatArray]:
-        """Parameters (p,) and covariance (p, p) in a space with further ones, 0 and known."""
+        """Return parameters (p,) and covariance (p, p) in a larger space; additional ones are 0 and
+        known."""
         own = [space.index(name) for name in self.fitted.space.names]
         x, covariance = np.zeros(space.size), np.zeros((space.size, space.size))
         x[own], covariance[np.ix_(own, own)] = self.fitted.x, self.covariance
         return x, covariance
 
     def uncertainty(self, unexplained: float) -> Uncertainty:
-        """The `uncertainty` of the rig after its identification.
+        """Return the `uncertainty` of the identified rig.
 
-        unexplained: share of fields that the model leaves unexplained. Fingers and harmonics stay
-        as they were; the common_gain, which no fit narrows, is added to the error of the gains'
-        mean.
+        unexplained: fraction of the fields that the model does not explain. Fingers and harmonics
+        keep their uncertainty. common_gain, which no fit narrows, is added to the error of the mean
+        gain.
         """
         space, before = self.fitted.space, self.fitted.model.rig.uncertainty
         mean = _rows(space, "gain").mean(axis=0, keepdims=True)
@@ -230,13 +248,13 @@ class Identification:
 
 
 def identify(rig: Rig, measurement: Measurement, *, progress: Progress = unseen) -> Identification:
-    """Identify a rig by a measurement on it.
+    """Identify a rig from a measurement on it.
 
-    progress: called with the fits done and all, one of everything and one of each held-out share.
-    Raises InputError for a rig with a part that does not scale, for a plate that was not linear or
-    has changed during the measurement, for gains that no drive or sensor has (another unit, a wrong
-    sign), and where a quantity that answers depend on stays unknown, with the tone and the sensor
-    that would show it.
+    progress: called with the number of fits done and the total (one full fit, one per fold). Raises
+    InputError for a rig with a part that does not scale, for a plate that was not linear or has
+    changed during the measurement, for impossible gains of drives or sensors (another unit, a wrong
+    sign), and for undetermined quantities that answers depend on, with the tone and the sensor that
+    would determine them.
     """
     _check(rig, measurement)
     fitted = fit_board(rig, measurement)
@@ -258,7 +276,7 @@ def identify(rig: Rig, measurement: Measurement, *, progress: Progress = unseen)
 
 
 def _check(rig: Rig, measurement: Measurement) -> None:
-    check_measurable(rig.plate)  # what is left uncertain of modes is written as thickness
+    check_measurable(rig.plate)  # remaining uncertainty of modes is written as thickness
     names = [era.name for era in rig.eras]
     for sensor in measurement.sensors:
         if sensor.era and sensor.era not in names:
@@ -285,11 +303,11 @@ def _check(rig: Rig, measurement: Measurement) -> None:
 
 
 def solved_for(rig: Rig, frequency_max: float) -> FreePlate:
-    """The free plate of a rig, solved for tones up to a frequency [Hz]."""
-    check_is_plate(rig.plate, "a fit or a check by measurements")
+    """Return the free plate of a rig, solved for tones up to a frequency [Hz]."""
+    check_is_plate(rig.plate, "a fit or check with measurements")
     mesh: PlateMesh = rig.mesh
     if not isinstance(mesh, SpectralMesh):
-        # Places move freely only where a plate is solved in functions over all of it.
+        # Positions move freely only on a plate with global basis functions.
         mesh = mesh_of("auto", rig.plate, frequency_max=rig.limits.frequency_max)
     return solve_free_plate(rig.plate, mesh, frequency_max=max(frequency_max, 200.0))
 
@@ -302,9 +320,9 @@ def model_of(
     masses: int,
     more: Sequence[Sensor] = (),
 ) -> ForwardModel:
-    """The rig with a number of additional masses at the tones that were measured.
+    """Return the model of a rig with additional masses at the measured tones.
 
-    free: the rig's free plate, as solved; more: further sensors beside those of the measurement.
+    free: solved free plate of the rig; masses: their number; more: additional sensors.
     """
     sensors = (*measurement.sensors, *more)
     space = space_of(
@@ -319,9 +337,9 @@ def model_of(
 
 
 def fit_board(rig: Rig, measurement: Measurement) -> Fit:
-    """Fit in stages, and for a board with a grain again with the grain that the fit shows.
+    """Fit in stages; for a board with a grain, fit again with the grain found.
 
-    The rig of the fit's model has the grain that was found.
+    The rig of the resulting model has this grain.
     """
     if rig.plate.material.orthotropy is None:
         return fit_in_stages(rig, measurement)
@@ -342,12 +360,12 @@ def fit_board(rig: Rig, measurement: Measurement) -> Fit:
 
 
 def _mode_shift(found: Fit) -> float:
-    """Rms by which the lowest modes had to shift, in standard deviations, 0 without any."""
+    """Return the RMS shift of the lowest modes, in standard deviations, 0 without any."""
     return rms(found.x[found.space.of("mode_shifts")])
 
 
 def _grain_shown(found: Fit) -> tuple[float, float]:
-    """Logarithms of the factors on the moduli across and of shear that the shifts of modes show."""
+    """Return logarithms of factors on the transverse and shear moduli from the shifts of modes."""
     shifts, free = found.space.of("mode_shifts"), found.model.free
     lowest = lowest_elastic(free.modes.eigenvalues, int(shifts.sum()))
     shapes = [each[:, lowest] for each in free.modes.unknowns(np.empty((0, 3)))]
@@ -361,7 +379,7 @@ def _grain_shown(found: Fit) -> tuple[float, float]:
 
 
 def _with_grain(rig: Rig, across: float, shear: float) -> Rig:
-    """The rig of a board with other moduli across and of shear, by factors."""
+    """Return the rig of a board with transverse and shear moduli multiplied by factors."""
     of = rig.plate.material.shares
     shares = replace(of, e2=of.e2 * across, g12=of.g12 * shear)
     material = replace(rig.plate.material, orthotropy=shares)
@@ -381,7 +399,7 @@ def fit_in_stages(rig: Rig, measurement: Measurement) -> Fit:
         more = _in_full(_with_mass(wider, rough, x, number=1), measurement)
         if more.cost <= found.cost - _MASS_GAINS / 2:
             found = more
-    # With the plate solved for its thickness and modulus, as a table will be.
+    # Solve the plate for its identified thickness and modulus, as for a table.
     identified = plate_with(rig.plate, found.plate.values)
     identified = replace(identified, mode_deviations=rig.plate.mode_deviations)
     anew = replace(found.model, free=solved_with_modes_of(free, identified), last_places={})
@@ -402,7 +420,8 @@ def _simple(model: ForwardModel, rough: Measurement) -> Fit:
 
 
 def _with_mass(model: ForwardModel, rough: Measurement, x: FloatArray, *, number: int) -> list[Fit]:
-    """Fit places and an additional mass from where it explains most, and from none, best first."""
+    """Fit positions and an additional mass, starting where it explains most, and from none; best
+    first."""
     space, plate = model.space, model.rig.plate
     start = inwards(space, x, by=_INWARDS)
     others = space.uncertain & ~space.of("masses", "mode_shifts", "mode_losses")
@@ -420,21 +439,21 @@ def _with_mass(model: ForwardModel, rough: Measurement, x: FloatArray, *, number
 
 
 def _in_full(starts: list[Fit], measurement: Measurement) -> Fit:
-    """Fit everything to the noise as it is, from the two best starts."""
+    """Fit all parameters with the measured noise, from the two best starts."""
     return likeliest_fit([fit(each.model, measurement, start=each.x) for each in starts[:2]])
 
 
 def solved_with_modes_of(free: FreePlate, plate: Plate) -> FreePlate:
-    """Solve a plate on the mesh of another one, with all of its modes though it may be stiffer."""
+    """Solve a plate on another one's mesh, with all of its modes even if it is stiffer."""
     stiffer = plate.lowest_bending_frequency / free.plate.lowest_bending_frequency
     frequency_max = free.frequency_max * max(stiffer * _FREQUENCY_MARGIN, 1.0)
     return solve_free_plate(plate, free.mesh, frequency_max=frequency_max)
 
 
 def _check_level(values: PlateValues) -> None:
-    """Raise InputError if all responses are far too large or small: another unit.
+    """Raise InputError if all responses are far too large or small because of a wrong unit.
 
-    This is checked of fits that explain nothing, too: a wrong unit can be why they do not.
+    Also applied to poor fits, since a wrong unit can be the reason.
     """
     drive_level = np.log(np.abs(values["gain"])).mean()
     sensor_level = np.log(np.abs(values["sensor_gain"])).mean()
@@ -447,10 +466,10 @@ def _check_level(values: PlateValues) -> None:
 
 
 def _check_gains(rig: Rig, measurement: Measurement, values: PlateValues, space: Space) -> None:
-    """Raise InputError for gains no drive or sensor has: another unit, a sign, a wrong plug.
+    """Raise InputError for impossible gains of drives or sensors: a wrong unit, sign or plug.
 
-    A response tells only the product of a drive's and a sensor's gain, so that the fit shares an
-    error of either among both, and its residuals do not show a wrong unit or sign.
+    A response determines only the product of a drive's and a sensor's gain. The fit therefore
+    splits an error between both, and its residuals do not show a wrong unit or sign.
     """
     wrong = []
     for kind, names in (
@@ -477,14 +496,15 @@ def _check_gains(rig: Rig, measurement: Measurement, values: PlateValues, space:
 
 
 def relevant(space: Space) -> dict[str, FloatArray]:
-    """Combinations (m, p) of parameters that answers depend on, by name."""
+    """Return combinations (m, p) of parameters that answers depend on, by name."""
     mass = _rows(space, "thickness")
     by_rigidity = mass + _rows(space, "modulus") / 2
     gain, phase = _rows(space, "gain"), _rows(space, "phase")
     damping = _rows(space, "damping_each") + _rows(space, "damping") - mass
     factor = space.groups["force_factor"]
     if factor.stop > factor.start:
-        # An exciter damps and pushes by its coil: the share of its suspension shows little alone.
+        # An exciter's coil both damps and drives; the contribution of its suspension hardly shows
+        # alone.
         damping = damping[space.std[factor] == 0]
         gain = gain + _rows(space, "force_factor")
     return {
@@ -498,23 +518,24 @@ def relevant(space: Space) -> dict[str, FloatArray]:
 
 
 def _rows(space: Space, kind: str) -> FloatArray:
-    """One row for each parameter of a kind, (m, p)."""
+    """Return one row per parameter of a kind, (m, p)."""
     return np.eye(space.size)[space.groups[kind]]
 
 
 def std_of(combinations: FloatArray, space: Space, covariance: FloatArray) -> FloatArray:
-    """Standard deviations (m,) of linear combinations (m, p) of parameters in their units."""
+    """Return standard deviations (m,) of linear combinations (m, p) of parameters in their
+    units."""
     scaled = combinations * space.std
     return np.asarray(np.sqrt(np.einsum("mp,pq,mq->m", scaled, covariance, scaled)))
 
 
 def hold_out(found: Fit, *, progress: Progress = unseen) -> HeldOutPaths | None:
-    """Predict paths from fits to the others; None where these do not determine enough of them."""
+    """Predict paths from fits to the others; None if these determine too few of them."""
     measurement, model = found.measurement, found.model
     folds = (model.observed[:, None] + np.arange(len(model.rig.eras))) % HELD_OUT_FOLDS
     squares, variance = np.full((2, *measurement.values.shape), np.nan)
     own = np.flatnonzero(found.searched)
-    fits, noise = [], min(found.chi2, 1.0)  # readings may be better than they are stated
+    fits, noise = [], min(found.chi2, 1.0)  # readings can be better than stated
     for fold in range(HELD_OUT_FOLDS):
         progress(1 + fold, 1 + HELD_OUT_FOLDS)
         hidden = measurement.known & (folds == fold)
@@ -535,7 +556,7 @@ def hold_out(found: Fit, *, progress: Progress = unseen) -> HeldOutPaths | None:
     if predicted.sum() < _MIN_PREDICTED:
         return None
     total, unexplained = (
-        # Noise that is subtracted may exceed the errors.
+        # The subtracted noise can exceed the errors.
         math.sqrt(max((parts[predicted] / mean_square[predicted]).mean(), 0.0))
         for parts in (squares, squares - variance)
     )
@@ -546,9 +567,9 @@ def hold_out(found: Fit, *, progress: Progress = unseen) -> HeldOutPaths | None:
 
 
 def unknowns(found: Identification) -> list[str]:
-    """Describe what answers depend on and the measurement leaves unknown, and what would show it.
+    """Describe quantities that answers depend on but the measurement leaves unknown, with advice.
 
-    The standard deviations are those before the measurement and after it.
+    States their standard deviations before and after the measurement.
     """
     space, model, rows = found.fitted.space, found.fitted.model, []
     prior = np.diag(space.uncertain.astype(float))
@@ -559,7 +580,7 @@ def unknowns(found: Identification) -> list[str]:
         if kind == "stiffness" and model.frequencies[0] > _SUSPENSION_FELT:
             excites = ["force_factor" in era.fields for era in model.rig.eras]
             unknown = unknown[~np.array(excites)[unknown]]
-        # Of losses and frequencies of single modes only those count that no tone has shown.
+        # Losses and frequencies of single modes count only if no tone has shown them.
         of_modes = kind in ("frequency", "loss")
         if not len(unknown) or (of_modes and len(unknown) < len(combinations)):
             continue
@@ -573,7 +594,7 @@ def unknowns(found: Identification) -> list[str]:
 
 
 def _advice(found: Identification, combination: FloatArray) -> str:
-    """ERA, tone and place whose response would narrow a combination (p,) most, in words."""
+    """Describe the ERA, tone and position whose response would narrow a combination (p,) most."""
     fitted = found.fitted
     model, rig = fitted.model, fitted.model.rig
     limits, sides = rig.limits, (rig.plate.length, rig.plate.width)
@@ -597,7 +618,7 @@ def _advice(found: Identification, combination: FloatArray) -> str:
     narrowed = np.zeros(at.responses.shape)
     direction = covariance @ (direction * wider.space.std)
     slopes = jacobian(at) / noise[..., None]
-    for part in (slopes.real, slopes.imag):  # by each response measured on its own
+    for part in (slopes.real, slopes.imag):  # each response alone
         variance = ((part @ covariance) * part).sum(axis=-1)
         narrowed += (part @ direction) ** 2 / (1 + variance)
     f, s, e = map(int, np.unravel_index(best_of(narrowed.ravel()), narrowed.shape))
@@ -607,7 +628,7 @@ def _advice(found: Identification, combination: FloatArray) -> str:
 
 
 def identification_errors(found: Identification) -> dict[KeyPath, float]:
-    """Standard errors of the values that a rig's file states, by the path of their key."""
+    """Return standard errors of the values in a rig file, by key path."""
     rig, groups = found.rig, found.fitted.space.groups
     plate, eras, feet = (
         [found.std[groups[kind]] for kind in kinds]
@@ -615,5 +636,5 @@ def identification_errors(found: Identification) -> dict[KeyPath, float]:
     )
     relative = np.concatenate([*plate, np.transpose(eras).ravel(), *feet])
     own = parameters_of(rig, ("thickness", "loss_factor"), ("stiffness", "damping"), rig.foot_names)
-    stated = zip(own, relative, strict=False)  # feet that no spring holds have no error
+    stated = zip(own, relative, strict=False)  # feet without a spring have no error
     return errors_by_key(rig, ((each, each.before * error) for each, error in stated))

@@ -1,15 +1,15 @@
-"""Measured responses of a rig, their files, and the file of the accelerometers.
+"""Measured responses of a rig, their files, and the accelerometer file.
 
-A CSV file has the columns `COLUMNS`, one value a line, in any order. A UFF file has a function of
+A CSV file has the columns `COLUMNS`, one value per row, in any order. A UFF file has a function of
 type 4 for every sensor and ERA, acceleration over displacement, with the nodes' positions in
-dataset 15 or 2411; the reference node is the ERA, by its name or position. Responses to exciters
-are per volt: in columns `real_m_s2_v` and `imag_m_s2_v`, or in functions whose reference has the
-general data type (1) and the unit V. The mass of a sensor that is moved and the setting of a
-measurement are in columns of their own, or in the second line of free text of a function:
+dataset 15 or 2411. The reference node is the ERA, identified by name or position. Responses to
+exciters are per volt: in columns `real_m_s2_v` and `imag_m_s2_v`, or in functions whose reference
+has the general data type (1) and the unit V. The mass of a moved sensor and the setting of a
+measurement have their own columns, or are in the second line of free text of a function:
 `sensor_mass_g=2 setting=level 0.1`.
 
-The places of sensors are read of the file of the accelerometers, whose other columns are those of
-their inputs (`era_haptics.lab.measuring.sound_card`).
+Sensor positions are read from the accelerometer file, whose other columns describe their inputs
+(`era_haptics.lab.measuring.sound_card`).
 """
 
 import logging
@@ -50,7 +50,7 @@ _EDGE_TOLERANCE = 1e-3
 _logger = logging.getLogger(__name__)
 _SILENT_SENSOR = 0.005  # of the loudest sensor, in the median over frequencies and ERAs
 LEAST_SENSORS = 3
-"""Fewest sensors with a signal of which a plate can be fitted."""
+"""Minimum number of sensors with a signal for fitting a plate."""
 
 COLUMNS = ("era", "sensor", "x_m", "y_m", "frequency_hz", "real_1_s2", "imag_1_s2")
 _PER_VOLT = ("real_m_s2_v", "imag_m_s2_v")
@@ -58,7 +58,7 @@ ERA_COLUMNS = ("era_x_m", "era_y_m")  # optional
 _MASS, SETTING = "sensor_mass_g", "setting"  # optional, too
 _NOTE = re.compile(rf"\b{_MASS}=(?P<mass>\S+)(?:\s+{SETTING}=(?P<setting>.*))?")
 MAX_SENSOR_MASS = 500.0
-"""Largest mass [g] of a sensor that is moved; a heavier one is not an accelerometer."""
+"""Largest mass of a moved sensor [g]; a heavier one is not an accelerometer."""
 
 _UP = 3  # +z
 _GENERAL = 1  # a data type without one of its own
@@ -131,17 +131,18 @@ class Measurement:
     """Whether phases are relative to the drive; otherwise only phases between sensors are known,
     and no polarity."""
     drives_lag: bool = False
-    """Whether bases follow what is played with an unknown lag, as behind voltage amplifiers."""
+    """Whether bases follow their drive with an unknown lag, for example behind voltage
+    amplifiers."""
     skipped: int = 0
-    """Number of values that were read beyond the rig's limits of frequency."""
+    """Number of values outside the rig's frequency limits, which were skipped."""
     gain_std: float = 0.0
-    """Relative standard deviation from 1 of the gain that each drive has at every frequency: 0
-    where gains are 1, infinite where nothing states them. A phase is free with its magnitude."""
+    """Relative standard deviation of each drive's gain from 1, at every frequency: 0 for gains of
+    1, infinite for unknown gains. The phase is free if the magnitude is."""
     drives: tuple[int, ...] = ()
-    """Number of the ERA that each of the n channels drives, empty where each drives its own."""
+    """Index of the ERA that each of the n channels drives; empty if each drives its own."""
     bases: ComplexArray | None = None
-    """Amplitude of each ERA (f, eras) where all play together as one channel, None where each plays
-    by itself."""
+    """Amplitude of each ERA (f, eras) if all play together as one channel, None if each plays
+    alone."""
 
     def __post_init__(self) -> None:
         """Raise InputError for unordered frequencies."""
@@ -155,15 +156,15 @@ class Measurement:
 
     @property
     def points(self) -> FloatArray:
-        """Places of the sensors (s, 2) [m]."""
+        """Positions of the sensors (s, 2) [m]."""
         return np.array([(each.x, each.y) for each in self.sensors]).reshape(-1, 2)
 
     @cached_property
     def std(self) -> FloatArray:
-        """Standard error of the real and of the imaginary part (f, s, n), infinite of outliers.
+        """Standard error of the real and of the imaginary part (f, s, n), infinite for outliers.
 
-        The usual one is 1 % of a response and of a tenth of its sensor's root mean square together:
-        never relative alone, since a response may vanish. Raises InputError for one of zero.
+        The default is 1 % of a response plus 1 % of a tenth of its sensor's RMS, since a response
+        can be zero. Raises InputError for a standard error of zero.
         """
         found = self.errors
         if found is None:
@@ -184,16 +185,17 @@ class Measurement:
 
     @cached_property
     def weight(self) -> FloatArray:
-        """1 / std, 0 where nothing is known (f, s, n)."""
+        """1 / std, 0 for unknown values (f, s, n)."""
         return np.where(self.known, 1 / self.std, 0.0)
 
     @cached_property
     def filled(self) -> ComplexArray:
-        """The values, 0 where nothing is known (f, s, n)."""
+        """Values, 0 for unknown ones (f, s, n)."""
         return np.where(self.known, self.values, 0.0)
 
     def driven(self, responses: ComplexArray) -> ComplexArray:
-        """Responses (f, s, eras, ...) to the ERAs, or their slopes, as those to the n channels."""
+        """Convert responses (f, s, eras, ...) to the ERAs, or their slopes, to those to the n
+        channels."""
         if self.bases is not None:
             mixed = np.einsum("fse...,fe->fs...", responses, self.bases)
             return np.asarray(mixed[:, :, None])
@@ -206,13 +208,13 @@ class Measurement:
 
     @cached_property
     def tone_rms(self) -> FloatArray:
-        """Root mean square of the values at each tone, (f, 1, 1) [1/s²]."""
+        """RMS of the values at each tone, (f, 1, 1) [1/s²]."""
         squares = np.where(self.known, np.abs(self.values) ** 2, 0.0)
         count = self.known.sum(axis=(1, 2), keepdims=True)
         return np.asarray(np.sqrt(squares.sum(axis=(1, 2), keepdims=True) / np.maximum(count, 1)))
 
     def part(self, kept: NDArray[np.bool_]) -> Self:
-        """Keep the values of a mask (f, s, n), with the errors that they have."""
+        """Keep the values of a mask (f, s, n), with their errors."""
         return replace(self, values=np.where(kept, self.values, np.nan), errors=self.std)
 
     def without(self, sensors: NDArray[np.bool_]) -> Self:
@@ -225,12 +227,13 @@ class Measurement:
         )
 
     def moved(self, points: FloatArray) -> Self:
-        """The same with the sensors at other places (s, 2) [m]."""
+        """Return a copy with the sensors at other positions (s, 2) [m]."""
         places = zip(self.sensors, points.tolist(), strict=True)
         return replace(self, sensors=tuple(replace(each, x=x, y=y) for each, (x, y) in places))
 
     def check(self) -> None:
-        """Raise InputError for a plate that was not linear or has changed meanwhile."""
+        """Raise InputError for a plate that was not linear or has changed during the
+        measurement."""
         for repeats, limit, cause in (
             (self.half_level, NONLINEAR, "at half the level; measure at a lower level"),
             (self.at_end, DRIFTED, "at the end; wait until the plate has settled, measure again"),
@@ -300,11 +303,11 @@ class MeasuredValue:
 
 
 def measurement_of(measured: Sequence[MeasuredValue], rig: Rig) -> Measurement:
-    """Join values into a measurement of a rig's plate, of drives that lag as behind a card.
+    """Combine values into a measurement of a rig's plate; drives are assumed to lag (sound card).
 
-    Values beyond the rig's limits of frequency, as a spectrum's line of 0 Hz, are skipped. Raises
-    InputError, with file and line, for points off the plate, unknown ERAs or positions, a response
-    given twice, a sensor at two positions, and where nothing is left.
+    Values outside the rig's frequency limits, such as a spectrum's 0 Hz line, are skipped. Raises
+    InputError, with file and line, for points off the plate, unknown ERAs or positions, duplicate
+    responses, a sensor at two positions, and if no value is left.
     """
     low, high = rig.limits.frequency_min, rig.limits.frequency_max
     within = [each for each in measured if low <= each.frequency <= high]
@@ -387,15 +390,15 @@ def _check_point(measured: MeasuredValue, rig: Rig) -> None:
 
 
 def _era_of(measured: MeasuredValue, rig: Rig) -> int:
-    """Find the number of the ERA that was driven, by its name or else by its position."""
+    """Return the index of the driven ERA, found by its name or else by its position."""
     at, names = measured.era_point, [era.name for era in rig.eras]
     for number, era in enumerate(rig.eras):
         near = at is not None and math.dist(at, (era.x, era.y)) <= _ERA_TOLERANCE
         if era.name == measured.era:
             if at is not None and not near:
                 raise InputError(
-                    f"{measured.place}: ERA {era.name} must be at {_shown((era.x, era.y))} m "
-                    f"as in the rig, got {_shown(at)} m; check the plate"
+                    f"{measured.place}: ERA {era.name} must be at {_shown((era.x, era.y))} m, its "
+                    f"position in the rig, got {_shown(at)} m; check the plate"
                 )
             return number
         if near and measured.era not in names:
@@ -411,7 +414,7 @@ def _shown(point: tuple[float, float]) -> str:
 
 
 def silent_sensors(measurement: Measurement) -> NDArray[np.bool_]:
-    """Mask of sensors without a response to any ERA (s,)."""
+    """Return a mask of sensors without a response to any ERA (s,)."""
     size = np.abs(measurement.values)
     loudest = np.where(np.isfinite(size), size, 0).max(axis=1, keepdims=True)
     share = size / np.where(loudest > 0, loudest, np.nan)
@@ -460,7 +463,7 @@ def write_responses_csv(
 ) -> None:
     """Write responses as CSV with all digits.
 
-    Raises OSError; InputError for ERAs beside exciters, whose units differ.
+    Raises OSError; InputError for a rig with both ERAs and exciters, whose units differ.
     """
     units = {era.UNIT for era in rig.eras}
     if len(units) > 1:
@@ -628,7 +631,7 @@ def _uff_values(
 
 
 def _unit(place: str, label: str, known: Mapping[str, float]) -> float:
-    """The value of a unit by its label in SI units; raises InputError."""
+    """Return the value of a unit, given by its label, in SI units; raises InputError."""
     plain = label.lower().translate(_SPELLED).replace("sec", "s")
     if plain not in known:
         spelled = ", ".join(filter(None, known))
@@ -637,7 +640,7 @@ def _unit(place: str, label: str, known: Mapping[str, float]) -> float:
 
 
 def _noted(function: Function) -> tuple[float, str]:
-    """Mass of the sensor [kg] and setting by the free text of a function; raises InputError."""
+    """Return sensor mass [kg] and setting from the free text of a function; raises InputError."""
     found = _NOTE.search(function.note)
     if found is None:
         return 0.0, ""
@@ -649,7 +652,7 @@ def _noted(function: Function) -> tuple[float, str]:
 
 
 def sensor_mass(place: str, grams: float, *, column: str = _MASS) -> float:
-    """A sensor's mass [kg] from grams in a column; raises InputError."""
+    """Convert a sensor's mass from grams in a column to [kg]; raises InputError."""
     if not 0 <= grams <= MAX_SENSOR_MASS:  # nor for NaN
         raise InputError(
             f"{place}: {column} must be from 0 to {MAX_SENSOR_MASS:g}, got {grams:g}; it is in "
@@ -659,7 +662,7 @@ def sensor_mass(place: str, grams: float, *, column: str = _MASS) -> float:
 
 
 def read_places(path: Path, plate: Plate) -> dict[str, Point]:
-    """Read places [m] of sensors on a plate by name; raises InputError with file and line."""
+    """Read positions of sensors [m] on a plate by name; raises InputError with file and line."""
     places: dict[str, Point] = {}
     for line in read_lines(path, PLACE_COLUMNS, optional=INPUT_COLUMNS):
         name, at = named_place(line, places, plate)
@@ -668,7 +671,7 @@ def read_places(path: Path, plate: Plate) -> dict[str, Point]:
 
 
 def named_place(line: CsvLine, before: Collection[str], plate: Plate) -> tuple[str, Point]:
-    """Name and place of a sensor; raises InputError for a name that one before has."""
+    """Return name and position of a sensor; raises InputError for a duplicate name."""
     name = line.cells["sensor"]
     if not name or name in before:
         raise InputError(f"{line.place}: sensor must be a name that no other has, got {name!r}")

@@ -1,11 +1,11 @@
-"""Parameters of a plate that a fit can change: one class for each kind of parameter.
+"""Parameters of a plate that a fit can change, one class per kind.
 
-A kind is, for example, the stiffness of the ERAs: one parameter for each ERA, the logarithm of a
-factor on the rig's value. Its class states
+A kind is, for example, the stiffness of the ERAs: one parameter per ERA, the logarithm of a factor
+on the rig's value. Its class defines
 
 - `names`: the names of its parameters for a given rig;
-- `prior` and `datasheet_prior`: how well they are known before a fit, for a rig that is measured in
-  place and for one of which there are only data sheets;
+- `prior` and `datasheet_prior`: their uncertainty before a fit, for an installed rig and for a rig
+  described only by data sheets;
 - `value`: the value of the rig that they represent;
 - `derivative`: the derivatives of the plate's responses with respect to them.
 
@@ -40,10 +40,10 @@ _COIL_MASS_STD = 0.2
 _AS_BUILT = Uncertainty()
 _DAMPING_STD = math.log(_AS_BUILT.damping)
 _MIN_LOSS_STD = 0.7
-"""Least standard deviation of a loss from a data sheet, relative."""
+"""Minimum standard deviation of a loss from a data sheet, relative."""
 
 
-# Base classes: they give parameters their names, and priors that several kinds have.
+# Base classes: names of parameters, and priors that several kinds share.
 
 
 class StatedByRig(ParameterKind):
@@ -55,7 +55,7 @@ class StatedByRig(ParameterKind):
 
 
 class PlateParameter(ParameterKind):
-    """A kind with one parameter."""
+    """Kind with a single parameter."""
 
     label: str
 
@@ -64,7 +64,7 @@ class PlateParameter(ParameterKind):
 
 
 class EraParameter(ParameterKind):
-    """A kind with one parameter for each ERA."""
+    """Kind with one parameter per ERA."""
 
     label: str
 
@@ -73,7 +73,7 @@ class EraParameter(ParameterKind):
 
 
 class SensorParameter(ParameterKind):
-    """A kind with one parameter for each sensor."""
+    """Kind with one parameter per sensor."""
 
     label: str
 
@@ -82,7 +82,7 @@ class SensorParameter(ParameterKind):
 
 
 class ModeParameter(ParameterKind):
-    """A kind with one parameter for each of the lowest elastic modes."""
+    """Kind with one parameter for each of the lowest elastic modes."""
 
     label: str
 
@@ -91,7 +91,7 @@ class ModeParameter(ParameterKind):
 
 
 class FormError(ParameterKind):
-    """A kind that only a plate with form errors has, known exactly for a rig measured in place."""
+    """Kind that exists only on plates with form errors, exactly known for an installed rig."""
 
     label: str
 
@@ -194,7 +194,7 @@ class LossFactor(PlateParameter):
         return _loss_prior(scope, math.log(scope.uncertainty.damping))
 
     def value(self, values: PlateValues) -> float:
-        """Loss factor of the plate, with what `LossAdded` adds."""
+        """Loss factor of the plate, including `LossAdded`."""
         scaled = values.rig.plate.loss_factor * values.factor("loss")
         added = values.deviations("loss_added")[0]
         return float(np.clip(scaled + added, 0.0, MAX_LOSS_FACTOR))
@@ -290,7 +290,7 @@ class Stiffness(StatedByRig, EraFactor):
 
 
 class Damping(PlateParameter):
-    """Logarithm of one factor on the damping of all ERAs."""
+    """Logarithm of a common factor on the damping of all ERAs."""
 
     name = label = "damping"
     std = _DAMPING_STD
@@ -301,7 +301,7 @@ class Damping(PlateParameter):
         return Prior(math.log(scope.uncertainty.damping) * _uncertain_damping(scope).max())
 
     def value(self, values: PlateValues) -> FloatArray:
-        """Damping of each ERA (n,) [N s/m], with all three kinds that change it."""
+        """Damping of each ERA (n,) [N s/m], combining the three kinds that change it."""
         log_factors = values.deviations("damping") + values.deviations("damping_each")
         scaled = values_of_eras(values.rig, "damping") * np.exp(log_factors)
         return np.maximum(scaled + values.deviations("damping_added"), 0.0)
@@ -393,7 +393,8 @@ class DrivePhase(EraParameter):
 
 
 class DriveInertia(EraParameter):
-    """Inertia of each drive [1/kHz²]; one standard deviation is a resonance at 700 Hz."""
+    """Inertia of each drive [1/kHz²]; one standard deviation corresponds to a resonance at
+    700 Hz."""
 
     name = "inertia"
     label = "inertia of drive"
@@ -411,7 +412,8 @@ class DriveInertia(EraParameter):
 
 
 class DriveDrag(EraParameter):
-    """Drag of each drive [1/kHz]; one standard deviation is a damping ratio of 0.5 at 700 Hz."""
+    """Drag of each drive [1/kHz]; one standard deviation corresponds to a damping ratio of 0.5 at
+    700 Hz."""
 
     name = "drag"
     label = "drag of drive"
@@ -470,7 +472,7 @@ class MagnetMass(ExciterFactor):
 class ForceFactor(ExciterFactor):
     """Logarithm of a factor on the force factor of each exciter.
 
-    The coil also damps, as the suspension does; no response tells these apart.
+    The coil also damps, like the suspension; responses cannot separate the two.
     """
 
     name = "force_factor"
@@ -512,7 +514,7 @@ class EraLocation(ParameterKind):
         return plate.by_places[..., : 2 * len(plate.sources)]
 
 
-# What else is attached to the plate.
+# Other attachments of the plate
 
 
 class AddedMasses(ParameterKind):
@@ -603,7 +605,7 @@ class SensorPhase(SensorParameter):
         return np.asarray(1j * plate.by_sensors)
 
 
-# Form errors, which no rig file describes: a cutter's, a ruler's, a cable's.
+# Form errors, which no rig file describes: inaccurate cutting, positions, and attached cables
 
 
 class SensorScale(FormError):
@@ -758,25 +760,25 @@ FORM_ERRORS = tuple(kind.name for kind in ALL_KINDS if isinstance(kind, FormErro
 def _added_prior(
     value: ParameterValues, *, std: ParameterValues, largest: ParameterValues
 ) -> Prior:
-    """Prior of what is added to a value that cannot become negative."""
+    """Return the prior of an addition to a value that cannot become negative."""
     return Prior(std, -value, np.maximum(largest - value, value))
 
 
 def _form_error_prior(scope: SearchScope, std: float) -> Prior:
-    """Prior of a form error, exactly known on a plate that has none."""
+    """Return the prior of a form error, exactly known on a plate without form errors."""
     return Prior(std if scope.has_form_errors else 0.0)
 
 
 def _loss_prior(scope: SearchScope, std: float) -> Prior:
-    """Prior of a loss of the plate, exactly known on a plate that has none."""
+    """Return the prior of a loss of the plate, exactly known on a plate without it."""
     is_uncertain = scope.uncertainty.damping > 1 and scope.rig.plate.loss_factor > 0
     return Prior(std if is_uncertain else 0.0)
 
 
 def _lag_prior(scope: SearchScope, std: float) -> Prior:
-    """Prior of the lag of each drive that nothing states.
+    """Return the prior of the unknown lag of each drive.
 
-    A measured gain includes the lag of its drive, and an exciter's force that of its coil.
+    A measured gain includes the lag of its drive, and an exciter's force includes that of its coil.
     """
     has_gains = [bool(era.gains) for era in scope.rig.eras]
     is_known = np.array(has_gains) | scope.excites

@@ -1,17 +1,18 @@
-"""Which plate and wiring explain the measured values of channels best.
+"""Find the plate and wiring that explain the measured values of channels best.
 
     d_fsn ~ m_fn exp(i phi_fn) a_fsn(x) + noise,   m_fn near G_n
 
 d are measured values, a those of the model, G_n the gain of a channel. Magnitudes m vary about G_n
-with frequency as those of real actuators do; phases phi are free, since they need not have been
-measured. Both follow from x and G, so that only these are searched (`model.estimate.fit`). Priors
-hold x near the rig's values: a large deviation is evidence against the rig.
+with frequency, like those of real actuators. Phases phi are free, since a measurement can lack
+them. Both follow from x and G, so that only these are searched (`model.estimate.fit`). Priors hold
+x near the rig's values: a large deviation is evidence against the rig.
 
-Which ERA a channel drives follows from the modal assurance criterion (MAC) of shapes: 1 for the
-same shape with any gain and phase, about one over the number of sensors for noise.
+The ERA that a channel drives is identified by the modal assurance criterion (MAC) of shapes: 1 for
+the same shape with any gain and phase, about one over the number of sensors for noise.
 
-Where the rig's plate does not fit, each `Hypothesis` varies one value over a range, and the rest of
-the rig is fitted within its priors. Where it fits, loads are sought where each would explain most.
+If the rig's plate does not fit, each `Hypothesis` varies one value over a range, and the rest of
+the rig is fitted within its priors. If it fits, loads are searched at the positions where they
+would explain most.
 """
 
 import math
@@ -49,35 +50,38 @@ STARTS = [
     for modulus in np.log(np.linspace(0.6, 1.6, 11)).tolist()
     for stiffness in np.log([0.4, 0.6, 0.8, 1.0, 1.25, 1.6, 2.5]).tolist()
 ]
-"""Logarithms of factors on modulus and stiffnesses from which to search."""
+"""Logarithms of factors on modulus and stiffnesses at which searches start."""
 
 FALSE_ALARM = 0.01
-"""Share of plates as written that a test of values, form or thickness calls wrong."""
+"""False-alarm rate of a test of values, form or thickness on correct plates."""
 
 MAX_FIT_ERROR = 0.2
-"""Largest rms error of an acceptable plate, relative to the response."""
+"""Largest RMS error of an acceptable plate, relative to the response."""
 
 MODEL_ERROR = 0.05
-"""Error of values relative to their row's rms: scales and places of sensors, what is not modelled.
+"""Error of values relative to their row's RMS: scales and positions of sensors, and model
+errors.
 """
 
 MIN_COST_REDUCTION = 20.0
-"""Reduction of a cost by another wiring or conjugated phases that is clear."""
+"""Cost reduction that proves another wiring or conjugated phases."""
 
 _GAIN_STD = 0.08  # over frequency, relative
 _SOFT = 2.0  # standard deviations
-_MAX_OUTLIERS = 0.05  # of all values; of a plate 3 % longer than its rig's a tenth look like some
-_MIN_CONFIDENCE = 0.99  # in another ERA than the rig's
-_LEAST_MISFIT = 0.02  # below it sensors' errors dominate
+_MAX_OUTLIERS = (
+    0.05  # of all values; of a plate 3 % longer than its rig's, a tenth look like outliers
+)
+_MIN_CONFIDENCE = 0.99  # minimum, for an ERA other than the rig's
+_LEAST_MISFIT = 0.02  # below it, sensor errors dominate
 
 _SIZES = (0.6, 0.67, 0.75, 0.82, 0.88, 0.94, 1.06, 1.13, 1.21, 1.33, 1.5, 1.67)
 _STIFFNESSES = (0.01, 0.03, 0.1, 0.2, 0.35, 0.5, 0.65, 0.8, 1.25, 1.5, 2.0, 3.0, 5.0, 10.0, 30.0)
 _FITTED = 5  # hypotheses for which the rest of the rig is fitted
-_REFINED = 2  # of these, whose value is refined
+_REFINED = 2  # best hypotheses whose value is refined
 _REFINEMENTS = 7  # values
-_CORRELATION = 4.0  # errors of a model are correlated over sensors and frequencies
+_CORRELATION = 4.0  # since model errors are correlated over sensors and frequencies
 
-_NOISE = (0.01, 0.05)  # of a row's rms: least and largest that a fit with form is weighted by
+_NOISE = (0.01, 0.05)  # of a row's RMS, minimum and maximum for weights of a fit with form errors
 _FIRST_NOISE = 0.02
 _LOAD_GRID = Grid(32, 24)  # where loads are sought
 _MAX_LOADS = 2
@@ -85,27 +89,27 @@ _LIGHT, _FIRM = 0.3, 3.0  # of a fingertip
 _CLEAR_LOAD = 40.0  # reduction of half the sum of squares
 
 Load: TypeAlias = PointLoad | FingertipLoad
-"""What may lie on a plate."""
+"""Load that can lie on a plate."""
 
 
 @dataclass(frozen=True, eq=False)
 class Match:
-    """The best fit of a plate to values of channels."""
+    """Best fit of a plate to values of channels."""
 
     plate: SensedPlate
     """The plate of the rig before the fit."""
     values: ComplexArray
     """Values (f, s, n) of the channels, NaN where unknown."""
     fit: Fit
-    """Its fit, of values relative to the level of each channel."""
+    """Fit of the values relative to the level of each channel."""
     beside: FloatArray
-    """Logarithm of the level of each channel beside the gain of the ERA that it drives (n,)."""
+    """Logarithm of each channel's level relative to the gain of the ERA that it drives (n,)."""
     model_error: float
-    """Error of the model by which the values were weighted, relative to the rms of their row."""
+    """Model error used to weight the values, relative to the RMS of their row."""
 
     @property
     def drives(self) -> list[int]:
-        """Number of the ERA that each channel drives (n,)."""
+        """Index of the ERA that each channel drives (n,)."""
         return [*self.fit.measurement.drives]
 
     @cached_property
@@ -115,7 +119,7 @@ class Match:
 
     @cached_property
     def z(self) -> FloatArray:
-        """Deviation of each fitted value (n,), as `SensedPlate.deviations`."""
+        """Deviation of each fitted value (n,); see `SensedPlate.deviations`."""
         return self.plate.deviations(self.fit.x)
 
     @cached_property
@@ -139,10 +143,10 @@ class Match:
 
     @cached_property
     def outliers(self) -> NDArray[np.bool_]:
-        """Mask of values (f, s, n) that no error counts: those that a calibration would leave out.
+        """Mask of outliers (f, s, n), which a calibration would leave out.
 
-        Empty where they are too many, and for a sensor most of whose values they are: such values
-        are not accidental, but show that the plate, its wiring or the sensor's place is another.
+        Empty if there are too many. Most of a sensor's values are not counted as outliers either:
+        they show a wrong plate, wiring or sensor position.
         """
         known = np.isfinite(self.values)
         left, _ = without_outliers(
@@ -154,7 +158,7 @@ class Match:
 
     @cached_property
     def shares(self) -> FloatArray:
-        """Residuals relative to the rms of their row (m,)."""
+        """Residuals relative to the RMS of their row (m,)."""
         kept = np.where(self.outliers, np.nan, self.fit.measurement.values)
         measured = replace(
             self.fit.measurement, values=kept, errors=_errors(kept, self.model_error)
@@ -165,7 +169,7 @@ class Match:
 
     @property
     def error(self) -> float:
-        """Rms of the residuals relative to the rms of their row."""
+        """RMS of the residuals relative to the RMS of their row."""
         return rms(self.shares) if len(self.shares) else math.inf
 
     @property
@@ -180,12 +184,12 @@ class Match:
 
     @property
     def chance(self) -> float:
-        """Upper limit of the share of plates as written with a value at least as far off."""
+        """Upper bound of the fraction of correct plates with a value at least as far off."""
         return float(2 * len(self.z) * ndtr(-self.worst))
 
 
 def _errors(values: ComplexArray, share: float) -> FloatArray:
-    """Errors of values (f, s, n): a share of the rms of their row."""
+    """Return errors of values (f, s, n): a fraction of the RMS of their row."""
     return share * np.broadcast_to(row_rms(values), values.shape)
 
 
@@ -199,8 +203,8 @@ def match_plate(
 ) -> Match:
     """Fit a rig's plate at sensors to values (f, s, n) of channels.
 
-    drives (n,): number of the ERA that each channel drives; model_error: relative to a row's rms;
-    starts: logarithms of factors on the modulus and on all stiffnesses from which to search.
+    drives (n,): index of the ERA that each channel drives; model_error: relative to a row's RMS;
+    starts: logarithms of factors on the modulus and on all stiffnesses at which to start.
     """
     model, driven, known = plate.model, list(drives), np.isfinite(values)
     heard = known.any(axis=1)
@@ -215,7 +219,7 @@ def match_plate(
         ratio = np.log(np.maximum(row_rms(values) / row_rms(predicted), 1e-6))[:, 0]
         levels = np.nan_to_num(known_median(np.where(heard, ratio, np.nan)))
         at[own[used]] = (levels / std)[used]
-        # Two channels may drive one ERA: each has its own level beside the gain of the last one.
+        # Two channels can drive one ERA: each has its level relative to the gain of the last one.
         beside = np.where(used, levels - std * at[own], 0.0)
         scaled = values / np.exp(beside)
         measured = Measurement(
@@ -232,12 +236,12 @@ def match_plate(
 
 
 def likeliest(matches: Sequence[Match]) -> Match:
-    """The match of least cost, the first of those that are nearly equal."""
+    """Return the match with the lowest cost, the first of those that are nearly equal."""
     return best_by(matches, lambda each: -each.fit.cost)
 
 
 def known_median(values: FloatArray) -> FloatArray:
-    """Median over the first axis of what is known of values (f, ...), NaN of nothing."""
+    """Return the median over the first axis of the known values (f, ...), NaN without any."""
     ordered, count = np.sort(values, axis=0), np.isfinite(values).sum(axis=0)
     low = np.take_along_axis(ordered, np.maximum(count - 1, 0)[None] // 2, axis=0)
     high = np.take_along_axis(ordered, count[None] // 2, axis=0)  # NaN without any
@@ -245,7 +249,7 @@ def known_median(values: FloatArray) -> FloatArray:
 
 
 def modal_assurance(values: ComplexArray, model: ComplexArray) -> FloatArray:
-    """Modal assurance criterion |a^H d|² / (|a|² |d|²) of shapes (..., s); NaN of empty ones.
+    """Modal assurance criterion |a^H d|² / (|a|² |d|²) of shapes (..., s); NaN for empty ones.
 
     1 for the same shape with any gain, about 1/s for noise. Values that are not finite are ignored.
     """
@@ -261,14 +265,14 @@ class ShapeMatch:
     """MAC of channels and ERAs on the most similar plate."""
 
     mac: FloatArray
-    """MAC (f, n, n) of the channel that the rig wires to the first ERA with the second ERA, NaN if
-    not driven."""
+    """MAC (f, n, n) between the channel wired to the first ERA in the rig and the second ERA, NaN
+    if not driven."""
     start: tuple[float, float] = (0.0, 0.0)
     """Logarithms of that plate's factors on modulus and stiffnesses."""
 
     @property
     def starts(self) -> tuple[tuple[float, float], ...]:
-        """Logarithms of factors from which to search: 0, and those of that plate."""
+        """Logarithms of factors at which to start: 0, and those of that plate."""
         return tuple(dict.fromkeys([(0.0, 0.0), self.start]))
 
     @cached_property
@@ -285,9 +289,9 @@ class ShapeMatch:
         ]
 
     def error(self, eras: Sequence[int] | None = None) -> float:
-        """Share of the responses, rms, that the shapes of ERAs (n,) leave unexplained.
+        """RMS fraction of the responses that the shapes of ERAs (n,) leave unexplained.
 
-        eras: by default each channel's own.
+        eras: default each channel's own.
         """
         own = range(self.mac.shape[1])
         alike = self.mac[:, own, list(own if eras is None else eras)]
@@ -295,9 +299,9 @@ class ShapeMatch:
         return math.sqrt(max(0.0, float(left.mean()))) if len(left) else math.inf
 
     def confidence(self, channel: int, era: int, other: int) -> float:
-        """Confidence 0..1 that the channel drives one ERA and not the other.
+        """Confidence 0 to 1 that the channel drives one ERA and not the other.
 
-        By Student's t-test of the difference of their misfits over frequencies.
+        From Student's t-test on the difference of their misfits over frequencies.
         """
         misfit = np.log(np.maximum(1 - self.mac[:, channel], _LEAST_MISFIT))
         gain = misfit[:, other] - misfit[:, era]
@@ -311,17 +315,17 @@ class ShapeMatch:
 def match_responses(
     model: ComplexArray, values: ComplexArray, start: tuple[float, float] = (0.0, 0.0)
 ) -> ShapeMatch:
-    """Compare values (f, s, n) with responses (f, s, n) of one plate."""
+    """Compare values (f, s, n) with the responses (f, s, n) of a single plate."""
     model, values = model.swapaxes(1, 2), values.swapaxes(1, 2)
     return ShapeMatch(modal_assurance(values[:, :, None], model[:, None]), start)
 
 
 def match_shapes(plate: SensedPlate, values: ComplexArray) -> ShapeMatch:
-    """Compare values (f, s, n) with a rig's ERAs on plates of other modulus and stiffnesses."""
+    """Compare values (f, s, n) with a rig's ERAs on plates with other modulus and stiffnesses."""
 
     def score(found: ShapeMatch) -> float:
         alike = [found.medians[number, era] for number, era in enumerate(found.nearest)]
-        # Values far from the rig's must be clearly better.
+        # Values far from the rig's must fit clearly better.
         return float(np.nansum(alike) - 0.05 * sum(map(abs, found.start)) * len(alike))
 
     tried = [
@@ -350,7 +354,7 @@ def best_wiring(plate: SensedPlate, values: ComplexArray, shapes: ShapeMatch) ->
 
 @dataclass(frozen=True, eq=False)
 class Hypothesis:
-    """Another plate: one value of the rig differs, and the rest is fitted."""
+    """Alternative plate: one value of the rig differs, and the rest is fitted."""
 
     key: str
     """Key of the value in the rig file."""
@@ -362,11 +366,11 @@ class Hypothesis:
     match: Match
     """The plate with that value."""
     share: float
-    """Share 0..1 of the likelihood among all hypotheses."""
+    """Fraction 0 to 1 of the likelihood among all hypotheses."""
 
     @property
     def era(self) -> str:
-        """Name of the only ERA whose value it is, "" for another value."""
+        """Name of the ERA if the value belongs to a single ERA, otherwise ""."""
         return self.key[len("eras.") :].rpartition(".")[0]
 
     @property
@@ -376,7 +380,7 @@ class Hypothesis:
 
 
 def _ranges(rig: Rig) -> dict[str, tuple[str, tuple[float, ...]]]:
-    """Units of the values of a rig that may be other ones, and the factors to try, by key."""
+    """Return units of the rig values that can be wrong, and the factors to try, by key."""
     of_eras = {f"eras.{era.name}.stiffness": ("N/m", _STIFFNESSES) for era in rig.eras}
     return {
         **{f"plate.{name}": ("m", _SIZES) for name in ("thickness", "length", "width")},
@@ -389,7 +393,7 @@ def _ranges(rig: Rig) -> dict[str, tuple[str, tuple[float, ...]]]:
 
 
 def _value(rig: Rig, key: str) -> float:
-    """The value of a key in a rig, of all ERAs their mean."""
+    """Return the value of a key in a rig, the mean for a key of all ERAs."""
     owner, _, name = key.rpartition(".")
     if not key.startswith("eras"):
         return float(rig.plate.material.E if name == "E" else getattr(rig.plate, name))
@@ -398,9 +402,9 @@ def _value(rig: Rig, key: str) -> float:
 
 
 def _varied(rig: Rig, key: str, factor: float) -> Rig:
-    """The rig with another value of a key, of bolts by a share of the plate's mass.
+    """Return the rig with another value of a key; for bolts, a fraction of the plate's mass.
 
-    Raises InputError for a value that it cannot have.
+    Raises InputError for an impossible value.
     """
     plate, (owner, _, name) = rig.plate, key.rpartition(".")
     if name in ("thickness", "E"):
@@ -408,7 +412,7 @@ def _varied(rig: Rig, key: str, factor: float) -> Rig:
     if name == "loss_factor":
         return replace(rig, plate=replace(plate, loss_factor=min(plate.loss_factor * factor, 0.9)))
     if name in ("length", "width"):
-        # With everything attached in proportion.
+        # Attachments move in proportion.
         x, y = (factor, 1.0) if name == "length" else (1.0, factor)
         plate = replace(plate, length=plate.length * x, width=plate.width * y)
         eras = tuple(replace(era, x=era.x * x, y=era.y * y) for era in rig.eras)
@@ -428,14 +432,14 @@ def _varied(rig: Rig, key: str, factor: float) -> Rig:
 
 
 def _solved(match: Match, key: str, factor: float) -> SensedPlate | None:
-    """The plate of a match with another value of a key, None where it cannot have it."""
+    """Return the plate of a match with another value of a key, None if the value is impossible."""
     try:
         other = _varied(match.plate.rig, key, factor)
     except InputError:
         return None
     if key not in ("plate.length", "plate.width"):
         return match.plate.of(other)
-    # A sensor that would be off the plate counts as at its edge.
+    # A sensor that would be off the plate is moved to its edge.
     measured = match.fit.measurement
     points = np.clip(measured.points, 0, [other.plate.length, other.plate.width])
     return sensed_plate(other, measured.moved(points).sensors, measured.frequencies)
@@ -448,10 +452,10 @@ def _matched(match: Match, key: str, factor: float) -> Match | None:
 
 
 def compared(match: Match) -> list[Hypothesis]:
-    """Find which other plates explain the values of a match best, most likely first.
+    """Find other plates that explain the values of a match, most likely first.
 
-    One value is varied at once; density, which is the inverse of the modulus and of stiffnesses, is
-    not.
+    Varies one value at a time. Density is not varied, since it is the inverse of modulus and
+    stiffnesses.
     """
     rig, of = match.plate.rig, _ranges(match.plate.rig)
     scores = [
@@ -481,7 +485,7 @@ def compared(match: Match) -> list[Hypothesis]:
 def _refined(
     factors: Sequence[float], factor: float, match: Match, matched: Callable[[float], Match | None]
 ) -> Match:
-    """Search for the best factor between the neighbours of one in a range."""
+    """Search for the best factor between the neighbours of a factor in a range."""
     padded = (factors[0] / 1.5, *factors, factors[-1] * 1.5)
     at, known = 1 + factors.index(factor), [match]
 
@@ -502,7 +506,7 @@ def _refined(
 
 
 def _misfit(values: ComplexArray, model: ComplexArray) -> float:
-    """Difference of shapes and, up to a gain of each channel, of magnitudes; 0 if equal."""
+    """Difference of shapes and, up to one gain per channel, of magnitudes; 0 if equal."""
     mac = modal_assurance(values.swapaxes(1, 2), model.swapaxes(1, 2))
     known = np.isfinite(values)
     driven = known.any(axis=(0, 1))
@@ -512,9 +516,9 @@ def _misfit(values: ComplexArray, model: ComplexArray) -> float:
 
 
 def match_with_form(match: Match) -> tuple[Match, list[Load]]:
-    """Match the values of a match with a plate with form errors, and find what lies on it.
+    """Fit form errors to the values of a match, and find loads on the plate.
 
-    Form errors explain what builders and rulers do, but not a mass in one place near an edge.
+    Form errors explain inaccurate cutting and positioning, but not a single mass near an edge.
     """
 
     def matched(loads: Sequence[Load], noise: float) -> Match:
@@ -535,7 +539,7 @@ def match_with_form(match: Match) -> tuple[Match, list[Load]]:
 
 
 def linearised(match: Match) -> Fit:
-    """The fit of a match linearised with gains that are free at every frequency."""
+    """Return the fit of a match, linearised with free gains at every frequency."""
     kept = np.where(match.outliers, np.nan, match.values)
     errors = _errors(kept, match.model_error)
     measured = replace(match.fit.measurement, values=kept, errors=errors, gain_std=math.inf)
@@ -545,9 +549,9 @@ def linearised(match: Match) -> Fit:
 
 
 def _loads(match: Match) -> Sequence[Load]:
-    """A mass and a finger where each would explain most.
+    """Return a mass and a finger at the positions where each would explain most.
 
-    A finger lighter than a share of a fingertip is skipped.
+    A finger lighter than a fraction of a fingertip is skipped.
     """
     rig, omega, free = match.plate.rig, match.plate.model.omega, linearised(match)
     points, tip = _LOAD_GRID.centres(rig.plate), rig.fingertip or Fingertip()

@@ -1,8 +1,8 @@
-"""Spaces of the parameters of a rig, and rigs with fitted values.
+"""Parameter spaces of rigs, and rigs with fitted values.
 
-A space lists all parameters of a rig that is measured in place (`space_of`), or of a rig described
-by data sheets only (`space_from_datasheets`). `rig_with` writes fitted values to a rig.
-`model.estimate.parameters` has the kinds of parameters.
+A space lists all parameters of an installed rig (`space_of`), or of a rig described only by data
+sheets (`space_from_datasheets`). `rig_with` writes fitted values to a rig.
+`model.estimate.parameters` defines the kinds of parameters.
 """
 
 import math
@@ -23,7 +23,7 @@ UNIT_KEYS = {"%": "percent", "°": "deg", "/kHz²": "1/kHz^2", "/kHz": "1/kHz"}
 """Units in JSON reports, where these differ from the units in printed reports."""
 
 MAX_GUESSED = math.sqrt(0.5)
-"""Standard error of a parameter with a prior, in its deviations, beyond which the prior determines
+"""Standard error of a parameter with a prior, in its deviations, above which the prior determines
 it more than the data do."""
 
 VALUE_UNITS = {
@@ -42,7 +42,7 @@ VALUE_UNITS = {
 
 _AT_EDGE = 1e-6  # m
 _MIN_MASS = 1e-5  # kg; a lighter one is not written to a rig
-_GAIN_STEP = 10.0  # Hz, of a drive that lags; linear between them is right to a thousandth
+_GAIN_STEP = 10.0  # Hz, for a drive with lag; linear interpolation is then accurate to 0.1 %
 
 
 def space_of(
@@ -54,10 +54,10 @@ def space_of(
     masses: int = 0,
     mode_count: int = MODE_SHIFTS,
 ) -> Space:
-    """Parameters of a rig that is measured in place; `SearchScope` explains the arguments.
+    """Return the parameters of an installed rig; `SearchScope` explains the arguments.
 
-    The rig's `common_gain` is no parameter: if it was measured with the same sensors, they cannot
-    show its error.
+    `common_gain` is not a parameter: if it was measured with the same sensors, they cannot show its
+    error.
     """
     scope = SearchScope(rig, sensors, uncertainty, drives_lag, masses, mode_count)
     space = Space.empty(PARAMETER_KINDS)
@@ -69,7 +69,7 @@ def space_of(
 
 
 def space_from_datasheets(rig: Rig, sensors: Sequence[str], form_modes: int | None) -> Space:
-    """Parameters of a rig described by data sheets only.
+    """Return the parameters of a rig described only by data sheets.
 
     form_modes: number of modes that can shift on a plate with form errors, None for a plate without
     form errors.
@@ -92,8 +92,8 @@ def space_from_datasheets(rig: Rig, sensors: Sequence[str], form_modes: int | No
 def inwards(space: Space, x: FloatArray, *, by: float) -> FloatArray:
     """Move positions in x (p,) that are on an edge of the plate inwards, by standard deviations.
 
-    On an edge a position can vary in one direction only, and a start there would miss half of its
-    neighbourhood.
+    On an edge a position can vary in one direction only, so a start there would cover only half of
+    its neighbourhood.
     """
     moved = x.copy()
     for number in space.indices("place"):
@@ -107,7 +107,7 @@ def inwards(space: Space, x: FloatArray, *, by: float) -> FloatArray:
 
 
 def rig_with(rig: Rig, values: PlateValues, uncertainty: Uncertainty) -> Rig:
-    """The rig with identified values; additional masses come after its own."""
+    """Return the rig with identified values; additional masses follow its own."""
     thickness, modulus = values["thickness"], values["modulus"]
     laminate = rig.laminate
     if laminate is not None:
@@ -159,10 +159,10 @@ def plate_with(plate: Plate, values: PlateValues) -> Plate:
 
 
 def _gains(rig: Rig, values: PlateValues, number: int) -> tuple[Gain, ...]:
-    """Gains of an ERA: those of the rig times what was identified.
+    """Return gains of an ERA: the rig's, multiplied by the identified ones.
 
-    An ERA without measured gains gets one at a single frequency, or some over the rig's frequencies
-    where its drive lags.
+    An ERA without measured gains gets a single gain, or several over the rig's frequencies if its
+    drive lags.
     """
     era, gain = rig.eras[number], values["gain"][number]
     drive_lags = bool(values["inertia"][number] or values["drag"][number])
@@ -180,7 +180,7 @@ def _gains(rig: Rig, values: PlateValues, number: int) -> tuple[Gain, ...]:
 
 
 def _unit_gains(lowest: float, highest: float) -> tuple[Gain, ...]:
-    """Gains of 1 at frequencies [Hz] that are close enough for linear interpolation of a lag."""
+    """Return unit gains at frequencies [Hz] close enough for linear interpolation of a lag."""
     count = 1 + math.ceil((highest - lowest) / _GAIN_STEP)
     return tuple(
         (frequency, 1.0, 0.0) for frequency in np.linspace(lowest, highest, count).tolist()

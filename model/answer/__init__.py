@@ -1,1 +1,2 @@
-"""Answers: what fingers are to feel, what is played for it, and what each gets."""
+"""Answer queries: choose frequencies and weights for the fingers, and promise levels and
+contrasts."""

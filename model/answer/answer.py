@@ -1,22 +1,22 @@
-"""What is played for fingers, and what each of them feels.
+"""Answer of a query: layers to play, and the resulting sensation at each finger.
 
-`Contents` is a question: K contents, each for its fingers, which all others are to be kept from.
-Content j alone is the question "these are targets, all others are quiet", so K contents are K
-searches over one load of the plate; sharing weights among them gains 0.3 dB at most. Contents
-differ in frequency, so their powers add. From a few candidates of each the combination is chosen by
-the worst finger on drawn plates; what is promised is computed on other draws, the same for all
-tones. The contrast at finger k is
+`Contents` is a query: K contents, each meant for its own fingers and kept from all others. Content
+j alone is a query with its fingers as targets and all others quiet, so K contents are K searches
+over one loaded plate; weights shared between contents gain 0.3 dB at most. Contents have different
+frequencies, so their powers add. From a few candidates for each content, the combination is chosen
+that has the best contrast at the worst finger on drawn plates. Promises are computed on other
+draws, the same for all tones. The contrast at finger k is
 
     C_k = g_k own_k / sqrt(max_p sum_j g_j^2 power_j(p)),  j other contents, p points of finger k,
 
-and at a quiet finger that of the weakest content to all contents together. A single content has the
-tone of the highest contrast at its level. Since contents differ in frequency, a contrast depends on
-whose thresholds amplitudes are compared with: the least over the table's sets of thresholds counts,
-in the choice and in the promise. The weights of one content do not depend on the set; its second
-harmonics do, and candidates are judged by the set to which these are loudest.
+and at a quiet finger that of the weakest content to all contents together. A single content uses
+the tone with the highest contrast at its level. Since contents differ in frequency, a contrast
+depends on the thresholds: the lowest over the table's threshold sets counts, in the choice and in
+the promise. The weights of a content do not depend on the threshold set. Its second harmonics do,
+and candidates are judged by the set with the loudest harmonics.
 
-`Tones` is what `model.answer.tone_search` finds for a question. `Answer` is what follows from both:
-a `Layer` for each content, and a `Sensation` for each finger.
+`Tones` is the result of `model.answer.tone_search`. `Answer` combines query and tones: a `Layer`
+per content, and a `Sensation` per finger.
 """
 
 import cmath
@@ -51,93 +51,95 @@ from model.vibration import Excitation, Tone
 PROMISED_PERCENTILE = 9
 """Percentile of the drawn plates that is promised.
 
-It is about the tenth percentile of plates that are solved exactly: effects beyond the first order
-in parameters other than the thickness cost some tenths of a decibel.
+Corresponds to about the tenth percentile of exactly solved plates: effects beyond first order in
+parameters other than the thickness cost some tenths of a decibel.
 """
 
 REACHED = 1 - 1e-5
-"""Share of a level that counts as all of it."""
+"""Fraction of a level that counts as reached."""
 
 KEPT, MISSING = 16, 4
-"""Frequencies that are searched for a single content, and how many of them may miss the level.
+"""Number of frequencies searched for a single content, and how many of them can miss the level.
 
-The first is a multiple of what kernels take at once. Those of the highest bounds |c^H w| /
-sqrt(w^H R w) of w = R^-1 c are taken, with R the mean over the quiet fingers: a bound takes one
+The first is a multiple of the kernels' batch size. Frequencies with the highest bounds |c^H w| /
+sqrt(w^H R w) of w = R^-1 c are searched, with R the mean over the quiet fingers: a bound takes one
 system of equations, a search several.
 """
 
 MIN_CANDIDATES, MAX_CANDIDATES = 4, 32
-"""Candidates of a single content, and the most of any content in all its bands.
+"""Number of candidates for a single content, and the maximum over all bands of any content.
 
-So many by the mean over fingertips, and as many by their points.
+This many by the mean over fingertips, and as many by their points.
 """
 
 MAX_COMBINATIONS, PRUNING_STEP = 200, 4
-"""Combinations of candidates that are kept for the next content, and the step of draws in between.
+"""Combinations of candidates kept for the next content, and the step of draws in between.
 
 Fewer are kept for more than four contents, so that time grows with the square of their number.
 """
 
 APART_HZ = 30.0
-"""Least distance of the frequencies of two contents [Hz]: nearer ones would be felt to beat."""
+"""Minimum distance between the frequencies of two contents [Hz]; closer ones feel like beating."""
 
 
 @dataclass(frozen=True)
 class Stream:
-    """A content for some fingers."""
+    """Content for some fingers."""
 
     targets: tuple[int, ...]
     """Its fingers, by index."""
     level_db_sl: float
     bands: tuple[tuple[int, int], ...]
-    """First row of the table's frequencies and one past the last, for each band that it may have.
+    """First row of the table's frequencies and one past the last, for each allowed band.
 
-    There is one band unless contents may exchange theirs.
+    There is one band unless contents can swap theirs.
     """
     priority: int = 0
-    """Higher priorities take the stroke first."""
+    """Higher priorities get the stroke first."""
     duration: float | None = None
-    """Time [s] over which the level is felt, None for a content that lasts."""
+    """Time over which the level is felt [s], None for a continuous content."""
     limit_db_sl: float | None = None
-    """Level up to which it is as strong as others allow, None where its level is fixed."""
+    """Upper limit of a level that the other fingers set, None for a fixed level."""
     course: Course | None = None
-    """Course over the duration, whose highest share has the level."""
+    """Envelope over the duration, whose maximum has the level."""
 
 
 @dataclass(frozen=True, eq=False)
 class Contents:
-    """K contents for k fingers on a plate."""
+    """Query of K contents for k fingers on a plate."""
 
     places: tuple[Point, ...]
-    """Places of all fingers [m], then of the further patches of hands."""
+    """Positions of all fingers [m], then of the additional patches of hands."""
     loads: tuple[float, ...]
     """Load of each finger relative to the rig's fingertip, empty for 1 each."""
     streams: tuple[Stream, ...]
     """The contents."""
     quiet: tuple[int, ...]
-    """Fingers, by index, that are to feel nothing; those without a content are unprotected."""
+    """Indices of fingers that should feel nothing; others without a content are unprotected."""
     apart_hz: float = 0.0
-    """Least distance of the contents' frequencies [Hz] where their bands allow it."""
+    """Minimum distance between the contents' frequencies [Hz], if their bands allow it."""
     background: Complex64Array | None = None
-    """Form of the rest of the plate at all of the table's frequencies; None with other fingers."""
+    """Form of the rest of the plate at all of the table's frequencies; None if there are other
+    fingers."""
     drive_mode: str = UNRESTRICTED
-    """Any but UNRESTRICTED plays one content."""
+    """Drive mode; all except UNRESTRICTED play a single content."""
     is_shaped: bool = False
-    """Whether onsets are shaped, after which nothing rings."""
+    """Whether onsets are shaped, which leaves no ringing."""
     least_ramp: float = 0.0
-    """Least ramp [s] of short contents, whose ramp is otherwise a quarter of their duration."""
+    """Minimum ramp of short contents [s], whose ramp is otherwise a quarter of their duration."""
     avoided: tuple[int, ...] = ()
-    """Rows of the table's frequencies that no content may have."""
+    """Rows of the table's frequencies that no content can use."""
 
     @property
     def is_ranked(self) -> bool:
-        """Whether only KEPT frequencies are searched at first: for one content of one finger."""
+        """Whether only KEPT frequencies are searched first: for a single content of a single
+        finger."""
         first = self.streams[0]
         return len(self.streams) == len(first.targets) == len(first.bands) == 1 <= len(self.quiet)
 
     @property
     def candidates(self) -> int:
-        """Number of candidates of each content in each of its bands, by means and by points."""
+        """Number of candidates per content and band, by means and by points."""
         count, bands = len(self.streams), len(self.streams[0].bands)
         return max(1, min(MIN_CANDIDATES + count // 2, MAX_CANDIDATES // bands))
 
@@ -148,17 +150,17 @@ class Contents:
 
     @property
     def rows(self) -> IntArray:
-        """Rows of the table's frequencies that contents may have, ascending, (f,)."""
+        """Rows of the table's frequencies that contents can use, ascending, (f,)."""
         bands = [np.arange(*band) for stream in self.streams for band in stream.bands]
         return np.setdiff1d(np.concatenate(bands), self.avoided)
 
     def others(self, number: int) -> list[int]:
-        """Fingers that a content, by its number, is kept from."""
+        """Return the fingers that a content, by its number, is kept from."""
         every = {*self.quiet}.union(*(stream.targets for stream in self.streams))
         return sorted(every - {*self.streams[number].targets})
 
     def of_first(self, count: int) -> Self:
-        """Return the contents of the first fingers alone."""
+        """Return only the contents of the first `count` fingers."""
         return replace(
             self,
             places=self.places[:count],
@@ -172,7 +174,7 @@ class Contents:
 
     @property
     def levels(self) -> Float32Array:
-        """Amplitude to threshold of each content, (K,)."""
+        """Amplitude of each content relative to the threshold, (K,)."""
         levels = [10 ** (stream.level_db_sl / 20) for stream in self.streams]
         return np.array(levels, dtype=np.float32)
 
@@ -182,9 +184,9 @@ _ROUNDING = 1e-6  # of single precision
 
 @dataclass(frozen=True, eq=False)
 class Tones:
-    """m tones of K contents, one of each or more, and what k fingers feel of them.
+    """m tones of K contents, one or more each, and the resulting sensation of k fingers.
 
-    With s sets of thresholds, the rig's own first.
+    For s sets of thresholds, the rig's own first.
     """
 
     rows: list[int]
@@ -192,27 +194,28 @@ class Tones:
     weights: Sequence[Sequence[complex]]
     """Weights of the ERAs (m, n), up to full stroke."""
     gains: list[float]
-    """Gain (m,) of each tone to its level, within the stroke."""
+    """Gain (m,) of each tone for its level, within the stroke."""
     owners: Sequence[int]
     """Content (m,) of each tone."""
     contrast_db: Sequence[Sequence[float]]
-    """Contrast (k, 3): nominal, on half of the drawn plates, and promised.
+    """Contrast (k, 3): nominal, median of the drawn plates, and promised.
 
-    The least over the sets of thresholds; NaN without other contents or fingers.
+    The lowest over the threshold sets; NaN without other contents or fingers.
     """
     level_db_sl: Sequence[Sequence[float]]
-    """Level (k, 2) of a finger's own content by the rig's own set: nominal and promised."""
+    """Level (k, 2) of a finger's own content by the rig's own threshold set: nominal and
+    promised."""
     foreign_db_sl: Sequence[Sequence[float]]
-    """Level (k, s) of other contents by each set, which nine of ten plates do not exceed.
+    """Upper bound of the level (k, s) of other contents on 90 % of plates, by each threshold set.
 
     NaN at fingers that neither feel a content nor are quiet.
     """
     worst_db: float
-    """Promised contrast of the worst finger, NaN for one finger alone."""
+    """Promised contrast of the worst finger, NaN for a single finger."""
     stroke_factor: float
-    """Least factor on the gains for the stroke, 1 for none."""
+    """Smallest factor on the gains to fit the stroke, 1 for none."""
     is_apart: bool
-    """Whether the frequencies are as far apart as wanted."""
+    """Whether the frequencies keep the minimum distance."""
 
     def excitations(
         self,
@@ -221,10 +224,10 @@ class Tones:
         frequencies: FloatArray,
         highest_drives: FloatArray,
     ) -> list[Excitation]:
-        """Return the excitations of a content, one for each of its tones, the carrier first.
+        """Return the excitations of a content, one per tone, the carrier first.
 
-        frequencies (f,) [Hz] and highest_drives (f, eras) are the table's. The strongest ERA, or
-        the first of those nearly as strong, has phase zero.
+        frequencies (f,) [Hz] and highest_drives (f, eras) are those of the table. The strongest
+        ERA, or the first of those nearly as strong, has phase zero.
         """
         found = list[Excitation]()
         every = zip(self.rows, self.weights, self.gains, self.owners, strict=True)
@@ -232,7 +235,7 @@ class Tones:
             if owner != content:
                 continue
             frequency, tones = float(frequencies[row]), dict[str, Tone]()
-            # Python's numbers: numpy's take ten times as long, one by one.
+            # Python's own numbers: one by one, numpy's are ten times slower.
             enough = (1 - NEARLY) * max(map(abs, values))
             (strongest, *_) = [value for value in values if abs(value) >= enough]
             factor = strongest.conjugate() / abs(strongest)
@@ -248,103 +251,105 @@ class Tones:
 
     @classmethod
     def none(cls, fingers: int, sets: int) -> "Tones":
-        """Return no tones, as so many fingers feel them; sets: number of sets of thresholds."""
+        """Return no tones, for `fingers` fingers and `sets` threshold sets."""
         contrast, level = [(math.inf,) * 3] * fingers, [(-math.inf,) * 2] * fingers
         heard = [(-math.inf,) * sets] * fingers
         return cls([], [], [], [], contrast, level, heard, math.nan, 1.0, is_apart=True)
 
 
 MIN_CONTRAST_DB, OWN_CONTRAST_DB = 6.0, 12.0
-"""Promised contrast [dB] from which a vibration is served, and from which it is a finger's own."""
+"""Promised contrast [dB] above which a vibration is served, and above which it is a finger's
+own."""
 
 IMPERCEPTIBLE_DB_SL = -10.0
-"""Level that a finger does not notice: ten decibels allow for differences between people."""
+"""Imperceptible level: ten decibels below the threshold allow for differences between people."""
 
 SAME_LEVEL = 0.1
 """Difference [dB] below which two levels count as equal."""
 
-_SHORT_OF = 0.05  # dB; a level closer to the wanted one is reached
+_SHORT_OF = 0.05  # dB below the wanted level that counts as reached
 
 OWN, MIXED, SHARED, HELD_BACK, QUIET = "own", "mixed", "shared", "held back", "quiet"
 
 
 @dataclass(frozen=True)
 class Sensation:
-    """What a finger gets.
+    """What a finger feels.
 
-    Promised measures are those that 90 % of plates within the rig's uncertainty reach, or do not
-    exceed; the others are nominal, those of the modelled plate with the fingers on it. Levels are
-    relative to the rig's own threshold set, except for `foreign_level_db_sl`.
+    Promised values are reached (or for foreign levels, not exceeded) by 90 % of plates within the
+    rig's uncertainty. All others are nominal values of the modelled plate with the fingers on it.
+    Levels are relative to the rig's own threshold set, except for `foreign_level_db_sl`.
     """
 
     finger: Finger
     verdict: str
     """`own`; `mixed`; `shared`; `held back`; or `quiet`.
 
-    A vibration is mixed below OWN_CONTRAST_DB, or where it pauses while others are felt. Shared is
-    the vibration of another finger. One that is held back has the contrast that it would have had.
+    A vibration is mixed below OWN_CONTRAST_DB, or if it pauses while others are felt. `shared`: the
+    vibration of another finger. `held back`: not played; the contrast is what it would have had.
     """
     layer: int | None = None
     """Number of the layer that plays its vibration, None without one."""
     level_db_sl: float = -math.inf
-    """Level of its stimulus, over the duration if that is limited."""
+    """Level of its stimulus, averaged over the duration, if limited."""
     promised_level_db_sl: float = -math.inf
     contrast_db: float | None = None
-    """Level above that of all other vibrations here, None where there is nothing to compare.
+    """Level relative to all other vibrations here, None if there is nothing to compare.
 
-    Of a single vibration: above its own level at the loudest quiet finger. Of a quiet finger: the
-    weakest vibration, at its own finger, above all of them here. As all contrasts the least over
-    the rig's sets of thresholds.
+    For a single vibration: relative to its own level at the loudest quiet finger. For a quiet
+    finger: the weakest vibration at its own finger, relative to all vibrations here. The lowest
+    over the rig's threshold sets, like all contrasts.
     """
     median_contrast_db: float | None = None
-    """The same contrast, on half of the plates."""
+    """The same contrast, median of the plates."""
     promised_contrast_db: float | None = None
     foreign_level_db_sl: float | None = None
-    """Promised level of all other vibrations at the loudest point here, above the lowest threshold.
+    """Promised level of all other vibrations at the loudest point here, relative to the lowest
+    threshold.
 
-    It is the greatest over the rig's threshold sets, up to 30 dB above `rig_foreign_level_db_sl`,
-    and decides whether others may be felt. Do not compare it with this finger's level.
+    The highest over the rig's threshold sets, up to 30 dB above `rig_foreign_level_db_sl`. It
+    decides whether others can be felt. Do not compare it with this finger's level.
     """
     rig_foreign_level_db_sl: float | None = None
-    """The same level relative to the rig's own threshold set, as the levels of the finger are."""
+    """The same level relative to the rig's own threshold set, like the finger's own levels."""
     lowered_db: float = 0.0
-    """By how much it is weaker than its stimulus asks [dB]."""
+    """Reduction below the requested level [dB]."""
     is_disturbing: bool = False
-    """Whether it is held back because of a finger's max_foreign_db_sl."""
+    """Whether it is held back because of another finger's max_foreign_db_sl."""
     pauses: bool = False
-    """Whether it ends, or comes and goes."""
+    """Whether it ends, or is modulated."""
 
     @property
     def is_foreign_felt(self) -> bool:
-        """Whether other vibrations here may be felt."""
+        """Whether other vibrations can be felt here."""
         return is_felt(self.foreign_level_db_sl)
 
 
 @dataclass(frozen=True)
 class Layer:
-    """What is played at once for the fingers of one vibration."""
+    """Excitations that play simultaneously for the fingers of one vibration."""
 
     excitation: Excitation
     """Tones of all ERAs."""
     fingers: tuple[int, ...] = (0,)
     """Fingers that feel it, by number."""
     side_bands: tuple[Excitation, ...] = ()
-    """Excitations beside it that make its strength come and go."""
+    """Additional excitations that modulate its strength."""
     ramp: float = ONSET_RAMP
     """Duration [s] of the plain onset and ending."""
     onset: Envelopes | None = None
-    """Shaped onset in place of the ramp."""
+    """Shaped onset instead of the ramp."""
     ending: Envelopes | None = None
-    """Shaped ending in place of the ramp."""
+    """Shaped ending instead of the ramp."""
     drive_mode: str = UNRESTRICTED
     contrast_to_plate_db: float | None = None
-    """Level above that of the plate beyond 50 mm, root mean square, if there is no other finger."""
+    """Level relative to the plate more than 50 mm away (RMS), if there is no other finger."""
     swings: tuple[Swing, ...] = ()
-    """Ways in which its level may come and go; empty for a layer that lasts."""
+    """Possible envelopes of its level; empty for a continuous layer."""
 
     @property
     def frequency(self) -> float | None:
-        """Its frequency [Hz], side bands excluded; None if it has several or is empty."""
+        """Its frequency [Hz] without side bands; None if it is empty or has several."""
         frequencies = {tone.frequency for tone in self.excitation.values()}
         return frequencies.pop() if len(frequencies) == 1 else None
 
@@ -355,18 +360,19 @@ class Layer:
 
     @property
     def drives(self) -> list[tuple[Excitation, tuple[Swing, ...]]]:
-        """The excitation and its side bands, each with the swings of its level."""
+        """The excitation and its side bands, each with its envelopes."""
         return [(each, self.swings) for each in self.excitations]
 
     @property
     def voices(self) -> tuple["Layer", ...]:
-        """The layer without its side bands, and a layer for each of them, along its ramp."""
+        """The layer without side bands, and a layer per side band, with the same ramp."""
         carrier = replace(self, side_bands=())
         beside = replace(carrier, onset=None, ending=None, contrast_to_plate_db=None)
         return carrier, *[replace(beside, excitation=each) for each in self.side_bands]
 
     def scaled(self, gain_db: float) -> "Layer":
-        """Return the layer with a gain [dB] on its excitations and envelopes: contrasts stay."""
+        """Return the layer with a gain [dB] on excitations and envelopes; contrasts do not
+        change."""
         factor = 10 ** (gain_db / 20)
         louder = [
             {n: replace(tone, amplitude=tone.amplitude * factor) for n, tone in each.items()}
@@ -392,16 +398,16 @@ class Limits:
     frequencies: tuple[float, float] = ANY_BAND
     """Lowest and highest frequency [Hz]."""
     amplitudes: Mapping[str, float] | None = None
-    """Largest amplitude [m] by ERA, None for the strokes."""
+    """Largest amplitude [m] by ERA, None for full stroke."""
     power: float = math.inf
     """Sum of the squared levels of all ERAs."""
     slew: float = math.inf
     """Fastest rise of a level [1/s]."""
     excursion: float = 1.0
-    """Share of the magnets' excursions that may be used."""
+    """Usable fraction of the magnets' excursions."""
 
     def factor_within(self, layers: Sequence[Layer], table: LocalizationTable) -> float:
-        """Return the factor, 1 at most, that brings layers of a table within all limits."""
+        """Return the factor (at most 1) that brings a table's layers within all limits."""
         drives = [each for layer in layers for each in layer.drives]
         share, power = table.excursion_of(drives) / self.excursion, 0.0
         strokes = table.full_levels
@@ -417,19 +423,19 @@ NO_LIMITS = Limits()
 
 @dataclass(frozen=True, eq=False)
 class Answer:
-    """What is played for fingers, and what each of them feels."""
+    """Layers to play for fingers, and the resulting sensations."""
 
     asked: tuple[Finger, ...]
-    """The fingers, with what each asks for."""
+    """The fingers, with their requests."""
     contents: Contents
-    """Contents that are played, and fingers that are kept quiet."""
+    """Played contents and quiet fingers."""
     tones: Tones
     """Tones of the contents."""
     held: tuple[tuple[int, float, bool], ...]
     """Vibrations that are held back: finger, contrast [dB] that it would have had, and whether it
-    would disturb another one."""
+    would disturb another finger."""
     applied: tuple[str, ...]
-    """What was changed of the fingers' requests, in words."""
+    """Changes to the fingers' requests, one sentence each."""
     eras: tuple[Source, ...]
     """ERAs of the table."""
     frequencies: FloatArray
@@ -439,15 +445,15 @@ class Answer:
     thresholds: Float32Array
     """Detection threshold at each frequency (f,) [m/s²]."""
     envelopes: tuple[tuple[Envelopes | None, Envelopes | None], ...] = ()
-    """Shaped onset and ending of each layer; empty if they are plain ramps."""
+    """Shaped onset and ending of each layer; empty for plain ramps."""
 
     def __repr__(self) -> str:
-        """Show what each finger gets, without the numbers behind it."""
+        """Show the sensations without internal numbers."""
         return f"Answer(fingers={self.fingers}, applied={self.applied})"
 
     @cached_property
     def fingers(self) -> tuple[Sensation, ...]:
-        """What each finger gets, in the order of `asked`."""
+        """Sensation of each finger, in the order of `asked`."""
         sensations: dict[int, Sensation] = {}
         for number, stream in enumerate(self.contents.streams):
             for finger in stream.targets:
@@ -464,7 +470,7 @@ class Answer:
         return tuple([sensations[number] for number in range(len(self.asked))])
 
     def _sensation_of_content(self, number: int, finger: int) -> Sensation:
-        """Return what a finger feels of a content for it, both by number."""
+        """Return the sensation of a finger that feels a content, both by number."""
         stream = self.contents.streams[number]
         pauses = self.pauses(number)
         level, promised_level = self.levels_db_sl(number, finger)
@@ -506,13 +512,13 @@ class Answer:
 
     @cached_property
     def layers(self) -> tuple[Layer, ...]:
-        """What is played, a layer for each vibration."""
+        """Layers to play, one per vibration."""
         layers, least = [], self.contents.least_ramp
         for number, stream in enumerate(self.contents.streams):
             excitation, *sides = self.tones.excitations(
                 number, self.eras, self.frequencies, self.highest_drives
             )
-            if self.contents.drive_mode != UNRESTRICTED:  # all tones are one excitation
+            if self.contents.drive_mode != UNRESTRICTED:  # all tones form one excitation
                 every = (excitation, *sides)
                 excitation = {name: tone for each in every for name, tone in each.items()}
                 sides = []
@@ -541,7 +547,7 @@ class Answer:
         return tuple(layers)
 
     def placement(self, layer: Layer) -> Placement:
-        """Places of the fingers of a layer, and of all others."""
+        """Return the positions of the fingers of a layer, and of all others."""
         own = [self.asked[number] for number in layer.fingers]
         others = [each for n, each in enumerate(self.asked) if n not in layer.fingers]
         return Placement(
@@ -551,9 +557,9 @@ class Answer:
         )
 
     def levels_db_sl(self, number: int, finger: int) -> tuple[float, float]:
-        """Nominal and promised level of a layer at a finger, both by number.
+        """Return the nominal and promised level of a layer at a finger, both by number.
 
-        Of a course at a share of 1.
+        For an envelope: at its maximum, 1.
         """
         course = self.contents.streams[number].course
         level, promised = self.tones.level_db_sl[finger]
@@ -561,7 +567,7 @@ class Answer:
         return level - strongest_db, promised - strongest_db
 
     def lowered_db(self, number: int) -> float:
-        """By how much [dB] a layer, by its number, is weaker than the strongest of its stimuli."""
+        """Return how far a layer, by its number, is below the strongest of its stimuli [dB]."""
         stream = self.contents.streams[number]
         lasts, short = stream.duration is None, -math.inf
         for finger in stream.targets:
@@ -572,7 +578,8 @@ class Answer:
         return short if short > SAME_LEVEL else 0.0
 
     def pauses(self, number: int) -> bool:
-        """Whether a layer, by its number, ends or comes and goes, so that it masks nothing then."""
+        """Return whether a layer, by its number, ends or is modulated, so that it masks nothing
+        meanwhile."""
         stream = self.contents.streams[number]
         stimulus = self.asked[stream.targets[0]].stimulus
         is_modulated = stimulus is not None and stimulus.modulation_hz is not None
@@ -607,25 +614,25 @@ class Answer:
 
     @property
     def lacks_contrast(self) -> bool:
-        """Whether a finger has less contrast to others' vibrations than it asks for."""
+        """Whether a finger has less contrast to others' vibrations than it requires."""
         targets = [finger for stream in self.contents.streams for finger in stream.targets]
         found, asked = self.tones.contrast_db, self.asked
         return any(found[each][2] < asked[each].min_contrast_db for each in targets)
 
     @property
     def disturbed(self) -> list[int]:
-        """Fingers, by number, at which others' vibrations are stronger than they allow."""
+        """Fingers, by number, with stronger vibrations of others than they allow."""
         levels = enumerate(zip(self.tones.foreign_db_sl, self.asked, strict=False))
         return [finger for finger, (by, each) in levels if by[0] > each.max_foreign_db_sl]
 
     @property
     def stroke_factor(self) -> float:
-        """Share of the requested levels that the ERAs' stroke allows, 1 for all."""
+        """Fraction of the requested levels that the ERAs' stroke allows, 1 for all."""
         return self.tones.stroke_factor
 
     @property
     def _contrast_to_plate_db(self) -> float | None:
-        """Level of the weakest target above that of the rest of the plate [dB].
+        """Level of the weakest target relative to the rest of the plate [dB].
 
         None if there are other fingers.
         """
@@ -643,11 +650,11 @@ class Answer:
         return level - float(decibels(math.sqrt(power)))
 
     def to_frame(self) -> Any:
-        """Return what each finger feels as a pandas DataFrame, a row per finger; needs pandas.
+        """Return the sensations as a pandas DataFrame, one row per finger; requires pandas.
 
         Levels are relative to the rig's own threshold set, those of others at the loudest point of
-        the fingertip. worst_foreign_level_db_sl alone is above the lowest thresholds known
-        (`Sensation.foreign_level_db_sl`), up to 30 dB higher: not to be compared with the others.
+        the fingertip. Only worst_foreign_level_db_sl is relative to the lowest thresholds known
+        (`Sensation.foreign_level_db_sl`), up to 30 dB higher; do not compare it with the others.
         """
         at, found = np.array([each.at for each in self.asked]), self.fingers
         frequencies = [layer.frequency or math.nan for layer in self.layers]
@@ -669,17 +676,18 @@ class Answer:
 
 
 def _known(value: float) -> float | None:
-    """Return a number, None in place of NaN."""
+    """Return a number, None for NaN."""
     return None if math.isnan(value) else value
 
 
 def verdict_of(
     promised_contrast_db: float | None, foreign_level_db_sl: float | None, *, pauses: bool
 ) -> str:
-    """Return whether a vibration of some promised contrast is a finger's own or mixed with others.
+    """Return whether a vibration with this promised contrast is a finger's own or mixed with
+    others.
 
-    A vibration masks weaker ones while it lasts; beside one that pauses nothing foreign may be
-    felt.
+    A continuous vibration masks weaker ones. During the pauses of another vibration, foreign ones
+    must not be felt.
     """
     is_own = promised_contrast_db is None or promised_contrast_db >= OWN_CONTRAST_DB
     return OWN if is_own and not (pauses and is_felt(foreign_level_db_sl)) else MIXED
@@ -691,7 +699,7 @@ def is_felt(level_db_sl: float | None) -> bool:
 
 
 def verdict_shown(verdict: str | None, *, is_foreign_felt: bool) -> str | None:
-    """Return a verdict in words, with a note if others' vibrations are felt beside it."""
+    """Return a verdict in words, with a note if others' vibrations are felt as well."""
     return f"{verdict}, others faintly felt" if verdict == OWN and is_foreign_felt else verdict
 
 

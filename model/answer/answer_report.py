@@ -1,12 +1,12 @@
-"""What of an answer is computed on request, and answers as JSON.
+"""Results derived from an answer on request, and answers as JSON.
 
-- `Timing` shapes onsets and endings of layers and rates them in time.
-- `measures`: transients and residual vibration of an answer's first layer, and how concentrated it
-  is over the plate.
-- `exposures`: vibration at each finger, weighted as ISO 5349-1 does for the hand. A level above the
-  threshold does not show what is harmful in the long run; that depends on acceleration, weighted by
-  frequency (docs/concepts/people.md).
-- `query_one`, `query_batch`: questions as JSON objects, and their answers.
+- `Timing` shapes onsets and endings of layers and evaluates them in time.
+- `measures`: transients and residual vibration of an answer's first layer, and its concentration
+  over the plate.
+- `exposures`: vibration at each finger with the hand-arm weighting of ISO 5349-1. A level above the
+  threshold does not show long-term harm, which depends on frequency-weighted acceleration
+  (docs/concepts/people.md).
+- `query_one`, `query_batch`: queries as JSON objects, and their answers.
 """
 
 import cmath
@@ -52,9 +52,9 @@ from registry.wording import first_problem
 
 
 class Timing:
-    """Shaping and rating of layers on the plate of a table in time.
+    """Shapes and evaluates layers in time, on the plate of a table.
 
-    Takes about ten milliseconds to make, and one more at the first use of each frequency.
+    Takes about ten milliseconds to build, and one more at the first use of each frequency.
     """
 
     def __init__(self, table: LocalizationTable) -> None:
@@ -67,17 +67,17 @@ class Timing:
         )
 
     def prepare(self, frequencies: Iterable[float]) -> None:
-        """Compute in advance what shaping needs at frequencies [Hz]."""
+        """Compute the data for shaping at frequencies [Hz] in advance."""
         for frequency in frequencies:
             self._shaper.prepare(frequency)
 
     def with_envelopes(
         self, layer: Layer, placement: Placement, *, onset: bool = True, ending: bool = True
     ) -> Layer:
-        """Add a shaped onset and ending, or one of them; takes some milliseconds.
+        """Add a shaped onset, a shaped ending or both to a layer; takes a few milliseconds.
 
         Without other fingers the onset keeps the rest of the plate quiet. Envelopes are computed
-        for the plate without fingers: with them they would gain 1 to 1.5 dB of contrast over the
+        for the plate without fingers; with fingers they would gain 1 to 1.5 dB of contrast over the
         first 100 ms, and take 6 ms longer.
         """
         targets, quiet, tones = placement.targets, placement.quiet, layer.excitation
@@ -90,13 +90,14 @@ class Timing:
         return layer
 
     def shaped(self, found: Answer) -> Answer:
-        """Add onsets and endings to all layers of an answer that was made for shaped ones."""
+        """Add onsets and endings to all layers of an answer computed for shaped ones."""
         layers = [self.with_envelopes(each, found.placement(each)) for each in found.layers]
         both = [(each.onset, each.ending) for each in layers]
         return replace(found, envelopes=tuple(both))
 
     def transient_contrast_db(self, layer: Layer, placement: Placement) -> float | None:
-        """Contrast over the first 100 ms [dB] along the onset or the ramp, fingers on the plate.
+        """Contrast over the first 100 ms [dB] along the onset or the ramp, with fingers on the
+        plate.
 
         None without quiet fingers.
         """
@@ -127,25 +128,26 @@ def _few_points(table: LocalizationTable, places: Sequence[Point]) -> tuple[Floa
     return tips.few_weights.astype(float), tips.few.astype(float)
 
 
-_SPACING = 0.0025  # m; resolves the area of a circle of 50 mm to a percent
+_SPACING = 0.0025  # m; resolves the area of a 50 mm circle to a percent
 _PERCENTILE = 95
 
 
 @dataclass(frozen=True)
 class Concentration:
-    """How much of a vibration is near its targets."""
+    """Concentration of a vibration around its targets."""
 
     contrast_95_db: float
-    """Peak acceleration at the targets to the 95th percentile of the plate beyond 50 mm of them."""
+    """Peak acceleration at the targets relative to the 95th percentile over the plate beyond
+    50 mm."""
     area_above_half: float
-    """Area [m²] of the plate, targets included, that vibrates more than half as much as they do."""
+    """Area of the plate, targets included, that vibrates more than half as much as they do [m²]."""
     energy_share_near: float
-    """Share of the kinetic energy within 50 mm of the targets."""
+    """Fraction of the kinetic energy within 50 mm of the targets."""
 
 
 @dataclass(frozen=True)
 class Measures:
-    """Measures of the first layer of an answer that take some ten milliseconds to compute."""
+    """Measures of an answer's first layer that take about ten milliseconds to compute."""
 
     transient_contrast_db: float | None
     """Contrast of accelerations over the first 100 ms, None without other fingers."""
@@ -154,7 +156,7 @@ class Measures:
     concentration: Concentration | None
     """None with other fingers."""
     is_imperceptible_to_quiet: bool | None
-    """Whether quiet fingers stay 10 dB below all sets of thresholds, on nine of ten plates."""
+    """Whether quiet fingers stay 10 dB below all threshold sets, on 90 % of plates."""
 
 
 def measures(table: LocalizationTable, answer: Answer, *, timing: Timing | None = None) -> Measures:
@@ -201,10 +203,11 @@ def concentration_of(
     felt: float,
     plate: Plate,
 ) -> Concentration:
-    """Rate a vibration with amplitudes (f, p) [m/s²] at `cell_centres`, frequencies (f,) [Hz].
+    """Evaluate a vibration with amplitudes (f, p) [m/s²] at `cell_centres`, frequencies (f,) [Hz].
 
     near (p,): centres within 50 mm of a target; felt [m/s²]: mean amplitude at the least driven
-    target. Energy is kinetic, of uniform mass. Where all centres are near, contrast is to all.
+    target. Energy is kinetic, for uniform mass. If all centres are near, contrast is relative to
+    all.
     """
     peak = amplitudes.sum(axis=0)
     around = peak if near.all() else peak[~near]
@@ -216,14 +219,14 @@ def concentration_of(
     )
 
 
-# Hz; the limits of the band, 10^0.8 and 10^3.1, and where the weighting begins to fall.
+# Hz; band limits 10^0.8 and 10^3.1, and the corner where the weighting begins to fall.
 _LOW, _HIGH, _FALL = 10**0.8, 10**3.1, 100 / (2 * np.pi)
 
 _BAND_Q, _FALL_Q = 1 / np.sqrt(2), 0.64
 
 
 def hand_weighting(frequencies: FloatArray) -> FloatArray:
-    """Return the weighting Wh at frequencies [Hz], of their shape: 0.96 at 12.5 Hz, 0.063 at 250.
+    """Return the weighting Wh at frequencies [Hz], in their shape: 0.96 at 12.5 Hz, 0.063 at 250.
 
     A band from 6.3 to 1259 Hz, second-order Butterworth on both sides, with a transition from
     acceleration to velocity at 15.9 Hz (ISO 5349-1:2001, annex A; ISO 8041).
@@ -236,11 +239,11 @@ def hand_weighting(frequencies: FloatArray) -> FloatArray:
 
 
 def exposures(table: LocalizationTable, found: Answer) -> list[float]:
-    """Return the weighted acceleration at each finger of an answer, root mean square [m/s²].
+    """Return the weighted RMS acceleration at each finger of an answer [m/s²].
 
-    Normal to the plate, of all vibrations together at their full strength, at the loudest point of
-    the fingertip; nine of ten plates do not exceed it. Harmonics above 1 kHz, where thresholds end,
-    do not count.
+    Normal to the plate, for all vibrations together at full strength, at the loudest point of the
+    fingertip; 90 % of plates do not exceed it. Harmonics above 1 kHz, where thresholds end, are
+    ignored.
     """
     tones, contents = found.tones, found.contents
     if not tones.rows:
@@ -262,7 +265,7 @@ def exposures(table: LocalizationTable, found: Answer) -> list[float]:
 
 
 def query_one(table: LocalizationTable, values: Mapping[str, Any]) -> dict[str, Any]:
-    """Answer one question with the keys of a batch's line. Raises InputError."""
+    """Answer a query with the keys of a batch line. Raises InputError."""
     asked, timing = _parsed(values, {}), Timing(table)
     prepare_answers(table, asked.mode)
     timing.prepare(table.frequencies.tolist())
@@ -274,9 +277,9 @@ def query_batch(
     lines: Iterable[str],
     defaults: Mapping[str, Any] = MappingProxyType({}),
 ) -> Iterator[dict[str, Any]]:
-    """Answer every line that is not empty; one without an answer yields an `error` and its `line`.
+    """Answer every non-empty line; a failed query yields an `error` and its `line`.
 
-    defaults: values of keys that lines leave out.
+    defaults: values of missing keys.
     """
     prepare_answers(table)
     timing = Timing(table)
@@ -293,7 +296,7 @@ _Place = Annotated[list[float], Field(min_length=2, max_length=2)]
 
 
 class _Own(BaseModel):
-    """Schema of a finger with a vibration of its own, by the fields of `Stimulus` and `Finger`."""
+    """Schema of a finger with its own vibration, with the fields of `Stimulus` and `Finger`."""
 
     model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
 
@@ -310,7 +313,7 @@ class _Own(BaseModel):
     is_protected: bool = True
 
     def finger(self, level_db_sl: float) -> Finger:
-        """Make the finger; level_db_sl: the line's, if it has none of its own."""
+        """Build the finger; level_db_sl: the line's level, used if the finger has none."""
         given = self.model_dump(exclude_none=True)
         at = _point(given.pop("at"))
         if self.band_hz is not None:
@@ -341,11 +344,11 @@ class _Line(BaseModel):
 _OF_TARGETS = {"target", "targets", "duration"}
 
 _OF_OWN = {"bands_may_swap", "apart_hz"}
-"""Keys of a line that only one of the two kinds of questions may have."""
+"""Keys of a line that are valid for only one of the two kinds of queries."""
 
 
 def _parsed(line: str | Mapping[str, Any], defaults: Mapping[str, Any]) -> _Line:
-    """Validate a question, given as JSON or as keys and values; raises InputError."""
+    """Validate a query given as JSON or as keys and values; raises InputError."""
     try:
         if isinstance(line, str):
             asked = _Line.model_validate_json(line)
@@ -364,12 +367,12 @@ def _parsed(line: str | Mapping[str, Any], defaults: Mapping[str, Any]) -> _Line
         without = "without" if asked.own else "with"
         raise InputError(f"{', '.join(sorted(others))} must be given {without} own")
     if {"target", "targets"} <= given:
-        raise InputError("target must be given without targets; name all of them there")
+        raise InputError("target must be given without targets; list all of them in targets")
     return asked.model_copy(update={k: v for k, v in defaults.items() if k not in given})
 
 
 def answer_as_json(table: LocalizationTable, asked: _Line, timing: Timing) -> dict[str, Any]:
-    """Answer a line; its loads are of the quiet fingers if others have their own vibrations."""
+    """Answer a line; its loads belong to the quiet fingers if others have their own vibrations."""
     if asked.own:
         fingers = [each.finger(asked.level_db_sl) for each in asked.own]
         loads = _loads(asked, len(asked.quiet), what="quiet finger")
@@ -464,7 +467,7 @@ def _layer_as_json(layer: Layer, table: LocalizationTable) -> dict[str, Any]:
 def _envelopes_as_json(
     envelopes: Envelopes | None, table: LocalizationTable
 ) -> dict[str, Any] | None:
-    """Return level 0..1 of the stroke and phase at the start and at every knot, by ERA."""
+    """Return level (0 to 1 of full stroke) and phase at the start and at every knot, by ERA."""
     if envelopes is None:
         return None
 

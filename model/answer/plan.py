@@ -1,17 +1,17 @@
-"""The answer to all fingers at once, and who gives way where not all can be served.
+"""Answer all fingers together, and decide which fingers give way if not all can be served.
 
-Fingers that ask for a vibration get one each, as long as the worst finger has the least contrast.
-Where it has not, fingers share: the nearest first, and only where they allow it. Two fingers that
-could not be kept apart even if they were alone on the plate come before two that merely may share.
-If that is not enough, vibrations are served in turn, by priority and arrival: each one for which
-those before it leave room. One that could not be kept from the finger beside it anyway comes last.
-Where not even the first can be served, the best answer that was tried is given, except that bounds
-set by fingers themselves always hold, by silence if need be.
+Every finger that requests a vibration gets its own, as long as the worst finger has the minimum
+contrast. Otherwise fingers share: the nearest first, and only if they allow it. Two fingers that
+could not be separated even if they were alone on the plate come before two that merely allow
+sharing. If that is not enough, vibrations are served one after the other, by priority and arrival,
+each only if the previous ones leave room for it. A vibration that could not be kept from the next
+finger anyway comes last. If not even the first can be served, the best answer tried is returned,
+except that bounds set by fingers always hold, by silence if necessary.
 
 Then follow modulation, by a carrier and two side bands, and the levels: as strong as quiet fingers
-allow, and within the amplifiers' limits. At full modulation each side band has half the amplitude
-of the carrier. With the carrier's weights side bands would leak 3 to 12 dB more, so each has
-weights of its own, found like those of a content at its frequency. The carrier is chosen for all
+allow, and within the amplifiers' limits. At full modulation each side band has half the carrier's
+amplitude. With the carrier's weights, side bands would leak 3 to 12 dB more, so each side band has
+separate weights, computed like those of a content at its frequency. The carrier is chosen for all
 three together, near the best steady one.
 """
 
@@ -57,20 +57,20 @@ from model.structure.attachments import with_patches
 from model.table.table import SAME_FREQUENCY, LocalizationTable
 
 MAX_SEPARATE = 5
-"""Number of fingers that may share up to which each gets a vibration of its own at first.
+"""Maximum number of sharing fingers that first get separate vibrations.
 
-With more of them, 34 of 36 sets beside two quiet fingers ended with one vibration for all.
+With more of them, 34 of 36 sets with two quiet fingers ended with one vibration for all.
 """
 
 CONTENTS_A_STEP = 3
-"""Of this many vibrations one is merged, at least one in all, before the rest is measured again."""
+"""One in this many vibrations (at least one) is merged before the rest is evaluated again."""
 
 _SHARES = np.array([1.0, 0.5, 0.5])  # amplitudes of carrier and side bands
 _ALL_DB = 20 * math.log10(float(np.linalg.norm(_SHARES)))  # all three, above the carrier
-_NEAR = 2  # carriers tried on each side of the steady one, in frequencies of the table
-_SAME = 0.5  # Hz; largest difference of the side bands' distances from the carrier
-_ROUNDING_DB = 1e-3  # difference of promises that count as equal
-_SILENT_DB = -60.0  # gain at which no content is felt
+_NEAR = 2  # carriers tried on each side of the steady one, in table frequencies
+_SAME = 0.5  # Hz; largest asymmetry of the side bands about the carrier
+_ROUNDING_DB = 1e-3  # difference of promises that counts as equal
+_SILENT_DB = -60.0  # gain at which a content is not felt
 
 
 def answer(
@@ -86,25 +86,25 @@ def answer(
     min_contrast_db: float = MIN_CONTRAST_DB,
     limits: Limits = NO_LIMITS,
 ) -> Answer:
-    """Answer all fingers at once, each with a vibration of its own.
+    """Answer all fingers together, each with its own vibration.
 
     Args:
         table: of the plate on which the fingers are.
-        fingers: with the stimulus that each is to feel.
-        quiet: more fingers, which are to be kept quiet.
-        drive_mode: the table's own if None; must be `phased` for more than one vibration.
+        fingers: with their stimuli.
+        quiet: more fingers, which should feel nothing.
+        drive_mode: default the table's; must be `phased` for more than one vibration.
         shaped: whether the amplifiers play shaped onsets and endings, which `Timing` adds.
-        apart_hz: least distance of the vibrations' frequencies from each other and from avoided_hz,
-            where their bands allow it.
-        avoided_hz: frequencies that play already.
-        bands_may_swap: whether a finger may have the band of another one.
+        apart_hz: minimum distance of the frequencies from each other and from avoided_hz,
+            if their bands allow it.
+        avoided_hz: frequencies that are playing already.
+        bands_may_swap: whether fingers can swap bands.
         min_contrast_db: promised contrast of the worst finger below which fingers give way.
         limits: of the amplifiers.
 
-    A modulated stimulus is made steady if its modulation would leave a finger unserved, if its side
-    bands do not fit, if it is shared, or if clocks are not held together. Levels are lowered where
-    stroke and limits do not allow all of them: lower priorities first, and the louder ones first
-    among equal priorities.
+    A modulated stimulus becomes steady if its modulation would leave a finger unserved, if its side
+    bands do not fit, if it is shared, or if clocks are not synchronised. If stroke and limits do
+    not allow all levels, lower priorities are reduced first, and louder ones first among equal
+    priorities.
 
     Raises InputError for fingers that contradict each other, and for a band without frequencies.
     """
@@ -126,19 +126,19 @@ def answer(
     result = search.within_limits(search.solve())
     notes = (*_steady_notes(result), *_level_notes(result))
     if not notes:
-        return result  # a copy would lose what it has computed
+        return result  # a copy would lose cached results
     return replace(result, applied=(*result.applied, *notes))
 
 
 def _quiet_finger(position: Point | Finger) -> Finger:
-    """A finger that is to be kept quiet."""
+    """Convert to a finger that should feel nothing."""
     return position if isinstance(position, Finger) else Finger(position)
 
 
 def _rows_near(
     table: LocalizationTable, frequencies: Sequence[float], apart_hz: float
 ) -> frozenset[int]:
-    """Rows of the table that are too near to frequencies [Hz]."""
+    """Return rows of the table that are too close to frequencies [Hz]."""
     rows: set[int] = set()
     for frequency in frequencies:
         distance = np.abs(table.frequencies - frequency)
@@ -154,13 +154,13 @@ def query(
     drive_mode: str | None = None,
     **stimulus: Any,
 ) -> Answer:
-    """Answer fingers that feel one vibration and others that feel nothing, as `answer` does."""
+    """Answer fingers that feel one vibration and others that feel nothing; see `answer`."""
     fingers = together(placed, Stimulus(level_db_sl, **stimulus))
     return answer(table, fingers, drive_mode=drive_mode)
 
 
 def prepare_answers(table: LocalizationTable, drive_mode: str | None = None) -> None:
-    """Compute in advance what the first answer of a table in a drive mode needs."""
+    """Compute in advance the data for the first answer of a table in a drive mode."""
     centre = (table.plate.length / 2, table.plate.width / 2)
     for quiet in ((), ((0.0, 0.0),)):
         placed = Placement((centre,), quiet)
@@ -168,7 +168,7 @@ def prepare_answers(table: LocalizationTable, drive_mode: str | None = None) -> 
 
 
 def _steady_notes(result: Answer) -> Iterator[str]:
-    """Yield notes of vibrations that are steady although their stimulus is modulated."""
+    """Yield notes about vibrations that are steady although their stimulus is modulated."""
     tones_of = Counter(result.tones.owners)
     for number, stream in enumerate(result.contents.streams):
         finger = result.asked[stream.targets[0]]
@@ -178,7 +178,7 @@ def _steady_notes(result: Answer) -> Iterator[str]:
 
 
 def _level_notes(result: Answer) -> Iterator[str]:
-    """Yield notes of vibrations that are weaker than requested, with the reason."""
+    """Yield notes about vibrations that are weaker than requested, with the reason."""
     for stream in result.contents.streams:
         first = stream.targets[0]
         lasts = stream.duration is None
@@ -187,26 +187,26 @@ def _level_notes(result: Answer) -> Iterator[str]:
         if stream.limit_db_sl is not None or is_reached:
             continue
         if result.stroke_factor < 1 - NEARLY or lasts:
-            reason = "all that the ERAs' stroke and the amplifiers allow"
+            reason = "the limit of the ERAs' stroke and the amplifiers"
         else:
-            reason = "so that quiet fingers feel half of it at most"
+            reason = "so that quiet fingers feel at most half of it"
         at = _at(result.asked[first])
         yield f"vibration of {at} is lowered to {level:.1f} dB SL, {reason}"
 
 
 @dataclass(frozen=True)
 class _Plan:
-    """Which fingers, by index, feel which content; all others that are protected are quiet."""
+    """Assignment of fingers to contents, by index; all others that are protected are quiet."""
 
     contents: tuple[tuple[int, ...], ...]
-    """The fingers of each content, its own first."""
+    """Fingers of each content, its own first."""
     applied: tuple[str, ...] = ()
-    """What was changed, in words."""
+    """Changes to the requests, one sentence each."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Search:
-    """The search for an answer; fingers are numbered in their order."""
+    """Search for an answer; fingers are numbered in their order."""
 
     table: LocalizationTable = field(kw_only=False)
     fingers: tuple[Finger, ...] = field(kw_only=False)
@@ -214,16 +214,16 @@ class _Search:
     is_shaped: bool
     apart_hz: float
     avoided: frozenset[int]
-    """Rows of the table's frequencies that play already, or are too near to these."""
+    """Rows of the table's frequencies that are playing already, or are too close to these."""
     bands_may_swap: bool
     limits: Limits
     min_contrast_db: float
 
     def solve(self) -> Answer:
-        """Find who feels which vibration, then set modulation and levels.
+        """Assign vibrations to fingers, then set modulation and levels.
 
-        First each finger has its own vibration. Until all have enough contrast, fingers share, and
-        then are served in turn. Otherwise the best answer that was tried is returned.
+        First, each finger has its own vibration. Until all have enough contrast, fingers share, and
+        are then served one after the other. Otherwise the best answer tried is returned.
         """
         plan = self._first_plan()
         self._check_drive_mode(plan)
@@ -231,8 +231,8 @@ class _Search:
         result = tried[-1]
         if self._fails(result):
             result = self._serve_in_turn(plan, tried)
-        if result.tones.worst_db < self.min_contrast_db:  # NaN for a finger alone
-            note = f"nothing reaches {self.min_contrast_db:g} dB: the best that was tried is served"
+        if result.tones.worst_db < self.min_contrast_db:  # NaN for a single finger
+            note = f"no answer reaches {self.min_contrast_db:g} dB: the best one tried is used"
             result = replace(result, applied=(*result.applied, note))
         if self.drive_mode == UNRESTRICTED and not self.table.clocks.groups:
             result = with_modulation(self.table, result, playable=self.limits.frequencies)
@@ -241,9 +241,9 @@ class _Search:
         return result
 
     def within_limits(self, result: Answer) -> Answer:
-        """Lower the answer to what the amplifiers' limits allow.
+        """Reduce the answer to the amplifiers' limits.
 
-        If a finger would no longer be served, all are answered again at the lower levels.
+        If this would leave a finger unserved, all are answered again at the lower levels.
         """
         result = as_ramps_allow(self.table, result, self.limits)
         factor = self.limits.factor_within(result.layers, self.table)
@@ -255,7 +255,7 @@ class _Search:
         return scaled(result, float(decibels(factor))) if factor < 1 else result
 
     def _lowered_by_priority(self, result: Answer) -> Answer:
-        """Lower the vibrations, those of low priority first, so that limits hold."""
+        """Lower the vibrations, low priorities first, until limits hold."""
         gains = gains_within(self.table, result, self.limits)
         lowered = with_gains(self.table, result, gains)
         if is_served(lowered, result):
@@ -264,16 +264,18 @@ class _Search:
         return replace(softer.solve(), asked=self.fingers)
 
     def _check_drive_mode(self, plan: _Plan) -> None:
-        """Raise InputError for several vibrations in a drive mode that plays one."""
+        """Raise InputError for several vibrations in a drive mode that plays only one."""
         if len(plan.contents) > 1 and self.drive_mode != UNRESTRICTED:
             raise InputError(
-                f"drive mode must be {UNRESTRICTED} for a vibration of each of several fingers, "
-                f"got {self.drive_mode}, which plays one; where the amplifiers play it give "
-                f"drive_mode={UNRESTRICTED!r}, or --mode {UNRESTRICTED} to era table query or build"
+                f"drive mode must be {UNRESTRICTED} for separate vibrations of several fingers, "
+                f"got {self.drive_mode}, which plays one; if the amplifiers support it, use "
+                f"drive_mode={UNRESTRICTED!r}, or --mode {UNRESTRICTED} with era table query or "
+                "build"
             )
 
     def _fails(self, result: Answer) -> bool:
-        """Whether a finger has less contrast than all must have, or than it asks for."""
+        """Return whether a finger has less contrast than the common minimum, or than it
+        requires."""
         return _is_out_of_bounds(result) or result.tones.worst_db < self.min_contrast_db
 
     def _share_until_served(self, plan: _Plan) -> tuple[_Plan, list[Answer]]:
@@ -288,13 +290,15 @@ class _Search:
         return plan, tried
 
     def _first_plan(self) -> _Plan:
-        """A vibration of its own for each finger, except for those that must or may share."""
+        """Return a plan with a separate vibration for each finger, unless fingers must or can
+        share."""
         plan = _Plan(self._first_contents)
         return self._many_joined(plan) if len(plan.contents) > MAX_SEPARATE else plan
 
     @cached_property
     def _first_contents(self) -> tuple[tuple[int, ...], ...]:
-        """The fingers of each vibration at first: together if they must feel one."""
+        """Return the fingers of each vibration of the first plan: together if they must feel
+        one."""
         groups: list[list[int]] = []
         for number, finger in enumerate(self.fingers):
             if finger.stimulus is None:
@@ -308,7 +312,8 @@ class _Search:
         return tuple(map(tuple, groups))
 
     def _with_more_shared(self, plan: _Plan) -> _Plan:
-        """Let the nearest two fingers share that cannot be apart, else the nearest that may."""
+        """Let the nearest two fingers share that cannot be separated, else the nearest that allow
+        it."""
         for _ in range(max(1, len(plan.contents) // CONTENTS_A_STEP)):
             pair = self._nearest(plan, are_apart=False)
             if not pair or self._contrast_alone(*pair) >= self.min_contrast_db:
@@ -319,9 +324,9 @@ class _Search:
         return plan
 
     def _nearest(self, plan: _Plan, *, are_apart: bool = True) -> tuple[tuple[int, ...], ...]:
-        """The nearest two contents that may be one, empty if there are none.
+        """Return the nearest two contents that can be merged, empty if there are none.
 
-        are_apart: whether each finger could be served with a vibration of its own.
+        are_apart: whether each finger could be served with its own vibration.
         """
         distances: dict[tuple[tuple[int, ...], ...], float] = {}
         for number, second in enumerate(plan.contents):
@@ -334,9 +339,10 @@ class _Search:
         return best_by([*distances], lambda contents: -distances[contents])
 
     def _contrast_alone(self, own: Sequence[int], others: Sequence[int]) -> float:
-        """Contrast [dB] of the nearest two of own and other fingers, if only these were touching.
+        """Return the contrast [dB] of the nearest own and other finger, if only these were
+        touching.
 
-        Regardless of their stimuli; infinite without others.
+        Independent of their stimuli; infinite without others.
         """
         pairs = [(self.fingers[a], self.fingers[b]) for a in own for b in others]
         if not pairs:
@@ -350,7 +356,7 @@ class _Search:
         return alone._measure(_Plan(((0,),))).tones.worst_db
 
     def _quiet_beside(self, felt: Sequence[int]) -> list[int]:
-        """The fingers that must not feel the vibration of these fingers."""
+        """Return the fingers that must not feel the vibration of the given fingers."""
         return [
             number
             for number, finger in enumerate(self.fingers)
@@ -358,7 +364,7 @@ class _Search:
         ]
 
     def _serve_in_turn(self, plan: _Plan, tried: Sequence[Answer]) -> Answer:
-        """Serve contents one after another, each if all served so far still have what they need.
+        """Serve contents one after another, each only if all earlier ones keep what they require.
 
         If not even the first can be served, the best of the answers tried is returned.
         """
@@ -383,7 +389,7 @@ class _Search:
         return self._with_held_back(result, with_content)
 
     def _order_key(self, content: Sequence[int], together: Answer) -> tuple[bool, bool, int, bool]:
-        """Sort key of a content that is served in turn; together: the answer with all of them.
+        """Return the sort key of a content served in turn; together: the answer with all contents.
 
         First come fingers that others disturb, then higher priorities, then protected fingers. Last
         come contents that could not even be kept from the finger next to their own.
@@ -399,7 +405,8 @@ class _Search:
     def _with_held_back(
         self, result: Answer, with_content: Mapping[tuple[int, ...], Answer]
     ) -> Answer:
-        """Note the contents that are held back, with what each would have been promised."""
+        """Record the contents that are held back, with the contrast each would have been
+        promised."""
         felt = {finger for stream in result.contents.streams for finger in stream.targets}
         held: list[tuple[int, float, bool]] = []
         notes: list[str] = []
@@ -415,7 +422,7 @@ class _Search:
         return replace(result, held=tuple(held), applied=(*result.applied, *notes))
 
     def _joined(self, plan: _Plan, contents: Sequence[tuple[int, ...]]) -> _Plan:
-        """The plan with some of its contents joined to the one of the highest priority."""
+        """Return the plan with some contents merged into the one with the highest priority."""
         by_priority = sorted(contents, key=lambda content: -self.fingers[content[0]].priority)
         host, guests = by_priority[0], by_priority[1:]
         joined = sum(guests, host)
@@ -429,7 +436,7 @@ class _Search:
         return replace(plan, contents=tuple(plan_contents), applied=(*plan.applied, *notes))
 
     def _many_joined(self, plan: _Plan) -> _Plan:
-        """The plan with one content for more than MAX_SEPARATE fingers that may share."""
+        """Return the plan with a single content for more than MAX_SEPARATE sharing fingers."""
         groups = defaultdict[str | bool, list[tuple[int, ...]]](list)
         for content in plan.contents:
             finger = self.fingers[content[0]]
@@ -442,7 +449,8 @@ class _Search:
 
     @cached_property
     def _bands(self) -> dict[int, tuple[int, int]]:
-        """First row of the table's frequencies that each finger may have, and one past the last."""
+        """Return the first row of the table's frequencies and one past the last for each finger's
+        band."""
         frequencies = self.table.frequencies.tolist()
         bands: dict[int, tuple[int, int]] = {}
         for number, finger in enumerate(self.fingers):
@@ -453,16 +461,16 @@ class _Search:
             if first == end:
                 nearest = min(frequencies, key=lambda frequency: abs(frequency - low))
                 raise InputError(
-                    f"band of {_at(finger)} must be LOW-HIGH in Hz and hold a frequency of the "
-                    f"table, {frequencies[0]:g} to {frequencies[-1]:g} Hz, of which {nearest:g} Hz "
-                    f"is the nearest, got {low:g}-{high:g}; build a table with others: era table "
+                    f"band of {_at(finger)} must be LOW-HIGH in Hz and contain a frequency of the "
+                    f"table, {frequencies[0]:g} to {frequencies[-1]:g} Hz (nearest: {nearest:g} "
+                    f"Hz), got {low:g}-{high:g}; build a table with others: era table "
                     "build --frequencies"
                 )
             bands[number] = first, end
         return bands
 
     def _contents(self, plan: _Plan) -> Contents:
-        """The contents of a plan, as the search for tones takes them."""
+        """Return the contents of a plan for the tone search."""
         streams = tuple(self._stream(content) for content in plan.contents)
         quiet = tuple(self._quiet_beside(sum(plan.contents, ())))
         background = None
@@ -491,7 +499,8 @@ class _Search:
         )
 
     def _stream(self, content: Sequence[int]) -> Stream:
-        """The stream of a content: its first finger's stimulus at the highest requested level."""
+        """Return the stream of a content: its first finger's stimulus at the highest requested
+        level."""
         fingers = [self.fingers[number] for number in content]
         bands = tuple(self._bands.values()) if self.bands_may_swap else (self._bands[content[0]],)
         levels = [finger.stimulus.level_db_sl for finger in fingers if finger.stimulus]
@@ -518,7 +527,7 @@ class _Search:
         notes = plan.applied
         ignores_avoided = len(contents.avoided) < len(self.avoided)
         if not tones.is_apart or ignores_avoided:
-            notes = (*notes, f"frequencies are nearer than {self.apart_hz:g} Hz")
+            notes = (*notes, f"frequencies are closer than {self.apart_hz:g} Hz")
         return Answer(
             asked=self.fingers,
             contents=contents,
@@ -547,18 +556,18 @@ def _softer(found: Answer, gains_db: Sequence[float]) -> tuple[Finger, ...]:
 
 
 def _is_out_of_bounds(found: Answer) -> bool:
-    """Whether a finger has less contrast, or more of others' contents, than it allows."""
+    """Return whether a finger has less contrast, or more of others' contents, than it allows."""
     is_one_of_many = len(found.contents.streams) > 1  # a single content cannot give way
     return (is_one_of_many and found.lacks_contrast) or bool(found.disturbed)
 
 
 def worst_of(found: Answer) -> float:
-    """Return the promised contrast [dB] of the worst finger, infinite for one finger alone."""
+    """Return the promised contrast [dB] of the worst finger, infinite for a single finger."""
     return math.inf if found.promised_worst_db is None else found.promised_worst_db
 
 
 def is_served(found: Answer, steady: Answer) -> bool:
-    """Whether all fingers have what they require, and at least 6 dB unless they had less before."""
+    """Return whether all fingers have what they require, and at least 6 dB unless they had less."""
     worst, before = found.promised_worst_db, steady.promised_worst_db
     if (
         worst is not None
@@ -579,12 +588,12 @@ def with_modulation(
     *,
     playable: tuple[float, float],
 ) -> Answer:
-    """Modulate an answer as its fingers ask, where that leaves all fingers served.
+    """Modulate an answer as its fingers request, if all fingers remain served.
 
     playable: lowest and highest frequency [Hz] of side bands. These are equally far below and above
     the carrier, at the table's frequencies nearest to the modulation, APART_HZ from all tones of
     other contents, and not among the avoided frequencies. A shared content is steady. Levels are
-    lowered to what the stroke allows.
+    lowered to fit the stroke.
     """
     lowest = max(playable[0], table.frequencies[0])
     highest = min(playable[1], table.frequencies[-1])
@@ -615,7 +624,7 @@ def with_modulation(
 def _with_tones_of(
     table: LocalizationTable, found: Answer, number: int, candidates: Sequence[Sequence[int]]
 ) -> Answer:
-    """Give a content the carrier and side bands of the best contrast, within the stroke."""
+    """Give a content the carrier and side bands with the best contrast, within the stroke."""
     tones = found.tones
     owners, rows, gains = np.array(tones.owners), np.array(tones.rows), np.array(tones.gains)
     tone_at = cache(_alone_at(table, found, number))
@@ -636,7 +645,7 @@ def _with_tones_of(
 
 
 def _carriers(table: LocalizationTable, steady: int, modulation: float) -> Iterator[list[int]]:
-    """Yield rows of a carrier near a steady one and of the side bands nearest to a modulation."""
+    """Yield rows of a carrier near a steady one, and of the side bands nearest to a modulation."""
     frequencies = table.frequencies
     for carrier in range(max(steady - _NEAR, 0), min(steady + _NEAR + 1, len(frequencies))):
         f = frequencies[carrier]
@@ -651,7 +660,8 @@ def _fits(
     limits: tuple[float, float],
     taken: FloatArray,
 ) -> bool:
-    """Whether carrier and side bands [Hz] are symmetric, within limits, and apart from others."""
+    """Return whether carrier and side bands [Hz] are symmetric, within limits, and apart from
+    others."""
     f, below, above = tones
     gap, reach = above - f, max(above - f, modulation)
     is_even = gap > 0 and abs(f - below - gap) <= _SAME
@@ -661,7 +671,7 @@ def _fits(
 
 
 def _alone_at(table: LocalizationTable, found: Answer, number: int) -> Callable[[int], Tones]:
-    """Return a function that finds a content's tone at a row, all other fingers being quiet."""
+    """Return a function that finds a content's tone at a row, with all other fingers quiet."""
     stream, contents = found.contents.streams[number], found.contents
     (finger,), course = stream.targets, stream.course
     level_db_sl = stream.level_db_sl - (0.0 if course is None else course.strongest_db)
@@ -677,20 +687,20 @@ def _alone_at(table: LocalizationTable, found: Answer, number: int) -> Callable[
 
 
 def _contrast_db(tones: Sequence[Tones]) -> float:
-    """Promised contrast [dB] of a carrier and its side bands, whose leaks add up."""
+    """Return the promised contrast [dB] of a carrier and its side bands, whose leakage adds up."""
     own = np.array([each.worst_db for each in tones])
     leaks = (_SHARES**2 * 10 ** (-own / 10))[np.isfinite(own)]
     return _ALL_DB - float(decibels(np.sqrt(leaks.sum()))) if len(leaks) else math.inf
 
 
 def _within_stroke(table: LocalizationTable, found: Answer) -> Answer:
-    """Lower the contents of an answer to what the stroke allows of all tones together."""
+    """Lower the contents of an answer until all tones together fit the stroke."""
     tones, streams = found.tones, found.contents.streams
     rows, owners, gains = (np.array(each) for each in (tones.rows, tones.owners, tones.gains))
     drives = np.zeros((len(streams), len(table.eras)))
     np.add.at(drives, owners, gains[:, None] * np.abs(tones.weights))
     reached = [min(tones.level_db_sl[finger][1] for finger in each.targets) for each in streams]
-    levels = np.maximum(10 ** (np.array(reached) / 20), 1e-9)  # above 0 for silent ones
+    levels = np.maximum(10 ** (np.array(reached) / 20), 1e-9)  # above 0 for silent contents
     priorities = [each.priority for each in streams]
     factors, factor = share_stroke(np.ones(len(streams)), drives, levels, priorities)
     if factor < 1 - NEARLY:
@@ -701,16 +711,16 @@ def _within_stroke(table: LocalizationTable, found: Answer) -> Answer:
 
 
 def as_quiet_fingers_allow(table: LocalizationTable, found: Answer) -> Answer:
-    """Set the levels of stimuli that are limits to what the other fingers allow.
+    """Set the levels of stimuli with `is_limit` to the highest that the other fingers allow.
 
-    All of them together reach at most IMPERCEPTIBLE_DB_SL at quiet fingers, by the rig's own
-    thresholds, on nine of ten plates. For the sake of fingers with a vibration of their own, none
-    is raised above that level, but none is lowered either.
+    All of them together reach at most IMPERCEPTIBLE_DB_SL at quiet fingers, relative to the rig's
+    own thresholds, on 90 % of plates. For fingers with their own vibration, none is raised above
+    that level, but none is lowered either.
     """
     streams, tones = found.contents.streams, found.tones
     limited = [n for n, each in enumerate(streams) if each.limit_db_sl is not None]
     heard = tones.foreign_db_sl
-    if len(limited) < len(streams):  # what is heard of the limited ones alone
+    if len(limited) < len(streams):  # level of the limited contents alone
         alone = np.full(len(streams), _SILENT_DB)
         alone[limited] = 0.0
         heard = with_gains(table, found, alone).tones.foreign_db_sl
@@ -727,9 +737,9 @@ def as_quiet_fingers_allow(table: LocalizationTable, found: Answer) -> Answer:
 
 
 def as_ramps_allow(table: LocalizationTable, found: Answer, limits: Limits) -> Answer:
-    """Lengthen the ramps of short stimuli to what the amplifiers' slew allows.
+    """Lengthen the ramps of short stimuli to respect the amplifiers' slew limit.
 
-    Levels are raised in turn, unless a stimulus is a limit, whose level is set by other fingers.
+    Levels are raised in return, except for stimuli with `is_limit`, whose level other fingers set.
     """
     contents, tones, strokes = found.contents, found.tones, table.full_levels
     if contents.is_shaped or all(stream.duration is None for stream in contents.streams):
@@ -747,8 +757,8 @@ def as_ramps_allow(table: LocalizationTable, found: Answer, limits: Limits) -> A
 def gains_within(table: LocalizationTable, found: Answer, limits: Limits) -> FloatArray:
     """Compute gains [dB] on the layers of an answer that bring them within the amplifiers' limits.
 
-    Limits are shared like the stroke: lower priorities are lowered first, and the louder ones among
-    equal priorities. Power counts as each layer's share of that of all together.
+    Limits are shared like the stroke: lower priorities are reduced first, and louder layers first
+    among equal priorities. A layer's power counts by its share of the total.
     """
     strokes = table.full_levels
     each_layer = [amplitudes_of(layer.excitations) for layer in found.layers]
@@ -783,7 +793,7 @@ def with_gains(table: LocalizationTable, found: Answer, gains_db: FloatArray) ->
 
 
 def scaled(found: Answer, gain_db: float) -> Answer:
-    """Apply one gain [dB] to all of an answer: contrasts stay."""
+    """Apply one gain [dB] to a whole answer; contrasts do not change."""
     tones, factor = found.tones, 10 ** (gain_db / 20)
     louder = replace(
         tones,

@@ -1,8 +1,8 @@
-"""What fingers feel of tones on the nominal plate and on drawn ones, and what is promised.
+"""Compute the sensation of tones on the nominal plate and on drawn plates, and promise it.
 
-`FingersOnPlate` puts fingers on a table's plate; its forms are what a search for tones needs
-(`FingerForms`, and `RingingUnderFingers` for drives of limited duration). `promised` then computes
-from the tones of all contents together levels, contrasts and the gains to the contents' levels.
+`FingersOnPlate` puts fingers on a table's plate. Its forms are the input of a search for tones
+(`FingerForms`, and `RingingUnderFingers` for drives of limited duration). From the tones of all
+contents, `promised` computes levels, contrasts and the gains for the contents' levels.
 """
 
 import math
@@ -47,43 +47,43 @@ from model.table.table import FingertipShapes, LocalizationTable, read_fingertip
 from model.transients.time_response import enveloped_accelerations
 
 CENTRE_AND_RIM, CENTRE_AND_FOUR = np.array([0, *range(9, 21)]), np.array([0, 9, 12, 15, 18])
-"""Fine points of a fingertip between which no null can hide, and a few of them, by index."""
+"""Indices of fine points of a fingertip between which no null can hide, and of a few of them."""
 
 MAX_FINGERS_BY_POINT = 4
-"""Number of quiet fingers up to which a search considers the points of each one by one."""
+"""Maximum number of quiet fingers whose points a search considers individually."""
 
 MAX_VARIANCE_FINE = 0.005
-"""Variance of an ERA's gain up to which nulls are so deep that few points do not show them."""
+"""Variance of an ERA's gain below which nulls are so deep that few points do not show them."""
 
 _BESIDE_HZ, _LEAST_SHARE = 60.0, 1e-3
-"""Distance of the frequencies beside its own that count of a drive, and the least share of one in
-the power of its strongest moments."""
+"""Maximum distance of frequencies that count for a drive, and their minimum fraction of the power
+of its strongest moments."""
 
-_LEAST_PERIODS = 1.7  # beyond that by the reciprocal of a pulse's duration is 1.4 % of its energy
+_LEAST_PERIODS = 1.7  # beyond this, by 1/duration of a pulse, is 1.4 % of its energy
 
 MIN_RAISED_CONTRAST_DB = 6.0
-"""Contrast [dB] down to which the drive of a short stimulus is raised: others feel half of it."""
+"""Minimum contrast [dB] when the drive of a short stimulus is raised: others feel half of it."""
 
 _TINY = 1e-20
 
 SIDE_BANDS = 0.02
-"""Share of a content's power, for one ERA, in side bands at other fingers while weights change.
+"""Fraction of a content's power, for one ERA, in side bands at other fingers while weights change.
 
-Of n ERAs it is an n-th: their changes have no common phase, while their fields at their own finger
-have. The value is fitted to plates solved in time, so that 90 % of the promises on a path are kept.
+For n ERAs it is divided by n: their changes have no common phase, unlike their fields at their own
+finger. The value is fitted to plates solved in time, so that 90 % of the promises on a path hold.
 """
 
 
 @dataclass(frozen=True, eq=False)
 class FingersOnPlate:
-    """The plate of a table with k fingers on it."""
+    """Plate of a table with k fingers on it."""
 
     table: LocalizationTable
     tips: FingertipShapes
     """Mode shapes under the fingers."""
     touched: TouchedPlate
     at_harmonics: TouchedPlate | None
-    """The plate at twice the table's frequencies, None where ERAs have no harmonics."""
+    """Plate at twice the table's frequencies, None if ERAs have no harmonics."""
 
     @classmethod
     def of(
@@ -94,10 +94,10 @@ class FingersOnPlate:
         *,
         by_kernel: bool = True,
     ) -> "FingersOnPlate":
-        """Put fingers at places [m] on a table's plate.
+        """Put fingers at positions [m] on a table's plate.
 
-        loads: relative to the rig's fingertip, empty for 1 each; by_kernel: whether kernels in C
-        may be used.
+        loads: relative to the rig's fingertip, empty for 1 each; by_kernel: whether to use C
+        kernels.
         """
         if by_kernel:
             tips = read_fingertips(table, places)
@@ -120,7 +120,7 @@ class FingersOnPlate:
     def forms(self, rows: IntArray, *, with_fine: bool) -> "FingerForms":
         """Compute fields and expected powers at rows (f,) of the table's frequencies.
 
-        with_fine: at the fine points of fingertips, too.
+        with_fine: also at the fine points of fingertips.
         """
         tips, fine = self.tips, self.tips.fine if with_fine else None
         power = self.table.search_error_power
@@ -131,7 +131,7 @@ class FingersOnPlate:
     def drawn(
         self, by: Drawing, rows: IntArray, weights: Complex64Array, *, with_powers: bool = False
     ) -> FingertipAmplitudes:
-        """Compute amplitudes at all fine points on drawn plates, of tones at rows (m,).
+        """Compute amplitudes at all fine points on drawn plates, for tones at rows (m,).
 
         weights (m, n): of the ERAs.
         """
@@ -142,10 +142,10 @@ class FingersOnPlate:
     def felt(
         self, by: Drawing, rows: IntArray, weights: Complex64Array, owners: IntArray
     ) -> tuple[Float32Array, Float32Array]:
-        """Return mean amplitude over fingertips and power at the loudest points, of c drives.
+        """Return mean amplitude over fingertips and power at the loudest points, for c drives.
 
-        Both (c, k, 1 + d) to threshold; the power includes second harmonics. owners (m,): the drive
-        of each tone, ascending.
+        Both (c, k, 1 + d) relative to the threshold; the power includes second harmonics. owners
+        (m,): the drive of each tone, ascending.
         """
         starts = np.flatnonzero(np.diff(owners, prepend=-1))
         harmonics = np.add.reduceat(self.harmonics(by, rows, weights), starts)
@@ -159,7 +159,7 @@ class FingersOnPlate:
     def harmonics(self, by: Drawing, rows: IntArray, weights: Complex64Array) -> Float32Array:
         """Squared amplitude of second harmonics at fingers, (m, k, 1 + d).
 
-        To the table's `compared_harmonic_thresholds`.
+        Relative to the table's `compared_harmonic_thresholds`.
         """
         if self.at_harmonics is None:
             return np.zeros((len(rows), len(self.tips.few), 1 + by.count), dtype=np.float32)
@@ -168,7 +168,8 @@ class FingersOnPlate:
         return np.asarray(found / np.square(threshold)[:, None, None])
 
     def powers(self, by: Drawing, rows: IntArray, weights: Complex64Array) -> Float32Array:
-        """Squared amplitudes to threshold of tones at fine points, (m, k, p, 1 + d)."""
+        """Squared amplitudes of tones at fine points relative to the threshold, (m, k, p, 1 +
+        d)."""
         found = self.drawn(by, rows, weights, with_powers=True).powers
         return np.asarray(found).reshape(len(rows), *self.tips.fine_weights.shape, -1)
 
@@ -196,7 +197,7 @@ class FingerForms:
         contacts, tips, table = self.contacts, self.fingers.tips, self.fingers.table
         weights = tips.few_weights[targets]
         mean = (weights[:, None] @ contacts.fields[:, targets])[:, :, 0]
-        # Differences of the field over a target are no uncertainty of its level.
+        # The field's variation over a target does not make its level uncertain.
         expected = contacts.uncertain[:, targets] + outer(mean)
         found = Forms(
             mean.swapaxes(0, 1),
@@ -219,7 +220,7 @@ class FingerForms:
     def by_point(
         self, forms: Forms, others: Sequence[int], points: IntArray = CENTRE_AND_RIM
     ) -> Forms:
-        """Return forms in which each point of every other finger counts by itself.
+        """Return forms in which each point of every other finger counts separately.
 
         points (p,): indices of fine points. Uncertainty counts by the mean over the fingertip.
         """
@@ -233,13 +234,13 @@ class FingerForms:
 class RingingUnderFingers:
     """Drives along an envelope on a table's plate with fingers.
 
-    Tones at the table's frequencies near that of a drive stand for its envelope, whatever it is:
-    weights are searched and drawn plates judged with these tones (`DriveEnvelope.shares_at`).
+    The envelope is represented by tones at the table's frequencies near the drive's. Weights are
+    searched and drawn plates evaluated with these tones (`DriveEnvelope.shares_at`).
     """
 
     table: LocalizationTable
     places: tuple[Point, ...]
-    """Places of the fingers [m]."""
+    """Positions of the fingers [m]."""
     loads: tuple[float, ...]
     """Loads relative to the rig's fingertip, empty for 1 each."""
     envelope: DriveEnvelope
@@ -249,7 +250,7 @@ class RingingUnderFingers:
     def of_streams(
         cls, table: LocalizationTable, contents: Contents
     ) -> list["RingingUnderFingers | None"]:
-        """Make one for each content with a duration; None for those that last or are shaped."""
+        """Build one for each content with a duration; None for continuous or shaped ones."""
         found: list[RingingUnderFingers | None] = []
         for stream in contents.streams:
             envelope: DriveEnvelope | None = None
@@ -264,15 +265,15 @@ class RingingUnderFingers:
 
     @cached_property
     def shares(self) -> FloatArray:
-        """Shares (f, f) of a drive's steady power, of tones at each of the table's frequencies.
+        """Fraction (f, f) of a drive's steady power in tones at each of the table's frequencies.
 
-        A row for each of these that the drive may have.
+        One row per frequency that the drive can have.
         """
         hertz, known = self.table.frequencies, dict[tuple[float, ...], FloatArray]()
         ends = (hertz <= hertz[0] + _BESIDE_HZ).sum(), (hertz >= hertz[-1] - _BESIDE_HZ).sum()
         beyond = int(max(ends)) - 1
         wide = np.pad(hertz, beyond, mode="reflect", reflect_type="odd")
-        # Tones beyond the table's ends count as tones as far inside.
+        # Tones beyond the table's ends are reflected into it.
         rows = np.pad(np.arange(len(hertz)), beyond, mode="reflect")
         found = np.zeros((len(hertz), len(hertz)))
         for own, at in enumerate(hertz.tolist()):
@@ -289,8 +290,8 @@ class RingingUnderFingers:
     def spectrum(self, drive: WeightedTones) -> WeightedTones:
         """Return steady tones with the energy of a drive along the envelope, on any plate.
 
-        By Parseval's theorem, except for what the drive excites far beside its frequencies.
-        Amplitudes count by the threshold at the drive's own frequency.
+        By Parseval's theorem, except for frequencies far from the drive's. Amplitudes are compared
+        with the threshold at the drive's own frequency.
         """
         found, thresholds = [], self.table.thresholds
         for own, weights in drive:
@@ -315,7 +316,7 @@ class RingingUnderFingers:
         )
 
     def lasting_long_enough(self, some: IntArray) -> IntArray:
-        """Return the rows whose spectrum does not reach down to 0 Hz; all if there are none.
+        """Return the rows whose spectrum does not reach down to 0 Hz; all rows if there are none.
 
         A drive of fewer periods moves the plate as a whole, which no frequency of a table shows.
         """
@@ -328,7 +329,7 @@ class RingingUnderFingers:
         return long if len(long) else some
 
     def over_drive(self, drive: WeightedTones) -> OverDuration:
-        """Return what fingers feel of a drive; each is solved once."""
+        """Return the sensation of a drive over the duration; each drive is solved once."""
         hertz, drives = self.table.frequencies, self.table.highest_drives
         key = tuple([(row, weights.tobytes()) for row, weights in drive])
         if key not in self._solved:
@@ -341,7 +342,7 @@ class RingingUnderFingers:
         return self._solved[key]
 
     def over(self, tones: Iterable[tuple[float, ComplexArray]]) -> OverDuration:
-        """Solve what fingers feel of tones together: frequency [Hz], base motions (eras,) [m]."""
+        """Solve the sensation of simultaneous tones: frequency [Hz], base motions (eras,) [m]."""
         table, tips = self.table, read_fingertips(self.table, self.places)
         k, p, r = tips.fine.shape
         loads = fingertip_loads(table.fingertip, self.places, self.loads)
@@ -366,10 +367,10 @@ class RingingUnderFingers:
 def on_drawn_plates(
     energies: FloatArray, heard: FloatArray, factor: FloatArray | float
 ) -> FloatArray:
-    """Return the power over a duration on drawn plates (..., 1 + d), nominal first, from energies.
+    """Convert energies to power over a duration on drawn plates (..., 1 + d), nominal first.
 
-    heard (...): power over the duration on the nominal plate; factor: ratio of this power to the
-    energy at the target, by which the energy that other plates add counts.
+    heard (...): power over the duration on the nominal plate; factor: ratio of power to energy at
+    the target, applied to the additional energy on other plates.
     """
     added = factor * (energies - energies[..., :1])
     return np.asarray(np.maximum(heard[..., None] + added, 0.0))
@@ -387,10 +388,10 @@ def promised(
     ringing: Sequence[RingingUnderFingers | None] = (),
     ways: Sequence[Sequence[int]] = (),
 ) -> Tones:
-    """Compute what fingers feel of tones at rows (m,), of weights (m, n).
+    """Compute the sensation of tones at rows (m,) with weights (m, n).
 
-    owners (m,): the content of each tone; gains (m,): None for those to the contents' levels;
-    ringing: of each content, None for those that last or are shaped; ways: as in `with_tones`.
+    owners (m,): the content of each tone; gains (m,): None for those that give the contents'
+    levels; ringing: per content, None for continuous or shaped ones; ways: as in `with_tones`.
     """
     shares, streams = fingers.tips.fine_weights, contents.streams
     steady = power = fingers.powers(PROMISED_DRAWS, rows, weights)
@@ -452,10 +453,11 @@ def with_tones(
     gains: FloatArray | None,
     ways: Sequence[Sequence[int]] = (),
 ) -> Answer:
-    """Return the answer with other tones and what these promise together.
+    """Return the answer with other tones, and the resulting promises.
 
-    gains: of the tones, None for those to the contents' levels. ways: the fingers, by number, that
-    are places on the way of each of the first ones, which remain: each feels the mean power there.
+    gains: of the tones, None for those that give the contents' levels. ways: fingers, by number,
+    that are points on the path of each of the first fingers; each of these feels the mean power
+    there.
     """
     contents = found.contents
     fingers = FingersOnPlate.of(table, contents.places, contents.loads)
@@ -476,8 +478,8 @@ def _compared(
 ) -> tuple[FloatArray, FloatArray, FloatArray, float]:
     """Return level (k, 2), contrast (k, 3), foreign level (k,), and the worst promise.
 
-    As amplitude ratios, by one set of thresholds: the one by which power (m, k, p, d) and that of
-    harmonics (m, k, d) are given. NaN where there is nothing to compare.
+    As amplitude ratios, for one threshold set, to which power (m, k, p, d) and that of harmonics
+    (m, k, d) are relative. NaN if there is nothing to compare.
     """
     streams, k = contents.streams, len(contents.places)
     level, contrast, of_others = (np.full(size, np.nan) for size in ((k, 2), (k, 3), k))
@@ -500,7 +502,7 @@ def _compared(
         contrast[finger] = figures(ratios[-1])
     worst = figures(np.min(ratios, axis=0)) if ratios else (np.nan,) * 3
     if len(streams) == 1:
-        contrast[[*streams[0].targets]] = worst  # the one at the loudest quiet finger
+        contrast[[*streams[0].targets]] = worst  # contrast at the loudest quiet finger
     return level, contrast, of_others, worst[2]
 
 
@@ -553,13 +555,13 @@ def _gains_to_levels(
     weights: Complex64Array,
     owners: IntArray,
 ) -> tuple[FloatArray, float]:
-    """Return gains (K,) of contents to their levels on nine of ten plates, as `share_stroke`.
+    """Return gains (K,) that give contents their levels on 90 % of plates; see `share_stroke`.
 
-    A short stimulus reaches its level on the nominal plate. It is raised for that only as far as
-    others feel half of it, or nothing.
+    A short stimulus reaches its level on the nominal plate. It is raised only while others feel at
+    most half of it, or nothing.
     """
     streams, levels = contents.streams, contents.levels.astype(float)
-    alone = np.arange(len(owners))  # as if each had a frequency of its own
+    alone = np.arange(len(owners))  # as if all frequencies were different
     imperceptible = 10 ** (IMPERCEPTIBLE_DB_SL / 20)
     gains = np.empty(len(streams))
     for j, stream in enumerate(streams):
@@ -589,9 +591,9 @@ def share_stroke(
     levels: FloatArray,
     priorities: Sequence[int],
 ) -> tuple[FloatArray, float]:
-    """Lower gains (K,) to levels (K,) until they fit the stroke; also return the least factor.
+    """Lower gains (K,) to levels (K,) until they fit the stroke; also return the smallest factor.
 
-    Among contents of one priority the louder ones are lowered first, to one level (max-min
+    Among contents of one priority, the louder ones are lowered first to a common level (max-min
     fairness), until all fit into what higher priorities leave.
     """
     amplitudes = gains[:, None] * np.abs(weights)
@@ -619,10 +621,10 @@ def felt_amplitudes(
     is_own: NDArray[np.bool_],
     targets: Sequence[int],
 ) -> Float32Array:
-    """Return the least amplitude that a content's targets feel of its own tones, (d,).
+    """Return the lowest amplitude of a content's own tones at its targets, (d,).
 
-    power (m, k, p, d): of all tones; shares (k, p): of the points in the mean over a fingertip.
-    Tones of other contents at the same row (m,) may cancel part of it.
+    power (m, k, p, d): of all tones; shares (k, p): weights of the points in the mean over a
+    fingertip. Tones of other contents at the same row (m,) can cancel part of it.
     """
     squares = np.zeros(power.shape[1:], dtype=power.dtype)
     for tone in np.flatnonzero(is_own).tolist():
@@ -639,7 +641,7 @@ def loudest_power(
     """Return the power (d,) of j tones at the loudest point of a finger.
 
     power (j, k, p, d): amplitudes of tones at the same row (j,) add; harmonics (j, k, d): power of
-    second harmonics over each fingertip, of any phase.
+    second harmonics over each fingertip, at any phase.
     """
     at = power[:, finger]
     total = np.zeros(at.shape[1:], dtype=at.dtype)
@@ -650,10 +652,12 @@ def loudest_power(
 
 
 def promise(values: Float32Array, percent: float = PROMISED_PERCENTILE) -> float:
-    """Return a percentile over the drawn plates of values (1 + d,), the first of them nominal."""
+    """Return a percentile over the drawn plates of values (1 + d,), the first value being
+    nominal."""
     return float(percentile(values[1:].astype(float), percent))
 
 
 def figures(ratio: Float32Array) -> tuple[float, float, float]:
-    """Return of ratios (1 + d,) the nominal one, the median of the drawn plates and the promise."""
+    """Return the nominal value, the median of the drawn plates and the promise of ratios (1 +
+    d,)."""
     return float(ratio[0]), promise(ratio, 50), promise(ratio)

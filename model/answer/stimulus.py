@@ -1,11 +1,11 @@
-"""Fingers on a plate, the stimulus that each is to feel, and the envelope along which it is driven.
+"""Fingers on a plate, the stimulus for each, and the envelope of its drive.
 
-A stimulus lasts, or has a duration, over which it is even or follows a course. The plate follows
-its drive late: over 40 ms the root mean square at a finger is several decibels below that of the
-steady vibration, ten decibels on a sharp resonance, and the plate rings on after the end. A finger
-therefore feels the mean of its demodulated acceleration over the duration; any other fingertip
-counts by its power, ringing included; both by the strongest moments where there is a course
-(`DriveEnvelope`).
+A stimulus is continuous, or has a duration with a constant level or an envelope. The plate follows
+its drive late: over 40 ms, the RMS at a finger is several decibels below that of the steady
+vibration, ten decibels on a sharp resonance, and the plate rings after the end. Therefore a finger
+is assumed to feel the mean of its demodulated acceleration over the duration. Any other fingertip
+counts by its power, including ringing. With an envelope, both are evaluated over the strongest
+moments (`DriveEnvelope`).
 """
 
 import math
@@ -31,24 +31,24 @@ from registry.limits import MAX_CONTACTS, MAX_FINGER_LOAD, MAX_HAND_LOAD
 MIN_LEVEL_DB_SL, MAX_LEVEL_DB_SL = -100.0, 60.0
 """Bounds of a stimulus's level [dB SL].
 
-The lower one is below the smallest amplitude of a channel. The exposure at the upper one is
-discussed in docs/concepts/people.md.
+The lower bound is below the smallest amplitude of a channel. docs/concepts/people.md discusses the
+exposure at the upper bound.
 """
 
 _MIN_DURATION, _MAX_DURATION = 0.001, 1e6
-"""Bounds of a stimulus's duration [s]: no time step of a plate is nearly as short or as long."""
+"""Bounds of a stimulus's duration [s], far beyond any time step of a plate."""
 
 MIN_MODULATION, MAX_MODULATION = 10.0, 30.0
-"""Bounds of a modulation [Hz] that is played by side bands; slower ones are changes of level."""
+"""Bounds of a modulation played by side bands [Hz]; slower modulations are changes of level."""
 
 MAX_PRIORITY = (1 << 31) - 1
 """Highest priority of a finger; the lowest is its negative."""
 
 ANY_BAND = (0.0, math.inf)
-"""The band [Hz] of a stimulus that may have any frequency."""
+"""Band [Hz] of a stimulus without a frequency constraint."""
 
 NEVER, BY_NAME, ANY, MUST = SHARING = ("never", "by name", "any", "must")
-"""Rules by which a finger may feel the vibration of another one (`Finger.sharing`)."""
+"""Rules for feeling the vibration of another finger (`Finger.sharing`)."""
 
 _UNITS = {
     "load": "the load of the rig's fingertip",
@@ -59,29 +59,29 @@ _UNITS = {
 
 @dataclass(frozen=True)
 class Stimulus:
-    """What a finger is to feel."""
+    """Requested sensation of a finger."""
 
     level_db_sl: float = STRONG_DB_SL
-    """Level over its duration, onset included, on the plate as modelled.
+    """Level over its duration, onset included, on the nominal plate.
 
-    Of a stimulus that lasts: the level that nine of ten plates give. With a course: at a share
-    of 1.
+    For a continuous stimulus: the level that 90 % of plates reach. With an envelope: at its
+    maximum, 1.
     """
     band_hz: tuple[float, float] = ANY_BAND
     """Lowest and highest frequency."""
     duration: float | None = None
-    """Duration [s], None for a stimulus that lasts; a click has 0.04 s."""
+    """Duration [s], None for a continuous stimulus; a click has 0.04 s."""
     modulation_hz: float | None = None
-    """How often per second its strength comes and goes, None for a steady one.
+    """Modulation frequency of its strength [Hz], None for a steady one.
 
-    From MIN_MODULATION to MAX_MODULATION, of a stimulus that lasts or has a course.
+    From MIN_MODULATION to MAX_MODULATION, for a stimulus that is continuous or has an envelope.
     """
     is_limit: bool = False
-    """Whether the level is an upper limit, up to which it is as strong as quiet fingers allow."""
+    """Whether the level is an upper limit; it is then as strong as quiet fingers allow."""
     name: str | None = None
-    """Fingers whose stimuli have the same name may be given one vibration."""
+    """Fingers whose stimuli have the same name can share one vibration."""
     course: "Course | None" = field(default=None, hash=False, repr=False)
-    """How strongly it is felt over its duration, which is that of the course."""
+    """Envelope of the strength, which also sets the duration."""
 
     def __post_init__(self) -> None:
         """Check everything that does not depend on the table; raises InputError."""
@@ -107,7 +107,7 @@ class Stimulus:
                 )
             if self.duration not in (None, self.course.duration):
                 raise InputError(
-                    f"duration must be left out of a stimulus with a course, got {self.duration:g}"
+                    f"duration must be left out for a stimulus with a course, got {self.duration:g}"
                 )
             object.__setattr__(self, "duration", self.course.duration)
         if self.duration is not None:
@@ -115,7 +115,7 @@ class Stimulus:
             if not _MIN_DURATION <= self.duration <= _MAX_DURATION:  # False for NaN
                 raise InputError(
                     f"duration must be from {_MIN_DURATION:g} to {_MAX_DURATION:g} s, got "
-                    f"{self.duration:g}; leave it out of a stimulus that lasts"
+                    f"{self.duration:g}; leave it out for a continuous stimulus"
                 )
         if self.modulation_hz is not None:
             expect_number(self.modulation_hz, what="modulation_hz", unit="Hz")
@@ -126,49 +126,49 @@ class Stimulus:
                 )
             if self.duration is not None and self.course is None:
                 raise InputError(
-                    "modulation_hz must be left out of a stimulus with a duration but no course"
+                    "modulation_hz must be left out for a stimulus with a duration but no course"
                 )
 
 
 @dataclass(frozen=True)
 class Finger:
-    """A finger on the plate and what it asks for."""
+    """A finger on the plate with its request."""
 
     at: Point
     """Its place [m]."""
     stimulus: Stimulus | None = None
-    """What it is to feel, None for nothing."""
+    """Stimulus that it should feel, None for nothing."""
     load: float = 1.0
     """Its load on the plate, relative to the rig's fingertip.
 
-    A load above 10 is that of a hand that rests (`HAND_LOAD`): it changes what others feel, is
-    known within a factor of 3 only, and has neither a stimulus nor protection.
+    A load above 10 is a resting hand (`HAND_LOAD`): it changes what others feel, is known only
+    within a factor of 3, and has neither a stimulus nor protection.
     """
     priority: int = 0
-    """Vibrations of lower priority are given up or lowered first."""
+    """Vibrations of lower priority give way or are lowered first."""
     sharing: str = BY_NAME
-    """Whether it may feel the vibration of another finger.
+    """Whether it can feel the vibration of another finger.
 
-    `never`; that of a finger of the same name (`by name`); that of the nearest finger that may
-    have `any`; or it `must` feel one with all fingers of its name. In all cases but `never` it may
-    also feel that of a finger so near that no vibration could be kept from either.
+    `never`; that of a finger with the same name (`by name`); that of the nearest finger that also
+    allows `any`; or it `must` feel one vibration with all fingers of its name. Except for `never`,
+    it can also feel the vibration of a finger so close that the two cannot be separated.
     """
     is_protected: bool = True
-    """Whether others' vibrations are kept from it even where its own is given up.
+    """Whether others' vibrations are kept from it even if its own is given up.
 
-    Without a stimulus and protection its load alone counts, wherever it is.
+    Without a stimulus and without protection only its load counts, wherever it is.
     """
     min_contrast_db: float = -math.inf
-    """Least promised contrast to others' vibrations; below it these or its own are given up."""
+    """Minimum promised contrast to others' vibrations; below it, these or its own are given up."""
     max_foreign_db_sl: float = math.inf
-    """Largest level of others' vibrations here, else they are held back.
+    """Maximum level of others' vibrations here; louder ones are held back.
 
-    By the rig's own thresholds, on nine of ten plates.
+    Relative to the rig's own thresholds, on 90 % of plates.
     """
 
     def __post_init__(self) -> None:
         """Check everything that does not depend on the table; raises InputError."""
-        # The types are tested first: most fingers pass, and calls would take longer.
+        # Types are tested first: most fingers pass, and calls would take longer.
         if type(self.at) is not tuple or [*map(type, self.at)] != [float, float]:
             _check_pair(
                 self.at, what="place of a finger", such_as="(0.08, 0.06), x and y in metres"
@@ -192,14 +192,14 @@ class Finger:
             )
         if not isinstance(self.is_protected, bool):
             raise InputError(f"is_protected must be True or False, got {shown(self.is_protected)}")
-        if str(self.sharing) not in SHARING:  # an array has no truth
+        if str(self.sharing) not in SHARING:  # an array has no truth value
             raise InputError(
                 f"sharing must be one of {', '.join(SHARING)}, got {shown(self.sharing)}"
             )
 
     @property
     def is_load(self) -> bool:
-        """Whether its load alone counts: a hand that rests, or what asks for nothing at all."""
+        """Whether only its load counts: a resting hand, or a finger without any request."""
         asks_nothing = self.stimulus is None and not self.is_protected
         return asks_nothing or self.load > MAX_FINGER_LOAD
 
@@ -209,9 +209,9 @@ class Finger:
         return None if self.stimulus is None else self.stimulus.name
 
     def may_feel_one_with(self, other: "Finger", *, are_apart: bool = True) -> bool:
-        """Whether both fingers may feel one vibration.
+        """Return whether both fingers can feel one vibration.
 
-        are_apart: whether each could be given a vibration of its own.
+        are_apart: whether each could have its own vibration.
         """
         one, two = self.stimulus, other.stimulus
         if one is None or two is None or NEVER in (self.sharing, other.sharing):
@@ -230,7 +230,7 @@ class Finger:
 
 @dataclass(frozen=True)
 class Placement:
-    """Places [m] of the fingers that are to feel a vibration, and of all others."""
+    """Positions [m] of the fingers that should feel a vibration, and of all others."""
 
     targets: tuple[Point, ...]
     quiet: tuple[Point, ...] = ()
@@ -244,7 +244,7 @@ class Placement:
 
 
 def together(placed: Placement, stimulus: Stimulus) -> list[Finger]:
-    """Make fingers of a placement: targets that must feel one stimulus together, and quiet ones."""
+    """Build the fingers of a placement: targets that must share one stimulus, and quiet ones."""
     loads = placed.loads or (1.0,) * len(placed.contacts)
     if len(loads) != len(placed.contacts):
         raise InputError(
@@ -258,7 +258,7 @@ def together(placed: Placement, stimulus: Stimulus) -> list[Finger]:
 
 
 def check_on_plate(what: str, places: Iterable[Point], plate: Plate) -> None:
-    """Raise InputError for places [m] off the plate; what: their name in the message."""
+    """Raise InputError for positions [m] off the plate; what: their name in the message."""
     length, width = plate.length, plate.width
     for x, y in places:
         if not (0 <= x <= length and 0 <= y <= width):  # False for NaN
@@ -296,7 +296,7 @@ def check_fingers(fingers: Sequence[Finger], plate: Plate) -> None:
 
 
 def check_level(level_db_sl: float) -> None:
-    """Raise InputError for a level [dB SL] that no stimulus may have."""
+    """Raise InputError for a level [dB SL] outside the allowed range."""
     if not MIN_LEVEL_DB_SL <= level_db_sl <= MAX_LEVEL_DB_SL:
         raise InputError(
             f"level must be between {MIN_LEVEL_DB_SL:g} and {MAX_LEVEL_DB_SL:g} dB SL, got "
@@ -313,31 +313,32 @@ def _check_pair(given: object, *, what: str, such_as: str) -> None:
 
 
 _MAX_POINTS = 20_000
-"""Most times of a course."""
+"""Maximum number of times in an envelope."""
 
 COURSE_KNOT_STEP = 0.010
-"""Time [s] between the knots along which amplifiers play a course, if the wires carry so many."""
+"""Interval of the knots with which amplifiers play an envelope [s], if the wires are fast
+enough."""
 
 STRONGEST = 0.040
-"""Time [s] of the strongest moments of a course, by which it is felt."""
+"""Total time of the strongest moments by which an envelope is felt [s]."""
 
-_STEP, _SHORT = 0.005, 1.0  # s; between samples of a course; courses up to _SHORT have half of it
+_STEP, _SHORT = 0.005, 1.0  # s; sampling interval of envelopes, halved for durations up to _SHORT
 
 SILENCE = 1e-6
-"""Share in place of 0, for which levels are finite."""
+"""Replaces 0, so that levels are finite."""
 
 
 @dataclass(frozen=True)
 class Course:
-    """Shares of the highest amplitude of a stimulus over its duration."""
+    """Envelope of a stimulus: fraction of its highest amplitude over the duration."""
 
     times: Sequence[float]
     """Times [s], ascending from 0 to the duration."""
     shares: Sequence[float]
-    """Share at each time, 0 to 1; linear in between."""
+    """Fraction at each time, 0 to 1; linear in between."""
 
     def __post_init__(self) -> None:
-        """Check times and shares; raises InputError."""
+        """Check times and fractions; raises InputError."""
         if not 2 <= len(self.times) == len(self.shares) <= _MAX_POINTS:
             raise InputError(
                 f"a course must have 2 to {_MAX_POINTS} times and as many shares, got "
@@ -359,21 +360,21 @@ class Course:
 
     @property
     def step(self) -> float:
-        """Time [s] between its samples."""
+        """Sampling interval [s]."""
         return _STEP if self.duration > _SHORT else _STEP / 2
 
     @cached_property
     def strongest_db(self) -> float:
-        """Root mean square of its strongest moments [dB], relative to a share of 1."""
+        """RMS of its strongest moments [dB], relative to a constant 1."""
         times = np.asarray(self.step * np.arange(self.duration / self.step + 1), dtype=float)
         samples, count = np.maximum(self.at(times), SILENCE), round(STRONGEST / self.step)
         return float(10 * np.log10(np.convolve(samples**2, np.full(count, 1 / count)).max()))
 
     @cached_property
     def swings(self) -> tuple[Swing, ...]:
-        """The course as amplifiers may play it from knot to knot: once, then over and over.
+        """Possible playbacks of the envelope from knot to knot: once, then repeated.
 
-        One for each distance of the knots: wires that carry fewer have them further apart.
+        One per knot interval: slower wires use longer intervals.
         """
         found = []
         for step in (COURSE_KNOT_STEP, 2 * COURSE_KNOT_STEP, 4 * COURSE_KNOT_STEP):
@@ -385,12 +386,12 @@ class Course:
         return tuple(found)
 
     def at(self, times: FloatArray) -> FloatArray:
-        """Shares at times [s] (n,), 0 outside."""
+        """Return fractions at times [s] (n,), 0 outside."""
         return np.asarray(np.interp(times, *self._line, left=0.0, right=0.0))
 
     @cached_property
     def _line(self) -> tuple[FloatArray, FloatArray]:
-        """Times and shares as arrays, made once: they are read for every piece that is played."""
+        """Times and fractions as arrays, cached: they are read for every piece played."""
         return np.array(self.times), np.array(self.shares)
 
 
@@ -398,40 +399,40 @@ ONSET_RAMP = 0.040
 """Duration of a plain ramp [s].
 
 Twice what just avoids a click: the slower start gains 4 dB of contrast over the first 100 ms, and
-at 20 dB SL the target still feels it after a fifth of it (docs/concepts/transients.md).
+at 20 dB SL the target still feels it after a fifth of the ramp (docs/concepts/transients.md).
 """
 
 FADE_RAMP = 0.020
-"""Duration of the fade [s] under fingers that stay on the plate; a shorter one feels like a tap."""
+"""Duration of the fade under fingers that stay on the plate [s]; a shorter one feels like a tap."""
 
 _RINGING = 0.100
-"""Time [s] after a short effect over which the ringing at other fingers counts.
+"""Time after a short effect over which the ringing at other fingers counts [s].
 
-Weights keep it down for that time and no longer: with 20 ms it was up to 7 dB stronger afterwards
-on four ERAs, and 18 dB on a large table.
+Weights suppress ringing only for this time: with 20 ms it was up to 7 dB stronger afterwards on
+four ERAs, and 18 dB on a large table.
 """
 
 SHAPED_FROM = 0.2
-"""Shortest duration [s] of a stimulus with a shaped onset, which settles in half of it."""
+"""Shortest duration of a stimulus with a shaped onset [s], which settles in half of that."""
 
 _PULSE_STEP, _MAX_PULSE_STEPS = 0.001, 48
-"""Steps [s] of pulses, and how many one has at most within its duration."""
+"""Step [s] of pulses, and maximum number of steps within the duration."""
 
-_RESOLUTION = 1.0  # Hz, at least; of the spectrum of an envelope
+_RESOLUTION = 1.0  # Hz, minimum resolution of an envelope's spectrum
 
 
 def pulse_ramp(duration: float) -> float:
-    """Return the plain ramp [s] of a vibration of some duration [s]: a quarter of it.
+    """Return the plain ramp [s] of a vibration: a quarter of its duration [s].
 
-    The vibration is then even over its duration: no 40 ms of a click of 40 ms are more than 0.8 dB
-    (median) stronger than the first 40 ms; with a ramp of half the duration 1.5 dB, of all of it
-    3 dB.
+    The vibration is then nearly constant: no 40 ms of a 40 ms click (ringing included) are more
+    than 0.8 dB (median) stronger than the first 40 ms. With a ramp of half the duration it is 1.5
+    dB, with the full duration 3 dB.
     """
     return min(ONSET_RAMP, duration / 4)
 
 
 def shaped_gain(duration: float) -> float:
-    """Return the mean amplitude over a duration [s] with a shaped onset, 1 for steady.
+    """Return the mean amplitude over a duration [s] with a shaped onset, 1 if steady.
 
     The target follows a raised cosine, whose square has a mean of 3/8.
     """
@@ -440,10 +441,10 @@ def shaped_gain(duration: float) -> float:
 
 @lru_cache
 def swings_of_pulse(duration: float, ramp: float) -> tuple[Swing, Swing]:
-    """Return the swings of pulses of a duration [s] one after the other, along plain ramps [s].
+    """Return the envelopes of consecutive pulses of a duration [s], with plain ramps [s].
 
-    The first swing ends along the pulse's ramp, the second along FADE_RAMP. A pulse longer than
-    SHAPED_FROM counts by that much: by then its onset has decayed as far as its end will.
+    The first ends along the pulse's ramp, the second along FADE_RAMP. A pulse longer than
+    SHAPED_FROM counts as that long: by then its onset has decayed as far as its end will.
     """
     length = min(duration, SHAPED_FROM)
     count = math.ceil((length + DECAYED) / _PULSE_STEP)
@@ -459,12 +460,13 @@ def swings_of_pulse(duration: float, ramp: float) -> tuple[Swing, Swing]:
 
 @dataclass(frozen=True, eq=False)
 class OverDuration:
-    """What k fingers feel of a drive over its duration, on the nominal plate."""
+    """Sensation of k fingers over the duration of a drive, on the nominal plate."""
 
     gains: FloatArray
     """Mean amplitude (k,) relative to the steady one."""
     heard: FloatArray
-    """Squared amplitude to threshold (k, p) at each point, mean over the strongest such time."""
+    """Squared amplitude at each point relative to the threshold (k, p), mean over the strongest
+    time."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -476,16 +478,16 @@ class DriveEnvelope:
     step: float
     """Time [s] between values."""
     within: int
-    """Number of steps over which it is felt: the strongest ones of a course, else the first."""
+    """Number of steps over which it is felt: the strongest ones of an envelope, else the first."""
     share: float = 1.0
-    """Share of these steps in the duration, the rest of which is steady."""
+    """Fraction of the duration covered by these steps; the rest is steady."""
     is_course: bool = False
 
     @classmethod
     def of_pulse(cls, duration: float, ramp: float) -> "DriveEnvelope":
-        """Make the envelope of a pulse of a duration along plain ramps [s].
+        """Build the envelope of a pulse of a duration [s] with plain ramps [s].
 
-        It includes the ringing after the end, where a quiet finger may feel most.
+        It includes the ringing after the end, where a quiet finger can feel most.
         """
         length = min(duration, SHAPED_FROM)  # the rest is steady
         count = min(_MAX_PULSE_STEPS, max(1, math.ceil(length / _PULSE_STEP)))
@@ -497,7 +499,7 @@ class DriveEnvelope:
 
     @classmethod
     def of_course(cls, course: Course) -> "DriveEnvelope":
-        """Make the envelope along a course, with a plain ramp where it starts or ends above 0."""
+        """Build the envelope of a course, with a plain ramp if it starts or ends above 0."""
         count = math.ceil((course.duration + _RINGING) / course.step)
         times = np.asarray(course.step * np.arange(count), dtype=float)
         after, (first, *_, last) = np.asarray(times - course.duration), course.shares
@@ -507,16 +509,17 @@ class DriveEnvelope:
         return cls(np.maximum(values, SILENCE), course.step, within, is_course=True)
 
     def moments(self, squares: FloatArray) -> FloatArray:
-        """Means of squares (n, ...) over the time that is felt, from each step on, (n', ...)."""
+        """Means of squares (n, ...) over the felt time, starting at each step, (n', ...)."""
         sums = np.cumsum(squares, axis=0, dtype=float)
         sums[self.within :] -= sums[: -self.within].copy()
         return np.asarray(sums[self.within - 1 :] / self.within)
 
     def felt(self, squares: FloatArray, weights: FloatArray) -> OverDuration:
-        """Return what k fingers feel, from squared amplitudes to threshold (n + 1, k, p).
+        """Return the sensation of k fingers from squared amplitudes relative to the threshold (n +
+        1, k, p).
 
-        The last of the squares is that of the steady vibration; weights (k, p): of the points in
-        the mean over a fingertip.
+        The last square is that of the steady vibration; weights (k, p): of the points in the mean
+        over a fingertip.
         """
         power = self.share * self.moments(squares[:-1]) + (1 - self.share) * squares[-1]
         own = power if self.is_course else power[:1]
@@ -525,11 +528,13 @@ class DriveEnvelope:
         return OverDuration(felt / np.maximum(steady, 1e-30), power.max(axis=0))
 
     def shares_at(self, off: FloatArray) -> FloatArray:
-        """Shares (b,) of the steady power, of tones at distances off (b,) [Hz] from the drive's.
+        """Return the fraction (b,) of the steady power in tones at distances (b,) [Hz] from the
+        drive's.
 
-        Together the tones have the energy of the drive on any plate (Parseval); for a course, the
-        energy of the strongest moments of each. What lies between two tones is split in proportion
-        to nearness; beside the drive's own frequency, which may be in a null, by its square.
+        Together the tones have the energy of the drive on any plate (Parseval); for an envelope,
+        the energy of its strongest moments. Energy between two tones is split in proportion to
+        nearness, but near the drive's own frequency, which can be in a null, by the square of
+        nearness.
         """
         count = max(len(self.values), math.ceil(1 / _RESOLUTION / self.step))
         count = fft.next_fast_len(count)

@@ -1,9 +1,9 @@
-"""The search for the tones of contents: a kernel in C, and the same in numpy.
+"""Search for the tones of contents: a C kernel, and an equivalent in numpy.
 
-`choose_tones` packs a question for the kernel. What the kernel does not cover (durations, courses,
-avoided frequencies, the drive mode `switched`) and machines without a compiler take
-`choose_by_numpy`, which must find what the kernel finds: candidates of each content by
-`model.drive_modes`, judged on drawn plates, of which the best combination is promised.
+`choose_tones` packs a query for the kernel. `choose_by_numpy` handles cases that the kernel does
+not support (durations, envelopes, avoided frequencies, the drive mode `switched`) and machines
+without a compiler. It must give the same result: candidates for each content by
+`model.drive_modes`, evaluated on drawn plates, of which the best combination is promised.
 """
 
 from array import array
@@ -77,18 +77,18 @@ from model.finger import decibels
 from model.table.table import SAME_FREQUENCY, LocalizationTable, given_raster
 
 MAX_BY_POINT = 8
-"""Frequencies at which weights over a duration are also searched by the points of fingertips."""
+"""Frequencies at which weights over a duration are also searched with the points of fingertips."""
 
 IN_TIME = 3
-"""Number of candidates of a pulse that are solved in time: the best by their energy."""
+"""Number of pulse candidates solved in time, the best by energy."""
 
-_TINY, _TOO_LOUD = 1e-20, 1e12  # powers; of candidates that are out
+_TINY, _TOO_LOUD = 1e-20, 1e12  # powers; for rejected candidates
 
-_BATCH = 64  # candidates that are judged at once
+_BATCH = 64  # candidates evaluated together
 
 
 def choose_tones(table: LocalizationTable, contents: Contents) -> Tones:
-    """Choose tones for each content and compute what they promise."""
+    """Choose tones for each content and compute their promises."""
     streams, places, quiet, by = contents.streams, contents.places, contents.quiet, kernels()
     starts, targets, bands, priorities, levels = [0], list[int](), list[int](), [], array("f")
     is_here = contents.drive_mode == UNRESTRICTED and not contents.avoided
@@ -110,7 +110,7 @@ def choose_tones(table: LocalizationTable, contents: Contents) -> Tones:
     )
     if contents.loads.count(1.0) < len(contents.loads):
         stiffness = [*_stiffness(table, k, contents.loads)]
-    # Arrays of numpy would take as long to make and to read, each, as all of these together.
+    # One array: building and reading several numpy arrays would take as long each.
     numbers = array("i", [*starts, *targets, *quiet, *priorities, *bands])
     at = array("d", [coordinate for place in places for coordinate in place])
     background = contents.background
@@ -160,19 +160,19 @@ def choose_tones(table: LocalizationTable, contents: Contents) -> Tones:
 
 
 _Loads: TypeAlias = tuple[Complex64Array, Complex64Array, Float32Array]
-"""Stiffness of fingers, also for harmonics, and how uncertain their loads are."""
+"""Stiffness of fingers, also at harmonics, and the uncertainty of their loads."""
 
 _Fingers: TypeAlias = tuple[PlateDraws, PlateDraws, *_Loads]
-"""Draws that judge and that promise; loads of fingers of load 1."""
+"""Draws for evaluation and for promises; loads of fingers of load 1."""
 
 _Kept: TypeAlias = tuple[TouchedPlates, GivenRaster, Rules, dict[int, _Fingers]]
-"""Structures of a table: plate, raster, rules, and those for each number of fingers."""
+"""Cached structures of a table: plate, raster, rules, and per number of fingers."""
 
 _kept: WeakKeyDictionary[LocalizationTable, _Kept] = WeakKeyDictionary()
 
 
 def _kept_of(table: LocalizationTable) -> _Kept:
-    """Pack a table's plate and raster, and the rules by which tones are chosen, for kernels."""
+    """Pack a table's plate and raster, and the selection rules, for kernels."""
     uncertainty, groups = table.uncertainty, table.clocks.groups
     variance = uncertainty.gain_variance
     rules = Rules(
@@ -217,7 +217,7 @@ def _kept_of(table: LocalizationTable) -> _Kept:
 
 
 def _with_fingers(table: LocalizationTable, fingers: int) -> _Fingers:
-    """Draw the plates of a table with a number of fingers, as kernels read them."""
+    """Draw the plates of a table with a number of fingers, in the kernels' format."""
     judging, promise = (
         draws_structure(table.on_eras, table.clocks, fingers, by)
         for by in (JUDGING_DRAWS, PROMISED_DRAWS)
@@ -226,7 +226,8 @@ def _with_fingers(table: LocalizationTable, fingers: int) -> _Fingers:
 
 
 def _stiffness(table: LocalizationTable, fingers: int, loads: tuple[float, ...] = ()) -> _Loads:
-    """Return fingers' stiffness at a table's frequencies, at twice these, and deviations."""
+    """Return fingers' stiffness at a table's frequencies and at twice these, and standard
+    deviations."""
     stiffness = table.attached.finger_stiffness(fingers, loads)
     stds = table.attached.load_stds(fingers, loads)
     if not table.uncertainty.harmonic:
@@ -253,22 +254,22 @@ class Candidates:
     streams: IntArray
     """Content of each (m,)."""
     bands: IntArray
-    """Band of each (m,), by number within its content."""
+    """Band of each candidate (m,), by number within its content."""
     scores: FloatArray
     drives: Sequence[WeightedTones]
 
     @property
     def rows(self) -> IntArray:
-        """Row of the first tone of each (m,)."""
+        """Row of the first tone of each candidate (m,)."""
         return np.array([drive[0][0] for drive in self.drives], dtype=int)
 
 
 def choose_by_numpy(
     table: LocalizationTable, contents: Contents, *, by_kernel: bool = False
 ) -> Tones:
-    """Choose tones for each content and compute what they promise, in numpy.
+    """Choose tones for each content and compute their promises, in numpy.
 
-    by_kernel: whether the plate under its fingers is solved in C.
+    by_kernel: whether to solve the plate with fingers in C.
     """
     fingers = FingersOnPlate.of(table, contents.places, contents.loads, by_kernel=by_kernel)
     ringing, rows = RingingUnderFingers.of_streams(table, contents), contents.rows
@@ -293,9 +294,9 @@ def choose_by_numpy(
 
 
 def ranked(fingers: FingersOnPlate, contents: Contents) -> IntArray:
-    """Return the rows most worth a search for one target, ascending.
+    """Return the most promising rows for a single target, ascending.
 
-    By one form of all other fingers together.
+    Based on one form of all other fingers together.
     """
     table, tips, touched = fingers.table, fingers.tips, fingers.touched
     rows, target, others = contents.rows, contents.streams[0].targets[0], contents.others(0)
@@ -313,7 +314,7 @@ def ranked(fingers: FingersOnPlate, contents: Contents) -> IntArray:
     searched = search_all(Forms(mean, power, found.power, threshold, level, 0.0))
     order = best_first(searched.bound)
     reaches = searched.score[order] > 0
-    # Rows that would be better than the best, were they loud enough.
+    # Rows that would beat the best one if they were loud enough.
     first = int(reaches.argmax()) if reaches.any() else len(order)
     missing = order[:first][:MISSING]
     reaching = order[reaches][: KEPT - len(missing)]
@@ -328,7 +329,7 @@ def _candidates(
 ) -> tuple[Candidates, bool]:
     """Find the best tones of each content in each band, and whether a level was hard to reach.
 
-    With all ERAs together, or with each group whose clocks are held together.
+    With all ERAs together, or with each group of ERAs on a common clock.
     """
     count, hertz = len(contents.streams), fingers.table.frequencies
     every = np.arange(len(hertz)) if any(ringing) else rows
@@ -338,7 +339,7 @@ def _candidates(
     is_limited = False
     for number, stream in enumerate(contents.streams):
         others = contents.others(number)
-        over = ringing[number] if others else None  # alone, its ringing disturbs no finger
+        over = ringing[number] if others else None  # a single finger's ringing disturbs no other
         level = stream.level_db_sl + float(decibels(count))
         rest = None if contents.background is None or others else contents.background[every]
         lasting = formed.of(stream.targets, others, level, rest)
@@ -373,7 +374,7 @@ def _switched_candidates(
 ) -> Candidates:
     """Find the best patterns of the drive mode `switched` for a single content.
 
-    Each with ERAs of one group; near the highest level if none reaches the wanted one.
+    Uses ERAs of one group at a time; near the highest level if none reaches the requested one.
     """
     (stream,), quiet, rows = contents.streams, contents.quiet, contents.rows
     rows = rows if over is None or not quiet else over.lasting_long_enough(rows)
@@ -412,13 +413,13 @@ def _at(some: IntArray, lasting: Forms, over: RingingUnderFingers | None) -> For
 
 
 def _groups(table: LocalizationTable) -> list[NDArray[np.bool_]]:
-    """Return masks (n,) of the ERAs that may play one content together, one per group."""
+    """Return masks (n,) of the ERAs that can play one content together, one per group."""
     groups = np.array(table.clocks.groups or [0] * len(table.eras))
     return [groups == each for each in np.unique(groups)]
 
 
 def _apart(score: Float32Array, frequencies: FloatArray, count: int, apart_hz: float) -> list[int]:
-    """Return indices of the two best scores, and of the next best whose frequencies are apart."""
+    """Return indices of the two best scores, and of the next best at separate frequencies."""
     found: list[int] = []
     for at in best_first(score).tolist():
         if score[at] <= 0 or len(found) == count:
@@ -435,11 +436,11 @@ def _judged(
     found: Candidates,
     ringing: Sequence[RingingUnderFingers | None],
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Judge m candidates on d drawn plates: level (m,) on nine of ten, as an amplitude.
+    """Evaluate m candidates on d drawn plates: level (m,) that 90 % reach, as an amplitude.
 
     Over a duration, the level is nominal. Also returns the amplitude (m, d) at the targets and the
-    squared one (m, k, d) at the loudest points, scaled to the contents' levels if there are several
-    contents.
+    squared amplitude (m, k, d) at the loudest points, scaled to the contents' levels if there are
+    several contents.
     """
     drives = [
         drive if (over := ringing[stream]) is None else over.spectrum(drive)
@@ -476,7 +477,7 @@ def _judged(
 
 
 def tones_of(drives: Sequence[WeightedTones]) -> tuple[IntArray, Complex64Array, IntArray]:
-    """Return rows (m,) and weights (m, n) of the tones of drives, and each one's drive (m,)."""
+    """Return rows (m,) and weights (m, n) of the tones of drives, and the drive of each (m,)."""
     tones = [(row, weights, number) for number, each in enumerate(drives) for row, weights in each]
     rows, weights, owners = (np.array(each) for each in zip(*tones, strict=True))
     return rows, weights, owners
@@ -487,9 +488,9 @@ def best_tone(
 ) -> int:
     """Choose the candidate of a single content: level first, then contrast.
 
-    Without other fingers the score counts, and equally a level that varies little among plates.
-    wanted: amplitude to threshold; scores (m,); own (m, d), quiet (m, q, d), least (m,) as of
-    `_judged`.
+    Without other fingers, the score counts, and equally a level that varies little among plates.
+    wanted: amplitude relative to the threshold; scores (m,); own (m, d), quiet (m, q, d), least
+    (m,): from `_judged`.
     """
     reaches = least >= wanted * REACHED
     if not reaches.any():
@@ -507,10 +508,10 @@ def best_combination(
     own: FloatArray,
     loudest: FloatArray,
 ) -> tuple[IntArray, bool]:
-    """Choose a candidate of each content (K,); also return whether their frequencies are apart.
+    """Choose a candidate for each content (K,); also return whether their frequencies are apart.
 
-    Contents exchange bands if they have several. Combinations whose frequencies are apart come
-    first, all others only if there are none.
+    Contents swap bands if they have several. Combinations with separate frequencies come first;
+    others are used only without any.
     """
     streams, hertz = contents.streams, table.frequencies[found.rows]
     sensitivities = table.sensitivities[:, found.rows]
@@ -543,10 +544,10 @@ def worst_ratios(
     loudest: FloatArray,
     sensitivities: Float32Array,
 ) -> FloatArray:
-    """Power ratio at the worst finger on nine of ten plates, of combinations (c, j): (c,).
+    """Return the power ratio at the worst finger on 90 % of plates for combinations (c, j): (c,).
 
-    The least over the sets of thresholds, by sensitivities (s, m). Only the first j contents play;
-    own (m, d), loudest (m, k, d) as of `_judged`.
+    The lowest over the threshold sets, with sensitivities (s, m). Only the first j contents play;
+    own (m, d), loudest (m, k, d): from `_judged`.
     """
     least = np.full(len(combinations), np.inf)
     for factors in sensitivities.astype(float):

@@ -426,7 +426,7 @@ REFUSED: dict[str, list[Callable[[], object]]] = {
         lambda: asked(duration=math.inf),
     ],
     "duration must be a number": [lambda: asked(duration=10**400)],
-    "duration must be left out of a stimulus with a course": [
+    "duration must be left out for a stimulus with a course": [
         lambda: Stimulus(20.0, duration=0.2, course=along(0.5, np.array([0.0, 1.0, 0.0])))
     ],
     "course must be one such as": [lambda: Stimulus(20.0, course=(0.0, 1.0))],

@@ -1,1 +1,1 @@
-"""A rig, from the file that describes it to the values that the model computes with."""
+"""Rigs: from the rig file to the values used by the model."""

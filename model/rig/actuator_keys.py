@@ -1,12 +1,12 @@
-"""Actuators in a rig file: values of their keys, and a section for each kind.
+"""Actuators in a rig file: values of their keys, and one section per kind.
 
-A section makes the actuator that it states, and states one again. ERAs are the default kind.
+A section builds the actuator it describes, and writes one back. ERAs are the default kind.
 
-A data sheet's resonance of an exciter is mostly that of the light coil against the magnet, `free`;
-glued to a plate the magnet moves, `mounted`. Stiffness and damping follow from either and the mass
-that moves: k = m (2 pi f)², c = 2 pi f m / Q. The voltage at level 1 is the lower one of the
-amplifier's clip and of the voltage that heats the coil by its rated power, (R_e + R_g) sqrt(2 P /
-R_e).
+An exciter's data sheet usually states the resonance of the light coil against the fixed magnet,
+`free`. When glued to a plate the magnet moves, `mounted`. Stiffness and damping follow from either
+resonance and the moving mass: k = m (2 pi f)², c = 2 pi f m / Q. The voltage at level 1 is the
+lower of the amplifier's clip and the voltage that heats the coil with its rated power, (R_e + R_g)
+sqrt(2 P / R_e).
 """
 
 import math
@@ -48,7 +48,7 @@ def _identifier(text: str) -> str:
 
 
 def check_url(text: str) -> str:
-    """The URL of an amplifier; raises ValueError for other text."""
+    """Return the URL of an amplifier; raises ValueError for other text."""
     if not re.fullmatch(r"[a-z][a-z0-9+.-]*://[!-~]{0,250}", text):
         raise ValueError(
             "must be a URL, for example sim:// or serial:///dev/ttyUSB0?baud=921600, got "
@@ -58,7 +58,8 @@ def check_url(text: str) -> str:
 
 
 def check_ascending(bounds: tuple[float, float]) -> tuple[float, float]:
-    """The lower and the higher frequency [Hz]; raises ValueError for others."""
+    """Return the lower and the higher frequency [Hz]; raises ValueError if they are not
+    ascending."""
     low, high = bounds
     if low >= high:
         raise ValueError(f"must be the lower and the higher frequency, got {low:g} and {high:g} Hz")
@@ -68,7 +69,7 @@ def check_ascending(bounds: tuple[float, float]) -> tuple[float, float]:
 def _rows(
     columns: str, lowest: Sequence[float], highest: Sequence[float], *, ascending: bool = True
 ) -> AfterValidator:
-    """Check of rows of numbers between bounds, by default sorted by the first of them."""
+    """Check rows of numbers for bounds, and by default for ascending first numbers."""
 
     def checked(rows: list[tuple[float, ...]]) -> list[tuple[float, ...]]:
         for row in rows:
@@ -85,7 +86,7 @@ def _rows(
 
 
 def _one_of(known: Collection[str], what: str, remedy: str = "") -> AfterValidator:
-    """Check of text that is one of the known names of something."""
+    """Check that text is one of the known names."""
 
     def checked(name: str) -> str:
         if name not in known:
@@ -125,27 +126,27 @@ Frequency = Annotated[float, Quantity(FREQUENCY, at_least=1, at_most=2000)]
 
 
 def place_on(plate: Plate, place: tuple[float, float]) -> tuple[float, float]:
-    """A place clipped to the plate, off whose edge rounding may have put it."""
+    """Clip a position to the plate; rounding can have moved it across the edge."""
     x, y = place
     return min(max(x, 0.0), plate.length), min(max(y, 0.0), plate.width)
 
 
 def _gains_of(rows: Sequence[GainRow] | None) -> tuple[Gain, ...]:
-    """Gains of rows with phases in degrees."""
+    """Return gains from rows with phases in degrees."""
     return tuple((f, size, math.radians(phase)) for f, size, phase in rows or ())
 
 
 class ActuatorSection(Section):
-    """What actuators of every kind have; each kind extends it by its own."""
+    """Keys that all kinds of actuators share; each kind adds its own."""
 
     keys: ClassVar[Mapping[str, str]]
-    """By field of the actuator that a fit changes."""
+    """Rig-file key by field of the actuator, for fields that a fit changes."""
 
     instead: ClassVar[Mapping[str, tuple[str, ...]]]
-    """Keys that some of them replace: these are always written, whatever else of a rig changes."""
+    """Alternatives that each key replaces; these keys are always written, whatever else changes."""
 
     is_electrical: ClassVar[bool] = False
-    """Whether its full level is a voltage, so that an amplifier which drives it is an output."""
+    """Whether its full level is a voltage, so that its amplifier has an electrical output."""
 
     model_config = ConfigDict(
         json_schema_extra={
@@ -154,20 +155,20 @@ class ActuatorSection(Section):
     )
 
     at: Place
-    """`[x, y]` where it acts on the plate; on the plate, at most one per position."""
+    """`[x, y]`: position on the plate; at most one actuator per position."""
 
     amplifier: Identifier | None = None
-    """The amplifier that drives it; none for an ERA that only supports the plate.
+    """Amplifier that drives it; none for an ERA that only supports the plate.
 
     Limits: a name under `amplifiers`
     """
 
     channel: Annotated[int, Field(ge=0, le=255)] | None = None
-    """Its channel; unique per ERA, none without an amplifier."""
+    """Channel of the amplifier; unique per ERA, none without an amplifier."""
 
     foot: Foot = 0.0
-    """Radius of the disc on which it presses, 0 for a point as in the paper; only the part on the
-    plate counts. Required from a stiffness of 1 MN/m: [points and
+    """Radius of its contact disc, 0 for a point as in the paper; only the part on the plate counts.
+    Required from a stiffness of 1 MN/m: [points and
     feet](../concepts/plate-model.md#points-and-feet).
     """
 
@@ -181,11 +182,11 @@ class ActuatorSection(Section):
 
     @abstractmethod
     def made(self, name: str, plate: Plate, count: int) -> Actuator:
-        """The actuator of a name on a plate; count: of the rig's actuators."""
+        """Build an actuator with this name on a plate; count: number of the rig's actuators."""
 
     @classmethod
     def stated(cls, actuator: Actuator) -> dict[str, Any]:
-        """Values of the keys that state what a fit changes of an actuator, as `made` reads them."""
+        """Return the values of keys for the fields that a fit changes; inverse of `made`."""
         found: dict[str, Any] = {"at": [actuator.x, actuator.y]}
         found |= {key: getattr(actuator, name) for name, key in cls.keys.items()}
         return found | {"gains": [[f, size, math.degrees(a)] for f, size, a in actuator.gains]}
@@ -193,27 +194,27 @@ class ActuatorSection(Section):
     @classmethod
     @abstractmethod
     def problems(cls, given: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
-        """What keys require of each other: problems by key.
+        """Yield conflicts between keys: problems by key.
 
-        given: keys of a file with the values of those that are valid by themselves, else None.
+        given: keys of a file; valid ones with their values, others None.
         """
 
 
 STIFF_MOUNT = 1e6
-"""Stiffness [N/m] from which the dent of a point force in the plate counts beside the mount's own.
+"""Stiffness [N/m] above which the local dent under a point force matters.
 
-On the paper's plate a radius of 5 mm in place of a point changes the response by 2 % at 400 Hz and
-16 % near a resonance.
+On the paper's plate, a radius of 5 mm instead of a point changes the response by 2 % at 400 Hz and
+by 16 % near a resonance.
 """
 
 _SAME = {each.name for each in fields(Era)} - {"damping", "gains"}
-"""Fields that have the values of the keys of their names."""
+"""Fields with the same name and value as their key."""
 
 
 class EraSection(ActuatorSection):
     """One ERA; without an amplifier it only supports the plate.
 
-    Defaults of damping and stroke are assumed, the paper prints neither.
+    Defaults of damping and stroke are assumptions; the paper does not state them.
     """
 
     kind: Literal["era"] = "era"
@@ -223,24 +224,24 @@ class EraSection(ActuatorSection):
     """Stiffness of its spring, k_b."""
 
     damping_ratio: Annotated[float, Quantity(RATIO, at_least=0, at_most=2)] = 0.05
-    """Zeta of its damper: c = 2 zeta sqrt(k_b m / n), m the bare plate's mass, n the number of
-    ERAs.
+    """Damping ratio zeta: c = 2 zeta sqrt(k_b m / n), with m the bare plate's mass and n the number
+    of ERAs.
     """
 
     damping: Annotated[float, Quantity(DAMPING, at_least=0, at_most=1e6)] | None = None
-    """C itself, instead of `damping_ratio`."""
+    """Damping c, instead of `damping_ratio`."""
 
     bolt_mass: Annotated[float, Quantity(MASS, at_least=0, at_most=10)] = 0.0
-    """Mass that moves with the plate, m_b."""
+    """Mass m_b that moves with the plate."""
 
     stroke: Annotated[float, Quantity(LENGTH, above=0, at_most=0.01)] = 100e-6
-    """Amplitude of its base at level 1, where its gain is 1."""
+    """Amplitude of its base at level 1 (zero to peak), where its gain is 1."""
 
     keys: ClassVar = {each: each for each in ("stiffness", "damping", "bolt_mass", "gains")}
     instead: ClassVar = {"damping": ("damping_ratio",)}
 
     def made(self, name: str, plate: Plate, count: int) -> Era:
-        """An ERA; its damping from a ratio depends on plate and count."""
+        """Build an ERA; a damping ratio is relative to plate and count."""
         by_ratio = damping_from_ratio(
             self.damping_ratio, stiffness=self.stiffness, plate_mass=plate.mass, era_count=count
         )
@@ -250,7 +251,8 @@ class EraSection(ActuatorSection):
 
     @classmethod
     def problems(cls, given: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
-        """Damping in two ways, half of a wiring, and a stiff mount without a size."""
+        """Yield problems: two kinds of damping, incomplete wiring, and a stiff mount without a
+        radius."""
         if {"damping", "damping_ratio"} <= given.keys():
             yield "damping", "must not be given with damping_ratio; remove one of the two"
         for key, other in (("amplifier", "channel"), ("channel", "amplifier")):
@@ -260,12 +262,12 @@ class EraSection(ActuatorSection):
 
 
 def stiff_mount_problems(given: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
-    """The problem of a stiff mount without a size, by key; none of others. given: as `problems`."""
+    """Yield the problem of a stiff mount without a radius; given: see `problems`."""
     stiffness = given.get("stiffness")
     if stiffness is not None and stiffness >= STIFF_MOUNT and "foot" not in given:
         yield (
             "foot",
-            f"missing; add the radius of the patch on which it holds the plate: at "
+            f"missing; add the radius of its contact with the plate: at "
             f"{stiffness:g} N/m, {STIFF_MOUNT:g} N/m or more, the response depends on it",
         )
 
@@ -274,28 +276,28 @@ _OTHER = "; leave it out and give the values of another"
 
 
 class ExciterSection(ActuatorSection):
-    """One exciter, a voice coil that is glued to the plate and a magnet behind it.
+    """One exciter: a voice coil glued to the plate, with a magnet behind it.
 
-    Values that a type has may be left out; those given replace them.
+    Values of its type can be left out; given values replace them.
     """
 
     kind: Literal["exciter"]
     """`exciter`."""
 
     type: Annotated[str, _one_of(EXCITER_TYPES, "type of exciter", _OTHER)] | None = None
-    """A type that is sold, whose values are taken where no key gives them.
+    """Commercial type; its values are used for keys that are not given.
 
     Limits: a name [below](#exciters)
     """
 
     coil_mass: Annotated[float, Quantity(MASS, at_least=0, at_most=0.1)] | None = None
-    """Mass of the coil and what is glued with it, m_c, which moves with the plate.
+    """Mass m_c of the coil and its adhesive, which moves with the plate.
 
     Default: of the type
     """
 
     weight: Annotated[float, Quantity(MASS, above=0, at_most=10)] | None = None
-    """Mass of the part that moves if the coil is glued, M: the magnet, and mostly the housing.
+    """Mass M that moves if the coil is glued: the magnet, usually with the housing.
 
     Default: of the type
     """
@@ -307,56 +309,56 @@ class ExciterSection(ActuatorSection):
     """
 
     resonance_is: Literal["free", "mounted"] | None = None
-    """Whose resonance this is: that of the coil with the magnet held, as on most data sheets
-    (`free`), or that of the magnet behind a glued coil (`mounted`).
+    """What the resonance refers to: `free` for the coil with the magnet held, as on most data
+    sheets; `mounted` for the magnet behind a glued coil.
 
     Default: required with `resonance`
     """
 
     q: Annotated[float, Quantity(RATIO, above=0, at_most=1000)] | None = None
-    """Mechanical quality there, without the current (Qms).
+    """Mechanical quality factor at this resonance, without current (Qms).
 
     Default: of the type
     """
 
     stiffness: Annotated[float, Quantity(STIFFNESS, above=0, at_most=1e9)] | None = None
-    """Stiffness of the suspension, k, as a fit finds it; it replaces `resonance`."""
+    """Stiffness k of the suspension, as written by a fit; replaces `resonance`."""
 
     damping: Annotated[float, Quantity(DAMPING, at_least=0, at_most=1e6)] | None = None
-    """Damping of the suspension, c, without current; it replaces `q`."""
+    """Damping c of the suspension, without current; replaces `q`."""
 
     force_factor: Annotated[float, Quantity(FORCE_FACTOR, above=0, at_most=1000)] | None = None
-    """Force by current, Bl.
+    """Force per current, Bl.
 
     Default: of the type
     """
 
     resistance: Annotated[float, Quantity(RESISTANCE, above=0, at_most=1e4)] | None = None
-    """Resistance of the coil, R_e.
+    """Coil resistance R_e.
 
     Default: of the type
     """
 
     inductance: Annotated[float, Quantity(INDUCTANCE, at_least=0, at_most=0.1)] | None = None
-    """Inductance of the coil, L.
+    """Coil inductance L.
 
     Default: of the type, or 0
     """
 
     source_resistance: Annotated[float, Quantity(RESISTANCE, at_least=0, at_most=1e4)] = 0.1
-    """Resistance of the amplifier's output and the cable, R_g; the default is an assumption."""
+    """Output resistance R_g of amplifier and cable; the default is an assumption."""
 
     power: Annotated[float, Quantity(POWER, above=0, at_most=1e4)] | None = None
-    """Power in the coil at level 1, averaged over a sine: the rated power, or less.
+    """Power in the coil at level 1, averaged over a sine: the rated power or less.
 
     Default: of the type
     """
 
     clip: Annotated[float, Quantity(VOLTAGE, above=0, at_most=1000)] | None = None
-    """Amplitude of the voltage at which the amplifier clips; level 1 stays below it."""
+    """Voltage amplitude at which the amplifier clips; level 1 stays below it."""
 
     excursion: Annotated[float, Quantity(LENGTH, above=0, at_most=0.1)] | None = None
-    """Largest amplitude of the coil in the magnet, x_max.
+    """Largest amplitude of the coil in the magnet, Xmax.
 
     Default: of the type, or unlimited
     """
@@ -377,17 +379,17 @@ class ExciterSection(ActuatorSection):
 
     @property
     def of_type(self) -> dict[str, float]:
-        """Values of its type by key, none without a type."""
+        """Values of its type by key, empty without a type."""
         return _of_type(self.type)
 
     @property
     def values(self) -> dict[str, Any]:
-        """Values by key, those of the type where the section gives none."""
+        """Values by key, including those of the type."""
         unknown = dict.fromkeys(ExciterSection.model_fields) | {"resonance_is": "free"}
         return unknown | self.of_type | self.model_dump(exclude_none=True)
 
     def made(self, name: str, plate: Plate, count: int) -> Exciter:
-        """An exciter; nothing of it depends on the count."""
+        """Build an exciter; independent of the count."""
         values = self.values
         moving = values["coil_mass"] if values["resonance_is"] == "free" else values["weight"]
         k = self.stiffness or moving * (2 * math.pi * values["resonance"]) ** 2
@@ -414,9 +416,9 @@ class ExciterSection(ActuatorSection):
 
     @classmethod
     def problems(cls, given: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
-        """What is missing or stated in two ways, a resonance of what, and too much power."""
+        """Yield missing keys, conflicting keys, an ambiguous resonance, and excessive power."""
         name, power = given.get("type"), given.get("power")
-        # Of a type that is misspelt, nothing is known to be missing.
+        # A misspelt type does not make its keys missing.
         unknown = "type" in given and name is None
         known = given.keys() | _of_type(name).keys()
         for key in () if unknown else _NEEDED:
@@ -429,20 +431,20 @@ class ExciterSection(ActuatorSection):
             if {key, other} <= given.keys():
                 yield other, f"must not be given with {key}; remove one of the two"
         if "resonance" in given and "resonance_is" not in given:
-            yield "resonance_is", f"missing; add which of both it is: {_EITHER}"
+            yield "resonance_is", f"missing; add which one it is: {_EITHER}"
         if {"stiffness", "resonance_is"} <= given.keys():
             yield "resonance_is", "must not be given with stiffness; remove it"
         rated = _of_type(name).get("power", math.inf)
         if power is not None and power > rated:
-            yield "power", f"must be at most {rated:g} W, which a {name} bears, got {power:g} W"
+            yield "power", f"must be at most {rated:g} W, the rating of a {name}, got {power:g} W"
 
 
 _NEEDED = ("coil_mass", "weight", "force_factor", "resistance", "power", "resonance", "q")
 _INSTEAD = {"resonance": "stiffness", "q": "damping"}
 
 _EITHER = (
-    "free, of the light coil against the magnet, as on most data sheets, or mounted, of the magnet "
-    "behind the coil that is glued to the plate, several times lower"
+    "free for that of the light coil against the magnet, as on most data sheets, or mounted for "
+    "that of the magnet behind the coil that is glued to the plate, several times lower"
 )
 
 
@@ -452,10 +454,10 @@ def _of_type(name: str | None) -> dict[str, float]:
 
 
 ActuatorOfAnyKind: TypeAlias = Annotated[EraSection | ExciterSection, ByKind()]
-"""Sections of which `kind` chooses one, ERAs by default."""
+"""Section selected by `kind`, ERAs by default."""
 
 ACTUATOR_KINDS: Mapping[type[Actuator], type[ActuatorSection]] = {
     Era: EraSection,
     Exciter: ExciterSection,
 }
-"""Section by class of the actuator."""
+"""Section by actuator class."""

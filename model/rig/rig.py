@@ -1,9 +1,8 @@
-"""A rig: a plate, its ERAs, their amplifier channels, and how well all of them are known.
+"""Rig: a plate, its ERAs, their amplifier channels, and the uncertainty of all of them.
 
-Also here: which parts of a rig must be the same for a table to hold (`physics_of`), and named
-layouts of ERAs. The drawings of the paper's layouts (its Figures 8 and 9) are not available, so
-these are our own; their places are fractions of the plate's sides, so that a layout fits every
-plate.
+Also defines which parts of a rig must match a table (`physics_of`), and named layouts of ERAs. The
+drawings of the paper's layouts (its Figures 8 and 9) are not available, so the layouts here are our
+own. Their positions are fractions of the plate's length and width, so that they fit every plate.
 """
 
 import hashlib
@@ -47,7 +46,7 @@ BOUNDS = {
     "mode_frequency": (0.0, 0.1),
     "mode_amplitude": (0.0, 0.3),
 }
-"""What a rig may state of each parameter: exactly known, and the most."""
+"""Allowed values of each parameter: the one that means exactly known, and the maximum."""
 
 _RELATIVE = (
     "gain",
@@ -64,14 +63,14 @@ _RELATIVE = (
 )
 
 MAX_UNCERTAINTY = 1000.0
-"""Largest value of any uncertainty, also in a study of plates beyond BOUNDS."""
+"""Largest value of any uncertainty, also in studies of plates beyond BOUNDS."""
 
 
 @dataclass(frozen=True)
 class Uncertainty:
-    """One standard deviation of each parameter; independent of each other.
+    """One standard deviation per parameter; parameters are independent.
 
-    The defaults are those of a plate as built from its drawing and not measured.
+    The defaults are for a plate built from its drawing and not measured.
     """
 
     gain: float = 0.05
@@ -83,48 +82,50 @@ class Uncertainty:
     stiffness: float = 0.1
     """Stiffness of each ERA, relative."""
     damping: float = 1.5
-    """A factor, of the ERAs' damping and of the plate's loss factor; 1 for none."""
+    """Factor, for the ERAs' damping and for the plate's loss factor; 1 for no uncertainty."""
     fingertip: float = 0.5
     """Logarithm of each finger's load."""
     common_gain: float = 0.0
-    """Gain of all channels together, relative."""
+    """Common gain of all channels, relative."""
     field: float = 0.0
-    """Motion that one ERA causes at a finger, relative to its root mean square over the
-    plate, beside all other uncertainties."""
+    """Motion caused by one ERA at a finger, relative to its RMS over the plate, in addition to all
+    other uncertainties."""
     modulus: float = 0.02
     """Modulus of elasticity of the plate, relative; it counts as 0 if `thickness` is 0."""
     place: float = 0.001
-    """Place of each ERA, along x and along y [m]."""
+    """Position of each ERA, along x and along y [m]."""
     harmonic: float = 0.01
-    """Second harmonic of each ERA's motion, root mean square as a share of its own amplitude, of
-    any phase."""
+    """Second harmonic of each ERA's motion, RMS relative to the ERA's own amplitude, at any
+    phase."""
     supports: float = 0.0
-    """Logarithm of the stiffness of each foot; 0.3 of a rig file with feet by default."""
+    """Logarithm of the stiffness of each foot; a rig file with feet has a default of 0.3."""
     weather: float = 0.0
-    """Modulus of the plate by temperature and moisture, relative, even if the thickness is known.
+    """Modulus of the plate due to temperature and moisture, relative, even if the thickness is
+    known.
 
-    A rig file derives its default from `plate.temperature` and `plate.humidity`.
+    The default in a rig file is derived from `plate.temperature` and `plate.humidity`.
     """
     foreign_mass: float = 0.0
-    """Mass [kg] of an object that may lie anywhere on the plate, 0 where none is expected."""
+    """Mass [kg] of an object anywhere on the plate, 0 if none is expected."""
     mode_frequency: float = 0.0
-    """Natural frequency of each mode by itself, relative, beside what moves all together."""
+    """Natural frequency of each mode individually, relative, in addition to shifts common to
+    all."""
     mode_amplitude: float = 0.0
-    """Size of the shape of each elastic mode by itself, relative."""
+    """Amplitude of each elastic mode shape individually, relative."""
 
     def __post_init__(self) -> None:
-        """Refuse values that are not finite, negative ones, and a factor below 1."""
+        """Reject values that are not finite, negative values, and a factor below 1."""
         for key, (exact, _) in BOUNDS.items():
             expect_between(getattr(self, key), exact, MAX_UNCERTAINTY, what=f"uncertainty: {key}")
 
     @classmethod
     def none(cls) -> "Uncertainty":
-        """A rig whose every parameter is known exactly."""
+        """Return the uncertainty of an exactly known rig."""
         return cls(**{key: exact for key, (exact, _) in BOUNDS.items()})
 
     @classmethod
     def clipped(cls, **estimates: float) -> "Uncertainty":
-        """An uncertainty by estimates, each brought within BOUNDS."""
+        """Return an uncertainty from estimates, each clipped to BOUNDS."""
         return cls(
             **{
                 key: min(max(value, BOUNDS[key][0]), BOUNDS[key][1])
@@ -133,7 +134,7 @@ class Uncertainty:
         )
 
     def __str__(self) -> str:
-        """Its terms that are not none, as 'gain 5 %, phase 5°, damping x 1.5'."""
+        """Format the terms that are uncertain, as 'gain 5 %, phase 5°, damping x 1.5'."""
         percents = [
             f"{key.replace('_', ' ')} {100 * getattr(self, key):.3g} %"
             for key in _RELATIVE
@@ -152,28 +153,31 @@ class Uncertainty:
     def gain_variance(self) -> float:
         """Mean square of a channel's relative error, phase included: (1 + g²) exp(p²) - 1.
 
-        Relative to the mean of all, whose amplitude is smaller by exp(-p² / 2); p in radians.
+        Relative to the mean over all channels, whose amplitude is smaller by exp(-p² / 2); p in
+        radians.
         """
         return (1 + self.gain**2) * math.exp(math.radians(self.phase_deg) ** 2) - 1
 
     @property
     def elasticity(self) -> float:
-        """Relative standard deviation of the modulus; only by weather if the thickness is known."""
+        """Relative standard deviation of the modulus; only due to weather if the thickness is
+        known."""
         return math.hypot(self.modulus if self.thickness > 0 else 0.0, self.weather)
 
     @property
     def frequency(self) -> float:
-        """Relative standard deviation of natural frequencies, by thickness and modulus."""
+        """Relative standard deviation of natural frequencies, due to thickness and modulus."""
         return math.hypot(self.thickness, self.elasticity / 2)
 
     @property
     def changes_modes(self) -> bool:
-        """Whether modes are uncertain, all together or each by itself."""
+        """Whether modes are uncertain, jointly or individually."""
         return max(self.frequency, self.mode_frequency, self.mode_amplitude) > 0
 
     @staticmethod
     def of_frequency(std: float) -> dict[str, float]:
-        """Thickness and modulus, as uncertain as each other, of that of natural frequencies."""
+        """Return equal uncertainties of thickness and modulus that give this one of natural
+        frequencies."""
         each = std / math.hypot(1.0, 0.5)
         return {"thickness": each, "modulus": each}
 
@@ -184,7 +188,7 @@ SAME_POINT = 1e-6
 
 @dataclass(frozen=True)
 class Channel:
-    """The wiring of an ERA: an amplifier by its name in the rig, and the number of its channel."""
+    """Wiring of an ERA: name of an amplifier in the rig, and channel number."""
 
     amplifier: str
     number: int
@@ -192,40 +196,40 @@ class Channel:
 
 @dataclass(frozen=True)
 class Rig:
-    """A plate on its ERAs, with wiring and limits."""
+    """Plate on its ERAs, with wiring and limits."""
 
     plate: Plate
     mesh: PlateMesh
     eras: tuple[Actuator, ...]
-    """Those that are driven."""
+    """Driven actuators."""
     wiring: Mapping[str, Channel]
-    """Channel by the name of the ERA."""
+    """Channel by ERA name."""
     amplifiers: Mapping[str, str]
     """URL by name."""
     limits: GuardLimits
     masses: tuple[PointLoad, ...] = ()
-    """On the plate, and what supports it without being driven: last, ERAs without an amplifier."""
+    """Masses on the plate and passive supports; ERAs without an amplifier come last."""
     laminate: Laminate | None = None
-    """Layers of the plate, even if it is solved as a homogeneous one; None if it has one layer."""
+    """Layers of the plate, even if it is solved as a homogeneous one; None for a single layer."""
     uncertainty: Uncertainty = field(default_factory=Uncertainty)
-    """How well its parameters are known."""
+    """Uncertainty of its parameters."""
     fingertip: Fingertip | None = field(default_factory=Fingertip)
-    """Load of each finger on the plate; None for weightless ones."""
+    """Load of each finger on the plate; None for massless fingers."""
     threshold: str = DEFAULT_THRESHOLD
-    """Name of the set of detection thresholds that levels are above (`model.finger`)."""
+    """Name of the threshold set to which levels are relative (`model.finger`)."""
     promised_thresholds: tuple[str, ...] = THRESHOLDS
-    """Names of the sets by which promises hold, beside that one."""
+    """Names of additional threshold sets for which promises hold."""
     supports: tuple[str, ...] = ()
     """Names of the ERAs without an amplifier."""
     outputs: frozenset[str] = frozenset()
-    """The amplifiers whose full level is an output, to which bases move by their gains."""
+    """Amplifiers with an electrical output: a gain relates it to the motion of bases."""
     clock_errors: Mapping[str, float] = field(default_factory=dict)
-    """What each amplifier is taken to state of its clock [s]; infinite if it cannot be steered."""
+    """Assumed clock error of each amplifier [s]; infinite if its clock cannot be steered."""
     document: Document | None = field(default=None, compare=False, repr=False)
     """Its keys."""
 
     def __post_init__(self) -> None:
-        """Check that ERAs and masses are on the plate, and places and names of ERAs unique."""
+        """Check that ERAs and masses are on the plate, with unique positions and names of ERAs."""
         for what, place in (
             *((f"ERA {era.name}", (era.x, era.y)) for era in self.eras),
             *(("point mass", (mass.x, mass.y)) for mass in self.masses),
@@ -243,12 +247,12 @@ class Rig:
                     )
                 if math.dist((era.x, era.y), (other.x, other.y)) < SAME_POINT:
                     raise InputError(
-                        f"ERAs must be at different places, got {other.name} and {era.name} at "
+                        f"ERAs must be at different positions, got {other.name} and {era.name} at "
                         f"({era.x:g}, {era.y:g}) m; move one of them"
                     )
 
     def era(self, name: str) -> Actuator:
-        """The ERA of a name; raises InputError for an unknown one."""
+        """Return an ERA by name; raises InputError for an unknown name."""
         eras = {era.name: era for era in self.eras}
         if name not in eras:
             raise InputError(
@@ -259,18 +263,18 @@ class Rig:
 
     @property
     def grain(self) -> str:
-        """The side along which its keys say that the grain of a board runs."""
+        """Side along which the grain of a board runs according to its keys."""
         keys: Mapping[str, Any] = self.document.data if self.document else {}
         return str(keys.get("plate", {}).get("grain", "length"))
 
     @cached_property
     def full_levels(self) -> dict[str, float]:
-        """Full level of each ERA, by its name: its stroke [m], or volts of an exciter."""
+        """Full level of each ERA by name: its stroke [m], or volts for an exciter."""
         return {era.name: era.full_level for era in self.eras}
 
     @property
     def exactly_known(self) -> tuple[str, ...]:
-        """Keys of its uncertainty that are taken as none, though a plate that is built has some."""
+        """Keys of the uncertainty that are zero although every real plate has some."""
         built = Uncertainty(supports=FEET_DEVIATE if self.feet else 0.0)
         return tuple(
             key
@@ -280,78 +284,78 @@ class Rig:
 
     @property
     def uncertainty_note(self) -> str | None:
-        """One line on what is taken as none; None where every parameter is uncertain."""
+        """One line about uncertainties assumed to be zero; None if every parameter is uncertain."""
         if not self.exactly_known:
             return None
         return (
-            f"uncertainty taken as none: {', '.join(self.exactly_known)}; what is promised holds "
-            f"for these known exactly, the rest: {self.uncertainty}"
+            f"uncertainty taken as zero: {', '.join(self.exactly_known)}; promises assume that "
+            f"these are exactly known, the rest: {self.uncertainty}"
         )
 
     @property
     def surface_notes(self) -> tuple[str, ...]:
-        """Suspicious properties of its surface's modes, a line each; none of a plate."""
+        """Warnings about modes of its surface, one line each; empty for a plate."""
         return () if self.plate.surface is None else self.plate.surface.notes
 
     @cached_property
     def feet(self) -> tuple[int, ...]:
-        """Numbers of the masses that are feet, in the order of their file."""
+        """Indices of the masses that are feet, in file order."""
         return feet_of(self.masses)
 
     @property
     def foot_names(self) -> tuple[str, ...]:
-        """Names of the feet in its file, without one their numbers from 1."""
+        """Names of the feet in its file; a foot without a name has its number from 1."""
         stated: Any = self.document.data.get("supports", {}) if self.document else {}
         named = [name for name, keys in stated.items() if "at" in keys]
         return tuple(named or [str(number) for number in range(1, 1 + len(self.feet))])
 
     @property
     def largest_stiffness(self) -> float:
-        """That of the stiffest spring of an actuator [N/m], for the accuracy of a mesh."""
+        """Stiffness of the stiffest actuator spring [N/m], for the accuracy of a mesh."""
         return max(era.in_time.stiffness for era in self.eras)
 
     @property
     def channel_counts(self) -> Counter[str]:
-        """Numbers of channels that are wired, by the amplifier's name."""
+        """Number of wired channels by amplifier name."""
         return Counter(channel.amplifier for channel in self.wiring.values())
 
     @property
     def fingerprint(self) -> str:
-        """Fingerprint of all that decides what is felt; see `fingerprint_of`."""
+        """Fingerprint of all properties that affect the sensation; see `fingerprint_of`."""
         return fingerprint_of(self)
 
 
 MAY_DIFFER = {
     "Rig.mesh": "the discretisation error of its own mesh is part of a table",
-    "Rig.wiring": "where levels go, not what they do",
-    "Rig.amplifiers": "where levels go, not what they do",
-    "Rig.limits": "patterns are held to those of the rig in service, whenever they are played",
-    "Rig.outputs": "an amplifier that says otherwise is refused when it is opened",
+    "Rig.wiring": "affects where levels go, not their effect",
+    "Rig.amplifiers": "affects where levels go, not their effect",
+    "Rig.limits": "checked against the rig in service whenever a pattern is played",
+    "Rig.outputs": "an amplifier with another value is rejected when it is opened",
     "Rig.clock_errors": "each amplifier states its own when it is opened",
-    "Rig.supports": "which of the masses have a name, not what they weigh",
-    "Rig.document": "all that it says is in the other fields",
-    "Rig.laminate": "all that is solved of it is in the plate",
+    "Rig.supports": "affects the names of masses, not their weights",
+    "Rig.document": "repeats other fields",
+    "Rig.laminate": "the solved values are in the plate",
     "Material.name": "displayed only",
-    "Surface.file": "its content is known by its digest",
+    "Surface.file": "its content is identified by its digest",
     "Surface.notes": "they follow from its modes",
 }
-"""What a table's rig may have otherwise, by class and field, each with the reason.
+"""Properties in which a table's rig can differ, by class and field, each with the reason.
 
-Everything else, and so every new field, must be the same.
+All other fields, including every new field, must match.
 """
 
 PHYSICS = tuple(each.name for each in fields(Rig) if f"Rig.{each.name}" not in MAY_DIFFER)
-"""Fields of a rig that a table has, too."""
+"""Fields of a rig that are also stored in a table."""
 
 
 def physics_of(of: object) -> dict[str, Any]:
-    """What must be the same of a rig and of a table for the same answers, as plain data.
+    """Return the properties of a rig or a table that must match for equal answers, as plain data.
 
-    of: a rig, or what has its PHYSICS. Fields by name, without those that are as empty as they are
-    by default: what was solved before there was such a field stays valid.
+    of: a rig, or an object with its PHYSICS. Fields by name, without empty defaults, so that tables
+    from before a field existed stay valid.
     """
     found = {name: _plain(getattr(of, name)) for name in PHYSICS}
-    # A laminate is its layers; what it is like depends on the frequency.
+    # A laminate is represented by its layers; its equivalent plate depends on the frequency.
     if "laminate" in found["plate"]:
         del found["plate"]["material"], found["plate"]["thickness"]
     found["masses"].sort(key=canonical_json)
@@ -361,17 +365,20 @@ def physics_of(of: object) -> dict[str, Any]:
 
 
 def fingerprint_of(of: object) -> str:
-    """SHA-256 over all that decides what fingers feel, `physics_of` a rig or a table."""
+    """Return the SHA-256 of `physics_of` a rig or a table: all properties that affect the
+    sensation."""
     return hashlib.sha256(canonical_json(physics_of(of)).encode()).hexdigest()
 
 
 def differences(of: object, rig: Rig) -> list[str]:
-    """Keys whose values, of a table, must be those of a rig and are not, but for rounding."""
+    """Describe the keys in which a table's values must match a rig's but differ by more than
+    rounding."""
     return [*_differing("", physics_of(of), physics_of(rig))]
 
 
 def _plain(value: Any) -> Any:
-    """A value in mappings, lists, floats and text, without what may differ and empty defaults."""
+    """Convert a value to mappings, lists, floats and text, without MAY_DIFFER and empty
+    defaults."""
     match value:
         case bool() | str() | None:
             return value
@@ -387,7 +394,7 @@ def _plain(value: Any) -> Any:
 
 
 def _differing(key: str, own: Any, rigs: Any) -> Iterator[str]:
-    """Differences of plain data below a key; a list of another length differs as a whole."""
+    """Yield differences of plain data below a key; a list of another length differs as a whole."""
     if isinstance(own, dict) and isinstance(rigs, dict):
         for name in rigs | own:
             yield from _differing(f"{key}.{name}".lstrip("."), own.get(name), rigs.get(name))
@@ -400,17 +407,17 @@ def _differing(key: str, own: Any, rigs: Any) -> Iterator[str]:
 
 
 def canonical_json(value: object) -> str:
-    """JSON of plain data with sorted keys, the same for 1 and 1.0, and for -0.0 and 0.0."""
+    """Return JSON with sorted keys, the same for 1 and 1.0, and for -0.0 and 0.0."""
     return json.dumps(_plain(value), sort_keys=True, separators=(",", ":"))
 
 
 RelativePlace = tuple[float, float]
-"""Place of an ERA as fractions of the length and the width, 0 to 1."""
+"""Position of an ERA as fractions of length and width, 0 to 1."""
 
 
 @dataclass(frozen=True)
 class EraLayout:
-    """Places of the ERAs of a rig."""
+    """Positions of a rig's ERAs."""
 
     name: str
     places: tuple[RelativePlace, ...]
@@ -429,7 +436,7 @@ FOUR_ERA_LAYOUTS = (
     EraLayout("trapezoid", ((0, 0), (1, 0), (3 / 4, 1), (1 / 4, 1))),
     EraLayout("diagonal", ((0, 0), (1 / 3, 1 / 3), (2 / 3, 2 / 3), (1, 1))),
 )
-"""Layouts of four ERAs; the first is that of the paper's Table 2."""
+"""Layouts of four ERAs; the first one is from the paper's Table 2."""
 
 _OTHERS = (
     EraLayout("centre", ((1 / 2, 1 / 2),)),
@@ -444,13 +451,13 @@ _OTHERS = (
 
 
 def named_layouts(era_count: int) -> tuple[EraLayout, ...]:
-    """The named layouts with a number of ERAs."""
+    """Return the named layouts for a number of ERAs."""
     layouts = (*FOUR_ERA_LAYOUTS, *_OTHERS)
     return tuple(layout for layout in layouts if len(layout.places) == era_count)
 
 
 def alike(era: OneKind, positions: FloatArray) -> tuple[OneKind, ...]:
-    """Copies of an ERA at positions [m] (n, 2), named E1, E2, ..."""
+    """Return copies of an ERA at positions [m] (n, 2), named E1, E2, ..."""
     return tuple(
         replace(era, name=f"E{number}", x=float(x), y=float(y))
         for number, (x, y) in enumerate(positions, start=1)

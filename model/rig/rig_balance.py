@@ -1,4 +1,4 @@
-"""How the plate of a rig rests on its supports: the load of each, and warnings of tipping."""
+"""Load of each support of a rig's plate, and warnings of tipping."""
 
 from collections import Counter
 from collections.abc import Iterator
@@ -14,14 +14,14 @@ TOUCH_FORCE = 1.0
 """Force [N] of a firm touch, which should not tip a plate (docs/concepts/people.md)."""
 
 _NEAR_EDGE = 0.1
-"""Share of the supports' extent within which a centre of mass is near their edge."""
+"""Fraction of the supports' extent within which a centre of mass is near their edge."""
 
-_LIFTS = -1e-6  # N; below it a support is pulled upwards
-_EDGES = "edges"  # of what holds a plate along all of them
+_LIFTS = -1e-6  # N; lower loads mean that a support is pulled upwards
+_EDGES = "edges"  # name of supports along all edges
 
 
 class RigBalance:
-    """A rig's plate at rest on its supports."""
+    """Static balance of a rig's plate on its supports."""
 
     def __init__(self, rig: Rig) -> None:
         self._rig = rig
@@ -29,19 +29,19 @@ class RigBalance:
         kinds = _kinds_by_name(rig)
         names = [name for name, count in _support_counts(rig).items() for _ in range(count)]
         self.loads: Counter[str] = Counter()
-        """Static load [N] of each support by its name; of what holds the edges the sum."""
+        """Static load [N] of each support by name; for supports along the edges, the sum."""
         for name, load in zip(names, self._balance.loads.tolist(), strict=True):
             self.loads[name] += load
         self._kinds = {name: kinds[name] for name in self.loads}
 
     @property
     def tips_over(self) -> bool:
-        """Whether the plate tips over by its own weight."""
+        """Whether the plate tips over under its own weight."""
         return self._balance.inside < 0
 
     @property
     def phrase(self) -> str:
-        """How the plate rests, as the end of a sentence."""
+        """Describe the balance, as the end of a sentence."""
         parts = []
         for kind, count in Counter(self._kinds.values()).items():
             loads = [load for name, load in self.loads.items() if self._kinds[name] == kind]
@@ -56,13 +56,13 @@ class RigBalance:
         return f"rests on {' and '.join(parts)}"
 
     def notes(self) -> Iterator[str]:
-        """Yield warnings of a plate that tips over, nearly so, or lifts off a support."""
+        """Yield warnings of a plate that tips over, nearly tips over, or lifts off a support."""
         balance = self._balance
         centre = f"the centre of mass, {_millimetres(balance.centre)},"
         where = f"{'eras' if self._rests_on_eras else 'supports'}"
         if self.tips_over:
             yield (
-                f"{where}: {centre} lies {-1e3 * balance.inside:.3g} mm outside {self._names}: the "
+                f"{where}: {centre} is {-1e3 * balance.inside:.3g} mm outside {self._names}: the "
                 "plate tips over; move them apart, or add supports"
             )
             return
@@ -75,7 +75,7 @@ class RigBalance:
                 )
         if balance.inside_share < _NEAR_EDGE:
             yield (
-                f"{where}: {centre} lies only {1e3 * balance.inside:.2g} mm within {self._names}: "
+                f"{where}: {centre} is only {1e3 * balance.inside:.2g} mm within {self._names}: "
                 "the plate nearly tips over; move them apart, or add supports"
             )
         tipping = self._tipping_touch()
@@ -88,7 +88,7 @@ class RigBalance:
             )
 
     def as_json(self) -> dict[str, Any]:
-        """Return it as `era config check --json` prints it."""
+        """Return the JSON object of `era config check --json`."""
         balance = self._balance
         tipping = self._tipping_touch()
         return {
@@ -122,9 +122,9 @@ class RigBalance:
 
 
 def _support_counts(rig: Rig) -> dict[str, int]:
-    """Return the names of all supports, in the order of their loads, with their numbers of springs.
+    """Return the number of springs of each support, by name, in the order of their loads.
 
-    ERAs come first, then the supports of the file, then mounts that are not driven.
+    ERAs come first, then the supports of the file, then passive mounts.
     """
     counts = {era.name: 1 for era in rig.eras if era.support.stiffness > 0}
     springs = [load for load in rig.masses if load.stiffness > 0]
@@ -142,13 +142,13 @@ def _support_counts(rig: Rig) -> dict[str, int]:
 
 
 def _mount_names(rig: Rig) -> list[str]:
-    """Return the names of mounts that are not driven, and hold the plate."""
+    """Return the names of passive mounts."""
     mounts = rig.masses[len(rig.masses) - len(rig.supports) :]
     return [name for name, mount in zip(rig.supports, mounts, strict=True) if mount.stiffness > 0]
 
 
 def _kinds_by_name(rig: Rig) -> dict[str, str]:
-    """Return the kind of each support by its name."""
+    """Return the kind of each support by name."""
     kinds = {}
     mounts = {*_mount_names(rig)}
     eras = {era.name for era in rig.eras}
@@ -163,7 +163,7 @@ def _kinds_by_name(rig: Rig) -> dict[str, str]:
 
 
 def _span(low: float, high: float) -> str:
-    """Format the least and the largest value, or one if they read the same."""
+    """Format the minimum and maximum, or a single value if both read the same."""
     first, last = f"{low:.2g}", f"{high:.2g}"
     return first if first == last else f"{first} to {last}"
 

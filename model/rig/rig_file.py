@@ -1,7 +1,7 @@
-"""Reading a rig from its file: the text of its mesh, checks across its sections, and the rig.
+"""Read a rig from its file: parse its mesh, check across sections, and build the rig.
 
-A section checks and makes its own part (`model.rig.sections`). Problems between sections that are
-valid by themselves are found here, and all problems of a file are reported at once.
+Every section checks and builds its own part (`model.rig.sections`). This module checks for
+conflicts between valid sections. All problems of a file are reported together.
 """
 
 import hashlib
@@ -62,8 +62,8 @@ from registry.plugins import did_you_mean
 
 _MAX_ELEMENTS_PER_SIDE = 1000
 _ACCURACY = Quantity(RATIO, at_least=0.0005, at_most=0.1)
-_DEFAULT_ACCURACY = 0.01  # places within 0.1 mm of an ERA's change the response as much
-_MAX_NODES = 300_000  # a million degrees of freedom: minutes, and most of a machine's memory
+_DEFAULT_ACCURACY = 0.01  # changes the response as much as 0.1 mm of an ERA's position
+_MAX_NODES = 300_000  # a million degrees of freedom: minutes, and most of the memory
 
 _STRIPS = " with strips of "
 
@@ -71,16 +71,17 @@ _STRIPS = " with strips of "
 def mesh_of(
     text: str, plate: Plate, *, frequency_max: float, stiffness: float = 0.0, foot: float = 0.0
 ) -> PlateMesh:
-    """The mesh `auto` or `auto A %`, accurate up to a frequency [Hz], or that of `parse_mesh`.
+    """Return the mesh `auto` or `auto A %`, accurate up to a frequency [Hz], or that of
+    `parse_mesh`.
 
-    Those are of polynomials over the plate for an error of the response of A %, by default 1 %.
-    stiffness [N/m]: of the stiffest ERA; foot [m]: radius of the smallest, 0 for a point.
+    `auto` uses polynomials over the plate for a response error of A %, default 1 %. stiffness
+    [N/m]: of the stiffest ERA; foot [m]: smallest contact radius, 0 for a point.
     """
     words = text.split()
     if plate.surface is not None:
         if words != ["auto"]:
             raise InputError(
-                f"mesh must not be given of a surface, whose modes are known, got {text[:40]!r}"
+                f"mesh must not be given for a surface, whose modes are known, got {text[:40]!r}"
             )
         return KnownModes.of(plate, plate.surface)
     if words[:1] != ["auto"]:
@@ -110,10 +111,10 @@ def mesh_of(
 
 
 def parse_mesh(text: str, plate: Plate) -> PlateMesh:
-    """The mesh `NXxNY`, or `NXxNY ELEMENT`, over a plate; with Legendre the numbers are degrees.
+    """Parse the mesh `NXxNY`, or `NXxNY ELEMENT`, over a plate; Legendre numbers are degrees.
 
-    Elements may be `with strips of` a length, as a mesh is printed. Raises InputError for other
-    text, an unknown element, and no elements.
+    Elements can have `with strips of` a length, as a mesh is printed. Raises InputError for other
+    text, an unknown element, and zero elements.
     """
     if plate.surface is not None:
         return KnownModes.of(plate, plate.surface)
@@ -138,7 +139,7 @@ def parse_mesh(text: str, plate: Plate) -> PlateMesh:
 
 
 class Way(NamedTuple):
-    """One of two ways to state something: keys that it needs, and further ones of it alone."""
+    """One of two alternative ways to describe a property: its required keys, and optional ones."""
 
     needed: Set[str]
     further: Set[str] = frozenset()
@@ -149,7 +150,7 @@ _ISOTROPIC, _ORTHOTROPIC = Way(ISOTROPIC, {"by_frequency"}), Way(ORTHOTROPIC)
 
 
 def check_across(validation: Validation[RigSection], *, mesh_given: bool) -> None:
-    """Add problems between sections that are valid by themselves."""
+    """Add conflicts between sections that are valid on their own."""
     limits = validation.field(("limits", "frequency"), LimitsSection)
     high = (limits or LimitsSection().frequency)[1]
     plate = _check_plate(validation, frequency_max=high)
@@ -157,7 +158,7 @@ def check_across(validation: Validation[RigSection], *, mesh_given: bool) -> Non
         _check_mesh(validation, plate, frequency_max=high)
     path = "uncertainty", "mode_amplitude"
     if plate is not None and plate.surface is None and validation.field(path, UncertaintySection):
-        validation.add(path, "must be of a surface by its modes; remove it, or give surface")
+        validation.add(path, "must be given only with surface; remove it, or give surface")
     eras = {}
     for name, keys in validation.mapping(("eras",)).items():
         section = section_by_kind([*ACTUATOR_KINDS.values()], keys)
@@ -180,7 +181,8 @@ def _check_attached(
     section: type[MassSection | SupportSection],
     plate: Plate | None,
 ) -> dict[str, Any]:
-    """Check that a mass or support is on the plate, at a point or along the edges; its keys."""
+    """Check that a mass or support is on the plate, at a point or along the edges; return its
+    keys."""
     given = _given(validation, path, section)
     _check_on_plate(validation, path, given.get("at"), plate)
     per_length = "mass_per_length" if section is MassSection else "stiffness_per_length"
@@ -193,20 +195,20 @@ def _check_attached(
 
 
 def _check_way(validation: Validation[RigSection], path: KeyPath, this: Way, other: Way) -> bool:
-    """Check that a section has all keys of the way that it takes, and none of the other."""
+    """Check that a section has all keys of the chosen alternative and none of the other."""
     given = _given(validation, path).keys()
     missing, too_many = this.needed - given, given & (other.needed | other.further)
     for key in sorted(missing):
         instead = ", ".join(sorted(other.needed))
         validation.add((*path, key), f"missing; add it, or {instead} instead")
     for key in sorted(too_many):
-        beside = min(this.needed & given, default="the others")
-        validation.add((*path, key), f"must not be given with {beside}; remove it")
+        other_key = min(this.needed & given, default="the others")
+        validation.add((*path, key), f"must not be given with {other_key}; remove it")
     return not (missing or too_many)
 
 
 def _check_plate(validation: Validation[RigSection], *, frequency_max: float) -> Plate | None:
-    """The plate if its section is valid: thickness and material, or layers."""
+    """Return the plate if its section is valid: thickness and material, or layers."""
     given = _given(validation, ("plate",))
     if "surface" in (whole := validation.mapping(())):
         return _check_surface(validation, frequency_max=frequency_max)
@@ -242,12 +244,12 @@ def _check_plate(validation: Validation[RigSection], *, frequency_max: float) ->
 
 
 def _modes_of(section: SurfaceSection, document: Document) -> Path:
-    """The file of a surface's modes, beside the rig file or the one that a link leads to."""
+    """Return the file of a surface's modes, relative to the rig file or the target of its link."""
     return replace(document, source=str(Path(document.source).resolve())).beside(section.modes)
 
 
 def _check_surface(validation: Validation[RigSection], *, frequency_max: float) -> Plate | None:
-    """The plate of a surface if its section is valid, and its modes are enough."""
+    """Return the plate of a surface if its section is valid and has enough modes."""
     for key in validation.mapping(()).keys() & {"plate", "mesh"}:
         validation.add((key,), "must not be given with surface; remove it")
     section: SurfaceSection | None = validation.field(("surface",), RigSection)
@@ -270,7 +272,7 @@ def _check_surface(validation: Validation[RigSection], *, frequency_max: float) 
 
 
 def _check_material(validation: Validation[RigSection], path: KeyPath) -> bool:
-    """Check that a material by numbers has those of one of both kinds, and only these."""
+    """Check that a numeric material has the numbers of exactly one of both kinds."""
     given = _given(validation, path).keys()
     has_grain = len(given & ORTHOTROPIC) > (1 if given & ISOTROPIC else 0)
     ways = (_ORTHOTROPIC, _ISOTROPIC) if has_grain else (_ISOTROPIC, _ORTHOTROPIC)
@@ -325,7 +327,7 @@ def _check_on_plate(
     place: tuple[float, float] | None,
     plate: Plate | None,
 ) -> None:
-    """Check the place of what is attached to a plate, where both are known."""
+    """Check that an attachment is on the plate, if both positions and plate are valid."""
     if place is None or plate is None:
         return
     (x, y), length, width = place, plate.length, plate.width
@@ -370,7 +372,7 @@ def _check_wiring(
 def _given(
     validation: Validation[RigSection], path: KeyPath, section: type[Section] = Section
 ) -> dict[str, Any]:
-    """Keys of a section that are not empty, with the values of those that are valid, else None."""
+    """Return the non-empty keys of a section: valid ones with their values, others None."""
     own = validation.mapping(path)
     return {
         key: validation.field((*path, key), section)
@@ -380,21 +382,20 @@ def _given(
 
 
 _BASE_KEYS = ("base", "base_fingerprint", "standard_errors")
-"""Keys of a fitted rig beside those of a rig: they say what it differs from, and how surely."""
+"""Keys that only a fitted rig has: its base, and standard errors."""
 
 _RIG_KEYS = {*RigSection.model_fields, *_BASE_KEYS}
 
 _MAX_KEYS_SHOWN = 3
 
-_NAMED = ("eras", "supports", "amplifiers")  # sections whose entries a fit takes from the base
+_NAMED = ("eras", "supports", "amplifiers")  # sections whose entries are merged with the base
 
 
 def with_base(document: Document) -> Document:
-    """Merge a fitted rig's keys over those of the rig file that it names as its `base`.
+    """Merge a fitted rig's keys with the rig file named by its `base`.
 
-    Another document is returned as it is. Raises ConfigError for a base that is missing, outside
-    the folder, fitted itself, invalid, or not as it was when it was fitted, and for names that it
-    lacks.
+    Other documents are returned unchanged. Raises ConfigError for a base that is missing, outside
+    the folder, fitted itself, invalid, or changed since the fit, and for names that it lacks.
     """
     if "base" not in document.data or document.over is not None:
         return document
@@ -407,46 +408,48 @@ def with_base(document: Document) -> Document:
         refuse(f"must be the name of a rig file, got {shown(name)}")
     named = shown(name)
     if PurePath(name).is_absolute() or ".." in PurePath(name).parts:
-        refuse(f"must be in the folder of this file or below it, got {named}; put both together")
+        refuse(
+            f"must be in the folder of this file or below it, got {named}; put both files together"
+        )
     path = base_path(document)
     if not path.is_file():
-        refuse(f"must be a rig file beside this one, got {named}, which is not there; put it back")
+        refuse(f"must be an existing rig file in this folder or below it, got {named}; put it back")
     if path.resolve() == Path(document.source).resolve():
-        refuse(f"must be the rig file that was fitted, got {named}, this file; name the other one")
+        refuse(f"must be the rig file that was fitted, got this file, {named}; name the other one")
     base = read_document(path)
     check_is_rig(base)
     if "base" in base.data:
-        refuse(f"must be a whole rig, got {named}, which has a base of its own; name that one")
+        refuse(f"must be a complete rig, got {named}, which has a base of its own; name that base")
     if document.data.get("base_fingerprint") != base_fingerprint(base):
         refuse(
-            f"{named} must have the plate, ERAs, masses and supports, as written, that it had when "
-            "they were fitted; undo what was changed there, or fit anew"
+            f"{named} must have the same plate, ERAs, masses and supports as when "
+            "they were fitted; undo the changes there, or fit again"
         )
     over = own_keys(document)
     for kind in _NAMED:
         known, given = (each.get(kind) for each in (base.data, over))
         for each in given if isinstance(given, dict) else ():
             if not isinstance(known, dict) or each not in known:
-                refuse(f"must be in {named}, which has none of this name; remove it", kind, each)
+                refuse(f"must be a name in {named}, which does not have it; remove it", kind, each)
     data = merged_keys(base.data, over)
     return Document(document.source, "", data, document.find_lines, over=document)
 
 
 def base_path(document: Document) -> Path:
-    """The rig file that a fitted one names as its base."""
+    """Return the path of the rig file named as base by a fitted one."""
     return Path(document.source).parent / str(document.data["base"])
 
 
 def own_keys(document: Document) -> dict[str, Value]:
-    """The keys of a rig that a fitted file states itself, beside its base."""
+    """Return the rig keys that a fitted file has in addition to its base."""
     return {key: value for key, value in document.data.items() if key not in _BASE_KEYS}
 
 
 def base_fingerprint(base: Document) -> str:
-    """Sixteen digits that change with a rig's plate, ERAs, masses and supports.
+    """Return sixteen digits that change with a rig's plate, ERAs, masses and supports.
 
-    Values count to twelve digits, in whatever unit a file states them. Wiring, limits and
-    thresholds may change: no fit depends on them. Raises ConfigError for an invalid rig.
+    Values count to twelve digits, in any unit. Wiring, limits and thresholds can change, since no
+    fit depends on them. Raises ConfigError for an invalid rig.
     """
     physics = physics_of(rig_of(base))
     stated = canonical_json({key: physics[key] for key in ("plate", "eras", "masses")})
@@ -455,9 +458,9 @@ def base_fingerprint(base: Document) -> str:
 
 
 def merged_keys(base: Value, over: Value, *, is_final: bool = True) -> Any:
-    """Keys of a file with those of another over them, mapping by mapping; lists are replaced.
+    """Merge keys of two files recursively, `over` taking precedence; lists are replaced as a whole.
 
-    is_final: whether null leaves a key out; else it stays, for a later merge.
+    is_final: whether null removes a key; otherwise null is kept for a later merge.
     """
     if not (isinstance(base, dict) and isinstance(over, dict)):
         return over
@@ -475,8 +478,8 @@ def merged_keys(base: Value, over: Value, *, is_final: bool = True) -> Any:
 def load_rig(path: Path | str, *, mesh: str | None = None) -> Rig:
     """Read a rig file; mesh: `auto` or NXxNY, replaces that of the file.
 
-    Raises ConfigError with all problems of the file; InputError for an invalid mesh. The mesh given
-    here may be coarser than a file's, to study its error.
+    Raises ConfigError with all problems of the file; InputError for an invalid mesh. This mesh can
+    be coarser than a file allows, to study its error.
 
     Example:
         >>> rig = era.load_rig("examples/paper_plate.yaml")
@@ -500,12 +503,12 @@ def check_is_rig(document: Document) -> None:
 
 
 def parse_rig(source: str, text: str) -> Rig:
-    """Read the text of a rig file that came from a source; raises ConfigError."""
+    """Parse the text of a rig file; raises ConfigError."""
     return rig_of(parse_document(source, text))
 
 
 def rig_of(document: Document, *, mesh: str | None = None) -> Rig:
-    """Make the rig of a document, with another mesh if one is given; raises as `load_rig`."""
+    """Build the rig of a document, with another mesh if given; raises like `load_rig`."""
     document = with_base(document)
     check_is_rig(document)
     validation = Validation(document, RigSection)
@@ -516,7 +519,7 @@ def rig_of(document: Document, *, mesh: str | None = None) -> Rig:
     if section.surface is not None:
         modes = _modes_of(section.surface, document)
         plate = section.surface.made(modes)
-        # The keys of a rig go to other folders and processes, its modes do not.
+        # Other folders and processes receive the keys of a rig, but not its modes file.
         named = section.surface.model_dump(exclude_none=True) | {"modes": str(modes)}
         stated = document.data | {"surface": to_jsonable_python(named)}
         document = replace(document, text="", data=stated, find_lines=dict)
@@ -576,12 +579,12 @@ def rig_of(document: Document, *, mesh: str | None = None) -> Rig:
 
 
 def example_rig_path() -> Path:
-    """The path of the commented rig of the paper's plate.
+    """Return the path of the commented rig of the paper's plate.
 
     Example:
         >>> era.example_rig_path().name
         'paper_plate.yaml'
     """
-    here = Path(__file__).parents[1]  # a wheel has it in the model's data
+    here = Path(__file__).parents[1]  # part of the package data in a wheel
     installed = here / "data" / "paper_plate.yaml"
     return installed if installed.exists() else here.parent / "examples" / "paper_plate.yaml"

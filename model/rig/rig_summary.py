@@ -1,8 +1,8 @@
 """Summary of a rig, and warnings about its file.
 
-Numbers of its plate and exciters: materials, rigidity, bending wavelengths, types. Warnings say
-what a rig does not know or leaves out, and which frequencies its exciters cannot follow. Warnings
-for which plates are solved, or wires are known, are in `controller.rig_file_check`.
+The summary contains numbers of plate and exciters: materials, rigidity, bending wavelengths, types.
+Warnings name unknown or neglected effects, and frequencies that exciters cannot follow. Warnings
+that need solved plates or wires are in `controller.rig_file_check`.
 """
 
 import cmath
@@ -41,25 +41,25 @@ from model.structure.surface import WELL_KNOWN
 from registry.limits import GuardLimits
 
 _NEARLY = 1.001
-_LAG = 0.01  # (omega L / R)² from which time and frequency differ visibly
-_ABOVE = 1.3  # times the resonance of a magnet, where little depends on it
-_LIGHT, _HIGH = 0.3, 100.0  # share of the coil in the magnet's mass; Hz
+_LAG = 0.01  # (omega L / R)² above which results in time and frequency domain differ visibly
+_ABOVE = 1.3  # times a magnet's resonance; above it, the resonance matters little
+_LIGHT, _HIGH = 0.3, 100.0  # coil mass relative to the magnet's; Hz
 
 
 def exciters_of(rig: Rig) -> list[Exciter]:
-    """The exciters among its actuators."""
+    """Return the exciters among the actuators."""
     return [era for era in rig.eras if isinstance(era, Exciter)]
 
 
 def sections_of(rig: Rig) -> dict[str, ExciterSection]:
-    """Keys of its exciters by name, none of a rig without keys."""
+    """Return the keys of exciters by name, empty for a rig without keys."""
     keys: Any = rig.document.data["eras"] if rig.document else {}
     names = [one.name for one in exciters_of(rig) if one.name in keys]
     return {name: ExciterSection.model_validate(keys[name]) for name in names}
 
 
 def exciter_notes(rig: Rig) -> Iterator[str]:
-    """Yield warnings of resonances that may be misread, and of what may harm exciters."""
+    """Yield warnings of resonances that can be misread, and of hazards to exciters."""
     sections = sections_of(rig)
     misread: dict[str, list[str]] = {}
     for name, section in sections.items():
@@ -71,9 +71,9 @@ def exciter_notes(rig: Rig) -> Iterator[str]:
 
 
 def resonance_notes(rig: Rig) -> Iterator[str]:
-    """Yield a warning where a rig plays near the resonance of its magnets.
+    """Yield a warning if a rig plays near the resonance of its magnets.
 
-    A resonance that may be misread does not count.
+    Resonances with a suspicious value are skipped.
     """
     low, high = rig.limits.frequency_min, rig.limits.frequency_max
     sections = sections_of(rig)
@@ -92,7 +92,7 @@ def resonance_notes(rig: Rig) -> Iterator[str]:
 
 
 def _misread_resonance(section: ExciterSection) -> str | None:
-    """A warning for a resonance that is said to be the mounted one, and hardly can be."""
+    """Return a warning for a `mounted` resonance that is too high to be one."""
     values = section.values
     f, coil, weight = values["resonance"], values["coil_mass"], values["weight"]
     if section.stiffness or values["resonance_is"] != "mounted":
@@ -107,15 +107,15 @@ def _misread_resonance(section: ExciterSection) -> str | None:
 
 
 def _hazards(one: Exciter, section: ExciterSection, rig: Rig) -> Iterator[str]:
-    """Yield what may harm an exciter, and what the model then misses, by key."""
+    """Yield hazards to an exciter, and effects that the model then misses, by key."""
     volts, limits = rig.limits.level * one.largest_gain * one.voltage, rig.limits
     heat = (volts / one.loop_resistance) ** 2 * one.resistance / 2
     by_gains = f"gains: of up to {one.largest_gain:.3g}"
     rated = section.of_type.get("power", section.values["power"])
     if heat > _NEARLY * rated:
         yield (
-            f"{by_gains} put {heat:.3g} W into the coil at full level, which bears {rated:.3g} W; "
-            "lower power, or limits.level"
+            f"{by_gains} put {heat:.3g} W into the coil at full level, which is rated for "
+            f"{rated:.3g} W; lower power, or limits.level"
         )
     if section.clip is not None and volts > _NEARLY * section.clip:
         yield (
@@ -123,20 +123,20 @@ def _hazards(one: Exciter, section: ExciterSection, rig: Rig) -> Iterator[str]:
             f"{section.clip:.3g} V; lower power, or limits.level"
         )
     if not math.isfinite(one.excursion):
-        yield "excursion: missing, so that nothing limits how far its magnet moves; add it"
+        yield "excursion: missing, so the motion of its magnet is unlimited; add it"
     sag = 0.0 if one.held else GRAVITY * one.magnet_mass / one.stiffness
     if sag > one.excursion:
         yield (
-            f"resonance: of {one.magnet_frequency:.3g} Hz when glued, at which the magnet hangs "
-            f"{1e3 * sag:.2g} mm from its middle by its weight, of an excursion of "
+            f"resonance: of {one.magnet_frequency:.3g} Hz when glued, at which the magnet sags "
+            f"{1e3 * sag:.2g} mm from its centre under its weight, with an excursion of "
             f"{1e3 * one.excursion:.2g} mm; check resonance, resonance_is and weight, or hold it"
         )
     highest = limits.frequency_max
     lag = (2 * math.pi * highest * one.inductance / one.loop_resistance) ** 2
     if lag > _LAG:
         yield (
-            f"inductance: (omega L / R)² is {lag:.2g} at {highest:g} Hz, by which onsets, "
-            "endings and courses are computed too strong or too weak; check it, or end "
+            f"inductance: (omega L / R)² is {lag:.2g} at {highest:g} Hz, so onsets, "
+            "endings and envelopes are computed too strong or too weak; check it, or end "
             f"limits.frequency at {math.floor(highest * math.sqrt(_LAG / lag))} Hz"
         )
 
@@ -146,16 +146,16 @@ FURTHER = {
     for each in fields(Plate)
     if each.name in PLAIN_KEYS and not each.metadata.get("has_own_row")
 }
-"""Dimensions of the keys of a plate that are listed together in a summary."""
+"""Dimensions of the plate keys that are grouped in a summary."""
 
 
 def plate_summary(rig: Rig) -> dict[str, Any]:
-    """The plate that is solved, the laminate that it stands for, and what it carries.
+    """Return the solved plate, the laminate that it represents, and its attachments.
 
-    Keys carry their units. A laminate comes with both bounds of its rigidity, perfectly bonded and
-    freely sliding layers, and, where its layers are bonded, the rigidity in free bending waves at
-    both ends of the rig's frequencies. Of a surface by its modes the plate is the homogeneous one
-    with as many modes and the same mass.
+    Keys include their units. A laminate has both bounds of its rigidity, for perfectly bonded and
+    freely sliding layers, and, if its layers are bonded, the rigidity in free bending waves at both
+    ends of the rig's frequencies. A surface is represented by the homogeneous plate with the same
+    number of modes and the same mass.
     """
     plate, limits, gap, surface = rig.plate, rig.limits, rig.plate.air_gap, rig.plate.surface
     return {
@@ -232,7 +232,8 @@ def plate_summary(rig: Rig) -> dict[str, Any]:
 
 
 def _grain(plate: Plate) -> dict[str, float] | None:
-    """Numbers of a board along and across the plate's length; None of an isotropic plate."""
+    """Return numbers of a board along and across the plate's length; None for an isotropic
+    plate."""
     material = plate.material
     if material.orthotropy is None:
         return None
@@ -270,10 +271,10 @@ def _laminate(laminate: Laminate, limits: GuardLimits) -> dict[str, Any]:
 
 
 def _types(rig: Rig) -> dict[str, dict[str, Any]]:
-    """Types of a rig's exciters by name: what to know of each, and what no source gives of it.
+    """Return the types of a rig's exciters by name, with notes and values without a source.
 
-    assumed: by key the lowest and the highest value that is likely, unless every exciter of the
-    type states its own.
+    assumed: lowest and highest likely value by key, unless every exciter of the type states its
+    own.
     """
     found: dict[str, dict[str, Any]] = {}
     for section in sections_of(rig).values():
@@ -287,8 +288,9 @@ def _types(rig: Rig) -> dict[str, dict[str, Any]]:
     return found
 
 
-# Modes are within 3 % of the direct solution up to half of where layers slide by themselves, off
-# by as much as there is around it (faces of 0.5 mm aluminium on 50 mm of E 0.1 to 10 MPa).
+# Modes are within 3 % of the direct solution up to half the frequency at which layers slide on
+# their own, and off by a similar factor near it (0.5 mm aluminium faces on 50 mm of E 0.1 to 10
+# MPa).
 _FAR_FROM_SLIDING = 2.0
 
 
@@ -296,10 +298,10 @@ _NEEDED = ("required", "oneOf", "dependentRequired", "minProperties")
 
 
 def rig_schema() -> dict[str, Any]:
-    """The JSON schema of a whole rig, and of a fitted one, which has what differs from its base."""
+    """Return the JSON schema of a complete rig, and of a fitted one with changes to its base."""
     whole = RigSection.model_json_schema()
     fitted = _partial(whole)
-    errors = {"type": "object", "description": "standard errors of values, by their keys"}
+    errors = {"type": "object", "description": "standard errors of values, by key"}
     fitted["properties"] |= {"base": {"type": "string"}, "base_fingerprint": {"type": "string"}}
     fitted["properties"]["standard_errors"] = errors
     definitions = {**whole.pop("$defs"), "fitted": {"$defs": fitted.pop("$defs")}}
@@ -308,7 +310,7 @@ def rig_schema() -> dict[str, Any]:
 
 
 def _partial(schema: Any) -> Any:
-    """A JSON schema of which nothing is needed, and where null leaves a key of the base out."""
+    """Return a JSON schema without required keys, in which null removes a key of the base."""
     if isinstance(schema, list):
         return [_partial(each) for each in schema]
     if not isinstance(schema, dict):
@@ -321,41 +323,45 @@ def _partial(schema: Any) -> Any:
     return found
 
 
-_THICK = 0.02  # m; of one material
-_NEARLY_ALL = 0.9  # of the modes up to a frequency the highest may be so far below it
+_THICK = 0.02  # m, for a single material
+_NEARLY_ALL = (
+    0.9  # of the frequency up to which modes are needed; the highest mode can be this far below it
+)
 
 
 def plate_notes(rig: Rig) -> Iterator[str]:
-    """Yield warnings of a plate in the wrong unit, and of what air and soft layers cost."""
+    """Yield warnings of a plate in the wrong unit, and of neglected effects of air and soft
+    layers."""
     plate, low, high = rig.plate, rig.limits.frequency_min, rig.limits.frequency_max
     yield from rig.surface_notes
     if isinstance(rig.mesh, KnownModes) and rig.mesh.frequency < _NEARLY_ALL * WELL_KNOWN * high:
         yield (
             f"surface: {rig.mesh} leave fields uncertain at {high:g} Hz (limits.frequency); export "
-            f"those up to {WELL_KNOWN * high:g} Hz, {WELL_KNOWN:g} times as high"
+            f"modes up to {WELL_KNOWN * high:g} Hz, {WELL_KNOWN:g} times as high"
         )
     if rig.laminate is None and plate.thickness > _THICK:
         yield (
-            f"plate.thickness: {1e3 * plate.thickness:g} mm is thick for a plate that is to be "
-            "felt; check its unit, mm or cm"
+            f"plate.thickness: {1e3 * plate.thickness:g} mm is too thick to be felt; "
+            "check its unit, mm or cm"
         )
     if plate.air_gap is not None and (error := plate.air_gap.coupling_error(low)):
-        off = "half of it or more: take no answer from it" if error > 0.1 else f"{100 * error:g} %"
+        off = "50 % or more: do not use the result" if error > 0.1 else f"{100 * error:g} %"
         yield (
-            f"plate.air_gap: in {1e3 * plate.air_gap.depth:g} mm friction of the air couples the "
-            f"modes at {low:g} Hz, which is left out: the response may be off by {off}"
+            f"plate.air_gap: air friction in {1e3 * plate.air_gap.depth:g} mm couples the "
+            f"modes at {low:g} Hz, which is neglected: the response can be off by {off}"
         )
     slide = math.inf if plate.laminate is None else slide_frequency(plate.laminate, high)
     if high >= slide / _FAR_FROM_SLIDING:
         yield (
-            f"plate.layers: at {slide:.3g} Hz they slide to and fro by themselves, and change "
-            "their thickness little above, which is left out: take no answer from it above "
+            f"plate.layers: at {slide:.3g} Hz they slide to and fro on their own, and change "
+            "their thickness little above, which is neglected: do not use results above "
             f"{slide / _FAR_FROM_SLIDING:.3g} Hz"
         )
 
 
 def mount_notes(rig: Rig) -> Iterator[str]:
-    """Yield what stiff mounts cost that are points, and few points of an edge with many waves."""
+    """Yield warnings of stiff mounts that are points, and edges with too few points for many
+    waves."""
     decade = math.log(10) / (2 * math.pi * rig.plate.shear_rigidity)
     mounts = {era.name: era.support for era in rig.eras} | dict(
         zip(rig.supports, rig.masses[len(rig.masses) - len(rig.supports) :], strict=True)
@@ -379,7 +385,7 @@ def mount_notes(rig: Rig) -> Iterator[str]:
 
 
 def summary_line(rig: Rig, *, verdict: str = "good") -> str:
-    """One line about the plate and its ERAs; verdict: its first words."""
+    """Return one line about the plate and its ERAs; verdict: its first words."""
     plate, laminate = rig.plate, rig.laminate
     thickness = plate.thickness if laminate is None else laminate.thickness
     sizes = " x ".join(f"{1e3 * size:g}" for size in (plate.length, plate.width, thickness))
@@ -388,7 +394,7 @@ def summary_line(rig: Rig, *, verdict: str = "good") -> str:
         made_of = f"laminate ({', '.join(layer.material.name for layer in laminate.layers)})"
     whole, solved = f"{sizes} mm of {made_of}", f"mesh {rig.mesh}"
     if plate.surface is not None:
-        whole = f"{1e3 * plate.length:g} x {1e3 * plate.width:g} mm of a surface"
+        whole = f"surface of {1e3 * plate.length:g} x {1e3 * plate.width:g} mm"
         solved = f"{rig.mesh} of {Path(plate.surface.file).name}, {plate.mass:.3g} kg"
     parts = [
         whole,
@@ -400,14 +406,14 @@ def summary_line(rig: Rig, *, verdict: str = "good") -> str:
         edges = "sealed" if gap.closed else "open"
         parts.insert(1, f"{1e3 * gap.depth:g} mm of air behind it, {edges} at the edges")
     if feet := [*_attached(rig, "supports"), *rig.supports]:
-        parts.append(f"supported without being driven by {', '.join(feet)}")
+        parts.append(f"supported passively by {', '.join(feet)}")
     if carried := sum(mass.mass for mass in rig.masses):
         parts.append(f"carries {1e3 * carried:g} g")
     return f"{verdict}: {', '.join(parts)}"
 
 
 def _attached(rig: Rig, kind: str) -> dict[str, Any]:
-    """Masses or supports of the rig's file."""
+    """Return masses or supports of the rig file."""
     keys: Any = {} if rig.document is None else rig.document.data.get(kind)
     return dict(keys or {})
 
@@ -416,9 +422,9 @@ _MAX_ANGLE = math.radians(20.5)  # between two rows
 
 
 def gain_notes(rig: Rig) -> list[str]:
-    """Warnings: ERAs behind an output whose gains are missing, and each with rows too far apart.
+    """Return warnings of missing gains behind an output, and of gains with rows too far apart.
 
-    What others than ERAs do behind an output is known without gains.
+    Other actuators than ERAs need no gains behind an output.
     """
     behind = [era for era in rig.eras if rig.wiring[era.name].amplifier in rig.outputs]
     low, high = rig.limits.frequency_min, rig.limits.frequency_max
@@ -426,9 +432,9 @@ def gain_notes(rig: Rig) -> list[str]:
     notes = []
     if names:
         notes.append(
-            f"gains of {', '.join(names)}: missing behind an output, so that their motion is a "
-            "guess, a stroke by full level at every frequency; measure the plate and calibrate the "
-            "rig"
+            f"gains of {', '.join(names)}: missing behind an output, so their motion is "
+            "assumed to be the stroke at full level at every frequency; measure the plate and "
+            "calibrate the rig"
         )
     return [*notes, *(text for era in behind for text in _notes(era, low, high))]
 

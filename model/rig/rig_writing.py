@@ -1,8 +1,8 @@
-"""Rigs made, changed and written by the keys of a rig file, and what a fit found beside one.
+"""Build, change and write rigs by their keys, and write the results of a fit.
 
-A rig keeps the keys that it was made of, so that dependent values follow a change: the damping of a
-ratio, a mesh that is chosen, the homogeneous plate of a laminate. The file that a person wrote is
-never written again: a fitted rig names it as its `base` and states what differs from it.
+A rig keeps the keys that it was built from, so that dependent values follow a change: damping from
+a ratio, an automatic mesh, the equivalent plate of a laminate. A user's file is never overwritten:
+a fitted rig names it as its `base` and contains only the differences.
 """
 
 import math
@@ -41,7 +41,7 @@ from model.structure.material import known_material
 from model.structure.modal_elasticity import check_is_plate
 from model.structure.plate import FIELDS_BESIDE_THEORY
 
-_SAME, _NONE = 1e-9, 1e-12  # relative; and what counts as nothing of every quantity
+_SAME, _NONE = 1e-9, 1e-12  # relative; and below it, a value of any quantity counts as zero
 
 
 def save_beside(
@@ -53,13 +53,13 @@ def save_beside(
     errors: Mapping[KeyPath, float] | None = None,
     expected: Rig | None = None,
 ) -> Rig:
-    """Write the keys of a rig that a command found beside its file, which stays as it is.
+    """Write fitted keys to a new rig file, which names the original file as its base.
 
-    document: that the rig was made of; of a fitted one the keys stay where these say nothing else.
-    errors: standard errors by the path of their key. expected: the rig that is to be read back. An
-    output that is neither in the folder of the rig's file nor above it cannot name that file: there
-    the whole rig is written. Returns the rig as it reads back. Raises InputError, before anything
-    is written, where that is another one than expected; OSError if it cannot be written.
+    document: from which the rig was built; if it is a fitted one, its keys are kept unless
+    replaced. errors: standard errors by key path. expected: the rig that the file must read back
+    as. If the output is neither in the folder of the rig file nor above it, it cannot name that
+    file, and contains the complete rig. Returns the rig as read back. Raises InputError, before
+    writing, if that differs from the expected one; OSError if the file cannot be written.
     """
     over = document.over
     base = Path(document.source) if over is None else base_path(over)
@@ -80,8 +80,8 @@ def save_beside(
     section = Validation(document, RigSection).finish()
     if expected is not None and not _is_same(rig, expected, section):
         raise InputError(
-            f"{document.source}: values read back must be those written; write plate and ERAs as "
-            "`era config init` does, and try again"
+            f"{document.source}: values read back must equal those written; write plate and ERAs "
+            "as `era config init` does, and try again"
         )
     with whole_or_nothing(output) as stream:
         stream.write(text.encode())
@@ -96,10 +96,10 @@ def save_fitted(
     comment: str,
     errors: Mapping[KeyPath, float] | None = None,
 ) -> None:
-    """Write a fitted rig beside the file of the rig that its fit began with, as `save_beside`.
+    """Write a fitted rig with the original rig file as its base; see `save_beside`.
 
-    Written are plate, ERAs, feet, uncertainty and masses that differ. Raises InputError where the
-    file reads back with other values.
+    Writes plate, ERAs, feet, uncertainty and masses that differ. Raises InputError if the file
+    reads back with other values.
     """
     keys = fitted_keys(before, after)
     document = _document_of(before)
@@ -107,9 +107,10 @@ def save_fitted(
 
 
 def fitted_keys(before: Rig, after: Rig) -> dict[str, Any]:
-    """Keys of a rig file that make of one rig another one of the same ERAs, and no others.
+    """Return the rig-file keys that turn one rig into another one with the same ERAs, and no
+    others.
 
-    A key that must be left out is None.
+    A key to be removed is None.
     """
     document = _document_of(before)
     section, data = Validation(document, RigSection).finish(), cast("dict[str, Any]", document.data)
@@ -140,14 +141,14 @@ def fitted_keys(before: Rig, after: Rig) -> dict[str, Any]:
 
 
 def fitted_rows(rig: Rig) -> list[tuple[str, Any, Any, float | None]]:
-    """Key, value of the base, value and standard error of all that a fitted rig has otherwise.
+    """Return key, base value, value and standard error of every key that a fitted rig changes.
 
     Numbers in SI units; None without a standard error. Raises InputError for a rig without a base.
     """
     document = _document_of(rig)
     if document.over is None:
         raise InputError(
-            f"{document.source} must be a fitted rig, with a `base` beside it; `era calibrate` and "
+            f"{document.source} must be a fitted rig with a `base`; `era calibrate` and "
             "`era rig identify` write one"
         )
     base = rig_of(read_document(base_path(document.over)))
@@ -162,7 +163,7 @@ def fitted_rows(rig: Rig) -> list[tuple[str, Any, Any, float | None]]:
 
 
 def _leaves(value: Any, path: KeyPath = ()) -> Iterator[tuple[KeyPath, Any]]:
-    """Yield what is in nested mappings, with its path; a list is one value."""
+    """Yield the values in nested mappings with their paths; a list is one value."""
     if not isinstance(value, Mapping):
         yield path, value
         return
@@ -171,21 +172,21 @@ def _leaves(value: Any, path: KeyPath = ()) -> Iterator[tuple[KeyPath, Any]]:
 
 
 def _beside(output: Path, base: Path) -> str | None:
-    """The name by which a file names another one in its folder or below it; None elsewhere."""
+    """Return the relative name of a file in another one's folder or below it; None elsewhere."""
     folder = output.absolute().parent
     place = base.absolute()
     return place.relative_to(folder).as_posix() if place.is_relative_to(folder) else None
 
 
 def _document_of(rig: Rig) -> Document:
-    """The document that a rig was made of; raises InputError without one."""
+    """Return the document that a rig was built from; raises InputError without one."""
     if rig.document is None:
         raise InputError("rig must be read from a file or made by era.rig, got one without keys")
     return rig.document
 
 
 def _nested(values: Mapping[KeyPath, Any], data: Any = None) -> dict[str, Any]:
-    """Values by path as nested mappings; a list on the way is that of the data, changed."""
+    """Convert values by path to nested mappings; lists along a path are copied from the data."""
     found: dict[str, Any] = {}
     for path, value in values.items():
         at: Any = found
@@ -201,7 +202,8 @@ def _nested(values: Mapping[KeyPath, Any], data: Any = None) -> dict[str, Any]:
 
 
 def _restated_material(data: Any, path: KeyPath, value: dict[str, Any]) -> dict[str, Any]:
-    """Numbers of a fitted material with all else that the file says of it, by name or by keys."""
+    """Merge fitted numbers of a material with its remaining keys, whether given by name or by
+    keys."""
     for part in path:
         data = data[part]
     if isinstance(data, Mapping):
@@ -211,7 +213,7 @@ def _restated_material(data: Any, path: KeyPath, value: dict[str, Any]) -> dict[
 
 
 def _values(rig: Rig, section: RigSection) -> dict[KeyPath, Any]:
-    """Values of a rig that a fit may change, by where its file has them, as it states them."""
+    """Return the values of a rig that a fit can change, by key path, as the file states them."""
     found: dict[KeyPath, Any] = {
         ("uncertainty", key): value for key, value in asdict(rig.uncertainty).items()
     }
@@ -227,7 +229,7 @@ def _values(rig: Rig, section: RigSection) -> dict[KeyPath, Any]:
 
 
 def _is_same(one: Rig, other: Rig, section: RigSection) -> bool:
-    """Whether all numbers of two rigs that are written agree, but for rounding of logarithms."""
+    """Return whether all written numbers of two rigs agree within rounding of logarithms."""
     here, there = ([*_numbers(each, section)] for each in (one, other))
     return len(here) == len(there) and all(
         math.isclose(a, b, rel_tol=_SAME, abs_tol=_NONE) for a, b in zip(here, there, strict=True)
@@ -235,8 +237,8 @@ def _is_same(one: Rig, other: Rig, section: RigSection) -> bool:
 
 
 def _numbers(rig: Rig, section: RigSection) -> Iterator[float]:
-    """Yield all numbers of a rig that are written."""
-    # A file's own masses come before its supports, and those that were found after both.
+    """Yield all written numbers of a rig."""
+    # A file's own masses come before its supports, identified ones after both.
     masses = sorted(
         rig.masses, key=lambda each: (each.stiffness > 0, round(each.x, 5), round(each.y, 5))
     )
@@ -255,20 +257,20 @@ _SECTIONS = RigSection.model_fields.keys() - {"plate", "eras"}
 """Keys that are changed as a whole."""
 
 _CHANGED = "change_rig"
-"""Name of its document in errors."""
+"""Document name in errors."""
 
 _PLACED = {"eras", "masses", "supports"}
-"""Those of what has a place on the plate."""
+"""Sections whose entries have a position on the plate."""
 
 _OF_THEORY = PlateSection.model_fields.keys() - {*FIELDS_BESIDE_THEORY, "modes"}
-"""Keys of a plate that decide the modes to which its `modes` are relative."""
+"""Keys of a plate that determine the theoretical modes to which its `modes` are relative."""
 
 _REWRITTEN = ("plate", "mesh", "eras", "masses", "laminate", "uncertainty")
-"""Fields of a rig that the text of a fitted one states."""
+"""Fields of a rig that the text of a fitted one contains."""
 
 
 def checked_keys(source: str, section: type[Section], keys: Mapping[str, Any]) -> dict[str, Any]:
-    """Keys of a section as data of a file; source: what is called with them. Raises ConfigError."""
+    """Return the keys of a section as file data; source: caller, for errors. Raises ConfigError."""
     document = _document(source, keys)
     Validation(document, section).finish()
     return document.data
@@ -288,12 +290,12 @@ def rig(
     threshold: str | None = None,
     promised_thresholds: Sequence[str] | None = None,
 ) -> Rig:
-    """Make a rig of a `Plate` and an `Era` for each name, as of a file with these sections.
+    """Build a rig from a `Plate` and an `Era` per name, like a file with these sections.
 
-    amplifiers: by default `{"main": {"url": "sim://"}}`, a simulated one, with the ERAs on its
+    amplifiers: default `{"main": {"url": "sim://"}}`, a simulated one, with the ERAs on its
     channels in order; uncertainty, fingertip: also an `Uncertainty` and a `Fingertip`, "none" for
-    weightless fingers. What is left out, or None, has the file's default. Raises ConfigError with
-    all problems, by argument and key.
+    massless fingers. Omitted arguments, and None, have the defaults of a file. Raises ConfigError
+    with all problems, by argument and key.
 
     Example:
         >>> sheet = era.Plate(length=0.4, width=0.3, thickness="3 mm", material="aluminium")
@@ -328,7 +330,7 @@ def rig(
 def save_rig(rig: Rig, path: Path | str) -> None:
     """Write a rig file that reads back as this rig: its file's text, or all of its keys.
 
-    Raises InputError for a rig that no file states, OSError if the file cannot be written.
+    Raises InputError for a rig that a file cannot express, OSError if the file cannot be written.
 
     Example:
         >>> era.save_rig(mine, "mine.yaml")
@@ -351,14 +353,14 @@ def save_rig(rig: Rig, path: Path | str) -> None:
 
 
 def change_rig(rig: Rig, **changes: Any) -> Rig:
-    """Make a rig with other keys: of the plate, as thickness=0.002, or of whole sections.
+    """Return a rig with other keys, of the plate (thickness=0.002) or of whole sections.
 
-    `plate` and `eras` change only the keys given: eras={"SW": {"stiffness": 2e4}}. Values that
-    depend on a changed key are computed again: damping from `damping_ratio`, a mesh `auto`, the
-    equivalent plate of a laminate. When a side changes, ERAs and masses keep their share of it.
-    None removes a key or an ERA. A key that is removed has its default, also `fingertip`; a finger
-    without load is fingertip="none". Raises ConfigError with all problems, InputError for `modes`
-    that were identified on another plate.
+    `plate` and `eras` change only the given keys: eras={"SW": {"stiffness": 2e4}}. Dependent values
+    are computed again: damping from `damping_ratio`, a mesh `auto`, the equivalent plate of a
+    laminate. If the plate changes size, ERAs and masses keep their relative positions. None removes
+    a key or an ERA, which restores the default; this includes `fingertip`: use fingertip="none" for
+    a massless finger. Raises ConfigError with all problems, InputError for `modes` identified on
+    another plate.
 
     Example:
         >>> thick = era.change_rig(rig, thickness=0.002, eras={"SW": {"stiffness": 2e4}})
@@ -379,8 +381,8 @@ def change_rig(rig: Rig, **changes: Any) -> Rig:
     changes_modes = not _OF_THEORY.isdisjoint(plate_changes)
     if data["plate"].get("modes") and changes_modes and "modes" not in plate_changes:
         raise InputError(
-            f"{_CHANGED}: plate.modes must be given with another plate, got those identified on "
-            "this one; modes=None for the theory's"
+            f"{_CHANGED}: plate.modes must be given for another plate, got those identified on "
+            "this one; use modes=None for theoretical modes"
         )
     sections = _with_shares_kept(rig, data)
     for key in _SECTIONS & changes.keys():
@@ -390,7 +392,7 @@ def change_rig(rig: Rig, **changes: Any) -> Rig:
 
 
 def _with_shares_kept(rig: Rig, data: Mapping[str, Any]) -> dict[str, Any]:
-    """Sections of a rig with other sides, where all that stands on the plate keeps its share."""
+    """Return the sections of a rig of another size, with relative positions unchanged."""
     read = Validation(_document(_CHANGED, data), RigSection).field
     length = read(("plate", "length"), PlateSection) or rig.plate.length
     width = read(("plate", "width"), PlateSection) or rig.plate.width
@@ -404,7 +406,7 @@ def _with_shares_kept(rig: Rig, data: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _moved(keys: Mapping[str, Any], factors: tuple[float, float]) -> Mapping[str, Any]:
-    """Keys of a section with its position times factors, unchanged without a position."""
+    """Multiply the position in a section's keys by factors; unchanged without a position."""
     if "at" not in keys:
         return keys
     position = [
@@ -415,7 +417,8 @@ def _moved(keys: Mapping[str, Any], factors: tuple[float, float]) -> Mapping[str
 
 
 def _merged(own: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    """Sections of which keys are changed, added, or left out, as whole sections are, by None."""
+    """Merge changes into sections: keys are changed or added; None removes keys or whole
+    sections."""
     sections = {**own, **changes}
     return _given(
         {
@@ -426,9 +429,9 @@ def _merged(own: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any
 
 
 def stated(rig: Rig) -> Document:
-    """A document that states a rig; raises InputError for one that was not made of keys.
+    """Return a document that expresses a rig; raises InputError for one not built from keys.
 
-    Of a rig that was fitted it has the plate, ERAs, masses and uncertainty.
+    For a fitted rig it contains plate, ERAs, masses and uncertainty.
     """
     document = _document_of(rig)
     before = rig_of(document)
@@ -440,14 +443,14 @@ def stated(rig: Rig) -> Document:
     is_same = _is_same(back, rig, Validation(document, RigSection).finish())
     if not is_same or replace(back, **{name: getattr(rig, name) for name in _REWRITTEN}) != rig:
         raise InputError(
-            "rig must have other plate, ERAs, masses and uncertainty than its keys alone; change "
+            "rig must differ from its keys only in plate, ERAs, masses and uncertainty; change "
             "others by change_rig"
         )
     return found
 
 
 def _document(source: str, keys: Mapping[str, Any]) -> Document:
-    """The keys that a program gives, as data of a file."""
+    """Return keys given by a program as file data."""
     return Document(
         source,
         "",
@@ -459,5 +462,5 @@ def _document(source: str, keys: Mapping[str, Any]) -> Document:
 
 
 def _given(keys: Mapping[str, Any]) -> dict[str, Any]:
-    """The keys that are not left out."""
+    """Return the keys that are not left out."""
     return {key: value for key, value in keys.items() if value is not None}

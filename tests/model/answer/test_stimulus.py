@@ -433,7 +433,7 @@ REFUSED: dict[str, list[Callable[[], object]]] = {
     "modulation_hz must be left out": [lambda: asked(duration=0.04, modulation_hz=20.0)],
     "is_limit must be True or False": [lambda: asked(is_limit="no")],
     "drive mode must be one of": [lambda: asked(drive_mode="loud")],
-    "hold a frequency": [
+    "contain a frequency": [
         lambda: asked(band_hz=(600.0, 800.0)),
         lambda: of_fingers(wants(TARGET, (41, 42)), wants(FINGERS_QUIET[0])),
     ],

@@ -65,8 +65,8 @@ def test_centre_of_mass_near_the_edge_of_the_feet_is_reported(
     assert balance.tips_over == is_outside
     distance = 1e3 * LENGTH * abs(share - 0.5)
     text = " ".join(balance.notes())
-    assert (f"lies {distance:.3g} mm outside the supports" in text) == is_outside
-    assert (f"lies only {distance:.2g} mm within the supports" in text) == is_near
+    assert (f"is {distance:.3g} mm outside the supports" in text) == is_outside
+    assert (f"is only {distance:.2g} mm within the supports" in text) == is_near
 
 
 @pytest.mark.parametrize("force", [0.9, 1.1])

@@ -196,7 +196,7 @@ BOTH_WAYS = f"{OWN}, resonance: 224 Hz, resonance_is: free, stiffness: 3 kN/m"
 @pytest.mark.parametrize(
     ("keys", "key", "said"),
     [
-        (f"{OWN}, resonance: 224 Hz", "resonance_is", "free, of the light coil"),
+        (f"{OWN}, resonance: 224 Hz", "resonance_is", "free for that of the light coil"),
         ("type: DAEX25CT-4, resonance: 60", "resonance_is", ""),
         (OWN, "resonance", "missing; add it, or a type that has it"),
         (BOTH_WAYS, "stiffness", ""),

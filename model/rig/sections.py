@@ -1,7 +1,7 @@
-"""The sections of a rig file: keys with defaults and bounds, and what they make.
+"""Sections of a rig file: keys with defaults and bounds, and the objects they describe.
 
-A section that reads a part of a rig (`made`) also writes it (`stated`). Bounds are wide: they catch
-values in the wrong unit.
+A section that builds a part of a rig (`made`) also writes it (`stated`). Bounds are wide: they
+catch values in the wrong unit.
 """
 
 import math
@@ -104,10 +104,10 @@ from registry.limits import GuardLimits
 
 
 class _MaterialByName:
-    """Annotation of a material that may be given by name."""
+    """Annotation of a material that can be given by name."""
 
     def read(self, value: object, section: ValidatorFunctionWrapHandler) -> object:
-        """Look up a material by its name: its numbers may depend on the thickness."""
+        """Look up a material by name; its numbers can depend on the thickness."""
         return known_material(value) if isinstance(value, str) else section(value)
 
     def __get_pydantic_core_schema__(
@@ -127,11 +127,11 @@ ModulusRows = Annotated[list[GainRow], Field(min_length=2, max_length=200), MODU
 
 ISOTROPIC = frozenset({"E", "nu"})
 ORTHOTROPIC = frozenset({"E1", "E2", "G12", "G13", "G23", "nu12"})
-"""Numbers of a material that is the same in all directions, and of one with a grain."""
+"""Required numbers of an isotropic material, and of an orthotropic one (with a grain)."""
 
 
 class MaterialSection(Section):
-    """A material by its numbers: `E` and `nu`, or those along and across a grain."""
+    """Material given by numbers: `E` and `nu`, or those along and across a grain."""
 
     model_config = ConfigDict(
         json_schema_extra={
@@ -161,7 +161,7 @@ class MaterialSection(Section):
     """
 
     E1: Modulus | None = None
-    """Young's modulus along the grain, in place of `E`, see [boards](#boards)."""
+    """Young's modulus along the grain, instead of `E`; see [boards](#boards)."""
 
     E2: Modulus | None = None
     """Across the grain."""
@@ -170,25 +170,27 @@ class MaterialSection(Section):
     """Shear modulus in the plane of the board."""
 
     nu12: Annotated[float, Quantity(RATIO, above=-5, below=5)] | None = None
-    """Contraction across the grain by a stress along it, in place of `nu`.
+    """Contraction across the grain due to stress along it, instead of `nu`.
 
-    Limits: above -5, below 5; less than the root of E1 / E2
+    Limits: above -5, below 5; less than the square root of E1 / E2
     """
 
     G13: Modulus | None = None
     """Transverse shear modulus along the grain."""
 
     G23: Modulus | None = None
-    """Transverse shear modulus across it, of wood the rolling shear."""
+    """Transverse shear modulus across the grain; for wood, the rolling shear modulus."""
 
     by_frequency: ModulusRows | None = None
-    """Modulus by frequency, as of a [layer](#layers), for an isotropic material.
+    """Modulus as a function of frequency, for an isotropic material; same format as in a
+    [layer](#layers).
 
     Limits: 2 rows or more, by ascending frequency
     """
 
     def of_thickness(self, thickness: float) -> Material:
-        """Make the material, the same at any thickness; raises InputError for one of no solid."""
+        """Build the material, the same at any thickness; raises InputError for impossible elastic
+        constants."""
         if self.E is not None and self.nu is not None:
             return Material(self.name, self.E, self.rho, self.nu)
         E1, E2, nu12 = self.E1, self.E2, self.nu12
@@ -200,7 +202,7 @@ class MaterialSection(Section):
 
     @staticmethod
     def stated(material: Material) -> dict[str, Any]:
-        """The keys that state a material, the inverse of `of_thickness`."""
+        """Return the keys that describe a material; inverse of `of_thickness`."""
         ratio = "nu" if material.orthotropy is None else "nu12"
         return {"name": material.name, **material.moduli, "rho": material.rho, ratio: material.nu}
 
@@ -209,7 +211,7 @@ MaterialOrName = Annotated[MaterialSection | KnownMaterial, _MaterialByName()]
 
 
 def _named(material: MaterialSection | KnownMaterial | None) -> KnownMaterial | None:
-    """Return the known material that one is, or has the name of; None for another one."""
+    """Return the known material that is given or named; None for another one."""
     if isinstance(material, MaterialSection):
         is_known = material.name in material_names()
         return known_material(material.name) if is_known else None
@@ -226,17 +228,17 @@ class LayerSection(Section):
     """Thickness of this layer."""
 
     loss_factor: Annotated[float, Quantity(RATIO, at_least=0, at_most=2)] | None = None
-    """Eta of the layer itself, E (1 + i eta), beside the `loss_factor` of the plate."""
+    """Loss factor of the layer itself, E (1 + i eta), in addition to the plate's `loss_factor`."""
 
     by_frequency: ModulusRows | None = None
-    """`[[frequency in Hz, factor of E, loss factor], ...]`: linear in the logarithms of frequency
-    and factor, constant outside; in place of `loss_factor`.
+    """`[[frequency in Hz, factor of E, loss factor], ...]`: interpolated linearly in the logarithms
+    of frequency and factor, constant outside; replaces `loss_factor`.
 
     Limits: 2 rows or more, by ascending frequency
     """
 
     def made(self) -> LaminateLayer:
-        """Make the layer; by_frequency of its material holds if it states no losses of its own."""
+        """Build the layer; its material's by_frequency applies unless it has losses of its own."""
         rows = self.by_frequency
         if rows is None and self.loss_factor is None:
             rows = [*(self.material.by_frequency or ())]
@@ -252,10 +254,10 @@ class AirGapSection(Section):
     """Air between the plate and a rigid wall behind it."""
 
     depth: Annotated[float, Quantity(LENGTH, at_least=1e-5, at_most=0.1)]
-    """Depth of the gap; the wall behind it does not move."""
+    """Depth of the gap to a rigid wall."""
 
     closed: bool = False
-    """`true` for a gap sealed along all edges; otherwise it is open along all of them.
+    """`true` for a gap sealed along all edges, `false` for one open along all edges.
 
     Default: none
 
@@ -264,7 +266,7 @@ class AirGapSection(Section):
 
 
 def _ascending(ends: tuple[float, float]) -> tuple[float, float]:
-    """Return the lower and the higher value; raises ValueError for others."""
+    """Return the lower and the higher value; raises ValueError if they are not ascending."""
     if ends[0] > ends[1]:
         raise ValueError(f"must be the lower and the higher value, got {ends[0]:g} and {ends[1]:g}")
     return ends
@@ -282,9 +284,10 @@ _AT_ENDS = 0.8  # benchmarks.promise weather: 86 to 94 % at both ends
 class PlateSection(Section):
     """The plate: thickness and material, or layers from one face to the other.
 
-    loss_factor: not printed in the paper; 1 % is usual for a metal panel. It is that at 150 Hz and
-    varies as the power loss_exponent of the frequency. modes: natural frequency and loss factor of
-    the lowest elastic modes, ascending, relative to those of the plate's theory.
+    - loss_factor: not stated in the paper; 1 % is usual for a metal panel. Valid at 150 Hz; varies
+      with frequency to the power of loss_exponent.
+    - modes: natural frequency and loss factor of the lowest elastic modes, ascending, relative to
+      those of plate theory.
     """
 
     model_config = ConfigDict(
@@ -306,71 +309,73 @@ class PlateSection(Section):
     """
 
     material: MaterialOrName | None = None
-    """A name, or numbers, see [material](#material).
+    """A name, or numbers; see [material](#material).
 
     Default: required, or `layers`
     """
 
     grain: Literal["length", "width"] = "length"
-    """Which side the grain of a board runs along: axis 1 of its material, of plywood the grain of
+    """Side along which the grain of a board runs: axis 1 of its material; for plywood, the grain of
     its faces.
     """
 
     layers: Annotated[list[LayerSection], Field(min_length=1, max_length=20)] | None = None
-    """A laminate instead of `thickness` and `material`, see [layers](#layers)."""
+    """Laminate, instead of `thickness` and `material`; see [layers](#layers)."""
 
     bond: Annotated[Bond, Strict(strict=False)] = Bond.FULL
-    """Whether the layers hold together, see [laminates](#laminates)."""
+    """Bond between the layers; see [laminates](#laminates)."""
 
     air_gap: AirGapSection | None = None
-    """Air between the plate and a rigid wall behind it, see [air_gap](#air_gap).
+    """Air between the plate and a rigid wall behind it; see [air_gap](#air_gap).
 
     Limits: see there
     """
 
     loss_factor: Annotated[float, Quantity(RATIO, at_least=0, below=1)] | None = None
-    """Structural damping eta of a hysteretic stiffness (1 + i eta) K, of the mounted plate.
+    """Structural loss factor eta of the mounted plate: hysteretic stiffness (1 + i eta) K.
 
-    Default: 0.01, or the greater one of its [material](#material)
+    Default: 0.01, or that of its [material](#material) if larger
     """
 
     loss_exponent: Annotated[
         float, Quantity(RATIO, at_least=-MAX_LOSS_EXPONENT, at_most=MAX_LOSS_EXPONENT)
     ] = 0.0
-    """`loss_factor` is that at 150 Hz and varies as this power of the frequency."""
+    """Exponent of the loss factor's frequency dependence; `loss_factor` is its value at 150 Hz."""
 
     temperature: Temperatures | None = None
-    """Lowest and highest one at which it is used, see [weather](#weather); °C, °F and K are read.
+    """Lowest and highest temperature of use; see [weather](#weather). Units: °C, °F, K.
 
     Limits: ascending, -40 °C to 120 °C
     """
 
     measured_temperature: Temperature = STANDARD_TEMPERATURE
-    """That at which the numbers of this file hold: when the plate was measured."""
+    """Temperature at which the numbers of this file hold, i.e. when the plate was measured."""
 
     humidity: Humidities | None = None
-    """Lowest and highest relative humidity of the air at which it is used, such as [35 %, 65 %].
+    """Lowest and highest relative humidity of use, such as [35 %, 65 %].
 
     Limits: ascending, 0 to 1
     """
 
     measured_humidity: Humidity = STANDARD_HUMIDITY
-    """That at which the numbers of this file hold: of the weeks before the plate was measured."""
+    """Relative humidity at which the numbers of this file hold, i.e. in the weeks before the plate
+    was measured."""
 
     modes: Annotated[list[ModeRow], Field(max_length=64, default_factory=list), MODES]
     """Natural frequency and loss factor of the lowest elastic modes of the free plate, ascending,
-    relative to those of its theory, as an identification finds them; shapes and higher modes
-    stay.
+    relative to plate theory, as written by an identification. Mode shapes and higher modes do not
+    change.
 
     Limits: rows of [0.8 to 1.25, 0.01 to 100]
     """
 
     @property
     def weather(self) -> float:
-        """Standard deviation of the plate's modulus over density by its weather, relative.
+        """Relative standard deviation of the plate's modulus over density due to weather.
 
-        That at which nine of ten plates keep a promise at both ends; 0 where no range is stated. Of
-        layers that of the one that changes most, of materials by numbers as of the one of the name.
+        At this value 90 % of plates keep a promise at both ends of the range; 0 without a range.
+        For layers, that of the layer that changes most; for materials given by numbers, that of the
+        material with the same name.
         """
         if self.temperature is None and self.humidity is None:
             return 0.0
@@ -383,9 +388,9 @@ class PlateSection(Section):
 
     @property
     def laminate(self) -> Laminate | None:
-        """The laminate of the plate; None for a homogeneous one.
+        """Laminate of the plate; None for a homogeneous plate.
 
-        A single layer stands for a material that depends on frequency.
+        A single layer represents a material that depends on frequency.
         """
         if self.layers is not None:
             return Laminate(tuple(each.made() for each in self.layers), bond=self.bond)
@@ -396,8 +401,9 @@ class PlateSection(Section):
         return Laminate((LaminateLayer(alone, thickness, by_frequency=tuple(known.by_frequency)),))
 
     def made(self, *, frequency_max: float) -> Plate:
-        """Make the plate; what is like a laminate is so at the highest frequency [Hz]."""
-        # The greater one of a mounted panel's and of the material itself, if none is stated.
+        """Build the plate; a laminate is represented by its equivalent plate at the highest
+        frequency [Hz]."""
+        # If no loss factor is given: the larger of a mounted panel's and the material's own.
         known = self.material.own_loss if isinstance(self.material, KnownMaterial) else 0.0
         default = max(known, Plate.loss_factor)
         own: dict[str, Any] = {name: getattr(self, name) for name in PLAIN_KEYS}
@@ -420,10 +426,10 @@ class PlateSection(Section):
         return Plate(thickness=self.thickness, material=material, **own)
 
     def stated(self, plate: Plate, laminate: Laminate | None) -> dict[KeyPath, Any]:
-        """Values of these keys, by path, that state another plate: the inverse of `made`.
+        """Return the values of these keys, by path, that describe another plate; inverse of `made`.
 
-        laminate: of which that plate is made. Of the same form as this section: as many layers, an
-        air gap if there is one, and the same grain and bond.
+        laminate: from which that plate is built. It must have the form of this section: as many
+        layers, the same air gap (if any), grain and bond.
         """
         layers = laminate.layers if laminate else ()
         found: dict[KeyPath, Any] = {}
@@ -452,7 +458,7 @@ PLAIN_KEYS: Mapping[str, Dimension] = {
     for each in key.metadata
     if isinstance(each, Quantity) and name in Plate.__dataclass_fields__
 }
-"""Dimensions of the keys of a plate that are quantities with the value of a field of `Plate`."""
+"""Dimensions of plate keys that are quantities and equal a field of `Plate`."""
 
 Corner = Annotated[
     tuple[
@@ -465,27 +471,28 @@ Ring = Annotated[list[Corner], Field(min_length=3, max_length=1000)]
 
 
 class SurfaceSection(Section):
-    """A surface by the modes of another program, in place of a plate."""
+    """Surface given by modes of another program, instead of a plate."""
 
     modes: FileName
-    """File of its modes beside the rig file: universal, .npz or .csv; see [surfaces](#surface).
+    """File of its modes, relative to the rig file: universal, .npz or .csv; see
+    [surfaces](#surface).
 
     Limits: a file
     """
 
     normal: Literal["x", "y", "z", "-x", "-y", "-z", "local x", "local y", "local z"] = "z"
-    """Direction out of the surface towards fingers, in axes of the file; `local z` for the normal
-    at each node, of a curved surface.
+    """Direction from the surface towards the fingers, in axes of the file; `local z` for the normal
+    at each node of a curved surface.
     """
 
     mass: Annotated[float, Quantity(MASS, above=0, at_most=1000)] | None = None
-    """That moves along the normal.
+    """Mass that moves along the normal.
 
-    Default: of the rigid modes in the file; required without them
+    Default: from the rigid modes in the file; required without them
     """
 
     loss_factor: Annotated[float, Quantity(RATIO, at_least=0, below=1)] | None = None
-    """Structural damping of all modes.
+    """Structural loss factor of all modes.
 
     Default: twice the damping ratio of each mode in the file, else 0.01
     """
@@ -497,7 +504,7 @@ class SurfaceSection(Section):
     """
 
     def made(self, path: Path) -> Plate:
-        """Make the plate of the modes of a file; raises InputError for what are none."""
+        """Build the plate from a modes file; raises InputError for invalid modes."""
         digest = digest_of_file(path)
         shapes = surface_shapes(str(path), digest, self.normal)
         notes = check_surface(str(path), digest, self.normal, self.mass)
@@ -505,7 +512,7 @@ class SurfaceSection(Section):
         if self.loss_factor is None and not 0 <= loss < 1:
             raise InputError(
                 f"{path}: damping ratios must be from 0 to below 0.5 in most modes, got "
-                f"{loss / 2:g} in the median; export shares of critical damping, or give "
+                f"{loss / 2:g} in the median; export fractions of critical damping, or give "
                 "surface.loss_factor"
             )
         rings = shapes.outline if self.outline is None else self.outline
@@ -537,7 +544,7 @@ Points = Annotated[int, Field(ge=3, le=40)]
 
 
 class MassSection(Section):
-    """A mass on the plate, at a point or on a disc, or along all edges."""
+    """Mass on the plate, at a point or on a disc, or along all edges."""
 
     model_config = ConfigDict(
         json_schema_extra={
@@ -552,28 +559,28 @@ class MassSection(Section):
     """
 
     mass: Annotated[float, Quantity(MASS, at_least=0, at_most=10)] | None = None
-    """Its mass.
+    """Mass at the point.
 
     Default: required with `at`
     """
 
     foot: Foot = 0.0
-    """Radius of the disc on which it sits, 0 for a point."""
+    """Radius of its contact disc, 0 for a point."""
 
     along: Edges | None = None
-    """`edges` for a frame that is bonded to all of them, in place of `at`."""
+    """`edges` for a frame bonded to all edges, instead of `at`."""
 
     mass_per_length: Annotated[float, Quantity(LINE_MASS, at_least=0, at_most=100)] | None = None
-    """Mass of such a frame per length.
+    """Frame mass per length.
 
     Default: required with `along`
     """
 
     points: Points = DEFAULT_POINTS
-    """Number of points of each edge at which a frame acts; more for many waves along it."""
+    """Number of points per edge at which a frame acts; increase it for many waves along an edge."""
 
     def made(self, plate: Plate) -> tuple[PointLoad, ...]:
-        """Make the mass on a plate, or those of a frame along its edges."""
+        """Build the mass on a plate, or the masses of a frame along its edges."""
         if self.at is not None:
             x, y = place_on(plate, self.at)
             return (PointLoad(x, y, mass=self.mass or 0.0, foot=self.foot),)
@@ -585,7 +592,7 @@ class MassSection(Section):
 
 
 class SupportSection(Section):
-    """A foot under the plate, or what holds its edges; it is not driven."""
+    """Passive foot under the plate, or support along its edges."""
 
     at: Place | None = None
     """`[x, y]`, on the plate.
@@ -594,7 +601,7 @@ class SupportSection(Section):
     """
 
     kind: FootKind | None = None
-    """Kind of a foot with the stiffness [below](#supports), unless `stiffness` is given."""
+    """Type of foot, which sets its stiffness [as listed](#supports) unless `stiffness` is given."""
 
     stiffness: Annotated[float, Quantity(STIFFNESS, above=0, at_most=1e12)] | None = None
     """Stiffness of its spring.
@@ -603,33 +610,33 @@ class SupportSection(Section):
     """
 
     loss_factor: Annotated[float, Quantity(RATIO, at_least=0, at_most=2)] | None = None
-    """Eta of the spring, k (1 + i eta).
+    """Loss factor eta of the spring, k (1 + i eta).
 
-    Default: that [below](#supports), or 0 with `damping`
+    Default: [as listed](#supports), or 0 with `damping`
     """
 
     damping: Annotated[float, Quantity(DAMPING, at_least=0, at_most=1e6)] | None = None
-    """Damping of a viscous damper, in place of a loss factor or beside one that is given."""
+    """Viscous damping, instead of a loss factor or in addition to a given one."""
 
     foot: Foot = 0.0
-    """Radius of the disc on which it presses, 0 for a point; required from 1 MN/m on."""
+    """Radius of its contact disc, 0 for a point; required from 1 MN/m."""
 
     along: Edges | None = None
-    """`edges` for what holds all of them, as foam tape, in place of `at`."""
+    """`edges` for a support along all edges, such as foam tape, instead of `at`."""
 
     stiffness_per_length: (
         Annotated[float, Quantity(LINE_STIFFNESS, above=0, at_most=1e9)] | None
     ) = None
-    """Stiffness per length of what holds the edges.
+    """Stiffness per length of a support along the edges.
 
     Default: required with `along`
     """
 
     points: Points = DEFAULT_POINTS
-    """Number of points of each edge at which it acts; more for many waves along it."""
+    """Number of points per edge at which it acts; increase it for many waves along an edge."""
 
     def made(self, plate: Plate) -> tuple[PointLoad, ...]:
-        """Make the foot under a plate, or springs along its edges."""
+        """Build the foot under a plate, or springs along its edges."""
         damping, loss_factor = self.damping or 0.0, self.loss_factor
         if loss_factor is None:
             loss_factor = FOOT_LOSS if self.damping is None else 0.0
@@ -654,18 +661,18 @@ class SupportSection(Section):
 
 
 class AmplifierSection(Section):
-    """An amplifier: its URL, and what its full level is."""
+    """Amplifier: its URL, and the meaning of its full level."""
 
     url: Annotated[str, AfterValidator(check_url)]
-    """How to reach it: `sim://`, `serial:///dev/ttyUSB0?baud=921600`.
+    """Address: `sim://`, `serial:///dev/ttyUSB0?baud=921600`.
 
     Limits: [`SCHEME://...`](urls.md)
     """
 
     full_level: Literal["motion", "output"] | None = None
-    """What it plays at level 1.
+    """Quantity played at level 1.
 
-    Default: `output` where it drives an exciter, else `motion`
+    Default: `output` if it drives an exciter, else `motion`
 
     Limits: `motion`, `output`
     """
@@ -673,14 +680,14 @@ class AmplifierSection(Section):
     clock_error: Annotated[
         float | Literal["unknown"], Quantity(TIME, at_least=0, at_most=0.001, word="unknown")
     ] = 5e-6
-    """By which its clock may be wrong, for `era config check`; once connected it states it itself.
+    """Clock error assumed by `era config check`; once connected, the amplifier states its own.
 
     Limits: 0 to 1 ms, or `unknown` for a clock that cannot be steered
     """
 
 
 def _within(key: str, unit: Dimension = RATIO) -> Quantity:
-    """The bounds of a parameter of an `Uncertainty`."""
+    """Return the bounds of a parameter of an `Uncertainty`."""
     return Quantity(unit, at_least=BOUNDS[key][0], at_most=BOUNDS[key][1])
 
 
@@ -700,64 +707,65 @@ class UncertaintySection(Section):
     """Stiffness of each ERA, relative."""
 
     damping: Annotated[float, _within("damping")] = Uncertainty.damping
-    """A factor, of the ERAs' damping and, independently, of the plate's loss factor."""
+    """Factor, for the ERAs' damping and, independently, the plate's loss factor."""
 
     fingertip: Annotated[float, _within("fingertip")] = Uncertainty.fingertip
     """Natural logarithm of each finger's load."""
 
     common_gain: Annotated[float, _within("common_gain")] = Uncertainty.common_gain
-    """Gain of all channels together, relative: of levels only."""
+    """Common gain of all channels, relative; affects levels only."""
 
     field: Annotated[float, _within("field")] = Uncertainty.field
-    """Acceleration that each ERA causes at a finger, relative to its root mean square over
-    the plate, by whatever no other key describes.
+    """Acceleration caused by each ERA at a finger, relative to its RMS over the plate, from causes
+    that no other key describes.
     """
 
     modulus: Annotated[float, _within("modulus")] = Uncertainty.modulus
     """Modulus of elasticity of the plate, relative; it counts as 0 if `thickness` is 0."""
 
     place: Annotated[float, _within("place", LENGTH)] = Uncertainty.place
-    """Place of each ERA, along x and along y."""
+    """Position of each ERA, along x and along y."""
 
     harmonic: Annotated[float, _within("harmonic")] = Uncertainty.harmonic
-    """Second harmonic of each ERA's motion as a share of its own amplitude, of any phase."""
+    """Second harmonic of each ERA's motion relative to its own amplitude, at any phase."""
 
     supports: Annotated[float, _within("supports")] | None = None
     """Natural logarithm of the stiffness of each foot.
 
-    Default: 0.3 where a rig has feet, else 0
+    Default: 0.3 if the rig has feet, else 0
     """
 
     weather: Annotated[float, _within("weather")] | None = None
-    """Of the plate's modulus by temperature and moisture, relative, also where `thickness` is 0.
+    """Modulus of the plate due to temperature and moisture, relative; also used if `thickness` is
+    0.
 
-    Default: by `plate.temperature` and `plate.humidity`, see [weather](#weather), else 0
+    Default: from `plate.temperature` and `plate.humidity`, see [weather](#weather), else 0
     """
 
     foreign_mass: Annotated[float, _within("foreign_mass", MASS)] = Uncertainty.foreign_mass
-    """Mass of an object that may lie anywhere on the plate, such as a cup of 200 g; see
-    [what lies on the plate](../concepts/people.md#what-lies-on-the-plate).
+    """Mass of an object that can be anywhere on the plate, such as a 200 g cup; see [what lies on
+    the plate](../concepts/people.md#what-lies-on-the-plate).
     """
 
     mode_frequency: Annotated[float, _within("mode_frequency")] = Uncertainty.mode_frequency
-    """Natural frequency of each mode by itself, relative, as modes of a computed
-    [surface](#surface) differ from those of the one that was made.
+    """Natural frequency of each mode individually, relative: the difference between a computed
+    [surface](#surface) and the one that was built.
     """
 
     mode_amplitude: Annotated[float, _within("mode_amplitude")] = Uncertainty.mode_amplitude
-    """Size of the shape of each mode of a surface by itself, relative."""
+    """Amplitude of each mode shape of a surface individually, relative."""
 
     def made(self, *, has_feet: bool, weather: float) -> Uncertainty:
-        """Make the uncertainty of a rig; that of its feet, if none is stated, as `FEET_DEVIATE`.
+        """Build the uncertainty of a rig; for feet, default `FEET_DEVIATE`.
 
-        weather: that of its plate, if none is stated.
+        weather: default, from the plate.
         """
         unknown = {"supports": FEET_DEVIATE if has_feet else 0.0, "weather": weather}
         return Uncertainty(**(unknown | self.model_dump(exclude_none=True)))
 
 
 class FingertipSection(Section):
-    """The load of a fingertip, see `Fingertip`; a key left out has the default's value."""
+    """Load of a fingertip, see `Fingertip`; a missing key has its default value."""
 
     stiffness: Annotated[float, Quantity(STIFFNESS, at_least=0, at_most=1e6)] = 1000.0
     """Stiffness of the pulp."""
@@ -779,7 +787,7 @@ class FingertipSection(Section):
 
 
 class LimitsSection(Section):
-    """Limits of commands, see `GuardLimits`; all but the frequencies are unlimited by default.
+    """Limits of commands, see `GuardLimits`; all except the frequencies are unlimited by default.
 
     The default frequencies are those that skin feels well.
     """
@@ -787,38 +795,37 @@ class LimitsSection(Section):
     frequency: Annotated[
         tuple[Frequency, Frequency], Strict(strict=False), AfterValidator(check_ascending)
     ] = (40.0, 500.0)
-    """Lowest and highest mechanical frequency that may be driven."""
+    """Lowest and highest mechanical drive frequency."""
 
     level: Annotated[float, Quantity(RATIO, at_least=0, at_most=1)] = 1.0
-    """Share of the full level, as of an ERA's stroke."""
+    """Maximum level, as a fraction of full level (an ERA's stroke)."""
 
     slew: Annotated[float, Quantity(SLEW, above=0, at_most=1e6)] | None = None
     """Maximum rise of a level; `2 %/ms` is from rest to full stroke in 50 ms. Ramps are lengthened
-    accordingly, an envelope that rises faster is refused. It counts from the lowest level that
-    may be playing, along the whole ramp: a raised cosine is 1.6 times as steep at its middle.
+    accordingly; an envelope that rises faster is rejected. The rise is measured from the lowest
+    level that can be playing, averaged over the ramp: a raised cosine is 1.6 times as steep in its
+    middle.
     """
 
     power: Annotated[float, Quantity(RATIO, above=0, at_most=256)] | None = None
-    """Sum of the squared levels of the channels of one amplifier; 1 is one channel at full stroke,
-    or four at half of it.
+    """Maximum sum of the squared levels of one amplifier's channels; 1 is one channel at full
+    stroke, or four channels at half stroke.
     """
 
     on_time: Annotated[float, Quantity(TIME, above=0, at_most=86_400)] | None = None
-    """How long one amplifier may vibrate without a pause, ramps included; it ends by itself by
-    then.
-    """
+    """Longest continuous vibration of one amplifier, ramps included; it ends on its own by then."""
 
     duty: Annotated[float, Quantity(RATIO, above=0, at_most=1)] | None = None
-    """Share of any ten seconds during which one amplifier may vibrate, ramps included."""
+    """Maximum fraction of any ten seconds in which one amplifier vibrates, ramps included."""
 
     rate: Annotated[float, Quantity(RATE, at_least=1, at_most=2000)] | None = None
-    """Command sets per second, other than silence, that one amplifier is sent, counted over 1.1 s,
-    so that none of its seconds has more although some are delayed on their way; a set refused
-    for it is played as soon as it is allowed.
+    """Maximum number of command sets per second sent to one amplifier, other than silence. They are
+    counted over 1.1 s, so that no second at the amplifier has more even if some are delayed. A
+    rejected set is played as soon as the limit allows.
     """
 
     def made(self) -> GuardLimits:
-        """Make the limits, infinite where none is stated."""
+        """Build the limits, infinite unless given."""
         low, high = self.frequency
         given = self.model_dump(exclude={"frequency"}, exclude_none=True)
         return GuardLimits(frequency_min=low, frequency_max=high, **given)
@@ -827,13 +834,15 @@ class LimitsSection(Section):
 class RigSection(Section):
     """A rig file.
 
-    mesh: auto, auto 1 %, NXxNY, or NXxNY ELEMENT; uncertainty: without it that of a plate which was
-    not measured; fingertip: none for weightless fingers; threshold: a set of detection thresholds;
-    promised_thresholds: those by which promises hold.
+    - mesh: auto, auto 1 %, NXxNY, or NXxNY ELEMENT.
+    - uncertainty: default for a plate without measurements.
+    - fingertip: none for massless fingers.
+    - threshold: a set of detection thresholds.
+    - promised_thresholds: sets for which promises hold.
     """
 
     plate: PlateSection | None = None
-    """The plate, see [plate](#plate).
+    """The plate; see [plate](#plate).
 
     Default: required, or `surface`
     """
@@ -845,58 +854,58 @@ class RigSection(Section):
             json_schema_input_type=SurfaceSection | str | None,
         ),
     ] = None
-    """Modes of another program in place of a plate, see [surface](#surface).
+    """Modes of another program, instead of a plate; see [surface](#surface).
 
     Limits: a mapping, or a file of modes
     """
 
     mesh: str = "auto"
-    """`auto A %` uses polynomials over the plate for an error of the response of A % up to the
-    upper `limits.frequency`, `auto` for 1 %, or elements where there would be too many; see [the
-    plate model](../concepts/plate-model.md). Else elements along x and y, of MITC4 Q3, Q4 or Q5,
-    with a narrow row of them along every edge if strips are given; or the degrees of polynomials
-    with `Legendre` in place of an element. A mesh with fewer than six elements per bending
-    wavelength there is refused.
+    """`auto A %` uses polynomials over the plate for a response error of A % up to the upper
+    `limits.frequency` (`auto`: 1 %), or elements if that takes too many polynomials; see [the plate
+    model](../concepts/plate-model.md). Otherwise: the number of elements along x and y, of type
+    MITC4, Q3, Q4 or Q5, with a narrow row along every edge if strips are given; or polynomial
+    degrees with `Legendre` as the element. A mesh with fewer than six elements per bending
+    wavelength at that frequency is rejected.
 
     Limits: `auto`, `auto A %` with A from 0.05 to 10, `NXxNY` with 1 to 1000 a side, `NXxNY
     ELEMENT`, or `NXxNY ELEMENT with strips of W`
     """
 
     eras: Annotated[dict[Identifier, ActuatorOfAnyKind], Field(min_length=1, max_length=64)]
-    """ERAs, or exciters, by name, see [eras](#eras) and [exciters](#exciters)."""
+    """ERAs or exciters by name; see [eras](#eras) and [exciters](#exciters)."""
 
     masses: Annotated[dict[Identifier, MassSection], Field(max_length=64, default_factory=dict)]
-    """Masses by name, see [masses](#masses)."""
+    """Masses by name; see [masses](#masses)."""
 
     supports: Annotated[
         dict[Identifier, SupportSection], Field(max_length=64, default_factory=dict)
     ]
-    """What holds the plate and is not driven, by name, see [supports](#supports)."""
+    """Passive supports of the plate by name; see [supports](#supports)."""
 
     amplifiers: Annotated[dict[Identifier, AmplifierSection], Field(min_length=1)]
-    """Amplifiers by name, see [amplifiers](#amplifiers)."""
+    """Amplifiers by name; see [amplifiers](#amplifiers)."""
 
     limits: LimitsSection = LimitsSection()
-    """Limits of commands, see [limits](#limits)."""
+    """Limits of commands; see [limits](#limits)."""
 
     uncertainty: UncertaintySection = UncertaintySection()
-    """How well the rig is known, see [uncertainty](#uncertainty)."""
+    """Uncertainty of the rig; see [uncertainty](#uncertainty)."""
 
     fingertip: Annotated[
         FingertipSection,
-        # Not a union, of which pydantic would name both in errors.
+        # Not a union, since pydantic would name both alternatives in errors.
         WrapValidator(
             lambda value, section: value if value == "none" else section(value),
             json_schema_input_type=FingertipSection | Literal["none"],
         ),
     ] = FingertipSection()
-    """Load of each finger on the plate, see [fingertip](#fingertip); `none` for weightless ones.
+    """Load of each finger on the plate, see [fingertip](#fingertip); `none` for massless fingers.
 
     Limits: a mapping, or `none`
     """
 
     threshold: ThresholdSet = DEFAULT_THRESHOLD
-    """Set of detection thresholds to which levels in dB SL refer, see
+    """Threshold set to which levels in dB SL refer; see
     [people](../concepts/people.md#detection-thresholds).
 
     Limits: `vibrotactile-probe`, `pressing-fingertip`
@@ -906,8 +915,8 @@ class RigSection(Section):
         list[ThresholdSet],
         Field(min_length=1, default_factory=lambda: [*THRESHOLDS]),
     ]
-    """Sets beside that of `threshold` by which promises hold: the one that says least counts. All
-    that are published if left out; name that of `threshold` alone for promises by it alone.
+    """Additional threshold sets for which promises hold: the set with the lowest promise counts.
+    Default: all published sets. Name only that of `threshold` to base promises on it alone.
 
     Limits: a list of `vibrotactile-probe`, `pressing-fingertip`
     """

@@ -410,7 +410,7 @@ FOAMED = LAMINATE[: LAMINATE.index("  layers:")] + FOAM + LAMINATE[LAMINATE.inde
         (GAP.replace("GAP", "0.1 mm"), "plate.air_gap", "off by 50 % or more"),
         (GAP.replace("GAP", "0.5 mm, closed: true"), "plate.air_gap", None),
         (GAP.replace("GAP", "0.2 mm, closed: true"), "plate.air_gap", "off by 10 %"),
-        (GAP.replace("GAP", "0.05 mm, closed: true"), "plate.air_gap", "off by half of it"),
+        (GAP.replace("GAP", "0.05 mm, closed: true"), "plate.air_gap", "off by 50 %"),
         # 6.4 cm in place of 6.4 mm of plywood, and no board of a shop.
         (THICK.replace("1.5 mm", "6.4 cm"), "plate.thickness", "64 mm"),
         (THICK.replace("1.5 mm", "18 mm"), "plate.thickness", None),

@@ -249,6 +249,22 @@ def test_readme_shows_what_the_demonstration_prints(
     assert what is None, what
 
 
+FIRST_COMMANDS = re.findall(r"`\.venv/bin/era ([^`]+)`", (ROOT / "README.md").read_text("utf-8"))
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("command", FIRST_COMMANDS)
+def test_first_command_of_each_reader_succeeds(
+    command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The commands in the README's table end with status 0; `--dashboard` would wait: its help."""
+    monkeypatch.chdir(ROOT)
+    arguments = command.replace("--dashboard", "--help").split()
+    if arguments[0] == "demo":
+        arguments += ["--out", str(tmp_path)]
+    assert run_era(arguments) == 0
+
+
 FACT_PAGES = [
     ROOT / "README.md",
     ROOT / "CONTRIBUTING.md",

@@ -29,26 +29,26 @@ SECTIONS: Mapping[str, type[Section]] = {
 
 
 def _own_losses() -> str:
-    """Default loss factors of plates by their material, where it is not that of all plates."""
+    """Default loss factors of materials that differ from the general default."""
     own = {name: each.own_loss for name, each in KNOWN_MATERIALS.items() if each.own_loss}
     by_loss = [
         f"{100 * loss:g} % ({', '.join(f'`{name}`' for name in own if own[name] == loss)})"
         for loss in dict.fromkeys(own.values())
     ]
-    return f"Wood loses more by itself, so by name the default is {' or '.join(by_loss)}, assumed."
+    return f"Wood has higher losses: its default, by name, is {' or '.join(by_loss)} (assumed)."
 
 
 def _types() -> str:
-    """Types of exciters, and what to know of each."""
+    """Types of exciters, each with its note."""
     return "\n".join(f"- `{each.name}`: {each.note}" for each in EXCITER_TYPES.values())
 
 
 def _feet() -> str:
     """Stiffness and loss factor of feet by their kind."""
-    feet = ", ".join(f"of `{kind}` {each / 1e3:g} kN/m" for kind, each in FEET.items())
+    feet = ", ".join(f"`{kind}` {stiffness / 1e3:g} kN/m" for kind, stiffness in FEET.items())
     return (
-        f"Stiffness of a foot {feet}; a loss factor of {FOOT_LOSS:g}, also along edges: *assumed*, "
-        "of feet of some 2 cm."
+        f"Assumed values for feet of about 2 cm: stiffness of {feet}; loss factor {FOOT_LOSS:g}, "
+        "also along edges."
     )
 
 
@@ -59,7 +59,7 @@ def _weather() -> str:
         f"{f'{each.by_moisture:g} %' if each.by_moisture else '-'} | {each.weather} |"
         for name, each in KNOWN_MATERIALS.items()
     ]
-    head = ["| material | modulus by a kelvin | by 1 % of moisture | source |", "|---|---|---|---|"]
+    head = ["| material | modulus per kelvin | per 1 % of moisture | source |", "|---|---|---|---|"]
     return "\n".join([*head, *rows])
 
 

@@ -167,7 +167,7 @@ class ActuatorSection(Section):
     """Channel of the amplifier; unique per ERA, none without an amplifier."""
 
     foot: Foot = 0.0
-    """Radius of its contact disc, 0 for a point as in the paper; only the part on the plate counts.
+    """Radius of its contact disc, 0 for a point; only the part on the plate counts.
     Required from a stiffness of 1 MN/m: [points and
     feet](../concepts/plate-model.md#points-and-feet).
     """

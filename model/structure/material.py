@@ -164,10 +164,9 @@ _MOISTURE = (
 _WOOD: Any = {
     "by_kelvin": -0.0023,
     "by_moisture": -1.5,
-    "weather": "Wood Handbook FPL-GTR-190: along the grain, at 12 % of moisture, 7 % less at 50 °C "
-    "than at 20 °C (table 5-15); from memory 9 % more at 6 % of moisture than at 12 %, and across "
-    "the grain twice as much; with the density 2.4 % of modulus over density by 1 % of moisture, "
-    "where waves in wood and boards slow by about 1 %, that is 2 % (Han, Wu and Wang 2006)",
+    "weather": "Wood Handbook FPL-GTR-190: along the grain at 12 % moisture, 7 % less at 50 °C "
+    "than at 20 °C (table 5-15); from memory, 9 % more at 6 % moisture than at 12 %, and twice as "
+    "much across the grain",
 }
 
 VENEER = 1.4e-3  # m; before the faces are sanded to boards of 1.4 n - 0.6 mm
@@ -224,7 +223,7 @@ _KNOWN = (
         variation="E 195 to 210 GPa, rho 7700 to 8000 kg/m³; stainless steel: lower E, higher rho",
         loss_factor="0.0002 to 0.0006",
         by_kelvin=-0.00025,
-        weather="tuning forks of plain steel, from memory; EN 1993-1-2 has none below 100 °C",
+        weather="tuning forks of plain steel, from memory; EN 1993-1-2 starts at 100 °C",
     ),
     KnownMaterial(
         Material("soda-lime-glass", E=70e9, rho=2500.0, nu=0.2),
@@ -232,7 +231,7 @@ _KNOWN = (
         variation="E 69 to 74 GPa, nu 0.20 to 0.23 in makers' data; tempering changes neither",
         loss_factor="0.0006 to 0.002",
         by_kelvin=-0.0001,
-        weather="from memory: 0.01 % a kelvin, of silicate glasses",
+        weather="silicate glasses, 0.01 % per kelvin, from memory",
     ),
     KnownMaterial(
         Material("chemically-strengthened-glass", E=71.5e9, rho=2420.0, nu=0.21),
@@ -241,7 +240,7 @@ _KNOWN = (
         "cover glasses; give the numbers of your own",
         loss_factor="0.0006 to 0.002",
         by_kelvin=-0.0001,
-        weather="as soda-lime glass, assumed",
+        weather="assumed equal to soda-lime glass",
     ),
     KnownMaterial(
         Material("acrylic", E=4.6e9, rho=1190.0, nu=0.37),
@@ -253,8 +252,8 @@ _KNOWN = (
         "beside that of the plate",
         by_frequency=((10.0, 4.2 / 4.6, 0.075), (100.0, 1.0, 0.06), (1000.0, 5.0 / 4.6, 0.045)),
         by_kelvin=-0.004,
-        weather="its modulus by frequency, a decade for 21 K: activation energy of the beta "
-        "relaxation 78 kJ/mol, from memory; its loss factor then rises by 1.2 % a kelvin",
+        weather="from its modulus over frequency, a decade for 21 K: activation energy of the beta "
+        "relaxation 78 kJ/mol, from memory; its loss factor then rises by 1.2 % per kelvin",
     ),
     KnownMaterial(
         Material("polycarbonate", E=2.4e9, rho=1200.0, nu=0.38),
@@ -263,7 +262,7 @@ _KNOWN = (
         variation="E 2.1 to 2.4 GPa, rho 1190 to 1220 kg/m³, nu 0.37 to 0.40",
         loss_factor="0.01",
         by_kelvin=-0.002,
-        weather="assumed, as the ISO 527 modulus of its makers falls to 60 °C",
+        weather="assumed from makers' ISO 527 moduli up to 60 °C",
     ),
     KnownMaterial(
         plywood(6.4e-3),
@@ -393,7 +392,7 @@ class ExciterType:
 _EXCITER_TYPES_KNOWN = (
     ExciterType(
         "DAEX13-4SM",
-        "13 mm; no sheet gives force factor and coil mass, and its resonance is unreliable",
+        "13 mm; force factor and coil mass are in no data sheet, and its resonance is unreliable",
         {
             "coil_mass": _assumed(0.7e-3, 0.5e-3, 1.0e-3),
             "weight": SheetValue(14.3e-3, f"{_PART_PAGE}: 15 g in all, less the coil's"),
@@ -408,7 +407,7 @@ _EXCITER_TYPES_KNOWN = (
     ),
     ExciterType(
         "DAEX25CT-4",
-        "25 mm, a coin",
+        "25 mm, coin type",
         {
             "coil_mass": SheetValue(1.29e-3, _PINNED),
             "weight": _assumed(33.5e-3, 28.7e-3, 43.7e-3),
@@ -438,7 +437,7 @@ _EXCITER_TYPES_KNOWN = (
     ),
     ExciterType(
         "EX25FHE2-4",
-        "25 mm in a frame, sold in place of DAEX25FHE-4; masses and force factor as of that one",
+        "25 mm in a frame, successor of DAEX25FHE-4, whose masses and force factor it uses",
         {
             "coil_mass": _assumed(1.61e-3, 1.2e-3, 2.0e-3),
             "weight": _assumed(109.29e-3, 85e-3, 130e-3),

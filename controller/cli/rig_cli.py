@@ -68,7 +68,7 @@ def identify(
         str | None,
         typer.Option(
             metavar="DEVICE",
-            help="Sound card that plays and records: jack, jack:CLIENT, or a device of PortAudio.",
+            help='Sound card that plays and records: PortAudio number, "NAME" or "NAME, HOST API".',
         ),
     ] = None,
     sensors_file: Annotated[

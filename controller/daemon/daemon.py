@@ -33,7 +33,6 @@ from controller.operation.supervisor import Supervisor
 from controller.play.loop import Observers
 from controller.process.daemon_process import (
     MIN_DESCRIPTORS,
-    ServiceManager,
     SocketLock,
     allow_many_descriptors,
 )
@@ -50,6 +49,7 @@ from model.quantities import counted
 from model.table.table import LocalizationTable
 from model.table.table_file import cached_table, load_table
 from registry import threads
+from registry.service_manager import ServiceManager
 from registry.threads import DaemonThreads, in_thread, leave_work, no_long_collections
 
 _CLOSE_TIMEOUT = 0.2  # s; for the control loop to end after all reachable amplifiers are silent

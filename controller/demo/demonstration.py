@@ -39,7 +39,7 @@ from controller.demo.recorder import (
 )
 from controller.effects.layout import BUZZ
 from controller.operation.operation_states import DaemonState
-from controller.process.daemon_process import ServiceManager, SocketLock
+from controller.process.daemon_process import SocketLock
 from controller.process.log import LogThread, start_log
 from controller.sources.touch import ALIGNED, TouchFrame, TouchSource
 from controller.sources.tuio import RecordedDatagram, TuioSource, read_capture
@@ -60,6 +60,7 @@ from model.rig.rig_file import load_rig
 from model.structure.plate import Plate
 from model.table.table import LocalizationTable
 from registry import threads
+from registry.service_manager import ServiceManager
 from registry.virtual_time import VirtualTimeLoop
 
 MIN_ERAS_FOR_THREE = 8

@@ -1,23 +1,18 @@
-"""The engine of a software amplifier: its library, settings, lines and counters.
+"""The engine of a software amplifier: its library, settings and counters.
 
-The library is `firmware/ports/sound/sound.h`, of a wheel of this platform or compiled at first use.
-A terminal or port is kept while the process that plays restarts. Counters are in memory that the
-process that watches it shares.
+The library is `firmware/ports/sound/sound.h`, from a wheel of this platform or compiled at first
+use.
 """
 
 import ctypes
-import mmap
 import os
-import tempfile
-import time
 from functools import cache
 from pathlib import Path
-from typing import IO
 
 from drivers.errors import LinkError
 from model.compiled.kernels import compile_library, kept_library
 from model.errors import InputError
-from sim.soft_amp.settings import MAX_CHANNELS, Law, SoftAmplifierSettings
+from sim.soft_amp.settings import Law, SoftAmplifierLine, SoftAmplifierSettings
 
 ENGINE = "sound-engine.so"
 """The file of the library in a wheel of one platform; no name of a module, which it would hide."""
@@ -91,29 +86,9 @@ class Counters(ctypes.Structure):
         ("xruns", ctypes.c_uint64),
         ("clipped", ctypes.c_uint64),
         ("requests", ctypes.c_uint64),
-        ("is_streaming", ctypes.c_uint32),
-        ("is_lost", ctypes.c_uint32),
         ("is_realtime", ctypes.c_uint32),
-        ("state", ctypes.c_uint32 * 2),
-        ("fault", ctypes.c_uint32 * 2),
         ("block", ctypes.c_uint32),
     )
-
-
-def new_file() -> IO[bytes]:
-    """A file without a name, of the size of the counters, all zero."""
-    file = tempfile.TemporaryFile()  # noqa: SIM115  the caller's
-    file.truncate(ctypes.sizeof(Counters))
-    return file
-
-
-def counters_in(descriptor: int) -> Counters:
-    """The counters in a file, shared with every process that maps it."""
-    return Counters.from_buffer(mmap.mmap(descriptor, ctypes.sizeof(Counters)))
-
-
-_POLL = 0.001  # s
-_HANDOVER = 2.0  # s
 
 
 class _SoundSettings(ctypes.Structure):
@@ -124,7 +99,6 @@ class _SoundSettings(ctypes.Structure):
         ("protocol", ctypes.c_uint32),
         ("limit", ctypes.c_double),
         ("max_gaps", ctypes.c_uint32),
-        ("is_recovering", ctypes.c_uint32),
         ("serial_number", ctypes.c_char_p),
     )
 
@@ -133,39 +107,16 @@ class _LinesSettings(ctypes.Structure):
     _fields_ = (
         ("terminal", ctypes.c_int),
         ("listening", ctypes.c_int),
-        ("parent", ctypes.c_int),
-    )
-
-
-class JackCalls(ctypes.Structure):
-    """`struct jack_calls`: a client, its ports, and addresses of functions of libjack."""
-
-    _fields_ = (
-        ("client", ctypes.c_void_p),
-        ("ports", ctypes.c_void_p * MAX_CHANNELS),
-        ("buffer", ctypes.c_void_p),
-        ("cycle_times", ctypes.c_void_p),
-        ("time", ctypes.c_void_p),
-        ("latency", ctypes.c_void_p),
-        ("is_realtime", ctypes.c_void_p),
-        ("port_by_id", ctypes.c_void_p),
-        ("is_mine", ctypes.c_void_p),
     )
 
 
 def start_engine(
-    settings: SoftAmplifierSettings,
-    *,
-    rate: int,
-    counters: Counters,
-    is_recovering: bool,
-    terminal: int,
-    listening: int,
-    parent: int,
+    settings: SoftAmplifierSettings, place: SoftAmplifierLine, *, rate: int, counters: Counters
 ) -> None:
-    """Start the amplifiers at a rate [Hz] and their lines; descriptors: -1 for none.
+    """Start the amplifiers at a sample rate [Hz], and serve their line; raises LinkError.
 
-    Raises InputError, LinkError.
+    Requests of hosts take effect when the callback renders a block. There is one engine in a
+    process, and it has no end.
     """
     sound = _SoundSettings(
         rate,
@@ -174,21 +125,11 @@ def start_engine(
         settings.protocol,
         settings.limit,
         settings.max_gaps,
-        is_recovering,
         settings.serial_number.encode(),
     )
-    lines = _LinesSettings(terminal, listening, parent)
+    lines = _LinesSettings(place.terminal, place.listening)
     problem = library().sound_start(
         ctypes.byref(sound), ctypes.byref(lines), ctypes.byref(counters)
     )
     if problem:
-        raise LinkError(f"soft-amp: cannot start: {os.strerror(abs(problem))}")
-
-
-def take_over() -> None:
-    """Let the sound thread render from now on."""
-    end = time.monotonic() + _HANDOVER
-    while not library().sound_take_over():
-        if time.monotonic() > end:
-            raise LinkError(f"soft-amp: its lines did not respond within {_HANDOVER:g} s")
-        time.sleep(_POLL)
+        raise LinkError(f"soft-amp: cannot start: {os.strerror(problem)}")

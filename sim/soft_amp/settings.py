@@ -33,11 +33,11 @@ class Protocol(IntEnum):
 
 @dataclass(frozen=True)
 class SoftAmplifierSettings:
-    """A software amplifier; its values pass as JSON.
+    """A software amplifier.
 
-    device: `jack`, `jack:CLIENT`, or a name or number of PortAudio; rate [Hz] and block [frames]:
-    those of the device if None; limit: largest sample, 0..1; max_gaps: holes in the sound within
-    a second, more are a fault. Raises InputError.
+    device: name or number of a device of PortAudio; rate [Hz] and block [frames]: None for those of
+    the device; limit: largest sample, 0..1; max_gaps: gaps in the sound within a second, more are a
+    fault. Raises InputError.
     """
 
     device: str

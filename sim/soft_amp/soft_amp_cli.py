@@ -28,7 +28,7 @@ def soft_amp(
         str | None,
         typer.Option(
             metavar="DEVICE",
-            help="Play through jack, jack:CLIENT, or a name or number of PortAudio.",
+            help='PortAudio device by number, "NAME" or "NAME, HOST API" (see --list).',
         ),
     ] = None,
     channels: Annotated[
@@ -45,28 +45,28 @@ def soft_amp(
         typer.Option(metavar="PATH", help="Link this path to the pseudo-terminal."),
     ] = None,
     rate: Annotated[
-        int | None, typer.Option(metavar="HZ", help="Sample rate; that of the device by default.")
+        int | None, typer.Option(metavar="HZ", help="Sample rate; default: that of the device.")
     ] = None,
     block: Annotated[
         int | None,
         typer.Option(
             metavar="FRAMES",
-            help="Samples of a block; of JACK its own.",
+            help="Frames per block; default: 128 or 256, for JACK the server's period.",
             min=16,
             max=8192,
         ),
     ] = None,
     law: Annotated[
         Law,
-        typer.Option(help="Play the wanted force, or the root of a bias plus half of it."),
+        typer.Option(help="linear: play the force; square: the root of a bias plus half of it."),
     ] = Law.LINEAR,
     limit: Annotated[
-        float, typer.Option(metavar="LEVEL", help="Largest sample, as a share of full scale.")
+        float, typer.Option(metavar="LEVEL", help="Largest sample, 0 to 1 of full scale.")
     ] = 1.0,
     max_gaps: Annotated[
         int,
         typer.Option(
-            metavar="N", help="Gaps in the sound within a second; more are a fault.", min=0, max=63
+            metavar="N", help="Gaps per second in the sound; more are a fault.", min=0, max=63
         ),
     ] = 3,
     serial_number: Annotated[
@@ -74,22 +74,22 @@ def soft_amp(
     ] = None,
     list_devices: Annotated[
         bool,
-        typer.Option("--list", help="List devices: outputs, inputs, rates, blocks; and exit."),
+        typer.Option("--list", help="List devices with outputs, inputs, rate and block; exit."),
     ] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="List as one JSON object.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="List as a JSON object.")] = False,
     until_eof: Annotated[
         bool, typer.Option("--until-eof", help="Exit at the end of standard input.")
     ] = False,
 ) -> None:
-    """Be an amplifier that plays through a sound device. Print its URL; Ctrl-C ends.
+    """Run a software amplifier on a sound card. Print its URL and play until Ctrl-C.
 
-    Wait, in fault, for a sound server that does not run. Silence is samples of zero. Level 1 is
-    full scale of the device. Silent within 50 ms once its host or itself is killed.
+    Level 1 is full scale of the device, and silence is samples of zero. Exits with status 3 if the
+    device is missing or lost. On Linux the kernel kills the process if its sound stalls for 0.1 s;
+    the sound stops with the process. For systemd: Type=notify.
     """
     from model.commands.options import print_report
-    from sim.soft_amp.engine import library
     from sim.soft_amp.output import listed_devices
-    from sim.soft_amp.respawning import SoftAmplifierSupervisor
+    from sim.soft_amp.sound_player import SoftAmplifierPlayer
 
     if list_devices:
         print_report(*listed_devices(), as_json=as_json)
@@ -111,22 +111,21 @@ def soft_amp(
         limit=limit,
         max_gaps=max_gaps,
     )
-    library()  # compiled here, where its errors are reported
     with _place(serial=serial, tcp=tcp, modbus_tcp=modbus_tcp, link=link) as place:
-        supervisor = SoftAmplifierSupervisor(
-            settings,
-            place,
-            report=lambda line: print(f"soft-amp: {line}", file=sys.stderr, flush=True),
-        )
+        player = SoftAmplifierPlayer(settings, place, report=_report)
         try:
-            supervisor.start()
+            player.start()
             for url in place.urls(settings.amplifiers, protocol=protocol):
                 print(url, flush=True)
             with suppress(KeyboardInterrupt):
-                supervisor.watch(until=sys.stdin.fileno() if until_eof else None)
-            print(f"soft-amp: {supervisor.underruns()}", file=sys.stderr)
+                player.watch(until=sys.stdin.fileno() if until_eof else None)
+            _report(player.underruns())
         finally:
-            supervisor.end()
+            player.end()
+
+
+def _report(line: str) -> None:
+    print(f"soft-amp: {line}", file=sys.stderr, flush=True)
 
 
 def _serial_number(given: str | None, *, device: str) -> str:

@@ -27,13 +27,14 @@ from typer.core import TyperGroup
 
 from controller.cli.main import LoadModules, join_commands, run
 from controller.daemon.children import gateway_options
-from controller.process.daemon_process import ServiceManager, SocketLock
+from controller.process.daemon_process import SocketLock
 from controller.process.log import LogFormatter, LogThread, RateLimitFilter
 from era_haptics.command import command_modules, main
 from model.errors import InputError
 from packages import PACKAGES
 from processes.gateways import wait_for
 from processes.interrupted import full_disk
+from registry.service_manager import ServiceManager
 
 
 @pytest.mark.parametrize(

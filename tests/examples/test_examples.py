@@ -156,7 +156,10 @@ MAX_EXPOSURE = 2.0
 """On systemd's scale from 0 to 10, where `OK` ends at 4.9."""
 MAX_EXPOSURE_AT_HOME = 6.3
 """Without what needs privileges or namespaces of the manager: capabilities and views of files."""
-REAL_TIME = ("sched_setscheduler", "mlockall", "setpriority", "ioctl", "memfd_create")
+REAL_TIME = (
+    *("sched_setscheduler", "mlockall", "setpriority", "ioctl", "memfd_create"),
+    *("timer_create", "timer_settime"),
+)
 """What a sound server and its clients call."""
 
 
@@ -209,8 +212,8 @@ def test_unit_is_valid_and_hardened(tmp_path: Path, is_allowed: bool) -> None:
 def test_units_at_home_are_valid_and_start_one_after_the_other(tmp_path: Path) -> None:
     """systemd accepts them as a user's; each wants and follows the one before it.
 
-    The link is that of the rig; the card has an output for each exciter, an input for the sensor
-    and one for the cable.
+    systemd restarts the amplifier, and kills it if it stalls. The link is that of the rig; the card
+    has an output for each exciter, an input for the sensor and one for the cable.
     """
     program = installed_program("systemd-analyze", package="systemd")
     texts = {}
@@ -242,6 +245,8 @@ def test_units_at_home_are_valid_and_start_one_after_the_other(tmp_path: Path) -
     outputs, inputs = map(int, re.findall(r"--(?:out|in)channels (\d+)", texts["era-sound-server"]))
     assert (outputs, inputs) == (len(rig["eras"]), 2)
     assert f"--channels {len(rig['eras'])} " in texts["era-soft-amp"]
+    for line in ("Type=notify", "Restart=always", "WatchdogSec=500ms", "WatchdogSignal=SIGKILL"):
+        assert f"\n{line}\n" in texts["era-soft-amp"]
 
 
 PAGES = ROOT / "docs" / "how-to"

@@ -68,17 +68,22 @@ def desk_plate(
 
     from era_haptics.lab.measuring.sound_card import read_sensors
     from kit.desk_plate import MESH, Converters, draw_truth
+    from kit.jack_client import jack_client
     from model.rig.rig_file import load_rig
-    from sim.soft_amp.jack import JackClient
 
     rig = load_rig(rig_file)
     sensors = read_sensors(sensors_file, rig.plate, may_move=True)
     drawn = draw_truth(rig, seed=seed, mesh=mesh or MESH)
-    client = JackClient(name, is_only=True)
+    client = jack_client(name)
     try:
         converters = Converters(delay=delay, noise=noise)
         plate = DeskPlate(
-            drawn, sensors, rate=client.rate, converters=converters, seed=seed, is_shared=y_cable
+            drawn,
+            sensors,
+            rate=client.samplerate,
+            converters=converters,
+            seed=seed,
+            is_shared=y_cable,
         )
         if truth is not None:
             truth.write_text(json.dumps(drawn.as_json(), indent=1) + "\n", encoding="utf-8")
@@ -86,10 +91,11 @@ def desk_plate(
         gc.collect()
         gc.freeze()  # what is loaded is never looked through again, in the middle of a block
         running.start()
-        typer.echo(f"jack:{name}")
+        typer.echo(f"{name}, JACK")
         typer.echo(
             f"desk-plate: simulated; {plate.outputs} inputs for what the card plays, "
-            f"{plate.inputs} outputs, {client.rate} Hz, blocks of {client.block} frames",
+            f"{plate.inputs} outputs, {client.samplerate} Hz, "
+            f"blocks of {client.blocksize} frames",
             err=True,
         )
         with suppress(KeyboardInterrupt):

@@ -39,7 +39,7 @@ def measure(
     device: Annotated[
         str | None,
         typer.Option(
-            metavar="DEVICE", help="Sound card: jack, jack:CLIENT, or a PortAudio device."
+            metavar="DEVICE", help='Sound card: PortAudio number, "NAME" or "NAME, HOST API".'
         ),
     ] = None,
     is_simulated: Annotated[
@@ -152,7 +152,7 @@ def outputs(
     device: Annotated[
         str,
         typer.Option(
-            metavar="DEVICE", help="Sound card: jack, jack:CLIENT, or a PortAudio device."
+            metavar="DEVICE", help='Sound card: PortAudio number, "NAME" or "NAME, HOST API".'
         ),
     ],
     beside: Annotated[

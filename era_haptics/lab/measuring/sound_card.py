@@ -15,8 +15,9 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -38,8 +39,13 @@ from model.structure.attachments import footprints_of
 from model.structure.plate import Plate
 from model.transients.time_response import plate_in_time
 from sim.soft_amp.engine import callback_address
-from sim.soft_amp.jack import JackClient, jack_name, libjack
-from sim.soft_amp.output import portaudio_device, portaudio_stream, sounddevice
+from sim.soft_amp.output import (
+    forget_lost_device,
+    is_stream_active,
+    portaudio_device,
+    portaudio_stream,
+    sounddevice,
+)
 
 PERIOD = 1.0
 """s; lines are whole numbers of hertz."""
@@ -224,24 +230,6 @@ class _Transfer(ctypes.Structure):
         ("inputs", ctypes.c_uint32),
         ("is_running", ctypes.c_uint32),
         ("gaps", ctypes.c_uint32),
-        ("is_lost", ctypes.c_uint32),
-        ("has_next", ctypes.c_uint32),
-        ("next_frame", ctypes.c_uint32),
-        ("ports", ctypes.c_void_p),
-        ("arrivals", ctypes.c_void_p),
-        ("blocks", ctypes.c_uint64),
-    )
-
-
-class Ports(ctypes.Structure):
-    """`struct transfer_ports`: ports of a JACK client, and addresses of functions of libjack."""
-
-    _fields_ = (
-        ("client", ctypes.c_void_p),
-        ("outputs", ctypes.c_void_p * MAX_PORTS),
-        ("inputs", ctypes.c_void_p * MAX_PORTS),
-        ("buffer", ctypes.c_void_p),
-        ("frame_time", ctypes.c_void_p),
     )
 
 
@@ -249,7 +237,6 @@ class DeviceLost(LinkError):
     """A device that is gone, or takes no samples, in the middle of a run."""
 
 
-_CLIENT = "era-measure"
 _BLOCK = 512  # frames; late samples are worse than a delay, which is measured
 
 
@@ -271,34 +258,19 @@ class SoundCard:
                 raise InputError(f"{what} must be at most {MAX_PORTS}, got {count}")
         self._transfer = _Transfer(outputs=outputs, inputs=inputs)
         self._limit = limit * (1 + 1e-6)  # of rounding
-        self._close: Callable[[], object] = lambda: None
+        self._stream: Any = None
         self.gaps = 0
-        """Holes in the sound of the last run."""
+        """Gaps in the sound of the last run."""
 
     @property
     def given(self) -> int:
         """Address of the data for the callbacks."""
         return ctypes.addressof(self._transfer)
 
-    def play_through(self, client: JackClient) -> None:
-        """Be the ports of a JACK client, which are connected; raises LinkError."""
-        library, self.rate, self._close = libjack(), float(client.rate), client.close
-        self._ports = ports = Ports(client=client.pointer)  # kept, since the callbacks use it
-        ports.outputs[: len(client.outputs)] = client.outputs
-        ports.inputs[: len(client.inputs)] = client.inputs
-        ports.buffer = ctypes.cast(library.jack_port_get_buffer, ctypes.c_void_p)
-        ports.frame_time = ctypes.cast(library.jack_last_frame_time, ctypes.c_void_p)
-        self._transfer.ports = ctypes.addressof(ports)
-        callbacks = {
-            "jack_set_process_callback": callback_address("transfer_jack_process"),
-            "jack_on_shutdown": callback_address("transfer_jack_shutdown"),
-        }
-        client.start(callbacks, self.given)
-
     def run(self, played: FloatArray) -> Float32Array:
         """Play samples (n, outputs), and return those recorded meanwhile (n, inputs).
 
-        `gaps` counts holes in the sound. Raises DeviceLost, ValueError for samples beyond the
+        `gaps` counts gaps in the sound. Raises DeviceLost, ValueError for samples beyond the
         limit.
         """
         transfer = self._transfer
@@ -310,8 +282,11 @@ class SoundCard:
                 time.sleep(_POLL)
                 if transfer.position != done:
                     done, since = transfer.position, time.monotonic()
-                elif transfer.is_lost or time.monotonic() - since > _STALLED:
-                    raise DeviceLost(f"{self.name}: the device was lost, or takes no samples")
+                elif not self._is_playing():
+                    self._abandon()
+                    raise DeviceLost(f"{self.name}: the device was lost")
+                elif time.monotonic() - since > _STALLED:
+                    raise DeviceLost(f"{self.name}: took no sample within {_STALLED:g} s")
         finally:
             if done < len(found):
                 self.close()  # the callback still has the memory
@@ -330,42 +305,37 @@ class SoundCard:
         found = np.zeros((len(out), transfer.inputs), dtype=np.float32)
         self._memory = out, found  # kept, since the callback uses it
         transfer.play, transfer.record = out.ctypes.data, found.ctypes.data
-        transfer.frames, transfer.position, transfer.blocks = len(out), 0, 0
+        transfer.frames, transfer.position = len(out), 0
         transfer.is_running = 1
         return found
 
-    @property
-    def position(self) -> int:
-        """Frames that were played and recorded since `start`."""
-        return int(self._transfer.position)
+    def _is_playing(self) -> bool:
+        return self._stream is None or is_stream_active(self._stream)
+
+    def _abandon(self) -> None:
+        """Leave a lost device to the end of the process."""
+        self._stream = None
+        forget_lost_device()
 
     def close(self) -> None:
         """Stop immediately and release the device."""
-        self._close()
+        if self._stream is not None:
+            self._stream.close(ignore_errors=True)
+            self._stream = None
 
 
 def open_card(device: str, *, outputs: int, inputs: int, limit: float) -> SoundCard:
-    """Open `jack`, `jack:CLIENT`, or a PortAudio device by its name or number.
+    """Open a PortAudio device by its name or number.
 
-    A PortAudio stream runs in both directions on one device, because two devices would have two
-    clocks. limit: largest sample, relative to full scale. Raises InputError for an unsuitable
-    device, LinkError for one that is busy or gone.
+    The stream runs in both directions on one device, because two devices would have two clocks.
+    limit: largest sample, relative to full scale. Raises InputError for an unsuitable device,
+    LinkError for one that is busy or gone.
     """
     card = SoundCard(outputs=outputs, inputs=inputs, limit=limit)
-    kind, _, other = device.partition(":")
-    if kind == "jack":
-        card.name, client = jack_name(other), JackClient(_CLIENT)
-        try:
-            client.wire(other, outputs=outputs, inputs=inputs)
-            card.play_through(client)
-        except BaseException:
-            client.close()
-            raise
-        return card
     found = portaudio_device(device, outputs=outputs, inputs=inputs)
     card.name, card.rate = found["name"], float(found["default_samplerate"])
     try:
-        stream = portaudio_stream(
+        card._stream = portaudio_stream(
             found["index"],
             callback_address("transfer_portaudio"),
             card.given,
@@ -380,7 +350,6 @@ def open_card(device: str, *, outputs: int, inputs: int, limit: float) -> SoundC
             f"--device {card.name}: cannot be opened: {problem.args[0]}; end the program that "
             "uses it"
         ) from None
-    card._close = partial(stream.close, ignore_errors=True)
     return card
 
 

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: MIT
 //
-// What a running software amplifier counts, in memory that the process which watches it shares.
-// The order and sizes are those of sim/soft_amp/counters.py.
+// What a running software amplifier counts. The order and sizes are those of `Counters` in
+// sim/soft_amp/engine.py.
 
 #ifndef COUNTERS_H
 #define COUNTERS_H
@@ -9,17 +9,14 @@
 #include <stdint.h>
 
 struct counters {
-    uint64_t blocks;   // rendered; stands still when the sound thread does
+    uint64_t blocks;   // rendered
     uint64_t frames;   // samples of each channel
     uint64_t gaps;     // holes in the sample clock: sound that was lost
     uint64_t xruns;    // reported by the driver or server, mostly without loss
     uint64_t clipped;  // samples beyond the hard limit
     uint64_t requests; // pieces received
-    uint32_t is_streaming; // the sound thread is to render
-    uint32_t is_lost;      // the device has gone
-    uint32_t is_realtime;  // bit 0: the sound thread, bit 1: that of the lines
-    uint32_t state[2], fault[2]; // of each amplifier
-    uint32_t block;        // frames, of the last block
+    uint32_t is_realtime;  // 1: the sound thread has real-time priority
+    uint32_t block;        // frames of the last block
 };
 
 #define COUNT(field, by) __atomic_fetch_add(&(field), (by), __ATOMIC_RELAXED)

@@ -52,8 +52,6 @@ int engine_init(struct engine *engine, const struct sound_settings *settings,
         amplifier_init(&engine->amplifier[i], name, notify);
         amplifier_time(&engine->amplifier[i], engine_microseconds());
         modbus_init(&engine->modbus[i], &engine->amplifier[i], (uint8_t)(i + 1));
-        if (settings->is_recovering)
-            amplifier_fail(&engine->amplifier[i], FAULT_INTERNAL, NO_CHANNEL);
     }
     engine->settings.serial_number = NULL;
     return 0;
@@ -179,16 +177,13 @@ static void keep_time(struct engine *engine, uint32_t frames, double ahead)
 
 static void measure(struct engine *engine)
 {
-    bool is_faulty = GET(engine->counters->is_lost) || !engine->has_stream ||
-                     has_too_many_gaps(engine);
+    bool is_faulty = has_too_many_gaps(engine);
     for (unsigned i = 0; i < engine->amplifiers; i++) {
         struct measured measured = {
             .cause = is_faulty ? FAULT_INTERNAL : FAULT_NONE, .channel = NO_CHANNEL};
         amplifier_measured(&engine->amplifier[i], measured);
         if (GET(engine->is_ending) && engine->amplifier[i].state == OPERATION_ENABLED)
             amplifier_stop(&engine->amplifier[i], ENDING_RAMP);
-        SET(engine->counters->state[i], (uint32_t)engine->amplifier[i].state);
-        SET(engine->counters->fault[i], (uint32_t)engine->amplifier[i].fault);
     }
 }
 
@@ -234,7 +229,7 @@ void engine_render(struct engine *engine, const struct output outputs[], uint32_
         for (unsigned i = 0; i < engine->amplifiers; i++) {
             double gain = soft_start(engine, i);
             amplifier_forces(&engine->amplifier[i], forces);
-            for (unsigned channel = 0; channel < CHANNELS && outputs != NULL; channel++) {
+            for (unsigned channel = 0; channel < CHANNELS; channel++) {
                 const struct output *output = &outputs[i * CHANNELS + channel];
                 output->samples[frame * output->stride] = sample(engine, forces[channel], gain);
             }

@@ -2,9 +2,9 @@
 //
 // An amplifier made of software: the core, rendered by the callback of a sound device.
 //
-// Whoever renders owns the amplifiers: the sound thread while a stream runs, else the thread of the
-// lines (lines.c), which makes samples that nobody hears, in fault. Requests reach them through
-// a ring and take effect with the next block; replies come back through another. Nothing waits.
+// The sound thread owns the amplifiers. Requests of hosts reach it through a ring from the thread of
+// the lines (lines.c) and take effect with the next block; replies return through another ring.
+// Neither thread ever waits for the other.
 //
 // More than 16 channels are two amplifiers of half as many, at addresses 1 and 2.
 
@@ -29,7 +29,6 @@ struct sound_settings {
     uint32_t law, protocol;     // enum law, enum protocol
     double limit;               // largest sample, 0..1
     uint32_t max_gaps;          // within a second; more are a fault
-    uint32_t is_recovering;     // begin in fault, since a device was lost before
     const char *serial_number;  // at most 30 bytes
 };
 
@@ -50,7 +49,6 @@ struct engine {
     struct record host;          // with which it came
     uint64_t gaps_at[GAPS_MAX];  // frames at the last ones
     uint32_t gap_count;
-    uint32_t wants_stream, has_stream; // handing over to the sound thread and that it is done
     uint32_t is_ending;          // fall silent, the stream ends
 };
 
@@ -78,7 +76,6 @@ uint64_t engine_microseconds(void);
 struct lines_settings {
     int terminal;  // descriptor of a pseudo-terminal, or -1
     int listening; // descriptor of a socket that listens, or -1
-    int parent;    // end of a pipe that closes when the process that watches ends: so does this one
 };
 
 // Start the thread; return 0, or the number of an error.

@@ -17,8 +17,8 @@
 #define PRIORITY 4     // SCHED_RR, below that of sound threads
 #define PIECE 250      // bytes in a record
 #define WAIT 100       // ms
-#define SILENT_RATE 1  // ms between samples that nobody hears
-#define WATCHED (CONNECTIONS + 3)
+#define SOON 1         // ms until the requests are looked at again while their ring is full
+#define WATCHED (CONNECTIONS + 2)
 
 static struct line {
     int connection; // -1: none
@@ -29,8 +29,6 @@ static struct line {
 
 static struct engine *engine;
 static struct lines_settings settings;
-static uint64_t silent_since; // us
-static uint64_t silent_samples;
 
 static bool pass_on(struct line *line, const uint8_t *bytes, uint16_t length)
 {
@@ -115,17 +113,6 @@ static void send_replies(void)
     }
 }
 
-// Without a stream: samples that nobody hears keep the clock of the amplifiers.
-static void render_silently(void)
-{
-    double due = (double)(engine_microseconds() - silent_since) * engine->settings.rate / 1e6;
-    double ahead = (double)silent_samples - due;
-    uint64_t frames = (uint64_t)due - silent_samples;
-    silent_samples += frames;
-    if (frames > 0)
-        engine_render(engine, NULL, (uint32_t)(frames < 10000 ? frames : 10000), ahead);
-}
-
 static void watch(struct pollfd watched[WATCHED])
 {
     bool has_room = engine->requests.written - GET(engine->requests.taken) <= RING_SIZE / 2;
@@ -133,11 +120,9 @@ static void watch(struct pollfd watched[WATCHED])
         watched[i].fd = has_room ? lines[i].connection : -1;
     watched[CONNECTIONS].fd = has_room ? settings.listening : -1;
     watched[CONNECTIONS + 1].fd = engine->wake[0];
-    watched[CONNECTIONS + 2].fd = settings.parent;
     for (unsigned i = 0; i < WATCHED; i++)
         watched[i].events = POLLIN;
-    bool is_soon = !has_room || !engine->has_stream;
-    if (poll(watched, WATCHED, is_soon ? SILENT_RATE : WAIT) < 0)
+    if (poll(watched, WATCHED, has_room ? WAIT : SOON) < 0)
         for (unsigned i = 0; i < WATCHED; i++)
             watched[i].revents = 0;
 }
@@ -148,8 +133,6 @@ static void *serve_lines(void *ignored)
     struct pollfd watched[WATCHED];
     for (;;) {
         watch(watched);
-        if (watched[CONNECTIONS + 2].revents != 0)
-            _exit(1); // nobody watches any more
         while (read(engine->wake[0], bytes, sizeof bytes) > 0)
             continue;
         send_replies();
@@ -158,11 +141,6 @@ static void *serve_lines(void *ignored)
                 take(&lines[i]);
         if (watched[CONNECTIONS].revents != 0)
             accept_host();
-        if (!engine->has_stream) {
-            render_silently();
-            if (GET(engine->wants_stream))
-                SET(engine->has_stream, 1);
-        }
     }
     return ignored;
 }
@@ -173,13 +151,12 @@ int lines_start(struct engine *served, const struct lines_settings *given)
     struct sched_param priority = {.sched_priority = PRIORITY};
     engine = served;
     settings = *given;
-    silent_since = engine_microseconds();
     for (unsigned i = 0; i < CONNECTIONS; i++)
         lines[i].connection = -1;
     if (settings.terminal >= 0)
         open_host(&lines[0], settings.terminal);
     int problem = pthread_create(&thread, NULL, serve_lines, NULL);
-    if (problem == 0 && pthread_setschedparam(thread, SCHED_RR, &priority) == 0)
-        __atomic_fetch_or(&engine->counters->is_realtime, 2, __ATOMIC_RELEASE);
+    if (problem == 0)
+        pthread_setschedparam(thread, SCHED_RR, &priority); // where that is allowed
     return problem;
 }

@@ -18,47 +18,10 @@ static uint32_t wanted(const struct transfer *transfer, uint32_t frames)
 
 static void done(struct transfer *transfer, uint32_t frames)
 {
-    if (transfer->arrivals != NULL)
-        transfer->arrivals[transfer->blocks] = engine_microseconds();
-    transfer->blocks++;
     uint64_t position = transfer->position + frames;
     if (position == transfer->frames)
         SET(transfer->is_running, 0);
     SET(transfer->position, position);
-}
-
-int transfer_jack_process(uint32_t frames, void *given)
-{
-    struct transfer *transfer = given;
-    const struct transfer_ports *ports = transfer->ports;
-    uint32_t count = wanted(transfer, frames);
-    uint32_t frame = ports->frame_time(ports->client);
-    if (count && transfer->has_next && frame != transfer->next_frame && transfer->position)
-        COUNT(transfer->gaps, 1);
-    transfer->next_frame = frame + frames;
-    transfer->has_next = 1;
-    for (uint32_t i = 0; i < transfer->outputs; i++) {
-        float *to = ports->buffer(ports->outputs[i], frames);
-        memset(to, 0, frames * sizeof(float));
-        const float *from = transfer->play + transfer->position * transfer->outputs + i;
-        for (uint32_t n = 0; n < count; n++)
-            to[n] = from[(uint64_t)n * transfer->outputs];
-    }
-    for (uint32_t i = 0; count && i < transfer->inputs; i++) {
-        const float *from = ports->buffer(ports->inputs[i], frames);
-        float *to = transfer->record + transfer->position * transfer->inputs + i;
-        for (uint32_t n = 0; n < count; n++)
-            to[(uint64_t)n * transfer->inputs] = from[n];
-    }
-    if (count)
-        done(transfer, count);
-    return 0;
-}
-
-void transfer_jack_shutdown(void *given)
-{
-    struct transfer *transfer = given;
-    SET(transfer->is_lost, 1);
 }
 
 int transfer_portaudio(const void *input, void *output, unsigned long frames,

@@ -20,16 +20,14 @@ The drive is a state, so that accelerations follow from it: with it as input the
 frequency.
 """
 
-import ctypes
 import math
 import threading
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import linalg, signal
 
 from drivers.errors import LinkError
@@ -41,7 +39,9 @@ from model.rig.rig import Rig
 from model.rig.rig_file import parse_mesh
 from model.structure.attachments import Era, FingertipLoad, fingertip_loads, footprints_of
 from model.structure.plate import Plate
-from sim.soft_amp.jack import JackClient, libjack
+
+if TYPE_CHECKING:
+    import jack
 
 _ORDER = 4
 _CORNER = 0.42  # of the sample rate; anti-aliasing filters of converters pass all of the audio band
@@ -546,58 +546,50 @@ class DeskPlate:
 BLOCK_MULTIPLE = SAMPLES
 """Frames of a block must be a multiple of this."""
 
-_PROCESS = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_uint32, ctypes.c_void_p)
-_SHUTDOWN = ctypes.CFUNCTYPE(None, ctypes.c_void_p)
-
 
 class JackPlate:
     """Ports in_1.. and out_1.. of a client; each block is advanced in the server's callback.
 
-    Raises LinkError; InputError for a server whose blocks do not suit.
+    Raises InputError for a server whose blocks do not suit.
     """
 
-    def __init__(self, client: JackClient, plate: DeskPlate) -> None:
-        if client.block % BLOCK_MULTIPLE:
+    def __init__(self, client: "jack.Client", plate: DeskPlate) -> None:
+        if client.blocksize % BLOCK_MULTIPLE:
             raise InputError(
                 f"blocks of the JACK server must be a multiple of {BLOCK_MULTIPLE} frames, got "
-                f"{client.block}; start it with -p 128"
+                f"{client.blocksize}; start it with -p 128"
             )
         self._client, self._plate = client, plate
         self._problem: Exception | None = None
         self._ended = threading.Event()
-        client.wire(None, outputs=plate.inputs, inputs=plate.outputs)
-        self._callbacks = _PROCESS(self._advance), _SHUTDOWN(self._lose)  # kept: libjack calls them
+        for number in range(plate.inputs):
+            client.outports.register(f"out_{number + 1}", is_terminal=True)
+        for number in range(plate.outputs):
+            client.inports.register(f"in_{number + 1}", is_terminal=True)
 
     def start(self) -> None:
-        """Begin to vibrate; raises LinkError."""
-        called, lost = (ctypes.cast(each, ctypes.c_void_p) for each in self._callbacks)
-        self._client.start({"jack_set_process_callback": called, "jack_on_shutdown": lost})
+        """Begin to vibrate."""
+        self._client.set_process_callback(self._advance)
+        self._client.set_shutdown_callback(self._lose)
+        self._client.activate()
 
     def wait(self, timeout: float) -> None:
         """Wait for a time [s]; raises what ended the plate."""
         if self._ended.wait(timeout) and self._problem is not None:
             raise self._problem
 
-    def _lose(self, _ignored: object) -> None:
+    def _lose(self, _status: object, _reason: object) -> None:
         self._problem = LinkError("jack: the server has ended; start it, and this again")
         self._ended.set()
 
-    def _advance(self, frames: int, _ignored: object) -> int:
+    def _advance(self, _frames: int) -> None:
         if self._problem is not None:
-            return 0
+            return
         try:
-            played = np.stack([_samples(port, frames) for port in self._client.inputs], axis=1)
+            played = np.stack([port.get_array() for port in self._client.inports], axis=1)
             heard = self._plate.advance(played.astype(float))
-            for port, samples in zip(self._client.outputs, heard.T, strict=True):
-                _samples(port, frames)[:] = samples
+            for port, samples in zip(self._client.outports, heard.T, strict=True):
+                port.get_array()[:] = samples
         except Exception as problem:  # nothing above catches it in the server's thread
             self._problem = problem
             self._ended.set()
-        return 0
-
-
-def _samples(port: int, frames: int) -> NDArray[np.float32]:
-    """The samples (frames,) of a port, in place; within a callback only."""
-    address = libjack().jack_port_get_buffer(port, frames)
-    pointer = ctypes.cast(address, ctypes.POINTER(ctypes.c_float))
-    return np.ctypeslib.as_array(pointer, (frames,))

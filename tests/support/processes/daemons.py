@@ -35,7 +35,7 @@ from controller.api.schema import ApiMessage, Empty
 from controller.api.server import ApiServer, Connection
 from controller.daemon.config import DaemonConfig, load_daemon_config
 from controller.daemon.daemon import Daemon
-from controller.process.daemon_process import ServiceManager, SocketLock
+from controller.process.daemon_process import SocketLock
 from controller.process.log import LogThread
 from drivers.host.amplifier import WATCHDOG as AMPLIFIER_WATCHDOG
 from drivers.host.amplifier import Amplifier as AmplifierAmplifier
@@ -59,6 +59,7 @@ from processes.patient_daemon import PROGRAM
 from processes.typed_page import ERA
 from registry import threads
 from registry.limits import GuardLimits
+from registry.service_manager import ServiceManager
 from sim.amplifier.simulated_amplifier import SimulatedAmplifier
 
 PATIENCE = 180.0  # s; generous, for a loaded machine

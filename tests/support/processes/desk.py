@@ -1,7 +1,7 @@
 """A desk of real processes: jackd, a plate, and the commands that a user types.
 
 One plate goes from the first measurement to touches. While daemon and software amplifier play,
-a JACK client with a callback in C records every sample of the accelerometers. Fitted values are
+a JACK client records every sample of the accelerometers. Fitted values are
 compared with the truth of the plate on the desk.
 """
 
@@ -27,14 +27,12 @@ from controller.api.client import Client
 from controller.api.jsonrpc import RpcError
 from controller.api.link import Unreachable
 from controller.api.methods import StatusResult
-from drivers.errors import LinkError
-from era_haptics.lab.measuring.sound_card import SoundCard, open_card
 from kit.desk_plate import Actuator
-from model.arrays import ComplexArray, Float32Array, FloatArray
+from model.arrays import ComplexArray, FloatArray
 from model.finger import detection_threshold
 from model.rig.rig import Rig
 from model.rig.rig_file import load_rig
-from sim.soft_amp.jack import JackClient
+from processes.jack_recorder import Capture
 
 ERA = Path(sys.executable).with_name("era")
 _ROOT = Path(__file__).parents[3]
@@ -43,6 +41,9 @@ PLATE = (sys.executable, str(_PROGRAM), "rig.yaml", "--sensors", "sensors.csv")
 EXAMPLES = _ROOT / "examples" / "desk"
 RATE, BLOCK = 48_000, 512
 """Hz, and frames: the most that an amplifier may take, for a machine without real-time priority."""
+
+DEVICE = "desk, JACK"
+"""The plate, for PortAudio."""
 
 _START = 60.0  # s; on a busy machine
 _END = 20.0  # s
@@ -116,24 +117,10 @@ def desk(folder: Path, *, seed: int, mesh: str = "8x6 Q3") -> Iterator[Desk]:
     server = ["jackd", "-n", name, "-S", "-r", "-d", "dummy", "-p", str(BLOCK), "-r", str(RATE)]
     plate = [*PLATE, "--seed", seed, "--mesh", mesh, "--truth", "truth.json", "--until-eof"]
     with contextlib.ExitStack() as stack:
-        stack.enter_context(_own_server(name))
         log = stack.enter_context((folder / "desk.log").open("w"))
         running(stack, server, folder, environment, log)
         process = _plate(stack, plate, folder, environment, log)
         yield Desk(folder, environment, process)
-
-
-@contextlib.contextmanager
-def _own_server(name: str) -> Iterator[None]:
-    """Let clients in this process use a server."""
-    before = os.environ.get("JACK_DEFAULT_SERVER")
-    os.environ["JACK_DEFAULT_SERVER"] = name
-    try:
-        yield
-    finally:
-        del os.environ["JACK_DEFAULT_SERVER"]
-        if before is not None:
-            os.environ["JACK_DEFAULT_SERVER"] = before
 
 
 def _plate(
@@ -190,55 +177,6 @@ def running(
     return process
 
 
-AUDIBLE = 1e-6
-_CAPTURE_START = 20.0  # s
-
-
-class Capture(SoundCard):
-    """So many inputs in_1, ... of a client of JACK_DEFAULT_SERVER; longest [s] that it captures.
-
-    It waits until the server is up. While that lives no other server can be used in this process.
-    """
-
-    def __init__(self, name: str, channels: int, *, longest: float = 600.0) -> None:
-        super().__init__(outputs=0, inputs=channels, limit=0)
-        self._client = open_client(name)
-        self.block = self._client.block
-        self._client.wire(None, inputs=channels)
-        self.play_through(self._client)
-        frames = round(longest * self.rate)
-        self._samples = self.start(np.zeros((frames, 0)))
-
-    def samples(self, count: int) -> Float32Array:
-        """The last samples (count, channels)."""
-        return self._samples[self.position - count : self.position]
-
-    def is_sounding(self) -> bool:
-        """Whether the last block had sound."""
-        return self.position > 0 and bool(np.abs(self.samples(self.block)).max() > AUDIBLE)
-
-    def end_of_sound(self) -> int:
-        """The position after the last sample with sound."""
-        loudest = np.abs(self._samples[: self.position]).max(axis=1)
-        return int(np.flatnonzero(loudest > AUDIBLE)[-1]) + 1
-
-    def is_played_to(self, port: str) -> bool:
-        """Whether a program plays to a port of the server."""
-        return bool(self._client.connected_to(port))
-
-
-def open_client(name: str) -> JackClient:
-    """A client, as soon as the server is up."""
-    end = time.monotonic() + _CAPTURE_START
-    while True:
-        try:
-            return JackClient(name)
-        except LinkError:
-            if time.monotonic() > end:
-                raise
-            time.sleep(0.02)
-
-
 @dataclass(frozen=True)
 class Error:
     """Difference of a fitted value from the truth.
@@ -274,21 +212,24 @@ def touches(desk: Desk, sets: list[list[str]]) -> list[Touch]:
     inputs = {row["sensor"]: int(row["input"]) - 1 for row in rows}
     found = []
     with playing(desk, level_db_sl=30) as era, era.armed("desk", lease_s=60):
-        card = open_card("jack:desk", outputs=0, inputs=max(inputs.values()) + 1, limit=0)
+        server = desk.environment["JACK_DEFAULT_SERVER"]
+        capture = Capture(server, "touches", max(inputs.values()) + 1)
+        capture.connect("desk")
         for names in sets:
             target, *quiet = (places[name] for name in names)
             desk.touch_plate([target, *quiet])
             status = hold(era, [*quiet, target], _SETTLING)
-            recorded = card.start(np.zeros((round(_WINDOW * card.rate), 0)))
-            while card.position < len(recorded):
+            count = round(_WINDOW * capture.rate)
+            end = capture.position + count
+            while capture.position < end:
                 era.touch([*quiet, target])
                 time.sleep(0.02)
-            heard = recorded.astype(float)
+            heard = capture.samples(count).astype(float)
             era.touch([])
             assert status.promised_contrast_db is not None
             assert status.predicted_contrast_db is not None
             samples = heard[:, [inputs[name] for name in names]]
-            target_size, *quiet_sizes = sizes(samples, status, card.rate)
+            target_size, *quiet_sizes = sizes(samples, status, capture.rate)
             found.append(
                 Touch(
                     len(names),
@@ -297,7 +238,7 @@ def touches(desk: Desk, sets: list[list[str]]) -> list[Touch]:
                     float(20 * np.log10(target_size / max(quiet_sizes))),
                 )
             )
-        card.close()
+        capture.close()
     return found
 
 
@@ -309,7 +250,7 @@ def playing(desk: Desk, *, level_db_sl: float) -> Iterator[Client]:
         f"rig: calibrated.yaml\ntable: table.npz\nsocket: era.sock\nlevel_db_sl: {level_db_sl}\n"
     )
     (desk.folder / "daemon.yaml").write_text(config, "utf-8")
-    amplifier = [ERA, "soft-amp", "--device", "jack:desk", "--channels", 4]
+    amplifier = [ERA, "soft-amp", "--device", DEVICE, "--channels", 4]
     amplifier += ["--link", desk.folder / "amp", "--until-eof"]
     daemon = [ERA, "daemon", "daemon.yaml"]
     with contextlib.ExitStack() as stack:
@@ -414,7 +355,7 @@ class Session:
 def session(*, seed: int, touched: int) -> Session:
     """Measure, calibrate, build a table, identify, touch; raises RuntimeError."""
     with tempfile.TemporaryDirectory(prefix="desk") as name, desk(Path(name), seed=seed) as plate:
-        device = ["--device", "jack:desk", "--sensors", "sensors.csv"]
+        device = ["--device", DEVICE, "--sensors", "sensors.csv"]
         plate.run("measure", "rig.yaml", *device, "-o", "measured.uff")
         fitted = plate.run("calibrate", "rig.yaml", "measured.uff", "-o", "calibrated.yaml")
         plate.run("table", "build", "calibrated.yaml", "-o", "table.npz", "--mode", "phased")

@@ -36,12 +36,11 @@ from model.rig.rig import Rig
 from model.rig.rig_summary import exciters_of
 from model.structure.attachments import footprints_of
 from model.transients.base_motion import Motion
-from processes.desk import Capture
 from processes.typed_page import ERA
 from sim.plant.plant import Plant
 
 RATE = 48_000
-BLOCK = 128
+BLOCK = 256
 START = 20.0  # s
 HOST = str(Path(__file__).with_name("steady_host.py"))
 
@@ -56,15 +55,20 @@ class JackServer:
 
 @contextlib.contextmanager
 def jack_server(
-    name: str, *, rate: int = RATE, inputs: int = 2, outputs: int = 2
+    name: str, *, rate: int = RATE, inputs: int = 2, outputs: int = 2, is_monitored: bool = False
 ) -> Iterator[JackServer]:
-    """A server of its own; synchronous: a machine that stalls delays samples and loses none."""
+    """A server of its own, without a sound card.
+
+    It is synchronous, so that a machine that stalls delays samples and loses none; one that is
+    monitored is not, as servers of sound cards are not.
+    """
     environment = os.environ | {"JACK_DEFAULT_SERVER": name, "JACK_NO_START_SERVER": "1"}
     priority = ["-R", "-P10"] if os.geteuid() == 0 else ["-r"]
     dummy = ["-d", "dummy", "-p", str(BLOCK), "-r", str(rate)]
     dummy += ["-C", str(inputs), "-P", str(outputs)]
+    waiting, monitors = ([], ["-m"]) if is_monitored else (["-S"], [])
     with subprocess.Popen(
-        ["jackd", "-n", name, "-S", *priority, *dummy],
+        ["jackd", "-n", name, *waiting, *priority, *dummy, *monitors],
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
         env=environment,
@@ -73,13 +77,6 @@ def jack_server(
             yield JackServer(process, environment)
         finally:
             process.terminate()
-
-
-def capture_on(server: str, name: str, channels: int) -> Capture:
-    """A client of a server that captures, as soon as that is up."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("JACK_DEFAULT_SERVER", server)
-        return Capture(name, channels)
 
 
 class SoftAmp:
@@ -102,12 +99,6 @@ class SoftAmp:
     def log(self) -> str:
         """What it has reported."""
         return self._log.read_text()
-
-    @property
-    def player(self) -> int:
-        """The process that plays."""
-        path = Path(f"/proc/{self.process.pid}/task/{self.process.pid}/children")
-        return int(path.read_text().split()[0])
 
     def end(self) -> None:
         """End it as the end of its input does."""

@@ -1,8 +1,8 @@
 """A plate or board on the desk behind a sound card: measured, and identified.
 
 In time against a direct solution; with one sensor that is moved, its mass and its file; and through
-a real JACK server, or PortAudio over it, with what they refuse and lose. A process has one server
-at a time, and PortAudio keeps it, so that commands try PortAudio.
+PortAudio over a real JACK server, with what they reject and lose. PortAudio keeps to one server in
+a process, so that commands use it.
 """
 
 import json
@@ -13,7 +13,6 @@ import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
@@ -27,9 +26,7 @@ from era_haptics.lab.measuring.sound_card import (
     Desk,
     DeviceLost,
     Multisine,
-    SoundCard,
     WiredSensor,
-    open_card,
     read_sensors,
 )
 from kit.desk_plate import (
@@ -46,10 +43,9 @@ from model.rig.rig import Rig
 from model.rig.rig_file import example_rig_path, parse_rig
 from model.structure.attachments import PointLoad
 from processes.gateways import wait_for
-from processes.sound_cards import DeskCard, JackServer, capture_on, jack_server
+from processes.jack_recorder import Capture
+from processes.sound_cards import DeskCard, JackServer, jack_server
 from processes.typed_page import ERA
-from sim.soft_amp.output import open_output
-from sim.soft_amp.settings import Protocol, SoftAmplifierSettings
 
 BOARD = """
 plate: {length: 300 mm, width: 230 mm, thickness: 5 mm, loss_factor: 0.01,
@@ -80,14 +76,6 @@ def board() -> Rig:
 DESK = Path(__file__).parents[4] / "examples" / "desk"
 STALLED = 8.0  # s; without a message of the server it would be ten
 CHANNELS = 5  # of that desk: four ERAs and the loop-back
-SETTINGS = SoftAmplifierSettings(
-    device="jack:card", channels=CHANNELS, protocol=Protocol.SERIAL, serial_number="S"
-)
-
-
-def card(device: str, *, outputs: int = CHANNELS, inputs: int = 0) -> SoundCard:
-    """A card that is opened."""
-    return open_card(device, outputs=outputs, inputs=inputs, limit=1.0)
 
 
 def refusal(server: JackServer, *arguments: str) -> tuple[int, str]:
@@ -114,83 +102,53 @@ def measure(server: JackServer, device: str, folder: Path) -> tuple[int, str]:
 
 
 @pytest.mark.real_time
-@pytest.mark.needs("jackd", "cc")
-@pytest.mark.needs("portaudio")
-def test_unsuitable_and_busy_cards_are_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """No such one; too few channels; no inputs: one message, exit status 2, and no file.
-
-    One that is played to is busy for measurement and amplifier, also by PortAudio: JACK would add
-    up what two play.
-    """
+@pytest.mark.needs("jackd", "portaudio", "cc")
+def test_unsuitable_card_is_rejected(tmp_path: Path) -> None:
+    """No such device, no inputs, too few outputs: one message, exit status 2, and no file."""
     name = f"card{os.getpid()}"
-    monkeypatch.setenv("JACK_DEFAULT_SERVER", name)
-    with jack_server(name) as server:
-        capture = capture_on(name, "card", CHANNELS)
-        for device, ports, cause in (
-            ("jack:nothing", {}, "5 outputs, got 0"),
-            ("jack:card", {"outputs": CHANNELS + 1}, "6 outputs, got 5"),
-            ("jack:card", {"inputs": 1}, "1 inputs, got 0"),
+    with jack_server(name, outputs=CHANNELS - 1, inputs=13) as server:
+        capture = Capture(name, "card", CHANNELS)
+        for device, cause in (
+            ("card, JACK", "13 inputs, got 0"),
+            ("system, JACK", "5 outputs, got 4"),
+            ("no such device", "no such device"),
+            ("jack:card", '"CLIENT, JACK"'),
         ):
-            with pytest.raises(InputError, match=cause):
-                card(device, **ports)
-        for device, cause in (("card", "inputs, got 0"), ("no such device", "no such device")):
             status, message = measure(server, device, tmp_path)
             assert (status, message.count("\n")) == (2, 1)
             assert cause in message
         assert not any(tmp_path.iterdir())
-        with closing(card("jack:card")):
-            with pytest.raises(LinkError, match="busy"):
-                card("jack:card")
-            with pytest.raises(LinkError, match="busy"):
-                open_output(SETTINGS)
-            for device, status, cause in (("card", 3, "busy"), ("none such", 2, "none such")):
-                done = refusal(server, "soft-amp", "--device", device, "--channels", "2")
-                assert (done[0], done[1].count("\n"), cause in done[1]) == (status, 1, True)
         capture.close()
 
 
 @pytest.mark.real_time
-@pytest.mark.needs("jackd", "cc")
-def test_measurement_without_its_server_is_lost(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    """Ended while a run plays: one message and exit status 3 at once; then there is none."""
+@pytest.mark.needs("jackd", "portaudio", "cc")
+def test_measurement_without_its_server_is_lost(tmp_path: Path) -> None:
+    """Ended while a run plays: one message and exit status 3 before a timeout, and no file."""
     name = f"lost{os.getpid()}"
-    monkeypatch.setenv("JACK_DEFAULT_SERVER", name)
     with jack_server(name, inputs=13, outputs=CHANNELS) as server:
-        looking = capture_on(name, "looking", 1)  # once the server is up
+        looking = Capture(name, "looking", 1)  # once the server is up
         with ThreadPoolExecutor() as thread:
-            measuring = thread.submit(measure, server, "jack", tmp_path)
-            wait_for(lambda: looking.is_played_to("era-measure:in_13"))  # the last to be connected
+            measuring = thread.submit(measure, server, "system, JACK", tmp_path)
+            wait_for(lambda: looking.is_played_to(f"system:playback_{CHANNELS}"))
             looking.close()  # libjack does not bear to close a client of a server that is gone
             server.process.terminate()  # one that is killed occupies one of JACK's eight places
             ended = time.monotonic()
             status, message = measuring.result()
         assert (status, message.count("\n"), "lost" in message) == (3, 1, True)
         assert time.monotonic() - ended < STALLED
-        status, message = measure(server, "jack", tmp_path)
-        assert (status, "no server" in message) == (3, True)
     assert not any(tmp_path.iterdir())
 
 
 @pytest.mark.real_time
-@pytest.mark.needs("jackd", "cc")
-@pytest.mark.needs("portaudio")
-def test_rate_that_gives_no_whole_milliseconds_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    """44.1 kHz of a server or device, for an amplifier; a measurement takes any whole one."""
+@pytest.mark.needs("jackd", "portaudio")
+def test_rate_that_gives_no_whole_milliseconds_is_rejected_for_an_amplifier() -> None:
+    """44.1 kHz of a server; a measurement takes any rate."""
     name = f"rate{os.getpid()}"
-    monkeypatch.setenv("JACK_DEFAULT_SERVER", name)
     with jack_server(name, rate=44_100) as server:
-        capture = capture_on(name, "card", CHANNELS)
-        with pytest.raises(InputError, match=r"multiple of 1000 Hz.*got 44100 Hz"):
-            open_output(SETTINGS)
-        status, message = refusal(server, "soft-amp", "--device", "card", "--channels", "2")
-        assert (status, "got 44100 Hz" in message) == (2, True)
-        with closing(card("jack:card")) as measuring:
-            assert measuring.rate == 44_100
-        capture.close()
+        Capture(name, "looking", 1).close()  # once the server is up
+        status, message = refusal(server, "soft-amp", "--device", "system", "--channels", "2")
+        assert (status, "multiple of 1000 Hz" in message, "44100 Hz" in message) == (2, True, True)
 
 
 CARD_RATE, LEVEL = 8_000.0, 0.3

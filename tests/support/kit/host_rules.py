@@ -403,6 +403,7 @@ class HostRules:
         self.advance()
         self.requests += 1
         time = threads.now()
+        self._note_unanswered(wire)
         amplifiers = [
             amplifier
             for amplifier in self.amplifiers.values()
@@ -432,6 +433,12 @@ class HostRules:
                 self._note_reply(pending, arrival.values, time)
             elif pending is not None and pending.name in ("Set", "Commit"):
                 pending.amplifier.staged = pending.amplifier.committed_token = None
+
+    def _note_unanswered(self, wire: str) -> None:
+        """Without a reply to a set or a commit, the amplifier may not have received it."""
+        pending = self._pending.get(wire)
+        if pending is not None and pending.name in ("Set", "Commit"):
+            pending.amplifier.committed_token = None
 
     def _note_unasked(
         self, amplifier: HostedAmplifier, arrival: Event | OtherHost, time: float

@@ -97,6 +97,9 @@ class AmplifierRules(ExpectedAmplifier):
     def _fault_injected(self, window: FaultWindow) -> None:
         if window.fault == "reboot":
             self.forget("a restart")
+        elif window.fault == "over_temperature":
+            # The temperature jumps: the amplifier derates before any status shows it.
+            self.outputs.may_derate = True
 
     def _note(self, rule: str, time: float, what: str, *, must: object, seen: object) -> None:
         what = f"amplifier {self._name}: {what} must be {must}, got {seen}"

@@ -287,10 +287,14 @@ class Assembly:
     began: float = -math.inf
     collected: dict[int, list[int]] = field(default_factory=dict)
 
+    def is_expired(self, now: float) -> bool:
+        """Whether the first part came too long before a time [s]."""
+        return now - self.began > STAGED_LIFE
+
     def keep(self, part: Values, now: float) -> bool:
         """Keep a part but the last at a time [s]; False where `parts` is not as before."""
         token, count = part["token"], part["parts"]
-        if token != self.token or now - self.began > STAGED_LIFE:
+        if token != self.token or self.is_expired(now):
             self.token, self.count, self.began, self.collected = token, count, now, {}
         if count == self.count:
             self.collected[part["index"]] = part["stream"]

@@ -28,7 +28,6 @@ from drivers.protocol.definition import (
     MESSAGES,
     NO_CHANNEL,
     QUANTITIES,
-    STAGED_LIFE,
     STATES,
     STATUS_FLAGS,
     VERSION,
@@ -169,7 +168,7 @@ class SetIntake:
 
     def _under_way(self, now: float) -> int:
         """Return the token of the set that is collected or staged, 0 for none."""
-        if now - self._parts.began > STAGED_LIFE:
+        if self._parts.is_expired(now):
             self.drop()
         return self._parts.token
 
@@ -306,7 +305,7 @@ class SimulatedAmplifier:
         if name == "Set" and not is_last(values):
             is_held = self.state == _ENABLED and values["session"] == self.session
             if is_held and self._intake.keep(values, now):
-                self._last_fed = now
+                self.feed(now)
             return {}
         message, following = MESSAGES[name], AMPLIFIER_TRANSITIONS.get((self.state, name))
         if following is None or (name == "Arm" and self._is_interlock_open):
@@ -315,9 +314,13 @@ class SimulatedAmplifier:
             raise Refusal(f"{name} must have the session that is held", "WRONG_SESSION")
         reply = self._carry_out(name, values, following, now)
         if message.feeds and self.state == _ENABLED:
-            self._last_fed = now
+            self.feed(now)
         # After feeding the watchdog, so that the status shows it full.
         return self.status(now) if reply is None else reply
+
+    def feed(self, now: float) -> None:
+        """Restart the watchdog at a time [s]."""
+        self._last_fed = now
 
     def status(self, now: float) -> Values:
         """Return the values of the status at a time [s] up to which it has been ticked."""
@@ -473,7 +476,7 @@ class SimulatedAmplifier:
         self.token = 0
         self.session = values["session"]
         self.clock.shift(values["shift"])
-        self._last_fed = now
+        self.feed(now)
         self._enter(_ENABLED, now)
 
     def _clear(self, latch: int, following: str, now: float) -> None:

@@ -78,21 +78,13 @@ def discover(
         bool,
         typer.Option(help="Send an identify request to every port."),
     ] = True,
-    slcan: Annotated[
-        bool,
-        typer.Option(
-            "--slcan",
-            help="Detect CAN adapters on serial ports by sending V and CR, which other devices may "
-            "take for a command; then listen to their bus at 500 kbit/s.",
-        ),
-    ] = False,
     trace: Trace = None,
     json_: Json = False,
 ) -> None:
     """List serial ports, CAN interfaces and the amplifiers on them."""
     from drivers.by_hand.reaching import discover as discovered
 
-    result, problems = run(discovered(url or [], probes=probe, slcan=slcan), trace)
+    result, problems = run(discovered(url or [], probes=probe), trace)
     if json_:
         print(json.dumps(result))
     else:
@@ -114,7 +106,6 @@ def _show_discovered(result: dict[str, Any], problems: dict[str, DriverError]) -
     for amplifier in result["amplifiers"]:
         print("  ".join(amplifier.values()))
     reached = [amplifier["url"] for amplifier in result["amplifiers"]]
-    reached += [heard for row in result["places"] for heard in row["heard"]]
     print(f"Next: era amp identify {shlex.quote(reached[0])}" if reached else "no amplifier found")
 
 

@@ -1,23 +1,19 @@
 """Amplifiers by URL: connect to one, discover all, and check those of a configuration.
 
-Discovery lists the serial ports and CAN interfaces of this machine. It sends nothing before it
-probes, except `with_slcan`, which sends V and CR to serial ports and opens CAN adapters in
-listen-only mode, so that nothing is sent on their bus. The checks of a configuration open nothing.
+Discovery lists the serial ports and CAN interfaces of this machine, and sends nothing before it
+probes. The checks of a configuration open nothing.
 Messages become rows for reading, with units in the names of keys.
 """
 
 import asyncio
 import math
 import random
-import re
-import time
 from collections.abc import AsyncIterator, Iterable, Iterator, Mapping, Sequence
-from contextlib import asynccontextmanager, suppress
-from dataclasses import dataclass, replace
+from contextlib import asynccontextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import serial
 from serial.tools.list_ports import comports
 
 from drivers.errors import CommandError, DriverError, FrameError, LinkError, LinkTimeout
@@ -25,7 +21,6 @@ from drivers.host.amplifier import WATCHDOG, Amplifier
 from drivers.host.bounds import FREQUENCY_FLOOR
 from drivers.host.clock import REPORTS, reports_of
 from drivers.opening import Lines
-from drivers.ports import remedy_of
 from drivers.protocol.definition import (
     FAULTS,
     FEATURES,
@@ -45,7 +40,7 @@ from drivers.protocol.definition import (
 )
 from drivers.protocol.records import Number, Record, Rows, Values, bits_of
 from drivers.urls import ADDRESS, BAUD, BUS_ERROR, CLOCK_ERRORS, RTU_BAUD, line_kind_of
-from drivers.wires.can_frames import BITRATE, NODE_MAX, SLCAN, SLCAN_RATES, TextReader, cob_id
+from drivers.wires.can_frames import BITRATE
 from drivers.wires.wire import WireAddress, address_of, reply_words, request_words
 from registry import threads
 from registry.limits import GuardLimits
@@ -168,14 +163,6 @@ def wire_rows(amplifier: Amplifier) -> dict[str, Any]:
     }
 
 
-_BAUD = 115_200  # ignored by USB devices, which most adapters are
-_REPLY_TIMEOUT = 0.1  # s; USB adapters and their drivers delay bytes by 16 ms at most
-_LISTENING_TIME = 0.2  # s; four heartbeats of 50 ms
-_NODES = set(range(1, NODE_MAX + 1))
-_VERSION = re.compile(rb"V([0-9A-Fa-f]{4})\r")
-_END = re.compile(rb"[\r\x07]")  # done, or refused
-_DONE = b"\r"
-
 _NETWORK = Path("/sys/class/net")
 _CAN_TYPE = "280"  # ARPHRD_CAN of Linux
 _UNDESCRIBED = "n/a"  # by pyserial
@@ -190,82 +177,11 @@ class Candidate:
     description: str
     urls: tuple[str, ...]
     remedy: str | None = None
-    is_serial: bool = False
-    is_slcan: bool = False
 
 
 def candidates() -> list[Candidate]:
     """List the serial ports and CAN interfaces of this machine, usable or not."""
     return [*_serial_ports(), *_can_interfaces()]
-
-
-def with_slcan(candidate: Candidate) -> Candidate:
-    """Turn a serial port into a CAN adapter if it replies as one.
-
-    Blocks; the module docstring lists the bytes sent. Its amplifiers are not identified.
-    """
-    if not candidate.is_serial:
-        return candidate
-    try:
-        adapter = detect_slcan(candidate.name)
-    except (OSError, ValueError) as problem:
-        return replace(candidate, remedy=f"{candidate.name} cannot be used: {remedy_of(problem)}")
-    if adapter is None:
-        return candidate
-    return replace(adapter, description=f"{candidate.description}: {adapter.description}")
-
-
-def detect_slcan(port: str) -> Candidate | None:
-    """Detect the adapter on a serial port, or None. Blocks for half a second.
-
-    With its version of hardware and firmware, and the nodes whose heartbeats were received, or why
-    it could not listen. Raises OSError if the port cannot be used.
-    """
-    with serial.Serial(
-        port, _BAUD, timeout=_REPLY_TIMEOUT, write_timeout=_REPLY_TIMEOUT, exclusive=True
-    ) as line:
-        line.reset_input_buffer()
-        line.write(b"V\r")
-        found = _VERSION.search(_text_until(line, _VERSION))
-        if found is None:
-            return None
-        line.write(b"C\r")  # in case it was left open
-        _text_until(line, _END)
-        nodes, what = list[int](), "no listen-only mode, so it was not opened"
-        try:
-            speed = b"S%d\r" % SLCAN_RATES.index(BITRATE)
-            if _is_done(line, speed) and _is_done(line, b"L\r"):
-                nodes = sorted(_heard(line))
-                what = f"heartbeats of nodes: {', '.join(map(str, nodes)) or 'none'}"
-        finally:
-            with suppress(serial.SerialException):
-                line.write(b"C\r")
-                line.flush()
-    urls = tuple(f"can+slcan://{port}?bitrate={BITRATE}#{node}" for node in nodes)
-    return Candidate(port, f"slcan adapter {found[1].decode()}, {what}", urls, is_slcan=True)
-
-
-def _is_done(line: serial.Serial, command: bytes) -> bool:
-    line.write(command)
-    return _text_until(line, _END).startswith(_DONE)
-
-
-def _text_until(line: serial.Serial, end: re.Pattern[bytes]) -> bytes:
-    """Read until a match or the timeout."""
-    text, deadline = b"", time.monotonic() + _REPLY_TIMEOUT
-    while not end.search(text) and time.monotonic() < deadline:
-        text += line.read(max(1, line.in_waiting))
-    return text
-
-
-def _heard(line: serial.Serial) -> set[int]:
-    """Return the nodes whose heartbeats are received."""
-    reader, deadline = TextReader(SLCAN), time.monotonic() + _LISTENING_TIME
-    heard: set[int] = set()
-    while time.monotonic() < deadline:
-        for frame in reader.feed(line.read(max(1, line.in_waiting))):
-            heard.add(frame.id - cob_id("heartbeat"))
-    return heard & _NODES
 
 
 def _serial_ports() -> Iterator[Candidate]:
@@ -274,7 +190,7 @@ def _serial_ports() -> Iterator[Candidate]:
         urls = tuple(f"serial://{path}?baud={speed}" for speed in _SPEEDS)
         urls += (f"modbus+rtu://{path}?baud={RTU_BAUD}#{ADDRESS}",)
         description = "serial port" if port.description == _UNDESCRIBED else port.description
-        yield Candidate(path, description, urls, is_serial=True)
+        yield Candidate(path, description, urls)
 
 
 def _can_interfaces() -> Iterator[Candidate]:
@@ -308,17 +224,14 @@ async def identify_all(urls: Iterable[str]) -> Found:
 
 
 async def discover(
-    urls: Sequence[str], *, probes: bool, slcan: bool
+    urls: Sequence[str], *, probes: bool
 ) -> tuple[dict[str, Any], dict[str, DriverError]]:
     """List ports, interfaces and the amplifiers on them; returns that, and problems by URL.
 
-    urls: identified too; probes: every port is sent identify requests; slcan: CAN adapters on
-    serial ports are detected.
+    urls: identified too; probes: every port is sent identify requests.
     """
-    places = [with_slcan(place) if slcan else place for place in candidates()]
-    probed = [
-        place.urls for place in places if probes and place.remedy is None and not place.is_slcan
-    ]
+    places = candidates()
+    probed = [place.urls for place in places if probes and place.remedy is None]
     found = await identify_all(urls)
     # Of mute places each URL takes the time in which a board may start.
     for identified_there in await asyncio.gather(*map(identify_all, probed)):
@@ -345,7 +258,6 @@ def _row(place: Candidate, found: Found) -> dict[str, Any]:
         "place": place.name,
         "description": place.description,
         "urls": list(place.urls),
-        "heard": list(place.urls) if place.is_slcan else [],
         "answers": [url for url, who in replies.items() if not isinstance(who, DriverError)],
         "remedy": place.remedy or next(unusable, None),
     }

@@ -180,7 +180,7 @@ class CanClient(JudgeClient):
             return segments(self.next_number(), number, words)
 
         first, *rest = frames()
-        yield "seven bytes in its first frame", self.packed([first[:7], *rest])
+        yield "a first frame of seven bytes", self.packed([first[:7], *rest])
         yield "another node", self.packed(frames(), to=self.free)
         first, *rest = frames()
         yield "121 words", self.packed([first[:3] + b"\x79" + first[4:], *rest])
@@ -190,7 +190,10 @@ class CanClient(JudgeClient):
             yield "its last frame missing", self.packed(frames()[:-1])
             yield "its first frame missing", self.packed(frames()[1:])
             first, *rest = frames()
-            yield "two frames of one place", self.packed([altered(rest[-1], 2), *rest, first])
+            yield (
+                "two different frames with one index",
+                self.packed([altered(rest[-1], 2), *rest, first]),
+            )
 
     def data_of(self, name: str) -> list[bytes]:
         """Return the data of the frames heard of a kind, by the name of its identifier."""
@@ -215,7 +218,7 @@ async def numbers(subject: Subject) -> None:
     """
     client = cast(CanClient, subject.client)
     require(
-        subject.exchange_time <= _FAST, "the line is too slow to see for how long it keeps a number"
+        subject.exchange_time <= _FAST, "the line is too slow to observe how long a number is kept"
     )
     await subject.arm()
     client.quiet = _FAST
@@ -241,7 +244,7 @@ async def numbers(subject: Subject) -> None:
         await asyncio.sleep(_FORGOTTEN)
         sent = threads.now()
         frames = segments(number, _SET, words)[::order]
-        await expect_replies(1, "frames in another order", *frames)
+        await expect_replies(1, "reordered frames", *frames)
         subject.played(part, sent)
         client.number = number
         await subject.ping()
@@ -252,19 +255,19 @@ async def numbers(subject: Subject) -> None:
     _, words = subject.words_of(subject.one())
     for number in (2, 4):
         *others, last = segments(number, _SET, words)
-        await expect_replies(0, "a part of a message", *others)
+        await expect_replies(0, "an incomplete message", *others)
         await (follow(3) if number == 2 else asyncio.sleep(_FORGOTTEN))
-        await expect_replies(0, "the last frame of a message that was given up", last)
+        await expect_replies(0, "the last frame of an abandoned message", last)
     again = MESSAGES["Commit"].request.pack(subject.filled({"token": subject.token}))
     for number, kind, sent_words in ((9, _STATUS, []), (10, _COMMIT, again)):
         *others, last = segments(number, kind, sent_words)
         await expect_replies(
-            1, f"message {kind} with bytes behind its words", *others, last[:4] + b"\xff" * 4
+            1, f"message {kind} with bytes after its words", *others, last[:4] + b"\xff" * 4
         )
     client.number = 10
     shown = (await client.exchange(HELLO, [0xFFFF])).words
     named = read_as("identity", IDENTITY.unpack, shown, is_strict=False)
-    expect_equal(named, subject.identity, "identity by a Hello with words")
+    expect_equal(named, subject.identity, "identity returned to a Hello with words")
     await subject.ping()
 
 
@@ -440,20 +443,24 @@ async def areas(subject: Subject) -> None:
     await write(_ACHIEVED, 6, 15, 0)
     tag, result, *behind = await area(_ACHIEVED)
     seen = tag, result, any(behind)
-    expect_equal(seen, (6, _TOO_LONG, False), "tag, result of a word too many, registers behind")
+    expect_equal(
+        seen, (6, _TOO_LONG, False), "tag, result, nonzero registers behind, for one extra word"
+    )
     for tag, count, result in ((7, 1, _BEYOND), (8, 3, 0)):  # parts; of session 0
         await write(_SET, tag, 0, 1, count << 1)
         expect_equal(
             await area(_SET),
             [tag, result, *_NO_WORDS],
-            f"reply area after the first of {count} parts that is wrong",
+            f"reply area after an invalid first part of {count}",
         )
     for number in (_CAPS, _STATUS):
         await write(number, 9, 0)
-        expect_equal(await area(number, 2), [9, _TOO_LONG], "tag, result of a refusal")
+        expect_equal(await area(number, 2), [9, _TOO_LONG], "tag, result of a rejected request")
         tag, result, first = await area(number, 3)
         shown_once = tag, result, first > 0
-        expect_equal(shown_once, (9, 0, True), "tag, result, words once a refusal was read")
+        expect_equal(
+            shown_once, (9, 0, True), "tag, result, presence of words after a rejection was read"
+        )
     texts = await client.read(IDENTITY_REGISTER, IDENTITY_COUNT, function=READ_HOLDING)
     part = await client.read(IDENTITY_REGISTER + 2, 16)
     expect_equal(part, texts[2:18], "part of the identity")
@@ -471,12 +478,12 @@ async def present_areas(subject: Subject) -> None:
     kept = await client.read(BOX * _PING + REPLY_OFFSET, AREA)
     await subject.run([subject.one(level=0.5), partial(subject.request, "GetStatus")])
     again = await client.read(BOX * _PING + REPLY_OFFSET, AREA)
-    expect_equal(again, kept, "reply to a Ping, read again after a set")
+    expect_equal(again, kept, "reply area of Ping, read again after a Set")
     first, *_ = subject.parts(subject.one(), now=0, count=3)
     await subject.send(send("Set", **first))
     tag = client.number
     shown = await client.read(BOX * _SET + REPLY_OFFSET, AREA)
-    expect_equal(shown, (tag, 0, *_NO_WORDS), "reply area after a part that is kept")
+    expect_equal(shown, (tag, 0, *_NO_WORDS), "reply area after a part that was kept")
     if not (client.is_rtu or client.has_gateway):
         await subject.run([stage(subject.one())])
         words = MESSAGES["Commit"].request.pack(subject.filled({"token": subject.token}))
@@ -485,11 +492,11 @@ async def present_areas(subject: Subject) -> None:
     if client.is_rtu:
         subject.require_alone()
         data = client.adu(client.write_of(_PING, [subject.session, 0], tag=4242), unit=0)
-        await client.expect_silence(data, "a Ping for all")
+        await client.expect_silence(data, "a broadcast Ping")
         await subject.starve()
         await client.send(client.adu(client.write_of(_STOP, [0], tag=4242), unit=0))
         (tag,) = await client.read(BOX * _STOP + REPLY_OFFSET, 1)
-        verify(tag != 4242, "tag after a Stop for all", expected="as before", seen=tag)
+        verify(tag != 4242, "tag after a broadcast Stop", expected="unchanged", seen=tag)
 
 
 def _bad_pdus(client: ModbusClient, ping: bytes) -> Iterator[tuple[str, bytes, int]]:
@@ -502,25 +509,25 @@ def _bad_pdus(client: ModbusClient, ping: bytes) -> Iterator[tuple[str, bytes, i
     yield "function 23", struct.pack(">BHHHHBH", 23, 0, 1, BOX * _PING, 1, 2, 1), 1
     for what, first, registers, code in (
         ("a write within a message", BOX * _PING + 1, [1, 1], 2),
-        ("a write of no message", BOX * 63, [1, 1], 2),
+        ("a write to an unknown message", BOX * 63, [1, 1], 2),
         ("a write of message 1", BOX, [1], 2),
         ("a write to a reply area", area, [1, 1], 2),
         ("a write of 122 registers", BOX * _PING, [1] * 122, 2),
         ("a write of 0 registers", BOX * _PING, [], 3),
-        ("a write of 0 registers of no message", BOX * 63, [], 3),
+        ("a write of 0 registers to an unknown message", BOX * 63, [], 3),
     ):
         yield what, write_pdu(first, registers), code
     wrong_size = ping[:5] + bytes([ping[5] + 2]) + ping[6:] + b"\0\0"
-    yield "a write of another number of bytes", wrong_size, 3
+    yield "a write with a wrong number of bytes", wrong_size, 3
     for what, first, count, code in (
-        ("a read beyond an area", last - 1, 2, 2),
-        ("a read behind an area", last, 1, 2),
-        ("a read of no message", BOX * 63 + REPLY_OFFSET, 1, 2),
-        ("a read of what is written", BOX * _PING, 1, 2),
+        ("a read across the end of an area", last - 1, 2, 2),
+        ("a read after the end of an area", last, 1, 2),
+        ("a read of an unknown message", BOX * 63 + REPLY_OFFSET, 1, 2),
+        ("a read of a request register", BOX * _PING, 1, 2),
         ("a read beyond the identity", IDENTITY_REGISTER, IDENTITY_COUNT + 1, 2),
         ("a read of 0 registers", area, 0, 3),
         ("a read of 126 registers", area, 126, 3),
-        ("a read of 126 registers where there are none", 0, 126, 3),
+        ("a read of 126 unknown registers", 0, 126, 3),
     ):
         of_one = read_pdu(first, 1)  # pymodbus makes none of 0 or 126
         yield what, of_one[:3] + count.to_bytes(2), code
@@ -572,7 +579,7 @@ async def pieces(subject: Subject) -> None:
         client.write(first)
         await asyncio.sleep(wait)
         require_in_time(
-            not wait < limit < threads.now() - began, "the rest of a frame came too late"
+            not wait < limit < threads.now() - began, "the rest of a frame arrived too late"
         )
         heard = await client.send(second, count=len(frames))
         what = f"responses after {len(first)} bytes and a pause of {1e3 * wait:g} ms"
@@ -663,14 +670,14 @@ class SerialClient(JudgeClient):
         statuses = (self.request(_STATUS, []) for _ in range(_SEQUENCES))
         plain = next(each for each in statuses if each[1] == len(each) - 2)
         yield from {
-            "a block that goes on behind its end": b"\0\xff" + plain[2:],
+            "a COBS block longer than the frame": b"\0\xff" + plain[2:],
             "eight bytes": _framed(_checked(content[:4])),
             "its last byte missing": good[:-2] + b"\0",
             "its first byte missing": b"\0" + good[2:],
-            "a broken stuffing": b"\0\xff" + good[2:],
+            "invalid COBS": b"\0\xff" + good[2:],
             "no CRC": _framed(content[:-_CRC_SIZE]),
             "more than 240 bytes of payload": _framed(_checked(long)),
-            "the bit of a reply": _framed(_checked(reply)),
+            "bit 7 of a reply": _framed(_checked(reply)),
             "another address": self.request(number, words, to=self.free),
         }.items()
 
@@ -696,7 +703,7 @@ async def damaged_frames(subject: Subject) -> None:
     for other in client.neighbours if client.kind == "serial" else ():
         client.address = other
         named = await client.hello()
-        verify(named != subject.identity, "addresses that reply", expected=own, seen=other)
+        verify(named != subject.identity, "address of this amplifier", expected=own, seen=other)
     client.address = own
     await subject.arm()
     await subject.play(subject.one())
@@ -740,7 +747,7 @@ async def discarded_frames(subject: Subject) -> None:
     await client.expect_silence(client.request(EVENT, event), "an Event")
     await subject.run([subject.arm, subject.one()])
     answer = await client.exchange(_SET, subject.words_of(subject.one())[1], behind=b"\0")
-    expect_equal(answer.code, "BAD_LENGTH", "refusal of a set with half a word")
+    expect_equal(answer.code, "BAD_LENGTH", "code for a Set with half a word")
     head = [subject.session, subject.token + 1, 2 << 1]
     part = client.request(_SET, head, behind=b"\0")
     await client.expect_silence(part, "a part with half a word")
@@ -750,7 +757,7 @@ async def discarded_frames(subject: Subject) -> None:
         words = message.request.pack(subject.filled(values))
         for version in (VERSION - 1, 0):
             data = client.request(message.number, words, to=0, version=version)
-            await client.expect_silence(data, f"a {name} of version {version} for all")
+            await client.expect_silence(data, f"a broadcast {name} of version {version}")
             await subject.run([subject.ping])
 
 
@@ -772,14 +779,14 @@ async def tolerated_frames(subject: Subject) -> None:
         ("noise before it", [b"\x55\xaa\x01" + ping()], 1),
         ("zeros before it", [b"\0\0\0" + ping()], 1),
         ("half a frame before it", [ping()[:7] + ping()], 1),
-        ("another back to back", [ping() + ping()], 2),
+        ("another frame back to back", [ping() + ping()], 2),
         ("300 bytes of noise before it", [b"\x77" * 300 + ping()], 1),
         (
             "the longest payload before it",
             [client.request(_SET, (), behind=bytes(240)) + ping()],
             2,
         ),
-        ("its delimiter shared", [ping()[:-1] + ping()], 2),
+        ("a shared delimiter", [ping()[:-1] + ping()], 2),
     ):
         for piece in pieces[:-1]:
             client.write(piece)

@@ -76,8 +76,8 @@ def layers_play_on(subject: Subject) -> RequestRows:
 def valid_for(subject: Subject) -> RequestRows:
     """After valid_for: the layer ends along its ramp, state stays armed.
 
-    Count valid_for in real time from the start of the layer, in milliseconds of 16 bits; 0 is no
-    end.
+    Count valid_for in real time from the start of the layer, as 16-bit milliseconds;
+    0 is no end.
     """
     ramp, short = min(100, subject.can["ramp_max"]), subject.lasting(100)
     half, pause = subject.one(level=0.5, valid_for=short), 0.12 * subject.slowness
@@ -414,7 +414,7 @@ def voices(subject: Subject) -> RequestRows:
     """More voices than `voices` on a channel: the oldest fades end within 2 ms, no refusal.
 
     Count only voices that last longer than 2 ms, keep a spare voice for each layer, and shorten
-    released voices in the order in which their ways began.
+    released voices in the order in which their paths began.
     """
     channels, last = sorted({0, subject.channels[-1]}), subject.layers[-1]
     count = min(subject.can["voices"], _MAX_VOICES)
@@ -481,10 +481,10 @@ async def limited(subject: Subject) -> None:
     Note every sample whose sum exceeds full level by more than a step of level, show the flag in
     the next Status, then clear it.
     """
-    require(subject.level * 2 > 1.0, "tried above half of full level only; see --level")
+    require(subject.level * 2 > 1.0, "tested only above half of full level; see --level")
     require(
         abs(subject.other - subject.frequency) >= subject.can["frequency_step"],
-        "it has one frequency, whose tones interfere",
+        "all tones have the same frequency and interfere",
     )
     last = subject.channels[-1]
     over = layer(1, subject.tone(frequency=subject.other))
@@ -499,13 +499,15 @@ async def limited(subject: Subject) -> None:
         await asyncio.sleep(_AMID)
         await subject.request("GetAchieved", layer=0)
         flags = await subject.request(name, **values)
-        expect_equal(has_flag(flags.values, "limited"), True, "limited, by a sum that is over")
+        expect_equal(
+            has_flag(flags.values, "limited"), True, "flag limited after a sum above full level"
+        )
 
     await unseen("Ping")
     opposite = layer(1, subject.tone(0, 1.0, 180.0))
     await subject.run([layer(1), play_now(subject.one(), opposite), _AMID])
     flags = await subject.request("GetStatus")
-    expect_equal(has_flag(flags.values, "limited"), False, "limited, by tones that cancel")
+    expect_equal(has_flag(flags.values, "limited"), False, "flag limited for tones that cancel")
     await unseen("Stop", ramp=0)
 
 
@@ -517,7 +519,7 @@ _SHIFTS = 1, 0x4000, 0xC001
 
 
 def _require_known(subject: Subject) -> None:
-    require(subject.can["clock_error"] != CLOCK_UNKNOWN, "it states no clock_error")
+    require(subject.can["clock_error"] != CLOCK_UNKNOWN, "clock_error is not stated")
 
 
 async def _read(subject: Subject, otherwise: type[ContractViolation] = ContractViolation) -> None:
@@ -528,7 +530,7 @@ async def _read(subject: Subject, otherwise: type[ContractViolation] = ContractV
     await subject.request("GetStatus")
     subject.dating.expect_steady(otherwise)
     is_coarse = subject.can["clock_error"] > QUANTITIES["clock_error"].to_wire(HIGH_TIME)
-    verify(is_coarse or len(low) > 1, "low word of the clock", expected="any", seen=low)
+    verify(is_coarse or len(low) > 1, "low words of the clock", expected="several values", seen=low)
 
 
 @reading("protocol.md#the-clock")
@@ -583,7 +585,7 @@ async def clock_rate(subject: Subject) -> None:
     _require_known(subject)
     await subject.request("GetStatus")  # whose exchanges all rests on
     duration = max(0.35, 1.5 * subject.read_time / (_HIGHEST * RATE_STEP - DRIFT))
-    require(duration <= _MAX_DURATION, "its exchanges are too long to see a rate")
+    require(duration <= _MAX_DURATION, "the line is too slow to observe the rate")
 
     lasting = _LASTING if subject.exchange_time <= _QUICK else duration / 2  # s; not of the clock
     timed = subject.one(valid_for=round(1000 * lasting), ramp=subject.ramp)
@@ -643,7 +645,7 @@ async def measured(subject: Subject) -> None:
 
     async def voltages() -> list[int]:
         rows = (await subject.request("GetMeasured"))["channels"]
-        expect_equal(len(rows), len(subject.channels), "number of channels that are measured")
+        expect_equal(len(rows), len(subject.channels), "number of measured channels")
         return [each["channel_voltage"] for each in rows]
 
     silent = await voltages()
@@ -653,5 +655,5 @@ async def measured(subject: Subject) -> None:
         await asyncio.sleep(0.05)
         playing = (await voltages())[channel]
         expect_within(
-            playing, silent[channel] + 1, math.inf, f"voltage of channel {channel} that plays"
+            playing, silent[channel] + 1, math.inf, f"voltage of channel {channel} while it plays"
         )

@@ -77,7 +77,7 @@ async def identity(client: JudgeClient) -> None:
     first = await greeted(client)
     for name in ("vendor", "product", "serial_number", "firmware"):
         verify(bool(first[name]), name, expected="a text", seen="none")
-    expect_equal(await client.hello(), first, "identity, read again")
+    expect_equal(await client.hello(), first, "identity, read a second time")
 
 
 @reading("protocol.md#identity-and-capabilities")
@@ -106,7 +106,7 @@ async def starts_disarmed(subject: Subject) -> None:
     disarmed = [number for number in STATES.values() if number != ENABLED]
     expect_one_of(status["state"], disarmed, "state before Arm")
     is_open = has_flag(status, "interlock_open") and not subject.has("interlock")
-    expect_equal(is_open, False, "interlock of one without")
+    expect_equal(is_open, False, "interlock_open without the feature interlock")
     expect_within(status["flags"], 0, (1 << len(STATUS_FLAGS)) - 1, "flags")
 
 
@@ -159,7 +159,7 @@ async def _expect_prompt(
         1e3 * fastest,
         0,
         1e3 * REACTION,
-        f"time until the reply to {name} begins [ms], the shortest of {_TRIES}",
+        f"shortest time until the reply to {name} begins [ms], of {_TRIES}",
     )
 
 
@@ -172,7 +172,7 @@ async def unknown_types(subject: Subject) -> None:
     """
     for number in _UNKNOWN:
         answer = await subject.client.exchange(number, ())
-        expect_equal(answer.code, "UNKNOWN_TYPE", f"refusal of message {number}")
+        expect_equal(answer.code, "UNKNOWN_TYPE", f"code for message {number}")
     missing = [name for name, feature in _FEATURE_OF.items() if not subject.has(feature)]
     await subject.run([send(each, raw=_shortest(each), code="UNKNOWN_TYPE") for each in missing])
 
@@ -205,7 +205,7 @@ async def reading_changes_nothing(subject: Subject) -> None:
     await subject.run([send("GetAchieved", layer=number) for number in subject.layers])
     known = *subject.channels, NO_CHANNEL
     for each in (await subject.request("GetFaults"))["faults"]:
-        expect_one_of(each["channel"], known, "channel of a fault")
+        expect_one_of(each["channel"], known, "channel of a listed fault")
     await subject.status()
 
 
@@ -219,10 +219,10 @@ async def hello_for_ever(subject: Subject) -> None:
     client = cast(SerialClient, subject.client)
     for payload, version in ((b"", 3), (b"\1\2\3", 0), (b"\1", 77), (b"", 2)):
         shown = await client.hello(payload, version)
-        expect_equal(shown, subject.identity, f"identity by a Hello of version {version}")
+        expect_equal(shown, subject.identity, f"identity returned to a Hello of version {version}")
     for version in (0, 2, 3, 255):
         answer = await client.exchange(MESSAGES["GetStatus"].number, (), version=version)
-        expect_equal(answer.code, "UNSUPPORTED_VERSION", f"refusal of version {version}")
+        expect_equal(answer.code, "UNSUPPORTED_VERSION", f"code for a frame of version {version}")
     ping = MESSAGES["Ping"].number
     for number, words, code in (
         (ping, [1, 0], "BAD_LENGTH"),
@@ -230,7 +230,7 @@ async def hello_for_ever(subject: Subject) -> None:
         (_UNKNOWN[0], [1, 0], "UNKNOWN_TYPE"),
     ):
         answer = await client.exchange(number, words, behind=b"\0")
-        expect_equal(answer.code, code, f"refusal of message {number} with half a word")
+        expect_equal(answer.code, code, f"code for message {number} with half a word")
 
 
 def _shortest(name: str, **others: Any) -> list[int]:
@@ -279,7 +279,7 @@ async def events(subject: Subject) -> None:
     await subject.arm(0.0)
     types = [EVENT, MESSAGES["Arm"].number][not is_stated :]
     seen = [each.type & _TYPE for each in client.order]
-    expect_equal(seen, types, "types of the messages after Arm, the Event before the reply")
+    expect_equal(seen, types, "message types after Arm (Event, then reply)")
 
     async def unasked() -> None:
         count = len(client.order)
@@ -289,8 +289,8 @@ async def events(subject: Subject) -> None:
         if is_stated:
             verify(
                 len(client.order) > count,
-                "Events of a watchdog that expires while nothing is asked",
-                expected="one at least",
+                "Events after a watchdog expired without a request",
+                expected="at least one",
                 seen="none",
             )
 
@@ -332,9 +332,9 @@ async def events(subject: Subject) -> None:
     expect_equal(shown, needed if is_stated else [], "states, faults and latches of Events")
     if client.kind == "serial":
         steps = {(b.frame.sequence - a.frame.sequence) % 0x10000 for a, b in pairwise(found)}
-        expect_equal(steps - {1}, set(), "steps of the numbers of Events, beyond 1")
+        expect_equal(steps - {1}, set(), "steps between Event numbers other than 1")
     channels = {each["channel"] for each in reports}
-    expect_equal(channels - {NO_CHANNEL}, set(), "channels of Events")
+    expect_equal(channels - {NO_CHANNEL}, set(), "channels of Events other than 255")
 
 
 @driving("protocol.md#broadcasts", "serial", "rtu", "can")
@@ -369,7 +369,7 @@ async def broadcasts(subject: Subject) -> None:
         flawed: list[tuple[int, list[int]]] = [(stop, []), (stop, [0, 0]), (_UNKNOWN[0], [])]
         unheld = commit, _shortest("Commit", session=77, token=subject.token or 1)
         frames = [client.request(*each, to=0) for each in (unheld, *flawed, *requests)]
-        await client.expect_silence(client.question(0), "what is for one alone, to all", *frames)
+        await client.expect_silence(client.question(0), "broadcasts of other messages", *frames)
         await subject.request("GetStatus")
 
     async def obey(name: str, *before: bytes, **values: object) -> None:
@@ -377,7 +377,7 @@ async def broadcasts(subject: Subject) -> None:
         values = subject.filled(values)
         words = message.request.pack(values)
         data = client.request(message.number, words, to=0)
-        await client.expect_silence(data, f"{name} for all", *before)
+        await client.expect_silence(data, f"a broadcast {name}", *before)
         when = subject.since(sent)
         subject.shown.sets.expire(when)
         require_in_time(not subject.shown.sets.has_expired, "a set expired before its Commit")
@@ -418,7 +418,7 @@ async def mark(subject: Subject) -> None:
         when = subject.dating.interval(When(sent, written + REACTION + client.transit))
         subject.shown.carry_out("Mark", {}, {}, when)
         await subject.run([subject.ping, subject.status])
-        expect_equal(len(client.heard), 0, "replies to a Mark for all")
+        expect_equal(len(client.heard), 0, "number of replies to a broadcast Mark")
 
 
 @driving("protocol.md#addresses")
@@ -454,18 +454,22 @@ async def addresses(subject: Subject) -> None:
         client.timeout, timeout = client.quiet, client.timeout
         is_there = await _is_at(client, own, tries=1)
         client.timeout = timeout
-        expect_equal(is_there, False, "whether it replies at its old address")
+        expect_equal(is_there, False, "reply at the old address")
         if client.kind == "can":
             client.address = free  # at which a node does not listen before a start
             data = client.request(MESSAGES["GetStatus"].number, ())
-            await client.expect_silence(data, "GetStatus of a node that has booted")
-        expect_equal(await _is_at(client, free), True, "whether it replies at its new address")
+            await client.expect_silence(data, "GetStatus after the boot-up")
+        expect_equal(await _is_at(client, free), True, "reply at the new address")
         if client.has_broadcasts and not client.neighbours:
             back = MESSAGES["SetAddress"].request.pack({**right, "address": own})
             data = client.request(MESSAGES["SetAddress"].number, back, to=0)
-            await client.expect_silence(data, "SetAddress for all")
+            await client.expect_silence(data, "a broadcast SetAddress")
             await asyncio.sleep(_MOVED)
-            expect_equal(await _is_at(client, own), True, "whether SetAddress for all moves it")
+            expect_equal(
+                await _is_at(client, own),
+                True,
+                "reply at the old address after a broadcast SetAddress back",
+            )
     finally:
         if not (is_back := client.address == own and await _is_at(client, own)):
             if await _is_at(client, free):
@@ -474,7 +478,7 @@ async def addresses(subject: Subject) -> None:
             is_back = await _is_at(client, own)
         client.address = own
         client.heard.clear()
-    expect_equal(is_back, True, "whether it replies at its first address again")
+    expect_equal(is_back, True, "reply at the first address after the check")
 
 
 async def _is_at(client: JudgeClient, address: int, *, tries: int = _SURE) -> bool:
@@ -545,7 +549,7 @@ async def read_object(client: CanClient, index: int, subindex: int = 0, *, code:
         verify(
             is_next,
             f"segment of object {index:04x}/{subindex}",
-            expected="the next",
+            expected="the next segment",
             seen=answer.hex(),
         )
         data += answer[1 : 8 - (answer[0] >> 1 & 7)]
@@ -575,7 +579,7 @@ async def network_management(subject: Subject) -> None:
             data, f"GetStatus after {command}", client.question(client.address)
         )
         is_read = bool(client.data_of("sdo_answer"))
-        expect_equal(is_read, command != "stop", f"whether objects are read after {command}")
+        expect_equal(is_read, command != "stop", f"object readable after {command}")
         await client.command("start", to=started_as)
         await expect_interval(_DEFAULT if "reset" in command else _OTHER, command)
 
@@ -609,7 +613,7 @@ async def network_management(subject: Subject) -> None:
     await expect_interval(_DEFAULT, "reset_node")
     words = MESSAGES["Arm"].request.pack(subject.filled({"watchdog": subject.can["watchdog_max"]}))
     arm = await client.exchange(MESSAGES["Arm"].number, words)
-    expect_equal(arm.code, "", "refusal of an Arm with the session from before reset_node")
+    expect_equal(arm.code, "", "code for an Arm with the session held before reset_node")
     subject.require_alone()
 
 
@@ -624,7 +628,9 @@ async def heartbeats(subject: Subject) -> None:
 
     async def expect_objects(error_register: int, state: int) -> None:
         shown = [(await read_object(client, *each))[0] for each in ((0x1001, 0), (0x2002, 1))]
-        expect_equal(shown, [error_register, state], "error register and state, as objects")
+        expect_equal(
+            shown, [error_register, state], "error register and state in objects 1001 and 2002"
+        )
 
     stated = int.from_bytes(await read_object(client, _HEARTBEAT), "little")
     for interval in (stated, _OTHER, 0, stated):
@@ -661,7 +667,7 @@ async def emergencies(subject: Subject) -> None:
     """
     require(
         subject.exchange_time <= _QUICK,
-        "the line is too slow to take it out of operation in the 5 ms of a fault",
+        "the line is too slow to send an NMT command within the 5 ms of a fault",
     )
     await subject.in_time(partial(_fails_unheard, subject))
 
@@ -683,9 +689,9 @@ async def _fails_unheard(subject: Subject) -> None:
     heard += client.data_of("emergency")
     await client.command("start")
     verify(bool(heard), "emergencies of a fault", expected="two", seen="none")
-    require_in_time(state == REACTING, "it was taken out of operation behind the fade of a fault")
+    require_in_time(state == REACTING, "the NMT command arrived after the fade of the fault")
     states = [each[3] & 0xF for each in heard]
-    expect_equal(states, [REACTING, FAULT], "states in emergencies amid and behind that fade")
+    expect_equal(states, [REACTING, FAULT], "states in the emergencies during and after the fade")
     await subject.run([subject.settle, subject.clear])
 
 

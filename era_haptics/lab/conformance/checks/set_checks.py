@@ -125,7 +125,7 @@ async def steps_as_stated(subject: Subject) -> None:
     """
     base = subject.tone(0)
     coarse = [name for name in _TONE if subject.can[f"{name}_step"] > 3]
-    require(bool(coarse), "its steps are about those of the wire")
+    require(bool(coarse), "the stated steps are about as fine as the steps of the wire")
     ranges = {
         "frequency": (subject.lowest, base.frequency, subject.highest),
         "level": (1, base.level - subject.can["level_step"], _LEVEL),
@@ -142,7 +142,7 @@ async def steps_as_stated(subject: Subject) -> None:
             shown = await subject.request("GetAchieved", layer=0)
             found.update(each[name] for each in shown["commands"])
         expect_within(
-            len(found), 0, 2, f"number of values achieved of {_SCANNED} within a step of {name}"
+            len(found), 0, 2, f"number of different achieved values within one {name}_step"
         )
 
 
@@ -335,7 +335,7 @@ def long_set(subject: Subject) -> list[LayerSet]:
 def _require_quick(subject: Subject) -> None:
     require(
         16 * subject.exchange_time <= STAGED_LIFE,
-        "the line is too slow for a set in several parts",
+        "the line is too slow for a set of several parts",
     )
 
 
@@ -743,7 +743,7 @@ async def _starts(subject: Subject, duration: float, *, shift: int = 0) -> None:
                 shown["levels"][0] / FULL,
                 low - rough,
                 high + rough,
-                f"level {1e3 * since:.2f} ms behind its moment, by its clock",
+                f"level {1e3 * since:.2f} ms after the moment, by the amplifier's clock",
             )
         await asyncio.sleep(_NEAR)
     subject.dating.expect_steady()

@@ -355,8 +355,8 @@ async def watchdog(subject: Subject) -> None:
 async def trips_amid_fades(subject: Subject) -> None:
     """Watchdog expiry during fades, onsets, endings, waiting sets: silent 5 ms later.
 
-    In a fault, shorten every way to zero that would end later than 5 ms from now, released voices
-    and endings included.
+    In a fault, end every voice within 5 ms: shorten each fade, onset or ending that would take
+    longer, also of released voices.
     """
     time = subject.shortest_watchdog
     for sets in subject.transitions(min(3 * time, subject.can["ramp_max"])):
@@ -484,4 +484,4 @@ async def fault_list(subject: Subject) -> None:
     stopped = send("Stop", ramp=0), subject.clear
     await subject.run([trip, subject.clear, trip, subject.clear, *stopped, listed, 0.1])
     found = await listed()
-    expect_equal(found, before[: max(len(found), 2)], "faults and channels that are listed")
+    expect_equal(found, before[: max(len(found), 2)], "listed faults and channels")

@@ -309,7 +309,7 @@ def test_what_may_harm_an_exciter_is_said() -> None:
         (f"{own}{gains}, excursion: 9 mm, clip: 4 V", "gains", "ask for 9 V"),
         (own, "excursion", "missing"),
         (own.replace("0.1 mH", "1 mH"), "inductance", "is 0.18 at 300 Hz"),
-        (own.replace("224", "60") + ", excursion: 1 mm", "resonance", "hangs 4.7 mm"),
+        (own.replace("224", "60") + ", excursion: 1 mm", "resonance", "sags 4.7 mm"),
     ):
         notes = [each for each in warned(keys, "[100, 300]") if each.startswith(f"eras.SW.{key}")]
         assert [note for note in notes if said in note], (key, warned(keys, "[100, 300]"))

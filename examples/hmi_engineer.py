@@ -54,7 +54,7 @@ they felt: one JSON object per line each way.
 
 # %%
 far_end = start(
-    *("sim", era.example_rig_path(), "--exact", "--serial"),  # the plate that the table knows
+    *("sim", era.example_rig_path(), "--exact", "--serial"),  # the table's nominal plate
     *("--control", folder / "control"),
 )
 url = far_end.stdout.readline().strip().removeprefix("main: ")
@@ -140,9 +140,8 @@ with client.armed("example"):
 if not status.drive:
     sys.exit(f"nothing was played: {status.silence_reason or status.cause}")
 
-# %%
-# Amplitudes of different frequencies add; a target counts by its mean, a quiet finger by its
-# loudest point, as in the predictions.
+# %% Amplitudes of different frequencies add. As in the predictions, a target counts by its mean and
+# a quiet finger by its loudest point.
 peak = {name: np.sum(each["amplitude_m_s2"], axis=0) for name, each in felt.items()}
 at_target = peak["target"] @ felt["target"]["weights"]
 felt_contrast_db = 20 * np.log10(at_target / peak["quiet"].max())

@@ -1,8 +1,8 @@
-"""Makes measured.uff and measured.csv: responses of a plate that is not quite the paper's.
+"""Write measured.uff and measured.csv: responses of a plate slightly different from the paper's.
 
 A modal test on the simulated plate: twelve accelerometers, each ERA driven alone at a tenth of its
-stroke, frequency after frequency. The truth that `era calibrate` has to find is below; so are the
-faults of the measurement: noise, one sensor whose scale is wrong, one that is dead.
+stroke, frequency after frequency. The true values that `era calibrate` must find are below, and so
+are the faults of the measurement: noise, one sensor with a wrong scale, one dead sensor.
 
     python examples/make_measured.py
     era calibrate examples/paper_plate.yaml examples/measured.uff -o calibrated.yaml
@@ -149,7 +149,7 @@ def record_responses(
     for number, era in enumerate(rig.eras):
         for row, frequency in enumerate(frequencies.tolist()):
             start, omega, base = plant.time, 2 * math.pi * frequency, 0.1 * era.stroke
-            # The phase is that of the plate's clock.
+            # The phase refers to the plate's clock.
             tone = Term(start, math.inf, omega, base * np.exp(1j * omega * start))
             plant.set_input(number, [tone])
             plant.skip(start + SETTLE)
@@ -163,7 +163,7 @@ def record_responses(
 
 
 def main() -> None:
-    """Measure, and write both files beside this one."""
+    """Measure, and write both files to this folder."""
     here = Path(__file__).parent
     rig = load_rig(here / "paper_plate.yaml")
     scales = {WRONG: 1.25, DEAD: 0.0}

@@ -1,9 +1,9 @@
-"""Makes recordings of touches as a TUIO 1.1 tracker sends them; schedules stand for people.
+"""Write recordings of touches in the format of a TUIO 1.1 tracker; schedules simulate people.
 
-In touches.tuio one to three fingers come and go at places drawn once with a fixed seed, at least
-6 cm apart. In the others each person stays in an upright strip of the plate: two_people.tuio; and
-three_people.tuio, where one slides and one leaves before the others. Run it again after a change;
-it needs python-osc:
+In touches.tuio, one to three fingers come and go at random positions (fixed seed), at least 6 cm
+apart. In the other files each person stays in a vertical strip of the plate: two_people.tuio, and
+three_people.tuio, in which one person slides and one leaves before the others. Run it again after a
+change; it requires python-osc:
 
     python examples/make_touches.py
 """
@@ -24,7 +24,7 @@ FINGERS_PER_GROUP = (1, 2, 3, 2, 3, 1, 3, 2)
 AT_ONCE = (3, 7)  # groups whose fingers all come down at one moment
 HOLD = 0.55  # seconds from one finger to the next, and after the last one
 PAUSE = 0.15  # seconds with no finger down
-REST = 0.75  # the same before those that come at one moment: the plate has stopped ringing
+REST = 0.75  # the same before simultaneous touches: the plate has stopped ringing
 FRAME = 1 / 60  # seconds between the frames of a tracker
 SETTLING = 0.08  # seconds over which a fingertip rolls into its place
 ROLL = 0.0015  # metres that it rolls
@@ -90,7 +90,7 @@ def write_capture(path: Path | str, datagrams: Sequence[RecordedDatagram]) -> No
 
 
 def record(name: str, paths: Sequence[tuple], rng: np.random.Generator) -> None:
-    """Write the recording of some fingers beside this file, until shortly after the last lift."""
+    """Write the recording of some fingers to this folder, until shortly after the last lift."""
     rolls = rng.normal(scale=ROLL, size=(len(paths), 2)) / PLATE
     datagrams = []
     end = max(times[-1] for times, _ in paths) + PAUSE

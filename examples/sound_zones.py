@@ -1,9 +1,9 @@
-"""Two methods of personal sound zones on a plate, beside the library's own, on drawn plates.
+"""Compare two methods of personal sound zones with the library's own, on drawn plates.
 
     python examples/sound_zones.py        pairs of fingers on the paper's plate
     python examples/sound_zones.py DIR    entries for the contrast benchmark exported into DIR
 
-One finger shall feel a vibration, the others nothing: a bright and a dark zone.
+One finger should feel a vibration, the others nothing: a bright and a dark zone.
 """
 
 import json
@@ -51,7 +51,7 @@ def pressure_matching(bright, dark, loading=1e-3):
 METHODS = {"contrast control": contrast_control, "pressure matching": pressure_matching}
 
 
-# What they are given, and what their weights do.
+# Inputs of the methods, and results of their weights.
 def fields_of(plates, fingers):
     """Fields of each plate under the fingers, (plates, frequencies, ERAs, points)."""
     tip = np.column_stack([TURNS.real, TURNS.imag])
@@ -70,10 +70,11 @@ def felt(weights, fields):
 
 
 def chosen(method, fields, thresholds, judged=None):
-    """Frequency by its index and weights (ERAs,): the most contrast of those with the level.
+    """Return the frequency index and weights (ERAs,) with the most contrast among those with the
+    level.
 
-    Level and contrast that nine of ten plates give, the largest weight at full stroke. judged: the
-    fields of these, by default those of which the weights are.
+    Level and contrast are those of 90 % of plates, for the largest weight at full stroke. judged:
+    fields for the evaluation, default the fields for the weights.
     """
     zones = np.concatenate(fields, axis=2).reshape(*fields.shape[1:3], len(fields), -1)
     bright, dark = np.split(zones, [len(SHARES)], axis=3)
@@ -103,7 +104,7 @@ def plates_of(rig, *counts):
 
 
 def by_method(fields, thresholds):
-    """Frequency by its index and weights of each method, by its name and whose fields it knows."""
+    """Return frequency index and weights by method name and known fields."""
     return {
         f"{name}, {of}": chosen(method, some, thresholds)
         for name, method in METHODS.items()
@@ -112,7 +113,8 @@ def by_method(fields, thresholds):
 
 
 def compare(pairs):
-    """Contrast [dB] that nine of ten judging plates give at each pair of fingers, by method."""
+    """Return the contrast [dB] on 90 % of the evaluation plates for each pair of fingers, by
+    method."""
     rig = era.load_rig(era.example_rig_path())
     table, plates, found = era.table(rig), plates_of(rig, FEW, MANY), {}
     judges = [era.SolvedPlate(rig, seed=seed) for seed in JUDGES]
@@ -137,7 +139,7 @@ def compare(pairs):
 
 
 def write_entries(folder):
-    """Write an entry for each method and what it knows, for `python -m benchmarks.contrast`."""
+    """Write an entry per method and known fields, for `python -m benchmarks.contrast`."""
     document, patterns = json.loads((folder / "localization-1.json").read_text("utf-8")), {}
     for plate, content in document["plates"].items():
         rig = era.load_rig(folder / f"{plate}.yaml")

@@ -28,9 +28,9 @@ def regular_file(name: str, flags: int) -> int:
 
 
 def open_regular(path: Path, max_bytes: int) -> BinaryIO:
-    """Open a file to read; raises OSError as `regular_file` does, and for a larger one.
+    """Open a file for reading; raises OSError like `regular_file`, and for a larger file.
 
-    Its `strerror` says what must be. A sparse file may be long without a disk behind it.
+    `strerror` states the rule. A sparse file can be long without using the disk.
     """
     stream = open(path, "rb", opener=regular_file)  # noqa: SIM115
     if os.fstat(stream.fileno()).st_size > max_bytes:

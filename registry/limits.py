@@ -1,4 +1,5 @@
-"""Limits of fingers at once, and of commands, which rigs state and amplifiers' guards enforce."""
+"""Limits of the number of fingers, and of commands, as given by rigs and enforced by amplifiers'
+guards."""
 
 import math
 from dataclasses import dataclass
@@ -7,7 +8,8 @@ MAX_CONTACTS = 20
 """Most fingers: two people with ten each, or four with five; more are a forearm or a spill."""
 
 MAX_FINGERS = 10
-"""Most fingers that feel effects unless a daemon's file says otherwise: those of one person."""
+"""Maximum number of fingers with effects unless a daemon file sets it: the fingers of one
+person."""
 
 MAX_CONTENTS = 6
 """Most contents at the same time; with more, no plate has any contrast left."""
@@ -36,9 +38,9 @@ MAX_FINGER_LOAD = 10.0
 """Largest load of a finger, in fingertips; what loads a plate by more is a hand that rests."""
 
 HAND_LOAD, MAX_HAND_LOAD = 12.0, 40.0
-"""Load of a hand that rests on a plate, in fingertips, where its size is unknown, and the largest.
+"""Load of a resting hand of unknown size, in fingertips, and the maximum.
 
-That of the heel of a hand with part of its weight lies between its force, to the power of two
-thirds (7 fingertips for 10 N), and its area (30 for 20 cm²). docs/concepts/people.md has the
-sources, and how well this is known.
+The load of the heel of a hand with part of its weight is between estimates from its force to the
+power of two thirds (7 fingertips for 10 N) and from its area (30 for 20 cm²).
+docs/concepts/people.md states sources and uncertainty.
 """

@@ -219,7 +219,7 @@ def _found(group: str, path: tuple[str, ...]) -> dict[str, tuple[EntryPoint, ...
 
 @cache
 def _of_others(path: tuple[str, ...]) -> dict[str, EntryPoint]:
-    """One plug-in of each other package, by its top-level module."""
+    """Return one plug-in of each other package, by its top-level module."""
     points = [
         point
         for group in entry_points().groups

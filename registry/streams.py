@@ -1,7 +1,7 @@
-"""Standard streams: text of others never steers a terminal, and closed streams do no harm.
+"""Standard streams: foreign text never controls a terminal, and closed streams do no harm.
 
-What a program prints may quote names in files, replies of amplifiers or words of other clients.
-Control characters in these could clear a terminal, rename its window or hide a line.
+Output can quote names in files, replies of amplifiers or words of other clients. Control characters
+in these could clear a terminal, rename its window or hide a line.
 """
 
 import io

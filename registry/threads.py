@@ -1,13 +1,13 @@
-"""Threads, event loops and time, where amplifiers must not wait.
+"""Threads, event loops and time for programs in which amplifiers must not wait.
 
-Blocking work runs in daemon threads, so that no cancellation and no exit waits for it: a program
-waits for the threads of asyncio's own pool before it ends, which may take indefinitely if a
-connection or a disk hangs. Garbage collections are kept short while amplifiers are armed: a full
-one visits every loaded object, 80 ms with the numerical and CAN libraries, and on a busy machine
-longer than an amplifier's watchdog. Pauses between retries grow.
+Blocking work runs in daemon threads, so that neither a cancellation nor an exit waits for it. (A
+program waits for asyncio's own thread pool before it ends, possibly forever if a connection or a
+disk hangs.) Garbage collections are kept short while amplifiers are armed: a full one visits every
+loaded object, which takes 80 ms with the numerical and CAN libraries, and longer than an
+amplifier's watchdog on a busy machine. Pauses between retries increase.
 
-The clock of links and far ends is that of the event loop: time.monotonic() on asyncio's own loops,
-and virtual time on a loop with a virtual clock.
+The clock of links and far ends is the event loop's: time.monotonic() on asyncio's own loops,
+virtual time on a loop with a virtual clock.
 """
 
 import _thread
@@ -37,9 +37,9 @@ _T = TypeVar("_T")
 async def in_thread(
     work: Callable[[], _T], *, name: str, undo: Callable[[_T], object] | None = None
 ) -> _T:
-    """Run work in a thread of this name and return its result.
+    """Run work in a thread with this name and return its result.
 
-    undo: called, in a thread too, with the result of work that was cancelled, to close what it
+    undo: called in a thread with the result of cancelled work, to close the resource that it
     opened.
     """
     done: Future[_T] = Future()
@@ -62,7 +62,7 @@ async def in_thread(
 def _run(
     work: Callable[[], _T], done: "Future[_T]", undo: Callable[[_T], object] | None = None
 ) -> None:
-    """Do work and note its result or error; it counts as at work until that is noted."""
+    """Do work and store its result or error; it counts as running until then."""
     _at_work.add(done)
     try:
         _note_result(work, done, undo)
@@ -73,7 +73,7 @@ def _run(
 def _note_result(
     work: Callable[[], _T], done: "Future[_T]", undo: Callable[[_T], object] | None
 ) -> None:
-    """Note the result of work, or its error; undo: called with that of work that was cancelled."""
+    """Store the result of work, or its error; undo: called with the result of cancelled work."""
     try:
         result = work()
     except Exception as error:
@@ -93,13 +93,14 @@ def are_at_work() -> bool:
 
 
 def leave_work() -> None:
-    """End the process at once where work goes on; to be called when all else is closed.
+    """End the process immediately if work is running; call this last, when everything else is
+    closed.
 
-    A library may wait for ever for its own threads if it ends while one is at work.
+    A library can wait forever for its own threads if a program ends while one is running.
     """
     if _at_work:
         for stream in (sys.stdout, sys.stderr):
-            print(end="", file=stream, flush=True)  # a closed one is None
+            print(end="", file=stream, flush=True)  # a closed stream is None
         os._exit(0)
 
 
@@ -107,9 +108,9 @@ class DaemonThreads(ThreadPoolExecutor):
     """A pool for event loops, their own or another, with a daemon thread for each work."""
 
     def submit(self, work: Callable[_P, _T], /, *args: _P.args, **named: _P.kwargs) -> "Future[_T]":
-        """Do work at once."""
+        """Start work immediately."""
         done: Future[_T] = Future()
-        # Not by `threading`, which waits until it runs: a millisecond where that computes.
+        # `threading` would wait until the thread runs, a millisecond on a busy machine.
         _thread.start_new_thread(_run, (partial(work, *args, **named), done))
         return done
 
@@ -190,9 +191,10 @@ def no_long_collections() -> Iterator[None]:
 
 @contextmanager
 def without_collections() -> Iterator[None]:
-    """Create objects, as in a thread: no collection visits them, nor afterwards if they are many.
+    """Create objects in a thread without garbage collections, which skip them later if they are
+    many.
 
-    Few are collected as usual: excluded garbage is never freed.
+    A few objects are collected as usual, since excluded garbage is never freed.
     """
     with _building:
         is_outermost = gc.isenabled()
@@ -209,7 +211,7 @@ def without_collections() -> Iterator[None]:
 FIRST_PAUSE = 0.1  # s; a loose contact recovers within it
 MAX_PAUSE = 5.0  # s; the longest wait after an adapter was plugged in again
 GOOD_TIME = 60.0
-"""Time [s] of working after which pauses start anew."""
+"""Time of successful operation [s] after which pauses are reset."""
 
 
 def pauses(first: float = FIRST_PAUSE, maximum: float = MAX_PAUSE) -> Iterator[float]:
@@ -241,7 +243,7 @@ async def stop_accepting(server: asyncio.Server) -> None:
     """
     for each in server.sockets:
         asyncio.get_running_loop().remove_reader(each)
-    for _ in range(3):  # iterations in which what was accepted is opened
+    for _ in range(3):  # iterations in which accepted connections are opened
         await asyncio.sleep(0)
     server.close()
 

@@ -1,9 +1,9 @@
 """Virtual time: an event loop whose clock jumps to its next timer as soon as nothing is ready.
 
-Computing takes no time on this clock. A program whose parts all run in one loop therefore gives the
-same results on every machine, and ends as soon as they are computed. Sockets of the machine work as
-usual and cost no time, so they are reproducible only where the machine delivers at once, as Unix
-sockets do within a process.
+Computing takes no time on this clock. A program that runs entirely in one loop therefore gives the
+same results on every machine, and ends as soon as they are computed. Sockets work as usual and cost
+no time, so they are reproducible only if the machine delivers data immediately, as Unix sockets
+within a process do.
 """
 
 import asyncio
@@ -28,7 +28,7 @@ class Stuck(Exception):
 
 
 class VirtualTimeLoop(asyncio.SelectorEventLoop):
-    """The loop; threads that it starts through an executor run at once, in the loop itself."""
+    """Event loop with virtual time; executor functions run immediately, in the loop itself."""
 
     def __init__(self) -> None:
         self.now = START
@@ -40,7 +40,7 @@ class VirtualTimeLoop(asyncio.SelectorEventLoop):
 
     @property
     def waits_for_threads(self) -> bool:
-        """Whether the clock stands still, because threads are at work for this program."""
+        """Whether the clock is stopped because threads are working for this program."""
         return threads.are_at_work()
 
     @property
@@ -55,7 +55,7 @@ class VirtualTimeLoop(asyncio.SelectorEventLoop):
     def run_in_executor(  # type: ignore[override]
         self, executor: Any, func: Callable[..., T], *args: Any
     ) -> "asyncio.Future[T]":
-        """Run the function at once: there are no threads."""
+        """Run the function immediately: there are no threads."""
         future: asyncio.Future[T] = self.create_future()
         try:
             future.set_result(func(*args))
@@ -73,7 +73,8 @@ class _JumpingSelector(selectors.DefaultSelector):
         self._turns = 0
 
     def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
-        """Return what is ready; if nothing is and a timer is set, move the clock to it."""
+        """Return the ready events; if there are none and a timer is set, advance the clock to
+        it."""
         self._turns += 1
         if self._turns > _MAX_TURNS:
             self._turns = 0

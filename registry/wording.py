@@ -14,7 +14,7 @@ def reworded(message: str) -> str:
 
 
 def first_problem(error: "ValidationError") -> tuple[str, str]:
-    """The place of the first invalid value, "" for the whole, and what is wrong with it."""
+    """Return the position of the first invalid value, "" for the whole, and its error."""
     first = error.errors()[0]
     return ".".join(str(part) for part in first["loc"]), reworded(first["msg"])
 

@@ -1,11 +1,11 @@
-"""An amplifier of protocol 4 in front of a device that plays one sine on each channel.
+"""Amplifier of protocol 4 in front of a device that plays one sine per channel.
 
-The project's simulated amplifier keeps states, sets, watchdog and what each channel plays; here
-that goes to a `Device`, in steps of 5 ms. A second process watches this one, and silences the
-device when it stalls or ends. `scpi.py` is the device for signal generators.
+The project's simulated amplifier handles states, sets, watchdog and channel outputs; this program
+sends the outputs to a `Device`, in steps of 5 ms. A second process monitors this one, and silences
+the device if it stalls or ends. `scpi.py` is the device for signal generators.
 
-Not possible on such a device: the sum of several layers on a channel (the loudest is played),
-changes without steps, and phases that hold between a tone that goes on and one that begins.
+Not possible on such a device: the sum of several layers on a channel (the loudest one is played),
+changes without steps, and phase relations between a continuing tone and a new one.
 """
 
 import asyncio
@@ -28,7 +28,7 @@ from sim.transport.far_end import make_terminal
 STEP = 0.005  # s; between changes of a tone that fades
 BEAT = 0.05  # s; between signs of life for the process that watches
 STALLED = 0.25  # s without one, after which it silences the device
-REPLY = 0.1  # s; in which the device must have done what it was sent
+REPLY = 0.1  # s; within which the device must have carried out a request
 RETRY = 0.05  # s; before it is sent silence again
 ALIVE, DONE = b".", b"!"
 _LEVEL = QUANTITIES["level"]
@@ -47,7 +47,7 @@ class Tone:
 
 
 class Device(Protocol):
-    """What plays; its methods raise OSError or ValueError where it does not do as it was told."""
+    """Output device; its methods raise OSError or ValueError if a request fails."""
 
     channels: int
 
@@ -55,14 +55,14 @@ class Device(Protocol):
         """Note the tone of a channel, None for silence."""
 
     async def send(self) -> None:
-        """Make all that was noted true, from one moment on, and have it confirmed."""
+        """Apply all pending settings simultaneously, and wait for confirmation."""
 
     async def silence(self) -> None:
-        """Connect anew if that is needed, and have all outputs off, confirmed."""
+        """Reconnect if necessary, and switch all outputs off, confirmed."""
 
 
 class AdaptedAmplifier(SimulatedAmplifier):
-    """An amplifier whose levels are not 0 before those of its device are; is_lost: it fails."""
+    """Amplifier whose levels become 0 only after those of its device; is_lost: it fails."""
 
     def __init__(self, name: str, *, channels: int) -> None:
         super().__init__(name, channels=channels, is_output=True)
@@ -82,7 +82,8 @@ class AdaptedAmplifier(SimulatedAmplifier):
         return super().handle(name, values, now)
 
     def status(self, now: float) -> Values:
-        """Return the status with what the device may still play, without what is not measured."""
+        """Return the status with levels that the device can still play, without unmeasured
+        values."""
         not_measured = {each.name: None for each in STATUS.added}
         status = {**super().status(now), **not_measured, "high_voltage": 0, "temperature": 250}
         pairs = zip(status["levels"], self.device_levels, strict=True)

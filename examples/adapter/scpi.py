@@ -3,8 +3,9 @@
     python examples/adapter/scpi.py 192.168.1.20:5025 --full-voltage 5
 
 It prints the URL of the amplifier. full voltage [V]: the peak at level 1, into an open circuit. The
-force of an ERA goes with the voltage squared, so that half the frequency and the root of the level
-are played. The words are those of the Keysight 33500B/33600A Operating and Service Guide.
+force of an ERA is proportional to the square of the voltage, so half the frequency and the square
+root of the level are played. The commands are those of the Keysight 33500B/33600A Operating and
+Service Guide.
 """
 
 import argparse
@@ -41,9 +42,9 @@ class Generator:
         self._requested[channel] = tone
 
     async def send(self) -> None:
-        """Set frequencies, voltages and phases; tones start together unless one goes on.
+        """Set frequencies, voltages and phases; tones start together unless one continues.
 
-        PHAS:SYNC restarts both channels: beside a tone that goes on there is none.
+        PHAS:SYNC restarts both channels, so it is not sent while a tone continues.
         """
         words, starts = [], False
         for channel, tone in self._requested.items():
@@ -98,17 +99,17 @@ class Generator:
         self._streams = None
 
     async def _checked(self, *words: str) -> None:
-        """Send words; raises ValueError for what the instrument says of them, outputs off."""
+        """Send commands; raises ValueError if the instrument reports an error, with outputs off."""
         error = (await self._request(*words, "*OPC?", "SYST:ERR?"))[-1]
         if int(error.split(",")[0]):
             await self._request("*CLS", *OFF)
             raise ValueError(f"the generator reports {error}")
 
     async def _request(self, *words: str) -> list[str]:
-        """Send words in one line; returns the answers to its questions.
+        """Send commands in one line; returns the replies to its queries.
 
-        Replies have no number in IEEE 488.2: that of the register *ESE, which nothing else uses,
-        tells a late one.
+        Replies have no number in IEEE 488.2: the register *ESE, which nothing else uses, identifies
+        a late one.
         """
         if self._streams is None:
             raise ConnectionError("not connected")

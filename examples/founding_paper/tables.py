@@ -87,7 +87,7 @@ def tables(rig: Rig) -> Iterator[tuple[str, dict[str, Floats]]]:
 
 
 def claims(figures: dict[str, PaperFigure]) -> dict[str, object]:
-    """What the paper says of its Figures 10 to 13, as numbers of the figures' tables."""
+    """Return the paper's claims on Figures 10 to 13 as numbers from the figures' tables."""
     single, pairs = (_medians(figures[name]) for name in ("figure_10", "figure_11_boxplots"))
     edge, diagonal = _maps(figures["figure_11_maps"])
     switched = _maps(figures["figure_12"])
@@ -152,7 +152,7 @@ def _maps(figure: PaperFigure) -> list[Floats]:
 
 
 def _kept(figure: PaperFigure, now: Floats, then: Floats) -> float:
-    """Share of the nulls of one map that are nulls of another; 0 without nulls."""
+    """Return the fraction of nulls in one map that are nulls of another; 0 without nulls."""
     x, y = (np.unique(np.asarray(figure.tables[""][key], float)) for key in ("x_m", "y_m"))
     nulls = find_nulls(x, y, now.reshape(len(y), len(x)))
     if not len(nulls):
@@ -178,7 +178,7 @@ def _print_columns(columns: dict[str, Floats], digits: int) -> None:
 
 
 def main() -> None:
-    """Print all of it."""
+    """Print all tables and claims."""
     rig = load_rig(sys.argv[1] if len(sys.argv) > 1 else RIG)
     for name, columns in tables(rig):
         print(f"{name}: natural frequencies / Hz")

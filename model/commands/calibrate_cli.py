@@ -73,10 +73,10 @@ def write_fitted_rig(
     comment: Sequence[str],
     errors: "Mapping[KeyPath, float]",
 ) -> list[str]:
-    """Write what a fit found beside the rig's file, and return the files written.
+    """Write a fitted rig with the original file as its base, and return the files written.
 
     rigs: before and after the fit; comment: a heading that `_HEADING` matches, then the report;
-    errors: standard errors by the path of their key in the file.
+    errors: standard errors by key path.
     """
     from model.rig.rig_writing import save_fitted
 

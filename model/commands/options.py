@@ -25,7 +25,10 @@ RigArgument = Annotated[Path, typer.Argument(metavar="RIG", help="Rig file, e.g.
 TableArgument = Annotated[Path, typer.Argument(metavar="TABLE", help="Table file, e.g. T.npz.")]
 MeshOption = Annotated[
     str | None,
-    typer.Option(metavar="NXxNY", help="Mesh, as in a rig: auto, 12x9, '12x9 Q3'; default: rig."),
+    typer.Option(
+        metavar="NXxNY",
+        help="Mesh, in the format of a rig file: auto, 12x9, '12x9 Q3'; default: rig.",
+    ),
 ]
 FolderOption = Annotated[
     Path, typer.Option("--output", "-o", metavar="DIR", help="Folder to write into.")
@@ -105,8 +108,8 @@ def progress_bar(unit: str, *, is_transient: bool = False) -> "Iterator[Progress
 class _ProgressLines:
     """Progress as lines of text on standard error, at most one every two seconds.
 
-    The remaining time is that of the stage: a new one starts where the total changes or the count
-    starts again.
+    The remaining time is that of the current stage, which starts when the total changes or the
+    count restarts.
     """
 
     def __init__(self, unit: str) -> None:
@@ -115,7 +118,7 @@ class _ProgressLines:
         self._updated = self._printed = self._started = time.monotonic()
 
     def update(self, done: int, total: int) -> None:
-        """Print what is done if the last line is old enough."""
+        """Print the progress if the last line is old enough."""
         now = time.monotonic()
         if total != self._total or done <= self._done:
             self._started = self._updated
@@ -154,9 +157,9 @@ def next_line(*words: str | Path) -> str:
 
 
 def seed_of_plate(*, exact: bool, seed: int | None) -> int | None:
-    """Return the seed of a simulated plate, 0 by default, or None for the rig's own plate.
+    """Return the seed of a simulated plate, 0 by default, or None for the nominal plate.
 
-    Raises InputError where both options are given.
+    Raises InputError if both options are given.
     """
     if exact and seed is not None:
         raise InputError("--exact and --seed exclude each other; give one")

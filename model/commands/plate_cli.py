@@ -99,7 +99,9 @@ def plate_map(
     mesh: MeshOption = None,
     points: Annotated[
         str | None,
-        typer.Option(metavar="XxY", help="Points of the map. Default: those of the mesh."),
+        typer.Option(
+            metavar="XxY", help="Points of the map. Default: as many as the mesh resolves."
+        ),
     ] = None,
     output: Annotated[
         Path | None, typer.Option("--output", "-o", metavar="MAP.png", help="Picture to draw.")
@@ -171,7 +173,7 @@ def plate_map(
 
 
 class _Levels(NamedTuple):
-    """Levels over a plate [dB SL]: the median, and that which 99 % of the points reach."""
+    """Levels over a plate [dB SL]: the median, and the level that 99 % of the points reach."""
 
     median: float
     on_99_percent: float
@@ -203,7 +205,7 @@ _NUMBERS = {"frequency": "", "level": "1", "phase": "0"}
 def parse_drives(texts: Sequence[str], rig: "Rig") -> "Excitation":
     """Parse texts of `--drive`, such as `SW=110` or `NE=250@0.5:90`, to an excitation.
 
-    The level is 1, full stroke, and the phase 0 where they are left out. Raises InputError.
+    Default level 1 (full stroke) and phase 0. Raises InputError.
     """
     from model.vibration import Tone
 
@@ -353,7 +355,7 @@ def materials(as_json: JsonOption = False) -> None:
     for name in material_names():
         try:
             known[name] = known_material(name)
-        except InputError as error:  # that of one plug-in does not hide the others
+        except InputError as error:  # an error in one plug-in does not hide the others
             problems.append(str(error))
     entries: list[dict[str, Any]] = [
         {

@@ -159,7 +159,7 @@ def query(
     ] = False,
     drive_mode: Annotated[
         str | None,
-        typer.Option("--mode", help="Drive mode: phased or switched. Default: that of the table."),
+        typer.Option("--mode", help="Drive mode: phased or switched. Default: the table's."),
     ] = None,
     level: Annotated[
         float, typer.Option(metavar="DB_SL", help="Level at the target, dB SL.")
@@ -249,7 +249,7 @@ def _band(text: str) -> tuple[float, float]:
 
 
 def _rows_of_layers(found: dict[str, Any]) -> Iterator[str]:
-    """Yield the drive of a single layer; of several, the frequencies beside the fingers do."""
+    """Yield the drive of a single layer; with several, the fingers' rows show the frequencies."""
     if len(found["layers"]) != 1:
         return
     (layer,) = found["layers"]
@@ -263,9 +263,9 @@ def _rows_of_layers(found: dict[str, Any]) -> Iterator[str]:
 
 
 def _rows_of_fingers(found: dict[str, Any], threshold_sets: Sequence[str]) -> Iterator[str]:
-    """Yield a line for each finger with its vibration and verdict, then the changes made.
+    """Yield one line per finger with its vibration and verdict, then the changes made.
 
-    threshold_sets: names, that of the rig first.
+    threshold_sets: names, the rig's set first.
     """
     from model.answer.answer import verdict_shown
     from model.finger import scale_in_words
@@ -388,9 +388,7 @@ def contrast_map(
     ],
     modes: Annotated[
         str | None,
-        typer.Option(
-            metavar="MODE,MODE", help="Drive modes to compare. Default: that of the table."
-        ),
+        typer.Option(metavar="MODE,MODE", help="Drive modes to compare. Default: the table's."),
     ] = None,
     level: Annotated[
         float, typer.Option(metavar="DB_SL", help="Level at each position, dB SL.")

@@ -74,13 +74,12 @@ class FindingKind:
     """A kind of finding."""
 
     text: str
-    """Its line, filled in with the fields and details of a finding: what is wrong, what to do."""
+    """Printed line with placeholders for fields and details of a finding: problem and remedy."""
     criterion: str
-    """When it is found, as the page says."""
+    """Criterion of the finding, as printed on the page."""
     about: str = "channel"
-    """What it is about: `file` (what the rig's file says the wrong way round), `channel`, `sensor`
-    (which is left out), `plate`, `load` (what lies on the plate) or `form` (a deviation that no key
-    of a rig names)."""
+    """Subject: `file` (the rig file describes it the wrong way round), `channel`, `sensor` (left
+    out), `plate`, `load` (object on the plate) or `form` (difference that no rig key describes)."""
     is_fault: bool = True
     """Whether it fails the check."""
 
@@ -134,7 +133,7 @@ FINDING_KINDS = {
     ),
     "all strong or weak": FindingKind(
         "{state}: the channels of {of} play {least:.2f} to {value:.2f} of the "
-        "commanded amplitude: check the sensors' sensitivity first, which affects all of them "
+        "commanded amplitude: check the sensors' sensitivity first, which affects all channels "
         "alike; then the amplifier's volume",
         "three quarters of the channels are strong, or three quarters are weak",
     ),
@@ -160,7 +159,7 @@ FINDING_KINDS = {
         "WEAK: {wiring} plays {value:.2f} of the commanded amplitude: check its voltage, "
         "volume and mounting, or measure its gain with `era calibrate`",
         "the gain is below 0.8 of the rig's, or beyond 3.5 standard deviations of the `gain` "
-        "(for exciters also `stiffness`) in the rig's `uncertainty` if that is more",
+        "(for exciters also `stiffness`) in the rig's `uncertainty`, whichever allows more",
     ),
     "strong": FindingKind(
         "STRONG: {wiring} plays {value:.2f} of the commanded amplitude: lower its voltage or "
@@ -220,7 +219,7 @@ FINDING_KINDS = {
         "plate",
     ),
     "outliers": FindingKind(
-        "OUTLIERS: {count} left out, {value} of them of sensor {of}: check for loose "
+        "OUTLIERS: {count} left out, including {value} at sensor {of}: check for loose "
         "contacts if they are many",
         "values that a calibration would leave out, up to 5 % of all",
         "plate",
@@ -258,7 +257,7 @@ FINDING_KINDS = {
         "plate",
     ),
 }
-"""Every kind of finding by its name."""
+"""All kinds of findings by name."""
 
 
 @dataclass(frozen=True)
@@ -268,27 +267,27 @@ class Finding:
     kind: str
     """Key of `FINDING_KINDS`."""
     of: str
-    """What it is of, by name."""
+    """Name of the part it concerns."""
     value: float = 0.0
-    """How large it is, as its text says."""
+    """Size, as printed in its text."""
     confidence: float = 1.0
     """Confidence 0..1 in it."""
     chance: float = 1.0
     """Share of plates as written that look as far off or further."""
     details: Mapping[str, Any] = field(default_factory=dict)
-    """Further values, of which the text is made."""
+    """Additional values for the text."""
     json: Mapping[str, Any] = field(default_factory=dict)
-    """What it adds to the JSON of the plate: of a `file` its key, of a load or form what is known
-    of it."""
+    """Additional JSON keys of the plate: for a `file` its key, for a load or form its
+    properties."""
 
     @property
     def about(self) -> str:
-        """What it is about, as `FindingKind.about`."""
+        """Subject; see `FindingKind.about`."""
         return FINDING_KINDS[self.kind].about
 
     @property
     def rows(self) -> list[str]:
-        """Lines for people: what is wrong, and what to do."""
+        """Return printed lines: problem and remedy."""
         own = {"of": self.of, "value": self.value, "confidence": self.confidence}
         return FINDING_KINDS[self.kind].text.format(**{**self.details, **own}).splitlines()
 
@@ -299,7 +298,7 @@ class Finding:
 
 
 Correction: TypeAlias = tuple[Finding, Rig, Measurement]
-"""What a file says the wrong way round, with the rig and the measurement put right."""
+"""Finding about a wrong rig file, with the corrected rig and measurement."""
 
 
 def reversed_axes(
@@ -335,7 +334,7 @@ def reversed_axes(
 
 
 def exchanged_sensors(match: Match, observation: Measurement) -> Correction | None:
-    """Find sensors whose values are those of the matched plate at another's place."""
+    """Find sensors whose values match the plate at another sensor's position."""
     values, model = match.values, match.responses[..., match.drives]
     known, size = np.isfinite(values), row_rms(values)
     measured = np.where(known, values, 0) / size
@@ -404,12 +403,12 @@ def misread_resonance(
 ) -> Correction | None:
     """Find exciters whose other resonance clearly explains the observation better.
 
-    An exciter pushes a plate against its magnet, well above the resonance of the magnet on the
-    glued coil with its whole force, far below it hardly, and with the opposite sign. A file that
-    takes a sheet's `free` resonance for the `mounted` one thus describes exciters that all look
-    reversed, and weak by another factor at each frequency. On twelve boards as bought the gains
-    left by a coarse fit vary over frequency by 0.15 to 0.43 (standard deviation of their
-    logarithms) with the right meaning, and by 1.2 or more with the other.
+    Well above the resonance of the magnet on the glued coil, an exciter pushes the plate against
+    its magnet with its full force. Far below, the force is small and has the opposite sign. If a
+    file states the data sheet's `free` resonance as `mounted`, the exciters appear reversed, and
+    weak by a different factor at each frequency. On twelve boards from standard parts, gains left
+    by a coarse fit vary over frequency by 0.15 to 0.43 (standard deviation of their logarithms)
+    with the right resonance, and by 1.2 or more with the wrong one.
     """
     rig, values = plate.rig, observation.values
     written = {
@@ -451,7 +450,8 @@ def _variation(plate: SensedPlate, shapes: ShapeMatch, values: ComplexArray) -> 
 
 @dataclass(frozen=True)
 class ChannelVerdict:
-    """A channel: the ERA to which the rig wires it, the one that it drives, and its states."""
+    """Verdict on a channel: the ERA it is wired to in the rig, the ERA it drives, and its
+    states."""
 
     era: str
     """ERA to which the rig wires it."""
@@ -460,9 +460,9 @@ class ChannelVerdict:
     channel: int
     """Its number there."""
     states: tuple[str, ...]
-    """What is wrong with it, as kinds of findings; "well" alone if nothing is, and "not driven"."""
+    """Problems, as kinds of findings; only "well" without problems, or "not driven"."""
     drives: str | None = None
-    """ERA that it drives, None for a dead channel or one that was not driven."""
+    """ERA that it drives, None for a dead or undriven channel."""
     gain: float | None = None
     """Gain relative to the command and the rig's gains."""
     phase: float | None = None
@@ -490,7 +490,7 @@ class Verdict:
     frequencies: FloatArray
     """Tones that were used (f,) [Hz]."""
     findings: tuple[Finding, ...] = ()
-    """What was found, in the order in which to look at it."""
+    """Findings, in the order in which to check them."""
     plate_matches: bool = True
     """Whether the rig's plate within its priors explains the measurement."""
     match: Match | None = None
@@ -500,8 +500,8 @@ class Verdict:
     changes: Mapping[str, float] | None = None
     """Relative differences from the rig as `plate_changes`, None without a plate that fits."""
     promise_margins: tuple[float, ...] = ()
-    """Margins [dB] of the plate's contrasts over those that the rig's table promises; empty if they
-    were not compared."""
+    """Margins [dB] of the plate's contrasts over the promises of the rig's table; empty if not
+    compared."""
 
     def of_kinds(self, *kinds: str) -> list[Finding]:
         """The findings of some kinds."""
@@ -513,7 +513,7 @@ class Verdict:
 
     @property
     def wiring_matches(self) -> bool:
-        """Whether every driven channel drives its ERA as the rig says."""
+        """Whether every driven channel drives its own ERA."""
         return all(set(channel.states) <= {"well", "not driven"} for channel in self.channels)
 
     @property
@@ -523,12 +523,12 @@ class Verdict:
 
     @property
     def kept_share(self) -> float | None:
-        """Share of the table's promises that the plate keeps, None where they were not compared."""
+        """Fraction of the table's promises that the plate keeps, None if not compared."""
         return float(np.mean(np.array(self.promise_margins) >= 0)) if self.promise_margins else None
 
 
 def with_findings(verdict: Verdict) -> Verdict:
-    """The verdict with the findings that follow from it, besides those that it has."""
+    """Return the verdict with the findings that follow from it added."""
     mounts = [  # an ERA that hardly holds the plate
         Finding("detached", each.era, each.value / each.expected)
         for each in verdict.hypotheses[:1]
@@ -554,7 +554,7 @@ def cycles(channels: Sequence[ChannelVerdict]) -> list[list[ChannelVerdict]]:
 
 
 def _of_channels(verdict: Verdict) -> Iterator[Finding]:
-    """Find what is wrong with channels: what they have in common first."""
+    """Yield problems of channels, common ones first."""
     channels, swapped = verdict.channels, cycles(verdict.channels)
     for cycle in swapped:
         names, confidence = [each.era for each in cycle], min(each.confidence for each in cycle)
@@ -584,9 +584,9 @@ def _of_channels(verdict: Verdict) -> Iterator[Finding]:
 
 
 def _of_plate(verdict: Verdict) -> Iterator[Finding]:
-    """Find how the plate differs from the rig, and which hypotheses would explain it.
+    """Yield differences of the plate from the rig, and the hypotheses that would explain them.
 
-    A loose exciter is named in its place. Where it does not differ, outliers are counted.
+    A loose exciter is named instead. Without differences, outliers are counted.
     """
     match, hypotheses = verdict.match, verdict.hypotheses
     is_loose = any("loose" in each.states for each in verdict.channels)
@@ -624,12 +624,12 @@ def _of_plate(verdict: Verdict) -> Iterator[Finding]:
 
 
 def match_beyond(match: Match) -> tuple[Match, list[Finding]]:
-    """Match a plate once more with form errors and loads, and find what is beyond tolerances."""
+    """Match a plate again with form errors and loads, and find those beyond tolerances."""
     best, loads = match_with_form(match)
     rig, error = match.plate.rig, {"unexplained": best.error}
     mass = sum(each.mass for each in loads if isinstance(each, PointLoad))
     is_heavy = mass >= _HEAVY * rig.plate.mass
-    # A mass within tolerance is no fault, nor are form errors that would stand in for it.
+    # A mass within tolerance is not a fault, and neither are form errors that could replace it.
     named = [each for each in loads if is_heavy or isinstance(each, FingertipLoad)]
     if named:
         return best, [_load_finding(each, best.error) for each in named]
@@ -665,11 +665,11 @@ def _load_finding(load: Load, error: float) -> Finding:
 
 
 def _along_plate(match: Match) -> tuple[FloatArray, tuple[float, float]]:
-    """Rise of the scales of sensors along both sides (2,), and the taper that explains it.
+    """Return the slope of sensor scales along both sides (2,), and the taper that explains it.
 
-    A plate that is thinner at one end moves more there. The rise is in standard deviations, the
-    taper relative at the ends of x and of y. The prior of a fit reduces scales, so that those of
-    sound plates vary by less than their tolerance.
+    A plate moves more at a thinner end. The slope is in standard deviations, the taper relative at
+    the ends of x and of y. The fit's prior reduces scales, so the scales of good plates vary by
+    less than their tolerance.
     """
     space, plate, points = match.fit.space, match.plate.rig.plate, match.fit.measurement.points
     own = space.groups["sensor_scale"]

@@ -27,7 +27,7 @@ _LISTED_STDS = 2.0  # from the rig's value, beyond which a parameter is listed
 
 
 def confusions(names: Sequence[str], covariance: FloatArray) -> list[str]:
-    """Name the parameter whose error is most correlated with that of each parameter.
+    """Name the parameter with the most correlated error, for each parameter.
 
     The name is empty if the correlation is at most 0.9. covariance: of the errors, (p, p).
     """
@@ -133,7 +133,7 @@ def check_rows(calibration: Calibration) -> list[str]:
 
 
 def calibration_json(calibration: Calibration, before: Rig) -> dict[str, Any]:
-    """All results for programs, units in the keys or beside the values."""
+    """Return all results as JSON, with units in the keys or next to the values."""
     held_out = calibration.held_out
     return {
         "parameters": [
@@ -218,9 +218,9 @@ def _estimate(fitted: Parameter, alike: str) -> tuple[str, str, str, str, str]:
 
 
 def identified_parameters(found: Identification) -> list[Parameter]:
-    """All parameters that were uncertain, less their values in the rig, in units of reports.
+    """Return all uncertain parameters as differences from the rig, in report units.
 
-    Per cent are those of the rig's value; places of a mass count from the middle of the plate.
+    Per cent refer to the rig's value; positions of a mass are relative to the middle of the plate.
     """
     space, rows = found.fitted.space, []
     for kind, part in space.groups.items():
@@ -257,8 +257,8 @@ def fit_rows(found: Identification) -> list[str]:
         rows.append(f"the board's grain was found, too: {moduli} GPa")
     if not found.is_known_well:
         rows.append(
-            f"not known well enough: modes are {found.mode_shift:.1f} standard deviations from "
-            f"those of the rig's plate (at most {MAX_MODE_SHIFT:g})"
+            f"not known well enough: modes differ by {found.mode_shift:.1f} standard deviations "
+            f"from the rig's plate (at most {MAX_MODE_SHIFT:g})"
         )
     if held is None:
         return [*rows, *quality_rows(known, beside="nothing is promised")]
@@ -270,16 +270,16 @@ def fit_rows(found: Identification) -> list[str]:
     )
     if held.unexplained > _MISTAKEN:
         rows.append(
-            "the plate differs from the rig by more than its parameters, such as in thickness from "
-            "end to end; errors of values and answers allow for that"
+            "the plate differs from the rig in more than its parameters, for example in a "
+            "thickness that varies over its length; errors of values and answers allow for this"
         )
     return rows
 
 
 def parameter_rows(found: Identification) -> list[str]:
-    """Table of parameters: those that a rig file states, and all others that clearly differ.
+    """Return a table of parameters: those of a rig file, and others that clearly differ.
 
-    Those of the plate come first, then ERA by ERA. What was found is the difference from the rig.
+    Plate parameters come first, then ERA by ERA. Values are differences from the rig.
     """
     places = {era.name: place for place, era in enumerate(found.rig.eras)}
     names = found.fitted.space.names
@@ -320,7 +320,7 @@ def contrast_rows(expected: Sequence[ExpectedContrast]) -> list[str]:
 def identification_json(
     found: Identification, expected: Sequence[ExpectedContrast]
 ) -> dict[str, Any]:
-    """All results for programs, units in the keys or beside the values."""
+    """Return all results as JSON, with units in the keys or next to the values."""
     return {
         "explained": found.is_explained,
         "chi2": found.chi2,

@@ -1,11 +1,12 @@
 """Rig check: compare measured responses with a rig.
 
-`diagnose` first finds what a rig's file says the wrong way round, then matches plate and wiring
-(`model.estimate.plate_match`), and gives a `Verdict`: a state for each channel, and its findings,
-which the functions of `model.estimate.findings` judge.
+`diagnose` first looks for errors in the rig file that describe another plate, then matches plate
+and wiring (`model.estimate.plate_match`), and returns a `Verdict` with the state of each channel
+and the findings of `model.estimate.findings`.
 
-Before a fit (`model.estimate.calibrate.check_consistency`) it refuses what is not what it claims to
-be. Each check looks for one error alone, in what the fit would leave free, and names it.
+Before a fit (`model.estimate.calibrate.check_consistency`), it also rejects responses that
+contradict their metadata. Each check looks for one error among the parameters that the fit leaves
+free.
 """
 
 import math
@@ -74,11 +75,11 @@ MISSED_DB = 1.0
 """Largest miss of the promises of a table by half of its answers [dB]."""
 
 _LEAST_FREQUENCIES = 4
-_GAIN_STDS = 3.5  # of the rig's uncertainty, where that allows more
+_GAIN_STDS = 3.5  # of the rig's uncertainty, if larger
 _MIN_COHERENCE = 0.6  # length of the mean of unit phasors of a reliable phase
 _MAX_PHASE_ERROR = 45.0  # degrees
 _DEAD = 0.03  # of the response that the rig predicts
-_FAINT = 0.3  # of it: dead if its shape is not that of an ERA either
+_FAINT = 0.3  # of the prediction; dead if the shape matches no ERA either
 _NO_SHAPE = 0.6  # MAC
 _SENSOR_SCALE = (0.7, 1.4)
 _MUTE = 0.1  # of the others' scale
@@ -88,7 +89,7 @@ _MIN_CHANGE = 0.03  # relative, of a reported value
 _GLUES = np.geomspace(100.0, 1e5, 61)  # N/m
 _RISES = 0.2  # of the logarithm of a gain over the frequencies
 _EXPLAINS = 0.6  # of the median deviation without glue
-_MIN_CHANNELS = 3  # of which a median shows what is the amplifier's
+_MIN_CHANNELS = 3  # whose median shows a common error of the amplifier
 
 _MAX_GAIN = 3.0  # of all channels together; a factor either way is another quantity or unit
 _QUANTITIES = (
@@ -121,17 +122,19 @@ def diagnose(
 ) -> Verdict:
     """Compare a measurement with the rig's prediction.
 
-    false_alarm: share of plates as written with a value that may be called wrong; has_form: whether
-    the plate may have form errors, so that deviations beyond their tolerances are sought, by
-    sensors of known scale; refuses: whether responses that are not what they claim to be are an
-    error; skipped: findings of sensors that were left out before. Raises InputError for fewer than
-    three usable sensors or four frequencies.
+    - false_alarm: false-alarm rate on correct plates.
+    - has_form: whether to include form errors, and search for deviations beyond their tolerances
+      (needs sensors of known scale).
+    - refuses: whether responses that contradict their metadata are an error.
+    - skipped: findings about sensors that were left out before.
+
+    Raises InputError for fewer than three usable sensors or four frequencies.
     """
     plate, observation, dead, silent = _heard(rig, observation)
     skipped += silent
 
     def corrected(found: Correction, *, has_form: bool) -> Verdict:
-        """The verdict on what is put right, with what was wrong."""
+        """Return the verdict on the corrected rig and measurement, including the error found."""
         correction, rig, observation = found
         if refuses:
             raise InputError(correction.rows[0].partition(": ")[2])
@@ -229,7 +232,7 @@ def _matched_verdict(
     if has_form:
         with_form, beyond = match_beyond(match)
         match = with_form if with_form.error <= MAX_FORM_ERROR else match
-    # Values that stand in for a form error that is less likely say nothing of themselves.
+    # Values that absorb an even less likely form error prove nothing on their own.
     limit = min([false_alarm, *(each.chance for each in beyond)])
     matches = match.error <= MAX_FIT_ERROR and match.chance >= limit
     hypotheses = [] if matches else compared(nominal)
@@ -265,7 +268,7 @@ def _dead_channels(
 
 
 def _off_scale(match: Match) -> list[Finding]:
-    """Find sensors with a scale unlike that of the others, if the plate fits."""
+    """Find sensors whose scale differs from that of the others, if the plate fits."""
     if match.median_error > MAX_FIT_ERROR:
         return []
     known = np.isfinite(match.values) & np.isfinite(match.predicted) & ~match.outliers
@@ -285,10 +288,10 @@ def _off_scale(match: Match) -> list[Finding]:
 def _channels(
     match: Match, rig: Rig, loose: set[int], dead: NDArray[np.bool_], *, has_phases: bool
 ) -> Iterator[ChannelVerdict]:
-    """Judge all channels of a rig by the plate that fits best.
+    """Judge all channels of a rig with the best-fitting plate.
 
-    loose: numbers of channels whose exciter is loose; dead (n,): mask of channels; has_phases:
-    whether phases of values count from those of the drives.
+    loose: indices of channels with a loose exciter; dead (n,): mask of channels; has_phases:
+    whether phases are relative to the drives.
     """
     shapes, values = match_responses(match.responses, match.values), match.values
     predicted, known = np.where(match.outliers, np.nan, match.predicted), rig.uncertainty
@@ -306,7 +309,7 @@ def _channels(
         if has_phases:
             phase, coherence = mean_phase(values[..., n], predicted[..., n])
         states = ["other ERA"] if driven != n else []
-        # No response tells a force factor from a gain.
+        # Responses cannot separate a force factor from a gain.
         varies = 0.0 if isinstance(era, Era) else known.stiffness
         strong = max(STRONG, math.exp(_GAIN_STDS * math.hypot(known.gain, varies)))
         if not 1 / strong <= gain <= strong:
@@ -342,9 +345,10 @@ def _without_response(rig: Rig, number: int, *, is_dead: bool) -> ChannelVerdict
 
 
 def mean_phase(measured: ComplexArray, predicted: ComplexArray) -> tuple[float | None, float]:
-    """Mean phase [degrees] of values (f, s) relative to predicted ones, and its coherence 0..1.
+    """Return the mean phase [degrees] of values (f, s) relative to predicted ones, and its
+    coherence.
 
-    The phase is None where the coherence is too low.
+    The phase is None if the coherence (0 to 1) is too low.
     """
     products = predicted.conj() * measured
     inner = np.where(np.isfinite(products), products, 0).sum(axis=1)
@@ -355,7 +359,7 @@ def mean_phase(measured: ComplexArray, predicted: ComplexArray) -> tuple[float |
 
 
 def _loosened(match: Match, hypotheses: Sequence[Hypothesis]) -> set[int]:
-    """Numbers of the channels of exciters that deviate most, or are the likeliest hypothesis.
+    """Return the channels of exciters that differ most, or are the likeliest hypothesis.
 
     Each acts with less than its own stiffness.
     """
@@ -369,12 +373,11 @@ def _loosened(match: Match, hypotheses: Sequence[Hypothesis]) -> set[int]:
 
 
 def _behind_glue(match: Match) -> set[int]:
-    """Numbers of the channels whose exciter clearly acts through a spring of glue.
+    """Return the channels whose exciter clearly acts through a spring of glue.
 
-    What comes through a spring z between coil and plate is g_f ~ G |z / (z + D(w_f))|, with the
-    gains g_f of a channel and the dynamic stiffness D of its exciter, which falls above the
-    resonance of the magnet: the gain rises with frequency. What all channels have in common is the
-    amplifier's.
+    A spring z between coil and plate gives gains g_f ~ G |z / (z + D(w_f))|, where the dynamic
+    stiffness D of the exciter decreases above the resonance of the magnet: the gain rises with
+    frequency. A change common to all channels comes from the amplifier.
     """
     drives, kept = match.drives, np.where(match.outliers, np.nan, match.values)
     gains = np.abs(gains_of(match.responses[..., drives], kept))
@@ -401,9 +404,9 @@ def _behind_glue(match: Match) -> set[int]:
 
 
 def plate_changes(rig: Rig, match: Match) -> dict[str, float]:
-    """Relative differences of the most probable plate from a rig's, by kind of value.
+    """Return relative differences of the most probable plate from a rig's, by kind of value.
 
-    For ERAs it is their mean; bolts are skipped, since most rigs have none.
+    For ERAs, the mean; bolts are skipped, since most rigs have no bolt mass.
     """
     changes = {}
     for kind in ("modulus", "loss_factor", "stiffness", "damping"):
@@ -414,10 +417,10 @@ def plate_changes(rig: Rig, match: Match) -> dict[str, float]:
 
 
 def judged_by_promises(verdict: Verdict, rig: Rig) -> Verdict:
-    """Add the margins of the promises that the rig's table makes, on the matched plate.
+    """Add the margins of the promises of the rig's table, on the matched plate.
 
-    The verdict stays as it is where no plate fits, and for a rig that has no table or no room for
-    four fingers.
+    Returns the verdict unchanged if no plate fits, or if the rig has no table or no room for four
+    fingers.
     """
     if verdict.match is None or verdict.changes is None:
         return verdict
@@ -444,7 +447,7 @@ def check_meaning(rig: Rig, measurement: Measurement) -> None:
 
 
 def _check_quantity(plate: SensedPlate, shapes: ShapeMatch, values: ComplexArray) -> None:
-    """Raise InputError where gains of all channels are those of another quantity or unit."""
+    """Raise InputError if the gains of all channels indicate another quantity or unit."""
     model = plate.model.at(plate.moved(*shapes.start)).responses[..., shapes.nearest]
     gains = gains_of(model, values)
     size = np.log(row_rms(values) / row_rms(model))[:, 0]
@@ -452,7 +455,7 @@ def _check_quantity(plate: SensedPlate, shapes: ShapeMatch, values: ComplexArray
     omega = plate.model.omega[:, None]
 
     def distance(factor: float, power: int) -> float:
-        """Distance of gains from those of a quantity, by size and by phase."""
+        """Return the distance of gains from those of a quantity, in size and phase."""
         expected = factor * (1j * omega) ** power
         off = np.abs(size - np.log(np.abs(expected)))[known]
         phase = np.angle(gains / expected)[known]
@@ -469,8 +472,8 @@ def _check_quantity(plate: SensedPlate, shapes: ShapeMatch, values: ComplexArray
             f"{name}: all are {np.exp(level):.3g} times the prediction; {remedy}"
         )
     raise InputError(
-        f"responses must be those of the rig to a factor of {_MAX_GAIN:g}, got "
-        f"{np.exp(level):.3g} of what it predicts; check their unit and the stroke of the ERAs"
+        f"responses must match the rig within a factor of {_MAX_GAIN:g}, got "
+        f"{np.exp(level):.3g} times the prediction; check their unit and the stroke of the ERAs"
     )
 
 
@@ -487,10 +490,10 @@ def _check_phases(plate: SensedPlate, shapes: ShapeMatch, values: ComplexArray) 
 
 
 def verdict_rows(verdict: Verdict) -> list[str]:
-    """Lines of findings with their remedies, or one that all is well."""
+    """Return lines of findings with their remedies, or a line that all is well."""
     rows = [row for each in verdict.findings for row in each.rows]
     if verdict.is_well and not verdict.about("sensor"):
-        wiring = "WIRING WELL: every channel that was driven drives its ERA as the rig says"
+        wiring = "WIRING WELL: every driven channel drives its own ERA"
         all_well = "ALL WELL: plate and channels match the rig"
         rows.append(wiring if difference_rows(verdict) else all_well)
     return rows

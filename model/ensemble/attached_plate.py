@@ -1,18 +1,18 @@
 """The plate with its attachments, at drive frequencies and possible thicknesses, without fingers.
 
-`AttachedPlate` has the reduced plate, its ERAs and masses, and their uncertainty. `PlateOnEras` has
-these eliminated, for each thickness and once for a table.
+`AttachedPlate` has the reduced plate, its ERAs and masses, and their uncertainty. `PlateOnEras`
+eliminates these, for each thickness and once per table.
 
-Free plate in reduced coordinates: A(x, y) = phi_x diag(g) phi_y^T with g = 1 / (s lambda - w²),
-s lambda = (1 + i eta) lambda + i loss. A plate that is thicker by a factor has modal masses larger
-by this factor and frequencies higher by it (as in `model.reduction.free_plate`); another modulus
+Free plate in reduced coordinates: A(x, y) = phi_x diag(g) phi_y^T with g = 1 / (s lambda - w²), s
+lambda = (1 + i eta) lambda + i loss. A plate that is thicker by a factor has modal masses larger by
+this factor and frequencies higher by it (as in `model.reduction.free_plate`); another modulus
 changes the frequencies alone. With h times the thickness, and frequencies q times as high,
 
     g = 1 / (h (q² s lambda - w²)),    dg / d ln loss = -i h q² Im(s lambda) g².
 
 Plates are drawn along one axis, that of q; h is the expected value for a plate with that q. Modes
-whose frequencies and sizes are uncertain, each by itself, are drawn anew at each place on it: with
-a mode's own frequency v times as high, and its shape a times as large,
+with individually uncertain frequency and amplitude are drawn separately for each plate: with
+frequency factor v and amplitude factor a of a mode,
 
     g = a² / (h (v² q² s lambda - w²)).
 
@@ -20,21 +20,21 @@ With dynamic stiffness Z of the attachments b, ERAs first, elimination gives
 
     K = (1 + Z A)^-1,  T = -w² K^T phi g,  Y = -(Z + Z A Z) / w⁴.
 
-T is the acceleration of the reduced coordinates by a force at each attachment of the plate on its
-ERAs, whose receptance between places x and y is phi_x g phi_y^T + (T phi_x)^T Y T phi_y: the
-attachments do not appear again.
+T is the acceleration of the reduced coordinates due to a force at each attachment of the plate on
+its ERAs. The receptance of that plate between positions x and y is phi_x g phi_y^T + (T phi_x)^T Y
+T phi_y, without further reference to the attachments.
 
-Thicknesses are solved exactly: modes that are close may move past a tone. Within their uncertainty
-the other parameters change the response nearly in proportion.
+Thicknesses are solved exactly, because closely spaced modes can move past a tone. Within their
+uncertainty the other parameters change the response nearly in proportion.
 
-Sources may also be misplaced. A source acts with its force F on a plate that moves by w,
-F = F_0 - Z w when all sources are driven. At shapes phi + d it adds a force F d - phi Z d w: a
-couple, and a force at its own place. Of an ERA, which is stiff, both count as an error of its
-stiffness that changes the fields of all sources by as much. An exciter is a force of its own drive;
-there such an error would be one of its gain, which changes nothing at fingers where the field
-vanishes, though the field of a couple has another shape. The part of the couple's field along that
-of the force therefore counts as an error of stiffness, and the rest as an error of the source's
-field, at each finger.
+Sources can also be misplaced. A source acts with its force F on a plate that moves by w, F = F_0 -
+Z w when all sources are driven. At shapes phi + d it adds a force F d - phi Z d w: a couple, and a
+force at its own place. For an ERA, which is stiff, both count as an equivalent error of its
+stiffness, which changes the fields of all sources. An exciter is a force driven by its own signal;
+there such an error would be a gain error, which changes nothing at fingers in a null, although the
+field of a couple has another shape. The part of the couple's field along that of the force
+therefore counts as an error of stiffness, and the rest as an error of the source's field, at each
+finger.
 """
 
 import math
@@ -68,7 +68,7 @@ from model.structure.plate import Plate
 from registry.limits import MAX_FINGER_LOAD
 
 LEAST_THICKNESS = 0.1
-"""Least thickness of plates that deviate, relative to the modelled one."""
+"""Minimum relative thickness of drawn plates."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,21 +84,21 @@ class Mounts:
     strokes: Complex64Array
     """Stroke (f, n) of each ERA's base [m], through which errors of its spring and damper act."""
     by_stiffness: Complex64Array
-    """Change (f, s) of `stiffness` by one standard deviation of the attachments' own [N/m].
+    """Change (f, s) of `stiffness` per standard deviation of the attachments' stiffness [N/m].
 
-    Of the attachments up to the last foot that deviates; 0 for masses that are no feet.
+    Covers attachments up to the last uncertain foot; 0 for masses other than feet.
     """
     by_damping: Complex64Array
-    """Change (f, n) of the ERAs' dynamic stiffness by one standard deviation of damping [N/m]."""
+    """Change (f, n) of the ERAs' dynamic stiffness per standard deviation of damping [N/m]."""
 
 
 def mounts_of(
     eras: Sequence[Source], masses: Sequence[PointLoad], w: FloatArray, uncertainty: Uncertainty
 ) -> Mounts:
-    """Compute ERAs and masses at w (f,) [rad/s], wherever they are.
+    """Compute ERAs and masses at w (f,) [rad/s], independent of their positions.
 
     Errors of an ERA's stiffness are half the difference between one standard deviation up and down,
-    since the suspension of an exciter is resonant; feet deviate by `supports`.
+    since the suspension of an exciter is resonant; `supports` is the uncertainty of feet.
     """
     off = (1 + uncertainty.stiffness, 1 - uncertainty.stiffness)
     stiffer, softer = (np.array([era.deviating(w, by, 1.0)[0] for era in eras]).T for by in off)
@@ -144,7 +144,7 @@ class AttachedPlate(Mounts):
     def of_thicknesses(
         self, deviations: FloatArray, of_modes: FloatArray, row: int
     ) -> tuple[Complex64Array, Complex64Array]:
-        """Return g of plates of several thicknesses at a row of the frequencies, (d, r) [s²/kg].
+        """Return g for plates of several thicknesses at a row of the frequencies, (d, r) [s²/kg].
 
         Also its change by one standard deviation of the loss factor. deviations (d,): of the
         plates' frequencies, of_modes (2, r, d): of each mode's own frequency and size, both in
@@ -152,7 +152,7 @@ class AttachedPlate(Mounts):
         """
         known = self.uncertainty
         own = np.maximum(1 + known.mode_frequency * of_modes[0].T, LEAST_THICKNESS) ** 2
-        # Those of the rigid body have the weight of a plate, which is known.
+        # The amplitude of rigid-body modes follows from the plate's known mass.
         size = (1 + known.mode_amplitude * (self.modal[row].real > 0) * of_modes[1].T) ** 2
         share = (known.thickness / known.frequency) ** 2 if known.frequency > 0 else 1.0
         off = known.frequency * deviations
@@ -177,7 +177,8 @@ class AttachedPlate(Mounts):
         return found.astype(np.complex64)
 
     def load_stds(self, count: int, loads: Sequence[float] = ()) -> Float32Array:
-        """Standard deviation of the logarithm of loads as of `finger_stiffness`, (count,)."""
+        """Return standard deviations of the logarithm of loads, as in `finger_stiffness`,
+        (count,)."""
         is_hand = np.array(loads or (1.0,) * count) > MAX_FINGER_LOAD
         return np.where(is_hand, HAND_STD, self.uncertainty.fingertip).astype(np.float32)
 
@@ -233,7 +234,7 @@ def attach(
 
 
 def at_harmonics(twice: AttachedPlate, sources: Sequence[Source]) -> AttachedPlate:
-    """Return a plate at twice the frequencies, its sources driven by their gains at once these."""
+    """Return a plate at twice the frequencies, with the sources' gains at the original ones."""
     gains, own = (
         np.array([each.gain(factor * twice.frequencies) for each in sources]).T
         for factor in (0.5, 1.0)
@@ -243,7 +244,8 @@ def at_harmonics(twice: AttachedPlate, sources: Sequence[Source]) -> AttachedPla
 
 
 MODELLED, THICKER, THINNER = 0, 1, 2
-"""Indices of the nominal thickness, and of those by a standard deviation from it."""
+"""Indices of the nominal thickness, and of the thicknesses one standard deviation above and
+below."""
 
 
 @lru_cache(maxsize=8)
@@ -263,9 +265,10 @@ def thickness_nodes(count: int) -> FloatArray:
 
 
 def mode_numbers(modes: int, count: int) -> FloatArray:
-    """Return deviations (2, modes, count) of each mode's frequency and size, 0 of one plate alone.
+    """Return deviations (2, modes, count) of each mode's frequency and amplitude, 0 for a single
+    plate.
 
-    In standard deviations, beside the `thickness_nodes` of as many plates.
+    In standard deviations, in addition to the `thickness_nodes` of as many plates.
     """
     if count < 2:
         return np.zeros((2, modes, count))
@@ -279,11 +282,11 @@ class PlateOnEras:
 
     plate: AttachedPlate
     first: dict[int, int]
-    """Index of the first of the `thickness_nodes`, by their number."""
+    """Index of the first of the `thickness_nodes`, by number of nodes."""
     receptance: Complex64Array
     """g (f, t, r) of the free plate [s²/kg]."""
     by_loss: Complex64Array
-    """Its change (f, t, r) by one standard deviation of the loss factor."""
+    """Change (f, t, r) per standard deviation of the loss factor."""
     by_force: Complex64Array
     """T (f, t, b, r) [m/s²/N]."""
     coupling: Complex64Array
@@ -341,12 +344,12 @@ def _eliminated(
 def with_places(
     on: PlateOnEras, shifts: FloatArray, gram: Float32Array, by_field: Sequence[bool]
 ) -> tuple[PlateOnEras, FloatArray]:
-    """Include errors of the sources' places in a plate, as larger errors of their stiffness.
+    """Include position errors of the sources in a plate, as larger errors of their stiffness.
 
-    Also return the mean square (f, n) of the error of each source's field that remains beside these
-    [(m/s²)²], at full stroke, on the modelled plate without fingers. shifts (n, 2, r): change of
-    the shapes at the sources by one standard deviation along x and y; gram (r, r): mean product of
-    the shapes where fingers rest; by_field (n,): whether couples count as errors of the field.
+    Also return the remaining mean square error (f, n) of each source's field [(m/s²)²], at full
+    stroke, on the modelled plate without fingers. shifts (n, 2, r): change of the shapes at the
+    sources per standard deviation along x and y; gram (r, r): mean product of the shapes where
+    fingers rest; by_field (n,): whether couples count as errors of the field.
     """
     plate, n = on.plate, on.plate.era_count
     deformed = np.eye(n) * plate.strokes[:, None] - on.moved[:, MODELLED, :n]

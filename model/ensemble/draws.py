@@ -1,13 +1,14 @@
-"""Fixed draws of plates within the uncertainty: exact in the thickness, else to first order.
+"""Random draws of plates within the uncertainty, fixed by a seed: thickness exact, the rest
+first-order.
 
-Plates are drawn once for each number of ERAs and fingers, by standard normal numbers whose mean and
-variance are made exact, so that a few draws give the percentiles of many. Candidates are judged by
-other draws than the promise, which would otherwise be too favourable. Nine of ten plates keep what
-is promised.
+Plates are drawn once per number of ERAs and fingers, from standard normal numbers whose mean and
+variance are made exact, so that a few draws give the percentiles of many. Candidates are evaluated
+with other draws than the promise, which would otherwise be too optimistic. 90 % of plates keep a
+promise.
 
-`ClockErrors` are delays of amplifiers, each common to the ERAs of one. An ERA of an amplifier whose
-clock is late by d moves as exp(-2 pi i f d) of its commanded motion. With one amplifier delays do
-not count: a common phase of all ERAs is not felt.
+`ClockErrors` are delays of amplifiers, common to all ERAs of one amplifier. If an amplifier's clock
+is late by d, its ERAs move as exp(-2 pi i f d) times the commanded motion. With a single amplifier
+delays have no effect: a common phase of all ERAs cannot be felt.
 """
 
 import math
@@ -40,15 +41,15 @@ class Drawing:
 
 JUDGING_DRAWS = Drawing(count=64, seed=1, thicknesses=5)
 PROMISED_DRAWS = Drawing(count=200, seed=8, thicknesses=40, bases=5)
-"""Draws by which candidates are judged, and those of the promise."""
+"""Draws for evaluating candidates, and draws for the promise."""
 
 COMMON = 2.0
-"""Error of the common gain of all ERAs on drawn plates, in standard deviations."""
+"""Error of the common gain on drawn plates, in standard deviations."""
 
 
 @dataclass(frozen=True, eq=False)
 class Draws:
-    """Parameters of d plates from the thinnest to the thickest, with a attachments and fingers.
+    """Parameters of d plates from the thinnest to the thickest, with `a` attachments, and fingers.
 
     In standard deviations unless stated otherwise.
     """
@@ -84,17 +85,17 @@ def draw(
     harmonic: float,
     thicknesses: int,
 ) -> Draws:
-    """Draw plates with ERAs, masses and fingers, of a number of thicknesses.
+    """Draw plates with ERAs, masses and fingers, with a given number of thicknesses.
 
-    to_feet: number of masses up to the last foot that deviates; gain, phase [rad]: standard
-    deviations for each ERA; common_gain: for all together; harmonic: root mean square for each ERA.
-    Each thickness has equally many plates, or one less. All answers of a plate share its common
-    gain: half of the plates have it COMMON standard deviations low, the others high, so that a
-    plate whose gain is not farther off keeps nine of ten levels.
+    to_feet: number of masses up to the last uncertain foot; gain, phase [rad]: standard deviations
+    per ERA; common_gain: for all ERAs together; harmonic: RMS per ERA. Every thickness has equally
+    many plates, or one fewer. All answers of a plate share its common gain: half of the plates have
+    it COMMON standard deviations low, the others high, so that 90 % of levels hold on a plate whose
+    gain is within this range.
     """
     rng = np.random.default_rng([seed, era_count, finger_count])
     n, k = era_count, finger_count
-    # Numbers of feet come last, so that they leave those of all else unchanged.
+    # Numbers for feet come last, so that they leave all others unchanged.
     numbers = standard_normal(rng, 3 + n + k + 2 * n + 2 * k + 1 + 2 * n + to_feet, count)
     numbers = numbers[:, numbers[0].argsort()]  # by thickness
     parameters, sizes, phases, real, imaginary, common, harmonics, quadrature, feet = np.split(
@@ -131,7 +132,7 @@ def standard_normal(rng: np.random.Generator, rows: int, count: int) -> np.ndarr
 
 
 PERCENTILE = 10
-"""Percentile of the drawn plates that is promised: nine of ten have more."""
+"""Promised percentile of the drawn plates: 90 % have more."""
 
 
 def over_fingertips(
@@ -139,7 +140,7 @@ def over_fingertips(
 ) -> tuple[Float32Array, Float32Array]:
     """Return mean amplitude and largest squared amplitude over fingertips, both (c, k, d).
 
-    power (c, k p, d): squared amplitudes at points; weights (k, p): of these in the mean.
+    power (c, k p, d): squared amplitudes at points; weights (k, p): of the points in the mean.
     """
     by_finger = power.reshape(len(power), *weights.shape, -1)
     means = np.asarray((weights[:, None] @ np.sqrt(by_finger))[:, :, 0])
@@ -159,7 +160,7 @@ def percentile(values: FloatArray, percent: float = PERCENTILE) -> FloatArray:
 MAX_HELD = 0.0003
 """Error of a clock [s] up to which its amplifier plays contents together with others.
 
-Beyond it, of 12 identified ERAs on three amplifiers, those of one amplifier alone promise more.
+Beyond it, with 12 identified ERAs on three amplifiers, the ERAs of a single amplifier promise more.
 """
 
 _AS_GOOD_AS_UNKNOWN = 0.01  # s; a period of 100 Hz
@@ -168,9 +169,9 @@ _MAX_VARIANCE = 4.0  # of a phase [rad²]; more is no phase at all
 
 @dataclass(frozen=True)
 class ClockErrors:
-    """Delays of amplifiers, and on which of them each of n ERAs is.
+    """Delays of amplifiers, and the amplifier of each of n ERAs.
 
-    Empty if one amplifier has all ERAs or all clocks are exact; then nothing is drawn.
+    Empty if one amplifier drives all ERAs or all clocks are exact; then nothing is drawn.
     """
 
     amplifier: tuple[int, ...] = ()
@@ -200,9 +201,9 @@ class ClockErrors:
 
     @property
     def groups(self) -> tuple[int, ...]:
-        """Group of each ERA (n,): 0 for all whose clocks are held together, then one per amplifier.
+        """Group of each ERA (n,): 0 for all with synchronised clocks, then one per amplifier.
 
-        Empty if all are held together. A content plays on the ERAs of one group only.
+        Empty if all are synchronised. A content plays on the ERAs of a single group.
         """
         alone = [number for number, each in enumerate(self.errors) if each > MAX_HELD]
         if not alone:
@@ -215,7 +216,8 @@ class ClockErrors:
         )
 
     def power_shares(self, frequencies: FloatArray) -> Float32Array | None:
-        """Share (f, n, n) by which the modelled power of pairs of ERAs grows; None if exact.
+        """Share (f, n, n) by which delays increase the modelled power of pairs of ERAs; None if
+        exact.
 
         Relative to the mean over the delays: exp(p²) - 1 for ERAs of one amplifier, with p = 2 pi f
         times its error, and 0 for others.

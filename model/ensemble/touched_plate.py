@@ -1,25 +1,25 @@
-"""Fingers on plates whose ERAs are eliminated, and what is felt of drawn ones, in numpy and in C.
+"""Fingers on plates with eliminated ERAs, and felt vibration on drawn plates, in numpy and in C.
 
 k fingers of dynamic stiffness D at centres c change fields X of a plate on its ERAs to
 
     X - G D P X_c,  P = (1 + G_cc D)^-1,
 
-where G is the displacement by a force at each finger without the others; with them -w² G P^T is the
-acceleration by it. Symbols are those of `attached_plate`; a case is a frequency and a thickness.
-The expected power of weights w at a fingertip is w^H R w to first order,
+where G is the displacement due to a force at each finger without the others. With the others, the
+acceleration is -w² G P^T. Symbols are as in `attached_plate`; a case is a frequency and a
+thickness. The expected power of weights w at a fingertip is w^H R w to first order,
 
     R = mean_p { h* h^T + dh* dh^T + dc* dc^T + sum_j |s_j t_pj|² r_j* r_j^T + sigma² diag |h|² },
 
-with h the field of each ERA, t_pj the acceleration by a force at attachment j, and r_j the
-deformation of that attachment by each ERA at full stroke. Each change d is by one standard
-deviation, s_j that of the stiffness. The ERAs' damping c changes for all together; the stiffness of
-each ERA and foot and the load of each finger j change on their own, as do gains, by sigma. These
-are exact derivatives of the loaded plate, except for the local deflection under a finger. The
-thickness counts by half the sum of dh* dh^T of the plates thicker and thinner by one standard
-deviation, solved exactly; the modulus is included there (`attached_plate`). The loss factor changes
-next to nothing.
+with h the field of each ERA, t_pj the acceleration due to a force at attachment j, and r_j the
+deformation of that attachment due to each ERA at full stroke. Each change d is for one standard
+deviation; s_j is the standard deviation of the stiffness. The ERAs' damping c changes for all
+together; the stiffness of each ERA and foot and the load of each finger j change on their own, as
+do gains, by sigma. These are exact derivatives of the loaded plate, except for the local deflection
+under a finger. The thickness counts by half the sum of dh* dh^T of the plates thicker and thinner
+by one standard deviation, solved exactly; the modulus is included there (`attached_plate`). The
+effect of the loss factor is negligible.
 
-`TouchedPlate` is in numpy, `TouchedByKernel` the same in C; `touch` takes the faster one there is.
+`TouchedPlate` is in numpy, `TouchedByKernel` the same in C; `touch` uses the faster one available.
 """
 
 import ctypes
@@ -77,7 +77,7 @@ class LoadedContacts:
 
 @dataclass(frozen=True, eq=False)
 class Changes:
-    """Forces at attachments a in c cases, by one standard deviation of uncertain parameters."""
+    """Forces at attachments `a` in c cases, per standard deviation of uncertain parameters."""
 
     loss: Complex64Array
     """By the loss factor (c, a)."""
@@ -88,7 +88,7 @@ class Changes:
     drives: Complex64Array
     """Force of each ERA as it plays (c, a), which an error of its gain multiplies."""
     by_loss: Complex64Array
-    """Acceleration (c, p) at points by the loss factor, beside that by the forces."""
+    """Additional acceleration (c, p) at points per standard deviation of the loss factor."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,8 +122,9 @@ class TouchedPlate:
     ) -> tuple[Complex64Array, Complex64Array]:
         """Return responses to forces and ERAs, in cases of rows (c,) and nodes (c,).
 
-        Acceleration [m/s²/N] at points of shapes (p, r) by a force at each attachment and then each
-        finger, (c, p, b + k); displacement of these by each ERA at full stroke [m], (c, b + k, n).
+        Acceleration [m/s²/N] at points with shapes (p, r) for a force at each attachment and then
+        each finger, (c, p, b + k); displacement of attachments and fingers for each ERA at full
+        stroke [m], (c, b + k, n).
         """
         on, plate, n = self.on, self.on.plate, self.on.plate.era_count
         w2 = plate.minus_omega2[rows, None, None]
@@ -210,7 +211,7 @@ class TouchedPlate:
         moved: Complex64Array,
         points: Float32Array,
     ) -> Changes:
-        """Compute changes of forces, for weights (c, n) and the motion (c, b + k) by them [m]."""
+        """Compute changes of forces, for weights (c, n) and the resulting motion (c, b + k) [m]."""
         plate, n = self.on.plate, weights.shape[1]
         shapes = np.concatenate([plate.shapes, self.centres])
         stiffness = np.concatenate([plate.stiffness[rows], self.stiffness[rows]], axis=1)
@@ -295,8 +296,8 @@ class TouchedPlate:
     ) -> Float32Array:
         """Mean square of second harmonics over k fingertips [m²/s⁴], (m, k, 1 + d).
 
-        For a plate at twice the frequencies (`at_harmonics`). points (k, p, r): shapes; the rest as
-        in `drawn`. The nominal plate has none.
+        For a plate at twice the frequencies (`at_harmonics`). points (k, p, r): shapes; other
+        arguments: see `drawn`. The nominal plate has none.
         """
         (k, p), d, n = shares.shape, by.count, self.on.plate.era_count
         draws, _, (t, first_base), _ = drawn_on(self.on, k, by)
@@ -419,7 +420,7 @@ def touch(
     loads: tuple[float, ...] = (),
     clocks: ClockErrors = EXACT_CLOCKS,
 ) -> TouchedPlate:
-    """Put fingers on a plate, by kernels in C where they can be compiled.
+    """Put fingers on a plate, using C kernels if they can be compiled.
 
     centres (k, r): shapes there; loads (k,): relative to the rig's fingertip, empty for 1 each;
     clocks: errors of the amplifiers' clocks.
@@ -437,8 +438,8 @@ def drawn_on(
     """Draw plates for a number of fingers.
 
     Returns the draws; the number of their thicknesses; the number of thicknesses for changes and
-    the index of the first of these; and the index of the first thickness of the draws. There is one
-    thickness, the nominal one, if it is certain.
+    the index of the first one; and the index of the first thickness of the draws. If the thickness
+    is certain, only the nominal one exists.
     """
     plate = on.plate
     first = on.first.get(by.thicknesses, MODELLED)
@@ -471,10 +472,10 @@ def expected_power(
 ) -> Complex64Array:
     """Compute expected powers R (f, g, n, n) at g groups of points.
 
-    fields: h and each of its changes (f, g, p, n); own (f, g, j, n): changes by the stiffness of
-    each attachment and the load of each finger, root mean square over the points; weights (g, p):
-    of the points; error_power (f, ..., n): mean square of the error of each ERA's field; shares
-    (f, n, n): by which delays of amplifiers increase the power of h.
+    fields: h and each of its changes (f, g, p, n); own (f, g, j, n): RMS changes over the points
+    due to the stiffness of each attachment and the load of each finger; weights (g, p): of the
+    points; error_power (f, ..., n): mean square error of each ERA's field; shares (f, n, n): by
+    which delays of amplifiers increase the power of h.
     """
     f, g, _, n = own.shape
     root = np.sqrt(weights)[..., None]

@@ -1,11 +1,11 @@
-"""The free plate, solved once for all ERAs, fingers and masses that may be attached at points.
+"""Free plate, solved once for all ERAs, fingers and masses that can be attached at points.
 
 Modes of the free plate up to twice the highest frequency come from one factorisation for each
 symmetry class; the contribution of the truncated modes takes a few more solves with the same
 factors for each point of attachment, cached. On a mesh of elements these are solved for on demand;
-in polynomials all modes of the deflection are known, and the sums over the truncated ones are taken
-as they stand. Solutions for points are then a low-rank correction (`model.structure.attachments`):
-for each frequency a system as small as their number, independent of the mesh.
+with polynomials all modes of the deflection are known, and the truncated ones are summed directly.
+Solutions for points are then a low-rank correction (`model.structure.attachments`): per frequency,
+a system with as many unknowns as points, independent of the mesh.
 
 Receptance. Modes and truncated modes of one solution serve for every modulus, thickness and loss
 factor: with q = (1 + i eta) E h² / (E h²)_solved and modal masses that grow as h,
@@ -16,16 +16,16 @@ z = w² / q, T_j the sums over the truncated modes. By q it changes as
 
     h dA / d ln q = sum phi phi' (-q lambda g²) + sum T_j (-(c + z dc / dz) / q).
 
-All stiffness of a plate is taken as E h³ and all its mass as h (laws of scale of the fields of
-`model.structure.plate.Plate`); a plate with other parts is refused (`check_scales`). That is exact
-for a thin plate; by shear, rotary inertia and the layer at its edges the response of the paper's
-plate then differs by 0.1 % for 2 % of thickness, and 0.3 % for 5 %.
+All stiffness of a plate is assumed to scale with E h³ and all its mass with h (see the fields of
+`model.structure.plate.Plate`); a plate with other parts is rejected (`check_scales`). This is exact
+for a thin plate. Shear, rotary inertia and the edge layers change the response of the paper's plate
+by 0.1 % for 2 % of thickness, and by 0.3 % for 5 %.
 
-Truncated modes. One of eigenvalue lambda has the receptance 1 / ((1 + i eta)(lambda - z)), z =
-omega² / (1 + i eta). A static solve with the shift sigma gives u = 1 / (lambda + sigma) in its
-place, two solves u², and so on; all truncated modes have u within (0, u_c], u_c that of the lowest.
-So u / (1 - s u), s = z + sigma, is approximated on that interval by a polynomial in u without
-constant term. The optimum follows from Chebyshev's; its relative error for each mode is
+Truncated modes. A mode with eigenvalue lambda has the receptance 1 / ((1 + i eta)(lambda - z)), z =
+omega² / (1 + i eta). A static solve with the shift sigma gives u = 1 / (lambda + sigma) instead,
+two solves u², and so on. All truncated modes have u within (0, u_c], where u_c belongs to the
+lowest. So u / (1 - s u), s = z + sigma, is approximated on that interval by a polynomial in u
+without constant term. The optimum follows from Chebyshev's; its relative error for each mode is
 
     T_k(t(u)) / T_k(t(1 / s)),    t(u) = 2 u / u_c - 1,
 
@@ -118,7 +118,7 @@ def _interpolation(terms: int) -> tuple[FloatArray, FloatArray]:
 
 
 _MAX_CACHED = 4  # sets of points whose residual vectors, or shapes, are kept
-_MAX_KEPT_BYTES = 1 << 26  # of residual vectors: those of a map's raster are solved for it alone
+_MAX_KEPT_BYTES = 1 << 26  # of residual vectors; those of a map's raster are not cached
 
 
 class FiniteElementModes:
@@ -199,7 +199,7 @@ class FiniteElementModes:
 
 
 def _rigid_modes(matrices: PlateMatrices) -> FloatArray:
-    """Up and down, and both tilts, (dof, 3): a solver's are some mixture of them."""
+    """Return heave and both tilts, (dof, 3); a solver returns arbitrary mixtures of these."""
     nodes, plate = matrices.mesh.nodes, matrices.plate
     modes = np.zeros((len(nodes), DOF_PER_NODE, RIGID_BODY_MODES))
     modes[:, 0, 0] = 1
@@ -253,7 +253,7 @@ class SpectralModes:
         self.largest_truncated = float(u.max())
         # u / u_c of each truncated mode to the powers 1, 2, ...
         self._powers = (u / u.max()) ** np.arange(1, 2 * RESIDUAL_ORDER + 1)[:, None]
-        # By shape and content, of which either alone may be those of others.
+        # By shape and content; other points can share either one.
         self._known: dict[tuple[tuple[int, ...], bytes], _PointShapes] = {}
         self._is_softer = False
 
@@ -307,7 +307,7 @@ class SpectralModes:
         return missing / self.largest_truncated
 
     def _observe(self, points: FloatArray) -> _PointShapes:
-        """What is known of points or footprints on the plate, cached."""
+        """Return the cached shapes at points or footprints on the plate."""
         points = np.atleast_2d(np.asarray(points, dtype=float))
         key = points.shape, points.tobytes()
         if key not in self._known:
@@ -329,16 +329,17 @@ class SpectralModes:
 FreeModes: TypeAlias = SpectralModes | FiniteElementModes | SurfaceModes
 """Modes phi of a free plate up to a cut-off, and all truncated ones together by their sums.
 
-A truncated mode of eigenvalue lambda counts with u = 1 / (lambda + shift), in units of
-largest_truncated, u_c, that of the lowest [s²/rad²]. eigenvalues omega² (r,) [rad²/s²], and losses
-(r,), their imaginary part beside the plate's own loss factor; dispersion: how they change with
-frequency, None where they do not. Between points (n, 2) and others (m, 2), or footprints (n, 3):
+A truncated mode with eigenvalue lambda is represented by u = 1 / (lambda + shift), in units of
+largest_truncated, u_c, the value of the lowest one [s²/rad²]. eigenvalues omega² (r,) [rad²/s²],
+and losses (r,), their imaginary part in addition to the plate's loss factor; dispersion: their
+change with frequency, None without any. Between points (n, 2) and others (m, 2), or footprints (n,
+3):
 
 - shapes_at(points): of the modes, (n, r);
 - truncated_terms(points, others): sums of phi phi' (u / u_c)^j over the truncated modes, j = 1, 2,
   ..., (TERMS, n, m);
-- alternatives(), not of elements: modes of plates that this one may be as well, by which fields are
-  uncertain;
+- alternatives(), not of elements: modes of equally likely plates, which show the uncertainty of
+  fields;
 - basis(points, others): deflection at others of modes and of the RESIDUAL_ORDER residual vectors of
   forces at the points, term by term, (m, r + RESIDUAL_ORDER n); unknowns(points): its columns in
   the unknowns of the plate, by symmetry class.
@@ -368,11 +369,11 @@ def combined(functions: ComplexArray, products: FloatArray) -> ComplexArray:
 
 @dataclass(frozen=True, eq=False)
 class FreeReceptance:
-    """What multiplies shapes and sums at frequencies (f,), for plates of some stiffness and mass.
+    """Factors of shapes and sums at frequencies (f,), for plates of a given stiffness and mass.
 
-    omega (f,) [rad/s]; with any number of cases in front of them: thickness (...), relative to that
-    solved, q (..., f): see above, elastic (..., f, r): E lambda of each mode [rad²/s²] relative to
-    the modulus solved, losses included; shift, largest: of the truncated sums.
+    omega (f,) [rad/s]; with any number of cases in front of them: thickness (...), relative to the
+    solved one, q (..., f): see above, elastic (..., f, r): E lambda of each mode [rad²/s²] relative
+    to the modulus solved, losses included; shift, largest: of the truncated sums.
     """
 
     omega: FloatArray
@@ -420,7 +421,7 @@ FREQUENCY_MARGIN = 2.0
 
 @dataclass(frozen=True, eq=False)
 class FreePlate:
-    """Modes and factors of one plate on one mesh; see `solve_free_plate`.
+    """Modes and factors of a plate on a mesh; see `solve_free_plate`.
 
     frequency_max [Hz]: upper limit of the response; shift [rad²/s²]: of the factorisations.
     """
@@ -442,8 +443,8 @@ class FreePlate:
         """Acceleration [m/s²] at points [m] (p, 2) per frequency [Hz] (f,) and source: (f, n, p).
 
         Each alone at full level and phase zero, the others at rest. Raises InputError for a
-        frequency that is not above zero, above frequency_max or above what the mesh carries, and
-        for points off the plate.
+        frequency that is not positive, or above frequency_max or the mesh's limit, and for points
+        off the plate.
         """
         omega = self._omega(frequencies)
         at = footprints_of(sources, loads)

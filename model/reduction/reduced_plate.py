@@ -2,10 +2,10 @@
 
 Modes of the free plate, and for every attachment three residual vectors, orthogonal to them: the
 response of the truncated modes to a force there, and its growth with omega. Without these the modes
-converge slowly near a point force. Where an attachment comes or goes while the plate vibrates, the
-plate is reduced again and its motion is projected.
+converge slowly near a point force. If an attachment is added or removed while the plate vibrates,
+the plate is reduced again and its motion is projected.
 
-On its ERAs it has the matrices of mass, damping and stiffness
+On its ERAs, its mass, damping and stiffness matrices are
 
 M = I + sum m_b phi phi^T, K = diag(omega²) + sum k_b phi phi^T, C = C_s + sum c phi phi^T; phi are
 the free plate's shapes at an ERA. Point masses add in the same way. A fingertip adds its contact
@@ -15,27 +15,27 @@ magnet is free: its spring and damper end at a mass.
 
 Structural damping. The frequency domain uses a hysteretic stiffness (1 + i eta) diag(omega²), which
 no causal equation in time has. C_s is its viscous equivalent: in the modes psi_j, omega_j of the
-plate *on its ERAs*, C_s,jk = eta psi_j^T diag(omega²) psi_k / sqrt(omega_j omega_k), eta the
-geometric mean of those at omega_j and omega_k where it varies with frequency, and what soft layers,
-air and the springs of supports with a loss factor lose added to eta omega². That is positive
+plate *on its ERAs*, C_s,jk = eta psi_j^T diag(omega²) psi_k / sqrt(omega_j omega_k), with eta the
+geometric mean of its values at omega_j and omega_k if it varies with frequency. Losses of soft
+layers, of air and of support springs with a loss factor are added to eta omega². C_s is positive
 semidefinite, and at every resonance of the supported plate it dissipates exactly the power of the
 hysteretic one; a ratio eta/2 on the modes of the *free* plate would not, because the energy in the
 springs has no loss. Contacts do not change it. The two differ off resonance: with eta = 1 % the
 steady accelerations of the paper's plate differ by at most 0.5 % (relative L2 over the plate, 40 to
 500 Hz), in proportion to eta; deep nulls move a little, they are not filled.
 
-Its modes on its ERAs are those of the undamped plate. A damping ratio says how much of its energy
-such a mode loses, psi' C psi / (2 omega) at modal mass 1, to the plate's own losses and to the
-dampers of the ERAs; that dampers also couple the modes is left out here, not in the plate in time.
+Its modes on its ERAs are those of the undamped plate. The damping ratio of such a mode, psi' C psi
+/ (2 omega) at modal mass 1, includes the plate's own losses and the ERAs' dampers. The coupling of
+modes by dampers is neglected here, but not in the time domain.
 
-Slopes of fields by the places of the points where they are taken (`place_slopes`) are differences
-of second order, inwards at edges. Closed forms would be simple for polynomials, but a footprint
-that an edge cuts adds integrals along that edge, and the compliance of unresolved waves is fitted,
-with limits beside edges. Over this step differences are right to 1e-6 of the largest, and the
-rounding of another processor changes them by 3e-8.
+Slopes of fields with respect to position (`place_slopes`) are second-order differences, one-sided
+at edges. Closed forms would be simple for polynomials, but a footprint that an edge cuts adds
+integrals along that edge, and the compliance of unresolved waves is fitted, with limits beside
+edges. Over this step differences are right to 1e-6 of the largest, and the rounding of another
+processor changes them by 3e-8.
 
 A plate with form errors, which a rig file does not describe, is the same coordinates with other
-stiffness and mass between them (`ReducedModes`): an estimate fits these to measured responses.
+stiffness and mass between them (`ReducedModes`): an estimate fits both to measured responses.
 """
 
 import math
@@ -95,10 +95,10 @@ class ReductionBasis:
 class ReducedPlate:
     """The free plate in coordinates with M = I and K = diag(omega²).
 
-    omega: (r,) [rad/s], 0 for rigid-body modes, the last ones of the residual vectors; losses:
-    (r,) [rad²/s²] beside those of the plate's loss factor; at: shapes at points (p, 2) or
-    footprints (p, 3) [m], (p, r) [1/sqrt(kg)]; origin: None where only the coordinates are known;
-    dispersion: how omega² changes with frequency, None where it does not.
+    omega: (r,) [rad/s], 0 for rigid-body modes, residual vectors last; losses: (r,) [rad²/s²] in
+    addition to the plate's loss factor; at: shapes at points (p, 2) or footprints (p, 3) [m], (p,
+    r) [1/sqrt(kg)]; origin: None if only the coordinates are known; dispersion: change of omega²
+    with frequency, None without any.
     """
 
     plate: Plate
@@ -133,7 +133,7 @@ class ReducedPlate:
     def projection_from(self, other: "ReducedPlate") -> FloatArray:
         """M-orthogonal projection of another reduction's coordinates onto its own, (r, other's r).
 
-        Exact where it has all points of the other. Both must come from one free plate.
+        Exact if it has all points of the other. Both must come from the same free plate.
         """
         if self.origin is None or other.origin is None:
             return np.eye(len(self.omega))
@@ -217,11 +217,11 @@ def modal_matrices(
     contacts: Sequence[FingertipLoad] = (),
     attachment_shapes: FloatArray | None = None,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """M, C, K (r + m + n, ...) of the plate on its ERAs with its loads under n fingertips.
+    """Return M, C, K (r + m + n, ...) of the plate on its ERAs with its loads and n fingertips.
 
-    After the plate's coordinates come those of m far ends of the sources, and the phalanges' in the
-    order of contacts. attachment_shapes: shapes at the ERAs, loads and contacts where known
-    already. Raises InputError for ERAs and loads that do not support the plate.
+    The plate's coordinates are followed by those of m far ends of the sources, and of the phalanges
+    in the order of contacts. attachment_shapes: shapes at the ERAs, loads and contacts, if already
+    known. Raises InputError for ERAs and loads that do not support the plate.
     """
     check_supported(reduced.plate, eras, loads=loads)
     fixed = len(eras) + len(loads)
@@ -249,9 +249,10 @@ def modal_matrices(
 def on_springs(
     reduced: ReducedPlate, parts: Sequence[InTime], phi: FloatArray
 ) -> tuple[ModalElasticity, tuple[FloatArray, FloatArray, FloatArray]]:
-    """Elasticity of the free plate, and M, C, K (r + m, r + m) with n parts of shapes phi (n, r).
+    """Return elasticity of the free plate, and M, C, K (r + m, r + m) with n parts of shapes phi
+    (n, r).
 
-    The last m coordinates are those of the far ends that have a mass. C is of the parts alone.
+    The last m coordinates belong to far ends that have a mass. C includes only the parts.
     """
     elasticity = ModalElasticity.of(reduced.plate, reduced.omega**2, reduced.losses)
     keys = ("mass", "inertance", "damping", "stiffness")
@@ -270,9 +271,9 @@ def on_springs(
 
 
 def stretches(parts: Sequence[InTime], phi: FloatArray) -> FloatArray:
-    """By how much each coordinate stretches n parts of shapes phi (n, r), (n, r + m).
+    """Return the stretch of n parts with shapes phi (n, r) per coordinate, (n, r + m).
 
-    The displacement of the plate less that of the far end, where that has a mass.
+    The displacement of the plate minus that of the far end, if it has a mass.
     """
     free = [number for number, part in enumerate(parts) if part.far_mass is not None]
     found = np.pad(phi, ((0, 0), (0, len(free))))
@@ -326,7 +327,7 @@ class SupportedModes:
     def at(self, points: FloatArray) -> FloatArray:
         """Mode shapes at points [m] (p, 2), (p, n), scaled to modal mass 1 [1/sqrt(kg)].
 
-        Raises InputError for points off the plate, and what are none.
+        Raises InputError for points off the plate, and invalid points.
         """
         try:
             places = np.asarray(points, dtype=float)
@@ -334,8 +335,8 @@ class SupportedModes:
             places = np.empty(0)
         if places.shape[-1:] != (2,) or places.ndim > 2:
             raise InputError(
-                f"points is {shown(points)}, not places on the plate; give x, y in metres, as in "
-                "[[0.1, 0.08]]"
+                f"points must be positions on the plate, got {shown(points)}; give x, y in metres, "
+                "as in [[0.1, 0.08]]"
             )
         return np.asarray(self.reduced.at(places) @ self.coordinates)
 
@@ -375,7 +376,8 @@ def place_slopes(
     step = _STEP * sides
     is_inner = np.minimum(at, sides - at)[:, 0] >= step
     inwards = np.where(at[:, 0] > sides / 2, -1.0, 1.0)
-    # Steps to two further points, and what they and the point itself count, (n, 2) each.
+    # Offsets of two neighbouring points, and the weights of these and of the point itself, (n, 2)
+    # each.
     first, second = np.where(is_inner, 1.0, inwards), np.where(is_inner, -1.0, 2 * inwards)
     own = np.where(is_inner, 0.0, -1.5 * inwards)
     counts = own, np.where(is_inner, 0.5, 2 * inwards), np.where(is_inner, -0.5, -0.5 * inwards)
@@ -394,7 +396,7 @@ def place_slopes(
 
 @dataclass(frozen=True, eq=False)
 class ReducedModes:
-    """A plate's modes and residual vectors at all that is attached, for one with form errors.
+    """Modes and residual vectors at all attachments of a plate, in which it can have form errors.
 
     No further modes count as truncated.
     """
@@ -402,9 +404,9 @@ class ReducedModes:
     eigenvalues: FloatArray
     """omega² (r,) [rad²/s²]."""
     losses: FloatArray
-    """Their imaginary part beside the plate's own loss factor (r,)."""
+    """Their imaginary part in addition to the plate's loss factor (r,)."""
     dispersion: Dispersion | None
-    """How they change with frequency, None where they do not."""
+    """Their change with frequency, None without any."""
     shapes_at: Callable[[FloatArray], FloatArray]
     """Shapes at points or footprints [m], (n, r)."""
     cells: FloatArray
@@ -447,7 +449,7 @@ Modes: TypeAlias = FreeModes | ReducedModes
 
 @dataclass(frozen=True, eq=False)
 class AttachmentPoints:
-    """Shapes at a points of attachment and observation, v of which may move along x and y."""
+    """Shapes at `a` points of attachment and observation, v of them movable along x and y."""
 
     footprints: FloatArray
     """Place and radius of each (a, 3) [m]."""
@@ -472,9 +474,9 @@ class AttachmentPoints:
 def places_of(
     modes: Modes, footprints: FloatArray, movable: IntArray, sides: FloatArray
 ) -> AttachmentPoints:
-    """Solve for footprints (a, 3) on a plate of some sides (2,) [m].
+    """Solve for footprints (a, 3) on a plate with given sides (2,) [m].
 
-    movable (v,): numbers of those that may move.
+    movable (v,): indices of movable footprints.
     """
     moving, shapes = footprints[movable], modes.shapes_at(footprints)
     truncated = modes.truncated_terms(footprints, footprints)

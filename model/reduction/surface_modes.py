@@ -1,21 +1,22 @@
-"""Modes of a surface that were read, in place of those of a plate that are solved.
+"""Modes of a surface read from a file, used instead of a plate's solved modes.
 
-Modes above the cut-off are truncated ones that are known. What lies above the last mode is a
-compliance that is estimated from the number and the size of the upper half of the modes, as are
-its higher terms, without which no reduced plate (`model.reduction.reduced_plate`) would hold it:
+Modes above the cut-off are known truncated modes. The compliance of all modes above the last one is
+estimated from the number and amplitude of the upper half of the modes, including its higher terms,
+without which a reduced plate (`model.reduction.reduced_plate`) could not represent it:
 
     T_j(p, q) = n f u^j sqrt(m(p) m(q)) c_j(k |p - q|) / (2j - 1),   u = 1 / (4 pi² f²),
     c_j(r) = (4j - 2) int_1^inf J0(r x) / x^(4j - 1) dx,   j = 1, 2, ...
 
 with n modes per Hz and the frequency f up to which as many are expected, both of the straight line
 through the natural frequencies by their number, m their mean square at a point and k their
-wavenumber. It is what a homogeneous plate with these modes adds. Residual vectors that a program
-exports as modes are truncated modes like others.
+wavenumber. A homogeneous plate with these modes has this compliance. Residual vectors that a
+program exports as modes are truncated modes like others.
 
-The estimate is a mean. That of one surface differs by which modes come next: of Gaussian shapes by
-sqrt(2 / 3N) with N modes known, at each place and in each symmetry by itself, which moves
-resonances on stiff ERAs. So its error is that of surfaces whose next modes are drawn: sums of plane
-waves of the same density, size and wavenumber at evenly spaced frequencies (`alternatives`).
+The estimate is a mean. The compliance of a given surface depends on its next modes: for Gaussian
+shapes its relative deviation is sqrt(2 / 3N) with N known modes, at each position and in each
+symmetry separately, which shifts resonances on stiff ERAs. Its error is therefore estimated from
+surfaces whose next modes are drawn: sums of plane waves of the same density, size and wavenumber at
+evenly spaced frequencies (`alternatives`).
 """
 
 import math
@@ -59,8 +60,8 @@ def _correlations() -> tuple[FloatArray, FloatArray]:
 class SurfaceModes:
     """Modes of a surface below a cut-off; see `FreeModes`.
 
-    plate: that stands for it; one that is thicker or stiffer has all of its modes scaled. shift
-    [rad²/s²]: of the order of the lowest modes.
+    plate: equivalent plate; a thicker or stiffer one has all modes scaled. shift [rad²/s²]: of the
+    order of the lowest modes.
     """
 
     def __init__(

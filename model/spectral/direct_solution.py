@@ -1,15 +1,15 @@
-"""Direct solution of a plate in polynomials at each frequency, and slopes of its stiffness.
+"""Direct solution of a plate in polynomials at each frequency, and derivatives of its stiffness.
 
-The direct solution is the reference of the modal one: it approximates nothing in frequency.
-Adhesives, air and the inertia along the plate are those of the frequency at hand, and the
-compliance that polynomials do not resolve is added.
+The direct solution is the reference for the modal one, without approximation in frequency.
+Adhesives, air and in-plane inertia have their values at each frequency, and the compliance that
+polynomials do not resolve is added.
 
-Slopes are those of the stiffness between given shapes with the plate's sides and Poisson's ratios.
-Displacements along the plate follow deflections by least energy: a change of stiffness dK then
-changes the energy of shapes v by v^T dK v, to first order without a solve of another plate. By a
-side it has a closed form (`class_stiffness`); by Poisson's ratio nu, which changes alike in all
-layers, it follows from a small change of the section, in which K is linear. The stiffness that air
-adds, and changes of rotary inertia, are left out.
+Derivatives are those of the stiffness between given shapes with respect to the plate's sides and
+Poisson's ratios. Displacements along the plate follow deflections by least energy: a change of
+stiffness dK then changes the energy of shapes v by v^T dK v, to first order without a solve of
+another plate. By a side it has a closed form (`class_stiffness`); by Poisson's ratio nu, which
+changes alike in all layers, it follows from a small change of the section, in which K is linear.
+The stiffness that air adds, and changes of rotary inertia, are left out.
 """
 
 import math
@@ -165,10 +165,10 @@ def stiffness_slopes(
 def grain_slopes(
     plate: Plate, degrees: tuple[int, int], unknowns: Sequence[FloatArray]
 ) -> FloatArray:
-    """Derivatives of the stiffness of shapes (r,) of a board, (2, r), each by itself.
+    """Derivatives of the stiffness of shapes (r,) of a board, (2, r), each separately.
 
-    By the logarithms of its modulus across the length and of its shear modulus in the plane.
-    unknowns: as of `stiffness_slopes`.
+    With respect to the logarithms of its transverse modulus and its in-plane shear modulus.
+    unknowns: see `stiffness_slopes`.
     """
     layers = layers_of(plate)
     material, thickness = plate.material, plate.thickness

@@ -1,4 +1,4 @@
-"""What is attached to the plate: actuators (ERAs), masses, feet, frames, and fingertips.
+"""Attachments of the plate: actuators (ERAs), masses, feet, frames, and fingertips.
 
 Each acts on the plate with a dynamic stiffness; a source also drives it with a force. The plate on
 its attachments is a low-rank correction of the free plate (Woodbury identity).
@@ -7,15 +7,15 @@ An ERA is a spring, a damper and a bolt between the plate and a base that moves.
 contact mass that moves with the plate, and a spring and a damper (the pulp) to the phalanx, which a
 joint holds. The phalanx is not at rest: at 60, 100 and 250 Hz the real part of the dynamic
 stiffness is 69, -87 and -358 N/m where a phalanx at rest gives 972, 921 and 507.
-docs/concepts/people.md says how well the values are known.
+docs/concepts/people.md states the uncertainty of these values.
 
-A bonded frame or foam tape along the edges acts at Gauss-Legendre points of each edge with their
-weights: with n points the work in products of shapes up to degree 2 n - 1 is exact. As points they
-keep their mass and stiffness on a plate of any thickness. Each point is a small disc, since a point
-force dents a plate with shear deformation without limit, as the logarithm of its size.
+A bonded frame or foam tape along the edges acts at weighted Gauss-Legendre points of each edge: n
+points are exact for products of shapes up to degree 2 n - 1. As points they keep their mass and
+stiffness on a plate of any thickness. Each point is a small disc, since a point force dents a plate
+with shear deformation without limit, as the logarithm of its size.
 
-Footprints are such discs, or points, at which attachments act. A force on a disc is spread evenly
-over the part of it that is on the plate, and the attachment follows the mean deflection there.
+Footprints are such discs, or points, at which attachments act. A force on a disc is distributed
+evenly over its part on the plate, and the attachment follows the mean deflection there.
 
 Springs support a plate if they hold all of its rigid-body modes.
 """
@@ -56,7 +56,7 @@ class InTime:
     stiffness: float  # N/m
     damping: float  # N s/m
     far_mass: float | None = None
-    """Mass of the far end [kg]; None where that is held, or its motion is given."""
+    """Mass of the far end [kg]; None if it is held, or its motion is given."""
 
     by_drive: float = 0.0
     """Force that pushes the plate and the far end apart, per unit of the drive."""
@@ -105,7 +105,7 @@ class Source(ABC):
     @property
     @abstractmethod
     def support(self) -> "PointLoad":
-        """What it is at rest to a plate that moves slowly."""
+        """Static equivalent, for a slowly moving plate."""
 
     @property
     @abstractmethod
@@ -114,14 +114,14 @@ class Source(ABC):
 
     @property
     def excursion(self) -> float:
-        """Largest motion between its ends [m]: infinite where nothing limits it."""
+        """Largest motion between its ends [m]; infinite without a limit."""
         return math.inf
 
     def gain(self, frequencies: FloatArray) -> ComplexArray:
         """Complex gain of its drive at frequencies [Hz], of their shape; 1 without measured gains.
 
-        Linear between measured frequencies, constant outside. At negative frequencies, as in the
-        lower sideband of a fast ramp, the conjugate: what is driven is real.
+        Linear between measured frequencies, constant outside. At negative frequencies (the lower
+        sideband of a fast ramp) it is the conjugate, because the drive is real.
         """
         if not self.gains:
             return np.ones(np.shape(frequencies), dtype=complex)
@@ -142,9 +142,10 @@ class Source(ABC):
     def deviating(
         self, omega: FloatArray, stiffness: Factor, damping: Factor
     ) -> tuple[ComplexArray, ComplexArray]:
-        """Dynamic stiffness [N/m], and force by its drive without its gain, of one that deviates.
+        """Dynamic stiffness [N/m], and force per drive without gain, with stiffness and damping
+        scaled.
 
-        stiffness, damping: by factors; all arguments broadcast.
+        stiffness, damping: factors; all arguments broadcast.
         """
 
     @abstractmethod
@@ -157,7 +158,7 @@ class Source(ABC):
 
     @abstractmethod
     def loosened(self, share: float) -> Self:
-        """The source where it is held by a share of its contact."""
+        """Return the source held by a fraction of its contact."""
 
     @property
     @abstractmethod
@@ -262,15 +263,16 @@ HAND_STD = 1.1
 """Standard deviation of the logarithm of the load of each patch of a hand, a factor of 3."""
 
 HAND_PATCHES = ((-0.0125, -0.0125), (0.0125, -0.0125), (-0.0125, 0.0125), (0.0125, 0.0125))
-"""Patches on which a hand of `HAND_LOAD` rests, each with a quarter of it, from its middle [m].
+"""Patches on which a hand of `HAND_LOAD` rests, each with a quarter of the load, from its centre
+[m].
 
-Those of a heavier hand are farther apart, by the square root of its load.
+Patches of a heavier hand are farther apart, by the square root of its load.
 """
 
 
 @dataclass(frozen=True)
 class Fingertip:
-    """Load of one fingertip; the defaults are those of a finger that presses lightly."""
+    """Load of one fingertip; the defaults are for a lightly pressing finger."""
 
     stiffness: float = 1000.0
     """Stiffness of the pulp [N/m]."""
@@ -293,9 +295,9 @@ class Fingertip:
     def dynamic_stiffness(self, omega: FloatArray | ComplexArray) -> ComplexArray:
         """Force on the plate per displacement of the contact at omega [rad/s], of its shape [N/m].
 
-        A complex omega is that of exp(i omega t).
-        D = -omega² m_c + Z_p Z_b / (Z_p + Z_b), with Z_p = k + i omega c of the pulp and
-        Z_b = k_j + i omega c_j - omega² m_p of the phalanx on its joint.
+        omega can be complex, with time dependence exp(i omega t). D = -omega² m_c + Z_p Z_b / (Z_p
+        + Z_b), with Z_p = k + i omega c of the pulp and Z_b = k_j + i omega c_j - omega² m_p of the
+        phalanx on its joint.
         """
         w = np.asarray(omega)
         pulp = self.stiffness + 1j * w * self.damping
@@ -315,7 +317,8 @@ class Fingertip:
         )
 
     def under(self, load: float) -> "Fingertip":
-        """A finger of a load, or a patch of a hand of it, whose mass behind is larger, too."""
+        """Return a finger with a load, or a patch of a hand with this load, whose mass behind is
+        also larger."""
         is_finger = load <= MAX_FINGER_LOAD
         return self.scaled(load) if is_finger else self.multiplied(load / len(HAND_PATCHES))
 
@@ -325,11 +328,11 @@ class Fingertip:
 
 
 OBJECT_STIFFNESS, OBJECT_DAMPING_RATIO = 1e5, 0.1
-"""Contact of an object that lies on the plate, as of a cup or a phone: assumed [N/m]."""
+"""Assumed contact stiffness [N/m] and damping ratio of an object on the plate, such as a cup."""
 
 
 def object_load(mass: float) -> Fingertip:
-    """Load of an object of a mass [kg] that lies on the plate: the mass on a contact spring."""
+    """Return the load of an object of a mass [kg] on the plate: the mass on a contact spring."""
     damping = 2 * OBJECT_DAMPING_RATIO * math.sqrt(OBJECT_STIFFNESS * mass)
     return Fingertip(OBJECT_STIFFNESS, damping, 0.0, mass, 0.0, 0.0)
 
@@ -364,9 +367,9 @@ def check_loads(loads: Iterable[float], *, highest: float = MAX_FINGER_LOAD) -> 
 def with_patches(
     contacts: Sequence[Point], loads: Sequence[float], size: Point
 ) -> tuple[list[Point], list[float]]:
-    """Return places [m] and loads of contacts on a plate of a size [m], hands by their patches.
+    """Return positions [m] and loads of contacts on a plate of a size [m], with hands as patches.
 
-    The first patch of a hand takes its place, the others follow all contacts.
+    The first patch of a hand replaces it, the others follow all contacts.
     """
     places, by = [*contacts], [*loads]
     for number, ((x, y), load) in enumerate(zip(contacts, loads, strict=True)):
@@ -386,9 +389,9 @@ def fingertip_loads(
     contacts: Sequence[tuple[float, float]],
     loads: Sequence[float] = (),
 ) -> list[FingertipLoad]:
-    """Fingertips that rest at contacts [m]; none where they are weightless.
+    """Return fingertips at contacts [m]; none if they are massless.
 
-    loads: of each relative to the fingertip, empty for 1.
+    loads: relative to the fingertip, empty for 1 each.
     """
     if fingertip is None:
         return []
@@ -412,7 +415,7 @@ class PointLoad:
     """Radius of the disc on which it acts [m], 0 for a point."""
 
     loss_factor: float = 0.0
-    """Loss factor eta of the spring, k (1 + i eta), as of foam."""
+    """Loss factor eta of the spring, k (1 + i eta), for example of foam."""
 
     is_foot: bool = False
     """Whether it is a foot, to whose stiffness `Uncertainty.supports` applies."""
@@ -430,7 +433,7 @@ class PointLoad:
     def dynamic_stiffness(self, omega: FloatArray) -> ComplexArray:
         """D = k (1 + i eta) + i omega c - omega² m [N/m], of the shape of omega [rad/s].
 
-        At negative frequencies, as in the lower sideband of a fast ramp, the conjugate.
+        At negative frequencies (the lower sideband of a fast ramp), the conjugate.
         """
         spring = self.spring(omega)
         return np.asarray(spring + 1j * omega * self.damping - omega**2 * self.mass)
@@ -454,7 +457,7 @@ _Complex = TypeVar("_Complex", bound="np.complexfloating[Any, Any]")
 
 
 def footprints_of(*attached: Iterable[Support]) -> FloatArray:
-    """Footprints x, y, radius [m] of what is attached, one group after the other, (n, 3)."""
+    """Return footprints x, y, radius [m] of attachments, one group after the other, (n, 3)."""
     places = [[each.x, each.y, each.foot] for group in attached for each in group]
     return np.array(places, dtype=float).reshape(-1, 3)
 
@@ -506,13 +509,13 @@ FootKind: TypeAlias = Literal["foam", "rubber"]
 """Kinds of feet of a rig file."""
 
 FEET: Mapping[FootKind, float] = {"foam": 2e3, "rubber": 30e3}
-"""Stiffness [N/m] of a foot by its kind: assumed, of some 2 cm; of one's own weigh and press."""
+"""Assumed stiffness of a foot by its kind [N/m], for about 2 cm; measure your own by weighing."""
 
 FEET_DEVIATE = 0.3
-"""Standard deviation of the logarithm of a foot's stiffness, unless a rig says another: assumed.
+"""Assumed standard deviation of the logarithm of a foot's stiffness, unless the rig states one.
 
-Also of one that was pressed: that is static, and rubber is stiffer in vibrations, more or less by
-its compound.
+Also applies to a measured static stiffness: rubber is stiffer in vibration, depending on its
+compound.
 """
 
 DEFAULT_POINTS = 7
@@ -526,7 +529,8 @@ FOOT_LOSS = 0.15
 
 
 def edge_points(plate: Plate, count: int) -> Iterator[tuple[float, float, float]]:
-    """Points x, y of all four edges and the length that each stands for [m]; count: of an edge."""
+    """Yield points x, y of all four edges and the length that each represents [m]; count: per
+    edge."""
     nodes, weights = leggauss(count)
     for along, across, is_along_x in (
         (plate.length, plate.width, True),
@@ -555,7 +559,7 @@ BasisT = TypeVar("BasisT", FloatArray, NDArray[np.float32], sparse.csr_array)
 
 
 def as_footprints(places: FloatArray) -> FloatArray:
-    """Footprints x, y, radius [m], (n, 3), of these or of points (n, 2)."""
+    """Convert footprints (n, 3) or points (n, 2) to footprints x, y, radius [m], (n, 3)."""
     places = np.atleast_2d(np.asarray(places, dtype=float))
     if places.size == 0:
         return np.empty((0, 3))
@@ -668,7 +672,7 @@ def static_loads(
 
 
 def centre_of_mass(plate: Plate) -> Point:
-    """Return the centre of mass [m] of the bare plate: its middle, or that of a surface's modes."""
+    """Return the centre of mass of the bare plate [m]: its centre, or that of a surface's modes."""
     if plate.surface is not None:
         centre = centre_of_surface(plate.surface)
         if centre is not None:
@@ -679,7 +683,7 @@ def centre_of_mass(plate: Plate) -> Point:
 def _attached(
     plate: Plate, eras: Sequence[Source], loads: Sequence[PointLoad]
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Factors p (3, n), stiffness [N/m] and mass [kg] (n,) of what is attached.
+    """Return factors p (3, n), stiffness [N/m] and mass [kg] (n,) of all attachments.
 
     In units of the plate's sides, in which both tilts have the size of the heave.
     """

@@ -1,8 +1,8 @@
-"""How a rigid plate rests on its supports: its centre of mass, their static loads, and tipping.
+"""Static balance of a rigid plate on its supports: centre of mass, static loads, and tipping.
 
-Supports are springs to the ground: ERAs, held exciters and feet. A foot only pushes; what is bolted
-or glued can also pull. The plate tips where its centre of mass lies outside the convex hull of the
-supports, and a finger that presses outside of it tips the plate over an edge of the hull.
+Supports are springs to the ground: ERAs, held exciters and feet. A foot only pushes; bolted or
+glued supports can also pull. The plate tips if its centre of mass is outside the convex hull of the
+supports. A finger that presses outside the hull tips the plate over an edge of the hull.
 """
 
 from collections.abc import Iterable, Sequence
@@ -27,13 +27,13 @@ class Balance:
     """A plate at rest on n supports, which are not in one line."""
 
     weight: float
-    """Of the plate and all that moves with it [N]."""
+    """Weight of the plate and everything that moves with it [N]."""
     centre: Point
     """Centre of mass [m]."""
     supports: FloatArray
     """Positions of the supports (n, 2) [m]."""
     loads: FloatArray
-    """Static load of each support (n,) [N]; one that is pulled upwards has a negative load."""
+    """Static load of each support (n,) [N], negative if it is pulled upwards."""
 
     @property
     def edges(self) -> FloatArray:
@@ -50,18 +50,19 @@ class Balance:
 
     @property
     def inside_share(self) -> float:
-        """The least distance to an edge, as a share of the hull's depth behind that edge.
+        """Smallest distance to an edge, relative to the hull's depth behind that edge.
 
-        On three supports it is the least share of the weight that one of them carries.
+        On three supports it equals the smallest fraction of the weight on a support.
         """
         edges = self.edges
         depths = np.max(-(self.supports @ edges[:, :2].T + edges[:, 2]), axis=0)
         return float(np.min(-_distances(edges, self.centre) / depths))
 
     def tipping_force(self, points: Iterable[Point]) -> tuple[float, Point] | None:
-        """Return the least force [N] on one of these points [m] that tips the plate, and the point.
+        """Return the smallest force [N] on any of these points [m] that tips the plate, and the
+        point.
 
-        None if no point lies outside the hull. The centre of mass must lie within it.
+        None if no point is outside the hull. The centre of mass must be within it.
         """
         edges = self.edges
         holding = -self.weight * _distances(edges, self.centre)  # N m, about each edge
@@ -78,9 +79,9 @@ class Balance:
 
 
 def balance_of(plate: Plate, sources: Sequence[Source], loads: Sequence[PointLoad] = ()) -> Balance:
-    """Return how a plate rests on its sources and loads, which support it.
+    """Return the balance of a plate on its sources and loads.
 
-    The static loads are those of a rigid plate on springs; of three supports they follow from the
+    Static loads are those of a rigid plate on springs; on three supports they follow from the
     positions alone.
     """
     attached = [*(source.support for source in sources), *loads]

@@ -5,16 +5,16 @@ frame. Between them are the suspension, k and c, and the force Bl i of the curre
 amplifier drives it through Z = R_e + R_g + i omega L, R_g its own output resistance: i = (V - i
 omega Bl (w - x)) / Z. With
 
-    S = k + i omega (c + Bl² / Z),    T = omega² M / (omega² M - S), 1 where the magnet is held,
+    S = k + i omega (c + Bl² / Z),    T = omega² M / (omega² M - S), 1 if the magnet is held,
 
-the force on a plate that is held is F = T Bl V / Z, and the dynamic stiffness is D = S T - omega²
-m_c. Far below the resonance of the magnet, omega_m² = k / M, the force falls as omega²; above it,
-it is nearly the same at every frequency. A data sheet's resonance is mostly that of the light coil
-against the magnet, `free`; glued to a plate the magnet moves, at f_m = f_s sqrt(m_s / M), m_s the
-moving mass of that sheet.
+the force on a clamped plate is F = T Bl V / Z, and the dynamic stiffness is D = S T - omega² m_c.
+Far below the resonance of the magnet, omega_m² = k / M, the force falls as omega²; above it, it is
+nearly the same at every frequency. A data sheet usually states the resonance of the light coil
+against the magnet, `free`. When glued to a plate the magnet moves, at f_m = f_s sqrt(m_s / M), m_s
+the moving mass in the data sheet.
 
-Not modelled: stiffness and damping by amplitude, heat of the coil (0.39 % of R_e a kelvin), eddy
-currents, rocking of the magnet.
+Not modelled: amplitude dependence of stiffness and damping, heating of the coil (0.39 % of R_e per
+kelvin), eddy currents, rocking of the magnet.
 """
 
 import math
@@ -35,8 +35,7 @@ _MAX_LAG = 0.1
 class Exciter(Source):
     """One exciter whose coil is glued to the plate.
 
-    Its stiffness k and damping c are those of the suspension, its gains those of its amplifier and
-    converter.
+    Stiffness k and damping c refer to the suspension, gains to amplifier and converter.
     """
 
     UNIT: ClassVar[str] = "V"
@@ -97,7 +96,7 @@ class Exciter(Source):
 
     @property
     def support(self) -> PointLoad:
-        """What it is to a plate that moves slowly: its weight, and a spring where it is held."""
+        """Static equivalent: its weight, and a spring if it is held."""
         if self.held:
             return PointLoad(
                 self.x, self.y, self.stiffness, self.damping, self.coil_mass, self.foot
@@ -140,8 +139,8 @@ class Exciter(Source):
     def base(self, omega: FloatArray) -> ComplexArray:
         """Motion Bl V / (Z omega² M) at full level by which errors of its spring change the force.
 
-        A spring that is stiffer by dS acts with dS T² (base - w) [m]; of a magnet that is held the
-        spring alone is at rest, and it is 0.
+        A spring that is stiffer by dS acts with dS T² (base - w) [m]; 0 for a held magnet, whose
+        spring is at rest.
         """
         w = np.asarray(omega)
         if self.held:
@@ -169,9 +168,10 @@ class Exciter(Source):
         return np.asarray(share.reshape(-1, *[1] * (moved.ndim - 1)) * moved)
 
     def loosened(self, share: float) -> Self:
-        """An exciter that acts with a share of its dynamic stiffness, by its glue, and less force.
+        """Return an exciter with a fraction of its dynamic stiffness, because of its glue, and less
+        force.
 
-        The force falls by the root of the share, and by as much again in a gain.
+        The force decreases with the square root of the fraction, and as much again in a gain.
         """
         return replace(
             self.varied(stiffness=share, damping=share),
@@ -220,7 +220,7 @@ class Exciter(Source):
         return np.asarray(stiffness * self.stiffness + 1j * w * lost)
 
     def _share(self, w: FloatArray, spring: ComplexArray | None = None) -> ComplexArray:
-        """T, by S [N/m] where it is not its own."""
+        """T, for S [N/m] if given, else its own."""
         if self.held:
             return np.ones(w.shape, dtype=complex)
         inertia = w**2 * self.magnet_mass
@@ -233,7 +233,7 @@ class Exciter(Source):
 
 
 Actuator: TypeAlias = Era | Exciter
-"""Any of them, each a `Source`; further kinds are listed here and in `model.rig.actuator_keys`."""
+"""Any actuator, each a `Source`; other kinds are listed here and in `model.rig.actuator_keys`."""
 
 OneKind = TypeVar("OneKind", Era, Exciter, Actuator)
 """Kind of actuator that a function takes and returns."""

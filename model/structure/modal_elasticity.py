@@ -1,13 +1,13 @@
 """Stiffness and loss of each mode of a free plate, and the scaling of a solution to other plates.
 
-A real plate is less homogeneous than its theory: laminate, seams, air and edges change the lowest
-modes each in its own way. So a plate may state by how much the eigenvalue and the loss factor of
-its lowest elastic modes differ (`Plate.mode_deviations`), and that its loss factor varies as a
-power of the frequency. Shapes and higher modes remain those of the theory. Adhesives and air change
-the complex eigenvalues of modes with frequency: their dispersion.
+A real plate is less homogeneous than theory: laminate, seams, air and edges change the lowest modes
+individually. A plate can therefore state differences of the eigenvalue and the loss factor of its
+lowest elastic modes (`Plate.mode_deviations`), and a power law of its loss factor over frequency.
+Shapes and higher modes follow theory. Adhesives and air change the complex eigenvalues of modes
+with frequency: their dispersion.
 
-`Discretisation` is what meshes of elements and of polynomials have in common: the shortest waves
-that they resolve.
+`Discretisation` is the common base of finite-element and polynomial meshes: the shortest waves that
+they resolve.
 """
 
 from abc import ABC, abstractmethod
@@ -24,9 +24,9 @@ from model.structure.plate import LOSS_FREQUENCY, Plate
 
 @dataclass(frozen=True, eq=False)
 class Dispersion:
-    """What is added to the eigenvalues of r modes, which they have at their own frequencies.
+    """Change of the eigenvalues of r modes with frequency, zero at their own frequencies.
 
-    frequencies (k,) [Hz], ascending; values (k, r) [rad²/s²]: in the mode's own shape; a cubic
+    frequencies (k,) [Hz], ascending; values (k, r) [rad²/s²]: for the mode's own shape; a cubic
     spline of the logarithm of frequency in between, constant outside.
     """
 
@@ -56,9 +56,10 @@ def loss_factors(plate: Plate, omega: FloatArray) -> FloatArray:
 
 
 def lowest_elastic(eigenvalues: FloatArray, count: int) -> IntArray:
-    """Numbers of the lowest elastic modes among eigenvalues (r,), ascending, at most count.
+    """Return the indices of the lowest elastic modes among eigenvalues (r,), ascending, at most
+    `count`.
 
-    Equal ones, as of a square plate, in the order that they have.
+    Equal eigenvalues, for example of a square plate, keep their order.
     """
     with np.errstate(divide="ignore"):
         order = np.argsort(np.round(np.log(eigenvalues), 9), kind="stable")
@@ -70,8 +71,8 @@ def lowest_elastic(eigenvalues: FloatArray, count: int) -> IntArray:
 class ModalElasticity:
     """Eigenvalues omega² (r,) [rad²/s²] of a plate, and loss factors (r,) relative to its own.
 
-    losses (r,) [rad²/s²]: what modes lose beside those, in soft layers and air; dispersion: how
-    they change with frequency, None where they do not.
+    losses (r,) [rad²/s²]: additional losses of modes in soft layers and air; dispersion: their
+    change with frequency, None without any.
     """
 
     plate: Plate
@@ -88,7 +89,8 @@ class ModalElasticity:
         losses: FloatArray,
         dispersion: Dispersion | None = None,
     ) -> Self:
-        """Those of a plate whose theory has these (r,), all of its lowest among them."""
+        """Return those of a plate with these theoretical values (r,), including all of its lowest
+        modes."""
         deviations = np.array(plate.mode_deviations, dtype=float).reshape(-1, 2)
         if not len(deviations):
             return cls(plate, eigenvalues, np.ones(len(eigenvalues)), losses, dispersion)
@@ -120,10 +122,10 @@ class ModalElasticity:
 
 
 WITHOUT_PART = (
-    "measuring finds them anew; leave it out of the rig file, and let era rig identify find the "
-    "plate that has it"
+    "measuring determines them again; leave it out of the rig file, and use era rig identify to "
+    "find the plate that has it"
 )
-"""Remedy of what varies thickness and modulus whatever the rig says of them."""
+"""Remedy for operations that vary thickness and modulus regardless of the rig's uncertainty."""
 
 
 def check_scales(
@@ -131,11 +133,11 @@ def check_scales(
     *factors: FloatArray | float,
     remedy: str = "set uncertainty.thickness and uncertainty.weather to 0",
 ) -> None:
-    """Raise InputError for factors on thickness or modulus of a plate with a part that stays.
+    """Raise InputError for factors on thickness or modulus if a part of the plate does not scale.
 
-    What is solved of a plate then serves for others by `modal_receptance`, unless it has parts
-    whose mass or stiffness does not scale: fields of `Plate` without the metadata `scales`. remedy:
-    the end of the message.
+    A solution serves for other plates through `modal_receptance`, unless the plate has parts whose
+    mass or stiffness does not scale: fields of `Plate` without the metadata `scales`. remedy: the
+    end of the message.
     """
     fixed_parts = [
         part.name
@@ -144,7 +146,7 @@ def check_scales(
     ]
     if fixed_parts and any(np.any(np.asarray(factor) != 1) for factor in factors):
         raise InputError(
-            f"plate.{fixed_parts[0]}: thickness and modulus must be those that were solved, since "
+            f"plate.{fixed_parts[0]}: thickness and modulus must be the solved ones, since "
             f"this part does not scale with them; {remedy}"
         )
 
@@ -156,21 +158,22 @@ def check_measurable(plate: Plate) -> None:
 
 
 def check_is_plate(plate: Plate, what: str) -> None:
-    """Raise InputError for a surface by its modes, of which something cannot be done."""
+    """Raise InputError for a surface given by modes, for operations that need a plate."""
     if plate.surface is not None:
         raise InputError(
-            f"surface: {what} must be of a plate, got a surface by its modes, which has no "
-            "thickness, size or modulus; give plate in its place, or export other modes"
+            f"surface: {what} requires a plate, got a surface given by modes, which has no "
+            "thickness, size or modulus; give plate instead, or export other modes"
         )
 
 
 def modal_receptance(
     stiffness: ComplexArray, omega: FloatArray, thickness: FloatArray | float = 1.0
 ) -> ComplexArray:
-    """Receptance of modes of a complex stiffness (..., f, r) [rad²/s²], (..., f, r) [s²/kg].
+    """Return the receptance of modes with a complex stiffness (..., f, r) [rad²/s²], (..., f, r)
+    [s²/kg].
 
-    1 / (h (h² stiffness - omega²)), of plates so many times as thick, thickness h (...): thin ones,
-    whose stiffness goes as the cube of it.
+    1 / (h (h² stiffness - omega²)) for plates with relative thickness h (...): thin ones, whose
+    stiffness is proportional to h³.
     """
     h = np.asarray(thickness)[..., None, None]
     return np.asarray(1 / (h * (h**2 * stiffness - (omega**2)[:, None])), dtype=complex)

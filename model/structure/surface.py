@@ -1,15 +1,16 @@
-"""A surface that another program solved, or a test measured: its modes along the normal.
+"""Surface given by its normal modes, computed by another program or measured in a modal test.
 
-It takes the place of a plate in a rig (`surface` in place of `plate`). What the rest asks a plate
-by itself for, wavelengths, weight and its rectangle, is then that of a homogeneous plate with as
-many modes and the same mass. Touches have coordinates in the plane across the normal, from the
-corner of the rectangle around all nodes, or those that the file states.
+It replaces the plate in a rig (`surface` instead of `plate`). Where other modules need plate
+properties (wavelengths, weight, bounding rectangle), a homogeneous plate with the same number of
+modes and the same mass is used. Touch coordinates are in the plane perpendicular to the normal,
+with the origin at the corner of the bounding rectangle of all nodes, or the origin stated by the
+file.
 
-The mass is that of the rigid motion along the normal: with modes phi of unit modal mass and c so
-that sum c phi = 1, it is |c|². Mounts that hold the surface must be in its modes or in the rig, not
-in both.
+The mass is that of rigid motion along the normal: with modes phi of unit modal mass and
+coefficients c such that sum c phi = 1, it is |c|². Mounts that hold the surface must be included
+either in the modes or in the rig, not in both.
 
-Not modelled: forces and motion within the surface, of its actuators, too.
+Not modelled: in-plane forces and motion, including those of the actuators.
 """
 
 import hashlib
@@ -36,21 +37,21 @@ THICKNESS, NU = 2e-3, 0.25
 """Thickness [m] and Poisson's ratio of the homogeneous plate, both arbitrary."""
 
 EDGES = 1.25
-"""Number of modes of a plate with free edges over that of its area alone."""
+"""Number of modes of a plate with free edges relative to the estimate from its area alone."""
 
 LEAST_KNOWN, WELL_KNOWN = 1.15, 3.0
 """Multiples of the highest frequency up to which modes must be known, and should be: with fewer,
 fields were wrong by a fifth; with those up to three times by 3 %."""
 
 MAX_DEVIATING = 64
-"""Number of the lowest elastic modes that may differ from those of a file."""
+"""Number of lowest elastic modes that can differ from those of a file."""
 
 RIGID_FREQUENCY = 1.0  # Hz; below it a mode is of the rigid body
-_HELD = 0.2  # motion along the normal of a rigid mode, to that of the one with most
+_HELD = 0.2  # normal motion of a rigid mode, relative to the mode with the most
 _SEEN = 1e-3  # the same of elastic modes, to their median; others move within the surface
 _TILTING = 3  # rigid modes of a surface that is free: it moves along the normal and tilts
 _FEWEST = 6  # nodes, and elastic modes
-_BESIDE = 9  # nodes beside each other, whose plane has the normal
+_BESIDE = 9  # neighbouring nodes that define the plane for a normal
 _ON_OUTLINE = 1e-3  # m; a place so near to it is on the surface
 _SAME_MASS = 0.1
 _SAME_LOSS = 0.01
@@ -58,7 +59,7 @@ _SAME_LOSS = 0.01
 
 @dataclass(frozen=True)
 class Surface:
-    """What a plate is by the modes of a file; `surface_modes` reads them."""
+    """Properties of a plate given by the modes of a file; `surface_modes` reads the modes."""
 
     file: str
     digest: str
@@ -68,7 +69,7 @@ class Surface:
     """Direction of touches: an axis of the file, -z for one downwards, or `local z`."""
 
     count: int
-    """Number of modes, those of the rigid body among them."""
+    """Number of modes, including rigid-body modes."""
 
     rigid: int
     """Number of modes of the rigid body; 0 for a surface that its modes hold."""
@@ -83,22 +84,23 @@ class Surface:
     """Edges and cut-outs as rings of points [m]; none for the whole rectangle."""
 
     sizes: tuple[float, ...] = ()
-    """Factors of the shapes of the lowest elastic modes, on one that differs from the file's."""
+    """Factors on the shapes of the lowest elastic modes, if they differ from the file's."""
 
     notes: tuple[str, ...] = ()
     """Suspicious properties of the modes, as warnings show them."""
 
     def frequency_factor(self, thickness: float, modulus: float) -> float:
-        """Return the factor of its natural frequencies for a homogeneous plate that deviates.
+        """Return the factor of its natural frequencies for an equivalent plate with other
+        properties.
 
-        thickness [m], modulus [Pa]: those of the plate that stands for it.
+        thickness [m], modulus [Pa]: of the equivalent homogeneous plate.
         """
         return thickness / THICKNESS * math.sqrt(modulus / self.modulus)
 
 
 @dataclass(frozen=True, eq=False)
 class SurfaceShapes:
-    """Modes along the normal at n nodes, of unit modal mass; those of the rigid body come first."""
+    """Normal modes at n nodes, with unit modal mass, rigid-body modes first."""
 
     points: FloatArray
     """Nodes (n, 2) in coordinates of touches [m]."""
@@ -110,7 +112,7 @@ class SurfaceShapes:
     """(n, r) [1/sqrt(kg)]."""
 
     damping_ratios: FloatArray
-    """(r,), NaN where the file has none."""
+    """(r,), NaN if missing in the file."""
 
     rigid: int
     """Number of modes of the rigid body."""
@@ -243,7 +245,8 @@ def evenly_spaced(points: FloatArray, count: int) -> FloatArray:
 
 
 def _normals(nodes: FloatArray, axis: int) -> FloatArray:
-    """Unit normals (n, 3) at nodes: of the plane nearest to those beside each, along an axis."""
+    """Return unit normals (n, 3) at nodes: of the best-fit plane of each node's neighbours, along
+    an axis."""
     from scipy.spatial import cKDTree  # only curved surfaces need it
 
     _, near = cKDTree(nodes).query(nodes, k=min(_BESIDE, len(nodes)))
@@ -253,7 +256,8 @@ def _normals(nodes: FloatArray, axis: int) -> FloatArray:
 
 
 def _mass(rigid: FloatArray) -> float:
-    """Mass [kg] by rigid modes (n, r) of unit modal mass, NaN where they make no even motion."""
+    """Return the mass [kg] from rigid modes (n, r) of unit modal mass, NaN if they have no uniform
+    motion."""
     # Six digits of a file leave directions that are rounding, and would be light.
     shares, *_ = np.linalg.lstsq(rigid, np.ones(len(rigid)), rcond=1e-4)
     is_even = rigid.size > 0 and np.abs(rigid @ shares - 1).max() < 0.05
@@ -301,10 +305,10 @@ def is_within(outline: Rings, points: FloatArray) -> NDArray[np.bool_]:
 
 
 def homogeneous(shapes: SurfaceShapes, mass: float | None) -> tuple[float, float, float]:
-    """Modulus [Pa], density [kg/m³] and loss factor of the plate that stands for a surface.
+    """Return modulus [Pa], density [kg/m³] and loss factor of a surface's equivalent plate.
 
-    Its modes are N(f) = 1.25 S / 2 sqrt(mu / D) f. mass [kg]: stated, None where the modes have
-    it; raises InputError where both contradict each other, and without either.
+    Its modes are N(f) = 1.25 S / 2 sqrt(mu / D) f. mass [kg]: as stated, None to use that of the
+    modes; raises InputError if both contradict each other, and without either.
     """
     own = shapes.mass
     if mass is None and math.isnan(own):
@@ -314,7 +318,7 @@ def homogeneous(shapes: SurfaceShapes, mass: float | None) -> tuple[float, float
         )
     if mass is not None and abs(own / mass - 1) > _SAME_MASS:
         raise InputError(
-            f"mass must be that of the modes, {own:.4g} kg, got {mass:.4g} kg; check the units of "
+            f"mass must match the modes, {own:.4g} kg, got {mass:.4g} kg; check the units of "
             "the file and its modal masses, or leave it out"
         )
     elastic, area = shapes.frequencies[shapes.rigid :], float(np.prod(shapes.size))
@@ -329,7 +333,7 @@ def homogeneous(shapes: SurfaceShapes, mass: float | None) -> tuple[float, float
 
 
 def deviating_losses(shapes: SurfaceShapes, loss_factor: float) -> tuple[tuple[float, float], ...]:
-    """Deviations of the lowest elastic modes whose damping is not a plate's (`mode_deviations`)."""
+    """Return damping differences of the lowest elastic modes from a plate's (`mode_deviations`)."""
     ratios = shapes.damping_ratios[shapes.rigid :][:MAX_DEVIATING]
     known = np.where(ratios > 0, 2 * ratios, loss_factor) / max(loss_factor, 1e-12)
     if np.abs(known - 1).max() < _SAME_LOSS:

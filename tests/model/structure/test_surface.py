@@ -362,5 +362,5 @@ def test_odd_modes_are_read_or_refused_with_their_place(
         for command in ("plate convergence {0}", "rig identify {0} -o {0}.new --measured {0}"):
             assert run_era(command.format(rig).split()) == 2
             assert (
-                "surface by its modes, which has no thickness, size or" in capsys.readouterr().err
+                "surface given by modes, which has no thickness, size or" in capsys.readouterr().err
             )

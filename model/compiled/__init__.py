@@ -1,1 +1,1 @@
-"""C for what numpy is slow at: many small matrices; all of it has a counterpart in numpy."""
+"""C kernels for batches of small matrices, each with a NumPy reference implementation."""

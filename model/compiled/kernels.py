@@ -1,9 +1,9 @@
-"""The kernels in C: their structures, and the library for this processor.
+"""C kernels: their structures, and the library for this processor.
 
-`kernels` loads the library from the wheel, or compiles it at first use by the machine's compiler
-and keeps it in the user's cache folder. It runs within this process, so it is loaded only if no
-other user could have written it and if it is complete: the SHA-256 of its content is in a file
-beside it. The structures are those of the kernels' headers, which describe their fields.
+`kernels` loads the library from the wheel, or compiles it at first use with the machine's compiler
+and caches it in the user's cache folder. It runs within this process, so it is loaded only if no
+other user could have written it and if it is complete: the SHA-256 of its content is in a second
+file. The kernels' headers describe the fields of the structures.
 """
 
 import ctypes
@@ -132,7 +132,7 @@ class GivenRaster(Structure):
 
 
 class GivenQuestion(Structure):
-    """Fingers, and what each is to feel: `question` in C, without its trailing results."""
+    """Fingers and their requests: `question` in C, without its trailing results."""
 
     _fields_ = [
         *_fields(i="contents bands fingers quiet_count candidates combinations", f="apart"),
@@ -142,7 +142,7 @@ class GivenQuestion(Structure):
 
 
 class FoundTones(Structure):
-    """Tones, and what is felt of them: `answered` in C."""
+    """Tones and their sensations: `answered` in C."""
 
     _fields_ = _fields(i="is_apart", p="rows figures")
 
@@ -183,7 +183,7 @@ def compile_library(
             f"({compiler or ', '.join(_COMPILERS)}); install one (Debian: apt install gcc "
             "libc6-dev; macOS: xcode-select --install)"
         )
-    # In a folder of its own, since threads and processes may compile the same library at once.
+    # A separate folder, since threads and processes can compile the same library simultaneously.
     with tempfile.TemporaryDirectory(prefix=".", dir=path.parent) as folder:
         made = Path(folder) / path.name
         _compile(made, compiler.split(), sources, flags=flags, what=what)
@@ -242,8 +242,8 @@ def kept_library(
 ) -> ctypes.CDLL:
     """Load the library of C sources; compile it if the cache has none that is safe and complete.
 
-    If the cache cannot be used, it is compiled to a temporary folder, for this process only. what:
-    its name in messages. Raises InputError.
+    If the cache cannot be used, compile to a temporary folder, for this process only. what: name of
+    the library in messages. Raises InputError.
     """
     sources = list(sources)
     # The C library and its version, if known: glibc2.36.
@@ -272,8 +272,8 @@ def kept_library(
 def check_own(path: Path, *, sticky: bool = False) -> None:
     """Raise PermissionError if a user other than this one and root could write a file or folder.
 
-    sticky: whether others may write to a folder with the sticky bit, where they cannot rename the
-    files of others.
+    sticky: whether others can write to a folder with the sticky bit, in which they cannot rename
+    other users' files.
     """
     if not hasattr(os, "geteuid"):  # Windows: its cache folders are the user's own
         return
@@ -362,9 +362,10 @@ class Version:
 
     name: str
     lanes: int
-    """Cases at once: as many as fill a register of the processor; more are many times slower."""
+    """Cases processed together: as many as fill a register of the processor; more are many times
+    slower."""
     features: Mapping[str, str]
-    """Compiler flag of each feature, by numpy's name of it."""
+    """Compiler flag per feature, by numpy's feature name."""
 
     @property
     def file(self) -> str:
@@ -403,7 +404,7 @@ def processor_features() -> AbstractSet[str]:
 
 @dataclass(frozen=True, eq=False)
 class Kernels:
-    """The library, and the number of cases that its kernels take at once."""
+    """The library, and the number of cases per kernel call."""
 
     library: ctypes.CDLL
     lanes: int
@@ -427,7 +428,7 @@ def kernels() -> Kernels | None:
 
 
 WITHOUT_KERNELS = "answers take 6 to 19 times as long without kernels in C"
-"""Measured for steady vibrations of one finger to twenty that share, beside 0 to 6 quiet ones.
+"""Measured for steady vibrations of one to twenty sharing fingers, with 0 to 6 quiet fingers.
 
 On four and on twelve ERAs; clicks take 1.3 times as long.
 """

@@ -22,7 +22,7 @@ from registry.files import read_regular
 
 _MAX_SIZE = 1 << 20  # bytes
 MAX_PROBLEMS = 50
-"""Number of problems of one file that are reported; with more it is the wrong kind of file."""
+"""Maximum number of reported problems per file; with more it is the wrong kind of file."""
 
 IF_EMPTY = "`era config init` writes one to begin with"
 """Remedy for an empty configuration file."""
@@ -49,9 +49,9 @@ class ConfigError(InputError):
     """A configuration file that cannot be used, with every problem that was found in it."""
 
     def __init__(self, source: str, problems: Sequence[ConfigProblem]) -> None:
-        """Say the problems, `FILE:LINE: key: what is wrong; what to do`, one on a line.
+        """Format the problems, one per line: `FILE:LINE: key: problem; remedy`.
 
-        Of more than MAX_PROBLEMS the first ones.
+        Only the first MAX_PROBLEMS are included.
         """
         self.source = source
         in_order = sorted(problems, key=lambda problem: problem.line or 0)
@@ -75,9 +75,9 @@ class Document:
     text: str
     data: dict[str, Value]
     find_lines: Callable[[], Mapping[KeyPath, int]] = field(default=dict, compare=False)
-    """Finds the line of every key and list entry by its path, for errors; of no text none."""
+    """Finds the line of every key and list entry by path, for errors; empty without text."""
     over: "Document | None" = None
-    """The file alone, where `data` are its keys over those of the file that it names as `base`."""
+    """The file alone, if `data` are its keys merged over those of its `base`."""
 
     @cached_property
     def lines(self) -> Mapping[KeyPath, int]:
@@ -86,7 +86,7 @@ class Document:
 
     @property
     def whole_text(self) -> str:
-        """Text with all of its keys, those of a base as well."""
+        """Text with all of its keys, including those of a base."""
         return self.text or data_text(self.data)
 
     def value(self, path: KeyPath) -> Value:
@@ -106,7 +106,7 @@ class Document:
 
     def beside(self, name: str) -> Path:
         """The path of a file that this one names, relative to its folder; `~` is the home."""
-        # Path.expanduser raises where there is no such home; this leaves the name as it is.
+        # Path.expanduser raises without a home; this leaves the name unchanged.
         return Path(self.source).parent / os.path.expanduser(name)  # noqa: PTH111
 
     def problem(self, path: KeyPath, message: str) -> ConfigProblem:
@@ -240,9 +240,9 @@ _NO_KEY = re.compile(r"\s*[\w.-]+(:(?![\s/]|$)|\N{FULLWIDTH COLON})")  # `key:va
 
 
 def _remedy(text: str, line: int) -> str:
-    """What to do about a line that looks right: a directive, a blank that is no space, `key:value`.
+    """Suggest a remedy for a line that looks right: a directive, a non-breaking space, `key:value`.
 
-    The parser sees some of these at the next line that is not empty.
+    The parser reports some of these at the next line that is not empty.
     """
     lines = text.splitlines()[:line]
     if len(lines) == line and lines[-1].startswith("%"):
@@ -280,14 +280,16 @@ def _missing_comma(text: str, mark: Any) -> tuple[int, str]:
     )
 
 
-_LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # libyaml where it is there
-_NOT_ALLOWED = yaml.reader.Reader.NON_PRINTABLE  # libyaml counts bytes, and knows other characters
+_LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # libyaml if available
+_NOT_ALLOWED = (
+    yaml.reader.Reader.NON_PRINTABLE
+)  # libyaml counts bytes, and accepts other characters
 
 
 class _PlainReader:
-    """Makes values of events, which are checked before: nothing expands or gets constructed.
+    """Builds values from events, after checking them: nothing is expanded or constructed.
 
-    lines: of every key and list entry by its path; repeated: keys that are given twice.
+    lines: of every key and list entry by path; repeated: duplicate keys.
     """
 
     def __init__(self, source: str, text: str) -> None:
@@ -396,7 +398,7 @@ class _PlainDumper(yaml.SafeDumper):
         return self.represent_scalar("tag:yaml.org,2002:str", value, style=style)
 
     def ignore_aliases(self, data: Any) -> bool:
-        """Write a value that stands twice out twice."""
+        """Write repeated values in full."""
         return True
 
 

@@ -1,8 +1,9 @@
-"""Values of users and their checks: quantities with units, sections of files, options, shapes.
+"""User input and its validation: quantities with units, sections of files, options, shapes.
 
 A quantity is a number with a unit, such as `12 in`, `1.5 mm` or `70 GPa`, or a bare SI number.
-Sections of configuration files are pydantic models, whose problems are all reported at once. The
-command line gives positions, counts and frequency ranges as text. Shapes are regions of the plate.
+Sections of configuration files are pydantic models; all problems of a file are reported together.
+The command line gives positions, counts and frequency ranges as text. Shapes are regions of the
+plate.
 """
 
 import math
@@ -59,7 +60,7 @@ class Section(BaseModel):
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
 
 
-_MAX_NAME = 100  # characters; what is longer is no misspelt word
+_MAX_NAME = 100  # characters; longer words are not spelling errors
 
 SectionT = TypeVar("SectionT", bound=Section)
 PartT = TypeVar("PartT", bound=Section)
@@ -78,7 +79,7 @@ class Quantity:
     at_most: float = float("inf")
     below: float = float("inf")
     word: str = ""
-    """A word that may stand in place of a number, and is kept as it is."""
+    """Word that is accepted instead of a number, and kept unchanged."""
 
     def read(self, value: object) -> float:
         """Convert to SI units; raises ValueError for another dimension or a value out of bounds."""
@@ -148,7 +149,7 @@ def quantities(field: FieldInfo) -> list[Quantity]:
 
 
 class ByKind:
-    """Annotation of a union of sections, one of which a mapping's `kind` chooses, or the first."""
+    """Annotation of a union of sections; `kind` selects one, by default the first."""
 
     def __get_pydantic_core_schema__(
         self, source: Any, handler: GetCoreSchemaHandler
@@ -182,7 +183,8 @@ def _kinds(section: type[Section]) -> tuple[str, ...]:
 
 
 def section_by_kind(sections: Sequence[type[PartT]], value: object) -> type[PartT]:
-    """The section whose `kind` a mapping has; the first of them for any other, or none."""
+    """Return the section for the `kind` of a mapping; the first one for an unknown or missing
+    kind."""
     given = value.get("kind") if isinstance(value, dict) else None
     return next((each for each in sections if given in _kinds(each)), sections[0])
 
@@ -281,7 +283,7 @@ def _problem(
                 quotes=_in_quotes(details),
                 entries=counted(bound, "entry", plural="entries"),
                 characters=counted(bound, "character"),
-                # where it is known to be too many, it is not counted
+                # too many entries are not counted
                 count=len(given) if isinstance(given, list | dict) else 0,
             )
         case _:
@@ -292,7 +294,7 @@ def _problem(
 
 
 def _without_value(root: type[Section], path: KeyPath, document: Document) -> str:
-    """What to write at a key for no value, "" where there must be one."""
+    """Return the text for "no value" at a key, "" if a value is required."""
     section = _section_at(root, path[:-1], document)  # or the type of a list or mapping
     field = getattr(section, "model_fields", {}).get(path[-1])
     if field is None or field.is_required():
@@ -317,7 +319,7 @@ _MESSAGES = {
     "too_short": "must have at least {entries}, got {count}",
     "too_long": "must have at most {entries}, got {count}",
 }
-"""Messages by pydantic's kinds of errors, of which it gives further values."""
+"""Messages by pydantic's error kinds, with their placeholders."""
 
 
 def _in_quotes(details: ErrorDetails) -> str:
@@ -339,7 +341,7 @@ def _shown(details: ErrorDetails) -> str:
 
 
 def _section_at(root: type[Section], path: KeyPath, document: Document) -> type[Section]:
-    """The section at a path, of several kinds that of the document."""
+    """Return the section at a path; if it has several kinds, the one in the document."""
     kind: Any = root
     for number, part in enumerate(path, start=1):
         if get_origin(kind) in (dict, list):
@@ -358,7 +360,7 @@ def _section_at(root: type[Section], path: KeyPath, document: Document) -> type[
 _Point: TypeAlias = tuple[float, float]
 
 _CIRCLE_CORNERS = 60  # a multiple of 4
-_TOLERANCE = 1e-9  # m; a point this close to a side lies on it
+_TOLERANCE = 1e-9  # m; a point this close to a side is on it
 
 
 @dataclass(frozen=True)
@@ -427,7 +429,7 @@ class Circle:
 
 @dataclass(frozen=True)
 class Polygon:
-    """A polygon by its corners; crossing sides follow the even-odd rule."""
+    """Polygon given by its corners; crossing sides follow the even-odd rule."""
 
     points: tuple[_Point, ...]
 
@@ -485,7 +487,7 @@ RegionShape: TypeAlias = Rectangle | Circle | Polygon
 
 
 def _is_on_side(x: float, y: float, start: _Point, end: _Point) -> bool:
-    """Whether a point lies on a side, within a nanometre."""
+    """Return whether a point is on a side, within a nanometre."""
     length = math.dist(start, end)
     if length == 0:
         return (x, y) == start
@@ -514,7 +516,7 @@ class CircleSection(Section):
 
 
 class ShapedSection(Section):
-    """A section of one shape."""
+    """Section with exactly one shape."""
 
     rectangle: RectangleSection | None = None
     circle: CircleSection | None = None
@@ -531,7 +533,8 @@ class ShapedSection(Section):
         return Polygon(tuple(self.polygon or ()))
 
     def shape_problem(self, sides: _Point | None) -> tuple[tuple[str, ...], str] | None:
-        """Where and why it has not one shape, on a plate of these sides [m]; None if it has.
+        """Return where and why the section lacks a single shape on a plate of these sides [m], else
+        None.
 
         sides: None for any plate.
         """

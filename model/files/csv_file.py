@@ -88,7 +88,7 @@ class CsvLine:
         at_least: float = -MAX_VALUE,
         at_most: float = MAX_VALUE,
     ) -> float:
-        """The number in a column, or what stands for a column that the file does not have.
+        """Return the number in a column, or the default for a missing column.
 
         Raises InputError for anything but a number within these bounds.
         """
@@ -121,14 +121,14 @@ def read_lines(
     """Yield the lines of a file whose first line names its columns, in any order.
 
     Columns are separated by commas, semicolons or tabs. With semicolons and tabs a decimal comma is
-    accepted unless some number has a decimal point: the comma may then separate thousands. Empty
-    lines, remarks above the names (after *, #, ! or //), empty cells behind the last column and
-    unknown columns are skipped. instead: columns that replace the last ones if the file has the
+    accepted unless some number has a decimal point, since the comma can then separate thousands.
+    Empty lines, remarks above the names (after *, #, ! or //), empty cells behind the last column
+    and unknown columns are skipped. instead: columns that replace the last ones if the file has the
     first of them.
 
     The file is read line by line: one that is damaged takes no more memory than its first lines.
-    Raises InputError with file and line for missing and repeated columns, names that may be
-    misspelt, lines of another length, and a file without any.
+    Raises InputError with file and line for missing and repeated columns, names that are probably
+    misspelt, lines of another length, and a file without lines.
     """
     skipped, separator = _head_of(path)
     has_decimal_comma = separator != "," and not _has_points(path, skipped)
@@ -207,7 +207,7 @@ def _rows_from(path: Path, skipped: int) -> Iterator[str]:
 
 
 def _text_rows(path: Path) -> Iterator[str]:
-    """All rows of a file without their ends; raises InputError for what is no text."""
+    """Yield all rows of a file without line ends; raises InputError for a binary file."""
     with open_measured(path) as file, text_stream(file) as stream:
         try:
             for number, row in enumerate(lines_of(stream, _MAX_LINE)):

@@ -28,16 +28,16 @@ from model.files.uff import DatasetBlock, blocks, numbers_in, read_nodes, rows_o
 
 _SHELLS = frozenset(range(40, 100)) | {171, 172}  # plane stress, plates, membranes, thin shells
 _BEAMS = frozenset(range(11, 38))  # whose elements have a further row
-# Types of analysis. Complex ones of the first order have a modal A, those of the second a mass.
+# Analysis types. Complex modes of first order have a modal A, those of second order a mass.
 _NORMAL_MODES, _FIRST_ORDER, _SECOND_ORDER = 2, 3, 7
 _MODES = (_NORMAL_MODES, _FIRST_ORDER, _SECOND_ORDER)
 _DISPLACEMENT = (0, 8)  # unknown, displacement
 _MAX_COMPLEX = 0.3  # imaginary part that a turned shape may have, relative to its real part
 _MAX_ROUNDING = 1.0  # Hz; below 0, of the frequencies of rigid-body modes
 _VALUES_A_ROW = 6
-_MAX_REALS = 14  # numbers of a mode before its shape; those that are left out are 0
+_MAX_REALS = 14  # numbers of a mode before its shape; missing ones are 0
 _HEAD = {55: (9, 6), 2414: (14, 9)}
-"""Rows before the first node of a mode, and of these the row of its types, by dataset."""
+"""Rows before the first node of a mode, and the row with its types, by dataset."""
 
 _OPTIONAL = {"damping_ratios", "places", "faces"}
 _ARRAYS = {
@@ -62,13 +62,13 @@ class ModeShapes:
     """Displacements (r, n, 3), or (r, n) along the normal, [1/sqrt(kg)]."""
 
     damping_ratios: FloatArray
-    """(r,), NaN where the file has none."""
+    """(r,), NaN if missing in the file."""
 
     faces: Sequence[Sequence[int]] = ()
-    """Nodes of each face in turn, by their rows."""
+    """Nodes of each face in order, by row."""
 
     places: FloatArray | None = None
-    """Nodes in coordinates of touches (n, 2) [m]; None where they are projected."""
+    """Nodes in touch coordinates (n, 2) [m]; None if they are projected."""
 
 
 def read_modes(path: Path, content: bytes) -> ModeShapes:
@@ -256,7 +256,7 @@ def _read_faces(path: Path, block: DatasetBlock) -> Iterator[list[int]]:
 
 
 def _read_mode(path: Path, block: DatasetBlock) -> _Mode | None:
-    """Read a dataset 55 or 2414; None for one that is no mode."""
+    """Read a dataset 55 or 2414; None if it is not a mode."""
     place, rows = f"{path}:{block.line}", block.rows
     head, types = _HEAD[block.kind]
     if len(rows) <= head + 1:
@@ -306,13 +306,13 @@ def _read_mode(path: Path, block: DatasetBlock) -> _Mode | None:
 
 @dataclass(frozen=True)
 class _Modal:
-    """Modal parameters of one dataset."""
+    """Modal parameters of a dataset."""
 
     frequency: float
     """Natural frequency [Hz]."""
 
     mass: complex
-    """Modal mass; a shape divided by its root is of unit modal mass."""
+    """Modal mass; a shape divided by its square root has unit modal mass."""
 
     damping_ratio: float
     """Share of critical damping, NaN without one."""
@@ -322,7 +322,7 @@ class _Modal:
 
 
 def _normal_mode(place: str, kind: int, reals: Sequence[float]) -> _Modal:
-    """Parameters of a normal mode; its mass is 1 where the file has none."""
+    """Return the parameters of a normal mode; its mass is 1 if missing in the file."""
     if kind == 55:
         frequency, mass, viscous, hysteretic = reals[:4]
     else:
@@ -337,10 +337,10 @@ def _normal_mode(place: str, kind: int, reals: Sequence[float]) -> _Modal:
 
 
 def _complex_mode(place: str, kind: int, analysis: int, reals: Sequence[float]) -> _Modal:
-    """Parameters of a complex mode by its pole and its modal A, or its modal mass.
+    """Return the parameters of a complex mode from its pole and its modal A, or its modal mass.
 
-    A of a shape psi at a pole is psi' (2 pole M + C) psi. With proportional damping this is
-    2j Im(pole) times the modal mass. Units of A are those of mass over time.
+    For a shape psi at a pole, A is psi' (2 pole M + C) psi. With proportional damping this is 2j
+    Im(pole) times the modal mass. The units of A are mass per time.
     """
     if kind == 55 and analysis == _SECOND_ORDER:
         raise InputError(
@@ -384,7 +384,7 @@ def _values(path: Path, block: DatasetBlock, head: int, count: int) -> tuple[lis
 
 
 def _real(place: str, shape: ComplexArray) -> FloatArray:
-    """A complex shape turned by the phase that leaves least of it imaginary."""
+    """Rotate a complex shape to the phase with the smallest imaginary part."""
     turned = shape * np.exp(-0.5j * np.angle((shape**2).sum()))
     if np.abs(turned.imag).max() > _MAX_COMPLEX * np.abs(turned.real).max():
         raise InputError(

@@ -1,4 +1,4 @@
-"""Checks of output paths: ending, folder, and what may be replaced."""
+"""Check output paths: suffix, folder, and whether a file can be replaced."""
 
 from pathlib import Path
 

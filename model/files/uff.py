@@ -29,8 +29,8 @@ BYTE_ORDER_MARKS = (b"\xef\xbb\xbf", *_UTF_16)
 
 _MAX_BYTES = 512 << 20
 _HEADER_LINES = 12  # of dataset 58, its number first
-_NOTE = 2  # of these, see `Function`
-# Of these, by name: line, first and last column, and how its text is read.
+_NOTE = 2  # of the note lines, see `Function`
+# Header fields by name: line, first and last column, and conversion of the text.
 _FIELDS = {
     "func_type": (6, 0, 5, int),
     "rsp_ent_name": (6, 31, 41, str),
@@ -115,7 +115,7 @@ def write_universal(path: Path, content: Universal) -> None:
     """Write nodes, units and functions in ASCII, double precision (12 digits), atomically.
 
     An evenly spaced abscissa has six digits for its step. Raises OSError, and InputError for
-    numbers that are not finite, for which pyuff would write zeros.
+    numbers that are not finite, which pyuff would write as zeros.
     """
     import pyuff
 
@@ -350,7 +350,7 @@ def _function(path: Path, block: DatasetBlock) -> Function:
 
 
 def _bytes_of(path: Path, block: DatasetBlock, found: Mapping[str, Any], count: int) -> FloatArray:
-    """So many numbers of a binary record, or all that it has."""
+    """Return up to `count` numbers of a binary record."""
     data = block.content.split(b"\n", _HEADER_LINES)[-1]
     size = 8 if found["ord_data_type"] in (4, 6) else 4
     if data[count * size :].strip(b"\0 \t\r\n"):

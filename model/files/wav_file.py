@@ -13,9 +13,9 @@ from model.arrays import FloatArray
 from model.errors import InputError
 
 _PCM, _FLOAT, _EXTENSIBLE = 1, 3, 0xFFFE  # formats; the last has another one in an extension
-_EXTENDED = 24  # where that is
+_EXTENDED = 24  # position of the format in an extended header
 _LONG = b"ds64"  # a chunk of RF64 with sizes of 64 bits
-_UNKNOWN_SIZE = 0x7FFF0000  # and larger: of what was not known yet
+_UNKNOWN_SIZE = 0x7FFF0000  # or larger: written before the size is known
 _MAX_SAMPLE = 1e3  # times full scale
 _KINDS = {
     (_PCM, 1): "u1",
@@ -26,11 +26,11 @@ _KINDS = {
     (_FLOAT, 4): "f4",
     (_FLOAT, 8): "f8",
 }
-"""Types of samples by format and size [bytes], in arrays where no type has that size a larger."""
+"""Sample types by format and size [bytes]; the array type is the next larger one."""
 
 
 def samples_of(content: bytes) -> tuple[int, FloatArray]:
-    """The rate [Hz] of a file, and samples (n, channels) of which 1 is full scale.
+    """Return the sample rate [Hz] of a file, and samples (n, channels) relative to full scale.
 
     Raises InputError, which does not name the file.
     """
@@ -49,7 +49,7 @@ def samples_of(content: bytes) -> tuple[int, FloatArray]:
     if not raw.size:
         raise InputError("has no samples")
     samples = _scaled(raw.ravel().view(f"{order}{kind}")).reshape(-1, channels)
-    is_sample = np.abs(samples).max(axis=1) <= _MAX_SAMPLE  # not for what is no number
+    is_sample = np.abs(samples).max(axis=1) <= _MAX_SAMPLE  # False for NaN
     if not is_sample.all():
         raise InputError(f"sample {int(is_sample.argmin())} must be -1 to 1, or not far beyond")
     return rate, samples
@@ -83,7 +83,7 @@ def _refused(why: str) -> InputError:
 
 
 def _scaled(given: Any) -> FloatArray:
-    with np.errstate(all="ignore"):  # of float what is too large or no number is refused then
+    with np.errstate(all="ignore"):  # floats that are too large or not numbers are rejected below
         plain = given.astype(np.float32)
     if given.dtype == np.uint8:
         return np.asarray((plain - 128) / 128)

@@ -1,13 +1,13 @@
-"""Modes of a plate in Legendre polynomials, and the compliance that these do not resolve.
+"""Modes of a plate in Legendre polynomials, and the unresolved compliance.
 
 The plate has one layer or several, with the air behind it, and is solved one symmetry class at a
 time. Displacements along the plate follow the deflection (`model.spectral.polynomials.follow`):
 only the deflection and the air vibrate. Moduli that depend on the frequency or lose energy, and the
-friction of air, are taken for every mode at its own natural frequency: the complex mode is solved
-for in the space of the lowest modes of three real plates, whose moduli span those of the
-frequencies in question. Its imaginary eigenvalue is its loss; at other frequencies the mode keeps
-its shape, and has another eigenvalue. Modes beyond them are those of the plate at the middle
-frequency. `SpectralMesh` chooses the degrees of the polynomials for a frequency.
+friction of air, are evaluated for every mode at its own natural frequency: the complex mode is
+solved in the space of the lowest modes of three real plates, whose moduli span the frequency range.
+Its imaginary eigenvalue is its loss; at other frequencies the mode keeps its shape and has another
+eigenvalue. Higher modes belong to the plate at the middle frequency. `SpectralMesh` chooses the
+degrees of the polynomials for a frequency.
 
 At a point, Legendre polynomials up to degree p resolve waves along x up to the wavenumber a = 2 (p
 - 0.9) / (L s), s = sqrt(1 - (2 x / L - 1)²), and b along y. The compliance missing under a point
@@ -15,10 +15,10 @@ force is the infinite plate's in all shorter waves, the mean over all directions
 
     1 / (4 pi D k²) + ln(k_max / k) / (2 pi S),    k = min(a / |cos phi|, b / |sin phi|),
 
-D the flexural rigidity, of a board that towards phi, and S the shear rigidity. The square of a
+with flexural rigidity D (for a board, in direction phi) and shear rigidity S. The square of a
 Legendre polynomial oscillates along the plate, and so does the compliance missing in all higher
-ones: at x = L (1 - cos t) / 2 there is 1 + o times as much in all waves that end at a, so that a is
-to be divided by sqrt(1 + o),
+ones: at x = L (1 - cos t) / 2 it is 1 + o times as large in all waves that end at a, so a is
+divided by sqrt(1 + o),
 
     o = cos(2 (p - 1) t) / ((p - 1) sin t).
 
@@ -74,7 +74,7 @@ from model.structure.surface import EDGES, LEAST_KNOWN, Surface
 NODES = 12
 """Frequencies of a band at which modes state their stiffness."""
 
-_SPAN = 1.5  # of the moduli of the three plates where only losses matter
+_SPAN = 1.5  # of the moduli of the three plates if only losses matter
 _DEPENDENT = 1e-10  # share of the largest below which directions of the space are left out
 _STEPS = 12  # of the iteration for a complex mode, which takes three or four
 
@@ -86,8 +86,8 @@ class SpectralClass:
     """Modes of a symmetry class of m polynomials of the deflection.
 
     eigenvalues omega² (r,) and losses (r,) [rad²/s²], the imaginary part beyond the plate's loss
-    factor times omega²; below zero of air that vibrates by itself, which has less; dispersion (k,
-    r): what is to be added to them at the frequencies of the band; truncated (t,): eigenvalues of
+    factor times omega²; negative for vibration of the air itself, which has smaller losses;
+    dispersion (k, r): change of both at the frequencies of the band; truncated (t,): eigenvalues of
     the other modes; shapes (m, r + t): polynomials of the deflection, of all.
     """
 
@@ -266,9 +266,10 @@ class _Space:
         self._starts = basis.T @ whole[:, : last + 1]
 
     def mode(self, number: int, eigenvalue: float) -> tuple[complex, FloatArray, ComplexArray]:
-        """Complex eigenvalue [rad²/s²] of a mode near a real one, and its deflection (m,).
+        """Return the complex eigenvalue [rad²/s²] of a mode near a real one, and its deflection
+        (m,).
 
-        And what it is at the frequencies of the band, in its own shape, (k,).
+        Also its eigenvalue at the frequencies of the band, for the same shape, (k,).
         """
         value, start = complex(eigenvalue), self._starts[:, number].astype(complex)
         mode = start
@@ -320,10 +321,10 @@ _TO_CENTROID = 0.5  # where a disc that is cut by an edge acts, between its cent
 _LEAST_SINE = 1.5  # times 1 / p: nearest to its end that a polynomial resolves ever finer
 _DIRECTIONS = (np.arange(32) + 0.5) * np.pi / 64
 _COS2, _SIN2 = np.cos(_DIRECTIONS) ** 2, np.sin(_DIRECTIONS) ** 2
-_UNCERTAIN = 0.2  # share by which it may be higher: twice its error, for the estimate of errors
+_UNCERTAIN = 0.2  # relative; twice the error of the estimate
 _ON_FOOT = 0.5  # least share of a point's that is taken for a disc, which an edge may cut
-# k d beyond which forces share no unresolved wave: the fourth zero of `_decay`. What they share
-# fades towards it, since a field that ends in a step or a kink cannot be interpolated.
+# k d beyond which forces share no unresolved wave: the fourth zero of `_decay`. The shared
+# compliance fades towards it, since a field with a step or a kink cannot be interpolated.
 _FAR = 13.603179753989906
 
 # Gauss points of ln t, t = 1 to 100, for integrals over dt / t: footprints leave little beyond.
@@ -348,7 +349,8 @@ def local_compliance(
 class UnresolvedCompliance:
     """At n footprints [m] (n, 3): compliance of a point force in bending and in shear [m/N] (n,).
 
-    wavenumber [1/m] (n,): where it begins; decade [m/N] (n,): of shear in ten times shorter waves.
+    wavenumber [1/m] (n,): lower limit of unresolved waves; decade [m/N] (n,): shear compliance of
+    ten times shorter waves.
     """
 
     footprints: FloatArray
@@ -405,9 +407,9 @@ def edge_compliance(plate: Plate, side: float, degrees: IntArray, foot: float) -
 def uncertain_compliance(
     plate: Plate, own: UnresolvedCompliance, other: UnresolvedCompliance
 ) -> FloatArray:
-    """By how much the unresolved compliance may be too low [m/N] (n, m).
+    """Return the possible error of the unresolved compliance [m/N] (n, m).
 
-    A share of it, and for a point, of which shear has no limit, ten times shorter waves.
+    A fraction of it, plus, for a point (unlimited in shear), ten times shorter waves.
     """
     same = (own.footprints[:, None] == other.footprints).all(axis=2)
     points = same & (own.footprints[:, 2] == 0)[:, None]
@@ -418,7 +420,10 @@ def uncertain_compliance(
 def unresolved_at(
     plate: Plate, degrees: tuple[int, int], places: FloatArray
 ) -> UnresolvedCompliance:
-    """What polynomials of these degrees do not resolve at footprints (n, 3) or points (n, 2)."""
+    """Return the compliance unresolved by polynomials of these degrees at footprints or points.
+
+    places: footprints (n, 3) or points (n, 2).
+    """
     places = as_footprints(places)
     points = places[:, :2]
     if places[:, 2].any():
@@ -441,7 +446,7 @@ def unresolved_at(
     at_corner = edge.prod(axis=1) / ratio_at_edge**2
     bending = 1 + edge.sum(axis=1) + (_CORNER - 1 - 2 * ratio_at_edge) * at_corner
     mean = wavelengths2.mean(axis=1)
-    softness = D / plate.rigidity_towards(_COS2)  # 1 of what is the same in all directions
+    softness = D / plate.rigidity_towards(_COS2)  # 1 for isotropic materials
     logarithm = np.log(np.maximum(1, wavelengths2 / h**2)).mean(axis=1) / 2
     images = (1 + edge / ratio_at_edge).prod(axis=1)
     return UnresolvedCompliance(
@@ -456,9 +461,11 @@ def unresolved_at(
 def _on_discs(
     k: FloatArray, d: FloatArray, a: FloatArray, b: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """What footprints leave (n,): a share of the compliance in bending, and decades in shear.
+    """Return the effect of footprints (n,): a factor on the compliance in bending, and decades in
+    shear.
 
-    k (n,): where it begins [1/m]; d (n,): distance of two footprints with radii a and b [m].
+    k (n,): lower limit of unresolved waves [1/m]; d (n,): distance of two footprints with radii a
+    and b [m].
     """
     t = np.exp(_LOG_T)
     discs = special.j0(np.multiply.outer(k * d, t))
@@ -604,7 +611,7 @@ class SpectralMesh(Discretisation):
         return type(self)(nx, ny, plate.length, plate.width)
 
     def interpolation_error(self, plate: Plate, frequency: float) -> float:
-        """0: its polynomials are evaluated wherever they are asked for."""
+        """0: polynomials are evaluated at any point."""
         return 0.0
 
 
@@ -618,7 +625,7 @@ class KnownModes(Discretisation):
 
     @classmethod
     def of(cls, plate: Plate, surface: Surface) -> Self:
-        """Those that a file has of a surface; plate: that stands for it."""
+        """Return the modes of a surface file; plate: its equivalent plate."""
         faster = surface.frequency_factor(plate.thickness, plate.material.E)
         highest = faster * surface.frequency
         return cls(surface.count, 1, plate.length, plate.width, highest)
@@ -643,7 +650,7 @@ class KnownModes(Discretisation):
 
     @property
     def shortest_wavelength(self) -> float:
-        """The bending wavelength [m] of its highest mode, by their number."""
+        """Bending wavelength [m] of the highest mode, estimated from the number of modes."""
         return math.sqrt(EDGES * math.pi * self.length * self.width / self.nx)
 
     def highest_frequency(self, plate: Plate) -> float:
@@ -661,7 +668,7 @@ class KnownModes(Discretisation):
                 )
 
     def finer(self) -> Self:
-        """Itself: there is no other solution to compare with."""
+        """Return itself: there is no finer solution."""
         return self
 
     def resolving(self, plate: Plate, frequency: float) -> Self:
@@ -670,7 +677,7 @@ class KnownModes(Discretisation):
         return replace(self, nx=math.ceil(self.nx * known / self.frequency), frequency=known)
 
     def interpolation_error(self, plate: Plate, frequency: float) -> float:
-        """0: splines through its nodes are evaluated wherever they are asked for."""
+        """0: splines through the nodes are evaluated at any point."""
         return 0.0
 
 

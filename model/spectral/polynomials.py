@@ -1,4 +1,4 @@
-"""Functions of x and y over a plate, and its matrices in them, one symmetry class at a time.
+"""Basis functions of x and y over a plate, and its matrices, one symmetry class at a time.
 
 Functions of one direction are Legendre polynomials and boundary layers of a free edge, all of them
 even or odd about the middle. Displacements along a free edge twist the layers of a plate against
@@ -46,7 +46,8 @@ EVEN, ODD = 1, -1
 CLASSES = tuple(product((EVEN, ODD), (EVEN, ODD)))
 """Parity about the middle along x and along y of the four symmetry classes."""
 
-# A boundary layer with less than this share of its norm outside what is there already is left out.
+# Boundary layers with less than this fraction of their norm outside the existing functions are
+# dropped.
 _NEGLIGIBLE = 0.02
 _ALIKE = 1.5  # ratio of decays for which one function serves
 _MAX_LAYERS = 3  # boundary layers of a side
@@ -57,8 +58,8 @@ _PIECES = (0.0, 1.5, 5.0, 14.0)  # of a boundary layer, over its decay
 class EdgedFunctions:
     """Orthonormal functions of x in (0, length) [m], by parity: EVEN or ODD about the middle.
 
-    Those of a parity are its Legendre polynomials up to a degree, ascending, then boundary layers
-    of these decays [1/m] at both ends, orthogonalised.
+    Per parity: Legendre polynomials up to a degree, ascending, then boundary layers with these
+    decay constants [1/m] at both ends, orthogonalised.
     """
 
     length: float
@@ -200,9 +201,9 @@ def _polynomials(x: FloatArray, length: float, degree: int) -> FloatArray:
 def edge_decays(section: CrossSection, along: int) -> tuple[float, ...]:
     """Decays [1/m] of the boundary layers of a laminate's free edge, the widest first.
 
-    along: 0 for those along x, of edges across it, 1 for those along y. Displacements along an edge
-    twist the layers against each other: twist v'' = slip v over the distance from it. Of one
-    homogeneous layer k = sqrt(10) / h, of a board times sqrt(G23 / G12) or sqrt(G13 / G12).
+    along: 0 for decay along x, at edges across it, 1 for decay along y. Displacements along an edge
+    twist the layers against each other: twist v'' = slip v over the distance from it. For a
+    homogeneous layer k = sqrt(10) / h, for a board times sqrt(G23 / G12) or sqrt(G13 / G12).
     """
     slip, twist = np.real(section.slip[1 - along]), np.real(section.twist)
     squares = linalg.eigh(slip, twist, eigvals_only=True)[1:]
@@ -215,7 +216,7 @@ def edge_decays(section: CrossSection, along: int) -> tuple[float, ...]:
 
 @dataclass(frozen=True, eq=False)
 class ClassFunctions:
-    """Functions along x and y of one symmetry class, for a number of interfaces.
+    """Functions along x and y of a symmetry class, for a number of interfaces.
 
     of_w, of_x, of_y: numbers of functions along x and y of w and of one interface's u_x and u_y.
     """
@@ -355,9 +356,9 @@ class AirMotion:
 
 
 def air_motion(of: ClassFunctions, gap: AirGap) -> AirMotion:
-    """Air of one symmetry class, twice as many shapes along each side as polynomials.
+    """Air of a symmetry class, with twice as many shapes along each side as polynomials.
 
-    Where nothing varies along y, a strip of infinite width, the air flows along x only.
+    If nothing varies along y (a strip of infinite width), the air flows only along x.
     """
     a, b = of.parity
     along_x, kx = _shapes(of.x.points, of.x.length, of.x.degree, a, closed=gap.closed)

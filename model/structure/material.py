@@ -1,14 +1,15 @@
 """A material, and the catalogue of materials and of exciters by name, each with its source.
 
-An installed package adds a material by an entry point of the group `era_haptics.materials` that
-leads to a `KnownMaterial` of that name; rig files, their schema and `era plate materials` follow.
+An installed package adds a material through an entry point of the group `era_haptics.materials`
+that refers to a `KnownMaterial` with that name; rig files, their schema and `era plate materials`
+then include it.
 
 Moduli of plywood are those of its veneers: E of the grain where it runs along, and none across it
 (Handbook of Finnish Plywood), so that in bending, with the cross veneers between heights a and b
 from the middle, E2 h³ = 8 E sum (b³ - a³) and E1 + E2 = E.
 
-No maker's sheet of an exciter could be opened: values are second hand, or assumed where no source
-gives any. A resonance is that of the light coil against the magnet (`free`). Measure your own.
+Manufacturers' data sheets of exciters were not available: values are second-hand, or assumed if
+there is no source. Resonances are `free` (the light coil against the magnet). Measure your own.
 """
 
 from collections.abc import Callable, Mapping
@@ -82,7 +83,7 @@ class Material:
 
     @property
     def plane_stress(self) -> float:
-        """1 - nu_12 nu_21, by which moduli are divided in a plate."""
+        """1 - nu_12 nu_21, the divisor of plate moduli."""
         return 1 - self.nu**2 * self.shares.e2
 
     def turned(self) -> "Material":
@@ -111,18 +112,18 @@ class KnownMaterial:
     """How much they vary between grades and measurements."""
 
     loss_factor: str
-    """Order of the bare material's own (Cremer and Heckl, Structure-Borne Sound, 2nd ed.; of
-    polycarbonate only an order).
+    """Order of magnitude of the bare material's loss factor (Cremer and Heckl, Structure-Borne
+    Sound, 2nd ed.).
     """
 
     own_loss: float = 0.0
-    """Loss factor of a plate by default where it exceeds 1 %, that of a mounted panel's joints."""
+    """Default loss factor of a plate if it exceeds 1 %, the value for a mounted panel's joints."""
 
     by_frequency: tuple[tuple[float, float, float], ...] = ()
-    """Frequency [Hz], factor of E and loss factor, as of a layer; empty for constant ones."""
+    """Frequency [Hz], factor of E and loss factor, as in a layer; empty if constant."""
 
     by_thickness: Callable[[float], Material] | None = None
-    """The material of a board of a thickness [m]; `material` is then that of one thickness."""
+    """Material of a board by thickness [m]; `material` is then the one for a typical thickness."""
 
     by_kelvin: float = 0.0
     """Relative change of its moduli by a kelvin."""
@@ -138,10 +139,11 @@ class KnownMaterial:
         return self.material if self.by_thickness is None else self.by_thickness(thickness)
 
     def by_weather(self, temperature: float, humidity: float) -> float:
-        """Relative change of modulus over density at rest in air of a temperature and a humidity.
+        """Relative change of modulus over density in equilibrium with air at a temperature and
+        humidity.
 
-        Twice that of natural frequencies, from 20 °C and 65 %, the climate of tests of wood
-        (EN 408). temperature [°C]; humidity: relative, 0 to 1.
+        Twice the change of natural frequencies, relative to 20 °C and 65 %, the climate of wood
+        tests (EN 408). temperature [°C]; humidity: relative, 0 to 1.
         """
         import numpy as np  # which plug-ins of materials do without
 
@@ -338,7 +340,7 @@ _MATERIALS: PluginRegistry[KnownMaterial] = PluginRegistry(
 
 
 def material_names() -> tuple[str, ...]:
-    """Names of all materials, those of plug-ins included; no plug-in is loaded."""
+    """Return names of all materials, including plug-ins, without loading these."""
     return _MATERIALS.names()
 
 
@@ -364,7 +366,7 @@ _NET_WEIGHT = f"{_DESIGN}: net weight of 110.9 g less the coil's"
 
 @dataclass(frozen=True)
 class SheetValue:
-    """A value in SI units with its source; lowest and highest where it is assumed."""
+    """Value in SI units with its source; with lowest and highest value if it is assumed."""
 
     value: float
     source: str = ""
@@ -377,7 +379,7 @@ def _assumed(value: float, lowest: float, highest: float) -> SheetValue:
 
 @dataclass(frozen=True)
 class ExciterType:
-    """A type by its name; note: what to know before buying it; values: by key of a rig file."""
+    """Exciter type by name; note: information for buyers; values: by rig-file key."""
 
     name: str
     note: str

@@ -1,17 +1,17 @@
-"""The touch plate: materials, layers, the air behind it, and how it bends.
+"""Touch plate: materials, layers, the air behind it, and bending stiffness.
 
-From the ground up: a material, a sheet of it, a laminate, an air gap, the plate; then stiffness of
-a laminate's section, bending waves in it, and the homogeneous plate that is like it.
+Defines, in this order: sheet, laminate, air gap, plate; then the stiffness of a laminate's section,
+its bending waves, and its equivalent homogeneous plate.
 
-Laminates, such as cover glass on adhesive on a panel. Every layer bends, stretches and shears by
-itself. Displacements along the plate are continuous from layer to layer and linear within each (a
-layerwise theory of first order: Reddy, Mechanics of Laminated Composite Plates and Shells, 2nd ed.,
-ch. 12); the deflection is the same through the thickness. Soft adhesives between stiff layers then
-shear as in the theories of Kerwin (J. Acoust. Soc. Am. 31 (1959) 952) and Mead and Markus (J. Sound
-Vib. 10 (1969) 163), more the shorter the wave. With stiff adhesives it becomes classical laminate
-theory. Layers may also be laid loosely (`Bond.NONE`) and slide on each other without friction.
-Bonded layers are solved as they are (`model.spectral.modes`), loose ones and a single one as the
-homogeneous plate, which also gives wavelengths, meshes and estimates.
+Laminates, such as cover glass on adhesive on a panel. Every layer bends, stretches and shears
+individually. Displacements along the plate are continuous from layer to layer and linear within
+each (a layerwise theory of first order: Reddy, Mechanics of Laminated Composite Plates and Shells,
+2nd ed., ch. 12); the deflection is the same through the thickness. Soft adhesives between stiff
+layers then shear as in the theories of Kerwin (J. Acoust. Soc. Am. 31 (1959) 952) and Mead and
+Markus (J. Sound Vib. 10 (1969) 163), more the shorter the wave. With stiff adhesives it becomes
+classical laminate theory. Layers may also be laid loosely (`Bond.NONE`) and slide on each other
+without friction. Bonded layers are solved individually (`model.spectral.modes`), loose layers and
+single layers as the homogeneous plate, which also gives wavelengths, meshes and estimates.
 
 Air in a narrow gap behind the plate flows along it. In the low reduced frequency model (Zwikker and
 Kosten 1949; Beltman, J. Sound Vib. 227 (1999) 555) the pressure is constant across the gap, the
@@ -67,7 +67,7 @@ class Sheet:
     def flexural_rigidity(self) -> float:
         """Flexural rigidity D = E h³ / 12 (1 - nu²) [N m], paper Eq. 7.
 
-        Of a board the geometric mean of those along and across its length.
+        For a board, the geometric mean along and across its length.
         """
         return math.sqrt(self.material.shares.e2) * self._along
 
@@ -215,17 +215,17 @@ class AirGap:
 
     depth: float  # m
     closed: bool = False
-    """Whether it is sealed along all edges; otherwise it is open to the room along all of them."""
+    """Whether it is sealed along all edges; otherwise it is open along all edges."""
 
     def __post_init__(self) -> None:
         """Refuse a depth that is not above zero."""
         expect_values(self, "air gap", above="depth")
 
     def coupling_error(self, frequency: float) -> float:
-        """Error of the response where friction couples modes, which is left out, at least [-].
+        """Lower bound of the response error from neglecting the coupling of modes by friction [-].
 
-        At a frequency [Hz], by thicknesses of the boundary layer sqrt(2 mu / (rho omega)): within
-        3 % over a deeper open gap, 5 % over a deeper sealed one, where it is 0 here; then 10 %, and
+        At a frequency [Hz], by thicknesses of the boundary layer sqrt(2 mu / (rho omega)): within 3
+        % over a deeper open gap, 5 % over a deeper sealed one, where it is 0 here; then 10 %, and
         in a gap too narrow for modes half of the response and more.
         """
         layers = self.depth / math.sqrt(VISCOSITY / (math.pi * _DENSITY * frequency))
@@ -253,16 +253,16 @@ MAX_LOSS_FACTOR, MAX_LOSS_EXPONENT = 1.0, 2.0
 SHEAR_CORRECTION = 5 / 6
 
 LOSS_FREQUENCY = 150.0
-"""Frequency [Hz] at which a plate has its loss factor, where that varies."""
+"""Frequency at which a varying loss factor has its stated value [Hz]."""
 
 
 def _scales(*, is_of_theory: bool = True, has_own_row: bool = False) -> dict[str, bool]:
     """Metadata of a field of `Plate` whose mass and stiffness scale with those of the plate.
 
-    The plate's mass scales with its thickness h, its bending stiffness with E h³. While all parts
-    scale like that, or are a share of it, one solution serves for other thicknesses and moduli.
-    A field without this metadata does not scale (`check_scales`), so a plate that has it must be
-    solved for each thickness.
+    The plate's mass scales with its thickness h, its bending stiffness with E h³. If all parts
+    scale like this, or are a fraction of the plate, one solution serves for other thicknesses and
+    moduli. A field without this metadata does not scale (`check_scales`), so a plate that has it
+    must be solved for each thickness.
 
     is_of_theory: whether the field decides the modes of the plate's theory. If not, a table of the
     plate follows a change of it, and identified modes remain those of the changed plate.
@@ -282,10 +282,10 @@ class Plate(Sheet):
     """Along y [m]."""
 
     thickness: float = field(metadata=_scales())
-    """Thickness [m]; for a laminate that of the equivalent homogeneous plate."""
+    """Thickness [m]; for a laminate, of the equivalent homogeneous plate."""
 
     material: Material = field(metadata=_scales())
-    """Material; for a laminate that of the equivalent homogeneous plate."""
+    """Material; for a laminate, of the equivalent homogeneous plate."""
 
     loss_factor: float = field(default=0.01, metadata=_scales(is_of_theory=False))
     """Structural loss factor eta of a hysteretic stiffness (1 + i eta) K, at LOSS_FREQUENCY.
@@ -340,7 +340,8 @@ class Plate(Sheet):
         return self.laminate is not None or self.air_gap is not None
 
     def scaled(self, *, modulus: float = 1.0, thickness: float = 1.0) -> "Plate":
-        """The plate with its moduli and thickness, those of every layer, times a factor."""
+        """Return the plate with moduli and thickness, including those of all layers, multiplied by
+        factors."""
         laminate = self.laminate
         return replace(
             self,
@@ -409,7 +410,7 @@ class Plate(Sheet):
         return math.ceil(EDGES * math.pi * area)
 
     def contains(self, x: float, y: float) -> bool:
-        """Whether a point [m] lies on the plate, its edges included."""
+        """Return whether a point [m] is on the plate, edges included."""
         is_near = 0 <= x <= self.length and 0 <= y <= self.width
         return is_near and bool(self.covers(np.array([[x, y]]))[0])
 
@@ -469,8 +470,8 @@ class CrossSection:
 def opposite_motions(layers: Sequence[LaminateLayer]) -> FloatArray:
     """Motions of the interfaces that bending can excite, orthonormal columns (n + 1, k).
 
-    Where the layers are the same from above as from below, interfaces move opposite to their mirror
-    images: half of them, of a single layer its rotation.
+    In a symmetric laminate, interfaces move opposite to their mirror images: half of the motions,
+    or the rotation of a single layer.
     """
     count = len(layers) + 1
     if tuple(layers) != tuple(layers)[::-1]:
@@ -529,10 +530,10 @@ def slide_frequency(laminate: Laminate, frequency: float) -> float:
 
 
 def shear_corrections(layers: Sequence[LaminateLayer]) -> FloatArray:
-    """Shear correction factor of each layer (n,): 5/6 of a single one, 1 of a soft core.
+    """Shear correction factor of each layer (n,): 5/6 for a single layer, 1 for a soft core.
 
-    (∫ tau)² / (h ∫ tau²) over the layer, tau the shear stress that balances the bending stress of
-    layers without slip: exact wherever shear matters, in soft layers between stiff ones.
+    (∫ tau)² / (h ∫ tau²) over the layer, with tau the shear stress that balances the bending stress
+    of layers without slip. Exact in soft layers between stiff ones, where shear matters most.
     """
     factors = np.empty(len(layers))
     E, nu, thickness, centres = _columns(layers)
@@ -618,7 +619,7 @@ def _columns(
 def bending(laminate: Laminate, frequency: float) -> Bending:
     """Rigidity and Poisson's ratio of the free bending wave of a frequency [Hz].
 
-    The ratio is between those of perfectly bonded and of freely sliding layers.
+    The ratio is between the values for perfectly bonded and freely sliding layers.
     """
     return _bending_at(laminate, abs(wavenumber_of(laminate, frequency)), frequency)
 
@@ -628,8 +629,8 @@ def equivalent_plate(
 ) -> Plate:
     """Make the plate of a laminate, with its homogeneous equivalent at a frequency [Hz].
 
-    length, width [m]. It keeps the laminate where its layers are solved as they are: not where they
-    slide, or where there is a single elastic one.
+    length, width [m]. It keeps the laminate if its layers are solved individually, i.e. unless they
+    slide or there is a single elastic layer.
     """
     first, *others = laminate.layers
     if not others and first.is_elastic:

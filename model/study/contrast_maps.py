@@ -1,11 +1,11 @@
 """Felt contrast over the plate of a table: to random other fingers, and to given quiet ones.
 
-`WeakCells`: for the centre of each cell as the target, the contrast that nine of ten plates give to
-another finger at random places at least 5 cm away. A cell is *feasible* if the median other finger
-leaves 12 dB at 20 dB SL: at 12 dB SL, which is clearly felt, the other finger is then at its
+`WeakCells`: for the centre of each cell as the target, the promised contrast (90 % of plates) to
+another finger at random positions at least 5 cm away. A cell is *feasible* if the median other
+finger leaves 12 dB at 20 dB SL: at 12 dB SL, which is clearly felt, the other finger is then at its
 threshold. It is *weak* if more than one other finger in ten leaves less.
 
-`ContrastMap`: the contrast of a finger at every place of the plate to the same quiet fingers.
+`ContrastMap`: the contrast of a finger at every position to the same quiet fingers.
 """
 
 import math
@@ -32,7 +32,7 @@ from model.structure.plate import Plate
 from model.table.table import LocalizationTable
 
 MIN_DISTANCE = 0.05
-"""Least distance of the fingers of a contact set [m], as of fingertips of two hands."""
+"""Minimum distance between the fingers of a contact set [m], similar to fingertips of two hands."""
 
 
 def are_apart(contacts: FloatArray) -> bool:
@@ -79,10 +79,10 @@ less variance than from places drawn freely.
 """
 
 Contrasts: TypeAlias = tuple[float, float]
-"""Promised felt contrast [dB], and that of the nominal plate."""
+"""Promised felt contrast [dB], and contrast on the nominal plate."""
 
 Ask: TypeAlias = Callable[[Placement], Contrasts | None]
-"""Returns the contrasts of a finger beside quiet ones, None if the level is not reached."""
+"""Returns the contrasts of a finger to quiet ones, None if the level is not reached."""
 
 _DECIMALS = 9  # of places [m]: below that is rounding
 
@@ -105,7 +105,7 @@ class WeakCells:
     tenth_db: FloatArray
     """Tenth percentile (cells,) over other fingers."""
     errors_db: FloatArray
-    """One standard deviation of both by the choice of the other fingers, (2, cells)."""
+    """Standard deviation of both due to the choice of the other fingers, (2, cells)."""
     pairs_db: FloatArray
     """Promised and nominal felt contrast (2, pairs) of all pairs that reach the level."""
 
@@ -138,7 +138,7 @@ def sampling_error(values: ArrayLike, percent: float) -> float:
 
     For any distribution of the values: half the distance between the order statistics that are one
     standard deviation of the number of values below the percentile away from it. Equal values count
-    once, since they are of questions that mirror each other.
+    once, since they come from mirrored queries.
     """
     sample = np.asarray(values, dtype=float)
     share, count = percent / 100, len(np.unique(sample))
@@ -318,7 +318,7 @@ class ContrastMap:
     quiet: tuple[Point, ...]
     """Places of the quiet fingers [m]."""
     promised_db: dict[str, FloatArray]
-    """Felt contrast (ny, nx) that nine of ten plates give, by drive mode.
+    """Promised felt contrast (ny, nx), on 90 % of plates, by drive mode.
 
     NaN where the level is not reached, and under a quiet finger.
     """
@@ -345,7 +345,7 @@ class ContrastMap:
         return as_frame(self.columns)
 
     def as_json(self) -> dict[str, Any]:
-        """Return the map for programs, one row per y; null where there is no answer."""
+        """Return the map as JSON, one row per y; null if there is no answer."""
         return {
             "x_m": self.x.tolist(),
             "y_m": self.y.tolist(),

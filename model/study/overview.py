@@ -1,9 +1,9 @@
 """Overview of a table: map and summary, costs of clocks and weather, export to other programs.
 
 - `find_overview`, `summarize`: cells of the map, and felt contrast of random contacts.
-- `clock_cost`, `uncertainty_cost`: the contrast that two contents keep while clocks of amplifiers
-  have some error, and in the rig's weather or beside an object, by answers of the rig's own plate
-  at a few places and frequencies, in a second.
+- `clock_cost`, `uncertainty_cost`: the contrast that two contents keep with clock errors of
+  amplifiers, in the rig's weather, or with an object on the plate; from answers on the nominal
+  plate at a few positions and frequencies, in a second.
 - `export_mat`, `export_csv`: a .mat file of everything, or .csv files of patterns or fields;
   `docs/reference/table-file.md` lists every name with its shape and unit.
 """
@@ -72,7 +72,7 @@ def find_overview(
 ) -> Overview:
     """Query a table for its map and its contact sets; takes a second, five with sixteen ERAs.
 
-    progress: called with the number of answered questions, and the total.
+    progress: called with the number of queries done and the total.
     """
     rng, ask, answered = np.random.default_rng(0), ask_once(table), list[list[Contrasts | None]]()
     cells = pair_questions(table)
@@ -89,7 +89,7 @@ def find_overview(
 def set_questions(
     table: LocalizationTable, *, others: int, rng: np.random.Generator
 ) -> list[Placement]:
-    """Draw questions with random fingers, one of them the target; none on too small a plate."""
+    """Draw queries with random fingers, one being the target; none on too small a plate."""
     found: list[Placement] = []
     with suppress(InputError):
         for _ in range(CONTACT_SETS):
@@ -101,8 +101,8 @@ def set_questions(
 def summarize(table: LocalizationTable, overview: Overview) -> dict[str, Any]:
     """Summarize a table, with median and tenth percentile of felt contrast [dB] over contact sets.
 
-    Promised contrasts are those of nine of ten plates, the others those of the nominal plate; each
-    has one standard deviation by the choice of the sets.
+    Promised contrasts hold on 90 % of plates, the others on the nominal plate; each has a standard
+    deviation due to the choice of the sets.
     """
     weak = overview.cells
     available = table.available_level_db_sl
@@ -182,7 +182,7 @@ def _coarse_table(rig: Rig) -> LocalizationTable:
 
 
 def _cost(exact: FloatArray, kept: FloatArray) -> PromiseCost:
-    # The loss is taken place by place, since places differ by far more.
+    # The loss is computed per position, since positions differ far more.
     lost = max(float(np.median(exact - kept)), 0.0)
     median = float(np.median(exact))
     return PromiseCost(median, median - lost)
@@ -207,7 +207,7 @@ MAX_MAT_BYTES = (1 << 31) - 1
 def export_mat(table: LocalizationTable, path: Path) -> None:
     """Write a struct `table` as a .mat file of version 5.
 
-    Raises InputError for a table that the format cannot hold, OSError where it cannot be written.
+    Raises InputError for a table that the format cannot hold, OSError if it cannot be written.
     """
     from scipy.io import savemat
 
@@ -261,10 +261,10 @@ def export_mat(table: LocalizationTable, path: Path) -> None:
 def export_csv(table: LocalizationTable, path: Path, *, content: str) -> None:
     """Write a .csv file whose columns have their units in their names.
 
-    content: "patterns": a row for each target and quiet finger of the table's map, with what each
-    ERA plays in the table's drive mode, empty where it is silent, and what is promised, all empty
-    where the level is not reached; "fields": a row for each raster point and frequency, with real
-    and imaginary acceleration by each ERA alone at full stroke.
+    content: "patterns": a row for each target and quiet finger of the table's map, with the drive
+    of each ERA in the table's drive mode (empty if silent) and the promises, all empty if the level
+    is not reached; "fields": a row for each raster point and frequency, with real and imaginary
+    acceleration for each ERA alone at full stroke.
     """
     write_rows(path, {"patterns": _pattern_rows, "fields": _field_rows}[content](table))
 

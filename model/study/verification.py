@@ -1,21 +1,20 @@
-"""Plates within the uncertainty of a rig solved exactly: the check of what answers promise.
+"""Verify promises of answers on exactly solved plates within a rig's uncertainty.
 
-Each plate is solved in the reduced coordinates of the table, at the pattern's frequencies. One that
-is thicker by a factor has the same mode shapes; natural frequencies and modal masses scale with it.
-That is exact for thin plates; shear and rotary inertia of the paper's plate change the response by
-less than 1e-3 over 2 %.
+Each plate is solved in the reduced coordinates of the table, at the pattern's frequencies. A
+thicker plate has the same mode shapes; natural frequencies and modal masses scale with it. That is
+exact for thin plates; shear and rotary inertia of the paper's plate change the response by less
+than 1e-3 over 2 %.
 
 Verification of a table: a sample of it recomputed by other methods.
 
-- Content: fields on the raster and at the cells, against the plate solved at each frequency
-  without modes (`model.spectral.direct_solution`), relative L2. On finite elements, and with
-  measured modes,
-  against the free plate solved anew with the ERAs attached (`model.reduction.free_plate`).
+- Content: fields on the raster and at the cells, against the plate solved at each frequency without
+  modes (`model.spectral.direct_solution`), relative L2. On finite elements, and with measured
+  modes, against the free plate solved anew with the ERAs attached (`model.reduction.free_plate`).
 - Answers: level and contrast at random contacts, against the same with the fingers attached, too.
-- Promises: the felt contrast of nine of ten plates, on plates solved exactly.
+- Promises: the felt contrast on 90 % of exactly solved plates.
 - Answers in time: amplitudes at the fingertips once the pattern, started from rest on the plate in
   time (`model.transients.time_response`), has settled. Contrast beyond 25 dB counts as 25: in a
-  null, hysteretic and viscous damping differ by more than the vibration that is left.
+  null, hysteretic and viscous damping differ by more than the remaining vibration.
 """
 
 import contextlib
@@ -307,14 +306,14 @@ PLATES = 200
 """Number of plates drawn for each answer."""
 
 MIN_KEPT_SHARE = 0.8
-"""Share of plates that must keep a promise; nine of ten are expected on average over answers."""
+"""Fraction of plates that must keep a promise; 90 % are expected on average over answers."""
 
 SAMPLED_FREQUENCIES = 3
 
 _ANSWERS = 30  # on another plate, ten each with one, two and three quiet fingers
 _ALL_OVER = Grid(8, 6)  # where the root mean square is taken
 
-_WINDOW = 0.25  # s, in which steady amplitudes are read
+_WINDOW = 0.25  # s, over which steady amplitudes are evaluated
 _REMAINING = 1e-4  # share of the free vibration by the start that may be left then
 _MAX_DURATION = 20.0  # s
 
@@ -466,8 +465,8 @@ def verify_table(
     """Recompute content and answers to random contacts, with 1, 2, 3 quiet ones in turn.
 
     The rig must be the table's own: check the fingerprint when loading. samples: number of answers;
-    progress: called with the numbers of answers done and of all. Raises InputError where no
-    contacts have an answer.
+    progress: called with the number of answers done and the total. Raises InputError if no contacts
+    have an answer.
     """
     rng = np.random.default_rng(seed)
     free = solve_free_plate(rig.plate, table.mesh, frequency_max=float(table.frequencies[-1]))
@@ -596,7 +595,7 @@ def _contrast(felt: FloatArray, weights: FloatArray) -> float:
 
 
 def _random_answer(table: LocalizationTable, rng: np.random.Generator, *, others: int) -> Answer:
-    """Return the table's answer to random contacts 5 cm apart; fewer where they do not fit."""
+    """Return the table's answer to random contacts 5 cm apart; fewer if they do not fit."""
     for tries in range(1000):
         count = 1 + max(1, others - tries // 200)
         with contextlib.suppress(InputError):
@@ -612,9 +611,9 @@ def _random_answer(table: LocalizationTable, rng: np.random.Generator, *, others
 
 
 def promise_margins(rig: Rig, plate: Rig) -> tuple[float, ...]:
-    """Margins [dB] of contrasts over those that the table of a rig promises, on another plate.
+    """Return margins [dB] of contrasts over the promises of a rig's table, on another plate.
 
-    For random fingers, on the plate solved exactly. None where the rig has no table or no room for
+    For random fingers, on the exactly solved plate. Empty if the rig has no table or no room for
     four fingers.
     """
     rng, margins = np.random.default_rng(0), []
@@ -652,7 +651,7 @@ class ExpectedContrast:
     after: float
     """The same with answers of the identified rig."""
     promised: float
-    """Given by nine of ten of these plates with answers of the identified rig."""
+    """Contrast that 90 % of these plates have with answers of the identified rig."""
 
 
 def expected_contrast(

@@ -1,8 +1,8 @@
-"""The localization table: patterns that one finger feels and others do not.
+"""Localization table: the data for patterns that one finger feels and others do not.
 
-It holds the modes of a plate on a raster over it, from which the fields of the ERAs at all drive
-frequencies follow, with any fingers on the plate and for any plate within the rig's uncertainty, so
-that any fingertips can be queried in any drive mode.
+It contains the modes of a plate on a raster. From these follow the fields of the ERAs at all drive
+frequencies, with any fingers on the plate and for any plate within the rig's uncertainty, so that
+any fingertips can be queried in any drive mode.
 
 Lagrange polynomials over six points of the raster (quintic) at a spacing of a twentieth of the
 shortest bending wavelength interpolate a field within 1e-4. The points of a fingertip are then one
@@ -83,7 +83,8 @@ _OBJECT_PLACES = Grid(6, 5)
 """Cells in whose middles an object may lie that the rig's uncertainty expects."""
 
 OBJECT_FACTOR = 6.0
-"""Factor on the mean square of what it changes, which near fingers and ERAs is far more.
+"""Factor on the mean square change of fields by an object, which is far larger near fingers and
+ERAs.
 
 Chosen so that about 80 % of the promises are kept (`benchmarks.promise everyday`).
 """
@@ -183,7 +184,7 @@ class Raster:
     def _lagrange(self) -> FloatArray:
         """Coefficients of a patch's Lagrange polynomials along x and y, for powers of -1..1.
 
-        (2, 1, powers, powers); the shorter side's have zeros beside them.
+        (2, 1, powers, powers); the shorter side's are padded with zeros.
         """
         side = self.patch
         found = np.zeros((2, 1, max(side), max(side)))
@@ -244,7 +245,7 @@ of the founding paper's cells; and how many a bending wave has at least."""
 def default_drive_frequencies(limits: GuardLimits) -> FloatArray:
     """Drive frequencies of a table by default: 40 to 500 Hz within the rig's limits, (f,) [Hz].
 
-    Steps of 10 Hz from the lowest limit where that leaves none.
+    Steps of 10 Hz from the lowest limit if this range is empty.
     """
     low, high = limits.frequency_min, limits.frequency_max
     first, past = np.searchsorted(DEFAULT_FREQUENCIES, [low, np.nextafter(high, np.inf)])
@@ -254,7 +255,7 @@ def default_drive_frequencies(limits: GuardLimits) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class LocalizationTable:
-    """Modes of one plate on its ERAs, and all else that patterns follow from."""
+    """Modes of a plate on its ERAs, and all other data for patterns."""
 
     plate: Plate
     eras: tuple[Actuator, ...]
@@ -274,7 +275,7 @@ class LocalizationTable:
     omega: FloatArray
     """(r,) [rad/s], of the reduced free plate (`model.reduction.reduced_plate`)."""
     losses: FloatArray
-    """(r,) [rad²/s²], of it beside those of the plate's loss factor."""
+    """(r,) [rad²/s²], in addition to the plate's loss factor."""
     dispersion_frequencies: FloatArray
     """(k,) [Hz], of `dispersion`; k = 0 for none."""
     dispersion: ComplexArray
@@ -288,7 +289,7 @@ class LocalizationTable:
     """Estimated relative L2 error (f,) of the fields over the raster (`model.vibration`), maximum
     over the ERAs."""
     clocks: ClockErrors = EXACT_CLOCKS
-    """Errors of those of its amplifiers, which no file has: of those that are connected."""
+    """Clock errors of connected amplifiers, which are not stored in the file."""
 
     def __repr__(self) -> str:
         low, high = self.frequencies[[0, -1]]
@@ -362,21 +363,21 @@ class LocalizationTable:
         for asked, nearest in zip(frequencies.tolist(), self.frequencies[rows], strict=True):
             if not abs(asked - nearest) <= SAME_FREQUENCY:
                 raise InputError(
-                    f"frequency of a tone must be one of the table's, of which {nearest:g} Hz is "
-                    f"the nearest, got {asked:g} Hz; build a table with it: era table build "
+                    f"frequency of a tone must be in the table (nearest: {nearest:g} Hz), "
+                    f"got {asked:g} Hz; build a table with it: era table build "
                     "--frequencies"
                 )
         return np.asarray(rows)
 
     def shapes_at(self, points: Sequence[Point] | FloatArray) -> FloatArray:
-        """Shapes of the reduced plate at points or footprints [m] of it, (p, r)."""
+        """Return shapes of the reduced plate at points or footprints [m], (p, r)."""
         if not len(points):
             return np.empty((0, len(self.omega)))
         return self.raster.at(self.shapes, np.array(points)).astype(float)
 
     @cached_property
     def full_levels(self) -> dict[str, float]:
-        """Full level of each ERA, by its name: its stroke [m], or volts of an exciter."""
+        """Full level of each ERA by name: its stroke [m], or volts for an exciter."""
         return {era.name: era.full_level for era in self.eras}
 
     def drive_of(self, excitation: Excitation) -> dict[str, dict[str, float]]:
@@ -434,7 +435,7 @@ class LocalizationTable:
 
     @property
     def threshold_sets(self) -> tuple[str, ...]:
-        """Names (s,) of the sets of thresholds by which promises hold, that of levels first."""
+        """Names (s,) of the threshold sets for promises, the set for levels first."""
         return tuple(dict.fromkeys((self.threshold, *self.promised_thresholds)))
 
     @cached_property
@@ -453,7 +454,7 @@ class LocalizationTable:
     def harmonic_thresholds(self) -> Float32Array:
         """Detection thresholds [m/s²] at twice all frequencies, (f,).
 
-        Infinite beyond the data of the set, to 1 kHz, where nothing is felt.
+        Infinite beyond the set's data (up to 1 kHz), where vibration cannot be felt.
         """
         twice = 2 * self.frequencies
         highest = highest_known(self.threshold)
@@ -462,9 +463,10 @@ class LocalizationTable:
 
     @cached_property
     def compared_harmonic_thresholds(self) -> Float32Array:
-        """Those at twice all frequencies as low as any set has them beside its own at these, (f,).
+        """Thresholds at twice all frequencies for comparing candidates, (f,).
 
-        By them candidates are compared; what weights are found by takes the rig's own.
+        As low as in any set relative to its threshold at the tone; weights are searched with the
+        rig's own.
         """
         return np.asarray(self.harmonic_thresholds / self._harmonic_excess.max(axis=0))
 
@@ -476,9 +478,9 @@ class LocalizationTable:
 
     @property
     def _harmonic_excess(self) -> Float32Array:
-        """How much higher harmonics stand above their tones by each set than the first, (s, f).
+        """Excess of harmonics over their tones in each set relative to the first, (s, f).
 
-        Beyond the data of a set by the thresholds at their end.
+        Beyond a set's data, its last threshold is used.
         """
         twice = np.minimum(2 * self.frequencies, min(map(highest_known, self.threshold_sets)))
         found = sensitivities(twice, self.threshold_sets, self.threshold) / self.sensitivities
@@ -486,7 +488,7 @@ class LocalizationTable:
 
     @cached_property
     def modal_dispersion(self) -> Dispersion | None:
-        """Change of the eigenvalues with frequency, None where they do not."""
+        """Change of the eigenvalues with frequency, None without any."""
         if not len(self.dispersion_frequencies):
             return None
         return Dispersion(self.dispersion_frequencies, self.dispersion)
@@ -514,10 +516,10 @@ class LocalizationTable:
         return any(math.isfinite(era.excursion) for era in self.eras)
 
     def excursion_of(self, drives: Iterable[tuple[Excitation, Sequence[Swing]]]) -> float:
-        """Part of the magnets' excursion that is kept for drives, whose parts add.
+        """Return the fraction of the magnets' excursion that drives use, added over drives.
 
-        Of full level the share of each that is strongest in `allowed_shares`, or in what may swing
-        along the worst of its swings; 0 without a limit.
+        For each drive, the largest fraction of `allowed_shares`, or of its worst envelope; 0
+        without a limit.
         """
         if not self._is_limited:
             return 0.0
@@ -571,7 +573,7 @@ class LocalizationTable:
 
     @cached_property
     def at_harmonics(self) -> PlateOnEras:
-        """The same at twice the drive frequencies, of those thicknesses that come first there."""
+        """The same at twice the drive frequencies, for the thicknesses listed first there."""
         twice = self._attached(2 * self.frequencies)
         counts = {JUDGING_DRAWS.thicknesses, PROMISED_DRAWS.bases}
         driven = at_harmonics(twice, self.eras).driven_less(self.allowed_shares)
@@ -579,18 +581,18 @@ class LocalizationTable:
 
     @cached_property
     def error_power(self) -> Float32Array:
-        """Mean square of the error of each ERA's field, (f, eras).
+        """Mean square error of each ERA's field, (f, eras).
 
-        `field_error_power`, and of exciters what places that are off leave beside errors of
-        stiffnesses.
+        `field_error_power`, and for exciters the part of position errors that stiffness errors do
+        not cover.
         """
         return np.asarray(self.field_error_power + self._with_places[1], dtype=np.float32)
 
     @cached_property
     def field_error_power(self) -> Float32Array:
-        """The same over the plate by discretisation, and by what the rig's uncertainty states.
+        """The same over the plate, from discretisation and the rig's uncertainty.
 
-        Its `field`, and an object of its `foreign_mass`, the mean over places where it may lie.
+        Includes its `field`, and an object of its `foreign_mass`, averaged over possible positions.
         """
         error = np.hypot(self.discretisation_error, self.uncertainty.field)[:, None]
         fields = self.on_eras.fields
@@ -658,7 +660,7 @@ class LocalizationTable:
     def background(self, targets: Sequence[Point]) -> Complex64Array:
         """Expected power of the plate beyond targets, without fingers on it, (f, eras, eras).
 
-        Of clocks that are off, beside the nominal one.
+        Includes clock errors, in addition to the nominal power.
         """
         points, fields, power = self._everywhere
         is_near = ~is_background(points, targets)
@@ -681,7 +683,7 @@ _FEW, _FINE = len(FIVE_POINTS.points), len(FINE_POINTS.points)
 
 
 def read_fingertips(table: LocalizationTable, places: Sequence[Point]) -> FingertipShapes:
-    """Shapes at fingertips centred at places [m], by a kernel in C where there is one."""
+    """Return shapes at fingertips centred at positions [m], with a C kernel if available."""
     by = kernels()
     if by is None:
         return table.raster.fingertips(np.array(places), table.shapes)

@@ -1,10 +1,10 @@
-"""Building, keeping and reading localization tables.
+"""Build, cache and read localization tables.
 
-A table is built the same to the bit by any number of processes, and kept between runs in the user's
-cache folder. Its file is an uncompressed .npz with a JSON header. Members are `header` (JSON as
-bytes) and the arrays of `LocalizationTable` under their own names. The header has the format
-version, the plate's fingerprint, the inputs of the table, and a SHA-256 over the content, so that a
-damaged or foreign file is refused before any of it is used.
+A table is bit-identical for any number of processes, and cached between runs in the user's cache
+folder. Its file is an uncompressed .npz with a JSON header. Members are `header` (JSON as bytes)
+and the arrays of `LocalizationTable` under their own names. The header contains the format version,
+the plate's fingerprint, the inputs of the table, and a SHA-256 of the content, so that a damaged or
+foreign file is rejected before use.
 """
 
 import hashlib
@@ -131,8 +131,8 @@ def save_table(table: LocalizationTable, path: Path | str) -> None:
 def load_table(path: Path | str, *, rig: Rig | None = None) -> LocalizationTable:
     """Read a table.
 
-    rig: that it must be of, but for what may differ (`model.rig.rig.MAY_DIFFER`). Raises InputError
-    for a missing, damaged or foreign file, with the keys in which it is of another rig.
+    rig: must match the table, except for `model.rig.rig.MAY_DIFFER`. Raises InputError for a
+    missing, damaged or foreign file, and for another rig, with the keys that differ.
 
     Example:
         >>> era.save_table(table, "table.npz")
@@ -258,10 +258,10 @@ def _assemble(header: _Header, arrays: dict[str, Any]) -> LocalizationTable:
 
 @dataclass(frozen=True, eq=False)
 class TableProblem:
-    """All that the numbers of a table depend on; the drive mode is not among it.
+    """All inputs that determine the numbers of a table; the drive mode does not.
 
-    frequencies (f,) [Hz], ascending, within the rig's limits. Raises InputError for others, and
-    for a rig whose ERAs do not support its plate.
+    frequencies (f,) [Hz], ascending, within the rig's limits. Raises InputError for others, and for
+    a rig whose ERAs do not support its plate.
     """
 
     rig: Rig
@@ -441,7 +441,7 @@ def cached_table(
     """Return a rig's table from the user's cache folder, built if it is not there, and its file.
 
     frequencies (f,) [Hz]: `default_drive_frequencies` if None. A damaged file is built again. The
-    file is None where the folder cannot be written.
+    file is None if the folder cannot be written.
     """
     if frequencies is None:
         frequencies = default_drive_frequencies(rig.limits)

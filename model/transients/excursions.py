@@ -1,4 +1,4 @@
-"""How far the magnets of exciters move, and what keeps them within their excursion.
+"""Excursions of exciter magnets, and the limits on drives that keep them within range.
 
 An onset moves a magnet further than the settled vibration: free vibration near its own resonance
 beats with the drive. A drive that rises or falls steadily, along whatever ramp, is a mean of drives
@@ -7,15 +7,15 @@ full level are computed for that (`MagnetMotions`). Levels that come and go are 
 step (`Swing`): at the rate of the beat, 10 to 60 times a second, they pump the magnets' free
 vibration, since a side band is at their resonance. The eigenvectors near the drive are followed
 exactly, for straight lines between steps; those far above follow the level at once. Shaped
-envelopes rise above their final amplitude; as much of their difference to a plain ramp is kept as
-the magnets allow.
+envelopes rise above their final amplitude; their difference from a plain ramp is scaled to what the
+magnets allow.
 
-All of that is of the board as modelled. How much further those of boards within the rig's
-uncertainty move is found from a few that are drawn, at each frequency: nine of ten stay within.
+All of this holds for the nominal board. The additional motion on boards within the rig's tolerances
+is estimated from a few drawn boards, per frequency, so that 90 % stay within range.
 
-`reach_of` finds from which frequency on a rig reaches a level over its whole plate. At each place,
-as the mean over a finger that rests there, all actuators add in phase, at full level or at the
-share of it that the rig's limits and the magnets' excursion allow.
+`reach_of` finds the frequency above which a rig reaches a level over its whole plate. At each
+position (mean over a resting finger) all actuators add in phase, at full level, or at the fraction
+that the rig's limits and the magnets' excursion allow.
 """
 
 import math
@@ -53,12 +53,13 @@ _NEAR, _BESIDE = 1.5, 50.0  # near eigenvectors are below this multiple of a dri
 
 @dataclass(frozen=True, eq=False)
 class Excursions:
-    """Excursions [m] of each exciter at the rig's level, (n,).
+    """Excursions of each exciter at the rig's level [m], (n,).
 
-    at_lowest: settled at its lowest frequency; largest: in onsets within all that it allows, of
-    those that are limited; passed (n,): whether these are more than they may be; allowed: the
-    lowest frequency [Hz] from which all stay within up to the highest, infinite where they do not
-    there.
+    - at_lowest: settled at its lowest frequency.
+    - largest: in onsets within all its limits, for exciters with a limit.
+    - passed (n,): whether these exceed the limits.
+    - allowed: lowest frequency [Hz] above which all stay within the limits up to the highest,
+      infinite if there is none.
     """
 
     at_lowest: FloatArray
@@ -113,9 +114,9 @@ def motions_along(
 
 
 BOARDS, _SEED = 12, 4
-"""Boards that are drawn, and of which seed."""
+"""Number of drawn boards, and their seed."""
 
-_NINE_OF_TEN = 1.28  # standard deviations
+_NINE_OF_TEN = 1.28  # standard deviations for 90 %
 _SOFTEST = 0.1  # times the stiffness of the file
 _FAR_WITHIN = 1 / 3  # of the excursion
 
@@ -146,7 +147,7 @@ class MagnetMotions:
     ) -> "MagnetMotions":
         """Make the motions of a plate's magnets; empty if no source is limited.
 
-        uncertainty: of the plate with its loads, None where it is known.
+        uncertainty: of the plate with its loads, None if it is exactly known.
         """
         limits = np.array([each.excursion for each in plate.eras])
         some = np.isfinite(limits)
@@ -155,7 +156,8 @@ class MagnetMotions:
         return cls(plate, rows, limits[some], tuple(cls.of(each) for each in drawn))
 
     def allowed(self, *frequencies: float) -> FloatArray:
-        """Motions (f, m) [m] on the modelled board with which nine of ten boards stay within."""
+        """Return motions (f, m) [m] on the nominal board that keep 90 % of boards within the
+        limits."""
         return self.excursions / _further(self, frequencies)[:, None]
 
     def shares(self, frequencies: FloatArray) -> FloatArray:
@@ -230,9 +232,9 @@ def share_along(magnets: MagnetMotions, frequency: float, swing: Swing) -> float
 
 @lru_cache(_SWINGS_KEPT)
 def _further(magnets: MagnetMotions, frequencies: tuple[float, ...]) -> FloatArray:
-    """How much further magnets move on the last of nine of ten boards (f,), 1 at least.
+    """Return the factor by which magnets move further on 90 % of boards (f,), at least 1.
 
-    1 where jumps to full level are far within the excursion.
+    1 if jumps to full level are far within the excursion.
     """
     at, found = np.array(frequencies), np.ones(len(frequencies))
     own = (magnets.by_jumps(at) / magnets.excursions).max(axis=1)
@@ -301,8 +303,8 @@ def magnets_of(rig: Rig, free: FreePlate) -> MagnetMotions:
 def relative_motions(rig: Rig, free: FreePlate, frequencies: FloatArray) -> ComplexArray:
     """Return the settled motion of each exciter's coil in its magnet, (f, eras, m) [m].
 
-    By each actuator at full level: T (w - y), with the plate's motion w and the base y that
-    stands for the current (`Exciter.base`). free: the rig's plate. Without fingers: they reduce it.
+    For each actuator at full level: T (w - y), with the plate's motion w and the base y equivalent
+    to the current (`Exciter.base`). free: the rig's plate. Without fingers: they reduce it.
     """
     exciters, omega = exciters_of(rig), 2 * np.pi * frequencies
     places = np.array([[one.x, one.y] for one in exciters])
@@ -360,7 +362,7 @@ class Reach:
 
     @property
     def start(self) -> float | None:
-        """Lowest frequency [Hz] at which all places reach the level, None if there is none."""
+        """Lowest frequency [Hz] above which all positions reach the level, None without one."""
         whole = self.frequencies[self.shares == 1]
         return float(whole[0]) if len(whole) else None
 
@@ -406,7 +408,7 @@ def reach_of(rig: Rig, free: FreePlate) -> Reach:
 
 
 def _held(rig: Rig, free: FreePlate, places: FloatArray, frequencies: FloatArray) -> FloatArray:
-    """Factor (f, p) by which a finger at a place reduces the motion there, 1 + D R."""
+    """Return the factor (f, p) by which a finger reduces the motion at its position, 1 + D R."""
     if rig.fingertip is None:
         return np.ones((len(frequencies), len(places)))
     attached = (*rig.eras, *rig.masses)

@@ -44,8 +44,8 @@ ENDING_KNOTS = 8
 """Knots of an ending; the last, after 40 ms, is silence."""
 
 # Weight of the target's deviation from its ramp against the quiet finger's motion, relative to the
-# expected ratio of the two in the steady state: where a pattern leaves the quiet finger 20 dB below
-# the target, the ramp is not traded for more. Between half and twice this contrast changes by
+# expected ratio of the two in the steady state: if a pattern leaves the quiet finger 20 dB below
+# the target, the ramp is not sacrificed for more. Between half and twice this contrast changes by
 # 0.5 dB.
 TARGET_WEIGHT = 2.0
 

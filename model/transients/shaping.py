@@ -206,7 +206,7 @@ Fingertips: TypeAlias = Callable[[Sequence[Point]], tuple[FloatArray, FloatArray
 class Shaper:
     """Shaping of onsets and endings for a plate on its ERAs.
 
-    All that does not depend on the contacts is computed once for each frequency.
+    Everything independent of the contacts is computed once per frequency.
     """
 
     def __init__(

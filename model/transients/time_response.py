@@ -1,9 +1,9 @@
-"""The plate in time: its equations of motion in modal form, solved exactly.
+"""Plate in the time domain: modal equations of motion, solved exactly.
 
     M q'' + C q' + K q = sum over ERAs of phi (k_b y + c y')
 
-q are the coordinates of the reduced free plate and the displacements of the phalanges of fingers
-on it, phi the shapes at an ERA, y the motion of the ERA's base; M, C and K are those of
+q are the coordinates of the reduced free plate and the displacements of the phalanges of fingers on
+it, phi the shapes at an ERA, y the motion of the ERA's base; M, C and K are those of
 `model.reduction.reduced_plate`. For exciters y is the voltage, k_b and c are the forces by it and
 by its rate that push plate and magnet apart, and q includes the displacements of their magnets. The
 first-order system is diagonalised once for each set of attachments. There are three kinds of
@@ -20,7 +20,7 @@ drives, all without a step size, so that no error grows with time:
   displacements u0 of weightless fingers, receptances G between them and dynamic stiffness D, they
   hold the plate by the forces (1 + D G)^-1 D u0. The demodulated response less its quasi-static
   part, which a slow envelope would give, is inverted on the line s = i omega + sigma + i nu by a
-  discrete Fourier transform; what comes after the time that is followed returns as
+  discrete Fourier transform; the response after the end of the period wraps around, attenuated by
   exp(-sigma period). For long envelopes the plate is solved every half hertz, with linear
   interpolation, up to where smooth envelopes have a spectrum, which is ended along a raised cosine.
 
@@ -82,8 +82,8 @@ class ForcedVibration:
     def as_free(self, numbers: Sequence[int], times: Sequence[float]) -> ComplexArray:
         """Return z (j, m) of free vibrations in the state of solutions (j,) at times (j,) [s]."""
         z, half = self.modal(numbers, times), self.plate.half
-        # The conjugate of an eigenvector is that of the conjugate eigenvalue, which LAPACK puts
-        # behind each eigenvalue above the real axis; a real one is its own.
+        # The conjugate of an eigenvector belongs to the conjugate eigenvalue, which LAPACK stores
+        # behind each eigenvalue above the real axis; a real one is its own conjugate.
         partner = half + (self.plate.decay.imag > 0)
         return np.asarray(-0.5j * (z[:, half] - z[:, partner].conj()))
 
@@ -131,7 +131,7 @@ class PlateInTime:
     forced: ComplexArray
     """z' (2 r, r) by a force on each coordinate."""
     stretches: FloatArray
-    """Displacement (eras, r) at each ERA less that of its free magnet, by each coordinate."""
+    """Displacement (eras, r) at each ERA minus that of its free magnet, per coordinate."""
 
     def shapes_at(self, points: FloatArray) -> FloatArray:
         """Return the shapes (p, r) of all coordinates at points (p, 2) [m]."""
@@ -140,7 +140,7 @@ class PlateInTime:
     def with_far_ends(self, shapes: FloatArray) -> FloatArray:
         """Return the shapes (..., r) of all coordinates, from those of the reduced plate's.
 
-        These come first; magnets and phalanges are not on the plate, and have 0.
+        These come first; magnets and phalanges are not on the plate and have shape 0.
         """
         others = len(self.vectors) // 2 - shapes.shape[-1]
         return np.pad(shapes, (*[(0, 0)] * (shapes.ndim - 1), (0, others))) if others else shapes
@@ -155,8 +155,8 @@ class PlateInTime:
     ) -> ForcedVibration:
         """Return particular solutions for sets of motions (k,) that play from times (k,) [s] on.
 
-        Each is for the terms that move the ERAs' bases at its time. Terms of one frequency are
-        added up, so that the cost of samples depends on the number of frequencies only.
+        Each is for the terms that move the ERAs' bases at its time. Terms with the same frequency
+        are added, so that the cost of samples depends only on the number of frequencies.
         """
         moments = np.array(times, dtype=float)
         number, active = motions.active(numbers, moments).nonzero()
@@ -168,7 +168,7 @@ class PlateInTime:
         is_first = np.ones(len(each), dtype=bool)
         is_first[1:] = (each[1:] != each[:-1]) | (number[1:] != number[:-1])
         omegas = each[is_first]
-        # By frequency and ERA, of which it is the force on the base.
+        # By frequency and ERA, as forces on the base.
         cell = (is_first.cumsum() - 1) * len(self.eras) + era
         receptance = 1 / (1j * omegas[:, None] - self.eigenvalues)
         y, a1 = phase_factor * motions.c0[active], None
@@ -242,7 +242,7 @@ class PlateInTime:
 
     @cached_property
     def half(self) -> NDArray[np.intp]:
-        """Indices (m,) of one eigenvalue of every conjugate pair and of the real ones.
+        """Indices (m,) of one eigenvalue per conjugate pair and of the real ones.
 
         Ordered from the slowest to the fastest decay.
         """
@@ -326,7 +326,7 @@ def _inverse(vectors: ComplexArray) -> ComplexArray:
         return np.full_like(vectors, np.nan)
 
 
-_BATCH = 512  # frequencies or samples at once, at some kilobytes each
+_BATCH = 512  # frequencies or samples per batch, some kilobytes each
 
 
 def from_rest(

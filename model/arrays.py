@@ -1,8 +1,8 @@
-"""Array types, points of a lattice, and choices among scores that rounding cannot turn.
+"""Array types, lattice points, and choices among scores that are robust against rounding.
 
-Scores that are equal in theory, as of two places that mirror each other, differ by rounding, which
-varies with the processor. So scores within a small distance of the best count as equal to it, and
-the first of them is chosen.
+Scores that are equal in theory, for example at mirrored positions, differ by rounding, which
+depends on the processor. Scores within a small distance of the best therefore count as equal to it,
+and the first of them is chosen.
 """
 
 from collections.abc import Callable, Sequence
@@ -39,7 +39,8 @@ def rms(values: ArrayLike) -> float:
 
 
 def nullable(values: ArrayLike | None) -> Any:
-    """Numbers for JSON, an array as lists: None in place of what is not finite or not there."""
+    """Convert to JSON numbers, an array to lists; None for missing values and values that are not
+    finite."""
     found = np.asarray(values, dtype=float)
     return np.where(np.isfinite(found), found, np.array(None)).tolist()
 
@@ -62,9 +63,10 @@ def best_along(scores: ArrayLike, axis: int) -> IntArray:
 
 
 def best_first(scores: ArrayLike) -> IntArray:
-    """Order of scores (n,), the highest first; of those nearly equal the first one first.
+    """Return the order of scores (n,), highest first; nearly equal scores keep their order.
 
-    Each of a run of nearly equal scores is near its neighbours, not always near all others.
+    Neighbours in a run of nearly equal scores are close to each other, but not always to all
+    others.
     """
     values = np.asarray(scores)
     order = np.argsort(-values, kind="stable")

@@ -17,7 +17,7 @@ def cache_folder() -> Path:
     if folder.is_absolute():
         return folder
     raise FileNotFoundError(
-        "a cache folder needs a home folder, and this user has none; set HOME or XDG_CACHE_HOME"
+        "a cache folder needs a home folder, which this user lacks; set HOME or XDG_CACHE_HOME"
     )
 
 

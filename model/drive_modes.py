@@ -1,7 +1,8 @@
-"""Drive modes: which frequencies, amplitudes and phases the ERAs may have, and the best of them.
+"""Optimise ERA drives in each drive mode.
 
-- `switched`: one or two ERAs at full stroke, each at a frequency of its own.
-- `phased`: all ERAs at one frequency, with any amplitudes and phases.
+- `switched`: one or two ERAs at full stroke, each at its own frequency.
+- `phased`: all ERAs at one frequency, with arbitrary amplitudes and phases (minimum-variance,
+  MVDR/LCMV, weights).
 
 Symbols, here and in `model.table`: f frequencies, p points under fingers, q quiet fingertips, r
 reduced modal coordinates; h field of an ERA at a point, R Hermitian form of the expected power at
@@ -16,15 +17,15 @@ the root of the sum of their squares over the detection thresholds, so the power
 units of their frequencies' thresholds.
 
 `phased`. At each frequency the expected power at the quiet fingertips, a weighted mean over them,
-is the quadratic form w^H R w. The weights that reach the targets with the least of it solve
-R w = c, where c is the sum of conj(h_t) over the targets, each times a factor. Since the maximum
-over the quiet fingertips counts, their weights mu_q are multiplied by the root of their expected
-power and the system is solved again: Lawson's algorithm for minimax approximation, in three steps,
-of which the best is kept, since the minimax of expected powers is not the best percentile. A mean
-is at most the maximum, so for one target |c^H w| / sqrt(w^H R w) bounds the score at a frequency.
-For several targets it is an estimate: phases and factors in c are the best of those tried. Without
-errors a spring or damper at an ERA does not change the best contrast: it adds a force where the
-drive acts anyway. `model/compiled/search.h` is the same in C.
+is the quadratic form w^H R w. The weights that reach the targets with the least power solve R w =
+c, where c is the sum of conj(h_t) over the targets, each times a factor. Since the maximum over the
+quiet fingertips counts, their weights mu_q are multiplied by the root of their expected power and
+the system is solved again: Lawson's algorithm for minimax approximation. The best of three steps is
+kept, since the minimax of expected powers is not the best percentile. A mean is at most the
+maximum, so for one target |c^H w| / sqrt(w^H R w) bounds the score at a frequency. For several
+targets it is an estimate from several tried phases and factors in c. Without errors a spring or
+damper at an ERA does not change the best contrast: it adds a force where the drive acts anyway.
+`model/compiled/search.h` is the same in C.
 
 `switched`. Switching frequencies and activation sets moves the nulls (the paper's idea). Four ERAs
 and 27 frequencies make 4 * 27 + 6 * 27² = 4482 patterns, sixteen and 47 a quarter of a million.
@@ -78,7 +79,7 @@ WeightedTones: TypeAlias = list[tuple[int, Complex64Array]]
 LEVEL_MARGIN = 1.0
 """Reserve that a drive must have at its targets, in standard deviations of their amplitude.
 
-About what nine of ten plates need; the draws of an answer decide.
+About the need of 90 % of plates; the draws of an answer decide.
 """
 
 _TINY, _LEAST_POWER, _LEAST_AMPLITUDE = 1e-7, np.float32(1e-30), np.float32(1e-20)
@@ -260,7 +261,7 @@ class CoherentResult:
     """The best weights at each frequency."""
 
     score: Float32Array
-    """Score (f,), 0 where no weights were found that reach the level."""
+    """Score (f,), 0 if no weights reach the level."""
     weights: Complex64Array
     """Weights (f, eras)."""
     bound: Float32Array
@@ -364,7 +365,7 @@ def tried(forms: Forms, method: LawsonMethod) -> CoherentResult:
 def _moved(shares: Float32Array, expected: Float32Array) -> Float32Array:
     """Return the shares (f, q) of quiet fingertips after a Lawson step, by their expected powers.
 
-    Unchanged at frequencies where no ERA is driven.
+    Unchanged at frequencies without a driven ERA.
     """
     moved = shares * np.sqrt(np.maximum(expected, 0))
     total = np.add.reduce(moved, axis=-1, keepdims=True)
@@ -437,7 +438,7 @@ ALTERNATIVES = 4
 """Number of patterns that are kept, the best first, to be judged on drawn plates."""
 
 BATCH = 512
-"""Number of patterns that are computed exactly at first, those of the highest bounds."""
+"""Number of patterns computed exactly at first, those with the highest bounds."""
 
 
 def find_switched(forms: Forms) -> list[tuple[float, WeightedTones]]:

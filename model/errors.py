@@ -8,9 +8,9 @@ from registry.streams import printable
 
 
 class InputError(ValueError):
-    """Invalid input; the message says what, where and the remedy.
+    """Invalid input; the message states the rule, the value, its location and the remedy.
 
-    Control characters of what it quotes are escaped.
+    Control characters in quoted values are escaped.
     """
 
     def __init__(self, message: object = "") -> None:
@@ -72,7 +72,7 @@ def expect_path(value: object, *, what: str) -> Path:
 
 
 def shown(value: object) -> str:
-    """Text and numbers as they are, other values by their class."""
+    """Format text and numbers unchanged, other values by their class."""
     if value is None or isinstance(value, str | Real):
         text = repr(value)
         return text if len(text) <= _MAX_LENGTH else f"{text[:_MAX_LENGTH]}..."

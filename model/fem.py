@@ -1,4 +1,4 @@
-"""The plate in finite elements: mesh, matrices, and natural modes.
+"""Finite-element model of the plate: mesh, matrices, and natural modes.
 
 A structured mesh over the plate of Reissner-Mindlin rectangles: MITC4, the paper's, Q3 to Q5.
 
@@ -61,7 +61,7 @@ class Element:
     def integrals(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         """Integrals over -1..1 of N_i N_j, N_i' N_j and N_i' N_j', exact, (n, n) each.
 
-        And those of N_i N_j as rotations take part in shear: of MITC4 by their means.
+        Also those of N_i N_j for rotations in shear; for MITC4, of their means.
         """
         points, weights = legendre.leggauss(len(self.side))
         powers = np.arange(len(self.side))
@@ -129,7 +129,7 @@ MITC4 = Element("MITC4", (-1.0, 1.0))
 Q3, Q4, Q5 = (Element(f"Q{order}", _gauss_lobatto(order)) for order in (3, 4, 5))
 
 ELEMENTS = {element.name: element for element in (MITC4, Q3, Q4, Q5)}
-"""All of them, by name."""
+"""All elements by name."""
 
 
 def element_of(name: str) -> Element:
@@ -264,10 +264,10 @@ class Mesh(Discretisation):
         return type(self)(nx, ny, plate.length, plate.width, self.element)
 
     def interpolation_error(self, plate: Plate, frequency: float) -> float:
-        """By how much its shape functions may deviate from a wave between nodes, relative to it.
+        """Return the largest deviation of its shape functions from a wave between nodes, relative.
 
-        A wave k between nodes a step s apart is followed by a polynomial of order p within
-        (k s)^(p + 1) / 4 (p + 1).
+        A polynomial of order p follows a wave k between nodes a step s apart within (k s)^(p + 1) /
+        4 (p + 1).
         """
         order = self.element.order
         step = max(self.element_size) / order
@@ -403,8 +403,8 @@ def simply_supported_modes(
 ) -> tuple[FloatArray, FloatArray]:
     """Natural frequencies (n,) [Hz], ascending, and undamped modes (dof, n) of modal mass 1.
 
-    Without deflection on all four edges, where rotations are free. Raises InputError for a count
-    above what the mesh has.
+    All four edges have no deflection and free rotation. Raises InputError for a count above the
+    mesh's number of modes.
     """
     mesh, touch = matrices.mesh, matrices.deflection_at(footprints_of(loads))
     springs = sparse.diags_array(np.array([load.stiffness for load in loads], dtype=float))

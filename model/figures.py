@@ -1,11 +1,10 @@
 """Pictures as matplotlib figures.
 
 - Maps of the plate's acceleration, with marks for ERAs and nulls.
-- Measurements beside a calibration, and beside promises.
-- Templates: a board in real size with the places of what is glued to it, to print and stick on.
-  Lengths are millimetres. A template of the underside is mirrored left to right, its letters are
-  not.
-- Contents: where each of several is felt, as a table predicts it, in a colour of its own.
+- Measurements compared with a calibration, and with promises.
+- Templates: full-scale drawings of a board that mark where each part is glued. Lengths are in
+  millimetres. A template of the underside is mirrored left to right, but its letters are not.
+- Contents: where each content is felt according to a table, each in its own colour.
 - Tables: weak cells, levels, contrast, and an answer with its fingertips.
 """
 
@@ -210,7 +209,7 @@ BORDER, STRIP = 12.0, 22.0
 RULER = 100  # mm
 A4 = (210.0, 297.0), (297.0, 210.0)  # mm; upright and across
 NOT_PRINTED = 8.0  # mm; edges of a page that printers leave white
-CROSS = 6.0  # mm; half of it
+CROSS = 6.0  # mm; half its size
 LETTER, LINE = 1.6, 3.2  # mm, of labels
 GRAIN = 40.0  # mm; length of the arrow
 
@@ -254,13 +253,13 @@ class Template:
         return f"{length:g} x {width:g} mm, seen from {side}; places x, y in mm"
 
     def label(self, name: str, at: tuple[float, float]) -> list[str]:
-        """Return the lines beside a place: name, output of an actuator, and coordinates."""
+        """Return the lines next to a position: name, output of an actuator, and coordinates."""
         channel = self.rig.wiring.get(name)
         output = f", output {channel.number + 1}" if channel else ""
         return [f"{name}{output}", f"{at[0]:.1f}, {at[1]:.1f}"]
 
     def places(self) -> Iterator[tuple[str, tuple[float, float], float, str]]:
-        """Yield name, place and radius [mm], and style of the circle, for all that is glued on."""
+        """Yield name, position and radius [mm], and style of the circle, for all glued parts."""
         for era in self.rig.eras:
             yield era.name, (1000 * era.x, 1000 * era.y), 1000 * era.foot, "solid"
         data: Mapping[str, Any] = self.rig.document.data if self.rig.document else {}
@@ -293,7 +292,7 @@ def write_template(path: Path, template: Template) -> int:
 
 
 def template_pages(template: Template) -> Iterator[Figure]:
-    """Yield A4 pages, upright or across, whichever takes fewer, from the top left on."""
+    """Yield A4 pages from the top left, in portrait or landscape format (fewer pages win)."""
     low, high, bottom, top = template.paper
     sizes = [(width - 2 * NOT_PRINTED, height - NOT_PRINTED - STRIP) for width, height in A4]
     counts = [
@@ -306,7 +305,7 @@ def template_pages(template: Template) -> Iterator[Figure]:
     columns, rows = pages
     for row, column in product(range(rows), range(columns)):
         upper = top - row * down
-        # Columns are counted from the left of the paper, whatever the direction of x.
+        # Columns are counted from the left of the paper, for either direction of x.
         left = high - (column + 1) * across if template.is_below else low + column * across
         name = f"; row {row + 1} of {rows}, column {column + 1} of {columns}: join at the frame"
         box = left, left + across, upper - down, upper
@@ -358,7 +357,7 @@ def _draw(axes: Axes, template: Template, box: Box) -> None:
             va="bottom" if up > 0 else "top",
             annotation_clip=True,
         )
-    if template.grain:  # an arrow at the lower end of what is seen of the board
+    if template.grain:  # arrow at the lower end of the visible part of the board
         dx, dy = (GRAIN / 2 * each for each in template.grain)
         x, y = (max(low, 0) + min(high, length)) / 2, max(bottom, 0) + CROSS + dy
         arrow = {"arrowstyle": "<->", "lw": 0.7, "color": "0.6"}
@@ -409,7 +408,7 @@ def contents_figure(
 ) -> Figure:
     """Draw a panel with all contents and one for each, as the table predicts them.
 
-    Beside every finger are its verdict, level and contrast.
+    Verdict, level and contrast are printed next to every finger.
     """
     count = len(contents)
     levels = np.array([_levels(table, each) for each in contents])
@@ -485,7 +484,7 @@ def _draw_contents(
 
 
 def _label_finger(axes: Axes, finger: Sensation, contents: Sequence[Layer]) -> None:
-    """Write verdict, level and contrast beside a finger, on the side towards the middle."""
+    """Write verdict, level and contrast next to a finger, towards the middle of the plate."""
     words = verdict_shown(finger.verdict, is_foreign_felt=finger.is_foreign_felt)
     lines = [str(words)]
     if finger.layer is not None:
@@ -531,7 +530,7 @@ def table_figures(table: LocalizationTable, overview: Overview) -> Iterator[tupl
 
 
 def weak_cells_figure(table: LocalizationTable, weak: WeakCells) -> Figure:
-    """Draw contrast from each cell to the median other finger and to one in ten."""
+    """Draw the contrast from each cell to the median other finger, and the tenth percentile."""
     panels = {
         "median other finger": weak.median_db,
         "one other finger in ten (tenth percentile)": weak.tenth_db,
@@ -547,7 +546,7 @@ def weak_cells_figure(table: LocalizationTable, weak: WeakCells) -> Figure:
 
 
 def levels_figure(table: LocalizationTable) -> Figure:
-    """Draw the highest level of any pattern of one or two ERAs at each cell."""
+    """Draw the highest level at each cell that one or two ERAs can reach."""
     levels = table.available_level_db_sl
     title = (
         f"Highest level of one or two ERAs at full stroke\n(crosses: dead, below {FELT_DB_SL:g} "
@@ -647,7 +646,7 @@ def answer_figure(table: LocalizationTable) -> Figure:
 
 
 def layer_figure(table: LocalizationTable, answer: Answer, number: int) -> Figure:
-    """Draw the level of a layer of an answer over the plate, the fingers and what is promised."""
+    """Draw the level of an answer's layer over the plate, the fingers and the promises."""
     figure = Figure(figsize=(6.4, 4.6), layout="constrained")
     axes, layer = figure.subplots(), answer.layers[number]
     axes.set_axis_off()
@@ -659,7 +658,7 @@ def layer_figure(table: LocalizationTable, answer: Answer, number: int) -> Figur
     promised = answer.fingers[layer.fingers[0]].promised_contrast_db
     if promised is not None:
         axes.set_title(
-            f"contrast at least {promised:.0f} dB on nine of ten plates", fontsize=11, pad=20
+            f"contrast at least {promised:.0f} dB on 90 % of plates", fontsize=11, pad=20
         )
     draw_level_scale(figure, [axes], table.threshold, shrink=0.8)
     return figure

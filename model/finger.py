@@ -123,8 +123,8 @@ def _centroids(low: FloatArray, high: FloatArray) -> FloatArray:
 FINGERTIP_RADIUS = 0.013
 """Radius [m] over which a fingertip counts.
 
-A contact of 5 mm radius, the mean of index fingers on touch screens, and the 8 mm by which a finger
-may move before its pattern changes (docs/concepts/people.md).
+A contact of 5 mm radius, the mean of index fingers on touch screens, and the 8 mm that a finger can
+move before its pattern changes (docs/concepts/people.md).
 """
 
 
@@ -257,7 +257,7 @@ def sensitivities(
 ) -> FloatArray:
     """Return the ratios (s, f) of a set's thresholds to those of s other sets.
 
-    By these factors an amplitude is higher above the others' thresholds. frequencies (f,) [Hz].
+    An amplitude is higher above the other sets' thresholds by these factors. frequencies (f,) [Hz].
     Raises InputError for frequencies at which any set has no data.
     """
     own = detection_threshold(frequencies, threshold)
@@ -302,7 +302,7 @@ def is_beyond(points: FloatArray, targets: Sequence[tuple[float, float]]) -> NDA
 def is_background(points: FloatArray, targets: Sequence[tuple[float, float]]) -> NDArray[np.bool_]:
     """Return which points (p, 2) [m] are background to targets [m], (p,).
 
-    Those beyond NEAR_RADIUS, or all if the plate is so small that there are none.
+    Points beyond NEAR_RADIUS, or all points on a plate too small for this.
     """
     beyond = is_beyond(points, targets)
     return beyond if beyond.any() else ~beyond
@@ -340,7 +340,7 @@ def over_threshold(
 ) -> FloatArray:
     """Divide each frequency of samples (n, p) [m/s²] at a rate [Hz] by its threshold.
 
-    Only of their felt part. Beyond the data of a set its last threshold is taken.
+    Uses only their felt part. Beyond the data of a set, its last threshold is used.
     """
     count, known = len(samples), _tabulated(threshold)[0]
     frequencies = np.clip(np.fft.rfftfreq(2 * count, 1 / sample_rate), known[0], known[-1])

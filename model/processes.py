@@ -35,9 +35,9 @@ def on_processes(
 ) -> Iterator[tuple[int, _Result]]:
     """Yield numbers of tasks with their results in the order in which they are done.
 
-    count: of processes, 1 for this one; solve: a function of a module; shared: its first argument,
-    sent to each process once. The processes end at once if the caller stops early, as on Ctrl-C.
-    Raises InputError if a process dies.
+    count: number of processes, 1 for this one; solve: a module-level function; shared: its first
+    argument, sent to each process once. The processes end immediately if the caller stops early,
+    for example on Ctrl-C. Raises InputError if a process dies.
     """
     if count == 1:
         yield from ((number, solve(shared, task)) for number, task in tasks.items())
@@ -117,7 +117,7 @@ def _run(task: Any) -> Any:
 
 
 Progress: TypeAlias = Callable[[int, int], None]
-"""Is called with what is done, of all: tasks, places, stages."""
+"""Called with the number of tasks, positions or stages done, and the total."""
 
 
 def unseen(done: int, total: int) -> None:
@@ -132,7 +132,7 @@ def check_progress(given: object) -> None:
 
 _CONNECT_TIMEOUT = 10.0  # s
 
-# Dask takes long to refuse what is not an address.
+# Dask takes long to reject an invalid address.
 _ADDRESS = re.compile(r"(tcp|tls)://[\w.\-\[\]:]+:\d{1,5}")
 
 

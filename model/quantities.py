@@ -17,9 +17,9 @@ def in_display_unit(value: float, unit: str, *, digits: int = 3) -> str:
 
 
 def with_error(value: float, error: float, unit: str = "", *, sign: str = "") -> str:
-    """Format a value with its standard error, two digits of which are shown: `74.02 ± 0.87 GPa`.
+    """Format a value with its standard error to two digits: `74.02 ± 0.87 GPa`.
 
-    Units as `in_display_unit`; sign: "+" shows that of values above zero, too.
+    Units: see `in_display_unit`; sign: "+" also shows the sign of values above zero.
     """
     factor, shown_unit = _DISPLAY_UNITS.get(unit, (1.0, unit))
     value, error = value * factor, error * factor
@@ -41,5 +41,5 @@ def percent_down(share: float) -> str:
 
 
 def counted(number: int, thing: str, *, plural: str | None = None) -> str:
-    """Format a number with its noun; plural: where it is not the noun with an s."""
+    """Format a number with its noun; plural: if it is not the noun with an s."""
     return f"{number} {thing if number == 1 else plural or f'{thing}s'}"

@@ -210,7 +210,7 @@ class NaturalModes:
         return np.asarray(self.basis(points) @ self.coordinates)
 
 
-_BEYOND = 4.0  # factor on what a mesh resolves, since coarse ones are compared with others
+_BEYOND = 4.0  # factor on a mesh's resolution, since coarse meshes are compared with others
 
 
 def natural_modes(
@@ -225,7 +225,7 @@ def natural_modes(
 
     support: free (elastic modes only), eras, or simply-supported, which is solved by finite
     elements; free: the rig's plate, if it has been solved on the mesh. Raises InputError for a
-    count below 1 or above what the mesh has, and for a simply supported plate of layers.
+    count below 1 or above the mesh's number of modes, and for a simply supported plate of layers.
     """
     if count < 1:
         raise InputError(f"modes must be 1 or more, got {count}")
@@ -296,7 +296,7 @@ MOVED = 0.1e-3
 """Distance [m] of an ERA from its nominal place; few are mounted better."""
 
 FOOT = 5e-3
-"""Radius of a foot [m] that a point stands for."""
+"""Radius of a foot [m] represented by a point."""
 
 # The coarsest MITC4 mesh of a study; on the paper's plate up to 500 Hz it is the paper's 12x9. Each
 # next one has twice as many elements along both sides.
@@ -455,7 +455,7 @@ def _solved(rig: Rig, mesh: PlateMesh) -> FreePlate:
     return solve_free_plate(rig.plate, mesh, frequency_max=rig.limits.frequency_max)
 
 
-_MAX_VALUES = 1_000_000  # of fields at once, 16 bytes each
+_MAX_VALUES = 1_000_000  # of fields per batch, 16 bytes each
 _ACCURACY = 0.005  # of polynomials before their two further degrees
 
 
@@ -507,7 +507,7 @@ def estimate_error(
         if isinstance(free.modes, FiniteElementModes)
         else [replace(free, modes=each) for each in free.modes.alternatives()]
     )
-    # Of the field, of its error by the mesh, and by what the modes leave open.
+    # Squares of the field, of its error from the mesh, and of its uncertainty from the modes.
     squares = np.zeros((3, len(frequencies), len(eras)))
     # A few points at a time: whole fields of sixteen ERAs take a gigabyte.
     parts = math.ceil(len(frequencies) * len(eras) * len(points) / _MAX_VALUES)

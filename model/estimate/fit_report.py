@@ -51,10 +51,10 @@ def estimate_table(rows: Sequence[tuple[str, str, str, str, str]]) -> list[str]:
 def quality_rows(
     uncertainty: Uncertainty, *, held_out: str = "", error: float | None = None, beside: str
 ) -> list[str]:
-    """Lines of the uncertainty that the new rig states, and of the held-out prediction.
+    """Return lines on the uncertainty stated by the new rig, and on the held-out prediction.
 
-    held_out: what was held out; error: of its prediction, relative to the response, None where too
-    little was measured to hold any out; beside: a further note on the fit's errors.
+    held_out: description of the held-out data; error: of its prediction, relative to the response,
+    None without held-out data; beside: an additional note on the fit's errors.
     """
     found = (
         f"{held_out} predicted within {percent(error)} of the response"

@@ -105,7 +105,8 @@ class Exciter(Source):
 
     @property
     def in_time(self) -> InTime:
-        """Its equations in time, of a current that follows u - L u' / R at once, R = R_e + R_g.
+        """Equations in the time domain, for a current that follows u - L u' / R without delay, R =
+        R_e + R_g.
 
         u is the voltage less the back EMF. Force and damping are within (omega L / R)² of the exact
         ones, 0.5 % at 500 Hz of a common coil.

@@ -1,1 +1,1 @@
-"""An amplifier made of software, played by a sound device."""
+"""A software amplifier that plays through a sound card."""

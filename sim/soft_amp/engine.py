@@ -15,7 +15,7 @@ from model.errors import InputError
 from sim.soft_amp.settings import Law, SoftAmplifierLine, SoftAmplifierSettings
 
 ENGINE = "sound-engine.so"
-"""The file of the library in a wheel of one platform; no name of a module, which it would hide."""
+"""File of the library in a platform wheel. It is not named like a module, which it would hide."""
 
 _HERE = Path(__file__).parent
 _FOLDERS = (_HERE / "firmware", _HERE.parents[1] / "firmware")  # of a wheel, of a checkout
@@ -34,7 +34,7 @@ _WHAT = "soft-amp: its engine"
 
 @cache
 def library() -> ctypes.CDLL:
-    """Load the library, compiled if there is none; raises InputError."""
+    """Load the library, and compile it if necessary; raises InputError."""
     own = _HERE / ENGINE
     if own.exists():
         try:
@@ -48,14 +48,14 @@ def library() -> ctypes.CDLL:
 
 
 def callback_address(name: str) -> int:
-    """Return the address of a function of the library, a callback."""
+    """Return the address of a callback in the library."""
     found = ctypes.cast(getattr(library(), name), ctypes.c_void_p).value
     assert found is not None  # noqa: S101  of a function
     return found
 
 
 def compile_engine(path: Path) -> None:
-    """Compile the library to a file. Raises InputError."""
+    """Compile the library to a file; raises InputError."""
     sources, _, flags = _recipe()
     compile_library(path, sources, flags=flags, what=_WHAT)
 

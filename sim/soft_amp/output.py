@@ -35,10 +35,10 @@ def sounddevice() -> ModuleType:
 
 
 def portaudio_device(device: str, *, outputs: int, inputs: int = 0) -> Any:
-    """Return PortAudio's description of a device, by its name or number.
+    """Find a device by its name or number, and return PortAudio's description.
 
-    outputs, inputs: channels that it must have. Raises InputError for a device that does not suit,
-    LinkError if there is no device at all.
+    outputs, inputs: required channels. Raises InputError for an unsuitable device, LinkError if
+    there is no device at all.
     """
     library = sounddevice()
     number: int | str = int(device) if device.isdecimal() else device
@@ -145,9 +145,9 @@ _REFUSED = {-9997: "--rate", -9998: "--channels"}
 
 
 class PortAudioOutput:
-    """The stream of a software amplifier; its callback is C, without Python.
+    """The stream of a software amplifier, with a callback in C.
 
-    Raises InputError for a device that does not suit, LinkError for one that is busy or not there.
+    Raises InputError for an unsuitable device, LinkError for one that is busy or missing.
     """
 
     def __init__(self, settings: SoftAmplifierSettings) -> None:

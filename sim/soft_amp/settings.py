@@ -1,4 +1,4 @@
-"""What a software amplifier is to do, and where hosts reach it."""
+"""Settings of a software amplifier, and the line on which hosts reach it."""
 
 import math
 import os
@@ -12,20 +12,20 @@ from pathlib import Path
 from model.errors import InputError
 
 MAX_CHANNELS = 32
-"""Of two amplifiers; one has at most 16 by the protocol."""
+"""Channels of two amplifiers; the protocol allows 16 per amplifier."""
 
 CHANNELS_OF_AMPLIFIER = 16
 
 
 class Law(StrEnum):
-    """How a sample follows from the wanted one; in the order of `enum law`."""
+    """Function from the wanted force to the sample, in the order of `enum law`."""
 
     LINEAR = "linear"
     SQUARE = "square"
 
 
 class Protocol(IntEnum):
-    """Of the line; the values are those of `enum protocol`."""
+    """Protocol of the line, numbered as in `enum protocol`."""
 
     SERIAL = 0
     MODBUS = 1
@@ -73,7 +73,7 @@ class SoftAmplifierSettings:
 
 
 def check_rate(rate: float, *, what: str) -> int:
-    """A sample rate [Hz] that the engine can have; InputError otherwise."""
+    """Return a sample rate [Hz] that suits the engine; raises InputError."""
     if rate % 1000 or not 8000 <= rate <= 192_000:
         raise InputError(
             f"{what}: sample rate must be a multiple of 1000 Hz from 8000 to 192000, got {rate:g} "

@@ -1,4 +1,4 @@
-"""`era soft-amp`: an amplifier made of software, played by a sound device."""
+"""The command `era soft-amp`."""
 
 import sys
 from contextlib import suppress
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 def port_option(served: str) -> Any:
-    """The option for a loopback port; served: what is served there."""
+    """Return the option for a loopback port; served: the protocol on this port."""
     return typer.Option(
         metavar="PORT", help=f"Serve {served} on this loopback port; 0: any.", min=0, max=65535
     )

@@ -1,7 +1,7 @@
 """A software amplifier that plays, in the process of the command.
 
-Its sound comes from the callback in C. The loop here ends it when the device is gone, counts what
-was lost, and tells systemd that the sound goes on.
+Its sound comes from the callback in C. The loop in this module ends the process when the device is
+lost, reports gaps, and notifies systemd as long as blocks are rendered.
 """
 
 import os
@@ -48,7 +48,7 @@ def _raise_priority() -> None:
 class SoftAmplifierPlayer:
     """An amplifier on an open device; report: takes a line for each event.
 
-    Raises InputError for a device that does not suit, LinkError for one that is busy or not there.
+    Raises InputError for an unsuitable device, LinkError for one that is busy or missing.
     """
 
     def __init__(

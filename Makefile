@@ -93,6 +93,7 @@ lint: .venv/installed-test
 	$(BIN)/mypy
 	$(BIN)/python tests/support/checks/vocabulary.py
 	$(BIN)/python tests/support/checks/unique_names.py
+	$(BIN)/python tests/support/checks/english.py
 	$(PAGES) --check
 
 # Weight and density of the tree, for reviewers; nothing fails on them. One folder: make weigh WEIGH=controller

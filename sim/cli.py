@@ -49,7 +49,7 @@ def sim(
         list[str] | None,
         typer.Option(
             metavar="NAME=WIRE",
-            help="Wire of one amplifier: main=serial, side=modbus-tcp:5020 (repeatable). "
+            help="Wire of an amplifier: main=serial, side=modbus-tcp:5020 (repeatable). "
             "Default: the scheme of its url in the rig.",
         ),
     ] = None,
@@ -101,7 +101,7 @@ def sim(
 ) -> None:
     """Simulate the amplifiers of a rig on real wires. Print a URL for each; Ctrl-C ends.
 
-    The plate deviates from the rig within the rig's uncertainty, the same for the same --seed.
+    The simulated plate is drawn at random from the rig's tolerances (repeatable with --seed).
     """
     from sim.early_exit import exit_on_signal
 
@@ -121,7 +121,7 @@ def sim(
             speed=speed,
             shared=shared,
             unpluggable=faults is not None,
-            line_kind=PROMPT if virtual_time else None,  # a host has no time that stands still
+            line_kind=PROMPT if virtual_time else None,  # a host's time never stops
             seed=drawn or 0,
         )
         common = _common_wire(

@@ -13,7 +13,7 @@ _INTERRUPTED = 130
 
 @contextmanager
 def exit_on_signal() -> Iterator[None]:
-    """Exit at once with status 130 on SIGTERM and SIGINT."""
+    """Exit immediately with status 130 on SIGTERM and SIGINT."""
     numbers = (signal.SIGTERM, signal.SIGINT)
     before = [signal.signal(number, lambda *_: os._exit(_INTERRUPTED)) for number in numbers]
     try:

@@ -75,7 +75,7 @@ class FaultWindow(Section):
 
 @dataclass
 class Faults:
-    """The faults of one amplifier and its wire; begin [s]: when the windows' time scale begins.
+    """Faults of an amplifier and its wire; begin: origin of the windows' time scale [s].
 
     The same seed gives the same faults.
     """
@@ -97,7 +97,7 @@ class Faults:
     ) -> list[tuple[float, bytes]]:
         """Delivered pieces of a frame sent at a time [s], each with its delay [s].
 
-        finds_damage: whether the wire itself discards what is damaged, as TCP does.
+        finds_damage: whether the wire itself discards damaged data, like TCP.
         """
         arriving = [(0.0, frame)]
         for window in self.windows:
@@ -150,7 +150,7 @@ class FaultFile(Section):
     faults: list[FaultWindow]
 
     def of(self, amplifier: str, *, begin: float) -> Faults:
-        """The faults of one amplifier; begin [s]: when their time scale begins."""
+        """Return the faults of an amplifier; begin: origin of their time scale [s]."""
         own = [window for window in self.faults if window.amplifier in (None, amplifier)]
         return Faults(own, begin=begin, seed=self.seed)
 

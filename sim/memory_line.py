@@ -1,8 +1,8 @@
 """Simulated amplifiers in this process, by URLs `sim://RIG.yaml`; amplifiers share their rig.
 
-The plate deviates from the rig's within its uncertainty, as that of `era sim`. The amplifiers of a
-rig that are named are under one plate, as are those of one control socket; the only amplifier of a
-rig that is not named has one of its own. Requests and replies are the bytes of a serial line, with
+As in `era sim`, the plate is drawn at random from the rig's tolerances. All named amplifiers of a
+rig drive the same plate, as do all amplifiers of one control socket; the only amplifier of a rig,
+if not named, has a separate plate. Requests and replies are the bytes of a serial line, with
 the delays of a USB adapter where a rig has several amplifiers. Not modelled: transmission time.
 """
 
@@ -39,7 +39,7 @@ _FORM = (
 class SimulationUrl:
     """A URL `sim://RIG.yaml[?control=PATH][&amplifier=NAME][&line=KIND][&seed=N]`.
 
-    `&exact` in place of a seed, None here: the rig's own plate, with no deviation. Raises
+    `&exact` in place of a seed, None here: the nominal plate, without errors. Raises
     CommandError.
     """
 
@@ -61,7 +61,7 @@ class SimulationUrl:
         self.line_kind = options.get("line")
 
     def delays(self, rig: Rig, amplifier: str) -> LineDelays | None:
-        """Those of an amplifier's line; as is usual where the rig has several amplifiers."""
+        """Delays of an amplifier's line; the usual ones if the rig has several amplifiers."""
         kind = self.line_kind or (SIMULATED if len(rig.amplifiers) > 1 else None)
         return delays_of(kind, self.seed, amplifier)
 
@@ -94,7 +94,7 @@ async def _opened(url: SimulationUrl) -> AsyncIterator[tuple[SimulationContext, 
 
 
 def _shared(url: SimulationUrl) -> "_SharedRig":
-    """That of open amplifiers of the rig and control, or a new one."""
+    """Return the simulation of open amplifiers of this rig and control, or a new one."""
     if url.control is None and url.amplifier is None:
         return _SharedRig(None)
     control = url.control and url.control.resolve()
@@ -188,7 +188,7 @@ class MemoryPort:
         self._wire.inward.send(data)
 
     def poll(self) -> None:
-        """Do nothing: what has come was handed over."""
+        """Do nothing: received bytes were already delivered."""
 
     def close(self) -> None:
         """Close it; disarm before, or vibrations last until the watchdogs trip."""

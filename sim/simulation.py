@@ -1,7 +1,7 @@
 """The simulation as a process: a bench behind its wires, until a signal ends it.
 
-Time is that of the event loop: the wall clock, or a virtual clock that is stepped explicitly while
-I/O is served as usual.
+Uses the time of the event loop: the wall clock, or a virtual clock stepped explicitly while I/O is
+served as usual.
 
 The project's firmware may be in place of the simulated amplifiers: a process with a serial line for
 each. `make firmware` builds it from the sources of a checkout; it is not part of the wheel. Its
@@ -39,7 +39,7 @@ _STARTUP_TIMEOUT = 10.0  # s
 
 
 def find_firmware() -> Path:
-    """The built firmware, a program; InputError where there is none."""
+    """Return the program of the built firmware; InputError if it does not exist."""
     program = FIRMWARE_FOLDER / "era-firmware"
     if program.exists():
         return program
@@ -109,7 +109,7 @@ class Simulation:
     """A rig and the wires of its amplifiers, by name.
 
     faults: with times from when the URLs are printed; fingers: initial positions [m];
-    imperfections: in what the bench differs from the rig; control: path of the control socket;
+    imperfections: differences between bench and rig; control: path of the control socket;
     until_eof: end with standard input; firmware: in the place of the simulated amplifiers;
     links: to their pseudo-terminals.
     """
@@ -140,7 +140,7 @@ async def run_simulation(
     ready is called once with the URLs by amplifier. Time is virtual in a `SteppedLoop`. Raises
     InputError, LinkError.
     """
-    import termios  # noqa: F401  # fails where there are neither terminals nor these signals
+    import termios  # noqa: F401  # fails on systems without terminals and these signals
 
     ended = asyncio.Event()
     loop = asyncio.get_running_loop()

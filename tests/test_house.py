@@ -8,11 +8,12 @@ import ast
 import re
 from graphlib import TopologicalSorter
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from changed_tests import ALSO, also
-from checks import vocabulary
+from checks import english, vocabulary
 from checks.vocabulary import retired_identifiers
 
 ROOT = Path(__file__).parents[1]
@@ -63,3 +64,51 @@ def test_what_users_copy_keeps_the_rule(tmp_path: Path, monkeypatch: pytest.Monk
     monkeypatch.setattr(vocabulary, "ROOT", tmp_path)
     found = [each.partition(", use")[0] for each in retired_identifiers()]
     assert found == ["examples/one.py:1: begin", "README.md:5: begin"]
+
+
+FOREIGN = {
+    "README.md": "# Plate\n\nCode such as `what is` is free.\n\nIt plays what\nis asked.\n",
+    "docs/how-to/page.md": "```\nat once\n```\n\n| key | all that plays |\n",
+    "examples/rig.yaml": "plate: 1\nmass: 2  # nine of ten\n",
+    "model/module.py": '''"""Answers of it."""
+
+WEIGHT = 1  # kg; beside the plate
+
+
+@app.command()
+def stop() -> None:
+    """Stop at once."""
+    raise InputError(
+        f"the plate {name} deviates "
+        "anew"
+    )
+
+
+_logger.warning("as of %s", "what", "is")
+''',
+}
+
+
+def test_foreign_sentences_are_found_at_their_lines(tmp_path: Path) -> None:
+    """In pages, YAML comments, docstrings, comments, help, errors and the log, but not in code."""
+    for name, text in FOREIGN.items():
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text(text, "utf-8")
+    prose = english.read(tmp_path, allowed=["asked"])
+    found = {
+        name: [(finding.line, finding.pattern) for finding in part.findings]
+        for name, part in prose.items()
+        if part.findings
+    }
+    assert found == {
+        "README.md": [(5, "clause for a noun")],
+        "docs/how-to/page.md": [(5, "pronoun for a noun")],
+        "examples/rig.yaml": [(2, "nine of ten")],
+        "model: docs": [(1, "of it"), (3, "beside")],
+        "model: texts": [(8, "at once"), (10, "deviate"), (11, "archaic"), (15, "as of")],
+    }
+    settings: dict[str, Any] = {"budgets": {"default": 2.0, "docs": 6.0}, "exceptions": {}}
+    reported = "\n".join(english.over_budget(prose, settings))
+    assert "model/module.py:8: at once: 'Stop at once'; write immediately" in reported
+    settings["exceptions"] = {name: {"budget": 2000.0} for name in prose}
+    assert not [*english.over_budget(prose, settings)]

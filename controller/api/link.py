@@ -42,7 +42,7 @@ class Unreachable(LinkError):
     def at(cls, path: Path, error: OSError) -> "Unreachable":
         """Return the error for a failed connection to a socket, with its remedy."""
         if path.exists() and not path.is_socket():
-            return cls(f"{path} is not a socket; give the one that `era daemon` printed")
+            return cls(f"{path} is not a socket; give the socket that `era daemon` printed")
         if isinstance(error, FileNotFoundError | ConnectionRefusedError):
             return cls(
                 f"no daemon runs at {path}; start one (era daemon CONFIG), or give the socket of "

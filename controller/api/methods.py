@@ -230,7 +230,7 @@ class PlayParams(ApiMessage):
     level_db_sl: float | None = Field(
         None,
         description="-20 or more. For an effect, default and maximum are its own level; for "
-        "points, the default is 20 and the maximum is that of the layout",
+        "points, the default is 20 and the layout has the maximum",
     )
     points: _Points = Field(
         [],

@@ -232,7 +232,7 @@ def require_untouched(*, is_known: bool, has_terminal: bool) -> None:
         raise InputError(
             "nothing must touch the plate during the measurement; check it, and confirm with --yes"
         )
-    typer.confirm("Is nothing touching the plate, for the next minute?", abort=True, err=True)
+    typer.confirm("Will the plate be free of contact for the next minute?", abort=True, err=True)
 
 
 def measured_line(rig: "Rig", measured: "MeasuredPlate") -> str:

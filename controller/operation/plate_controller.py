@@ -60,7 +60,7 @@ class Controller:
         self.urls = dict(rig.amplifiers if urls is None else urls)
         if self.urls.keys() != rig.amplifiers.keys():
             raise InputError(
-                f"amplifiers must be those of the rig ({', '.join(sorted(rig.amplifiers))}), got "
+                f"amplifiers must match the rig ({', '.join(sorted(rig.amplifiers))}), got "
                 f"{', '.join(sorted(self.urls)) or 'none'}"
             )
         self._make_lines = lines

@@ -186,7 +186,7 @@ def band_problem(band: Band, frequencies: FloatArray) -> str | None:
 
 Targets = tuple[tuple[Contact, Target], ...]
 
-BEING_CHOSEN = "what it shall feel is being chosen; wait a moment"
+BEING_CHOSEN = "its content is being selected; wait a moment"
 
 
 def own_level_db_sl(sensation: Sensation) -> float:
@@ -632,7 +632,7 @@ def _power_db(power: float) -> float:
 
 def no_layer_free(count: int) -> str:
     """Return why a content is held back when all layers of the amplifiers are in use."""
-    return f"no layer is free: the amplifiers play {count} contents at once; lift a finger"
+    return f"no layer is free: the amplifiers play {count} simultaneous contents; lift a finger"
 
 
 def not_served(contact: Contact, reason: str) -> FingerSensation:

@@ -1,1 +1,1 @@
-"""The simulated amplifier: its states, what its channels play, how warm it is."""
+"""The simulated amplifier: states, playback of channels, temperature."""

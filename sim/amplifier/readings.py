@@ -1,4 +1,4 @@
-"""What a simulated amplifier reports: capabilities, measurements, faults, temperature and clock.
+"""Reports of a simulated amplifier: capabilities, measurements, faults, temperature and clock.
 
     Crystal: counts age + error * age + warm_up * tau * (age - tau * (1 - exp(-age / tau))) [s]
     Clock:   runs 1 + rate times as fast as its crystal, from each change of its rate on
@@ -113,9 +113,9 @@ LIMITED = 1 + _Q["level"].step
 
 
 def with_readings(status: Values, *, temperature: float, supply: float) -> Values:
-    """Return a status with its readings, which may follow from the rest of it.
+    """Return a status with its readings, which can depend on its other values.
 
-    temperature [°C]; supply: share of its voltage that the supply has.
+    temperature [°C]; supply: supply voltage relative to its nominal value.
     """
     in_units = {"temperature": temperature, "high_voltage": HIGH_VOLTAGE * supply}
     return status | {name: _Q[name].to_wire(value) for name, value in in_units.items()}
@@ -139,7 +139,7 @@ def fault_list(faults: Iterable[FaultRecord], now: float) -> Values:
 
 
 def achieved(playback: Playback, layer: int) -> Values:
-    """Return the values of GetAchieved: what a layer plays."""
+    """Return the values of GetAchieved for a layer."""
     playing = playback.playing(layer)
     commands = [
         {
@@ -161,10 +161,10 @@ def achieved(playback: Playback, layer: int) -> Values:
 
 
 def measured(playback: Playback, now: float) -> Iterator[Values]:
-    """Yield what a capacitor of a typical actuator draws at the level of each channel."""
+    """Yield the current of a typical actuator's capacitor at the level of each channel."""
     for channel in range(playback.channels):
         level = min(playback.level(channel, now), 1.0)
-        # Force goes with the voltage squared, at half the frequency.
+        # Force is proportional to the squared voltage, at half the frequency.
         voltage = HIGH_VOLTAGE * math.sqrt(level / 2)
         frequencies = [voice.frequency for voice in playback.all_voices[channel]]
         omega = math.pi * max(frequencies, default=0.0)
@@ -197,8 +197,8 @@ _STEPS = 4  # of Newton's method: each leaves the square of an error of 1e-4
 class Crystal:
     """A crystal, by default without errors.
 
-    error: relative, by which it is fast at first; warm_up [1/s]: by which that grows at first, see
-    `SETTLING`; ahead [s]: what the clock shows beyond the bench's time at first.
+    error: initial relative rate error; warm_up: its initial growth [1/s], see `SETTLING`; ahead:
+    initial lead of the clock over the bench's time [s].
     """
 
     error: float = 0.0
@@ -220,14 +220,14 @@ class Crystal:
 
 
 class StraightClock(NamedTuple):
-    """A clock that runs straight on: what it shows [s] at a time [s], and its seconds a second."""
+    """A clock with a constant rate: its value [s] at a time [s], and its rate."""
 
     time: float
     shown: float
     pace: float
 
     def at(self, time: float) -> float:
-        """Return what it shows at a time [s], within a turn."""
+        """Return its value at a time [s], within a turn."""
         return (self.shown + (time - self.time) * self.pace) % CLOCK_TURN
 
 
@@ -251,7 +251,7 @@ class AmplifierClock:
         return clock_at(self._parts(time) % _TURN / _PER_SECOND)
 
     def seconds(self, time: float) -> float:
-        """Return the clock [s] at a time [s], where it does not go round."""
+        """Return the clock [s] at a time [s], without wrapping."""
         return self._parts(time) / _PER_SECOND
 
     def straight(self, time: float) -> StraightClock:
@@ -284,7 +284,7 @@ class AmplifierClock:
     def reaches(self, high: int, time: float) -> float:
         """Return when its high word becomes this one next [s], as it runs at a time [s].
 
-        That time itself, where it begins just there.
+        That time itself, if it starts exactly there.
         """
         left = (high * HIGH_STEPS * _TURN // SPAN - self._parts(time)) % _TURN
         counted = self._counted(time) / _PER_CRYSTAL + left / (_PER_CRYSTAL * self._pace_words)

@@ -2,7 +2,7 @@
 
 Requests and replies are the values of their records (`drivers.protocol.definition`), integers of
 the wire. Events happen at their own time: a watchdog that expired between two calls expired when it
-was due, and what plays is a description in time (`drivers.playing`), not samples.
+was due, and playback is a description in time (`drivers.playing`), not samples.
 
 `AMPLIFIER_TRANSITIONS` has the requests that are allowed in each state, and the state that follows;
 any other request is refused (WRONG_STATE). Transitions without a request: OPERATION_ENABLED to
@@ -88,7 +88,7 @@ Layers: TypeAlias = tuple[LayerSet, ...]
 
 
 class SetIntake:
-    """Takes the parts of sets, and keeps the one that is whole until it is committed.
+    """Takes the parts of sets, and stores a complete set until it is committed.
 
     capabilities: values of its record. committed: token of the set committed last, 0 for none.
     One set is under way at most: collected, or staged.
@@ -115,7 +115,7 @@ class SetIntake:
         """Take the last part of a set that was not committed, at a time [s].
 
         Returns the layers that are staged now, or the number of the first part that is missing.
-        Raises Refusal, which drops the parts of this set alone, and only where that is whole.
+        Raises Refusal; this drops only the parts of this set, and only if it is complete.
         """
         token, under_way = part["token"], self._under_way(now)
         is_under_way = token == under_way
@@ -143,7 +143,7 @@ class SetIntake:
         return layers
 
     def commit(self, token: int, now: float) -> Layers | None:
-        """Return the layers of the staged set; None where it was committed before.
+        """Return the layers of the staged set; None if it was already committed.
 
         Raises Refusal if none is staged under this token.
         """
@@ -158,7 +158,7 @@ class SetIntake:
         return layers
 
     def drop(self) -> None:
-        """Discard what is not committed."""
+        """Discard everything not committed."""
         self._parts, self._staged = Assembly(), None
 
     def forget(self) -> None:
@@ -209,8 +209,8 @@ class SimulatedAmplifier:
     """An amplifier with a name and a number of channels; times [s] of any one clock.
 
     listeners: called with the values of every Event, and its time [s]. capabilities: others hold
-    from the next restart. session: held while armed, or the one that ended last. clock: on which
-    phases count, by default without errors.
+    from the next restart. session: held while armed, or the last one. clock: reference of
+    phases, by default without errors.
     """
 
     is_answering = True
@@ -255,7 +255,7 @@ class SimulatedAmplifier:
         self._watchdog = 0.0
         self._last_fed = 0.0
         self.token = 0
-        """Of the set since arming that changed last what plays; 0: none."""
+        """Token of the last set since arming that changed the playback; 0: none."""
         self._silent_from = -math.inf  # end of the last silencing ramp
         self._discharged_from = -math.inf  # of the last one while high voltage was on
         self._is_limited = False
@@ -268,7 +268,7 @@ class SimulatedAmplifier:
 
     @property
     def next_event(self) -> float:
-        """Time of the next event [s], until which what plays is known."""
+        """Time of the next event [s]; playback is known until then."""
         due = self.playback.next_due
         if self._waiting is not None:
             due = min(due, self._waiting[0])
@@ -278,7 +278,7 @@ class SimulatedAmplifier:
         return min(due, self._last_fed + self._watchdog, hot)
 
     def tick(self, now: float) -> None:
-        """Process the events due by now, in order."""
+        """Process the events due at now, in order."""
         while (moment := self.next_event) <= now:
             if self._waiting is not None and moment == self._waiting[0]:
                 self._start_waiting(moment)
@@ -358,11 +358,11 @@ class SimulatedAmplifier:
         )
 
     def withdraw_status(self) -> None:
-        """Take the last status back, as that of a broadcast: the next one shows the same."""
+        """Withdraw the last status, as after a broadcast: the next one shows the same."""
         self._marked, self._is_limited = self._shown_once
 
     def summary(self, now: float) -> AmplifierSummary:
-        """What it does at a time [s] up to which it has been ticked; unlike a status, no report."""
+        """Return its state at the time [s] of the last tick, without the effects of a status."""
         levels, is_on = self._levels(now)
         return AmplifierSummary(self.state, self.fault, self._intake.committed, is_on, levels)
 
@@ -399,7 +399,7 @@ class SimulatedAmplifier:
             self._handle_overtemperature(moment)
 
     def restart(self, moment: float) -> None:
-        """Power-cycle: silent at once, disarmed, without sets."""
+        """Power-cycle: immediately silent, disarmed, without sets."""
         self._heat = ThermalState(moment, self._heat.at(moment))
         self.fault = "NONE"
         self._start()
@@ -457,7 +457,7 @@ class SimulatedAmplifier:
         return None
 
     def _is_foreign(self, session: int, name: str) -> bool:
-        """Whether a session is not the one that is held, or to arm, has ended."""
+        """Whether a session is not the current one or, for arming, has ended."""
         if self.state == _ENABLED:
             return session != self.session
         return name == "Arm" and session == self.session
@@ -487,7 +487,7 @@ class SimulatedAmplifier:
             self._enter(following, now)
 
     def take_part(self, part: Values, now: float) -> Values:
-        """Take the last part of a set, and play it where it is whole and says so."""
+        """Take the last part of a set, and play the set if it is complete and so requests."""
         token = part["token"]
         taken = None if token == self._intake.committed else self._intake.take(part, now)
         is_missing = isinstance(taken, int)
@@ -531,7 +531,7 @@ class SimulatedAmplifier:
         self._changed(now)
 
     def _silence(self, moment: float, *, ramp: float) -> None:
-        """Silence every channel within the ramp [s], and discard what is staged or waits."""
+        """Silence every channel within the ramp [s], and discard staged and waiting sets."""
         self.playback.silence(moment, ramp)
         self._silent_from = max(self.playback.silent_from, moment)
         if self.state in ("SWITCHED_ON", _ENABLED):
@@ -557,7 +557,7 @@ class SimulatedAmplifier:
             listener(event, moment)
 
     def _changed(self, moment: float) -> None:
-        """Note that what plays changes."""
+        """Record a change of playback."""
         squares = (self.playback.settled(channel) ** 2 for channel in self._channels)
         self._heat = self._heat.driven(moment, load=sum(squares) / len(self._channels))
 

@@ -1,4 +1,4 @@
-"""An amplifier of a bench as far ends serve it, with faults injected at their times."""
+"""An amplifier of a bench, as served by far ends, with injected faults."""
 
 import asyncio
 import math
@@ -14,12 +14,12 @@ from sim.faults import Faults, FaultWindow
 
 
 class AmplifierDevice:
-    """An amplifier of a bench by name, in the place of an `Amplifier`, with its faults.
+    """An amplifier of a bench by name, in place of an `Amplifier`, with its faults.
 
-    Requests advance the bench, and what they change moves its plate. In a storm of Naks it refuses
-    all of them but Hello. address: on its wire, from 1; plug_listeners: called when the wire is
-    unplugged (False) and plugged in again (True); boot_listeners: when its supply is back;
-    listeners: with the values of every Event, and its time [s]. Its time is that of the running
+    Requests advance the bench, and their changes move its plate. In a storm of Naks it rejects all
+    requests except Hello. address: on its wire, from 1; plug_listeners: called when the wire is
+    unplugged (False) and plugged in again (True); boot_listeners: called when its supply is back;
+    listeners: called with the values of every Event, and its time [s]. Uses the time of the running
     event loop.
     """
 
@@ -75,7 +75,7 @@ class AmplifierDevice:
         return self._bench.exchange(self.name, name, values, now=now)
 
     def withdraw_status(self) -> None:
-        """Take the last status back, as that of a broadcast."""
+        """Withdraw the last status, as after a broadcast."""
         self._amplifier.withdraw_status()
 
     def restart(self, moment: float) -> None:
@@ -90,7 +90,7 @@ class AmplifierDevice:
             self._schedule(window)
 
     def inject_fault(self, window: FaultWindow) -> None:
-        """Add a fault that begins now, whatever its `at`."""
+        """Add a fault that starts now, ignoring its `at`."""
         now = threads.now()
         window = window.model_copy(update={"at": now - self.faults.begin})
         self.faults.windows = (*self.faults.windows, window)

@@ -1,11 +1,11 @@
 """The simulated rig: amplifiers and fingers on one plate in the time domain.
 
-Time is passed in; only `keep_time` reads a clock. Channels drive the ERAs by the rig's wiring,
-level 1 being the full stroke, with the imperfections given.
+Time is passed in; only `keep_time` reads a clock. Channels drive the ERAs according to the rig's
+wiring, with the given imperfections; level 1 is the full stroke.
 
-The plate is solved anew where the motion of a base changes, and a host changes the rate of an
-amplifier's clock with every Ping. So the plate continues with a straight clock for each amplifier
-until that differs by `WRONG` from the amplifier's own.
+The plate is solved again whenever the motion of a base changes, and a host changes the rate of an
+amplifier's clock with every Ping. The plate therefore uses a straight clock for each amplifier
+until it differs by `WRONG` from the amplifier's own clock.
 """
 
 import asyncio
@@ -50,31 +50,31 @@ from sim.plant.imperfections import Imperfections, motion_of, realised
 from sim.plant.plant import PLANT_SAMPLE_RATE, FingerPlacement, LoadedPlate, Plant
 
 WRONG = 0.5e-6
-"""Most by which a clock of the plate is wrong [s]: 0.1 degrees of 500 Hz, when it is replaced."""
+"""Largest error of a clock of the plate [s], 0.1 degrees at 500 Hz; then it is replaced."""
 
-_SOON = 0.05  # s; of a clock that is wrong then: a rate that is no correction of the last
-_ALIKE = 10e-6  # of a pace; rates that a host chooses by readings that are not exact
-_DRIFT = 0.1e-6  # s; by which the warm-up of a crystal may change it unseen
+_SOON = 0.05  # s; a clock wrong within this time has a new rate, not a corrected one
+_ALIKE = 10e-6  # of a pace; tolerance of rates that a host derives from inexact readings
+_DRIFT = 0.1e-6  # s; tolerance for the warm-up of a crystal
 
 
 class StraightClocks:
-    """Straight clocks in place of those of amplifiers by name, which hold at a time [s]."""
+    """Straight approximations of amplifier clocks by name, valid at a time [s]."""
 
     def __init__(self, clocks: Mapping[str, AmplifierClock], *, time: float) -> None:
         self._clocks = clocks
         self.straight = {name: clock.straight(time) for name, clock in clocks.items()}
-        """Those that hold now, by name."""
+        """Current clocks by name."""
         self._due = dict.fromkeys(clocks, time)
         self._changes = dict.fromkeys(clocks, 0)
         self.renew(time)
 
     @property
     def next_due(self) -> float:
-        """When one of them has to be looked at [s]."""
+        """Time [s] of the next check of a clock."""
         return min(self._due.values())
 
     def renew(self, time: float) -> list[str]:
-        """Replace those that do not hold from a time [s] on; return their names."""
+        """Replace clocks that are no longer valid at a time [s]; return their names."""
         renewed = []
         for name, clock in self._clocks.items():
             if time < self._due[name] and self._changes[name] == clock.changes:
@@ -84,7 +84,7 @@ class StraightClocks:
             lasts = _lasts(self.straight[name], now)
             if lasts < _SOON:
                 known = self.straight[name]
-                # The mean pace since another clock was right, where that is alike.
+                # The mean pace since the previous replacement, if it is similar.
                 mean = known.pace + _behind(known, now) / max(now.time - known.time, _SOON)
                 self.straight[name] = (
                     now._replace(pace=mean) if abs(mean - now.pace) < _ALIKE else now
@@ -96,28 +96,28 @@ class StraightClocks:
 
 
 def _lasts(known: StraightClock, now: StraightClock) -> float:
-    """Return for how long [s] a clock is right enough, negative if it is wrong."""
+    """Return how long [s] a clock remains accurate, negative if it is wrong."""
     drift, left = abs(now.pace - known.pace), WRONG - abs(_behind(known, now))
     return left / drift if drift else math.copysign(math.inf, left)
 
 
 def _behind(known: StraightClock, now: StraightClock) -> float:
-    """Return by how much a clock is behind that of now [s]."""
+    """Return the lag of a clock behind the current one [s]."""
     return math.remainder(now.shown - known.at(now.time), CLOCK_TURN)
 
 
 _TICK = 0.01  # s; of `keep_time`
-_MAX_BEHIND = 0.1  # s; of the plate behind the amplifiers, once time goes on
-_MAX_STEP = 1.0  # s; sampled at once
+_MAX_BEHIND = 0.1  # s; lag of the plate behind the amplifiers
+_MAX_STEP = 1.0  # s; sampled in one step
 
 Voices: TypeAlias = tuple[Voice, ...]
-"""What a channel plays."""
+"""Voices of a channel."""
 
 
 class Bench:
     """A simulated rig at rest at time now [s]; sample_rate [Hz]: of fingers.
 
-    Fingers load the plate as the rig's fingertip. imperfections: in what the bench differs from the
+    Fingers load the plate like the rig's fingertip. imperfections: differences between bench and
     rig. Raises InputError for unknown channels.
     """
 
@@ -134,14 +134,14 @@ class Bench:
         self.sample_rate = sample_rate
         self.imperfections = imperfections
         self.real = imperfections.plate.realised(rig)
-        """The rig with the errors of plate and ERAs: what moves, and where feet stand."""
+        """The rig with the errors of plate and ERAs, and its feet."""
         self.time = now
-        """The present time [s]."""
-        # Behind the amplifiers, and advanced in few large steps: nothing acts back on them.
+        """Current time [s]."""
+        # Lags behind the amplifiers, in few large steps: nothing acts back on them.
         self._plant = _plant_of(self.real, now)
         self._sampled_until = now  # up to when [s] fingers have samples
         self._fingers = PlateFingers(self._plant.reduced)
-        # Fingers that are not on the plate in time yet; the newest, and those that load the plate.
+        # Fingers not yet on the plate; the newest placement, and the one that loads the plate.
         self._placements: deque[FingerPlacement] = deque()
         self.positions: Mapping[str, Point] = {}
         self._contacts: Mapping[str, FingertipLoad] = {}
@@ -158,7 +158,7 @@ class Bench:
         }
         clocks = {name: amplifier.clock for name, amplifier in self.amplifiers.items()}
         self._clocks = StraightClocks(clocks, time=now)
-        # By ERA: what its channel plays, and what moves its base, later by the amplifier's delay.
+        # By ERA: voices of its channel, and those moving its base after the amplifier's delay.
         self._wired = [rig.wiring[era.name] for era in rig.eras]
         self._commanded: list[Voices] = [()] * len(rig.eras)
         self._applied_outputs: list[Voices] = [()] * len(rig.eras)
@@ -169,7 +169,7 @@ class Bench:
 
     @property
     def fingers(self) -> PlateFingers:
-        """The fingers, with what they have felt up to the present time."""
+        """The fingers, with their vibration up to the current time."""
         self._sample_plate()
         return self._fingers
 
@@ -251,7 +251,7 @@ class Bench:
 
     @property
     def unsolved(self) -> FingerPlacement | None:
-        """The first of the fingers that are to be placed whose plate is not solved, if any."""
+        """The first pending placement of fingers without a solved plate, if any."""
         return next((one for one in self._placements if not one.is_solved), None)
 
     def records(self, since: float, until: float) -> tuple[dict[str, FingerRecord], list[float]]:
@@ -304,9 +304,9 @@ class Bench:
         return found
 
     def _sample_plate(self, until: float = math.inf, *, solves: bool = True) -> None:
-        """Advance the plate to a time [s] or the present one.
+        """Advance the plate to a time [s] or the current one.
 
-        solves: fingers that are unsolved by then; otherwise to the first of them.
+        solves: whether to solve unsolved placements; otherwise stops at the first of them.
         """
         end = min(until, self.time)
         while self._placements and self._placements[0].time <= end:
@@ -342,7 +342,7 @@ class Bench:
             self._fingers.record(times, accelerations)
 
     def _update_plant(self) -> None:
-        """Pass on to the plant what channels play, and by which clock, after their delay."""
+        """Pass the voices of channels and their clocks to the plant, after their delay."""
         renewed = self._clocks.renew(self.time)
         for index, wired in enumerate(self._wired):
             playing = self.amplifiers[wired.amplifier].outputs[wired.number]
@@ -381,14 +381,14 @@ def _tabulated(solve: Callable[[], LoadedPlate], sample_rate: float) -> LoadedPl
 
 
 def _plant_of(real: Rig, time: float) -> Plant:
-    """The plant of a rig as it is, at rest at a time [s]."""
+    """The plant of a real rig, at rest at a time [s]."""
     reduced = _reduced(
         real.plate, real.mesh, tuple(real.eras), tuple(real.masses), real.limits.frequency_max
     )
     return Plant(reduced, real.eras, loads=real.masses, time=time)
 
 
-@lru_cache(maxsize=2)  # successive benches of one rig share it
+@lru_cache(maxsize=2)  # shared by successive benches of one rig
 def _reduced(
     plate: Plate,
     mesh: Mesh,

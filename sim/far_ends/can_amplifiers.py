@@ -3,15 +3,15 @@
 Objects of a node are read and written by SDO (CiA 301). 2000 has the identity: four texts, then the
 versions. 2001 and 2002 have the words of the replies to GetCaps and GetStatus, a subindex each.
 Uploads are expedited or segmented, downloads expedited; no object that can be written is longer
-than four bytes. Far ends exchange packed frames (`drivers.wires.can_frames`), those of a message
-together.
+than four bytes. Far ends exchange packed frames (`drivers.wires.can_frames`), all frames of a
+message together.
 
-A frame of one member of the bus is received by all others, at one time. Not modelled: arbitration,
+All other members of the bus receive a frame simultaneously. Not modelled: arbitration,
 retransmission, bus-off.
 
-Adapters speak LAWICEL's serial ASCII commands (slcan), which end with CR and are answered with CR,
-or BELL for errors, and socketcand over TCP, with elements `< ... >`. Acceptance masks, time stamps
-and polling are accepted without effect. Not modelled: modes other than raw mode, extended
+Adapters use LAWICEL's serial ASCII commands (slcan), which end with CR and are acknowledged with
+CR, or BELL for errors, and socketcand over TCP, with elements `< ... >`. Acceptance masks, time
+stamps and polling are accepted without effect. Not modelled: modes other than raw mode, extended
 identifiers, discovery by broadcast.
 """
 
@@ -193,7 +193,7 @@ _POLL = 0.05  # s; between looks whether a heartbeat is wanted again
 
 
 class CanAmplifiers(FarEnd):
-    """Amplifiers by their nodes on one bus; send: called with their frames."""
+    """Amplifiers by node on one bus; send: called with their frames."""
 
     def __init__(self, amplifiers: Mapping[int, AmplifierPort], send: SendBytes) -> None:
         self._nodes = [_Node(amplifier, node, send) for node, amplifier in amplifiers.items()]
@@ -209,7 +209,7 @@ class CanAmplifiers(FarEnd):
         return min(node.next_event for node in self._nodes)
 
     def tick(self, now: float) -> None:
-        """Send the heartbeats and events due by now [s]."""
+        """Send the heartbeats and events due at now [s]."""
         for node in self._nodes:
             node.tick(now)
 
@@ -246,7 +246,7 @@ class _Node:
         return min(self._heartbeat_due, self._amplifier.next_event)
 
     def tick(self, now: float) -> None:
-        """Send what is due by now."""
+        """Send everything due at now."""
         self._amplifier.tick(now)
         while self._heartbeat_due <= now:
             interval = self._objects.heartbeat
@@ -255,13 +255,13 @@ class _Node:
             self._heartbeat_due += interval / 1000 if interval else _POLL
 
     def boot(self, now: float) -> None:
-        """Begin anew, not operational; what the amplifier plays is its own."""
+        """Restart, not operational; the amplifier's playback is not affected."""
         self._reset()
         self._put(cob_id("heartbeat", self._number), bytes([_BOOT_UP]))
         self._heartbeat_due = now + self._objects.heartbeat / 1000
 
     def take(self, frame: CanFrame, now: float) -> None:
-        """Take a frame of another device; what a message without a number asks is for all."""
+        """Take a frame of another device; a message without a node number is for all nodes."""
         data, sender, is_operational = frame.data, self._number, self._state == _OPERATIONAL
         if not self._amplifier.is_answering:
             return
@@ -296,14 +296,14 @@ class _Node:
             self.boot(now)
 
     def _leave(self, state: int, now: float) -> None:
-        """Stop what plays, then leave the state in which there are requests."""
+        """Stop playback, then leave the state that accepts requests."""
         if self._amplifier.state == "OPERATION_ENABLED":
             ramp = QUANTITIES["ramp"].to_wire(SILENCING_RAMP)
             self._amplifier.handle("Stop", {"ramp": ramp}, now)
         self._state = state
 
     def _tell(self, event: Values, now: float) -> None:
-        """Send an event, with an emergency where a fault comes or goes."""
+        """Send an event, with an emergency message if a fault starts or ends."""
         is_answering = self._amplifier.is_answering
         if is_answering and self._state == _OPERATIONAL:
             self._put(REPLY + self._number, *segments(0, EVENT, EVENT_RECORD.pack(event)))
@@ -317,17 +317,17 @@ class _Node:
         self._was_faulty = is_faulty
 
     def _put(self, can_id: int, *data: bytes) -> None:
-        """Send frames of one identifier."""
+        """Send frames with an identifier."""
         self._send(pack_frames(CanFrame(can_id, each) for each in data))
 
 
 Listener = Callable[[CanFrame], None]
 
-_OVERHEAD = 8  # bytes of a frame beside its data, about, with stuffing and gap
+_OVERHEAD = 8  # approximate bytes of a frame in addition to its data, with stuffing and gap
 
 
 class CanBus:
-    """A bus whose members are identified by their listeners.
+    """A bus; its members are identified by their listeners.
 
     bitrate [bit/s]: None for no transmission time.
     """

@@ -39,7 +39,7 @@ _ILLEGAL_FUNCTION, _ILLEGAL_ADDRESS, _ILLEGAL_VALUE = 1, 2, 3
 
 
 class ModbusAmplifiers(FarEnd):
-    """Amplifiers by their units on one line or port; send: called with the bytes for the host."""
+    """Amplifiers by unit on one line or port; send: called with the bytes for the host."""
 
     def __init__(
         self,
@@ -69,11 +69,11 @@ class ModbusAmplifiers(FarEnd):
 
     @property
     def next_event(self) -> float:
-        """Time by which silence has ended a frame that is not whole [s]; infinite without one."""
+        """Time [s] when silence ends an incomplete frame; infinite without one."""
         return self._last + self._timeout + _MARGIN if self._reader.rest else math.inf
 
     def tick(self, now: float) -> None:
-        """Take the silence of the line until a time [s], which ends a frame that is not whole."""
+        """Process the silence of the line until a time [s], which ends an incomplete frame."""
         if self._reader.rest and now - self._last > self._timeout:
             self._take(self._reader.end(), now)
 
@@ -147,13 +147,13 @@ class _Unit:
         return 0, reply
 
     def _read(self, request: Pdu, now: float) -> Sequence[int]:
-        """Return the registers that a request reads; none where some of them cannot be read."""
+        """Return the registers that a request reads; none if any of them cannot be read."""
         address, count = request.address, request.count
         if (message := message_shown(request)) is not None:
             first = message.number * BOX + REPLY_OFFSET
             tag, result, words = self._replies.get(message.number, (0, 0, ()))
             if message.name in PRESENT:
-                if result:  # a refusal is read once
+                if result:  # a rejection is read once
                     self._replies[message.number] = tag, 0, ()
                 else:
                     result, words = self._execute(message, (), now, is_for_all=False)

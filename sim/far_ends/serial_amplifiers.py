@@ -35,7 +35,7 @@ _SET_ADDRESS = MESSAGES["SetAddress"].number
 
 
 class SerialAmplifiers(FarEnd):
-    """Amplifiers by their addresses on one line; send: called with the bytes for the host."""
+    """Amplifiers by address on one line; send: called with the bytes for the host."""
 
     def __init__(self, amplifiers: Mapping[int, AmplifierPort], send: SendBytes) -> None:
         self._amplifiers = dict(amplifiers)

@@ -37,14 +37,17 @@ Numbered = Mapping[int, AmplifierDevice]
 
 @dataclass(frozen=True)
 class SimulatedWire:
-    """How simulated amplifiers are reached.
+    """Connection to simulated amplifiers.
 
-    kind: a key of `FAR_ENDS`; speed [bit/s]: None for no transmission time, or that of the kind
-    where its line is not prompt; port: on the loopback interface, 0 for any; shared: all amplifiers
-    on one serial line, at addresses 1, 2, ...; unpluggable: URLs stay valid when the wire is
-    unplugged and plugged in again; line: tells apart wires that are otherwise equal; line_kind: one
-    of `LINE_KINDS`, None for what is usual where there are several amplifiers, else prompt; seed:
-    of its delays; address: unit, node or address there, None for any.
+    kind: a key of `FAR_ENDS`.
+    speed: [bit/s]; None for no transmission time, or the kind's default if its line has delays.
+    port: on the loopback interface, 0 for any.
+    shared: all amplifiers on one serial line, at addresses 1, 2, ...
+    unpluggable: URLs stay valid when the wire is unplugged and plugged in again.
+    line: distinguishes otherwise equal wires.
+    line_kind: one of `LINE_KINDS`; None for the usual one with several amplifiers, else prompt.
+    seed: of its delays.
+    address: unit, node or address there, None for any.
     """
 
     kind: str
@@ -109,11 +112,11 @@ def _on_bus(
 
 @dataclass(frozen=True)
 class FarEndKind:
-    """How the far end of a kind of wire is opened, and the form of its URLs.
+    """Opens the far end of a kind of wire; also the form of its URLs.
 
-    url: with {host} where it is a TCP port; speed [bit/s]: usual one; line_kind: of its line where
-    there are several amplifiers; open_end: makes the far end of amplifiers by address, at a speed;
-    bits: of a byte on the line, with start, parity and stop, 0 where bytes take no time.
+    url: with {host} for a TCP port; speed: usual speed [bit/s]; line_kind: of its line with several
+    amplifiers; open_end: makes the far end of amplifiers by address, at a speed; bits: of a byte on
+    the line, with start, parity and stop, 0 if bytes take no time.
     """
 
     url: str
@@ -171,7 +174,7 @@ FAR_ENDS: Mapping[str, FarEndKind] = {
 }
 """By the names of `era sim --wire`."""
 _KIND_OF_SCHEME = {kind.scheme: name for name, kind in FAR_ENDS.items()}
-_EXAMPLE = "; as in --wire main=serial"
+_EXAMPLE = ", such as --wire main=serial"
 
 
 @asynccontextmanager
@@ -180,10 +183,12 @@ async def _open_line(wire: SimulatedWire, devices: Devices) -> Urls:
     numbered = {device.address: device for device in devices}
     if wire.kind == "serial" and len(devices) == 1:
         numbered = {ADDRESS: first}
-    # That of the kind where its line is not prompt, else none.
+    # The speed of the kind if its line has delays, else none.
     speed = wire.speed or (None if wire.line_kind in (None, PROMPT) else kind.speed)
     delays = delays_of(wire.line_kind, wire.seed, first.name)
-    faults = Faults() if kind.url.startswith("can") else None  # those of frames are on the bus
+    faults = (
+        Faults() if kind.url.startswith("can") else None
+    )  # frame faults are injected on the bus
     with kind.open_end(speed, numbered) as make_end:
         end: TcpEnd | TerminalEnd
         if kind.is_ported:
@@ -216,9 +221,9 @@ def assign_wires(
 ) -> dict[str, SimulatedWire]:
     """The wire of each amplifier, by name.
 
-    amplifiers: URLs by name; options: texts like `main=modbus-tcp:5020`; common: the wire of all
-    others, None to follow their URLs; defaults: speed and sharing of those wires. Equal wires are
-    shared. Raises InputError.
+    amplifiers: URLs by name; options: texts like `main=modbus-tcp:5020`; common: wire of all other
+    amplifiers, None to follow their URLs; defaults: speed and sharing of these wires. Equal wires
+    are shared. Raises InputError.
     """
     assigned: dict[str, SimulatedWire] = {}
     for text in options:
@@ -242,7 +247,7 @@ def choose_lines(
 ) -> dict[str, SimulatedWire]:
     """Wires by amplifier with the kinds of line that options name: `KIND` or `NAME=KIND`.
 
-    A name stands for all amplifiers of its line, and counts more than what is for all. Raises
+    A name means all amplifiers of its line, and overrides the option for all lines. Raises
     InputError.
     """
     kinds: dict[str, str] = {}

@@ -1,1 +1,1 @@
-"""The plate in the time domain: excitation, contacts, and what fingers feel."""
+"""The plate in the time domain: excitation, contacts, and fingertip vibration."""

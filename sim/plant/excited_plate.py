@@ -1,7 +1,7 @@
 """Play layers on the plate in the time domain, without wires and amplifiers.
 
 From rest the bases move exactly as commanded, along shaped onsets or a ramp. The plate is linear:
-each layer is played alone, which keeps a finger's own apart from those of others.
+each layer is played alone, which separates a finger's own layers from those of others.
 """
 
 from collections.abc import Mapping, Sequence
@@ -41,16 +41,16 @@ from sim.plant.imperfections import Imperfections, realised
 from sim.plant.plant import PLANT_SAMPLE_RATE, LoadedPlate, Plant
 
 STEADY = 0.25
-"""Length [s] of the last part, in which steady amplitudes are fitted; resolves 10 Hz."""
+"""Length [s] of the final window for fitting steady amplitudes; resolves 10 Hz."""
 
 LEVEL_WINDOW, LEVEL_STEP = 0.03, 0.005
-"""Hann window under which a level over time is a root mean square, and the steps of both [s]."""
+"""Length and step [s] of the Hann window for the RMS level over time."""
 
 _RINGING = 3.0
-"""Time constants of the slowest vibration that the plate is given: 5 % of its start are left."""
+"""Settling time in time constants of the slowest vibration: 5 % of its start remain."""
 
 _MIN_DURATION = 1.0
-"""Playback [s] where none is given, unless the plate rings longer."""
+"""Default playback time [s], unless the plate rings longer."""
 
 MIN_SIGNAL = 0.01
 """Shortest signals [s]; shorter ones are followed by zeros."""
@@ -61,13 +61,13 @@ _MAX_DURATION = 10.0
 
 @dataclass(frozen=True, eq=False)
 class FeltFinger:
-    """What one finger felt on the plate that played, steady and over time; nothing is promised.
+    """Vibration felt by a finger during playback, steady and over time; without promises.
 
-    level_db_sl: of its own layers, mean over the fingertip; foreign_level_db_sl: of all others at
-    its loudest point; both -inf without one. times (w,) [s], and at these levels_db_sl and
-    foreign_levels_db_sl (w,): root mean square under a Hann window of 30 ms. All levels are
-    relative to one threshold set, that of the playback. An answer's foreign_level_db_sl is the
-    greatest over several sets: compare this one with its rig_foreign_level_db_sl.
+    level_db_sl: level of its own layers, mean over the fingertip; foreign_level_db_sl: level of all
+    other layers at its loudest point; both -inf without layers. levels_db_sl, foreign_levels_db_sl
+    (w,): RMS levels under a Hann window of 30 ms, at times (w,) [s]. All levels are relative to the
+    threshold set of the playback. An answer's foreign_level_db_sl is the maximum over several sets:
+    compare this one with its rig_foreign_level_db_sl.
     """
 
     level_db_sl: float
@@ -78,7 +78,7 @@ class FeltFinger:
     foreign_levels_db_sl: FloatArray = field(repr=False)
 
     def to_frame(self) -> Any:
-        """Time, its own level and that of the others as a pandas DataFrame; needs pandas."""
+        """Return time, own level and foreign level as a pandas DataFrame; needs pandas."""
         return as_frame(
             {
                 "time_s": self.times,
@@ -90,10 +90,10 @@ class FeltFinger:
 
 @dataclass(frozen=True, eq=False)
 class Vibration:
-    """What one layer, or signals of all ERAs, do alone at all fingers.
+    """Vibration of one layer alone, or of signals of all ERAs, at all fingers.
 
-    frequencies (f,) [Hz], none of signals; fingers: numbers of those that it is for; records: of
-    all fingers, one after the other; harmonics (f,) [Hz]: of ERAs that have some.
+    frequencies (f,) [Hz], empty for signals; fingers: indices of its targets; records: of all
+    fingers in order; harmonics (f,) [Hz]: of ERAs with harmonics.
     """
 
     frequencies: tuple[float, ...]
@@ -146,22 +146,22 @@ class PlatePlayback:
 
     @property
     def targets(self) -> tuple[FingerRecord, ...]:
-        """Records of the fingers that have a layer."""
+        """Records of the fingers with a layer."""
         return tuple([self.records[number] for number in self._own])
 
     @property
     def quiet(self) -> tuple[FingerRecord, ...]:
-        """Records of the fingers that have none."""
+        """Records of the fingers without a layer."""
         return tuple([each for number, each in enumerate(self.records) if number not in self._own])
 
     @property
     def _own(self) -> list[int]:
-        """Numbers of the fingers that have a layer, ascending."""
+        """Indices of the fingers with a layer, ascending."""
         return sorted({number for each in self.vibrations for number in each.fingers})
 
     @cached_property
     def fingers(self) -> tuple[FeltFinger, ...]:
-        """What each finger felt, in the order in which they were given."""
+        """Vibration felt by each finger, in the given order."""
         numbers, (count, step), own = range(len(self.records)), self._window, self._own
         levels = np.array([self._levels(number) for number in numbers])
         mine, others = levels[:, :, 0].T
@@ -215,7 +215,7 @@ class PlatePlayback:
 
     @property
     def _window(self) -> tuple[int, int]:
-        """Samples of a window over which a level over time is taken, and between two of these."""
+        """Number of samples of a level's window, and between windows."""
         times = self.records[0].times
         rate = (len(times) - 1) / (times[-1] - times[0])
         return min(round(LEVEL_WINDOW * rate), len(times)), round(LEVEL_STEP * rate)
@@ -246,7 +246,7 @@ class PlatePlayback:
         else:
             last = np.hanning(inside.sum() + 2)[1:-1]
             steady = 2 * last @ felt[inside] ** 2 / last.sum()
-        # That of a tone is the square of its amplitude, twice its mean square.
+        # The power of a tone is its squared amplitude, twice its mean square.
         return np.vstack([steady, 2 * power / weights.sum()])
 
 
@@ -266,7 +266,7 @@ def play(
 
     The fingers load the plate as the rig's fingertip, by their loads. reduced: the plate that the
     imperfections make of the rig's, for forces at its ERAs and loads. Each layer starts along its
-    onset, or its ramp. Latency, skew and noise are left out. Raises InputError for fingers off the
+    onset or ramp. Latency, skew and noise are left out. Raises InputError for fingers off the
     plate, layers that the rig cannot play, and a duration out of range.
     """
     check_fingers(fingers, rig.plate)
@@ -311,7 +311,7 @@ def play_signals(
 ) -> PlatePlayback:
     """Play signals (eras, n) in full strokes on a plate at rest, for all fingers with a stimulus.
 
-    Records have the signals' samples [Hz]; the rest as of `play`.
+    Records have the sample rate of the signals [Hz]; otherwise see `play`.
     """
     check_fingers(fingers, rig.plate)
     duration = signals.shape[1] / sample_rate
@@ -339,7 +339,7 @@ def _plant_under(
     imperfections: Imperfections,
     loaded: LoadedPlate | None = None,
 ) -> Plant:
-    """The plate at rest under fingers; loaded: where that is solved already."""
+    """The plate at rest under fingers; loaded: if already solved."""
     plant = Plant(reduced, imperfections.plate.realised(rig).eras, loads=rig.masses)
     resting = imperfections.resting(rig, fingers)
     plant.set_contacts({str(n): each for n, each in enumerate(resting)}, loaded=loaded)
@@ -347,7 +347,7 @@ def _plant_under(
 
 
 def _points(rig: Rig, fingers: Sequence[Finger]) -> FloatArray:
-    """Points (p, 2) of all fingertips, one after the other."""
+    """Points (p, 2) of all fingertips, in order."""
     return np.concatenate([fingertip_points(*each.at, rig.plate) for each in fingers])
 
 

@@ -1,4 +1,4 @@
-"""Fingertips on the plate, whose samples are kept for ten seconds.
+"""Fingertips on the plate, with samples of the last ten seconds.
 
 The load of a finger on the plate is in `sim.plant.plant`.
 """
@@ -59,7 +59,7 @@ class PlateFingers:
     def place(self, positions: Mapping[str, Point], *, reduced: ReducedPlate | None = None) -> None:
         """Replace the fingers by those at these positions [m]; InputError changes nothing.
 
-        reduced: the plate in new coordinates, where they change.
+        reduced: the plate in new coordinates, if they change.
         """
         self.check(positions)
         reduced = reduced or self._reduced
@@ -117,7 +117,7 @@ def _join(
     since: float,
     until: float,
 ) -> FingerRecord:
-    """The record of one finger from the pieces at its last position."""
+    """Join the pieces at a finger's last position to its record."""
     stay: list[tuple[FloatArray, FloatArray]] = []
     for layout, times, accelerations in reversed(pieces):
         if not stay and name not in layout.positions:

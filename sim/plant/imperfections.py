@@ -1,10 +1,10 @@
 """Imperfections of a bench: of its amplifiers, its plate and ERAs, and the fingers on it.
 
-Amplifiers have errors of gain and phase, delays, and crystals that are not exact; plate and ERAs
-differ from the rig's, ERAs stand elsewhere, and fingers do not weigh alike. Each ERA adds a second
-harmonic: a share of each tone's amplitude at twice its frequency and phase, with an angle of its
-own. Not modelled: sums and differences of several tones, harmonics of signals, other distortion,
-and drifting errors of channels.
+Amplifiers have gain and phase errors, delays, and inexact crystals; plate and ERAs differ from the
+rig's, ERAs are displaced, and finger loads vary. Each ERA adds a second harmonic: a share of each
+tone's amplitude at twice its frequency and phase, with its own angle. Not modelled: sums and
+differences of several tones, harmonics of signals, other distortion, and drifting errors of
+channels.
 """
 
 import cmath
@@ -38,7 +38,7 @@ _CRYSTAL, _WARM_UP = 50e-6, 1e-6  # 50 ppm, and 1 ppm/s either way
 
 @dataclass(frozen=True)
 class ChannelErrors:
-    """Errors of one channel: gain factor, phase [rad].
+    """Errors of a channel: gain factor, phase [rad].
 
     harmonic: second harmonic of its ERA's motion, relative to it (`sim.plant.imperfections`).
     """
@@ -64,10 +64,9 @@ class ChannelErrors:
 class PlateErrors:
     """A plate on its ERAs relative to the rig's: factors, by default 1.
 
-    stiffness: by ERA; places [m]: by ERA, by how far it is off; era_damping: of all ERAs; feet: of
-    the stiffness of each foot, by its number among the rig's masses; mesh: on which it is solved,
-    None for the rig's; modes: eigenvalue and squared size (2, m) of each of the lowest elastic
-    modes.
+    stiffness: by ERA; places: displacement of each ERA [m]; era_damping: of all ERAs; feet: of the
+    stiffness of each foot, by its index among the rig's masses; mesh: for solving, None for the
+    rig's; modes: eigenvalue and squared size (2, m) of the lowest elastic modes.
     """
 
     thickness: float = 1.0
@@ -126,7 +125,7 @@ class Imperfections:
 
     channels: errors by channel; delays [s]: from a command to the base motion, by amplifier;
     crystals: of the clocks, by amplifier; plate: errors of the plate and its ERAs; fingertip:
-    standard deviation of the logarithm of a finger's load; seed: of these loads.
+    log-normal spread of a finger's load; seed: of these loads.
     """
 
     channels: Mapping[Channel, ChannelErrors] = field(default_factory=dict)
@@ -169,14 +168,14 @@ class Imperfections:
         return self.crystals.get(amplifier, Crystal())
 
     def load_of(self, finger: str, fingertip: Fingertip) -> Fingertip:
-        """The load of a finger by its id, always the same."""
+        """The load of a finger by id, always the same."""
         if self.fingertip == 0:
             return fingertip
         rng = np.random.default_rng([self.seed, crc32(finger.encode())])
         return fingertip.multiplied(math.exp(self.fingertip * rng.standard_normal()))
 
     def resting(self, rig: Rig, fingers: Sequence[Finger]) -> list[FingertipLoad]:
-        """Fingers as loads of the plate; none where the rig's are weightless."""
+        """Fingers as loads of the plate; empty if the rig's fingertips are weightless."""
         places, loads = [each.at for each in fingers], [each.load for each in fingers]
         return [
             replace(each, fingertip=self.load_of(str(number), each.fingertip))
@@ -213,7 +212,7 @@ def draw_imperfections(rig: Rig, *, seed: int = 0) -> Imperfections:
         stiffness={era.name: relative(std.stiffness) for era in rig.eras},
         mesh=_other_mesh(rig),
     )
-    # Numbers of their own, so that all else of a seed stays.
+    # A separate generator, so that other draws of a seed do not change.
     rng = np.random.default_rng([seed, crc32(b"modulus, places, harmonics")])
     of_feet = np.random.default_rng([seed, crc32(b"feet")])
     plate = replace(
@@ -242,9 +241,9 @@ def _feet(rig: Rig, factors: FloatArray) -> dict[int, float]:
 
 
 def draw_of_ensemble(rig: Rig, *, seed: int) -> Imperfections:
-    """Draw a plate as those on which promises are checked (`model.study.verification`).
+    """Draw a plate like those used to check promises (`model.study.verification`).
 
-    As `draw_imperfections`, and with what the gains of all channels have in common.
+    Like `draw_imperfections`, plus a common gain error of all channels.
     """
     drawn = draw_plates(
         np.random.default_rng(seed),
@@ -279,7 +278,7 @@ def draw_of_ensemble(rig: Rig, *, seed: int) -> Imperfections:
 def _drawn(
     rig: Rig, channels: Mapping[Channel, ChannelErrors], plate: PlateErrors, seed: int
 ) -> Imperfections:
-    """Imperfections with the crystals of the amplifiers, which were switched on at any time."""
+    """Imperfections with the amplifiers' crystals, switched on at arbitrary times."""
     rng = np.random.default_rng([seed, crc32(b"crystals")])
     crystals = {
         name: Crystal(
@@ -313,7 +312,7 @@ def realised(motion: Motion, errors: ChannelErrors) -> list[Term]:
 
 
 def of_voices(voices: Sequence[Voice], share: complex) -> list[Voice]:
-    """Second harmonics of the voices of a channel; none of share 0."""
+    """Second harmonics of the voices of a channel; empty for share 0."""
     if not share:
         return []
     found = []
@@ -326,7 +325,7 @@ def of_voices(voices: Sequence[Voice], share: complex) -> list[Voice]:
 
 
 def of_layer(layer: Layer, shares: Mapping[str, complex]) -> list[Layer]:
-    """Second harmonics of a layer's voices as it starts; shares: by ERA, none where all are 0."""
+    """Second harmonics of a starting layer; shares: by ERA, empty if all are 0."""
     if not any(shares.values()):
         return []
     return [
@@ -349,16 +348,16 @@ def _of_envelope(envelope: BaseEnvelope, share: complex) -> BaseEnvelope:
 
 
 def _doubled(amplitude: complex, share: complex) -> complex:
-    """Amplitude of the second harmonic of one."""
+    """Amplitude of a second harmonic."""
     return share * amplitude * amplitude / abs(amplitude) if amplitude else 0j
 
 
 def motion_of(
     voices: Sequence[Voice], clock: StraightClock, *, stroke: float, delay: float = 0.0
 ) -> list[Term]:
-    """Return the motion of a base by the voices of its channel, level 1 being the stroke [m].
+    """Return the motion of a base due to its channel's voices; level 1 is the stroke [m].
 
-    clock: of the amplifier, on which angles count; delay [s]: of the base behind its voices.
+    clock: amplifier clock for the angles; delay: of the base behind its voices [s].
     """
     return [term for voice in voices for term in _terms(voice, clock, stroke, delay)]
 

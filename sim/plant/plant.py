@@ -3,13 +3,13 @@
 No step size enters. Between changes the motion is a sum of free vibrations, which decay, and of
 forced ones (`model.transients.time_response`); every change adds free vibrations that keep
 displacement and velocity continuous. Accelerations are sampled from tables of these exponentials,
-one product of matrices for a block of samples.
+with one matrix product per block of samples.
 
 A fingertip acts at a point, and its phalanx moves: a low-rank change and one more coordinate. The
 reduced basis is extended by the static vectors of the point, and the small system diagonalised
-again; solutions are cached by the set of contacts. Structural damping remains that of the plate on
-its ERAs. Fingers that come to rest are solved apart: a large plate takes a tenth of a second, in
-which its amplifiers must continue to reply.
+again; solutions are cached by the set of contacts. Structural damping is that of the plate on its
+ERAs. Fingers that come to rest are solved separately: a large plate takes a tenth of a second,
+while its amplifiers must continue to reply.
 """
 
 import math
@@ -73,8 +73,8 @@ Under: TypeAlias = tuple[LoadedPlate, Mapping[str, FingertipLoad]]
 def carried_state(state: FloatArray, before: Under, after: Under) -> FloatArray:
     """Displacement and velocity of all coordinates, (2 r,), carried to another set of contacts.
 
-    Those of the plate and of magnets, and of the phalanges of fingers that stay, are continuous; a
-    new finger's phalanx is at rest.
+    The state of the plate, of magnets and of remaining fingers' phalanges is continuous; a new
+    finger's phalanx is at rest.
     """
     (plate, contacts), (other, wanted) = before, after
     halves, count = np.split(state, 2), len(plate.reduced.omega)
@@ -90,7 +90,7 @@ def carried_state(state: FloatArray, before: Under, after: Under) -> FloatArray:
 
 
 class LoadedPlateCache:
-    """Solutions of one plate on its ERAs with its loads, under any contacts.
+    """Solutions of a plate on its ERAs with its loads, for any contacts.
 
     reduced: for forces at the ERAs and loads. Raises InputError for ERAs that do not support it.
     """
@@ -140,7 +140,7 @@ class LoadedPlateCache:
         return self._unloaded.with_attachments_at(np.array(points))
 
 
-@lru_cache(maxsize=2)  # successive benches of one rig share it
+@lru_cache(maxsize=2)  # shared by successive benches of one rig
 def _solve_unloaded(
     reduced: ReducedPlate, eras: tuple[Source, ...], loads: tuple[PointLoad, ...]
 ) -> PlateInTime:
@@ -171,7 +171,7 @@ class FingerPlacement:
         self._loaded: LoadedPlate | None = None
 
     def supersedes(self, before: "FingerPlacement", last: "FingerPlacement") -> bool:
-        """Whether the last one can be left out, as of fingers that slide faster than is solved.
+        """Whether the last placement can be left out, for fingers that slide faster than is solved.
 
         Its solution has not begun, and it only moved the same fingers.
         """
@@ -179,7 +179,7 @@ class FingerPlacement:
         return is_slide and not (last.is_solved or last._is_started)
 
     def solved(self) -> LoadedPlate | None:
-        """The plate under these fingers, solved if it is not yet; raises what solving raises."""
+        """The plate under these fingers, solved if necessary; raises the errors of solving."""
         self._is_started = True
         with self._lock:
             try:
@@ -190,15 +190,15 @@ class FingerPlacement:
                 self.is_solved = True
 
 
-_NEGLIGIBLE = 1e-17  # of the strongest free vibration: a tenth of what rounding leaves of it
-_SMALLEST = 1e-60  # m/s²; what is subnormal is slow
+_NEGLIGIBLE = 1e-17  # of the strongest free vibration: a tenth of its rounding error
+_SMALLEST = 1e-60  # m/s²; subnormal numbers are slow
 _TABLES_KEPT = 8  # sets of omegas
 
 
 class Sampler:
-    """Samples a loaded plate at points of these shapes (q, r), phalanges included.
+    """Samples a loaded plate at points with mode shapes (q, r), including phalanges.
 
-    precision: of the sums, double or single; everything before them is double.
+    precision: of the sums, double or single; all other steps use double.
     """
 
     def __init__(
@@ -214,14 +214,14 @@ class Sampler:
         self.precision = precision
         plate = loaded.plate
         self._by_forced = np.ascontiguousarray((points @ plate.displacement).T)
-        # Conjugate exponents and amplitudes at the points (m, q), those that decay fastest last.
+        # Conjugate exponents and amplitudes at the points (m, q), fastest decay last.
         self._decay = plate.decay.conj()
         self._free = (points @ plate.free_acceleration).conj().T
         self._strengths = np.abs(self._free).max(axis=1, initial=0.0)
         self._free_table = self._columns(loaded.exponentials(sample_rate))
         self._forced: ForcedVibration | None = None
-        self._solution = -1  # which these are, with their conjugate amplitudes (n, q):
-        self._constant = self._growth = self._free[:0]  # of all its solutions, and per second
+        self._solution = -1  # current solution, with its conjugate amplitudes (n, q):
+        self._constant = self._growth = self._free[:0]  # of all solutions, and per second
         self._exponents = self._decay[:0]
         self._forced_table = self._free_table[:, :0]
 
@@ -236,8 +236,8 @@ class Sampler:
     ) -> None:
         """Write accelerations at times (n,) [s], evenly spaced, to out (n, q).
 
-        free (m,): amplitude of each free vibration at the time of the forced one, which is a
-        solution by its number.
+        free (m,): amplitude of each free vibration at the time of the forced one, a solution by
+        index.
         """
         if forced is not self._forced or solution != self._solution:
             self._use(forced, solution)

@@ -35,7 +35,7 @@ TERMINAL_SCHEMES = ("serial", "modbus+rtu", "can+slcan")
 def links_by_amplifier(options: Sequence[str], *, amplifiers: Sequence[str]) -> dict[str, Path]:
     """The links of amplifiers by name; options: texts as `PATH` or `NAME=PATH`. Raises InputError.
 
-    `PATH` alone is that of the first amplifier.
+    `PATH` alone is the path of the first amplifier.
     """
     links: dict[str, Path] = {}
     for text in options:
@@ -44,7 +44,7 @@ def links_by_amplifier(options: Sequence[str], *, amplifiers: Sequence[str]) -> 
             name, path = amplifiers[0], text
         if name not in amplifiers:
             raise InputError(
-                f"--link {text}: amplifier must be one of {', '.join(amplifiers)}, as in "
+                f"--link {text}: amplifier must be one of {', '.join(amplifiers)}, such as "
                 f"--link {amplifiers[0]}=/tmp/{amplifiers[0]}"
             )
         if name in links or not path:
@@ -57,7 +57,7 @@ def links_by_amplifier(options: Sequence[str], *, amplifiers: Sequence[str]) -> 
 def linked_urls(urls: Mapping[str, str], links: Mapping[str, Path]) -> Iterator[dict[str, str]]:
     """URLs of amplifiers with their pseudo-terminals under other paths, both by name.
 
-    Amplifiers of one line share its link. Raises InputError for a wire that is no pseudo-terminal.
+    Amplifiers of one line share its link. Raises InputError for a wire without a pseudo-terminal.
     """
     with ExitStack() as stack:
         paths: dict[str, str] = {}
@@ -94,7 +94,9 @@ def linked(link: Path, *, to: str) -> Iterator[str]:
         try:
             yield str(link.absolute())
         finally:
-            if link.is_symlink() and str(link.readlink()) == to:  # not another's by now
+            if (
+                link.is_symlink() and str(link.readlink()) == to
+            ):  # not replaced by another program meanwhile
                 link.unlink()
 
 
@@ -123,7 +125,7 @@ class PseudoTerminal:
     """The far end's side of a serial line: a pseudo-terminal of the system. Raises LinkError.
 
     on_data: called with bytes from the host; unpluggable: the port is a symbolic link, which
-    outlives each pseudo-terminal. What a host does not read is lost.
+    outlives each pseudo-terminal. Bytes that a host does not read are lost.
     """
 
     def __init__(self, on_data: Callable[[bytes], None], *, unpluggable: bool = False) -> None:
@@ -232,7 +234,7 @@ class FarEnd(ABC):
 
     @property
     def next_event(self) -> float:
-        """Time [s] at which it is to be ticked; infinite: never."""
+        """Time [s] of the next tick; infinite: never."""
         return math.inf
 
     @abstractmethod
@@ -240,7 +242,7 @@ class FarEnd(ABC):
         """Take bytes from the host at a time [s]."""
 
     def tick(self, now: float) -> None:  # noqa: B027
-        """Process what is due by a time [s]."""
+        """Process everything due by a time [s]."""
 
     def close(self) -> None:  # noqa: B027
         """Send nothing more."""
@@ -422,7 +424,7 @@ class TcpEnd:
 
 
 class _TcpClient(asyncio.Protocol):
-    """One client; what is damaged on its way is lost, as TCP finds it."""
+    """One client; damaged data are lost, because TCP detects them."""
 
     def __init__(self, port: TcpEnd) -> None:
         self._port = port

@@ -1,9 +1,9 @@
 """A simulated line: transmission time, the delays of its kind, and injected faults.
 
-Delays are those of operating systems, USB frames, latency timers and networks. What takes long
-arrives in pieces, each at the time of its last bit, so that an amplifier that minds pauses between
-bytes sees none. Not modelled: gaps between the bytes of a frame, retransmission, other devices on
-the same USB, the trigger levels of UARTs, an FTDI packet that a second reply fills up.
+Delays come from operating systems, USB frames, latency timers and networks. Long transmissions
+arrive in pieces, each at the time of its last bit, so that an amplifier sensitive to pauses between
+bytes detects none. Not modelled: gaps between the bytes of a frame, retransmission, other devices
+on the same USB, the trigger levels of UARTs, an FTDI packet that a second reply fills up.
 """
 
 import asyncio
@@ -16,10 +16,10 @@ from functools import partial
 from registry import threads
 from sim.faults import Faults, Toward
 
-_FTDI_PACKET = 62  # bytes beside two of status
-_SIGMAS, _STALLS = 4.0, 5.0  # of a log-normal part and of a stall: no longer ones occur
-_ORDER = 1e-9  # s; between what arrives, since timers of one moment run in any order
-_FRAME_ERROR = 50e-6  # of a USB host's crystal against its machine's clock; it may be 500e-6
+_FTDI_PACKET = 62  # bytes, in addition to two status bytes
+_SIGMAS, _STALLS = 4.0, 5.0  # limits of the log-normal part and of a stall
+_ORDER = 1e-9  # s; between arrivals, because simultaneous timers run in arbitrary order
+_FRAME_ERROR = 50e-6  # of a USB host's crystal relative to its machine's clock; up to 500e-6
 
 
 @dataclass(frozen=True)
@@ -74,12 +74,12 @@ class LineKind:
         return programs + 2 * self.frame * (1 + _FRAME_ERROR) + self.latency_timer
 
     def delays(self, seed: object) -> "LineDelays":
-        """Return those of one line; equal seeds give equal delays."""
+        """Return the delays of a line; equal seeds give equal delays."""
         return LineDelays(self, random.Random(repr(seed)))  # noqa: S311  reproducible, not secret
 
 
 class LineDelays:
-    """The delays of one line of a kind; times are given in the order of the bytes, each way."""
+    """Delays of a line of a kind; times must be in the order of the bytes, in each direction."""
 
     def __init__(self, kind: LineKind, rng: random.Random) -> None:
         self._kind = kind
@@ -97,7 +97,7 @@ class LineDelays:
         return self._left
 
     def arrive(self, time: float, size: int) -> float:
-        """Return when a host has so many bytes, the last of which is off the line at a time [s]."""
+        """Return the arrival time [s] of bytes whose last bit leaves the line at a time."""
         ready = self._next_frame(self._packet_end(time, size)) + size * self._kind.usb_byte
         self._arrived = max(self._arrived + _ORDER, ready + self._kind.waking.draw(self._rng))
         return self._arrived
@@ -130,7 +130,7 @@ class LineDelays:
 # wake-ups take less than 81 us, one in ten less than 42, one in a hundred more than a millisecond.
 _WRITING = Latency(least=8e-6, median=5e-6, sigma=0.8, stalls=0.005, stall=1e-3)
 _WAKING = Latency(least=20e-6, median=55e-6, sigma=0.6, stalls=0.02, stall=1e-3)
-# With the network stacks of both ends, and a task of the amplifier's that waits for its turn.
+# With the network stacks of both ends, and a task of the amplifier that waits for its turn.
 _SENDING = Latency(least=60e-6, median=50e-6, sigma=1.0, stalls=0.02, stall=2e-3)
 _RECEIVING = Latency(least=80e-6, median=90e-6, sigma=1.0, stalls=0.03, stall=2e-3)
 _HIGH_SPEED = LineKind(_WRITING, _WAKING, frame=125e-6, usb_byte=8 / 480e6)
@@ -148,22 +148,22 @@ LINE_KINDS: Mapping[str, LineKind] = {
     "can-usb": _FULL_SPEED,
     "ethernet": LineKind(_SENDING, _RECEIVING),
 }
-"""Kinds of lines by name, beside `PROMPT`.
+"""Kinds of lines by name, except `PROMPT`.
 
-native: a UART of the board; ftdi: with the chip's timer of 16 ms, or as the host's driver sets it
-where it can; can: a controller of the board, can-usb: an adapter; ethernet: Modbus TCP, servers.
-On CAN a frame waits for that on the bus, too.
+native: a UART of the board; ftdi: with the chip's timer of 16 ms, or as set by the host's driver,
+if possible; can: a controller of the board, can-usb: an adapter; ethernet: Modbus TCP, servers.
+On CAN a frame also waits for the frame on the bus.
 """
 LINE_NAMES = (*LINE_KINDS, PROMPT)
-"""All that a line may be."""
+"""All kinds of lines."""
 
 
 def delays_of(kind: str | None, *line: object) -> LineDelays | None:
-    """Return those of a line of a kind by its name, None where it is prompt, as without a name."""
+    """Return the delays of a line by kind; None if it is prompt, or without a kind."""
     return None if kind in (None, PROMPT) else LINE_KINDS[kind].delays(line)
 
 
-_PIECE = 0.01  # s; of the wire's time, of what arrives at once
+_PIECE = 0.01  # s; wire time of a piece that arrives together
 
 
 class SimulatedLine:
@@ -195,7 +195,7 @@ class SimulatedLine:
     def send(self, frame: bytes, now: float | None = None) -> None:
         """Send a frame, which queues behind earlier ones; now: the present time [s] if not given.
 
-        The same time for several lines makes what they carry arrive at one time.
+        With the same time for several lines, their data arrive simultaneously.
         """
         now = threads.now() if now is None else now
         arriving = self._faults.pass_on(

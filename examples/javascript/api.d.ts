@@ -247,7 +247,7 @@ export interface PlayParams {
   /** a finger must be within 20 mm of the position */
   x_m: number;
   y_m: number;
-  /** -20 or more. For an effect, default and maximum are its own level; for points, the default is 20 and the maximum is that of the layout */
+  /** -20 or more. For an effect, default and maximum are its own level; for points, the default is 20 and the layout has the maximum */
   level_db_sl?: number | null;
   /** continuous event: `[time_s, intensity, sharpness]` in order of time; 0 to 60 s, 0 to 1, 0 to 1 */
   points?: Array<Array<number>>;

@@ -52,7 +52,7 @@ ERROR_MEANINGS = {
     ErrorCode.LEASE: "the lease has expired, or belongs to another client",
     ErrorCode.REFUSED: "a limit or an amplifier refused",
     ErrorCode.LINK: "the link to an amplifier failed",
-    ErrorCode.BUSY: "too many requests or connections at once",
+    ErrorCode.BUSY: "too many requests or connections",
     ErrorCode.NOT_SILENT: "after a stop, an amplifier is not confirmed silent",
 }
 """Meaning of each error code."""

@@ -824,7 +824,7 @@ def _within_layers(
     layer_count = capabilities.layers if has_layers else 1
     if len(targets) <= layer_count:
         return targets, ()
-    reason = f"the drive mode {mode} plays 1 content at once; lift a finger"
+    reason = f"the drive mode {mode} plays only one content; lift a finger"
     if has_layers:
         reason = no_layer_free(layer_count)
     group_sizes = Counter([target.shared_as for _, target in targets])

@@ -179,7 +179,7 @@ def request_text(name: str, values: Values) -> str:
 
 
 class ExpectedAmplifier:
-    """Expected state of one amplifier; state, latch, token and session are None if unknown; times
+    """Expected state of an amplifier; state, latch, token and session are None if unknown; times
     [s].
 
     - report: receives violations; always: receives violations that nothing excuses; unclear:

@@ -2,7 +2,7 @@
 
 A set starts at some time between its commit and the reply, or slightly later. The playback places
 each commit in the middle of its interval. Every transition has a half-width of its start time and a
-radius by which its first amplitude can differ. Times [s] are those of any one clock.
+radius by which its first amplitude can differ. Times [s] refer to any clock.
 """
 
 import math
@@ -257,7 +257,7 @@ def silent() -> Playback:
 
 
 class ExpectedOutputs:
-    """Expected channels and layers of one amplifier, initially silent; times and intervals in
+    """Expected channels and layers of an amplifier, initially silent; times and intervals in
     seconds.
 
     - can: capabilities, empty while unknown.
@@ -265,7 +265,7 @@ class ExpectedOutputs:
     - began, cause: interval and cause of the last change.
     - is_exact: levels equal the commands within one step; may_derate: levels can be lower because
       the amplifier is warm.
-    - interferes: levels show the interference of tones of one frequency.
+    - interferes: levels show the interference of tones at the same frequency.
     - lasting: values of `valid_for` that a layer can report, of its set or a waiting one.
     """
 
@@ -503,7 +503,7 @@ CLOCK_DRIFT = DRIFT + QUANTITIES["rate"].high
 
 
 class ExpectedClock:
-    """Expected clock of one amplifier, first unknown; report: receives violations; slack [s]."""
+    """Expected clock of an amplifier, first unknown; report: receives violations; slack [s]."""
 
     def __init__(self, report: ReportMismatch, slack: float) -> None:
         self._report, self._slack = report, slack
@@ -530,9 +530,9 @@ class ExpectedClock:
         self._read = None
 
     def unheard(self) -> None:
-        """Record that the next status can show a clock other than that of the last known request.
+        """Record that the next status can show another clock than the last known request's.
 
-        Either the current clock, if an earlier status showed the Mark, or that of a repeated Mark.
+        Either the current clock, if an earlier status showed the Mark, or a repeated Mark's clock.
         """
         self._is_unclear = True
 

@@ -499,7 +499,7 @@ _ERROR = QUANTITIES["clock_error"]
 
 
 class Dating:
-    """Convert times [s] to the clock of one amplifier, which starts near this machine's time.
+    """Convert times [s] to the clock of an amplifier, which starts near this machine's time.
 
     pace: seconds of the clock per second of its crystal. error: largest contradiction between
     readings beyond the allowed drift, since it was reset to 0.
@@ -674,7 +674,7 @@ def layer(
     after: bool = False,
     renew: bool = False,
 ) -> LayerSet:
-    """Build the content of one layer; ramp, valid_for in ms."""
+    """Build the content of a layer; ramp, valid_for in ms."""
     return LayerSet(number, ramp, valid_for, commands, after, renew)
 
 

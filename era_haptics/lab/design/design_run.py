@@ -496,7 +496,7 @@ def _design(
 
 
 def _judged(layouts: Sequence[RankedLayout], runner: Runner) -> list[RankedLayout]:
-    """Return the layouts with their answers; one that several starts reach counts once."""
+    """Return the layouts with their answers; layouts reached by several starts count once."""
     problems = list(dict.fromkeys(each.problem for each in layouts))
     keys = [(problems.index(each.problem), each.found.positions.tobytes()) for each in layouts]
     different = dict(zip(keys, layouts, strict=True))
@@ -512,7 +512,7 @@ def _judged(layouts: Sequence[RankedLayout], runner: Runner) -> list[RankedLayou
 
 
 def _start(problems: Sequence[DesignProblem], task: tuple[int, int]) -> list[ScoredLayout]:
-    """Return the layouts of one start of one problem; the last has the requested number of ERAs."""
+    """Return the layouts of a start for a problem; the last has the requested number of ERAs."""
     number, start = task
     problem = problems[number]
     search = _search_of(problem)
@@ -526,7 +526,7 @@ def _start(problems: Sequence[DesignProblem], task: tuple[int, int]) -> list[Sco
 def _score(
     problems: Sequence[DesignProblem], task: tuple[int, list[FloatArray]]
 ) -> list[ScoredLayout]:
-    """Score given layouts of one problem."""
+    """Score given layouts of a problem."""
     number, layouts = task
     return _search_of(problems[number]).scored(layouts)
 
@@ -654,7 +654,7 @@ def _instead_of(key: str, section: Mapping[str, Any]) -> tuple[str, ...]:
 
 
 def _free_channels(rig: Rig, kept: tuple[str, ...], *, count: int) -> list[Channel]:
-    """Return the rig's channels without those of kept ERAs, then channels of added amplifiers."""
+    """Return the rig's channels except the ones of kept ERAs, then channels of added amplifiers."""
     free = [channel for name, channel in rig.wiring.items() if name not in kept]
     names = (
         name for number in range(2, 99) if (name := f"amplifier{number}") not in rig.amplifiers

@@ -79,7 +79,7 @@ CANDIDATES = {True: 48, False: 80}
 SEARCH_FINGERS, SEARCH_FREQUENCIES = 32, 16
 
 JUDGED_SETS = 200
-"""Number of contact sets for full evaluation, different from those of the search."""
+"""Number of contact sets for full evaluation, separate from the search's sets."""
 
 DEFAULT_ERA_GAP = 0.03
 """Minimum distance between two ERAs [m]."""
@@ -131,7 +131,7 @@ class Area:
 def area_of(where: str, plate: Plate) -> Area:
     """Return an area given by its name or by a file of polygons.
 
-    Raises InputError for another kind of file, or one that cannot be read.
+    Raises InputError for another kind of file, or an unreadable file.
     """
     length, width = plate.length, plate.width
     if where in (EDGE, ANYWHERE):
@@ -481,7 +481,7 @@ class DesignProblem:
 
     @property
     def searched_frequencies(self) -> FloatArray:
-        """Frequencies of the scores [Hz], a subset of those of the rig's tables, (f,).
+        """Frequencies of the scores [Hz], a subset of the rig's table frequencies, (f,).
 
         Their number is proportional to the number of contents, each of which needs separate
         frequencies: for three contents, scores at all 47 frequencies correlate with answers by

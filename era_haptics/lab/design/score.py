@@ -195,7 +195,7 @@ class Scorer:
             )
         )
         minus_omega2 = mounts.minus_omega2[:, None, None]
-        # Plates on the ERAs, without fingers; those of other thickness come first.
+        # Plates on the ERAs, without fingers; other thicknesses come first.
         A = places.between[:, :, chosen[:, None], chosen]
         E = places.to_tips[:, :, :, chosen]
         v, f = A.shape[:2]
@@ -299,7 +299,7 @@ class ScoredLayout:
 
 
 class LayoutSearch:
-    """Searches layouts of one problem; its seed draws the contact sets for the scores."""
+    """Searches layouts of a problem; its seed draws the contact sets for the scores."""
 
     def __init__(self, problem: DesignProblem) -> None:
         """Solve the plate for all candidates; raises InputError for an area without room."""

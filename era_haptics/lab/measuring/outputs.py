@@ -102,7 +102,7 @@ def listen_to_outputs(
     level: float,
     move: Callable[[str], None],
 ) -> list[OutputFinding]:
-    """Play on each output for a few seconds at each position, and return what each output drives.
+    """Play on each output for a few seconds at each position, and assign it to an actuator.
 
     beside: input, counted from 1, of the accelerometer that is placed next to each actuator; move:
     called with the name of the next actuator. Raises InputError or LinkError for a clipped or
@@ -272,7 +272,7 @@ def _moved(name: str) -> None:
 def _requested(
     desk: Desk, card: SoundCard, count: int, *, level: float, frequency: float | None
 ) -> list[OutputFinding]:
-    """Ask on the terminal what each output drives."""
+    """Ask on the terminal which actuator each output drives."""
     names, found = {name.lower(): name for name, _ in desk.eras}, list[OutputFinding]()
     for number in range(1, count + 1):
         played = tone(desk, number, outputs=count, rate=card.rate, level=level, frequency=frequency)

@@ -392,7 +392,7 @@ class WiredSensor:
 def read_sensors(
     path: Path, plate: Plate, *, mass: float | None = None, may_move: bool = False
 ) -> tuple[WiredSensor, ...]:
-    """Read the accelerometers of a plate, or the positions of one that is moved.
+    """Read the accelerometers of a plate, or the positions of a moved one.
 
     mass [g]: of the sensor, overrides the file; may_move: whether a moved sensor is allowed. Raises
     InputError with file and line.
@@ -412,7 +412,7 @@ def read_sensors(
 
 
 def are_positions(sensors: Sequence[WiredSensor]) -> bool:
-    """Return whether the sensors are positions of one moved sensor."""
+    """Return whether the sensors are positions of a moved sensor."""
     return len(sensors) > 1 and len({sensor.input for sensor in sensors}) == 1
 
 

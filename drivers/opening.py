@@ -65,7 +65,7 @@ class Lines:
                 await opened.close()
                 opened = None
             if opened is None:
-                opened = await self._open(address)
+                opened = await self.open_line(address)
                 if self._opened is not before:
                     await opened.close()
                     raise LinkError(f"{address.line} was closed while it was being opened")
@@ -83,7 +83,8 @@ class Lines:
             is_output=is_output,
         )
 
-    async def _open(self, address: WireAddress) -> _OpenLine:
+    async def open_line(self, address: WireAddress) -> _OpenLine:
+        """Open the line of an amplifier, for the first of its amplifiers."""
         line = Line(address.make_wire(), address.line, boot_time=address.boot_time)
         if (before := self._wires.get(address.line)) is not None:
             line.wire.follow(before)

@@ -188,7 +188,7 @@ NETWORK_DELAY = 1.0
 
 Later delivery by a broken network is not considered.
 """
-_CONNECT_TIMEOUT = 1.0  # s; a hundred times the delay within a building
+CONNECT_TIMEOUT = 1.0  # s; a hundred times the delay within a building
 _NEXT_AFTER = 0.25  # s; RFC 8305, section 5; after a refusal, the next address follows immediately
 _NUMERIC = socket.NI_NUMERICHOST | socket.NI_NUMERICSERV
 _READ_MAX = 4096  # bytes per read, so that other connections get their turn
@@ -201,11 +201,11 @@ async def open_connection(
     """Connect to the first address of a host that accepts; raises LinkError with a remedy."""
     endpoint = f"{host}:{port}"
     try:
-        async with asyncio.timeout(_CONNECT_TIMEOUT):
+        async with asyncio.timeout(CONNECT_TIMEOUT):
             return await _first_to_accept(host, port, _Connection(endpoint, on_data, on_loss))
     except TimeoutError:
         raise LinkError(
-            f"{endpoint}: no connection within {_CONNECT_TIMEOUT:g} s; check the address, the "
+            f"{endpoint}: no connection within {CONNECT_TIMEOUT:g} s; check the address, the "
             "network and that the amplifier is switched on"
         ) from None
     except OSError as error:

@@ -6,7 +6,7 @@ Each line has its time and its kind:
     request   every request of an amplifier with its reply, its error and its duration
 
 A line is formatted and written by a thread of its own. Tracing never waits for it: records beyond
-_MAX_PENDING are dropped, and their number is written as soon as there is room.
+MAX_PENDING_RECORDS are dropped, and their number is written as soon as there is room.
 """
 
 import logging
@@ -22,7 +22,7 @@ from typing import TextIO
 
 from drivers.errors import CommandError
 
-_MAX_PENDING = 20_000
+MAX_PENDING_RECORDS = 20_000
 """Records kept for the thread: more than a second of the fastest wire."""
 
 _POLL_INTERVAL = 0.05  # s
@@ -97,7 +97,7 @@ class TraceWriter:
 
     def add(self, kind: str, text: Callable[[], str]) -> None:
         """Queue a line of a kind; its text is made when it is written."""
-        if len(self._pending) < _MAX_PENDING:
+        if len(self._pending) < MAX_PENDING_RECORDS:
             self._pending.append((datetime.now(UTC), kind, text))
         else:
             self.dropped += 1

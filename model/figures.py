@@ -143,7 +143,7 @@ def label_plate(axes: Axes) -> None:
     axes.set_ylabel("y / cm")
 
 
-_DPI = 150
+DPI = 150
 _UNDATED = {".svg": {"Date": None}, ".pdf": {"CreationDate": None}}
 """Metadata with which equal figures are equal bytes."""
 
@@ -160,7 +160,7 @@ def save_figure(figure: Figure, path: Path, *, inches: tuple[float, float] | Non
         figure.set_size_inches(inches)
     ending = path.suffix.lower()
     with whole_or_nothing(path) as stream, rc_context({"svg.hashsalt": "era"}):
-        figure.savefig(stream, dpi=_DPI, format=ending[1:], metadata=_UNDATED.get(ending))
+        figure.savefig(stream, dpi=DPI, format=ending[1:], metadata=_UNDATED.get(ending))
 
 
 _ROWS = 2  # of sensors

@@ -130,7 +130,7 @@ def check_progress(given: object) -> None:
         raise InputError(f"progress must be a function of done and total, got {shown(given)}")
 
 
-_CONNECT_TIMEOUT = 10.0  # s
+SCHEDULER_TIMEOUT = 10.0  # s
 
 # Dask takes long to reject an invalid address.
 _ADDRESS = re.compile(r"(tcp|tls)://[\w.\-\[\]:]+:\d{1,5}")
@@ -162,7 +162,7 @@ def on_cluster(
         ) from error
     try:
         # Dask has no type annotations.
-        client = Client(address, timeout=_CONNECT_TIMEOUT, set_as_default=False)  # type: ignore[no-untyped-call]
+        client = Client(address, timeout=SCHEDULER_TIMEOUT, set_as_default=False)  # type: ignore[no-untyped-call]
     except (OSError, ValueError) as error:
         raise InputError(
             f"no Dask scheduler answers at {address} ({error}); start one with `dask "

@@ -301,7 +301,7 @@ FOOT = 5e-3
 # The coarsest MITC4 mesh of a study; on the paper's plate up to 500 Hz it is the paper's 12x9. Each
 # next one has twice as many elements along both sides.
 _COARSEST_PER_WAVELENGTH = 6.5
-_DOUBLINGS = 3
+MESH_DOUBLINGS = 3
 
 # Relative to the plate's lowest bending frequency, below which a natural frequency is rounding of
 # free tilting on one or two ERAs.
@@ -354,7 +354,7 @@ def meshes_to_compare(rig: Rig) -> tuple[PlateMesh, ...]:
         return tuple(dict.fromkeys([lowest, automatic, automatic.finer(), rig.mesh]))
     size = plate.bending_wavelength(high) / _COARSEST_PER_WAVELENGTH
     nx, ny = (max(1, math.ceil(side / size)) for side in (plate.length, plate.width))
-    plain = [Mesh(nx << n, ny << n, plate.length, plate.width) for n in range(_DOUBLINGS + 1)]
+    plain = [Mesh(nx << n, ny << n, plate.length, plate.width) for n in range(MESH_DOUBLINGS + 1)]
     chosen = [*plain, automatic, Mesh.accurate(plate, frequency_max=high), rig.mesh]
     return tuple(dict.fromkeys(chosen))
 

@@ -113,7 +113,7 @@ def pytest_sessionfinish() -> None:
 def plain_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
     """Pictures drawn in a moment, for commands that write some beside what is tested."""
     monkeypatch.setattr("matplotlib.figure.Figure.set_layout_engine", lambda *_, **__: None)
-    monkeypatch.setattr("model.figures._DPI", 20)
+    monkeypatch.setattr("model.figures.DPI", 20)
 
 
 @pytest.fixture(scope="session")

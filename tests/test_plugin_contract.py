@@ -20,7 +20,7 @@ from controller.effects.effect import Effect
 from controller.effects.kinds import Buzz, effect_kind, effect_kinds
 from controller.effects.layout import SurfaceLayout, load_layout
 from controller.effects.player import EffectPlayer
-from controller.sources.touch import _SOURCES, Contact, ContactKey, TouchSource, open_source
+from controller.sources.touch import TOUCH_SOURCES, Contact, ContactKey, TouchSource, open_source
 from controller.sources.tuio import TuioSource
 from drivers.errors import CommandError
 from drivers.wires.serial_line import SerialAddress
@@ -374,7 +374,9 @@ def test_every_touch_source_of_the_project_is_registered() -> None:
         bases += base.__subclasses__()
         if base.__module__.startswith("controller.sources") and not isabstract(base):
             sources.append(f"{base.__module__}:{base.__name__}")
-    assert sorted(sources) == sorted(_SOURCES.own.values()), "add it to controller/sources/touch.py"
+    assert sorted(sources) == sorted(TOUCH_SOURCES.own.values()), (
+        "add it to controller/sources/touch.py"
+    )
 
 
 @of_every_kind

@@ -65,6 +65,9 @@ class Daemon:
     observe: adds observers of the control loop.
     lines: makes the lines to the amplifiers.
     watchdog [s]: of the amplifiers; longer for simulated ones on a busy machine.
+
+    Its parts are the attributes `controller`, `supervisor`, `publisher`, `layouts`, `inputs`, `api`
+    and `server`; `config` is the configuration in use.
     """
 
     def __init__(
@@ -80,7 +83,7 @@ class Daemon:
         lines: Callable[[Lines | None], Lines] = Lines,
         watchdog: float = WATCHDOG,
     ) -> None:
-        self._config = config.for_table(table.frequencies)
+        self.config = config.for_table(table.frequencies)
         self._frequencies = table.frequencies
         self._released: list[Effect] = []  # of replaced layouts, not freed yet
         self._log = log
@@ -91,71 +94,71 @@ class Daemon:
         self._next_reload = asyncio.get_running_loop().create_future()
         self._shutdown = asyncio.Event()
         self._shutdown_cause = "the daemon is shutting down"
-        self._supervisor = Supervisor(
+        self.supervisor = Supervisor(
             state_changed=(
-                lambda old, new: self._publisher.state_changed(old, new),
+                lambda old, new: self.publisher.state_changed(old, new),
                 lambda old, new: manager.notify(f"STATUS={headline(new.state.value, new.cause)}"),
             ),
-            link_changed=lambda *change: self._publisher.link_changed(*change),
+            link_changed=lambda *change: self.publisher.link_changed(*change),
             alive=lambda: manager.alive(threads.now()),
         )
-        self.started = self._supervisor.started
+        self.started = self.supervisor.started
         """Set once it serves, and its amplifiers are open or searched for."""
-        self._layouts = LayoutChoice(self._config, table.frequencies, changed=self._layout_changed)
+        self.layouts = LayoutChoice(self.config, table.frequencies, changed=self._layout_changed)
         # All others get no layouts, so that these can be freed once they are replaced.
         config = replace(config, layouts={})
-        self._publisher = EventPublisher(
-            operation=lambda: self._supervisor.operation,
+        self.publisher = EventPublisher(
+            operation=lambda: self.supervisor.operation,
             amplifiers=lambda: amplifier_statuses(
-                self._controller.amplifiers,
+                self.controller.amplifiers,
                 config.urls,
-                are_open=self._controller.group.is_open,
-                lost=self._supervisor.operation.lost,
-                what_may_play=self._supervisor.what_may_play,
-                clock_errors=self._controller.group.clock_errors,
-                targets=self._publisher.view.targets,
+                are_open=self.controller.group.is_open,
+                lost=self.supervisor.operation.lost,
+                what_may_play=self.supervisor.what_may_play,
+                clock_errors=self.controller.group.clock_errors,
+                targets=self.publisher.view.targets,
             ),
-            layouts=self._layouts,
-            inputs=lambda: self._inputs.event,
+            layouts=self.layouts,
+            inputs=lambda: self.inputs.event,
         )
-        self._controller = self._supervisor.controller = Controller(
+        self.controller = self.supervisor.controller = Controller(
             config.rig,
             table,
             lines=lines,
             urls=config.urls,
             serial_numbers=config.section.serial_numbers,
-            connected=self._supervisor.connected,
-            intent_source=self._layouts.player,
+            connected=self.supervisor.connected,
+            intent_source=self.layouts.player,
             timing=Timing(table),
             drive_mode=config.section.mode,
             watchdog=watchdog,
         )
-        cycle = self._controller.cycle
+        cycle = self.controller.cycle
         cycle.tracker.max_fingers = config.section.max_fingers
-        self._supervisor.observe(cycle.observers)
-        self._publisher.observe(cycle.observers)
+        self.supervisor.observe(cycle.observers)
+        self.publisher.observe(cycle.observers)
         observe(cycle.observers)
-        self._inputs = TouchInputs(
+        self.inputs = TouchInputs(
             cycle.deliver,
             cycle.lift,
             rejects=cycle.rejects,
-            changed=lambda: self._publisher.hub.publish("inputs", self._publisher.inputs),
+            changed=lambda: self.publisher.hub.publish("inputs", self.publisher.inputs),
         )
-        self._api = ApiService(
+        self.api = ApiService(
             config,
             table,
-            self._controller,
-            self._supervisor,
-            publisher=self._publisher,
-            layouts=self._layouts,
+            self.controller,
+            self.supervisor,
+            publisher=self.publisher,
+            layouts=self.layouts,
             reload=self.reload,
         )
-        self._server = ApiServer(
-            self._api.handlers(),
-            on_disconnect=self._api.client_left,
-            holds_lease=self._api.holds_lease,
+        self.server = ApiServer(
+            self.api.handlers(),
+            on_disconnect=self.api.client_left,
+            holds_lease=self.api.holds_lease,
             is_busy=lambda: cycle.is_preparing,
-            stop_all=self._supervisor.stop_anyhow,
+            stop_all=self.supervisor.stop_anyhow,
             clock=threads.now,
         )
         self._gateway: asyncio.Task[None] | None = None
@@ -174,13 +177,13 @@ class Daemon:
         self._reloading = asyncio.create_task(self._reload_when_requested(), name="reloads")
         running: asyncio.Task[None] | None = None
         try:
-            await self._server.open(lock.bind())
-            self._log.subscriber = self._publisher.logged
-            running = asyncio.create_task(self._supervisor.run(), name="control loop")
-            self._inputs.start(self._config.touch)
+            await self.server.open(lock.bind())
+            self._log.subscriber = self.publisher.logged
+            running = asyncio.create_task(self.supervisor.run(), name="control loop")
+            self.inputs.start(self.config.touch)
             if self._dashboard is not None:
                 options = gateway_options(
-                    self._dashboard, self._config.socket, shows_token=self._shows_token
+                    self._dashboard, self.config.socket, shows_token=self._shows_token
                 )
                 self._gateway = asyncio.create_task(keep_gateway(options), name="gateway")
             shutdown = asyncio.create_task(self._shutdown.wait())
@@ -231,13 +234,13 @@ class Daemon:
         is_done = False
         try:
             change = await self._read_again()
-            is_armed = self._supervisor.operation.state in ENERGISED
+            is_armed = self.supervisor.operation.state in ENERGISED
             reasons = change.refusals(is_armed=is_armed)
             if reasons:
                 reasons += [f"{text}, but not applied" for text in change.changes]
             else:
-                reasons = [*change.changes, *self._layouts.apply(change)] or ["nothing has changed"]
-                self._config = change.config
+                reasons = [*change.changes, *self.layouts.apply(change)] or ["nothing has changed"]
+                self.config = change.config
                 is_done = True
             self._released = change.effects
             del change
@@ -254,21 +257,21 @@ class Daemon:
         changes: list[ConfigChange] = []
 
         def read() -> None:
-            changes.append(read_again(self._config, self._frequencies))
+            changes.append(read_again(self.config, self._frequencies))
 
         await in_thread(read, name="reload")
         return changes.pop()
 
     def _layout_changed(self) -> None:
-        self._publisher.hub.publish("layout", self._layouts.event)
-        self._controller.cycle.request_update()
+        self.publisher.hub.publish("layout", self.layouts.event)
+        self.controller.cycle.request_update()
 
     async def _close(self, running: "asyncio.Task[None] | None") -> None:
         """Silence the amplifiers first, then close everything else."""
         self._manager.notify("STOPPING=1")
         self._reloading.cancel()
         try:
-            await self._supervisor.close(self._shutdown_cause)
+            await self.supervisor.close(self._shutdown_cause)
         finally:
             if running is not None:
                 _, late = await asyncio.wait({running}, timeout=_CLOSE_TIMEOUT)
@@ -279,14 +282,14 @@ class Daemon:
             gateway = () if self._gateway is None else (self._gateway,)
             for task in gateway:
                 task.cancel()
-            closing = (self._inputs.close(), self._server.close(), self._api.close())
+            closing = (self.inputs.close(), self.server.close(), self.api.close())
             for found in await asyncio.gather(*closing, *gateway, return_exceptions=True):
                 if isinstance(found, Exception) and not isinstance(found, OSError):
                     _logger.error("closing failed", exc_info=found)
-            self._publisher.hub.close()
+            self.publisher.hub.close()
 
     def _status_line(self) -> str:
-        operation = self._supervisor.operation
+        operation = self.supervisor.operation
         return headline(operation.state.value, operation.cause)
 
 

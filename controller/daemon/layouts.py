@@ -188,8 +188,8 @@ class LayoutChoice:
 
 
 _MIN_PAUSE, _MAX_PAUSE = 1.0, 30.0  # s; before a failed source is restarted
-_CLOSE_TIMEOUT = 0.2  # s
-_WATCH_INTERVAL = 1.0  # s; between checks of all inputs
+SOURCE_CLOSE_TIMEOUT = 0.2  # s
+WATCH_INTERVAL = 1.0  # s; between checks of all inputs
 
 
 class TouchInputs:
@@ -210,7 +210,7 @@ class TouchInputs:
         rejects: RejectCounter,
         changed: Callable[[], None] = lambda: None,
     ) -> None:
-        self._deliver = deliver
+        self.deliver = deliver
         self._lift = lift
         self._rejects = rejects
         self._changed = changed
@@ -234,14 +234,14 @@ class TouchInputs:
             task.cancel()
         if not self._running:
             return
-        _, late = await asyncio.wait(self._running, timeout=_CLOSE_TIMEOUT)
+        _, late = await asyncio.wait(self._running, timeout=SOURCE_CLOSE_TIMEOUT)
         for task in late:  # otherwise the program would wait for it at its end
             _logger.warning("%s: not ended by cancellation", task.get_name())
             with suppress(Exception):  # it can ignore this too, or fail
                 task.get_coro().close()
             task.cancel()
         ends = asyncio.gather(*late, return_exceptions=True)
-        await asyncio.wait([ends], timeout=_CLOSE_TIMEOUT)
+        await asyncio.wait([ends], timeout=SOURCE_CLOSE_TIMEOUT)
 
     async def _run(self, touch_input: TouchInput) -> None:
         prefix, calibration = f"{touch_input.name}:", touch_input.calibration
@@ -252,7 +252,7 @@ class TouchInputs:
             touches = frame.touches
             if calibration != ALIGNED:
                 touches = tuple(map(calibration.apply, touches))
-            self._deliver(replace(frame, source=prefix + source, touches=touches))
+            self.deliver(replace(frame, source=prefix + source, touches=touches))
 
         backoff = Backoff(_MIN_PAUSE, _MAX_PAUSE)
         while True:
@@ -289,7 +289,7 @@ class TouchInputs:
     async def _watch(self) -> None:
         """Update the state of all inputs periodically."""
         while True:
-            await asyncio.sleep(_WATCH_INTERVAL)
+            await asyncio.sleep(WATCH_INTERVAL)
             self._look()
 
 

@@ -142,7 +142,7 @@ _CONTACT_TIMEOUT = 2.0
 DECAY = 0.1
 """Time [s] for the plate to ring down after the last touch."""
 
-_RECOVERY = 30.0
+RECOVERY_TIMEOUT = 30.0
 """Time [s] within which the daemon must be armed, also again after a fault."""
 
 _RIG_FILE = "rig.yaml"
@@ -379,8 +379,11 @@ async def keep_armed(daemon: Daemon, path: Path, recorder: TouchRecorder) -> Non
 
 
 async def _armed(era: AsyncClient) -> str:
-    """Clear a fault, but no stop, and arm; return the lease. Raises LinkError after `_RECOVERY`."""
-    end = threads.now() + _RECOVERY
+    """Clear a fault, but no stop, and arm; return the lease.
+
+    Raises LinkError after `RECOVERY_TIMEOUT`.
+    """
+    end = threads.now() + RECOVERY_TIMEOUT
     while True:
         status = await era.status()
         if status.state == DaemonState.QUICK_STOP_ACTIVE or threads.now() > end:

@@ -150,7 +150,7 @@ def _operation(name: str, method: Method, references: Any) -> dict[str, Any]:
 MAX_BODY = 1 << 16  # bytes
 MAX_REQUESTS = 256  # simultaneous, to the daemon
 MAX_SESSIONS = 24  # WebSockets; the daemon has 32 connections, and some for stops
-_METRICS_TIME = 0.5  # s; for which metrics are cached
+METRICS_INTERVAL = 0.5  # s; for which metrics are cached
 _MAX_DISARMS = 8  # simultaneous, so that the daemon always reads a stop that follows
 _STOP_DELAY = 0.01  # s; maximum wait for a body with the name of the stopping client
 _HEARTBEAT = 10.0  # s; without a frame from a browser, until a ping is sent
@@ -238,7 +238,7 @@ class Gateway:
     async def _metrics(self, _: web.Request) -> web.Response:
         """Return the daemon's status for Prometheus, cached because it needs no token."""
         async with self._reading:
-            if time.monotonic() >= self._read_at + _METRICS_TIME:
+            if time.monotonic() >= self._read_at + METRICS_INTERVAL:
                 try:
                     self._exposition = exposition(await self._own.status())
                 except (RpcError, Unreachable):

@@ -54,7 +54,7 @@ class Controller:
     ) -> None:
         self.cycle = Cycle(rig.plate, Group({}, watchdog=watchdog))
         """The control loop."""
-        self._rig, self._intent_source, self._timing = rig, intent_source, timing
+        self._rig, self.intent_source, self._timing = rig, intent_source, timing
         self.table = table
         """The localization table to query."""
         self.urls = dict(rig.amplifiers if urls is None else urls)
@@ -63,7 +63,7 @@ class Controller:
                 f"amplifiers must match the rig ({', '.join(sorted(rig.amplifiers))}), got "
                 f"{', '.join(sorted(self.urls)) or 'none'}"
             )
-        self._make_lines = lines
+        self.make_lines = lines
         self._lines: Lines | None = None  # also set after a failed attempt to open
         self._before: Lines | None = None  # the previous lines, kept after closing
         self._opened: dict[str, Amplifier] = {}  # latest ones, identified or not
@@ -105,7 +105,7 @@ class Controller:
         cycle = self.cycle
         cycle.is_closed = False
         if self._lines is None or self._lines.is_closing:
-            self._lines = self._before = self._make_lines(self._before)
+            self._lines = self._before = self.make_lines(self._before)
         lines = self._lines
         try:
             async with cycle.sending:  # to the previous amplifiers
@@ -134,7 +134,7 @@ class Controller:
                 capabilities=playback_capabilities(
                     self._rig, amplifiers, drive_mode=self._drive_mode
                 ),
-                intent_source=self._intent_source,
+                intent_source=self.intent_source,
                 timing=self._timing,
                 check=self.group.sets.refusal_of,
                 arrived=cycle.request_update,

@@ -102,12 +102,12 @@ class Supervisor:
         # Not the epoch of a daemon before, whose clients may still be connected.
         self.operation = Operation(epoch=secrets.randbelow(_EPOCHS))
         self.started = asyncio.Event()  # the amplifiers are open, or searched for
-        self._closing = asyncio.Event()
+        self.closing = asyncio.Event()
         self._changed = asyncio.Event()  # to another state, since `run` has looked at it
         self._state_observers = (_log_transition, *state_changed)
         self._link_observer, self._alive = link_changed, alive
         self._reports = DeferredCalls()
-        self._tasks: set[asyncio.Task[Any]] = set()
+        self.tasks: set[asyncio.Task[Any]] = set()
         self._loss_lock = asyncio.Lock()  # held until the lost amplifiers are closed
         self._clears: list[int] = []  # epochs of clears in progress
         self._lease_timer: asyncio.TimerHandle | None = None
@@ -143,14 +143,14 @@ class Supervisor:
                 else:
                     await self._poll()
         finally:
-            await asyncio.gather(*self._tasks, return_exceptions=True)
+            await asyncio.gather(*self.tasks, return_exceptions=True)
             loop.cancel()
             await asyncio.gather(loop, return_exceptions=True)
             self._reports.flush()
 
     async def close(self, cause: str) -> None:
         """Ramp down, read back, disarm and close the amplifiers; then `run` ends."""
-        self._closing.set()
+        self.closing.set()
         await self.handle(DaemonEvent(Trigger.CLOSE, cause))
         self._reports.flush()
 
@@ -259,8 +259,8 @@ class Supervisor:
     def _spawn(self, work: Coroutine[Any, Any, _T]) -> "asyncio.Task[_T]":
         """Run work in a task that `run` waits for."""
         task = asyncio.ensure_future(work)
-        self._tasks.add(task)
-        task.add_done_callback(self._tasks.discard)
+        self.tasks.add(task)
+        task.add_done_callback(self.tasks.discard)
         return task
 
     async def _in_background(self, work: Awaitable[object]) -> None:
@@ -391,7 +391,7 @@ class Supervisor:
         except (LinkError, CommandRefused, FrameError) as error:
             lost = self._not_opened(error)
             event = DaemonEvent(Trigger.NOT_FOUND, str(error), _remedy_of(error), amplifiers=lost)
-        if self._closing.is_set():
+        if self.closing.is_set():
             await self.controller.close()
         else:
             await self._in_background(self.handle(event))
@@ -422,7 +422,7 @@ class Supervisor:
             if await self._reopen():
                 break
             await self._pause(pause)
-        while self.assume_energised(threads.now()) and not self._closing.is_set():
+        while self.assume_energised(threads.now()) and not self.closing.is_set():
             await self._pause(_RECHECK)
             await self.controller.group.statuses()  # loud amplifiers can be silent by now
         if self.controller.group.is_open:  # no further loss

@@ -162,7 +162,7 @@ def number_option(options: str, name: str, *, default: float) -> float:
         return math.nan
 
 
-_SOURCES: PluginRegistry[Callable[[str], TouchSource]] = PluginRegistry(
+TOUCH_SOURCES: PluginRegistry[Callable[[str], TouchSource]] = PluginRegistry(
     "touch source",
     "era_haptics.touch_sources",
     TouchSource,
@@ -178,7 +178,7 @@ _SOURCES: PluginRegistry[Callable[[str], TouchSource]] = PluginRegistry(
 
 def source_schemes() -> tuple[str, ...]:
     """URL schemes of touch sources, plug-ins last."""
-    return _SOURCES.names()
+    return TOUCH_SOURCES.names()
 
 
 def open_source(url: str) -> TouchSource:
@@ -186,7 +186,7 @@ def open_source(url: str) -> TouchSource:
 
     Raises InputError for an unknown scheme, a failing plug-in or an invalid URL.
     """
-    return _SOURCES.make(url)
+    return TOUCH_SOURCES.make(url)
 
 
 _Row: TypeAlias = tuple[float, float, float]

@@ -191,7 +191,7 @@ class Amplifier:
         self._ledger: Ledger | None = None
         self._admitted: StagedSet | None = None
         self._checked = _UNCHECKED  # the layers checked last, until when [s] that holds, the result
-        self._contradictions = 0  # of statuses, in a row
+        self.contradictions = 0  # of statuses, in a row
         self._misachieved = 0  # contradictions of achieved layers, in a row
         self._contradicted_at = -math.inf
         self._was_unfed = False  # whether the last contradiction was in a status that does not feed
@@ -455,12 +455,12 @@ class Amplifier:
             problem = plays_wrong
         if problem is None:
             if tells or not self._was_unfed:
-                self._contradictions, self._contradicted_at = 0, -math.inf
+                self.contradictions, self._contradicted_at = 0, -math.inf
             return
         self._was_unfed = not fed
         if now - self._contradicted_at >= _SAME_MOMENT:
-            self._contradictions, self._contradicted_at = self._contradictions + 1, now
-            if self._contradictions >= MAX_CONTRADICTIONS:
+            self.contradictions, self._contradicted_at = self.contradictions + 1, now
+            if self.contradictions >= MAX_CONTRADICTIONS:
                 raise contradicted(self.name, problem)
 
     def note_unasked(self, arrival: Event | OtherHost | DuplicateAddress) -> None:
@@ -621,7 +621,7 @@ class Amplifier:
             raise
         self.session, self.feeding.watchdog = session, watchdog
         self.armed_latch = status["latch"]
-        self._contradictions = self._misachieved = 0
+        self.contradictions = self._misachieved = 0
         self.ledger.forget()
         if status["state"] != ENABLED:
             raise disarmed(self.name, status)

@@ -228,7 +228,7 @@ class Group:
         """Makes them play together."""
         self._clocks = Clocks(self.members)
         self._heartbeats = Heartbeats(self.members, self.sets, self._clocks, restored)
-        self._watchdog, self._draw = watchdog, draw
+        self._watchdog, self.draw = watchdog, draw
         self._arming = asyncio.Lock()  # a second arm waits for the first
         self._closing = asyncio.Lock()  # a second close waits for the first
         self._limit: asyncio.Timeout | None = None  # ends an exchange in progress when it is moved
@@ -300,7 +300,7 @@ class Group:
                 amplifier.check_other_host()
             await self._clocks.settle()
             members.check_none_since(before)
-            drawn = self._draw(_SESSION.minimum, _SESSION.maximum)
+            drawn = self.draw(_SESSION.minimum, _SESSION.maximum)
             sessions = {
                 line: (drawn + number) % _SESSION.maximum + 1
                 for number, line in enumerate(members.lines)

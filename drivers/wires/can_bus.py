@@ -221,7 +221,7 @@ _READS = 64  # frames per iteration, so that a flood does not block the event lo
 _BUS_OFF = 0x40  # error class of SocketCAN
 _FULL = "Transmit buffer full"  # of python-can, if the socket's buffer is full
 _FULL_PAUSE = 0.0005  # s; before frames are sent again to a full transmit queue
-_FULL_TIMEOUT = 0.03  # s; without progress, after which frames are dropped as too old
+FULL_TIMEOUT = 0.03  # s; without progress, after which frames are dropped as too old
 
 logging.getLogger("can").addHandler(logging.NullHandler())  # its messages become LinkErrors
 
@@ -276,7 +276,7 @@ class Outbox:
 
     def put(self, frames: Iterable[CanFrame], now: float) -> None:
         """Add the frames of a request in place of all others but broadcasts."""
-        self._given_up_at = now + _FULL_TIMEOUT
+        self._given_up_at = now + FULL_TIMEOUT
         broadcasts = [entry for entry in self._frames if entry[0].id == REQUEST]
         added = [(frame, self._given_up_at) for frame in frames]
         self._frames = deque([*broadcasts, *added])
@@ -297,7 +297,7 @@ class Outbox:
         if self._frames and self._frames[0][0] is frame:
             self._frames.popleft()
             if now <= self._given_up_at:
-                self._given_up_at = now + _FULL_TIMEOUT
+                self._given_up_at = now + FULL_TIMEOUT
 
     def clear(self) -> None:
         """Drop all frames."""
@@ -634,7 +634,7 @@ class SlcanAddress(CanAddress):
 
 
 _SOCKETCAND_FORM = "can+socketcand://HOST:PORT/can0?bitrate=500000#NODE"
-_GREETING_TIMEOUT = 2.0  # s
+GREETING_TIMEOUT = 2.0  # s
 _MAX_REPLIES = 9
 
 
@@ -676,7 +676,7 @@ class SocketcandAddress(CanAddress):
         port = TextPort(SOCKETCAND, on_data, on_other=replied)
         port.below = await open_port(self.place, port.received, lost)
         try:
-            async with asyncio.timeout(_GREETING_TIMEOUT):
+            async with asyncio.timeout(GREETING_TIMEOUT):
                 await expect("< hi >")
                 port.below.write(f"< open {self.channel} >".encode())
                 await expect("< ok >")
@@ -686,7 +686,7 @@ class SocketcandAddress(CanAddress):
             port.below.close()
             if not isinstance(error, TimeoutError | LinkError):
                 raise
-            cause = str(error) or f"no reply within {_GREETING_TIMEOUT:g} s"
+            cause = str(error) or f"no reply within {GREETING_TIMEOUT:g} s"
             raise LinkError(
                 f"CAN bus {self.line} cannot be opened: {cause}; check address and port, and that "
                 "socketcand serves this bus there"

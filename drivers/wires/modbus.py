@@ -152,7 +152,7 @@ class ModbusWire(Wire):
         self._baud = baud
         self._is_rtu = is_rtu
         self.confirms_parts = is_rtu or baud > 0
-        self._number = number
+        self.number = number
         self._request: _Request | None = None
         self._write: _Request | None = None  # the write of a set that was sent with its read
         self._last: _Request | None = None  # the last request that had a response
@@ -274,8 +274,8 @@ class ModbusWire(Wire):
 
     def _sent(self, message: Message, tag: int, pdu: Pdu) -> _Request:
         """Return a request with its frame, under the next transaction number."""
-        self._number = self._number % 0xFFFF + 1
-        self._unawaited.discard(self._number)
+        self.number = self.number % 0xFFFF + 1
+        self._unawaited.discard(self.number)
         self.counters.frames_out += 1
         is_write = pdu.function_code == WRITE
         if self._baud:
@@ -285,13 +285,13 @@ class ModbusWire(Wire):
             size = ECHO_SIZE if is_write else RESPONSE_SIZE + 2 * pdu.count
             self.busy = self.takes + self._time(size) + self.silence
             return _Request(message, tag, pdu, RTU.buildFrame(pdu))
-        pdu.transaction_id = self._number
+        pdu.transaction_id = self.number
         return _Request(message, tag, pdu, TCP.buildFrame(pdu))
 
     def _written(self, unit: int, name: str, values: Values) -> _Request:
         """Return a request that begins with a write."""
         message = REQUESTS[name]
-        tag = self._number % 0xFFFF + 1
+        tag = self.number % 0xFFFF + 1
         registers = message.request.append([tag], values)
         write = Write(dev_id=unit, address=message.number * BOX, registers=registers)
         return self._sent(message, tag, write)

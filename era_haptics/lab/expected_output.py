@@ -285,7 +285,7 @@ class ExpectedOutputs:
         self._report, self._unclear, self._slack = report, unclear, slack
         self.playback = playback_of(can) if can else silent()
         """Playback with each commit in the middle of its interval."""
-        self._plays = UncertainPlayback(self.playback)
+        self.uncertain_playback = UncertainPlayback(self.playback)
         self._half_step = can.get("level_step", 1) / 2 / _LEVEL.per_unit
         self._has_floor = True  # False after a fault, which can cut a fade short
         self._unknown = [-math.inf] * _LAYERS  # per layer, until when its output is unknown [s]
@@ -328,9 +328,9 @@ class ExpectedOutputs:
         """
         is_prompt = not (is_at_once or any(map(_is_timed, layers)))
         start, end = when[0], when[1] + (SAMPLE if is_prompt else LATE)
-        if self._unclear is not None and self._plays.is_ambiguous((start, end), layers):
+        if self._unclear is not None and self.uncertain_playback.is_ambiguous((start, end), layers):
             self._unclear(_AMBIGUOUS)
-        shortened_by = self._plays.shortened_by((start, end), layers)
+        shortened_by = self.uncertain_playback.shortened_by((start, end), layers)
         channels = range(self.playback.channels)
         self._before = [*map(self.playback.settled, channels)]
         for one in layers:
@@ -340,7 +340,7 @@ class ExpectedOutputs:
                 lasting.clear()
             if not one.renew:
                 lasting.add(one.valid_for)
-            half = self._plays.half[number]
+            half = self.uncertain_playback.half[number]
             if start - half <= self.playback.end_of(number) <= end + half:
                 # It can end on its own, and then by other transitions than the set's.
                 goes_on = one.renew or any(each.keep_phase for each in one.commands)
@@ -349,7 +349,7 @@ class ExpectedOutputs:
                 fade = end + _MAX_ENDING + _RAMP.from_wire(one.ramp)
                 self._unknown[number] = min(self._unknown[number], fade)
             self._unknown[number] = max(self._unknown[number], shortened_by)
-        self._plays.commit(layers, token, (start, end))
+        self.uncertain_playback.commit(layers, token, (start, end))
         numbers = ", ".join(str(each.layer) for each in layers)
         self.began, self.cause = when, f"set {token} (layers: {numbers or 'none'})"
         self._has_floor, self.is_exact = True, self.is_exact and is_exact
@@ -361,15 +361,15 @@ class ExpectedOutputs:
         """Fade all layers along a ramp [s] from some time in an interval; return when all are
         silent."""
         start, end = when[0], when[1] + LATE
-        if self._plays.is_ambiguous((start, end), None, ramp):
+        if self.uncertain_playback.is_ambiguous((start, end), None, ramp):
             self._unknown = [math.inf] * _LAYERS  # fades, or falls silent by its ending
             if self._unclear is not None:
                 self._unclear(_AMBIGUOUS)
-        self._plays.silence((start, end), ramp)
+        self.uncertain_playback.silence((start, end), ramp)
         is_known = max(self._unknown) < start
         self._unknown = [min(until, end + ramp) for until in self._unknown]
         self.began, self.cause, self._has_floor = when, cause, has_floor
-        ends, lag = self.playback.ends_by, self._plays.lag
+        ends, lag = self.playback.ends_by, self.uncertain_playback.lag
         first = max(ends - lag, start) if has_floor and is_known else when[0]
         return first, max(ends + lag, end if is_known else end + ramp)
 
@@ -388,7 +388,7 @@ class ExpectedOutputs:
         """
         start, end = self._widened(when)
         is_known = max(self._unknown) < start
-        return _ALL_LAYERS - self._plays.unsure(start, end) if is_known else set()
+        return _ALL_LAYERS - self.uncertain_playback.unsure(start, end) if is_known else set()
 
     def tokens_of(self, layer: int, sure: set[int]) -> set[int]:
         """Return the tokens that a layer can report; sure: layers whose output is known."""
@@ -458,7 +458,9 @@ class ExpectedOutputs:
         start, end = self._widened(when)
         largest = 0.0
         for channel, level in enumerate(levels[: self.playback.channels]):
-            low, high = self._plays.bounds(channel, start, end, is_exact=self.interferes)
+            low, high = self.uncertain_playback.bounds(
+                channel, start, end, is_exact=self.interferes
+            )
             largest = max(largest, low)
             voices = len(self.playback.all_voices[channel])
             slack = max((_MAX_STEPS + voices) * self._half_step, _TOLERANCE)
@@ -479,7 +481,7 @@ class ExpectedOutputs:
         """Return the rule that a wrong level violates."""
         if self.cause == "the watchdog":
             return "watchdog"
-        if self.playback.settles_at > self._widened(when)[0] - self._plays.lag:
+        if self.playback.settles_at > self._widened(when)[0] - self.uncertain_playback.lag:
             return "ramp"
         if not self.cause.startswith("set"):
             return "silent"

@@ -92,8 +92,9 @@ class AdaptedAmplifier(SimulatedAmplifier):
             status["flags"] |= 1 << STATUS_FLAGS["high_voltage"]
         return status
 
-    def _is_cause_gone(self, now: float) -> bool:
-        return not self.is_lost and super()._is_cause_gone(now)
+    def is_cause_gone(self, now: float) -> bool:
+        """Return whether the instrument replies and the cause of the fault is gone."""
+        return not self.is_lost and super().is_cause_gone(now)
 
 
 class Adapter:

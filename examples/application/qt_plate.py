@@ -59,10 +59,10 @@ class Plate(QObject):
         self._touches: list[dict[str, Any]] = []
         self._is_open = False
         self._silent = 0  # s
-        self._socket = QWebSocket()
-        self._socket.textMessageReceived.connect(self._received)
-        self._socket.stateChanged.connect(self._state_changed)
-        self._socket.pong.connect(self._heard)
+        self.socket = QWebSocket()
+        self.socket.textMessageReceived.connect(self._received)
+        self.socket.stateChanged.connect(self._state_changed)
+        self.socket.pong.connect(self._heard)
         for interval, action in ((1000, self._check), (1500, self._renew), (50, self._repeat)):
             timer = QTimer(self, interval=interval)
             timer.timeout.connect(action)
@@ -100,7 +100,7 @@ class Plate(QObject):
         is_arming = self._armed in (done for done, _ in self._pending.values())
         if is_arming or self._lease is not None:
             self.disarm()
-            self._socket.flush()  # the application may end now
+            self.socket.flush()  # the application may end now
 
     def touch(self, places: list[tuple[float, float]]) -> None:
         """Report all fingers, at x, y [m], the newest last; repeated until the next call."""
@@ -123,11 +123,11 @@ class Plate(QObject):
 
     def _connect(self) -> None:
         self._silent = 0
-        self._socket.open(self._request, self._options)
+        self.socket.open(self._request, self._options)
 
     def _send(self, method: str, params: dict[str, Any], **head: int) -> None:
         request = {"jsonrpc": "2.0", **head, "method": method, "params": params}
-        self._socket.sendTextMessage(json.dumps(request))
+        self.socket.sendTextMessage(json.dumps(request))
 
     def _received(self, text: str) -> None:
         self._silent = 0
@@ -158,7 +158,7 @@ class Plate(QObject):
         for _ in range(len(self._pending)):
             self.refused.emit("the connection was lost")
         self._pending.clear()
-        self.failed.emit(self._socket.closeReason() or self._socket.errorString())
+        self.failed.emit(self.socket.closeReason() or self.socket.errorString())
         QTimer.singleShot(500, self, self._connect)
 
     def _heard(self) -> None:
@@ -168,9 +168,9 @@ class Plate(QObject):
         """Leave a gateway that is silent: a lost network closes nothing."""
         self._silent += 1
         if self._silent > MAX_SILENT:
-            self._socket.abort()
+            self.socket.abort()
         elif self._is_open:
-            self._socket.ping()
+            self.socket.ping()
 
     def _armed(self, result: dict[str, Any]) -> None:
         self._lease = result["lease"]

@@ -166,7 +166,7 @@ class ShapedTone(Structure):
 
 
 _COMPILERS = ("cc", "gcc", "clang")
-_TIMEOUT = 120.0  # s
+COMPILE_TIMEOUT = 120.0  # s
 
 
 def compile_library(
@@ -210,13 +210,13 @@ def _compile(
             capture_output=True,
             encoding="utf-8",
             errors="replace",
-            timeout=_TIMEOUT,
+            timeout=COMPILE_TIMEOUT,
             check=False,
         )
     except subprocess.TimeoutExpired:
         raise InputError(
-            f"{what} must be compiled within {_TIMEOUT:g} s, got no end of {' '.join(compiler)}; "
-            "set CC to another compiler"
+            f"{what} must be compiled within {COMPILE_TIMEOUT:g} s, got no end of "
+            f"{' '.join(compiler)}; set CC to another compiler"
         ) from None
     if done.returncode:
         lines = done.stderr.strip().splitlines() or ["no message"]
@@ -349,9 +349,9 @@ def _digest(files: Iterable[Path], flags: Sequence[str]) -> str:
     return made_of.hexdigest()[:16]
 
 
-_HERE = Path(__file__).parent
-_SOURCES = tuple(sorted(_HERE.glob("*.c")))
-_HEADERS = tuple(sorted(_HERE.glob("*.h")))
+KERNEL_FOLDER = Path(__file__).parent
+_SOURCES = tuple(sorted(KERNEL_FOLDER.glob("*.c")))
+_HEADERS = tuple(sorted(KERNEL_FOLDER.glob("*.h")))
 _FLAGS = ("-std=gnu99", "-O2", "-fno-math-errno", "-fno-trapping-math", "-Wno-psabi")
 _WHAT = "the library of kernels"
 
@@ -415,7 +415,7 @@ def kernels() -> Kernels | None:
     """Load the kernels for this processor; None without a compiler, where numpy is used instead."""
     has = processor_features()
     version = next(each for each in versions() if each.features.keys() <= has)
-    own = _HERE / version.file
+    own = KERNEL_FOLDER / version.file
     try:
         if own.exists():
             return Kernels(ctypes.CDLL(str(own)), version.lanes)

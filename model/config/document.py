@@ -28,7 +28,7 @@ IF_EMPTY = "`era config init` writes one to begin with"
 """Remedy for an empty configuration file."""
 
 _MAX_DEPTH = 20
-_MAX_VALUES = 50_000
+MAX_DOCUMENT_VALUES = 50_000
 _ZIP = b"PK\x03\x04"
 
 Scalar: TypeAlias = bool | int | float | str | None
@@ -280,7 +280,7 @@ def _missing_comma(text: str, mark: Any) -> tuple[int, str]:
     )
 
 
-_LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # libyaml if available
+YAML_LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # libyaml if available
 _NOT_ALLOWED = (
     yaml.reader.Reader.NON_PRINTABLE
 )  # libyaml counts bytes, and accepts other characters
@@ -294,7 +294,7 @@ class _PlainReader:
 
     def __init__(self, source: str, text: str) -> None:
         self._source, self._text = source, text
-        self._events: Iterator[Any] = yaml.parse(text, Loader=_LOADER)
+        self._events: Iterator[Any] = yaml.parse(text, Loader=YAML_LOADER)
         self.lines: dict[KeyPath, int] = {}
         self.repeated: list[ConfigProblem] = []
         self._count = 0
@@ -353,8 +353,8 @@ class _PlainReader:
         if len(path) > _MAX_DEPTH:
             raise self._refused(path[:3], event, f"is nested more than {_MAX_DEPTH} levels deep")
         self._count += 1
-        if self._count > _MAX_VALUES:
-            raise self._refused((), event, f"has more than {_MAX_VALUES} values")
+        if self._count > MAX_DOCUMENT_VALUES:
+            raise self._refused((), event, f"has more than {MAX_DOCUMENT_VALUES} values")
 
     def _refused(self, path: KeyPath, event: Any, message: str) -> ConfigError:
         return ConfigError(self._source, [ConfigProblem(_line(event), key_name(path), message)])

@@ -74,10 +74,10 @@ _MAX_OUTLIERS = (
 _MIN_CONFIDENCE = 0.99  # minimum, for an ERA other than the rig's
 _LEAST_MISFIT = 0.02  # below it, sensor errors dominate
 
-_SIZES = (0.6, 0.67, 0.75, 0.82, 0.88, 0.94, 1.06, 1.13, 1.21, 1.33, 1.5, 1.67)
+SIZE_FACTORS = (0.6, 0.67, 0.75, 0.82, 0.88, 0.94, 1.06, 1.13, 1.21, 1.33, 1.5, 1.67)
 _STIFFNESSES = (0.01, 0.03, 0.1, 0.2, 0.35, 0.5, 0.65, 0.8, 1.25, 1.5, 2.0, 3.0, 5.0, 10.0, 30.0)
-_FITTED = 5  # hypotheses for which the rest of the rig is fitted
-_REFINED = 2  # best hypotheses whose value is refined
+FITTED_HYPOTHESES = 5  # hypotheses for which the rest of the rig is fitted
+REFINED_HYPOTHESES = 2  # best hypotheses whose value is refined
 _REFINEMENTS = 7  # values
 _CORRELATION = 4.0  # since model errors are correlated over sensors and frequencies
 
@@ -383,8 +383,8 @@ def _ranges(rig: Rig) -> dict[str, tuple[str, tuple[float, ...]]]:
     """Return units of the rig values that can be wrong, and the factors to try, by key."""
     of_eras = {f"eras.{era.name}.stiffness": ("N/m", _STIFFNESSES) for era in rig.eras}
     return {
-        **{f"plate.{name}": ("m", _SIZES) for name in ("thickness", "length", "width")},
-        "plate.material.E": ("Pa", tuple(size**2 for size in _SIZES)),
+        **{f"plate.{name}": ("m", SIZE_FACTORS) for name in ("thickness", "length", "width")},
+        "plate.material.E": ("Pa", tuple(size**2 for size in SIZE_FACTORS)),
         "plate.loss_factor": ("", (0.1, 0.3, 3.0, 10.0, 30.0)),
         "eras.stiffness": ("N/m", _STIFFNESSES),
         "eras.bolt_mass": ("kg", (0.01, 0.02, 0.04, 0.08, 0.16)),
@@ -466,11 +466,12 @@ def compared(match: Match) -> list[Hypothesis]:
     ]
     best = {key: (score, factor) for score, factor, key in ranked_by(scores, lambda each: each[0])}
     fits = []
-    for key, (_, factor) in ranked_by([*best.items()], lambda each: -each[1][0])[:_FITTED]:
+    hypotheses = ranked_by([*best.items()], lambda each: -each[1][0])
+    for key, (_, factor) in hypotheses[:FITTED_HYPOTHESES]:
         if found := _matched(match, key, factor):
             fits.append((key, factor, found))
     fits = ranked_by(fits, lambda each: -each[2].fit.cost)
-    for number, (key, factor, found) in enumerate(fits[:_REFINED]):
+    for number, (key, factor, found) in enumerate(fits[:REFINED_HYPOTHESES]):
         refined = _refined(of[key][1], factor, found, partial(_matched, match, key))
         fits[number] = (key, factor, refined)
     costs = np.array([found.fit.cost for _, _, found in fits])

@@ -27,7 +27,7 @@ DISPLACEMENT, ACCELERATION, UFF_TIME, UFF_FREQUENCY = 8, 12, 17, 18  # data type
 _UTF_16 = (b"\xff\xfe", b"\xfe\xff")
 BYTE_ORDER_MARKS = (b"\xef\xbb\xbf", *_UTF_16)
 
-_MAX_BYTES = 512 << 20
+MAX_UFF_BYTES = 512 << 20
 _HEADER_LINES = 12  # of dataset 58, its number first
 _NOTE = 2  # of the note lines, see `Function`
 # Header fields by name: line, first and last column, and conversion of the text.
@@ -192,7 +192,7 @@ def read_measured_bytes(path: Path) -> bytes:
 def open_measured(path: Path) -> Iterator[BinaryIO]:
     """Open a measured file; raises InputError if it is missing or too large."""
     try:
-        with open_regular(path, _MAX_BYTES) as file:
+        with open_regular(path, MAX_UFF_BYTES) as file:
             yield file
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror}") from error

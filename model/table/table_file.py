@@ -425,7 +425,7 @@ def _no_error(problem: TableProblem) -> Arrays:
 
 MAX_CACHED_TABLES = 50  # of some megabytes each; the least recently used go first
 
-_CURRENT = f"table-{FORMAT_VERSION}.{NUMERICS_VERSION}-"
+CURRENT_PREFIX = f"table-{FORMAT_VERSION}.{NUMERICS_VERSION}-"
 
 _logger = logging.getLogger(__name__)
 
@@ -451,7 +451,7 @@ def cached_table(
     except OSError as error:
         _logger.warning("table cache: table not kept for the next run: %s", error)
         return solve_table(problem, drive_mode=drive_mode, progress=progress), None
-    path = folder / f"{_CURRENT}{problem.digest[:16]}-{drive_mode}.npz"
+    path = folder / f"{CURRENT_PREFIX}{problem.digest[:16]}-{drive_mode}.npz"
     try:
         table = load_table(path, rig=rig)
     except InputError as error:
@@ -476,7 +476,7 @@ def cached_table(
 def _clean_up(folder: Path) -> None:
     """Remove tables of other versions, and all but the most recently used ones."""
     tables = list(folder.glob("table-*.npz"))
-    current = [path for path in tables if path.name.startswith(_CURRENT)]
+    current = [path for path in tables if path.name.startswith(CURRENT_PREFIX)]
     recent = sorted(current, key=lambda path: path.stat().st_mtime)[-MAX_CACHED_TABLES:]
     for path in set(tables) - set(recent):
         path.unlink(missing_ok=True)

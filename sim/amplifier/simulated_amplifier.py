@@ -256,7 +256,7 @@ class SimulatedAmplifier:
         self._last_fed = 0.0
         self.token = 0
         """Token of the last set since arming that changed the playback; 0: none."""
-        self._silent_from = -math.inf  # end of the last silencing ramp
+        self.silent_from = -math.inf  # end of the last silencing ramp
         self._discharged_from = -math.inf  # of the last one while high voltage was on
         self._is_limited = False
         self.is_derated = False
@@ -273,7 +273,7 @@ class SimulatedAmplifier:
         if self._waiting is not None:
             due = min(due, self._waiting[0])
         if self.state != _ENABLED:
-            return min(due, self._silent_from if self.state in _ENDING else math.inf)
+            return min(due, self.silent_from if self.state in _ENDING else math.inf)
         hot = self._heat.when(FAULT_ABOVE if self.is_derated else DERATE_ABOVE)
         return min(due, self._last_fed + self._watchdog, hot)
 
@@ -379,7 +379,7 @@ class SimulatedAmplifier:
         """
         self._faults.appendleft((fault, channel, moment))
         if self.state in (_ENABLED, "SWITCHED_ON", "QUICK_STOP_ACTIVE"):
-            self._silence(moment, ramp=SILENCING_RAMP)
+            self.silence(moment, ramp=SILENCING_RAMP)
             self.fault = fault
             self.latch = token_after(self.latch)
             self._enter("FAULT_REACTION_ACTIVE", moment, channel=channel)
@@ -419,14 +419,14 @@ class SimulatedAmplifier:
                 if name == "Stop":
                     self.latch = token_after(self.latch)
                 ramp = min(values["ramp"], self.capabilities["ramp_max"])
-                self._silence(now, ramp=_Q["ramp"].from_wire(ramp))
+                self.silence(now, ramp=_Q["ramp"].from_wire(ramp))
                 self._enter(following, now)
                 self.tick(now)
             case "Silence":
                 if values["ramp"] > self.capabilities["ramp_max"]:
                     limit = self.capabilities["ramp_max"]
                     raise Refusal(f"ramp must be at most {limit}, got {values['ramp']}")
-                self._silence(now, ramp=_Q["ramp"].from_wire(values["ramp"]))
+                self.silence(now, ramp=_Q["ramp"].from_wire(values["ramp"]))
             case "Ping" if self.state == _ENABLED:
                 self.clock.steer(values["rate"], now)
                 if self._waiting is not None:
@@ -471,7 +471,7 @@ class SimulatedAmplifier:
         if self.state == _ENABLED:  # the same again: its reply was lost
             return
         # Arming starts at level zero, even if the last session left a fade.
-        self._silence(now, ramp=SILENCING_RAMP)
+        self.silence(now, ramp=SILENCING_RAMP)
         self._intake.forget()
         self.token = 0
         self.session = values["session"]
@@ -482,7 +482,7 @@ class SimulatedAmplifier:
     def _clear(self, latch: int, following: str, now: float) -> None:
         if self.state in _LATCHED and latch != self.latch:
             raise Refusal(f"latch must be {self.latch}, got {latch}", "WRONG_LATCH")
-        if self._silent_from <= now and self._is_cause_gone(now):
+        if self.silent_from <= now and self.is_cause_gone(now):
             self.fault = "NONE"
             self._enter(following, now)
 
@@ -495,7 +495,7 @@ class SimulatedAmplifier:
         if isinstance(taken, tuple) and part["now"]:
             self._intake.commit(token, now)
             self._start_waiting(now)
-            self._play(taken, token, now)
+            self.play(taken, token, now)
         return {
             "token": token,
             "exact": not (is_missing or self.is_derated),
@@ -510,16 +510,17 @@ class SimulatedAmplifier:
         if 1 <= (at - high_word(self.clock.reading(now))) % HIGH_WORDS <= AHEAD_MAX:
             self._waiting = self.clock.reaches(at, now), commit, layers
         else:
-            self._play(layers, commit["token"], now)
+            self.play(layers, commit["token"], now)
 
     def _start_waiting(self, moment: float) -> None:
         """Play the set that waits for a moment, if there is one."""
         if self._waiting is not None:
             _, commit, layers = self._waiting
             self._waiting = None
-            self._play(layers, commit["token"], moment)
+            self.play(layers, commit["token"], moment)
 
-    def _play(self, layers: Layers, token: int, now: float) -> None:
+    def play(self, layers: Layers, token: int, now: float) -> None:
+        """Start the layers of a set at a time [s]."""
         wanted = derated(layers, DERATED) if self.is_derated else layers
         self.playback.commit(wanted, token, now)
         if all(layer.renew for layer in layers):
@@ -530,12 +531,12 @@ class SimulatedAmplifier:
         )
         self._changed(now)
 
-    def _silence(self, moment: float, *, ramp: float) -> None:
+    def silence(self, moment: float, *, ramp: float) -> None:
         """Silence every channel within the ramp [s], and discard staged and waiting sets."""
         self.playback.silence(moment, ramp)
-        self._silent_from = max(self.playback.silent_from, moment)
+        self.silent_from = max(self.playback.silent_from, moment)
         if self.state in ("SWITCHED_ON", _ENABLED):
-            self._discharged_from = self._silent_from
+            self._discharged_from = self.silent_from
         self._intake.drop()
         self._waiting = None
         self._changed(moment)
@@ -570,7 +571,7 @@ class SimulatedAmplifier:
         self.playback.scale(moment, DERATED, _DERATING_RAMP)
         self._changed(moment)
 
-    def _is_cause_gone(self, now: float) -> bool:
+    def is_cause_gone(self, now: float) -> bool:
         """Whether the cause of the fault no longer persists."""
         if self.fault == "INTERLOCK":
             return not self._is_interlock_open

@@ -423,7 +423,7 @@ async def test_plate_is_armed_again_after_a_fault_but_not_after_a_stop(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """After one of amplifiers that stalled it is cleared, and the recorder hears of both."""
-    monkeypatch.setattr(demonstration, "_RECOVERY", 5.0)
+    monkeypatch.setattr(demonstration, "RECOVERY_TIMEOUT", 5.0)
     async with asyncio.TaskGroup() as tasks, ready_daemon(tmp_path) as (bench, era):
         recorder = TouchRecorder(cast(SimulatedPlate, None), tasks, on_row=lambda row: None)
         arming = asyncio.create_task(demonstration.keep_armed(bench.daemon, bench.socket, recorder))

@@ -162,7 +162,7 @@ async def test_connection_timeout_has_a_remedy(
     listening: tuple[socket.socket, int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The connection is neither accepted nor refused."""
-    monkeypatch.setattr(ports, "_CONNECT_TIMEOUT", 0.0)
+    monkeypatch.setattr(ports, "CONNECT_TIMEOUT", 0.0)
     with pytest.raises(LinkError, match=rf"127.0.0.1:{listening[1]}: .*check the address"):
         await connected(listening[1])
 
@@ -234,7 +234,7 @@ from drivers import ports
 from drivers.errors import LinkError
 
 socket.getaddrinfo = lambda *args, **kwargs: threading.Event().wait()
-ports._CONNECT_TIMEOUT = 0.05
+ports.CONNECT_TIMEOUT = 0.05
 try:
     asyncio.run(ports.open_connection("amplifier.test", 502, lambda _: None, lambda _: None))
 except LinkError as problem:

@@ -172,15 +172,14 @@ def test_trace_has_time_direction_bytes_and_meaning(tmp_path: Path) -> None:
 
 def test_slow_file_drops_and_counts(monkeypatch: pytest.MonkeyPatch) -> None:
     """The caller never waits; the number of dropped records stands in the file."""
-    monkeypatch.setattr(trace, "_MAX_PENDING", 10)
+    monkeypatch.setattr(trace, "MAX_PENDING_RECORDS", 10)
     file, may_go_on, is_writing = Mock(), threading.Event(), threading.Event()
     file.write.side_effect = lambda text: is_writing.set() or may_go_on.wait(60)
     writer = TraceWriter(file)
-    monkeypatch.setattr(trace, "_writers", [writer])
-    trace.frame(Direction.OUT, b"", "first", str)
+    writer.add("first", str)
     assert is_writing.wait(60)
     for _ in range(25):
-        trace.frame(Direction.OUT, b"", "later", str)
+        writer.add("later", str)
     assert writer.dropped == 15
     may_go_on.set()
     writer.close()

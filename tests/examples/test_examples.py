@@ -622,7 +622,7 @@ async def test_connection_is_made_again_with_topics_and_lease(tmp_path: Path) ->
             line = await asyncio.wait_for(process.stdout.readline(), PATIENCE)
             assert line, (await process.stderr.read()).decode()  # else the program has ended
             awaited.discard(line)
-        for connection in list(bench.daemon._server.clients):
+        for connection in list(bench.daemon.server.clients):
             connection.abort()
         await asyncio.sleep(4)  # longer than the lease
         assert (await era.status()).armed_by == "javascript"

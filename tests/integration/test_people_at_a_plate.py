@@ -596,7 +596,7 @@ def test_application_without_its_user_or_connection_lifts_and_disarms(
         left = Qt.MouseButton.LeftButton
 
         def disarm() -> None:
-            window.plate._socket.abort()
+            window.plate.socket.abort()
             QTest.mouseClick(window.disarm, left)
 
         for leave in (window.hide, disarm, window.close):

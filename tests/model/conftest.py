@@ -25,7 +25,7 @@ def without_kernels(
 
     def take() -> None:
         monkeypatch.setattr(kernels, "kept_library", fail)
-        monkeypatch.setattr(kernels, "_HERE", tmp_path)  # nor one of a wheel
+        monkeypatch.setattr(kernels, "KERNEL_FOLDER", tmp_path)  # nor one of a wheel
         kernels.kernels.cache_clear()
 
     yield take

@@ -165,7 +165,7 @@ def test_cluster_without_workers_or_scheduler_is_refused(monkeypatch) -> None:
     """
     from distributed import LocalCluster
 
-    monkeypatch.setattr(processes, "_CONNECT_TIMEOUT", 0.2)
+    monkeypatch.setattr(processes, "SCHEDULER_TIMEOUT", 0.2)
     nowhere = "tcp://127.0.0.1:1"
     with LocalCluster(n_workers=0, dashboard_address=":0") as empty:
         for address, said in (
@@ -406,7 +406,7 @@ def test_compiler_that_gives_no_library_is_bad_input(
     assert why_slow() is None
     with monkeypatch.context() as patch:
         patch.setenv("CC", cc)
-        patch.setattr(library_cache, "_TIMEOUT", 0.01)
+        patch.setattr(library_cache, "COMPILE_TIMEOUT", 0.01)
         with pytest.raises(InputError):
             compile_library(tmp_path / "seven.so", [source], flags=(), what="seven")
     assert [path.name for path in tmp_path.iterdir()] == ["seven.c"]

@@ -4,6 +4,7 @@ Delays are by the numbers of their standards and data sheets.
 """
 
 import os
+import random
 import signal
 import statistics
 import subprocess
@@ -62,7 +63,7 @@ def test_ftdi_holds_small_replies_until_its_timer_has_run() -> None:
 
 def test_latency_has_its_least_and_median_and_stalls() -> None:
     """Half of 20 000 draws lie below 10 + 20 us; 2 % have 1 ms more on average."""
-    rng = LINE_KINDS["native"].delays(1)._rng
+    rng = random.Random(1)
     drawn = [Latency(10e-6, 20e-6, 0.5).draw(rng) for _ in range(20_000)]
     assert min(drawn) > 10e-6
     assert statistics.median(drawn) == pytest.approx(30e-6, rel=0.03)

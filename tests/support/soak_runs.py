@@ -670,7 +670,7 @@ class Soak(Chain):
         self.operation.kill_host()
         self.loop.kill_hosts()
         self.host_rules.closed()
-        work = [self.hosting, *self.supervisor._tasks]
+        work = [self.hosting, *self.supervisor.tasks]
         for task in work:
             task.cancel()
         await asyncio.gather(*work, return_exceptions=True)

@@ -242,7 +242,7 @@ plates."""
 
 _ALIKE = 1.25  # ratio of frequencies that feel nearly alike
 
-_MAX_TOUCHES, MAX_POSITIONS = 30, 120  # in one region, in all
+MAX_REGION_TOUCHES, MAX_POSITIONS = 30, 120  # in one region, in all
 _MIN_STEP = 0.008  # m; closer touches hardly differ
 _RESTING_AWAY = 0.06  # m, minimum distance from a touch to the resting finger
 
@@ -340,7 +340,7 @@ def check_layout(
     simulator = TouchSimulator(table)
     parts = [*layout.uses()]
     checked = []
-    count = max(1, min(_MAX_TOUCHES, MAX_POSITIONS // max(1, len(parts))))
+    count = max(1, min(MAX_REGION_TOUCHES, MAX_POSITIONS // max(1, len(parts))))
     for number, (region, on, name) in enumerate(parts):
         progress(number, len(parts))
         checked.append(_check(layout, region, on, name, table, simulator, count))
@@ -381,7 +381,7 @@ def _check(
 
 
 def touch_positions(
-    layout: SurfaceLayout, region: Region | None, plate: Plate, count: int = _MAX_TOUCHES
+    layout: SurfaceLayout, region: Region | None, plate: Plate, count: int = MAX_REGION_TOUCHES
 ) -> tuple[list[Point], float]:
     """Return up to `count` positions [m], evenly spaced over a region, and the area of each [m²].
 

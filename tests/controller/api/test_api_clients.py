@@ -74,7 +74,7 @@ async def test_client_connects_again_with_subscriptions_and_lease(tmp_path: Path
 
         async def lose(duration: float) -> None:
             bench.socket.rename(away)
-            for connection in list(bench.daemon._server.clients):
+            for connection in list(bench.daemon.server.clients):
                 connection.abort()
             await asyncio.sleep(duration)
             away.rename(bench.socket)
@@ -172,7 +172,7 @@ async def test_events_that_a_client_is_too_slow_for_are_counted(tmp_path: Path) 
     """Dropped by the daemon, or by the client as they were not taken: each event is had or lost."""
     async with ready_daemon(tmp_path) as (bench, other), await bench.client() as era:
         await era.subscribe("log")
-        hub = bench.daemon._publisher.hub
+        hub = bench.daemon.publisher.hub
         line = LogEvent(level="info", message="x" * 900, cause=None, remedy=None)
         for count in (*[100] * 20, 1000, 1):  # at once
             for _ in range(count):

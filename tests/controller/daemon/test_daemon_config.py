@@ -371,7 +371,7 @@ async def test_reload_costs_the_loop_nothing(
             counting.setattr(asyncio.Handle, "_run", counted)
             await asyncio.create_task(bench.daemon.reload())
             await asyncio.sleep(0.2)  # until all is as the layout says
-        assert len(bench.daemon._config.layouts["large"].regions) == REGIONS
+        assert len(bench.daemon.config.layouts["large"].regions) == REGIONS
         assert len(events) > 10
         assert max(events) <= MOST_EVENTS
         assert (await era.status()).state == ENABLED

@@ -110,7 +110,7 @@ class Served(Taken):
     @property
     def operation(self) -> Operation:
         """What the supervisor knows."""
-        return self.bench.daemon._supervisor.operation
+        return self.bench.daemon.supervisor.operation
 
     @property
     def is_energised(self) -> bool:
@@ -130,7 +130,7 @@ class Served(Taken):
     @property
     def feels(self) -> list[str | None]:
         """What the fingers feel."""
-        return [each.feels for each in self.bench.daemon._publisher.view.contact_statuses()]
+        return [each.feels for each in self.bench.daemon.publisher.view.contact_statuses()]
 
     @property
     def levels(self) -> list[float]:
@@ -268,7 +268,7 @@ class Served(Taken):
 
     def expires(self) -> None:
         """Let the lease be over."""
-        supervisor = self.bench.daemon._supervisor
+        supervisor = self.bench.daemon.supervisor
         assert supervisor.operation.lease is not None
         lease = replace(supervisor.operation.lease, expires_at=0.0)
         supervisor.operation = replace(supervisor.operation, lease=lease)
@@ -281,17 +281,17 @@ class Served(Taken):
     async def arms_within(self) -> None:
         """Arm as the server does for a client."""
         client = cast(Any, SimpleNamespace(has_left=False))
-        await self.bench.daemon._api.arm(client, ArmParams(owner="me", lease_s=60))
+        await self.bench.daemon.api.arm(client, ArmParams(owner="me", lease_s=60))
 
     def arming_waits(self) -> None:
         """Let the amplifiers be armed only when it goes on."""
-        arm = self.bench.daemon._controller.arm
+        arm = self.bench.daemon.controller.arm
 
         async def slow() -> None:
             await self.going_on.wait()
             await arm()
 
-        self.patch.setattr(self.bench.daemon._controller, "arm", slow)
+        self.patch.setattr(self.bench.daemon.controller, "arm", slow)
 
     def skips(self, *methods: str, work: Callable[..., None] = lambda *_: None) -> None:
         """Let methods of the daemon do nothing from now on, or this work."""
@@ -450,11 +450,11 @@ async def test_plate_plays_on_when_the_name_of_a_client_cannot_be_read(
         raise AssertionError("name of a client read in the control loop")
 
     async with served(seats=True) as daemon:
-        era, controller = daemon.era, daemon.bench.daemon._controller
+        era, controller = daemon.era, daemon.bench.daemon.controller
 
         async def hold(*places: str) -> None:
             """Hold fingers of a touch source of the daemon for 0.4 s."""
-            plate = daemon.bench.daemon._config.rig.plate
+            plate = daemon.bench.daemon.config.rig.plate
             touches = []
             for number, place in enumerate(places):
                 x, y = PLACES[place]
@@ -489,7 +489,7 @@ async def test_gain_of_a_source_is_felt_at_its_finger_alone_along_a_fade() -> No
         daemon.holds(**{f"era.{each}": [each] for each in SEATS})
         await asyncio.sleep(1.0)
         tones = {each.effect: each.frequency_hz for each in (await era.status()).contacts}
-        planner = bench.daemon._controller.cycle.planner
+        planner = bench.daemon.controller.cycle.planner
         (sent,) = [
             n for n, one in planner.slots.by_layer.items() if "right" in one.content.key[0].source
         ]

@@ -246,7 +246,7 @@ async def test_names_with_a_strength_are_bounded(tmp_path: Path) -> None:
     """
     async with ready_daemon(tmp_path, "strengths: kept.json\n") as (bench, era):
         sender = f"table:tuio:10.0.0.2/{chr(0x1F600) * 100!a}"
-        bench.daemon._layouts.player.strengths.note(sender)
+        bench.daemon.layouts.player.strengths.note(sender)
         assert (await era.strength(name=sender, gain_db=-6)).strengths == {sender: -6}
         await era.strength(name=sender, gain_db=0)
         names = [f"{number} {'x' * 70}" for number in range(MAX_NAMES + 1)]
@@ -272,9 +272,10 @@ async def test_event_read_late_takes_nothing_back_that_was_seen(tmp_path: Path) 
         epoch = (await era.stop()).epoch
         assert (await next_event(era, "state")).data["epoch"] < epoch
         await era.clear()
-        supervisor = bench.daemon._supervisor
+        supervisor = bench.daemon.supervisor
         supervisor.operation = replace(supervisor.operation, epoch=0)
-        era._link.abort()
+        for connection in list(bench.daemon.server.clients):
+            connection.abort()
         await era.stop()
         assert (await next_event(era, "state")).data["epoch"] >= epoch - 1
         await era.clear()
@@ -298,7 +299,7 @@ async def test_shutdown_while_a_port_is_opened_leaves_none_open(
         async with daemon_at(far, tmp_path) as bench:
             await until(lambda: opened)
             bench.daemon.shut_down("end of the test")
-            await until(lambda: bench.daemon._supervisor._closing.is_set())
+            await until(lambda: bench.daemon.supervisor.closing.is_set())
             asyncio.get_running_loop().call_later(0.1, may_open.set)
         await until(lambda: not opened[0].is_open)
         assert len(opened) == 1

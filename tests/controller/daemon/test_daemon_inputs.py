@@ -71,8 +71,8 @@ async def test_touches_of_clients_are_delivered_and_lifted_when_one_leaves(
     """
     frames: list[TouchFrame] = []
     async with ready_daemon(tmp_path) as (bench, era):
-        tell_first(bench.daemon._controller.cycle, "deliver", frames.append)
-        tracker = bench.daemon._controller.cycle.tracker
+        tell_first(bench.daemon.controller.cycle, "deliver", frames.append)
+        tracker = bench.daemon.controller.cycle.tracker
         update = tracker.update
 
         def failing(frame: TouchFrame, **options: bool) -> Change:
@@ -146,7 +146,7 @@ async def test_inputs_run_beside_each_other(
         "c:": Panel("z"),
     }
     monkeypatch.setattr("controller.daemon.config.open_source", panels.__getitem__)
-    monkeypatch.setattr("controller.daemon.layouts._WATCH_INTERVAL", 0.01)
+    monkeypatch.setattr("controller.daemon.layouts.WATCH_INTERVAL", 0.01)
     frames: list[TouchFrame] = []
     lifted: list[str] = []
     inputs = touch_inputs(frames.append, lifted.append)
@@ -186,7 +186,7 @@ def test_closing_waits_for_no_source_that_goes_on(monkeypatch: pytest.MonkeyPatc
                     await asyncio.sleep(60)
 
     monkeypatch.setattr("controller.daemon.config.open_source", lambda url: Stubborn())
-    monkeypatch.setattr("controller.daemon.layouts._CLOSE_TIMEOUT", 0.0)
+    monkeypatch.setattr("controller.daemon.layouts.SOURCE_CLOSE_TIMEOUT", 0.0)
 
     async def serve() -> None:
         LEFT.append(touch_inputs())
@@ -223,7 +223,7 @@ async def test_failed_input_is_restarted_after_growing_pauses(
 
     monkeypatch.setattr("controller.daemon.config.open_source", lambda url: Late())
     monkeypatch.setattr("controller.daemon.layouts.asyncio.sleep", pause)
-    monkeypatch.setattr("controller.daemon.layouts._WATCH_INTERVAL", 0.5)
+    monkeypatch.setattr("controller.daemon.layouts.WATCH_INTERVAL", 0.5)
     inputs = touch_inputs()
     inputs.start([TouchInput("left", "a:", TouchCalibration())])
     while len(runs) < 3:
@@ -319,7 +319,7 @@ async def test_few_of_a_flood_of_touches_become_sets(tmp_path: Path) -> None:
         await era.arm("me", lease_s=60)
         begin = threads.now()
         for ago, touches in ((0.12, (Touch(1, 0.4, 0.5),)), (0.06, ())):
-            bench.daemon._controller.cycle.deliver(TouchFrame("brief", begin - ago, touches))
+            bench.daemon.controller.cycle.deliver(TouchFrame("brief", begin - ago, touches))
         await journal.hear(10)
         assert not journal.raising_since(begin)
         begin = threads.now()

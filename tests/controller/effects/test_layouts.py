@@ -278,8 +278,7 @@ def test_taps_are_clicks_beside_what_lasts_at_their_times_levels_and_bands() -> 
 
     A click is not raised above what lasts, since its level is that of the file.
     """
-    file = File(file="it.ahap")  # at 20 dB SL by default
-    file._pattern = PATTERN
+    file = file_of(PATTERN)
     player = player_of(it=file)
     play(player, 3.0)
     clicks = []

@@ -134,7 +134,7 @@ async def test_metrics_are_read_once_for_all_and_a_failure_is_answered_and_logge
     status = AsyncMock(side_effect=Unreachable)
     monkeypatch.setattr(app.AsyncClient, "status", status)
     monkeypatch.setattr("os.nice", lambda _: 0)
-    monkeypatch.setattr(app, "_METRICS_TIME", 1e9)
+    monkeypatch.setattr(app, "METRICS_INTERVAL", 1e9)
     port: asyncio.Future[int] = asyncio.get_running_loop().create_future()
     settings = GatewaySettings(socket=tmp_path / "era.sock")
     serving = asyncio.create_task(serve(settings, announce=port.set_result))
@@ -142,7 +142,7 @@ async def test_metrics_are_read_once_for_all_and_a_failure_is_answered_and_logge
         for _ in range(3):
             assert "era_up 0.0" in (await client.get("/metrics")).text
         assert status.await_count == 1
-        monkeypatch.setattr(app, "_METRICS_TIME", 0.0)
+        monkeypatch.setattr(app, "METRICS_INTERVAL", 0.0)
         await client.get("/metrics")
         assert status.await_count == 2
         assert [each for each in caplog.records if each.exc_info] == []

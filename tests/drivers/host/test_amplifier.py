@@ -50,8 +50,8 @@ def test_second_status_amid_hello_is_not_of_another_amplifier() -> None:
 async def test_second_amplifier_at_an_address_is_told(kind: str) -> None:
     """Both reply to Hello, with their serial numbers; it names the remedy."""
     line = MemoryLine(kind, "a", "b")
-    ends = line._end, line.kind.far_end({2: SimulatedAmplifier("c", channels=2)}, line._send)
-    line._end = Mock(receive=lambda data, now: [each.receive(data, now) for each in ends])
+    ends = line.far_end, line.kind.far_end({2: SimulatedAmplifier("c", channels=2)}, line.send)
+    line.far_end = Mock(receive=lambda data, now: [each.receive(data, now) for each in ends])
     with pytest.raises(LinkError, match="several amplifiers reply at address 2"):
         await line.hosts["b"].open()
     await line.hosts["a"].open()

@@ -331,7 +331,7 @@ class OnLines(Taken):
 
     def last_request_arrives(self) -> None:
         """Let the last request that was kept arrive."""
-        self.lines[0].later(0.0, self.lines[0]._arrived, "Ping", self.kept[-1])
+        self.lines[0].later(0.0, self.lines[0].arrives, "Ping", self.kept[-1])
 
     def hands_over_the_copies(self) -> None:
         """Let all copies come once more."""
@@ -515,7 +515,7 @@ class OnLines(Taken):
 
     def draws(self, session: int) -> None:
         """Let the session that is armed next have a number."""
-        self.group._draw = lambda low, high: session
+        self.group.draw = lambda low, high: session
 
     def sleeps(self, seconds: float) -> None:
         """Let this machine sleep."""

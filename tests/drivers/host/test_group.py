@@ -173,7 +173,7 @@ async def test_time_that_this_process_misses_is_no_time_of_the_amplifier(
         """The amplifier runs in the same process, so that it does not reply meanwhile."""
         timers = [each for each in end.loop._scheduled if not each.cancelled()]  # type: ignore[attr-defined]
         for each in timers:
-            if each._callback in (end._arrived, end.line.received):
+            if each._callback in (end.arrives, end.line.received):
                 end.loop.call_at(each.when() + lasts, each._callback, *each._args)
                 each.cancel()
         end.loop.now += lasts  # type: ignore[attr-defined]
@@ -331,7 +331,7 @@ async def test_what_ends_amid_an_exchange_may_be_shown_or_not(ends_by: str) -> N
         for _ in range(4):
             await asyncio.sleep(rng.uniform(0.0, 0.02))
             shown.add((await host.read_status())["tokens"][0] > 0)
-            assert host._contradictions == 0
+            assert host.contradictions == 0
         end.inward = end.outward = unaltered
         await group.silence(0.0)
         await asyncio.sleep(0.1)
@@ -350,8 +350,8 @@ async def test_lines_that_are_exchanged_while_armed_are_silenced(
     """
     first, second = ends
     if what == "cables":
-        first._end, second._end = (
-            one.kind.far_end({1: far}, one._send)
+        first.far_end, second.far_end = (
+            one.kind.far_end({1: far}, one.send)
             for one, far in ((first, second.far["b"]), (second, first.far["a"]))
         )
     else:

@@ -351,7 +351,7 @@ def test_number_of_an_unanswered_broadcast_can_be_used_again() -> None:
     wire.request(
         0, "Commit", {"session": 9, "token": 7, "at": 0}
     )  # transaction 2, without a response
-    wire._number = 1
+    wire.number = 1
     assert isinstance(reply_to(wire, peer, "GetStatus", {}), Reply)
 
 

@@ -329,7 +329,7 @@ def test_convergence_lists_errors_of_finer_and_finer_meshes(monkeypatch, tmp_pat
         return studied[0]
 
     monkeypatch.setattr("model.vibration.study_convergence", study_once)
-    monkeypatch.setattr("model.vibration._DOUBLINGS", 1)
+    monkeypatch.setattr("model.vibration.MESH_DOUBLINGS", 1)
     rig = write_rig(tmp_path / "rig.yaml", ("[40 Hz, 500 Hz]", "[40 Hz, 125 Hz]"))
     arguments = ("convergence", rig, "--mesh", "6x5", "--frequencies", "110")
     found = as_json("plate", *arguments)

@@ -286,7 +286,7 @@ def test_document_keeps_the_line_of_every_key(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, loader: object
 ) -> None:
     """Lines count from one; a missing key has that of the nearest above it; with libyaml or not."""
-    monkeypatch.setattr(reading, "_LOADER", loader)
+    monkeypatch.setattr(reading, "YAML_LOADER", loader)
     document = read_document(write(tmp_path, "# note\na: 1\n\nb:\n  c: [1,\n    2]\n  d: x\n"))
     assert document.data == {"a": 1, "b": {"c": [1, 2], "d": "x"}}
     expected = {("a",): 2, ("b",): 4, ("b", "c"): 5, ("b", "c", 0): 5, ("b", "c", 1): 6}
@@ -345,7 +345,7 @@ def test_missing_comma_is_named_where_it_lacks(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, loader: object
 ) -> None:
     """In the first mapping below a key too, before quotes, and at the end of the line before."""
-    monkeypatch.setattr(reading, "_LOADER", loader)
+    monkeypatch.setattr(reading, "YAML_LOADER", loader)
     for wrong, line, after in (
         ("s:\n  A: {x: 12 mm y: 1}\n", 2, "mm in column 14"),
         (
@@ -371,7 +371,7 @@ def test_document_refuses_what_is_not_a_file(
 
     So are more values than the limit, lowered here from 50 000.
     """
-    monkeypatch.setattr("model.config.document._MAX_VALUES", 100)
+    monkeypatch.setattr("model.config.document.MAX_DOCUMENT_VALUES", 100)
     (tmp_path / "large.yaml").write_text("a: [" + "1," * 200 + "1]")
     with pytest.raises(ConfigError) as caught:
         read_document(tmp_path / name)

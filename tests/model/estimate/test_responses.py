@@ -323,7 +323,7 @@ def test_values_beyond_the_limits_are_left_out(coarse_rig, path, caplog):
 def test_read_measured_refuses_files_without_measurements(path, monkeypatch):
     """An empty one, text, one cut off or too large, no file, and an unknown ending."""
     good = path.read_bytes()
-    monkeypatch.setattr("model.files.uff._MAX_BYTES", len(good) - 1)
+    monkeypatch.setattr("model.files.uff.MAX_UFF_BYTES", len(good) - 1)
     for content, said in (
         (b" \n", path.name),
         (b"Dear all, the measurement was a success.\n", path.name),

@@ -512,7 +512,11 @@ def test_plate_of_another_length_is_refused_by_its_length(monkeypatch: pytest.Mo
 
     Of few sizes and causes; whole searches are tested with diagnoses.
     """
-    for name, few in (("_SIZES", (0.82, 1.21)), ("_FITTED", 3), ("_REFINED", 1)):
+    for name, few in (
+        ("SIZE_FACTORS", (0.82, 1.21)),
+        ("FITTED_HYPOTHESES", 3),
+        ("REFINED_HYPOTHESES", 1),
+    ):
         monkeypatch.setattr(plate_match, name, few)
     true = perturbed(larger(PAPER, 1.2), frequencies=FREQUENCIES)
     with pytest.raises(InputError, match=r"plate\.length"):

@@ -291,7 +291,7 @@ def test_cached_table_of_other_numerics_is_replaced(builds, monkeypatch, cache):
     """A table of another NUMERICS_VERSION is not used, and removed with the next that is kept."""
     with monkeypatch.context() as older:
         older.setattr(table_file, "NUMERICS_VERSION", 0)
-        older.setattr(table_file, "_CURRENT", "table-4.0-")
+        older.setattr(table_file, "CURRENT_PREFIX", "table-4.0-")
         cached_table(RIG, **FEW)
     (cache / "table-0123456789abcdef.npz").touch()
     _, path = cached_table(RIG, **FEW)

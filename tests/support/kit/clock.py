@@ -533,7 +533,7 @@ class MemoryLine:
         self.kind = KINDS[kind]
         self._sending = self._handling = ""
         self._due: dict[str, float] = {}  # s; of what was handed over last, by who takes it
-        self._end = self.kind.far_end(dict(enumerate(self.far.values(), 1)), self._send)
+        self.far_end = self.kind.far_end(dict(enumerate(self.far.values(), 1)), self.send)
         self.line = Line(wire or self.kind.wire(), "line")
         self.line.open(self)
         self.hosts = {
@@ -549,7 +549,7 @@ class MemoryLine:
     def boot(self, node: int) -> None:
         """Have a CAN node begin anew, as after its supply was away."""
         frame = CanFrame(cob_id("nmt"), bytes((CANOPEN["nmt"]["reset_node"], node)))
-        self._end.receive(pack_frames([frame]), self.loop.time())
+        self.far_end.receive(pack_frames([frame]), self.loop.time())
 
     def write(self, data: bytes) -> None:
         """Send bytes of the host."""
@@ -558,7 +558,7 @@ class MemoryLine:
             self.sent.append((self.loop.time(), f"{address}:{number}"))
             self._sending = BY_NUMBER[number].name if number in BY_NUMBER else "Hello"
         for delay, altered in self.inward(self._sending, data):
-            self.later(delay, self._arrived, self._sending, altered)
+            self.later(delay, self.arrives, self._sending, altered)
 
     def later(self, delay: float, take: Callable[..., None], *given: str | bytes) -> None:
         """Hand bytes over after a delay [s], those of one moment in order: timers fire in any."""
@@ -571,11 +571,13 @@ class MemoryLine:
     def poll(self) -> None:
         """All that has come was handed over."""
 
-    def _arrived(self, name: str, data: bytes) -> None:
+    def arrives(self, name: str, data: bytes) -> None:
+        """Hand bytes of the host to the amplifiers; name: of the request."""
         self._handling = name
-        self._end.receive(data, self.loop.time())
+        self.far_end.receive(data, self.loop.time())
 
-    def _send(self, data: bytes) -> None:
+    def send(self, data: bytes) -> None:
+        """Send bytes of the amplifiers."""
         for delay, altered in self.outward(self._handling, data):
             self.later(delay, self.line.received, altered)
 
@@ -686,14 +688,14 @@ class JudgedLine:
         self._loop = asyncio.get_running_loop()
         self.client = CLIENTS[kind](1)
         self.client.transmit = self.write
-        self._due = self._arrival = 0.0
+        self.due = self._arrival = 0.0
         self._ticked: list[SimulatedAmplifier | FarEnd] = []
         if isinstance(far, SimulatedAmplifier):
             known = {1: far, **(neighbours or {})}
             self._ticked += known.values()
-            self._end = KINDS[kind].far_end(known, self._send)
+            self._end = KINDS[kind].far_end(known, self.send)
         else:
-            self._end = far(self._send)
+            self._end = far(self.send)
         self._ticked.append(self._end)
         if isinstance(self._end, CanAmplifiers):
             self._end.start(self._loop.time())
@@ -708,9 +710,10 @@ class JudgedLine:
         """End what is due by itself."""
         self._ticking.cancel()
 
-    def _send(self, data: bytes) -> None:
-        self._due = max(self._loop.time() + DELAY, self._due + _APART)  # in their order
-        self._loop.call_at(self._due, self.client.received, data)
+    def send(self, data: bytes) -> None:
+        """Send bytes of the amplifier to the client."""
+        self.due = max(self._loop.time() + DELAY, self.due + _APART)  # in their order
+        self._loop.call_at(self.due, self.client.received, data)
 
     async def _tick(self) -> None:
         """Let happen what is due by itself."""

@@ -143,7 +143,7 @@ class Fingers(Chain):
     @property
     def player(self) -> EffectPlayer:
         """What the layout makes of the fingers."""
-        player = self.controller._intent_source
+        player = self.controller.intent_source
         assert isinstance(player, EffectPlayer)
         return player
 

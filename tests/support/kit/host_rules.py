@@ -238,8 +238,8 @@ class _JudgedLines(Lines):
         super().__init__(before)
         self._rules = rules
 
-    async def _open(self, address: WireAddress) -> Any:
-        opened = await super()._open(address)
+    async def open_line(self, address: WireAddress) -> Any:
+        opened = await super().open_line(address)
         self._rules.listen(opened.line, address.line)
         return opened
 
@@ -279,7 +279,7 @@ class HostRules:
 
     def follow(self, controller: Controller) -> None:
         """Judge a control loop from now on: its wires, and the commands of its operator."""
-        controller._make_lines = partial(_JudgedLines, rules=self)
+        controller.make_lines = partial(_JudgedLines, rules=self)
         for command in get_args(OperatorCommand):
             tell_first(controller, command, partial(self.commanded, command))
         tell_first(controller, "open", self.opened)

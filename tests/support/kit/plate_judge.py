@@ -48,7 +48,7 @@ class AmplifierRules(ExpectedAmplifier):
         self.advance(now)
         if self.may_start(when) or len(self.outputs.sure(when)) < _LAYERS:
             return
-        settled_before = now - self.outputs._plays.lag - self.slack
+        settled_before = now - self.outputs.uncertain_playback.lag - self.slack
         for channel, frequency in played.items():
             voices = self.outputs.playback.all_voices[channel]
             commanded = [voice.frequency for voice in voices if not voice.has_ended]

@@ -216,9 +216,9 @@ def chain_of(daemon: Daemon, far: FarSide) -> Chain:
     """The chain of a daemon in virtual time, which hears of its fingers and faults."""
     assert far.machine is not None
     rules = HostRules(far.urls)
-    chain = Chain(far, far.machine, rules, PlateJudge(far, rules), lambda: daemon._controller)
+    chain = Chain(far, far.machine, rules, PlateJudge(far, rules), lambda: daemon.controller)
     touched = partial(chain.plate_judge.touched, must_be_felt=False)
-    for owner, method in ((daemon._controller.cycle, "deliver"), (daemon._inputs, "_deliver")):
+    for owner, method in ((daemon.controller.cycle, "deliver"), (daemon.inputs, "deliver")):
         tell_first(owner, method, touched)
     for device in far.devices.values():
         tell_first(device, "inject_fault", lambda *_: rules.disturb())
@@ -381,7 +381,7 @@ def silent_from_of(far: FarSide, name: str) -> float:
     far.summary()
     one = cast(SimulatedAmplifier, far.bench.amplifiers[name])
     ends = [tone.silent_from for output in one.outputs for tone in output]
-    return max([one._silent_from, *ends])
+    return max([one.silent_from, *ends])
 
 
 def loudness(far: FarSide) -> float:

@@ -73,7 +73,7 @@ SLIDER = Rectangle(0.02, 0.14, 0.26, 0.04)
 @pytest.fixture(autouse=True)
 def _few_touches(monkeypatch: pytest.MonkeyPatch) -> None:
     """A third of the touches of each region that the command tries."""
-    monkeypatch.setattr(layout_check, "_MAX_TOUCHES", 10)
+    monkeypatch.setattr(layout_check, "MAX_REGION_TOUCHES", 10)
 
 
 @cache
@@ -256,7 +256,7 @@ def test_files_that_config_init_writes_fit_each_other(
 ) -> None:
     """Each beside the rig; fingers in any two regions of the layout are promised 4 dB at once."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(layout_check, "_MAX_TOUCHES", 20)
+    monkeypatch.setattr(layout_check, "MAX_REGION_TOUCHES", 20)
     monkeypatch.setattr(layout_picture, "MAX_TRIPLES", 0)
     assert run_era(["config", "init", "rig.yaml"]) == 0
     if kind != "rig":

@@ -81,7 +81,7 @@ def changed(
 ) -> None:
     """Let lines pass on by a method, after a time [s], what becomes of each message.
 
-    write: of the host; _send: of its amplifier.
+    write: of the host; send: of its amplifier.
     """
     pass_on = getattr(JudgedLine, method)
 
@@ -116,9 +116,9 @@ def test_amplifier_with_the_whole_table_passes_loud(names: list[str]) -> None:
 class _Coarse(SimulatedAmplifier):
     """An amplifier that keeps its own steps, of frequency from its lowest one on, and says so."""
 
-    def _play(self, layers: Sequence[LayerSet], token: int, now: float) -> None:
+    def play(self, layers: Sequence[LayerSet], token: int, now: float) -> None:
         played = [replace(one, commands=tuple(map(self._rounded, one.commands))) for one in layers]
-        super()._play(played, token, now)
+        super().play(played, token, now)
 
     def _rounded(self, tone: Command) -> Command:
         if not tone.level:
@@ -198,9 +198,9 @@ def test_level_below_a_step_is_refused() -> None:
 class _PlaysOn(SimulatedAmplifier):
     """An amplifier that plays on after Stop."""
 
-    def _silence(self, moment: float, *, ramp: float) -> None:
+    def silence(self, moment: float, *, ramp: float) -> None:
         if self.state != "OPERATION_ENABLED":
-            super()._silence(moment, ramp=ramp)
+            super().silence(moment, ramp=ramp)
 
 
 def test_nothing_is_run_after_one_that_is_not_silenced() -> None:
@@ -242,7 +242,7 @@ def test_amplifier_that_is_not_identified_fails_once(
     alter: Callable[[bytes], bytes], passed: int, reason: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """With the message and the cause; a good Hello has passed, and what follows is not run."""
-    changed(monkeypatch, "_send", lambda data: (0.0, alter(data)))
+    changed(monkeypatch, "send", lambda data: (0.0, alter(data)))
     before, (failed, *others) = (found := judged("serial", far=plain()))[:passed], found[passed:]
     assert [each.result for each in before] == [Result.PASSED] * passed
     assert failed.result is Result.FAILED
@@ -330,7 +330,7 @@ def obey_late(monkeypatch: pytest.MonkeyPatch, delay: float) -> None:
         is_late = REQUEST_NAMES.get(frame.type & 0x7F) not in ("GetStatus", "GetCaps", "GetFaults")
         return is_late * delay, data
 
-    changed(monkeypatch, "_send", late)
+    changed(monkeypatch, "send", late)
 
 
 class _LongWatchdog(SimulatedAmplifier):
@@ -402,14 +402,14 @@ def test_rate_of_a_clock_is_tried_on_a_slow_wire(
 
 
 def _hold(line: JudgedLine) -> None:
-    line._due = asyncio.get_running_loop().time() + 0.1
+    line.due = asyncio.get_running_loop().time() + 0.1
 
 
 @pytest.mark.parametrize(
     ("name", "held", "method", "hold"),
     [
-        ("doubled_frames", range(22), "_send", _hold),
-        pytest.param("events", range(15), "_send", _hold, marks=pytest.mark.long),
+        ("doubled_frames", range(22), "send", _hold),
+        pytest.param("events", range(15), "send", _hold, marks=pytest.mark.long),
         # As long as a set lives
         ("parts_that_are_dropped", range(15, 45, 3), "write", lambda line: _stall(1.1)),
         ("parts_again", range(15, 35, 3), "write", lambda line: _stall(1.1)),
@@ -626,7 +626,7 @@ def test_malformed_reply_fails_one_check_with_its_bytes(
         return bad[0]
 
     count = iter(range(10_000_000))
-    changed(monkeypatch, "_send", lambda data: (0.0, alter(data) if next(count) == 10 else data))
+    changed(monkeypatch, "send", lambda data: (0.0, alter(data) if next(count) == 10 else data))
     names = ["identity", "capabilities", "starts_disarmed", "replies_in_time", "stop"]
     results = judged(kind, names)
     (failed,) = (each for each in results if each.result == "failed")
@@ -716,7 +716,7 @@ def test_garbage_has_a_verdict(kind: str, share: float, monkeypatch: pytest.Monk
     rng = random.Random(5)
     changed(
         monkeypatch,
-        "_send",
+        "send",
         lambda data: (0.0, garbled(kind, rng, data) if rng.random() < share else data),
     )
     results = judged(kind)

@@ -68,7 +68,7 @@ def test_conforming_amplifier_passes_on_a_shared_line(
     kind: str, names: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Its neighbours get nothing, and nodes on CAN stay out of operation, by their heartbeats."""
-    others, beats, send = neighbours_of(kind), set[bytes](), JudgedLine._send
+    others, beats, send = neighbours_of(kind), set[bytes](), JudgedLine.send
 
     def heard(line: JudgedLine, data: bytes) -> None:
         if kind == "can":
@@ -76,7 +76,7 @@ def test_conforming_amplifier_passes_on_a_shared_line(
             beats.update(each.data for each in frames if each.id & 127 in others)
         send(line, data)
 
-    monkeypatch.setattr(JudgedLine, "_send", heard)
+    monkeypatch.setattr(JudgedLine, "send", heard)
     results = judged(kind, names, neighbours=others)
     failed = [f"{each.check.name}: {each.reason}" for each in results if each.result == "failed"]
     assert not failed, failed

@@ -33,7 +33,7 @@ from controller.demo.recorder import (
     simulated_plate,
     steady_contrast_db,
 )
-from controller.play.intent import FingerSensation, not_served
+from controller.play.intent import not_served
 from controller.play.loop import Observers, PlayReport
 from controller.sources.touch import Change, Contact, ContactKey, TouchFrame
 from controller.sources.tuio import TuioSource
@@ -41,8 +41,6 @@ from drivers.errors import LinkError
 from era_haptics.command import run_era as run_command
 from kit.clock import in_virtual_time, run_virtual
 from kit.plates import small_table
-from model.answer.answer import OWN, Sensation
-from model.answer.stimulus import Finger
 from model.finger import detection_threshold
 from model.rig.rig_file import example_rig_path, load_rig
 from model.table import table_file
@@ -54,7 +52,6 @@ from sim.faults import FaultWindow
 
 FIGURES = ("contrast_db", "level_db_sl")
 PROMISED = ("promised_contrast_db",)
-FELT = Sensation(Finger((0.1, 0.1)), OWN, layer=0, promised_level_db_sl=20.0)
 KEYS = (
     *("time_s", "until_s", "targets_m", "quiet_m", "reason", "drive", "mode", "latency_ms"),
     *("played_s", "steady"),
@@ -302,62 +299,6 @@ async def test_rows_after_a_fault_name_it_until_the_plate_is_armed_again() -> No
     assert reasons[:3] == ["too close to an edge", FAULT, FAULT]
     assert reasons[3] != FAULT
     assert recorder.fault is None
-
-
-@in_virtual_time
-async def test_pattern_is_measured_while_no_finger_moves_or_lands(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """Before a slide that lasts until the next pattern; what it rings to afterwards is no level.
-
-    The plate hears of each place, and of a load alone. Without what a quiet finger felt there is no
-    contrast.
-    """
-    monkeypatch.setattr(threads, "now", asyncio.get_running_loop().time)
-    measure, place = AsyncMock(return_value={"test#1": vibration([[1.0], [1.0]])}), AsyncMock()
-    rows: list[TouchRow] = []
-    async with recorder_of(rows, vibration=measure, place_fingers=place) as recorder:
-        start, loop = threads.now(), Observers()
-        recorder.observe(loop)
-        (changed,), (applied_now,) = loop.contacts_changed, loop.reported
-        finger, other = contact(1), contact(3)
-        changed((finger,), Change(down=(finger,)))
-        played = SimpleNamespace(
-            content=SimpleNamespace(targets=((finger, None),)),
-            layer=SimpleNamespace(drive_mode="phased"),
-            drive={},
-        )
-        for quiet, lands in (((), False), ((contact(2),), False), ((contact(2),), True)):
-            applied = SimpleNamespace(
-                time=threads.now(),
-                targets=(FingerSensation(finger, FELT),),
-                layer=SimpleNamespace(ramp=0.04),
-                quiet=quiet,
-                contents={1: played},
-                latency=0.01,
-            )
-            applied_now(cast(PlayReport, applied))
-            await asyncio.sleep(1.0)
-            if lands:
-                changed((finger, other), Change(down=(other,)))
-                await asyncio.sleep(0.8)
-            else:
-                for _ in range(8):
-                    finger = replace(finger, x=finger.x + 0.004)
-                    changed((finger,), Change(moved=(finger,)))
-                    await asyncio.sleep(0.1)
-        finger = replace(finger, load=2.0)
-        changed((finger, other), Change(moved=(finger,)))
-        changed((other,), Change(up=(finger,)))
-        applied_now(PlayReport((other,), (), None, threads.now()))
-    assert [each.args for each in measure.await_args_list] == [
-        pytest.approx((start + since, start + until))
-        for since, until in ((0.755, 0.995), (2.555, 2.795), (4.355, 4.595))
-    ]
-    assert place.await_count == 1 + 16 + 1 + 1 + 1
-    assert [each.args[1].get("test#1") for each in place.await_args_list[-2:]] == [2.0, None]
-    (row,) = rows
-    assert (row.steady, row.measured_level_db_sl, row.measured_contrast_db) == (True, None, None)
 
 
 @pytest.mark.parametrize(

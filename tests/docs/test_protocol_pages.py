@@ -228,18 +228,6 @@ def test_angles_by_hand_are_those_of_the_voices() -> None:
         assert float(since.split()[0]) * unit == pytest.approx(seconds, rel=1e-3)
 
 
-def test_memory_of_the_least_amplifier_is_its_sum() -> None:
-    """The four terms of the page for one channel without knots, and for two with 32."""
-
-    def memory(channels: int, knots: int, knot: int, voice: int) -> float:
-        waiting = 8 * (3 + channels * (8 + 4 * knots))
-        return 1151 + waiting + 12 * channels * (voice + 2 * knot * knots) + 100
-
-    (stated,) = re.findall(r"That is (\d+) kB[^.]*, (\d+) kB[^.]* and (\d+) kB", PAGE)
-    sums = memory(1, 0, 4, 40), memory(2, 32, 4, 40), memory(2, 32, 16, 40)
-    assert [*map(int, stated)] == [round(each / 1000) for each in sums]
-
-
 UNCHECKED = {"terms", "example", "encoding", "messages", "output", "memory", "the-host"}
 """Headings of the page without rules of an amplifier that another heading lacks."""
 

@@ -112,17 +112,6 @@ def test_responses_times_weights_are_a_map(seed: int | None) -> None:
     )
 
 
-def test_responses_of_drawn_plates_deviate_as_the_uncertainty() -> None:
-    """Where gains alone are uncertain: by 5 % and 5 degrees, of all channels together by 20 %."""
-    known = era.Uncertainty(0.05, 5.0, 0.0, 0.0, 1.0, 0.0, common_gain=0.2)
-    plate = era.SolvedPlate(replace(PLATE.rig, uncertainty=known))
-    nominal = plate.responses(TARGET, [110.0])[0, :, 0]
-    logs = np.log([plate.responses(TARGET, [110.0], seed=n)[0, :, 0] for n in range(40)] / nominal)
-    assert logs.imag.std() == pytest.approx(np.radians(5), rel=0.2)
-    assert logs.real.mean(axis=1).std() == pytest.approx(0.2, rel=0.25)
-    assert (logs.real.T - logs.real.mean(axis=1)).std() == pytest.approx(0.05, rel=0.25)
-
-
 RATE, COUNT = 10_000.0, 13_000
 SIGNAL = np.sin(2 * np.pi * 333.3 * np.arange(COUNT) / RATE + np.radians(20))
 
@@ -404,21 +393,6 @@ def test_layers_of_accepts_frequency_drive_and_tone() -> None:
 
 
 SPLIT = replace(RIG, amplifiers={"a": "sim://", "b": "sim://"})
-ONE, SEVERAL = ((0.1, 0.2),), ((0.1, 0.2), (0.3, 0.1))
-
-
-@pytest.mark.parametrize(
-    ("places", "read"),
-    [
-        *((each, ONE) for each in ((0.1, 0.2), [0.1, 0.2], [(0.1, 0.2)])),
-        *((np.array(each), ONE) for each in ([0.1, 0.2], [[0.1, 0.2]])),
-        ([(0.1, 0.2), (0.3, 0.1)], SEVERAL),
-        *((each, ()) for each in ((), [], np.empty((0, 2)))),
-    ],
-)
-def test_as_points_reads_places(places: object, read: tuple[object, ...]) -> None:
-    """One alone or in a list, as an array or not; several in their order; any empty one is none."""
-    assert as_points(places, what="target") == read
 
 
 @pytest.mark.parametrize(

@@ -178,18 +178,6 @@ def test_best_drives_come_first(mode):
             assert level >= given.wanted * (1 - 1e-5)
 
 
-def test_a_level_margin_asks_for_more_level():
-    """A target whose amplitude 2 has a standard deviation of 1 has one of them in reserve."""
-    first = np.array([[1, 0], [0, 0]], dtype=np.complex64)  # of two ERAs
-    target, power = 2 * first[:1, None], 5 * first[None, None]  # 2² + 1²
-    quiet = np.eye(2, dtype=np.complex64)[None, None]
-    for wanted, mode in ((0.99, "phased"), (0.99, "switched")):
-        given = Forms(target, power, quiet, np.ones(1, np.float32), wanted, level_margin=1.0)
-        assert found_in(mode, given)
-        assert found_in(mode, replace(given, wanted=1.01)) == []
-        assert found_in(mode, replace(given, wanted=1.99, level_margin=0.0))
-
-
 @pytest.mark.parametrize("mode", MODES)
 def test_max_sensation_is_reached_and_not_exceeded(mode):
     """Just below the highest level a drive is found, a tenth above none."""

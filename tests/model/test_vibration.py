@@ -18,7 +18,6 @@ from model.errors import InputError
 from model.fem import Mesh
 from model.finger import (
     FINE_POINTS,
-    FINGERTIP_RADIUS,
     FIVE_POINTS,
     THRESHOLDS,
     DiscRule,
@@ -26,7 +25,6 @@ from model.finger import (
     check_has_threshold,
     detection_threshold,
     felt_part,
-    fingertips_on,
     highest_measured,
     sensation_level,
     sensitivities,
@@ -228,17 +226,6 @@ def test_cut_discs_keep_the_mean_of_linear_functions(
     assert weights.min() >= 0
     assert weights.sum() == pytest.approx(1)
     np.testing.assert_allclose(weights @ points, np.array(moments) / area, atol=1e-5)
-
-
-def test_fingertips_on_keeps_every_point_on_the_plate_and_under_the_finger() -> None:
-    """At a hundred places, corners among them, no point is off the plate or the fingertip."""
-    rng = np.random.default_rng(1)
-    size = np.array([PLATE.length, PLATE.width])
-    centres = np.concatenate([rng.uniform(0, size, (100, 2)), [[0, 0], size, [0, size[1]]]])
-    points, weights = fingertips_on(centres, length=PLATE.length, width=PLATE.width)
-    assert ((points >= -1e-15) & (points <= size + 1e-15)).all()
-    assert np.linalg.norm(points - centres[:, None], axis=2).max() <= FINGERTIP_RADIUS + 1e-12
-    np.testing.assert_allclose(weights.sum(axis=1), 1)
 
 
 PROBE, PRESSING = "vibrotactile-probe", "pressing-fingertip"

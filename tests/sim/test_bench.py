@@ -6,7 +6,6 @@ What voices do to the plate follows the clock of their amplifier, with its law, 
 import asyncio
 import json
 import math
-import random
 import threading
 from collections.abc import Callable
 from dataclasses import replace
@@ -28,7 +27,7 @@ from processes.firmware_machine import arm_bench, keep_alive
 from processes.firmware_machine import play as play_at_once
 from registry.limits import HAND_LOAD
 from sim.amplifier.readings import AmplifierClock, Crystal
-from sim.bench.bench import WRONG, Bench, StraightClocks
+from sim.bench.bench import Bench
 from sim.control import SimulationContext, execute
 from sim.plant.imperfections import Imperfections, motion_of
 from sim.plant.plant import FingerPlacement
@@ -108,23 +107,6 @@ def test_shift_is_of_the_phase(coarse_rig: Rig) -> None:
         play_at_once(bench, AmplifierTone(0, 110.0, 0.5), now=0.1)
         found.append(phases(bench, (3.0,), 110.0)[0, 0])
     assert math.degrees(found[1] - found[0]) == pytest.approx(360 * 110 * 5 * 20 / 65536, abs=1e-3)
-
-
-def test_plate_follows_a_steered_clock_by_few_changes() -> None:
-    """Rates that differ by 1 ppm, every 50 ms: 0.6 us wrong at most by a change in two seconds."""
-    chance = random.Random(1)
-    clock = AmplifierClock(Crystal(error=50e-6, warm_up=1e-6), since=0.0)
-    plate, changes, time = StraightClocks({"a": clock}, time=0.0), 0, 0.0
-    for number in range(1, 2400):
-        while (due := plate.next_due) < number / 20:
-            changes += len(plate.renew(due))
-            time = due
-        time = number / 20
-        assert abs(plate.straight["a"].at(time) - clock.straight(time).shown) < WRONG + 0.1e-6
-        steady = -round(1e7 * (clock.crystal.pace(time) - 1))
-        clock.steer(steady + chance.randrange(-10, 11), time)
-        changes += len(plate.renew(time))
-    assert changes < 60
 
 
 START = 98765.4321  # as large as a clock may be

@@ -256,7 +256,7 @@ class SoundCard:
         for what, count in (("outputs", outputs), ("inputs", inputs)):
             if count > MAX_PORTS:
                 raise InputError(f"{what} must be at most {MAX_PORTS}, got {count}")
-        self._transfer = _Transfer(outputs=outputs, inputs=inputs)
+        self.transfer = _Transfer(outputs=outputs, inputs=inputs)
         self._limit = limit * (1 + 1e-6)  # of rounding
         self._stream: Any = None
         self.gaps = 0
@@ -265,7 +265,7 @@ class SoundCard:
     @property
     def given(self) -> int:
         """Address of the data for the callbacks."""
-        return ctypes.addressof(self._transfer)
+        return ctypes.addressof(self.transfer)
 
     def run(self, played: FloatArray) -> Float32Array:
         """Play samples (n, outputs), and return those recorded meanwhile (n, inputs).
@@ -273,7 +273,7 @@ class SoundCard:
         `gaps` counts gaps in the sound. Raises DeviceLost, ValueError for samples beyond the
         limit.
         """
-        transfer = self._transfer
+        transfer = self.transfer
         before = transfer.gaps
         found = self.start(played)
         done, since = 0, time.monotonic()
@@ -298,7 +298,7 @@ class SoundCard:
 
         Raises ValueError for samples beyond the limit.
         """
-        transfer = self._transfer
+        transfer = self.transfer
         out = np.ascontiguousarray(played, dtype=np.float32)
         if not (np.abs(out) <= self._limit).all():  # also rejects NaN
             raise ValueError(f"samples must be at most {self._limit:g}, got {np.abs(out).max():g}")

@@ -338,15 +338,6 @@ def test_beside_others_bands_reach_a_third_of_an_octave() -> None:
     assert found.clicks[0].band == pytest.approx((161.9, 259.5), abs=0.1)
 
 
-def test_smoothed_step_is_a_raised_cosine_of_20_ms() -> None:
-    """10 ms after a step its integral is 30 of 40 ms and 20 / pi more: 0.91 of it."""
-    pattern = Pattern(1.0, ((0.0, 0.0), (0.5, 0.0), (0.5, 1.0), (1.0, 1.0)))
-    course = rendered(pattern, 20.0, EVERY_10_HZ).smoothed().course
-    moments = np.array([0.48, 0.4975, 0.5075, 0.52, 0.9, 1.0])
-    after = (30 + 20 / math.pi) / 40
-    assert course.at(moments) == pytest.approx([0.0, 0.5, after, 1.0, 1.0, 0.0], abs=0.03)
-
-
 @pytest.mark.parametrize(("hertz", "is_texture"), [(25.0, True), (4.0, False)])
 def test_modulation_of_10_to_30_hz_is_a_texture_that_smoothing_keeps(
     hertz: float, is_texture: bool

@@ -34,11 +34,9 @@ from controller.api.schema import PlayedTone
 from controller.gateway import app
 from controller.gateway.access import Access
 from controller.gateway.app import serve
-from controller.gateway.field import FieldSolver
 from controller.gateway.gateway_settings import GatewaySettings
 from controller.gateway.metrics import exposition
 from model.arrays import ComplexArray
-from model.rig.rig_file import example_rig_path, load_rig
 from processes.daemons import ready_daemon, stated_readings
 from processes.gateways import (
     TOKEN,
@@ -171,24 +169,6 @@ def pattern(**layers: dict[str, PlayedTone]) -> PatternEvent:
         predicted_level_db_sl=None,
         latency_ms=1.0,
     )
-
-
-def test_frame_has_a_field_of_each_content() -> None:
-    """Two contents at one frequency stay apart, and each is what it is alone.
-
-    With the threshold of feeling at 100 Hz, 0.249 m/s² in the file of the set by the probe.
-    """
-    solver = FieldSolver(load_rig(example_rig_path()))
-    one = PlayedTone(frequency_hz=100.0, level=0.5, phase_deg=0.0)
-    other = PlayedTone(frequency_hz=100.0, level=0.25, phase_deg=90.0)
-    drives = {0: {"SW": one}, 3: {"SW": other, "NE": other}}
-    both = decoded(solver.frame(drives))
-    assert both.layers == (0, 3)
-    assert both.frequencies == (100.0, 100.0)
-    assert both.thresholds == pytest.approx((0.249, 0.249))
-    for field, (number, drive) in zip(both.fields, drives.items(), strict=True):
-        (alone,) = decoded(solver.frame({number: drive})).fields
-        assert field == pytest.approx(alone, abs=1e-4 * np.abs(both.fields).max())
 
 
 class Decoded(NamedTuple):

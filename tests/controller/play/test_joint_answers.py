@@ -24,7 +24,6 @@ from controller.play.intent import HapticIntent, Target
 from controller.play.joint_answers import (
     Crossfades,
     answered,
-    selection_of,
     with_paths,
 )
 from controller.play.loop import PlayReport
@@ -276,36 +275,6 @@ def test_what_is_felt_on_a_way_is_the_mean_power_there_and_a_share_for_side_band
         assert sensed.contrast_db == pytest.approx(float(felt_here[0]), abs=0.8)
         assert np.mean(on_plates >= sensed.promised_contrast_db) == pytest.approx(0.9, abs=0.08)
     assert len(found.layers) == len(found.fingers) == 2
-
-
-def test_a_promise_for_a_way_holds_at_places_between() -> None:
-    """Nominal contrast at nine places of the next 8 mm, by fields of the table, in both contents.
-
-    At a place that the answer is not for, 30 mm behind, it does not.
-    """
-    contacts = [contact(1, MOVER, vx=0.2), contact(2, OTHER)]
-    question = asked(
-        [(each, Target(each.key, 14.0, content=str(each.key.id))) for each in contacts]
-    )
-    found = answered(paper_table(), question, question.lasting, playable(), now=NOW)
-    moving, _ = selection_of(paper_table(), question, found, question.lasting).finger_sensations
-    least = []
-    for way in [*(0.008 + 0.001 * step for step in range(9)), -0.022]:
-        at = (MOVER[0] + way, MOVER[1])
-        own, foreign = (
-            max(
-                abs(
-                    paper_table().amplitudes(
-                        layer.excitation, np.array([at]), contacts=[at, OTHER]
-                    )[1]
-                ).ravel()
-            )
-            / float(paper_table().thresholds[found.tones.rows[number]])
-            for number, layer in enumerate(found.layers)
-        )
-        least.append(20 * math.log10(own / foreign))
-    assert min(least[:-1]) >= (moving.sensation.promised_contrast_db or 0.0)
-    assert least[-1] < min(least[:-1])
 
 
 FIRST, SECOND = (0.2133, 0.0366), (0.1206, 0.1132)

@@ -298,38 +298,3 @@ def test_clock_that_is_rarely_read_wrong_is_off_by_no_more_than_is_said() -> Non
             said.append(talk.held.error(talk.now))
             leads.append(talk.counter.lead)
     assert rms(leads) < STEP / 2 < rms(said) < STEP
-
-
-def _prompt(rng: random.Random) -> float:
-    """Draw how long a reply takes without bits [s]."""
-    return rng.uniform(30e-6, 70e-6) + 0.2e-3 * (rng.random() < 0.1)
-
-
-@pytest.mark.parametrize("takes", [0.0, 0.2e-3], ids=["all", "late at first"])
-@pytest.mark.parametrize("bits", [0.3e-3, 0.6e-3], ids=["pty", "slcan over TCP"])
-def test_bits_that_take_no_time_do_not_count(bits: float, takes: float) -> None:
-    """921 600 baud on a pseudo-terminal, 500 kbit/s on TCP: 30 us and up to 40 more each way.
-
-    One reply of ten takes 0.2 ms more, which makes no reading early.
-
-    So two of +-40 ppm that are read alike differ by what is late in the lowest readings: 9 us rms,
-    as over a network. Nothing is said of them, also where bits seemed to count at first.
-    """
-    leads = list[list[float]]()
-    for seed, crystal in enumerate((40e-6, -40e-6)):
-        rng = random.Random(seed)
-        late = partial(rng.uniform, 30e-6, 70e-6)
-        back = partial(_prompt, rng)
-        talk = Exchanges(Counter(crystal), late, bits, takes=takes and bits, back=back)
-        talk.held.identified(10, bits=2 * bits)
-        if takes:
-            talk.back = partial(rng.uniform, 2 * bits, 3 * bits)
-        talk.run(0.2)
-        talk.back, talk.takes = back, 0.0
-        talk.arm()
-        for _ in range(60):
-            talk.run(0.5)
-            assert talk.held.problem(talk.now) is None
-        assert talk.counter.rate == pytest.approx(-crystal, abs=3e-6)
-        leads.append(talk.leads[-400:])
-    assert rms([one - other for one, other in zip(*leads, strict=True)]) < 9e-6

@@ -156,33 +156,6 @@ async def test_amplifier_may_play_until_what_is_under_way_has_arrived() -> None:
     assert end.levels("a") == [0.0, 0.0]
 
 
-@pytest.mark.parametrize("wire", ["serial", "tcp", "can"])
-@pytest.mark.parametrize(
-    "missed", [(0.001, 0.028), (0.012, 0.015), (0.001, 0.5)], ids=["early", "late", "long"]
-)
-@grouped(("a",))
-async def test_time_that_this_process_misses_is_no_time_of_the_amplifier(
-    group: Group, ends: list[MemoryLine], missed: tuple[float, float]
-) -> None:
-    """From a moment [s] after a request on for a time: a reply of 8 ms then is no timeout."""
-    (end,) = ends
-    after, lasts = missed
-    end.outward = lambda name, data: [(0.008 if after < 0.008 else 0.016, data)]
-
-    def stand_still() -> None:
-        """The amplifier runs in the same process, so that it does not reply meanwhile."""
-        timers = [each for each in end.loop._scheduled if not each.cancelled()]  # type: ignore[attr-defined]
-        for each in timers:
-            if each._callback in (end.arrives, end.line.received):
-                end.loop.call_at(each.when() + lasts, each._callback, *each._args)
-                each.cancel()
-        end.loop.now += lasts  # type: ignore[attr-defined]
-
-    end.loop.call_later(after, stand_still)
-    await group.amplifiers["a"].read_status()
-    assert end.retries == 0
-
-
 @grouped(("a",), wire="serial")
 async def test_reply_that_never_comes_to_a_process_that_is_often_delayed_is_given_up(
     group: Group, ends: list[MemoryLine]

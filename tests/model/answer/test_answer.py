@@ -477,19 +477,6 @@ def test_a_modulation_between_two_steps_of_the_table_plays_the_nearest(table):
         assert len(layer.side_bands) == count
 
 
-@pytest.mark.parametrize("modulation", [20.0, 30.0])
-def test_all_tones_of_two_contents_are_apart(table, modulation):
-    """By 30 Hz, side bands of one and carrier and side bands of the other, where any is."""
-    gaps = []
-    for places in contact_sets(8, fingers=2, seed=7):
-        found = answer(table, [wants(at, modulation_hz=modulation) for at in places])
-        if any(each.side_bands for each in found.layers):
-            one, other = ([each.frequency, *sides_of(each)] for each in found.layers)
-            gaps.append(np.abs(np.subtract.outer(one, other)).min())
-    assert len(gaps) >= 4
-    assert min(gaps) >= 30.0
-
-
 @pytest.mark.parametrize("priorities", [[1], [1, 1], [1, 2]])
 def test_side_bands_are_within_the_stroke(table, priorities):
     """At their peaks the amplitudes of all tones of an ERA add up to its stroke at most."""

@@ -1,7 +1,6 @@
 """Measures of answers on request, their exposure, and questions as JSON and on the command line."""
 
 import errno
-import json
 import re
 from dataclasses import replace
 from unittest.mock import Mock
@@ -91,18 +90,6 @@ def concentration(*amplitudes, frequencies=(100.0,)):
     )
 
 
-def test_concentration_on_a_plate_within_five_centimetres():
-    """Where nothing is farther away, all of it is around the target."""
-    small = replace(PLATE, length=0.06, width=0.06)
-    points = cell_centres(small)
-    near = ~is_beyond(points, [(0.03, 0.03)])
-    found = concentration_of(
-        np.array([100.0]), np.full((1, len(points)), 0.5), near, felt=1.0, plate=small
-    )
-    assert found.contrast_95_db == pytest.approx(20 * np.log10(2))
-    assert found.energy_share_near == pytest.approx(1.0)
-
-
 def test_concentration_agrees_with_points_counted_one_by_one():
     """Two targets, from points 1.7 mm apart; with quiet fingers there is no concentration."""
     table = smooth_table()
@@ -168,25 +155,6 @@ def test_transient_measures_agree_with_another_solution_of_the_plate(rig, table)
     assert found[1][0] > found[0][0] + 3
     assert found[1][1] < found[0][1] - 10
     assert shaped_layer.excitation == plain.excitation
-
-
-def test_query_batch_has_knots_only_with_envelopes(table):
-    """21 and 8 knots for every ERA, from silence to the pattern and back; else null."""
-    line = {"target": [0.09, 0.07], "quiet": [[0.25, 0.18]]}
-    plain, with_knots = query_batch(
-        table, [json.dumps(line), json.dumps(line | {"envelopes": True})]
-    )
-    assert with_knots["transient_contrast_db"] > plain["transient_contrast_db"]
-    (plain,), (with_knots,) = plain["layers"], with_knots["layers"]
-    assert plain["onset"] is plain["ending"] is None
-    for era, tone in with_knots["drive"].items():
-        onset, ending = with_knots["onset"][era], with_knots["ending"][era]
-        assert (len(onset["knots"]), len(ending["knots"])) == (21, 8)
-        assert onset["start"]["level"] == ending["knots"][-1]["level"] == 0
-        assert onset["frequency_hz"] == tone["frequency_hz"]
-        for joint in (ending["start"], onset["knots"][-1]):
-            assert joint["level"] == pytest.approx(tone["level"])
-            assert joint["phase_deg"] == pytest.approx(tone["phase_deg"], abs=1e-6)
 
 
 BAD_LINES = {

@@ -36,7 +36,6 @@ from model.answer.answer import (
     Answer,
     Limits,
     verdict_of,
-    verdict_shown,
 )
 from model.answer.plan import answer, query
 from model.answer.promise import FingersOnPlate, RingingUnderFingers, on_drawn_plates
@@ -518,23 +517,3 @@ def test_levels_and_bounds_are_above_the_rigs_own_thresholds():
 def test_what_pauses_is_own_only_where_nothing_foreign_is_felt(contrast, foreign, pauses, verdict):
     """From 12 dB on, and of what pauses at 0 dB SL of others at most."""
     assert verdict_of(contrast, foreign, pauses=pauses) == verdict
-
-
-def test_a_texture_is_mixed_where_a_steady_content_is_own():
-    """Both say that the other is felt; that it is faint is said of the steady one alone.
-
-    On a plate that is well known, where both have 12 dB.
-    """
-    well = Uncertainty(0.015, 1.5, 0.002, 0.01, 1.1, 0.5)
-    rig = replace(smooth_rig(), promised_thresholds=THRESHOLDS, uncertainty=well)
-    of = build_table(rig, frequencies=np.linspace(40.0, 320.0, 29))
-    steady = set_answer(of, ONE_EACH)
-    found = set_answer(of, [wants((0.09, 0.07), modulation_hz=20.0), ONE_EACH[1]])
-    assert found.layers[0].side_bands
-    assert [each.pauses for each in found.fingers] == [True, False]
-    assert all(each.is_foreign_felt for each in (*steady.fingers, *found.fingers))
-    assert found.fingers[0].promised_contrast_db >= 12
-    assert [each.verdict for each in steady.fingers] == [OWN, OWN]
-    assert [each.verdict for each in found.fingers] == [MIXED, OWN]
-    words = [verdict_shown(each.verdict, is_foreign_felt=True) for each in found.fingers]
-    assert words == [MIXED, "own, others faintly felt"]

@@ -296,56 +296,6 @@ def solved() -> SensedPlate:
     return sensed_plate(SENSED_PLATE_RIG, sensors_at(SENSED_PLATE_POINTS), SENSED_PLATE_FREQUENCIES)
 
 
-@pytest.mark.parametrize(("factor", "within"), [(1.01, 1e-3), (0.95, 5e-3)])
-def test_responses_are_those_of_a_new_solve(
-    solved: SensedPlate, factor: float, within: float
-) -> None:
-    """Of another thickness, relative L2; shear and rotary inertia limit it."""
-    of = SENSED_PLATE_RIG.plate
-    other = replace(SENSED_PLATE_RIG, plate=replace(of, thickness=factor * of.thickness))
-    found = solved.of(other).responses()
-    exact = sensed_plate(other, solved.model.sensors, SENSED_PLATE_FREQUENCIES).responses()
-    assert np.linalg.norm(found - exact) / np.linalg.norm(exact) < within
-
-
-@pytest.mark.parametrize("loss_factor", np.linspace(0.001, 0.05, 20).tolist())
-def test_lower_bounds_are_no_loss_and_no_damping(solved, loss_factor):
-    """A fit that ends at them has a rig: by rounding values would be just below zero."""
-    eras = [
-        replace(era, damping=1e3 * loss_factor * share)
-        for era, share in zip(SENSED_PLATE_RIG.eras, (0.02, 0.03, 0.07, 0.11), strict=True)
-    ]
-    plate = replace(SENSED_PLATE_RIG.plate, loss_factor=loss_factor)
-    other = solved.of(replace(SENSED_PLATE_RIG, plate=plate, eras=tuple(eras)))
-    values = other.values(other.model.space.lower)
-    is_factor = [row.is_factor for row in other.rows]
-    np.testing.assert_allclose(values[np.logical_not(is_factor)], 0, atol=1e-12)
-
-
-@pytest.mark.parametrize(
-    ("stated", "expected"),
-    [
-        # ln 3 / ln 1.7, since 70 % is what sheets leave; -0.5 / 0.7; ln 1.2 / (0.1² + 0.02²)^½
-        (SENSED_PLATE_RIG.uncertainty, (2.070, -0.714, 1.788)),
-        # ln 3 / (ln² 3 + 0.2²)^½, -0.5 of that, ln 1.2 / (0.3² + 0.02²)^½
-        (replace(SENSED_PLATE_RIG.uncertainty, damping=3.0, stiffness=0.3), (0.984, -0.448, 0.606)),
-    ],
-    ids=["as sheets leave", "as the rig states"],
-)
-def test_deviations_are_those_of_factors_where_losses_are_more(solved, stated, expected):
-    """A damper three times as strong, one half as strong, and a spring 20 % stiffer."""
-    plate = solved.of(replace(SENSED_PLATE_RIG, uncertainty=stated))
-    z = np.zeros(plate.model.space.size)
-    z[plate.model.space.groups["damping_added"]] = 2.0 / 0.7, -0.5 / 0.7, 0.0, 0.0
-    stiffer = np.log(1.2) / max(stated.stiffness, 0.1)
-    z[plate.model.space.groups["stiffness"]] = 0.0, 0.0, stiffer, 0.0
-    by_name = dict(zip([row.name for row in plate.rows], plate.deviations(z), strict=True))
-    first, second, third, _ = (era.name for era in SENSED_PLATE_RIG.eras)
-    found = [by_name[f"{first} damping"], by_name[f"{second} damping"]]
-    found.append(by_name[f"{third} stiffness"])
-    np.testing.assert_allclose(found, expected, atol=1e-3)
-
-
 FORM_ERRORS_FREQUENCIES = np.arange(50.0, 491.0, 40.0)
 
 USUAL = {

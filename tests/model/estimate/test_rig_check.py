@@ -38,8 +38,8 @@ from kit.weekend_boards import FOLDER, BuiltBoard
 from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError
 from model.estimate import plate_match
-from model.estimate.calibrate import MAX_OUTLIERS, calibrate, check_consistency
-from model.estimate.fit import sensed_plate, without_outliers
+from model.estimate.calibrate import calibrate, check_consistency
+from model.estimate.fit import sensed_plate
 from model.estimate.measurement import (
     MeasuredPlate,
     Measurement,
@@ -50,7 +50,6 @@ from model.estimate.measurement import (
     write_responses_csv,
     write_responses_uff,
 )
-from model.estimate.plate_match import MAX_FIT_ERROR, match_plate
 from model.estimate.rig_check import (
     as_json,
     channel_table,
@@ -587,14 +586,3 @@ def test_diagnose_refuses_too_few_sensors_or_frequencies(coarse_rig, built):
         diagnose(coarse_rig, few)
     with pytest.raises(InputError, match="driven"):
         diagnose(coarse_rig, replace(built, values=np.full_like(built.values, np.nan)))
-
-
-def test_match_plate_takes_no_misfit_for_outliers(coarse_rig):
-    """Of a plate 3 % longer than its rig's a calibration would leave a tenth of all values out."""
-    rng = np.random.default_rng(1003)
-    built = on_paper(larger(within_tolerance(coarse_rig, rng), 1.03), rng)
-    plate = sensed_plate(coarse_rig, built.sensors, built.frequencies)
-    match = match_plate(plate, built.values, drives=range(4))
-    std, _ = without_outliers(built.values, match.predicted)
-    assert 0.05 < np.isinf(std).mean() < MAX_OUTLIERS
-    assert match.error > MAX_FIT_ERROR

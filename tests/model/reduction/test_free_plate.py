@@ -4,7 +4,6 @@ The reduced plate, its slopes and its modes, against the full one; a part whose 
 the thickness; modes that differ from the theory, and a loss factor that varies, in every solution.
 """
 
-import math
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
@@ -26,18 +25,16 @@ from model.finger import Grid
 from model.reduction import free_plate
 from model.reduction.free_plate import (
     FreePlate,
-    SpectralModes,
     solve_free_plate,
 )
 from model.reduction.reduced_plate import (
     modal_matrices,
     place_slopes,
-    reduce_free_plate,
     reduce_plate,
 )
 from model.rig.rig import Rig, Uncertainty
 from model.rig.rig_file import example_rig_path, load_rig
-from model.spectral.modes import SpectralMesh, local_compliance
+from model.spectral.modes import SpectralMesh
 from model.structure.attachments import Era, PointLoad, footprints_of
 from model.structure.material import Material
 from model.structure.plate import (
@@ -252,27 +249,6 @@ def test_receptances_equal_direct_solve(free):
             assert np.linalg.norm(quick - exact) < 2e-6 * np.linalg.norm(exact)
 
 
-def test_receptances_of_a_thicker_plate(free):
-    """A thin plate h times as thick moves at w as the plate itself does at w / h, over h³.
-
-    With loads of dynamic stiffness Z(w) / h³.
-    """
-    places = np.array([[0.0, 0.0, 0.01], [0.21, 0.07, 0.01], [0.11, WIDTH, 0.0]])
-    points, frequencies = free.mesh.nodes[::29], np.array([61.0, 155.0, 390.0])
-    loads = (PointLoad(0.2, 0.1, mass=0.02), PointLoad(0.05, 0.2, 1000.0, 2.0, 2e-4))
-    h = 1.05
-    scaled = [
-        replace(
-            load, stiffness=load.stiffness / h**3, damping=load.damping / h**2, mass=load.mass / h
-        )
-        for load in loads
-    ]
-    expected = free.receptances(places, points, frequencies / h, loads=scaled)
-    found = free.receptances(places, points, frequencies, loads=loads, thickness=h)
-    for ours, theirs in zip(found, expected, strict=True):
-        np.testing.assert_allclose(ours, theirs / h**3, atol=1e-9 * np.abs(ours).max())
-
-
 MESH = Mesh(6, 5, LENGTH, WIDTH, ELEMENTS["Q4"], 0.003)
 CORNERS = [(0.0, 0.0), (LENGTH, 0.0), (LENGTH, WIDTH), (0.0, WIDTH)]
 INSIDE = [(0.051, 0.017), (0.29, 0.08), (0.12, WIDTH)]
@@ -301,26 +277,6 @@ def test_reduced_plate_response_equals_direct_solve(places):
         error = np.linalg.norm(answer.T - direct[row], axis=1)
         error /= np.linalg.norm(direct[row], axis=1)
         assert error.max() < 3e-5
-
-
-def test_projection_carries_motion_to_another_reduction():
-    """To more points nothing is lost; to fewer, or others, it is the mass-weighted projection.
-
-    Which is the same seen from either side, and exact at the points that both answer for.
-    """
-    small = reduce_plate(PAPER, MESH, np.array(CORNERS))
-    large = small.with_attachments_at(np.array(INSIDE))
-    other = small.with_attachments_at(np.array([[0.2, 0.1]]))
-    up, down = large.projection_from(small), small.projection_from(large)
-    np.testing.assert_allclose(up.T @ up, np.eye(len(small.omega)), atol=1e-9)
-    np.testing.assert_allclose(down, up.T, atol=1e-9)
-    shapes = small.at(MESH.nodes)
-    np.testing.assert_allclose(large.at(MESH.nodes) @ up, shapes, atol=1e-8 * np.abs(shapes).max())
-    across = other.projection_from(large)
-    np.testing.assert_allclose(across, large.projection_from(other).T, atol=1e-9)
-    through_small = other.projection_from(small) @ down
-    np.testing.assert_allclose(across @ up, through_small @ up, atol=1e-9)
-    assert np.linalg.norm(across - through_small) > 0.1
 
 
 SIDES = np.array([0.3, 0.2])
@@ -464,35 +420,3 @@ def test_plate_in_time_has_them(deviating_rig: Rig) -> None:
         found = -(omega**2) * (reduced.at(DEVIATING_POINTS) @ moved)
         error = np.linalg.norm(found - expected[row]) / np.linalg.norm(expected[row])
         assert error < 0.01
-
-
-LOSSLESS = replace(make_paper_rig(12, 9).plate, loss_factor=0.0)
-PLACES = np.array([(0.13, 0.11, 0), (0.17, 0, 0), (LENGTH, WIDTH, 0), (0.05, 0.06, 0.01)])
-
-# ln 10 / (2 pi kappa G h) with kappa 5/6 and G = 70 GPa / 2.66, at a point inside; on an edge and
-# at a corner its images double it once and twice; a disc ends the logarithm.
-DECADE = math.log(10) / (2 * math.pi * 5 / 6 * 70e9 / 2.66 * 0.0015)
-DECADES = DECADE * np.array([1, 2, 4, 0])
-
-
-def test_softer_plate_gives_way_by_a_fifth_and_a_decade_more():
-    """Under slow forces: a fifth of the unresolved compliance, and a decade under points.
-
-    Of the paper's plate without damping in polynomials. The softer one's reduction has the same
-    receptance, as that of the plate itself.
-    """
-    free = solve_free_plate(LOSSLESS, SpectralMesh(12, 9, LENGTH, WIDTH), frequency_max=500.0)
-    assert isinstance(free.modes, SpectralModes)
-    (modes,) = free.modes.alternatives()
-    softer = replace(free, modes=modes)
-    assert pytest.approx(1.1e-8, rel=0.05) == DECADE
-    expected = 0.2 * local_compliance(LOSSLESS, (12, 9), PLACES, PLACES) + np.diag(DECADES)
-    stiff, soft = (
-        np.stack(plate.receptances(PLACES, PLACES, np.array([5.0]))) for plate in (free, softer)
-    )
-    for more in (soft - stiff)[:, 0].real:  # between places, and to points
-        np.testing.assert_allclose(more, expected, rtol=1e-3, atol=1e-13)
-    reduced = reduce_free_plate(softer, PLACES)
-    shapes = reduced.at(PLACES)
-    found = shapes / (reduced.omega**2 - (10 * math.pi) ** 2) @ shapes.T
-    np.testing.assert_allclose(found, soft[0, 0].real, rtol=1e-5)

@@ -24,7 +24,6 @@ from model.config.document import ConfigError, KeyPath, read_document
 from model.errors import InputError
 from model.fem import assemble
 from model.reduction.free_plate import solve_free_plate
-from model.reduction.reduced_plate import reduce_plate
 from model.rig import rig_writing
 from model.rig.rig import FOUR_ERA_LAYOUTS, Channel, Rig, Uncertainty
 from model.rig.rig_file import load_rig, parse_mesh, parse_rig
@@ -35,10 +34,8 @@ from model.rig.rig_writing import (
     save_fitted,
     save_rig,
 )
-from model.structure.attachments import Fingertip, PointLoad, footprints_of
+from model.structure.attachments import Fingertip, PointLoad
 from model.table.table_file import build_table
-from model.transients.base_motion import BaseMotions, Term
-from model.transients.time_response import plate_in_time
 
 # A line per value, so that every problem has a line of its own.
 GOOD = """\
@@ -587,19 +584,6 @@ def test_era_gain_is_interpolated_and_held_beyond_its_frequencies(
         free.acceleration(each.eras, frequencies, points) for each in (uneven, coarse_rig)
     )
     np.testing.assert_allclose(scaled, factor * plain, rtol=1e-10)
-
-
-def test_particular_solution_is_the_same_for_negative_frequency(
-    coarse_rig: Rig, uneven: Rig
-) -> None:
-    """Im[c exp(i w t)] is Im[-conj(c) exp(-i w t)]: quick ramps of low tones are made of both."""
-    reduced = reduce_plate(coarse_rig.plate, coarse_rig.mesh, footprints_of(coarse_rig.eras))
-    plate, omega, c = plate_in_time(reduced, uneven.eras), 2 * math.pi * 150.0, 6e-5 + 3e-5j
-    tones = Term(0.0, math.inf, omega, c), Term(0.0, math.inf, -omega, -c.conjugate())
-    expected, back = (
-        plate.driven(BaseMotions([(), (tone,)]), [0], [0.0]).state(0, 0.0123) for tone in tones
-    )
-    np.testing.assert_allclose(back, expected, atol=1e-9 * np.abs(expected).max())
 
 
 def test_corners_and_pairs_are_those_of_the_paper(coarse_rig: Rig) -> None:

@@ -21,21 +21,18 @@ from kit.plates import ALUMINIUM, LENGTH, WIDTH, make_paper_rig
 from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError
 from model.fem import (
-    ELEMENTS,
     Q5,
     Mesh,
     assemble,
-    element_slopes,
 )
-from model.reduction.free_plate import SpectralModes, solve_free_plate
+from model.reduction.free_plate import solve_free_plate
 from model.reduction.reduced_plate import reduce_free_plate, supported_modes
 from model.rig.rig_file import load_rig, mesh_of, parse_mesh, parse_rig
-from model.spectral.direct_solution import AtOneFrequency, grain_slopes, stiffness_slopes
+from model.spectral.direct_solution import AtOneFrequency
 from model.spectral.modes import MaterialBand, SpectralMesh, SpectralPlate, local_compliance
-from model.spectral.polynomials import CLASSES as PARITY_CLASSES
 from model.spectral.polynomials import air_motion
 from model.structure.attachments import Era, footprints_of
-from model.structure.material import Material, Orthotropy
+from model.structure.material import Material
 from model.structure.plate import (
     HEAT_RATIO,
     PRESSURE,
@@ -71,89 +68,6 @@ def test_patches_dent_as_the_infinite_plate_says():
     compliance = 1 / (PAPER.flexural_rigidity * k**4) + 1 / (shear * k**2)
     expected = trapezoid(shapes * compliance * k**2 / (2 * math.pi), np.log(k))  # k d ln k = dk
     assert weights @ np.diagonal(between[0]).real == pytest.approx(expected, rel=0.02)
-
-
-GLASS = Material("glass", E=70e9, rho=2500.0, nu=0.22)
-THIN_PLATE = Plate(0.3, 0.21, 0.001, GLASS)
-LAYERS = (
-    LaminateLayer(GLASS, 0.0004),
-    LaminateLayer(Material("glue", E=50e6, rho=1000.0, nu=0.45), 0.0002),
-    LaminateLayer(GLASS, 0.0006),
-)
-SANDWICH = equivalent_plate(Laminate(LAYERS), length=0.3, width=0.21, frequency=200.0)
-BIRCH = Material("birch", 12.7e9, 680.0, 0.3, Orthotropy(0.38, 0.055, 0.028, 0.02))
-BOARD = Plate(0.3, 0.21, 0.002, BIRCH)
-DEGREES = (13, 11)
-SPECTRAL = SpectralMesh(*DEGREES, 0.3, 0.21)
-ELEMENTARY = Mesh(5, 4, 0.3, 0.21, ELEMENTS["Q5"])
-STEP = 2e-3
-
-
-def elastic_modes(plate, mesh):
-    """Eigenvalues (r,) of the lowest elastic modes, ascending, and their unknowns by class."""
-    own = replace(mesh, length=plate.length, width=plate.width)
-    modes = solve_free_plate(plate, own, frequency_max=800.0).modes
-    order = np.argsort(modes.eigenvalues)[3:15]
-    unknowns = modes.unknowns(np.array([[0.1, 0.1, 0.0]]))
-    return modes.eigenvalues[order], [each[:, order] for each in unknowns]
-
-
-def slopes_of(plate, mesh):
-    """Eigenvalues (r,), and derivatives of the stiffness between their modes (3, r, r)."""
-    eigenvalues, unknowns = elastic_modes(plate, mesh)
-    if isinstance(mesh, Mesh):
-        return eigenvalues, element_slopes(plate, mesh, unknowns[0])
-    return eigenvalues, stiffness_slopes(plate, DEGREES, unknowns, frequency=200.0)
-
-
-def changed(plate, number, change):
-    """The plate with another length, width or Poisson's ratio of all that it is made of."""
-    if number < 2:
-        side = ("length", "width")[number]
-        return replace(plate, **{side: getattr(plate, side) * (1 + change)})
-
-    def other(material):
-        return replace(material, nu=material.nu + change)
-
-    layers = [replace(layer, material=other(layer.material)) for layer in LAYERS]
-    laminate = plate.laminate and Laminate(tuple(layers))
-    return replace(plate, material=other(plate.material), laminate=laminate)
-
-
-@pytest.mark.parametrize(
-    ("plate", "mesh"),
-    [
-        (THIN_PLATE, SPECTRAL),
-        pytest.param(THIN_PLATE, ELEMENTARY, marks=pytest.mark.long),
-        (SANDWICH, SPECTRAL),
-        (BOARD, SPECTRAL),
-        pytest.param(BOARD, ELEMENTARY, marks=pytest.mark.long),
-    ],
-)
-def test_slopes_are_those_of_the_eigenvalues_of_other_plates(plate, mesh):
-    """Solved anew a little larger and smaller; rotary inertia accounts for 0.1 %."""
-    eigenvalues, slopes = slopes_of(plate, mesh)
-    for number, slope in enumerate(slopes):
-        more, less = (elastic_modes(changed(plate, number, by), mesh)[0] for by in (STEP, -STEP))
-        expected = (more - less) / (2 * STEP)
-        np.testing.assert_allclose(
-            np.diagonal(slope) / eigenvalues, expected / eigenvalues, atol=2e-3
-        )
-
-
-@pytest.mark.parametrize(("number", "key"), [(0, "e2"), (1, "g12")])
-def test_slopes_by_a_grain_are_those_of_boards_of_other_moduli(number, key):
-    """Solved anew with a modulus across, or of shear in the plane, a little higher and lower."""
-    eigenvalues, unknowns = elastic_modes(BOARD, SPECTRAL)
-    slopes = grain_slopes(BOARD, DEGREES, unknowns)[number]
-
-    def board(change):
-        shares = replace(BIRCH.orthotropy, **{key: getattr(BIRCH.orthotropy, key) * (1 + change)})
-        return replace(BOARD, material=replace(BIRCH, orthotropy=shares))
-
-    more, less = (elastic_modes(board(by), SPECTRAL)[0] for by in (STEP, -STEP))
-    expected = (more - less) / (2 * STEP) / eigenvalues
-    np.testing.assert_allclose(slopes / eigenvalues, expected, atol=2e-3)
 
 
 PANE = Plate(0.375, 0.225, 2.5e-3, Material("glass", E=70e9, rho=2500.0, nu=0.2))
@@ -448,44 +362,6 @@ def test_response_on_feet_is_that_of_fine_elements(layout, foot):
     assert np.linalg.norm(high - exact) / size < 0.001
 
 
-PLATES = {
-    "paper": PAPER,
-    "glass panel": Plate(0.36, 0.22, 0.0011, STIFF_GLASS),
-    "strip": Plate(0.5, 0.1, 0.0015, STIFF_GLASS),
-}
-
-
-@pytest.mark.parametrize(
-    ("plate", "degrees", "frequency"),
-    [("paper", (12, 9), 640.0), ("glass panel", (18, 12), 1000.0), ("strip", (16, 6), 2000.0)],
-)
-def test_modes_are_those_of_a_full_eigen_solution(plate, degrees, frequency):
-    """LAPACK on all unknowns of each class finds the same modes below a cut-off, and no others."""
-    of = PLATES[plate]
-    mesh = SpectralMesh(*degrees, of.length, of.width)
-    modes = SpectralModes(
-        of,
-        mesh,
-        shift=(2 * math.pi * 30) ** 2,
-        cutoff_frequency=frequency,
-        frequency_max=frequency,
-    )
-    every = np.concatenate([_all_eigenvalues(of, degrees, each) for each in PARITY_CLASSES])
-    expected = np.sqrt(np.maximum(every, 0)) / (2 * math.pi)
-    found = np.sqrt(np.sort(modes.eigenvalues)) / (2 * math.pi)
-    np.testing.assert_allclose(found, np.sort(expected[expected < frequency]), rtol=1e-5, atol=0.1)
-
-
-def _all_eigenvalues(plate: Plate, degrees, parity) -> np.ndarray:
-    """omega² of all unknowns of a class, displacements along the plate with their inertia."""
-    spectral = SpectralPlate(plate, degrees, 150.0)
-    of = spectral.functions(parity)
-    K = spectral.stiffness(of, [plate.material.E])
-    M = plate.material.rho * plate.thickness * np.eye(of.size)
-    M[of.deflections :, of.deflections :] /= 6  # of opposite unit motions
-    return linalg.eigvalsh(K, M)
-
-
 @pytest.mark.parametrize(
     ("low", "tolerances"),
     in_turn([(12, 9), (13, 10)], [(1.5e-3, 0.0, 0.05, 0.12), (1e-2, 5e-3, 0.25, 0.35)]),
@@ -561,29 +437,6 @@ def test_mesh_is_read_as_it_is_printed():
     for text in ("14x12 Legendre with strips of 3 mm", "12x9 Q5 with strips of 3 kg", "12x9 with"):
         with pytest.raises(InputError):
             parse_mesh(text, plate)
-
-
-@pytest.mark.parametrize("sides", [(LENGTH, WIDTH), (0.7, 0.1), (0.05, 0.06)])
-def test_coarsest_mesh_is_the_coarsest_that_resolves_its_frequency(sides):
-    """Its elements are short enough along both sides; one fewer along either is too long.
-
-    The highest frequency has six nodes to a wavelength: nodes an inch apart carry waves of 152.4
-    mm, which are those of 631.85 Hz.
-    """
-    plate = Plate(*sides, 0.0015, ALUMINIUM)
-    for frequency in (40.0, 500.0, 1637.0):
-        mesh = Mesh(1, 1, *sides).resolving(plate, frequency)
-        assert mesh.highest_frequency(plate) >= frequency
-        for fewer in ((mesh.nx - 1, mesh.ny), (mesh.nx, mesh.ny - 1)):
-            if min(fewer):
-                assert Mesh(*fewer, *sides).highest_frequency(plate) < frequency
-    paper = Plate(LENGTH, WIDTH, 0.0015, ALUMINIUM)
-    for mesh in (Mesh(12, 9, LENGTH, WIDTH), Mesh(4, 3, LENGTH, WIDTH, ELEMENTS["Q3"])):
-        # 2 pi / wavelength² * sqrt(D / rho h), with D = 22.0935 N m and rho h = 4.05 kg/m²
-        highest = mesh.highest_frequency(paper)
-        assert highest == pytest.approx(631.85, abs=0.01)
-        again = mesh.resolving(paper, highest * (1 - 1e-8))
-        assert (again.nx, again.ny) == (mesh.nx, mesh.ny)
 
 
 PLATE = Plate(0.3, 0.24, 0.002, ALUMINIUM)

@@ -15,7 +15,7 @@ import pytest
 from cases import in_turn, shortly
 from kit.direct_plate import direct_acceleration
 from kit.layered_strips import wave_number
-from kit.plates import ALUMINIUM, LENGTH, WIDTH, exciter_rig, make_paper_rig
+from kit.plates import ALUMINIUM, exciter_rig, make_paper_rig
 from model.arrays import FloatArray, lattice
 from model.errors import InputError
 from model.fem import ELEMENTS, Mesh, assemble
@@ -89,30 +89,6 @@ def test_force_and_dynamic_stiffness_by_hand(
     exciter = replace(BY_HAND, held=held)
     assert exciter.force(omega)[0] == pytest.approx(force, rel=1e-4)
     assert exciter.dynamic_stiffness(omega)[0] == pytest.approx(stiffness, rel=1e-4)
-
-
-@pytest.mark.parametrize("held", [False, True])
-def test_errors_of_the_suspension_act_as_its_changes_say(held: bool) -> None:
-    """Of one that is stiffer or damps more, the force changes as much as the stiffness does.
-
-    At any size, by the motion of its base; and dampers by a difference.
-    """
-    omega, step = 2 * np.pi * np.array([30.0, 47.0, 120.0, 400.0]), 1e-5
-    exciter = replace(BY_HAND, held=held, gains=((100.0, 0.5, 0.3),))
-    at_rest, force = exciter.dynamic_stiffness(omega), exciter.force(omega)
-    damped = exciter.varied(damping=1 + step).dynamic_stiffness(omega)
-    by_damping = exciter.damping * exciter.slopes(omega)["damping"][0]
-    assert by_damping == pytest.approx((damped - at_rest) / step, rel=1e-3)
-    for key in ("stiffness", "damping"):
-        other = exciter.varied(**{key: 1.3})
-        pushed = (other.dynamic_stiffness(omega) - at_rest) * exciter.base(omega)
-        size = np.abs(force).max()
-        assert pushed == pytest.approx(other.force(omega) - force, abs=1e-9 * size)
-        drive = exciter.full_level * exciter.gain(omega / (2 * np.pi))
-        off = {"stiffness": 1.0, "damping": 1.0, key: 1.3}
-        stiffness, by_voltage = exciter.deviating(omega, **off)
-        assert stiffness == pytest.approx(exciter.varied(**off).dynamic_stiffness(omega))
-        assert by_voltage * drive == pytest.approx(exciter.varied(**off).force(omega))
 
 
 @pytest.mark.parametrize("magnet", shortly(["free", "held"], ["free"]))
@@ -305,24 +281,6 @@ def test_equivalent_plate_keeps_rigidity_nu_and_mass(bond):
     assert plate.laminate == (laminate if bond == "full" else None)
 
 
-def test_equivalent_plate_keeps_rotary_inertia():
-    """Bonded glass: rho H³ / 12 of the whole; sliding: of each; a sandwich: faces at their arms."""
-    three = (LaminateLayer(GLASS, 1e-3),) * 3
-    assert of_plate(Laminate(three)).thickness == pytest.approx(3e-3, rel=1e-3)
-    assert of_plate(Laminate(three, Bond.NONE)).thickness == pytest.approx(1e-3, rel=1e-9)
-    stiff = replace(FOAM, E=7e9)
-    sandwich = Laminate(
-        (
-            LaminateLayer(ALUMINIUM, 1e-3),
-            LaminateLayer(stiff, 10e-3),
-            LaminateLayer(ALUMINIUM, 1e-3),
-        )
-    )
-    inertia = 2 * (2.7 * 1e-6 / 12 + 2.7 * 5.5e-3**2) + 1.0 * 1e-4 / 12
-    plate = of_plate(sandwich)
-    assert plate.material.rho * plate.thickness**3 / 12 == pytest.approx(inertia, rel=0.02)
-
-
 @pytest.mark.parametrize(
     ("modulus", "frequency"),
     [
@@ -463,31 +421,6 @@ def test_plate_is_supported_by_three_springs_not_in_line(eras: list[Era]) -> Non
         assert support_problem(ATTACHMENTS_PLATE, CORNERS[:held], loads=loads) is None
 
 
-def test_point_load_at_an_era_acts_as_bolt_mass_and_parallel_spring():
-    """A mass and a damper laid on an ERA act as its own would, but are not driven by its base."""
-    plate = Plate(LENGTH, WIDTH, 0.0015, ALUMINIUM)
-    free = solve_free_plate(plate, Mesh(12, 9, LENGTH, WIDTH))
-    places = [(0.0, 0.0), (LENGTH, 0.0), (0.1, WIDTH)]
-    frequencies = np.array([60.0, 110.0, 400.0])
-
-    def fields(load, stiffness=17000.0, damping=2.0, bolt_mass=0.0):
-        eras = [
-            Era(f"E{n}", x, y, stiffness, damping, bolt_mass, 1e-4)
-            for n, (x, y) in enumerate(places)
-        ]
-        loads = [replace(load, x=x, y=y) for x, y in places]
-        return free.acceleration(eras, frequencies, free.mesh.nodes, loads=loads)
-
-    nothing = PointLoad(0.0, 0.0)
-    laid, heavier = fields(replace(nothing, mass=0.01)), fields(nothing, bolt_mass=0.01)
-    np.testing.assert_allclose(laid, heavier, rtol=1e-8)
-    # The base of an ERA with spring k + s and stroke a k / (k + s) pushes as one of k and a does.
-    omega = 2 * np.pi * frequencies[:, None, None]
-    share = (17000 + 2j * omega) / (20000 + 2.3j * omega)
-    springs = fields(replace(nothing, stiffness=3000.0, damping=0.3))
-    np.testing.assert_allclose(springs, share * fields(nothing, 20000.0, 2.3), rtol=1e-8)
-
-
 HERTZ = np.array([60.0, 100.0, 250.0])
 
 
@@ -596,21 +529,6 @@ def test_plywood_has_the_moduli_of_the_handbook(thickness: float, moduli: tuple[
     own = known.of_thickness(thickness).moduli
     assert (round(own["E1"] / 1e6), round(own["E2"] / 1e6)) == moduli
     assert known.of_thickness(6.1e-3) == known.of_thickness(6.9e-3) == known.material
-
-
-def test_the_shortest_waves_of_a_board_are_those_of_its_softest_direction() -> None:
-    """D1 c⁴ + 2 (nu12 D2 + 2 D12) c² s² + D2 s⁴ by hand, least over a fine fan of directions."""
-    unit = 6.4e-3**3 / 12
-    plane = 1 - 0.05**2 * 4.8 / 12.7
-    along, across, twist = 12.7e9 * unit / plane, 4.8e9 * unit / plane, 0.7e9 * unit
-    c2 = np.linspace(0, 1, 100_001)
-    least = (
-        along * c2**2 + 2 * (0.05 * across + 2 * twist) * c2 * (1 - c2) + across * (1 - c2) ** 2
-    ).min()
-    plate = board().plate
-    expected = 2 * math.pi * (least / (680 * 6.4e-3 * (2 * math.pi * 500) ** 2)) ** 0.25
-    assert plate.bending_wavelength(500.0) == pytest.approx(expected, rel=1e-6)
-    assert plate.flexural_rigidity == pytest.approx(math.sqrt(along * across), rel=1e-9)
 
 
 @pytest.mark.parametrize(

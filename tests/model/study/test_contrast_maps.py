@@ -4,7 +4,7 @@ import csv
 import json
 import math
 from dataclasses import replace
-from itertools import combinations, product
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -27,21 +27,17 @@ from model.structure.plate import AirGap, Laminate, LaminateLayer
 from model.study import overview
 from model.study.contrast_maps import (
     WeakCells,
-    contrasts_reached,
     find_weak_cells,
     map_grid,
     pair_questions,
     text_map,
 )
 from model.study.overview import (
-    CONTACT_SETS,
-    Overview,
     PromiseCost,
     clock_cost,
     export_csv,
     export_mat,
     find_overview,
-    set_questions,
     summarize,
 )
 from model.table.table_file import build_table
@@ -133,16 +129,6 @@ def test_export_mat_holds_the_table_to_the_bit(table, struct):
     assert [era.name for era in struct.eras] == ["SW", "SE", "NE", "NW"]
     assert [era.stiffness_n_m for era in struct.eras] == [17000.0] * 4
     assert struct.eras[2].x_m == 0.3048
-
-
-def test_export_mat_holds_names_of_sets_as_a_cell_array(table, tmp_path):
-    """A column of strings, of one set too, beside the set of levels."""
-    for names in (("pressing-fingertip", "vibrotactile-probe"), ("pressing-fingertip",)):
-        export_mat(replace(table, promised_thresholds=names), tmp_path / "t.mat")
-        struct = loadmat(tmp_path / "t.mat", struct_as_record=False)["table"][0, 0]
-        assert struct.threshold.tolist() == ["vibrotactile-probe"]
-        assert struct.promised_thresholds.shape == (len(names), 1)
-        assert [each.item() for each in struct.promised_thresholds.flat] == list(names)
 
 
 ROWS = ((1.0, 1.0, 0.1), (900.0, 2.0, 0.1))
@@ -356,58 +342,3 @@ def test_summary_of_a_plate_too_small_for_two_fingers():
     summary = summarize(built, find_overview(built))
     assert summary["promised_contrast_1_quiet_median_db"] is None
     assert summary["feasible_share"] is None
-
-
-@pytest.mark.long
-def test_weak_cells_are_not_feasible_when_only_19_db_sl_are_reached(table):
-    """The map is at 20 dB SL, which no pattern reaches with these strokes."""
-    weaker = with_strokes(table, 10 ** ((19.0 - table.available_level_db_sl.max()) / 20))
-    assert weaker.available_level_db_sl.max() == pytest.approx(19.0, abs=0.01)
-    weak = find_overview(weaker).cells
-    assert np.isneginf(weak.median_db).all()
-    assert not weak.feasible.any()
-
-
-def test_summary_counts_levels_and_shares(table):
-    """Levels from 12 dB SL count as felt; shares are of the cells for which there is a value."""
-    one_to_hundred = np.array([np.arange(101.0), np.arange(101.0) + 5])
-    levels = np.sort(table.available_level_db_sl)
-    lower = 10 ** ((12.0 - levels[5:7].mean()) / 20)  # six of twelve cells are below 12 dB SL then
-    quieter = with_strokes(table, lower)
-    values = np.array([20.0, 12.0, 9.0, -np.inf, *[np.nan] * 8])
-    errors = np.zeros((2, 12))
-    weak = WeakCells(table.grid, np.zeros((12, 2)), values, values - 0.1, errors, one_to_hundred)
-    layers = tuple(LaminateLayer(table.plate.material, thickness) for thickness in (1e-3, 2e-3))
-    quieter = replace(quieter, plate=replace(table.plate, laminate=Laminate(layers)))
-    summary = summarize(quieter, Overview(weak, [one_to_hundred] * 3))
-    assert summary["plate_m"][2] == pytest.approx(3e-3)  # not of one material that bends alike
-    assert summary["frequency_range_hz"] == [60.0, 250.0]
-    expected = {
-        "dead_zone_share": 0.5,
-        "least_level_at_full_stroke_db_sl": levels[0] + 20 * np.log10(lower),
-        "feasible_share": 0.5,
-        "weak_share": 0.75,
-        "frequency_count": 3,
-        "patterns": 4 * 3 + 6 * 3**2,
-        "promised_contrast_2_quiet_median_db": 50.0,
-        "promised_contrast_2_quiet_tenth_percentile_db": 10.0,
-        "contrast_2_quiet_median_db": 55.0,
-        "discretisation_error_percent": 100 * max(quieter.discretisation_error),
-    }
-    assert {name: summary[name] for name in expected} == pytest.approx(expected, rel=1e-4)
-
-
-@pytest.mark.parametrize("others", [1, 3])
-def test_contact_sets_are_of_fingers_apart(table, others):
-    """As many sets as are wanted, all at least 5 cm apart, no two alike.
-
-    Of three answers the one without contrast, which misses the level, is left out.
-    """
-    questions = set_questions(table, others=others, rng=np.random.default_rng(1))
-    assert len({question.contacts for question in questions}) == CONTACT_SETS
-    for question in questions:
-        assert len(question.quiet) == others
-        for one, other in combinations(question.contacts, 2):
-            assert math.dist(one, other) >= 0.05
-    assert contrasts_reached([(1.0, 2.0), None, (3.0, 4.0)]).tolist() == [[1, 3], [2, 4]]
-    assert contrasts_reached([None]).shape == (2, 0)

@@ -24,7 +24,7 @@ from model.finger import Grid, detection_threshold, fingertip_points, fingertip_
 from model.reduction.free_plate import solve_free_plate
 from model.rig.rig import Uncertainty
 from model.structure.attachments import FingertipLoad, PointLoad
-from model.study.verification import AnswerCheck, Plates, draw_plates, felt_on, verify_table
+from model.study.verification import Plates, draw_plates, felt_on, verify_table
 from model.table.table_file import build_table, load_table, save_table
 from model.vibration import base_amplitudes, tone_fields
 
@@ -121,43 +121,6 @@ def test_verify_fails_changed_content(table, coarse_rig, tmp_path, name, factor)
     if name == "omega":
         assert not all(check.is_passed for check in found.answer_checks)
         assert found.failed_count >= 3
-
-
-@pytest.mark.parametrize(
-    ("changed", "is_passed"),
-    [
-        ({}, True),
-        ({"direct_level_db_sl": 20.2}, False),
-        ({"direct_level_db_sl": 19.8}, False),
-        ({"direct_contrast_db": 18.5}, False),
-        ({"direct_contrast_db": 17.5}, False),
-        ({"contrast_in_time_db": 16.5}, False),
-        ({"contrast_in_time_db": 18.9}, True),
-        ({"contrast_in_time_db": math.nan}, False),
-        ({"direct_level_db_sl": math.nan}, False),
-        ({"predicted_contrast_db": 40.0, "direct_contrast_db": 40.0}, False),
-        (
-            {"predicted_contrast_db": 40.0, "direct_contrast_db": 40.0, "contrast_in_time_db": 29},
-            True,
-        ),
-    ],
-)
-def test_answer_check_passes_within_its_tolerances(verified, changed, is_passed):
-    """0.1 dB of level and contrast, 1 dB more in time, where contrast beyond 25 dB counts as 25."""
-    check = AnswerCheck(
-        **{
-            "placed": verified.answer_checks[0].placed,
-            "predicted_level_db_sl": 20.0,
-            "predicted_contrast_db": 18.0,
-            "direct_level_db_sl": 20.0,
-            "direct_contrast_db": 18.05,
-            "contrast_in_time_db": 18.0,
-            "level_tolerance_db": 0.1,
-            "contrast_tolerance_db": 0.1,
-            **changed,
-        }
-    )
-    assert check.is_passed is is_passed
 
 
 TARGET, QUIET = (0.09, 0.07), ((0.25, 0.18), (0.03, 0.19))
@@ -276,33 +239,6 @@ def test_felt_on_agrees_with_the_direct_solve(targets, mode, loads):
     assert np.ptp(solved) > 0.15  # the plates do differ
     assert predicted.contrast_db == pytest.approx(solved[0], abs=0.15)
     assert not loads or np.abs(np.subtract(pressed_alike, solved)).max() > 0.2
-
-
-def test_discretisation_error_enters_the_contrast_of_plates():
-    """An error that drowns one finger's response trades places with it; twice the error is 6 dB.
-
-    Far above the response it is the whole amplitude D there: D over quiet and target over D make
-    target over quiet.
-    """
-    placed = Placement((TARGET,), QUIET[:1])
-    table = smooth_table()
-    excitation = only(table, placed, drive_mode="phased")[0].excitation
-    plates = replace(
-        draw_plates(
-            np.random.default_rng(0), Uncertainty.none(), of=table, count=3, contact_count=2
-        ),
-        deviation=1e6 * np.array([[0, 0], [1, 0], [0, 1j]]),
-    )
-
-    def contrasts(of):
-        _, contrast = felt_on(of, placed, excitation, plates)
-        return 20 * np.log10(contrast)
-
-    right, at_target, at_quiet = contrasts(table)
-    assert at_target + at_quiet == pytest.approx(right, abs=0.01)
-    worse = replace(table, discretisation_error=2 * table.discretisation_error)
-    found = contrasts(worse) - [right, at_target, at_quiet]
-    assert found == pytest.approx([0, 6.02, -6.02], abs=0.01)
 
 
 def test_an_object_that_may_lie_anywhere_is_an_error_of_fields():

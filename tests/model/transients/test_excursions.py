@@ -14,7 +14,7 @@ from scipy.signal import StateSpace, lsim
 
 from cases import shortly
 from kit.plates import exciter_rig, make_paper_rig
-from model.answer.stimulus import Course, swings_of_pulse
+from model.answer.stimulus import swings_of_pulse
 from model.reduction.free_plate import solve_free_plate
 from model.reduction.reduced_plate import (
     modal_matrices,
@@ -349,15 +349,3 @@ def test_pulses_over_and_over_add_up_where_they_come_at_the_worst_pace() -> None
     )
     assert found == pytest.approx([max(trains)] * 4, rel=0.05)
     assert found[0] > 1.1 * alone[0]
-
-
-def test_courses_swing_as_they_are_played_from_knot_to_knot() -> None:
-    """Of 95 swings a second knots every 10 ms leave 5, once and then over and over."""
-    times = np.arange(0.0, 0.6, 0.001)
-    shares = (1 + np.cos(2 * math.pi * 95 * times)) / 2
-    swing = Course(tuple(times.tolist()), tuple(shares.tolist())).swings[0]
-    expected = (1 + np.cos(2 * math.pi * 5 * swing.step * np.arange(1, 60))) / 2
-    assert swing.step == 0.01
-    assert swing.shares[1:60] == pytest.approx(expected, abs=1e-6)
-    assert not any(swing.shares[60:85])
-    assert max(swing.shares[85:]) > 0.99

@@ -1,6 +1,5 @@
 """Shaped onsets and endings, their knots and predictions, against ramps and a stepping solver."""
 
-import cmath
 import math
 from dataclasses import replace
 
@@ -19,14 +18,13 @@ from kit.plates import (
 )
 from model.arrays import lattice
 from model.errors import InputError
-from model.finger import Grid, fingertip_points, fingertip_weights
+from model.finger import fingertip_points, fingertip_weights
 from model.reduction.reduced_plate import ReducedPlate
 from model.structure.attachments import Era
 from model.structure.material import material
 from model.structure.plate import Plate
 from model.transients.base_motion import (
     BaseEnvelope,
-    BaseMotions,
     Envelopes,
     Motion,
     raised_cosine,
@@ -320,35 +318,6 @@ def test_acceleration_equals_time_stepping(few_modes):
     np.testing.assert_allclose(found, expected, atol=1e-5 * np.abs(expected).max())
 
 
-def test_contrast_db_is_that_of_the_weakest_target(setup):
-    """Contrast of an onset is that of the target which has less."""
-    rig, *_, transients = setup
-    onset = ramped_onset({"SW": Tone(180.0, 1e-4)}, rig.eras, ramp=0.02)
-    *alone, both = (
-        transients.contrast_db(onset, targets=targets, quiet=[(0.25, 0.2)])
-        for targets in ([(0.02, 0.02)], [(0.15, 0.11)], [(0.02, 0.02), (0.15, 0.11)])
-    )
-    assert abs(alone[0] - alone[1]) > 0.3
-    assert both == pytest.approx(min(alone), abs=1e-9)
-
-
-def test_residual_db_equals_sampled_plate(setup):
-    """Root mean square over plate, 100 ms and four phases agrees with the closed form."""
-    rig, *_, transients = setup
-    points = Grid(32, 24).centres(rig.plate)
-    left = steady = 0.0
-    for phase in (0.0, math.pi / 2):  # the two make up the mean over all phases
-        excitation = {"SE": Tone(110.0, 1e-4, phase)}
-        ending = ramped_ending(excitation, rig.eras, ramp=0.015)
-        felt = transients.acceleration(ending, points, duration=0.115, after=excitation)
-        left += (felt[round(0.015 * SAMPLE_RATE) :] ** 2).mean()
-        lasting = ramped_onset(excitation, rig.eras, ramp=0.0)
-        on = transients.acceleration(lasting, points, duration=0.1, after=excitation)
-        steady += (on**2).mean()
-    found = transients.residual_db(excitation, ending)
-    assert found == pytest.approx(10 * math.log10(left / steady), abs=0.1)
-
-
 def test_ramped_onset_and_ending_are_raised_cosines():
     """Half way through a ramp, up or down, the amplitude is half, and none or all at its ends."""
     rig = make_paper_rig(2, 2)
@@ -391,50 +360,9 @@ def test_bounded_minimum_equals_a_general_optimiser(seed):
     assert value(A, b, found) <= 0.99 * general.fun
 
 
-OMEGA = 2 * math.pi * 110.0
-
-
-FADES = [
-    (1.0, 0.02, OMEGA, 0j, 1e-4 * cmath.exp(0.7j)),
-    (1.005, 0.01, 2 * OMEGA, 1.6e-4j, 6e-5 - 2e-5j),
-    (1.01, 0.03, OMEGA, 5e-5 + 0j, 0j),
-    (1.015, 0.0, OMEGA / 2, 0j, 6e-5 + 0j),
-]
-"""From one complex amplitude [m] to another: start, ramp [s], frequency [rad/s], first and last."""
-
-
-def faded(
-    time: float, start: float, ramp: float, omega: float, first: complex, last: complex
-) -> float:
-    """Displacement [m] along a raised cosine."""
-    tau = time - start
-    if tau < 0:
-        return 0.0
-    share = 1.0 if tau >= ramp else (1 - math.cos(math.pi * tau / ramp)) / 2
-    return ((first + (last - first) * share) * cmath.exp(1j * omega * tau)).imag
-
-
 def terms(*fades: tuple[float, float, float, complex, complex]) -> Motion:
     """The motion of a base by some fades."""
     return [term for fade in fades for term in raised_cosine(*fade)]
-
-
-@pytest.mark.parametrize("time", [0.99, 1.0, 1.0031, 1.0142, 1.015, 1.0199, 1.03, 1.2])
-def test_terms_of_fades_add_up_to_raised_cosines(time: float) -> None:
-    """Of two sets of motions each base has its own, at every moment of a fade and after it."""
-    motions = BaseMotions([terms(FADES[0]), terms(*FADES[1:3])], [(), terms(FADES[3])])
-    tau = time - motions.start
-    value = motions.c0 + (0j if motions.c1 is None else motions.c1) * tau
-    y = (value * np.exp(1j * motions.omega * tau)).imag  # by the definition of a term
-    for number, era, fades in (
-        (0, 0, FADES[:1]),
-        (0, 1, FADES[1:3]),
-        (1, 0, []),
-        (1, 1, FADES[3:]),
-    ):
-        (of_set,) = motions.active([number], [time])
-        moved = y[of_set & (motions.era == era)].sum()
-        assert moved == pytest.approx(sum(faded(time, *fade) for fade in fades), abs=1e-17)
 
 
 ERA = Era("", 0, 0, stiffness=100.0**2, damping=2 * 100.0, bolt_mass=0.0, stroke=1e-4)

@@ -69,17 +69,6 @@ def test_crystal_and_rate_multiply() -> None:
     assert clock.reading(111.0) == round((11.0 + 40e-6 - 16e-9) * PER_SECOND) % (1 << 32)
 
 
-def test_warm_up_settles() -> None:
-    """A warm-up of 1 ppm/s makes a crystal 10 (1 - 1/e) ppm fast after 10 s, 10 ppm in the end."""
-    crystal = Crystal(warm_up=1e-6)
-    clock = AmplifierClock(crystal)
-    assert clock.straight(0.0).pace == 1.0
-    assert clock.straight(10.0).pace - 1 == pytest.approx(10e-6 * (1 - math.exp(-1)), rel=1e-9)
-    assert clock.straight(1000.0).pace - 1 == pytest.approx(10e-6, rel=1e-9)
-    # The integral of 10 (1 - exp(-t / 10)) ppm over 10 s is 100 / e us.
-    assert clock.seconds(10.0) - 10 == pytest.approx(100e-6 / math.e, abs=1e-11)
-
-
 def test_shift_moves_the_high_word_on() -> None:
     """A shift of 3 moves the clock on by 3 steps of its high word, over its end too."""
     clock = AmplifierClock()

@@ -46,7 +46,6 @@ from sim.plant.imperfections import (
     Imperfections,
     PlateErrors,
     draw_imperfections,
-    draw_of_ensemble,
     motion_of,
 )
 
@@ -195,17 +194,6 @@ def test_draw_imperfections_is_within_the_rigs_uncertainty(coarse_rig: Rig) -> N
     assert np.abs(alike).max() < 0.2
 
 
-def test_plates_as_promises_are_checked_on_have_other_feet(coarse_rig: Rig) -> None:
-    """Over five hundred plates their logarithms spread by 0.3, and weights stay as they are."""
-    weight = PointLoad(0.2, 0.1, mass=0.01)
-    foot = PointLoad(0.1, 0.08, stiffness=2e3, damping=1.0, is_foot=True)
-    rig = replace(coarse_rig, masses=(weight, foot), uncertainty=Uncertainty(supports=0.3))
-    found = [draw_of_ensemble(rig, seed=n).plate.realised(rig).masses for n in range(500)]
-    logs = np.log([other.stiffness / 2e3 for _, other in found])
-    assert (logs.mean(), logs.std()) == pytest.approx((0, 0.3), abs=0.03)
-    assert all(each == (weight, replace(foot, stiffness=each[1].stiffness)) for each in found)
-
-
 def test_draw_imperfections_of_a_known_rig_has_none(coarse_rig: Rig) -> None:
     """Only its mesh differs: one as fine as any that a rig gets."""
     known = replace(coarse_rig, uncertainty=Uncertainty.none())
@@ -335,39 +323,6 @@ def test_feel_separates_driven_frequencies() -> None:
         [110.0, 170.0],
     )
     np.testing.assert_allclose(clean.amplitude, [first, second], atol=1e-7)
-
-
-def test_fingers_felt_uses_the_last_position(coarse_rig: Rig) -> None:
-    """Samples from before a move do not count, nor those outside the window.
-
-    One finger goes while another stays: both have their samples, each from its own time. Ten
-    seconds are kept, also of fingers that were lifted since.
-    """
-    fingers = PlateFingers(flat_plate(coarse_rig))
-    fingers.place({"a": (0.1, 0.1), "b": (0.0, 0.0)})
-    assert len(fingers.layout.points) == 2 * 21
-    fingers.record(np.array([1.0, 2.0]), np.ones((2, 42)))
-    fingers.place({"a": (0.2, 0.1), "b": (0.0, 0.0)})
-    fingers.record(np.array([3.0, 4.0]), np.full((2, 42), 5.0))
-    felt = fingers.felt(1.5, 3.5)
-    assert {name: each.times.tolist() for name, each in felt.items()} == {
-        "a": [3.0],
-        "b": [2.0, 3.0],
-    }
-    assert felt["b"].accelerations[:, 0].tolist() == [1.0, 5.0]
-    np.testing.assert_array_equal(felt["a"].points, fingertip_points(0.2, 0.1, coarse_rig.plate))
-    assert fingers.felt(4.5, 5.0) == {}
-    fingers.place({"b": (0.0, 0.0)})
-    fingers.record(np.array([6.0]), np.ones((1, 21)))
-    felt = fingers.felt(0.0, 7.0)
-    assert {name: each.times.tolist() for name, each in felt.items()} == {
-        "a": [3.0, 4.0],
-        "b": [1.0, 2.0, 3.0, 4.0, 6.0],
-    }
-    fingers.place({})
-    fingers.record(np.array([14.5]), np.ones((1, 0)))
-    felt = fingers.felt(-1.0, 20.0)
-    assert {name: each.times.tolist() for name, each in felt.items()} == {"b": [6.0]}
 
 
 def test_fingers_off_the_plate_change_nothing(coarse_rig: Rig) -> None:

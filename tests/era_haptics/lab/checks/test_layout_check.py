@@ -8,7 +8,6 @@ import asyncio
 import json
 import math
 import re
-import wave
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache
@@ -31,7 +30,6 @@ from controller.effects.kinds import (
     Dial,
     File,
     Ramp,
-    Texture,
 )
 from controller.effects.layout import SurfaceLayout
 from controller.effects.player import EffectPlayer
@@ -39,24 +37,21 @@ from controller.play.selection import Chooser, Selector
 from controller.sources.touch import Contact, ContactKey
 from era_haptics.command import run_era
 from era_haptics.lab.checks import layout_check, layout_picture
-from era_haptics.lab.checks.content_check import check_content, content_figure, kept_shares
+from era_haptics.lab.checks.content_check import check_content, content_figure
 from era_haptics.lab.checks.layout_check import (
     CheckedEffect,
     check_layout,
     loaded_plate,
-    strongest_target,
 )
 from era_haptics.lab.checks.layout_picture import JointTouch, check_together, close_pairs
 from era_haptics.lab.cli import app
 from kit.fingers import WIRES, Pressed, playable
 from kit.fingers import table as paper_table
 from kit.plates import smooth_rig
-from kit.set_table import phased, wants
 from model.config.fields import Circle, Rectangle
 from model.errors import InputError
 from model.finger import (
     decibels,
-    detection_threshold,
     fingertip_points,
     fingertip_weights,
     over_threshold,
@@ -170,31 +165,6 @@ def test_check_names_a_frequency_that_the_table_does_not_have() -> None:
 STEADY = File.of(
     Pattern(0.5, ((0.0, 1.0), (0.5, 1.0)), ((0.0, 0.5),)), name="steady", level_db_sl=20.0
 )
-
-STRONGEST: list[tuple[Effect, float, float | None]] = [
-    (Click(), 20.0, 0.040),
-    (Buzz(), 20.0, None),
-    (Ramp(start_level=6.0), 20.0, 1.0),
-    (Texture(fast=0.5), 20.0, None),
-    (Detents(spacing=0.05), 20.0, 0.030),
-    (Dial(), 20.0, 0.030),
-    (STEADY, 20.0, 0.5),
-]
-"""An effect of each kind, its level and the duration of its pulses."""
-
-
-@pytest.mark.usefixtures("plain_pictures")
-@pytest.mark.parametrize(("effect", "level", "duration"), STRONGEST)
-def test_strongest_target_of_every_kind(
-    effect: Effect, level: float, duration: float | None
-) -> None:
-    """What its level is reached with, at rest or along some way."""
-    region = Region("knob", Circle(0.15, 0.1, 0.05))
-    layout = SurfaceLayout((region,), {"it": effect})
-    felt = strongest_target(layout, "it", region, at=(0.15, 0.1))
-    assert felt.level_db_sl == level
-    assert (felt.pulse and felt.pulse.duration) == duration
-
 
 LAYOUT = """\
 effects: {notches: {kind: detents}}
@@ -358,22 +328,6 @@ def layout(*regions: Region) -> SurfaceLayout:
     return SurfaceLayout(regions, effects, elsewhere=None)
 
 
-def test_places_are_the_worst_of_their_regions() -> None:
-    """Within both, and promised less than the centres, if anything; nearer regions less."""
-    west, near, east = region("west", WEST), region("near", NEXT), region("east", EAST)
-    found = check_together(layout(west, near, east), paper_table())
-    by_name = {each.regions: each for each in found}
-    for pair, each in by_name.items():
-        shapes = [one.shape for one in (west, near, east) if one.name in pair]
-        assert all(shape.contains(*at) for shape, at in zip(shapes, each.at, strict=True))
-        if len(pair) == 2:
-            fingers = [wants(shape.centre, level_db_sl=14.0) for shape in shapes]
-            centred = phased(paper_table(), fingers, min_contrast_db=-math.inf)
-            assert each.worst_db <= centred.promised_worst_db
-            assert each.worst_db <= min(each.contrasts)
-    assert by_name["west", "near"].worst_db < by_name["west", "east"].worst_db
-
-
 def test_pairs_that_are_felt_as_one_are_named() -> None:
     """Those below 6 dB, the rule's bound of what is mixed, the worst first; none of three."""
     at, worst = (0.0, 0.0), {"ab": 3.2, "ac": 6.0, "bc": -1.0, "abc": -5.0}
@@ -488,25 +442,6 @@ def test_what_lasts_has_its_level_and_taps_theirs() -> None:
 
 
 @pytest.mark.usefixtures("plain_pictures")
-def test_kept_share_counts_levels_within_3_db_where_20_below_the_highest_are_asked() -> None:
-    """Of 100 steps 40 count; 10 of these are 4 dB off; given 3 steps late."""
-    expected = np.concatenate([np.full(30, 20.0), np.full(10, 5.0), np.full(60, -1.0)])
-    given = np.roll(expected + np.where(np.arange(100) < 10, 4.0, 2.0), 3)
-    assert kept_shares(expected, given, 5)[3] == pytest.approx(0.75)
-    assert kept_shares(expected, given, 5).argmax() == 3
-
-
-@pytest.mark.usefixtures("plain_pictures")
-def test_taps_too_close_to_be_clicks_are_felt_in_what_lasts() -> None:
-    """Of two equal taps 50 ms apart the second is in what lasts, from 30 ms after the first on."""
-    taps = Transient(0.1, 1.0, 0.5), Transient(0.15, 1.0, 0.5)
-    found = check_content(Pattern(0.3, transients=taps), content_check_table(), 20.0, at=AT)
-    assert [each.stimulus.course is None for each in found.parts] == [False, True]
-    assert found.kept_share > 0.9
-    assert "1 of 2 taps" in found.lost[0]
-
-
-@pytest.mark.usefixtures("plain_pictures")
 def test_beside_a_quiet_finger_content_is_smoothed_and_promised() -> None:
     """The course starts and ends at rest; each part has a promise, the least counts."""
     found = check_content(SWELL, content_check_table(), 20.0, at=AT, quiet=[QUIET])
@@ -574,37 +509,6 @@ def test_level_beyond_all_is_refused_as_it_was_given() -> None:
     """Not as what becomes of it in the file."""
     with pytest.raises(InputError, match="level must be between -100 and 60 dB SL, got 70;"):
         check_content(Pattern(0.3, ((0.0, 0.5), (0.3, 0.5))), content_check_table(), 70.0, at=AT)
-
-
-@pytest.mark.usefixtures("plain_pictures")
-def test_sound_has_the_felt_level_at_one_scale(tmp_path: Path) -> None:
-    """Intensity 1 for a second at 20 and 14 dB SL: so many decibels above the threshold, sampled.
-
-    Both with the same full scale, 20 m/s², in 16 bits at 48 kHz, which Python's own module reads.
-    Content at 50 dB SL exceeds that scale and is rejected.
-    """
-    save_table(content_check_table(), tmp_path / "table.npz")
-    even = [{"time": 0, "amplitude": 1}, {"time": 1, "amplitude": 1}]
-    write_haptic(tmp_path / "even.haptic", amplitude=even)
-    arguments = ["play", str(tmp_path / "even.haptic"), "--at", "0.11,0.13", "--json", "--simulate"]
-    sound = tmp_path / "felt.wav"
-    arguments += [str(tmp_path / "table.npz"), "-o", str(sound), "--level"]
-    for level in (20.0, 14.0):
-        result = CliRunner().invoke(app, [*arguments, str(level)])
-        assert result.exit_code == 0
-        with wave.open(str(sound)) as file:
-            assert (file.getsampwidth(), file.getnchannels(), file.getframerate()) == (2, 1, 48000)
-            rate, samples = 48000, np.frombuffer(file.readframes(file.getnframes()), "<i2")
-        acceleration = 20.0 * samples / 32768
-        assert json.loads(result.stdout)["peak_m_s2"] == pytest.approx(acceleration.max(), rel=0.01)
-        middle = acceleration[int(0.3 * rate) : int(0.7 * rate)]
-        frequency = np.fft.rfftfreq(len(middle), 1 / rate)[np.abs(np.fft.rfft(middle)).argmax()]
-        threshold = float(detection_threshold(np.array(frequency), content_check_table().threshold))
-        felt = decibels(math.sqrt(2) * middle.std() / threshold)
-        assert felt == pytest.approx(level, abs=1.0)
-    result = CliRunner().invoke(app, [*arguments, "50"])
-    assert isinstance(result.exception, InputError)
-    assert str(result.exception).startswith("--full-scale must be at least the highest")
 
 
 def write_haptic(path: Path, **envelopes: list[dict[str, float]]) -> None:

@@ -4,7 +4,6 @@ import asyncio
 import math
 import os
 import pty
-import random
 import re
 from collections.abc import Callable, Sequence
 from contextlib import closing, nullcontext
@@ -23,9 +22,8 @@ from drivers.protocol.definition import REQUEST_NAMES
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Command, LayerSet, pack_layers
 from drivers.trace import tracing
-from drivers.wires.can_frames import pack_frames, unpack_frames
-from drivers.wires.modbus_frames import framed
-from drivers.wires.serial_frames import FrameReader, encode_frame
+from drivers.wires.can_frames import unpack_frames
+from drivers.wires.serial_frames import FrameReader
 from era_haptics.lab.conformance.check import (
     CheckResult,
     ConformanceCheck,
@@ -685,43 +683,3 @@ def test_clock_that_does_not_go_on_is_one_failure(
     driven = [each for each in results if each.check.drives]
     assert {each.result for each in driven} == {Result.NOT_RUN}
     assert all("clock" in each.reason for each in driven)
-
-
-def garbled(kind: str, rng: random.Random, data: bytes) -> bytes:
-    """Return other bytes, on CAN frames with other data, or frames that are sound but nonsense."""
-    match kind, rng.random() < 0.5:
-        case "can", is_sound:
-            kept = 4 if is_sound else 0
-            frames = [
-                frame._replace(
-                    data=frame.data[:kept] + rng.randbytes(max(len(frame.data) - kept, 0))
-                )
-                for frame in unpack_frames(data)
-            ]
-            return pack_frames(frames)
-        case "serial", True:
-            (frame,) = FrameReader().feed(data)
-            return encode_frame(frame._replace(payload=rng.randbytes(rng.randrange(100))))
-        case (("rtu" | "tcp"), True):
-            head = data[:2] if kind == "rtu" else data[:8]
-            pdu = head[-1:] + rng.randbytes(rng.randrange(60))
-            return framed(head[-2], pdu, int.from_bytes(data[:2]), is_rtu=kind == "rtu")
-    return rng.randbytes(rng.randrange(300))
-
-
-@pytest.mark.parametrize("kind", shortly(JUDGED_LINE_KINDS, ["serial", "can"]))
-@pytest.mark.parametrize("share", shortly([0.003, 0.03, 0.3, 1.0], [0.3]))
-def test_garbage_has_a_verdict(kind: str, share: float, monkeypatch: pytest.MonkeyPatch) -> None:
-    """In place of a share of all replies: every check has a result, and the whole has failed."""
-    rng = random.Random(5)
-    changed(
-        monkeypatch,
-        "send",
-        lambda data: (0.0, garbled(kind, rng, data) if rng.random() < share else data),
-    )
-    results = judged(kind)
-    assert [each.number for each in results] == [number for number, _ in of_kind(kind)]
-    assert ConformanceReport("x", 0.2, tuple(results), 0).overall == "failed"
-    assert sum(each.seconds for each in results) < 2 * MINUTE
-    if share < 0.1:
-        assert [each.result for each in results].count(Result.PASSED) > 10

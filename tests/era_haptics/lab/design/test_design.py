@@ -27,7 +27,7 @@ from era_haptics.lab.design.problem import (
     layouts_of,
     shortfall,
 )
-from era_haptics.lab.design.score import LayoutSearch, Scorer
+from era_haptics.lab.design.score import LayoutSearch
 from kit.plates import exciter_rig_text, make_paper_rig
 from model.arrays import ComplexArray, FloatArray
 from model.config.document import parse_document
@@ -305,23 +305,6 @@ def test_scores_count_plates_of_other_thickness_exactly(monkeypatch) -> None:
     assert dense < certain - 1
 
 
-def test_scores_fall_with_the_error_of_fields_as_answers_do() -> None:
-    """From 2 % on an uneven plate to 5 %, where little else is wrong: by what answers lose."""
-    pairs = [np.array([[0.06, 0.05], [0.2, 0.15]]), np.array([[0.1, 0.15], [0.25, 0.05]])]
-    scores, answers = [], []
-    for field in (0.02, 0.05):
-        known = Uncertainty(
-            *(0.005, 0.5, 0.002, 0.01, 1.1, 0.5), field=field, modulus=0.0, place=0.0, harmonic=0.0
-        )
-        some = replace(RIG, uncertainty=known)
-        scorer = Scorer(some, np.arange(60.0, 320.0, 10.0), pairs, eras=some.eras)
-        places = scorer.places(np.array([[era.x, era.y] for era in some.eras]))
-        scores.append(scorer.mean(places, np.arange(4)))
-        answers.append(assess(some, pairs).mean_db)
-    assert answers[0] - answers[1] > 4
-    assert scores[0] - scores[1] == pytest.approx(answers[0] - answers[1], abs=2)
-
-
 def test_the_score_of_two_contents_is_that_of_the_worse(monkeypatch) -> None:
     """Each with the other finger quiet, by a dense solve of either."""
     monkeypatch.setattr(problem_module, "SEARCH_FREQUENCIES", 2)
@@ -335,21 +318,6 @@ def test_the_score_of_two_contents_is_that_of_the_worse(monkeypatch) -> None:
         ]
         assert abs(each[0] - each[1]) > 0.5
         assert found.score_db == pytest.approx(min(each), abs=0.05)
-
-
-def test_given_layouts_are_the_rigs_own_named_and_random_ones(tmp_path) -> None:
-    """Each once, in the area and apart; a longer list begins with a shorter one."""
-    some = problem()
-    few, many = layouts_of("random:12", some), layouts_of("random:40", some)
-    assert list(many)[:12] == list(few)
-    assert list(few)[:4] == ["own", "mid-edges", "long edges", "short edges"]
-    assert len(many) == 40
-    assert len({each.round(6).tobytes() for each in many.values()}) == 40
-    assert all(some.are_apart(each) and some.area.contains(each).all() for each in many.values())
-    path = tmp_path / "layouts.yaml"
-    path.write_text("layouts:\n  three: [[0, 0], [30 cm, 0], [15 cm, 22 cm]]\n")
-    given = layouts_of(str(path), replace(some, kept=("NE",)))
-    assert given["three"].tolist() == [[0.3048, 0.2286], [0, 0], [0.3, 0], [0.15, 0.22]]
 
 
 def test_layouts_on_a_small_raster_are_all_there_are(monkeypatch) -> None:

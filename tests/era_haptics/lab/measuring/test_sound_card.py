@@ -38,7 +38,7 @@ from kit.desk_plate import (
 from model.arrays import Float32Array, FloatArray
 from model.errors import InputError
 from model.estimate.identify import identify
-from model.estimate.measurement import MeasuredPlate, measurement_of, read_measured, sensors_at
+from model.estimate.measurement import MeasuredPlate, measurement_of, read_measured
 from model.rig.rig import Rig
 from model.rig.rig_file import example_rig_path, parse_rig
 from model.structure.attachments import PointLoad
@@ -460,32 +460,6 @@ def test_place_that_fails_a_check_is_told_and_asked_for_again(
     assert bench.said.count("Put the sensor at P1") == 2
     assert re.search(cause, bench.said)
     assert not Path(bench.output).exists()
-
-
-@pytest.mark.long
-def test_plate_is_identified_better_with_the_mass_of_the_sensor(
-    rig: Rig, truth: Truth, make: Make
-) -> None:
-    """2 g at 12 places of a plate that deviates: the model explains them with the mass alone.
-
-    Springs, per mass of the plate, are then within four of the standard deviations written.
-    """
-    grid = [(x, y) for y in (0.035, 0.114, 0.194) for x in (0.035, 0.114, 0.194, 0.264)]
-    places = {f"P{n}": place for n, place in enumerate(grid, start=1)}
-    bench = make(output="measured.csv", places=places, grams=2.0)
-    assert bench.measure("--frequencies", "51:471:60", keys=[""] * len(places)) == 0
-    found = measurement_of(read_measured(Path(bench.output)), rig)
-    assert all(each.mass for each in found.sensors)
-    known, ignored = (
-        identify(rig, replace(found, sensors=places))
-        for places in (found.sensors, sensors_at(found.points, found.names))
-    )
-    assert (known.is_explained, ignored.is_explained) == (True, False)
-    mass = truth.rig.plate.thickness / known.rig.plate.thickness
-    for era, real in zip(known.rig.eras, truth.rig.eras, strict=True):
-        std = known.rig.uncertainty.stiffness
-        assert std < 0.01
-        assert mass * era.stiffness == pytest.approx(real.stiffness, rel=4 * std)
 
 
 def test_sensors_are_read_with_their_units(rig: Rig, tmp_path: Path) -> None:

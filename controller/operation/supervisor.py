@@ -177,7 +177,7 @@ class Supervisor:
         The requests to the amplifiers are queued when this returns.
         """
         stopping = self._spawn(self._stopped(self.controller.stop_all()))
-        self._step(DaemonEvent(Trigger.STOP, cause, remedy))
+        self.step(DaemonEvent(Trigger.STOP, cause, remedy))
         return asyncio.shield(stopping)
 
     def stop_anyhow(self) -> Awaitable[object]:
@@ -186,7 +186,7 @@ class Supervisor:
         try:
             return asyncio.ensure_future(self.controller.group.stop())
         finally:
-            call_guarded(partial(self._step, DaemonEvent(Trigger.STOP, cause, fault_remedy(cause))))
+            call_guarded(partial(self.step, DaemonEvent(Trigger.STOP, cause, fault_remedy(cause))))
 
     def renew(self, lease: Lease) -> Lease:
         """Return the lease of the client that armed, renewed; it must not have ended."""
@@ -214,10 +214,10 @@ class Supervisor:
 
     def _applied(self, event: DaemonEvent) -> Coroutine[Any, Any, None]:
         """Apply an event; await its actions."""
-        actions = self._step(event)
+        actions = self.step(event)
         return self._carry_out(actions, self.operation.epoch)
 
-    def _step(self, event: DaemonEvent) -> tuple[Action, ...]:
+    def step(self, event: DaemonEvent) -> tuple[Action, ...]:
         """Apply one transition; return its actions."""
         before, now = self.operation, threads.now()
         try:

@@ -168,7 +168,7 @@ class Slots:
         self.timing = timing
         self.check = check
         self._rig = rig
-        self._layer_count = capabilities.layers
+        self.layer_count = capabilities.layers
         self._ramp_max = capabilities.ramp_max
         self._support = capabilities.envelope_support
         self._expiry_of = expiry_of
@@ -270,7 +270,7 @@ class Slots:
             slot = self._led_from(content)
             if slot is not None and slot.content.frequency != content.frequency:
                 tuned_count += 1
-        if len(self.may_play) + tuned_count > self._layer_count:
+        if len(self.may_play) + tuned_count > self.layer_count:
             return False
         sets, _ = self._sets(contents, now, is_shaped=True)
         return self.check(sets.by_amplifier) is None
@@ -493,7 +493,7 @@ class Slots:
 
     def _layers_not_in(self, numbers: Set[int]) -> list[int]:
         """Return all layers except these."""
-        return [number for number in range(self._layer_count) if number not in numbers]
+        return [number for number in range(self.layer_count) if number not in numbers]
 
     def _sets(
         self, contents: Sequence[Content], now: float, *, is_shaped: bool

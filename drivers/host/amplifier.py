@@ -199,7 +199,7 @@ class Amplifier:
         self._are_several = False  # whether two amplifiers have replied since this was reset
         line.members[address] = self
         self.limits, self._serial_number = limits, serial_number
-        self._is_output = is_output
+        self.is_output = is_output
         self.identity: Values = {}
         self._stop: PendingStop | None = None
 
@@ -567,7 +567,7 @@ class Amplifier:
         check_identity(identity, self.name, self._serial_number)
         self.capabilities = shown
         can = await self.request("GetCaps", {}, Priority.OTHER, timeout=timeout)
-        check_capabilities(can, self.name, is_output=self._is_output)
+        check_capabilities(can, self.name, is_output=self.is_output)
         if self._ledger is None:
             self._ledger = Ledger(self.limits, can)
         elif can != self.capabilities:

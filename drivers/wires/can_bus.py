@@ -328,7 +328,7 @@ class BusPort(DevicePort):
         sends_at_once: bool,
     ) -> None:
         self._bus = bus
-        self._outbox = Outbox()
+        self.outbox = Outbox()
         self._outbox_changed = threading.Condition()  # its lock guards the outbox
         self._sends_at_once = sends_at_once
         self._is_blocked = False
@@ -347,7 +347,7 @@ class BusPort(DevicePort):
         if self.closing.is_set():
             raise self.lose(OSError("it is closed"))
         with self._outbox_changed:
-            self._outbox.put(unpack_frames(data), self.loop.time())
+            self.outbox.put(unpack_frames(data), self.loop.time())
             self._outbox_changed.notify()
         if self._sends_at_once:
             self._send()
@@ -374,18 +374,18 @@ class BusPort(DevicePort):
     def close(self) -> None:
         """Stop reading and writing; `wait_closed` closes the bus."""
         with self._outbox_changed:
-            self._outbox.clear()
+            self.outbox.clear()
             super().close()
             self._outbox_changed.notify()
 
     def _send(self) -> None:
         """Send frames until the adapter takes no more, then again after a pause."""
         try:
-            while (frame := self._outbox.first(self.loop.time())) and self._take(frame):
-                self._outbox.taken(frame, self.loop.time())
+            while (frame := self.outbox.first(self.loop.time())) and self._take(frame):
+                self.outbox.taken(frame, self.loop.time())
         except self.failures as error:
             raise self.lose(error) from error
-        if self._outbox and self._timer is None:
+        if self.outbox and self._timer is None:
             self._timer = self.loop.call_later(_FULL_PAUSE, self._send_again)
 
     def _send_again(self) -> None:
@@ -398,16 +398,16 @@ class BusPort(DevicePort):
         """Send frames as they come, each as soon as the adapter has taken the last one."""
         while True:
             with self._outbox_changed:
-                frame = self._outbox.first(self.loop.time())
+                frame = self.outbox.first(self.loop.time())
                 while frame is None and not self.closing.is_set():
                     self._outbox_changed.wait()
-                    frame = self._outbox.first(self.loop.time())
+                    frame = self.outbox.first(self.loop.time())
                 if frame is None or self.closing.is_set():
                     return
             is_taken = self._take(frame)  # without the lock: it may block
             with self._outbox_changed:
                 if is_taken:
-                    self._outbox.taken(frame, self.loop.time())
+                    self.outbox.taken(frame, self.loop.time())
                 else:
                     self._outbox_changed.wait(_FULL_PAUSE)
 

@@ -466,8 +466,8 @@ def compared(match: Match) -> list[Hypothesis]:
     ]
     best = {key: (score, factor) for score, factor, key in ranked_by(scores, lambda each: each[0])}
     fits = []
-    hypotheses = ranked_by([*best.items()], lambda each: -each[1][0])
-    for key, (_, factor) in hypotheses[:FITTED_HYPOTHESES]:
+    best_first = ranked_by([*best.items()], lambda each: -each[1][0])
+    for key, (_, factor) in best_first[:FITTED_HYPOTHESES]:
         if found := _matched(match, key, factor):
             fits.append((key, factor, found))
     fits = ranked_by(fits, lambda each: -each[2].fit.cost)

@@ -29,7 +29,7 @@ def check(
         typer.Option("--output", "-o", metavar="PICTURE", help="Picture to write, e.g. P.png."),
     ] = None,
 ) -> None:
-    """Simulate every region of a layout and report which regions stay distinct.
+    """Simulate every region and report which regions stay distinct.
 
     Touches are simulated in the time domain over each region, alone and with a resting second
     finger. Pairs and triples of regions are then touched simultaneously, at the positions with the

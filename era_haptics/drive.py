@@ -178,7 +178,7 @@ Driven: TypeAlias = float | Drive | Tone
 """A frequency [Hz] at full level, a `Drive`, or a `Tone` [Hz; m, or V for an exciter; rad]."""
 
 Drives: TypeAlias = Mapping[str, Driven | Sequence[Driven]]
-"""What each ERA plays, by name: one drive, or several that play simultaneously."""
+"""Drives of each ERA, by name: one drive, or several that play simultaneously."""
 
 Played: TypeAlias = Answer | Layer | Drives
 """What all ERAs play: an answer with all its layers, one layer, or drives."""

@@ -187,7 +187,7 @@ class CheckResult:
     def advice(self) -> tuple[str, str]:
         """Page and heading of the violated rule, and the remedy.
 
-        Those of the check, unless it failed by a value that other checks have as their subject.
+        They belong to the check, unless a value failed that is the subject of other checks.
         """
         for value in SHARED_VALUES:
             anchor = self.check.place.partition("#")[2]

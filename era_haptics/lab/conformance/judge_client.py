@@ -8,7 +8,7 @@ contract, not applicable, or too late (this machine missed a deadline).
 that shows u seconds was taken between s and r, so the amplifier's clock is ahead of this machine's
 by u - r to u - s. The intersection of all these intervals is short.
 
-`Capabilities` are those that the amplifier states, `Row` is what a check sends, and `Judge` is the
+`Capabilities` are the amplifier's own statement, `Row` is a request of a check, and `Judge` is the
 expected state of the amplifier.
 """
 
@@ -291,7 +291,7 @@ class JudgeClient(ABC):
         return outcome
 
     def check_reply(self, heard: HeardMessage, number: int, code: str) -> None:
-        """Check the type of a reply, and what the wire adds to it; code: of a rejection."""
+        """Check the type of a reply, and the fields added by the wire; code: of a rejection."""
         expect_equal(heard.type, number, "type of a reply")
 
     async def part(self, number: int, words: Sequence[int]) -> None:

@@ -1,1 +1,1 @@
-"""Checks of conformance, by what they ask of an amplifier."""
+"""Conformance checks, grouped by subject."""

@@ -229,7 +229,7 @@ async def numbers(subject: Subject) -> None:
         expect_equal(len(heard), count, f"replies to {what}")
 
     async def follow(number: int, *others: tuple[int, int]) -> None:
-        """Require a reply to a number, then to those that follow it."""
+        """Require a reply to a number, then to the following numbers."""
         accepted = math.inf
         for each, count in ((number, 1), *others):
             sent = threads.now()
@@ -292,7 +292,7 @@ class ModbusClient(JudgeClient):
         self._reader = AduReader(is_rtu=is_rtu, of_requests=False)
 
     def hear(self, data: bytes) -> bytes:
-        """Take responses from bytes, also other bytes; those of a gateway are left out."""
+        """Extract responses and other bytes; skip the responses of a gateway."""
         for adu in self._reader.feed(data):
             is_own = adu.unit == self.address or not adu.pdu
             if not is_own and adu.pdu[0] & EXCEPTION and adu.pdu[1:] in _GATEWAY:
@@ -353,10 +353,10 @@ class ModbusClient(JudgeClient):
         return read_as("identity", unpack_identity, registers)
 
     async def exchange(self, number: int, words: Sequence[int], **more: Any) -> RequestOutcome:
-        """Write a message, then read its reply; one that shows the present is read alone."""
+        """Write a message, then read its reply; a request for present values is only read."""
         tag, when = None, None
         if number not in _PRESENT or words:
-            tag = self.number % 0xFFFF + 1  # that of the frame, see `write_of`
+            tag = self.number % 0xFFFF + 1  # the tag of the frame, see `write_of`
             response, when = await self.transact(self.write_of(number, words))
             if response[0] & EXCEPTION:
                 code = EXCEPTIONS.get(response[1], f"exception {response[1]}")
@@ -396,7 +396,7 @@ class ModbusClient(JudgeClient):
                 yield f"a wrong byte {at}", altered(frame, at)
 
     async def send(self, data: bytes, *before: bytes, count: int = 0) -> list[HeardMessage]:
-        """Send frames, data the last; return what is heard until a reply must have come."""
+        """Send frames, data last; return the frames received until a reply is due."""
         self._reader.end()
         heard = await super().send(data, *before, count=count)
         if self.is_rtu:
@@ -404,7 +404,7 @@ class ModbusClient(JudgeClient):
         return heard
 
 
-_GATEWAY = b"\x0a", b"\x0b"  # exceptions: no path to a unit, or no response of it
+_GATEWAY = b"\x0a", b"\x0b"  # exceptions: no path to a unit, or no response from it
 _TOO_LONG, _BEYOND = (REFUSALS[name] << 8 | NO_CHANNEL for name in ("BAD_LENGTH", "BAD_VALUE"))
 _NO_WORDS = (0,) * (AREA - HEAD)
 

@@ -1,8 +1,8 @@
-"""Checks of what plays: layers and their ends, transitions, kept phases, voices, interference.
+"""Checks of playback: layers and their ends, transitions, kept phases, voices, interference.
 
-Checks of its clock: as it is read, moved on by Arm, and steered by Ping.
+Checks of the clock: read, shifted by Arm, and steered by Ping.
 
-Checks of what is measured: voltages and currents of channels, and tones at sensors.
+Checks of measured values: voltages and currents of channels.
 """
 
 import asyncio
@@ -42,7 +42,7 @@ from registry import threads
 _SLOW = 400  # steps of frequency: 20 Hz, whose periods are long against an exchange
 _LONG = 1.0  # s; in which errors of a phase add up
 _MAX_VOICES = 24  # that are tried
-_MOMENTS, _OTHER_SETS = 6, 8  # of sets, amid which the first fade lasts; of those that come beside
+_MOMENTS, _OTHER_SETS = 6, 8  # numbers of sets: during the first fade, and added to it
 _SHARES = 0.41, 0.1, 0.06  # of the test level, of the voices that are cut
 _LEFT = 0.0035, 0.0008  # s; that a fade has left which counts, and one which does not
 _BIT_15 = 1 << 15  # ms
@@ -125,7 +125,7 @@ def after(subject: Subject) -> RequestRows:
     first = subject.one(subject.tone(onset=subject.long_onset))
     waiting = layer(0, subject.tone(0, 0.25, frequency=subject.other), after=True)
     newer, over = layer(0, subject.tone(0, 0.75), after=True), _passed(subject, 3)
-    both = waiting, layer(1, subject.beside(1, 0.25))  # of which one alone waits
+    both = waiting, layer(1, subject.beside(1, 0.25))  # only one of them waits
 
     async def achieved() -> None:
         answer = await subject.request("GetAchieved", layer=0)
@@ -172,7 +172,7 @@ def after_the_last_onset(subject: Subject) -> RequestRows:
         # A channel that is not named falls silent with what waited.
         (layer(0, *both[: last + 1]), waiting),
         (layer(0, *exchanged[1 - min(last, 1) :]), replace(waiting, commands=named)),
-        # One that is released is not waited for.
+        # Nothing waits for a released voice.
         (subject.one(subject.tone(0, 0.5, ending=long)), layer(0), waiting),
         (play_now(subject.one(level=0.5), shaped), waiting),
         (rising, waiting),
@@ -195,7 +195,7 @@ def what_waits_for_an_onset(subject: Subject) -> RequestRows:
     beside = layer(1, subject.beside(1, 0.25), after=True)
     ends = replace(half, valid_for=subject.lasting(60), ramp=20)
     renewed = layer(0, renew=True, valid_for=subject.lasting(1000))
-    # Its end comes with that of its onset, by whole samples and binary fractions.
+    # Layer and onset end together: whole samples, and times that are binary fractions.
     quarter = subject.envelope(0.0625, *[1.0] * 3)
     is_quarter = (quarter.step, len(quarter.knots)) == (625, 3) and subject.slowness == 1
     together = subject.one(subject.tone(0, 0.5, onset=quarter), valid_for=250)
@@ -468,7 +468,7 @@ def voices(subject: Subject) -> RequestRows:
     full = layer(1, *tones(count + 1), ramp=ramp), fade_all, play_now(subject.one()), silence
     counted = [(partial(count_until, left), look) for left in _LEFT]
     return [
-        # The oldest tone fades last: what is cut is the way to 0 that began first.
+        # The oldest tone fades last: the fade that began first is cut off.
         (lasting, partial(fade, fades - 1), layer(1, ramp=ramp), *cuts, *full),
         *((lasting, partial(fade, fades - 2), *each, silence) for each in counted),
     ]
@@ -493,7 +493,7 @@ async def limited(subject: Subject) -> None:
     await subject.run([subject.arm, subject.whole(), near, *shown, just, _AMID, *shown])
 
     async def unseen(name: str, **values: int) -> None:
-        """Play a tone beside a fade, of which no status tells before that of a request."""
+        """Play a tone during a fade that no earlier status shows."""
         beside = play_now(subject.whole(), layer(1, ramp=subject.ramp))
         await subject.send_all([play_now(layer(0), over), beside])
         await asyncio.sleep(_AMID)
@@ -512,7 +512,7 @@ async def limited(subject: Subject) -> None:
 
 
 _LOWEST, _HIGHEST = QUANTITIES["rate"].minimum, QUANTITIES["rate"].maximum
-_READINGS, _APART = 8, 0.03  # of one state; s between two at most
+_READINGS, _APART = 8, 0.03  # readings of one state; at most this many s between two
 _MAX_DURATION = 8.0  # s; in which a rate must show
 _LASTING, _QUICK = 1.5, 0.01  # s; of a layer, whose end shows a wrong rate; for an exchange
 _SHIFTS = 1, 0x4000, 0xC001

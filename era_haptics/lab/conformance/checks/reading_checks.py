@@ -1,4 +1,4 @@
-"""Checks of what it is, can and refuses, which only read; of events, broadcasts and addresses.
+"""Checks of identity, capabilities and rejections, which only read; events, broadcasts, addresses.
 
 Checks of a CAN node: network management, heartbeats, emergencies, and objects by SDO.
 """
@@ -58,7 +58,7 @@ from era_haptics.lab.conformance.subject import Subject
 from era_haptics.lab.expected_amplifier import FAULT, OFF, REACTING
 from registry import threads
 
-_UNKNOWN = (*RESERVED_MESSAGES, 20, 24, 29, 63)  # numbers of no message, below those of vendors
+_UNKNOWN = (*RESERVED_MESSAGES, 20, 24, 29, 63)  # unassigned numbers, below the vendors' range
 _TRIES, _AT_ONCE = 20, 4
 _FEATURE_OF = {
     "GetMeasured": "electrical",
@@ -350,7 +350,7 @@ async def broadcasts(subject: Subject) -> None:
     serial = str(subject.identity["serial_number"])
 
     async def ignore_all(**others: object) -> None:
-        """Send all that is for one alone, and what is flawed, to all: nothing comes of it."""
+        """Broadcast unicast messages and flawed messages: the amplifier must ignore them."""
         values = {
             "session": subject.session,
             "latch": subject.latch,
@@ -497,10 +497,10 @@ _HEARTBEAT, _DEFAULT, _OTHER = 0x1017, CANOPEN["heartbeat_ms"], 20  # ms
 _NO_OBJECT, _NO_SUBINDEX, _READ_ONLY = 0x0602_0000, 0x0609_0011, 0x0601_0002
 _WRONG_LENGTH = 0x0607_0010
 _STILL = "state", "fault", "latch", "token", "channels"
-"""Words of a status that stay while nothing is asked of it."""
+"""Words of a status that do not change without a request."""
 _ABORT, _WRITTEN = 0x80, 0x60
 _CAN_NODE_TRIES, _POLL = 500, 0.001  # s
-_QUICK, _BEYOND = 0.003, 0.05  # s; for an exchange amid a fade; behind what is awaited
+_QUICK, _BEYOND = 0.003, 0.05  # s; for an exchange during a fade; after an expected event
 
 
 async def _exchange(client: CanClient, data: bytes) -> bytes:

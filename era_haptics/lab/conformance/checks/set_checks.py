@@ -1,8 +1,8 @@
-"""Checks of what a set may hold, and that it is taken whole or not at all.
+"""Checks of the contents of a set, and that it is accepted completely or not at all.
 
-Checks of sets in parts: which are kept, what the last is told, and what a refused set drops.
+Checks of sets in parts: kept parts, the reply to the last part, and effects of a rejected set.
 
-Checks of sets by tokens: staged, committed once, in their order, for a second, at a moment.
+Checks of tokens: staging, one commit, their order, expiry after a second, start times.
 """
 
 import asyncio
@@ -147,7 +147,7 @@ async def steps_as_stated(subject: Subject) -> None:
 
 
 def _part(words: list[int], code: str = "BAD_VALUE", *channels: int | None, **values: int) -> Send:
-    """Send words as a set of one part, which must be refused; channels: one of which is named."""
+    """Send words as a set of one part that must be rejected, naming one of the channels."""
     part: Values = {"index": 0, "parts": 1, "stream": words, **values}
     return send("Set", code=code, channels=channels or (None,), **part)
 
@@ -488,7 +488,7 @@ def refused_parts(subject: Subject) -> RequestRows:
         stage(half, token=3),
         flawed_one(play_now(flawed, token=4)),
         flawed_one(stage(flawed, token=4)),
-        # A last part of a newer set that is not whole changes nothing; one that is kept does.
+        # The last part of an incomplete newer set changes nothing; a part that is kept does.
         good[-1],
         send("Commit", token=3),
         stage(quarter, token=4),
@@ -573,7 +573,7 @@ def sets_expire(subject: Subject) -> RequestRows:
         partial(start, first),
         part,
         *others,
-        # One that is confirmed once more lives no longer.
+        # Another confirmation does not extend the life of a set.
         last,
         part,
         last,
@@ -593,7 +593,7 @@ def sets_expire(subject: Subject) -> RequestRows:
 _AROUND, _NEAR = 0.015, 0.0003
 _RISE, _ROUGH, _SAMPLE = 5, 0.0015, 0.00007  # ms; of full level: rounding; s, at 16 kHz
 _SLOWEST, _FASTEST = QUANTITIES["rate"].minimum, QUANTITIES["rate"].maximum
-# s; in which a rate of the clock shows; what was dropped, that it is
+# s; until a clock rate becomes visible; until a dropped set becomes visible
 _STAGING_LONG, _BEHIND = 0.2, 0.02
 
 
@@ -768,7 +768,7 @@ def what_waits_for_its_moment(subject: Subject) -> RequestRows:
         [send("Disarm", ramp=0), subject.settle, subject.arm],
         [arm],
         *([play_now(one)] for one in (half, subject.one(level=0.5))),
-        # It starts before what comes for its own layer.
+        # It starts before the next set for its own layer.
         [stage(subject.one(level=0.5)), send("Commit", token=2)],
         [send("Set", **first)],
         [stage(half), partial(subject.commit_in, left / 2)],

@@ -38,9 +38,9 @@ def plays_nothing_disarmed(subject: Subject) -> RequestRows:
 
 
 def _unarmed(subject: Subject, ramp: int = 0) -> list[Row]:
-    """Make what is refused, or changes no state, unless it is armed; ramp: of a Disarm [ms]."""
+    """Return requests that an unarmed amplifier rejects or ignores; ramp of the Disarm [ms]."""
     one, beyond = subject.one(level=0.75), QUANTITIES["ramp"].maximum
-    # The state comes before what is beyond the capabilities, and a layer that comes twice.
+    # The state is checked before the capabilities and before repeated layers.
     others: list[Row] = [play_now(one, token=9, code=_WRONG), stage(one, one, token=9, code=_WRONG)]
     refused = send("Commit", token=1, code=_WRONG), send("Silence", ramp=beyond, code=_WRONG)
     return [*others, *refused, send("Ping", session=77), send("Disarm", ramp=ramp)]
@@ -123,7 +123,7 @@ def sessions(subject: Subject) -> RequestRows:
     rows = (
         play_now(quarter, token=3, code="WRONG_SESSION"),
         send("Commit", token=2, code="WRONG_SESSION"),
-        # The session comes before what is beyond the capabilities.
+        # The session is checked before the capabilities.
         send("Silence", ramp=QUANTITIES["ramp"].maximum, code="WRONG_SESSION"),
         send("Ping", code="WRONG_SESSION"),
         *(
@@ -229,7 +229,7 @@ def silence_never_later(subject: Subject) -> RequestRows:
         (subject.whole(), slow, quick),
         (subject.whole(), quick, slow),
         (subject.one(), fading, slow),
-        # It is what is left of a fade that counts, not how long it was.
+        # The remaining time of a fade counts, not its duration.
         (subject.whole(), send("Stop", ramp=300), 0.2, send("Stop", ramp=150)),
     ]
 

@@ -32,6 +32,7 @@ def as_markdown(notebook: Path, pictures: Path) -> str:
     A figure that ends a cell is kept as a file in `pictures`.
     """
     names: dict[str, Any] = {"__name__": "__main__", "__file__": str(notebook)}
+    sys.path.insert(0, str(notebook.parent))  # as for a program that Python runs
     shown: list[str] = []
     for number, (is_text, source) in enumerate(cells(notebook.read_text("utf-8"))):
         if is_text:

@@ -46,14 +46,14 @@ PAGE = (ROOT / "docs" / "reference" / "python-api.md").read_text("utf-8")
 @pytest.mark.parametrize(
     "fact",
     [
-        "Raises InputError for a missing, damaged or foreign file, with",  # errors of a function
+        "Raises ConfigError with all problems of the file; InputError for",  # errors of a function
         "slew [1/s]: highest rise of a level;",  # units of a class's fields
         "Frequencies (f,) [Hz] and peak acceleration at points (p, 2) [m]",  # shapes
         "- `disarm() -> None`: Fall silent, then switch the high voltage off.",  # a method
         "- `is_reached: bool`: Whether all vibrations have their nominal levels",  # a property
         "- `async events() -> AsyncIterator[Notification]`: Yield notifications",  # a coroutine
         "`stop(*, client: str | None=None) -> StopResult`",  # a method of the stub
-        "`SolvedPlate(rig: Rig, *, seed: int | None=None)`: A rig's plate",  # a constructor
+        "`SolvedPlate(rig: Rig, *, seed: int | None=None)`: Plate of a rig",  # a constructor
     ],
 )
 def test_page_has_what_docstrings_say(fact: str) -> None:

@@ -239,10 +239,10 @@ WIRED = np.array([[0.02, 0.03, 0.02, 0.03, 0.0]] * 3 + [[0.0, 0.0, 0.0, 0.0, 0.9
         pytest.param(
             2,
             [0, 0, 0, 0, 0.3],
-            "input 2 must have sensor P2, got output 5 as by a cable",
+            "input 2 must have sensor P2, got output 5 as through a cable",
             id="a cable at the input of a sensor",
         ),
-        (3, [0, 0.8, 0, 0, 0], "input 3 must have sensor P3, got output 2 as by a cable"),
+        (3, [0, 0.8, 0, 0, 0], "input 3 must have sensor P3, got output 2 as through a cable"),
         (3, [0.02, 0.03, 0.02, 0.03, 0.3], None),  # monitoring beside a sensor takes nothing away
     ],
 )

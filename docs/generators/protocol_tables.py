@@ -77,7 +77,7 @@ _MEANINGS = {
     **{"levels_measured": "levels in Status are measured, not computed"},
     **{"interlock": "has an interlock", "electrical": "GetMeasured"},
     **{"address": "SetAddress", "mark": "Mark"},
-    **{"high_voltage": "on in 3 and 4, in 5 until silent, in 6 at most until silent"},
+    **{"high_voltage": "on in states 3 and 4, in 5 until silent, and in 6 no longer than until silent"},
     **{"interlock_open": "", "limited": "a sum was limited since the last Status"},
 }
 _PURPOSES = {
@@ -93,7 +93,7 @@ _PURPOSES = {
     "GetFaults": "returns past faults",
     "Clear": "acknowledges a stop or a fault",
     "Ping": "feeds the watchdog, steers the clock",
-    "GetAchieved": "returns the commands of a layer as played",
+    "GetAchieved": "returns the commands of a layer as they will play",
     "GetMeasured": "returns voltages and currents",
     "SetAddress": "changes the address",
     "Mark": "stores the clock",

@@ -77,7 +77,7 @@ _MEANINGS = {
     **{"levels_measured": "levels in Status are measured, not computed"},
     **{"interlock": "has an interlock", "electrical": "GetMeasured"},
     **{"address": "SetAddress", "mark": "Mark"},
-    **{"high_voltage": "on in states 3 and 4, in 5 until silent, and in 6 no longer than until silent"},
+    "high_voltage": "on in states 3 and 4, in 5 until silent, and in 6 no longer than until silent",
     **{"interlock_open": "", "limited": "a sum was limited since the last Status"},
 }
 _PURPOSES = {

@@ -159,7 +159,7 @@ FINDING_KINDS = {
         "WEAK: {wiring} plays {value:.2f} of the commanded amplitude: check its voltage, "
         "volume and mounting, or measure its gain with `era calibrate`",
         "the gain is below 0.8 of the rig's, or beyond 3.5 standard deviations of the `gain` "
-        "(for exciters also `stiffness`) in the rig's `uncertainty`, whichever allows more",
+        "(for exciters also `stiffness`) in the rig's `uncertainty`, whichever limit is wider",
     ),
     "strong": FindingKind(
         "STRONG: {wiring} plays {value:.2f} of the commanded amplitude: lower its voltage or "

@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 from controller.api.client import Client
-from controller.api.methods import StateEvent
+from controller.api.methods import StateEvent, TouchParams
 from processes.daemons import PATIENCE
 from processes.gateways import (
     TOKEN,
@@ -208,20 +208,17 @@ async def test_page_leaves_a_silent_network_and_repeats_no_arm(tmp_path: Path) -
 
 @pytest.mark.real_time
 async def test_page_that_loses_its_user_lifts_and_disarms(tmp_path: Path) -> None:
-    """Lifted once hidden, disarmed once left or closed, and by its button without a WebSocket.
+    """Fingers are lifted when the page is hidden; it disarms when it is closed or left.
 
-    Before it has chosen a layout by the gateway's module.
+    A connection that has lost its WebSocket disarms over HTTP. The page's clock stands still, so
+    that no lease runs out on a busy machine.
     """
     async with shown(tmp_path) as (tab, network, ended, origin):
-        (tmp_path / "layout.yaml").write_text("elsewhere: null\n", "utf-8")
-        layouts = "layouts: {home: layout.yaml, climate: layout.yaml}\n"
-        socket = ended.enter_context(real_daemon(tmp_path, layouts))
-        era = ended.enter_context(Client.connect(socket))
-        wait_for_state(era, "READY_TO_SWITCH_ON")
-        era.subscribe("state")
+        daemon = ended.enter_context(ScriptedDaemon(tmp_path))
         options = ("--allow-origin", origin)
-        network.target = ended.enter_context(gateway_process(tmp_path, socket, *options)).port
-        opened = (
+        gateway = ended.enter_context(gateway_process(tmp_path, daemon.socket, *options))
+        network.target = gateway.port
+        connect_and_arm = (
             "(async () => {"
             f"  const {{ Connection }} = await import('http://127.0.0.1:{network.port}/connection.js');"
             "  await new Promise((opened) => {"
@@ -230,33 +227,41 @@ async def test_page_that_loses_its_user_lifts_and_disarms(tmp_path: Path) -> Non
             "})()"
         )
 
-        async def until_disarmed() -> None:
-            """By a call; a lease that runs out has another cause."""
-            causes = (told.data["cause"] for told in era.events(timeout=PATIENCE))
-            assert await asyncio.to_thread(any, (each.startswith("disarmed by") for each in causes))
-            await asyncio.to_thread(wait_for_state, era, "READY_TO_SWITCH_ON")
-
-        for end in ("own.socket.close(); own.disarm()", "own.close()"):
+        async def show_page() -> None:
             await tab.show(url(origin))
             await tab.until(SAID, lambda text: text.startswith("ready: "))
-            await tab.evaluate(opened)
-            assert era.status().armed_by is not None
-            assert (await tab.evaluate("own.layout('climate')"))["layout"] == "climate"
-            await tab.evaluate(end)
-            await until_disarmed()
+            await tab.evaluate("performance.now = () => 0; undefined")
+
+        async def until_called(method: str, count: int) -> None:
+            await asyncio.to_thread(wait_for, lambda: daemon.methods.count(method) == count)
+
+        def fingers() -> list[int]:
+            """How many fingers each report so far has had."""
+            return [
+                len(params.touches) for _, params in daemon.calls if isinstance(params, TouchParams)
+            ]
+
+        endings = ("own.socket.close(); own.disarm()", "own.close()")
+        for count, ending in enumerate(endings, start=1):
+            await show_page()
+            await tab.evaluate(connect_and_arm)
+            assert (await tab.evaluate("own.layout('home')"))["layout"] == "home"
+            await tab.evaluate(ending)
+            await until_called("disarm", count)
         await tab.until("own.socket.readyState === WebSocket.CLOSED")
         await tab.click("#arm")
-        await asyncio.to_thread(wait_for_state, era, "OPERATION_ENABLED")
+        await until_called("arm", 3)
         x, y = await tab.evaluate(
             "(({x, y}) => [x + 50, y + 50])"
             "(document.querySelector('#plate').getBoundingClientRect())"
         )
         await tab.touch("touchStart", [(x, y)])
-        await asyncio.to_thread(wait_for, lambda: len(era.status().contacts) == 1)
+        await asyncio.to_thread(wait_for, lambda: 1 in fingers())
         await tab.evaluate(
             "Object.defineProperty(document, 'hidden', { value: true });"
             "document.dispatchEvent(new Event('visibilitychange'))"
         )
-        await asyncio.to_thread(wait_for, lambda: not era.status().contacts)
+        await asyncio.to_thread(wait_for, lambda: fingers()[-1] == 0)
+        assert daemon.methods.count("disarm") == 2
         await tab.call("Page.navigate", url="about:blank")
-        await until_disarmed()
+        await until_called("disarm", 3)

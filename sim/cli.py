@@ -33,7 +33,7 @@ def sim(
     modbus_rtu: Annotated[
         bool, typer.Option("--modbus-rtu", help="Serve Modbus RTU on one pseudo-terminal.")
     ] = False,
-    socketcand: Annotated[int | None, port_option("a CAN bus by socketcand")] = None,
+    socketcand: Annotated[int | None, port_option("a CAN bus through socketcand")] = None,
     slcan: Annotated[
         bool, typer.Option("--slcan", help="Serve a CAN bus behind a serial adapter (slcan).")
     ] = False,
@@ -49,7 +49,7 @@ def sim(
         list[str] | None,
         typer.Option(
             metavar="NAME=WIRE",
-            help="Wire of an amplifier: main=serial, side=modbus-tcp:5020 (repeatable). "
+            help="Wire of one amplifier, e.g. main=serial or side=modbus-tcp:5020 (repeatable). "
             "Default: the scheme of its url in the rig.",
         ),
     ] = None,
@@ -67,7 +67,11 @@ def sim(
     ] = False,
     speed: Annotated[
         int | None,
-        typer.Option(metavar="BIT/S", help="Simulate the transmission time of bytes.", min=300),
+        typer.Option(
+            metavar="BIT/S",
+            help="Simulate the transmission time of bytes at this speed.",
+            min=300,
+        ),
     ] = None,
     line: Annotated[
         list[str] | None,
@@ -79,7 +83,7 @@ def sim(
         ),
     ] = None,
     faults: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Inject the faults of a fault file.")
+        Path | None, typer.Option(metavar="FILE", help="Inject the faults listed in this file.")
     ] = None,
     finger: Annotated[
         list[str] | None,

@@ -71,8 +71,9 @@ class StrengthResult(ApiMessage):
 
     strengths: dict[str, float] = Field(
         default={},
-        description="gain in dB by name, 0 if none is set: configured inputs, sources that have "
-        "had fingers, connected clients, regions of the current layout, other names with a gain",
+        description="gain in dB by name (0 if not set), for configured inputs, sources that have "
+        "had fingers, connected clients, regions of the current layout, and all "
+        "other names with a gain",
     )
 
 
@@ -104,15 +105,19 @@ class StatusResult(StrengthResult, PatternFields, CauseAndRemedy):
     lift_latency_ms: LatencySummary | None = Field(
         None, description="after a lift, or a change without a touch, such as the end of an effect"
     )
-    rejected_touches: dict[str, Count] = Field(description="number by reason, of all sources")
+    rejected_touches: dict[str, Count] = Field(
+        description="number of rejected touches by reason, for all sources together"
+    )
     rejected_examples: dict[str, str] = Field(
-        default_factory=dict, description="the newest of each reason: its content and its source"
+        default_factory=dict,
+        description="content and source of the newest rejected touch for each reason",
     )
     inputs: list[TouchInputStatus] = Field(
         default_factory=list, description="configured touch inputs"
     )
     clicks_too_late: Count = Field(
-        0, description="short vibrations that came too late to be felt; playback continues"
+        0,
+        description="number of short vibrations that were too late to be felt; playback continues",
     )
     lost_events: dict[str, Count] = Field(
         default={}, description="notifications that clients were too slow to read, by topic"
@@ -121,7 +126,9 @@ class StatusResult(StrengthResult, PatternFields, CauseAndRemedy):
         None, description="name of the current layout; null if there is none"
     )
     layouts: list[str] = Field(default=[], description="names that `layout` accepts")
-    slow_reason: str | None = Field(None, description="why queries take longer than necessary")
+    slow_reason: str | None = Field(
+        None, description="why table queries take longer than necessary; null if they do not"
+    )
     threshold: str | None = Field(
         None, description="name of the rig's threshold set, to which levels in dB SL are relative"
     )
@@ -327,7 +334,7 @@ class LinkEvent(ApiMessage):
     """
 
     event: Literal["degraded", "restored", "lost", "retry", "reopened"]
-    amplifier: str | None = Field(description="its name, if known")
+    amplifier: str | None = Field(description="name of the amplifier, if known")
     message: str
     remedy: str | None
 
@@ -343,7 +350,9 @@ class InputsEvent(ApiMessage):
     """A touch input was opened, fell silent or was lost, or touches were rejected."""
 
     inputs: list[TouchInputStatus] = Field(description="all configured inputs")
-    rejected_touches: dict[str, Count] = Field(description="number by reason, of all sources")
+    rejected_touches: dict[str, Count] = Field(
+        description="number of rejected touches by reason, for all sources together"
+    )
 
 
 class TopicData(NamedTuple):
@@ -367,11 +376,14 @@ TOPICS: dict[Topic, TopicData] = {
         AmplifiersEvent, "status of the amplifiers, at rate_hz", "periodically"
     ),
     "latency": TopicData(LatencyEvent, "latency from touch to command, at rate_hz", "periodically"),
-    "log": TopicData(LogEvent, "log records from level info, except state and link changes"),
+    "log": TopicData(
+        LogEvent, "log records of level info and above, except state and link changes"
+    ),
     "link": TopicData(LinkEvent, "an amplifier link was degraded, lost or reopened"),
     "layout": TopicData(LayoutEvent, "the surface layout was changed or replaced"),
     "inputs": TopicData(
-        InputsEvent, "touch inputs lost, mute or restored; rejected touches, every second"
+        InputsEvent,
+        "changes of touch inputs (lost, mute, restored) and rejected touches, every second",
     ),
     "strength": TopicData(
         StrengthResult, "strengths of sources, clients and regions, at rate_hz", "periodically"

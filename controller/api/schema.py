@@ -107,7 +107,7 @@ class CauseAndRemedy(ApiMessage):
     """Cause of a state, and its remedy."""
 
     cause: str = Field(description="cause of the state")
-    remedy: str | None = Field(description="what to do about it; null if nothing")
+    remedy: str | None = Field(description="what to do about it; null if there is nothing to do")
 
 
 class EraPosition(ApiMessage):
@@ -121,7 +121,7 @@ class EraPosition(ApiMessage):
 
 
 class RigSummary(ApiMessage):
-    """The rig data needed to draw it."""
+    """The data needed to draw the rig."""
 
     length_m: float
     width_m: float
@@ -176,8 +176,9 @@ class ContactStatus(ApiMessage):
     y_m: float
     role: Literal["target", "quiet", "hand", "surplus"] | None = Field(
         None,
-        description="target: feels the pattern; quiet: kept quiet; hand (a resting hand), surplus "
-        "(a finger beyond max_fingers): only its load counts; null before the first decision",
+        description="target: feels the pattern; quiet: kept quiet; hand (a resting hand) and "
+        "surplus (a finger beyond max_fingers): counts only as a load; null before "
+        "the first decision",
     )
     level_db_sl: float | None = Field(
         None,
@@ -186,19 +187,25 @@ class ContactStatus(ApiMessage):
     )
     promised_contrast_db: float | None = Field(None, description=PROMISED)
     contrast_db: float | None = Field(
-        None, description="predicted, target over loudest quiet finger; null for a single finger"
+        None,
+        description="predicted felt contrast, target over loudest quiet finger; null for a single "
+        "finger",
     )
     effect: str | None = Field(None, description="the effect selected for it, if any")
-    feels: str | None = Field(None, description="the effect it feels: its own, or another finger's")
+    feels: str | None = Field(
+        None, description="the effect that the finger feels: its own, or another finger's"
+    )
     verdict: Literal["own", "mixed", "shared", "held back"] | None = Field(
         None,
-        description="what a target feels. own: its content; mixed: its own and others' (promised "
-        "contrast below 12 dB, or others are felt during its pauses); shared: another finger's "
-        "content; held back: nothing",
+        description="how a target feels its content. own: separately; mixed: together with other "
+        "contents (promised contrast below 12 dB, or others are felt during its "
+        "pauses); shared: it feels another finger's content instead; held back: not "
+        "at all",
     )
     frequency_hz: float | None = Field(
         None,
-        description="requested frequency of its content, before rounding; null for several",
+        description="requested frequency of its content, before rounding; null if the content has "
+        "several frequencies",
     )
     foreign_level_db_sl: float | None = Field(
         None,
@@ -217,9 +224,9 @@ class ContactStatus(ApiMessage):
     )
     leak_db_sl: float | None = Field(
         None,
-        description="crosstalk level at its current position on the nominal plate, relative to the "
-        "rig's threshold set; can exceed the promise while the finger moves; only in the status; "
-        "null if there are no other contents",
+        description="crosstalk level at the finger's current position on the nominal plate, "
+        "relative to the rig's threshold set; can exceed the promise while the "
+        "finger moves; sent only in the status; null if there are no other contents",
     )
     held_back: str | None = Field(
         None,
@@ -249,7 +256,9 @@ class PatternFields(ApiMessage):
     )
     layers: dict[str, dict[str, PlayedTone]] = Field(
         default_factory=dict,
-        description="tones of each content by layer, then by ERA as in `drive`; layers add up",
+        description="tones of each content by layer, then by ERA, in the format of `drive`; an ERA "
+        "plays "
+        "the sum of its layers",
     )
     promised_contrast_db: float | None = Field(None, description=PROMISED)
     predicted_contrast_db: float | None = Field(None, description="the same on the nominal plate")
@@ -276,12 +285,12 @@ class AmplifierSilence(ApiMessage):
     """Whether an amplifier is silent, after a stop or without its reply."""
 
     silence: Literal["confirmed_silent", "may_play", "watchdog_elapsed"] = Field(
-        description="confirmed by its status after a stop; may play; or unconfirmed, but its "
-        "watchdog must have silenced it"
+        description="confirmed_silent: confirmed by its status after a stop; watchdog_elapsed: "
+        "unconfirmed, but its watchdog should have silenced it by now"
     )
     may_play_for_s: float | None = Field(
-        description="time until its watchdog must have silenced it; null without a known watchdog "
-        "or after confirmed silence"
+        description="time until its watchdog should have silenced it; null if its watchdog is "
+        "unknown or silence is confirmed"
     )
     cause: str
 
@@ -299,18 +308,18 @@ class AmplifierSilence(ApiMessage):
 
 
 class AmplifierReport(CauseAndRemedy):
-    """A condition that an amplifier reports, other than a fault; it continues to play."""
+    """A condition other than a fault that an amplifier reports while it continues to play."""
 
     kind: ReportKind
 
 
 class AmplifierStatus(ApiMessage):
-    """One amplifier according to its last reply; null where unknown."""
+    """State of one amplifier from its last reply; unknown values are null."""
 
     name: str
     url: str
     serial_number: str | None
-    state: str | None = Field(description="its own state, as named by CiA 402")
+    state: str | None = Field(description="CiA 402 name of the amplifier's own state")
     word: str | None = Field(
         default_factory=lambda known: STATE_WORDS.get(known["state"]),
         description="the state in plain words",
@@ -328,15 +337,18 @@ class AmplifierStatus(ApiMessage):
     )
     degraded: bool = Field(
         False,
-        description="whether it does not reply but may still play; nothing new plays",
+        description="whether the amplifier does not reply but may still play; no new vibration "
+        "starts "
+        "meanwhile",
     )
     lost: bool = Field(description="whether the link to it is lost")
     closed_with_lost: bool = Field(
-        description="whether it was closed, although it replied, because another one is lost"
+        description="whether its link was closed, although it replied, because another amplifier "
+        "is lost"
     )
-    reports: list[AmplifierReport] = Field([], description="its reports of the last 10 s")
+    reports: list[AmplifierReport] = Field([], description="reports from the last 10 s")
     silence: AmplifierSilence | None = Field(
-        None, description="whether it is silent, while it does not reply; null while it does"
+        None, description="whether it is silent, while it does not reply; null while it replies"
     )
     statistics: LinkCounters
 
@@ -351,7 +363,7 @@ class AmplifierStatus(ApiMessage):
 class LatencySummary(ApiMessage):
     """Latency from the arrival of a touch frame to the last byte of its command, in ms.
 
-    Taken over the latest patterns; median and percentiles are null before the first one.
+    Computed from the latest patterns; median and percentiles are null before the first pattern.
     """
 
     count: Count
@@ -370,4 +382,6 @@ class EffectDescription(ApiMessage):
     name: str
     kind: str
     description: str
-    parameters: dict[str, Any] = Field(description="by name in a layout file, in SI units")
+    parameters: dict[str, Any] = Field(
+        description="parameters by their names in a layout file, in SI units"
+    )

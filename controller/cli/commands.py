@@ -41,11 +41,14 @@ def gateway(
     key: Annotated[Path | None, typer.Option(hidden=True)] = None,
     allow_host: Annotated[
         list[str] | None,
-        typer.Option(metavar="NAME", help="Further allowed host name."),
+        typer.Option(metavar="NAME", help="Additional host name to accept (repeatable)."),
     ] = None,
     allow_origin: Annotated[
         list[str] | None,
-        typer.Option(metavar="ORIGIN", help="Further allowed origin: https://HOST[:PORT]"),
+        typer.Option(
+            metavar="ORIGIN",
+            help="Additional origin to accept, https://HOST[:PORT] (repeatable).",
+        ),
     ] = None,
 ) -> None:
     """Serve the daemon's API and the dashboard to browsers.

@@ -57,7 +57,7 @@ def check(
 ) -> None:
     """Check a rig, daemon or layout file.
 
-    List all errors; exit with 1 if there are any.
+    Lists all errors. Exits with status 1 if there are any.
     """
     from model.compiled.kernels import why_slow
     from model.config.document import ConfigError, read_document

@@ -28,7 +28,9 @@ if TYPE_CHECKING:
 
 Socket = Annotated[
     Path | None,
-    typer.Option("--socket", metavar="PATH", help="Socket of the daemon; default: the usual path."),
+    typer.Option(
+        "--socket", metavar="PATH", help="Socket of the daemon. Default: its default path."
+    ),
 ]
 
 DASHBOARD = "127.0.0.1:8137"
@@ -93,7 +95,7 @@ def daemon(
 
 
 def status(socket: Socket = None, as_json: JsonOption = False) -> None:
-    """Exit status 0 in a fault, too."""
+    """The exit status is 0 even in a fault state."""
 
     with connected(socket) as era:
         status = era.status()
@@ -104,7 +106,10 @@ def status(socket: Socket = None, as_json: JsonOption = False) -> None:
 
 def arm(
     lease: Annotated[
-        float, typer.Option(metavar="S", min=1, max=60, help="Lease without renewal.")
+        float,
+        typer.Option(
+            metavar="S", min=1, max=60, help="Duration of the lease in s without renewal."
+        ),
     ] = 10.0,
     owner: Annotated[str, typer.Option(help="Name shown to other clients.")] = "era arm",
     once: Annotated[
@@ -113,7 +118,7 @@ def arm(
     socket: Socket = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Stays and renews the lease; Ctrl-C disarms."""
+    """Keeps running to renew the lease; Ctrl-C disarms."""
     with connected(socket) as era:
         if once:
             granted = era.arm(owner, lease_s=lease)
@@ -146,16 +151,22 @@ def of_method(method: str) -> Callable[..., None]:
 
 def strength(
     name: Annotated[
-        str | None, typer.Argument(metavar="[SOURCE|CLIENT|REGION]", help="Default: show all.")
+        str | None,
+        typer.Argument(
+            metavar="[SOURCE|CLIENT|REGION]",
+            help="Name whose strength to set or show. Default: show all.",
+        ),
     ] = None,
     gain_db: Annotated[
         float | None,
-        typer.Argument(metavar="[DB]", help="-40 to 0; default: show the current strength."),
+        typer.Argument(
+            metavar="[DB]", help="Strength in dB, -40 to 0. Default: show the current strength."
+        ),
     ] = None,
     socket: Socket = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Stored under this name. 0 dB is the level that layout and limits allow."""
+    """The strength is stored under this name. 0 dB is the level that layout and limits allow."""
     with connected(socket) as era:
         strengths = (era.status() if name is None else era.strength(name, gain_db)).strengths
     print_report(
@@ -166,9 +177,11 @@ def strength(
 
 
 def touch(
-    at: Annotated[list[str], typer.Argument(metavar="X,Y ...", help="Fingers on the plate [m].")],
+    at: Annotated[
+        list[str], typer.Argument(metavar="X,Y ...", help="Positions of fingers in metres.")
+    ],
     duration: Annotated[
-        float, typer.Option("--for", metavar="S", min=0, max=3600, help="Duration.")
+        float, typer.Option("--for", metavar="S", min=0, max=3600, help="Duration in s.")
     ] = 1.0,
     socket: Socket = None,
     as_json: JsonOption = False,
@@ -220,7 +233,10 @@ def watch(
         ),
     ] = None,
     rate: Annotated[
-        float, typer.Option(min=1, max=60, help="Rate of amplifiers, latency and strength [Hz].")
+        float,
+        typer.Option(
+            min=1, max=60, help="Rate of the topics amplifiers, latency and strength in Hz."
+        ),
     ] = 1,
     socket: Socket = None,
     as_json: Annotated[

@@ -37,10 +37,10 @@ def demo(
     wire: Annotated[
         str | None,
         typer.Option(
-            help="Wire to the amplifiers: sim (none, in this process); in real time serial "
-            "(pseudo-terminal), modbus (TCP), can (socketcand), or firmware (the C "
-            "amplifier on serial, after `make firmware`; its plate does not move). "
-            "Default: sim; in real time serial.",
+            help="Wire to the amplifiers: sim (no wire, in this process), or in real time serial "
+            "(pseudo-terminal), modbus (TCP), can (socketcand) or firmware (the C amplifier "
+            "on serial, after `make firmware`; its plate does not move). Default: sim, or "
+            "serial in real time.",
             show_default=False,
         ),
     ] = None,
@@ -66,7 +66,7 @@ def demo(
         str | None,
         typer.Option(
             metavar="[HOST:PORT]",
-            help=f"Serve a page in the browser to touch the plate yourself; default: {DASHBOARD}.",
+            help=f"Serve a page to touch the plate in a browser. Default: {DASHBOARD}.",
         ),
     ] = None,
 ) -> None:

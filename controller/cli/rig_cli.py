@@ -46,14 +46,14 @@ def identify(
             "--output",
             "-o",
             metavar="RIG.fitted.yaml",
-            help="File of the fitted rig, best in the folder of RIG.",
+            help="Output file for the fitted rig, preferably in the folder of RIG.",
         ),
     ],
     level: Annotated[
         float | None,
         typer.Option(
-            help="Largest sample of each output, 0 to 1; default: 0.3, or less if the rig's limits "
-            "require it."
+            help="Peak sample of each output, 0 to 1 of full scale. Default: 0.3, or less if the "
+            "rig's limits require it."
         ),
     ] = None,
     measured_file: Annotated[
@@ -61,7 +61,7 @@ def identify(
         typer.Option(
             "--measured",
             metavar="MEASURED.uff|.csv",
-            help="Read responses that era measure has written, and play nothing.",
+            help="Read the responses from a file written by era measure instead of playing.",
         ),
     ] = None,
     device: Annotated[
@@ -81,14 +81,14 @@ def identify(
         str | None,
         typer.Option(
             metavar="LO:HI:STEP",
-            help="Whole frequencies in Hz to play; default: odd ones, 10 apart.",
+            help="Frequencies to play, integers in Hz. Default: odd frequencies, 10 Hz apart.",
         ),
     ] = None,
     periods: Annotated[
         int | None,
         typer.Option(
             metavar="N",
-            help="Seconds of each run that count; default: 2.",
+            help="Number of 1 s periods evaluated in each run. Default: 2.",
             min=2,
             max=60,
         ),
@@ -101,7 +101,7 @@ def identify(
         int,
         typer.Option(
             metavar="N",
-            help="Draw other fingers for the expected contrast, and other phases to play.",
+            help="Random seed of the played phases and of the fingers for the expected contrast.",
             min=0,
         ),
     ] = 0,
@@ -109,9 +109,10 @@ def identify(
 ) -> None:
     """Identify the plate in place and write its rig.
 
-    The new rig states the remaining errors. With --device a sound card plays multisines and records
-    accelerometers, as era measure does, with its loop-back cable; with --measured nothing is
-    played. Exit status 1, and no rig is written, if the model does not explain the responses.
+    The new rig file states the remaining uncertainty. With --device, a sound card plays multisines
+    and records accelerometers, with the same loop-back cable as for era measure. With --measured,
+    nothing is played. Exits with status 1 and writes no rig if the model does not explain the
+    responses.
     """
     import time
 
@@ -356,7 +357,7 @@ def check(
         bool,
         typer.Option(
             "--without-phases",
-            help="Ignore the phases of the file, which do not refer to the drive.",
+            help="Ignore phases, for a file whose phases are not relative to the drive.",
         ),
     ] = False,
     mesh: Annotated[

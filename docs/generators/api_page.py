@@ -13,7 +13,12 @@ from message_types import Models, Notation, each_model
 def api_reference() -> str:
     """All lists, as Markdown."""
     models: Models = {}
-    lines = ["### Methods", "", "→ parameters, ← results; without any it is an empty object, `{}`."]
+    lines = [
+        "### Methods",
+        "",
+        "→ parameters, ← results. A method without parameters or results has an empty object, "
+        "`{}`.",
+    ]
     for name, method in METHODS.items():
         rows = [*_rows("→ ", method.params, models), *_rows("← ", method.result, models)]
         lines += ["", f"#### {name}", "", " ".join([SUMMARIES[name], *_notes(method)]), "", *rows]
@@ -42,9 +47,9 @@ def _notes(method: Method) -> Iterator[str]:
     if method.needs_reply:
         yield "Only with an `id`."
     if not method.is_repeated:
-        yield "The Python clients do not send it again where the reply is lost."
+        yield "The Python clients do not repeat it if the reply is lost."
     if not method.over_http:
-        yield "Over a lasting connection alone, not over HTTP."
+        yield "Needs a lasting connection; not available over HTTP."
 
 
 def _rows(prefix: str, model: type[ApiMessage], models: Models) -> Iterator[str]:
@@ -64,7 +69,7 @@ def _data(model: type[ApiMessage], models: Models) -> Iterator[str]:
     rows = list(_rows("", model, models))
     same = [row.split(" (")[0].removeprefix("- ") for row in rows if row in status]
     if len(same) > 1:
-        yield f"- {', '.join(same)}: as of [status](#status)"
+        yield f"- {', '.join(same)}: as in [status](#status)"
     yield from (row for row in rows if len(same) < 2 or row not in status)
 
 

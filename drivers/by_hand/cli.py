@@ -63,7 +63,7 @@ Trace = Annotated[
         "--trace",
         metavar="FILE",
         dir_okay=False,
-        help="Append every frame and request to FILE, with time and meaning.",
+        help="Append every frame and request to FILE, with its time and decoded content.",
         show_default=False,
     ),
 ]
@@ -72,7 +72,7 @@ Trace = Annotated[
 @amp.command()
 def discover(
     url: Annotated[
-        list[str] | None, typer.Argument(help="Identify at these URLs too.", show_default=False)
+        list[str] | None, typer.Argument(help="Additional URLs to query.", show_default=False)
     ] = None,
     probe: Annotated[
         bool,
@@ -129,9 +129,9 @@ def status(url: Url, trace: Trace = None, json_: Json = False) -> None:
 def drive(
     url: Url,
     channel: Annotated[int, typer.Option(help="Output channel, from 0.")] = 0,
-    frequency: Annotated[float, typer.Option(help="Mechanical frequency [Hz].")] = 110.0,
+    frequency: Annotated[float, typer.Option(help="Mechanical frequency in Hz.")] = 110.0,
     level: Annotated[float, typer.Option(help="Level, 0 to 1 of full stroke.")] = 0.2,
-    duration: Annotated[float, typer.Option("--for", help="Duration [s].")] = 0.5,
+    duration: Annotated[float, typer.Option("--for", help="Duration in s.")] = 0.5,
     trace: Trace = None,
     json_: Json = False,
 ) -> None:
@@ -160,11 +160,15 @@ def stop(url: Url, trace: Trace = None, json_: Json = False) -> None:
 @amp.command()
 def address(
     url: Url,
-    new: Annotated[int, typer.Argument(metavar="NEW", min=1, max=247, help="Address to take.")],
+    new: Annotated[
+        int,
+        typer.Argument(metavar="NEW", min=1, max=247, help="New address, unit or node number."),
+    ],
     serial_number: Annotated[
         str | None,
         typer.Option(
-            metavar="TEXT", help="Of the amplifier to change, if several reply at the address."
+            metavar="TEXT",
+            help="Serial number of the amplifier to change, if several reply at the address.",
         ),
     ] = None,
     trace: Trace = None,

@@ -19,11 +19,12 @@ def report(
         list[Path] | None,
         typer.Argument(metavar="[CONFIG]...", help="Rig, layout and daemon files to include."),
     ] = None,
-    output: Annotated[Path, typer.Option("-o", "--output", help="Folder to make.")] = Path(
+    output: Annotated[Path, typer.Option("-o", "--output", help="Folder to create.")] = Path(
         "era-report"
     ),
     socket: Annotated[
-        Path | None, typer.Option("--socket", help="Socket of the daemon; default: the usual path.")
+        Path | None,
+        typer.Option("--socket", help="Socket of the daemon. Default: its default path."),
     ] = None,
 ) -> None:
     """Collect files for a bug report in a folder.

@@ -49,13 +49,13 @@ export interface Topics {
   amplifiers: AmplifiersEvent;
   /** latency from touch to command, at rate_hz */
   latency: LatencyEvent;
-  /** log records from level info, except state and link changes */
+  /** log records of level info and above, except state and link changes */
   log: LogEvent;
   /** an amplifier link was degraded, lost or reopened */
   link: LinkEvent;
   /** the surface layout was changed or replaced */
   layout: LayoutEvent;
-  /** touch inputs lost, mute or restored; rejected touches, every second */
+  /** changes of touch inputs (lost, mute, restored) and rejected touches, every second */
   inputs: InputsEvent;
   /** strengths of sources, clients and regions, at rate_hz */
   strength: StrengthResult;
@@ -100,20 +100,20 @@ export interface Empty {
 export interface StatusResult {
   /** cause of the state */
   cause: string;
-  /** what to do about it; null if nothing */
+  /** what to do about it; null if there is nothing to do */
   remedy: string | null;
   /** in order of arrival, newest last */
   contacts: Array<ContactStatus>;
   /** tones of the newest content by ERA; silent ERAs are omitted */
   drive: Record<string, PlayedTone>;
-  /** tones of each content by layer, then by ERA as in `drive`; layers add up */
+  /** tones of each content by layer, then by ERA, in the format of `drive`; an ERA plays the sum of its layers */
   layers?: Record<string, Record<string, PlayedTone>>;
   /** felt contrast, target over loudest quiet finger, that 90 % of plates within the rig's tolerances reach; null for a single finger */
   promised_contrast_db?: number | null;
   /** the same on the nominal plate */
   predicted_contrast_db?: number | null;
   predicted_level_db_sl: number | null;
-  /** gain in dB by name, 0 if none is set: configured inputs, sources that have had fingers, connected clients, regions of the current layout, other names with a gain */
+  /** gain in dB by name (0 if not set), for configured inputs, sources that have had fingers, connected clients, regions of the current layout, and all other names with a gain */
   strengths?: Record<string, number>;
   /** time of this response on CLOCK_MONOTONIC */
   time_s: number;
@@ -139,13 +139,13 @@ export interface StatusResult {
   latency_ms: LatencySummary;
   /** after a lift, or a change without a touch, such as the end of an effect */
   lift_latency_ms?: LatencySummary | null;
-  /** number by reason, of all sources */
+  /** number of rejected touches by reason, for all sources together */
   rejected_touches: Record<string, number>;
-  /** the newest of each reason: its content and its source */
+  /** content and source of the newest rejected touch for each reason */
   rejected_examples?: Record<string, string>;
   /** configured touch inputs */
   inputs?: Array<TouchInputStatus>;
-  /** short vibrations that came too late to be felt; playback continues */
+  /** number of short vibrations that were too late to be felt; playback continues */
   clicks_too_late?: number;
   /** notifications that clients were too slow to read, by topic */
   lost_events?: Record<string, number>;
@@ -153,7 +153,7 @@ export interface StatusResult {
   layout?: string | null;
   /** names that `layout` accepts */
   layouts?: Array<string>;
-  /** why queries take longer than necessary */
+  /** why table queries take longer than necessary; null if they do not */
   slow_reason?: string | null;
   /** name of the rig's threshold set, to which levels in dB SL are relative */
   threshold?: string | null;
@@ -267,7 +267,7 @@ export interface StrengthParams {
 
 /** Strengths of all known touch sources, clients and regions. */
 export interface StrengthResult {
-  /** gain in dB by name, 0 if none is set: configured inputs, sources that have had fingers, connected clients, regions of the current layout, other names with a gain */
+  /** gain in dB by name (0 if not set), for configured inputs, sources that have had fingers, connected clients, regions of the current layout, and all other names with a gain */
   strengths?: Record<string, number>;
 }
 
@@ -287,7 +287,7 @@ export interface UnsubscribeParams {
 export interface StateEvent {
   /** cause of the state */
   cause: string;
-  /** what to do about it; null if nothing */
+  /** what to do about it; null if there is nothing to do */
   remedy: string | null;
   old: "NOT_READY" | "SWITCH_ON_DISABLED" | "READY_TO_SWITCH_ON" | "SWITCHED_ON" | "OPERATION_ENABLED" | "QUICK_STOP_ACTIVE" | "FAULT_REACTION_ACTIVE" | "FAULT" | "COMM_LOST";
   new: "NOT_READY" | "SWITCH_ON_DISABLED" | "READY_TO_SWITCH_ON" | "SWITCHED_ON" | "OPERATION_ENABLED" | "QUICK_STOP_ACTIVE" | "FAULT_REACTION_ACTIVE" | "FAULT" | "COMM_LOST";
@@ -308,7 +308,7 @@ export interface PatternEvent {
   contacts: Array<ContactStatus>;
   /** tones of the newest content by ERA; silent ERAs are omitted */
   drive: Record<string, PlayedTone>;
-  /** tones of each content by layer, then by ERA as in `drive`; layers add up */
+  /** tones of each content by layer, then by ERA, in the format of `drive`; an ERA plays the sum of its layers */
   layers?: Record<string, Record<string, PlayedTone>>;
   /** felt contrast, target over loudest quiet finger, that 90 % of plates within the rig's tolerances reach; null for a single finger */
   promised_contrast_db?: number | null;
@@ -348,7 +348,7 @@ export interface LogEvent {
 /** The link to amplifiers was lost, could not be reopened, or was reopened. Degraded: an amplifier does not reply but may still play; nothing new is played until it replies (restored) or is lost. */
 export interface LinkEvent {
   event: "degraded" | "restored" | "lost" | "retry" | "reopened";
-  /** its name, if known */
+  /** name of the amplifier, if known */
   amplifier: string | null;
   message: string;
   remedy: string | null;
@@ -366,11 +366,11 @@ export interface LayoutEvent {
 export interface InputsEvent {
   /** all configured inputs */
   inputs: Array<TouchInputStatus>;
-  /** number by reason, of all sources */
+  /** number of rejected touches by reason, for all sources together */
   rejected_touches: Record<string, number>;
 }
 
-/** The rig data needed to draw it. */
+/** The data needed to draw the rig. */
 export interface RigSummary {
   length_m: number;
   width_m: number;
@@ -398,21 +398,21 @@ export interface ContactStatus {
   id: number;
   x_m: number;
   y_m: number;
-  /** target: feels the pattern; quiet: kept quiet; hand (a resting hand), surplus (a finger beyond max_fingers): only its load counts; null before the first decision */
+  /** target: feels the pattern; quiet: kept quiet; hand (a resting hand) and surplus (a finger beyond max_fingers): counts only as a load; null before the first decision */
   role?: "target" | "quiet" | "hand" | "surplus" | null;
   /** predicted level of a target relative to the rig's threshold set (`threshold` of `status`); null if unknown */
   level_db_sl?: number | null;
   /** felt contrast, target over loudest quiet finger, that 90 % of plates within the rig's tolerances reach; null for a single finger */
   promised_contrast_db?: number | null;
-  /** predicted, target over loudest quiet finger; null for a single finger */
+  /** predicted felt contrast, target over loudest quiet finger; null for a single finger */
   contrast_db?: number | null;
   /** the effect selected for it, if any */
   effect?: string | null;
-  /** the effect it feels: its own, or another finger's */
+  /** the effect that the finger feels: its own, or another finger's */
   feels?: string | null;
-  /** what a target feels. own: its content; mixed: its own and others' (promised contrast below 12 dB, or others are felt during its pauses); shared: another finger's content; held back: nothing */
+  /** how a target feels its content. own: separately; mixed: together with other contents (promised contrast below 12 dB, or others are felt during its pauses); shared: it feels another finger's content instead; held back: not at all */
   verdict?: "own" | "mixed" | "shared" | "held back" | null;
-  /** requested frequency of its content, before rounding; null for several */
+  /** requested frequency of its content, before rounding; null if the content has several frequencies */
   frequency_hz?: number | null;
   /** crosstalk level of others' contents here, not exceeded on 90 % of plates, relative to the most sensitive published thresholds (not comparable with level_db_sl); null if there are no other contents */
   foreign_level_db_sl?: number | null;
@@ -420,7 +420,7 @@ export interface ContactStatus {
   rig_foreign_level_db_sl?: number | null;
   /** whether other contents can be felt here (foreign_level_db_sl above 0); with verdict own they are at least 12 dB weaker */
   is_foreign_felt?: boolean;
-  /** crosstalk level at its current position on the nominal plate, relative to the rig's threshold set; can exceed the promise while the finger moves; only in the status; null if there are no other contents */
+  /** crosstalk level at the finger's current position on the nominal plate, relative to the rig's threshold set; can exceed the promise while the finger moves; sent only in the status; null if there are no other contents */
   leak_db_sl?: number | null;
   /** why its own effect, or a click over its continuous effect, is not played; null if it is */
   held_back?: string | null;
@@ -436,12 +436,12 @@ export interface PlayedTone {
   phase_deg: number;
 }
 
-/** One amplifier according to its last reply; null where unknown. */
+/** State of one amplifier from its last reply; unknown values are null. */
 export interface AmplifierStatus {
   name: string;
   url: string;
   serial_number: string | null;
-  /** its own state, as named by CiA 402 */
+  /** CiA 402 name of the amplifier's own state */
   state: string | null;
   /** the state in plain words */
   word?: string | null;
@@ -453,15 +453,15 @@ export interface AmplifierStatus {
   reply_age_s: number | null;
   /** RMS error of its clock relative to the others, estimated by the host; null for a single amplifier or one that is not synchronised */
   clock_skew_us?: number | null;
-  /** whether it does not reply but may still play; nothing new plays */
+  /** whether the amplifier does not reply but may still play; no new vibration starts meanwhile */
   degraded?: boolean;
   /** whether the link to it is lost */
   lost: boolean;
-  /** whether it was closed, although it replied, because another one is lost */
+  /** whether its link was closed, although it replied, because another amplifier is lost */
   closed_with_lost: boolean;
-  /** its reports of the last 10 s */
+  /** reports from the last 10 s */
   reports?: Array<AmplifierReport>;
-  /** whether it is silent, while it does not reply; null while it does */
+  /** whether it is silent, while it does not reply; null while it replies */
   silence?: AmplifierSilence | null;
   statistics: LinkCounters;
   /** of the amplifier */
@@ -470,7 +470,7 @@ export interface AmplifierStatus {
   high_voltage_v: number | null;
 }
 
-/** Latency from the arrival of a touch frame to the last byte of its command, in ms. Taken over the latest patterns; median and percentiles are null before the first one. */
+/** Latency from the arrival of a touch frame to the last byte of its command, in ms. Computed from the latest patterns; median and percentiles are null before the first pattern. */
 export interface LatencySummary {
   count: number;
   median: number | null;
@@ -492,9 +492,9 @@ export interface TouchInputStatus {
 
 /** Whether an amplifier is silent, after a stop or without its reply. */
 export interface AmplifierSilence {
-  /** confirmed by its status after a stop; may play; or unconfirmed, but its watchdog must have silenced it */
+  /** confirmed_silent: confirmed by its status after a stop; watchdog_elapsed: unconfirmed, but its watchdog should have silenced it by now */
   silence: "confirmed_silent" | "may_play" | "watchdog_elapsed";
-  /** time until its watchdog must have silenced it; null without a known watchdog or after confirmed silence */
+  /** time until its watchdog should have silenced it; null if its watchdog is unknown or silence is confirmed */
   may_play_for_s: number | null;
   cause: string;
 }
@@ -516,7 +516,7 @@ export interface EffectDescription {
   name: string;
   kind: string;
   description: string;
-  /** by name in a layout file, in SI units */
+  /** parameters by their names in a layout file, in SI units */
   parameters: Record<string, unknown>;
 }
 
@@ -529,11 +529,11 @@ export interface EraPosition {
   channel: number;
 }
 
-/** A condition that an amplifier reports, other than a fault; it continues to play. */
+/** A condition other than a fault that an amplifier reports while it continues to play. */
 export interface AmplifierReport {
   /** cause of the state */
   cause: string;
-  /** what to do about it; null if nothing */
+  /** what to do about it; null if there is nothing to do */
   remedy: string | null;
   kind: "limited" | "interlock_open" | "hot" | "clock_not_steered" | "clock_jumped" | "clock_rate" | "clock_unsettled";
 }

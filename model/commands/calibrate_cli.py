@@ -139,7 +139,7 @@ def calibrate(
 ) -> None:
     """Fit a rig to measured responses.
 
-    Writes the fitted values to a separate file, and prints them with their errors.
+    Writes the fitted values to a separate file and prints them with their standard errors.
     """
     from model.estimate.calibrate import calibrate as fit
     from model.estimate.calibrate import calibration_errors

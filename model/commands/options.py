@@ -27,14 +27,17 @@ MeshOption = Annotated[
     str | None,
     typer.Option(
         metavar="NXxNY",
-        help="Mesh, in the format of a rig file: auto, 12x9, '12x9 Q3'; default: rig.",
+        help="Mesh, as in a rig file: auto, 12x9 or '12x9 Q3'. Default: the rig's.",
     ),
 ]
 FolderOption = Annotated[
     Path, typer.Option("--output", "-o", metavar="DIR", help="Folder to write into.")
 ]
 SizeOption = Annotated[
-    str | None, typer.Option("--size", metavar="WxH", help="Size of pictures in cm, such as 16x10.")
+    str | None,
+    typer.Option(
+        "--size", metavar="WxH", help="Size of pictures, width and height in cm, such as 16x10."
+    ),
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 QuietOption = Annotated[
@@ -45,14 +48,16 @@ ContactsOption = Annotated[
     Path | None,
     typer.Option(
         metavar="FILE",
-        help="Contacts, or a surface layout; default: anywhere, 1 to 3 quiet fingers.",
+        help="File of contacts, or a surface layout. Default: fingers anywhere, with 1 to 3 quiet "
+        "fingers.",
     ),
 ]
 LowestOption = Annotated[
     float, typer.Option(min=1.0, help="Minimum rigid-body frequency of the plate in Hz.")
 ]
 ClusterOption = Annotated[
-    str | None, typer.Option(metavar="tcp://HOST:PORT", help="Dask scheduler.")
+    str | None,
+    typer.Option(metavar="tcp://HOST:PORT", help="Address of a Dask scheduler to compute on."),
 ]
 ExactOption = Annotated[
     bool, typer.Option("--exact", help="Simulate the nominal plate (no parameter errors).")

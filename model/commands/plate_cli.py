@@ -94,17 +94,18 @@ def plate_map(
     rig_file: RigArgument,
     drive: Annotated[
         list[str],
-        typer.Option(metavar="ERA=HZ[@LEVEL[:PHASE_DEG]]", help="Tone of one ERA; repeatable."),
+        typer.Option(metavar="ERA=HZ[@LEVEL[:PHASE_DEG]]", help="Tone of one ERA (repeatable)."),
     ],
     mesh: MeshOption = None,
     points: Annotated[
         str | None,
         typer.Option(
-            metavar="XxY", help="Points of the map. Default: as many as the mesh resolves."
+            metavar="XxY",
+            help="Number of points along x and y. Default: as many as the mesh resolves.",
         ),
     ] = None,
     output: Annotated[
-        Path | None, typer.Option("--output", "-o", metavar="MAP.png", help="Picture to draw.")
+        Path | None, typer.Option("--output", "-o", metavar="MAP.png", help="Picture to write.")
     ] = None,
     size: SizeOption = None,
     as_json: JsonOption = False,
@@ -264,7 +265,7 @@ def convergence(
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Compare meshes with a finer one.
+    """Compare meshes with a finer reference mesh.
 
     Prints the errors of natural frequencies and responses.
     """
@@ -596,10 +597,10 @@ def template(
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Draw a full-scale template with all positions.
+    """Draw a full-scale template of the board.
 
-    It is the board with the positions of everything that is glued to it. Print at 100 %: the ruler
-    on it must measure 100 mm.
+    It marks the position of every part glued to the board. Print it at 100 %: the printed ruler
+    must measure 100 mm.
     """
     from model.estimate.measurement import read_places
     from model.figures import Template, write_template

@@ -67,7 +67,7 @@ def build(
         ),
     ] = "phased",
     grid: Annotated[
-        str, typer.Option(metavar="NXxNY", help="Target cells along x and y.")
+        str, typer.Option(metavar="NXxNY", help="Number of target cells along x and y.")
     ] = "12x9",
     mesh: MeshOption = None,
     workers: Annotated[int, typer.Option(min=1, max=256, help="Number of processes.")] = 1,
@@ -404,7 +404,7 @@ def contrast_map(
     size: SizeOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Map the promised contrast of every position to given quiet fingers."""
+    """Map promised contrast between each position and the quiet fingers."""
     from model.finger import Grid
     from model.study.contrast_maps import map_contrast
     from model.table.table_file import load_table
@@ -470,12 +470,12 @@ def plot(
     table_file: TableArgument,
     output: FolderOption,
     to: Annotated[
-        Literal["png", "svg", "pdf"], typer.Option("--format", help="Of the pictures.")
+        Literal["png", "svg", "pdf"], typer.Option("--format", help="Format of the pictures.")
     ] = "png",
     size: SizeOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Draw weak cells, levels, contrast and an answer."""
+    """Draw a table's weak cells, levels and contrast, and one answer."""
     from model.figures import save_figure, table_figures
     from model.study.overview import find_overview
     from model.table.table_file import load_table
@@ -502,7 +502,8 @@ def plot(
 def export(
     table_file: TableArgument,
     to: Annotated[
-        Literal["mat", "csv"], typer.Option("--format", help="MATLAB and Octave, or text.")
+        Literal["mat", "csv"],
+        typer.Option("--format", help="mat: for MATLAB and Octave; csv: text."),
     ],
     output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="File to write.")],
     content: Annotated[

@@ -27,7 +27,7 @@ def show(
     weak: Annotated[bool, typer.Option("--weak", help="List every weak cell.")] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Show levels, weak cells, contrast and origin of a table."""
+    """Show a table's levels, weak cells, contrast and origin."""
     from model.study.overview import find_overview, summarize
     from model.table.table_file import load_table
 
@@ -132,13 +132,16 @@ def _map_rows(cells: "WeakCells", *, listed: bool) -> Iterator[str]:
 def verify(
     table_file: TableArgument,
     rig_file: RigArgument,
-    samples: Annotated[int, typer.Option(min=1, max=10_000, help="Answers to recompute.")] = 12,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the sample.")] = 0,
+    samples: Annotated[
+        int, typer.Option(min=1, max=10_000, help="Number of answers to recompute.")
+    ] = 12,
+    seed: Annotated[int, typer.Option(min=0, help="Random seed of the sample.")] = 0,
     as_json: JsonOption = False,
 ) -> None:
     """Verify a table against a direct solution.
 
-    Compares a sample of answers at each frequency and in time. Exits with 1 if a check fails.
+    Compares a sample of answers, in the frequency domain and in the time domain. Exits with status
+    1 if a check fails.
     """
     from model.rig.rig_file import load_rig
     from model.study.verification import verify_table

@@ -33,7 +33,10 @@ def soft_amp(
     ] = None,
     channels: Annotated[
         int | None,
-        typer.Option(metavar="N", help="Channels, 2 to 32; above 16 as two amplifiers."),
+        typer.Option(
+            metavar="N",
+            help="Number of channels, 2 to 32; more than 16 are split into two amplifiers.",
+        ),
     ] = None,
     serial: Annotated[
         bool, typer.Option("--serial", help="Serve the serial protocol on a pseudo-terminal.")
@@ -45,7 +48,7 @@ def soft_amp(
         typer.Option(metavar="PATH", help="Link this path to the pseudo-terminal."),
     ] = None,
     rate: Annotated[
-        int | None, typer.Option(metavar="HZ", help="Sample rate; default: that of the device.")
+        int | None, typer.Option(metavar="HZ", help="Sample rate. Default: the device's.")
     ] = None,
     block: Annotated[
         int | None,
@@ -58,15 +61,20 @@ def soft_amp(
     ] = None,
     law: Annotated[
         Law,
-        typer.Option(help="linear: play the force; square: the root of a bias plus half of it."),
+        typer.Option(
+            help="linear: play the force; square: play the root of a bias plus half the force."
+        ),
     ] = Law.LINEAR,
     limit: Annotated[
-        float, typer.Option(metavar="LEVEL", help="Largest sample, 0 to 1 of full scale.")
+        float, typer.Option(metavar="LEVEL", help="Peak sample, 0 to 1 of full scale.")
     ] = 1.0,
     max_gaps: Annotated[
         int,
         typer.Option(
-            metavar="N", help="Gaps per second in the sound; more are a fault.", min=0, max=63
+            metavar="N",
+            help="Number of gaps per second in the sound above which a fault is latched.",
+            min=0,
+            max=63,
         ),
     ] = 3,
     serial_number: Annotated[
@@ -76,16 +84,18 @@ def soft_amp(
         bool,
         typer.Option("--list", help="List devices with outputs, inputs, rate and block; exit."),
     ] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="List as a JSON object.")] = False,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="With --list, print one JSON object.")
+    ] = False,
     until_eof: Annotated[
         bool, typer.Option("--until-eof", help="Exit at the end of standard input.")
     ] = False,
 ) -> None:
     """Run a software amplifier on a sound card. Print its URL and play until Ctrl-C.
 
-    Level 1 is full scale of the device, and silence is samples of zero. Exits with status 3 if the
+    Level 1 is the device's full scale, and silence is zero samples. Exits with status 3 if the
     device is missing or lost. On Linux the kernel kills the process if its sound stalls for 0.1 s;
-    the sound stops with the process. For systemd: Type=notify.
+    the sound stops with the process. In a systemd unit, use Type=notify.
     """
     from model.commands.options import print_report
     from sim.soft_amp.output import listed_devices

@@ -193,7 +193,8 @@ def check(
     at: Annotated[
         str | None,
         typer.Option(
-            metavar="X,Y", help="Position of the finger in metres; default: the median of five."
+            metavar="X,Y",
+            help="Position of the finger in metres. Default: the median of five positions.",
         ),
     ] = None,
     quiet: QuietOption = None,
@@ -214,7 +215,7 @@ def check(
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Simulate what a finger will feel of haptic files.
+    """Simulate how haptic files feel at a finger.
 
     The simulation is in the time domain, for a single finger or with quiet fingers present. A level
     is kept while the level at the skin, averaged over 20 ms, is within 3 dB of the file's; times at

@@ -34,7 +34,7 @@ def check(
     Touches are simulated in the time domain over each region, alone and with a resting second
     finger. Pairs and triples of regions are then touched simultaneously, at the positions with the
     lowest promised contrast. Amplifiers are assumed to be phased, whichever mode the table was
-    built for. Exits with status 1 if a region falls short of the layout.
+    built for. Exits with status 1 if it finds a problem in a region.
     """
     import time
 

@@ -30,7 +30,7 @@ def conformance(
             min=0.1,  # below it fractions are too close together for measured levels
             max=1.0,
             show_default=False,
-            help="Level at which channels are driven, relative to full level. Default: 0.2.",
+            help="Drive level of the channels, relative to full level. Default: 0.2.",
         ),
     ] = None,
     trace: Trace = None,

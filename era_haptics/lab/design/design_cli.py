@@ -38,15 +38,16 @@ def design(
         str,
         typer.Option(
             metavar="N|LO-HI",
-            help="Number of ERAs, including kept ones; at least 3 with other mounts. "
-            "Default: that of the rig.",
+            help="Number of ERAs, including kept ones; ERAs and other mounts together must be at "
+            "least 3. Default: the rig's.",
         ),
     ] = "",
     layouts: Annotated[
         str,
         typer.Option(
             metavar="random:N|FILE",
-            help="Rank layouts instead of searching: N random ones and the named ones, or a file.",
+            help="Rank layouts instead of searching: N layouts (named, then random ones), or the "
+            "layouts in a file.",
         ),
     ] = "",
     finalists: Annotated[
@@ -64,7 +65,7 @@ def design(
         str,
         typer.Option(
             metavar="edge|anywhere|FILE",
-            help="Area allowed for ERAs; FILE: polygons in YAML.",
+            help="Area allowed for ERAs; FILE contains polygons in YAML.",
         ),
     ] = "edge",
     contents: Annotated[
@@ -85,10 +86,14 @@ def design(
             help="Candidate stiffnesses for new ERAs; the best is used. Default: the rig's.",
         ),
     ] = "",
-    seed: Annotated[int, typer.Option(min=0, help="Seed of contact sets and starts.")] = 0,
-    starts: Annotated[int, typer.Option(min=1, max=64, help="Number of starts.")] = 4,
+    seed: Annotated[
+        int, typer.Option(min=0, help="Random seed of contact sets and starting layouts.")
+    ] = 0,
+    starts: Annotated[
+        int, typer.Option(min=1, max=64, help="Number of starting layouts of the search.")
+    ] = 4,
     workers: Annotated[
-        int | None, typer.Option(min=1, max=256, help="Local processes; default: 2.")
+        int | None, typer.Option(min=1, max=256, help="Number of local processes. Default: 2.")
     ] = None,
     cluster: ClusterOption = None,
     mesh: MeshOption = None,

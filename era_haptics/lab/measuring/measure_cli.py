@@ -30,7 +30,7 @@ def measure(
         typer.Option(
             "--sensors",
             metavar="SENSORS.csv",
-            help="Accelerometers: places, inputs, sensitivities.",
+            help="List of accelerometers with positions, inputs and sensitivities.",
         ),
     ],
     output: Annotated[
@@ -53,25 +53,29 @@ def measure(
         str | None,
         typer.Option(
             metavar="LO:HI:STEP",
-            help="Integer frequencies in Hz; default: odd ones, 10 apart, within the rig's limits.",
+            help="Frequencies to play, integers in Hz. Default: odd frequencies within the rig's "
+            "limits, 10 Hz apart.",
         ),
     ] = None,
     level: Annotated[
         float | None,
         typer.Option(
-            help="Peak sample of each output, 1 is full scale; default: 0.3, or less if the "
+            help="Peak sample of each output, 0 to 1 of full scale. Default: 0.3, or less if the "
             "rig's limits require it."
         ),
     ] = None,
     periods: Annotated[
-        int, typer.Option(metavar="N", help="Seconds of each run that count.", min=2, max=60)
+        int,
+        typer.Option(
+            metavar="N", help="Number of 1 s periods evaluated in each run.", min=2, max=60
+        ),
     ] = 2,
     mass: Annotated[
         float | None,
         typer.Option(
             "--sensor-mass",
             metavar="G",
-            help="Mass of a moved sensor in grams; default: column mass_g of --sensors.",
+            help="Mass of a moved sensor in grams. Default: column mass_g of --sensors.",
             min=0,
         ),
     ] = None,
@@ -82,22 +86,27 @@ def measure(
     y_cable: Annotated[
         bool,
         typer.Option(
-            "--y-cable", help="No free output: the loop-back shares the output of the last ERA."
+            "--y-cable",
+            help="Loop back the output of the last ERA, for a sound card without a free output.",
         ),
     ] = False,
     seed: Annotated[
-        int, typer.Option(metavar="N", help="Draw other phases, or another plate.", min=0)
+        int,
+        typer.Option(
+            metavar="N",
+            help="Random seed of the played phases and of the simulated plate.",
+            min=0,
+        ),
     ] = 0,
     as_json: JsonOption = False,
 ) -> None:
     """Measure a plate through a sound card.
 
-    Plays on all ERAs simultaneously and records accelerometers. A loop-back cable leads from the
-    output after those of the ERAs (or from that of the last ERA, --y-cable) to the input after
-    those of the sensors. It reveals the delay and lost blocks; runs with lost blocks are repeated.
-    If all rows of --sensors have the same input, one sensor is moved from row to row, and the
-    terminal prompts for each move. The resulting file is for era calibrate and era rig identify
-    --measured.
+    Plays on all ERAs simultaneously and records accelerometers. A loop-back cable must connect the
+    output after the ERA outputs (with --y-cable, the last ERA output) to the input after the sensor
+    inputs. It reveals the delay and lost blocks; runs with lost blocks are repeated. If all rows of
+    --sensors have the same input, one sensor is moved from row to row, and the terminal prompts for
+    each move. Use the file with era calibrate or era rig identify --measured.
     """
     from era_haptics.lab.measuring.measure import (
         measure_at_once,
@@ -177,26 +186,28 @@ def outputs(
         typer.Option(
             "--outputs",
             metavar="N",
-            help="Number of outputs to test; default: that of the rig.",
+            help="Number of outputs to test. Default: the rig's.",
             min=1,
         ),
     ] = None,
     level: Annotated[
-        float, typer.Option(help="Peak sample of each output, 1 is full scale.")
+        float, typer.Option(help="Peak sample of each output, 0 to 1 of full scale.")
     ] = 0.1,
     frequency: Annotated[
         float | None,
         typer.Option(
-            metavar="HZ", help="Frequency of the tone to feel in Hz; default: nearest to 160."
+            metavar="HZ",
+            help="Frequency of the tone in Hz. Default: the allowed frequency nearest to 160.",
         ),
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Find which output drives which actuator.
 
-    Plays a soft tone on one output after the other, and asks which actuator moved. With --beside,
-    an accelerometer (of any sensitivity) detects this, and also dead, loose or reversed actuators.
-    Exits with status 1 for those, and if channels differ from the rig's and are not written.
+    Plays a soft tone on each output in turn and prompts for the actuator that moved. With --beside,
+    an accelerometer (of any sensitivity) detects the actuator instead, and also detects dead, loose
+    or reversed actuators. Exits with status 1 if there are any, or if channels differ from the
+    rig's and are not written.
     """
     from era_haptics.lab.measuring.outputs import find_outputs
 

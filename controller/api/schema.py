@@ -107,7 +107,7 @@ class CauseAndRemedy(ApiMessage):
     """Cause of a state, and its remedy."""
 
     cause: str = Field(description="cause of the state")
-    remedy: str | None = Field(description="what to do about it; null if there is nothing to do")
+    remedy: str | None = Field(description="remedy; null if no action is needed")
 
 
 class EraPosition(ApiMessage):
@@ -240,7 +240,7 @@ class ContactStatus(ApiMessage):
 
 
 class PlayedTone(ApiMessage):
-    """Tone of one ERA, confirmed by its amplifier."""
+    """An ERA's tone, confirmed by the amplifier."""
 
     frequency_hz: float
     level: float = Field(description="0 to 1 of the full stroke")
@@ -285,8 +285,8 @@ class AmplifierSilence(ApiMessage):
     """Whether an amplifier is silent, after a stop or without its reply."""
 
     silence: Literal["confirmed_silent", "may_play", "watchdog_elapsed"] = Field(
-        description="confirmed_silent: confirmed by its status after a stop; watchdog_elapsed: "
-        "unconfirmed, but its watchdog should have silenced it by now"
+        description="confirmed_silent: confirmed by a status after the stop; watchdog_elapsed: "
+        "unconfirmed, but the watchdog should have silenced it by now"
     )
     may_play_for_s: float | None = Field(
         description="time until its watchdog should have silenced it; null if its watchdog is "
@@ -314,7 +314,7 @@ class AmplifierReport(CauseAndRemedy):
 
 
 class AmplifierStatus(ApiMessage):
-    """State of one amplifier from its last reply; unknown values are null."""
+    """An amplifier's state from the last reply; unknown values are null."""
 
     name: str
     url: str
@@ -333,7 +333,7 @@ class AmplifierStatus(ApiMessage):
     clock_skew_us: float | None = Field(
         None,
         description="RMS error of its clock relative to the others, estimated by the host; null "
-        "for a single amplifier or one that is not synchronised",
+        "for a single or unsynchronised amplifier",
     )
     degraded: bool = Field(
         False,
@@ -383,5 +383,5 @@ class EffectDescription(ApiMessage):
     kind: str
     description: str
     parameters: dict[str, Any] = Field(
-        description="parameters by their names in a layout file, in SI units"
+        description="parameters by name in a layout file, in SI units"
     )

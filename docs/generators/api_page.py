@@ -69,7 +69,7 @@ def _data(model: type[ApiMessage], models: Models) -> Iterator[str]:
     rows = list(_rows("", model, models))
     same = [row.split(" (")[0].removeprefix("- ") for row in rows if row in status]
     if len(same) > 1:
-        yield f"- {', '.join(same)}: as in [status](#status)"
+        yield f"- {', '.join(same)}: see [status](#status)"
     yield from (row for row in rows if len(same) < 2 or row not in status)
 
 

@@ -100,7 +100,7 @@ export interface Empty {
 export interface StatusResult {
   /** cause of the state */
   cause: string;
-  /** what to do about it; null if there is nothing to do */
+  /** remedy; null if no action is needed */
   remedy: string | null;
   /** in order of arrival, newest last */
   contacts: Array<ContactStatus>;
@@ -287,7 +287,7 @@ export interface UnsubscribeParams {
 export interface StateEvent {
   /** cause of the state */
   cause: string;
-  /** what to do about it; null if there is nothing to do */
+  /** remedy; null if no action is needed */
   remedy: string | null;
   old: "NOT_READY" | "SWITCH_ON_DISABLED" | "READY_TO_SWITCH_ON" | "SWITCHED_ON" | "OPERATION_ENABLED" | "QUICK_STOP_ACTIVE" | "FAULT_REACTION_ACTIVE" | "FAULT" | "COMM_LOST";
   new: "NOT_READY" | "SWITCH_ON_DISABLED" | "READY_TO_SWITCH_ON" | "SWITCHED_ON" | "OPERATION_ENABLED" | "QUICK_STOP_ACTIVE" | "FAULT_REACTION_ACTIVE" | "FAULT" | "COMM_LOST";
@@ -428,7 +428,7 @@ export interface ContactStatus {
   load?: number;
 }
 
-/** Tone of one ERA, confirmed by its amplifier. */
+/** An ERA's tone, confirmed by the amplifier. */
 export interface PlayedTone {
   frequency_hz: number;
   /** 0 to 1 of the full stroke */
@@ -436,7 +436,7 @@ export interface PlayedTone {
   phase_deg: number;
 }
 
-/** State of one amplifier from its last reply; unknown values are null. */
+/** An amplifier's state from the last reply; unknown values are null. */
 export interface AmplifierStatus {
   name: string;
   url: string;
@@ -451,7 +451,7 @@ export interface AmplifierStatus {
   high_voltage: boolean | null;
   /** time since its last reply */
   reply_age_s: number | null;
-  /** RMS error of its clock relative to the others, estimated by the host; null for a single amplifier or one that is not synchronised */
+  /** RMS error of its clock relative to the others, estimated by the host; null for a single or unsynchronised amplifier */
   clock_skew_us?: number | null;
   /** whether the amplifier does not reply but may still play; no new vibration starts meanwhile */
   degraded?: boolean;
@@ -492,7 +492,7 @@ export interface TouchInputStatus {
 
 /** Whether an amplifier is silent, after a stop or without its reply. */
 export interface AmplifierSilence {
-  /** confirmed_silent: confirmed by its status after a stop; watchdog_elapsed: unconfirmed, but its watchdog should have silenced it by now */
+  /** confirmed_silent: confirmed by a status after the stop; watchdog_elapsed: unconfirmed, but the watchdog should have silenced it by now */
   silence: "confirmed_silent" | "may_play" | "watchdog_elapsed";
   /** time until its watchdog should have silenced it; null if its watchdog is unknown or silence is confirmed */
   may_play_for_s: number | null;
@@ -516,7 +516,7 @@ export interface EffectDescription {
   name: string;
   kind: string;
   description: string;
-  /** parameters by their names in a layout file, in SI units */
+  /** parameters by name in a layout file, in SI units */
   parameters: Record<string, unknown>;
 }
 
@@ -533,7 +533,7 @@ export interface EraPosition {
 export interface AmplifierReport {
   /** cause of the state */
   cause: string;
-  /** what to do about it; null if there is nothing to do */
+  /** remedy; null if no action is needed */
   remedy: string | null;
   kind: "limited" | "interlock_open" | "hot" | "clock_not_steered" | "clock_jumped" | "clock_rate" | "clock_unsettled";
 }

@@ -216,7 +216,7 @@ def _heading(threshold: str, *, has_latency: bool) -> str:
     if has_latency:
         groups += f" {'latency':>7}"
         units += f" {'/ ms':>7}"
-    scale = f"{scale_in_words(threshold)}, contrasts the least over all sets"
+    scale = f"{scale_in_words(threshold)}; contrasts are the lowest of all sets"
     return "\n".join([scale, groups.rstrip(), units.rstrip(), columns, ""])
 
 

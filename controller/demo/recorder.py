@@ -54,7 +54,7 @@ class FingerVibration:
     weights: FloatArray
     """Weights (p,) of the points in the mean over the tip."""
     thresholds: tuple[str, ...] = (DEFAULT_THRESHOLD,)
-    """Names of threshold sets: levels are relative to the first, contrasts the least over all."""
+    """Threshold sets: levels refer to the first, contrasts are the lowest of all sets."""
 
     @property
     def level_db_sl(self) -> float:

@@ -174,7 +174,7 @@ ROWS = (
     ),
 )
 DRIVEN = {"SW": {"frequency_hz": 50.0}, "SE": {"frequency_hz": 50.0}, "NE": {"frequency_hz": 120.0}}
-SCALE = "levels above the thresholds of vibrotactile-probe, contrasts the least over all sets\n"
+SCALE = "levels above the thresholds of vibrotactile-probe; contrasts are the lowest of all sets\n"
 LINES = """\
   0.3   19.8,  5.9       0  SW SE 50 Hz, NE 120 Hz      -      -    20.0   19.0     9.6
   1.0    5.0,  5.0       2  SW SE 50 Hz, NE 120 Hz   12.2   14.0    20.0   19.0     9.6

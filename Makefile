@@ -27,15 +27,16 @@ firmware-test: .venv/installed-test
 	.ci/install gcc-arm-none-eabi:arm-none-eabi-gcc libnewlib-arm-none-eabi:
 	$(BIN)/python firmware/test/run.py $(FIRMWARE)
 
-# What needs the processors, and sometimes waits for processes: one worker more than there are; then
-# what plays in real time, which mostly waits: three more, of the files that name it. What loads the processors itself is in
-# `make test-long`.
-MORE_THAN_PROCESSORS = $(shell $(PYTHON) -c 'import os; print((os.cpu_count() or 1) + $(1))')
+# First the tests that mostly compute, then those that play in real time, from the files that name them.
+# Each with one worker more than there are processors: some tests wait for processes. More workers make
+# the second part no faster, and its deadlines harder to meet. Tests that load the processors
+# themselves are in `make test-long`.
+WORKERS = $(shell $(PYTHON) -c 'import os; print((os.cpu_count() or 1) + 1)')
 # A test that never ends is one failure, which says where it was; a worker begun anew would wait for ever.
 ENDING := -o faulthandler_timeout=400 -o faulthandler_exit_on_timeout=true --max-worker-restart 0
 test: .venv/installed-test
-	$(BIN)/pytest $(ENDING) -m 'not real_time and not long' --numprocesses $(call MORE_THAN_PROCESSORS,1) --dist loadfile --no-loadscope-reorder
-	$(BIN)/pytest $(ENDING) -m 'real_time and not long' --numprocesses $(call MORE_THAN_PROCESSORS,3) --dist loadfile --no-loadscope-reorder $$(grep -rl real_time tests --include='test_*.py')
+	$(BIN)/pytest $(ENDING) -m 'not real_time and not long' --numprocesses $(WORKERS) --dist loadfile --no-loadscope-reorder
+	$(BIN)/pytest $(ENDING) -m 'real_time and not long' --numprocesses $(WORKERS) --dist loadfile --no-loadscope-reorder $$(grep -rl real_time tests --include='test_*.py')
 
 # The tests nearest to what differs from main: about a minute, stopping at the first failure.
 # Since another commit: make test-changed SINCE=HEAD~3

@@ -266,7 +266,7 @@ class ApiService:
 
     @api_method(is_limited=False)  # the newest frame counts, so they never queue up
     def touch(self, client: Connection, params: TouchParams) -> Empty:
-        """Report all fingers of one touch source of this client."""
+        """Report all fingers of a touch source."""
         if client.number is None:
             client.number = next(self._next_number)
             self._clients.add(client)

@@ -28,11 +28,11 @@ _Row: TypeAlias = tuple[str, str, Mapping[Any, float | None], tuple[str, ...]]
 """Name, meaning, values by label values, and label names of a metric."""
 
 _AMPLIFIER_GAUGES: tuple[tuple[str, str, Callable[[AmplifierStatus], float | None]], ...] = (
-    ("degraded", "Whether it does not reply but may still play.", lambda a: a.degraded),
-    ("lost", "Whether the link is lost.", lambda a: a.lost),
+    ("degraded", "Whether the amplifier does not reply but may still play.", lambda a: a.degraded),
+    ("lost", "Whether the link to the amplifier is lost.", lambda a: a.lost),
     (
         "fault",
-        "Whether it reports a fault.",
+        "Whether the amplifier reports a fault.",
         lambda a: None if a.fault is None else a.fault != "NONE",
     ),
     ("high_voltage", "Whether high voltage is on.", lambda a: a.high_voltage),
@@ -43,7 +43,7 @@ _AMPLIFIER_GAUGES: tuple[tuple[str, str, Callable[[AmplifierStatus], float | Non
     ("reply_age_seconds", "Time since the last reply.", lambda a: a.reply_age_s),
     (
         "clock_skew_seconds",
-        "RMS error of its clock relative to the others.",
+        "RMS error of the amplifier's clock relative to the others.",
         lambda a: None if a.clock_skew_us is None else a.clock_skew_us / 1e6,
     ),
     (
@@ -119,7 +119,7 @@ def _gauges(status: StatusResult) -> list[_Row]:
         ),
         (
             "predicted_contrast_decibels",
-            "Felt contrast of the pattern, nominal.",
+            "Nominal felt contrast of the pattern.",
             {(): status.predicted_contrast_db},
             (),
         ),
@@ -137,13 +137,13 @@ def _gauges(status: StatusResult) -> list[_Row]:
         ),
         (
             "touch_input_open",
-            "Whether touches can come from an input.",
+            "Whether the input can deliver touches.",
             {(each.name,): each.state == "open" for each in status.inputs},
             ("input",),
         ),
         (
             "amplifier_report",
-            "1 for each of its recent reports.",
+            "1 for each recent report of the amplifier.",
             {
                 (each.name, kind): kind in {report.kind for report in each.reports}
                 for each in status.amplifiers
@@ -179,7 +179,7 @@ def _counters(status: StatusResult) -> list[_Row]:
         ),
         (
             "lost_events",
-            "Events that clients read too slowly.",
+            "Events lost because clients read too slowly.",
             {(topic,): count for topic, count in status.lost_events.items()},
             ("topic",),
         ),
@@ -200,7 +200,7 @@ def _histograms(status: StatusResult) -> list[tuple[str, str, LatencySummary | N
         ("touch_to_wire", "From a touch to the last byte of the command.", status.latency_ms),
         (
             "lift_to_wire",
-            "From a lift, or an end without a touch, likewise.",
+            "From a lift, or an end without a touch, to the last byte of the command.",
             status.lift_latency_ms,
         ),
     ]

@@ -1,6 +1,6 @@
 # Written by docs/generators/client_stub.py.
 # ruff: noqa: E501
-"""What every method of the API does: in reference, OpenAPI, and the help of `era`.
+"""Summaries of all API methods, for the reference, OpenAPI and the help of `era`.
 
 Apart from the messages, whose import would double the time of help.
 """
@@ -13,7 +13,7 @@ SUMMARIES = {
     "disarm": "Ramp to silence, then switch the high voltage off. Any client can disarm. While a link is lost, this stops all amplifiers.",
     "stop": "Quick-stop all amplifiers, latched until clear. Not an emergency stop. Any client can stop at any time. Error 1006 unless every amplifier is confirmed silent.",
     "clear": "Clear a stop, or a fault that no longer exists. Stays disarmed.",
-    "touch": "Report all fingers of one touch source of this client.",
+    "touch": "Report all fingers of a touch source.",
     "layout": "Switch to another of the daemon's layouts. Continuous effects under resting fingers change immediately. Effects of limited duration, and effects that a program plays, continue to their end.",
     "reload": "Read the daemon's files again and apply their layouts. All other changes are rejected; they need a restart.",
     "effects": "List the available effects.",

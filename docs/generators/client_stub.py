@@ -48,7 +48,7 @@ def summaries() -> str:
     lines = [
         "# Written by docs/generators/client_stub.py.",
         "# ruff: noqa: E501",
-        """"Summaries of all API methods, for the reference, OpenAPI and the help of `era`.",
+        '"""Summaries of all API methods, for the reference, OpenAPI and the help of `era`.',
         "",
         "Apart from the messages, whose import would double the time of help.",
         '"""',

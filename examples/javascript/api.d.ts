@@ -16,7 +16,7 @@ export interface Methods {
   stop: { params: RequestedBy; result: StopResult };
   /** Clear a stop, or a fault that no longer exists. Stays disarmed. */
   clear: { params: ClearParams; result: Empty };
-  /** Report all fingers of one touch source of this client. */
+  /** Report all fingers of a touch source. */
   touch: { params: TouchParams; result: Empty };
   /** Switch to another of the daemon's layouts. Continuous effects under resting fingers change immediately. Effects of limited duration, and effects that a program plays, continue to their end. */
   layout: { params: LayoutParams; result: LayoutResult };

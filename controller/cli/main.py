@@ -224,7 +224,7 @@ def _root(
         bool, typer.Option("--debug", help="Show the traceback of an error; allowed anywhere.")
     ] = False,
 ) -> None:
-    """Felt here, not there: localized vibration on large touch plates."""
+    """Haptic feedback for several fingers on one large touch plate."""
 
 
 def _invoke(group: TyperGroup, arguments: list[str]) -> int:

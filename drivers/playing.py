@@ -21,6 +21,7 @@ from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from itertools import chain, pairwise
 from operator import attrgetter
+from typing import NamedTuple
 
 from drivers.protocol.definition import QUANTITIES, SHORTENED_FADE
 from drivers.protocol.records import Values
@@ -124,7 +125,8 @@ class VoiceTransition:
             return 0.0
         points = (self.first, *self.knots, self.last)
         passed = int((time - self.start) / self.step) if self.knots else 0
-        return steepest(pairwise(points[passed:]), self.step, is_cosine=not self.knots)[1]
+        lines = pairwise(points[passed:])
+        return steepest(lines, self.step, is_cosine=not self.knots).change
 
 
 def along(
@@ -138,25 +140,31 @@ def along(
     return VoiceTransition(time, step, first, last, end, _amplitudes_of(envelope))
 
 
-def steepest(
-    ways: Iterable[tuple[complex, complex]], step: float, *, is_cosine: bool
-) -> tuple[float, float]:
-    """Return the steepest rise of the magnitude and the fastest change on ways between points.
+class Slope(NamedTuple):
+    """How fast an amplitude changes at most."""
 
-    Both are in full levels a second. Each way takes a step [s] and follows a straight line or a
-    raised cosine.
+    rise: float
+    """The steepest rise of its magnitude [full levels/s]."""
+    change: float
+    """Its fastest change in the complex plane [full levels/s]."""
+
+
+def steepest(lines: Iterable[tuple[complex, complex]], step: float, *, is_cosine: bool) -> Slope:
+    """Return the steepest slope on lines between two points.
+
+    Each line takes a step [s] and is followed linearly or along a raised cosine.
     """
-    rise = change = 0.0
-    for one, other in ways:
-        if one == other:
+    max_rise = max_change = 0.0
+    for start, end in lines:
+        if start == end:
             continue
-        fastest = abs(other - one) / step if step else math.inf
-        change = max(change, fastest)
+        change = abs(end - start) / step if step else math.inf
+        max_change = max(max_change, change)
         # The magnitude rises only if the end is farther out than the foot of the perpendicular.
-        if ((other - one) * other.conjugate()).real > 0:
-            rise = max(rise, fastest)
+        if ((end - start) * end.conjugate()).real > 0:
+            max_rise = max(max_rise, change)
     factor = math.pi / 2 if is_cosine else 1.0
-    return rise * factor, change * factor
+    return Slope(max_rise * factor, max_change * factor)
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,4 +1,4 @@
-"""Limits of one amplifier, and the worst case of a set relative to them.
+"""Limits of one amplifier, and the worst case of a set relative to these limits.
 
 `wire_limits` combines the limits of the rig, the amplifier, its channels and this module to the
 lowest of each. `Rounding` converts layers to wire integers: levels, frequencies and phases to the
@@ -6,9 +6,35 @@ nearest step, ramps upward, and `valid_for` never to 0, which would mean endless
 that the wire cannot carry or the limits forbid. `Budget` enforces rate, on-time and duty.
 
 `Bounds` gives the largest level, power and rise over all layers. A set starts at an unknown moment
-within the next tenth of a second, so the voices are taken from `drivers.playing` after a
-commit with that uncertainty. The magnitude of an amplitude moving on a line in the complex plane
-is a convex function; therefore sums are largest where each transition is at one of its points.
+within the next tenth of a second. `drivers.playing` computes the voices after a commit in the
+middle of this time span, with half the span as uncertainty:
+
+    magnitude
+        |   old voice: may fade later
+        | - - - - - - - - - -.
+        |   .                  `.   new voice: rises to its last
+        |     `.               .-`------------------------
+        |       `.          .-`   `.
+        |         `.     .-`        `.
+        |___________`_.-`_____________`.__________________ time
+               since     middle     until
+                 |<-- it may start -->|
+
+Every amplitude moves on straight lines in the complex plane, between the points of its transition:
+
+      Im|    first
+        |     *
+        |      `.         The magnitude is the distance from 0, a convex function on each line:
+        |        `*knot   it is largest at one of the ends.
+        |         |
+        |_________*last__ Re
+
+Sums of magnitudes are convex too while all voices move at the same pace, so only the points are
+compared. In an interval in which voices move at different paces, each one counts with the larger of
+its two ends.
+
+`PeakSums` is a coarse bound, five times as fast, which suffices for most sets without a limit of
+the slew: it adds up the peaks of all voices, as if they occurred simultaneously.
 """
 
 import math
@@ -16,8 +42,8 @@ from array import array
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import chain, pairwise, product, zip_longest
-from operator import index
+from itertools import pairwise, product, zip_longest
+from operator import add, index
 from typing import NamedTuple, TypeAlias
 
 from drivers.errors import CommandError, CommandRefused
@@ -26,6 +52,7 @@ from drivers.playing import (
     AmplifierLayer,
     AmplifierTone,
     Playback,
+    Slope,
     Voice,
     VoiceTransition,
     along,
@@ -35,182 +62,354 @@ from drivers.playing import (
 )
 from drivers.protocol.definition import QUANTITIES
 from drivers.protocol.records import Values, WireQuantity
-from drivers.protocol.sets import Command, LayerSet
+from drivers.protocol.sets import Command, Envelope, LayerSet
 from registry.limits import GuardLimits
 
-_PER_RAMP, _PER_VALID_FOR = QUANTITIES["ramp"].per_unit, QUANTITIES["valid_for"].per_unit
+_PER_RAMP = QUANTITIES["ramp"].per_unit
+_PER_VALID_FOR = QUANTITIES["valid_for"].per_unit
+_LEVEL, _PHASE = QUANTITIES["level"], QUANTITIES["phase"]
+_RAMP, _VALID_FOR = QUANTITIES["ramp"], QUANTITIES["valid_for"]
+_FREQUENCY = QUANTITIES["frequency"]
 _SILENCE: Sequence[complex] = (0j,)
-_NONE: Sequence[LayerSet] = ()
+_NO_SETS: Sequence[LayerSet] = ()
 
 
-class _Course(NamedTuple):
-    """A voice and how it may change."""
+class _PossibleVoice(NamedTuple):
+    """A voice as it may play after the sets."""
 
     voice: Voice
+    """The voice after all sets."""
     starts: Sequence[complex]
-    """Possible starting amplitudes."""
-    sets: Sequence[LayerSet] = ()
-    """Sets of its layer; empty once the voice has ended."""
-    is_new: bool = True
-    """Whether any of these sets changes it."""
-    is_late: bool = False
-    """Whether that set waits for another one to end."""
-    goes_on: bool = False
-    """Whether it continues the voice of its frequency that the layer plays."""
+    """Possible amplitudes at the start of its transition."""
+    layer_sets: Sequence[LayerSet] = ()
+    """Sets of its layer, which may end it; empty once the voice has ended."""
+    is_changed: bool = True
+    """Whether a set gives it a new transition."""
+    is_waiting: bool = False
+    """Whether that set waits for the end of an onset."""
+    continues: bool = False
+    """Whether it then continues the voice of its frequency in its layer."""
 
 
 class Bounds:
-    """What channels may play if layers are committed at any moment between two times [s]."""
+    """The loudest and fastest that channels can play if layers start between two times [s]."""
 
     def __init__(
         self, playback: Playback, layers: Sequence[LayerSet], since: float, until: float
     ) -> None:
-        self._playback, self._since = playback, since
-        self._middle, self._half = (since + until) / 2, (until - since) / 2
-        named = [one for one in layers if not one.renew]
-        over = {one.layer for one in named if playback.end_of(one.layer) <= until}
-        every = (*named, *playback.waiting)
-        self._of_layer: dict[int, list[LayerSet]] = {}
-        for one in every:
-            self._of_layer.setdefault(one.layer, []).append(one)
-        before = playback.all_voices
-        after, self._courses = [*before], [list[_Course]() for _ in before]
-        for one in every:
-            commands, ramp = {each.channel: each for each in one.commands}, one.ramp / _PER_RAMP
-            is_over = one.layer in over  # it may have begun to end when the set comes
-            earlier, half = (
-                ([()] * len(before), 0.0) if one.after or is_over else (after, self._half)
+        self._playback = playback
+        self._since = since
+        self._middle = (since + until) / 2
+        self._half = (until - since) / 2
+        self._layer_sets: dict[int, list[LayerSet]] = {}
+        self._possible: list[list[_PossibleVoice]] = [[] for _ in playback.all_voices]
+        started = [layer_set for layer_set in layers if not layer_set.renew]
+        all_sets = (*started, *playback.waiting)
+        for layer_set in all_sets:
+            self._layer_sets.setdefault(layer_set.layer, []).append(layer_set)
+        layers_set = {layer_set.layer for layer_set in started}
+        ending = {layer for layer in layers_set if playback.end_of(layer) <= until}
+        voices_by_channel = [*playback.all_voices]
+        for layer_set in all_sets:
+            is_ending = layer_set.layer in ending
+            if layer_set.after:
+                self._add_waiting(layer_set, is_ending=is_ending)
+            else:
+                voices_by_channel = self._after_set(
+                    voices_by_channel, layer_set, is_ending=is_ending
+                )
+        for channel, voices in enumerate(voices_by_channel):
+            old_voices = playback.all_voices[channel]
+            for old_voice, voice in zip_longest(old_voices, voices):
+                self._possible[channel].append(self._possible_voice(old_voice, voice))
+
+    def _after_set(
+        self, voices_by_channel: list[tuple[Voice, ...]], layer_set: LayerSet, *, is_ending: bool
+    ) -> list[tuple[Voice, ...]]:
+        """Return the voices of all channels after a set.
+
+        is_ending: whether its layer may have begun to end when the set starts. Then the ending
+        voices and the new ones count independently.
+        """
+        if not is_ending:
+            ramp = layer_set.ramp / _PER_RAMP
+            commands = _by_channel(layer_set)
+            return voices_after(
+                voices_by_channel, layer_set.layer, commands, self._middle, ramp, self._half
             )
-            played = voices_after(earlier, one.layer, commands, self._middle, ramp, half)
-            for channel, voices in enumerate(played):
-                if one.after:
-                    goes_on = bool(voices) and commands[channel].keep_phase and not is_over
-                    self._courses[channel] += [
-                        self._late(each, before[channel])._replace(goes_on=goes_on)
-                        for each in voices
-                    ]
-                else:
-                    after[channel] = (*after[channel], *voices) if is_over else voices
-        for courses, olds, voices in zip(self._courses, before, after, strict=True):
-            courses += [self._course(old, each) for old, each in zip_longest(olds, voices)]
+        voices_after_set = []
+        new_voices = self._voices_alone(layer_set)
+        for voices, new in zip(voices_by_channel, new_voices, strict=True):
+            voices_after_set.append((*voices, *new))
+        return voices_after_set
 
-    def _late(self, voice: Voice, olds: Sequence[Voice]) -> _Course:
-        """Return the course of a voice that waits: it may start anywhere on an old one's way."""
-        name = voice.layer, voice.frequency
-        continued = [old.transition for old in olds if (old.layer, old.frequency) == name]
-        points = [(0j,), *(way.points(self._since) for way in continued)]
-        return _Course(voice, [*chain(*points)], is_late=True)
+    def _voices_alone(self, layer_set: LayerSet) -> list[tuple[Voice, ...]]:
+        """Return the voices of all channels if only this set plays, from the middle on."""
+        silent: list[tuple[Voice, ...]] = [()] * len(self._possible)
+        ramp = layer_set.ramp / _PER_RAMP
+        commands = _by_channel(layer_set)
+        return voices_after(silent, layer_set.layer, commands, self._middle, ramp, 0.0)
 
-    def _course(self, old: Voice | None, voice: Voice) -> _Course:
-        """Return the course of a voice after all sets; old: that before, None for a new one."""
-        starts, sets, is_new = _SILENCE, self._of_layer.get(voice.layer, _NONE), True
-        if old is not None:
-            starts = old.transition.points(self._since)
-            is_new = old.transition is not voice.transition
-            # A voice that is falling silent goes on so if that ends before a fade would.
-            latest = voice.transition.end + self._half + SAME
-            is_fading = is_new and voice.has_ended and not voice.transition.knots
-            if is_fading and not old.transition.last and old.transition.end <= latest:
-                voice, is_new = old, False
-            sets = _NONE if old.has_ended else sets
-        return _Course(voice, starts, sets, is_new)
+    def _add_waiting(self, layer_set: LayerSet, *, is_ending: bool) -> None:
+        """Add the voices of a set that waits; is_ending: see `_after_set`."""
+        commands = _by_channel(layer_set)
+        for channel, voices in enumerate(self._voices_alone(layer_set)):
+            for voice in voices:
+                continues = commands[channel].keep_phase and not is_ending
+                starts = self._waiting_starts(channel, voice)
+                possible = _PossibleVoice(voice, starts, is_waiting=True, continues=continues)
+                self._possible[channel].append(possible)
+
+    def _waiting_starts(self, channel: int, voice: Voice) -> Sequence[complex]:
+        """Return where a waiting voice may start: silent, or from a voice that it continues."""
+        starts = [0j]
+        for old_voice in self._playback.all_voices[channel]:
+            if (old_voice.layer, old_voice.frequency) == (voice.layer, voice.frequency):
+                starts += old_voice.transition.points(self._since)
+        return starts
+
+    def _possible_voice(self, old_voice: Voice | None, voice: Voice) -> _PossibleVoice:
+        """Return a voice after all sets; old_voice: before the sets, None for a new voice."""
+        layer_sets = self._layer_sets.get(voice.layer, _NO_SETS)
+        if old_voice is None:
+            return _PossibleVoice(voice, _SILENCE, layer_sets)
+        old_transition = old_voice.transition
+        starts = old_transition.points(self._since)
+        is_changed = old_transition is not voice.transition
+        # A voice that is falling silent continues to do so if that ends before a fade would.
+        latest_end = voice.transition.end + self._half + SAME
+        is_fading = is_changed and voice.has_ended and not voice.transition.knots
+        if is_fading and not old_transition.last and old_transition.end <= latest_end:
+            voice = old_voice
+            is_changed = False
+        if old_voice.has_ended:
+            layer_sets = _NO_SETS
+        return _PossibleVoice(voice, starts, layer_sets, is_changed)
 
     def worst(self) -> tuple[list[float], float]:
-        """Return the largest level of each channel, and the largest sum of their squares.
+        """Return the largest level of each channel, and the largest sum of their squares."""
+        steady_levels = self._steady_levels()
+        transitions = self._changing_magnitudes()
+        times = _times_of_points(transitions, self._middle)
+        mixed = _intervals_of_different_paces(transitions, times)
+        count = len(times) + len(mixed)
+        channel_levels = [[level] * count for level in steady_levels]
+        for channel, transition in transitions:
+            levels = [abs(transition.at(time)) for time in times]
+            levels += [max(levels[number], levels[number + 1]) for number in mixed]
+            channel_levels[channel] = [*map(add, channel_levels[channel], levels)]
+        powers = []
+        for levels_at_time in zip(*channel_levels, strict=True):
+            powers.append(sum([level * level for level in levels_at_time]))
+        return [*map(max, channel_levels)], max(powers)
 
-        Between two points each magnitude is a convex function of the way. So is their sum while all
-        follow the same way; otherwise each may be at either of its ends.
+    def _steady_levels(self) -> list[float]:
+        """Return the sum of the peaks of each channel's unchanged and waiting voices.
+
+        A waiting voice and the voice that it continues count once, with the higher peak.
         """
-        steady, ways = [0.0] * len(self._courses), []
-        going_on = dict[tuple[int, int, float], float]()
-        for channel, courses in enumerate(self._courses):
-            for course in courses:
-                voice = course.voice
-                name = channel, voice.layer, voice.frequency
-                if course.is_new and not course.is_late:
-                    ways.append((channel, _magnitudes(course)))
-                elif course.goes_on or not (course.is_late or voice.has_ended):
-                    going_on[name] = max(going_on.get(name, 0.0), voice.peak(self._since))
+        levels = [0.0] * len(self._possible)
+        continued_peaks: dict[tuple[int, int, float], float] = {}
+        for channel, possible_voices in enumerate(self._possible):
+            for possible in possible_voices:
+                voice = possible.voice
+                if possible.is_changed and not possible.is_waiting:
+                    continue
+                peak = voice.peak(self._since)
+                if possible.continues or not (possible.is_waiting or voice.has_ended):
+                    key = channel, voice.layer, voice.frequency
+                    continued_peaks[key] = max(continued_peaks.get(key, 0.0), peak)
                 else:
-                    steady[channel] += voice.peak(self._since)
-        for (channel, _, _), peak in going_on.items():
-            steady[channel] += peak
-        moments = {way.start + way.step * at for _, way in ways for at in range(len(way.knots) + 2)}
-        times = sorted(moments | {self._middle})
-        levels = [[level] * len(times) for level in steady]
-        mixed = _of_several_ways([way for _, way in ways], times)
-        for level, of_channel in zip(levels, steady, strict=True):
-            level += [of_channel] * len(mixed)
-        for channel, way in ways:
-            values = [abs(way.at(time)) for time in times]
-            values += [max(values[index : index + 2]) for index in mixed]
-            levels[channel] = [*map(float.__add__, levels[channel], values)]
-        power = max(sum(level * level for level in each) for each in zip(*levels, strict=True))
-        return [*map(max, levels)], power
+                    levels[channel] += peak
+        for (channel, _, _), peak in continued_peaks.items():
+            levels[channel] += peak
+        return levels
+
+    def _changing_magnitudes(self) -> list[tuple[int, VoiceTransition]]:
+        """Return the channels of voices with new transitions, and these in magnitudes."""
+        transitions = []
+        for channel, possible_voices in enumerate(self._possible):
+            for possible in possible_voices:
+                if possible.is_changed and not possible.is_waiting:
+                    transitions.append((channel, _magnitudes(possible)))
+        return transitions
 
     def rise(self, channel: int) -> float:
         """Return the steepest rise of a level [full levels/s]; equal frequencies may beat."""
-        rises: dict[float, list[tuple[float, float]]] = {}  # by frequency: rise, change
-        for course in self._courses[channel]:
-            of_voice = rises.setdefault(course.voice.frequency, [])
-            of_voice.append(self._steepest(course))
-            for one in course.sets:
-                if one.after or not course.is_new:  # it may fade along the ramp of that set later
-                    of_voice.append(
-                        _steepest_of(course.starts, along(None, 0.0, one.ramp / _PER_RAMP, 0j, 0j))
-                    )
-        steepest_rise = 0.0
-        for several in rises.values():
-            is_alone = len(several) == 1
-            steepest_rise += several[0][0] if is_alone else sum([each for _, each in several])
-        return steepest_rise
+        slopes_by_frequency: dict[float, list[Slope]] = {}
+        for possible in self._possible[channel]:
+            slopes = slopes_by_frequency.setdefault(possible.voice.frequency, [])
+            slopes.append(self._slope(possible))
+            for layer_set in possible.layer_sets:
+                # It may fade along the ramp of that set later.
+                if layer_set.after or not possible.is_changed:
+                    fade = along(None, 0.0, layer_set.ramp / _PER_RAMP, 0j, 0j)
+                    slopes.append(_slope_from(possible.starts, fade))
+        rise = 0.0
+        for slopes in slopes_by_frequency.values():
+            if len(slopes) == 1:
+                rise += slopes[0].rise
+            else:
+                rise += sum([slope.change for slope in slopes])
+        return rise
 
-    def _steepest(self, course: _Course) -> tuple[float, float]:
-        """Return the steepest rise and the fastest change of a voice, including its ending."""
-        voice, starts, way = course.voice, course.starts, course.voice.transition
-        if course.is_new:
-            ways = [_steepest_of(starts, way)]
-            starts = (*starts, *way.knots, way.last)
+    def _slope(self, possible: _PossibleVoice) -> Slope:
+        """Return the steepest slope of a voice, including its ending."""
+        voice = possible.voice
+        transition = voice.transition
+        starts = possible.starts
+        if possible.is_changed:
+            slopes = [_slope_from(starts, transition)]
+            starts = (*starts, *transition.knots, transition.last)
         else:
             # A steady voice counts too: another voice of its frequency may cease to cancel it.
-            change = way.slope(self._since) if way.end > self._since else 0.0
-            ways = [(change if way.last or way.knots else 0.0, change)]
+            is_moving = transition.end > self._since
+            change = transition.slope(self._since) if is_moving else 0.0
+            is_falling_only = not (transition.last or transition.knots)
+            slopes = [Slope(0.0 if is_falling_only else change, change)]
         if not voice.has_ended:
             if voice.ending is not None:
-                ways.append(_steepest_of(starts, along(voice.ending, 0.0, 0.0, 0j, 0j)))
-            elif not course.is_new and self._playback.end_of(voice.layer) < math.inf:
+                slopes.append(_slope_from(starts, along(voice.ending, 0.0, 0.0, 0j, 0j)))
+            elif not possible.is_changed and self._playback.end_of(voice.layer) < math.inf:
                 ramp = self._playback.ramp_of(voice.layer)
-                ways.append(_steepest_of(starts, along(None, 0.0, ramp, 0j, 0j)))
-        rises, changes = zip(*ways, strict=True)
-        return max(rises), max(changes)
+                slopes.append(_slope_from(starts, along(None, 0.0, ramp, 0j, 0j)))
+        rises, changes = zip(*slopes, strict=True)
+        return Slope(max(rises), max(changes))
 
 
-def _magnitudes(course: _Course) -> VoiceTransition:
-    """Return the way of a voice in magnitudes; its ending may begin before the way is over."""
-    voice, way = course.voice, course.voice.transition
-    ending = 0.0 if voice.has_ended else peak_of(voice.ending)
-    first, *knots, last = map(abs, (way.first, *way.knots, way.last))
-    last = max(last, ending)
-    duration = (way.end - way.start) * _PER_VALID_FOR
-    if any(0 < one.valid_for < duration for one in course.sets):
-        first, knots = max(first, ending), [max(each, ending) for each in knots]
-    return VoiceTransition(way.start, way.step, first, last, way.end, tuple(knots))
+def _by_channel(layer_set: LayerSet) -> dict[int, Command]:
+    return {command.channel: command for command in layer_set.commands}
 
 
-def _of_several_ways(ways: Sequence[VoiceTransition], times: Sequence[float]) -> list[int]:
-    """Return the indices of the intervals between times in which not all follow the same way."""
-    kinds = {(way.end, None if way.knots else way.step) for way in ways}
-    if len(kinds) < 2:
+def _magnitudes(possible: _PossibleVoice) -> VoiceTransition:
+    """Return a transition in magnitudes; the voice's ending may begin before the transition ends.
+
+    Then every point that the ending may replace counts with the peak of the ending.
+    """
+    voice = possible.voice
+    transition = voice.transition
+    ending_peak = 0.0 if voice.has_ended else peak_of(voice.ending)
+    first = abs(transition.first)
+    knots = [abs(knot) for knot in transition.knots]
+    last = max(abs(transition.last), ending_peak)
+    duration = (transition.end - transition.start) * _PER_VALID_FOR
+    for layer_set in possible.layer_sets:
+        if 0 < layer_set.valid_for < duration:
+            first = max(first, ending_peak)
+            knots = [max(knot, ending_peak) for knot in knots]
+    return VoiceTransition(
+        transition.start, transition.step, first, last, transition.end, tuple(knots)
+    )
+
+
+def _times_of_points(
+    transitions: Sequence[tuple[int, VoiceTransition]], middle: float
+) -> list[float]:
+    """Return the times of all points of transitions, and the middle, in order [s]."""
+    times = {middle}
+    for _, transition in transitions:
+        for number in range(len(transition.knots) + 2):
+            times.add(transition.start + transition.step * number)
+    return sorted(times)
+
+
+def _intervals_of_different_paces(
+    transitions: Sequence[tuple[int, VoiceTransition]], times: Sequence[float]
+) -> list[int]:
+    """Return the indices of the intervals between times in which transitions differ in pace.
+
+    Transitions along an envelope move linearly; those along a ramp follow a raised cosine, whose
+    pace depends on its duration.
+    """
+    paces = set()
+    for _, transition in transitions:
+        cosine_duration = None if transition.knots else transition.step
+        paces.add((transition.end, cosine_duration))
+    if len(paces) < 2:
         return []
-    since = enumerate(times[:-1])
-    return [at for at, time in since if len({kind for end, kind in kinds if time < end}) > 1]
+    intervals = []
+    for number, start in enumerate(times[:-1]):
+        present = {duration for end, duration in paces if start < end}
+        if len(present) > 1:
+            intervals.append(number)
+    return intervals
 
 
-def _steepest_of(starts: Sequence[complex], way: VoiceTransition) -> tuple[float, float]:
-    """Return the steepest rise and the fastest change of a transition from these amplitudes."""
-    course = (*way.knots, way.last)
-    ways = (*product(starts, course[:1]), *pairwise(course))
-    return steepest(ways, way.step, is_cosine=not way.knots)
+def _slope_from(starts: Sequence[complex], transition: VoiceTransition) -> Slope:
+    """Return the steepest slope of a transition that starts from one of several amplitudes."""
+    points = (*transition.knots, transition.last)
+    lines = (*product(starts, points[:1]), *pairwise(points))
+    return steepest(lines, transition.step, is_cosine=not transition.knots)
+
+
+class PeakSums:
+    """Upper bounds of the levels if the peaks of all possible voices occur simultaneously.
+
+    Loops are plain and make few calls, because nearly every set is checked with it. Within a layer,
+    the sum of a rising and a falling tone on the same ramp is at most the larger of the two, unless
+    the new tone has an ending, which can begin during the ramp. A waiting tone that keeps its phase
+    continues the voice it waits for.
+    """
+
+    def __init__(
+        self, playback: Playback, layers: Sequence[LayerSet], since: float, until: float
+    ) -> None:
+        self.levels = [0.0] * playback.channels
+        """Upper bound of each channel's level."""
+        self._since = since
+        self._rising: dict[tuple[int, int], float] = {}
+        """Levels of tones that replace the voices of their layer, by layer and channel."""
+        self._continuing: dict[tuple[int, int, float], int] = {}
+        """Peaks of tones that continue a voice, in wire integers, by layer, channel, frequency."""
+        for layer_set in (*layers, *playback.waiting):
+            end = playback.end_of(layer_set.layer)
+            is_immediate = not layer_set.after and until < playback.next_due
+            is_continuing = layer_set.after and until < end
+            for command in layer_set.commands:
+                self._add_command(
+                    layer_set.layer,
+                    command,
+                    is_immediate=is_immediate,
+                    is_continuing=is_continuing and command.keep_phase,
+                )
+        for channel, voices in enumerate(playback.all_voices):
+            for voice in voices:
+                self._add_voice(channel, voice)
+
+    def _add_command(
+        self, layer: int, command: Command, *, is_immediate: bool, is_continuing: bool
+    ) -> None:
+        """Add the peak of a tone; is_continuing: whether it continues a voice of the layer."""
+        peak = command.level
+        for envelope in (command.onset, command.ending):
+            if envelope is not None and envelope.knots:  # `Envelope.peak`, written out for speed
+                peak = max(peak, max(envelope.knots)[0])
+        if is_continuing:
+            key = layer, command.channel, _FREQUENCY.from_wire(command.frequency)
+            counted = self._continuing.get(key, 0)
+            self._continuing[key] = max(counted, peak)
+            peak -= min(counted, peak)
+        self.levels[command.channel] += peak / _LEVEL.per_unit
+        if is_immediate and command.onset is None and command.ending is None:
+            self._rising[layer, command.channel] = command.level / _LEVEL.per_unit
+
+    def _add_voice(self, channel: int, voice: Voice) -> None:
+        """Add the peak of a voice, less what tones that replace or continue it have added."""
+        transition = voice.transition
+        peak = abs(transition.last)
+        if self._since < transition.end:
+            peak = max(peak, abs(transition.first), *map(abs, transition.knots))
+        if voice.ending is not None and voice.ending.knots:
+            peak = max(peak, max(voice.ending.knots)[0] / _LEVEL.per_unit)
+        if not voice.has_ended:
+            if self._continuing:
+                key = voice.layer, channel, voice.frequency
+                counted = self._continuing.pop(key, 0) / _LEVEL.per_unit
+                peak = max(peak - counted, 0.0)
+            if transition.last:
+                counted = self._rising.pop((voice.layer, channel), 0.0)
+                peak = max(peak - counted, 0.0)
+        self.levels[channel] += peak
 
 
 FREQUENCY_FLOOR = 10.0
@@ -249,38 +448,30 @@ def wire_limits(configured: GuardLimits, capabilities: Values) -> WireLimits:
     Raises CommandError for non-numeric limits, or limits that leave nothing to play.
     """
     for name in ("frequency_min", "frequency_max", "level"):
-        if not math.isfinite(value := getattr(configured, name)):
-            raise CommandError(f"{name} of the limits must be a finite number, got {value}")
+        limit = getattr(configured, name)
+        if not math.isfinite(limit):
+            raise CommandError(f"{name} of the limits must be a finite number, got {limit}")
     for name in ("slew", "power", "on_time", "duty", "rate"):
-        if not (value := getattr(configured, name)) > 0:
-            raise CommandError(f"{name} limit must be positive, got {value:g}")
-    reported = [capabilities, *capabilities["limits"]]
-    frequency, level = QUANTITIES["frequency"], QUANTITIES["level"]
-    lowest = max(FREQUENCY_FLOOR, configured.frequency_min)
-    limits = WireLimits(
-        max(-_whole_steps(-lowest, frequency), *(each["frequency_min"] for each in reported)),
-        min(
-            _whole_steps(configured.frequency_max, frequency),
-            *(each["frequency_max"] for each in reported),
-        ),
-        min(
-            _whole_steps(min(configured.level, 1.0), level),
-            *(each["level_max"] for each in reported),
-        ),
-        configured.slew,
-        configured.power,
-    )
-    if limits.frequency_min > limits.frequency_max:
-        low, high = (
-            frequency.from_wire(end) for end in (limits.frequency_min, limits.frequency_max)
-        )
+        limit = getattr(configured, name)
+        if not limit > 0:
+            raise CommandError(f"{name} limit must be positive, got {limit:g}")
+    frequency_min = -_whole_steps(-max(FREQUENCY_FLOOR, configured.frequency_min), _FREQUENCY)
+    frequency_max = _whole_steps(configured.frequency_max, _FREQUENCY)
+    level_max = _whole_steps(min(configured.level, 1.0), _LEVEL)
+    for reported in (capabilities, *capabilities["limits"]):
+        frequency_min = max(frequency_min, reported["frequency_min"])
+        frequency_max = min(frequency_max, reported["frequency_max"])
+        level_max = min(level_max, reported["level_max"])
+    if frequency_min > frequency_max:
+        low = _FREQUENCY.from_wire(frequency_min)
+        high = _FREQUENCY.from_wire(frequency_max)
         raise CommandError(
             f"limits of rig and amplifier must leave a frequency range, got {low:g} to {high:g} "
             "Hz; widen limits.frequency in the rig file or use another amplifier"
         )
-    if limits.level < 0:
+    if level_max < 0:
         raise CommandError(f"level limit must be at least 0, got {configured.level:g}")
-    return limits
+    return WireLimits(frequency_min, frequency_max, level_max, configured.slew, configured.power)
 
 
 def _whole_steps(value: float, quantity: WireQuantity) -> int:
@@ -290,10 +481,6 @@ def _whole_steps(value: float, quantity: WireQuantity) -> int:
 
 TOLERANCE = 1 + 1e-9
 """Tolerance factor of a limit for rounding of sums."""
-_LEVEL, _PHASE = QUANTITIES["level"], QUANTITIES["phase"]
-_RAMP, _VALID_FOR = QUANTITIES["ramp"], QUANTITIES["valid_for"]
-_FREQUENCY = QUANTITIES["frequency"]
-_VALID_FOR_MAX = _VALID_FOR.high
 _NO_KNOTS = ((0, 0),)
 
 
@@ -301,7 +488,8 @@ class Rounding:
     """Rounds layers for one amplifier; capabilities: values of its record."""
 
     def __init__(self, limits: WireLimits, capabilities: Values) -> None:
-        self._limits, self._can = limits, capabilities
+        self._limits = limits
+        self._can = capabilities
         self._channels: int = capabilities["channels"]
         self._layers: int = capabilities["layers"]
         self._ramp_max = _RAMP.from_wire(capabilities["ramp_max"])
@@ -310,43 +498,55 @@ class Rounding:
 
     def layers(self, layers: Sequence[AmplifierLayer]) -> tuple[LayerSet, ...]:
         """Return layers in integers of the wire; raises CommandRefused with channel and reason."""
-        rounded: list[LayerSet] = []
+        layer_sets: list[LayerSet] = []
         numbers: list[int] = []
         for layer in layers:
-            number, ramp, valid_for = index(layer.number), layer.ramp, layer.valid_for
-            if not 0 <= number < self._layers:
-                raise CommandRefused(f"layer must be 0 to {self._layers - 1}, got {number!r}")
-            if not 0 <= ramp <= self._ramp_max:  # nor NaN
-                raise CommandRefused(f"ramp must be 0 to {self._ramp_max:g} s, got {ramp!r} s")
-            if not 0 <= valid_for <= _VALID_FOR_MAX:
-                raise CommandRefused(
-                    f"valid_for must be 0 to {_VALID_FOR_MAX:g} s, got {valid_for!r} s"
-                )
-            if layer.renew and (layer.tones or layer.after):
-                raise CommandRefused("renew must be without tones and after")
-            if layer.after and not layer.tones:
-                raise CommandRefused("after must be with tones")
+            number = index(layer.number)
+            self._check_layer(layer, number)
+            numbers.append(number)
+            ramp = math.ceil(layer.ramp * _RAMP.per_unit - _SLACK)
+            valid_for = 0
+            if layer.valid_for:
+                valid_for = max(round(layer.valid_for * _VALID_FOR.per_unit), 1)
             commands = self._commands(layer.tones)
-            rounded.append(
+            layer_sets.append(
                 LayerSet(
                     number,
-                    min(math.ceil(ramp * _RAMP.per_unit - _SLACK), self._can["ramp_max"]),
-                    max(round(valid_for * _VALID_FOR.per_unit), 1) if valid_for else 0,
+                    min(ramp, self._can["ramp_max"]),
+                    valid_for,
                     tuple(commands.values()),
                     bool(layer.after),
                     bool(layer.renew),
                 )
             )
-            numbers.append(number)
         if len(set(numbers)) < len(numbers):
             raise CommandRefused(f"a set must have each layer once, got {numbers}")
-        return tuple(rounded)
+        return tuple(layer_sets)
+
+    def _check_layer(self, layer: AmplifierLayer, number: int) -> None:
+        """Raise CommandRefused for a layer that cannot be played, apart from its tones."""
+        ramp = layer.ramp
+        valid_for = layer.valid_for
+        if not 0 <= number < self._layers:
+            raise CommandRefused(f"layer must be 0 to {self._layers - 1}, got {number!r}")
+        if not 0 <= ramp <= self._ramp_max:  # nor NaN
+            raise CommandRefused(f"ramp must be 0 to {self._ramp_max:g} s, got {ramp!r} s")
+        if not 0 <= valid_for <= _VALID_FOR.high:
+            raise CommandRefused(
+                f"valid_for must be 0 to {_VALID_FOR.high:g} s, got {valid_for!r} s"
+            )
+        if layer.renew and (layer.tones or layer.after):
+            raise CommandRefused("renew must be without tones and after")
+        if layer.after and not layer.tones:
+            raise CommandRefused("after must be with tones")
 
     def _commands(self, tones: Sequence[AmplifierTone]) -> dict[int, Command]:
         """Return the commands of tones by channel; it runs with each set, so it makes few calls."""
-        limits, commands, shaped = self._limits, dict[int, Command](), list[AmplifierTone]()
+        limits = self._limits
+        commands: dict[int, Command] = {}
         for tone in tones:
-            channel, level, onset = index(tone.channel), tone.level, tone.onset
+            channel = index(tone.channel)
+            level = tone.level
             if not 0 <= channel < self._channels:
                 raise CommandRefused(
                     f"channel must be 0 to {self._channels - 1}, got {channel!r}", channel=channel
@@ -359,13 +559,10 @@ class Rounding:
                 values = f"{tone.frequency!r} Hz and {tone.phase!r} degrees"
                 raise refused(channel, f"frequency and phase must be finite numbers, got {values}")
             frequency = round(tone.frequency * _FREQUENCY.per_unit)
-            if level == 0 and onset is None:
+            if level == 0 and tone.onset is None:
                 frequency = limits.frequency_min
             if not limits.frequency_min <= frequency <= limits.frequency_max:
-                low, high = map(_FREQUENCY.from_wire, (limits.frequency_min, limits.frequency_max))
-                raise refused(
-                    channel, f"frequency must be {low:g} to {high:g} Hz, got {tone.frequency:g} Hz"
-                )
+                raise self._frequency_refused(channel, tone.frequency)
             phase = round(tone.phase * _PHASE.per_unit)
             if not _PHASE.minimum <= phase <= _PHASE.maximum:
                 phase = _PHASE.to_wire(float(tone.phase))
@@ -376,49 +573,49 @@ class Rounding:
                 phase,
                 bool(tone.keep_phase),
                 bool(tone.skip_ending),
-                onset,
+                tone.onset,
                 tone.ending,
             )
-            if onset is not None or tone.ending is not None:
-                shaped.append(tone)
-        if shaped:
-            self._check_envelopes(shaped)
+        for tone in tones:
+            if tone.onset is not None:
+                self._check_envelope(tone.channel, tone.onset)
+            if tone.ending is not None:
+                self._check_envelope(tone.channel, tone.ending)
         return commands
+
+    def _frequency_refused(self, channel: int, frequency: float) -> CommandRefused:
+        low = _FREQUENCY.from_wire(self._limits.frequency_min)
+        high = _FREQUENCY.from_wire(self._limits.frequency_max)
+        return refused(channel, f"frequency must be {low:g} to {high:g} Hz, got {frequency:g} Hz")
 
     def _level_refused(self, channel: int, name: str, level: float) -> CommandRefused:
         highest = self._limits.level / _LEVEL.per_unit
         return refused(channel, f"{name} must be 0 to {highest:g}, got {level!r}")
 
-    def _check_envelopes(self, tones: Sequence[AmplifierTone]) -> None:
-        """Raise CommandRefused for an envelope of a tone that is not allowed."""
+    def _check_envelope(self, channel: int, envelope: Envelope) -> None:
+        """Raise CommandRefused for an envelope that is not allowed."""
         low, high = self._can["envelope_step_min"], self._can["envelope_step_max"]
-        limit = self._can["knots"]
-        for tone in tones:
-            for shape in (tone.onset, tone.ending):
-                if shape is None:
-                    continue
-                if not low <= (step := shape.step) <= high:
-                    raise refused(
-                        tone.channel,
-                        f"step of an envelope must be {low} to {high} (0.1 ms), got {step}",
-                    )
-                if (count := len(shape.knots)) > limit:
-                    raise refused(
-                        tone.channel, f"knots of an envelope must be at most {limit}, got {count}"
-                    )
-                try:
-                    levels, phases = zip(*(shape.knots or _NO_KNOTS), strict=True)
-                    array("q", (*levels, *phases))  # raises for numbers that are no integers
-                except (TypeError, ValueError) as error:
-                    raise refused(
-                        tone.channel, f"knots of an envelope must be pairs of integers: {error}"
-                    ) from error
-                if not 0 <= min(levels) <= (peak := max(levels)) <= self._limits.level:
-                    raise self._level_refused(
-                        tone.channel, "level of a knot", peak / _LEVEL.per_unit
-                    )
-                if not _PHASE.minimum <= min(phases) <= max(phases) <= _PHASE.maximum:
-                    raise refused(tone.channel, "phase of a knot must be -180 to 179.99 degrees")
+        step = envelope.step
+        if not low <= step <= high:
+            raise refused(
+                channel, f"step of an envelope must be {low} to {high} (0.1 ms), got {step}"
+            )
+        max_knots = self._can["knots"]
+        count = len(envelope.knots)
+        if count > max_knots:
+            raise refused(channel, f"knots of an envelope must be at most {max_knots}, got {count}")
+        try:
+            levels, phases = zip(*(envelope.knots or _NO_KNOTS), strict=True)
+            array("q", (*levels, *phases))  # raises for numbers that are no integers
+        except (TypeError, ValueError) as error:
+            raise refused(
+                channel, f"knots of an envelope must be pairs of integers: {error}"
+            ) from error
+        peak = max(levels)
+        if not 0 <= min(levels) <= peak <= self._limits.level:
+            raise self._level_refused(channel, "level of a knot", peak / _LEVEL.per_unit)
+        if not _PHASE.minimum <= min(phases) <= max(phases) <= _PHASE.maximum:
+            raise refused(channel, "phase of a knot must be -180 to 179.99 degrees")
 
 
 def refused(channel: int, text: str) -> CommandRefused:
@@ -430,16 +627,21 @@ class Budget:
     """Counts the sets that were sent, and how long they may have vibrated; times are in s."""
 
     def __init__(self, limits: GuardLimits) -> None:
-        self._limits, self._rate = limits, min(limits.rate, RATE_CEILING)
+        self._limits = limits
+        self._rate = min(limits.rate, RATE_CEILING)
         self.is_unlimited = limits.on_time == math.inf and limits.duty >= 1
         self._duty_time = limits.duty * DUTY_WINDOW if limits.duty < 1 else math.inf
         allowed = max(1, int(self._rate * _RATE_WINDOW))
         # Sets that were delayed on their way arrive closer together than they were sent.
         self._window = max(_RATE_WINDOW, allowed / self._rate) + COMMIT_DELAY
         self._sent: deque[float] = deque(maxlen=allowed)
-        self._vibrations: deque[tuple[float, float]] = deque()  # ended ones: start, end
-        self._start: float | None = None  # earliest start of the current one
-        self._end = 0.0  # its latest end
+        """When the latest sets were sent; at most as many as a window allows."""
+        self._vibrations: deque[tuple[float, float]] = deque()
+        """Start and end of earlier vibrations."""
+        self._start: float | None = None
+        """Earliest start of the current vibration; None without one."""
+        self._end = 0.0
+        """Latest end of the current vibration."""
 
     def remaining(self, now: float, *, fade: float, delay: float) -> float:
         """Return the longest valid_for [s] of a vibration that is sent now; infinite if unlimited.
@@ -456,20 +658,24 @@ class Budget:
             )
         if self.is_unlimited:
             return math.inf
-        is_vibrating = self._start is not None and now < self._end
-        spent = fade + (delay if is_vibrating else 0.0)
-        used = now - self._start if is_vibrating and self._start is not None else 0.0
+        spent = fade
+        used = 0.0
+        if self._start is not None and now < self._end:
+            spent += delay
+            used = now - self._start
+        duty_used = self._used(now)
         return min(
             _left("on-time limit", used, self._limits.on_time, spent),
-            _left(f"duty limit over {DUTY_WINDOW:g} s", self._used(now), self._duty_time, spent),
+            _left(f"duty limit over {DUTY_WINDOW:g} s", duty_used, self._duty_time, spent),
         )
 
     def fade_left(self, now: float) -> float:
         """Return how long the current vibration may fade [s] if silence is sent now."""
         if self._start is None or now >= self._end:
             return math.inf
-        used = max(self._used(now) - self._duty_time, now - self._start - self._limits.on_time)
-        return max(0.0, -used - COMMIT_DELAY)
+        duty_left = self._duty_time - self._used(now)
+        on_time_left = self._limits.on_time - (now - self._start)
+        return max(0.0, min(duty_left, on_time_left) - COMMIT_DELAY)
 
     def sent(self, now: float, *, lasts: float) -> VibrationSpan | None:
         """Note a set that vibrates for `lasts` [s] at most; returns the vibration before it."""
@@ -477,16 +683,17 @@ class Budget:
         if self.is_unlimited:
             return None
         self._close(now)
-        before = self._start, self._end
+        last_vibration = self._start, self._end
         if self._start is None:
-            self._start, self._end = now, now
+            self._start = now
+            self._end = now
         self._end = max(self._end, now + COMMIT_DELAY + lasts)
-        return before
+        return last_vibration
 
-    def restore(self, before: VibrationSpan | None) -> None:
-        """Note that the set that was sent last was refused; before: what `sent` returned."""
-        if before is not None:
-            self._start, self._end = before
+    def restore(self, vibration: VibrationSpan | None) -> None:
+        """Restore the vibration that `sent` returned, because the set was not played."""
+        if vibration is not None:
+            self._start, self._end = vibration
 
     def confirm(self, sent_at: float, now: float, *, end: float) -> None:
         """Note that the set sent at a time [s] plays, and when it ends at the latest [s]."""
@@ -505,10 +712,13 @@ class Budget:
 
     def _used(self, now: float) -> float:
         """Return the time of vibration within the window that ends now [s]."""
-        opened = now - DUTY_WINDOW
-        current = () if self._start is None else ((self._start, min(now, self._end)),)
-        spans = [end - max(start, opened) for start, end in (*self._vibrations, *current)]
-        return sum((max(0.0, span) for span in spans), start=0.0)
+        vibrations = [*self._vibrations]
+        if self._start is not None:
+            vibrations.append((self._start, min(now, self._end)))
+        used = 0.0
+        for start, end in vibrations:
+            used += max(0.0, end - max(start, now - DUTY_WINDOW))
+        return used
 
 
 def _left(name: str, used: float, limit: float, spent: float) -> float:

@@ -1,4 +1,4 @@
-"""Ledger of one amplifier (sets sent, confirmed and possibly playing), its watchdog and stops.
+"""The ledger of an amplifier (sets sent, confirmed and possibly playing), its watchdog and stops.
 
 Only the ledger makes the sets sent over the wire. It checks a set when its turn on the line comes,
 with the rounding of the wire, together with the current playback. A set sent but not yet confirmed
@@ -20,6 +20,7 @@ from drivers.host.bounds import (
     TOLERANCE,
     Bounds,
     Budget,
+    PeakSums,
     Rounding,
     VibrationSpan,
     refused,
@@ -38,9 +39,10 @@ from drivers.protocol.sets import Command, LayerSet, is_vibrating
 from registry import threads
 from registry.limits import GuardLimits
 
-_LEVEL, _STEP = QUANTITIES["level"], QUANTITIES["envelope_step"]
-_RAMP, _VALID_FOR = QUANTITIES["ramp"], QUANTITIES["valid_for"]
-_FREQUENCY = QUANTITIES["frequency"]
+_LEVEL = QUANTITIES["level"]
+_STEP = QUANTITIES["envelope_step"]
+_RAMP = QUANTITIES["ramp"]
+_VALID_FOR = QUANTITIES["valid_for"]
 _STEPS = 2  # tolerance of levels in a status, in steps
 _MEASURING_ERROR = 0.002  # of full level, if the amplifier measures its levels
 _WEAK = 0.25  # largest measuring error, as a share of a weak level
@@ -211,9 +213,11 @@ def check_capabilities(can: Values, name: str, *, is_output: bool | None) -> Non
 
     is_output: see `Amplifier`; None also without a rig.
     """
-    for each, low, stated, high in capability_ranges(can):
+    for capability, low, stated, high in capability_ranges(can):
         if not low <= stated <= high:
-            raise WrongAmplifier(f"amplifier {name}: {each} must be {low} to {high}, got {stated}")
+            raise WrongAmplifier(
+                f"amplifier {name}: {capability} must be {low} to {high}, got {stated}"
+            )
     has_output = has_feature(can, "output")
     if is_output is not None and has_output is not is_output:
         raise WrongAmplifier(
@@ -229,12 +233,12 @@ class Doubt(NamedTuple):
     layers: tuple[LayerSet, ...]
     sent_at: float
     """When it may have begun to play [s]."""
-    before: VibrationSpan | None
+    last_vibration: VibrationSpan | None
     """The vibration that the budget counted before it."""
 
 
 class Ledger:
-    """The ledger of one amplifier, initially silent.
+    """The ledger of an amplifier, initially silent.
 
     limits: configured limits; capabilities: values of the amplifier's record. Raises CommandError
     if the limits leave nothing to play.
@@ -247,7 +251,8 @@ class Ledger:
 
     def adopt(self, capabilities: Values) -> None:
         """Adopt new capabilities of the silent amplifier; spent on-time and duty stay spent."""
-        self.limits, self.capabilities = wire_limits(self._configured, capabilities), capabilities
+        self.limits = wire_limits(self._configured, capabilities)
+        self.capabilities = capabilities
         self._is_measured = has_feature(capabilities, "levels_measured")
         self._rounding = Rounding(self.limits, capabilities)
         self.forget()
@@ -257,14 +262,22 @@ class Ledger:
         # An amplifier may cut fades short, depending on when it plays. Upper bounds assume that it
         # cuts none.
         self.playback = Playback(self.capabilities["channels"], voices=sys.maxsize)
-        self.lag = 0.0  # s; the amplifier may lag behind `playback` by this
-        self._starts, self._start_error = -math.inf, 0.0  # s; the moment of the last commit
-        self._advanced_to = -math.inf  # s; everything due by then has been carried out
+        self.lag = 0.0
+        """By how much the amplifier may lag behind `playback` [s]."""
+        self._starts = -math.inf
+        """Start time in the last commit [s]; -infinite for an immediate start."""
+        self._start_error = 0.0
+        """Largest error of that time on the amplifier's clock [s]."""
+        self._advanced_to = -math.inf
+        """Everything due by this time [s] has been carried out."""
         self.may_be_silent = set[int]()
         """Layers that may be silent, after a silence without a reply or a renewal that was late."""
         self.doubt: Doubt | None = None
         """The set that was committed and is not confirmed."""
-        self._first_sent = 0, 0.0  # token of the last set, and when its first commit went out [s]
+        self._last_token = 0
+        """Token of the last set that was committed."""
+        self._last_sent_at = 0.0
+        """When the first commit of that set went out, or its start time [s]."""
 
     def go_on_from(self, earlier: "Ledger") -> None:
         """Count the vibrations of an earlier ledger of the same rig, as after a reconnection."""
@@ -286,20 +299,7 @@ class Ledger:
             if self.doubt is not None:
                 token = self.doubt.token
                 raise CommandRefused(f"set {token} must be confirmed first; read the status")
-            fade = 0.0 if self._budget.is_unlimited else max(map(_fade, requested))
-            remaining = self._budget.remaining(
-                now, fade=fade, delay=delay + self._waits(requested, now)
-            )
-            if remaining < math.inf:
-                left = math.floor(min(remaining, _VALID_FOR.high) * _VALID_FOR.per_unit)
-                if left <= 0:
-                    raise CommandRefused("on-time or duty limit reached; pause the vibration")
-                requested = tuple(
-                    replace(one, valid_for=min(one.valid_for or left, left))
-                    if is_vibrating(one)
-                    else one
-                    for one in requested
-                )
+            requested = self._within_budget(requested, now, delay)
             self._check_sums(requested, now, delay)
             return requested
         except CommandRefused:
@@ -309,6 +309,25 @@ class Ledger:
         except Exception as error:
             _logger.exception("a set could not be checked")
             raise CommandRefused(f"a set could not be checked: {error!r}; silence it") from error
+
+    def _within_budget(
+        self, layers: tuple[LayerSet, ...], now: float, delay: float
+    ) -> tuple[LayerSet, ...]:
+        """Return layers with `valid_for` cut to the time that on-time and duty leave."""
+        fade = 0.0 if self._budget.is_unlimited else max(map(_fade, layers))
+        delay_with_onsets = delay + self._waits(layers, now)
+        remaining = self._budget.remaining(now, fade=fade, delay=delay_with_onsets)
+        if remaining == math.inf:
+            return layers
+        left = math.floor(min(remaining, _VALID_FOR.high) * _VALID_FOR.per_unit)
+        if left <= 0:
+            raise CommandRefused("on-time or duty limit reached; pause the vibration")
+        shortened = []
+        for layer in layers:
+            if is_vibrating(layer):
+                layer = replace(layer, valid_for=min(layer.valid_for or left, left))
+            shortened.append(layer)
+        return tuple(shortened)
 
     def sent(
         self,
@@ -327,42 +346,52 @@ class Ledger:
         """
         if self.doubt is not None and self.doubt.token == token:
             return
-        if self._first_sent[0] != token:
-            self._first_sent = token, now if starts is None else starts
-            self._starts, self._start_error = -math.inf if starts is None else starts, error
-        before: VibrationSpan | None = None
+        if self._last_token != token:
+            self._last_token = token
+            self._last_sent_at = now if starts is None else starts
+            self._starts = -math.inf if starts is None else starts
+            self._start_error = error
+        last_vibration: VibrationSpan | None = None
         if is_vibrating(*layers):
-            lasts = 0.0 if self._budget.is_unlimited else max(map(_lasts, layers))
-            before = self._budget.sent(now, lasts=lasts + self._waits(layers, now))
-        self.doubt = Doubt(token, layers, self._first_sent[1], before)
+            lasts = 0.0 if self._budget.is_unlimited else max(map(_duration, layers))
+            last_vibration = self._budget.sent(now, lasts=lasts + self._waits(layers, now))
+        self.doubt = Doubt(token, layers, self._last_sent_at, last_vibration)
 
     def resolve(self, token: int, now: float) -> None:
         """Resolve the doubt at a time [s] by the token that the amplifier has committed last.
 
         If it is the set in doubt, that plays, perhaps since it was sent; else it was not played.
         """
-        if self.doubt is None:
+        doubt = self.doubt
+        if doubt is None:
             return
-        sent, layers, sent_at, before = self.doubt
         self.doubt = None
-        if token != sent:
-            self._budget.restore(before)
+        if token != doubt.token:
+            self._budget.restore(doubt.last_vibration)
             return
+        sent_at = doubt.sent_at
         playback = self.playback
         if playback.next_due == math.inf and playback.settles_at <= sent_at - self.lag:
             self.lag = 0.0
-        self.lag = playback.uncertainty = max(self.lag, now - sent_at, self._start_error)
+        self.lag = max(self.lag, now - sent_at, self._start_error)
+        playback.uncertainty = self.lag
         if playback.next_due - 2 * self.lag <= now:
-            for one in layers:
-                ends = playback.end_of(one.layer)
-                if sent_at < ends and ends - 2 * self.lag <= now:
-                    if one.renew:
-                        self.may_be_silent.add(one.layer)
-                    else:
-                        playback.add_ends(one.layer, sent_at)
-        playback.commit(layers, token, sent_at)
+            for layer_set in doubt.layers:
+                self._note_possible_end(layer_set, sent_at, now)
+        playback.commit(doubt.layers, token, sent_at)
         if not self._budget.is_unlimited:
             self._budget.confirm(sent_at, now, end=self.playback.ends_by + self.lag)
+
+    def _note_possible_end(self, layer_set: LayerSet, sent_at: float, now: float) -> None:
+        """Note whether a layer may have ended before a set for it was played."""
+        layer = layer_set.layer
+        end = self.playback.end_of(layer)
+        if not (sent_at < end and end - 2 * self.lag <= now):
+            return
+        if layer_set.renew:
+            self.may_be_silent.add(layer)
+        else:
+            self.playback.add_ends(layer, sent_at)
 
     def correct(self, sent: LayerSet, achieved: LayerSet, token: int) -> None:
         """Adopt a layer of the set with this token as the amplifier reports that it plays it.
@@ -371,14 +400,16 @@ class Ledger:
         it, so that amplifier and ledger keep the phase of the same tones.
         """
         self.playback.correct(achieved, token)
-        for one, played in zip(sent.commands, achieved.commands, strict=True):
+        for command, played in zip(sent.commands, achieved.commands, strict=True):
             if self.limits.frequency_min <= played.frequency <= self.limits.frequency_max:
-                self._rounding.achieved[one.channel, one.frequency] = played.frequency
+                self._rounding.achieved[command.channel, command.frequency] = played.frequency
 
     def silenced(self, ramp: float, sent_at: float, now: float) -> None:
         """Note that all layers fall silent along a ramp [s], by a request sent at a time [s]."""
-        self.doubt, self.may_be_silent = None, set()
-        self.lag = self.playback.uncertainty = max(self.lag, now - sent_at)
+        self.doubt = None
+        self.may_be_silent = set()
+        self.lag = max(self.lag, now - sent_at)
+        self.playback.uncertainty = self.lag
         self.playback.silence(sent_at, ramp)
         if not self._budget.is_unlimited:
             self._budget.confirm(sent_at, now, end=self.playback.ends_by + self.lag)
@@ -389,39 +420,33 @@ class Ledger:
         sent_at, now: when the request for it went out, and when it came [s]. Levels of voices that
         change have only an upper bound, since it is not known exactly when they were committed.
         """
-        playback, late = self.playback, sent_at - self.lag
-        # Until then a status may show what played before.
+        playback = self.playback
+        late = sent_at - self.lag
+        # Until then a status may show the set before.
         if sent_at < self._starts + self._start_error or late < self._advanced_to:
             return None
         self._advance(late)
-        if len(status["levels"]) != playback.channels:
-            return f"levels must be {playback.channels}, got {len(status['levels'])}"
-        if len(status["tokens"]) != self.capabilities["layers"]:
-            return f"layers must be {self.capabilities['layers']}, got {len(status['tokens'])}"
-        unsure, by = {*self.may_be_silent}, now + 2 * self.lag
-        if playback.changes_at <= by:  # some layer may or may not have changed yet
-            unsure |= playback.unsure(by)
-        expected = playback.tokens
-        for layer, token in enumerate(status["tokens"]):
-            if token != expected.get(layer, 0) and not (
-                layer in unsure and token in playback.next_tokens(layer)
-            ):
-                return f"token of layer {layer} must be {expected.get(layer, 0)}, got {token}"
+        levels = status["levels"]
+        tokens = status["tokens"]
+        if len(levels) != playback.channels:
+            return f"levels must be {playback.channels}, got {len(levels)}"
+        if len(tokens) != self.capabilities["layers"]:
+            return f"layers must be {self.capabilities['layers']}, got {len(tokens)}"
+        unsure_layers = {*self.may_be_silent}
+        unsure_until = now + 2 * self.lag
+        if playback.changes_at <= unsure_until:  # some layer may or may not have changed yet
+            unsure_layers |= playback.unsure(unsure_until)
+        expected_tokens = playback.tokens
+        for layer, token in enumerate(tokens):
+            expected = expected_tokens.get(layer, 0)
+            if token == expected:
+                continue
+            if layer not in unsure_layers or token not in playback.next_tokens(layer):
+                return f"token of layer {layer} must be {expected}, got {token}"
         tolerance = _STEPS * max(self.capabilities["level_step"], 1)
-        for channel, level in enumerate(status["levels"]):
-            highest, is_settled = 0.0, not unsure
-            for voice in playback.all_voices[channel]:
-                transition = voice.transition
-                if voice.layer in unsure and not voice.has_ended:
-                    highest += voice.peak(late)
-                elif transition.end <= late:
-                    highest += abs(transition.last)
-                else:
-                    is_settled, highest = False, highest + transition.peak(late)
-            for one in playback.waiting if unsure else ():
-                tones = [each for each in one.commands if each.channel == channel]
-                highest += sum([each.peak for each in tones]) / _LEVEL.per_unit
-            high = round(min(highest, 1.0) * _LEVEL.per_unit)
+        for channel, level in enumerate(levels):
+            max_level, is_settled = self._highest_level(channel, late, unsure_layers)
+            high = round(min(max_level, 1.0) * _LEVEL.per_unit)
             if is_settled and high - tolerance <= level <= high + tolerance:  # the usual case
                 continue
             low = 0
@@ -435,6 +460,32 @@ class Ledger:
                 return f"level of channel {channel} must be {low} to {high} (1e-4), got {level}"
         return None
 
+    def _highest_level(
+        self, channel: int, late: float, unsure_layers: set[int]
+    ) -> tuple[float, bool]:
+        """Return the highest level that a status may show, and whether no voice changes.
+
+        late: the earliest time of the playback that it may show [s]. unsure_layers: layers that may
+        have changed or not.
+        """
+        playback = self.playback
+        level = 0.0
+        is_settled = not unsure_layers
+        for voice in playback.all_voices[channel]:
+            transition = voice.transition
+            if voice.layer in unsure_layers and not voice.has_ended:
+                level += voice.peak(late)
+            elif transition.end <= late:
+                level += abs(transition.last)
+            else:
+                is_settled = False
+                level += transition.peak(late)
+        for layer_set in playback.waiting if unsure_layers else ():
+            for command in layer_set.commands:
+                if command.channel == channel:
+                    level += command.peak / _LEVEL.per_unit
+        return level, is_settled
+
     def _advance(self, time: float) -> None:
         """Carry out everything due by a time [s]."""
         if time >= self.playback.changes_at:
@@ -446,24 +497,28 @@ class Ledger:
     ) -> tuple[LayerSet, ...]:
         """Return silent layers with ramps cut to the time that is left, endings only if safe."""
         left = math.floor(min(self._budget.fade_left(now), _RAMP.high) * _RAMP.per_unit)
-        silent = tuple(replace(one, ramp=min(one.ramp, left)) for one in layers)
+        silent = tuple([replace(layer, ramp=min(layer.ramp, left)) for layer in layers])
         try:
             if self.doubt is None:
                 self._check_sums(silent, now, delay)
                 return silent
         except CommandRefused:
             pass
-        commands = tuple(
-            Command(channel, self.limits.frequency_min, 0, 0, skip_ending=True)
-            for channel in range(self.capabilities["channels"])
-        )
-        return tuple(replace(one, commands=commands) for one in silent)
+        commands = []
+        for channel in range(self.capabilities["channels"]):
+            frequency = self.limits.frequency_min
+            commands.append(Command(channel, frequency, 0, 0, skip_ending=True))
+        return tuple([replace(layer, commands=tuple(commands)) for layer in silent])
 
     def _check_sums(self, layers: Sequence[LayerSet], now: float, delay: float) -> None:
-        late, until = now - self.lag, now + delay + self.lag  # the latest possible ends
+        """Raise CommandRefused if level, power or rise may exceed its limit."""
+        late = now - self.lag
+        until = now + delay + self.lag
         self._advance(late)
-        if self.limits.slew == math.inf and self._is_within_at_most(layers, late, until):
-            return
+        if self.limits.slew == math.inf:
+            peaks = PeakSums(self.playback, layers, late, until)
+            if self._are_within(peaks.levels):
+                return
         refusal = self._refusal_of_sums(layers, late, until)
         if refusal is None:
             return
@@ -472,6 +527,12 @@ class Ledger:
             refusal.until = faded + self.lag
         raise refusal
 
+    def _are_within(self, levels: Sequence[float]) -> bool:
+        """Whether the limits of level and power allow these levels simultaneously."""
+        max_level = self.limits.level / _LEVEL.per_unit
+        is_level_within = max(levels) <= max_level * TOLERANCE
+        return is_level_within and math.hypot(*levels) ** 2 <= self.limits.power * TOLERANCE
+
     def _refusal_of_sums(
         self, layers: Sequence[LayerSet], late: float, until: float
     ) -> CommandRefused | None:
@@ -479,8 +540,9 @@ class Ledger:
         bounds = Bounds(self.playback, layers, late, until)
         levels, power = bounds.worst()
         highest = self.limits.level / _LEVEL.per_unit
+        is_slew_limited = self.limits.slew < math.inf
         for channel, level in enumerate(levels):
-            rise = 0.0 if self.limits.slew == math.inf else bounds.rise(channel)
+            rise = bounds.rise(channel) if is_slew_limited else 0.0
             if rise > self.limits.slew * TOLERANCE:
                 return refused(
                     channel,
@@ -504,69 +566,26 @@ class Ledger:
         """Return how long layers wait at most for the ends of onsets [s]."""
         if self._budget.is_unlimited:
             return 0.0
-        ends = [self.playback.onsets_end(one.layer, now) for one in layers if one.after]
+        waiting = [layer.layer for layer in layers if layer.after]
+        ends = [self.playback.onsets_end(layer, now) for layer in waiting]
         return max(ends, default=now) - now
 
-    def _is_within_at_most(self, layers: Sequence[LayerSet], late: float, until: float) -> bool:
-        """Whether the limits hold even if all possible voices peak simultaneously.
 
-        This quick check is sufficient in nearly all cases. Within a layer, the sum of a rising and
-        a falling tone on the same ramp is at most the larger of the two, unless the new tone has an
-        ending, which can begin during the ramp. A waiting tone that keeps its phase continues the
-        voice it waits for.
-        """
-        playback, full = self.playback, _LEVEL.per_unit
-        levels, rising = [0.0] * playback.channels, dict[tuple[int, int], float]()
-        going_on = dict[tuple[int, int, float], int]()
-        for one in (*layers, *playback.waiting):
-            is_at_once = not one.after and until < playback.next_due
-            is_kept = one.after and until < playback.end_of(one.layer)
-            for command in one.commands:
-                peak = command.level
-                for shape in (command.onset, command.ending):
-                    if shape is not None and shape.knots:  # `Envelope.peak`, written out for speed
-                        peak = max(peak, max(shape.knots)[0])
-                if is_kept and command.keep_phase:
-                    name = one.layer, command.channel, _FREQUENCY.from_wire(command.frequency)
-                    before = going_on.get(name, 0)
-                    going_on[name] = max(before, peak)
-                    peak -= min(before, peak)
-                levels[command.channel] += peak / full
-                if is_at_once and command.onset is None and command.ending is None:
-                    rising[one.layer, command.channel] = command.level / full
-        for channel, voices in enumerate(playback.all_voices):
-            for voice in voices:
-                way, ending = voice.transition, voice.ending
-                largest = abs(way.last)
-                if late < way.end:
-                    largest = max(largest, abs(way.first), *map(abs, way.knots))
-                if ending is not None and ending.knots:
-                    largest = max(largest, max(ending.knots)[0] / full)
-                if going_on and not voice.has_ended:
-                    name = voice.layer, channel, voice.frequency
-                    largest = max(largest - going_on.pop(name, 0) / full, 0.0)
-                if not voice.has_ended and way.last:
-                    largest = max(largest - rising.pop((voice.layer, channel), 0.0), 0.0)
-                levels[channel] += largest
-        is_within = max(levels) <= self.limits.level / full * TOLERANCE
-        return is_within and math.hypot(*levels) ** 2 <= self.limits.power * TOLERANCE
-
-
-def _fade(one: LayerSet) -> float:
+def _fade(layer: LayerSet) -> float:
     """Return how long a layer takes to end [s], along its ramp or its longest ending."""
-    fade = _RAMP.from_wire(one.ramp)
-    for command in one.commands:
+    fade = _RAMP.from_wire(layer.ramp)
+    for command in layer.commands:
         if command.ending is not None:
-            knots = len(command.ending.knots) + 1
-            fade = max(fade, _STEP.from_wire(command.ending.step) * knots)
+            steps = len(command.ending.knots) + 1
+            fade = max(fade, _STEP.from_wire(command.ending.step) * steps)
     return fade
 
 
-def _lasts(one: LayerSet) -> float:
+def _duration(layer: LayerSet) -> float:
     """Return how long a layer vibrates at most [s], with its fade."""
-    if not is_vibrating(one):
-        return _fade(one)
-    return _fade(one) + (_VALID_FOR.from_wire(one.valid_for) or math.inf)
+    if not is_vibrating(layer):
+        return _fade(layer)
+    return _fade(layer) + (_VALID_FOR.from_wire(layer.valid_for) or math.inf)
 
 
 def is_silence(layers: Sequence[AmplifierLayer]) -> bool:

@@ -144,7 +144,7 @@ def _numbers(given: Any) -> FloatArray:
 
 @dataclass(frozen=True)
 class Drive:
-    """Drive of one ERA: frequency [Hz], level (0 to 1 of full stroke), phase [degrees].
+    """An ERA's drive: frequency [Hz], level (0 to 1 of full stroke), phase [degrees].
 
     Raises InputError if the frequency is not positive or the level is outside 0 to 1.
     """
@@ -188,7 +188,7 @@ def playable_layers(drive: Played, rig: Rig) -> tuple[Layer, ...]:
     """Return the layers of an answer, of one layer, or of drives, checked against the rig.
 
     Raises InputError for an answer without layers, an unknown ERA, a frequency outside the rig's
-    limits, or drives of one ERA that sum to more than full stroke.
+    limits, or drives whose sum at an ERA exceeds full stroke.
     """
     if isinstance(drive, Answer | Layer):
         layers = drive.layers if isinstance(drive, Answer) else (drive,)
@@ -238,7 +238,7 @@ def _layer_of(drive: object, rig: Rig) -> Layer:
 
 
 def _tone_of(given: Driven, name: str, rig: Rig) -> Tone:
-    """Convert the drive of one ERA to a tone; raises InputError for anything else."""
+    """Convert an ERA's drive to a tone; raises InputError for anything else."""
     stroke = rig.era(name).full_level
     if isinstance(given, tuple):
         raise InputError(

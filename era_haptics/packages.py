@@ -1,4 +1,4 @@
-"""Check the packages behind `era_haptics` before any of them is loaded.
+"""Check the packages that `era_haptics` needs before loading them.
 
 Their names are common, and Python imports the first match on its path: a file next to a program, or
 a package of another distribution.

@@ -100,7 +100,7 @@ class SolvedPlate:
         """Compute the acceleration [m/s²] at points for each ERA alone at full stroke.
 
         - points (p, 2) [m].
-        - frequencies (f,) [Hz]: default those of a table.
+        - frequencies (f,) [Hz]: default: the frequencies of a table.
         - fingers: resting on the plate, as positions [m] or with their loads.
         - seed: of another plate, as in `SolvedPlate(rig, seed=seed)`.
 
@@ -251,7 +251,7 @@ def draw_map(plate: SolvedPlate, drive: Played, *, title: str = "") -> "Figure":
 
 
 def draw_answer(table: LocalizationTable, answer: Answer, *, layer: int = 0) -> "Figure":
-    """Draw the level of one layer of an answer over the plate [dB SL], and the fingers.
+    """Draw an answer layer's level over the plate [dB SL], and the fingers.
 
     Raises InputError for a missing layer.
 

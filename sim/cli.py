@@ -49,7 +49,7 @@ def sim(
         list[str] | None,
         typer.Option(
             metavar="NAME=WIRE",
-            help="Wire of one amplifier, e.g. main=serial or side=modbus-tcp:5020 (repeatable). "
+            help="Wire of an amplifier, e.g. main=serial or side=modbus-tcp:5020 (repeatable). "
             "Default: the scheme of its url in the rig.",
         ),
     ] = None,

@@ -128,7 +128,7 @@ OPERATIONS: dict[str, tuple[type[BaseModel], _Function]] = {}
 def operation(
     *names: str, extra: Literal["allow", "ignore"] = "ignore"
 ) -> Callable[[_Function], _Function]:
-    """Register a function as the operations of these names; extra: what other keys are.
+    """Register a function as the operations with these names; extra: type of further keys.
 
     It is called with the context, the time [s] and the keys of a request, which are its further
     parameters. It returns the response, or raises InputError and changes nothing.

@@ -1,8 +1,8 @@
 """Simulated amplifiers in this process, by URLs `sim://RIG.yaml`; amplifiers share their rig.
 
 As in `era sim`, the plate is drawn at random from the rig's tolerances. All named amplifiers of a
-rig drive the same plate, as do all amplifiers of one control socket; the only amplifier of a rig,
-if not named, has a separate plate. Requests and replies are the bytes of a serial line, with
+rig drive the same plate, as do all amplifiers with the same control socket; the only amplifier of a
+rig, if not named, has a separate plate. Requests and replies are the bytes of a serial line, with
 the delays of a USB adapter where a rig has several amplifiers. Not modelled: transmission time.
 """
 

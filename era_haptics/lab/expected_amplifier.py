@@ -413,7 +413,7 @@ class ExpectedAmplifier:
             self.fed = when
 
     def part_refused(self, part: Values, code: str) -> None:
-        """Apply the rejection of the last part of a set, by its code."""
+        """Apply the rejection of a set's last part, according to the code."""
         if code not in _NOT_LOOKED_AT:
             self.sets.refused(part)
 

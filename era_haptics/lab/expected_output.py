@@ -553,7 +553,7 @@ class ExpectedClock:
             passed = ahead(shown, clock)
             if not low <= passed <= high:
                 what, must = (
-                    "time from the last clock reading to that of a Mark",
+                    "time from the last clock reading to a Mark's reading",
                     f"{low} to {high} s",
                 )
                 self._report("clock", when[1], what, must=must, seen=passed)

@@ -47,7 +47,7 @@ from model.structure.material import EXCITER_TYPES, KNOWN_MATERIALS
 HIDDEN = "hidden"
 
 Schema: TypeAlias = Mapping[str, Any]
-"""JSON schema or part of one."""
+"""JSON schema, or part of a schema."""
 
 _ROOT = Path(__file__).parents[2]
 _PACKAGES = ("registry", "drivers", "model", "controller", "sim", "era_haptics")
@@ -185,7 +185,7 @@ class _Configuration:
         return public_text(text, self._names) or self._names.known(text) or HIDDEN
 
     def _mapping_schema(self, value: Mapping[str, Value], schema: Schema) -> Schema:
-        """Return the alternative that fits a mapping best: by its kind, then by its known keys."""
+        """Return the alternative that fits a mapping best: first by kind, then by known keys."""
 
         def fit(choice: Schema) -> tuple[bool, int]:
             properties = choice.get("properties", {})

@@ -235,7 +235,7 @@ class AmplifierClock:
     """A clock of 32 bits that goes round once in 20 s, with supply since a time [s].
 
     Times [s] are the bench's, not before the last change; rate: in units of the wire; changes:
-    counts those of its rate, and those of what it shows.
+    counts changes of the rate, and changes of the shown value.
     """
 
     def __init__(self, crystal: Crystal = Crystal(), *, since: float = 0.0) -> None:
@@ -255,7 +255,7 @@ class AmplifierClock:
         return self._parts(time) / _PER_SECOND
 
     def straight(self, time: float) -> StraightClock:
-        """Return it as it runs at a time [s], as if it went on so."""
+        """Return the clock with its pace at a time [s], extrapolated without changes."""
         pace = self.crystal.pace(time - self._since) * (1 + self.rate / _PER_RATE)
         return StraightClock(time, self._parts(time) % _TURN / _PER_SECOND, pace)
 

@@ -141,7 +141,8 @@ class Bench:
         self._plant = _plant_of(self.real, now)
         self._sampled_until = now  # up to when [s] fingers have samples
         self._fingers = PlateFingers(self._plant.reduced)
-        # Fingers not yet on the plate; the newest placement, and the one that loads the plate.
+        # Fingers not yet on the plate; the newest placement, and the placement that loads the
+        # plate.
         self._placements: deque[FingerPlacement] = deque()
         self.positions: Mapping[str, Point] = {}
         self._contacts: Mapping[str, FingertipLoad] = {}
@@ -306,7 +307,7 @@ class Bench:
     def _sample_plate(self, until: float = math.inf, *, solves: bool = True) -> None:
         """Advance the plate to a time [s] or the current one.
 
-        solves: whether to solve unsolved placements; otherwise stops at the first of them.
+        solves: whether to solve unsolved placements; otherwise stops at the first unsolved one.
         """
         end = min(until, self.time)
         while self._placements and self._placements[0].time <= end:
@@ -388,7 +389,7 @@ def _plant_of(real: Rig, time: float) -> Plant:
     return Plant(reduced, real.eras, loads=real.masses, time=time)
 
 
-@lru_cache(maxsize=2)  # shared by successive benches of one rig
+@lru_cache(maxsize=2)  # shared by successive benches of the same rig
 def _reduced(
     plate: Plate,
     mesh: Mesh,

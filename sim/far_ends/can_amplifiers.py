@@ -68,7 +68,7 @@ class SdoAbort(Exception):
 
 
 _NAMES = {index: name for name, index in CANOPEN["objects"].items()}
-"""Of objects by their index."""
+"""Object by index."""
 
 
 class ObjectServer:
@@ -327,7 +327,7 @@ _OVERHEAD = 8  # approximate bytes of a frame in addition to its data, with stuf
 
 
 class CanBus:
-    """A bus; its members are identified by their listeners.
+    """A bus; each member is identified by a listener.
 
     bitrate [bit/s]: None for no transmission time.
     """

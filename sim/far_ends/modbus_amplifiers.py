@@ -147,7 +147,7 @@ class _Unit:
         return 0, reply
 
     def _read(self, request: Pdu, now: float) -> Sequence[int]:
-        """Return the registers that a request reads; none if any of them cannot be read."""
+        """Return the registers that a request reads; none if any register cannot be read."""
         address, count = request.address, request.count
         if (message := message_shown(request)) is not None:
             first = message.number * BOX + REPLY_OFFSET

@@ -1,7 +1,7 @@
 """Play layers on the plate in the time domain, without wires and amplifiers.
 
 From rest the bases move exactly as commanded, along shaped onsets or a ramp. The plate is linear:
-each layer is played alone, which separates a finger's own layers from those of others.
+each layer is played alone, which separates a finger's own layers from other fingers' layers.
 """
 
 from collections.abc import Mapping, Sequence
@@ -90,7 +90,7 @@ class FeltFinger:
 
 @dataclass(frozen=True, eq=False)
 class Vibration:
-    """Vibration of one layer alone, or of signals of all ERAs, at all fingers.
+    """Vibration at all fingers, from one layer alone or from the signals of all ERAs.
 
     frequencies (f,) [Hz], empty for signals; fingers: indices of its targets; records: of all
     fingers in order; harmonics (f,) [Hz]: of ERAs with harmonics.
@@ -264,7 +264,7 @@ def play(
     duration: at least the onsets and _RINGING time constants of the slowest vibration (0.2 to 0.9 s
     on the plates of the examples), or _MAX_DURATION; so long, and a second, for None.
 
-    The fingers load the plate as the rig's fingertip, by their loads. reduced: the plate that the
+    Each finger loads the plate with its load times the rig's fingertip. reduced: the plate that the
     imperfections make of the rig's, for forces at its ERAs and loads. Each layer starts along its
     onset or ramp. Latency, skew and noise are left out. Raises InputError for fingers off the
     plate, layers that the rig cannot play, and a duration out of range.

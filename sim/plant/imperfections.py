@@ -65,8 +65,8 @@ class PlateErrors:
     """A plate on its ERAs relative to the rig's: factors, by default 1.
 
     stiffness: by ERA; places: displacement of each ERA [m]; era_damping: of all ERAs; feet: of the
-    stiffness of each foot, by its index among the rig's masses; mesh: for solving, None for the
-    rig's; modes: eigenvalue and squared size (2, m) of the lowest elastic modes.
+    stiffness of each foot, by index among the rig's masses; mesh: for solving, None for the rig's;
+    modes: eigenvalue and squared size (2, m) of the lowest elastic modes.
     """
 
     thickness: float = 1.0
@@ -125,7 +125,7 @@ class Imperfections:
 
     channels: errors by channel; delays [s]: from a command to the base motion, by amplifier;
     crystals: of the clocks, by amplifier; plate: errors of the plate and its ERAs; fingertip:
-    log-normal spread of a finger's load; seed: of these loads.
+    log-normal spread of a finger's load; seed: random seed of the loads.
     """
 
     channels: Mapping[Channel, ChannelErrors] = field(default_factory=dict)

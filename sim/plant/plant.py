@@ -2,8 +2,8 @@
 
 No step size enters. Between changes the motion is a sum of free vibrations, which decay, and of
 forced ones (`model.transients.time_response`); every change adds free vibrations that keep
-displacement and velocity continuous. Accelerations are sampled from tables of these exponentials,
-with one matrix product per block of samples.
+displacement and velocity continuous. Accelerations are sampled from tables of exponentials, with
+one matrix product per block of samples.
 
 A fingertip acts at a point, and its phalanx moves: a low-rank change and one more coordinate. The
 reduced basis is extended by the static vectors of the point, and the small system diagonalised
@@ -140,7 +140,7 @@ class LoadedPlateCache:
         return self._unloaded.with_attachments_at(np.array(points))
 
 
-@lru_cache(maxsize=2)  # shared by successive benches of one rig
+@lru_cache(maxsize=2)  # shared by successive benches of the same rig
 def _solve_unloaded(
     reduced: ReducedPlate, eras: tuple[Source, ...], loads: tuple[PointLoad, ...]
 ) -> PlateInTime:
@@ -374,7 +374,7 @@ class Plant:
     ) -> Callable[[], LoadedPlate]:
         """What solves the plate under the contacts from a time [s] on, in any thread.
 
-        Calls must be in order of time, also with those of `set_contacts`.
+        Calls, including `set_contacts`, must be in order of time.
         """
         return self._plates.solution(tuple(contacts.values()), time=time)
 

@@ -35,7 +35,7 @@ def sounddevice() -> ModuleType:
 
 
 def portaudio_device(device: str, *, outputs: int, inputs: int = 0) -> Any:
-    """Find a device by its name or number, and return PortAudio's description.
+    """Find a device by name or number, and return PortAudio's description.
 
     outputs, inputs: required channels. Raises InputError for an unsuitable device, LinkError if
     there is no device at all.
@@ -147,7 +147,7 @@ _REFUSED = {-9997: "--rate", -9998: "--channels"}
 class PortAudioOutput:
     """The stream of a software amplifier, with a callback in C.
 
-    Raises InputError for an unsuitable device, LinkError for one that is busy or missing.
+    Raises InputError for an unsuitable device, LinkError for a busy or missing device.
     """
 
     def __init__(self, settings: SoftAmplifierSettings) -> None:
@@ -171,8 +171,9 @@ class PortAudioOutput:
         text, number = problem.args[0], problem.args[-1]
         if number in _REFUSED:
             return InputError(
-                f"{_REFUSED[number]} must be one that {self.name} offers, got {self.rate} Hz, "
-                f"{self._settings.channels} channels: {text}; omit --rate for its own, or try 48000"
+                f"{_REFUSED[number]} must be supported by {self.name}, got {self.rate} Hz, "
+                f"{self._settings.channels} channels: {text}; omit --rate for its own, or try "
+                "48000"
             )
         return LinkError(
             f"--device {self.name}: cannot be opened: {text}; end the program that plays on it"

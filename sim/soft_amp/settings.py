@@ -35,9 +35,9 @@ class Protocol(IntEnum):
 class SoftAmplifierSettings:
     """A software amplifier.
 
-    device: name or number of a device of PortAudio; rate [Hz] and block [frames]: None for those of
-    the device; limit: largest sample, 0..1; max_gaps: gaps in the sound within a second, more are a
-    fault. Raises InputError.
+    device: name or number of a device of PortAudio; rate [Hz] and block [frames]: None for the
+    defaults of the device; limit: largest sample, 0..1; max_gaps: gaps in the sound within a
+    second, more are a fault. Raises InputError.
     """
 
     device: str

@@ -22,7 +22,7 @@ _POLL = 0.02  # s
 _FIRST_BLOCK = 5.0  # s
 _FADE = 0.05  # s; ramp, blocks and buffers
 _REPORT = 10.0  # s between lines on underruns
-_PRIORITY = 2  # SCHED_RR, below that of the sound thread
+_PRIORITY = 2  # SCHED_RR, below the sound thread's priority
 
 
 def _has_ended(descriptor: int | None, *, timeout: float) -> bool:
@@ -48,7 +48,7 @@ def _raise_priority() -> None:
 class SoftAmplifierPlayer:
     """An amplifier on an open device; report: takes a line for each event.
 
-    Raises InputError for an unsuitable device, LinkError for one that is busy or missing.
+    Raises InputError for an unsuitable device, LinkError for a busy or missing device.
     """
 
     def __init__(

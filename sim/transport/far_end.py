@@ -57,7 +57,8 @@ def links_by_amplifier(options: Sequence[str], *, amplifiers: Sequence[str]) -> 
 def linked_urls(urls: Mapping[str, str], links: Mapping[str, Path]) -> Iterator[dict[str, str]]:
     """URLs of amplifiers with their pseudo-terminals under other paths, both by name.
 
-    Amplifiers of one line share its link. Raises InputError for a wire without a pseudo-terminal.
+    Amplifiers on the same line share its link. Raises InputError for a wire without a
+    pseudo-terminal.
     """
     with ExitStack() as stack:
         paths: dict[str, str] = {}
@@ -323,8 +324,8 @@ class TimedFarEnd:
 class TerminalEnd:
     """A pseudo-terminal in front of a far end, as an asynchronous context.
 
-    device: has the faults of the wire, those of frames if none are given; delays: see
-    `TwoWayLine`; unpluggable: see `make_terminal`.
+    device: injects the faults of the wire (by default, of frames); delays: see `TwoWayLine`;
+    unpluggable: see `make_terminal`.
     """
 
     def __init__(

@@ -218,7 +218,7 @@ def play_content(
     at: Point,
     quiet: Sequence[Point] = (),
 ) -> tuple[Rendition, tuple[Part, ...], float, FloatArray]:
-    """Simulate a pattern at one finger; arguments and errors are those of `check_content`.
+    """Simulate a pattern at one finger; same arguments and errors as `check_content`.
 
     Returns the rendition, its parts, the sample rate [Hz], and accelerations (n, p) [m/s²] at the
     points of the fingertip, which continue for at least 0.1 s after the end.

@@ -109,7 +109,7 @@ def play(
 
 
 def pattern_of(file: Path, channel: int | None = None) -> "Pattern":
-    """Read a haptic file, or a built-in content given by its name without a suffix."""
+    """Read a haptic file, or a built-in content given by name without a suffix."""
     from controller.content.formats import named_content, read_content
 
     return read_content(file if file.suffix else named_content(str(file)), channel)
@@ -458,8 +458,8 @@ def _verdict(checked: "CheckedContent", setting: _Setting) -> str:
     promised = least_promise(checked.parts)
     if promised is not None and promised < MIN_CONTRAST_DB:
         losses.append(
-            f"other fingers feel much of it: promised {promised:.1f} dB above them, should be "
-            f"at least {MIN_CONTRAST_DB:g} dB"
+            f"other fingers feel the content clearly: promised {promised:.1f} dB above them, "
+            f"should be at least {MIN_CONTRAST_DB:g} dB"
         )
     return f"level good, but {', '.join(losses)}" if losses else "good"
 

@@ -249,7 +249,7 @@ _RESTING_AWAY = 0.06  # m, minimum distance from a touch to the resting finger
 
 @dataclass(frozen=True)
 class CheckedEffect:
-    """Simulated touches of one effect in one region.
+    """Simulated touches of an effect in a region.
 
     on: layout key that plays the effect; promised_db_sl: None for as strong as the neighbours
     allow; touches: at each position alone, then with a resting finger; area [m²]: share of the

@@ -43,7 +43,7 @@ Steps: TypeAlias = Callable[[Any], Awaitable[None] | RequestRows]
 
 @dataclass(frozen=True, slots=True)
 class ConformanceCheck:
-    """Check of one rule of the protocol.
+    """Check of a protocol rule.
 
     title: stimulus and required reaction. place: page and heading of the rule, as an anchor.
     drives: whether it arms the amplifier. kinds: kinds of wire it applies to, empty for all.
@@ -82,7 +82,7 @@ _RESULTS = {
 """Results by outcome; any other outcome is a failure."""
 _BARS = {
     AlreadyArmed: "the amplifier is already armed, perhaps by another host",
-    UntimedClock: "the amplifier's clock does not advance with time; all times are judged by it",
+    UntimedClock: "the amplifier's clock does not advance with time; timing checks depend on it",
 }
 """Outcomes after which no check may drive the amplifier, with the reason."""
 
@@ -217,7 +217,7 @@ class CheckResult:
 
 @dataclass(frozen=True, slots=True)
 class ConformanceReport:
-    """Results of the checks of one amplifier.
+    """Results of an amplifier's checks.
 
     level: highest level at which channels may be driven. left: number of checks left out.
     """
@@ -431,7 +431,7 @@ async def _attempt(
 
 
 async def _carry_out(check: ConformanceCheck, subject: Subject, level: float) -> None:
-    """Carry out the steps of a check; one that drives starts at rest."""
+    """Carry out the steps of a check; a check that drives channels starts at rest."""
     subject.sent_set = []
     if check.drives:
         step = subject.can["level_step"] / FULL

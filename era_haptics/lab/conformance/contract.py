@@ -153,7 +153,7 @@ CLIENTS: Mapping[str, Callable[[int], JudgeClient]] = {
 
 @asynccontextmanager
 async def opened(url: str) -> AsyncIterator[JudgeClient]:
-    """Open an amplifier by its URL within a context, and wait until its board has started.
+    """Open the amplifier at a URL within a context, and wait until its board has started.
 
     Raises CommandError for an invalid URL, LinkError for a line that cannot be opened.
     """

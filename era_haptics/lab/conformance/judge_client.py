@@ -426,7 +426,7 @@ class JudgeClient(ABC):
     async def next(
         self, is_meant: Callable[[HeardMessage], bool], timeout: float
     ) -> HeardMessage | None:
-        """Return the first matching message; None if there is none in time [s]."""
+        """Return the first matching message; None if no message arrives in time [s]."""
         self.came = b""
         loop, due = asyncio.get_running_loop(), threads.now() + timeout
         timer = loop.call_at(due, self._news.set)
@@ -563,7 +563,7 @@ class Dating:
 
 @dataclass(frozen=True, slots=True)
 class Send:
-    """Request given by its values (the held session unless another is given) or by raw words.
+    """Request from values (with the held session unless another is given) or from raw words.
 
     layers: of a set, which is sent in parts. codes: allowed outcomes, "" meaning carried out.
     channels: those that a rejection can name.

@@ -122,7 +122,7 @@ class Subject:
 
     @cached_property
     def lowest(self) -> int:
-        """Lowest frequency common to all channels, in steps; NotApplicable if there is none."""
+        """Lowest frequency common to all channels, in steps; raises NotApplicable without one."""
         limits = [self.can, *self.can["limits"]]
         lowest = max(one["frequency_min"] for one in limits)
         require(lowest <= self.highest, "the channels have no frequency in common")
@@ -146,7 +146,7 @@ class Subject:
         return next(each for each in both if each <= self.highest)
 
     def has(self, feature: str) -> bool:
-        """Return whether it states a feature; empty: one that all amplifiers have."""
+        """Return whether the amplifier states a feature; empty: a feature of all amplifiers."""
         return not feature or has_feature(self.can, feature)
 
     def require(self, feature: str) -> None:
@@ -303,7 +303,7 @@ class Subject:
     async def answer(
         self, name: str, raw: Sequence[int] | None = None, **values: Any
     ) -> RequestOutcome:
-        """Send a request by its values, or raw words, and return the outcome.
+        """Send a request from values or raw words, and return the outcome.
 
         A part other than the last has no reply; errors show in what arrives with the next message.
         """
@@ -404,8 +404,8 @@ class Subject:
         return "clock" in shown and not is_marked
 
     def _dated(self, name: str, values: Values, shown: Values, when: When) -> When:
-        """Return the interval, by its clock, in which a status was true and its request carried
-        out.
+        """Return the interval, on the amplifier's clock, in which a status was true and its request
+        carried out.
 
         The clock can be read after the request is carried out, except for GetStatus.
         """
@@ -536,7 +536,7 @@ class Subject:
         return [{name: each[name] for name in each if name != "session"} for each in made]
 
     def words_of(self, *layers: LayerSet) -> tuple[Values, list[int]]:
-        """Return a set of one part that plays immediately, and its words."""
+        """Return a single-part set that plays immediately, and its words."""
         (part,) = self.parts(*layers)
         words = MESSAGES["Set"].request.pack({"session": self.session, **part})
         self.sent_set = [words]
@@ -547,7 +547,7 @@ class Subject:
         return self.dating.interval(When(sent, threads.now()))
 
     def played(self, part: Values, sent: float) -> None:
-        """Record that a set of one part, sent at a given time, was carried out."""
+        """Record that a single-part set, sent at a given time, was carried out."""
         self.shown.sets.sent(part)
         self.shown.carry_out("Set", part, {}, self.since(sent))
 
@@ -715,14 +715,14 @@ class Subject:
                     raise
 
     async def require_interference(self) -> None:
-        """Raise NotApplicable unless levels show that tones of one frequency cancel."""
+        """Raise NotApplicable unless levels show that tones at the same frequency cancel."""
         halves = [self.tone(0, 0.5, phase) for phase in (0.0, 180.0)]
         await self.play(*(layer(at, each) for at, each in enumerate(halves)))
         level = (await self.request("GetStatus"))["levels"][0]
         await self.play(*map(layer, range(2)))
         require(
             level <= 0.75 * self.level * FULL,  # phases may be rounded
-            "the levels do not show that tones of one frequency interfere",
+            "the levels do not show that tones at the same frequency interfere",
         )
         self.shown.outputs.interferes = True
 

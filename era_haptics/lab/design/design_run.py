@@ -318,7 +318,7 @@ def design(
     - contents: number of simultaneous contents, one finger each.
     - apart [m]: minimum distance between ERAs.
     - lowest [Hz]: minimum rigid-body frequency of a supported plate.
-    - stiffness [N/m]: candidates for new ERAs, of which the best is used; empty: that of the rig's.
+    - stiffness [N/m]: candidates for new ERAs; the best is used. Empty: the rig's stiffness.
     - finalists: number of given layouts that are evaluated in full.
     - starts: of a search.
     - workers: number of processes; None: one.
@@ -435,8 +435,7 @@ def search_layouts(problems: Sequence[DesignProblem], *, starts: int, runner: Ru
 def rank_layouts(
     given: Mapping[DesignProblem, NamedLayouts], *, finalists: int, runner: Runner
 ) -> Design:
-    """Rank given layouts, some of which support the plate; evaluate the first of each problem in
-    full."""
+    """Rank given layouts (some support the plate); evaluate the first of each problem in full."""
     problems = list(given)
     chunks = [
         (number, dict(list(given[problem].items())[at : at + CHUNK]))
@@ -467,7 +466,7 @@ def rank_layouts(
 def _design(
     best: RankedLayout, layouts: list[RankedLayout], starts: list[RankedLayout], runner: Runner
 ) -> Design:
-    """Assemble the result from layouts, some of them evaluated in full, and the best of these."""
+    """Assemble the result from layouts (some evaluated in full) and the best layout."""
     judged = [each for each in layouts if each.judged is not None]
     order = best_first([each.mean_db for each in judged]).tolist()
     ranked = [judged[each] for each in order]
@@ -596,7 +595,9 @@ def rig_text(design: Design, data: Mapping[str, Value]) -> str:
         f"{design.best.mean_db:.1f} dB over new contact sets.\n"
     )
     if added:
-        comment += f"# Replace the URLs of amplifiers {', '.join(added)} by those of real ones.\n"
+        comment += (
+            f"# Replace the URLs of amplifiers {', '.join(added)} by URLs of real amplifiers.\n"
+        )
     return comment + data_text(keys)
 
 

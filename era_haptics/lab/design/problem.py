@@ -129,7 +129,7 @@ class Area:
 
 
 def area_of(where: str, plate: Plate) -> Area:
-    """Return an area given by its name or by a file of polygons.
+    """Return a named area, or the area in a file of polygons.
 
     Raises InputError for another kind of file, or an unreadable file.
     """
@@ -348,7 +348,7 @@ def _drawn(
 
 
 def _place_in(shape: RegionShape, plate: Plate, rng: np.random.Generator) -> _Point:
-    """Draw a position [m] of the plate in a shape; raises InputError if there is none."""
+    """Draw a position [m] of the plate in a shape; raises InputError if the shape is empty."""
     box = box_of(shape)
     for _ in range(_MAX_TRIES):
         x, y = rng.uniform(*box).tolist()
@@ -412,7 +412,7 @@ class DesignProblem:
     - count: number of all ERAs.
     - apart [m]: minimum distance between ERAs.
     - lowest [Hz]: minimum rigid-body frequency.
-    - stiffness [N/m]: of ERAs that are not kept; None: that of the rig's.
+    - stiffness [N/m]: stiffness of ERAs that are not kept; None: the rig's.
 
     Raises InputError for too few ERAs to support the plate.
     """
@@ -498,7 +498,7 @@ class DesignProblem:
 
     @property
     def candidates(self) -> FloatArray:
-        """Start positions of a search [m], (c, 2); raises InputError if there are none."""
+        """Start positions of a search [m], (c, 2); raises InputError for an empty set."""
         return self._raster[0]
 
     @property

@@ -96,7 +96,8 @@ def latency(response: ComplexArray, frequencies: FloatArray) -> float:
     slope, first = np.polyfit(frequencies, phase, 1)
     if np.abs(phase - slope * frequencies - first).max() > _STRAIGHT:
         raise LinkError(
-            f"loop-back: its phase must be that of a delay up to {1e3 * _MAX_DELAY:g} ms; check "
+            f"loop-back: its phase must correspond to a delay of up to {1e3 * _MAX_DELAY:g} ms; "
+            f"check "
             "the cable, and that no other signal feeds this input"
         )
     return float(nearest - slope / (2 * np.pi))
@@ -325,7 +326,7 @@ class MeasuredResponses:
     looped: ComplexArray
 
     def quality(self, sensor: int) -> dict[str, float]:
-        """Return quality figures of a sensor, by its number, for JSON."""
+        """Return quality figures of the sensor with a given number, for JSON."""
         return {
             "coherence_median": float(np.median(self.coherence[:, sensor])),
             "coherence_min": float(self.coherence[:, sensor].min()),
@@ -476,7 +477,7 @@ def measure_plate(
 def measure_through(
     desk: Desk, card: SoundCard, multisine: Multisine, *, periods: int, progress: Progress
 ) -> MeasuredPlate:
-    """Measure all runs, then repeat one of them at half level and at full level.
+    """Measure all runs, then repeat one run at half level and at full level.
 
     progress: called with the number of runs done and the total.
     """
@@ -541,7 +542,7 @@ def _repeats(
 _MOVED_BY = 0.02  # of the response, or so many times its noise:
 _OF_NOISE = 3.0
 _APART = 5e-3  # m; nearer places may sound alike
-_AT = 5e-4  # m, tolerance between positions in a file and those of the sensors
+_AT = 5e-4  # m, tolerance between positions in a file and the sensors' positions
 _NOISY = 0.03  # of the response
 
 

@@ -26,7 +26,7 @@ def measured_by_simulation(
 ) -> tuple[list[str | None], dict[str, Any]]:
     """Write responses of a plate drawn within a rig's uncertainty; return the report.
 
-    frequencies (f,) [Hz]: None for those of `era measure`; seed: of the plate and of the noise.
+    frequencies (f,) [Hz]: None for the default of `era measure`; seed: of plate and noise.
     Sensors have the mass that their file states; a moved sensor is at one position at a time.
     Raises InputError for frequencies beyond the rig's limits.
     """

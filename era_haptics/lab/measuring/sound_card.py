@@ -325,11 +325,11 @@ class SoundCard:
 
 
 def open_card(device: str, *, outputs: int, inputs: int, limit: float) -> SoundCard:
-    """Open a PortAudio device by its name or number.
+    """Open a PortAudio device by name or number.
 
     The stream runs in both directions on one device, because two devices would have two clocks.
     limit: largest sample, relative to full scale. Raises InputError for an unsuitable device,
-    LinkError for one that is busy or gone.
+    LinkError for a busy or removed device.
     """
     card = SoundCard(outputs=outputs, inputs=inputs, limit=limit)
     found = portaudio_device(device, outputs=outputs, inputs=inputs)
@@ -363,8 +363,8 @@ _LEFT = 0.01  # of a free vibration
 def converters(response: ComplexArray) -> ComplexArray:
     """Complex loop-back response (f,), normalised to a median modulus of 1.
 
-    Dividing by it removes the delay, including fractions of a sample, and the shape of filters.
-    Gains remain, since levels and sensitivities are stated separately.
+    Dividing by the loop-back removes the delay, including fractions of a sample, and the shape of
+    filters. Gains remain, since levels and sensitivities are stated separately.
     """
     return np.asarray(response / np.median(np.abs(response)))
 
@@ -451,7 +451,7 @@ _OPTIONAL = dict(zip(INPUT_COLUMNS[2:], (1.0, 1.0, 0.0), strict=True))
 class Desk:
     """Wiring of a rig to a sound card: ERAs by channel, counted from 1, and a loop-back.
 
-    The loop-back is a cable from the output after those of the ERAs to the input after those of the
+    The loop-back is a cable from the output after the ERA outputs to the input after those of the
     sensors. If the card has no free output, it shares the output of the last ERA (is_shared).
     """
 

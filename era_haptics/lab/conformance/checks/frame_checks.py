@@ -149,7 +149,7 @@ class CanClient(JudgeClient):
         await asyncio.sleep(_SETTLING)
 
     def put(self, can_id: int, *data: bytes) -> None:
-        """Send frames of one identifier."""
+        """Send frames with a single identifier."""
         self.write(pack_frames(CanFrame(can_id, each) for each in data))
 
     def next_number(self) -> int:

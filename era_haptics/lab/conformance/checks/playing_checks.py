@@ -437,7 +437,8 @@ def voices(subject: Subject) -> RequestRows:
         return [made(each, ending=ending) for each in channels]
 
     async def fade(number: int) -> None:
-        """Have tones fade before some that last: the first the longest, the next by its ending.
+        """Start fading tones, then lasting ones: the first fade is the longest, the next uses its
+        ending.
 
         Those behind the few that are cut fade together, in as many layers as there are.
         """

@@ -147,7 +147,7 @@ async def steps_as_stated(subject: Subject) -> None:
 
 
 def _part(words: list[int], code: str = "BAD_VALUE", *channels: int | None, **values: int) -> Send:
-    """Send words as a set of one part that must be rejected, naming one of the channels."""
+    """Send words as a single-part set; expect a rejection that names one of the channels."""
     part: Values = {"index": 0, "parts": 1, "stream": words, **values}
     return send("Set", code=code, channels=channels or (None,), **part)
 

@@ -26,6 +26,7 @@ from model.reduction import free_plate  # noqa: E402
 from model.rig.rig import Rig  # noqa: E402
 from model.rig.rig_file import example_rig_path, load_rig  # noqa: E402
 from model.table.table_file import cached_table  # noqa: E402
+from processes.patient_daemon import allow_long_watchdogs, wait_long  # noqa: E402
 from processes.typed_page import needs  # noqa: E402
 from registry import threads  # noqa: E402
 
@@ -107,6 +108,13 @@ def pytest_sessionfinish() -> None:
     """Collect garbage once, whose errors count; pytest does it five times, of all that is left."""
     gc.collect()
     gc.freeze()
+
+
+@pytest.fixture
+def unhurried(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Hosts and simulated amplifiers in this process that wait for each other for long."""
+    wait_long(monkeypatch, reply_timeout=1.0)
+    allow_long_watchdogs(monkeypatch)
 
 
 @pytest.fixture

@@ -278,6 +278,7 @@ def test_foreign_master_drives_it(name: str, firmware: Path) -> None:
 
 
 @pytest.mark.real_time
+@pytest.mark.usefixtures("unhurried")
 @pytest.mark.parametrize("line", URL_ENDS)
 async def test_address_is_taken_and_kept_without_supply(
     line: str, firmware: Path, tmp_path: Path
@@ -309,6 +310,7 @@ async def move(amplifier: Amplifier, serial_number: str) -> Values:
 
 
 @pytest.mark.real_time
+@pytest.mark.usefixtures("unhurried")
 async def test_open_interlock_is_a_fault_until_it_is_closed(firmware: Path) -> None:
     """It silences an armed amplifier, keeps it from being armed, and is cleared once closed."""
     with running_firmware(firmware, "--serial") as (url, process):

@@ -129,7 +129,7 @@ async def test_daemon_ends_while_an_answer_hangs(tmp_path: Path) -> None:
     # Fingers that this machine is too busy to repeat in time would land again, and be asked again.
     program = (sys.executable, "-c", hangs, "--resting")
     async with (
-        far_end(tmp_path) as far,
+        far_end(tmp_path, is_patient=True) as far,
         daemon_process(tmp_path, far, "layouts: {panel: layout.yaml}\n", program=program) as daemon,
         await daemon.client() as era,
     ):

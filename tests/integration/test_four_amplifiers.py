@@ -9,7 +9,6 @@ another state than OPERATION_ENABLED.
 
 import asyncio
 import contextlib
-import json
 import math
 import os
 import re
@@ -41,10 +40,8 @@ from controller.api.jsonrpc import ErrorCode, RpcError
 from controller.api.methods import LayoutEvent, PatternEvent, StateEvent
 from controller.api.schema import ContactStatus, DaemonStateName
 from controller.api.server import Hub
-from controller.demo.demonstration import Scene, layout_of_people
 from controller.demo.recorder import TouchRecorder
 from controller.gateway.app import MAX_SESSIONS
-from controller.sources.tuio import read_capture
 from dashboard_pictures import REASON, SCREENS, STATE, open_dashboard
 from drivers.by_hand import actions
 from drivers.errors import LinkError, LinkTimeout
@@ -59,7 +56,7 @@ from kit.set_table import SetTable, make_rig
 from kit.wires import WIRES, far_side
 from model.fem import Mesh
 from model.rig.rig import Rig
-from model.rig.rig_file import example_rig_path, load_rig
+from model.rig.rig_file import load_rig
 from model.vibration import Tone
 from processes.daemons import (
     PATIENCE,
@@ -89,7 +86,7 @@ from processes.gateways import (
     wait_for_daemon,
     wait_for_state,
 )
-from processes.patient_daemon import PROGRAM, wait_long
+from processes.patient_daemon import wait_long
 from processes.typed_page import ERA
 from registry import threads
 from registry.limits import GuardLimits
@@ -390,8 +387,6 @@ async def test_page_connects_again_and_reports_a_stop_without_an_answer(
             await tab.until("document.querySelector('#problem').textContent.includes('by hand')")
 
 
-ERA_NAMES = {"SW", "SE", "NE", "NW"}
-
 # (id, down [s], up [s], x, y in TUIO's coordinates): one finger, then a second beside it, a pause,
 # and a third one alone.
 SCHEDULE = [
@@ -419,57 +414,6 @@ def demo(table_cache, tmp_path, monkeypatch, capsys):
         return status, printed.out, printed.err
 
     return run_demo
-
-
-def test_demo_contacts_feel_the_prediction(capture, demo, monkeypatch):
-    """Each touch has its row; level within 3 dB of the promise, contrast at least the promised.
-
-    Of the first plate that is drawn, on which these touches keep it. Then the same as two people,
-    by another layout of the daemon: both that are down together have a content each. Each
-    scene is sent from a port of its own, which is no second program.
-    In virtual time, as by default; what differs on wires is a far end of its own, see below.
-    """
-    layout = layout_of_people(load_rig(example_rig_path()).plate, {"left": None, "right": None})
-    recorded = read_capture(capture)
-    scenes = [Scene(recorded), Scene(recorded, layout)]
-    monkeypatch.setattr(controller.demo.demonstration, "example_scenes", lambda rig: scenes)
-    status, out, said = demo()
-    assert (status, said) == (0, "")  # no hint either
-    result = json.loads(out)
-    assert (result["wire"], result["clock"], result["void"]) == ("sim", "virtual", None)
-    rows, people = result["touches"][: len(SCHEDULE)], result["touches"][len(SCHEDULE) :]
-    assert len(people) == len(SCHEDULE)
-    assert not any("fingers" in row for row in (*rows, people[2]))
-    one, other = people[1]["fingers"]
-    assert [one["at_m"]] == people[0]["targets_m"]
-    assert [other["at_m"]] == people[1]["targets_m"]
-    assert abs(one["frequency_hz"] - other["frequency_hz"]) >= 30
-    for finger in (one, other):
-        assert finger["verdict"] in ("own", "mixed")
-        promised, measured = finger["promised_contrast_db"], finger["measured_contrast_db"]
-        assert 6 < promised < measured + 3 < promised + 23  # nine of ten plates keep it
-        assert finger["measured_level_db_sl"] == pytest.approx(20, abs=3)
-    for row, (_, _, _, x, y) in zip(rows, SCHEDULE, strict=True):
-        assert row["targets_m"] == [[pytest.approx(x * 0.3048), pytest.approx((1 - y) * 0.2286)]]
-        assert row["mode"] == "phased"
-        assert row["drive"].keys() <= ERA_NAMES
-        for tone in row["drive"].values():
-            assert tone["frequency_hz"] in range(40, 501, 10)
-            assert 0 < tone["level"] <= 1
-        assert row["steady"]
-        assert row["measured_level_db_sl"] == pytest.approx(row["predicted_level_db_sl"], abs=3)
-        assert row["latency_ms"] is None  # computing takes no time
-    alone, beside, last = rows
-    assert (alone["quiet_m"], last["quiet_m"]) == ([], [])
-    assert alone["predicted_contrast_db"] is None
-    assert beside["quiet_m"] == alone["targets_m"]
-    promised, measured = beside["promised_contrast_db"], beside["measured_contrast_db"]
-    assert 3 < promised < beside["predicted_contrast_db"]
-    assert promised <= measured < promised + 20
-    pictures = [*map(Path, result["files"])]
-    assert [each.name for each in pictures] == ["touches.png", "contents.png"]
-    for picture in pictures:
-        assert picture.read_bytes().startswith(b"\x89PNG")
 
 
 @pytest.mark.real_time
@@ -563,7 +507,7 @@ sys.exit(main())
 @pytest.fixture(scope="module")
 def daemon(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """The socket of one daemon for all tests."""
-    with real_daemon(tmp_path_factory.mktemp("daemon"), program=PROGRAM) as path:
+    with real_daemon(tmp_path_factory.mktemp("daemon")) as path:
         yield path
 
 

@@ -18,7 +18,6 @@ import numpy as np
 from controller.demo.demonstration import layout_of_people
 from kit.plates import make_paper_rig
 from model.table.table_file import build_table
-from processes import patient_daemon
 from processes.gateways import GatewayProcess, Page, gateway_process, open_browser, real_daemon
 
 
@@ -88,10 +87,7 @@ def two_people(folder: Path) -> Iterator[Path]:
     table = build_table(rig, frequencies=np.arange(60.0, 301.0, 20.0), drive_mode="phased")
     layout = layout_of_people(rig.plate, {"left": None, "right": None})
     (folder / "layout.yaml").write_text(json.dumps(layout), encoding="utf-8")
-    program = patient_daemon.RESTING
-    with real_daemon(
-        folder, "layouts: {panel: layout.yaml}\n", program=program, table=table
-    ) as socket:
+    with real_daemon(folder, "layouts: {panel: layout.yaml}\n", table=table) as socket:
         yield socket
 
 

@@ -19,7 +19,7 @@ from drivers.host.group import Group
 from drivers.opening import Lines
 from drivers.playing import AmplifierLayer, AmplifierTone
 from drivers.ports import PORT_OPENER
-from drivers.protocol.definition import MESSAGES
+from drivers.protocol.definition import MESSAGES, REPLY_TIMEOUT
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Command, LayerSet, achieved_problem
 from drivers.wires.can_frames import unpack_frames
@@ -201,23 +201,19 @@ async def test_bus_that_is_opened_again_goes_on_with_its_numbers() -> None:
         ["serial", "modbus+rtu", "modbus+tcp", "can+slcan", "can+python-can udp_multicast"],
     ),
 )
-async def test_group_plays_over_a_wire_and_stops(
-    wire: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.mark.usefixtures("unhurried")
+async def test_group_plays_over_a_wire_and_stops(wire: str) -> None:
     """Two amplifiers on one line: 0.5 on both after one commit, silent after the stop.
 
     Nobody has the third address; the others reply as before.
-
-    A busy machine may keep the commit waiting for longer than a host allows.
     """
-    monkeypatch.setattr("drivers.host.amplifier.COMMIT_DELAY", 10.0)
     async with WORD_WIRES[wire](2) as far, opened_lines() as lines:
         amplifiers = {
             str(number): await lines.amplifier(far.url(number), LIMITS, name=str(number))
             for number in far.amplifiers
         }
         assert len({each.line for each in amplifiers.values()}) == 1
-        group = Group(amplifiers, watchdog=2.0)
+        group = Group(amplifiers)
         await group.open()
         await group.arm()
         layers = [AmplifierLayer(0, (AmplifierTone(0, 100.0, 0.5),), 0.0)]
@@ -230,19 +226,17 @@ async def test_group_plays_over_a_wire_and_stops(
         assert [far.level(number) for number in far.amplifiers] == [0.0, 0.0]
         nobody = await lines.amplifier(far.url(3), LIMITS, name="3")
         with pytest.raises(LinkTimeout):
-            await nobody.read_status()
+            await nobody.request("GetStatus", {}, timeout=REPLY_TIMEOUT)
         await group.amplifiers["1"].read_status()
 
 
 @pytest.mark.real_time
-async def test_stop_of_another_line_is_sent_while_a_can_adapter_hangs(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+@pytest.mark.usefixtures("unhurried")
+async def test_stop_of_another_line_is_sent_while_a_can_adapter_hangs() -> None:
     """The other amplifier replies and falls silent during the call that hangs.
 
     Once the call returns, the amplifier behind the adapter is stopped, too.
     """
-    monkeypatch.setattr("drivers.host.amplifier.COMMIT_DELAY", 10.0)
     async with (
         WORD_WIRES["can+python-can virtual"](1) as behind_adapter,
         WORD_WIRES["serial"](1) as other,
@@ -254,7 +248,7 @@ async def test_stop_of_another_line_is_sent_while_a_can_adapter_hangs(
                 "adapter": await lines.amplifier(url, LIMITS, name="adapter"),
                 "other": await lines.amplifier(other.url(1), LIMITS, name="other"),
             }
-            group = Group(amplifiers, watchdog=2.0)
+            group = Group(amplifiers)
             await group.open()
             await group.arm()
             layers = [AmplifierLayer(0, (AmplifierTone(0, 100.0, 0.5),), 0.0)]
@@ -279,6 +273,7 @@ async def test_stop_of_another_line_is_sent_while_a_can_adapter_hangs(
         ["modbus+rtu", "serial+tcp", "modbus+tcp", "can+slcan server"],
     ),
 )
+@pytest.mark.usefixtures("unhurried")
 async def test_cut_line_is_lost_once_and_opened_again(wire: str) -> None:
     """Requests of both amplifiers fail with the same message, and those of a new line do not."""
     async with WORD_WIRES[wire](2) as far, opened_lines() as lines:

@@ -31,6 +31,7 @@ from drivers.protocol.definition import STATES
 from kit import hand_frames as hand
 from model.arrays import ComplexArray, Float32Array
 from model.errors import InputError
+from processes.daemons import PATIENCE
 from processes.gateways import wait_for
 from processes.jack_recorder import Capture
 from processes.sound_cards import BLOCK as CARD_BLOCK
@@ -325,18 +326,41 @@ def card(server: str) -> Iterator[Capture]:
 
 
 def amplifier_on(
-    device: str, channels: int, server: str, folder: Path, *options: str, notify: str = ""
+    device: str,
+    channels: int,
+    server: str,
+    folder: Path,
+    *options: str,
+    notify: str = "",
+    is_watched: bool = False,
 ) -> SoftAmp:
-    """An amplifier on a device of a server; notify: the socket of a service manager."""
+    """An amplifier on a device of a server; notify: the socket of a service manager.
+
+    is_watched: whether a stall ends it, which this machine may cause as well as a test.
+    """
     environment = os.environ | {"JACK_DEFAULT_SERVER": server}
     if notify:
         environment |= {"NOTIFY_SOCKET": notify, "WATCHDOG_USEC": "500000"}
     where = options or ("--link", str(folder / "amp"))
-    return SoftAmp(
+    amplifier = SoftAmp(
         *("--device", device, "--channels", str(channels), "--max-gaps", "63", *where),
         environment=environment,
         log=folder / "log",
+        is_watched=is_watched,
     )
+    STARTED.append(amplifier.process)
+    return amplifier
+
+
+STARTED: list["subprocess.Popen[str]"] = []
+
+
+@pytest.fixture(autouse=True)
+def no_amplifier_left() -> Iterator[None]:
+    """After a test that failed its amplifiers are killed, for they have real-time priority."""
+    yield
+    while STARTED:
+        STARTED.pop().kill()
 
 
 @pytest.mark.real_time
@@ -355,8 +379,7 @@ def test_samples_arrive_at_jack_as_commanded(tmp_path: Path) -> None:
         amp = amplifier_on("card, JACK", CARD_CHANNELS, name, tmp_path)
         assert f"{RATE} Hz, blocks of {CARD_BLOCK} frames" in amp.log
         with host(amp.url, CARD_CHANNELS) as playing:
-            wait_for(capture.is_sounding)
-            _wait_for_samples(capture, 2.3)  # 0.2 s of soft start and ramp
+            wait_for(lambda: capture.has_sounded_for(2.3))  # 0.2 s of soft start and ramp
             found = amplitudes(capture.samples(2 * RATE), RATE)
             sizes = np.median(np.abs(found), axis=0)
             steps = np.median(np.angle(found[:, 1:] / found[:, :-1]), axis=0)
@@ -374,6 +397,7 @@ def test_samples_arrive_at_jack_as_commanded(tmp_path: Path) -> None:
 
 @pytest.mark.real_time
 @pytest.mark.needs("jackd", "portaudio", "cc")
+@pytest.mark.usefixtures("unhurried")
 @pytest.mark.parametrize(
     ("how", "limit"),
     [(signal.SIGKILL, SILENCE_AFTER_KILL), (signal.SIGSTOP, SILENCE_AFTER_STALL)],
@@ -385,7 +409,8 @@ async def test_killed_or_stopped_amplifier_is_silent_and_restarts_disarmed(
 
     The next one takes its link over, plays zeros and is not armed.
     """
-    amp = amplifier_on("system, JACK", CARD_CHANNELS, server, tmp_path)
+    is_watched = how is signal.SIGSTOP
+    amp = amplifier_on("system, JACK", CARD_CHANNELS, server, tmp_path, is_watched=is_watched)
     with host(amp.url, CARD_CHANNELS):
         wait_for(card.is_sounding)
         position = card.position
@@ -415,8 +440,10 @@ def test_systemd_is_told_of_sound_and_not_of_a_stall(server: str, tmp_path: Path
     address = str(tmp_path / "notify")
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
         manager.bind(address)
-        manager.settimeout(20)
-        amp = amplifier_on("system, JACK", CARD_CHANNELS, server, tmp_path, notify=address)
+        manager.settimeout(PATIENCE)
+        amp = amplifier_on(
+            "system, JACK", CARD_CHANNELS, server, tmp_path, notify=address, is_watched=True
+        )
         ready, status, pid = manager.recv(4096).decode().splitlines()
         assert (ready, pid) == ("READY=1", f"MAINPID={amp.process.pid}")
         assert "system, 3 channels" in status
@@ -434,6 +461,7 @@ def test_systemd_is_told_of_sound_and_not_of_a_stall(server: str, tmp_path: Path
 
 @pytest.mark.real_time
 @pytest.mark.needs("jackd", "portaudio", "cc")
+@pytest.mark.usefixtures("unhurried")
 async def test_silence_is_an_open_output_of_zeros(server: str, tmp_path: Path) -> None:
     """After a lost host, a stop and a disarm: connected, and every sample exactly zero."""
     here = Capture(server, "zeros", 2)
@@ -474,8 +502,7 @@ def test_square_law_plays_the_root_of_a_bias_and_the_force(
     capture = Capture(server, "other", 2)
     soft_amp = amplifier_on("other, JACK", 2, server, tmp_path, line, "0", "--law", "square")
     with host(soft_amp.url, 2):
-        wait_for(capture.is_sounding)
-        _wait_for_samples(capture, 1.2)  # 0.2 s of soft start and ramp
+        wait_for(lambda: capture.has_sounded_for(1.3))  # 0.2 s of soft start and ramp
         forces = 2 * capture.samples(CARD_RATE) ** 2 - 1
         windows = forces.reshape(20, CARD_RATE // 20, 2)
         levels = np.abs(np.fft.rfft(windows, axis=1)[:, 1000 // 20]) / (CARD_RATE // 40)

@@ -37,7 +37,6 @@ from controller.daemon.config import DaemonConfig, load_daemon_config
 from controller.daemon.daemon import Daemon
 from controller.process.daemon_process import SocketLock
 from controller.process.log import LogThread
-from drivers.host.amplifier import WATCHDOG as AMPLIFIER_WATCHDOG
 from drivers.host.amplifier import Amplifier as AmplifierAmplifier
 from drivers.opening import Lines
 from drivers.playing import AmplifierLayer, AmplifierTone
@@ -55,7 +54,7 @@ from model.rig.rig import Rig
 from model.rig.rig_file import example_rig_path, load_rig
 from model.table.table import LocalizationTable
 from model.table.table_file import save_table
-from processes.patient_daemon import PROGRAM
+from processes.patient_daemon import PROGRAM, allow_long_watchdogs, wait_long
 from processes.typed_page import ERA
 from registry import threads
 from registry.limits import GuardLimits
@@ -136,18 +135,28 @@ async def running_daemon(
     folder: Path, more: str = "", **options: Any
 ) -> AsyncIterator[DaemonBench]:
     """A serving daemon; more: further lines of its file; options: as for `daemon_at`."""
-    async with far_end(folder) as far, daemon_at(far, folder, more, **options) as bench:
+    is_patient = not isinstance(asyncio.get_running_loop(), VirtualLoop)
+    async with (
+        far_end(folder, is_patient=is_patient) as far,
+        daemon_at(far, folder, more, **options) as bench,
+    ):
         yield bench
 
 
 @asynccontextmanager
 async def far_end(
-    folder: Path, *, changes: Sequence[tuple[str, str]] = ()
+    folder: Path, *, changes: Sequence[tuple[str, str]] = (), is_patient: bool = False
 ) -> AsyncIterator[FarSide]:
-    """The example's amplifier on a serial line; changes: replacements in the rig's text."""
-    rig = load_rig(write_rig(folder / "bench.yaml", *changes))
-    async with far_side(WIRES["serial"], rig) as far:
-        yield far
+    """The example's amplifier on a serial line; changes: replacements in the rig's text.
+
+    is_patient: it takes a long watchdog, for a daemon of `patient_daemon` or in this process.
+    """
+    with pytest.MonkeyPatch.context() as patch:
+        if is_patient:
+            allow_long_watchdogs(patch)
+        rig = load_rig(write_rig(folder / "bench.yaml", *changes))
+        async with far_side(WIRES["serial"], rig) as far:
+            yield far
 
 
 @asynccontextmanager
@@ -172,18 +181,11 @@ async def daemon_at(
     manager = ServiceManager(environment or {})
     loop = asyncio.get_running_loop()
     is_virtual = isinstance(loop, VirtualLoop)
-    # Daemon, amplifier and test share a process, which a busy machine delays; in real time the
-    # watchdog is the longest of the protocol, since no test of this bench lets it expire.
-    daemon = Daemon(
-        config,
-        table(config.rig),
-        log=log,
-        manager=manager,
-        dashboard=None,
-        watchdog=AMPLIFIER_WATCHDOG if is_virtual else 2.0,
-    )
-    chain = chain_of(daemon, far) if is_virtual else None
     patch = pytest.MonkeyPatch()
+    if not is_virtual:  # a machine that stalls delays daemon, amplifier and test
+        wait_long(patch)
+    daemon = Daemon(config, table(config.rig), log=log, manager=manager, dashboard=None)
+    chain = chain_of(daemon, far) if is_virtual else None
     if not has_reader:
         patch.setattr("controller.daemon.layouts.read_in_child", _read_here)
     task = asyncio.create_task(daemon.run(lock))
@@ -526,7 +528,7 @@ async def playing_daemon(
     With the client that holds it down, and what the amplifier is asked.
     """
     async with (
-        far_end(folder) as far,
+        far_end(folder, is_patient=True) as far,
         daemon_process(folder, far, more, program=PROGRAM, waits=waits) as daemon,
     ):
         journal = Journal(far)

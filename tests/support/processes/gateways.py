@@ -64,6 +64,7 @@ from model.rig.rig_file import parse_rig
 from model.table.table import LocalizationTable
 from model.table.table_file import save_table
 from processes.daemons import PATIENCE, daemon_table, write_daemon
+from processes.patient_daemon import RESTING
 from processes.typed_page import ERA, installed_program
 
 T = TypeVar("T")
@@ -318,12 +319,11 @@ def real_daemon(
     folder: Path,
     more: str = "",
     *,
-    program: Sequence[str | Path] = (ERA,),
     table: LocalizationTable | None = None,
 ) -> Iterator[Path]:
-    """The socket of `era daemon` with a simulated amplifier.
+    """The socket of a patient `era daemon` with a simulated amplifier.
 
-    more: further lines of its file; program: the command before `daemon`; table: by default small.
+    more: further lines of its file; table: by default small.
     """
     save_table(table or daemon_table(), folder / "table.npz")
     config = write_daemon(folder, {}, f"table: table.npz\n{more}")
@@ -331,7 +331,7 @@ def real_daemon(
     with (
         (folder / "daemon.log").open("a", encoding="utf-8") as log,
         subprocess.Popen(
-            [*program, "daemon", str(config)],
+            [*RESTING, "daemon", str(config)],
             stdin=subprocess.DEVNULL,
             stdout=log,
             stderr=log,

@@ -61,6 +61,15 @@ class Capture:
         """Whether the last block had sound."""
         return self.position > 0 and bool(np.abs(self.samples(self.block)).max() > AUDIBLE)
 
+    def has_sounded_for(self, seconds: float) -> bool:
+        """Whether there was sound in each of the last tenths of so many seconds."""
+        length = self.rate // 10
+        count = round(seconds * 10) * length
+        if self.position < count:
+            return False
+        loudest = np.abs(self.samples(count)).max(axis=1)
+        return bool((loudest.reshape(-1, length).max(axis=1) > AUDIBLE).all())
+
     def end_of_sound(self) -> int:
         """The position after the last sample with sound."""
         loudest = np.abs(self._samples[: self.position]).max(axis=1)

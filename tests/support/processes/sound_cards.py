@@ -79,14 +79,30 @@ def jack_server(
             process.terminate()
 
 
-class SoftAmp:
-    """A running `era soft-amp`; url: of its first amplifier."""
+UNWATCHED = """
+import sys
+from era_haptics.command import main
+from sim.soft_amp.engine import library
+library().sound_release()
+sys.exit(main())
+"""
+"""`era` whose software amplifier survives stalls: the kernel's timer that would kill it is off."""
 
-    def __init__(self, *options: str, environment: dict[str, str], log: Path) -> None:
+
+class SoftAmp:
+    """A running `era soft-amp`; url: of its first amplifier.
+
+    is_watched: whether a stall of its sound for 0.1 s ends it.
+    """
+
+    def __init__(
+        self, *options: str, environment: dict[str, str], log: Path, is_watched: bool = True
+    ) -> None:
         self._log = log
+        program = [ERA] if is_watched else [sys.executable, "-c", UNWATCHED]
         with log.open("wb") as errors:
             self.process = subprocess.Popen(
-                [ERA, "soft-amp", *options, "--until-eof"],
+                [*program, "soft-amp", *options, "--until-eof"],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=errors,
@@ -115,6 +131,7 @@ def host(url: str, channels: int) -> Iterator["subprocess.Popen[str]"]:
         stdout=subprocess.PIPE,
         stderr=subprocess.DEVNULL,
         text=True,
+        env=os.environ | {"PYTHONPATH": str(Path(__file__).parents[1])},
     ) as process:
         assert process.stdout.readline() == "armed\n"
         yield process

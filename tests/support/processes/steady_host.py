@@ -3,17 +3,22 @@
     python tests/support/processes/steady_host.py URL CHANNELS
 
 Each channel is 30 degrees ahead of the one before. It prints `armed`. The amplifier waits for it as
-long as the protocol allows, since a busy machine may hold it up.
+long as the protocol allows, and after a longer stall of the machine it plays again.
 """
 
 import asyncio
 import sys
+from collections.abc import Sequence
 
+import pytest
+
+from drivers.errors import CommandRefused, LinkError
 from drivers.host.amplifier import Amplifier
 from drivers.host.group import Group
 from drivers.opening import Lines
 from drivers.playing import AmplifierLayer, AmplifierTone
 from drivers.protocol.definition import QUANTITIES
+from processes.patient_daemon import wait_long
 from registry.limits import GuardLimits
 
 LIMITS = GuardLimits(40, 1000, 1.0)
@@ -30,12 +35,20 @@ async def main(url: str, channels: int) -> None:
     """Acknowledge a fault, arm and play."""
     amplifier = await linear_amplifier(Lines(), url)
     group = Group({"a": amplifier}, watchdog=WATCHDOG)
+    tones = [AmplifierTone(n, 1000.0, 0.5, (30.0 * n + 180) % 360 - 180) for n in range(channels)]
+    while True:
+        try:
+            await _play(group, tones)
+        except (CommandRefused, LinkError):
+            await asyncio.sleep(_BEAT)
+
+
+async def _play(group: Group, tones: Sequence[AmplifierTone]) -> None:
     await group.open()
     await group.clear()
     await group.arm()
     sys.stdout.write("armed\n")
     sys.stdout.flush()
-    tones = (AmplifierTone(n, 1000.0, 0.5, (30.0 * n + 180) % 360 - 180) for n in range(channels))
     await group.apply({"a": [AmplifierLayer(0, tuple(tones))]})
     while True:
         await group.beat()
@@ -43,4 +56,5 @@ async def main(url: str, channels: int) -> None:
 
 
 if __name__ == "__main__":
+    wait_long(pytest.MonkeyPatch())
     asyncio.run(main(sys.argv[1], int(sys.argv[2])))

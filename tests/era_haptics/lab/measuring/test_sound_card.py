@@ -10,7 +10,6 @@ import os
 import re
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -37,7 +36,6 @@ from kit.desk_plate import (
 )
 from model.arrays import Float32Array, FloatArray
 from model.errors import InputError
-from model.estimate.identify import identify
 from model.estimate.measurement import MeasuredPlate, measurement_of, read_measured
 from model.rig.rig import Rig
 from model.rig.rig_file import example_rig_path, parse_rig
@@ -74,7 +72,6 @@ def board() -> Rig:
 
 
 DESK = Path(__file__).parents[4] / "examples" / "desk"
-STALLED = 8.0  # s; without a message of the server it would be ten
 CHANNELS = 5  # of that desk: four ERAs and the loop-back
 
 
@@ -124,7 +121,7 @@ def test_unsuitable_card_is_rejected(tmp_path: Path) -> None:
 @pytest.mark.real_time
 @pytest.mark.needs("jackd", "portaudio", "cc")
 def test_measurement_without_its_server_is_lost(tmp_path: Path) -> None:
-    """Ended while a run plays: one message and exit status 3 before a timeout, and no file."""
+    """Ended while a run plays: one message, not that of a timeout, exit status 3, and no file."""
     name = f"lost{os.getpid()}"
     with jack_server(name, inputs=13, outputs=CHANNELS) as server:
         looking = Capture(name, "looking", 1)  # once the server is up
@@ -133,10 +130,9 @@ def test_measurement_without_its_server_is_lost(tmp_path: Path) -> None:
             wait_for(lambda: looking.is_played_to(f"system:playback_{CHANNELS}"))
             looking.close()  # libjack does not bear to close a client of a server that is gone
             server.process.terminate()  # one that is killed occupies one of JACK's eight places
-            ended = time.monotonic()
             status, message = measuring.result()
         assert (status, message.count("\n"), "lost" in message) == (3, 1, True)
-        assert time.monotonic() - ended < STALLED
+        assert "took no sample" not in message
     assert not any(tmp_path.iterdir())
 
 
@@ -171,24 +167,6 @@ def measured(
     desk = Desk(rig, SENSORS)
     multisine = Multisine(frequencies, len(desk.eras) + 1, CARD_RATE, LEVEL)
     return measure_through(desk, card, multisine, periods=2, progress=lambda done, of: None)
-
-
-@pytest.mark.long
-def test_identified_plate_is_the_one_behind_the_card(rig: Rig, truth: Truth) -> None:
-    """Springs per mass, rigidity, gains over frequency: what drove the plate, with resonances.
-
-    Within four standard deviations of what is written, and that is less than before.
-    """
-    found = identify(rig, measured(rig, truth).measurement)
-    assert found.is_explained
-    mass = truth.rig.plate.thickness / found.rig.plate.thickness
-    std = found.rig.uncertainty
-    assert std.stiffness < rig.uncertainty.stiffness / 3
-    for era, real, actuator in zip(found.rig.eras, truth.rig.eras, truth.actuators, strict=True):
-        assert mass * era.stiffness == pytest.approx(real.stiffness, rel=4 * std.stiffness)
-        ratio = era.gain(LINES) / actuator.response(LINES)
-        assert np.abs(np.angle(ratio)).max() < 4 * np.radians(std.phase_deg)
-        np.testing.assert_allclose(np.abs(ratio), np.abs(ratio).mean(), rtol=4 * std.gain)
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,6 @@ import os
 import re
 import subprocess
 import sys
-import sysconfig
 import tarfile
 import zipfile
 from configparser import ConfigParser
@@ -20,7 +19,6 @@ from cases import shortly
 from licences import NOTES
 from model.compiled.kernels import versions
 from packages import PACKAGES
-from processes.typed_page import InstalledEra, try_first
 from smoke import lowest, requirements
 
 ROOT = Path(__file__).parents[1]
@@ -159,36 +157,6 @@ def test_sdist_holds_what_is_needed_to_test_and_document_it(sdist: Path) -> None
     assert {"tests/test_wheel.py", "docs/conf.py", "examples/paper_plate.yaml"} <= names
     unwanted = re.compile(r"(^|/)(_build|dist|out|\.venv|__pycache__|\.[a-z_]+_cache)(/|$)|\.pyc$")
     assert [name for name in names if unwanted.search(name)] == []
-
-
-@pytest.mark.long
-def test_it_works_without_the_checkout(wheel: Path, tmp_path: Path) -> None:
-    """From an empty folder, with the wheel and its dependencies alone; `make smoke` does more."""
-    environment, folder = tmp_path / "environment", tmp_path / "empty"
-    folder.mkdir()
-    subprocess.run([sys.executable, "-m", "venv", "--without-pip", environment], check=True)
-    python = environment / "bin" / "python"
-    # The dependencies of the tests' own environment, but not its editable era-haptics: only the
-    # .pth files of an environment's own folder are followed.
-    site = next(environment.glob("lib/python*/site-packages"))
-    (site / "dependencies.pth").write_text(sysconfig.get_path("purelib"), encoding="utf-8")
-    pip = [sys.executable, "-m", "pip", "--disable-pip-version-check", "--python", str(python)]
-    options = ("-qq", "--no-deps", "--no-index", "--no-compile")
-    subprocess.run([*pip, "install", *options, str(wheel)], check=True)
-    era = InstalledEra(python, folder)
-    assert era.script("import model; print(model.__file__)").startswith(str(site))
-    assert (
-        Path(
-            era.script(
-                "from controller.demo.demonstration import example_touches_path as path\n"
-                "print(path('touches'))"
-            )
-        )
-        .stat()
-        .st_size
-        > 100_000
-    )
-    try_first(era)
 
 
 def test_every_dependency_has_a_bound_that_can_be_tried(wheel: Path) -> None:

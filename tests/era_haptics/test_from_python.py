@@ -408,7 +408,6 @@ SPLIT = replace(RIG, amplifiers={"a": "sim://", "b": "sim://"})
                 ({"XX": 110}, "XX'; choose from SW, SE, NE, NW"),
                 ({"XX": era.Tone(110, 1e-4)}, "XX'; choose from SW, SE, NE, NW"),
                 ({"SW": 0}, "frequency.* got 0 Hz"),
-                ({"SW": math.inf}, "frequency.* got inf Hz"),
                 ({"SW": "110 Hz"}, "frequency.* got '110 Hz'"),
                 ({"SW": [110, -1]}, "frequency.* got -1 Hz"),
                 ({"SW": 39.9}, r"SW must be from 40 to 500 Hz, got 39.9 Hz; .*limits\.freq"),
@@ -423,7 +422,6 @@ SPLIT = replace(RIG, amplifiers={"a": "sim://", "b": "sim://"})
             )
         ),
         (lambda: era.Drive(110, level=1.000000002), "level.* got 1.000000002"),
-        (lambda: era.Drive(110, level=math.nan), "level.* got nan"),
         (lambda: era.Drive(110, level=1, phase_deg=math.inf), "phase.* got inf"),
         *(  # of signals: shape, kind, value, rate and length, with the place of a value
             (lambda s=signals, r=rate: PLATE.play(s, TARGET, sample_rate=r), says)
@@ -435,7 +433,6 @@ SPLIT = replace(RIG, amplifiers={"a": "sim://", "b": "sim://"})
                 (np.zeros((4, 300)), 1000, "above 1000 Hz"),
                 (np.zeros((4, 300)), None, "sample_rate"),
                 (np.zeros((4, 30)), 6000, "last from 0.01 to 10 s, got 0.005"),
-                (np.zeros((4, 3000)), 200, "above 1000 Hz"),
                 ({"SW": 110}, 3000, "got a dict"),
             )
         ),
@@ -443,15 +440,12 @@ SPLIT = replace(RIG, amplifiers={"a": "sim://", "b": "sim://"})
             (lambda wrong=wrong: PLATE.responses(**wrong), says)
             for wrong, says in (
                 ({"points": [(9.0, 0.1)]}, "point"),
-                ({"points": TARGET, "fingers": [(0.1, 9.0)]}, "finger"),
                 ({"points": TARGET, "fingers": [era.Finger(TARGET, load=99.0)]}, "load"),
                 ({"points": TARGET, "frequencies": [600]}, r"500 Hz.*limits\.frequency"),
                 ({"points": TARGET, "frequencies": []}, "frequencies must be"),
-                ({"points": TARGET, "frequencies": [np.nan]}, "frequency"),
             )
         ),
         (lambda: PLATE.map({"SW": 501}), r"500 Hz.*limits\.frequency"),
-        (lambda: PLATE.play({"SW": 501}, TARGET), r"500 Hz.*limits\.frequency"),
         (
             lambda: PLATE.play({"SW": 40}, TARGET, quiet=QUIET, duration=0.1),
             r"at least 0.5\d* s.*got 0.1 s",

@@ -31,7 +31,6 @@ from dashboard_pictures import (
     open_dashboard,
     two_people,
 )
-from processes import patient_daemon
 from processes.daemons import PATIENCE
 from processes.gateways import (
     TOKEN,
@@ -61,7 +60,6 @@ def daemon(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     with real_daemon(
         folder,
         "layouts: {panel: layout.yaml, other: layout.yaml}\n",
-        program=patient_daemon.RESTING,
     ) as path:
         yield path
 
@@ -562,33 +560,3 @@ async def test_login_needs_the_token(tab: Page, gateway: GatewayProcess, era: Cl
             for command in ("era gateway", "era daemon", "era demo --dashboard"):
                 assert command in door  # one of them has printed where to look
             assert await tab.evaluate(REASON) == "gateway-refused"
-
-
-@pytest.mark.long
-async def test_page_reconnects_after_gateway_and_daemon_restarts(tab: Page, tmp_path: Path) -> None:
-    """Each loss is shown, and the page continues by itself."""
-    with gateway_process(tmp_path, tmp_path / "era.sock") as first:
-        with real_daemon(tmp_path):
-            await open_dashboard(tab, first, DESKTOP)
-        await tab.until(f"{REASON} === 'daemon-unreachable'")
-        assert await tab.evaluate("document.querySelector('#arm').disabled") is True
-        with real_daemon(tmp_path):
-            await tab.until(f"{STATE} === 'READY_TO_SWITCH_ON'")
-            port = first.port
-            first.process.kill()
-            await tab.until(f"{REASON} === 'gateway-unreachable'")
-            await tab.press(" ", "Space")
-            await tab.until("document.querySelector('#problem').innerText")
-            listen = ("--listen", f"127.0.0.1:{port}")
-            with gateway_process(tmp_path, tmp_path / "era.sock", *listen):
-                await tab.until(f"{STATE} === 'READY_TO_SWITCH_ON'")
-                await tab.until(f"{REASON} === 'simulated'")
-                # Either loss is one event, followed by the return.
-                await tab.until(
-                    "[...document.querySelectorAll('#log li')]"
-                    ".filter(e => e.querySelector('.error'))"
-                    ".map(e => e.querySelectorAll('.note').length)",
-                    lambda notes: sum(count > 0 for count in notes) == 2,
-                )
-                await tab.press(" ", "Space")  # delivered: what was complained of is over
-                await tab.until("!document.querySelector('#problem').innerText")

@@ -8,7 +8,6 @@ or a daemon are in tests/sim/soft_amp and tests/era_haptics/lab/measuring.
 
 import asyncio
 import contextlib
-import json
 import os
 import pickle
 import random
@@ -18,7 +17,6 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
 from types import SimpleNamespace
@@ -26,7 +24,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 import model
 from benchmarks.latency.session import daemon_session, plain_session, taps
@@ -38,15 +35,10 @@ from controller.daemon.daemon import check_daemon
 from controller.demo.demonstration import Scene, example_scenes, run_demo
 from controller.effects.layout import load_layout
 from controller.sources.tuio import read_capture
-from examples.make_measured import Accelerometer, record_responses, scanning_grid
 from kit.clock import in_virtual_time, run_virtual
-from kit.desk_plate import DeskModel, draw_truth
 from kit.fingers import write_schedule
-from kit.plates import PERTURBED_PLATE_FREQUENCIES, perturbed
-from model.cli import app
 from model.errors import InputError
-from model.estimate.measurement import measurement_of, read_measured, write_responses_csv
-from model.rig.rig_file import example_rig_path, load_rig
+from model.rig.rig_file import load_rig
 from model.table.table_file import build_table
 from processes.daemons import (
     ENABLED,
@@ -71,7 +63,7 @@ from processes.daemons import (
     write_daemon,
 )
 from processes.daemons import until as until_seen
-from processes.desk import BLOCK, DEVICE, PLATE, Desk, desk, identified_errors, session
+from processes.desk import DEVICE, PLATE, Desk, desk, identified_errors, session
 from processes.floods import flood
 from processes.gateways import TOKEN, gateway_process, real_daemon, wait_for
 from processes.jack_recorder import Capture
@@ -158,44 +150,6 @@ async def test_baseline_answers_every_touch() -> None:
         found = await taps(session, COUNT)
     assert found.unanswered == 0
     assert 0 < found.times.min() < found.times.max()
-
-
-MESH = "16x12"
-SENSOR = Accelerometer("", 0, 0, noise_density=5e-3, reach=200.0, resolution=1e-3)
-
-
-@pytest.mark.long
-@pytest.mark.usefixtures("plain_pictures")
-def test_calibration_finds_the_true_parameters(tmp_path: Path) -> None:
-    """Every parameter within 2 %, faults of the measurement named, and a rig that can be used.
-
-    Of what twelve sensors recorded of the true plate, P3 wrong and P8 dead.
-    """
-    rig = load_rig(example_rig_path(), mesh=MESH)
-    truth, scales = perturbed(rig), {"P3": 0.8, "P8": 0.0}
-    sensors = [
-        replace(sensor, scale=scales.get(sensor.name, 1.0))
-        for sensor in scanning_grid(rig.plate, 4, 3, like=SENSOR)
-    ]
-    responses = record_responses(truth, sensors, PERTURBED_PLATE_FREQUENCIES)
-    write_responses_csv(tmp_path / "measured.csv", responses, rig)
-    new = tmp_path / "new.yaml"
-    files = (example_rig_path(), tmp_path / "measured.csv", "-o", new)
-    result = CliRunner().invoke(app, ["calibrate", *map(str, files), "--mesh", MESH, "--json"])
-    assert result.exit_code == 0, result.output
-    told = json.loads(result.stdout)
-    wanted = [truth.plate.material.E, truth.plate.loss_factor]
-    wanted += [v for era in truth.eras for v in (era.stiffness, era.damping, era.bolt_mass)]
-    np.testing.assert_allclose([row["after"] for row in told["parameters"]], wanted, rtol=0.02)
-    assert told["dead_sensors"] == ["P8"]
-    assert told["sensor_scales"]["P3"]["scale"] == pytest.approx(0.8, rel=0.01)
-    assert told["held_out"]["error_after"] < 0.03 < 0.3 < told["held_out"]["error_before"]
-    assert told["files"] == [str(new)]
-    gains, true_gains = (
-        np.column_stack([era.gain(PERTURBED_PLATE_FREQUENCIES) for era in each.eras])
-        for each in (load_rig(new, mesh=MESH), truth)
-    )
-    assert np.median(np.abs(gains / true_gains - 1)) < 0.01
 
 
 CHANNELS = 4
@@ -623,28 +577,6 @@ def plate(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Desk]:
     """A plate behind a JACK server of its own."""
     with desk(tmp_path_factory.mktemp("desk"), seed=SEED, mesh=DESK_MESH) as running:
         yield running
-
-
-@pytest.mark.long
-@pytest.mark.alone
-@pytest.mark.needs("jackd", "cc")
-def test_measured_plate_is_the_one_on_the_desk(plate: Desk) -> None:
-    """Through PortAudio and files, against the plate's closed form, and its hidden delay.
-
-    73 samples of converters, a block of JACK and another of PortAudio, and a filter's third of a
-    sample; known but for periods of 60 Hz, which the tones have in common.
-    """
-    told = plate.run(
-        "measure", "rig.yaml", "--device", DEVICE, "--sensors", "sensors.csv",
-        "-o", "measured.csv", "--frequencies", "61:481:60",
-    )  # fmt: skip
-    assert told["latency_s"] * 48_000 == pytest.approx((73 + 2 * BLOCK) % 800, abs=0.5)
-    rig = load_rig(plate.folder / "rig.yaml")
-    found = measurement_of(read_measured(plate.folder / "measured.csv"), rig)
-    model = DeskModel(draw_truth(rig, seed=SEED, mesh=DESK_MESH), found.points).under()
-    exact = model.response(found.frequencies) / rig.eras[0].stroke
-    loud = np.abs(exact) > 0.2 * np.abs(exact).max(axis=(1, 2), keepdims=True)
-    np.testing.assert_allclose(found.values[loud], exact[loud], rtol=0.03)
 
 
 @pytest.mark.long

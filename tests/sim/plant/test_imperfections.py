@@ -15,23 +15,15 @@ from numpy.testing import assert_allclose
 
 from drivers.playing import AmplifierTone, Playback
 from drivers.protocol.sets import Command, Envelope, LayerSet
-from kit.direct_plate import direct_acceleration
 from kit.plates import FINGERTIP, lock_in
 from kit.plates import motion_of as sampled
 from model.answer.answer import Layer
 from model.answer.stimulus import Placement, Stimulus, together
 from model.arrays import FloatArray
 from model.errors import InputError
-from model.fem import assemble
-from model.finger import (
-    fingertip_points,
-    fingertip_weights,
-    mean_level_db_sl,
-    sensation_level,
-)
 from model.reduction.reduced_plate import ReducedPlate
 from model.rig.rig import Channel, Rig, Uncertainty
-from model.structure.attachments import Fingertip, FingertipLoad, PointLoad
+from model.structure.attachments import Fingertip, PointLoad
 from model.transients.base_motion import BaseEnvelope, shaped
 from model.transients.shaping import Transients
 from model.transients.time_response import plate_in_time
@@ -339,42 +331,7 @@ def test_fingers_off_the_plate_change_nothing(coarse_rig: Rig) -> None:
 
 TARGET, QUIET = (0.10, 0.03), (0.22, 0.16)
 FINGERS = Placement((TARGET,), (QUIET,))
-HEAVY = Fingertip(stiffness=5000.0, damping=20.0, contact_mass=0.005)
 EXCITATION = {"SW": VibrationTone(110.0, 1e-5), "NE": VibrationTone(250.0, 5e-6, math.pi / 2)}
-
-
-def steady(rig: Rig, place: tuple[float, float], *loads: FingertipLoad) -> np.ndarray:
-    """Amplitudes (2, p) [m/s²] under a fingertip at 110 and 250 Hz, by a direct solve."""
-    points = fingertip_points(*place, rig.plate)
-    frequencies = np.array([110.0, 250.0])
-    unit = direct_acceleration(
-        assemble(rig.plate, rig.mesh), rig.eras, frequencies, points, loads=loads
-    )
-    return np.abs([0.1 * unit[0, 0], 0.05 * unit[1, 2]])  # SW and NE, of 100 µm
-
-
-@pytest.mark.parametrize(
-    ("fingertip", "pressed"), [(None, ()), (HEAVY, ()), (HEAVY, (0.5, 2.0)), (None, (0.5, 2.0))]
-)
-def test_playback_steady_measures_agree_with_the_frequency_domain(
-    coarse_rig: Rig, reduced: ReducedPlate, fingertip: Fingertip | None, pressed: tuple[float, ...]
-) -> None:
-    """Level and contrast by a direct solve, within 0.1 dB, fingers that load the plate or not."""
-    rig = replace(coarse_rig, fingertip=fingertip)
-    fingers = replace(FINGERS, loads=pressed)
-    played = play_excitation(
-        rig, reduced, [Layer(EXCITATION)], together(fingers, Stimulus()), duration=None
-    )
-    tips = [fingertip.scaled(each) for each in pressed or (1, 1)] if fingertip else []
-    loads = [FingertipLoad(*at, tip) for at, tip in zip((TARGET, QUIET), tips, strict=False)]
-    at_target, at_quiet = (steady(coarse_rig, at, *loads) for at in (TARGET, QUIET))
-    weights = fingertip_weights(*TARGET, coarse_rig.plate)
-    level = mean_level_db_sl(np.array([110.0, 250.0]), at_target, weights)
-    quiet_level = sensation_level(np.array([110.0, 250.0]), at_quiet).max()
-    assert played.level_db_sl == pytest.approx(level, abs=0.1)
-    assert played.contrast_db == pytest.approx(level - quiet_level, abs=0.1)
-    free = mean_level_db_sl(np.array([110.0, 250.0]), steady(coarse_rig, TARGET), weights)
-    assert (abs(level - free) > 1) is (fingertip is not None)
 
 
 def test_playback_with_an_onset_envelope(coarse_rig: Rig, reduced: ReducedPlate) -> None:

@@ -16,8 +16,8 @@ from scipy.signal import butter, sosfiltfilt
 
 from kit.direct_plate import direct_acceleration
 from kit.plates import BASES as MOVED_BASES
+from kit.plates import STROKE as BASE_STROKE
 from kit.plates import (
-    FINGERTIP,
     apart,
     exciter_rig,
     faded_base,
@@ -26,13 +26,12 @@ from kit.plates import (
     resting,
     shaped_base,
 )
-from kit.plates import STROKE as BASE_STROKE
 from model.answer.plan import query
 from model.answer.stimulus import Finger, Placement, Stimulus
 from model.arrays import FloatArray
 from model.errors import InputError
 from model.fem import Mesh, PlateMatrices, assemble
-from model.reduction.reduced_plate import ReducedPlate, modal_matrices, reduce_plate
+from model.reduction.reduced_plate import ReducedPlate, reduce_plate
 from model.rig.rig import Rig
 from model.structure.attachments import Era, Fingertip, FingertipLoad, footprints_of
 from model.structure.plate import Plate
@@ -42,30 +41,6 @@ from sim.plant.excited_plate import play
 from sim.plant.plant import Plant
 
 STROKE = 1e-4
-
-
-@pytest.mark.parametrize("damping", [3.46, 3000.0])
-def test_plant_is_continuous_when_drives_change(
-    coarse_rig: Rig, reduced: ReducedPlate, damping: float
-) -> None:
-    """Starting, replacing and ending a drive abruptly changes neither at that moment.
-
-    With the larger damping some eigenvalues are real.
-    """
-    plant = Plant(reduced, [replace(era, damping=damping) for era in coarse_rig.eras])
-    assert (plant.loaded.plate.eigenvalues.imag == 0).any() == (damping > 1000)
-    plant.set_input(0, [Term(0.0, 0.1, 700.0, STROKE * np.exp(0.7j), 3j * STROKE)])
-    plant.skip(0.0345)
-    before = plant.state
-    plant.set_input(0, [Term(0.0345, np.inf, 1500.0, STROKE * 1j)])
-    plant.set_input(3, [Term(0.0, np.inf, 900.0, -STROKE)])
-    for old, new in zip(before, plant.state, strict=True):
-        np.testing.assert_allclose(new, old, rtol=1e-6, atol=1e-9 * np.abs(old).max())
-    plant.skip(0.05)
-    before = plant.state
-    plant.set_input(0, [])
-    for old, new in zip(before, plant.state, strict=True):
-        np.testing.assert_allclose(new, old, rtol=1e-6, atol=1e-9 * np.abs(old).max())
 
 
 def test_plant_refuses_an_unsupported_plate(coarse_rig: Rig, reduced: ReducedPlate) -> None:
@@ -83,15 +58,6 @@ PLACES = ((0.11, 0.07), (0.25, 0.15), (0.3048, 0.1))
 ONE, THREE = resting(PLACES[0]), resting(*PLACES)
 
 
-def vibrating(reduced: ReducedPlate, rig: Rig, *, until: float = 0.05) -> Plant:
-    """A plate that three bases move, at a moment [s]."""
-    plant = Plant(reduced, rig.eras)
-    for number, base in enumerate(BASES):
-        plant.set_input(number, base.terms)
-    plant.skip(until)
-    return plant
-
-
 def on_the_mesh(plant: Plant) -> tuple[FloatArray, FloatArray]:
     """Displacement and velocity at all nodes."""
     plate = plant.reduced.plate
@@ -104,41 +70,6 @@ def phalanges(plant: Plant) -> dict[str, FloatArray]:
     """Displacement and velocity of each contact's phalanx."""
     last = np.transpose(plant.state)[len(plant.reduced.omega) :]
     return dict(zip(plant.contacts, last, strict=True))
-
-
-def stored(plant: Plant, rig: Rig) -> float:
-    """Energy [J] of the plate on springs at rest: its motion, its bending, and its springs."""
-    r = len(plant.reduced.omega)
-    q, v = (part[:r] for part in plant.state)
-    M, _, K = modal_matrices(plant.reduced, rig.eras)
-    return float(q @ K @ q + v @ M @ v) / 2
-
-
-def test_contacts_keep_displacement_and_velocity_continuous(
-    coarse_rig: Rig, reduced: ReducedPlate
-) -> None:
-    """Fingers come, press harder, move and go: the whole plate goes on from where it is.
-
-    So do the phalanges of fingers that stay; those of new fingers are at rest.
-    """
-    plant = vibrating(reduced, coarse_rig)
-    harder = replace(FINGERTIP, stiffness=3000.0, damping=5.0, contact_mass=0.001)
-    pressed = resting(PLACES[0], fingertip=harder)
-    elsewhere = {"b": FingertipLoad(0.2, 0.2, FINGERTIP)}
-    changes: list[Mapping[str, FingertipLoad]] = [
-        ONE, THREE, THREE | pressed, pressed | elsewhere, elsewhere, {}
-    ]  # fmt: skip
-    for contacts in changes:
-        plant.skip(plant.time + 0.0031)
-        before, energy = on_the_mesh(plant), stored(plant, coarse_rig)
-        resting_before = phalanges(plant)
-        plant.set_contacts(contacts)
-        assert plant.contacts == contacts
-        for id, found in phalanges(plant).items():
-            assert_allclose(found, resting_before.get(id, (0.0, 0.0)), rtol=1e-9, atol=1e-12)
-        for old, new in zip(before, on_the_mesh(plant), strict=True):
-            assert_allclose(new, old, rtol=0, atol=1e-9 * np.abs(old).max())
-        assert stored(plant, coarse_rig) == pytest.approx(energy, rel=1e-9)
 
 
 def test_contacts_drop_vectors_of_lifted_fingers(coarse_rig: Rig, reduced: ReducedPlate) -> None:

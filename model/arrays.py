@@ -2,7 +2,7 @@
 
 Scores that are equal in theory, for example at mirrored positions, differ by rounding, which
 depends on the processor. Scores within a small distance of the best therefore count as equal to it,
-and the first of them is chosen.
+and the first one is chosen.
 """
 
 from collections.abc import Callable, Sequence

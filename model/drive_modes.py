@@ -109,7 +109,7 @@ class Forms:
     `quiet` counts the nominal plate by their mean. None, as `fine`, if the mean is good enough.
     """
     fine: Complex64Array | None = None
-    """Field (f, q, p, eras) at many points of quiet fingertips, of which the loudest counts."""
+    """Field (f, q, p, eras) at many points of quiet fingertips; the loudest point counts."""
     driven: NDArray[np.bool_] | None = None
     """Mask (eras,) of the ERAs that may have weights, None for all; see `among`."""
 
@@ -237,7 +237,7 @@ class LawsonMethod:
     is_limited: bool = False
     """Whether weights are brought to the level within full stroke, by multipliers."""
     variance: float = 0.0
-    """Variance of each ERA's contribution, in addition to that of the forms."""
+    """Variance of each ERA's contribution, in addition to the forms' variance."""
     gain: float = 0.0
     """Gain on the weights, limited to full stroke; 0 for none."""
 
@@ -363,7 +363,7 @@ def tried(forms: Forms, method: LawsonMethod) -> CoherentResult:
 
 
 def _moved(shares: Float32Array, expected: Float32Array) -> Float32Array:
-    """Return the shares (f, q) of quiet fingertips after a Lawson step, by their expected powers.
+    """Return the shares (f, q) of quiet fingertips after a Lawson step, from their expected powers.
 
     Unchanged at frequencies without a driven ERA.
     """

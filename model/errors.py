@@ -72,7 +72,7 @@ def expect_path(value: object, *, what: str) -> Path:
 
 
 def shown(value: object) -> str:
-    """Format text and numbers unchanged, other values by their class."""
+    """Format text and numbers unchanged, other values as their class name."""
     if value is None or isinstance(value, str | Real):
         text = repr(value)
         return text if len(text) <= _MAX_LENGTH else f"{text[:_MAX_LENGTH]}..."

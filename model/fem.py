@@ -61,7 +61,7 @@ class Element:
     def integrals(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         """Integrals over -1..1 of N_i N_j, N_i' N_j and N_i' N_j', exact, (n, n) each.
 
-        Also those of N_i N_j for rotations in shear; for MITC4, of their means.
+        Also the integrals of N_i N_j for rotations in shear; for MITC4, of their means.
         """
         points, weights = legendre.leggauss(len(self.side))
         powers = np.arange(len(self.side))
@@ -232,7 +232,7 @@ class Mesh(Discretisation):
 
     @property
     def raster(self) -> tuple[int, int]:
-        """Numbers of evenly spaced points along x and y that show what the mesh resolves.
+        """Numbers of evenly spaced points along x and y that show all details of the mesh.
 
         The nodes themselves for elements of the first order without strips.
         """

@@ -89,7 +89,7 @@ FIVE_POINTS = _rings((0.0, 1, 1 / 2), (1.0, 4, 1 / 2))
 """The centre and four points of the rim, exact to degree 3: for searches."""
 
 FINE_POINTS = _rings((0.0, 1, 1 / 6), (np.sqrt(0.5), 8, 4 / 6), (1.0, 12, 1 / 6))
-"""Twenty-one points, twelve of them on the rim, exact to degree 7: for figures."""
+"""Twenty-one points (twelve on the rim), exact to degree 7: for figures."""
 
 FIVE_AND_FINE = DiscRule(
     np.concatenate([FIVE_POINTS.points, FINE_POINTS.points]),
@@ -255,7 +255,7 @@ def detection_threshold(frequency: FloatArray, threshold: str = DEFAULT_THRESHOL
 def sensitivities(
     frequencies: FloatArray, sets: Sequence[str], threshold: str = DEFAULT_THRESHOLD
 ) -> FloatArray:
-    """Return the ratios (s, f) of a set's thresholds to those of s other sets.
+    """Return the ratios (s, f) of a set's thresholds to the thresholds of s other sets.
 
     An amplitude is higher above the other sets' thresholds by these factors. frequencies (f,) [Hz].
     Raises InputError for frequencies at which any set has no data.
@@ -338,7 +338,7 @@ def mean_level_db_sl(
 def over_threshold(
     samples: FloatArray, sample_rate: float, threshold: str = DEFAULT_THRESHOLD
 ) -> FloatArray:
-    """Divide each frequency of samples (n, p) [m/s²] at a rate [Hz] by its threshold.
+    """Divide samples (n, p) [m/s²] at a rate [Hz] by the threshold at each frequency.
 
     Uses only their felt part. Beyond the data of a set, its last threshold is used.
     """

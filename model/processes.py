@@ -61,7 +61,7 @@ def on_processes(
         is_done = True
     except BrokenProcessPool:
         raise InputError(
-            "a worker process died, perhaps short of memory; use fewer of them (--workers)"
+            "a worker process died, perhaps for lack of memory; use fewer workers (--workers)"
         ) from None
     finally:
         if not is_done:

@@ -9,8 +9,8 @@ draws, the same for all tones. The contrast at finger k is
 
     C_k = g_k own_k / sqrt(max_p sum_j g_j^2 power_j(p)),  j other contents, p points of finger k,
 
-and at a quiet finger that of the weakest content to all contents together. A single content uses
-the tone with the highest contrast at its level. Since contents differ in frequency, a contrast
+and at a quiet finger the ratio of the weakest content to all contents together. A single content
+uses the tone with the highest contrast at its level. Since contents differ in frequency, a contrast
 depends on the thresholds: the lowest over the table's threshold sets counts, in the choice and in
 the promise. The weights of a content do not depend on the threshold set. Its second harmonics do,
 and candidates are judged by the set with the loudest harmonics.
@@ -59,7 +59,7 @@ REACHED = 1 - 1e-5
 """Fraction of a level that counts as reached."""
 
 KEPT, MISSING = 16, 4
-"""Number of frequencies searched for a single content, and how many of them can miss the level.
+"""Number of frequencies searched for a single content, and how many can miss the level.
 
 The first is a multiple of the kernels' batch size. Frequencies with the highest bounds |c^H w| /
 sqrt(w^H R w) of w = R^-1 c are searched, with R the mean over the quiet fingers: a bound takes one
@@ -69,7 +69,7 @@ system of equations, a search several.
 MIN_CANDIDATES, MAX_CANDIDATES = 4, 32
 """Number of candidates for a single content, and the maximum over all bands of any content.
 
-This many by the mean over fingertips, and as many by their points.
+This many according to the mean over fingertips, and as many according to their points.
 """
 
 MAX_COMBINATIONS, PRUNING_STEP = 200, 4
@@ -155,7 +155,7 @@ class Contents:
         return np.setdiff1d(np.concatenate(bands), self.avoided)
 
     def others(self, number: int) -> list[int]:
-        """Return the fingers that a content, by its number, is kept from."""
+        """Return the fingers from which the content with a given number is kept."""
         every = {*self.quiet}.union(*(stream.targets for stream in self.streams))
         return sorted(every - {*self.streams[number].targets})
 
@@ -203,7 +203,7 @@ class Tones:
     The lowest over the threshold sets; NaN without other contents or fingers.
     """
     level_db_sl: Sequence[Sequence[float]]
-    """Level (k, 2) of a finger's own content by the rig's own threshold set: nominal and
+    """Level (k, 2) of a finger's own content relative to the rig's own threshold set: nominal and
     promised."""
     foreign_db_sl: Sequence[Sequence[float]]
     """Upper bound of the level (k, s) of other contents on 90 % of plates, by each threshold set.
@@ -226,8 +226,8 @@ class Tones:
     ) -> list[Excitation]:
         """Return the excitations of a content, one per tone, the carrier first.
 
-        frequencies (f,) [Hz] and highest_drives (f, eras) are those of the table. The strongest
-        ERA, or the first of those nearly as strong, has phase zero.
+        frequencies (f,) [Hz] and highest_drives (f, eras) are the table's. The strongest ERA, or
+        the first ERA nearly as strong, has phase zero.
         """
         found = list[Excitation]()
         every = zip(self.rows, self.weights, self.gains, self.owners, strict=True)
@@ -274,7 +274,7 @@ OWN, MIXED, SHARED, HELD_BACK, QUIET = "own", "mixed", "shared", "held back", "q
 
 @dataclass(frozen=True)
 class Sensation:
-    """What a finger feels.
+    """Vibration that a finger feels.
 
     Promised values are reached (or for foreign levels, not exceeded) by 90 % of plates within the
     rig's uncertainty. All others are nominal values of the modelled plate with the fingers on it.
@@ -294,7 +294,7 @@ class Sensation:
     """Level of its stimulus, averaged over the duration, if limited."""
     promised_level_db_sl: float = -math.inf
     contrast_db: float | None = None
-    """Level relative to all other vibrations here, None if there is nothing to compare.
+    """Level relative to all other vibrations here, None without other vibrations.
 
     For a single vibration: relative to its own level at the loudest quiet finger. For a quiet
     finger: the weakest vibration at its own finger, relative to all vibrations here. The lowest
@@ -327,7 +327,7 @@ class Sensation:
 
 @dataclass(frozen=True)
 class Layer:
-    """Excitations that play simultaneously for the fingers of one vibration."""
+    """Excitations that play simultaneously for the fingers of a vibration."""
 
     excitation: Excitation
     """Tones of all ERAs."""
@@ -567,7 +567,7 @@ class Answer:
         return level - strongest_db, promised - strongest_db
 
     def lowered_db(self, number: int) -> float:
-        """Return how far a layer, by its number, is below the strongest of its stimuli [dB]."""
+        """Return how far the layer with a given number is below its strongest stimulus [dB]."""
         stream = self.contents.streams[number]
         lasts, short = stream.duration is None, -math.inf
         for finger in stream.targets:
@@ -578,8 +578,8 @@ class Answer:
         return short if short > SAME_LEVEL else 0.0
 
     def pauses(self, number: int) -> bool:
-        """Return whether a layer, by its number, ends or is modulated, so that it masks nothing
-        meanwhile."""
+        """Return whether the layer with a given number ends or is modulated, so that it masks
+        nothing meanwhile."""
         stream = self.contents.streams[number]
         stimulus = self.asked[stream.targets[0]].stimulus
         is_modulated = stimulus is not None and stimulus.modulation_hz is not None
@@ -652,9 +652,10 @@ class Answer:
     def to_frame(self) -> Any:
         """Return the sensations as a pandas DataFrame, one row per finger; requires pandas.
 
-        Levels are relative to the rig's own threshold set, those of others at the loudest point of
-        the fingertip. Only worst_foreign_level_db_sl is relative to the lowest thresholds known
-        (`Sensation.foreign_level_db_sl`), up to 30 dB higher; do not compare it with the others.
+        Levels are relative to the rig's own threshold set; other contents' levels are at the
+        loudest point of the fingertip. Only worst_foreign_level_db_sl is relative to the lowest
+        thresholds known (`Sensation.foreign_level_db_sl`), up to 30 dB higher; do not compare it
+        with the others.
         """
         at, found = np.array([each.at for each in self.asked]), self.fingers
         frequencies = [layer.frequency or math.nan for layer in self.layers]

@@ -313,7 +313,7 @@ class _Own(BaseModel):
     is_protected: bool = True
 
     def finger(self, level_db_sl: float) -> Finger:
-        """Build the finger; level_db_sl: the line's level, used if the finger has none."""
+        """Build the finger; level_db_sl: the line's level, for a finger without a level."""
         given = self.model_dump(exclude_none=True)
         at = _point(given.pop("at"))
         if self.band_hz is not None:
@@ -367,7 +367,7 @@ def _parsed(line: str | Mapping[str, Any], defaults: Mapping[str, Any]) -> _Line
         without = "without" if asked.own else "with"
         raise InputError(f"{', '.join(sorted(others))} must be given {without} own")
     if {"target", "targets"} <= given:
-        raise InputError("target must be given without targets; list all of them in targets")
+        raise InputError("target must be given without targets; list all fingers in targets")
     return asked.model_copy(update={k: v for k, v in defaults.items() if k not in given})
 
 

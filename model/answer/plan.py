@@ -59,7 +59,7 @@ from model.table.table import SAME_FREQUENCY, LocalizationTable
 MAX_SEPARATE = 5
 """Maximum number of sharing fingers that first get separate vibrations.
 
-With more of them, 34 of 36 sets with two quiet fingers ended with one vibration for all.
+With more, 34 of 36 sets with two quiet fingers ended with one vibration for all.
 """
 
 CONTENTS_A_STEP = 3
@@ -324,7 +324,7 @@ class _Search:
         return plan
 
     def _nearest(self, plan: _Plan, *, are_apart: bool = True) -> tuple[tuple[int, ...], ...]:
-        """Return the nearest two contents that can be merged, empty if there are none.
+        """Return the nearest two contents that can be merged, empty if no two can.
 
         are_apart: whether each finger could be served with its own vibration.
         """
@@ -364,7 +364,8 @@ class _Search:
         ]
 
     def _serve_in_turn(self, plan: _Plan, tried: Sequence[Answer]) -> Answer:
-        """Serve contents one after another, each only if all earlier ones keep what they require.
+        """Serve contents one after another, each only if all earlier ones still meet their
+        requirements.
 
         If not even the first can be served, the best of the answers tried is returned.
         """
@@ -567,7 +568,8 @@ def worst_of(found: Answer) -> float:
 
 
 def is_served(found: Answer, steady: Answer) -> bool:
-    """Return whether all fingers have what they require, and at least 6 dB unless they had less."""
+    """Return whether all fingers meet their requirements, and have at least 6 dB unless they had
+    less."""
     worst, before = found.promised_worst_db, steady.promised_worst_db
     if (
         worst is not None
@@ -713,9 +715,9 @@ def _within_stroke(table: LocalizationTable, found: Answer) -> Answer:
 def as_quiet_fingers_allow(table: LocalizationTable, found: Answer) -> Answer:
     """Set the levels of stimuli with `is_limit` to the highest that the other fingers allow.
 
-    All of them together reach at most IMPERCEPTIBLE_DB_SL at quiet fingers, relative to the rig's
-    own thresholds, on 90 % of plates. For fingers with their own vibration, none is raised above
-    that level, but none is lowered either.
+    Together they reach at most IMPERCEPTIBLE_DB_SL at quiet fingers, relative to the rig's own
+    thresholds, on 90 % of plates. For fingers with their own vibration, none is raised above that
+    level, but none is lowered either.
     """
     streams, tones = found.contents.streams, found.tones
     limited = [n for n, each in enumerate(streams) if each.limit_db_sl is not None]

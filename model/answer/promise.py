@@ -47,7 +47,7 @@ from model.table.table import FingertipShapes, LocalizationTable, read_fingertip
 from model.transients.time_response import enveloped_accelerations
 
 CENTRE_AND_RIM, CENTRE_AND_FOUR = np.array([0, *range(9, 21)]), np.array([0, 9, 12, 15, 18])
-"""Indices of fine points of a fingertip between which no null can hide, and of a few of them."""
+"""Indices of fine points of a fingertip between which no null can hide, and of a few points."""
 
 MAX_FINGERS_BY_POINT = 4
 """Maximum number of quiet fingers whose points a search considers individually."""
@@ -316,7 +316,8 @@ class RingingUnderFingers:
         )
 
     def lasting_long_enough(self, some: IntArray) -> IntArray:
-        """Return the rows whose spectrum does not reach down to 0 Hz; all rows if there are none.
+        """Return the rows whose spectrum does not reach down to 0 Hz; all rows if every spectrum
+        does.
 
         A drive of fewer periods moves the plate as a whole, which no frequency of a table shows.
         """
@@ -390,7 +391,7 @@ def promised(
 ) -> Tones:
     """Compute the sensation of tones at rows (m,) with weights (m, n).
 
-    owners (m,): the content of each tone; gains (m,): None for those that give the contents'
+    owners (m,): the content of each tone; gains (m,): None for the gains that give the contents'
     levels; ringing: per content, None for continuous or shaped ones; ways: as in `with_tones`.
     """
     shares, streams = fingers.tips.fine_weights, contents.streams
@@ -455,9 +456,9 @@ def with_tones(
 ) -> Answer:
     """Return the answer with other tones, and the resulting promises.
 
-    gains: of the tones, None for those that give the contents' levels. ways: fingers, by number,
-    that are points on the path of each of the first fingers; each of these feels the mean power
-    there.
+    gains: of the tones, None for the gains that give the contents' levels. ways: fingers, by
+    number, that are points on the path of each of the first fingers; each of these feels the mean
+    power there.
     """
     contents = found.contents
     fingers = FingersOnPlate.of(table, contents.places, contents.loads)
@@ -593,7 +594,7 @@ def share_stroke(
 ) -> tuple[FloatArray, float]:
     """Lower gains (K,) to levels (K,) until they fit the stroke; also return the smallest factor.
 
-    Among contents of one priority, the louder ones are lowered first to a common level (max-min
+    Among contents of equal priority, the louder ones are lowered first to a common level (max-min
     fairness), until all fit into what higher priorities leave.
     """
     amplitudes = gains[:, None] * np.abs(weights)

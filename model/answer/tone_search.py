@@ -3,7 +3,7 @@
 `choose_tones` packs a query for the kernel. `choose_by_numpy` handles cases that the kernel does
 not support (durations, envelopes, avoided frequencies, the drive mode `switched`) and machines
 without a compiler. It must give the same result: candidates for each content by
-`model.drive_modes`, evaluated on drawn plates, of which the best combination is promised.
+`model.drive_modes`, evaluated on drawn plates; the promise is for the best combination.
 """
 
 from array import array
@@ -374,7 +374,8 @@ def _switched_candidates(
 ) -> Candidates:
     """Find the best patterns of the drive mode `switched` for a single content.
 
-    Uses ERAs of one group at a time; near the highest level if none reaches the requested one.
+    Uses the ERAs of a single group at a time; near the highest level if no group reaches the
+    requested level.
     """
     (stream,), quiet, rows = contents.streams, contents.quiet, contents.rows
     rows = rows if over is None or not quiet else over.lasting_long_enough(rows)

@@ -113,8 +113,8 @@ def progress_bar(unit: str, *, is_transient: bool = False) -> "Iterator[Progress
 class _ProgressLines:
     """Progress as lines of text on standard error, at most one every two seconds.
 
-    The remaining time is that of the current stage, which starts when the total changes or the
-    count restarts.
+    The remaining time covers the current stage, which starts when the total changes or the count
+    restarts.
     """
 
     def __init__(self, unit: str) -> None:
@@ -146,7 +146,7 @@ class _ProgressLines:
 
 
 def print_report(rows: Iterable[str | None], answer: Mapping[str, Any], *, as_json: bool) -> None:
-    """Print the report of a command: rows of text, of which None is skipped, or JSON."""
+    """Print a command's report: rows of text (None is skipped), or JSON."""
     text = json.dumps(answer) if as_json else "\n".join(row for row in rows if row is not None)
     sys.stdout.write(f"{text}\n")
 

@@ -94,7 +94,7 @@ def plate_map(
     rig_file: RigArgument,
     drive: Annotated[
         list[str],
-        typer.Option(metavar="ERA=HZ[@LEVEL[:PHASE_DEG]]", help="Tone of one ERA (repeatable)."),
+        typer.Option(metavar="ERA=HZ[@LEVEL[:PHASE_DEG]]", help="Tone of an ERA (repeatable)."),
     ],
     mesh: MeshOption = None,
     points: Annotated[
@@ -454,7 +454,7 @@ def show(rig_file: RigArgument, as_json: JsonOption = False) -> None:
 
 
 def _laminate_rows(laminate: dict[str, Any] | None) -> Iterator[str]:
-    """Yield the layers and rigidities of a laminate; None for a plate of one layer."""
+    """Yield the layers and rigidities of a laminate; None for a single-layer plate."""
     if laminate is None:
         yield "plate"
         return

@@ -285,7 +285,7 @@ def check_own(path: Path, *, sticky: bool = False) -> None:
         return
     if status.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
         mode = stat.filemode(status.st_mode)
-        raise PermissionError(f"{path} must be writable by its owner only, got {mode}; {remedy}")
+        raise PermissionError(f"{path} must be writable only for the owner, got {mode}; {remedy}")
 
 
 def _own_folder(folder: Path) -> Path:

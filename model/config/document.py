@@ -77,7 +77,7 @@ class Document:
     find_lines: Callable[[], Mapping[KeyPath, int]] = field(default=dict, compare=False)
     """Finds the line of every key and list entry by path, for errors; empty without text."""
     over: "Document | None" = None
-    """The file alone, if `data` are its keys merged over those of its `base`."""
+    """The file alone, if `data` are its keys merged over its `base`."""
 
     @cached_property
     def lines(self) -> Mapping[KeyPath, int]:
@@ -86,7 +86,7 @@ class Document:
 
     @property
     def whole_text(self) -> str:
-        """Text with all of its keys, including those of a base."""
+        """Text with all keys, including those inherited from a base."""
         return self.text or data_text(self.data)
 
     def value(self, path: KeyPath) -> Value:
@@ -242,7 +242,7 @@ _NO_KEY = re.compile(r"\s*[\w.-]+(:(?![\s/]|$)|\N{FULLWIDTH COLON})")  # `key:va
 def _remedy(text: str, line: int) -> str:
     """Suggest a remedy for a line that looks right: a directive, a non-breaking space, `key:value`.
 
-    The parser reports some of these at the next line that is not empty.
+    The parser reports some errors at the next line that is not empty.
     """
     lines = text.splitlines()[:line]
     if len(lines) == line and lines[-1].startswith("%"):

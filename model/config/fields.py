@@ -429,7 +429,7 @@ class Circle:
 
 @dataclass(frozen=True)
 class Polygon:
-    """Polygon given by its corners; crossing sides follow the even-odd rule."""
+    """Polygon defined by corners; crossing sides follow the even-odd rule."""
 
     points: tuple[_Point, ...]
 

@@ -6,7 +6,7 @@ variance are made exact, so that a few draws give the percentiles of many. Candi
 with other draws than the promise, which would otherwise be too optimistic. 90 % of plates keep a
 promise.
 
-`ClockErrors` are delays of amplifiers, common to all ERAs of one amplifier. If an amplifier's clock
+`ClockErrors` are delays of amplifiers, common to all ERAs of an amplifier. If an amplifier's clock
 is late by d, its ERAs move as exp(-2 pi i f d) times the commanded motion. With a single amplifier
 delays have no effect: a common phase of all ERAs cannot be felt.
 """

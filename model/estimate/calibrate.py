@@ -2,12 +2,12 @@
 
     d_fsn = g_fn a_fsn(x) + noise
 
-d are measured values at frequency f, sensor s and ERA n; a are those of the model, multiplied by
-the sensors' scales; g is a complex gain per frequency and ERA. x contains the rig's values and the
+d are measured values at frequency f, sensor s and ERA n; a are the model's, multiplied by the
+sensors' scales; g is a complex gain per frequency and ERA. x contains the rig's values and the
 plate's form errors, in standard deviations of data sheets and tolerances.
 
 `check_consistency` comes first: it rejects responses that contradict their metadata. Dead channels
-and outliers are left out. The fitted rig contains only what a rig file can express, with the
+and outliers are left out. The fitted rig contains only values that a rig file can express, with the
 remaining uncertainty.
 """
 
@@ -496,7 +496,7 @@ class Calibration:
         def relative(
             kind: str, theory: float = _MODEL_ERROR, unidentified: float = math.inf
         ) -> float:
-            """RMS error of the values of one kind."""
+            """RMS error of all values of a kind."""
             shares = [
                 math.hypot(error / one.value, theory) if one.is_identified else unidentified
                 for one, error in zip(self.parameters, errors, strict=True)
@@ -771,7 +771,7 @@ def _check_suspensions(found: Calibration) -> None:
         raise InputError(
             f"stiffness of feet {', '.join(one.foot for one in feet)} must be close to that of the "
             f"rig, got {factors(feet)} times it, the bound of the fit; check their "
-            "kind, their positions and that all of them touch the plate"
+            "kind, their positions and whether all touch the plate"
         )
 
 

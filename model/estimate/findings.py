@@ -93,7 +93,7 @@ FINDING_KINDS = {
         "file",
     ),
     "reversed": FindingKind(
-        "PLACES: frequencies must be those of their responses, got reversed order: {coarse}",
+        "PLACES: frequencies must be in the order of their responses, got reversed order: {coarse}",
         "as for `mirrored`, with the frequencies in reverse order",
         "file",
     ),

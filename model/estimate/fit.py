@@ -2,7 +2,7 @@
 
     d_fsn = g_fn a_fsn(x) + noise
 
-d are the values at frequency f, sensor s and drive n; a are those of a forward model whose
+d are the values at frequency f, sensor s and drive n; a are values of a forward model whose
 parameters x have a normal prior (of its `Space`, or given). Gains g are 1, or free at every
 frequency and drive. Free gains follow from a by linear least squares, so that only x is searched,
 with the derivatives of gains and residuals with respect to x (variable projection: Golub and
@@ -70,7 +70,7 @@ class Fit:
     x: FloatArray
     """All parameters (p,)."""
     cost: float
-    """Half the sum of squares of all residuals, including those of the prior."""
+    """Half the sum of squares of all residuals, including the prior's."""
     searched: NDArray[np.bool_]
     """Mask (p,) of the q parameters that were searched."""
     residuals: FloatArray
@@ -438,7 +438,7 @@ def noise_of(values: ComplexArray, residuals: FloatArray, left: FloatArray) -> F
 
 
 def likeliest_fit(found: Sequence[Fit]) -> Fit:
-    """Return the fit with the lowest cost, the first of those that are nearly equal."""
+    """Return the fit with the lowest cost; if several are nearly equal, the first."""
     return best_by(found, lambda each: -each.cost)
 
 
@@ -552,7 +552,7 @@ def are_impossible(
 class SensedPlate:
     """A rig's plate with sensors at points, without the rig's gains, and its fitted values.
 
-    Parameters z (p,) are those of the model's space, in standard deviations from the rig's values.
+    Parameters z (p,) belong to the model's space, in standard deviations from the rig's values.
     """
 
     rig: Rig
@@ -561,7 +561,8 @@ class SensedPlate:
 
     @cached_property
     def rows(self) -> tuple[Parameter, ...]:
-        """Fitted values (n,): modulus and loss factor, then those of every ERA and every foot."""
+        """Fitted values (n,): modulus and loss factor, then the values of every ERA and every
+        foot."""
         of_eras = ("stiffness", "damping", "bolt_mass", "magnet_mass")
         feet = self.rig.foot_names if self.rig.uncertainty.supports else ()
         return parameters_of(self.rig, ("modulus", "loss_factor"), of_eras, feet)
@@ -622,7 +623,8 @@ class SensedPlate:
         return self.model.at(np.zeros(self.model.space.size) if z is None else z).responses
 
     def rig_at(self, z: FloatArray, *beside: str) -> Rig:
-        """Return the rig with the fitted values of z, and with those of the given other kinds."""
+        """Return the rig with the fitted values of z, and with the values of the given other
+        kinds."""
         # A force factor is fitted together with the damping.
         own = self.model.space.of("force_factor", *beside)
         own[self.numbers] = True

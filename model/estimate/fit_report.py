@@ -277,7 +277,7 @@ def fit_rows(found: Identification) -> list[str]:
 
 
 def parameter_rows(found: Identification) -> list[str]:
-    """Return a table of parameters: those of a rig file, and others that clearly differ.
+    """Return a table of parameters: rig-file parameters, and others that clearly differ.
 
     Plate parameters come first, then ERA by ERA. Values are differences from the rig.
     """

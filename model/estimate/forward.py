@@ -145,12 +145,13 @@ class SearchScope:
 
 
 def values_of_eras(rig: Rig, kind: str) -> FloatArray:
-    """Return the values of a kind from a rig file for all ERAs (n,), 0 if an ERA has none."""
+    """Return the values of a kind from a rig file for all ERAs (n,), 0 for an ERA without a
+    value."""
     return np.array([getattr(era, era.fields.get(kind, ""), 0.0) for era in rig.eras])
 
 
 class ParameterKind(ABC):
-    """Parameters of one kind, such as the stiffness of each ERA; see `model.estimate.parameters`.
+    """Parameters of a kind, such as the stiffness of each ERA; see `model.estimate.parameters`.
 
     Parameters are deviations from the rig, usually logarithms of factors.
     """
@@ -344,7 +345,7 @@ class ForwardModel:
     law: ComplexArray | None = None
     """Change of the receptance (f, s, n) [m/N] if losses are viscous, None to neglect it."""
     last_places: dict[bytes, AttachmentPoints] = field(default_factory=dict)
-    """Latest solution for all attachments, by their footprints."""
+    """Latest solution for all attachments, by footprint."""
 
     def __post_init__(self) -> None:
         """Raise InputError for a plate with wrong responses and slopes."""
@@ -497,7 +498,7 @@ class PlateAt:
         self.sources = values.sources()
         """ERAs with their values."""
         self.source_slopes = [each.slopes(model.omega) for each in self.sources]
-        """Derivatives of each ERA's dynamic stiffness and force by its values."""
+        """Derivatives of each ERA's dynamic stiffness and force with respect to its values."""
         self.full_levels = np.array([each.full_level for each in self.sources])
         self.force = drive_forces(model.omega, self.sources) / self.full_levels
         """Force of each ERA on a clamped plate, per unit of its drive, (f, n)."""
@@ -626,7 +627,7 @@ class PlateAt:
         self.eta = eta
         """Loss factor (f,)."""
         self.modulus = modulus
-        """Modulus relative to that of the solved plate."""
+        """Modulus relative to the solved plate's."""
         self.bending: ComplexArray | None = None
         """Stiffness between modes with form errors (f, r, r) [rad²/s²]; `added` is their mass."""
         if model.form is not None:

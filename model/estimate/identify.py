@@ -112,7 +112,7 @@ _IN_COMMON = 2.0  # factor on standard deviations, for errors that all fits shar
 _UNKNOWN = 0.5
 """Fraction of the prior standard deviation above which a quantity counts as not identified.
 
-If the rig states less, the prior is that of a plate that was not measured: answers need no more.
+If the rig states less, the prior is the one for an unmeasured plate: answers need no more.
 """
 
 _SUSPENSION_FELT = (
@@ -147,7 +147,7 @@ class HeldOutPaths:
     unexplained: float
     """Without the part explained by noise and uncertain parameters together."""
     disagreement: FloatArray
-    """Covariance (p, p) of x, to be added to that of the fit."""
+    """Covariance (p, p) of x, to be added to the fit's covariance."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -530,7 +530,7 @@ def std_of(combinations: FloatArray, space: Space, covariance: FloatArray) -> Fl
 
 
 def hold_out(found: Fit, *, progress: Progress = unseen) -> HeldOutPaths | None:
-    """Predict paths from fits to the others; None if these determine too few of them."""
+    """Predict paths from fits to the others; None if the fits determine too few paths."""
     measurement, model = found.measurement, found.model
     folds = (model.observed[:, None] + np.arange(len(model.rig.eras))) % HELD_OUT_FOLDS
     squares, variance = np.full((2, *measurement.values.shape), np.nan)

@@ -276,7 +276,7 @@ def sensors_at(
 
 @dataclass(frozen=True)
 class MeasuredValue:
-    """Acceleration at one sensor per base displacement of one ERA, or per volt at an exciter.
+    """Acceleration at a sensor per base displacement of an ERA, or per volt at an exciter.
 
     Phases as exp(+i omega t), upwards positive for both.
     """
@@ -390,7 +390,7 @@ def _check_point(measured: MeasuredValue, rig: Rig) -> None:
 
 
 def _era_of(measured: MeasuredValue, rig: Rig) -> int:
-    """Return the index of the driven ERA, found by its name or else by its position."""
+    """Return the index of the driven ERA, found by name or else by position."""
     at, names = measured.era_point, [era.name for era in rig.eras]
     for number, era in enumerate(rig.eras):
         near = at is not None and math.dist(at, (era.x, era.y)) <= _ERA_TOLERANCE
@@ -631,7 +631,7 @@ def _uff_values(
 
 
 def _unit(place: str, label: str, known: Mapping[str, float]) -> float:
-    """Return the value of a unit, given by its label, in SI units; raises InputError."""
+    """Return the SI value of the unit with a given label; raises InputError."""
     plain = label.lower().translate(_SPELLED).replace("sec", "s")
     if plain not in known:
         spelled = ", ".join(filter(None, known))

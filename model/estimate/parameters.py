@@ -778,7 +778,7 @@ def _loss_prior(scope: SearchScope, std: float) -> Prior:
 def _lag_prior(scope: SearchScope, std: float) -> Prior:
     """Return the prior of the unknown lag of each drive.
 
-    A measured gain includes the lag of its drive, and an exciter's force includes that of its coil.
+    A measured gain includes the lag of its drive, and an exciter's force includes its coil's lag.
     """
     has_gains = [bool(era.gains) for era in scope.rig.eras]
     is_known = np.array(has_gains) | scope.excites

@@ -2,7 +2,7 @@
 
     d_fsn ~ m_fn exp(i phi_fn) a_fsn(x) + noise,   m_fn near G_n
 
-d are measured values, a those of the model, G_n the gain of a channel. Magnitudes m vary about G_n
+d are measured values, a the model's values, G_n the gain of a channel. Magnitudes m vary about G_n
 with frequency, like those of real actuators. Phases phi are free, since a measurement can lack
 them. Both follow from x and G, so that only these are searched (`model.estimate.fit`). Priors hold
 x near the rig's values: a large deviation is evidence against the rig.
@@ -236,7 +236,7 @@ def match_plate(
 
 
 def likeliest(matches: Sequence[Match]) -> Match:
-    """Return the match with the lowest cost, the first of those that are nearly equal."""
+    """Return the match with the lowest cost; if several are nearly equal, the first."""
     return best_by(matches, lambda each: -each.fit.cost)
 
 
@@ -272,7 +272,7 @@ class ShapeMatch:
 
     @property
     def starts(self) -> tuple[tuple[float, float], ...]:
-        """Logarithms of factors at which to start: 0, and those of that plate."""
+        """Logarithms of factors at which to start: 0, and the factors of that plate."""
         return tuple(dict.fromkeys([(0.0, 0.0), self.start]))
 
     @cached_property

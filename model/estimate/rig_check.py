@@ -268,7 +268,7 @@ def _dead_channels(
 
 
 def _off_scale(match: Match) -> list[Finding]:
-    """Find sensors whose scale differs from that of the others, if the plate fits."""
+    """Find sensors whose scale differs from the others', if the plate fits."""
     if match.median_error > MAX_FIT_ERROR:
         return []
     known = np.isfinite(match.values) & np.isfinite(match.predicted) & ~match.outliers
@@ -455,7 +455,7 @@ def _check_quantity(plate: SensedPlate, shapes: ShapeMatch, values: ComplexArray
     omega = plate.model.omega[:, None]
 
     def distance(factor: float, power: int) -> float:
-        """Return the distance of gains from those of a quantity, in size and phase."""
+        """Return the distance of gains from a quantity's gains, in size and phase."""
         expected = factor * (1j * omega) ** power
         off = np.abs(size - np.log(np.abs(expected)))[known]
         phase = np.angle(gains / expected)[known]

@@ -109,7 +109,7 @@ def arrays_in(
                 raise ValueError(f"{name}: must not be encrypted")
         declared = sum(entry.file_size for entry in entries)
         if declared > file_bytes:
-            raise ValueError(f"size must be that of the file, got {declared} bytes")
+            raise ValueError(f"size must match the file's, got {declared} bytes")
         arrays = {}
         for name, entry in members.items():
             with archive.open(entry) as stream:
@@ -165,4 +165,4 @@ def _check_npy_header(
         raise ValueError(f"{name}: {rule}, got {shown(str(shape))}")
     size = dtype.itemsize * math.prod(shape)  # Python integers: no overflow
     if size + stream.tell() != member_bytes:
-        raise ValueError(f"{name}: size must be that of the member, got {size} bytes")
+        raise ValueError(f"{name}: size must match the member's, got {size} bytes")

@@ -126,8 +126,8 @@ def read_lines(
     and unknown columns are skipped. instead: columns that replace the last ones if the file has the
     first of them.
 
-    The file is read line by line: one that is damaged takes no more memory than its first lines.
-    Raises InputError with file and line for missing and repeated columns, names that are probably
+    The file is read line by line: a damaged file takes no more memory than its first lines. Raises
+    InputError with file and line for missing and repeated columns, names that are probably
     misspelt, lines of another length, and a file without lines.
     """
     skipped, separator = _head_of(path)

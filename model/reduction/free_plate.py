@@ -118,7 +118,7 @@ def _interpolation(terms: int) -> tuple[FloatArray, FloatArray]:
 
 
 _MAX_CACHED = 4  # sets of points whose residual vectors, or shapes, are kept
-_MAX_KEPT_BYTES = 1 << 26  # of residual vectors; those of a map's raster are not cached
+_MAX_KEPT_BYTES = 1 << 26  # of residual vectors; residual vectors of a map's raster are not cached
 
 
 class FiniteElementModes:
@@ -199,7 +199,7 @@ class FiniteElementModes:
 
 
 def _rigid_modes(matrices: PlateMatrices) -> FloatArray:
-    """Return heave and both tilts, (dof, 3); a solver returns arbitrary mixtures of these."""
+    """Return heave and both tilts, (dof, 3); a solver returns arbitrary mixtures."""
     nodes, plate = matrices.mesh.nodes, matrices.plate
     modes = np.zeros((len(nodes), DOF_PER_NODE, RIGID_BODY_MODES))
     modes[:, 0, 0] = 1

@@ -24,9 +24,9 @@ springs has no loss. Contacts do not change it. The two differ off resonance: wi
 steady accelerations of the paper's plate differ by at most 0.5 % (relative L2 over the plate, 40 to
 500 Hz), in proportion to eta; deep nulls move a little, they are not filled.
 
-Its modes on its ERAs are those of the undamped plate. The damping ratio of such a mode, psi' C psi
-/ (2 omega) at modal mass 1, includes the plate's own losses and the ERAs' dampers. The coupling of
-modes by dampers is neglected here, but not in the time domain.
+Its modes on its ERAs are the undamped plate's. The damping ratio of such a mode, psi' C psi / (2
+omega) at modal mass 1, includes the plate's own losses and the ERAs' dampers. The coupling of modes
+by dampers is neglected here, but not in the time domain.
 
 Slopes of fields with respect to position (`place_slopes`) are second-order differences, one-sided
 at edges. Closed forms would be simple for polynomials, but a footprint that an edge cuts adds
@@ -273,7 +273,7 @@ def on_springs(
 def stretches(parts: Sequence[InTime], phi: FloatArray) -> FloatArray:
     """Return the stretch of n parts with shapes phi (n, r) per coordinate, (n, r + m).
 
-    The displacement of the plate minus that of the far end, if it has a mass.
+    The plate's displacement minus the far end's, if that has a mass.
     """
     free = [number for number, part in enumerate(parts) if part.far_mass is not None]
     found = np.pad(phi, ((0, 0), (0, len(free))))

@@ -384,7 +384,7 @@ class ExciterSection(ActuatorSection):
 
     @property
     def values(self) -> dict[str, Any]:
-        """Values by key, including those of the type."""
+        """Values by key, including the values of the type."""
         unknown = dict.fromkeys(ExciterSection.model_fields) | {"resonance_is": "free"}
         return unknown | self.of_type | self.model_dump(exclude_none=True)
 

@@ -1,4 +1,4 @@
-"""Rig: a plate, its ERAs, their amplifier channels, and the uncertainty of all of them.
+"""Rig: a plate, its ERAs, their amplifier channels, and their uncertainties.
 
 Also defines which parts of a rig must match a table (`physics_of`), and named layouts of ERAs. The
 drawings of the paper's layouts (its Figures 8 and 9) are not available, so the layouts here are our
@@ -46,7 +46,7 @@ BOUNDS = {
     "mode_frequency": (0.0, 0.1),
     "mode_amplitude": (0.0, 0.3),
 }
-"""Allowed values of each parameter: the one that means exactly known, and the maximum."""
+"""Allowed values of each parameter: the value for exactly known, and the maximum."""
 
 _RELATIVE = (
     "gain",
@@ -248,7 +248,7 @@ class Rig:
                 if math.dist((era.x, era.y), (other.x, other.y)) < SAME_POINT:
                     raise InputError(
                         f"ERAs must be at different positions, got {other.name} and {era.name} at "
-                        f"({era.x:g}, {era.y:g}) m; move one of them"
+                        f"({era.x:g}, {era.y:g}) m; move one ERA"
                     )
 
     def era(self, name: str) -> Actuator:
@@ -355,7 +355,7 @@ def physics_of(of: object) -> dict[str, Any]:
     from before a field existed stay valid.
     """
     found = {name: _plain(getattr(of, name)) for name in PHYSICS}
-    # A laminate is represented by its layers; its equivalent plate depends on the frequency.
+    # A laminate keeps its layers; its equivalent plate depends on the frequency.
     if "laminate" in found["plate"]:
         del found["plate"]["material"], found["plate"]["thickness"]
     found["masses"].sort(key=canonical_json)

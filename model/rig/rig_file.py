@@ -392,7 +392,7 @@ _NAMED = ("eras", "supports", "amplifiers")  # sections whose entries are merged
 
 
 def with_base(document: Document) -> Document:
-    """Merge a fitted rig's keys with the rig file named by its `base`.
+    """Merge a fitted rig's keys with the rig file that `base` names.
 
     Other documents are returned unchanged. Raises ConfigError for a base that is missing, outside
     the folder, fitted itself, invalid, or changed since the fit, and for names that it lacks.
@@ -476,7 +476,7 @@ def merged_keys(base: Value, over: Value, *, is_final: bool = True) -> Any:
 
 
 def load_rig(path: Path | str, *, mesh: str | None = None) -> Rig:
-    """Read a rig file; mesh: `auto` or NXxNY, replaces that of the file.
+    """Read a rig file; mesh: `auto` or NXxNY, replaces the file's mesh.
 
     Raises ConfigError with all problems of the file; InputError for an invalid mesh. This mesh can
     be coarser than a file allows, to study its error.

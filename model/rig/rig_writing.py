@@ -1,4 +1,4 @@
-"""Build, change and write rigs by their keys, and write the results of a fit.
+"""Build, change and write rigs from keys, and write the results of a fit.
 
 A rig keeps the keys that it was built from, so that dependent values follow a change: damping from
 a ratio, an automatic mesh, the equivalent plate of a laminate. A user's file is never overwritten:

@@ -334,7 +334,7 @@ class PlateSection(Section):
     loss_factor: Annotated[float, Quantity(RATIO, at_least=0, below=1)] | None = None
     """Structural loss factor eta of the mounted plate: hysteretic stiffness (1 + i eta) K.
 
-    Default: 0.01, or that of its [material](#material) if larger
+    Default: 0.01, or the loss factor of its [material](#material) if larger
     """
 
     loss_exponent: Annotated[
@@ -789,7 +789,7 @@ class FingertipSection(Section):
 class LimitsSection(Section):
     """Limits of commands, see `GuardLimits`; all except the frequencies are unlimited by default.
 
-    The default frequencies are those that skin feels well.
+    The default frequencies are in the range that skin feels well.
     """
 
     frequency: Annotated[
@@ -808,12 +808,13 @@ class LimitsSection(Section):
     """
 
     power: Annotated[float, Quantity(RATIO, above=0, at_most=256)] | None = None
-    """Maximum sum of the squared levels of one amplifier's channels; 1 is one channel at full
+    """Maximum sum of the squared levels of an amplifier's channels; 1 is one channel at full
     stroke, or four channels at half stroke.
     """
 
     on_time: Annotated[float, Quantity(TIME, above=0, at_most=86_400)] | None = None
-    """Longest continuous vibration of one amplifier, ramps included; it ends on its own by then."""
+    """Longest continuous vibration of an amplifier, including ramps; the amplifier then ends it on
+    its own."""
 
     duty: Annotated[float, Quantity(RATIO, above=0, at_most=1)] | None = None
     """Maximum fraction of any ten seconds in which one amplifier vibrates, ramps included."""
@@ -916,7 +917,7 @@ class RigSection(Section):
         Field(min_length=1, default_factory=lambda: [*THRESHOLDS]),
     ]
     """Additional threshold sets for which promises hold: the set with the lowest promise counts.
-    Default: all published sets. Name only that of `threshold` to base promises on it alone.
+    Default: all published sets. To base promises on `threshold` alone, list only that set.
 
     Limits: a list of `vibrotactile-probe`, `pressing-fingertip`
     """

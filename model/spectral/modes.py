@@ -420,7 +420,8 @@ def uncertain_compliance(
 def unresolved_at(
     plate: Plate, degrees: tuple[int, int], places: FloatArray
 ) -> UnresolvedCompliance:
-    """Return the compliance unresolved by polynomials of these degrees at footprints or points.
+    """Return the compliance that polynomials of the given degrees leave unresolved at footprints or
+    points.
 
     places: footprints (n, 3) or points (n, 2).
     """
@@ -588,7 +589,7 @@ class SpectralMesh(Discretisation):
 
     @property
     def raster(self) -> tuple[int, int]:
-        """Numbers of evenly spaced points along x and y that show what it resolves."""
+        """Numbers of evenly spaced points along x and y that show all details that it resolves."""
         return _POINTS_PER_DEGREE * self.nx + 1, _POINTS_PER_DEGREE * self.ny + 1
 
     @property

@@ -7,7 +7,7 @@ An ERA is a spring, a damper and a bolt between the plate and a base that moves.
 contact mass that moves with the plate, and a spring and a damper (the pulp) to the phalanx, which a
 joint holds. The phalanx is not at rest: at 60, 100 and 250 Hz the real part of the dynamic
 stiffness is 69, -87 and -358 N/m where a phalanx at rest gives 972, 921 and 507.
-docs/concepts/people.md states the uncertainty of these values.
+docs/concepts/people.md states their uncertainty.
 
 A bonded frame or foam tape along the edges acts at weighted Gauss-Legendre points of each edge: n
 points are exact for products of shapes up to degree 2 n - 1. As points they keep their mass and
@@ -272,7 +272,7 @@ Patches of a heavier hand are farther apart, by the square root of its load.
 
 @dataclass(frozen=True)
 class Fingertip:
-    """Load of one fingertip; the defaults are for a lightly pressing finger."""
+    """Load of a fingertip; the defaults are for a lightly pressing finger."""
 
     stiffness: float = 1000.0
     """Stiffness of the pulp [N/m]."""
@@ -509,7 +509,7 @@ FootKind: TypeAlias = Literal["foam", "rubber"]
 """Kinds of feet of a rig file."""
 
 FEET: Mapping[FootKind, float] = {"foam": 2e3, "rubber": 30e3}
-"""Assumed stiffness of a foot by its kind [N/m], for about 2 cm; measure your own by weighing."""
+"""Assumed stiffness of each kind of foot [N/m], for about 2 cm; measure your own by weighing."""
 
 FEET_DEVIATE = 0.3
 """Assumed standard deviation of the logarithm of a foot's stiffness, unless the rig states one.
@@ -672,7 +672,8 @@ def static_loads(
 
 
 def centre_of_mass(plate: Plate) -> Point:
-    """Return the centre of mass of the bare plate [m]: its centre, or that of a surface's modes."""
+    """Return the centre of mass of the bare plate [m]: its centre, or a surface's, from its
+    modes."""
     if plate.surface is not None:
         centre = centre_of_surface(plate.surface)
         if centre is not None:

@@ -59,8 +59,7 @@ class Balance:
         return float(np.min(-_distances(edges, self.centre) / depths))
 
     def tipping_force(self, points: Iterable[Point]) -> tuple[float, Point] | None:
-        """Return the smallest force [N] on any of these points [m] that tips the plate, and the
-        point.
+        """Return the smallest force [N] on any given point [m] that tips the plate, and the point.
 
         None if no point is outside the hull. The centre of mass must be within it.
         """
@@ -81,7 +80,7 @@ class Balance:
 def balance_of(plate: Plate, sources: Sequence[Source], loads: Sequence[PointLoad] = ()) -> Balance:
     """Return the balance of a plate on its sources and loads.
 
-    Static loads are those of a rigid plate on springs; on three supports they follow from the
+    Static loads are computed for a rigid plate on springs; on three supports they follow from the
     positions alone.
     """
     attached = [*(source.support for source in sources), *loads]

@@ -248,7 +248,7 @@ _KNOWN = (
         Material("acrylic", E=4.6e9, rho=1190.0, nu=0.37),
         source="rho and nu Plexiglas GS (cast PMMA), data sheet; E 4.2, 4.6 and 5 GPa at 10, 100 "
         "and 1000 Hz, assumed: as its beta relaxation has it near room temperature; the sheet's "
-        "3.3 GPa is that of a slow tensile test (ISO 527)",
+        "3.3 GPa is from a slow tensile test (ISO 527)",
         variation="20 % in E and in loss, assumed; falling as it warms",
         loss_factor="0.075, 0.06 and 0.045 at 10, 100 and 1000 Hz, assumed; taken as its own, "
         "beside that of the plate",

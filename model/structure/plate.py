@@ -53,7 +53,7 @@ class Bond(StrEnum):
 
 
 class Sheet:
-    """A sheet of one material of a thickness [m]."""
+    """A sheet of a material, with its thickness [m]."""
 
     material: Material
     thickness: float
@@ -257,7 +257,7 @@ LOSS_FREQUENCY = 150.0
 
 
 def _scales(*, is_of_theory: bool = True, has_own_row: bool = False) -> dict[str, bool]:
-    """Metadata of a field of `Plate` whose mass and stiffness scale with those of the plate.
+    """Metadata of a field of `Plate` whose mass and stiffness scale with the plate's.
 
     The plate's mass scales with its thickness h, its bending stiffness with E h³. If all parts
     scale like this, or are a fraction of the plate, one solution serves for other thicknesses and
@@ -340,8 +340,7 @@ class Plate(Sheet):
         return self.laminate is not None or self.air_gap is not None
 
     def scaled(self, *, modulus: float = 1.0, thickness: float = 1.0) -> "Plate":
-        """Return the plate with moduli and thickness, including those of all layers, multiplied by
-        factors."""
+        """Return the plate with moduli and thickness (also of all layers) multiplied by factors."""
         laminate = self.laminate
         return replace(
             self,

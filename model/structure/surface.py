@@ -1,4 +1,4 @@
-"""Surface given by its normal modes, computed by another program or measured in a modal test.
+"""Surface defined by normal modes, computed by another program or measured in a modal test.
 
 It replaces the plate in a rig (`surface` instead of `plate`). Where other modules need plate
 properties (wavelengths, weight, bounding rectangle), a homogeneous plate with the same number of
@@ -6,11 +6,11 @@ modes and the same mass is used. Touch coordinates are in the plane perpendicula
 with the origin at the corner of the bounding rectangle of all nodes, or the origin stated by the
 file.
 
-The mass is that of rigid motion along the normal: with modes phi of unit modal mass and
+The mass is the mass in rigid motion along the normal: with modes phi of unit modal mass and
 coefficients c such that sum c phi = 1, it is |c|². Mounts that hold the surface must be included
 either in the modes or in the rig, not in both.
 
-Not modelled: in-plane forces and motion, including those of the actuators.
+Not modelled: in-plane forces and motion, including the actuators'.
 """
 
 import hashlib
@@ -44,7 +44,7 @@ LEAST_KNOWN, WELL_KNOWN = 1.15, 3.0
 fields were wrong by a fifth; with those up to three times by 3 %."""
 
 MAX_DEVIATING = 64
-"""Number of lowest elastic modes that can differ from those of a file."""
+"""Number of lowest elastic modes that can differ from a file's modes."""
 
 RIGID_FREQUENCY = 1.0  # Hz; below it a mode is of the rigid body
 _HELD = 0.2  # normal motion of a rigid mode, relative to the mode with the most
@@ -166,7 +166,8 @@ def _centre(file: str, digest: str, normal: str) -> Point | None:
 
 @lru_cache(maxsize=4)
 def surface_shapes(file: str, digest: str, normal: str) -> SurfaceShapes:
-    """Read modes along a normal from a file with this digest; raises InputError if it has none."""
+    """Read modes along a normal from a file with this digest; raises InputError for a file without
+    modes."""
     from model.files.modal_file import read_modes  # only a surface needs these
     from model.files.uff import read_measured_bytes
 

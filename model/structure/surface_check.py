@@ -1,4 +1,4 @@
-"""Checks of a surface's modes against physics, before anything is promised of it.
+"""Checks of a surface's modes against physics, before any promise is computed.
 
 In a mode phi of unit modal mass, the integral of phi² over the mass of the part is 1. Elastic modes
 are orthogonal to rigid-body motion. A free part has that motion in its rigid-body modes, a held
@@ -280,7 +280,7 @@ def _is_near_one(values: Sequence[float], factor: float) -> bool:
 
 
 def _normalisation(modes: ModeShapes) -> str:
-    """Describe a normalisation other than to unit modal mass; empty if there is no sign of one.
+    """Describe a normalisation other than to unit modal mass; empty if there is no sign of another.
 
     The common value of all modes is a power of ten, or its root if units of mass were converted.
     """

@@ -5,7 +5,7 @@ thicker plate has the same mode shapes; natural frequencies and modal masses sca
 exact for thin plates; shear and rotary inertia of the paper's plate change the response by less
 than 1e-3 over 2 %.
 
-Verification of a table: a sample of it recomputed by other methods.
+Verification of a table: recomputes a sample by other methods.
 
 - Content: fields on the raster and at the cells, against the plate solved at each frequency without
   modes (`model.spectral.direct_solution`), relative L2. On finite elements, and with measured
@@ -651,7 +651,7 @@ class ExpectedContrast:
     after: float
     """The same with answers of the identified rig."""
     promised: float
-    """Contrast that 90 % of these plates have with answers of the identified rig."""
+    """Contrast that 90 % of the plates have with answers of the identified rig."""
 
 
 def expected_contrast(

@@ -13,7 +13,7 @@ Responses are demodulated: without the factor exp(s t), as the envelopes are. Th
 linear ramp t / step from time 0 on is z(t) = a0 + a1 t - a0 exp((lambda - s) t) in the coordinates
 of `PlateInTime`; that to a hat is its second difference.
 
-With many ERAs an onset uses a few combinations of them: the pattern's, and those that move the
+With many ERAs an onset uses a few combinations: the pattern's, and the combinations that move the
 fingers most; others would hardly contribute. Magnitudes of the complex knots are bounded: none
 exceeds the stroke. Single precision changes contrasts by some hundredths of a decibel. Knots are
 found by one call of a kernel in C, or in numpy without a compiler.
@@ -224,7 +224,7 @@ def _summed(responses: _ComplexArray, gain_variance: float) -> _ComplexArray:
     """Return the expected form over knots and ERAs of squares, summed over samples, rows and steps.
 
     responses (samples, d, knots, eras) as in `FingerResponses.hats`. In the step before the last,
-    each hat responds like that of the next knot in the last step, and so on.
+    each hat responds like the next knot's hat in the last step, and so on.
     """
     knots, eras = responses.shape[2:]
     flat = responses.reshape(-1, knots * eras)

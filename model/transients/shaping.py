@@ -1,4 +1,4 @@
-"""Shaped onsets and endings, and measures of them: transient contrast and residual vibration.
+"""Shaped onsets and endings, and their measures: transient contrast and residual vibration.
 
 Onset: least squares over the knots of every ERA. Each target follows its steady vibration times a
 raised cosine and each quiet fingertip stays still, from the first millisecond until the plate has
@@ -334,7 +334,7 @@ class Shaper:
         return responses_at(self.prepare(frequency), means, others, is_alone=not quiet)
 
     def _quiet_rows(self, positions: tuple[Point, ...]) -> FloatArray:
-        """Return rows (d, r) whose sum of squares is that of the fingertips' mean squares."""
+        """Return rows (d, r) whose sum of squares is the sum of the fingertips' mean squares."""
         weights, shapes = self._fingertips(positions)
         return np.asarray((np.sqrt(weights)[..., None] * shapes).reshape(-1, shapes.shape[-1]))
 

@@ -131,14 +131,14 @@ class PlateInTime:
     forced: ComplexArray
     """z' (2 r, r) by a force on each coordinate."""
     stretches: FloatArray
-    """Displacement (eras, r) at each ERA minus that of its free magnet, per coordinate."""
+    """Displacement (eras, r) at each ERA minus its free magnet's, per coordinate."""
 
     def shapes_at(self, points: FloatArray) -> FloatArray:
         """Return the shapes (p, r) of all coordinates at points (p, 2) [m]."""
         return self.with_far_ends(self.reduced.at(points))
 
     def with_far_ends(self, shapes: FloatArray) -> FloatArray:
-        """Return the shapes (..., r) of all coordinates, from those of the reduced plate's.
+        """Return the shapes (..., r) of all coordinates, from the shapes of the reduced plate's.
 
         These come first; magnets and phalanges are not on the plate and have shape 0.
         """

@@ -122,7 +122,7 @@ def rows(page: str, head: str) -> list[list[str]]:
 
 def test_people_see_the_word_that_the_page_has_for_each_state() -> None:
     """In the status, in the event of a change, and in a line unless the cause begins with it."""
-    shown = {row[0]: row[1].strip("*") for row in rows("daemon.md", "| state | shown |")}
+    shown = {row[0]: row[1].strip("*") for row in rows("daemon.md", "| state | shown as |")}
     assert list(shown) == [state.value for state in DaemonState]
     for state, word in shown.items():
         event = StateEvent(old="FAULT", new=state, cause="a cable was cut", remedy=None, epoch=1)

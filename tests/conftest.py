@@ -110,11 +110,19 @@ def pytest_sessionfinish() -> None:
     gc.freeze()
 
 
+CONFIRM_TIMEOUT = 10.0  # s; in place of 0.3 s, for a stop
+
+
 @pytest.fixture
 def unhurried(monkeypatch: pytest.MonkeyPatch) -> None:
     """Hosts and simulated amplifiers in this process that wait for each other for long."""
     wait_long(monkeypatch, reply_timeout=1.0)
     allow_long_watchdogs(monkeypatch)
+    # Tests that only start programs need not load the drivers.
+    from drivers.host.amplifier import Amplifier
+
+    monkeypatch.setitem(Amplifier.stop.__kwdefaults__, "timeout", CONFIRM_TIMEOUT)
+    monkeypatch.setattr("drivers.host.group.CONFIRM_TIMEOUT", CONFIRM_TIMEOUT)
 
 
 @pytest.fixture

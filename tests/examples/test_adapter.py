@@ -269,7 +269,7 @@ async def test_force_is_that_of_the_set_and_follows_it() -> None:
         assert (abs(first), abs(second)) == pytest.approx((0.25, 1.0), rel=1e-3)
         assert np.degrees(np.angle(first / second)) == pytest.approx(120.0, abs=0.1)
         before = len(instrument.log)
-        await group.apply({"a": [layer(0.64, ramp=0.05, keep_phase=True)]})
+        await group.apply({"a": [layer(0.64, ramp=1.0, keep_phase=True)]})
         async with asyncio.timeout(PATIENCE):
             while abs(instrument.force(1, 100.0)) < 0.6399:
                 await host.read_status()

@@ -235,7 +235,9 @@ async def test_daemon_replays_nothing_when_paused_longer_than_watchdog(tmp_path:
             os.kill(daemon.process.pid, signal.SIGCONT)
             await until_state(era, "FAULT")
             await ready(era)
-            await journal.hear(5)  # longer than the timeout of those contacts
+            async with asyncio.timeout(PATIENCE):
+                while (await era.status()).contacts:  # noqa: ASYNC110  until those have expired
+                    await asyncio.sleep(0.05)
             await armed(era)
             await journal.hear(10)
             sent = journal.raising_since(resumed)

@@ -86,7 +86,7 @@ from processes.gateways import (
     wait_for_daemon,
     wait_for_state,
 )
-from processes.patient_daemon import wait_long
+from processes.patient_daemon import LONG_WATCHDOG, wait_long
 from processes.typed_page import ERA
 from registry import threads
 from registry.limits import GuardLimits
@@ -293,7 +293,7 @@ async def test_lost_link_is_one_event_with_its_attempts(tab: Page, tmp_path: Pat
             bench.far.device.inject_fault(FaultWindow(fault="hang"))
             await tab.until(f"{STATE} === 'COMM_LOST'")
             assert await tab.evaluate(REASON) == "link-lost"
-            await tab.until(BANNER, lambda text: "after 2\u00a0s" in text)  # of the bench
+            await tab.until(BANNER, lambda text: f"after {LONG_WATCHDOG:g}\u00a0s" in text)
             await tab.until("document.querySelector('.tile.bad') !== null")
             tile = await tab.evaluate(TILE)
             assert "%" not in tile

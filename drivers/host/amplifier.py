@@ -9,8 +9,8 @@ import contextlib
 import logging
 import math
 from collections.abc import Callable, Coroutine, Sequence
-from dataclasses import replace
-from functools import cache
+from dataclasses import dataclass, replace
+from functools import cache, partial
 from typing import Any, TypeAlias
 
 from drivers.errors import (
@@ -102,7 +102,8 @@ CONFIRM_TIMEOUT = 0.3  # s; three replies of the slowest wire
 LISTENING = 0.3  # s; how long the host listens for another one if it finds an armed amplifier
 SECOND_REPLY = 0.02  # s; how long it waits for a second amplifier at the same address
 _INTERVAL = 0.005  # s; between two attempts to stop, in addition to the ramp
-_RAMP, _WATCHDOG = QUANTITIES["ramp"], QUANTITIES["watchdog"]
+_RAMP = QUANTITIES["ramp"]
+_WATCHDOG = QUANTITIES["watchdog"]
 _ENERGISED = (STATES["SWITCHED_ON"], ENABLED)
 _WIRE_ROUNDING = 0.5  # steps of the wire, in addition to half a step of the amplifier
 MAX_CONTRADICTIONS = 2
@@ -120,14 +121,36 @@ COMMITTING = 0.1
 _CHECKED_FOR = 0.005  # s; a check holds for so long unless anything is sent or received
 IsPreempted: TypeAlias = Callable[[], bool]
 """Whether something more urgent waits, so that a set that does not play yet is dropped."""
-_Checked: TypeAlias = tuple[tuple[LayerSet, ...], list[int]]
-_UNCHECKED: tuple[Sequence[AmplifierLayer] | None, float, float, _Checked] = (
-    None,
-    -math.inf,
-    0.0,
-    ((), []),
-)
 _logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class _CheckedSet:
+    """Layers that the ledger admits, ready to be staged."""
+
+    layers: Sequence[AmplifierLayer]
+    """The layers as requested."""
+    admitted: tuple[LayerSet, ...]
+    """The layers as admitted."""
+    stream: list[int]
+    """The admitted layers as words of the wire."""
+    delay: float
+    """Longest time from staging until they are committed [s]."""
+    valid_until: float
+    """Until when the check is valid [s], if nothing is sent or received meanwhile."""
+
+
+@dataclass
+class _SetRequest:
+    """A set that is checked when its turn on the line comes."""
+
+    token: int
+    layers: Sequence[AmplifierLayer]
+    now: bool
+    """Whether it plays immediately."""
+    is_preempted: IsPreempted | None
+    staged: StagedSet | None = None
+    """The set as it was made last."""
 
 
 class Amplifier:
@@ -137,6 +160,83 @@ class Amplifier:
     meaning of full level in the rig: True for the output of a linear amplifier, False for the
     motion of a stiff source, None for either.
     """
+
+    identity: Values
+    """Values of its identity record; empty until identified."""
+    capabilities: Values
+    """Values of its capabilities record; empty until identified, or if several reply."""
+    exchange_time: Callable[[str], float]
+    """Return how long the longest request with a name and its reply take on the wire [s]."""
+    counts: LinkStatistics
+    """Counts of the requests to it."""
+    listeners: list[Callable[[Values], None]]
+    """They are called with the values of each event."""
+    _serial_number: str | None
+    """Expected serial number, or the one that it had when it was first identified."""
+
+    # Status
+    status: Values | None = None
+    """The last status."""
+    status_at: float | None = None
+    """When the last status came [s]."""
+    latch: int | None = None
+    """Newest latch that a status has shown since it was identified."""
+    reported_at: dict[ReportKind, float]
+    """When a status last had a report of each kind [s]."""
+    contradictions: int = 0
+    """Number of contradictory statuses in a row."""
+    _contradicted_at: float = -math.inf
+    """When the last contradictory status came [s]."""
+    _was_unfed: bool = False
+    """Whether the last contradiction was in a status that does not feed."""
+    _misachieved: int = 0
+    """Number of contradictory achieved layers in a row."""
+    _other_host_at: float = -math.inf
+    """When another host was heard last [s]."""
+    _are_several: bool = False
+    """Whether two amplifiers have replied since this was reset."""
+
+    # Arming
+    session: int = 0
+    """Session of the last Arm."""
+    may_be_armed: bool = False
+    """Whether it may have carried out an Arm of this host since it was last disarmed."""
+    arming: tuple[int, float] = (0, -math.inf)
+    """`silences` when Arm was requested, and the time [s] until which the Arm may go out."""
+    armed_latch: int | None = None
+    """Latch in the reply to the last Arm."""
+    feeding: Feeding
+    """When its watchdog was fed."""
+    clock: HeldClock
+    """Its clock, synchronised with the line's clock."""
+
+    # Sets
+    played_at: float = -math.inf
+    """Earliest start [s] of the last set sent, or the time when silence was sent."""
+    starts: float = -math.inf
+    """Start time [s] of the staged set if committed next; a time in the past: immediately."""
+    committed: int = 0
+    """Token of the set that it committed last; 0 if it committed none since it was armed."""
+    _may_wait_until: float = -math.inf
+    """Latest start of the last set with a poor clock [s]."""
+    _is_start_known: bool = True
+    """Whether the start is known well enough to compare statuses with the sent sets."""
+    _ledger: Ledger | None = None
+    """None until it is identified."""
+    _admitted: StagedSet | None = None
+    """The set that is staged and not committed yet."""
+    _checked: _CheckedSet | None = None
+    """The layers that were checked last, if this check can be used again."""
+
+    # Stops
+    known: StopOutcome = UNREACHED
+    """Its possible output, apart from the evidence of statuses and watchdog."""
+    silence_cause: str | None = None
+    """Why it is degraded: it did not reply to a request, and may still play."""
+    silences: int = 0
+    """Number of stops and disarms that were sent to it."""
+    _stop: PendingStop | None = None
+    """The last stop, which later callers join until it was sent."""
 
     def __init__(
         self,
@@ -148,60 +248,22 @@ class Amplifier:
         serial_number: str | None = None,
         is_output: bool | None = False,
     ) -> None:
-        self.line, self.address, self.name = line, address, name
-        self.capabilities: Values = {}
-        """Values of its capabilities record; empty until identified, or if several reply."""
-        self.session = 0
-        self.may_be_armed = False
-        """Whether it may have carried out an Arm of this host since it was last disarmed."""
-        self.latch: int | None = None
-        """Newest latch that a status has shown since it was identified."""
-        self.status: Values | None = None
-        """The last status."""
-        self.status_at: float | None = None
-        """When the last status came [s]."""
-        self.arming = (0, -math.inf)
-        """`silences` when Arm was requested, and the time [s] until which the Arm may go out."""
-        self.armed_latch: int | None = None
-        """Latch in the reply to the last Arm."""
-        self.reported_at: dict[ReportKind, float] = {}
-        """When a status last had a report of each kind [s]."""
-        self.played_at = -math.inf
-        """Earliest start [s] of the last set sent, or the time when silence was sent."""
-        self.starts = -math.inf
-        """Start time [s] of the staged set if committed next; a time in the past: immediately."""
-        self._may_wait_until = -math.inf  # s; latest start of the last set, with a poor clock
-        self._is_start_known = True  # well enough to compare statuses with the sent sets
-        self.committed = 0
-        """Token of the set that it committed last; 0 if it committed none since it was armed."""
-        self.feeding = Feeding(line.wire.delay, line.wire.is_kept)
-        self.known = UNREACHED
-        """Its possible output, apart from the evidence of statuses and watchdog."""
-        self.clock = HeldClock()
-        """Its clock, synchronised with the line's clock."""
-        self.counts = LinkStatistics()
-        self.exchange_time = cache(self._exchange_time)  # cleared when it is identified
-        self.silence_cause: str | None = None
-        """Why it is degraded: it did not reply to a request, and may still play."""
-        self.listeners: list[Callable[[Values], None]] = []
-        """They are called with the values of each event."""
-        self.silences = 0
-        """Number of stops and disarms that were sent to it."""
-        self._time = line.time
-        self._ledger: Ledger | None = None
-        self._admitted: StagedSet | None = None
-        self._checked = _UNCHECKED  # the layers checked last, until when [s] that holds, the result
-        self.contradictions = 0  # of statuses, in a row
-        self._misachieved = 0  # contradictions of achieved layers, in a row
-        self._contradicted_at = -math.inf
-        self._was_unfed = False  # whether the last contradiction was in a status that does not feed
-        self._other_host_at = -math.inf  # when another host was heard last
-        self._are_several = False  # whether two amplifiers have replied since this was reset
-        line.members[address] = self
-        self.limits, self._serial_number = limits, serial_number
+        self.line = line
+        self.address = address
+        self.name = name
+        self.limits = limits
         self.is_output = is_output
-        self.identity: Values = {}
-        self._stop: PendingStop | None = None
+        self.capabilities = {}
+        self.identity = {}
+        self.reported_at = {}
+        self.listeners = []
+        self.feeding = Feeding(line.wire.delay, line.wire.is_kept)
+        self.clock = HeldClock()
+        self.counts = LinkStatistics()
+        self.exchange_time = cache(self._exchange_time)
+        self._serial_number = serial_number
+        self._time = line.time
+        line.members[address] = self
 
     @property
     def ledger(self) -> Ledger:
@@ -217,10 +279,14 @@ class Amplifier:
 
     def _exchange_time(self, name: str) -> float:
         """Return how long the longest request with this name and its reply take on the wire [s]."""
-        can = self.capabilities
-        size = (can["channels"], can["layers"]) if can else WIDEST
-        event = _EVENT_WORDS if name in _CHANGING else 0
-        return self.line.wire.exchange_time(request_words(name), reply_words(name, *size) + event)
+        channels, layers = WIDEST
+        if self.capabilities:
+            channels = self.capabilities["channels"]
+            layers = self.capabilities["layers"]
+        words = reply_words(name, channels, layers)
+        if name in _CHANGING:
+            words += _EVENT_WORDS
+        return self.line.wire.exchange_time(request_words(name), words)
 
     async def stage(
         self,
@@ -237,31 +303,35 @@ class Amplifier:
         CommandRefused with the reason; Preempted if a stop came first; FrameError if two replies in
         a row have another token.
         """
-        staged: StagedSet
-
-        def make() -> list[Values]:
-            nonlocal staged
-            if is_preempted is not None and is_preempted():
-                raise Overtaken(f"amplifier {self.name}: set {token} is preempted")
-            moment, (known, until, delay, checked) = self._time(), self._checked
-            if known is not layers or moment > until:
-                delay, checked = self._check(layers, moment)
-            (admitted, stream), self._checked = checked, _UNCHECKED
-            messages = parts(stream, session=self.session, token=token, now=now)
-            self._admitted = staged = StagedSet(token, admitted, True, until=moment + delay)
-            return messages
-
+        request = _SetRequest(token, layers, now, is_preempted)
         for _ in range(MAX_CONTRADICTIONS):
-            taken = await self.line.submit(self, priority, "Set", make)
-            if taken["token"] == token:
+            reply = await self.line.submit(self, priority, "Set", partial(self._make_set, request))
+            if reply["token"] == token:
                 break
         else:
-            problem = f"a set with token {token} must be taken, got token {taken['token']}"
+            problem = f"a set with token {token} must be taken, got token {reply['token']}"
             # This is not a rejection: the group stops all amplifiers.
             raise FrameError(str(contradicted(self.name, problem)))
-        if not (taken["played"] or (taken["staged"] and not now and self._admitted is staged)):
+        staged = request.staged
+        is_staged = reply["staged"] and not now and self._admitted is staged
+        if staged is None or not (reply["played"] or is_staged):
             raise Preempted(f"amplifier {self.name}: set {token} was not staged")
-        return staged if taken["exact"] else replace(staged, is_exact=False)
+        return staged if reply["exact"] else replace(staged, is_exact=False)
+
+    def _make_set(self, request: _SetRequest) -> list[Values]:
+        """Check a set, and return the values of its parts; raises CommandRefused or Overtaken."""
+        token = request.token
+        if request.is_preempted is not None and request.is_preempted():
+            raise Overtaken(f"amplifier {self.name}: set {token} is preempted")
+        moment = self._time()
+        checked = self._checked
+        if checked is None or checked.layers is not request.layers or moment > checked.valid_until:
+            checked = self._check(request.layers, moment)
+        self._checked = None
+        messages = parts(checked.stream, session=self.session, token=token, now=request.now)
+        request.staged = StagedSet(token, checked.admitted, True, until=moment + checked.delay)
+        self._admitted = request.staged
+        return messages
 
     def refusal_of(self, layers: Sequence[AmplifierLayer]) -> CommandRefused | None:
         """Return why the ledger would not admit layers now; None if it would.
@@ -271,37 +341,28 @@ class Amplifier:
         """
         moment = self._time()
         try:
-            delay, checked = self._check(layers, moment, longer=_CHECKED_FOR)
+            self._checked = self._check(layers, moment, valid_for=_CHECKED_FOR)
         except CommandRefused as error:
             return error
-        self._checked = layers, moment + _CHECKED_FOR, delay, checked
         return None
 
     def _check(
-        self, layers: Sequence[AmplifierLayer], moment: float, *, longer: float = 0.0
-    ) -> tuple[float, _Checked]:
-        """Return the longest time until layers are committed [s], and the layers as admitted.
-
-        longer: time until they are staged [s]. Raises CommandRefused.
-        """
-        takes = len(self.line.members) * self.exchange_time("Set")
-        delay = max(COMMIT_DELAY, ATTEMPTS * takes)
-        words = LAYER.words * len(layers)
-        for layer in layers:
-            words += COMMAND.words * len(layer.tones)
-            for tone in layer.tones:
-                for shape in (tone.onset, tone.ending):
-                    if shape is not None:
-                        words += ENVELOPE.words + KNOT.words * len(shape.knots)
+        self, layers: Sequence[AmplifierLayer], moment: float, *, valid_for: float = 0.0
+    ) -> _CheckedSet:
+        """Check layers for staging within a time after a moment [s]; raises CommandRefused."""
+        set_time = len(self.line.members) * self.exchange_time("Set")
+        delay = max(COMMIT_DELAY, ATTEMPTS * set_time)
+        words = _word_count(layers)
         if words > PART_WORDS:  # parts for all amplifiers of the line, each perhaps repeated
-            delay += 2 * words / PART_WORDS * takes
-        admitted = self.ledger.admit(layers, moment, delay=delay + longer)
+            delay += 2 * words / PART_WORDS * set_time
+        admitted = self.ledger.admit(layers, moment, delay=delay + valid_for)
         stream = pack_layers(admitted)
         if not self.capabilities and is_vibrating(*admitted):
             raise CommandRefused(f"amplifier {self.name} must be identified first; open it again")
-        if len(stream) > (limit := self.ledger.capabilities["set_words"]):
-            raise CommandRefused(f"a set must have at most {limit} words, got {len(stream)}")
-        return delay, (admitted, stream)
+        max_words = self.ledger.capabilities["set_words"]
+        if len(stream) > max_words:
+            raise CommandRefused(f"a set must have at most {max_words} words, got {len(stream)}")
+        return _CheckedSet(layers, admitted, stream, delay, moment + valid_for)
 
     def commit(self, token: int, at: int) -> asyncio.Future[Values]:
         """Play the staged set; returns a future of the status, which shows the tokens.
@@ -320,22 +381,14 @@ class Amplifier:
         armed. For a set and its commit it raises Preempted if the set is no longer admitted, and
         CommandRefused if it is too late.
         """
-        takes = self.exchange_time(name)
-        if name == "Set" and takes > FAST:  # most sets are much shorter than the longest one
+        duration = self.exchange_time(name)
+        if name == "Set" and duration > FAST:  # most sets are much shorter than the longest one
             words = SET_WORDS + len(values["stream"])
-            takes = self.line.wire.exchange_time(words, reply_words("Set"))
+            duration = self.line.wire.exchange_time(words, reply_words("Set"))
         if name in ("Hello", "Silence") or not MESSAGES[name].feeds:
-            return takes
+            return duration
         if name == "Set" or (name == "Commit" and values["token"] != self.committed):
-            admitted, token, now = self._admitted, values["token"], self._time()
-            if admitted is None or admitted.token != token:
-                raise Preempted(f"amplifier {self.name}: a stop, disarm or newer set came first")
-            if now > admitted.until and priority is Priority.SET:  # silence is never too late
-                raise CommandRefused(
-                    f"amplifier {self.name}: set {token} must be committed "
-                    f"{now - admitted.until:.3g} s earlier; the wire is too slow or too busy",
-                    until=now,
-                )
+            self._check_admitted(values["token"], priority)
         if name == "Arm":
             silences, until = self.arming
             if self.silences != silences:
@@ -351,117 +404,181 @@ class Amplifier:
             )
         if name != "Arm" and self.status is not None and self.status["state"] != ENABLED:
             raise disarmed(self.name, self.status)
-        return takes
+        return duration
+
+    def _check_admitted(self, token: int, priority: Priority) -> None:
+        """Raise Preempted or CommandRefused unless the set with a token may be sent now."""
+        admitted = self._admitted
+        if admitted is None or admitted.token != token:
+            raise Preempted(f"amplifier {self.name}: a stop, disarm or newer set came first")
+        now = self._time()
+        if now > admitted.until and priority is Priority.SET:  # silence is never too late
+            raise CommandRefused(
+                f"amplifier {self.name}: set {token} must be committed "
+                f"{now - admitted.until:.3g} s earlier; the wire is too slow or too busy",
+                until=now,
+            )
 
     def note_sent(self, name: str, values: Values, now: float, arrives: float) -> None:
         """Note a request that is sent now; `arrives`: when it arrives [s] unless it is delayed."""
-        self._checked = _UNCHECKED
+        self._checked = None
         if name != "Set":  # the reply to a Set shows no clock
             # Earlier requests may be lost, so this may arrive as soon as its bits have passed.
             self.clock.sent(name, values, now, now + self.line.wire.takes)
         if name == "Hello":
             return
-        feeding = self.feeding
         if MESSAGES[name].feeds and (name == "Arm" or values["session"] == self.session):
-            if name == "Silence" and self.silence_cause is not None:
-                # If it arrives, it does so within the time of the watchdog, and its ramp follows.
-                # Repeating it without reply does not put off when the amplifier must be silent.
-                feeding.may = now
-                feeding.fade = max(feeding.fade, _RAMP.from_wire(values["ramp"]))
-            else:
-                feeding.may = feeding.plays = now
-                feeding.arrives, feeding.fade = arrives, 0.0
+            self._note_possible_feeding(name, values, now, arrives)
         elif name in ("Stop", "Disarm"):
-            feeding.fade = max(feeding.fade, _RAMP.from_wire(values["ramp"]))
+            self.feeding.fade = max(self.feeding.fade, _RAMP.from_wire(values["ramp"]))
             self.silences += 1
         admitted = self._admitted
         if name == "Arm":
-            self._admitted, self.may_be_armed = None, True
+            self._admitted = None
+            self.may_be_armed = True
             self.known = replace(self.known, is_confirmed=False, may_play_until=-math.inf)
         elif name in _SILENCING:
             self._admitted = None
             if name == "Silence" and self._ledger is not None:
                 self.played_at = now
                 self._ledger.may_be_silent.update(range(self._ledger.capabilities["layers"]))
-        elif admitted is not None and values.get("token") == admitted.token and self._ledger:
-            is_now = name == "Set" and values["now"] and is_last(values)
-            if name == "Commit" or is_now:
-                starts = None if is_now or self.starts <= now else self.starts
-                self._may_wait_until, error = -math.inf, 0.0
-                if not is_now:
-                    self._may_wait_until = now + MAX_AHEAD
-                    error = abs(self.clock.lead(now)) + _SURELY * self.clock.scatter(now)
-                    self._is_start_known = error <= _MAX_START_ERROR
-                error = 0.0 if starts is None else min(max(error, HIGH_TIME), _MAX_START_ERROR)
-                self.played_at = arrives if starts is None else starts
-                self._ledger.sent(admitted.token, admitted.layers, now, starts=starts, error=error)
+        elif admitted is not None and values.get("token") == admitted.token:
+            if name == "Commit":
+                self._note_commit(admitted, now, arrives)
+            elif name == "Set" and values["now"] and is_last(values):
+                self._note_immediate_start(admitted, now, arrives)
+
+    def _note_possible_feeding(self, name: str, values: Values, now: float, arrives: float) -> None:
+        """Note a request that feeds the watchdog if it arrives."""
+        feeding = self.feeding
+        feeding.may = now
+        if name == "Silence" and self.silence_cause is not None:
+            # If it arrives, it does so within the time of the watchdog, and its ramp follows.
+            # Repeating it without reply does not put off when the amplifier must be silent.
+            feeding.fade = max(feeding.fade, _RAMP.from_wire(values["ramp"]))
+        else:
+            feeding.plays = now
+            feeding.arrives = arrives
+            feeding.fade = 0.0
+
+    def _note_commit(self, admitted: StagedSet, now: float, arrives: float) -> None:
+        """Note the commit of a set, which starts at `starts`, or when the commit arrives."""
+        error = abs(self.clock.lead(now)) + _SURELY * self.clock.scatter(now)
+        self._is_start_known = error <= _MAX_START_ERROR
+        self._may_wait_until = now + MAX_AHEAD
+        if self.starts <= now:
+            self.played_at = arrives
+            self.ledger.sent(admitted.token, admitted.layers, now)
+            return
+        self.played_at = self.starts
+        start_error = min(max(error, HIGH_TIME), _MAX_START_ERROR)
+        self.ledger.sent(
+            admitted.token, admitted.layers, now, starts=self.starts, error=start_error
+        )
+
+    def _note_immediate_start(self, admitted: StagedSet, now: float, arrives: float) -> None:
+        """Note a set that starts when it arrives."""
+        self._may_wait_until = -math.inf
+        self.played_at = arrives
+        self.ledger.sent(admitted.token, admitted.layers, now)
 
     def note_reply(self, name: str, values: Values, reply: Values, sent_at: float) -> None:
         """Note the reply to a request that was sent at a time [s].
 
         Raises CommandRefused if two consecutive statuses contradict the requests sent.
         """
-        now, self._checked = self._time(), _UNCHECKED
+        now = self._time()
+        self._checked = None
         self.counts.last_round_trip = now - sent_at
         message = MESSAGES.get(name)
         if message is None:
             return
         if message.feeds:
-            feeding = self.feeding
-            feeding.since, feeding.confirmed_at = sent_at, now
-            if sent_at > feeding.plays:
-                feeding.plays, feeding.fade = sent_at, 0.0
-        if message.reply is not STATUS:
-            if name == "Set" and reply["played"]:
-                self._confirm(values["token"], now)
-            return
-        if (latch := reply["latch"]) != self.latch and (
-            self.latch is None or is_newer_token(latch, self.latch)
-        ):
+            self._note_feeding(sent_at, now)
+        if message.reply is STATUS:
+            self._note_status(name, values, reply, sent_at, now)
+        elif name == "Set" and reply["played"]:
+            self._confirm(values["token"], now)
+
+    def _note_feeding(self, sent_at: float, now: float) -> None:
+        """Note that a request has surely fed the watchdog."""
+        feeding = self.feeding
+        feeding.since = sent_at
+        feeding.confirmed_at = now
+        if sent_at > feeding.plays:
+            feeding.plays = sent_at
+            feeding.fade = 0.0
+
+    def _note_status(
+        self, name: str, values: Values, status: Values, sent_at: float, now: float
+    ) -> None:
+        """Note a status that replies to a request sent at a time [s], see `note_reply`."""
+        latch = status["latch"]
+        if latch != self.latch and (self.latch is None or is_newer_token(latch, self.latch)):
             self.latch = latch
-        self.status, self.status_at = reply, now
-        # The status of a Commit adds nothing to those of heartbeats, unless it may show a Mark, or
-        # that the amplifier is no longer armed.
-        if name != "Commit" or len(self.line.members) > 1 or reply["state"] != ENABLED:
-            self.clock.replied(name, values, reply, now)
-        for kind in reports_of(reply, self.clock.problem(now)):
+        self.status = status
+        self.status_at = now
+        is_enabled = status["state"] == ENABLED
+        # Heartbeats show the same as the status of a Commit, unless it may show a Mark, or that the
+        # amplifier is no longer armed.
+        if name != "Commit" or len(self.line.members) > 1 or not is_enabled:
+            self.clock.replied(name, values, status, now)
+        for kind in reports_of(status, self.clock.problem(now)):
             self._note_report(kind, now)
-        ledger, is_enabled, fed = self._ledger, reply["state"] == ENABLED, message.feeds
+        ledger = self._ledger
         if ledger is not None and name in _SILENCING:
             ledger.silenced(_RAMP.from_wire(values["ramp"]), sent_at, now)
-            self.committed = reply["token"]
+            self.committed = status["token"]
             return
         # A set plays some time after its commit. An earlier status may show that it plays, but not
         # that it does not.
-        is_sure = reply["token"] != self.committed or sent_at >= self.played_at + COMMITTING
+        is_sure = status["token"] != self.committed or sent_at >= self.played_at + COMMITTING
         if ledger is not None and is_sure:
-            self._confirm(reply["token"], now)
+            self._confirm(status["token"], now)
         if name == "Ping" and not is_enabled:
-            raise disarmed(self.name, reply)
-        if ledger is None or not self.session or name in ("Arm", "Clear") or not is_enabled:
-            return
-        # The reply to a request that feeds does not show how the watchdog runs down.
-        tells = not fed and self.feeding.tells(sent_at)
-        problem = armed_problem(reply, self.armed_latch)
-        if problem is None and not fed:
-            left = reply["watchdog_left"] / _LEFT.per_unit
-            problem = self.feeding.problem(left, sent_at, now)
-        plays_wrong = None if problem else ledger.problem_of(reply, sent_at, now)
-        # If its clock is not held, a set may wait even though it was committed.
-        if plays_wrong and (
-            sent_at >= self._may_wait_until
-            or (self._is_start_known and self.clock.error(now) < math.inf)
-        ):
-            problem = plays_wrong
+            raise disarmed(self.name, status)
+        if ledger is not None and self.session and is_enabled and name not in ("Arm", "Clear"):
+            self._compare(ledger, status, sent_at, now, is_fed=MESSAGES[name].feeds)
+
+    def _compare(
+        self, ledger: Ledger, status: Values, sent_at: float, now: float, *, is_fed: bool
+    ) -> None:
+        """Compare the status of an armed amplifier with the requests that were sent.
+
+        is_fed: whether the request for the status feeds the watchdog. Raises CommandRefused for the
+        second contradiction in a row.
+        """
+        problem = self._problem_of(ledger, status, sent_at, now, is_fed=is_fed)
         if problem is None:
-            if tells or not self._was_unfed:
-                self.contradictions, self._contradicted_at = 0, -math.inf
+            # The reply to a request that feeds does not show how the watchdog runs down.
+            shows_watchdog = not is_fed and self.feeding.tells(sent_at)
+            if shows_watchdog or not self._was_unfed:
+                self.contradictions = 0
+                self._contradicted_at = -math.inf
             return
-        self._was_unfed = not fed
+        self._was_unfed = not is_fed
         if now - self._contradicted_at >= _SAME_MOMENT:
-            self.contradictions, self._contradicted_at = self.contradictions + 1, now
+            self.contradictions += 1
+            self._contradicted_at = now
             if self.contradictions >= MAX_CONTRADICTIONS:
                 raise contradicted(self.name, problem)
+
+    def _problem_of(
+        self, ledger: Ledger, status: Values, sent_at: float, now: float, *, is_fed: bool
+    ) -> str | None:
+        """Describe a contradiction in the status of an armed amplifier; None without one."""
+        problem = armed_problem(status, self.armed_latch)
+        if problem is None and not is_fed:
+            left = status["watchdog_left"] / _LEFT.per_unit
+            problem = self.feeding.problem(left, sent_at, now)
+        if problem is not None:
+            return problem
+        problem = ledger.problem_of(status, sent_at, now)
+        if problem is None or sent_at >= self._may_wait_until:
+            return problem
+        # If its clock is not synchronised, a set may wait even though it was committed.
+        is_synchronised = self._is_start_known and self.clock.error(now) < math.inf
+        return problem if is_synchronised else None
 
     def note_unasked(self, arrival: Event | OtherHost | DuplicateAddress) -> None:
         """Note a message that came without a request; an event is passed to the listeners."""
@@ -488,15 +605,15 @@ class Amplifier:
 
         Any number is accepted, since silence must never be refused for its ramp.
         """
-        highest = self.capabilities.get("ramp_max", _RAMP.maximum)
         if math.isnan(ramp):
             return _RAMP.to_wire(STOP_RAMP)
-        return min(_RAMP.to_wire(min(max(ramp, 0.0), _RAMP.high)), int(highest))
+        wire_ramp = _RAMP.to_wire(min(max(ramp, 0.0), _RAMP.high))
+        return min(wire_ramp, int(self.capabilities.get("ramp_max", _RAMP.maximum)))
 
     def is_silent(self, status: Values) -> bool:
         """Whether a status shows the levels of all channels, all zero."""
-        known = self.capabilities.get("channels")
-        return known == len(status["levels"]) and not any(status["levels"])
+        channels = self.capabilities.get("channels")
+        return channels == len(status["levels"]) and not any(status["levels"])
 
     def what_may_play(self, cause: str = "") -> StopOutcome:
         """Return how long it may still play.
@@ -507,14 +624,16 @@ class Amplifier:
         shown it. If it plays although it has confirmed silence, or although its watchdog must have
         silenced it, another host feeds it or it is broken: nothing is certain to silence it.
         """
-        status, at, until = self.status, self.status_at, self.known.may_play_until
+        status = self.status
+        status_at = self.status_at
+        until = self.known.may_play_until
         if not self.known.is_confirmed:
             until = max(until, self.feeding.may_play_until)
-        if status is not None and at is not None:
+        if status is not None and status_at is not None:
             is_armed = status["state"] == ENABLED
             if self.is_silent(status) and not is_armed:
-                until = at if until == math.inf else max(until, at)
-            elif (is_armed or any(status["levels"])) and at >= until:
+                until = status_at if until == math.inf else max(until, status_at)
+            elif (is_armed or any(status["levels"])) and status_at >= until:
                 until = math.inf
         cause = cause or self.line.loss or self.silence_cause or ""
         return StopOutcome(False, math.inf if until == -math.inf else until, cause)
@@ -532,10 +651,10 @@ class Amplifier:
         if self._admitted is not None and self._admitted.token == token:
             self._admitted = None
 
-    def go_on_from(self, before: "Amplifier") -> None:
+    def go_on_from(self, earlier: "Amplifier") -> None:
         """Adopt the state of the same amplifier from before its line was reopened."""
-        self.known = replace(before.what_may_play(), is_confirmed=before.known.is_confirmed)
-        self.may_be_armed = before.may_be_armed
+        self.known = replace(earlier.what_may_play(), is_confirmed=earlier.known.is_confirmed)
+        self.may_be_armed = earlier.may_be_armed
 
     async def open(self) -> None:
         """Identify the amplifier and leave it disarmed; a latched stop or fault stays latched.
@@ -563,17 +682,19 @@ class Amplifier:
             raise
         self._check_alone()
         # Until identified, it may be another amplifier, whose silence confirms nothing.
-        shown, self.capabilities = self.capabilities, {}
+        last_capabilities = self.capabilities
+        self.capabilities = {}
         check_identity(identity, self.name, self._serial_number)
-        self.capabilities = shown
+        self.capabilities = last_capabilities
         can = await self.request("GetCaps", {}, Priority.OTHER, timeout=timeout)
         check_capabilities(can, self.name, is_output=self.is_output)
         if self._ledger is None:
             self._ledger = Ledger(self.limits, can)
         elif can != self.capabilities:
             self._ledger.adopt(can)
-        self.identity, self.capabilities = identity, can
-        self.exchange_time.cache_clear()
+        self.identity = identity
+        self.capabilities = can
+        self.exchange_time = cache(self._exchange_time)
         status_words = reply_words("GetStatus", can["channels"], can["layers"])
         self.clock.identified(can["clock_error"], bits=self.line.wire.transit(status_words))
         self._serial_number = identity["serial_number"]
@@ -581,7 +702,7 @@ class Amplifier:
         return await self.read_status()
 
     def _check_alone(self) -> None:
-        """Raise LinkError if several amplifiers replied: silence of one confirms nothing."""
+        """Raise LinkError if several amplifiers replied: the silence of one proves nothing."""
         if self._are_several:
             self.capabilities = {}
             raise WrongAmplifier(
@@ -602,7 +723,8 @@ class Amplifier:
         # The timeout is short so that the watchdogs of other armed amplifiers do not run down.
         await self.identify(timeout=REPLY_TIMEOUT)
         wire = _WATCHDOG.to_wire(watchdog)
-        low, high = (self.ledger.capabilities[f"watchdog_{end}"] for end in ("min", "max"))
+        low = self.ledger.capabilities["watchdog_min"]
+        high = self.ledger.capabilities["watchdog_max"]
         if not low <= wire <= high:
             bounds = f"{_WATCHDOG.from_wire(low):g} to {_WATCHDOG.from_wire(high):g}"
             raise CommandError(f"watchdog must be {bounds} s, got {watchdog:g} s")
@@ -619,34 +741,38 @@ class Amplifier:
             if not (isinstance(error, Preempted) or error.may_play):
                 self.may_be_armed = was_armed
             raise
-        self.session, self.feeding.watchdog = session, watchdog
+        self.session = session
+        self.feeding.watchdog = watchdog
         self.armed_latch = status["latch"]
-        self.contradictions = self._misachieved = 0
+        self.contradictions = 0
+        self._misachieved = 0
         self.ledger.forget()
         if status["state"] != ENABLED:
             raise disarmed(self.name, status)
         return status
 
-    async def read_achieved(self, one: LayerSet, token: int) -> LayerSet:
+    async def read_achieved(self, layer: LayerSet, token: int) -> LayerSet:
         """Read how the amplifier plays a layer of the set with this token.
 
         The ledger uses the result from then on. A layer that continues an earlier set is returned
         as it was sent. Raises CommandRefused if the amplifier contradicts two sets in a row.
         """
-        shown = await self.request("GetAchieved", {"layer": one.layer}, Priority.SET)
-        if one.renew or shown["token"] != token:
-            return one
+        reply = await self.request("GetAchieved", {"layer": layer.layer}, Priority.SET)
+        if layer.renew or reply["token"] != token:
+            return layer
         can = self.ledger.capabilities
-        problem = achieved_problem(one, shown, can, is_exact=False, slack=_WIRE_ROUNDING)
-        achieved = achieved_layer(one, shown, can)
+        problem = achieved_problem(layer, reply, can, is_exact=False, slack=_WIRE_ROUNDING)
+        achieved = achieved_layer(layer, reply, can)
         if problem is None:
             self._misachieved = 0
-            self.ledger.correct(one, achieved, token)
+            self.ledger.correct(layer, achieved, token)
             return achieved
         self._misachieved += 1
         if self._misachieved >= MAX_CONTRADICTIONS:
-            _, what, must, seen = problem
-            raise contradicted(self.name, f"{what} in layer {one.layer} must be {must}, got {seen}")
+            _, quantity, must, got = problem
+            raise contradicted(
+                self.name, f"{quantity} in layer {layer.layer} must be {must}, got {got}"
+            )
         return achieved
 
     async def silence(self, ramp: float) -> Values:
@@ -693,11 +819,12 @@ class Amplifier:
 
         Identifies the amplifier again: after a loss of power it counts latches from 1.
         """
-        before, shown = self.silences, self.latch
+        last_silences = self.silences
+        last_latch = self.latch
         status = await self.identify(timeout=REPLY_TIMEOUT)
-        has_restarted = shown is None or is_newer_token(shown, status["latch"])
-        latch = status["latch"] if has_restarted else shown
-        if before != self.silences:
+        has_restarted = last_latch is None or is_newer_token(last_latch, status["latch"])
+        latch = status["latch"] if has_restarted else last_latch
+        if self.silences != last_silences:
             raise Preempted(f"amplifier {self.name}: a stop or disarm came first")
         self.known = replace(self.known, is_confirmed=False)
         return await self.request("Clear", {"latch": latch}, Priority.CLEAR)
@@ -713,12 +840,14 @@ class Amplifier:
         """
         stop = self._stop
         if stop is None or stop.is_sent or stop.result.done():
-            members, wire_ramp = len(self.line.members), self.wire_ramp(ramp)
+            members = len(self.line.members)
+            wire_ramp = self.wire_ramp(ramp)
             # On a shared line each amplifier has three exchanges: a stop and two statuses.
             timeout += ATTEMPTS * members * self.exchange_time("GetStatus")
             timeout += _RAMP.from_wire(wire_ramp)
             ends = threads.now() + timeout * (members + 1)  # others may keep the line busy
-            self._stop = stop = PendingStop(wire_ramp, timeout, ends)
+            stop = PendingStop(wire_ramp, timeout, ends)
+            self._stop = stop
             stop.result = asyncio.ensure_future(self._confirm_stop(stop))
             with contextlib.suppress(Exception):  # then `_confirm_stop` makes the request
                 stop.requested = self._request_stop(stop)
@@ -734,13 +863,15 @@ class Amplifier:
         A status confirms it if its state is latched, its latch is newer than each one seen before,
         and the levels of all channels are zero. Any other status may be old and only late.
         """
-        cause, pause = "", _RAMP.from_wire(stop.ramp) + _INTERVAL
+        cause = ""
+        pause = _RAMP.from_wire(stop.ramp) + _INTERVAL
         try:
             async with asyncio.timeout_at(stop.ends) as stop.limit:
                 while self.line.loss is None:
                     try:
-                        requested, stop.requested = stop.requested, None
-                        status = await (requested or self._request_stop(stop))
+                        request = stop.requested
+                        stop.requested = None
+                        status = await (request or self._request_stop(stop))
                         while _is_stopping(status, stop.latch):
                             if self.is_silent(status):
                                 self.known = StopOutcome(True, threads.now())
@@ -783,8 +914,20 @@ class Amplifier:
             left = status["watchdog_left"]
 
 
-def _is_stopping(status: Values, before: int | None) -> bool:
+def _word_count(layers: Sequence[AmplifierLayer]) -> int:
+    """Return how many words layers have on the wire."""
+    words = LAYER.words * len(layers)
+    for layer in layers:
+        words += COMMAND.words * len(layer.tones)
+        for tone in layer.tones:
+            for envelope in (tone.onset, tone.ending):
+                if envelope is not None:
+                    words += ENVELOPE.words + KNOT.words * len(envelope.knots)
+    return words
+
+
+def _is_stopping(status: Values, last_latch: int | None) -> bool:
     """Whether a status shows a stop that was carried out after this latch was the newest."""
-    if before is None or status["state"] not in LATCHED:
+    if last_latch is None or status["state"] not in LATCHED:
         return False
-    return status["latch"] > 0 and is_newer_token(status["latch"], before)
+    return status["latch"] > 0 and is_newer_token(status["latch"], last_latch)

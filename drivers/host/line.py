@@ -40,6 +40,7 @@ from drivers.protocol.definition import (
 from drivers.protocol.records import Values
 from drivers.trace import Direction
 from drivers.wires.wire import (
+    Arrival,
     BrokenReply,
     Continuation,
     DuplicateAddress,
@@ -241,14 +242,16 @@ class Job:
     def reach(self, part: int) -> None:
         """Note that all parts before this one have arrived; any progress restores all attempts."""
         if part > self.reached:
-            self.reached, self.attempts = part, ATTEMPTS
+            self.reached = part
+            self.attempts = ATTEMPTS
 
-    def is_missing(self, taken: Values) -> bool:
-        """Go back to the first part that a reply reports as missing; returns False if none is."""
-        missing = taken["missing"]
-        if taken["staged"] or taken["played"] or missing >= self.part:
+    def is_missing(self, reply: Values) -> bool:
+        """Go back to the first part that a reply reports as missing; False without one."""
+        missing = reply["missing"]
+        if reply["staged"] or reply["played"] or missing >= self.part:
             return False
-        self.part, self.values = missing, self.parts[missing]
+        self.part = missing
+        self.values = self.parts[missing]
         self.reach(missing)
         return True
 
@@ -308,7 +311,7 @@ GRACE = 0.008  # s; how long a stop waits for the reply to another request
 BUSY_PAUSE = 0.005  # s; before a request is repeated to a busy amplifier
 _AHEAD = 0.005  # s; lead for writing the next part of a set; a stop waits for bytes already sent
 _FULL_PAUSE = 0.0005  # s; before checking a blocked port again
-_LOOK_INTERVAL = 0.01  # s; between checks, each of which would detect a delay of this process
+_LOOK_INTERVAL = 0.01  # s; between checks; each check would detect a delay of this process
 _LATE = 0.005  # s; if a timer fires later than this, this process was delayed
 _MAX_LATE = 0.032
 """Maximum extra time [s] to await a reply after late replies.
@@ -346,10 +349,15 @@ class Line:
         self._loop = asyncio.get_running_loop()
         self.time = self._loop.time
         """The clock of the line [s]."""
-        self._boot_time, self._boots_until = boot_time, -math.inf
+        self._boot_time = boot_time
+        self._boots_until = -math.inf
+        """Until when Hello is repeated [s]; -infinite once an amplifier has replied."""
         self._is_pumping = False
-        self._sent_until = 0.0  # s; until then, sent bytes are still under way
-        self._free_at = 0.0  # s; until then a reply may still occupy the line
+        """Whether `pump` is running, which must not call itself."""
+        self._sent_until = 0.0
+        """Until when sent bytes are still under way [s]."""
+        self._free_at = 0.0
+        """Until when a reply may still occupy the line [s]."""
         self.late = 0.0
         """Delay of replies [s] beyond the time on the wire, at most `_MAX_LATE`."""
 
@@ -374,8 +382,11 @@ class Line:
         request with a higher priority made this one obsolete. member: None for a broadcast, which
         has no reply; its future ends once it was sent.
         """
-        make, values = (values, Values()) if callable(values) else (None, values)
-        job = Job(member, priority, name, values, timeout, self.time(), make)
+        job = Job(member, priority, name, {}, timeout, self.time())
+        if callable(values):
+            job.make = values
+        else:
+            job.values = values
         future = job.result
         if trace.is_active():
             future.add_done_callback(partial(_trace, job))
@@ -410,57 +421,70 @@ class Line:
         if trace.is_active():
             trace.frame(Direction.IN, data, self.name, lambda: ", ".join(map(repr, arrivals)))
         for arrival in arrivals:
-            if isinstance(arrival, Event | OtherHost | DuplicateAddress):
-                if (unasked := self.members.get(arrival.address)) is not None:
-                    unasked.note_unasked(arrival)
-                continue
-            job = self.current
-            if job is None or (member := job.member) is None:  # no broadcast is on the line
-                continue
-            self._sent_until = 0.0  # a request with a reply has arrived
-            if isinstance(arrival, Continuation):
-                self.late = max(self.late, min(self.time() - self._free_at, _MAX_LATE))
-                if self._queue and self._must_yield(job):
-                    self._not_answered(job)
-                else:
-                    self._start(job, arrival.data, is_present=arrival.is_present)
-                continue
-            self.current = member.silence_cause = None
-            if isinstance(arrival, WrittenPart):
-                self._go_on(job)
-                continue
-            late = self.time() - job.started_at - job.takes
-            self.late = min(max(late, self.late * _LATE_DECAY), _MAX_LATE)
-            if not isinstance(arrival, Reply):
-                self._refused(job, member, arrival)
-                continue
-            self._boots_until = -math.inf
-            try:
-                member.note_reply(job.name, job.values, arrival.values, job.sent_at)
-            except Exception as error:  # no caller may wait for ever, whatever has failed
-                self._fail(job, error)
-                continue
-            if job.result.done():  # its caller was cancelled
-                continue
-            if len(job.parts) > 1 and job.is_missing(arrival.values):
-                if job.attempts > 0:
-                    self._repeat(job, member)
-                else:
-                    self.wire.counters.remark = f"part {job.part} of a set does not arrive"
-                    self._give_up(job, member)
-            else:
-                job.result.set_result(arrival.values)
+            self._process(arrival)
         if self._queue:
             self.pump()
         elif self.current is None and self._timer is not None:
-            self._timer.cancel()  # no reply is awaited, so there is nothing to check
+            self._timer.cancel()  # no reply is due
             self._timer = None
+
+    def _process(self, arrival: Arrival) -> None:
+        """Process a message, or another result of received bytes."""
+        if isinstance(arrival, Event | OtherHost | DuplicateAddress):
+            sender = self.members.get(arrival.address)
+            if sender is not None:
+                sender.note_unasked(arrival)
+            return
+        job = self.current
+        if job is None or job.member is None:  # no broadcast is on the line
+            return
+        member = job.member
+        self._sent_until = 0.0  # a request with a reply has arrived
+        if isinstance(arrival, Continuation):
+            self.late = max(self.late, min(self.time() - self._free_at, _MAX_LATE))
+            if self._queue and self._must_yield(job):
+                self._not_answered(job)
+            else:
+                self._continue(job, arrival.data, is_present=arrival.is_present)
+            return
+        self.current = None
+        member.silence_cause = None
+        if isinstance(arrival, WrittenPart):
+            self._go_on(job)
+            return
+        late = self.time() - job.started_at - job.takes
+        self.late = min(max(late, self.late * _LATE_DECAY), _MAX_LATE)
+        if isinstance(arrival, Reply):
+            self._boots_until = -math.inf
+            self._replied(job, member, arrival.values)
+        else:
+            self._refused(job, member, arrival)
+
+    def _replied(self, job: Job, member: Member, reply: Values) -> None:
+        """End a request with its reply, or repeat the part of a set that the reply misses."""
+        try:
+            member.note_reply(job.name, job.values, reply, job.sent_at)
+        except Exception as error:  # every caller must get a result, after any failure
+            self._fail(job, error)
+            return
+        if job.result.done():  # its caller was cancelled
+            return
+        if len(job.parts) < 2 or not job.is_missing(reply):
+            job.result.set_result(reply)
+        elif job.attempts > 0:
+            self._repeat(job, member)
+        else:
+            self.wire.counters.remark = f"part {job.part} of a set does not arrive"
+            self._give_up(job, member)
 
     def lose(self, cause: str) -> None:
         """Fail every request: the port is lost, or closed."""
         self.loss = cause
-        current, self.current = self.current, None
-        for job in (*([] if current is None else [current]), *self._queue):
+        jobs = [*self._queue]
+        if self.current is not None:
+            jobs.insert(0, self.current)
+        self.current = None
+        for job in jobs:
             self._fail(job, LinkError(cause))
         if self._timer is not None:
             self._timer.cancel()
@@ -483,70 +507,107 @@ class Line:
         finally:
             self._is_pumping = False
 
-    def _start(self, job: Job, rest: bytes = b"", *, is_present: bool = False) -> None:
+    def _start(self, job: Job) -> None:
         """Make and send a request, and record it for each amplifier that receives it.
 
-        This is the only way of sending. rest: unsent bytes of the current request. is_present:
-        whether these bytes complete the request for the amplifier.
+        Requests are sent here, and the rest of a request in `_continue`; nothing else sends.
         """
-        member, data = job.member, rest
-        address = BROADCAST if member is None else member.address
+        member = job.member
         try:
-            if not rest:
-                if self.ahead is not None and member is not None and not job.part:
-                    ahead = self.ahead(job.name, job.priority)
-                    if ahead is not None:
-                        beat = Priority.HEARTBEAT
-                        self._start(Job(None, beat, "Commit", {}, 0.0, self.time(), ahead))
-                if job.attempts == ATTEMPTS:
-                    self.wire.counters.remark = ""
-                if job.make is not None:
-                    job.parts, job.make = job.make(), None
-                    job.values = job.parts[0]
-                if member is not None:
-                    job.takes = member.next_request(job.name, job.values, job.priority)
-                has_reply = member is not None and job.part >= len(job.parts) - 1
-                data = self.wire.request(address, job.name, job.values, has_reply=has_reply)
+            data = self._bytes_of(job)
             now = self.time()
             begins = max(now, self._sent_until)  # after bytes still under way
-            if not rest:
-                job.sent_at, job.started_at, job.due = now, begins, 0.0
-                for each in self.members.values():
-                    if address in (BROADCAST, each.address):
-                        each.note_sent(job.name, job.values, now, begins + self.wire.takes)
-            elif is_present and member is not None:
-                member.note_sent(job.name, job.values, now, begins + self.wire.takes)
-            if trace.is_active():
-                what = job.name if member is None else f"{job.name} to {address}"
-                trace.frame(Direction.OUT, data, self.name, lambda: what)
-            self._sent_until, self._free_at = begins + self.wire.takes, begins + self.wire.busy
-            try:
-                self._port.write(data)
-            except LinkTimeout as error:  # the port accepts nothing: the amplifier is degraded
-                if member is not None:
-                    member.silence_cause = str(error)
-                raise
-            if self.loss is not None:  # the port was lost while it was written
-                raise LinkError(self.loss)
-        except Exception as error:  # no caller may wait for ever, whatever has failed
-            self.current = None
-            self.wire.withdraw()
-            self._fail(job, error)
+            job.sent_at = now
+            job.started_at = begins
+            job.due = 0.0
+            address = _address_of(member)
+            for receiver in self.members.values():
+                if address in (BROADCAST, receiver.address):
+                    receiver.note_sent(job.name, job.values, now, begins + self.wire.takes)
+            self._write(job, data, begins)
+        except Exception as error:  # every caller must get a result, after any failure
+            self._fail_sending(job, error)
             return
         if member is None:
             job.result.set_result({})
             return
-        if not rest:
-            # On a slow wire there is one attempt less, so that an amplifier counts as degraded as
-            # soon as on other wires. A set of several parts keeps its attempts, because each part
-            # can be lost; heartbeats between the parts detect a mute amplifier.
-            is_cut = job.takes > FAST and job.attempts == ATTEMPTS and len(job.parts) < 2
-            job.attempts -= 2 if is_cut else 1
+        # On a slow wire there is one attempt less, so that an amplifier counts as degraded as soon
+        # as on other wires. A set of several parts keeps its attempts, because each part can be
+        # lost; heartbeats between the parts detect a mute amplifier.
+        is_cut = job.takes > FAST and job.attempts == ATTEMPTS and len(job.parts) < 2
+        job.attempts -= 2 if is_cut else 1
+        self._await_reply(job, now, begins)
+
+    def _continue(self, job: Job, rest: bytes, *, is_present: bool) -> None:
+        """Send unsent bytes of the current request.
+
+        is_present: whether these bytes complete the request for the amplifier.
+        """
+        member = job.member
+        try:
+            now = self.time()
+            begins = max(now, self._sent_until)
+            if is_present and member is not None:
+                member.note_sent(job.name, job.values, now, begins + self.wire.takes)
+            self._write(job, rest, begins)
+        except Exception as error:  # every caller must get a result, after any failure
+            self._fail_sending(job, error)
+            return
+        self._await_reply(job, now, begins)
+
+    def _bytes_of(self, job: Job) -> bytes:
+        """Return the bytes of a request, after sending the broadcast that precedes it, if any."""
+        member = job.member
+        if self.ahead is not None and member is not None and not job.part:
+            make_commit = self.ahead(job.name, job.priority)
+            if make_commit is not None:
+                now = self.time()
+                self._start(Job(None, Priority.HEARTBEAT, "Commit", {}, 0.0, now, make_commit))
+        if job.attempts == ATTEMPTS:
+            self.wire.counters.remark = ""
+        if job.make is not None:
+            job.parts = job.make()
+            job.make = None
+            job.values = job.parts[0]
+        if member is not None:
+            job.takes = member.next_request(job.name, job.values, job.priority)
+        has_reply = member is not None and job.part >= len(job.parts) - 1
+        return self.wire.request(_address_of(member), job.name, job.values, has_reply=has_reply)
+
+    def _write(self, job: Job, data: bytes, begins: float) -> None:
+        """Write bytes to the port; begins: when the first bit is on the wire [s]."""
+        member = job.member
+        if trace.is_active():
+            request = job.name if member is None else f"{job.name} to {member.address}"
+            trace.frame(Direction.OUT, data, self.name, lambda: request)
+        self._sent_until = begins + self.wire.takes
+        self._free_at = begins + self.wire.busy
+        try:
+            self._port.write(data)
+        except LinkTimeout as error:  # the port accepts nothing: the amplifier is degraded
+            if member is not None:
+                member.silence_cause = str(error)
+            raise
+        if self.loss is not None:  # the port was lost while it was written
+            raise LinkError(self.loss)
+
+    def _fail_sending(self, job: Job, error: Exception) -> None:
+        """End a request that could not be made or sent."""
+        self.current = None
+        self.wire.withdraw()
+        self._fail(job, error)
+
+    def _await_reply(self, job: Job, now: float, begins: float) -> None:
+        """Await the reply to a request whose first bit is on the wire at a time [s].
+
+        If further parts of a set follow, send the next part instead.
+        """
         # On Modbus each of the two responses may begin late.
         late = self.late if self.late > GRACE else 0.0
-        longer = job.takes - FAST if job.takes > FAST else 0.0
-        job.due = max(job.due, begins + longer + job.timeout + late)
-        job.delays, job.is_last_look = 0, False
+        slowness = max(job.takes - FAST, 0.0)
+        job.due = max(job.due, begins + slowness + job.timeout + late)
+        job.delays = 0
+        job.is_last_look = False
         self.current = job
         # This is `has_further_parts`, written out because it runs with every message.
         if job.part < len(job.parts) - 1 and not self.wire.confirms_parts:
@@ -567,7 +628,8 @@ class Line:
         """Send the next part of a set, unless a waiting request goes before it."""
         self.current = None
         job.attempts += 1  # the attempt for this part did not fail
-        job.part, job.values = job.part + 1, job.parts[job.part + 1]
+        job.part += 1
+        job.values = job.parts[job.part]
         if self.wire.confirms_parts:
             job.reach(job.part)
         if self._queue and self._queue.has_before(job, self.time()):
@@ -577,7 +639,7 @@ class Line:
 
     def _must_yield(self, job: Job) -> bool:
         """Whether a request must yield to a request that silences."""
-        return not job.is_stop_class and any(other.is_stop_class for other in self._queue)
+        return not job.is_stop_class and any(queued.is_stop_class for queued in self._queue)
 
     def _refused(self, job: Job, member: Member, arrival: Nak | BrokenReply) -> None:
         """Repeat a request that a busy amplifier refused; fail any other one."""
@@ -592,9 +654,10 @@ class Line:
 
     def _queue_again(self, job: Job) -> bool:
         """Queue a request again, and return True, unless a waiting request makes it obsolete."""
-        if any(job.is_superseded_by(other.priority, other.member) for other in self._queue):
-            self._fail(job, Preempted(SUPERSEDED))
-            return False
+        for queued in self._queue:
+            if job.is_superseded_by(queued.priority, queued.member):
+                self._fail(job, Preempted(SUPERSEDED))
+                return False
         # Last within its priority, so that a mute amplifier does not delay others.
         self._queue.append(job)
         return True
@@ -628,7 +691,8 @@ class Line:
             self._send_further(current)
             return
         waiting = [job.priority for job in self._queue if job.priority < current.priority]
-        first, is_reading = min(waiting, default=8), current.priority is Priority.READING
+        first = min(waiting, default=8)
+        is_reading = current.priority is Priority.READING
         free_at = max(self.time(), self._free_at)
         if first <= Priority.SILENCE:
             current.due = min(current.due, free_at + (0.0 if is_reading else GRACE))
@@ -651,8 +715,10 @@ class Line:
         If the timer fires late, this process was delayed by as much; the reply then keeps the time
         that it had left when the delay began.
         """
-        timer, self._timer = self._timer, None
-        job, now = self.current, self.time()
+        timer = self._timer
+        self._timer = None
+        job = self.current
+        now = self.time()
         if job is None or timer is None:
             return
         since = max(timer.when(), job.sent_at)
@@ -671,7 +737,8 @@ class Line:
                     self._not_answered(job)
                     self.pump()
                     return
-                job.due, job.is_last_look = now, True
+                job.due = now
+                job.is_last_look = True
         if self.current is not None and self._timer is None:
             due = min(self.current.due, self.time() + _LOOK_INTERVAL)
             self._timer = self._loop.call_at(due, self._look)
@@ -708,6 +775,10 @@ class Line:
             boot_time=boot_time,
         )
         self._fail(job, LinkTimeout(member.silence_cause))
+
+
+def _address_of(member: Member | None) -> int:
+    return BROADCAST if member is None else member.address
 
 
 def _trace(job: Job, result: "asyncio.Future[Values]") -> None:

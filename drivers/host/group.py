@@ -1,6 +1,6 @@
 """All amplifiers of a plate: they play together or not at all, and their watchdogs are fed here.
 
-`Group` holds the state of all amplifiers: a failure of one stops all, and nothing arms
+`Group` holds the state of all amplifiers: a failure of one amplifier stops all, and nothing arms
 automatically.
 
 Only `Heartbeats` decides which amplifier is fed, when, and by which request. A status read just
@@ -34,6 +34,7 @@ from drivers.host.joint_sets import (
     JointSets,
     Members,
     PlayedSet,
+    commit_of,
     is_lost,
     outcomes,
     word_passed_by_all,
@@ -60,17 +61,23 @@ class Heartbeats:
     def __init__(
         self, members: Members, sets: JointSets, clocks: Clocks, restored: Callable[[], None]
     ) -> None:
-        self._members, self._sets, self._restored = members, sets, restored
+        self._members = members
+        self._sets = sets
         self._clocks = clocks
-        self._running_due: dict[Amplifier, float] = {}  # s; of the next status before a heartbeat
-        self._readings: dict[Amplifier, asyncio.Future[Values]] = {}  # of mute amplifiers
+        self._restored = restored
+        self._running_due: dict[Amplifier, float] = {}
+        """When the next status is read before a heartbeat [s]."""
+        self._readings: dict[Amplifier, asyncio.Future[Values]] = {}
+        """The last status request to each mute amplifier."""
 
     def follow(self) -> None:
-        """Make each shared line feed all its amplifiers before a set to one of them."""
-        every = self._members.amplifiers.values()
+        """Make each shared line feed all its amplifiers before a set to one amplifier."""
+        amplifiers = self._members.amplifiers.values()
         for line in self._members.lines:
-            of_line = [each for each in every if each.line is line]
-            line.ahead = partial(self._ahead, line, of_line) if len(of_line) > 1 else None
+            line_amplifiers = [amplifier for amplifier in amplifiers if amplifier.line is line]
+            line.ahead = None
+            if len(line_amplifiers) > 1:
+                line.ahead = partial(self._ahead, line, line_amplifiers)
 
     def beat(self) -> Awaitable[Sequence[object]]:
         """Feed every amplifier that replies, and read the status of each mute one meanwhile.
@@ -83,57 +90,72 @@ class Heartbeats:
         heard first.
         """
         by_line: dict[Line, list[Amplifier]] = {}
-        mute: set[Line] = set()
-        for each in self._members.by_need:
-            if (each.silence_cause or each.line.loss) and is_lost(each):
+        mute_lines: set[Line] = set()
+        for amplifier in self._members.by_need:
+            line = amplifier.line
+            if (amplifier.silence_cause or line.loss) and is_lost(amplifier):
                 # Raised before awaiting the others, so that they are stopped immediately.
-                raise LinkTimeout(each.line.loss or each.silence_cause)
-            by_line.setdefault(each.line, []).append(each)
-            if each.silence_cause is not None:
-                mute.add(each.line)
-        self._clocks.look({line: by_line[line] for line in by_line if line not in mute})
+                raise LinkTimeout(line.loss or amplifier.silence_cause)
+            by_line.setdefault(line, []).append(amplifier)
+            if amplifier.silence_cause is not None:
+                mute_lines.add(line)
+        self._clocks.look({line: by_line[line] for line in by_line if line not in mute_lines})
         feeds: list[Feed] = []
-        for line, of_line in by_line.items():
-            may_read, token = line not in mute, 0
-            is_late, is_shared, now = line.late > GRACE, len(line.members) > 1, line.time()
-            for each in of_line:
-                if each.silence_cause is not None:
-                    self._listen(each)
-                    continue
-                feed: Feed = each.ping
-                due = self._running_due.get(each, 0.0)
-                if is_shared and not each.committed:
-                    token = token or self._first_token(of_line)
-                    feed = partial(each.stage, token, (), now=True, priority=Priority.HEARTBEAT)
-                elif may_read and now >= due and each.feeding.tells(now):
-                    due = now + max(each.exchange_time("Set") / _MAX_STATUS_LOAD, _STATUS_INTERVAL)
-                    self._running_due[each] = due
-                    all_of_line = 2 * each.exchange_time("GetStatus") * len(line.members)
-                    may_read = not is_late and all_of_line <= HEARTBEAT
-                    reading = each.read_status(Priority.HEARTBEAT)
-                    feed = partial(self._feed_after, each, self._members.epoch, reading)
-                elif is_late and not each.clock.is_alone:  # only heartbeats read this clock
-                    pause = asyncio.sleep(self._clocks.later())
-                    feed = partial(self._feed_after, each, self._members.epoch, pause)
-                feeds.append(feed)
+        for line, line_amplifiers in by_line.items():
+            feeds += self._feeds_of(line, line_amplifiers, may_read=line not in mute_lines)
         return self._members.all([feed() for feed in feeds])
 
-    def _first_token(self, of_line: Sequence[Amplifier]) -> int:
+    def _feeds_of(
+        self, line: Line, line_amplifiers: Sequence[Amplifier], *, may_read: bool
+    ) -> list[Feed]:
+        """Return what feeds the amplifiers of a line that reply, and listen to the others.
+
+        may_read: whether a status may be read first, to show how the watchdog runs down.
+        """
+        is_late = line.late > GRACE
+        is_shared = len(line.members) > 1
+        now = line.time()
+        epoch = self._members.epoch
+        token = 0
+        feeds: list[Feed] = []
+        for amplifier in line_amplifiers:
+            if amplifier.silence_cause is not None:
+                self._listen(amplifier)
+                continue
+            feed: Feed = amplifier.ping
+            due = self._running_due.get(amplifier, 0.0)
+            if is_shared and not amplifier.committed:
+                token = token or self._first_token(line_amplifiers)
+                feed = partial(amplifier.stage, token, (), now=True, priority=Priority.HEARTBEAT)
+            elif may_read and now >= due and amplifier.feeding.tells(now):
+                interval = amplifier.exchange_time("Set") / _MAX_STATUS_LOAD
+                self._running_due[amplifier] = now + max(interval, _STATUS_INTERVAL)
+                statuses_time = 2 * amplifier.exchange_time("GetStatus") * len(line.members)
+                may_read = not is_late and statuses_time <= HEARTBEAT
+                reading = amplifier.read_status(Priority.HEARTBEAT)
+                feed = partial(self._feed_after, amplifier, epoch, reading)
+            elif is_late and not amplifier.clock.is_alone:  # only heartbeats read this clock
+                pause = asyncio.sleep(self._clocks.later())
+                feed = partial(self._feed_after, amplifier, epoch, pause)
+            feeds.append(feed)
+        return feeds
+
+    def _first_token(self, line_amplifiers: Sequence[Amplifier]) -> int:
         """Return the token that an amplifier of a line has committed, or else a new one."""
-        committed = max([each.committed for each in of_line])
+        committed = max([amplifier.committed for amplifier in line_amplifiers])
         if not committed:
             self._sets.token = token_after(self._sets.token)
         return committed or self._sets.token
 
     async def _feed_after(
-        self, amplifier: Amplifier, before: int, awaited: Awaitable[object]
+        self, amplifier: Amplifier, epoch: int, awaited: Awaitable[object]
     ) -> Values:
         """Feed an amplifier after a reading or a pause, unless a stop or disarm came meanwhile.
 
-        before: the epoch when this was decided.
+        epoch: the epoch when this was decided.
         """
         await awaited
-        self._members.check_none_since(before)
+        self._members.check_none_since(epoch)
         return await amplifier.ping()
 
     def _listen(self, amplifier: Amplifier) -> None:
@@ -150,7 +172,7 @@ class Heartbeats:
             self._restored()
 
     def _ahead(
-        self, line: Line, of_line: Sequence[Amplifier], name: str, priority: Priority
+        self, line: Line, line_amplifiers: Sequence[Amplifier], name: str, priority: Priority
     ) -> Make | None:
         """Return a function that feeds a line before a request to an amplifier; None if not needed.
 
@@ -162,31 +184,30 @@ class Heartbeats:
             return None
         limit = HEARTBEAT
         if line.late <= GRACE:
-            limit = _UNFED + sum([each.exchange_time("Set") for each in of_line])
-        if line.time() - min([each.feeding.since for each in of_line]) <= limit:
+            limit = _UNFED + sum([amplifier.exchange_time("Set") for amplifier in line_amplifiers])
+        if line.time() - min([amplifier.feeding.since for amplifier in line_amplifiers]) <= limit:
             return None
-        session, token = of_line[0].session, 0
-        for each in of_line:
-            if each.committed and is_newer_token(each.committed, token):
-                token = each.committed
-        if not token or any(each.session != session for each in of_line):
+        session = line_amplifiers[0].session
+        token = 0
+        for amplifier in line_amplifiers:
+            if amplifier.session != session:
+                return None
+            if amplifier.committed and is_newer_token(amplifier.committed, token):
+                token = amplifier.committed
+        if not token:
             return None
+        return partial(_repeated_commit, line_amplifiers, token)
 
-        def make() -> list[Values]:
-            values = {
-                "session": session,
-                "token": token,
-                "at": word_passed_by_all(line.time(), of_line),
-            }
-            for each in of_line:
-                each.next_request("Commit", values, Priority.SET)
-            return [values]
 
-        return make
+def _repeated_commit(line_amplifiers: Sequence[Amplifier], token: int) -> list[Values]:
+    """Return a commit that starts immediately; raises unless all amplifiers allow it."""
+    at = word_passed_by_all(line_amplifiers[0].line.time(), line_amplifiers)
+    return commit_of(line_amplifiers, token, at)
 
 
 _T = TypeVar("_T")
-_SESSION, _TOKEN = QUANTITIES["session"], QUANTITIES["token"]
+_SESSION = QUANTITIES["session"]
+_TOKEN = QUANTITIES["token"]
 _logger = logging.getLogger(__name__)
 
 
@@ -204,7 +225,7 @@ class GroupState(Enum):
 
 
 class Group:
-    """Amplifiers by name, on open lines. A failure of one stops all; nothing arms automatically.
+    """Amplifiers by name, on open lines. A failure stops all; nothing arms automatically.
 
     A stop runs to completion even if its caller is cancelled. watchdog: of armed amplifiers [s].
     restored: called when a mute amplifier replies again; its watchdog has run down meanwhile.
@@ -228,10 +249,15 @@ class Group:
         """Makes them play together."""
         self._clocks = Clocks(self.members)
         self._heartbeats = Heartbeats(self.members, self.sets, self._clocks, restored)
-        self._watchdog, self.draw = watchdog, draw
-        self._arming = asyncio.Lock()  # a second arm waits for the first
-        self._closing = asyncio.Lock()  # a second close waits for the first
-        self._limit: asyncio.Timeout | None = None  # ends an exchange in progress when it is moved
+        self._watchdog = watchdog
+        self.draw = draw
+        """Draws random session numbers."""
+        self._arming = asyncio.Lock()
+        """A second arm waits for the first."""
+        self._closing = asyncio.Lock()
+        """A second close waits for the first."""
+        self._limit: asyncio.Timeout | None = None
+        """Ends an exchange in progress if it is rescheduled to an earlier time."""
 
     @property
     def clock_errors(self) -> Mapping[str, float]:
@@ -240,7 +266,7 @@ class Group:
 
     @property
     def is_open(self) -> bool:
-        """Whether they are neither closed nor lost."""
+        """Whether the amplifiers are neither closed nor lost."""
         return self.state not in (GroupState.CLOSED, GroupState.LOST)
 
     @property
@@ -253,15 +279,16 @@ class Group:
 
         Raises LinkError, or CommandError if a wire is too slow for the watchdog.
         """
-        members, before = self.members, self.members.epoch
+        members = self.members
+        epoch = members.epoch
         members.gives_up_at = math.inf
-        await self._all([each.open() for each in self.amplifiers.values()])
+        await self._all([amplifier.open() for amplifier in self.amplifiers.values()])
         for amplifier in self.amplifiers.values():
             check_watchdog(self._watchdog, amplifier.exchange_time("Set"))
         self._clocks.follow()
         self._heartbeats.follow()
         # What an amplifier has latched before is in its own status.
-        self.state = GroupState.DISARMED if members.epoch == before else GroupState.STOPPED
+        self.state = GroupState.DISARMED if members.epoch == epoch else GroupState.STOPPED
 
     async def arm(self) -> None:
         """Switch the high voltage on at level zero: on all amplifiers, or none stays armed.
@@ -271,69 +298,78 @@ class Group:
         nothing changes. Raises DriverError, and LinkDegraded if an amplifier only does not reply
         for the moment.
         """
-        members, before = self.members, self.members.epoch
+        members = self.members
+        epoch = members.epoch
         async with self._arming:
-            if not self.is_open:
-                raise CommandError(
-                    f"amplifiers must be open to be armed, got {self.state.name}; close and reopen "
-                    "all amplifiers"
-                )
-            if self.state is GroupState.STOPPED:  # a restarted amplifier has lost its latch
-                raise CommandRefused("a stop must be cleared before arming; clear, then arm again")
-            if members.silencing:  # otherwise the order of frames would decide the result
-                raise CommandRefused(
-                    "amplifiers are being stopped or disarmed; arm again if that is still wanted"
-                )
-            members.check_none_since(before)
+            self._check_may_arm()
+            members.check_none_since(epoch)
             amplifiers = [*self.amplifiers.values()]
             if self.is_armed:
                 statuses = await self.statuses(Priority.ARM)
-                members.check_none_since(before)
-                if all(each["state"] == ENABLED for each in statuses.values()):
+                members.check_none_since(epoch)
+                if all(status["state"] == ENABLED for status in statuses.values()):
                     return
                 self._leave_armed()
-                before = members.epoch
+                epoch = members.epoch
                 await members.silence(self._disarm, amplifiers, STOP_RAMP)
-                members.check_none_since(before)
+                members.check_none_since(epoch)
             for amplifier in amplifiers:
                 # If this came later, the disarm after a failure would end another host's vibration.
                 amplifier.check_other_host()
-            await self._clocks.settle()
-            members.check_none_since(before)
-            drawn = self.draw(_SESSION.minimum, _SESSION.maximum)
-            sessions = {
-                line: (drawn + number) % _SESSION.maximum + 1
-                for number, line in enumerate(members.lines)
-            }
-            arms = [each.arm(sessions[each.line], self._watchdog) for each in amplifiers]
-            arming = asyncio.ensure_future(outcomes(arms))
-            try:
-                members.checked(await asyncio.shield(arming))
-                members.check_none_since(before)
-            except BaseException as error:
-                await members.silence(self._disarm_armed, arming)
-                if isinstance(error, DriverError):
-                    members.check_none_since(before)
-                self._note(error)  # only now: an amplifier that replied to the disarm is not lost
-                if members.is_degraded_only(error):
-                    raise LinkDegraded(str(error)) from error
-                if members.lost_by:
-                    self._lose()
-                raise
+            await self._arm_all(amplifiers, epoch)
             self.sets.is_incomplete = False
             self.state = GroupState.ARMED
+
+    def _check_may_arm(self) -> None:
+        """Raise CommandError or CommandRefused if the state of the group forbids arming."""
+        if not self.is_open:
+            raise CommandError(
+                f"amplifiers must be open to be armed, got {self.state.name}; close and reopen "
+                "all amplifiers"
+            )
+        if self.state is GroupState.STOPPED:  # a restarted amplifier has lost its latch
+            raise CommandRefused("a stop must be cleared before arming; clear, then arm again")
+        if self.members.silencing:  # otherwise the order of frames would decide the result
+            raise CommandRefused(
+                "amplifiers are being stopped or disarmed; arm again if that is still wanted"
+            )
+
+    async def _arm_all(self, amplifiers: Sequence[Amplifier], epoch: int) -> None:
+        """Arm amplifiers that are disarmed; disarm them after a failure or a newer stop."""
+        members = self.members
+        await self._clocks.settle()
+        members.check_none_since(epoch)
+        drawn = self.draw(_SESSION.minimum, _SESSION.maximum)
+        sessions = {}
+        for number, line in enumerate(members.lines):
+            sessions[line] = (drawn + number) % _SESSION.maximum + 1
+        arms = [amplifier.arm(sessions[amplifier.line], self._watchdog) for amplifier in amplifiers]
+        arming = asyncio.ensure_future(outcomes(arms))
+        try:
+            members.checked(await asyncio.shield(arming))
+            members.check_none_since(epoch)
+        except BaseException as error:
+            await members.silence(self._disarm_armed, arming)
+            if isinstance(error, DriverError):
+                members.check_none_since(epoch)
+            self._note(error)  # only now: an amplifier that replied to the disarm is not lost
+            if members.is_degraded_only(error):
+                raise LinkDegraded(str(error)) from error
+            if members.lost_by:
+                self._lose()
+            raise
 
     async def _disarm_armed(self, arming: "asyncio.Future[Any]") -> None:
         """Disarm the amplifiers that this may have armed; another host may use the others."""
         await arming
         retried = self.members.retried
         disarms = [
-            retried(each, partial(each.disarm, STOP_RAMP))
-            for each in self.amplifiers.values()
-            if each.may_be_armed
+            retried(amplifier, partial(amplifier.disarm, STOP_RAMP))
+            for amplifier in self.amplifiers.values()
+            if amplifier.may_be_armed
         ]
         # An amplifier that is only mute does not stop the others.
-        if not all(isinstance(each, LinkError | None) for each in await outcomes(disarms)):
+        if not all(isinstance(outcome, LinkError | None) for outcome in await outcomes(disarms)):
             await self.stop()
 
     def beat(self) -> Coroutine[Any, Any, Sequence[object]]:
@@ -384,14 +420,16 @@ class Group:
         """
         if not self.is_armed:
             raise CommandRefused("the amplifiers must be armed; clear a stop, then arm")
-        members, before = self.members, self.members.epoch
+        members = self.members
+        epoch = members.epoch
         limit = asyncio.timeout(None)
         try:
             try:
                 async with limit as self._limit:
                     done = await exchange()
             finally:
-                self._limit, members.has_joint_set = None, False
+                self._limit = None
+                members.has_joint_set = False
         except Exception as error:
             self._note(error)
             has_lost = isinstance(error, LinkTimeout) and self.state is GroupState.LOST
@@ -399,10 +437,11 @@ class Group:
                 raise Preempted("given up, since silence comes first") from error
             if members.is_degraded_only(error):
                 raise LinkDegraded(str(error)) from error
-            is_explained = members.epoch != before and self.state is not GroupState.LOST
+            is_explained = members.epoch != epoch and self.state is not GroupState.LOST
             if is_explained and isinstance(error, DriverError):
                 raise Preempted("a stop or disarm came first") from error
-            replying = [name for name, each in self.amplifiers.items() if not each.silence_cause]
+            amplifiers = self.amplifiers
+            replying = [name for name in amplifiers if not amplifiers[name].silence_cause]
             await self.stop(waits_for=replying)
             if has_lost:  # even if the amplifier was only degraded when the exchange began
                 raise LinkTimeout(next(iter(members.lost_by.values()), str(error))) from error
@@ -422,7 +461,9 @@ class Group:
     async def _disarm(self, amplifiers: Sequence[Amplifier], ramp: float) -> None:
         retried = self.members.retried
         try:
-            await self._all([retried(each, partial(each.disarm, ramp)) for each in amplifiers])
+            await self._all(
+                [retried(amplifier, partial(amplifier.disarm, ramp)) for amplifier in amplifiers]
+            )
         except BaseException:
             await self.stop()
             raise
@@ -439,7 +480,8 @@ class Group:
         self._leave_armed()
         if self.is_open:
             self.state = GroupState.STOPPED
-        members, stops = self.members, dict[str, asyncio.Future[StopOutcome]]()
+        members = self.members
+        stops: dict[str, asyncio.Future[StopOutcome]] = {}
         for line in members.lines:
             if len(line.members) > 1:  # so that no amplifier waits for the reply of another
                 try:
@@ -462,17 +504,17 @@ class Group:
         """
         if self.members.silencing:
             raise Preempted("amplifiers are being stopped or disarmed; clear again afterwards")
-        before = self.members.epoch
+        epoch = self.members.epoch
         try:
-            await self._all([each.clear() for each in self.amplifiers.values()])
+            await self._all([amplifier.clear() for amplifier in self.amplifiers.values()])
         except LinkError:
             await self.stop()
             raise
         except CommandRefused as error:
-            if self.members.epoch != before:  # there is a newer stop
+            if self.members.epoch != epoch:  # there is a newer stop
                 raise Preempted("a stop came first; find the cause, then clear again") from error
             raise
-        if self.members.epoch == before and self.state is GroupState.STOPPED:
+        if self.members.epoch == epoch and self.state is GroupState.STOPPED:
             self.state = GroupState.DISARMED
 
     async def statuses(self, priority: Priority = Priority.OTHER) -> dict[str, Values]:
@@ -480,10 +522,11 @@ class Group:
 
         Raises LinkError once an amplifier is lost.
         """
-        amplifiers, retried = self.amplifiers.values(), self.members.retried
-        statuses = await self._all(
-            [retried(each, partial(each.read_status, priority)) for each in amplifiers]
-        )
+        readings = []
+        for amplifier in self.amplifiers.values():
+            read = partial(amplifier.read_status, priority)
+            readings.append(self.members.retried(amplifier, read))
+        statuses = await self._all(readings)
         return dict(zip(self.amplifiers, statuses, strict=True))
 
     async def close(self, ramp: float = DISARM_RAMP) -> None:
@@ -491,22 +534,18 @@ class Group:
 
         A failure stops all amplifiers and is logged. The owner of the lines closes them.
         """
-        is_armed, now = self.is_armed, threads.now()
+        was_armed = self.is_armed
+        now = threads.now()
         self._leave_armed()
         self.state = GroupState.CLOSED
         # An amplifier that does not reply by then can only be stopped.
         self.members.gives_up_at = min(self.members.gives_up_at, now + CONFIRM_TIMEOUT)
         async with self._closing:
-            amplifiers = [
-                each
-                for each in self.amplifiers.values()
-                if each.may_be_armed
-                and (
-                    is_armed
-                    or not is_lost(each)
-                    or (each.line.loss is None and each.what_may_play().may_play_until > now)
-                )
-            ]
+            amplifiers = []
+            for amplifier in self.amplifiers.values():
+                may_reply = was_armed or not is_lost(amplifier) or _may_play(amplifier, now)
+                if amplifier.may_be_armed and may_reply:
+                    amplifiers.append(amplifier)
             try:
                 if amplifiers:
                     await self.members.silence(self._disarm, amplifiers, ramp)
@@ -539,3 +578,8 @@ class Group:
         except LinkError as error:
             self._note(error)
             raise
+
+
+def _may_play(amplifier: Amplifier, now: float) -> bool:
+    """Whether a mute amplifier on a working line may still play."""
+    return amplifier.line.loss is None and amplifier.what_may_play().may_play_until > now

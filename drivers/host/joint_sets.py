@@ -55,7 +55,8 @@ from registry import threads
 _T = TypeVar("_T")
 _P = ParamSpec("_P")
 _REPEAT_INTERVAL = 0.005  # s; in addition to the time in which a reply is awaited
-need, _lost_from = attrgetter("feeding.since"), attrgetter("feeding.lost_from")
+need = attrgetter("feeding.since")
+_lost_from = attrgetter("feeding.lost_from")
 _silence_cause = attrgetter("silence_cause")
 
 
@@ -77,7 +78,7 @@ class Members:
     @property
     def lines(self) -> tuple[Line, ...]:
         """Each line once, in the order of the amplifiers, so that runs are reproducible."""
-        return tuple(dict.fromkeys([each.line for each in self.amplifiers.values()]))
+        return tuple(dict.fromkeys([amplifier.line for amplifier in self.amplifiers.values()]))
 
     @property
     def by_need(self) -> list[Amplifier]:
@@ -88,16 +89,16 @@ class Members:
     def degraded(self) -> tuple[str, ...]:
         """Names of amplifiers that do not reply but may still play; nothing new is played then."""
         mute = filter(_silence_cause, self.amplifiers.values())
-        return tuple([each.name for each in mute if not is_lost(each)])
+        return tuple([amplifier.name for amplifier in mute if not is_lost(amplifier)])
 
     @property
     def lost_by(self) -> Mapping[str, str]:
         """Why each lost amplifier is lost, by name."""
-        return {
-            name: each.line.loss or each.silence_cause or ""
-            for name, each in self.amplifiers.items()
-            if is_lost(each)
-        }
+        causes = {}
+        for name, amplifier in self.amplifiers.items():
+            if is_lost(amplifier):
+                causes[name] = amplifier.line.loss or amplifier.silence_cause or ""
+        return causes
 
     @property
     def lost_from(self) -> float:
@@ -108,11 +109,12 @@ class Members:
     @property
     def last_sent_at(self) -> float:
         """When a set or silence was last sent to any amplifier [s]."""
-        return max((each.played_at for each in self.amplifiers.values()), default=-math.inf)
+        times = [amplifier.played_at for amplifier in self.amplifiers.values()]
+        return max(times, default=-math.inf)
 
-    def check_none_since(self, before: int) -> None:
+    def check_none_since(self, epoch: int) -> None:
         """Raise Preempted if a stop, disarm or close has come since an epoch."""
-        if self.epoch != before:
+        if self.epoch != epoch:
             raise Preempted(
                 "amplifiers were disarmed, stopped or closed meanwhile; arm again if that is still "
                 "wanted"
@@ -131,7 +133,8 @@ class Members:
 
         A lost link is the most severe; the least are a preempted request and a degraded link.
         """
-        if errors := [each for each in results if isinstance(each, BaseException)]:
+        errors = [result for result in results if isinstance(result, BaseException)]
+        if errors:
             raise min(errors, key=self._severity)
         return cast("list[_T]", results)
 
@@ -175,13 +178,13 @@ class Members:
         self, stops: Mapping[str, "asyncio.Future[StopOutcome]"]
     ) -> Mapping[str, StopOutcome]:
         """Await stops by name; a failed stop gives the possible output of its amplifier."""
-        said: dict[str, StopOutcome] = {}
+        stop_outcomes: dict[str, StopOutcome] = {}
         for name, result in zip(stops, await outcomes([*stops.values()]), strict=True):
             if isinstance(result, BaseException):
                 cause = f"{type(result).__name__}: {result}"
                 result = self.amplifiers[name].what_may_play(cause)
-            said[name] = result
-        return said
+            stop_outcomes[name] = result
+        return stop_outcomes
 
 
 async def _to_completion(task: "asyncio.Future[_T]") -> _T:
@@ -223,11 +226,14 @@ _STEP = AHEAD_MAX // 2  # between two high words that are tried
 
 def _words_of(moment: float, amplifiers: Sequence[Amplifier]) -> dict[Amplifier, int]:
     """Return the nearest high word of the clock of each amplifier at a moment [s]."""
-    word = high_word(clock_at(moment + HIGH_TIME / 2))
-    return {
-        each: word if each.clock.can_be_steered else high_word(clock_at(_shown(each, moment)))
-        for each in amplifiers
-    }
+    steered_word = high_word(clock_at(moment + HIGH_TIME / 2))
+    words = {}
+    for amplifier in amplifiers:
+        if amplifier.clock.can_be_steered:
+            words[amplifier] = steered_word
+        else:
+            words[amplifier] = high_word(clock_at(_shown(amplifier, moment)))
+    return words
 
 
 def word_passed_by_all(now: float, amplifiers: Sequence[Amplifier]) -> int:
@@ -236,8 +242,11 @@ def word_passed_by_all(now: float, amplifiers: Sequence[Amplifier]) -> int:
     A commit with it starts immediately.
     """
     at = word_passed(now)
-    others = [each for each in amplifiers if not each.clock.can_be_steered]
-    times = [_shown(each, now + later) for each in others for later in (0.0, COMMITTING)]
+    times = []
+    for amplifier in amplifiers:
+        if not amplifier.clock.can_be_steered:
+            times.append(_shown(amplifier, now))
+            times.append(_shown(amplifier, now + COMMITTING))
     for _ in range(HIGH_WORDS // _STEP):
         if all(moment_of(at, time) is None for time in times):
             break
@@ -280,8 +289,8 @@ class JointSets:
     @property
     def is_in_doubt(self) -> bool:
         """Whether it is unknown if all amplifiers play the last set, which is then silenced."""
-        every = self._members.amplifiers.values()
-        return self.is_incomplete or any(map(attrgetter("is_in_doubt"), every))
+        amplifiers = self._members.amplifiers.values()
+        return self.is_incomplete or any(map(attrgetter("is_in_doubt"), amplifiers))
 
     def refusal_of(self, layers: Mapping[str, Sequence[AmplifierLayer]]) -> CommandRefused | None:
         """Return why ledgers would not admit layers by amplifier now; None if all would.
@@ -291,11 +300,11 @@ class JointSets:
         if self.is_in_doubt:
             return None
         amplifiers = self._members.amplifiers
-        refusals = {
-            name: refusal
-            for name, each in layers.items()
-            if (refusal := amplifiers[name].refusal_of(each)) is not None
-        }
+        refusals = {}
+        for name, amplifier_layers in layers.items():
+            refusal = amplifiers[name].refusal_of(amplifier_layers)
+            if refusal is not None:
+                refusals[name] = refusal
         return _merged(refusals) if refusals else None
 
     async def play(
@@ -309,8 +318,8 @@ class JointSets:
         Overtaken is returned if the set is preempted before its commit.
         """
         amplifiers = sorted([self._members.amplifiers[name] for name in layers], key=need)
-        self._members.has_joint_set = len({each.line for each in amplifiers}) > 1
-        before = self._members.epoch
+        self._members.has_joint_set = len({amplifier.line for amplifier in amplifiers}) > 1
+        epoch = self._members.epoch
         if self.token % INTERVAL == 0:
             await self._close_gaps()
         self.token = token = token_after(self.token)
@@ -318,52 +327,55 @@ class JointSets:
         priority = Priority.SILENCE if is_silent else Priority.SET
         is_now = is_silent or len(layers) == 1
         began = threads.now()
-        staging = partial(
-            Amplifier.stage, token=token, now=is_now, priority=priority, is_preempted=is_preempted
-        )
-        results = await outcomes([staging(each, layers=layers[each.name]) for each in amplifiers])
-        refusals: dict[str, CommandRefused] = {}
-        has_failed = is_silent
-        for each, result in zip(amplifiers, results, strict=True):
-            if isinstance(result, CommandRefused) and not result.is_disarmed:
-                if is_now and result.may_play:
-                    has_failed = True
-                elif not isinstance(result, Preempted):
-                    refusals[each.name] = result
-            elif isinstance(result, BaseException):
-                has_failed = True
-        if refusals and not has_failed:
+        stagings = []
+        for amplifier in amplifiers:
+            stagings.append(
+                amplifier.stage(
+                    token,
+                    layers[amplifier.name],
+                    now=is_now,
+                    priority=priority,
+                    is_preempted=is_preempted,
+                )
+            )
+        results = dict(zip(amplifiers, await outcomes(stagings), strict=True))
+        refusals, has_failed = _refusals(results, is_now=is_now)
+        if refusals and not (has_failed or is_silent):
             refusal = _merged(refusals)
             return await self._silenced(refusal, amplifiers, began) if is_now else refusal
         try:
-            if refusals:  # a worse failure of another amplifier is raised instead
-                several = zip(amplifiers, results, strict=True)
-                self._members.checked([one for each, one in several if each.name not in refusals])
-            staged = dict(zip(amplifiers, self._members.checked(results), strict=True))
+            # A worse failure of another amplifier is raised rather than a refusal.
+            others = [results[amplifier] for amplifier in results if amplifier.name not in refusals]
+            self._members.checked(others)
+            staged_sets = self._members.checked([*results.values()])
         except Overtaken as overtaken:
             return overtaken
+        staged = dict(zip(amplifiers, staged_sets, strict=True))
         if is_preempted is not None and not is_now and is_preempted():
             return Overtaken(f"set {token} is preempted")
         if not is_now:
-            self._members.check_none_since(before)
+            self._members.check_none_since(epoch)
             self.is_incomplete = True
             try:
                 await self._commit(staged)
             except CommandRefused as refusal:
-                if refusal.until is None or self._members.epoch != before:
+                if refusal.until is None or self._members.epoch != epoch:
                     raise
                 return await self._silenced(refusal, amplifiers, began)
         self.is_incomplete = False
-        played: dict[str, tuple[LayerSet, ...]] = {}
-        reading: dict[str, Awaitable[tuple[LayerSet, ...]]] = {}
-        starts_at = -math.inf
-        for each, one in staged.items():
-            played[each.name], starts_at = one.layers, max(starts_at, each.played_at)
-            if not one.is_exact:
-                reading[each.name] = _achieved(each, one)
-        if reading:
-            achieved = await self._members.all([*reading.values()])
-            played.update(zip(reading, achieved, strict=True))
+        return await self._played(token, staged)
+
+    async def _played(self, token: int, staged: Mapping[Amplifier, StagedSet]) -> PlayedSet:
+        """Return the set that was committed, after reading how amplifiers have rounded it."""
+        played = {amplifier.name: staged_set.layers for amplifier, staged_set in staged.items()}
+        starts_at = max([amplifier.played_at for amplifier in staged], default=-math.inf)
+        readings: dict[str, Awaitable[tuple[LayerSet, ...]]] = {}
+        for amplifier, staged_set in staged.items():
+            if not staged_set.is_exact:
+                readings[amplifier.name] = _achieved(amplifier, staged_set)
+        if readings:
+            achieved = await self._members.all([*readings.values()])
+            played.update(zip(readings, achieved, strict=True))
         return PlayedSet(token, played, starts_at)
 
     async def _silenced(
@@ -373,7 +385,9 @@ class JointSets:
 
         began: start of sending [s].
         """
-        if refusal.until is None or not any(each.played_at >= began for each in amplifiers):
+        if refusal.until is None or not any(
+            amplifier.played_at >= began for amplifier in amplifiers
+        ):
             self.is_incomplete = False
             return refusal
         await self.silence(STOP_RAMP)
@@ -383,8 +397,8 @@ class JointSets:
         """Let all layers of all amplifiers fall silent along a ramp [s]; they stay armed."""
         # Mute amplifiers come last, so that no other amplifier on the same line waits for them.
         amplifiers = self._members.by_need
-        amplifiers.sort(key=lambda each: each.silence_cause is not None)
-        await self._members.all([each.silence(ramp) for each in amplifiers])
+        amplifiers.sort(key=lambda amplifier: amplifier.silence_cause is not None)
+        await self._members.all([amplifier.silence(ramp) for amplifier in amplifiers])
         self.is_incomplete = False
 
     async def _commit(self, staged: Mapping[Amplifier, StagedSet]) -> None:
@@ -393,15 +407,17 @@ class JointSets:
         Raises CommandRefused if an amplifier does not play its set afterwards.
         """
         by_line: dict[Line, list[Amplifier]] = {}
-        for each in staged:
-            by_line.setdefault(each.line, []).append(each)
+        for amplifier in staged:
+            by_line.setdefault(amplifier.line, []).append(amplifier)
         token = self.token
         moment: float | None = None  # None: immediately
         if len(by_line) > 1:
-            await _freed([*by_line], until=min([one.until for one in staged.values()]))
+            await _freed(
+                [*by_line], until=min([staged_set.until for staged_set in staged.values()])
+            )
             moment = moment_behind(max([line.commit_arrives() for line in by_line]))
-        for each in staged:
-            each.starts = -math.inf if moment is None else moment
+        for amplifier in staged:
+            amplifier.starts = -math.inf if moment is None else moment
         if moment is None:
             words = dict.fromkeys(staged, word_passed_by_all(threads.now(), [*staged]))
         else:
@@ -410,54 +426,78 @@ class JointSets:
         broadcasts: list[Awaitable[Values]] = []
         for line, sharing in by_line.items():
             at = words[sharing[0]]
-            if len(sharing) == 1 or any(words[each] != at for each in sharing):
-                for each in sharing:  # alone on the line, or a clock is not steered
-                    requests[each] = each.commit(token, words[each])
+            if len(sharing) == 1 or any(words[amplifier] != at for amplifier in sharing):
+                for amplifier in sharing:  # alone on the line, or a clock is not steered
+                    requests[amplifier] = amplifier.commit(token, words[amplifier])
                 continue
-            make = partial(_commit_of, sharing, token, at)
+            make = partial(commit_of, sharing, token, at)
             broadcasts.append(line.submit(None, Priority.SET, "Commit", make))
-            for each in sharing:  # a heartbeat confirms it, and feeds the watchdog meanwhile
-                requests[each] = each.ping()
+            for amplifier in sharing:  # a heartbeat confirms it, and feeds the watchdog meanwhile
+                requests[amplifier] = amplifier.ping()
         # The broadcasts are awaited too: a queued one is not sent if this is cancelled.
         statuses = await self._members.all([*requests.values(), *broadcasts])
-        for each, status in zip(requests, statuses, strict=False):
+        for amplifier, status in zip(requests, statuses, strict=False):
             if status["token"] != token or status["state"] in LATCHED:
-                await _check_plays(each, status, token)
+                await _check_plays(amplifier, status, token)
 
     async def _close_gaps(self) -> None:
         """Let amplifiers whose token is far behind commit an empty set, which changes nothing."""
         behind = [
-            each
-            for each in self._members.amplifiers.values()
-            if each.committed > 0 and (self.token - each.committed) % _SPAN > _MAX_GAP
+            amplifier
+            for amplifier in self._members.amplifiers.values()
+            if amplifier.committed > 0 and (self.token - amplifier.committed) % _SPAN > _MAX_GAP
         ]
         if behind:  # amplifiers without a committed token accept any token as newer
             self.token = token_after(self.token)
-            await self._members.all([each.stage(self.token, (), now=True) for each in behind])
+            await self._members.all(
+                [amplifier.stage(self.token, (), now=True) for amplifier in behind]
+            )
 
 
 async def _freed(lines: Sequence[Line], *, until: float) -> None:
     """Wait until a commit can be sent on all lines simultaneously, or until a time [s]."""
-    while threads.now() < until and (
-        busy := [line.current.result for line in lines if line.current is not None]
-    ):
+    while threads.now() < until:
+        busy = [line.current.result for line in lines if line.current is not None]
+        if not busy:
+            return
         await asyncio.wait(busy)
 
 
+def _refusals(
+    results: Mapping[Amplifier, StagedSet | BaseException], *, is_now: bool
+) -> tuple[dict[str, CommandRefused], bool]:
+    """Return the ledgers' refusals of a set by amplifier, and whether it has failed otherwise.
+
+    is_now: whether the set plays as soon as it arrives, so that an amplifier may play it although
+    it has refused it.
+    """
+    refusals = {}
+    has_failed = False
+    for amplifier, result in results.items():
+        if isinstance(result, CommandRefused) and not result.is_disarmed:
+            if is_now and result.may_play:
+                has_failed = True
+            elif not isinstance(result, Preempted):
+                refusals[amplifier.name] = result
+        elif isinstance(result, BaseException):
+            has_failed = True
+    return refusals, has_failed
+
+
 def _merged(refusals: Mapping[str, CommandRefused]) -> CommandRefused:
-    """Join rejections by amplifier; `until` is known only if all of them are temporary."""
-    known = [each.until for each in refusals.values() if each.until is not None]
+    """Join rejections by amplifier; `until` is known only if all rejections are temporary."""
+    ends = [refusal.until for refusal in refusals.values() if refusal.until is not None]
     return CommandRefused(
         "; ".join(f"{name}: {refusal}" for name, refusal in refusals.items()),
         channel=next(iter(refusals.values())).channel,
-        until=max(known) if len(known) == len(refusals) else None,
+        until=max(ends) if len(ends) == len(refusals) else None,
     )
 
 
-def _commit_of(several: Sequence[Amplifier], token: int, at: int) -> list[Values]:
+def commit_of(amplifiers: Sequence[Amplifier], token: int, at: int) -> list[Values]:
     """Return a commit for several amplifiers of a line; raises unless it is allowed for all."""
-    values = {"session": several[0].session, "token": token, "at": at}
-    for amplifier in several:
+    values = {"session": amplifiers[0].session, "token": token, "at": at}
+    for amplifier in amplifiers:
         amplifier.next_request("Commit", values, Priority.SET)
     return [values]
 
@@ -480,7 +520,7 @@ async def _check_plays(amplifier: Amplifier, status: Values, token: int) -> None
 
 async def _achieved(amplifier: Amplifier, staged: StagedSet) -> tuple[LayerSet, ...]:
     """Read how an amplifier achieved the layers of the set it plays."""
-    return tuple([await amplifier.read_achieved(one, staged.token) for one in staged.layers])
+    return tuple([await amplifier.read_achieved(layer, staged.token) for layer in staged.layers])
 
 
 # Errors of a clock [s]: a good clock does not lower a promise, a fair one by a tenth of a dB.
@@ -496,26 +536,35 @@ class Clocks:
     """The clocks of the amplifiers of a group, on open lines."""
 
     def __init__(self, members: Members) -> None:
-        self._members, self._amplifiers = members, members.amplifiers
-        self._are_alike = True  # whether all amplifiers and lines are alike
+        self._members = members
+        self._amplifiers = members.amplifiers
+        self._are_alike = True
+        """Whether all amplifiers and lines are alike."""
         self._dither = 0.0
+        """The last varying part of a frame, see `later`."""
         self._readings: dict[Amplifier, asyncio.Future[Any]] = {}
+        """The last reading of each clock."""
         self._turns: dict[Line, Iterator[Amplifier]] = {}
-        self._marked: set[Line] = set()  # lines of several amplifiers that all support Mark
-        self._firsts: dict[Line, HeldClock | None] = {}  # the clock that the others follow
+        """The amplifiers of each line in endless turns."""
+        self._marked: set[Line] = set()
+        """Lines of several amplifiers that all support Mark."""
+        self._firsts: dict[Line, HeldClock | None] = {}
+        """The clock of each line that the others follow."""
 
     def follow(self) -> None:
         """Adopt the amplifiers and lines as just identified."""
-        every = self._amplifiers.values()
-        self._are_alike = len({_kind(each) for each in every}) == 1
+        amplifiers = self._amplifiers.values()
+        self._are_alike = len({_kind(amplifier) for amplifier in amplifiers}) == 1
         for line in self._members.lines:
-            of_line = [each for each in every if each.line is line]
-            self._turns[line] = cycle(of_line)
-            know_mark = [has_feature(each.ledger.capabilities, "mark") for each in of_line]
-            if len(of_line) > 1 and all(know_mark):
+            line_amplifiers = [amplifier for amplifier in amplifiers if amplifier.line is line]
+            self._turns[line] = cycle(line_amplifiers)
+            mark_support = []
+            for amplifier in line_amplifiers:
+                mark_support.append(has_feature(amplifier.ledger.capabilities, "mark"))
+            if len(line_amplifiers) > 1 and all(mark_support):
                 self._marked.add(line)
-        for each in every:
-            each.clock.is_alone = len(every) == 1
+        for amplifier in amplifiers:
+            amplifier.clock.is_alone = len(amplifiers) == 1
 
     @property
     def errors(self) -> Mapping[str, float]:
@@ -525,24 +574,30 @@ class Clocks:
         lines or amplifiers differ, half of the shortest exchange without its bits, because no
         exchange shows how that time is split between the two directions. A single amplifier has 0.
         """
-        every = self._amplifiers
-        if len(every) < 2:
-            return dict.fromkeys(every, 0.0)
-        now = next(iter(every.values())).line.time()
-        held = [each for each in every.values() if each.clock.error(now) < math.inf]
-        is_common = len(self._members.lines) == 1
-        is_common &= sum(not each.clock.is_compared for each in held) == 1
-        leads = {each: each.clock.lead(now) for each in every.values()}
-        common = median([leads[each] for each in held] or [0.0])
+        amplifiers = self._amplifiers
+        if len(amplifiers) < 2:
+            return dict.fromkeys(amplifiers, 0.0)
+        now = next(iter(amplifiers.values())).line.time()
+        leads = {}
+        synchronised_leads = []
+        uncompared_count = 0
+        for name, amplifier in amplifiers.items():
+            leads[name] = amplifier.clock.lead(now)
+            if amplifier.clock.error(now) < math.inf:
+                synchronised_leads.append(leads[name])
+                uncompared_count += not amplifier.clock.is_compared
+        is_common = len(self._members.lines) == 1 and uncompared_count == 1
+        common_lead = median(synchronised_leads or [0.0])
         # With this factor the RMS of the errors is at least the RMS of their differences.
-        wider = math.sqrt(len(held) / max(len(held) - 1, 1))
-        return {
-            name: math.hypot(
-                each.clock.error(now, off=wider * (leads[each] - common), is_common=is_common),
-                0.0 if self._are_alike else each.clock.shortest / 2,
-            )
-            for name, each in every.items()
-        }
+        count = len(synchronised_leads)
+        factor = math.sqrt(count / max(count - 1, 1))
+        errors = {}
+        for name, amplifier in amplifiers.items():
+            off = factor * (leads[name] - common_lead)
+            clock_error = amplifier.clock.error(now, off=off, is_common=is_common)
+            split_error = 0.0 if self._are_alike else amplifier.clock.shortest / 2
+            errors[name] = math.hypot(clock_error, split_error)
+        return errors
 
     async def settle(self) -> None:
         """Read poorly known clocks repeatedly while nothing plays, so that nothing is delayed.
@@ -559,38 +614,43 @@ class Clocks:
             pass
 
     async def _settle(self, line: Line, until: float) -> None:
-        of_line = [
-            each
-            for each in self._amplifiers.values()
-            if each.line is line and each.clock.can_be_steered
+        line_amplifiers = [
+            amplifier
+            for amplifier in self._amplifiers.values()
+            if amplifier.line is line and amplifier.clock.can_be_steered
         ]
-        before = self._members.epoch
-        while (now := line.time()) < until:
-            if max([each.clock.scatter(now) for each in of_line], default=0.0) <= _GOOD:
+        epoch = self._members.epoch
+        now = line.time()
+        while now < until:
+            errors = [amplifier.clock.scatter(now) for amplifier in line_amplifiers]
+            if max(errors, default=0.0) <= _GOOD:
                 break
             if line in self._marked:
-                self._compare(of_line, now)
+                self._compare(line_amplifiers, now)
                 await line.submit(None, Priority.READING, "Mark", {})
-            for each in of_line:
-                if line.time() >= until or self._members.epoch != before:
+            for amplifier in line_amplifiers:
+                if line.time() >= until or self._members.epoch != epoch:
                     return
-                await each.read_status(Priority.READING)
+                await amplifier.read_status(Priority.READING)
                 await asyncio.sleep(self.later())
+            now = line.time()
 
-    def _compare(self, of_line: Sequence[Amplifier], now: float) -> None:
-        """Make the clocks of a line follow one of them: as before, or else the best known."""
-        line = of_line[0].line
-        before = self._firsts.get(line)
+    def _compare(self, line_amplifiers: Sequence[Amplifier], now: float) -> None:
+        """Make the clocks of a line follow the same clock as before, or else the best one."""
+        line = line_amplifiers[0].line
+        last_first = self._firsts.get(line)
 
-        def rank(one: HeldClock) -> tuple[bool, bool, bool, float]:
-            # No other clock follows one that has jumped.
-            error = one.error(now)
-            return error == math.inf, one.problem(now) is not None, one is not before, error
+        def rank(clock: HeldClock) -> tuple[bool, bool, bool, float]:
+            # No other clock follows a clock that has jumped.
+            error = clock.error(now)
+            has_problem = clock.problem(now) is not None
+            return error == math.inf, has_problem, clock is not last_first, error
 
-        best = min([each.clock for each in of_line], key=rank)
-        first = self._firsts[line] = best if best.error(now) < math.inf else None
-        for each in of_line:
-            each.clock.compare(None if each.clock is first else first)
+        best = min([amplifier.clock for amplifier in line_amplifiers], key=rank)
+        first = best if best.error(now) < math.inf else None
+        self._firsts[line] = first
+        for amplifier in line_amplifiers:
+            amplifier.clock.compare(None if amplifier.clock is first else first)
 
     def look(self, by_line: Mapping[Line, Sequence[Amplifier]]) -> None:
         """Schedule readings of clocks between the heartbeats, which go out next.
@@ -600,34 +660,40 @@ class Clocks:
         """
         if len(self._amplifiers) == 1:
             return
-        loop, worst, busy = asyncio.get_running_loop(), 0.0, dict[Line, float]()
-        now, unmarked = loop.time(), list[tuple[Line, Sequence[Amplifier]]]()
-        for line, of_line in by_line.items():
-            takes = [each.exchange_time("GetStatus") for each in of_line]
-            shown = [each.counts.last_round_trip or 0.0 for each in of_line]
-            busy[line] = sum(map(max, takes, shown))
+        loop = asyncio.get_running_loop()
+        now = loop.time()
+        worst = 0.0
+        busy: dict[Line, float] = {}
+        unmarked: list[tuple[Line, Sequence[Amplifier]]] = []
+        for line, line_amplifiers in by_line.items():
+            busy[line] = 0.0
+            for amplifier in line_amplifiers:
+                last_round_trip = amplifier.counts.last_round_trip or 0.0
+                busy[line] += max(amplifier.exchange_time("GetStatus"), last_round_trip)
             if line in self._marked:
-                self._compare(of_line, now)
+                self._compare(line_amplifiers, now)
                 # A time of its own: what waits for a reply would go out in step with frames of USB.
                 later = self.later(_INTERVAL + busy[line])
                 loop.call_later(later, line.submit, None, Priority.HEARTBEAT, "Mark", {})
                 continue
-            unmarked.append((line, of_line))
-            for each in of_line:
-                if each.clock.can_be_steered:
-                    worst = max(worst, each.clock.scatter(now))
+            unmarked.append((line, line_amplifiers))
+            for amplifier in line_amplifiers:
+                if amplifier.clock.can_be_steered:
+                    worst = max(worst, amplifier.clock.scatter(now))
         if worst <= _GOOD:
             return
-        longer = max((_FAIR - _GOOD) / (worst - _GOOD), 1.0)
-        least = _INTERVAL * (longer if worst <= _POOR else 0.5)
-        for line, of_line in unmarked:
+        factor = 0.5
+        if worst <= _POOR:
+            factor = max((_FAIR - _GOOD) / (worst - _GOOD), 1.0)
+        min_interval = _INTERVAL * factor
+        for line, line_amplifiers in unmarked:
             if line.late <= GRACE:
                 # Each at a time of its own: behind another's reply it would be in step with frames.
-                interval = max(least, busy[line] / _MAX_LOAD) / len(of_line)
+                line_interval = max(min_interval, busy[line] / _MAX_LOAD)
+                interval = line_interval / len(line_amplifiers)
                 for number in range(1, int(HEARTBEAT / interval)):
-                    loop.call_later(
-                        self.later(number * interval), self.read_clock, next(self._turns[line])
-                    )
+                    amplifier = next(self._turns[line])
+                    loop.call_later(self.later(number * interval), self.read_clock, amplifier)
 
     def later(self, duration: float = 0.0) -> float:
         """Return a duration [s] plus a varying part of a frame."""
@@ -645,7 +711,8 @@ class Clocks:
 
 def _kind(amplifier: Amplifier) -> tuple[Any, ...]:
     """Return what must be equal for two amplifiers to receive their requests equally late."""
-    line, of = amplifier.line, amplifier.identity
+    line = amplifier.line
+    identity = amplifier.identity
     device = re.match(r"/.*/(\D*)", line.name)  # without its number; None for a network
-    made = of.get("vendor"), of.get("product"), of.get("firmware")
-    return type(line.wire), device and device[1], made
+    model = identity.get("vendor"), identity.get("product"), identity.get("firmware")
+    return type(line.wire), device and device[1], model

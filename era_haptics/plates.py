@@ -50,7 +50,7 @@ if TYPE_CHECKING:  # slow to import, like all drawing modules
 
 
 class SolvedPlate:
-    """Plate of a rig on its ERAs, solved once at first use, up to the rig's highest frequency.
+    """A rig's plate on its ERAs, solved once at first use, up to the rig's highest frequency.
 
     seed: draws plate, ERAs, channels and fingers at random from the rig's tolerances, as `era table
     verify` does, on another mesh; None for the nominal rig.
@@ -170,7 +170,8 @@ class SolvedPlate:
         duration: float | None = None,
         sample_rate: float | None = None,
     ) -> PlatePlayback:
-        """Compute what fingers feel during a duration [s], starting at rest; default: until steady.
+        """Compute the vibration that fingers feel for a duration [s], starting at rest; default:
+        until steady.
 
         - target: positions [m] of fingers that the whole drive is meant for; default: the fingers
           of an answer, each with its own layer and load.
@@ -297,7 +298,8 @@ def draw_contents(table: LocalizationTable, answer: Answer) -> "Figure":
 
 
 def draw_contrast_map(table: LocalizationTable, found: ContrastMap) -> "Figure":
-    """Draw the promised contrast of every position to quiet fingers, drive modes side by side.
+    """Draw the promised contrast between every position and the quiet fingers, with drive modes
+    side by side.
 
     Same picture as `era table map`.
 

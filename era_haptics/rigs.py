@@ -19,7 +19,7 @@ from model.rig.sections import PlateSection
 
 
 class PlateKeys(dict[str, Any]):
-    """Plate given by the keys of `plate` in a rig file.
+    """Plate defined by the keys of `plate` in a rig file.
 
     `Plate(length="12 in", width="9 in", thickness=0.0015, material="aluminium")`. Raises
     ConfigError, an InputError, with all problems.
@@ -30,7 +30,7 @@ class PlateKeys(dict[str, Any]):
 
 
 class EraKeys(dict[str, Any]):
-    """ERA given by the keys below `eras` in a rig file.
+    """ERA defined by the keys below `eras` in a rig file.
 
     `Era(at=(0, 0), stiffness="17 kN/m", amplifier="main", channel=0)`. Raises ConfigError.
     """
@@ -40,7 +40,7 @@ class EraKeys(dict[str, Any]):
 
 
 class ExciterKeys(dict[str, Any]):
-    """Exciter given by the keys below `eras` in a rig file; `kind` is set already.
+    """Exciter defined by the keys below `eras` in a rig file; `kind` is already set.
 
     `Exciter(type="DAEX25CT-4", at=(0.1, 0.1), amplifier="card", channel=0)`. Raises ConfigError.
     """
@@ -109,10 +109,10 @@ def calibrate(
 ) -> Calibration:
     """Fit a rig to responses measured in a .csv, .uff or .unv file, like `era calibrate`.
 
-    all_scales: estimate the scale of every sensor, not only of wrong ones; progress: called with
-    the number of fits done and the total. The result has the fitted `rig` with its uncertainty, and
-    `parameters` with standard errors; use it only if `is_good`. Raises InputError, with the cause,
-    for responses that contradict their metadata.
+    all_scales: estimate the scale of every sensor, not only of sensors with a wrong scale;
+    progress: called with the number of fits done and the total. The result has the fitted `rig`
+    with its uncertainty, and `parameters` with standard errors; use it only if `is_good`. Raises
+    InputError, with the cause, for responses that contradict their metadata.
 
     Example:
         >>> fit = era.calibrate(rig, "examples/measured.csv")

@@ -71,7 +71,7 @@ def query(
     drive_mode: str | None = None,
     shaped: bool = False,
 ) -> Answer:
-    """Query the table for fingers at these positions [m] that share one vibration.
+    """Query the table for fingers at the given positions [m] that share a vibration.
 
     Short form of `answer`; other parameters are explained there. Same as `era table query
     --target`.
@@ -164,7 +164,7 @@ def contrast_map(
     grid: Grid | None = None,
     progress: Progress = unseen,
 ) -> ContrastMap:
-    """Map the contrast of a finger at each position to these quiet fingers [m], like `era table
+    """Map the contrast between a finger at each position and the quiet fingers [m], like `era table
     map`.
 
     drive_modes: several to compare them, default the table's; level_db_sl: at each position; grid:

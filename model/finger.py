@@ -158,7 +158,7 @@ def _one(x: float, y: float, plate: Plate) -> tuple[FloatArray, FloatArray]:
 
 @dataclass(frozen=True)
 class Grid:
-    """A grid of target cells: nx by ny equal rectangles over the plate, numbered along x first."""
+    """Grid of target cells: nx by ny equal rectangles over the plate, numbered along x first."""
 
     nx: int
     ny: int

@@ -289,9 +289,9 @@ class Sensation:
     vibration of another finger. `held back`: not played; the contrast is what it would have had.
     """
     layer: int | None = None
-    """Number of the layer that plays its vibration, None without one."""
+    """Number of the layer that plays the finger's vibration, None if no layer does."""
     level_db_sl: float = -math.inf
-    """Level of its stimulus, averaged over the duration, if limited."""
+    """Level of the finger's stimulus, averaged over the duration, if limited."""
     promised_level_db_sl: float = -math.inf
     contrast_db: float | None = None
     """Level relative to all other vibrations here, None without other vibrations.
@@ -301,23 +301,23 @@ class Sensation:
     over the rig's threshold sets, like all contrasts.
     """
     median_contrast_db: float | None = None
-    """The same contrast, median of the plates."""
+    """Median of the same contrast over the plates."""
     promised_contrast_db: float | None = None
     foreign_level_db_sl: float | None = None
     """Promised level of all other vibrations at the loudest point here, relative to the lowest
     threshold.
 
-    The highest over the rig's threshold sets, up to 30 dB above `rig_foreign_level_db_sl`. It
-    decides whether others can be felt. Do not compare it with this finger's level.
+    The highest over the rig's threshold sets, up to 30 dB above `rig_foreign_level_db_sl`. Use it
+    to decide whether others can be felt, but do not compare it with this finger's own level.
     """
     rig_foreign_level_db_sl: float | None = None
     """The same level relative to the rig's own threshold set, like the finger's own levels."""
     lowered_db: float = 0.0
     """Reduction below the requested level [dB]."""
     is_disturbing: bool = False
-    """Whether it is held back because of another finger's max_foreign_db_sl."""
+    """Whether the vibration is held back because of another finger's max_foreign_db_sl."""
     pauses: bool = False
-    """Whether it ends, or is modulated."""
+    """Whether the vibration ends or is modulated."""
 
     @property
     def is_foreign_felt(self) -> bool:
@@ -332,9 +332,9 @@ class Layer:
     excitation: Excitation
     """Tones of all ERAs."""
     fingers: tuple[int, ...] = (0,)
-    """Fingers that feel it, by number."""
+    """Numbers of the fingers that feel the layer."""
     side_bands: tuple[Excitation, ...] = ()
-    """Additional excitations that modulate its strength."""
+    """Additional excitations that modulate the layer's amplitude."""
     ramp: float = ONSET_RAMP
     """Duration [s] of the plain onset and ending."""
     onset: Envelopes | None = None
@@ -345,11 +345,12 @@ class Layer:
     contrast_to_plate_db: float | None = None
     """Level relative to the plate more than 50 mm away (RMS), if there is no other finger."""
     swings: tuple[Swing, ...] = ()
-    """Possible envelopes of its level; empty for a continuous layer."""
+    """Possible envelopes of the layer's level; empty for a continuous layer."""
 
     @property
     def frequency(self) -> float | None:
-        """Its frequency [Hz] without side bands; None if it is empty or has several."""
+        """Frequency [Hz] without side bands; None if the layer is empty or has several
+        frequencies."""
         frequencies = {tone.frequency for tone in self.excitation.values()}
         return frequencies.pop() if len(frequencies) == 1 else None
 
@@ -426,7 +427,7 @@ class Answer:
     """Layers to play for fingers, and the resulting sensations."""
 
     asked: tuple[Finger, ...]
-    """The fingers, with their requests."""
+    """Fingers with their requests."""
     contents: Contents
     """Played contents and quiet fingers."""
     tones: Tones
@@ -441,7 +442,7 @@ class Answer:
     frequencies: FloatArray
     """Frequencies (f,) of the table [Hz]."""
     highest_drives: FloatArray
-    """Amplitude of each ERA at full level (f, eras) of the table."""
+    """Amplitude of each ERA at full level (f, eras), from the table."""
     thresholds: Float32Array
     """Detection threshold at each frequency (f,) [m/s²]."""
     envelopes: tuple[tuple[Envelopes | None, Envelopes | None], ...] = ()
@@ -608,7 +609,7 @@ class Answer:
 
     @property
     def promised_worst_db(self) -> float | None:
-        """Promised contrast [dB] of the worst finger, None for one finger alone."""
+        """Promised contrast [dB] of the worst finger, None for a single finger."""
         worst = self.tones.worst_db
         return None if math.isnan(worst) else worst
 

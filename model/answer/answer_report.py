@@ -152,7 +152,7 @@ class Measures:
     transient_contrast_db: float | None
     """Contrast of accelerations over the first 100 ms, None without other fingers."""
     residual_db: float
-    """Residual vibration in the 100 ms after the end, relative to the steady one."""
+    """Residual vibration in the 100 ms after the end, relative to the steady vibration."""
     concentration: Concentration | None
     """None with other fingers."""
     is_imperceptible_to_quiet: bool | None

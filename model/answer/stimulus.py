@@ -77,7 +77,8 @@ class Stimulus:
     From MIN_MODULATION to MAX_MODULATION, for a stimulus that is continuous or has an envelope.
     """
     is_limit: bool = False
-    """Whether the level is an upper limit; it is then as strong as quiet fingers allow."""
+    """Whether the level is an upper limit; the stimulus is then as strong as quiet fingers
+    allow."""
     name: str | None = None
     """Fingers whose stimuli have the same name can share one vibration."""
     course: "Course | None" = field(default=None, hash=False, repr=False)
@@ -135,11 +136,11 @@ class Finger:
     """A finger on the plate with its request."""
 
     at: Point
-    """Its place [m]."""
+    """Position [m]."""
     stimulus: Stimulus | None = None
-    """Stimulus that it should feel, None for nothing."""
+    """Stimulus that the finger should feel, None for nothing."""
     load: float = 1.0
-    """Its load on the plate, relative to the rig's fingertip.
+    """Load on the plate, relative to the rig's fingertip.
 
     A load above 10 is a resting hand (`HAND_LOAD`): it changes what others feel, is known only
     within a factor of 3, and has neither a stimulus nor protection.
@@ -159,7 +160,8 @@ class Finger:
     Without a stimulus and without protection only its load counts, wherever it is.
     """
     min_contrast_db: float = -math.inf
-    """Minimum promised contrast to others' vibrations; below it, these or its own are given up."""
+    """Minimum promised contrast to others' vibrations; below it, others' vibrations or the finger's
+    own are given up."""
     max_foreign_db_sl: float = math.inf
     """Maximum level of others' vibrations here; louder ones are held back.
 

@@ -182,9 +182,9 @@ class Calibration:
     prior: tuple[FloatArray, FloatArray]
     """Prior of the parameters: mean (p,) and covariance (p, p)."""
     dead_sensors: tuple[str, ...]
-    """Sensors left out of the fit, without a signal."""
+    """Sensors without a signal, left out of the fit."""
     dead_eras: tuple[str, ...]
-    """ERAs left out of the fit, which do not move the plate."""
+    """ERAs that do not move the plate, left out of the fit."""
 
     def to_frame(self) -> Any:
         """Return parameters before and after, units and errors as a pandas DataFrame.
@@ -208,7 +208,7 @@ class Calibration:
 
     @cached_property
     def rig(self) -> Rig:
-        """Calibrated rig: without form errors, with its gains and its uncertainty."""
+        """Calibrated rig with its gains and uncertainty, without form errors."""
         eras = []
         for era, gains in zip(self._fitted.eras, self._gains.T.tolist(), strict=True):
             rows = zip(self.measurement.frequencies.tolist(), gains, strict=True)
@@ -332,7 +332,7 @@ class Calibration:
 
     @cached_property
     def held_out(self) -> HeldOutSensors | None:
-        """Fit without some of the sensors of known scale, and predict their responses.
+        """Fit without some sensors of known scale, and predict their responses.
 
         The prediction uses the rig as written to its file, without other form errors. None if too
         few sensors remain for a fit.
@@ -607,10 +607,10 @@ def calibrate(
 ) -> Calibration:
     """Fit a rig to responses measured on it, after checking them with `check_consistency`.
 
-    all_scales: estimate the scale of every sensor, not only of wrong ones; progress: called with
-    the number of fits done and the total. Raises InputError if fewer than three sensors have a
-    signal, for a plate of another size, for impossible gains, and for suspensions or feet at a
-    bound.
+    all_scales: estimate the scale of every sensor, not only of sensors with a wrong scale;
+    progress: called with the number of fits done and the total. Raises InputError if fewer than
+    three sensors have a signal, for a plate of another size, for impossible gains, and for
+    suspensions or feet at a bound.
     """
     # All scales are free at first, so that a wrong one does not bias the fit.
     found = _fitted_with_scales(rig, measured, check_consistency(rig, measured))

@@ -306,7 +306,7 @@ def _under_fingertips(
 class SupportedModes:
     """Natural frequencies (n,) [Hz], ascending, damping ratios (n,), and shapes by `at`.
 
-    reduced: the plate whose coordinates (r, n) the modes are given in.
+    coordinates (r, n): the modes in the coordinates of the plate `reduced`.
     """
 
     natural_frequencies: FloatArray

@@ -82,7 +82,7 @@ class Uncertainty:
     stiffness: float = 0.1
     """Stiffness of each ERA, relative."""
     damping: float = 1.5
-    """Factor, for the ERAs' damping and for the plate's loss factor; 1 for no uncertainty."""
+    """Factor on the ERAs' damping and on the plate's loss factor; 1 for no uncertainty."""
     fingertip: float = 0.5
     """Logarithm of each finger's load."""
     common_gain: float = 0.0
@@ -108,8 +108,8 @@ class Uncertainty:
     foreign_mass: float = 0.0
     """Mass [kg] of an object anywhere on the plate, 0 if none is expected."""
     mode_frequency: float = 0.0
-    """Natural frequency of each mode individually, relative, in addition to shifts common to
-    all."""
+    """Natural frequency of each mode individually, relative, in addition to shifts common to all
+    modes."""
     mode_amplitude: float = 0.0
     """Amplitude of each elastic mode shape individually, relative."""
 
@@ -210,9 +210,9 @@ class Rig:
     masses: tuple[PointLoad, ...] = ()
     """Masses on the plate and passive supports; ERAs without an amplifier come last."""
     laminate: Laminate | None = None
-    """Layers of the plate, even if it is solved as a homogeneous one; None for a single layer."""
+    """Layers of the plate, even if it is solved as a homogeneous plate; None for a single layer."""
     uncertainty: Uncertainty = field(default_factory=Uncertainty)
-    """Uncertainty of its parameters."""
+    """Uncertainty of the rig's parameters."""
     fingertip: Fingertip | None = field(default_factory=Fingertip)
     """Load of each finger on the plate; None for massless fingers."""
     threshold: str = DEFAULT_THRESHOLD

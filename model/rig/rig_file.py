@@ -478,8 +478,8 @@ def merged_keys(base: Value, over: Value, *, is_final: bool = True) -> Any:
 def load_rig(path: Path | str, *, mesh: str | None = None) -> Rig:
     """Read a rig file; mesh: `auto` or NXxNY, replaces the file's mesh.
 
-    Raises ConfigError with all problems of the file; InputError for an invalid mesh. This mesh can
-    be coarser than a file allows, to study its error.
+    Raises ConfigError with all problems of the file; InputError for an invalid mesh. The mesh can
+    be coarser than a rig file allows, to study its error.
 
     Example:
         >>> rig = era.load_rig("examples/paper_plate.yaml")

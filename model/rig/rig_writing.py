@@ -328,7 +328,7 @@ def rig(
 
 
 def save_rig(rig: Rig, path: Path | str) -> None:
-    """Write a rig file that reads back as this rig: its file's text, or all of its keys.
+    """Write a rig file that reads back as this rig: the text of its file, or all its keys.
 
     Raises InputError for a rig that a file cannot express, OSError if the file cannot be written.
 
@@ -353,7 +353,7 @@ def save_rig(rig: Rig, path: Path | str) -> None:
 
 
 def change_rig(rig: Rig, **changes: Any) -> Rig:
-    """Return a rig with other keys, of the plate (thickness=0.002) or of whole sections.
+    """Return a rig with changed keys of the plate (thickness=0.002) or changed sections.
 
     `plate` and `eras` change only the given keys: eras={"SW": {"stiffness": 2e4}}. Dependent values
     are computed again: damping from `damping_ratio`, a mesh `auto`, the equivalent plate of a

@@ -309,21 +309,21 @@ def _places(plate: Plate, seed: list[int]) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class ContrastMap:
-    """Contrast of a finger at every place to the same quiet fingers, by drive mode."""
+    """Contrast between a finger at each position and the same quiet fingers, by drive mode."""
 
     x: FloatArray
-    """Places (nx,) along x [m]."""
+    """Positions (nx,) along x [m]."""
     y: FloatArray
-    """Places (ny,) along y [m]."""
+    """Positions (ny,) along y [m]."""
     quiet: tuple[Point, ...]
-    """Places of the quiet fingers [m]."""
+    """Positions of the quiet fingers [m]."""
     promised_db: dict[str, FloatArray]
     """Promised felt contrast (ny, nx), on 90 % of plates, by drive mode.
 
     NaN where the level is not reached, and under a quiet finger.
     """
     nominal_db: dict[str, FloatArray]
-    """The same, of the nominal plate."""
+    """The same on the nominal plate."""
 
     def __repr__(self) -> str:
         modes = ", ".join(self.promised_db)

@@ -268,7 +268,7 @@ class LocalizationTable:
     raster: Raster
     grid: Grid
     drive_mode: str
-    """Default of a question."""
+    """Default drive mode of a query."""
     code_version: str
     frequencies: FloatArray
     """(f,) [Hz]."""
@@ -279,11 +279,12 @@ class LocalizationTable:
     dispersion_frequencies: FloatArray
     """(k,) [Hz], of `dispersion`; k = 0 for none."""
     dispersion: ComplexArray
-    """Change (k, r) [rad²/s²] of its omega² with frequency (`model.structure.modal_elasticity`)."""
+    """Change (k, r) [rad²/s²] of the plate's omega² with frequency
+    (`model.structure.modal_elasticity`)."""
     attachment_shapes: FloatArray
-    """Its shapes (eras + masses, r) [1/sqrt(kg)] at ERAs and masses."""
+    """Mode shapes (eras + masses, r) [1/sqrt(kg)] at ERAs and masses."""
     shapes: NDArray[np.float32]
-    """Its shapes (points, r) [1/sqrt(kg)] on the raster."""
+    """Mode shapes (points, r) [1/sqrt(kg)] on the raster."""
     reference_mesh: PlateMesh
     discretisation_error: FloatArray
     """Estimated relative L2 error (f,) of the fields over the raster (`model.vibration`), maximum
@@ -301,7 +302,7 @@ class LocalizationTable:
 
     @property
     def fingerprint(self) -> str:
-        """Fingerprint of the rig that this table is for."""
+        """Fingerprint of the table's rig."""
         return fingerprint_of(self)
 
     @property

@@ -106,10 +106,10 @@ class Vibration:
 class PlatePlayback:
     """Records of fingertips while layers played, from rest at time 0.
 
-    vibrations: each layer alone; a finger that none is for is quiet; settled [s]: end of the
-    onsets; threshold: of levels and contrasts, by one set, where answers have the least over
-    several. Steady measures are fitted to the last 0.25 s, after the plate has settled, which
-    `play` sees to; those of signals are of the power in these, settled or not.
+    vibrations: each layer alone; a finger without a layer is quiet; settled [s]: end of the onsets;
+    threshold: of levels and contrasts, by one set, where answers have the least over several.
+    Steady measures are fitted to the last 0.25 s, after the plate has settled, which `play` sees
+    to; those of signals are of the power in these, settled or not.
     """
 
     vibrations: tuple[Vibration, ...]
@@ -133,12 +133,12 @@ class PlatePlayback:
 
     @property
     def frequencies(self) -> tuple[float, ...]:
-        """Frequencies that are driven [Hz], ascending."""
+        """Driven frequencies [Hz], ascending."""
         return tuple(sorted({each for one in self.vibrations for each in one.frequencies}))
 
     @cached_property
     def records(self) -> tuple[FingerRecord, ...]:
-        """Record of each finger, of all layers together, in the order in which they were given."""
+        """Record of each finger with all layers playing, in the given order of fingers."""
         return tuple(
             replace(alone[0], accelerations=np.sum([one.accelerations for one in alone], axis=0))
             for alone in zip(*[each.records for each in self.vibrations], strict=True)
@@ -184,24 +184,26 @@ class PlatePlayback:
 
     @property
     def level_db_sl(self) -> float:
-        """Steady level of a target's own [dB SL], mean over its fingertip; minimum over targets."""
+        """Steady level of a target's own layers [dB SL], mean over its fingertip; minimum over
+        targets."""
         return min([self.fingers[number].level_db_sl for number in self._own])
 
     @property
     def quiet_level_db_sl(self) -> float | None:
-        """Steady level at the loudest quiet point [dB SL]; None where a finger is alone."""
+        """Steady level at the loudest quiet point [dB SL]; None without a quiet finger."""
         felt = [each for number, each in enumerate(self.fingers) if number not in self._own]
         return max([each.foreign_level_db_sl for each in felt], default=None)
 
     @property
     def contrast_db(self) -> float | None:
-        """The least steady contrast of all fingers [dB]; None if alone."""
+        """Lowest steady contrast of all fingers [dB]; None for a single finger."""
         found = [each.contrast_db for each in self.fingers if each.contrast_db is not None]
         return min(found, default=None)
 
     @property
     def transient_contrast_db(self) -> float | None:
-        """Contrast [dB] of the peaks over the first 100 ms to quiet fingers; None without these."""
+        """Contrast [dB] of the peaks over the first 100 ms to quiet fingers; None without quiet
+        fingers."""
         targets, quiet = self.targets, self.quiet
         if not quiet or self.contrast_db is None:
             return None

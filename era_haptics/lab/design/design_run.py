@@ -160,7 +160,7 @@ class RankedLayout:
 
     @property
     def eras(self) -> tuple[Actuator, ...]:
-        """Its ERAs, without wiring."""
+        """ERAs of the layout, without wiring."""
         return self.problem.eras(self.found.positions)
 
     @property
@@ -184,7 +184,7 @@ class RankedLayout:
 
     @property
     def rig(self) -> Rig:
-        """The rig with these ERAs on free channels, if necessary of a new, simulated amplifier."""
+        """The rig with these ERAs on free channels, if necessary on a new, simulated amplifier."""
         keys = layout_keys(self.problem, self.found.positions, stated(self.problem.rig).data)
         return rig_of(Document("RankedLayout.rig", "", keys))
 

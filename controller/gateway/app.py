@@ -334,6 +334,7 @@ class Gateway:
             )
         finally:
             self._sessions.discard(socket)
+            connection.end_websocket()
         return socket
 
     async def _end_sessions(self, _: web.Application) -> None:

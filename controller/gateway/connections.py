@@ -185,6 +185,10 @@ class ClientConnection(asyncio.BufferedProtocol):
         """Close it without sending what waits to be sent."""
         self._transport.abort()
 
+    def end_websocket(self) -> None:
+        """Abort the connection after a timeout, in case the client does not read the last data."""
+        asyncio.get_running_loop().call_later(CLIENT_TIMEOUT, self.abort)
+
     # Called by the transport:
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:

@@ -68,7 +68,6 @@ from processes.daemons import (
     running_daemon,
     until_state,
 )
-from processes.gateways import ERA as INSTALLED_ERA
 from processes.gateways import (
     TOKEN,
     UNCONFIRMED,
@@ -494,15 +493,6 @@ def test_page_and_daemon(tmp_path: Path) -> None:
 
 ENABLED = "OPERATION_ENABLED"
 
-IMPATIENT = """
-import sys
-from era_haptics.command import main
-from controller.gateway import app, bridge, connections
-app.CLIENT_TIMEOUT = connections.CLIENT_TIMEOUT = bridge.SEND_TIMEOUT = 1.0
-sys.exit(main())
-"""
-"""`era` with shorter timeouts of the gateway."""
-
 
 @pytest.fixture(scope="module")
 def daemon(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
@@ -540,12 +530,9 @@ def watched(daemon: Path) -> Iterator[None]:
 
 
 @pytest.fixture
-def gateway(
-    request: pytest.FixtureRequest, watched: None, daemon: Path, tmp_path: Path
-) -> Iterator[GatewayProcess]:
-    """A gateway, which must not log anything; parameter: the command instead of `era`."""
-    program = getattr(request, "param", (INSTALLED_ERA,))
-    with gateway_process(tmp_path, daemon, program=program) as made:
+def gateway(watched: None, daemon: Path, tmp_path: Path) -> Iterator[GatewayProcess]:
+    """A gateway, which must not log anything."""
+    with gateway_process(tmp_path, daemon) as made:
         wait_for_daemon(made)
         yield made
         if made.process.poll() is None:
@@ -572,7 +559,6 @@ def test_gateway_serves_with_two_thousand_silent_connections(gateway: GatewayPro
 
 
 @pytest.mark.real_time
-@pytest.mark.parametrize("gateway", [(sys.executable, "-c", IMPATIENT)], indirect=True)
 def test_gateway_closes_connections_that_trickle_or_do_not_read(gateway: GatewayProcess) -> None:
     """Single bytes do not extend a timeout; other clients are served meanwhile."""
     head = f"POST /api/v1/arm HTTP/1.1\r\nHost: {gateway.host}\r\n"

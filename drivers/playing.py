@@ -28,7 +28,8 @@ from drivers.protocol.records import Values
 from drivers.protocol.sets import Command, Envelope, LayerSet
 
 _PER_STEP = QUANTITIES["envelope_step"].per_unit
-_PER_FULL, _PER_DEGREE = QUANTITIES["level"].per_unit, QUANTITIES["phase"].per_unit
+_PER_FULL = QUANTITIES["level"].per_unit
+_PER_DEGREE = QUANTITIES["phase"].per_unit
 _PER_HERTZ = QUANTITIES["frequency"].per_unit
 _SILENCE = Command(channel=0, frequency=0, level=0, phase=0)
 SAME = 1e-6
@@ -99,7 +100,8 @@ class VoiceTransition:
             return self.last
         if not uncertainty:
             return self.at(time)
-        since, until = max(time - uncertainty, self.start), max(time + uncertainty, self.start)
+        since = max(time - uncertainty, self.start)
+        until = max(time + uncertainty, self.start)
         return max(self.points(since, until), key=abs)
 
     def points(self, since: float, until: float = math.inf) -> tuple[complex, ...]:
@@ -197,14 +199,16 @@ class Voice:
         uncertainty: see `Playback` [s]. If it is uncertain which ends sooner, the largest amplitude
         of both lasts until both are over.
         """
-        transition, end = self.transition, time + ramp
+        transition = self.transition
+        end = time + ramp
         if transition.last or transition.end > end + uncertainty + SAME:
             is_over = time - uncertainty >= transition.end
             first = transition.last if is_over else transition.reached(time, uncertainty)
             transition = VoiceTransition(time, ramp, first, 0j, end)
         elif uncertainty and transition.end > end - uncertainty:
-            largest, over = transition.peak(time - uncertainty), max(transition.end, end)
-            transition = VoiceTransition(over, 0.0, complex(largest), 0j, over)
+            peak = transition.peak(time - uncertainty)
+            last_end = max(transition.end, end)
+            transition = VoiceTransition(last_end, 0.0, complex(peak), 0j, last_end)
         return Voice(self.layer, self.frequency, self.began, transition, True, self.ending)
 
     def ended(self, time: float, ramp: float, uncertainty: float = 0.0) -> "Voice":
@@ -218,9 +222,9 @@ class Voice:
         """Return it with its level and its ending scaled by a factor, along a ramp [s]."""
         transition = self.transition
         last = transition.last * factor
-        led = VoiceTransition(time, ramp, transition.at(time), last, time + ramp)
+        scaled = VoiceTransition(time, ramp, transition.at(time), last, time + ramp)
         ending = None if self.ending is None else self.ending.scaled(factor)
-        return replace(self, transition=led, ending=ending)
+        return replace(self, transition=scaled, ending=ending)
 
     def corrected(self, command: Command | None) -> "Voice":
         """Return it as it leads to the level and phase of a command; None: to silence."""
@@ -247,27 +251,29 @@ def voices_after(
     for channel, voices in enumerate(channels):
         command = commands.get(channel, _SILENCE)
         # This is `Command.is_driven`, written out for speed.
-        is_driven = is_new = command.level > 0 or command.onset is not None
-        last, frequency = amplitude_of(command.level, command.phase), command.frequency / _PER_HERTZ
-        after: list[Voice] = []
+        is_driven = command.level > 0 or command.onset is not None
+        is_new = is_driven
+        last = amplitude_of(command.level, command.phase)
+        frequency = command.frequency / _PER_HERTZ
+        voices_now: list[Voice] = []
         for voice in voices:
             if voice.layer != layer or voice.has_ended:
-                after.append(voice)
+                voices_now.append(voice)
             elif is_driven and command.keep_phase and voice.frequency == frequency:
                 is_new = False
                 first = voice.transition.reached(time, uncertainty)
                 transition = along(command.onset, time, ramp, first, last)
-                after.append(replace(voice, transition=transition, ending=command.ending))
+                voices_now.append(replace(voice, transition=transition, ending=command.ending))
             elif is_driven or command.skip_ending:
-                after.append(voice.faded(time, ramp, uncertainty))
+                voices_now.append(voice.faded(time, ramp, uncertainty))
             else:
-                after.append(voice.ended(time, ramp, uncertainty))
+                voices_now.append(voice.ended(time, ramp, uncertainty))
         if is_new:
             transition = VoiceTransition(time, ramp, 0j, last, time + ramp)
             if command.onset is not None:  # this is rare, so the usual case is without a call
                 transition = along(command.onset, time, ramp, 0j, last)
-            after.append(Voice(layer, frequency, time, transition, False, command.ending))
-        all_after.append(tuple(after))
+            voices_now.append(Voice(layer, frequency, time, transition, False, command.ending))
+        all_after.append(tuple(voices_now))
     return all_after
 
 
@@ -332,7 +338,8 @@ LAYERS_MAX = QUANTITIES["layer_count"].maximum
 """Largest number of layers of an amplifier."""
 _LEVEL, _PHASE = QUANTITIES["level"], QUANTITIES["phase"]
 _FREQUENCY, _SLEW = QUANTITIES["frequency"], QUANTITIES["slew"]
-_PER_RAMP, _PER_VALID_FOR = QUANTITIES["ramp"].per_unit, QUANTITIES["valid_for"].per_unit
+_PER_RAMP = QUANTITIES["ramp"].per_unit
+_PER_VALID_FOR = QUANTITIES["valid_for"].per_unit
 
 
 @dataclass
@@ -392,25 +399,24 @@ class Playback:
         """Play a set from a time [s] on."""
         if time >= self.changes_at:  # otherwise the call would change nothing
             self.advance(time)
-        for one in layers:
-            layer = self._layers.setdefault(one.layer, _Layer())
-            if one.renew:
-                layer.ends = _end_of(one, time) + self.uncertainty
+        for layer_set in layers:
+            layer = self._layers.setdefault(layer_set.layer, _Layer())
+            if layer_set.renew:
+                layer.ends = _end_of(layer_set, time) + self.uncertainty
                 continue
-            start = self.onsets_end(one.layer, time) if one.after else time
-            layer.waiting = (start, one, token) if start > time else None
+            start = self.onsets_end(layer_set.layer, time) if layer_set.after else time
+            layer.waiting = (start, layer_set, token) if start > time else None
             if start <= time:
-                self._start(one, token, time)
+                self._start(layer_set, token, time)
         self._note_changes()
 
     def silence(self, time: float, ramp: float) -> None:
         """Fade all layers along a ramp [s] without their endings, and drop waiting sets."""
         self.advance(time)
         self._layers.clear()
-        self.all_voices = [
-            tuple(voice.faded(time, ramp, self.uncertainty) for voice in voices)
-            for voices in self.all_voices
-        ]
+        for channel, voices in enumerate(self.all_voices):
+            faded = [voice.faded(time, ramp, self.uncertainty) for voice in voices]
+            self.all_voices[channel] = tuple(faded)
         self._note_changes()
 
     def advance(self, time: float) -> None:
@@ -429,9 +435,9 @@ class Playback:
         # that waited for its end can continue it.
         self._drop_faded(math.nextafter(at - self.uncertainty, -math.inf), number)
         if layer.waiting is not None and layer.waiting[0] <= at:
-            _, one, token = layer.waiting
+            _, layer_set, token = layer.waiting
             layer.waiting = None
-            self._start(one, token, at)
+            self._start(layer_set, token, at)
         else:
             self._end(number, at)
         self._note_changes()
@@ -439,23 +445,27 @@ class Playback:
     def _drop_faded(self, time: float, layer: int | None = None) -> None:
         """Drop voices that are silent from a time [s]; layer: only its voices, None for all."""
         for channel, voices in enumerate(self.all_voices):
-            kept = []
+            remaining = []
             for voice in voices:
                 is_other = layer is not None and voice.layer != layer
                 if is_other or voice.transition.last or voice.transition.end > time:
-                    kept.append(voice)
-            if len(kept) < len(voices):
-                self.all_voices[channel] = tuple(kept)
+                    remaining.append(voice)
+            if len(remaining) < len(voices):
+                self.all_voices[channel] = tuple(remaining)
 
     def _note_changes(self) -> None:
         """Update the voices, and the time of the next fade, end or start."""
-        first, settles, waiting = math.inf, -math.inf, []
+        first = math.inf
+        settles = -math.inf
+        waiting = []
         for layer in self._layers.values():
             first = min(first, layer.ends)
             if layer.waiting is not None:
                 first = min(first, layer.waiting[0])
                 waiting.append(layer.waiting[1])
-        self.next_due, self.waiting, tokens = first, waiting, {}
+        self.next_due = first
+        self.waiting = waiting
+        tokens = {}
         for voices in self.all_voices:
             for voice in voices:
                 end = voice.transition.end
@@ -464,7 +474,9 @@ class Playback:
                     first = end
                 if not voice.has_ended:
                     tokens[voice.layer] = self._layers[voice.layer].token
-        self.changes_at, self.settles_at, self.tokens = first, settles, tokens
+        self.changes_at = first
+        self.settles_at = settles
+        self.tokens = tokens
 
     def add_ends(self, layer: int, time: float) -> None:
         """Add copies of the voices of a layer that fall silent at a time [s].
@@ -473,53 +485,50 @@ class Playback:
         """
         ramp = self.ramp_of(layer)
         for channel, voices in enumerate(self.all_voices):
-            ends = [
-                each.ended(time, ramp, self.uncertainty)
-                for each in voices
-                if each.layer == layer and not each.has_ended
-            ]
+            ends = []
+            for voice in voices:
+                if voice.layer == layer and not voice.has_ended:
+                    ends.append(voice.ended(time, ramp, self.uncertainty))
             self.all_voices[channel] = (*voices, *ends)
 
-    def correct(self, one: LayerSet, token: int) -> None:
+    def correct(self, achieved: LayerSet, token: int) -> None:
         """Correct a layer to the playback reported by an amplifier for the set with this token."""
-        if one.layer not in self._layers or self._layers[one.layer].token != token:
+        layer = achieved.layer
+        if layer not in self._layers or self._layers[layer].token != token:
             return
-        commands = {command.channel: command for command in one.commands}
+        commands = {command.channel: command for command in achieved.commands}
         for channel, voices in enumerate(self.all_voices):
-            self.all_voices[channel] = tuple(
-                voice
-                if voice.layer != one.layer or voice.has_ended
-                else voice.corrected(commands.get(channel))
-                for voice in voices
-            )
+            corrected = []
+            for voice in voices:
+                if voice.layer == layer and not voice.has_ended:
+                    voice = voice.corrected(commands.get(channel))
+                corrected.append(voice)
+            self.all_voices[channel] = tuple(corrected)
         self._note_changes()
 
     def scale(self, time: float, factor: float, ramp: float) -> None:
         """Scale all lasting tones and their endings by a factor, along a ramp [s]."""
         self.advance(time)
-        self.all_voices = [
-            tuple(
-                voice if voice.has_ended else voice.scaled(time, factor, ramp) for voice in voices
-            )
-            for voices in self.all_voices
-        ]
+        for channel, voices in enumerate(self.all_voices):
+            scaled = []
+            for voice in voices:
+                scaled.append(voice if voice.has_ended else voice.scaled(time, factor, ramp))
+            self.all_voices[channel] = tuple(scaled)
         self._note_changes()
 
     def playing(self, layer: int) -> LayerSet:
         """Return the target set of a layer's voices, without envelopes; empty if silent."""
-        commands = tuple(
-            Command(
-                channel,
-                _FREQUENCY.to_wire(voice.frequency),
-                _LEVEL.to_wire(abs(voice.transition.last)),
-                _PHASE.to_wire(math.degrees(cmath.phase(voice.transition.last))),
-            )
-            for channel, voices in enumerate(self.all_voices)
-            for voice in voices
-            if voice.layer == layer and not voice.has_ended
-        )
-        known = self._layers.get(layer, _Layer()) if commands else _Layer()
-        return LayerSet(layer, known.ramp, known.valid_for, commands)
+        commands = []
+        for channel, voices in enumerate(self.all_voices):
+            for voice in voices:
+                if voice.layer == layer and not voice.has_ended:
+                    last = voice.transition.last
+                    frequency = _FREQUENCY.to_wire(voice.frequency)
+                    level = _LEVEL.to_wire(abs(last))
+                    phase = _PHASE.to_wire(math.degrees(cmath.phase(last)))
+                    commands.append(Command(channel, frequency, level, phase))
+        state = self._layers.get(layer, _Layer()) if commands else _Layer()
+        return LayerSet(layer, state.ramp, state.valid_for, tuple(commands))
 
     def level(self, channel: int, time: float) -> float:
         """Return the largest amplitude of a channel; voices of equal frequency interfere."""
@@ -535,9 +544,12 @@ class Playback:
 
     def next_tokens(self, layer: int) -> set[int]:
         """Return the possible tokens of a layer, now or after its due changes."""
-        known = self._layers.get(layer)
-        waiting = () if known is None or known.waiting is None else known.waiting[2:]
-        return {0, self.tokens.get(layer, 0), *waiting}
+        tokens = {0, self.tokens.get(layer, 0)}
+        state = self._layers.get(layer)
+        if state is not None and state.waiting is not None:
+            _, _, waiting_token = state.waiting
+            tokens.add(waiting_token)
+        return tokens
 
     def unsure(self, by: float, half: Sequence[float] = (0.0,) * LAYERS_MAX) -> set[int]:
         """Return the layers that may end or start a waiting set by a time [s].
@@ -546,8 +558,9 @@ class Playback:
         """
         unsure = {layer for due, layer in self.dues if due - half[layer] <= by}
         for voice in chain.from_iterable(self.all_voices):
-            way = voice.transition
-            if not (way.last or voice.has_ended) and way.end - way.half <= by:
+            transition = voice.transition
+            is_falling = not (transition.last or voice.has_ended)
+            if is_falling and transition.end - transition.half <= by:
                 unsure.add(voice.layer)
         return unsure
 
@@ -564,35 +577,40 @@ class Playback:
 
     def end_of(self, layer: int) -> float:
         """Return when a layer ends by itself [s]; infinite without `valid_for`."""
-        known = self._layers.get(layer)
-        return math.inf if known is None else known.ends
+        state = self._layers.get(layer)
+        return math.inf if state is None else state.ends
 
     @property
     def ends_by(self) -> float:
         """Latest time at which all is silent by itself [s]; infinite without `valid_for`."""
-        latest = [voice.silent_from for voices in self.all_voices for voice in voices]
-        ends = [end for end in latest if end < math.inf]
+        ends = []
+        for voice in chain.from_iterable(self.all_voices):
+            if voice.silent_from < math.inf:
+                ends.append(voice.silent_from)
         for number, layer in self._layers.items():
             if layer.waiting is not None:
                 return math.inf
-            fades = [
-                voice.ended(layer.ends, layer.ramp / _PER_RAMP).transition.end
-                for voices in self.all_voices
-                for voice in voices
-                if voice.layer == number and not voice.has_ended and layer.ends < math.inf
-            ]
-            ends += fades or [layer.ends]
+            ends += self._fade_ends(number, layer) or [layer.ends]
         return max(ends, default=-math.inf)
+
+    def _fade_ends(self, number: int, layer: _Layer) -> list[float]:
+        """Return when the voices of a layer have faded [s] after it ends by itself."""
+        ends: list[float] = []
+        if layer.ends == math.inf:
+            return ends
+        ramp = self.ramp_of(number)
+        for voice in chain.from_iterable(self.all_voices):
+            if voice.layer == number and not voice.has_ended:
+                ends.append(voice.ended(layer.ends, ramp).transition.end)
+        return ends
 
     def faded_from(self, time: float) -> float:
         """Return when the fades that go on at a time have ended [s]; without fades that time."""
-        ends = [
-            voice.transition.end
-            for voices in self.all_voices
-            for voice in voices
-            if voice.transition.last == 0
-        ]
-        return max([time, *ends])
+        end = time
+        for voice in chain.from_iterable(self.all_voices):
+            if voice.transition.last == 0:
+                end = max(end, voice.transition.end)
+        return end
 
     @property
     def dues(self) -> list[tuple[float, int]]:
@@ -606,42 +624,40 @@ class Playback:
 
     def onsets_end(self, layer: int, time: float) -> float:
         """Return the end [s] of a layer's onsets with knots; `time` without any."""
-        ends = (
-            voice.transition.end
-            for voices in self.all_voices
-            for voice in voices
-            if voice.layer == layer and not voice.has_ended and voice.transition.knots
-        )
+        ends = []
+        for voice in chain.from_iterable(self.all_voices):
+            if voice.layer == layer and not voice.has_ended and voice.transition.knots:
+                ends.append(voice.transition.end)
         return max(ends, default=time)
 
     def _end(self, layer: int, time: float) -> None:
         """Let a layer fall silent along its endings."""
         ramp = self._layers.pop(layer).ramp / _PER_RAMP
-        self.all_voices = [
-            tuple(
-                each.ended(time, ramp, self.uncertainty)
-                if each.layer == layer and not each.has_ended
-                else each
-                for each in voices
-            )
-            for voices in self.all_voices
-        ]
+        for channel, voices in enumerate(self.all_voices):
+            ended = []
+            for voice in voices:
+                if voice.layer == layer and not voice.has_ended:
+                    voice = voice.ended(time, ramp, self.uncertainty)
+                ended.append(voice)
+            self.all_voices[channel] = tuple(ended)
 
-    def _start(self, one: LayerSet, token: int, time: float) -> None:
+    def _start(self, layer_set: LayerSet, token: int, time: float) -> None:
         commands: dict[int, Command] = {}
-        for command in one.commands:
+        for command in layer_set.commands:
             commands[command.channel] = command
-        ramp = one.ramp / _PER_RAMP
-        after = voices_after(self.all_voices, one.layer, commands, time, ramp, self.uncertainty)
+        ramp = layer_set.ramp / _PER_RAMP
+        after = voices_after(
+            self.all_voices, layer_set.layer, commands, time, ramp, self.uncertainty
+        )
         for channel, voices in enumerate(after):
             if len(voices) > self.voices:
                 voices = tuple(cut_to(voices, time, self.voices, self.slew))
             self.all_voices[channel] = voices
         if not commands:
-            self._layers.pop(one.layer, None)
+            self._layers.pop(layer_set.layer, None)
             return
-        ends = _end_of(one, time) + self.uncertainty
-        self._layers[one.layer] = _Layer(token, one.ramp, one.valid_for, ends)
+        ends = _end_of(layer_set, time) + self.uncertainty
+        self._layers[layer_set.layer] = _Layer(token, layer_set.ramp, layer_set.valid_for, ends)
 
 
 def playback_of(capabilities: Values) -> Playback:
@@ -650,5 +666,5 @@ def playback_of(capabilities: Values) -> Playback:
     return Playback(capabilities["channels"], capabilities["voices"], slew)
 
 
-def _end_of(one: LayerSet, time: float) -> float:
-    return time + one.valid_for / _PER_VALID_FOR if one.valid_for else math.inf
+def _end_of(layer_set: LayerSet, time: float) -> float:
+    return time + layer_set.valid_for / _PER_VALID_FOR if layer_set.valid_for else math.inf

@@ -820,9 +820,9 @@ class LimitsSection(Section):
     """Maximum fraction of any ten seconds in which one amplifier vibrates, ramps included."""
 
     rate: Annotated[float, Quantity(RATE, at_least=1, at_most=2000)] | None = None
-    """Maximum number of command sets per second sent to one amplifier, other than silence. They are
-    counted over 1.1 s, so that no second at the amplifier has more even if some are delayed. A
-    rejected set is played as soon as the limit allows.
+    """Maximum number of command sets per second sent to one amplifier, other than silence. Sets are
+    counted over 1.1 s, so that the amplifier never gets more in one second even if some are
+    delayed. A rejected set is played as soon as the limit allows.
     """
 
     def made(self) -> GuardLimits:

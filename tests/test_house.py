@@ -1,7 +1,7 @@
-"""What keeps the house in order: imports of programs, names, retired words, tests of a change.
+"""Rules for the tree: no circular imports between programs, no foreign sentences.
 
-Import contracts exclude circles within the packages; here the folders beside them are checked. What
-a machine lacks skips the tests that use it, by name, and fails them in CI.
+Import contracts exclude circles within the packages. These tests check the folders of programs, the
+table of tests to run after a change, and files that users copy.
 """
 
 import ast

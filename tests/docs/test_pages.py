@@ -1,12 +1,7 @@
-"""Pages of the docs against what they describe, and the ways that lead to them.
+"""Compare the pages with the code, and type their commands.
 
-Generated parts; what pages state and something else decides (constants, URLs, versions, figures of
-other pages, files); the references of commands, of the daemon's file and of the amplifier, read by
-a reader that knows nothing else; the ways through the files in docs/architecture.md; links and
-names of pages in code; the comparison of shown with printed output; and the tutorials, typed.
-`make docs` builds the pages.
-
-What pages show of Python: the examples of the API's page, typed in one session; notebooks.
+The tests compare generated parts, constants, schemes, commands and keys with the code. They type
+the tutorials and the Python examples, run the notebooks, and check links and file names.
 """
 
 import doctest

@@ -1,4 +1,4 @@
-"""Planted faults: patterns find their code, faults are judged rightly, and no fault is stale."""
+"""Planted faults: each pattern matches its code exactly once, and no fault is stale."""
 
 import ast
 from pathlib import Path

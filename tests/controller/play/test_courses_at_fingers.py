@@ -1,8 +1,7 @@
-"""Files of content at fingers, played over a wire in virtual time on the simulated plate.
+"""Content files at fingers, played over a wire in virtual time on the simulated plate.
 
-Beside other effects and each other, at the edge of the plate, and at other fingers; how far strong
-programs, onsets and endings move magnets, sample by sample in another solution, and how much
-programs heat coils at the frequencies that move magnets most.
+They play alone, together, at the edge of the plate and under a moving finger. Magnets must stay
+within their excursion.
 """
 
 import math

@@ -1,7 +1,6 @@
-"""A calibration and its report: feet, places of sources, form errors of a plate.
+"""Calibration and its report: parameters, feet, positions of ERAs, and form errors of a plate.
 
-Rigs are fitted to responses of plates that are known, solved without the fit's own model; Jacobians
-are those of extrapolated differences, and responses with other values those of a plate solved anew.
+Rigs are fitted to responses of plates with known parameters.
 """
 
 from collections.abc import Iterator

@@ -1,8 +1,7 @@
 """Plates in Legendre polynomials and in finite elements: modes, meshes and harmonic responses.
 
-Against independent solvers, each other and elasticity. Also stiff mounts, the functions themselves,
-plates of layers, derivatives of the stiffness by sides and Poisson's ratio, and air behind a plate
-against finite differences of its pressure and published squeeze films.
+The references are independent solvers, elasticity, finite differences of the air pressure, and
+published squeeze films. The plates include stiff mounts and laminates.
 """
 
 import math

@@ -662,8 +662,8 @@ class SensedPlate:
         return np.asarray(size / np.maximum(unit, of_rig))
 
     def errors(self, z: FloatArray, error: FloatArray) -> FloatArray:
-        """Convert standard errors of z (p,) to those of the fitted values at z in their units
-        (n,)."""
+        """Convert standard errors of z (p,) to standard errors of the fitted values at z in their
+        units (n,)."""
         is_factor = np.array([row.is_factor for row in self.rows])
         slopes = self.model.space.std[self.numbers] * np.where(is_factor, self.values(z), 1.0)
         return np.asarray(slopes * error[self.numbers])

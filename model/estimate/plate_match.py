@@ -3,7 +3,7 @@
     d_fsn ~ m_fn exp(i phi_fn) a_fsn(x) + noise,   m_fn near G_n
 
 d are measured values, a the model's values, G_n the gain of a channel. Magnitudes m vary about G_n
-with frequency, like those of real actuators. Phases phi are free, since a measurement can lack
+with frequency, like those of real actuators. Phases phi are free, because a measurement can lack
 them. Both follow from x and G, so that only these are searched (`model.estimate.fit`). Priors hold
 x near the rig's values: a large deviation is evidence against the rig.
 

@@ -28,7 +28,7 @@ from model.files.uff import DatasetBlock, blocks, numbers_in, read_nodes, rows_o
 
 _SHELLS = frozenset(range(40, 100)) | {171, 172}  # plane stress, plates, membranes, thin shells
 _BEAMS = frozenset(range(11, 38))  # whose elements have a further row
-# Analysis types. Complex modes of first order have a modal A, those of second order a mass.
+# Analysis types. First-order complex modes have a modal A, second-order ones a mass.
 _NORMAL_MODES, _FIRST_ORDER, _SECOND_ORDER = 2, 3, 7
 _MODES = (_NORMAL_MODES, _FIRST_ORDER, _SECOND_ORDER)
 _DISPLACEMENT = (0, 8)  # unknown, displacement

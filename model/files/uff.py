@@ -443,7 +443,7 @@ def read_nodes(
     nodes: dict[int, tuple[float, ...]],
     turned: set[int],
 ) -> None:
-    """Add the nodes of a dataset, and the numbers of those with local displacements."""
+    """Add the nodes of a dataset, and the numbers of nodes with local displacements."""
     size = 1 if block.kind == 15 else 2
     for count, record in enumerate(rows_of(path, block, size)):
         numbers = [number for row in record for number in row]

@@ -158,7 +158,7 @@ class ActuatorSection(Section):
     """`[x, y]`: position on the plate; at most one actuator per position."""
 
     amplifier: Identifier | None = None
-    """Amplifier that drives it; none for an ERA that only supports the plate.
+    """Amplifier that drives the actuator; none for an ERA that only supports the plate.
 
     Limits: a name under `amplifiers`
     """
@@ -297,7 +297,7 @@ class ExciterSection(ActuatorSection):
     """
 
     weight: Annotated[float, Quantity(MASS, above=0, at_most=10)] | None = None
-    """Mass M that moves if the coil is glued: the magnet, usually with the housing.
+    """Mass M that moves when the coil is glued: the magnet, usually with the housing.
 
     Default: of the type
     """

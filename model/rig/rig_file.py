@@ -71,7 +71,7 @@ _STRIPS = " with strips of "
 def mesh_of(
     text: str, plate: Plate, *, frequency_max: float, stiffness: float = 0.0, foot: float = 0.0
 ) -> PlateMesh:
-    """Return the mesh `auto` or `auto A %`, accurate up to a frequency [Hz], or that of
+    """Return the mesh `auto` or `auto A %`, accurate up to a frequency [Hz], or the mesh of
     `parse_mesh`.
 
     `auto` uses polynomials over the plate for a response error of A %, default 1 %. stiffness

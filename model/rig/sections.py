@@ -374,8 +374,8 @@ class PlateSection(Section):
         """Relative standard deviation of the plate's modulus over density due to weather.
 
         At this value 90 % of plates keep a promise at both ends of the range; 0 without a range.
-        For layers, that of the layer that changes most; for materials given by numbers, that of the
-        material with the same name.
+        For layers, the change of the layer that changes most; for materials given by numbers, that
+        of the material with the same name.
         """
         if self.temperature is None and self.humidity is None:
             return 0.0
@@ -817,7 +817,7 @@ class LimitsSection(Section):
     its own."""
 
     duty: Annotated[float, Quantity(RATIO, above=0, at_most=1)] | None = None
-    """Maximum fraction of any ten seconds in which one amplifier vibrates, ramps included."""
+    """Maximum fraction of any ten seconds in which an amplifier vibrates, including ramps."""
 
     rate: Annotated[float, Quantity(RATE, at_least=1, at_most=2000)] | None = None
     """Maximum number of command sets per second sent to one amplifier, other than silence. Sets are

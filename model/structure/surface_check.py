@@ -159,7 +159,7 @@ def _pairs(modes: ModeShapes) -> tuple[FloatArray, FloatArray]:
 
 
 def _named(modes: ModeShapes, pair: NDArray[np.int_]) -> str:
-    """Two modes by their numbers in the file and their frequencies."""
+    """Two modes: their numbers in the file and their frequencies."""
     first, second = (int(number) for number in pair)
     return (
         f"modes {first + 1} and {second + 1} (at {modes.frequencies[first]:.5g} and "

@@ -9,7 +9,7 @@ Verification of a table: recomputes a sample by other methods.
 
 - Content: fields on the raster and at the cells, against the plate solved at each frequency without
   modes (`model.spectral.direct_solution`), relative L2. On finite elements, and with measured
-  modes, against the free plate solved anew with the ERAs attached (`model.reduction.free_plate`).
+  modes, against the free plate solved again with the ERAs attached (`model.reduction.free_plate`).
 - Answers: level and contrast at random contacts, against the same with the fingers attached, too.
 - Promises: the felt contrast on 90 % of exactly solved plates.
 - Answers in time: amplitudes at the fingertips once the pattern, started from rest on the plate in

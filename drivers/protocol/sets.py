@@ -104,8 +104,11 @@ class Command:
     @property
     def peak(self) -> int:
         """Highest level, including onset and ending."""
-        shapes = [each for each in (self.onset, self.ending) if each is not None]
-        return max(self.level, *(each.peak for each in shapes)) if shapes else self.level
+        peak = self.level
+        for envelope in (self.onset, self.ending):
+            if envelope is not None:
+                peak = max(peak, envelope.peak)
+        return peak
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,10 +128,10 @@ class LayerSet:
 
 def is_vibrating(*layers: LayerSet) -> bool:
     """Whether any layer plays after its set, so that it spends time and rate."""
-    for one in layers:
-        if one.renew:
+    for layer in layers:
+        if layer.renew:
             return True
-        for command in one.commands:  # as `Command.is_driven`, without a call
+        for command in layer.commands:  # as `Command.is_driven`, without a call
             if command.level > 0 or command.onset is not None:
                 return True
     return False
@@ -171,10 +174,11 @@ def unpack_layers(words: Sequence[int], can: Values = _WIDEST) -> tuple[LayerSet
         _check_length(words, at)
         head, at = LAYER.read(words, at)
         count = head.pop("count")
-        head["after"], head["renew"] = bool(head["after"]), bool(head["renew"])
+        head["after"] = bool(head["after"])
+        head["renew"] = bool(head["renew"])
         if head["renew"] if count else head["after"]:
             raise Refusal("renew must be without commands, after with some")
-        if any(head["layer"] == other.layer for other in layers):
+        if any(head["layer"] == layer.layer for layer in layers):
             raise Refusal(f"layer {head['layer']} must occur once in a set")
         for name, highest in (("layer", can["layers"] - 1), ("ramp", can["ramp_max"])):
             if head[name] > highest:
@@ -197,10 +201,12 @@ def unpack_layers(words: Sequence[int], can: Values = _WIDEST) -> tuple[LayerSet
 def _check_length(words: Sequence[int], at: int) -> None:
     """Raise Refusal where the stream ends amid the layer that begins at an index."""
     try:
-        count, at = words[at] & _COUNTS - 1, at + LAYER.words
+        count = words[at] & _COUNTS - 1
+        at += LAYER.words
         for _ in range(count):
-            shapes, at = words[at] >> _ENDING & 3, at + COMMAND.words  # onset and ending
-            for _ in range(shapes.bit_count()):
+            envelopes = words[at] >> _ENDING & 3  # onset and ending
+            at += COMMAND.words
+            for _ in range(envelopes.bit_count()):
                 at += ENVELOPE.words + KNOT.words * words[at]
         is_cut = at > len(words)
     except IndexError:
@@ -255,11 +261,11 @@ def parts(
     cuts = range(0, max(len(stream), 1), max_words)
     if len(cuts) > MAX_PARTS:
         raise ValueError(f"a set must have at most {MAX_PARTS} parts, got {len(cuts)}")
-    made: list[Values] = []
+    messages: list[Values] = []
     for index, at in enumerate(cuts):
         values = {"session": session, "token": token, "index": index, "parts": len(cuts)}
-        made.append({**values, "now": int(now), "stream": list(stream[at : at + max_words])})
-    return made
+        messages.append({**values, "now": int(now), "stream": list(stream[at : at + max_words])})
+    return messages
 
 
 def is_last(part: Values) -> bool:
@@ -293,21 +299,25 @@ class Assembly:
 
     def keep(self, part: Values, now: float) -> bool:
         """Keep a part but the last at a time [s]; False where `parts` is not as before."""
-        token, count = part["token"], part["parts"]
+        token = part["token"]
+        count = part["parts"]
         if token != self.token or self.is_expired(now):
-            self.token, self.count, self.began, self.collected = token, count, now, {}
+            self.token = token
+            self.count = count
+            self.began = now
+            self.collected = {}
         if count == self.count:
             self.collected[part["index"]] = part["stream"]
         return bool(count == self.count)
 
     def whole(self, last: Values) -> list[int] | int:
         """Return the stream of the set with this last part, or the first missing part."""
-        others = self.collected if last["token"] == self.token else {}
+        collected = self.collected if last["token"] == self.token else {}
         indices = range(last["parts"] - 1)
-        missing = next((index for index in indices if index not in others), None)
+        missing = next((index for index in indices if index not in collected), None)
         if missing is not None:
             return missing
-        return [*chain.from_iterable(others[index] for index in indices), *last["stream"]]
+        return [*chain.from_iterable(collected[index] for index in indices), *last["stream"]]
 
 
 TONE = "frequency", "level", "phase"
@@ -320,7 +330,7 @@ _DERATED = 0.01  # tolerance of the ratios in a derated set
 
 
 def achieved_problem(
-    one: LayerSet,
+    layer: LayerSet,
     reply: Values,
     can: Values,
     *,
@@ -333,26 +343,28 @@ def achieved_problem(
     can: capabilities. is_exact: equal to the word; can_scale: all levels can be lower by a common
     factor; slack: in steps of the wire, in addition to the steps of the amplifier.
     """
-    found = {each["channel"]: each for each in reply["commands"]}
+    achieved = {command["channel"]: command for command in reply["commands"]}
     shares: dict[int, float] = {}
-    if beyond := found.keys() - {tone.channel for tone in one.commands}:
+    beyond = achieved.keys() - {tone.channel for tone in layer.commands}
+    if beyond:
         return "commit", "channels that are not driven", "none", sorted(beyond)
-    names = ("layer", "ramp") if found else ("layer",)
-    must, seen = [getattr(one, name) for name in names], [reply[name] for name in names]
-    if must != seen:
-        return "plays", ", ".join(names), must, seen
-    for tone in one.commands:
+    names = ("layer", "ramp") if achieved else ("layer",)
+    must = [getattr(layer, name) for name in names]
+    got_values = [reply[name] for name in names]
+    if must != got_values:
+        return "plays", ", ".join(names), must, got_values
+    for tone in layer.commands:
         requested = {name: getattr(tone, name) for name in TONE}
-        got = found.get(tone.channel, {**requested, "level": 0})
+        got = achieved.get(tone.channel, {**requested, "level": 0})
         for name in TONE if tone.level else ("level",):  # silence has no phase
             error = abs(got[name] - requested[name])
             error = min(error, _TURN - error) if name == "phase" else error
             allowed = 0.0 if is_exact or not tone.level else _rounding(name, tone, can) + slack
             is_scaled = can_scale and name == "level" and got[name] <= requested[name]
             if error > allowed and not is_scaled:
-                what = f"error of achieved {name} of channel {tone.channel}"
-                rule = "plays" if tone.channel in found else "commit"
-                return rule, what, f"0 to {allowed:g}", error
+                quantity = f"error of achieved {name} of channel {tone.channel}"
+                rule = "plays" if tone.channel in achieved else "commit"
+                return rule, quantity, f"0 to {allowed:g}", error
         if tone.level and can_scale:
             shares[tone.level] = got["level"] / tone.level
     apart = max(shares.values(), default=0.0) - min(shares.values(), default=0.0)
@@ -361,28 +373,32 @@ def achieved_problem(
     return None
 
 
-def achieved_layer(one: LayerSet, reply: Values, can: Values) -> LayerSet:
+def achieved_layer(layer: LayerSet, reply: Values, can: Values) -> LayerSet:
     """Return a layer with the levels, frequencies and phases of a reply.
 
     can: capabilities. A tone at level 0, possibly the target of an onset, stays unchanged if the
     reported frequency is not its rounded value: an amplifier can report any.
     """
-    found = {each["channel"]: {name: each[name] for name in TONE} for each in reply["commands"]}
+    achieved = {}
+    for command in reply["commands"]:
+        achieved[command["channel"]] = {name: command[name] for name in TONE}
     commands = []
-    for tone in one.commands:
-        got = found.get(tone.channel, {"level": 0})
+    for tone in layer.commands:
+        got = achieved.get(tone.channel, {"level": 0})
         error = abs(got.get("frequency", tone.frequency) - tone.frequency)
         is_any = not tone.level and error > can["frequency_step"]
         commands.append(tone if is_any else replace(tone, **got))
-    return replace(one, commands=tuple(commands))
+    return replace(layer, commands=tuple(commands))
 
 
 def _rounding(name: str, tone: Command, can: Values) -> float:
     """Return by how much a part of a tone may be rounded: inwards at the limits."""
     step = can.get(f"{name}_step", 1)
     if name != "phase" and can:
-        value, limits = getattr(tone, name), can["limits"][tone.channel]
-        low, high = limits.get(f"{name}_min", 0), limits[f"{name}_max"]
+        value = getattr(tone, name)
+        limits = can["limits"][tone.channel]
+        low = limits.get(f"{name}_min", 0)
+        high = limits[f"{name}_max"]
         if not low <= value - step / 2 <= value + step / 2 <= high:
             return float(step)
     return float(step / 2)

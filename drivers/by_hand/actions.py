@@ -331,7 +331,7 @@ class BlockingAmplifier:
         Raises CommandRefused if the amplifier stops by itself, or its replies contradict requests.
         """
         _require_layers(layers)
-        played = self.apply([replace(each, valid_for=duration) for each in layers])
+        played = self.apply([replace(layer, valid_for=duration) for layer in layers])
         self._wait(keep_alive(self._amplifier, duration, HEARTBEAT))
         return played
 

@@ -311,8 +311,8 @@ class Record:
 
     def __init__(self, *fields: Field) -> None:
         self.fields = fields
-        self.added = [each for each in fields if isinstance(each, Number) and each.is_added]
-        self._unstated = [0] * sum(each.words for each in self.added)
+        self.added = [part for part in fields if isinstance(part, Number) and part.is_added]
+        self._unstated = [0] * sum(number.words for number in self.added)
         self.names: list[str] = []
         for field in fields:
             self.names += dict(field.parts) if isinstance(field, Bits) else [field.name]
@@ -324,14 +324,14 @@ class Record:
             names = dict(field.parts) if isinstance(field, Bits) else [field.name]
             self.places |= dict.fromkeys(names, self.words)
             self.words += field.words
-        self.shifts = [shift for each in fields if isinstance(each, Bits) for shift in each.shifts]
+        self.shifts = [shift for part in fields if isinstance(part, Bits) for shift in part.shifts]
         """Of the numbers that share a word."""
 
     @property
     def form(self) -> str:
         """The fields as `struct` names them, a word each: shared ones and numbers."""
-        signed = [isinstance(each, Number) and each.quantity.minimum < 0 for each in self.fields]
-        return "".join("h" if each else "H" for each in signed)
+        signed = [isinstance(part, Number) and part.quantity.minimum < 0 for part in self.fields]
+        return "".join("h" if is_signed else "H" for is_signed in signed)
 
     def append(self, words: list[int], *rows: Mapping[str, Any]) -> list[int]:
         """Append the words of values, by row, and return all.
@@ -342,7 +342,7 @@ class Record:
         Single-word numbers, nearly all, are packed without a call: every set has dozens of them.
         """
         if self.added:
-            unstated = dict.fromkeys(each.name for each in self.added)
+            unstated = dict.fromkeys(number.name for number in self.added)
             rows = tuple([{**unstated, **row} for row in rows])
         for values, field in product(rows, self.fields):
             if isinstance(field, Number):

@@ -173,11 +173,11 @@ class ModbusWire(Wire):
             if self._is_rtu:
                 return self._written(BROADCAST, name, values).frame
             sent = [self._written(unit, name, values) for unit in self._sizes]
-            self._unawaited.update(each.pdu.transaction_id for each in sent)
+            self._unawaited.update(adu.pdu.transaction_id for adu in sent)
             if self._baud and sent:  # a gateway sends each write after the reply to the last one
                 echo = self._time(ECHO_SIZE) + self.silence + REACTION
                 self.takes += (len(sent) - 1) * (self.takes + echo)
-            return b"".join(each.frame for each in sent)
+            return b"".join(adu.frame for adu in sent)
         self._sizes.setdefault(address, WIDEST)
         if name == "Hello":
             pdu = Read(dev_id=address, address=IDENTITY_REGISTER, count=IDENTITY_COUNT)

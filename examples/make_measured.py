@@ -96,7 +96,7 @@ def readings(
     noise = rng.standard_normal(accelerations.shape)
     columns = []
     for number, sensor in enumerate(sensors):
-        # White noise of this density up to half the sampling rate has this standard deviation.
+        # Standard deviation of white noise with this density up to half the sampling rate.
         deviation = sensor.noise_density * math.sqrt(RATE / 2)
         column = sensor.scale * accelerations[:, number] + deviation * noise[:, number]
         clipped = np.clip(column, -sensor.reach, sensor.reach)

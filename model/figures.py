@@ -182,7 +182,7 @@ def calibration_figure(calibration: Calibration) -> Figure:
         for column, era in enumerate(eras):
             axis = axes[row, column]
             for label, values, style in (
-                ("rig as it was", calibration.before, {"color": "0.6", "linewidth": 1.2}),
+                ("rig file", calibration.before, {"color": "0.6", "linewidth": 1.2}),
                 ("calibrated", calibration.after, {"color": "C0", "linewidth": 1.4}),
                 ("measured", calibration.measured, {"color": "C3", "marker": ".", "ls": "none"}),
             ):
@@ -196,7 +196,7 @@ def calibration_figure(calibration: Calibration) -> Figure:
     for axis in axes[-1]:
         axis.set_xlabel("frequency / Hz")
     for axis in axes[:, 0]:
-        axis.set_ylabel("m/s² per µm of base")
+        axis.set_ylabel("response / (m/s² per µm)")
     handles, labels = axes[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside upper center", ncols=3, fontsize=9)
     return figure
@@ -533,7 +533,7 @@ def weak_cells_figure(table: LocalizationTable, weak: WeakCells) -> Figure:
     """Draw the contrast from each cell to the median other finger, and the tenth percentile."""
     panels = {
         "median other finger": weak.median_db,
-        "one other finger in ten (tenth percentile)": weak.tenth_db,
+        "10th percentile of other fingers": weak.tenth_db,
     }
     figure = _cells_figure(
         table, weak.grid, panels, label=_CONTRAST, crossed=(~weak.feasible, weak.weak)
@@ -575,7 +575,7 @@ def contrast_figure(table: LocalizationTable, overview: Overview) -> Figure:
     axes.set_ylabel("contact sets with at least this contrast / %")
     axes.grid(color="0.9")
     figure.legend(loc="outside lower center", ncols=3, fontsize=9, frameon=False)
-    axes.set_title(f"Mode {table.drive_mode}: contact sets at least 5 cm apart")
+    axes.set_title(f"Mode {table.drive_mode}: contacts at least 5 cm apart")
     return figure
 
 

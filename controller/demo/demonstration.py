@@ -507,8 +507,8 @@ def touches_figure(table: LocalizationTable, rows: Sequence[TouchRow]) -> Figure
         _draw_touch(axes, table, row)
     draw_level_scale(figure, panels, table.threshold, shrink=0.7)
     figure.supxlabel(
-        "felt: mean over the fingertip; quiet: its loudest point; "
-        "felt contrast: the first less the loudest of the second",
+        "felt: mean over the fingertip; quiet: loudest point of the fingertip; "
+        "felt contrast: felt level minus the highest quiet level",
         fontsize=10,
     )
     return figure

@@ -142,7 +142,7 @@ class Adapter:
         self.amplifier.is_lost = True
 
     async def _follow(self) -> None:
-        """Send what has changed, then wait for the next change."""
+        """Send the changes, then wait for the next one."""
         amplifier = self.amplifier
         if amplifier.is_lost:
             async with asyncio.timeout(REPLY):

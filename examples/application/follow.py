@@ -1,4 +1,4 @@
-"""Hold two fingers on the plate for a while, and print what the plate does meanwhile.
+"""Hold two fingers on the plate for a while, and print the plate's events.
 
     python follow.py 0.40,0.23 0.13,0.23      # metres from the south-west corner
 

@@ -1,4 +1,4 @@
-"""A Qt application that shows what the plate does and lets a finger play on it, over the gateway.
+"""A Qt application that shows the plate's vibration and sends touches to it over the gateway.
 
     python qt_plate.py http://127.0.0.1:8137/ TOKEN
 
@@ -28,7 +28,7 @@ MAX_SILENT = 4  # s
 
 
 class Plate(QObject):
-    """The plate over a gateway; reconnects by itself and subscribes anew.
+    """The plate over a gateway; reconnects and resubscribes automatically.
 
     Calls that are pending at a loss fail and are never sent again: whether to arm, play or clear
     then is for the caller to decide. url: of the gateway.
@@ -72,7 +72,7 @@ class Plate(QObject):
     def call(
         self, method: str, done: Callable[[Any], None] = lambda result: None, **params: object
     ) -> None:
-        """Call a method of the API; `refused` tells if it fails."""
+        """Call an API method; `refused` reports a failure."""
         if not self._is_open:
             self.refused.emit("not connected")
             return
@@ -90,7 +90,7 @@ class Plate(QObject):
         self._call_anyhow("disarm")
 
     def stop(self) -> None:
-        """Stop all amplifiers; `refused` names those that are not confirmed silent."""
+        """Stop all amplifiers; `refused` names the amplifiers without confirmed silence."""
         self._lease = None
         self._call_anyhow("stop")
 

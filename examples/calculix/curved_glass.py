@@ -49,7 +49,7 @@ def edge(u: np.ndarray) -> np.ndarray:
 
 
 def elements() -> Iterator[tuple[str, np.ndarray]]:
-    """Yield each element by its material and its first half lines and layer."""
+    """Yield each element with its material, first half lines and layer."""
     solid = np.ones((len(U) - 1, len(V) - 1), dtype=bool)
     solid[CUT_OUT] = False
     for i, j in np.argwhere(solid):

@@ -32,7 +32,7 @@ FACES = {
     9: [(0, 1, 2, 3)],
     10: [(0, 1, 2, 3)],
 }
-"""Corners of each face of an element by its type in a .frd."""
+"""Corners of every element face, for each element type in a .frd file."""
 
 # A value has 12 characters (E12.5). With three digits in the exponent, as on Windows, it has up to
 # 13 and touches the next one. Fortran leaves out the letter of such an exponent. One digit before

@@ -62,7 +62,7 @@ class PaperFigure:
 
 
 def paper_figures(rig: Rig, number: str) -> Iterator[PaperFigure]:
-    """Make the figures of one number, or of `all`, on a rig's plate and mesh.
+    """Draw the figures with one number, or `all`, for a rig's plate and mesh.
 
     Raises InputError for a number without results in the paper, for a mesh too coarse for 320 Hz,
     and for a rig with fewer than two ERAs where a pair is driven.
@@ -94,7 +94,7 @@ def _modes(rig: Rig, free: FreePlate, *, name: str, support: str) -> PaperFigure
             draw_eras(axes, rig.eras, active=())
         axes.set_title(f"mode {mode}: {solved.frequencies[mode - 1]:.2f} Hz")
         axes.label_outer()
-    figure.colorbar(image, ax=grid, label="deflection, largest = 1")
+    figure.colorbar(image, ax=grid, label="deflection relative to the maximum")
     figure.suptitle(f"On {len(rig.eras)} ERAs" if support == "eras" else "Simply supported")
     of_shapes = {f"mode_{mode}": shape for mode, shape in zip(_MODES, shapes, strict=True)}
     tables: dict[str, Columns] = {
@@ -151,14 +151,14 @@ def _box_plots(rig: Rig, free: FreePlate, *, name: str, active_count: int) -> Pa
     axes.set_ylim(bottom=0)
     axes.set_title("boxes: quartiles over the plate; whiskers: minimum and maximum", fontsize=10)
     drive = "One active ERA" if active_count == 1 else "Two active ERAs"
-    figure.suptitle(f"{drive} (orange): peak accelerations added up over {len(SWEEP)} frequencies")
+    figure.suptitle(f"{drive} (orange): peak acceleration summed over {len(SWEEP)} frequencies")
     headers = ("layout", "active_eras", "era_fractions", *(f"{key}_m_s2" for key in STATISTICS))
     table: Columns = dict(zip(headers, zip(*rows, strict=True), strict=True))
     return PaperFigure(name, figure, {"": table})
 
 
 def equal_area_points(plate: Plate) -> FloatArray:
-    """Points [m] (p, 2) that stand for equal areas of a plate: centres of nearly square cells.
+    """Points [m] (p, 2) that represent equal areas of a plate: centres of nearly square cells.
 
     24 of them along the longer side, or as many as put twelve into a bending wave of the highest
     frequency. On the paper's plate, against cells a quarter as long: medians within 3 %, quartiles

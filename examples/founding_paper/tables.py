@@ -1,4 +1,4 @@
-"""The founding paper's tables and claims, beside what this model gives.
+"""The founding paper's tables and claims, compared with this model.
 
     python examples/founding_paper/tables.py [RIG]
 

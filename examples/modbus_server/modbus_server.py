@@ -5,7 +5,7 @@
 
 The server frames and answers; here are the registers of docs/reference/modbus.md, and behind them
 the project's simulated amplifier, in whose place yours goes: it takes the values of a message and
-returns those of its reply, or raises Refusal. Written for pymodbus 3.16, whose servers change with
+returns the reply registers, or raises Refusal. Written for pymodbus 3.16, whose servers change with
 its minor versions.
 """
 

@@ -305,7 +305,7 @@ def content_figure(pattern: Pattern, checked: CheckedContent) -> Figure:
     low, high = checked.expected - TOLERANCE_DB, checked.expected + TOLERANCE_DB
     counts = checked.expected > top - RANGE_DB
     levels.fill_between(times, low, high, where=counts, color=_REQUESTED, alpha=0.3, lw=0)
-    levels.plot(times, checked.expected, color=_REQUESTED, lw=1, label="asked, within 3 dB")
+    levels.plot(times, checked.expected, color=_REQUESTED, lw=1, label="requested, ±3 dB")
     levels.plot(times - checked.delay, checked.given, color=_FELT, lw=1.2, label="felt")
     levels.set_ylim(top - RANGE_DB, top + 2 * TOLERANCE_DB)
     levels.set_ylabel("level / dB SL")

@@ -798,7 +798,7 @@ def _contrast_figure(design: Design) -> Figure:
         label_plate(axes)
         axes.set_xlim(0, 100 * plate.length)
         axes.set_ylim(0, 100 * plate.width)
-        axes.set_title(f"{quiet} quiet: median {judged.median_db(quiet):.1f} dB")
+        axes.set_title(f"quiet fingers: {quiet}, median {judged.median_db(quiet):.1f} dB")
         axes.label_outer()
     figure.colorbar(image, ax=grid, label="promised contrast / dB")
     return figure

@@ -14,7 +14,7 @@ class CsvPoints(ContentFormat):
     ending = "example.csv"
 
     def read(self, content: bytes, source: str, channel: int) -> Pattern:
-        """Return a pattern of all lines; those that are empty are skipped."""
+        """Return the pattern in a file; empty lines are skipped."""
         points = []
         for number, line in enumerate(content.decode("utf-8", "replace").splitlines(), start=1):
             try:

@@ -1,4 +1,4 @@
-"""Print what a file of content asks for.
+"""Print the requested vibration of a content file.
 
 python try_format.py FILE
 """

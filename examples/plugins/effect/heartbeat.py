@@ -43,7 +43,7 @@ class Beating(EffectRun):
 
 
 class Heartbeat(Effect):
-    """The effect; its fields are its parameters in a layout, beside `level`."""
+    """The effect; its fields are its parameters in a layout, in addition to `level`."""
 
     kind: ClassVar[str] = "example-heartbeat"
     is_for_motion: ClassVar[bool] = False  # for on_press

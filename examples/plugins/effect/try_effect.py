@@ -1,4 +1,4 @@
-"""Print what a finger that rests for two seconds feels of a kind of effect.
+"""Print the vibration that an effect gives a finger resting for two seconds.
 
 python try_effect.py KIND
 """

@@ -1,4 +1,4 @@
-"""A material of one's own, by name. The numbers are an example: measure yours."""
+"""A material that rig files can use by name. The numbers are an example: measure yours."""
 
 from era_haptics.plugins.materials import KnownMaterial, Material
 

@@ -16,7 +16,7 @@ ADDRESSES = range(1, 248)
 
 
 class UnixAddress(WireAddress):
-    """The amplifier of a URL; those of one socket share a line."""
+    """The amplifier at a URL; amplifiers on one socket share a line."""
 
     def __init__(self, url: str) -> None:
         parts = urlsplit(url)
@@ -85,7 +85,7 @@ class UnixPort(asyncio.Protocol):
         self._transport.write(data)
 
     def poll(self) -> None:
-        """Do nothing: the event loop has read what has come."""
+        """Do nothing: the event loop has already read the received bytes."""
 
     def close(self) -> None:
         """Close it; no callback is called afterwards."""
@@ -93,4 +93,4 @@ class UnixPort(asyncio.Protocol):
         self._transport.abort()
 
     async def wait_closed(self) -> None:
-        """Return at once."""
+        """Return immediately."""

@@ -32,7 +32,7 @@ from drivers.host.amplifier import Amplifier
 from drivers.host.line import Line
 from drivers.playing import AmplifierLayer, AmplifierTone
 from drivers.protocol.definition import MAX_WORDS, QUANTITIES
-from drivers.protocol.sets import Envelope, LayerSet
+from drivers.protocol.sets import Command, Envelope, LayerSet
 from model import vibration as physics
 from model.answer import answer, stimulus
 from model.answer.answer import Limits, amplitudes_of
@@ -45,6 +45,7 @@ from model.rig.rig import Rig
 from model.table.table import LocalizationTable
 from model.transients import base_motion
 from model.transients.base_motion import BaseEnvelope, Envelopes
+from model.transients.excursions import Swing
 from model.transients.knots import ENDING_KNOTS, ONSET_KNOTS
 from registry import threads
 
@@ -63,10 +64,12 @@ PLAIN_STEP = 0.050
 HELD = 0.1
 """Time [s] after its last piece at which a layer ends on its own."""
 
-_FIRST, _NEXT, _SHORTEST = 0.16, 0.32, 0.12  # s; of pieces; the last is used with few knots
-_AMID = 0.020  # s; between knots of a first piece that leads there from something else
+_FIRST_PIECE = 0.16  # s
+_NEXT_PIECE = 0.32  # s
+_SHORTEST_PIECE = 0.12  # s; used with few knots
+_JOINING_STEP = 0.020  # s; between knots of a first piece that starts within its course
 
-MAX_STEP = _SHORTEST / 2
+MAX_STEP = _SHORTEST_PIECE / 2
 """Time [s] between the knots of an envelope with one knot."""
 
 MARGIN = 1.25
@@ -77,10 +80,19 @@ SETTLED = 10.0
 
 _FAR_BETTER = 2.0  # ratio to the assumed error
 
-_FREQUENCY, _LEVEL, _PHASE = (QUANTITIES[name] for name in ("frequency", "level", "phase"))
-_RAMP, _STEP = QUANTITIES["ramp"], QUANTITIES["envelope_step"]
+_MIN_AMPLITUDE = 1e-12  # m; left to an ERA that is fully used
+_MIN_SHARE = 1e-9  # of power or excursion; left if it is fully used
+
+_FREQUENCY = QUANTITIES["frequency"]
+_LEVEL = QUANTITIES["level"]
+_PHASE = QUANTITIES["phase"]
+_RAMP = QUANTITIES["ramp"]
+_STEP = QUANTITIES["envelope_step"]
 _PHASE_STEP = QUANTITIES["phase_step"]
-_LAYER_WORDS, _COMMAND_WORDS, _ENVELOPE_WORDS, _KNOT_WORDS = 3, 4, 2, 2
+_LAYER_WORDS = 3
+_COMMAND_WORDS = 4
+_ENVELOPE_WORDS = 2
+_KNOT_WORDS = 2
 _PART_WORDS = 3  # words of a message: session, token, part
 _DIGITS = 6  # decimals of a step on the wire
 _ROUNDING = 1e-9  # s
@@ -154,20 +166,20 @@ class PlaybackCapabilities:
 
     def left_by(self, layers: Sequence[answer.Layer], table: LocalizationTable) -> Self:
         """Return the capabilities with the limits that remain if all layers peak simultaneously."""
-        drives = [each for layer in layers for each in layer.drives]
-        taken, strokes = amplitudes_of([each for each, _ in drives]), table.full_levels
-        levels = [amplitude / strokes[name] for name, amplitude in taken.items()]
         limits = self.limits
-        left = replace(
-            limits,
-            amplitudes={
-                name: max(highest - taken.get(name, 0.0), 1e-12)
-                for name, highest in (limits.amplitudes or strokes).items()
-            },
-            power=max(math.sqrt(limits.power) - math.hypot(*levels), 1e-9) ** 2,
-            excursion=max(limits.excursion - table.excursion_of(drives), 1e-9),
-        )
-        return replace(self, limits=left)
+        full_levels = table.full_levels
+        drives = list[tuple[physics.Excitation, Sequence[Swing]]]()
+        for layer in layers:
+            drives += layer.drives
+        used_amplitudes = amplitudes_of([excitation for excitation, _ in drives])
+        levels = [amplitude / full_levels[name] for name, amplitude in used_amplitudes.items()]
+        amplitudes = dict[str, float]()
+        for name, highest in (limits.amplitudes or full_levels).items():
+            amplitudes[name] = max(highest - used_amplitudes.get(name, 0.0), _MIN_AMPLITUDE)
+        power = max(math.sqrt(limits.power) - math.hypot(*levels), _MIN_SHARE) ** 2
+        excursion = max(limits.excursion - table.excursion_of(drives), _MIN_SHARE)
+        spare = replace(limits, amplitudes=amplitudes, power=power, excursion=excursion)
+        return replace(self, limits=spare)
 
 
 def playback_capabilities(
@@ -185,51 +197,61 @@ def playback_capabilities(
                 f"channel of ERA {era} must be 0 to {channels - 1} on amplifier "
                 f"{wired.amplifier}, got {wired.number}; change its wiring in the rig file"
             )
-    each = [
-        playable_drive_modes(
-            level_step=_LEVEL.from_wire(one.ledger.capabilities["level_step"]),
-            phase_step=_PHASE_STEP.from_wire(one.ledger.capabilities["phase_step"]),
-        )
-        for one in amplifiers.values()
-    ]
-    playable = tuple(name for name in DRIVE_MODES if all(name in modes for modes in each))
+    playable = _playable_by_all(amplifiers)
     if drive_mode is not None and drive_mode not in playable:
         raise InputError(
             f"drive mode must be supported by all amplifiers ({', '.join(playable)}), got "
             f"{drive_mode}; leave it out for the best mode"
         )
+    capabilities = [amplifier.ledger.capabilities for amplifier in amplifiers.values()]
     return PlaybackCapabilities(
         drive_mode=drive_mode or playable[-1],
         playable=playable,
         limits=limits_of(rig, amplifiers),
         envelope_support=envelope_support(rig, amplifiers),
-        ramp_max=min(
-            _RAMP.from_wire(one.ledger.capabilities["ramp_max"]) for one in amplifiers.values()
-        ),
-        layers=min(one.ledger.capabilities["layers"] for one in amplifiers.values()),
+        ramp_max=min([_RAMP.from_wire(values["ramp_max"]) for values in capabilities]),
+        layers=min([values["layers"] for values in capabilities]),
         course_knots=_knots(rig, amplifiers, within=MAX_PIECE_TIME, step=MAX_STEP),
     )
 
 
+def _playable_by_all(amplifiers: Mapping[str, Amplifier]) -> tuple[str, ...]:
+    """Return the drive modes that every amplifier can play."""
+    playable = list(DRIVE_MODES)
+    for amplifier in amplifiers.values():
+        capabilities = amplifier.ledger.capabilities
+        modes = playable_drive_modes(
+            level_step=_LEVEL.from_wire(capabilities["level_step"]),
+            phase_step=_PHASE_STEP.from_wire(capabilities["phase_step"]),
+        )
+        playable = [name for name in playable if name in modes]
+    return tuple(playable)
+
+
 def limits_of(rig: Rig, amplifiers: Mapping[str, Amplifier]) -> Limits:
     """Return the limits of a rig's amplifiers by name, as last identified."""
-    limits = {name: one.ledger.limits for name, one in amplifiers.items()}
-    levels = {name: _LEVEL.from_wire(one.level) for name, one in limits.items()}
+    limits = {name: amplifier.ledger.limits for name, amplifier in amplifiers.items()}
+    lowest = max([_FREQUENCY.from_wire(values.frequency_min) for values in limits.values()])
+    highest = min([_FREQUENCY.from_wire(values.frequency_max) for values in limits.values()])
+    amplitudes = dict[str, float]()
+    for era in rig.eras:
+        amplifier_name = rig.wiring[era.name].amplifier
+        level = _LEVEL.from_wire(limits[amplifier_name].level)
+        amplitudes[era.name] = era.full_level * level
     return Limits(
-        (
-            max(_FREQUENCY.from_wire(one.frequency_min) for one in limits.values()),
-            min(_FREQUENCY.from_wire(one.frequency_max) for one in limits.values()),
-        ),
-        {era.name: era.full_level * levels[rig.wiring[era.name].amplifier] for era in rig.eras},
-        power=min(one.power for one in limits.values()),
-        slew=min(one.slew for one in limits.values()),
+        (lowest, highest),
+        amplitudes,
+        power=min([values.power for values in limits.values()]),
+        slew=min([values.slew for values in limits.values()]),
     )
 
 
 def envelope_support(rig: Rig, amplifiers: Mapping[str, Amplifier]) -> EnvelopeSupport:
     """Return the envelopes that all open amplifiers play and their wires carry within 10 ms."""
-    knots, onset, ending = _knots(rig, amplifiers), ONSET_KNOTS - 1, ENDING_KNOTS - 1
-    return EnvelopeSupport(min(knots, onset), ending if knots >= ending else 0)
+    knots = _knots(rig, amplifiers)
+    onset_knots = min(knots, ONSET_KNOTS - 1)
+    ending_knots = ENDING_KNOTS - 1
+    return EnvelopeSupport(onset_knots, ending_knots if knots >= ending_knots else 0)
 
 
 def _knots(
@@ -243,21 +265,21 @@ def _knots(
 
     step: longest time [s] between two knots.
     """
-    wired: dict[str, int] = defaultdict(int)
+    channel_counts = defaultdict[str, int](int)
     for channel in rig.wiring.values():
-        wired[channel.amplifier] += 1
-    by_line: dict[Line, list[str]] = defaultdict(list)
-    for name in wired:
-        by_line[amplifiers[name].line].append(name)
-    carried = [
-        _knots_on(line, [wired[name] for name in names], within) for line, names in by_line.items()
-    ]
-    carried += [
-        _knots_in(amplifiers[name].ledger.capabilities["set_words"], [count])
-        for name, count in wired.items()
-    ]
-    each = min([_knots_of(amplifiers[name], step) for name in wired], default=0)
-    return min(max(min(carried, default=0), 0), each)
+        channel_counts[channel.amplifier] += 1
+    if not channel_counts:
+        return 0
+    supported = list[int]()
+    counts_by_line = defaultdict[Line, list[int]](list)
+    for name, channel_count in channel_counts.items():
+        amplifier = amplifiers[name]
+        counts_by_line[amplifier.line].append(channel_count)
+        supported.append(_knots_of(amplifier, step))
+        supported.append(_knots_in(amplifier.ledger.capabilities["set_words"], [channel_count]))
+    for line, line_counts in counts_by_line.items():
+        supported.append(_knots_on(line, line_counts, within))
+    return max(min(supported), 0)
 
 
 def _knots_of(amplifier: Amplifier, max_step: float) -> int:
@@ -266,8 +288,10 @@ def _knots_of(amplifier: Amplifier, max_step: float) -> int:
     The required steps range from the model's step to max_step [s].
     """
     capabilities = amplifier.ledger.capabilities
-    low, high = (_STEP.from_wire(capabilities[f"envelope_step_{end}"]) for end in ("min", "max"))
-    return int(capabilities["knots"]) if low <= base_motion.KNOT_STEP <= max_step <= high else 0
+    shortest = _STEP.from_wire(capabilities["envelope_step_min"])
+    max_step_allowed = _STEP.from_wire(capabilities["envelope_step_max"])
+    has_steps = shortest <= base_motion.KNOT_STEP <= max_step <= max_step_allowed
+    return int(capabilities["knots"]) if has_steps else 0
 
 
 def _knots_on(line: Line, channels: list[int], within: float) -> int:
@@ -275,18 +299,21 @@ def _knots_on(line: Line, channels: list[int], within: float) -> int:
 
     channels: number of channels of each of its amplifiers; each amplifier gets a set.
     """
-    takes = line.wire.transit(MAX_WORDS)
-    if takes <= 0:
+    message_time = line.wire.transit(MAX_WORDS)
+    if message_time <= 0:
         return int(QUANTITIES["knots"].maximum)
-    return _knots_in(int(MAX_WORDS * within / takes), channels)
+    return _knots_in(int(MAX_WORDS * within / message_time), channels)
 
 
 def _knots_in(words: int, channels: list[int]) -> int:
     """Return the number of knots per channel that fit into a number of words."""
-    parts = -(-words // MAX_WORDS)
-    heads = len(channels) * _LAYER_WORDS + max(parts, len(channels)) * _PART_WORDS
-    each = _COMMAND_WORDS + _ENVELOPE_WORDS
-    return int((words - heads - sum(channels) * each) // (_KNOT_WORDS * sum(channels)))
+    amplifier_count = len(channels)
+    channel_count = sum(channels)
+    part_count = max(-(-words // MAX_WORDS), amplifier_count)
+    head_words = amplifier_count * _LAYER_WORDS + part_count * _PART_WORDS
+    channel_words = channel_count * (_COMMAND_WORDS + _ENVELOPE_WORDS)
+    knot_words = words - head_words - channel_words
+    return int(knot_words // (_KNOT_WORDS * channel_count))
 
 
 class CountedClocks:
@@ -296,7 +323,8 @@ class CountedClocks:
     """
 
     def __init__(self, rig: Rig, now: Callable[[], Mapping[str, float]]) -> None:
-        self._rig, self._now = rig, now
+        self._rig = rig
+        self._now = now
         self._names = sorted(rig.channel_counts)
         self._counted = EXACT_CLOCKS
         self._losses = dict.fromkeys(self._names, 0)  # since last logged as synchronised
@@ -318,26 +346,33 @@ class CountedClocks:
         """
         if len(self._names) < 2:
             return table
-        known = known or self._now()
-        if self._is_other(known):
-            before, errors = self.errors, {name: MARGIN * known[name] for name in self._names}
-            eras = [era.name for era in table.eras]
-            self._counted = ClockErrors.of(eras, self._rig.wiring, errors)
-            self.errors = errors
-            self._note(before)
-        for name in [*self._held_since]:  # mostly none
-            if threads.now() - self._held_since[name] >= SETTLED:
-                _logger.info(
-                    "amplifier %s: clock held to %.0f us for %.0f s, its ERAs play with the "
-                    "others'; losses before: %d",
-                    name,
-                    1e6 * self.errors[name],
-                    SETTLED,
-                    self._losses[name],
-                )
-                self._losses[name] = 0
-                del self._held_since[name]
+        present_errors = known or self._now()
+        if self._is_other(present_errors):
+            former_errors = self.errors
+            self.errors = {name: MARGIN * present_errors[name] for name in self._names}
+            era_names = [era.name for era in table.eras]
+            self._counted = ClockErrors.of(era_names, self._rig.wiring, self.errors)
+            self._note(former_errors)
+        if self._held_since:
+            self._log_settled()
         return table.with_clocks(self._counted)
+
+    def _log_settled(self) -> None:
+        """Log which clocks have been synchronised for long enough, with their losses before."""
+        now = threads.now()
+        for name, held_since in [*self._held_since.items()]:
+            if now - held_since < SETTLED:
+                continue
+            _logger.info(
+                "amplifier %s: clock held to %.0f us for %.0f s, its ERAs play with the "
+                "others'; losses before: %d",
+                name,
+                1e6 * self.errors[name],
+                SETTLED,
+                self._losses[name],
+            )
+            self._losses[name] = 0
+            del self._held_since[name]
 
     def is_one_lost(self, known: Mapping[str, float]) -> bool:
         """Whether a clock is no longer held to those with which its amplifier shares contents.
@@ -356,14 +391,14 @@ class CountedClocks:
                 return True
         return not self.errors
 
-    def _note(self, before: Mapping[str, float]) -> None:
+    def _note(self, former_errors: Mapping[str, float]) -> None:
         """Count losses; log once which amplifiers play contents of their own from now on.
 
         That is no warning when a line has just been opened, since no clock is known then.
         """
-        level = logging.WARNING if before else logging.INFO
+        level = logging.WARNING if former_errors else logging.INFO
         for name, error in self.errors.items():
-            was_alone = before.get(name, 0.0) > MAX_HELD
+            was_alone = former_errors.get(name, 0.0) > MAX_HELD
             if error <= MAX_HELD:
                 if was_alone:
                     self._held_since[name] = threads.now()
@@ -389,14 +424,16 @@ def piece_of(
     The envelope repeats until the pulse ends, at 0. knots: maximum of an envelope, 0 for ramps;
     is_first: whether the piece is the first of its layer.
     """
-    if not knots:
-        step, count = PLAIN_STEP, 1
-    else:
-        least = _AMID if is_first and since > 0 else stimulus.COURSE_KNOT_STEP
-        count = min(knots + 1, round((_FIRST if is_first else _NEXT) / least))
-        step = max(least, _SHORTEST / count)
-        left = min((pulse.duration - since) / step, count)
-        count = max(math.ceil(left - _ROUNDING), 2)
+    step = PLAIN_STEP
+    count = 1
+    if knots:
+        joins = is_first and since > 0
+        shortest_step = _JOINING_STEP if joins else stimulus.COURSE_KNOT_STEP
+        length = _FIRST_PIECE if is_first else _NEXT_PIECE
+        max_count = min(knots + 1, round(length / shortest_step))
+        step = max(shortest_step, _SHORTEST_PIECE / max_count)
+        steps_left = min((pulse.duration - since) / step, max_count)
+        count = max(math.ceil(steps_left - _ROUNDING), 2)
     times = since + step * np.arange(1, count + 1)
     shares = np.asarray(course.at(np.mod(times, course.duration)))
     shares[times > pulse.duration - _ROUNDING] = 0.0
@@ -431,21 +468,25 @@ def route(
             f"pattern must drive ERAs of the rig, got {', '.join(unknown)}; build a table for this "
             "rig"
         )
-    before: Drive = playing or {}
-    restarted = restarted_by(excitation, before) if restarted is None else restarted
+    drive: Drive = playing or {}
+    if restarted is None:
+        restarted = restarted_by(excitation, drive)
     strokes = rig.full_levels
     onsets, endings = on_wire(strokes, onset, ending)
     wired: dict[str, list[AmplifierTone]] = {name: [] for name in rig.amplifiers}
     for name, channel in rig.wiring.items():
-        driven, was, shape = excitation.get(name), before.get(name), onsets.get(name)
+        driven = excitation.get(name)
+        shape = onsets.get(name)
         if driven is None:
-            # Falling silent while others play, it skips its ending, which belongs to all together.
-            frequency = onset[name].frequency if onset and shape else rig.limits.frequency_min
+            # An ERA that falls silent while others play skips its ending: that is for all together.
+            frequency = rig.limits.frequency_min
+            if onset and shape:
+                frequency = onset[name].frequency
             tone = AmplifierTone(
                 channel.number, frequency, 0.0, 0.0, False, True, shape, endings.get(name)
             )
         else:
-            phase = driven.phase  # not finite it stays so, and the ledger refuses it
+            phase = driven.phase  # the ledger rejects one that is not finite
             if math.isfinite(phase):
                 phase = math.degrees(math.remainder(phase, math.tau))
             tone = AmplifierTone(
@@ -458,14 +499,19 @@ def route(
                 ending=endings.get(name),
             )
         wired[channel.amplifier].append(tone)
-        rise = tone.level  # from rest, or through zero to another phase
-        if was is not None and rise and was.frequency == tone.frequency:
-            rise += was.level
-        least = rise / rig.limits.slew
-        ramp = least if least > ramp else ramp  # ledgers refuse NaN
+        shortest_ramp = _rise(tone, drive.get(name)) / rig.limits.slew
+        if shortest_ramp > ramp:  # false for NaN, which the ledgers reject
+            ramp = shortest_ramp
     return {
         name: AmplifierLayer(number, tuple(tones), ramp, valid_for) for name, tones in wired.items()
     }
+
+
+def _rise(tone: AmplifierTone, former_tone: AmplifierTone | None) -> float:
+    """Return the largest change of level when a tone starts: from rest, or through a phase turn."""
+    if former_tone is None or not tone.level or former_tone.frequency != tone.frequency:
+        return tone.level
+    return tone.level + former_tone.level
 
 
 def restarted_by(excitation: physics.Excitation, playing: Drive) -> set[float]:
@@ -486,71 +532,83 @@ def thinned(envelopes: Envelopes, *, knots: int) -> Envelopes:
     They take the same time, in whole steps of the wire, with equal step and number of knots.
     """
     first = next(iter(envelopes.values()))
-    count, steps = len(first.knots), knots + 1
-    if count <= steps:
+    count = len(first.knots)
+    new_count = knots + 1
+    if count <= new_count:
         return envelopes
-    step = math.ceil(round(first.duration * _STEP.per_unit) / steps) / _STEP.per_unit
-    at = np.minimum(step * np.arange(1, steps + 1), first.duration) / first.step
-    since = np.minimum(at.astype(int), count - 1)
-    values = np.array([(each.start, *each.knots) for each in envelopes.values()])
-    between = values[:, since] + (values[:, since + 1] - values[:, since]) * (at - since)
-    return {
-        name: BaseEnvelope(each.frequency, each.start, tuple(row), step)
-        for (name, each), row in zip(envelopes.items(), between.tolist(), strict=True)
-    }
+    duration = round(first.duration * _STEP.per_unit)  # in steps of the wire
+    step = math.ceil(duration / new_count) / _STEP.per_unit
+    times = np.minimum(step * np.arange(1, new_count + 1), first.duration)
+    positions = times / first.step
+    lower = np.minimum(positions.astype(int), count - 1)
+    values = np.array([(envelope.start, *envelope.knots) for envelope in envelopes.values()])
+    slopes = values[:, lower + 1] - values[:, lower]
+    rows = values[:, lower] + slopes * (positions - lower)
+    thin = dict[str, BaseEnvelope]()
+    for (name, envelope), row in zip(envelopes.items(), rows.tolist(), strict=True):
+        thin[name] = BaseEnvelope(envelope.frequency, envelope.start, tuple(row), step)
+    return thin
 
 
-def on_wire(strokes: Mapping[str, float], *several: Envelopes | None) -> list[dict[str, Envelope]]:
-    """Return envelopes in integers of the wire; strokes [m]: by ERA, as envelopes are."""
-    motions: list[complex] = []
-    units: list[float] = []
-    for envelopes in several:
-        for name, one in envelopes.items() if envelopes else ():
-            motions += one.knots[:-1]
-            units += [strokes[name]] * (len(one.knots) - 1)
-    each = np.array(motions, dtype=complex) / units
-    levels = np.rint(np.abs(each) * _LEVEL.per_unit).astype(int)
-    phases = np.rint(np.degrees(np.angle(each)) * _PHASE.per_unit).astype(int)
+def on_wire(strokes: Mapping[str, float], *groups: Envelopes | None) -> list[dict[str, Envelope]]:
+    """Return groups of envelopes in integers of the wire; strokes [m] and envelopes are by ERA."""
+    motions = list[complex]()
+    units = list[float]()
+    for envelopes in groups:
+        for name, envelope in (envelopes or {}).items():
+            inner_knots = envelope.knots[:-1]
+            motions += inner_knots
+            units += [strokes[name]] * len(inner_knots)
+    shares = np.array(motions, dtype=complex) / units
+    levels = np.rint(np.abs(shares) * _LEVEL.per_unit).astype(int)
+    phases = np.rint(np.degrees(np.angle(shares)) * _PHASE.per_unit).astype(int)
     phases[phases > _PHASE.maximum] = _PHASE.minimum  # half a turn
     knots = zip(levels.tolist(), phases.tolist(), strict=True)
-    found: list[dict[str, Envelope]] = []
-    for envelopes in several:
-        found.append({})
-        for name, one in envelopes.items() if envelopes else ():
-            step = math.ceil(round(one.step * _STEP.per_unit, _DIGITS))
-            found[-1][name] = Envelope(step, tuple(islice(knots, len(one.knots) - 1)))
-    return found
+    wire_groups = list[dict[str, Envelope]]()
+    for envelopes in groups:
+        wire_envelopes = dict[str, Envelope]()
+        for name, envelope in (envelopes or {}).items():
+            step = math.ceil(round(envelope.step * _STEP.per_unit, _DIGITS))
+            wire_knots = tuple(islice(knots, len(envelope.knots) - 1))
+            wire_envelopes[name] = Envelope(step, wire_knots)
+        wire_groups.append(wire_envelopes)
+    return wire_groups
 
 
 def tones_by_era(
     played: Mapping[str, Sequence[LayerSet]], rig: Rig, number: int = 0
 ) -> dict[str, AmplifierTone]:
     """Return the tones of a layer, by ERA; without silent ones."""
-    playing = {
-        (amplifier, command.channel): command
-        for amplifier, layers in played.items()
-        for one in layers
-        for command in one.commands
-        if one.layer == number and command.level > 0
-    }
-    return {
-        name: AmplifierTone(
+    commands = dict[tuple[str, int], Command]()
+    for amplifier, layers in played.items():
+        for layer in layers:
+            if layer.layer != number:
+                continue
+            for command in layer.commands:
+                if command.level > 0:
+                    commands[amplifier, command.channel] = command
+    tones = dict[str, AmplifierTone]()
+    for name, channel in rig.wiring.items():
+        driving = commands.get((channel.amplifier, channel.number))
+        if driving is None:
+            continue
+        tones[name] = AmplifierTone(
             channel.number,
-            command.frequency / _FREQUENCY.per_unit,
-            command.level / _LEVEL.per_unit,
-            command.phase / _PHASE.per_unit,
+            driving.frequency / _FREQUENCY.per_unit,
+            driving.level / _LEVEL.per_unit,
+            driving.phase / _PHASE.per_unit,
         )
-        for name, channel in rig.wiring.items()
-        if (command := playing.get((channel.amplifier, channel.number))) is not None
-    }
+    return tones
 
 
 def full_drive(excitation: physics.Excitation, rig: Rig) -> dict[str, AmplifierTone]:
     """Return the tones of an excitation at the share 1 of its course, by ERA."""
     layers = route(excitation, rig, ramp=0.0)
-    return {
-        name: tone
-        for name, channel in rig.wiring.items()
-        for tone in layers[channel.amplifier].tones
-        if tone.channel == channel.number and name in excitation
-    }
+    tones = dict[str, AmplifierTone]()
+    for name, channel in rig.wiring.items():
+        if name not in excitation:
+            continue
+        for tone in layers[channel.amplifier].tones:
+            if tone.channel == channel.number:
+                tones[name] = tone
+    return tones

@@ -53,7 +53,7 @@ PAGE = (ROOT / "docs" / "reference" / "python-api.md").read_text("utf-8")
         "- `is_reached: bool`: Whether all vibrations have their nominal levels",  # a property
         "- `async events() -> AsyncIterator[Notification]`: Yield notifications",  # a coroutine
         "`stop(*, client: str | None=None) -> StopResult`",  # a method of the stub
-        "`SolvedPlate(rig: Rig, *, seed: int | None=None)`: Plate of a rig",  # a constructor
+        "`SolvedPlate(rig: Rig, *, seed: int | None=None)`: A rig's plate on",  # a constructor
     ],
 )
 def test_page_has_what_docstrings_say(fact: str) -> None:

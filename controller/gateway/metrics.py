@@ -1,10 +1,11 @@
-"""The daemon's status as Prometheus metrics."""
+"""The daemon's status as Prometheus metrics.
 
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
-from itertools import accumulate
-from operator import attrgetter
-from typing import Any, TypeAlias, get_args
+`exposition` formats a status. `_Families` collects the metrics; each function below adds a group.
+A metric without a known value is left out.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import TypeAlias, get_args
 
 from prometheus_client import generate_latest
 from prometheus_client.core import (
@@ -24,35 +25,6 @@ from controller.api.schema import (
 from drivers.host.clock import ReportKind
 from drivers.protocol.definition import READINGS
 
-_Row: TypeAlias = tuple[str, str, Mapping[Any, float | None], tuple[str, ...]]
-"""Name, meaning, values by label values, and label names of a metric."""
-
-_AMPLIFIER_GAUGES: tuple[tuple[str, str, Callable[[AmplifierStatus], float | None]], ...] = (
-    ("degraded", "Whether the amplifier does not reply but may still play.", lambda a: a.degraded),
-    ("lost", "Whether the link to the amplifier is lost.", lambda a: a.lost),
-    (
-        "fault",
-        "Whether the amplifier reports a fault.",
-        lambda a: None if a.fault is None else a.fault != "NONE",
-    ),
-    ("high_voltage", "Whether high voltage is on.", lambda a: a.high_voltage),
-    *(
-        (each.metric, f"{each.label.capitalize()} {each.meaning}.", attrgetter(each.key))
-        for each in READINGS
-    ),
-    ("reply_age_seconds", "Time since the last reply.", lambda a: a.reply_age_s),
-    (
-        "clock_skew_seconds",
-        "RMS error of the amplifier's clock relative to the others.",
-        lambda a: None if a.clock_skew_us is None else a.clock_skew_us / 1e6,
-    ),
-    (
-        "round_trip_seconds",
-        "From the last request to its reply.",
-        lambda a: a.statistics.round_trip_ms and a.statistics.round_trip_ms / 1e3,
-    ),
-)
-
 _LINK_COUNTERS = {
     "frames_out": "Frames sent to an amplifier.",
     "frames_in": "Frames received from an amplifier.",
@@ -64,160 +36,198 @@ _LINK_COUNTERS = {
     "refusals": "Requests refused by an amplifier.",
 }
 
-
-@dataclass
-class _Metrics(Collector):
-    """Metrics of a status."""
-
-    status: StatusResult | None
-
-    def collect(self) -> Iterator[Metric]:
-        """Yield all metrics with a known value."""
-        yield GaugeMetricFamily(
-            "era_up", "Whether the daemon responds.", value=float(self.status is not None)
-        )
-        if self.status is None:
-            return
-        for kind, rows in (
-            (GaugeMetricFamily, _gauges(self.status)),
-            (CounterMetricFamily, _counters(self.status)),
-        ):
-            for name, text, values, labels in rows:
-                family = kind(f"era_{name}", text, labels=labels)
-                for key, value in values.items():
-                    if value is not None:
-                        family.add_metric(key, float(value))
-                if family.samples:
-                    yield family
-        for name, text, latency in _histograms(self.status):
-            if latency is not None:
-                yield _histogram(f"era_{name}_seconds", text, latency)
+_Labelled: TypeAlias = Mapping[tuple[str, ...], float | None]
+"""Values of a metric by label values."""
 
 
 def exposition(status: StatusResult | None) -> bytes:
     """Format a status in Prometheus' text format; only `era_up 0` without one."""
-    return generate_latest(_Metrics(status))
+    families = _Families()
+    families.gauge("up", "Whether the daemon responds.", status is not None)
+    if status is not None:
+        _add_state(families, status)
+        _add_amplifiers(families, status.amplifiers)
+        _add_counters(families, status)
+        _add_latencies(families, status)
+    return generate_latest(families)
 
 
-def _gauges(status: StatusResult) -> list[_Row]:
-    return [
-        ("state", "1 for the current state.", _one_of(DaemonStateName, status.state), ("state",)),
-        ("armed", "Whether a client holds the lease.", {(): status.armed_by is not None}, ()),
-        (
-            "assume_energised",
-            "Whether a lost amplifier may still be playing.",
-            {(): status.assume_energised},
-            (),
-        ),
-        ("contacts", "Fingers on the plate.", {(): len(status.contacts)}, ()),
-        ("uptime_seconds", "Time since the daemon started.", {(): status.uptime_s}, ()),
-        (
-            "promised_contrast_decibels",
-            "Felt contrast that 90 % of plates within the rig's tolerances reach.",
-            {(): status.promised_contrast_db},
-            (),
-        ),
-        (
-            "predicted_contrast_decibels",
-            "Nominal felt contrast of the pattern.",
-            {(): status.predicted_contrast_db},
-            (),
-        ),
-        (
-            "predicted_level_decibels",
-            "Predicted level at the target.",
-            {(): status.predicted_level_db_sl},
-            (),
-        ),
-        (
-            "layout",
-            "1 for the layout in use.",
-            {(name,): name == status.layout for name in status.layouts},
-            ("layout",),
-        ),
-        (
-            "touch_input_open",
-            "Whether the input can deliver touches.",
-            {(each.name,): each.state == "open" for each in status.inputs},
-            ("input",),
-        ),
-        (
-            "amplifier_report",
-            "1 for each recent report of the amplifier.",
-            {
-                (each.name, kind): kind in {report.kind for report in each.reports}
-                for each in status.amplifiers
-                for kind in get_args(ReportKind)
-            },
-            ("amplifier", "kind"),
-        ),
-        *(
-            (
-                f"amplifier_{name}",
-                text,
-                {(each.name,): value_of(each) for each in status.amplifiers},
-                ("amplifier",),
-            )
-            for name, text, value_of in _AMPLIFIER_GAUGES
-        ),
-    ]
+class _Families(Collector):
+    """Metric families in the order of their addition."""
+
+    def __init__(self) -> None:
+        self._families: list[Metric] = []
+
+    def collect(self) -> Iterator[Metric]:
+        """Yield all families."""
+        yield from self._families
+
+    def gauge(self, name: str, meaning: str, value: float | None) -> None:
+        """Add a gauge without labels."""
+        self.gauges(name, meaning, (), {(): value})
+
+    def gauges(self, name: str, meaning: str, labels: Sequence[str], values: _Labelled) -> None:
+        """Add a gauge for each combination of label values."""
+        self._add(GaugeMetricFamily(f"era_{name}", meaning, labels=labels), values)
+
+    def counters(self, name: str, meaning: str, labels: Sequence[str], values: _Labelled) -> None:
+        """Add a counter for each combination of label values."""
+        self._add(CounterMetricFamily(f"era_{name}", meaning, labels=labels), values)
+
+    def histogram(self, name: str, meaning: str, latency: LatencySummary | None) -> None:
+        """Add a histogram in seconds, without its unknown sum."""
+        if latency is None:
+            return
+        buckets: list[tuple[str, float]] = []
+        total = 0
+        for edge_ms, count in latency.histogram:
+            total += count
+            buckets.append((f"{edge_ms / 1e3:g}", float(total)))
+        # The last count includes values above the last edge.
+        buckets[-1] = ("+Inf", float(total))
+        family = HistogramMetricFamily(f"era_{name}", meaning, buckets=buckets, sum_value=None)
+        self._families.append(family)
+
+    def _add(self, family: GaugeMetricFamily | CounterMetricFamily, values: _Labelled) -> None:
+        for labels, value in values.items():
+            if value is not None:
+                family.add_metric(labels, float(value))
+        if family.samples:
+            self._families.append(family)
 
 
-def _counters(status: StatusResult) -> list[_Row]:
-    return [
-        (
-            "clicks_too_late",
-            "Short vibrations that came too late to be felt.",
-            {(): status.clicks_too_late},
-            (),
-        ),
-        (
-            "rejected_touches",
-            "Rejected touches and messages of touch sources.",
-            {(reason,): count for reason, count in status.rejected_touches.items()},
-            ("reason",),
-        ),
-        (
-            "lost_events",
-            "Events lost because clients read too slowly.",
-            {(topic,): count for topic, count in status.lost_events.items()},
-            ("topic",),
-        ),
-        *(
-            (
-                f"link_{name}",
-                text,
-                {(each.name,): getattr(each.statistics, name) for each in status.amplifiers},
-                ("amplifier",),
-            )
-            for name, text in _LINK_COUNTERS.items()
-        ),
-    ]
+def _add_state(families: _Families, status: StatusResult) -> None:
+    """Add the state of the daemon, its fingers, layouts and touch inputs."""
+    states: _Labelled = {(state,): state == status.state for state in get_args(DaemonStateName)}
+    families.gauges("state", "1 for the current state.", ("state",), states)
+    is_armed = status.armed_by is not None
+    families.gauge("armed", "Whether a client holds the lease.", is_armed)
+    families.gauge(
+        "assume_energised",
+        "Whether a lost amplifier may still be playing.",
+        status.assume_energised,
+    )
+    families.gauge("contacts", "Fingers on the plate.", len(status.contacts))
+    families.gauge("uptime_seconds", "Time since the daemon started.", status.uptime_s)
+    families.gauge(
+        "promised_contrast_decibels",
+        "Felt contrast that 90 % of plates within the rig's tolerances reach.",
+        status.promised_contrast_db,
+    )
+    families.gauge(
+        "predicted_contrast_decibels",
+        "Nominal felt contrast of the pattern.",
+        status.predicted_contrast_db,
+    )
+    families.gauge(
+        "predicted_level_decibels",
+        "Predicted level at the target.",
+        status.predicted_level_db_sl,
+    )
+    layouts: _Labelled = {(name,): name == status.layout for name in status.layouts}
+    families.gauges("layout", "1 for the layout in use.", ("layout",), layouts)
+    open_inputs: _Labelled = {(source.name,): source.state == "open" for source in status.inputs}
+    families.gauges(
+        "touch_input_open", "Whether the input can deliver touches.", ("input",), open_inputs
+    )
 
 
-def _histograms(status: StatusResult) -> list[tuple[str, str, LatencySummary | None]]:
-    return [
-        ("touch_to_wire", "From a touch to the last byte of the command.", status.latency_ms),
-        (
-            "lift_to_wire",
-            "From a lift, or an end without a touch, to the last byte of the command.",
-            status.lift_latency_ms,
-        ),
-    ]
+def _add_amplifiers(families: _Families, amplifiers: Sequence[AmplifierStatus]) -> None:
+    """Add the reports and readings of amplifiers."""
+    reports: dict[tuple[str, ...], float] = {}
+    for amplifier in amplifiers:
+        reported = [report.kind for report in amplifier.reports]
+        for kind in get_args(ReportKind):
+            reports[amplifier.name, kind] = kind in reported
+    families.gauges(
+        "amplifier_report",
+        "1 for each recent report of the amplifier.",
+        ("amplifier", "kind"),
+        reports,
+    )
+    values = {amplifier.name: _amplifier_values(amplifier) for amplifier in amplifiers}
+    for name, meaning in _amplifier_gauges().items():
+        by_amplifier: dict[tuple[str, ...], float | None] = {}
+        for amplifier_name in values:
+            by_amplifier[amplifier_name,] = values[amplifier_name][name]
+        families.gauges(f"amplifier_{name}", meaning, ("amplifier",), by_amplifier)
 
 
-def _one_of(states: Any, current: str) -> dict[tuple[str], bool]:
-    """1 for the current one of several states, 0 for the others."""
-    return {(state,): state == current for state in get_args(states)}
+def _amplifier_gauges() -> dict[str, str]:
+    """Return the meanings of the gauges of an amplifier, by name."""
+    meanings = {
+        "degraded": "Whether the amplifier does not reply but may still play.",
+        "lost": "Whether the link to the amplifier is lost.",
+        "fault": "Whether the amplifier reports a fault.",
+        "high_voltage": "Whether high voltage is on.",
+    }
+    for reading in READINGS:
+        meanings[reading.metric] = f"{reading.label.capitalize()} {reading.meaning}."
+    meanings["reply_age_seconds"] = "Time since the last reply."
+    meanings["clock_skew_seconds"] = "RMS error of the amplifier's clock relative to the others."
+    meanings["round_trip_seconds"] = "From the last request to its reply."
+    return meanings
 
 
-def _histogram(name: str, text: str, latency: LatencySummary) -> Metric:
-    """The histogram in seconds, without its unknown sum."""
-    *edges, last = latency.histogram
-    sums = accumulate(count for _, count in edges)
-    buckets = [
-        (f"{edge / 1e3:g}", float(sum_)) for (edge, _), sum_ in zip(edges, sums, strict=True)
-    ]
-    # The last count includes values above the last edge.
-    buckets.append(("+Inf", sum(count for _, count in edges) + float(last[1])))
-    return HistogramMetricFamily(name, text, buckets=buckets, sum_value=None)
+def _amplifier_values(amplifier: AmplifierStatus) -> dict[str, float | None]:
+    """Return the values of the gauges of an amplifier, by name."""
+    values = {
+        "degraded": amplifier.degraded,
+        "lost": amplifier.lost,
+        "fault": None,
+        "high_voltage": amplifier.high_voltage,
+        "reply_age_seconds": amplifier.reply_age_s,
+        "clock_skew_seconds": None,
+        "round_trip_seconds": None,
+    }
+    if amplifier.fault is not None:
+        values["fault"] = amplifier.fault != "NONE"
+    for reading in READINGS:
+        values[reading.metric] = getattr(amplifier, reading.key)
+    if amplifier.clock_skew_us is not None:
+        values["clock_skew_seconds"] = amplifier.clock_skew_us / 1e6
+    round_trip_ms = amplifier.statistics.round_trip_ms
+    if round_trip_ms is not None:
+        values["round_trip_seconds"] = round_trip_ms / 1e3
+    return values
+
+
+def _add_counters(families: _Families, status: StatusResult) -> None:
+    """Add the counters of touches, lost events and links."""
+    families.counters(
+        "clicks_too_late",
+        "Short vibrations that came too late to be felt.",
+        (),
+        {(): status.clicks_too_late},
+    )
+    families.counters(
+        "rejected_touches",
+        "Rejected touches and messages of touch sources.",
+        ("reason",),
+        {(reason,): count for reason, count in status.rejected_touches.items()},
+    )
+    families.counters(
+        "lost_events",
+        "Events lost because clients read too slowly.",
+        ("topic",),
+        {(topic,): count for topic, count in status.lost_events.items()},
+    )
+    for name, meaning in _LINK_COUNTERS.items():
+        by_amplifier: dict[tuple[str, ...], float] = {}
+        for amplifier in status.amplifiers:
+            by_amplifier[amplifier.name,] = getattr(amplifier.statistics, name)
+        families.counters(f"link_{name}", meaning, ("amplifier",), by_amplifier)
+
+
+def _add_latencies(families: _Families, status: StatusResult) -> None:
+    """Add the histograms of latencies."""
+    families.histogram(
+        "touch_to_wire_seconds",
+        "From a touch to the last byte of the command.",
+        status.latency_ms,
+    )
+    families.histogram(
+        "lift_to_wire_seconds",
+        "From a lift, or an end without a touch, to the last byte of the command.",
+        status.lift_latency_ms,
+    )

@@ -7,7 +7,7 @@ number of keys are bounded before anything is parsed.
 
 import json
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from enum import IntEnum
 from typing import Annotated, Any, Literal, TypeAlias, TypeVar
 
@@ -78,31 +78,29 @@ class RpcError(Exception):
     def __init__(
         self,
         code: ErrorCode,
-        what: str,
+        problem: str,
         *,
         where: str | None = None,
         remedy: str | None = None,
         amplifiers: dict[str, AmplifierSilence] | None = None,
     ) -> None:
-        super().__init__(f"{what}; {remedy}" if remedy else what)
+        super().__init__(f"{problem}; {remedy}" if remedy else problem)
         self.code = code
-        self.data = ErrorData(what=what, where=where, remedy=remedy, amplifiers=amplifiers)
+        self.data = ErrorData(what=problem, where=where, remedy=remedy, amplifiers=amplifiers)
 
 
 class NotSilent(RpcError):
     """A stop after which an amplifier is not confirmed silent; amplifiers: all, by name."""
 
     def __init__(self, amplifiers: Mapping[str, AmplifierSilence]) -> None:
-        unconfirmed = {
-            name: each for name, each in amplifiers.items() if each.silence != "confirmed_silent"
-        }
-        what = "not confirmed silent: " + ", ".join(
-            f"{name} ({each.words}: {each.cause})" for name, each in unconfirmed.items()
-        )
+        unconfirmed: list[str] = []
+        for name, amplifier in amplifiers.items():
+            if amplifier.silence != "confirmed_silent":
+                unconfirmed.append(f"{name} ({amplifier.words}: {amplifier.cause})")
         self.amplifiers = dict(amplifiers)
         super().__init__(
             ErrorCode.NOT_SILENT,
-            what,
+            f"not confirmed silent: {', '.join(unconfirmed)}",
             remedy="switch these amplifiers off",
             amplifiers=self.amplifiers,
         )
@@ -111,8 +109,8 @@ class NotSilent(RpcError):
 class InvalidRequest(RpcError):
     """A line that is not a request; id: of its response, None if it cannot be read."""
 
-    def __init__(self, code: ErrorCode, what: str, *, remedy: str, id: Id = None) -> None:
-        super().__init__(code, what, remedy=remedy)
+    def __init__(self, code: ErrorCode, problem: str, *, remedy: str, id: Id = None) -> None:
+        super().__init__(code, problem, remedy=remedy)
         self.id = id
 
 
@@ -145,57 +143,71 @@ def read_request(line: bytes) -> Request:
 
 def request_of(document: Any) -> Request:
     """Validate the document of a line; raises InvalidRequest."""
-    return _validated(
-        Request,
-        document,
-        lambda _, problem: InvalidRequest(
+    try:
+        return _validated(Request, document)
+    except _InvalidMessage as problem:
+        raise InvalidRequest(
             ErrorCode.INVALID_REQUEST,
             f"not a JSON-RPC 2.0 request: {problem}",
             remedy='send {"jsonrpc": "2.0", "id": 1, "method": ..., "params": {...}}; no batches',
             id=_readable_id(document),
-        ),
-    )
+        ) from problem
 
 
 def read_params(model: type[_MessageT], request: Request) -> _MessageT:
     """Validate the parameters of a request; raises RpcError."""
-    return _validated(
-        model,
-        request.params,
-        lambda key, problem: RpcError(
+    try:
+        return _validated(model, request.params)
+    except _InvalidMessage as problem:
+        raise RpcError(
             ErrorCode.INVALID_PARAMS,
             f"{request.method}: {problem}",
-            where=key,
+            where=problem.key,
             remedy="see the method in docs/reference/api.md",
-        ),
-    )
+        ) from problem
 
 
-def _validated(
-    model: type[_ModelT], content: Any, refusal: Callable[[str | None, str], RpcError]
-) -> _ModelT:
-    """Validate a message, or raise its refusal by key and description of the first problem.
+class _InvalidMessage(Exception):
+    """A message that does not fit its model; key: of the first problem, None for the whole."""
 
-    Of many unknown keys the first alone is described, in bounded time; no input is quoted.
+    def __init__(self, key: str | None, text: str) -> None:
+        super().__init__(text if key is None else f"{key}: {text}")
+        self.key = key
+
+
+def _validated(model: type[_ModelT], content: Any) -> _ModelT:
+    """Validate a message; raises _InvalidMessage, which quotes no input.
+
+    If there are unknown keys, only the first is reported, so that the time is bounded.
     """
-    keys = content if isinstance(content, dict) else ()
-    unknown = [key for key in keys if key not in model.model_fields][:1]
+    unknown = _unknown_key(model, content)
     try:
-        return model.model_validate(dict.fromkeys(unknown) if unknown else content)
+        return model.model_validate(content if unknown is None else {unknown: None})
     except ValidationError as error:
         problems = error.errors(include_url=False, include_context=False, include_input=False)
-        problem = next((each for each in problems if each["loc"] == (*unknown,)), problems[0])
-        name = _printable(".".join(str(part) for part in problem["loc"]))
-        text = reworded(problem["msg"])
-        raise refusal(name or None, f"{name}: {text}" if name else text) from error
+        first = problems[0]
+        for problem in problems:
+            if problem["loc"] == (unknown,):
+                first = problem
+        key = _printable(".".join(map(str, first["loc"])))
+        raise _InvalidMessage(key or None, reworded(first["msg"])) from error
 
 
-def unknown_method(method: str, known: Iterable[str]) -> RpcError:
+def _unknown_key(model: type[BaseModel], content: object) -> str | None:
+    """Return the first key of an object that its model does not have."""
+    if isinstance(content, dict):
+        for key in content:
+            if key not in model.model_fields:
+                return str(key)
+    return None
+
+
+def unknown_method(method: str, methods: Iterable[str]) -> RpcError:
     """The error for a method that does not exist."""
     return RpcError(
         ErrorCode.UNKNOWN_METHOD,
         f"unknown method {method[:40]!a}",
-        remedy=f"use one of {', '.join(known)}",
+        remedy=f"use one of {', '.join(methods)}",
     )
 
 
@@ -206,11 +218,11 @@ def result_line(id: Id, result: str) -> bytes:
 
 def error_line(id: Id, error: RpcError) -> bytes:
     """The response to a request that failed; id None if it could not be read."""
-    content = {
-        "code": int(error.code),
-        "message": str(error)[:_MAX_ERROR_TEXT],
-        "data": error.data.model_dump(exclude=None if error.data.amplifiers else {"amplifiers"}),
-    }
+    data = error.data.model_dump()
+    if not error.data.amplifiers:
+        del data["amplifiers"]
+    message = str(error)[:_MAX_ERROR_TEXT]
+    content = {"code": int(error.code), "message": message, "data": data}
     return json.dumps({"jsonrpc": "2.0", "id": id, "error": content}).encode() + b"\n"
 
 
@@ -219,14 +231,12 @@ def read_error(error: Mapping[str, Any]) -> RpcError:
     data = error.get("data") or {}
     code = ErrorCode(error["code"])
     if code is ErrorCode.NOT_SILENT:
-        return NotSilent(
-            {
-                name: AmplifierSilence.model_validate(each, extra="ignore")
-                for name, each in data["amplifiers"].items()
-            }
-        )
-    what = data.get("what", error["message"])
-    return RpcError(code, what, where=data.get("where"), remedy=data.get("remedy"))
+        amplifiers: dict[str, AmplifierSilence] = {}
+        for name, silence in data["amplifiers"].items():
+            amplifiers[name] = AmplifierSilence.model_validate(silence, extra="ignore")
+        return NotSilent(amplifiers)
+    problem = data.get("what", error["message"])
+    return RpcError(code, problem, where=data.get("where"), remedy=data.get("remedy"))
 
 
 def request_line(id: Id, method: str, params: bytes) -> bytes:
@@ -244,27 +254,23 @@ def event_line(topic: str, *, time: float, lost: int, data: bytes) -> bytes:
 
 def parse_json(line: bytes) -> Any:
     """Parse bounded JSON without repeated keys, NaN and infinity; raises InvalidRequest."""
+    if not _is_bounded(line):
+        raise InvalidRequest(
+            ErrorCode.PARSE, "too many keys or values", remedy="send fewer touches per frame"
+        )
     problems: list[str] = []
 
     def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
         content = dict(pairs)
         if len(content) < len(pairs):
             counts = Counter(key for key, _ in pairs)
-            problems.append(f"key {_printable(counts.most_common(1)[0][0])} is repeated")
+            [(repeated, _)] = counts.most_common(1)
+            problems.append(f"key {_printable(repeated)} is repeated")
         return content
 
     def refuse_constant(name: str) -> None:
         problems.append(f"{name} is not JSON")
 
-    if (
-        len(line) > MAX_LINE_LENGTH
-        or line.count(b",") > MAX_SEPARATORS  # counted alone, as it mostly suffices
-        or sum(map(line.count, b":,")) > MAX_SEPARATORS
-        or sum(map(line.count, b"{[")) > MAX_OPENINGS
-    ):
-        raise InvalidRequest(
-            ErrorCode.PARSE, "too many keys or values", remedy="send fewer touches per frame"
-        )
     try:
         document = json.loads(
             line.decode(), object_pairs_hook=unique, parse_constant=refuse_constant
@@ -285,14 +291,29 @@ def parse_json(line: bytes) -> Any:
     return document
 
 
+def _is_bounded(line: bytes) -> bool:
+    """Whether a line is short, with few keys, values and levels, so that parsing is fast."""
+    if len(line) > MAX_LINE_LENGTH:
+        return False
+    commas = line.count(b",")
+    if commas > MAX_SEPARATORS:  # counts no colons in a hostile line
+        return False
+    separators = commas + line.count(b":")
+    openings = line.count(b"{") + line.count(b"[")
+    return separators <= MAX_SEPARATORS and openings <= MAX_OPENINGS
+
+
 def _readable_id(document: object) -> Id:
     """The id of a document that is not a request, if it has one."""
+    if not isinstance(document, dict):
+        return None
     try:
-        return _REQUEST_ID.validate_python(document["id"] if isinstance(document, dict) else None)
-    except (KeyError, ValidationError):
+        return _REQUEST_ID.validate_python(document.get("id"))
+    except ValidationError:
         return None
 
 
 def _printable(name: str) -> str:
     """A key, shortened and free of control characters."""
-    return (name if name.isprintable() else ascii(name))[:80]
+    printable = name if name.isprintable() else ascii(name)
+    return printable[:80]

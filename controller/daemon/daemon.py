@@ -20,11 +20,12 @@ from pathlib import Path
 from controller.api.methods import ReloadResult
 from controller.api.schema import headline
 from controller.api.server import ApiServer
+from controller.daemon.amplifier_messages import amplifier_statuses
 from controller.daemon.children import gateway_options, keep_gateway
 from controller.daemon.config import DaemonConfig, load_daemon_config, loopback_address
 from controller.daemon.handlers import ApiService
 from controller.daemon.layouts import ConfigChange, LayoutChoice, TouchInputs, read_again, release
-from controller.daemon.messages import EventPublisher, amplifier_statuses
+from controller.daemon.messages import EventPublisher
 from controller.effects.effect import Effect
 from controller.gateway.gateway_settings import require_gateway
 from controller.operation.operation_states import ENERGISED

@@ -38,10 +38,11 @@ from controller.api.methods import (
 )
 from controller.api.schema import AmplifierSilence, Empty, headline
 from controller.api.server import Connection, Handler
-from controller.content.points import pattern_of_points
+from controller.content.pattern import pattern_of_points
 from controller.daemon.config import API_SOURCES, DaemonConfig
 from controller.daemon.layouts import LayoutChoice
-from controller.daemon.messages import EventPublisher, effects_result, hello_result, playing_of
+from controller.daemon.messages import EventPublisher, effects_result, hello_result
+from controller.daemon.plate_view import playing_of
 from controller.effects.effect import MIN_DB_SL, Effect
 from controller.effects.kinds import File
 from controller.operation.operation_states import (

@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 from cases import shortly
-from controller.daemon.messages import amplifier_statuses
+from controller.daemon.amplifier_messages import amplifier_statuses
 from controller.operation import supervisor as supervisor_module
 from controller.operation.operation_states import (
     TRANSITIONS,

@@ -18,7 +18,7 @@ import pytest
 
 from cases import read_yaml, shortly
 from controller.content.pattern import Pattern, Transient
-from controller.daemon.messages import PlateView
+from controller.daemon.plate_view import PlateView
 from controller.effects.kinds import File
 from controller.effects.layout import SurfaceLayout, layout_of
 from controller.play.intent import CLICK, Content, HapticIntent, Pulse, Selection, Target

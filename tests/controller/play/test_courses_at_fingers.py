@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from controller.content.pattern import Curve, Pattern, Transient, sharpness_of
-from controller.daemon.messages import PlateView
+from controller.daemon.plate_view import PlateView
 from controller.effects.effect import Effect, Region
 from controller.effects.kinds import Buzz, File
 from controller.effects.layout import SurfaceLayout

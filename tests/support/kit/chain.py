@@ -21,7 +21,7 @@ from typing import Any, Self, TypeVar, cast
 
 import numpy as np
 
-from controller.daemon.messages import PlateView
+from controller.daemon.plate_view import PlateView
 from controller.effects.layout import SurfaceLayout, default_effects
 from controller.effects.player import EffectPlayer
 from controller.operation.plate_controller import Controller

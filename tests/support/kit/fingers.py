@@ -22,7 +22,7 @@ from pythonosc.osc_bundle_builder import IMMEDIATELY, OscBundleBuilder
 from pythonosc.osc_message_builder import OscMessageBuilder
 from scipy.signal import hilbert
 
-from controller.daemon.messages import PlateView
+from controller.daemon.plate_view import PlateView
 from controller.effects.effect import Region
 from controller.effects.kinds import Buzz
 from controller.effects.layout import SurfaceLayout

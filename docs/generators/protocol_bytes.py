@@ -210,7 +210,7 @@ def _rtu() -> str:
     return _block(
         {
             "The commit on RTU": exchange.request("Commit", _COMMIT),
-            "Stop along 5 ms, to all, on RTU": exchange.request("Stop", _STOP, 0),
+            "Stop with a ramp of 5 ms, to all, on RTU": exchange.request("Stop", _STOP, 0),
         }
     )
 
@@ -232,7 +232,7 @@ def _more(page: str) -> str:
         ("Hello", "Hello", {}, 1),
         (f"Arm with session {SESSION:04X}, watchdog 250 ms", "Arm", _ARM, 1),
         ("Ping of another session, refused", "Ping", {"session": 7, "rate": 0}, 1),
-        ("Stop along 5 ms, to all", "Stop", _STOP, 0),
+        ("Stop with a ramp of 5 ms, to all", "Stop", _STOP, 0),
     )
     number, before = _FIRST[page]
     exchange = _Exchange(_KINDS[page], number if page == "modbus" else 5)

@@ -60,11 +60,11 @@ _MEANINGS = {
     **{"FAULT": "silent, high voltage off, latched"},
     **{"NONE": "", "WATCHDOG": "not fed in time", "OVER_TEMPERATURE": "", "OVER_VOLTAGE": ""},
     **{"ARC": "", "CHANNEL": "one channel failed; all fall silent", "INTERNAL": ""},
-    **{"INTERLOCK": "opened in 3, 4 or 5; gone once closed", "OVER_CURRENT": ""},
+    **{"INTERLOCK": "opened in 3, 4 or 5; ends once it is closed", "OVER_CURRENT": ""},
     **{"UNKNOWN_TYPE": "unknown message, or its feature is missing"},
     **{"BAD_LENGTH": "missing or extra words"},
     **{"BAD_VALUE": "number out of range, or a bit that must be 0"},
-    **{"BAD_CHANNEL": "channel does not exist, or comes twice in a layer"},
+    **{"BAD_CHANNEL": "channel does not exist, or appears twice in a layer"},
     **{"WRONG_STATE": "not allowed in this state, or Arm with the interlock open"},
     **{"BAD_TOKEN": "0, not newer, or not staged"},
     **{"BUSY": "the host repeats the request after 5 ms, at most twice"},
@@ -77,7 +77,7 @@ _MEANINGS = {
     **{"levels_measured": "levels in Status are measured, not computed"},
     **{"interlock": "has an interlock", "electrical": "GetMeasured"},
     **{"address": "SetAddress", "mark": "Mark"},
-    "high_voltage": "on in states 3 and 4, in 5 until silent, and in 6 no longer than until silent",
+    "high_voltage": "on in states 3 and 4, and in 5 until silent; off in 6 once silent, or earlier",
     **{"interlock_open": "", "limited": "a sum was limited since the last Status"},
 }
 _PURPOSES = {
@@ -87,13 +87,13 @@ _PURPOSES = {
     "Disarm": "fades all voices, then switches the high voltage off",
     "Set": "transfers one part of a set",
     "Commit": "starts the staged set",
-    "Silence": "fades all voices, stays armed",
+    "Silence": "fades all voices without disarming",
     "Stop": "fades all voices and latches",
-    "GetStatus": "returns the present state",
+    "GetStatus": "returns the current state",
     "GetFaults": "returns past faults",
     "Clear": "acknowledges a stop or a fault",
     "Ping": "feeds the watchdog, steers the clock",
-    "GetAchieved": "returns the commands of a layer as they will play",
+    "GetAchieved": "returns the commands of a layer as they will be played",
     "GetMeasured": "returns voltages and currents",
     "SetAddress": "changes the address",
     "Mark": "stores the clock",
@@ -102,32 +102,32 @@ _CAPABILITY_MEANINGS = {
     "channels, layers": "numbers of channels and layers",
     "voices": "voices that each channel can play; at least the number of layers",
     "set_words": "longest stream of a set, in words",
-    "knots": "most knots of an envelope",
+    "knots": "maximum number of knots in an envelope",
     "features": "bits, listed above",
-    "frequency_min, frequency_max, level_max": "limits of the whole amplifier; "
-    "they enclose those of its channels",
-    "frequency_step, level_step, phase_step": "resolution with which it plays",
+    "frequency_min, frequency_max, level_max": "limits of the whole amplifier, "
+    "at least as wide as those of its channels",
+    "frequency_step, level_step, phase_step": "resolution of playback",
     "ramp_max": "longest ramp",
     "slew": "fastest change of amplitude. A steeper change is played at this slope and arrives "
     "later; no host requests one. 0: no limit",
     "watchdog_min, watchdog_max": "limits of the watchdog time",
     "envelope_step_min, envelope_step_max": "limits of the step of an envelope",
-    "clock_error": "largest error of a reading of the clock, or of the output relative to the "
-    "clock, beyond a constant that all amplifiers of a product share; 65535: unknown, or the "
+    "clock_error": "largest error of a clock reading, or of the output relative to the clock, "
+    "except for a constant error common to all amplifiers of a product; 65535: unknown, or the "
     "clock cannot be steered",
     "limits": "limits of each channel; sets are checked against these only",
 }
 _STATUS_MEANINGS = {
-    "state, fault": "fault is NONE except in the states 6 and 7",
+    "state, fault": "fault is NONE except in states 6 and 7",
     "flags": "bits, listed above",
     "latch": "number of the last stop or fault",
     "watchdog_left": "time until the watchdog expires; 0 unless armed",
     "temperature": "measured; 25 °C if it cannot be",
     "high_voltage": "measured, so it falls gradually; 0 if it cannot be",
     "clock": "see [the clock](#the-clock)",
-    "token": "committed last since Arm; 0: none",
+    "token": "token of the last set committed since Arm; 0: none",
     "channels, layers": "as in Capabilities",
-    "levels": "amplitude that each channel may have at `clock`, or up to 0.2 ms earlier",
+    "levels": "level of each channel (below) at `clock`, or up to 0.2 ms earlier",
     "tokens": "token of the set that each layer plays; 0: the layer is over",
 }
 
@@ -298,7 +298,7 @@ def objects() -> str:
             shown = [f"{number} {each}" for number, each in enumerate(names, start=1)]
             yield index, " · ".join(shown)
 
-    return _table(("object", "subindex and word, of four channels and eight layers"), rows())
+    return _table(("object", "subindex and word, with four channels and eight layers"), rows())
 
 
 def _blocks(*written: str) -> str:

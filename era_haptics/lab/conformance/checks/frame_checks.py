@@ -468,7 +468,7 @@ async def areas(subject: Subject) -> None:
 
 @driving("modbus.md#registers", "rtu", "tcp")
 async def present_areas(subject: Subject) -> None:
-    """Status area: the present at every read; other areas: unchanged since their last write.
+    """Status area: a current Status at every read; other areas: unchanged since their last write.
 
     Rebuild only GetCaps, GetStatus and GetFaults at a read. A broadcast changes no reply area.
     """
@@ -535,7 +535,7 @@ def _bad_pdus(client: ModbusClient, ping: bytes) -> Iterator[tuple[str, bytes, i
 
 @driving("modbus.md#functions-and-exceptions", "rtu", "tcp")
 async def exceptions(subject: Subject) -> None:
-    """Invalid function, register or count: the listed exception, no effect, not fed.
+    """Invalid function, register or count: the listed exception, no effect, does not feed.
 
     Check the count first, then the registers, and do nothing else for a request that gets an
     exception.
@@ -556,7 +556,7 @@ async def exceptions(subject: Subject) -> None:
 
 @reading("modbus.md#the-line", "rtu", "tcp")
 async def pieces(subject: Subject) -> None:
-    """Frame in pieces: reply; frame broken off by a pause: discarded, reply to the next one.
+    """Frame in pieces: reply; frame interrupted by a pause: discarded, reply to the next one.
 
     Collect bytes until the frame is complete. Drop an incomplete frame after 20 ms (RTU) or 1 s
     (TCP), and keep the bytes that follow a complete one.
@@ -693,7 +693,7 @@ def _framed(content: bytes) -> bytes:
 
 @driving("protocol.md#order-of-checks")
 async def damaged_frames(subject: Subject) -> None:
-    """Damaged frame, or frame for another address: no reply, no effect, not fed.
+    """Damaged frame, or frame for another address: no reply, no effect, does not feed.
 
     Check length, checksum and address before anything else, and discard the frame silently.
     """
@@ -717,7 +717,7 @@ async def damaged_frames(subject: Subject) -> None:
 
 @driving("protocol.md#sets")
 async def doubled_frames(subject: Subject) -> None:
-    """Frame that comes twice or late: treated as a repetition of its token.
+    """Frame that arrives twice or late: treated as a repetition of its token.
 
     Decide by the token whether a set is new, not by the sequence number of the frame.
     """

@@ -74,7 +74,7 @@ def layers_play_on(subject: Subject) -> RequestRows:
 
 @driving("protocol.md#layers")
 def valid_for(subject: Subject) -> RequestRows:
-    """After valid_for: the layer ends along its ramp, state stays armed.
+    """After valid_for: the layer ends with its ramp, the amplifier stays armed.
 
     Count valid_for in real time from the start of the layer, as 16-bit milliseconds;
     0 is no end.
@@ -150,7 +150,7 @@ def _passed(subject: Subject, sets: int) -> float:
 
 @driving("protocol.md#layers")
 def after_the_last_onset(subject: Subject) -> RequestRows:
-    """Set with `after`, several onsets: waits for the last with knots in its layer.
+    """Set with `after`, several onsets: waits for the last onset of its layer that has knots.
 
     Wait for voices of this layer that are not released and follow an onset with knots; ignore
     ramps, other layers and empty onsets.
@@ -182,7 +182,7 @@ def after_the_last_onset(subject: Subject) -> RequestRows:
 
 @driving("protocol.md#layers")
 def what_waits_for_an_onset(subject: Subject) -> RequestRows:
-    """Waiting commands start: valid_for counts from there, kept voices continue.
+    """Start of waiting commands: valid_for counts from then, keep_phase continues voices.
 
     Start what waits before you remove voices at amplitude 0, and let an earlier end of the layer
     drop it.
@@ -246,7 +246,7 @@ def cross_fades(subject: Subject) -> RequestRows:
 
 @driving("protocol.md#layers")
 def kept_phase(subject: Subject) -> RequestRows:
-    """keep_phase with the same frequency: the voice goes on from its present amplitude.
+    """keep_phase with the same frequency: the voice continues from its current amplitude.
 
     Continue a voice of the same layer, channel and frequency that is not released; otherwise begin
     a new one.
@@ -321,7 +321,7 @@ def endings(subject: Subject) -> RequestRows:
 
 @driving("protocol.md#layers")
 def endings_amid(subject: Subject) -> RequestRows:
-    """Ending during an onset or fade: starts at the present amplitude, once.
+    """Ending during an onset or fade: starts at the current amplitude, once.
 
     Begin an ending at the amplitude found, never restart it, and let a later fade shorten it but
     not prolong it.
@@ -547,7 +547,7 @@ async def clock_goes_on(subject: Subject) -> None:
 
 @driving("protocol.md#the-clock")
 def clock_readings(subject: Subject) -> RequestRows:
-    """Status while armed: its clock is of a moment between request and reply.
+    """Status while armed: its clock was read between the request and the reply.
 
     Read the clock when you build the reply, between samples too, without a constant or growing
     error above clock_error.

@@ -400,7 +400,7 @@ async def broadcasts(subject: Subject) -> None:
 
 @driving("protocol.md#the-clock")
 async def mark(subject: Subject) -> None:
-    """Mark: the next Status shows the clock of the Mark, the one after it the present.
+    """Mark: the next Status shows the clock of the Mark, the following one the current clock.
 
     Store the clock in the interrupt of the last byte of the Mark, show it in one Status, then
     discard it.
@@ -561,8 +561,8 @@ async def read_object(client: CanClient, index: int, subindex: int = 0, *, code:
 async def network_management(subject: Subject) -> None:
     """NMT command: replies only while OPERATIONAL; leaving it while armed is a Stop.
 
-    Run a Stop along 5 ms whenever NMT takes the node out of OPERATIONAL, and reset object 1017 and
-    the numbers after a reset.
+    Run a Stop with a ramp of 5 ms whenever NMT takes the node out of OPERATIONAL, and reset object
+    1017 and the numbers after a reset.
     """
     client = cast(CanClient, subject.client)
     await client.look_around()
@@ -619,7 +619,7 @@ async def network_management(subject: Subject) -> None:
 
 @driving("can.md#network-management", "can")
 async def heartbeats(subject: Subject) -> None:
-    """Object 1017: heartbeats at its interval; fault and Clear: their emergencies.
+    """Object 1017: heartbeats at its interval; fault and Clear: an emergency for each.
 
     Send the NMT state at the interval of object 1017, none for 0, and an emergency on entering 6,
     on entering 7 and on leaving 7.

@@ -84,7 +84,7 @@ def levels_of_every_frequency(subject: Subject) -> RequestRows:
 
 @driving("protocol.md#readings")
 async def achieved(subject: Subject) -> None:
-    """GetAchieved: every command within half a step; Taken: exact only if all are equal.
+    """GetAchieved: every value within half a step; Taken: exact only if nothing is rounded.
 
     Return the values that are really played with token, ramp and valid_for of their set, leave out
     released voices, and set exact only if nothing is rounded.
@@ -244,7 +244,7 @@ def _flawed_sets(subject: Subject) -> Iterator[Send]:
 
 @driving("protocol.md#parts-of-a-set")
 def all_or_nothing(subject: Subject) -> RequestRows:
-    """Set with one error: rejected whole with code and channel, playback unchanged.
+    """Set with one error: rejected as a whole with code and channel, playback unchanged.
 
     Validate the whole stream before you change anything, in the order of the page: length, layers,
     then each command with its onset and its ending.
@@ -272,7 +272,7 @@ def all_or_nothing(subject: Subject) -> RequestRows:
 
 @driving("protocol.md#identity-and-capabilities")
 def accepts_its_ranges(subject: Subject) -> RequestRows:
-    """Values at the ends of the stated ranges: accepted, also any frequency at level 0.
+    """Values at the ends of the stated ranges, and any frequency at level 0: accepted.
 
     Treat limits as inclusive, and check the frequency only of commands that drive.
     """
@@ -390,7 +390,7 @@ def parts_of_sets(subject: Subject) -> RequestRows:
 
 @driving("protocol.md#parts-of-a-set")
 def parts_that_are_dropped(subject: Subject) -> RequestRows:
-    """Part that must not be kept: no reply, the set being collected stays.
+    """Part that must not be kept: no reply, the set being collected does not change.
 
     Compare session, token and number of parts before you store a part; drop it silently if one is
     wrong.
@@ -442,7 +442,7 @@ def parts_that_are_dropped(subject: Subject) -> RequestRows:
 
 @driving("protocol.md#parts-of-a-set")
 def parts_again(subject: Subject) -> RequestRows:
-    """Part sent again: replaces the first copy; last part of a whole set: confirmed unread.
+    """Part sent again: replaces the first copy; last part of a whole set: only its token counts.
 
     Overwrite a stored part with its repetition. Once a set is staged or played, confirm its token
     without looking at the stream.
@@ -468,7 +468,7 @@ def parts_again(subject: Subject) -> RequestRows:
 
 @driving("protocol.md#parts-of-a-set")
 def refused_parts(subject: Subject) -> RequestRows:
-    """Set rejected as a whole: its parts are dropped, other sets stay.
+    """Set rejected as a whole: its parts are dropped, other sets are kept.
 
     On a rejection, free only the parts collected under that token.
     """
@@ -692,7 +692,7 @@ def newer_sets_replace(subject: Subject) -> RequestRows:
 
 @driving("protocol.md#start-of-a-set")
 def committed_together(subject: Subject) -> RequestRows:
-    """Commit of a set with all layers and channels: all start with one sample.
+    """Commit of a set with all layers and channels: all start at the same sample.
 
     Apply a whole set between two samples, not layer by layer across several.
     """
@@ -752,7 +752,7 @@ async def _starts(subject: Subject, duration: float, *, shift: int = 0) -> None:
 
 @driving("protocol.md#start-of-a-set")
 def what_waits_for_its_moment(subject: Subject) -> RequestRows:
-    """Set waiting for its moment: started by a newer one, dropped by what silences.
+    """Set waiting for its moment: a newer set starts it, every silencing request drops it.
 
     Before a newer Commit or `now` that you accept, start the set that waits. Drop it in Silence,
     Stop, Disarm, faults and an Arm with a new session.

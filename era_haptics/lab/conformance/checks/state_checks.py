@@ -94,7 +94,7 @@ async def watchdog_ranges(subject: Subject) -> None:
 
 @driving("protocol.md#states")
 def arms_again(subject: Subject) -> RequestRows:
-    """Arm with the session held: the watchdog restarts with its time, playback goes on.
+    """Arm with the session held: the watchdog restarts with the new time, playback continues.
 
     If the session is the one held, only store the new watchdog time and restart the count; keep
     voices, staged sets and the token.
@@ -236,7 +236,7 @@ def silence_never_later(subject: Subject) -> RequestRows:
 
 @driving("protocol.md#states")
 def stop_ends_all(subject: Subject) -> RequestRows:
-    """Stop during fades, onsets, endings and waiting sets: all end along its ramp.
+    """Stop during fades, onsets, endings and waiting sets: all end with the Stop's ramp.
 
     Fade every voice of every layer, released or not, skip endings, and drop what waits.
     """
@@ -271,7 +271,7 @@ def stops_are_numbered(subject: Subject) -> RequestRows:
 
 @driving("protocol.md#states")
 def clear_too_early(subject: Subject) -> RequestRows:
-    """Clear during the fade of a Stop: the state stays.
+    """Clear during the fade of a Stop: the state does not change.
 
     Leave QUICK_STOP_ACTIVE only when no voice lasts; until then, answer Clear with the present
     Status.
@@ -284,7 +284,7 @@ def clear_too_early(subject: Subject) -> RequestRows:
 
 @driving("protocol.md#start-of-a-set")
 def silence(subject: Subject) -> RequestRows:
-    """Silence: all layers fade along its ramp, staged sets are dropped, state stays armed.
+    """Silence: all layers fade with its ramp, staged sets are dropped, the amplifier stays armed.
 
     Fade every voice, drop collected, staged and waiting sets, and stay in OPERATION_ENABLED. Reject
     a ramp above ramp_max with BAD_VALUE.
@@ -342,9 +342,9 @@ async def _trips_for_good(subject: Subject, time: int) -> None:
 
 @driving("protocol.md#sessions-and-the-watchdog")
 async def watchdog(subject: Subject) -> None:
-    """Watchdog not fed: every channel reaches zero along 5 ms, fault latched until Clear.
+    """Watchdog not fed: every channel reaches zero in 5 ms, fault latched until Clear.
 
-    When the count reaches zero, fade all voices along 5 ms, beginning at most 5 ms late, latch
+    When the count reaches zero, fade all voices in 5 ms, beginning at most 5 ms late, latch
     WATCHDOG, and answer WRONG_STATE to Arm.
     """
     for time in (subject.shortest_watchdog, subject.can["watchdog_max"]):
@@ -378,8 +378,8 @@ async def watchdog_unread(subject: Subject) -> None:
 def what_feeds(subject: Subject) -> RequestRows:
     """Arm, Ping, Set, Commit or Silence of the session: watchdog_left restarts.
 
-    Restart the count for every accepted request that feeds, also a repeated Commit, a part that is
-    kept and a last part that gets Taken.
+    Restart the count for every accepted request that feeds, including a repeated Commit, a part
+    that is kept and a last part that gets Taken.
     """
     first, *_, last = subject.parts(*long_set(subject), token=3, now=0, count=3)
     feeds = (
@@ -469,7 +469,7 @@ async def trips_amid_other_requests(subject: Subject) -> None:
 
 @driving("protocol.md#readings")
 async def fault_list(subject: Subject) -> None:
-    """GetFaults after two faults: newest first with ages, kept by Clear.
+    """GetFaults after two faults: newest first with ages; Clear does not remove them.
 
     Store at least two faults with the time of each, newest first, and keep them until power-down.
     Channel 255 if no channel is at fault.

@@ -21,7 +21,7 @@ from model.arrays import ComplexArray, FloatArray
 from model.finger import detection_threshold, fingertip_points, fingertip_weights
 from model.rig.rig import Rig
 from model.structure.attachments import attached_stiffness, fingertip_loads
-from model.study.verification import Plates
+from model.study.exact_plates import Plates
 from model.vibration import Excitation, base_amplitudes
 
 RIG = Path(__file__).parents[1] / "examples" / "calculix" / "curved_glass.yaml"

@@ -42,7 +42,7 @@ from model.arrays import FloatArray, lattice
 from model.reduction.free_plate import FREQUENCY_MARGIN, solve_free_plate
 from model.rig.rig import Rig
 from model.rig.rig_file import load_rig
-from model.study.verification import draw_plates
+from model.study.exact_plates import draw_plates
 from model.table.table_file import build_table
 
 PAGE = Path(__file__).parents[1] / "docs" / "how-to" / "surface.md"

@@ -45,7 +45,7 @@ from model.reduction.reduced_plate import reduce_plate
 from model.rig.rig import Rig
 from model.rig.rig_file import rig_of
 from model.structure.attachments import footprints_of
-from model.study.verification import draw_plates, felt_on
+from model.study.exact_plates import draw_plates, felt_on
 from model.table.table import LocalizationTable
 from model.table.table_file import build_table
 from model.vibration import Excitation, Tone

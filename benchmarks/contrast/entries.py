@@ -32,7 +32,7 @@ from model.answer.stimulus import Placement
 from model.arrays import ComplexArray, FloatArray, IntArray
 from model.errors import InputError
 from model.rig.rig import Uncertainty
-from model.study.verification import Plates, accelerations_on, draw_plates, touched
+from model.study.exact_plates import Plates, accelerations_on, draw_plates, touched
 from model.table.table import LocalizationTable, read_fingertips
 from model.table.table_file import build_table
 from model.vibration import Excitation, Tone

@@ -23,7 +23,7 @@ from model.rig.rig import Rig
 from model.rig.rig_file import load_rig
 from model.structure.attachments import footprints_of
 from model.study.contrast_maps import random_contacts
-from model.study.verification import draw_plates
+from model.study.exact_plates import draw_plates
 from model.table.table import LocalizationTable
 from model.table.table_file import build_table
 from model.vibration import Tone, base_amplitudes

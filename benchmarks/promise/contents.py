@@ -19,7 +19,7 @@ from model.answer.plan import answer, prepare_answers
 from model.answer.stimulus import Finger, Placement, Stimulus
 from model.arrays import FloatArray
 from model.rig.rig_file import load_rig
-from model.study.verification import draw_plates, powers_on
+from model.study.exact_plates import draw_plates, powers_on
 from model.table.table import LocalizationTable, read_fingertips
 from model.table.table_file import build_table
 

@@ -35,7 +35,7 @@ from controller.api.schema import (
     TouchInputStatus,
     TouchPoint,
 )
-from controller.content.pattern import MAX_GIVEN
+from controller.content.points import MAX_GIVEN
 from controller.effects.strengths import GainDb, SourceName
 
 DEFAULT_LEASE = 10.0  # s

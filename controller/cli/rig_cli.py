@@ -123,7 +123,7 @@ def identify(
     from model.estimate.rig_check import check_meaning
     from model.rig.rig_file import load_rig
     from model.structure.modal_elasticity import check_measurable
-    from model.study.verification import expected_contrast
+    from model.study.expected_contrast import expected_contrast
 
     if measured_file is not None:
         played = {"--level": level, "--device": device}

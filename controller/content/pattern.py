@@ -1,27 +1,32 @@
-"""Patterns: the common form of all content, from files and from points that a program sends.
+"""Patterns: the common form of all content.
 
 Like AHAP and HJIF, a pattern has curves over time (intensity and sharpness of its continuous part)
 and transients. Sharpness, 0 to 1, represents a frequency.
 """
 
 from array import array
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, TypeAlias, overload
 
 import numpy as np
 
 from model.arrays import FloatArray
-from model.errors import InputError
 
 MAX_CONTENT_DURATION = 60.0
 """Longest content [s]."""
 
+MIN_HZ = 65.0
+"""Frequency [Hz] of sharpness 0, used by the MPEG reference encoder for AHAP."""
+
+MAX_HZ = 300.0
+"""Frequency [Hz] of sharpness 1."""
+
 _Point: TypeAlias = tuple[float, float]
 
 Curve: TypeAlias = Sequence[_Point]
-"""Times [s], none before the one ahead of it, and values 0 to 1: straight lines, steps where two
-times are equal."""
+"""Times [s], which never decrease, and values 0 to 1: straight lines, with a step between points of
+equal time."""
 
 
 class CurvePoints(Sequence[_Point]):
@@ -105,32 +110,34 @@ def misfit(pattern: Pattern) -> str:
     """Return the first problem of a pattern made by a format, or ""."""
     if not pattern.duration >= 0:  # also for NaN
         return f"must last 0 s or longer, got {pattern.duration:g} s"
-    taps = pattern.transients
-    for name, curve in (
-        ("intensity", pattern.intensity),
-        ("sharpness", pattern.sharpness),
-        ("intensity of transients", [(each.time, each.intensity) for each in taps]),
-        ("sharpness of transients", [(each.time, each.sharpness) for each in taps]),
-    ):
-        before = 0.0
-        for index, (time, value) in enumerate(curve):
-            if not before <= time <= MAX_CONTENT_DURATION:
-                bounds = f"{before:g} to {MAX_CONTENT_DURATION:g} s"
-                return f"time of {name}[{index}] must be {bounds}, got {time:g} s"
-            if not 0 <= value <= 1:
-                return f"{name}[{index}] must be 0 to 1, got {value:g} at {time:g} s"
-            before = time
+    transients = pattern.transients
+    intensities = [(transient.time, transient.intensity) for transient in transients]
+    sharpnesses = [(transient.time, transient.sharpness) for transient in transients]
+    return (
+        _curve_problem("intensity", pattern.intensity)
+        or _curve_problem("sharpness", pattern.sharpness)
+        or _curve_problem("intensity of transients", intensities)
+        or _curve_problem("sharpness of transients", sharpnesses)
+    )
+
+
+def _curve_problem(name: str, curve: Curve) -> str:
+    """Return the first problem of a curve, or ""."""
+    last_time = 0.0
+    for index, (time, value) in enumerate(curve):
+        if not last_time <= time <= MAX_CONTENT_DURATION:
+            limits = f"{last_time:g} to {MAX_CONTENT_DURATION:g} s"
+            return f"time of {name}[{index}] must be {limits}, got {time:g} s"
+        if not 0 <= value <= 1:
+            return f"{name}[{index}] must be 0 to 1, got {value:g} at {time:g} s"
+        last_time = time
     return ""
 
 
 def curve_at(curve: Curve, times: FloatArray, *, beyond: float | None = None) -> FloatArray:
-    """Return a curve at times [s]; beyond: value outside the curve, by default as at its ends."""
-    moments, values = np.array(curve or ((0.0, 0.0),)).T
-    return np.asarray(np.interp(times, moments, values, left=beyond, right=beyond))
-
-
-MIN_HZ, MAX_HZ = 65.0, 300.0
-"""Frequencies [Hz] of sharpness 0 and 1, as in the MPEG reference encoder for AHAP."""
+    """Return a curve at times [s]; beyond: value outside the curve, by default its end values."""
+    curve_times, values = np.array(curve or ((0.0, 0.0),)).T
+    return np.asarray(np.interp(times, curve_times, values, left=beyond, right=beyond))
 
 
 def sharpness_of(hertz: FloatArray) -> FloatArray:
@@ -141,74 +148,3 @@ def sharpness_of(hertz: FloatArray) -> FloatArray:
 def hertz_of(sharpness: FloatArray) -> FloatArray:
     """Return the frequencies [Hz] of sharpness, 0 to 1."""
     return MIN_HZ + sharpness * (MAX_HZ - MIN_HZ)
-
-
-MAX_GIVEN = 500
-"""Maximum number of points and taps together, as in OpenXR; Android guarantees 16."""
-
-Given: TypeAlias = Sequence[Sequence[float]]
-"""`[time_s, intensity, sharpness]` of each, in order of time."""
-
-_Row: TypeAlias = tuple[float, float, float]
-
-
-def pattern_of_points(points: Given, taps: Given = ()) -> Pattern:
-    """Return a pattern with straight lines between points, and with taps.
-
-    Raises InputError, with the index of the first invalid point or tap.
-    """
-    if not 1 <= (count := len(points) + len(taps)) <= MAX_GIVEN:
-        raise InputError(f"points and taps must be 1 to {MAX_GIVEN} together, got {count}")
-    lasting, short = [*_checked("points", points)], [*_checked("taps", taps)]
-    return Pattern(
-        max([time for time, _, _ in (*lasting[-1:], *short[-1:])]),
-        tuple([(time, intensity) for time, intensity, _ in lasting]),
-        tuple([(time, sharpness) for time, _, sharpness in lasting]),
-        tuple([Transient(*each) for each in short]),
-    )
-
-
-def points_of(pattern: Pattern) -> tuple[list[_Row], list[_Row]]:
-    """Return the points and taps of a pattern, evenly spaced points if it has too many.
-
-    Raises InputError for too many taps.
-    """
-    taps = [(each.time, each.intensity, each.sharpness) for each in pattern.transients]
-    room = MAX_GIVEN - len(taps)
-    if room < (2 if pattern.intensity else 0):
-        raise InputError(f"taps must be up to {MAX_GIVEN - 2}, got {len(taps)}; leave some out")
-    if not pattern.intensity:
-        return [], taps
-    times, levels = np.array(pattern.intensity).T
-    between = np.setdiff1d([time for time, _ in pattern.sharpness], times)
-    between = between[(between > times[0]) & (between < times[-1])]
-    moments = np.append(times, between)
-    order = np.argsort(moments, kind="stable")
-    levels = np.append(levels, curve_at(pattern.intensity, between))[order]
-    moments = moments[order]
-    if len(moments) > room:
-        moments = np.linspace(times[0], times[-1], room)
-        levels = curve_at(pattern.intensity, moments)
-    sharpness = curve_at(pattern.sharpness, moments)
-    return [*zip(moments.tolist(), levels.tolist(), sharpness.tolist(), strict=True)], taps
-
-
-def _checked(what: str, given: Given) -> Iterator[_Row]:
-    """Yield points or taps; raises InputError for the first invalid one."""
-    before = 0.0
-    for index, each in enumerate(given):
-        if len(each) != 3:
-            raise InputError(
-                f"{what}[{index}] must be [time_s, intensity, sharpness], got {len(each)} values"
-            )
-        time, intensity, sharpness = each
-        if not before <= time <= MAX_CONTENT_DURATION:
-            raise InputError(
-                f"{what}[{index}] time_s must be {before:g} to {MAX_CONTENT_DURATION:g}, "
-                f"got {time:g}"
-            )
-        for name, value in (("intensity", intensity), ("sharpness", sharpness)):
-            if not 0 <= value <= 1:
-                raise InputError(f"{what}[{index}] {name} must be 0 to 1, got {value:g}")
-        before = time
-        yield time, intensity, sharpness

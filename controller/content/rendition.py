@@ -7,6 +7,7 @@ from array import array
 from bisect import bisect_left
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from operator import attrgetter
 
 import numpy as np
 
@@ -33,9 +34,8 @@ SMOOTHING = 0.020
 
 _BAND = 0.1  # on each side of a frequency
 _WIDER = 2 ** (1 / 3) / (1 + _BAND)  # with other fingers: a third of an octave on each side
-_MIN_FREQUENCIES = (
-    3  # of the table in a band: one exact frequency costs 10 dB of contrast on four ERAs
-)
+# Frequencies of the table in a band; one exact frequency costs 10 dB of contrast on four ERAs.
+_MIN_FREQUENCIES = 3
 _MENTIONED = 0.05  # share of the continuous part whose sharpness can be lost without a remark
 _ROUNDING = 1e-9  # of times [s] and step counts
 _TEXTURE = 3.0  # Hz; on each side of a modulation frequency, counted with it
@@ -77,20 +77,20 @@ class Rendition:
         Modulation is kept. The envelope starts and ends at zero. Bands are widened to a third of an
         octave on each side, hardly noticeable, to gain 1 dB of contrast.
         """
-        clicks = tuple([replace(each, band=_wider(each.band)) for each in self.clicks])
-        among = replace(self, band=_wider(self.band), clicks=clicks)
+        clicks = tuple([replace(click, band=_wider(click.band)) for click in self.clicks])
+        smoothed = replace(self, band=_wider(self.band), clicks=clicks)
         if self.course is None:
-            return among
-        times, shares = np.array(self.course.times), np.array(self.course.shares)
+            return smoothed
+        times = np.array(self.course.times)
+        shares = np.array(self.course.shares)
+        step = times[1]
         texture = np.zeros(len(times))
         if self.modulation_hz is not None:
-            spectrum = np.fft.rfft(shares)
-            away = np.abs(np.fft.rfftfreq(len(shares), times[1]) - self.modulation_hz)
-            texture = np.fft.irfft(spectrum * (away <= _TEXTURE), len(shares))
-        shares = averaged(shares - texture, times[1], SMOOTHING) + texture
+            texture = _texture(shares, step, self.modulation_hz)
+        shares = averaged(shares - texture, step, SMOOTHING) + texture
         shares *= rise(times, SMOOTHING) * rise(times[-1] - times, SMOOTHING)
         course = Course(self.course.times, array("d", np.clip(shares, 0, 1)))
-        return replace(among, course=course)
+        return replace(smoothed, course=course)
 
 
 def requested_level(pattern: Pattern, level_db_sl: float, times: FloatArray) -> FloatArray:
@@ -99,10 +99,11 @@ def requested_level(pattern: Pattern, level_db_sl: float, times: FloatArray) -> 
     level_db_sl: level of intensity 1. Transients last 40 ms each, and the continuous part fades
     around them; -inf during silence.
     """
-    taps = [each for each in pattern.transients if each.intensity > 0]
-    starts = np.array([each.time for each in taps])
-    level = _lasting(pattern, level_db_sl, times) + decibels(_beside(starts, times))
-    return _with_taps(level, taps, level_db_sl, times)
+    transients = [transient for transient in pattern.transients if transient.intensity > 0]
+    starts = np.array([transient.time for transient in transients])
+    level = _continuous_level(pattern, level_db_sl, times) + decibels(_ducking(starts, times))
+    _raise_to_transients(level, transients, level_db_sl, times)
+    return level
 
 
 def rendered(pattern: Pattern, level_db_sl: float, frequencies: FloatArray) -> Rendition:
@@ -114,137 +115,182 @@ def rendered(pattern: Pattern, level_db_sl: float, frequencies: FloatArray) -> R
     becomes a click and the others are added to the continuous part.
     """
     pattern = _as_tap(pattern)
-    taps = _apart(pattern)
-    levels = _level_of(np.array([each.intensity for each in taps]), level_db_sl)
-    hertz = hertz_of(np.array([each.sharpness for each in taps]))
-    clicks = tuple(
-        Tap(tap.time, level, _band(frequency, frequencies))
-        for tap, level, frequency in zip(taps, levels.tolist(), hertz.tolist(), strict=True)
-    )
-    starts = np.array([each.time for each in clicks])
-    duration = max(pattern.duration, *((starts + CLICK_DURATION).tolist()), KNOT_STEP)
-    times = np.linspace(0, duration, int(np.ceil(duration / KNOT_STEP - _ROUNDING)) + 1)
-    level = _lasting(pattern, level_db_sl, times)
-    kept = {*taps}
-    close = [each for each in pattern.transients if each.intensity > 0 and each not in kept]
-    level = _with_taps(level, close, level_db_sl, times)
-    shares = 10 ** ((level - level.max(initial=-1e3)) / 20) * _beside(starts, times)
+    separate, close = _separated(pattern.transients)
+    clicks = _clicks(separate, level_db_sl, frequencies)
+    click_starts = np.array([click.time for click in clicks])
+    click_ends = click_starts + CLICK_DURATION
+    duration = max(pattern.duration, *click_ends.tolist(), KNOT_STEP)
+    times = _knots(duration)
+    level = _continuous_level(pattern, level_db_sl, times)
+    _raise_to_transients(level, close, level_db_sl, times)
+    shares = 10 ** ((level - level.max(initial=-1e3)) / 20) * _ducking(click_starts, times)
     remarks = list(pattern.remarks)
     if close:
+        count = len(close) + len(separate)
         remarks.append(
-            f"{len(close)} of {len(close) + len(taps)} taps, less than {1000 * CLICKS_APART:.0f} "
+            f"{len(close)} of {count} taps, less than {1000 * CLICKS_APART:.0f} "
             "ms from a stronger one: moved into the continuous part"
         )
-    course, band, modulation = None, _band(MIN_HZ, frequencies), None
-    sharpness_kept = 1.0
-    if highest := float(shares.max()):
-        course = Course(array("d", times), array("d", shares / highest))
-        of_taps = tuple((each.time, each.sharpness) for each in pattern.transients)
-        hertz = hertz_of(curve_at(pattern.sharpness or of_taps, times))
-        band = _band(_carrier(hertz, shares**2), frequencies)
-        modulation = _modulation(times, shares)
-        is_off_band = (hertz < band[0]) | (hertz > band[1])
-        sharpness_kept = 1 - float(np.average(is_off_band, weights=shares**2))
-        remarks += _lost(hertz[shares > 0], sharpness_kept, clicks)
-        level_db_sl = float(level.max() + decibels(highest))
+    highest = float(shares.max())
+    if not highest:
+        band = _band(MIN_HZ, frequencies)
+        return Rendition(duration, None, level_db_sl, band, None, clicks, tuple(remarks))
+    hertz = _hertz(pattern, times)
+    energy = shares**2
+    band = _band(_carrier(hertz, energy), frequencies)
+    is_off_band = (hertz < band[0]) | (hertz > band[1])
+    sharpness_kept = 1 - float(np.average(is_off_band, weights=energy))
+    remarks += _continuous_losses(hertz[shares > 0], sharpness_kept, clicks)
     return Rendition(
-        duration, course, level_db_sl, band, modulation, clicks, tuple(remarks), sharpness_kept
+        duration,
+        Course(array("d", times), array("d", shares / highest)),
+        float(level.max() + decibels(highest)),
+        band,
+        _modulation(times, shares),
+        clicks,
+        tuple(remarks),
+        sharpness_kept,
     )
-
-
-def _level_of(intensity: FloatArray, level_db_sl: float) -> FloatArray:
-    """Return the levels [dB SL] of intensities; -inf for 0."""
-    least = min(LEAST_DB_SL, level_db_sl)
-    return np.where(intensity > 0, least + intensity * (level_db_sl - least), -np.inf)
-
-
-def _lasting(pattern: Pattern, level_db_sl: float, times: FloatArray) -> FloatArray:
-    """Return the levels [dB SL] of the continuous part at times [s]."""
-    return _level_of(curve_at(pattern.intensity, times, beyond=0.0), level_db_sl)
-
-
-def _with_taps(
-    level: FloatArray, taps: Sequence[Transient], level_db_sl: float, times: FloatArray
-) -> FloatArray:
-    """Return levels [dB SL] at times [s], raised to the level of taps, 40 ms each."""
-    starts = np.array([each.time for each in taps])
-    levels = _level_of(np.array([each.intensity for each in taps]), level_db_sl)
-    first, last = np.searchsorted(times, [starts, starts + CLICK_DURATION])
-    number = np.repeat(np.arange(len(taps)), last - first)
-    during = np.arange(len(number)) + (last - np.cumsum(last - first))[number]
-    np.maximum.at(level, during, levels[number])
-    return level
-
-
-def _band(hertz: float, frequencies: FloatArray) -> Band:
-    """Return a band around a frequency [Hz] with enough frequencies of a table."""
-    nearest = frequencies[np.argsort(np.abs(np.log(frequencies / hertz)))[:_MIN_FREQUENCIES]]
-    return (
-        min((1 - _BAND) * hertz, float(nearest.min())),
-        max((1 + _BAND) * hertz, float(nearest.max())),
-    )
-
-
-def _wider(band: Band) -> Band:
-    """Return a band widened for other fingers."""
-    return band[0] / _WIDER, band[1] * _WIDER
 
 
 def _as_tap(pattern: Pattern) -> Pattern:
     """Convert a pattern too short for a plate to a transient; return others unchanged."""
-    moments, values = np.array(pattern.intensity or ((0.0, 0.0),)).T
-    sounds = np.maximum(values[1:], values[:-1]) > 0
-    length = float(np.diff(moments)[sounds].sum())
-    if pattern.transients or not values.any() or length >= CLICK_DURATION:
+    if pattern.transients or not pattern.intensity:
         return pattern
-    start = float(moments[np.flatnonzero(values)[0]])
-    sharpness = float(curve_at(pattern.sharpness, np.array([start]))[0])
-    lost = f"{1000 * length:.0f} ms, too short for a plate: played as a tap"
-    return replace(
-        pattern,
-        intensity=(),
-        transients=(Transient(start, float(values.max()), sharpness),),
-        remarks=(*pattern.remarks, lost),
-    )
+    times, intensities = np.array(pattern.intensity).T
+    is_felt = np.maximum(intensities[1:], intensities[:-1]) > 0
+    length = float(np.diff(times)[is_felt].sum())
+    if not intensities.any() or length >= CLICK_DURATION:
+        return pattern
+    start = times[np.flatnonzero(intensities)[:1]]
+    sharpness = float(curve_at(pattern.sharpness, start)[0])
+    transient = Transient(float(start[0]), float(intensities.max()), sharpness)
+    remark = f"{1000 * length:.0f} ms, too short for a plate: played as a tap"
+    remarks = (*pattern.remarks, remark)
+    return replace(pattern, intensity=(), transients=(transient,), remarks=remarks)
 
 
-def _apart(pattern: Pattern) -> list[Transient]:
-    """Return the transients that become clicks, in order: the strongest of close ones."""
-    kept, times = list[Transient](), list[float]()
-    for tap in sorted(pattern.transients, key=lambda each: -each.intensity):
-        at = bisect_left(times, tap.time)
-        around = times[max(at - 1, 0) : at + 1]
-        apart = min((abs(tap.time - each) for each in around), default=np.inf)
-        if tap.intensity > 0 and apart >= CLICKS_APART - _ROUNDING:
-            kept.insert(at, tap)
-            times.insert(at, tap.time)
-    return kept
+def _separated(
+    transients: Sequence[Transient],
+) -> tuple[list[Transient], list[Transient]]:
+    """Return the transients that become clicks, and those too close to a stronger one, in order."""
+    separate: list[Transient] = []
+    times: list[float] = []
+    for transient in sorted(transients, key=attrgetter("intensity"), reverse=True):
+        time = transient.time
+        index = bisect_left(times, time)
+        neighbours = times[max(index - 1, 0) : index + 1]
+        is_close = any(abs(time - near) < CLICKS_APART - _ROUNDING for near in neighbours)
+        if transient.intensity > 0 and not is_close:
+            separate.insert(index, transient)
+            times.insert(index, time)
+    clicks = {*separate}
+    return separate, [tap for tap in transients if tap.intensity > 0 and tap not in clicks]
 
 
-def _beside(starts: FloatArray, times: FloatArray) -> FloatArray:
+def _clicks(
+    transients: Sequence[Transient], level_db_sl: float, frequencies: FloatArray
+) -> tuple[Tap, ...]:
+    """Return the clicks of transients; level_db_sl: level of intensity 1."""
+    levels = _levels_of(transients, level_db_sl).tolist()
+    centres = hertz_of(np.array([transient.sharpness for transient in transients])).tolist()
+    clicks = []
+    for transient, level, hertz in zip(transients, levels, centres, strict=True):
+        clicks.append(Tap(transient.time, level, _band(hertz, frequencies)))
+    return tuple(clicks)
+
+
+def _knots(duration: float) -> FloatArray:
+    """Return equally spaced times [s] from 0 to a duration, at most a knot step apart."""
+    steps = int(np.ceil(duration / KNOT_STEP - _ROUNDING))
+    return np.linspace(0, duration, steps + 1)
+
+
+def _level_of(intensity: FloatArray, level_db_sl: float) -> FloatArray:
+    """Return the levels [dB SL] of intensities; -inf for 0."""
+    faintest = min(LEAST_DB_SL, level_db_sl)
+    level = faintest + intensity * (level_db_sl - faintest)
+    return np.where(intensity > 0, level, -np.inf)
+
+
+def _levels_of(transients: Sequence[Transient], level_db_sl: float) -> FloatArray:
+    """Return the levels [dB SL] of transients; level_db_sl: level of intensity 1."""
+    return _level_of(np.array([transient.intensity for transient in transients]), level_db_sl)
+
+
+def _continuous_level(pattern: Pattern, level_db_sl: float, times: FloatArray) -> FloatArray:
+    """Return the levels [dB SL] of the continuous part at times [s]."""
+    return _level_of(curve_at(pattern.intensity, times, beyond=0.0), level_db_sl)
+
+
+def _raise_to_transients(
+    level: FloatArray, transients: Sequence[Transient], level_db_sl: float, times: FloatArray
+) -> None:
+    """Raise levels [dB SL] at times [s] to the levels of transients, 40 ms each."""
+    starts = np.array([transient.time for transient in transients])
+    first, end = np.searchsorted(times, [starts, starts + CLICK_DURATION])
+    counts = end - first
+    number = np.repeat(np.arange(len(transients)), counts)
+    first_entry = np.cumsum(counts) - counts
+    index = np.arange(len(number)) + (first - first_entry)[number]
+    np.maximum.at(level, index, _levels_of(transients, level_db_sl)[number])
+
+
+def _ducking(starts: FloatArray, times: FloatArray) -> FloatArray:
     """Return the factor for the continuous part at times [s], ducked around click starts [s]."""
     bounded = np.concatenate([[-np.inf], starts, [np.inf]])
     number = np.searchsorted(starts, times, side="right")
-    away = np.minimum(times - bounded[number] - CLICK_DURATION, bounded[number + 1] - times)
-    return np.asarray(np.clip(away / DUCKING, 0, 1))
+    since_last = times - bounded[number] - CLICK_DURATION
+    until_next = bounded[number + 1] - times
+    distance = np.minimum(since_last, until_next)
+    return np.asarray(np.clip(distance / DUCKING, 0, 1))
+
+
+def _hertz(pattern: Pattern, times: FloatArray) -> FloatArray:
+    """Return the frequencies [Hz] of the continuous part at times [s].
+
+    A pattern without a sharpness curve has the sharpness of its transients.
+    """
+    sharpness = pattern.sharpness
+    if not sharpness:
+        sharpness = [(transient.time, transient.sharpness) for transient in pattern.transients]
+    return hertz_of(curve_at(sharpness, times))
+
+
+def _band(hertz: float, frequencies: FloatArray) -> Band:
+    """Return a band around a frequency [Hz] with enough frequencies of a table."""
+    distances = np.abs(np.log(frequencies / hertz))
+    nearest = frequencies[np.argsort(distances)[:_MIN_FREQUENCIES]]
+    low = min((1 - _BAND) * hertz, float(nearest.min()))
+    high = max((1 + _BAND) * hertz, float(nearest.max()))
+    return low, high
+
+
+def _wider(band: Band) -> Band:
+    """Return a band widened for other fingers."""
+    low, high = band
+    return low / _WIDER, high * _WIDER
 
 
 def _carrier(hertz: FloatArray, energy: FloatArray) -> float:
     """Return the mean frequency [Hz] in the band with most of the energy."""
     order = np.argsort(hertz, kind="stable")
-    ascending, below = hertz[order], np.append(0.0, np.cumsum(energy[order]))
-    tried = np.geomspace(MIN_HZ, MAX_HZ, 60)
-    first = np.searchsorted(ascending, (1 - _BAND) * tried)
-    end = np.searchsorted(ascending, (1 + _BAND) * tried, side="right")
-    best = best_of(below[end] - below[first])
-    near = order[first[best] : end[best]]
-    return float(np.average(hertz[near], weights=energy[near]))
+    ascending = hertz[order]
+    energy_below = np.append(0.0, np.cumsum(energy[order]))
+    centres = np.geomspace(MIN_HZ, MAX_HZ, 60)
+    first = np.searchsorted(ascending, (1 - _BAND) * centres)
+    end = np.searchsorted(ascending, (1 + _BAND) * centres, side="right")
+    best = best_of(energy_below[end] - energy_below[first])
+    in_band = order[first[best] : end[best]]
+    return float(np.average(hertz[in_band], weights=energy[in_band]))
 
 
-def _lost(hertz: FloatArray, sharpness_kept: float, clicks: Sequence[Tap]) -> Iterator[str]:
+def _continuous_losses(
+    hertz: FloatArray, sharpness_kept: float, clicks: Sequence[Tap]
+) -> Iterator[str]:
     """Yield a remark for each difference between the continuous part and the file.
 
-    hertz: its frequencies [Hz] wherever it is felt.
+    hertz: frequencies [Hz] of the continuous part while it is felt.
     """
     lost = 1 - sharpness_kept
     if lost > _MENTIONED:
@@ -260,14 +306,23 @@ def _modulation(times: FloatArray, shares: FloatArray) -> float | None:
     """Return the modulation frequency [Hz] of an envelope, if it is most of its variation."""
     hertz = np.fft.rfftfreq(len(shares), times[1])
     power = np.abs(np.fft.rfft(shares - shares.mean())) ** 2
-    is_texture = (hertz >= MIN_MODULATION) & (hertz <= MAX_MODULATION)
-    if power[is_texture].sum() <= power.sum() / 2:
+    is_modulation = (hertz >= MIN_MODULATION) & (hertz <= MAX_MODULATION)
+    modulation_power = power[is_modulation]
+    if modulation_power.sum() <= power.sum() / 2:
         return None
-    return float(hertz[is_texture][best_of(power[is_texture])])
+    return float(hertz[is_modulation][best_of(modulation_power)])
+
+
+def _texture(shares: FloatArray, step: float, modulation_hz: float) -> FloatArray:
+    """Return the part of an envelope, a step [s] apart, around its modulation frequency."""
+    spectrum = np.fft.rfft(shares)
+    distances = np.abs(np.fft.rfftfreq(len(shares), step) - modulation_hz)
+    return np.fft.irfft(spectrum * (distances <= _TEXTURE), len(shares))
 
 
 def averaged(values: FloatArray, step: float, width: float) -> FloatArray:
     """Average values, a step [s] apart, by a raised cosine with a half-height width [s]."""
     count = max(int(np.ceil(width / step - _ROUNDING)) - 1, 0)
-    kernel = np.cos(np.pi / 2 * step / width * np.arange(-count, count + 1)) ** 2
+    phases = np.pi / 2 * step / width * np.arange(-count, count + 1)
+    kernel = np.cos(phases) ** 2
     return np.convolve(values, kernel / kernel.sum())[count : count + len(values)]

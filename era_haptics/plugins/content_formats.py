@@ -4,7 +4,8 @@ Use `read_content` to try a format.
 """
 
 from controller.content.formats import read_content
-from controller.content.pattern import Pattern, Transient, pattern_of_points
+from controller.content.pattern import Pattern, Transient
+from controller.content.points import pattern_of_points
 from controller.content.reading import ContentFormat, ContentSection, Entries, read_json
 from model.config.fields import Validation
 from model.errors import InputError

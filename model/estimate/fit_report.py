@@ -19,7 +19,7 @@ from model.estimate.parameters import PARAMETER_KINDS
 from model.estimate.space import MAX_GUESSED, UNIT_KEYS
 from model.quantities import counted, in_display_unit, percent, with_error
 from model.rig.rig import Rig, Uncertainty
-from model.study.verification import ExpectedContrast
+from model.study.expected_contrast import ExpectedContrast
 
 _ALIKE = 0.9  # smallest correlation of two errors that is reported
 _MISTAKEN = 0.01  # unexplained, beyond which a plate differs from the rig by more than parameters

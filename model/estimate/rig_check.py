@@ -60,7 +60,8 @@ from model.quantities import percent
 from model.rig.rig import Rig
 from model.structure.attachments import GRAVITY, Era, PointLoad
 from model.structure.exciter import Exciter
-from model.study.verification import MIN_KEPT_SHARE, promise_margins
+from model.study.expected_contrast import promise_margins
+from model.study.verification import MIN_KEPT_SHARE
 
 STRONG = 1.25
 """Gain from which a channel is strong, or weak below its inverse: 2 dB.

@@ -26,7 +26,7 @@ from model.rig.rig_file import mesh_of
 from model.spectral.modes import PlateMesh
 from model.structure.attachments import Fingertip, FingertipLoad, fingertip_loads
 from model.structure.exciter import Actuator
-from model.study.verification import draw_plates
+from model.study.exact_plates import draw_plates
 from model.transients.base_motion import BaseEnvelope, Motion, Term, along_lines, raised_cosine
 from model.vibration import Tone, finer_mesh
 from sim.amplifier.readings import Crystal, StraightClock
@@ -241,7 +241,7 @@ def _feet(rig: Rig, factors: FloatArray) -> dict[int, float]:
 
 
 def draw_of_ensemble(rig: Rig, *, seed: int) -> Imperfections:
-    """Draw a plate like those used to check promises (`model.study.verification`).
+    """Draw a plate like those used to check promises (`model.study.exact_plates`).
 
     Like `draw_imperfections`, plus a common gain error of all channels.
     """

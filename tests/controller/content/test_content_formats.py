@@ -24,7 +24,8 @@ from controller.content.formats import (
     named_contents,
     read_content,
 )
-from controller.content.pattern import Curve, Pattern, Transient, pattern_of_points
+from controller.content.pattern import Curve, Pattern, Transient
+from controller.content.points import pattern_of_points
 from controller.content.rendition import rendered, requested_level
 from model.errors import InputError
 

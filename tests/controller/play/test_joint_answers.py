@@ -43,7 +43,7 @@ from model.config.fields import Rectangle
 from model.rig.rig import Rig, Uncertainty
 from model.rig.rig_file import load_rig
 from model.study.contrast_maps import random_contacts
-from model.study.verification import draw_plates, harmonics_on, powers_on
+from model.study.exact_plates import draw_plates, harmonics_on, powers_on
 from model.table.table import LocalizationTable, read_fingertips
 from model.table.table_file import build_table
 from sim.far_ends.wire_assignment import SimulatedWire

@@ -57,7 +57,7 @@ from model.finger import THRESHOLDS, detection_threshold, fingertip_points, fing
 from model.rig.rig import Uncertainty
 from model.rig.rig_file import load_rig
 from model.rig.rig_writing import change_rig
-from model.study.verification import draw_plates
+from model.study.exact_plates import draw_plates
 from model.table.table import LocalizationTable
 from model.table.table_file import build_table
 from model.transients.base_motion import ramped_onset, ramped_pulse

@@ -46,7 +46,7 @@ from model.structure.attachments import PointLoad
 from model.structure.exciter import Exciter
 from model.structure.material import Material, Orthotropy
 from model.structure.plate import Bond, Laminate, LaminateLayer, equivalent_plate
-from model.study.verification import expected_contrast
+from model.study.expected_contrast import expected_contrast
 
 FREQUENCIES = np.linspace(40.0, 500.0, 21)
 ONE_ROUND = (np.arange(len(FREQUENCIES))[:, None] + np.arange(4)) % 4 == 0

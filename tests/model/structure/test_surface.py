@@ -26,7 +26,8 @@ from model.rig.rig_file import load_rig, parse_rig
 from model.rig.rig_writing import save_rig
 from model.structure.attachments import GRAVITY, centre_of_mass, static_loads
 from model.structure.surface import is_within, rings_of
-from model.study.verification import amplitudes_on, draw_plates, verify_table
+from model.study.exact_plates import amplitudes_on, draw_plates
+from model.study.verification import verify_table
 from model.table.table import LocalizationTable
 from model.table.table_file import build_table, load_table, save_table
 from sim.plant.imperfections import draw_of_ensemble

@@ -24,7 +24,8 @@ from model.finger import Grid, detection_threshold, fingertip_points, fingertip_
 from model.reduction.free_plate import solve_free_plate
 from model.rig.rig import Uncertainty
 from model.structure.attachments import FingertipLoad, PointLoad
-from model.study.verification import Plates, draw_plates, felt_on, verify_table
+from model.study.exact_plates import Plates, draw_plates, felt_on
+from model.study.verification import verify_table
 from model.table.table_file import build_table, load_table, save_table
 from model.vibration import base_amplitudes, tone_fields
 

@@ -20,7 +20,7 @@ from model.rig.rig import Rig
 from model.structure.attachments import FingertipLoad
 from model.structure.material import Material
 from model.structure.plate import Plate
-from model.study.verification import Plates, felt_on
+from model.study.exact_plates import Plates, felt_on
 from model.table.table import LocalizationTable, Raster, default_drive_frequencies, read_fingertips
 from model.table.table_file import TableProblem, build_table
 from model.vibration import Tone, tone_fields

@@ -42,7 +42,7 @@ from model.structure.attachments import (
 from model.structure.exciter import Exciter
 from model.structure.material import Material
 from model.structure.plate import Plate
-from model.study.verification import Plates, harmonics_on, powers_on
+from model.study.exact_plates import Plates, harmonics_on, powers_on
 from model.table.table import LocalizationTable, read_fingertips
 from model.table.table_file import TableProblem, build_table, solve_table
 from model.transients.base_motion import Motion as BaseMotionMotion

@@ -38,7 +38,7 @@ from controller.api.methods import (
 )
 from controller.api.schema import AmplifierSilence, Empty, headline
 from controller.api.server import Connection, Handler
-from controller.content.pattern import pattern_of_points
+from controller.content.points import pattern_of_points
 from controller.daemon.config import API_SOURCES, DaemonConfig
 from controller.daemon.layouts import LayoutChoice
 from controller.daemon.messages import EventPublisher, effects_result, hello_result

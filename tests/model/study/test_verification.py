@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from kit.direct_plate import direct_acceleration
+from kit.outside_files import EXAMPLES
 from kit.plates import (
     FREQUENCIES,
     SMALL_TABLE_HZ,
@@ -18,14 +19,16 @@ from kit.plates import (
     smooth_table,
 )
 from kit.set_table import only
+from model.answer.plan import query
 from model.answer.stimulus import Placement
 from model.fem import assemble
 from model.finger import Grid, detection_threshold, fingertip_points, fingertip_weights
 from model.reduction.free_plate import solve_free_plate
 from model.rig.rig import Uncertainty
+from model.rig.rig_file import load_rig
 from model.structure.attachments import FingertipLoad, PointLoad
 from model.study.exact_plates import Plates, draw_plates, felt_on
-from model.study.verification import verify_table
+from model.study.verification import PromiseCheck, verify_table
 from model.table.table_file import build_table, load_table, save_table
 from model.vibration import base_amplitudes, tone_fields
 
@@ -122,6 +125,33 @@ def test_verify_fails_changed_content(table, coarse_rig, tmp_path, name, factor)
     if name == "omega":
         assert not all(check.is_passed for check in found.answer_checks)
         assert found.failed_count >= 3
+
+
+def test_verify_compares_tones_of_two_frequencies_by_every_threshold_set():
+    """The second answer of this sample has two frequencies, whose contrast depends on the set.
+
+    Relative to the rig's own set, it is 0.2 dB higher than predicted for the worst set.
+    """
+    rig = load_rig(EXAMPLES / "tutorial_rig.yaml")
+    table = build_table(rig, drive_mode="switched")
+    check = verify_table(table, rig, samples=2).answer_checks[1]
+    (layer,) = query(table, check.placed).layers
+    nominal = draw_plates(
+        np.random.default_rng(0), Uncertainty.none(), of=table, count=1, contact_count=3
+    )
+    _, by_own_set = felt_on(table, check.placed, layer.excitation, nominal)
+    assert 20 * np.log10(by_own_set[0]) > check.predicted_contrast_db + 0.2
+    assert check.direct_contrast_db == pytest.approx(check.predicted_contrast_db, abs=0.02)
+    assert check.is_passed
+
+
+@pytest.mark.parametrize(
+    ("kept_share", "answer_count", "is_passed"),
+    [(0.79, 1, True), (0.65, 1, False), (0.79, 12, False), (0.81, 12, True)],
+)
+def test_promise_check_allows_few_answers_the_spread_of_one(kept_share, answer_count, is_passed):
+    """By hand: 0.9 - 4 * 0.06 = 0.66 for one answer, 0.83 for twelve; never above 0.8."""
+    assert PromiseCheck(kept_share, answer_count).is_passed is is_passed
 
 
 TARGET, QUIET = (0.09, 0.07), ((0.25, 0.18), (0.03, 0.19))

@@ -159,29 +159,30 @@ def plate_with(plate: Plate, values: PlateValues) -> Plate:
 
 
 def _gains(rig: Rig, values: PlateValues, number: int) -> tuple[Gain, ...]:
-    """Return gains of an ERA: the rig's, multiplied by the identified ones.
+    """Return gains of an ERA: the rig's, multiplied by the identified gain and lag of its drive.
 
-    An ERA without measured gains gets a single gain, or several over the rig's frequencies if its
-    drive lags.
+    An ERA whose drive lags gets gains over the rig's frequencies; one without measured gains and
+    lag gets a single gain.
     """
-    era, gain = rig.eras[number], values["gain"][number]
+    era, identified_gain = rig.eras[number], values["gain"][number]
     drive_lags = bool(values["inertia"][number] or values["drag"][number])
-    if gain == 1 and not drive_lags:
+    if identified_gain == 1 and not drive_lags:
         return era.gains
     gains = era.gains or ((LOSS_FREQUENCY, 1.0, 0.0),)
     if drive_lags:
-        gains = _unit_gains(rig.limits.frequency_min, rig.limits.frequency_max)
+        gains = _gains_over(era, rig.limits.frequency_min, rig.limits.frequency_max)
     frequencies = np.array([frequency for frequency, _, _ in gains])
-    factors = gain * values.lag(frequencies)[:, number]
+    factors = identified_gain * values.lag(frequencies)[:, number]
     return tuple(
         (frequency, magnitude * abs(factor), phase + float(np.angle(factor)))
         for (frequency, magnitude, phase), factor in zip(gains, factors.tolist(), strict=True)
     )
 
 
-def _unit_gains(lowest: float, highest: float) -> tuple[Gain, ...]:
-    """Return unit gains at frequencies [Hz] close enough for linear interpolation of a lag."""
+def _gains_over(era: Actuator, lowest: float, highest: float) -> tuple[Gain, ...]:
+    """Return an ERA's gains at frequencies [Hz] close enough for linear interpolation of a lag."""
     count = 1 + math.ceil((highest - lowest) / _GAIN_STEP)
-    return tuple(
-        (frequency, 1.0, 0.0) for frequency in np.linspace(lowest, highest, count).tolist()
-    )
+    frequencies = np.linspace(lowest, highest, count)
+    gains = era.gain(frequencies)
+    rows = zip(frequencies.tolist(), np.abs(gains).tolist(), np.angle(gains).tolist(), strict=True)
+    return tuple(rows)

@@ -23,6 +23,7 @@ from model.estimate.fit_report import fit_rows, identification_json, parameter_r
 from model.estimate.forward import (
     SENSOR_FOOT,
     ForwardModel,
+    PlateValues,
     Sensor,
     Space,
     jacobian,
@@ -34,7 +35,7 @@ from model.estimate.identify import (
     identify,
 )
 from model.estimate.measurement import Measurement, Repeat
-from model.estimate.space import inwards, space_of
+from model.estimate.space import inwards, rig_with, space_of
 from model.fem import ELEMENTS, Mesh, assemble
 from model.reduction.free_plate import solve_free_plate
 from model.rig.rig import Rig
@@ -406,6 +407,22 @@ def test_drive_lags_as_an_actuator_with_a_resonance(model: ForwardModel) -> None
     lagging, rigid = (at_resonance.at(each).responses[0] for each in (x, np.zeros(space.size)))
     np.testing.assert_allclose(lagging[:, 1], rigid[:, 1] / 0.6j)
     np.testing.assert_allclose(lagging[:, [0, 2, 3]], rigid[:, [0, 2, 3]])
+
+
+def test_rig_with_a_lagging_drive_keeps_its_measured_gains(model: ForwardModel) -> None:
+    """By hand: the measured gain times the lag of a resonance at 500 Hz."""
+    space, x = model.space, np.zeros(model.space.size)
+    for name, value in (("inertia of drive SE", 4.0), ("drag of drive SE", 1.2)):
+        x[space.index(name)] = value / space.std[space.index(name)]
+    values = PlateValues(model.rig, space, x)
+    gains = ((60.0, 0.8, 0.3), (500.0, 1.2, -0.5))
+    eras = [replace(era, gains=gains) if era.name == "SE" else era for era in model.rig.eras]
+    measured = replace(model.rig, eras=tuple(eras))
+    frequencies = np.array([100.0, 300.0, 400.0])
+    found = rig_with(measured, values, model.rig.uncertainty).eras[1].gain(frequencies)
+    kilohertz = 1e-3 * frequencies
+    expected = eras[1].gain(frequencies) / (1 - 4.0 * kilohertz**2 + 1.2j * kilohertz)
+    np.testing.assert_allclose(found, expected, rtol=1e-3)
 
 
 KEYS = "type: DAEX25FHE-4, power: 1 W"

@@ -62,8 +62,10 @@ class Strengths:
 
         player: the client that plays its effect; region: the region of the effect.
         """
-        names = {*self._names_of(source), player, region} if self.gains_db else ()
-        return sum([gain for name, gain in self.gains_db.items() if name in names])
+        if not self.gains_db:
+            return 0
+        names = {*self._names_of(source), player, region}
+        return sum([gain_db for name, gain_db in self.gains_db.items() if name in names])
 
     def set(self, name: str, gain_db: float) -> None:
         """Set the gain [dB] of a name.
@@ -72,12 +74,13 @@ class Strengths:
         """
         gains = {**self.gains_db, name: gain_db}
         if len(gains) > MAX_NAMES:
-            gains.pop(next((each for each, gain in gains.items() if not gain), name))
-        if gain_db and name not in gains:
-            raise InputError(
-                f"strengths must have at most {MAX_NAMES} names, got one more; set another one "
-                "to 0 dB first"
-            )
+            unused_names = [stored_name for stored_name, gain in gains.items() if not gain]
+            if not unused_names:
+                raise InputError(
+                    f"strengths must have at most {MAX_NAMES} names, got one more; set another one "
+                    "to 0 dB first"
+                )
+            del gains[unused_names[0]]
         self.gains_db = gains
 
     def save(self, file: Path) -> None:
@@ -86,10 +89,11 @@ class Strengths:
             stream.write(json.dumps(self.gains_db, indent=1).encode())
 
     def _names_of(self, source: str) -> tuple[str, str]:
-        """Return the two names of a source, its own first."""
-        first, second, *rest = f"{source}::".split(":", 2)
-        client = dict(self.clients).get(f"{first}:{second}")
-        return (source, first) if client is None else (rest[0][:-2], client)
+        """Return the two names of a source: its own, and its input's or client's."""
+        for prefix, client in self.clients:
+            if source.startswith(f"{prefix}:"):
+                return source.removeprefix(f"{prefix}:"), client
+        return source, source.partition(":")[0]
 
 
 def read_strengths(file: Path | None) -> Mapping[str, float]:
@@ -114,9 +118,9 @@ def read_strengths(file: Path | None) -> Mapping[str, float]:
 
 def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     """Make an object of JSON; raises InputError for a name that is repeated."""
-    found = dict[str, Any]()
+    values = dict[str, Any]()
     for name, value in pairs:
-        if name in found:
+        if name in values:
             raise InputError(f"strengths must have each name once, got {shown(name)} twice")
-        found[name] = value
-    return found
+        values[name] = value
+    return values

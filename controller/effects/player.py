@@ -1,16 +1,16 @@
 """Player of a surface layout: converts contacts to a haptic intent, the effect of each finger."""
 
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
-from operator import itemgetter
+from typing import NamedTuple
 
+from controller.effects.click_turns import ClickTurns
 from controller.effects.effect import Effect, EffectRun, EffectStimulus, NoStimulus, Region
 from controller.effects.layout import SurfaceLayout
 from controller.effects.strengths import Strengths
-from controller.play.intent import NO_CONTACTS, Band, HapticIntent, Pulse, Target
+from controller.play.intent import NO_CONTACTS, Band, Gains, HapticIntent, Target
 from controller.sources.touch import Contact, ContactKey
-from model.transients.excursions import CLICKS_APART
 from registry.plugins import WrongResultError
 
 # Sensor noise must not make a finger on the edge of a region flip between regions: it stays in a
@@ -25,9 +25,6 @@ CLICK_ABOVE_DB = 6.0
 
 NOTICED_ABOVE_DB = 3.0
 """Level [dB] above a continuous effect at which a short pulse becomes noticeable."""
-
-# A short pulse that would wait longer [s], two turns plus rounding, is left out.
-_MAX_WAIT = 2 * CLICKS_APART + 0.005
 
 
 @dataclass
@@ -46,10 +43,15 @@ class _Play:
     player: str | None = None  # client that requested it
 
     @property
+    def is_requested(self) -> bool:
+        """Whether it was requested by name."""
+        return self.priority == REQUESTED_PRIORITY
+
+    @property
     def outlasts_its_layout(self) -> bool:
         """Whether it was requested, or is a press effect of limited duration."""
         is_press = self.effect.has_end and not self.effect.is_for_motion
-        return is_press or self.priority == REQUESTED_PRIORITY
+        return is_press or self.is_requested
 
 
 @dataclass
@@ -63,6 +65,14 @@ class _Finger:
     ended: str = ""  # name of the effect that ended most recently
 
 
+class _FeltPlay(NamedTuple):
+    """A play with its current stimulus."""
+
+    key: ContactKey
+    play: _Play
+    stimulus: EffectStimulus
+
+
 class EffectPlayer:
     """Plays the effects of a layout; times are arguments.
 
@@ -74,86 +84,92 @@ class EffectPlayer:
     """
 
     def __init__(self, layout: SurfaceLayout, strengths: Strengths | None = None) -> None:
-        self.layout, self.strengths = layout, strengths or Strengths()
-        self._already_pressed: dict[ContactKey, _Finger] = {}  # under another layout
+        self.layout = layout
+        self.strengths = strengths or Strengths()
         self._fingers: dict[ContactKey, _Finger] = {}
-        self._number = 0
-        self._last_click: tuple[ContactKey, Pulse] | None = None
-        self._waiting: dict[ContactKey, Pulse] = {}  # short pulses waiting for their turn
-        self._sensing = self._targets = self._felt = set[ContactKey]()  # of the latest intent
+        self._already_pressed: dict[ContactKey, _Finger] = {}  # under another layout
+        self._play_count = 0
+        self._clicks = ClickTurns()
+        # Fingers of the latest intent with a stimulus, with a target, and with a target that plays.
+        self._stimulated: set[ContactKey] = set()
+        self._targeted: set[ContactKey] = set()
+        self._served: set[ContactKey] = set()
 
     def intent(self, contacts: Sequence[Contact], now: float) -> HapticIntent:
         """Return the stimuli of all contacts at a time [s]."""
         self._update_regions(contacts, now)
         if not contacts:
             return HapticIntent((), NO_CONTACTS)
-        sensed: list[tuple[int, _Play, ContactKey, EffectStimulus]] = []
-        ends, protected, newest_elsewhere = list[float](), set[ContactKey](), 0
-        for contact in contacts:
-            finger = self._fingers[contact.key]
-            if finger.region is not None and finger.region.is_protected:
-                protected.add(contact.key)
-            for play, stimulus in self._current_stimuli(finger, contact, now, ends):
-                sensed.append((play.number, play, contact.key, stimulus))
-                if play.is_elsewhere:
-                    newest_elsewhere = max(newest_elsewhere, play.number)
-        sensed.sort(key=itemgetter(0))
-        waiting, self._waiting, targets = self._waiting, {}, list[Target]()
-        gains_db = dict[tuple[ContactKey, bool], float]()
-        self._sensing, self._targets, self._felt = set(), set(), set()
-        for number, play, key, stimulus in sensed:
-            self._sensing.add(key)
-            if play.is_elsewhere and number < newest_elsewhere:
-                continue
-            if len(contacts) > 1 and stimulus.among_others is not None:
-                stimulus = stimulus.among_others
-            target = stimulus.target(
-                key,
-                play.name,
-                play.region,
-                band=play.band,
-                priority=play.priority,
-                above_db=play.above_db,
-            )
-            targets.append(target)
-            self._targets.add(key)
-            gains_db[key, target.is_short] = self.strengths.gain_db(
-                key.source, play.player, play.region.name if play.region else None
-            )
-            if key in waiting and target.is_short:
-                self._waiting[key] = waiting[key]
-        felt = list[Target]()
+        changes: list[float] = []  # s; when the intent can change
+        felt_plays = self._felt_plays(contacts, now, changes)
+        self._stimulated = {felt.key for felt in felt_plays}
+        felt_plays = _with_newest_elsewhere(felt_plays)
+        is_alone = len(contacts) == 1
+        targets = [_target(felt, is_alone=is_alone) for felt in felt_plays]
+        self._targeted = {target.key for target in targets}
+        self._clicks.keep({target.key for target in targets if target.is_short})
+        playing = []
         for target in targets:
-            if not self._waits(target, now, ends):
-                felt.append(target)
-                self._felt.add(target.key)
+            start = self._start_of(target, now)
+            if start > now:
+                changes.append(start)
+            else:
+                playing.append(target)
+        self._served = {target.key for target in playing}
+        reasons: dict[str, None] = {}
+        if not playing:
+            reasons = dict.fromkeys(self.why_not(key) for key in self._fingers)
         return HapticIntent(
-            tuple(felt),
-            "" if felt else "; ".join(dict.fromkeys(map(self.why_not, self._fingers))),
-            until=min(ends, default=math.inf),
-            protected=frozenset(protected),
-            gains_db=gains_db,
+            tuple(playing),
+            "; ".join(reasons),
+            until=min(changes, default=math.inf),
+            protected=self._protected(),
+            gains_db=self._gains_db(felt_plays, targets),
         )
+
+    def _start_of(self, target: Target, now: float) -> float:
+        """Return when [s] a target starts to play; infinite for never."""
+        if target.pulse is None or not target.is_short:
+            return now
+        return self._clicks.start_of(target.key, target.pulse, now)
+
+    def _protected(self) -> frozenset[ContactKey]:
+        """Return the fingers in protected regions."""
+        protected = []
+        for key, finger in self._fingers.items():
+            if finger.region is not None and finger.region.is_protected:
+                protected.append(key)
+        return frozenset(protected)
+
+    def _gains_db(self, felt_plays: Sequence[_FeltPlay], targets: Sequence[Target]) -> Gains:
+        """Return the strengths [dB] of plays, by finger and by whether they are short pulses."""
+        gains_db = {}
+        for (key, play, _), target in zip(felt_plays, targets, strict=True):
+            region = None if play.region is None else play.region.name
+            gain_db = self.strengths.gain_db(key.source, play.player, region)
+            gains_db[key, target.is_short] = gain_db
+        return gains_db
 
     def why_not(self, key: ContactKey) -> str:
         """Return why a finger feels nothing in the latest intent; "" if it feels something."""
         finger = self._fingers.get(key)
-        if finger is None or key in self._felt:
+        if finger is None or key in self._served:
             return ""
-        name = finger.plays[-1].name if finger.plays else ""
-        if key in self._waiting:
-            return f"{name} waits for the short effects of other fingers"
-        if key in self._targets:
-            return f"{name} came too soon after short effects of other fingers; touch there again"
-        if key in self._sensing:
-            return f"{name} is felt only by the newest finger outside all regions; lift that finger"
-        if name and finger.plays[-1].effect.is_for_motion:
-            return f"{name} is not felt at rest; move the finger"
-        if name:
-            return f"{name} pauses; it continues on its own"
-        if finger.ended:
+        if not finger.plays and finger.ended:
             return f"{finger.ended} ended; touch there again"
-        return "no effect plays there; touch again in a region with an effect"
+        if not finger.plays:
+            return "no effect plays there; touch again in a region with an effect"
+        play = finger.plays[-1]
+        name = play.name
+        if self._clicks.is_waiting(key):
+            return f"{name} waits for the short effects of other fingers"
+        if key in self._targeted:
+            return f"{name} came too soon after short effects of other fingers; touch there again"
+        if key in self._stimulated:
+            return f"{name} is felt only by the newest finger outside all regions; lift that finger"
+        if play.effect.is_for_motion:
+            return f"{name} is not felt at rest; move the finger"
+        return f"{name} pauses; it continues on its own"
 
     def replace(self, layout: SurfaceLayout) -> None:
         """Switch to another layout; fingers already on the plate feel none of its press effects.
@@ -186,85 +202,40 @@ class EffectPlayer:
         applies; effect: replaces the layout's effect. Raises KeyError for an unknown effect.
         """
         effect = effect or self.layout.effects[name]
-        level = effect.level_db_sl if level_db_sl is None else level_db_sl
+        has_level = level_db_sl is not None or effect.gives_level_in(None)
+        if level_db_sl is None:
+            level_db_sl = effect.level_db_sl
         finger = self._fingers.get(contact.key)
         if finger is None or finger.since != contact.since:
             finger = self._add(contact, now)
         # Requests must not pile up.
         finger.plays = [
-            play
-            for play in finger.plays
-            if (play.name, play.priority) != (name, REQUESTED_PRIORITY)
+            play for play in finger.plays if not (play.is_requested and play.name == name)
         ]
-        requested = REQUESTED_PRIORITY
-        at = finger, finger.region, name, effect, contact, now
-        self._start(*at, level=level, priority=requested)
-        is_given = level_db_sl is not None or effect.gives_level_in(None)
-        finger.plays[-1].above_db = None if is_given else CLICK_ABOVE_DB
-        finger.plays[-1].player = player
-
-    def _waits(self, target: Target, now: float, ends: list[float]) -> bool:
-        """Whether a short pulse waits for its turn at a time [s]; if so, add its end to ends."""
-        key, pulse = target.key, target.pulse
-        if pulse is None or not target.is_short or pulse.started_at is not None:
-            return False
-        if math.isinf(pulse.due_at):
-            self._line_up(key, pulse)
-        if self._waiting.get(key) is not pulse:
-            return math.isinf(pulse.due_at)
-        if self._last_click is not None and self._last_click[0] != key:
-            # It can have started later than it was due.
-            pulse.due_at = max(pulse.due_at, self._last_click[1].start + CLICKS_APART)
-        if now < pulse.due_at:
-            ends.append(pulse.due_at)
-            return True
-        del self._waiting[key]
-        self._last_click = key, pulse
-        return False
-
-    def _line_up(self, key: ContactKey, pulse: Pulse) -> None:
-        """Schedule a short pulse in the slot of its finger's waiting pulse, or in the last slot."""
-        before = self._waiting.get(key)
-        if before is None:
-            others = [each.due_at for each in self._waiting.values()]
-            if self._last_click is not None and self._last_click[0] != key:
-                others.append(self._last_click[1].start)
-            due_at = max([pulse.requested_at, *(each + CLICKS_APART for each in others)])
-            if due_at > pulse.requested_at + _MAX_WAIT:
-                return
-        else:
-            due_at, before.due_at = before.due_at, -math.inf
-        pulse.due_at = due_at
-        self._waiting[key] = pulse
+        play = self._play(
+            finger.region,
+            name,
+            effect,
+            contact,
+            now,
+            level_db_sl=level_db_sl,
+            priority=REQUESTED_PRIORITY,
+        )
+        play.above_db = None if has_level else CLICK_ABOVE_DB
+        play.player = player
+        finger.plays.append(play)
 
     def _update_regions(self, contacts: Sequence[Contact], now: float) -> None:
         """Start and end effects as fingers enter and leave regions."""
-        since: dict[ContactKey, float] = {}
-        for contact in contacts:
-            since[contact.key] = contact.since
-        for key, one in [*self._fingers.items()]:
-            # A finger that came down again with the same id is a new one.
-            if since.get(key) != one.since:
-                del self._fingers[key]
-        if pressed := self._already_pressed.items():
-            self._already_pressed = {k: one for k, one in pressed if since.get(k) == one.since}
+        landed_at = {contact.key: contact.since for contact in contacts}
+        self._fingers = _remaining(self._fingers, landed_at)
+        self._already_pressed = _remaining(self._already_pressed, landed_at)
         for contact in contacts:
             finger = self._fingers.get(contact.key)
             if finger is None:
                 self._add(contact, now)
-                continue
-            position = (contact.x, contact.y)
-            if math.dist(position, finger.entered) < _NOISE:
-                continue
-            region = self.layout.region_at(*position)
-            if finger.region is not region:
-                left, finger.region, finger.entered = finger.region, region, position
-                finger.plays = [
-                    play for play in finger.plays if play.priority == REQUESTED_PRIORITY
-                ]
-                self._enter(finger, contact, now)
-                if left is not None and left.on_release is not None:
-                    self._start_in(finger, left, left.on_release, contact, now)
+            elif math.dist((contact.x, contact.y), finger.entered) >= _NOISE:
+                self._move(finger, contact, now)
 
     def _add(self, contact: Contact, now: float) -> _Finger:
         """Add a new finger and start its effects."""
@@ -273,13 +244,28 @@ class EffectPlayer:
         self._fingers[contact.key] = finger
         self.strengths.note(contact.key.source)
         self._enter(finger, contact, now)
-        if (before := self._already_pressed.pop(contact.key, None)) is not None:
-            kept = [each for each in before.plays if each.outlasts_its_layout]
-            for each in kept:  # older than the plays that start now
-                self._number += 1
-                each.number = self._number
-            finger.plays = [each for each in finger.plays if not each.outlasts_its_layout] + kept
+        pressed_finger = self._already_pressed.pop(contact.key, None)
+        if pressed_finger is not None:
+            finger.plays = [play for play in finger.plays if not play.outlasts_its_layout]
+            for play in pressed_finger.plays:
+                if play.outlasts_its_layout:
+                    play.number = self._next_number()
+                    finger.plays.append(play)
         return finger
+
+    def _move(self, finger: _Finger, contact: Contact, now: float) -> None:
+        """Start and end effects if a finger has moved to another region."""
+        position = (contact.x, contact.y)
+        region = self.layout.region_at(*position)
+        left = finger.region
+        if region is left:
+            return
+        finger.region = region
+        finger.entered = position
+        finger.plays = [play for play in finger.plays if play.is_requested]
+        self._enter(finger, contact, now)
+        if left is not None and left.on_release is not None:
+            self._start(finger, left, left.on_release, contact, now)
 
     def _enter(self, finger: _Finger, contact: Contact, now: float) -> None:
         """Start the effects of the region that a finger enters, or the effect outside all."""
@@ -288,65 +274,123 @@ class EffectPlayer:
         names = (region.on_move, region.on_press) if region else (self.layout.elsewhere,)
         for name in names:
             if name is not None:
-                self._start_in(finger, region, name, contact, now)
+                self._start(finger, region, name, contact, now)
 
-    def _start_in(
+    def _start(
         self, finger: _Finger, region: Region | None, name: str, contact: Contact, now: float
     ) -> None:
         """Start an effect of a region, or the effect outside all."""
-        level = self.layout.level_of(name, region)
+        level_db_sl = self.layout.level_of(name, region)
         priority = 0 if region is None else region.priority
         effect = self.layout.effects[name]
-        self._start(finger, region, name, effect, contact, now, level=level, priority=priority)
+        play = self._play(
+            region, name, effect, contact, now, level_db_sl=level_db_sl, priority=priority
+        )
+        finger.plays.append(play)
 
-    def _start(
+    def _play(
         self,
-        finger: _Finger,
         region: Region | None,
         name: str,
         effect: Effect,
         contact: Contact,
         now: float,
         *,
-        level: float | None,
+        level_db_sl: float | None,
         priority: int,
-    ) -> None:
-        """Start an effect in a region, or outside all."""
-        self._number += 1
-        run = effect.start_in(region, contact, now, level_db_sl=level)
+    ) -> _Play:
+        """Start a run of an effect in a region, or outside all."""
+        run = effect.start_in(region, contact, now, level_db_sl=level_db_sl)
         if not isinstance(run, EffectRun):
             raise WrongResultError(effect, run, EffectRun)
-        band = effect.band_in(region)
-        is_elsewhere = region is None and priority != REQUESTED_PRIORITY
-        above = None if effect.gives_level_in(region) else CLICK_ABOVE_DB
-        finger.plays.append(
-            _Play(name, effect, run, self._number, priority, band, region, is_elsewhere, above)
+        return _Play(
+            name,
+            effect,
+            run,
+            self._next_number(),
+            priority,
+            effect.band_in(region),
+            region,
+            is_elsewhere=region is None and priority != REQUESTED_PRIORITY,
+            above_db=None if effect.gives_level_in(region) else CLICK_ABOVE_DB,
         )
 
-    def _current_stimuli(
-        self, finger: _Finger, contact: Contact, now: float, ends: list[float]
-    ) -> Collection[tuple[_Play, EffectStimulus]]:
-        """Return the newest continuous play and the newest short pulse of a finger.
+    def _next_number(self) -> int:
+        self._play_count += 1
+        return self._play_count
 
-        Adds every `until` to ends. Calls all plays, because motion effects follow the finger.
+    def _felt_plays(
+        self, contacts: Sequence[Contact], now: float, changes: list[float]
+    ) -> list[_FeltPlay]:
+        """Return the newest continuous play and the newest short pulse of all fingers, by start.
+
+        changes: gets the times [s] at which stimuli can change.
         """
-        felt: dict[bool, tuple[_Play, EffectStimulus]] = {}
-        lasting: list[_Play] = []
-        for play in finger.plays:
-            result = play.run.feel(contact, now)
-            if result is None:
-                finger.ended = play.name
-                continue
-            if not isinstance(result, EffectStimulus | NoStimulus):
-                raise WrongResultError(play.run, result, EffectStimulus)
-            lasting.append(play)
-            if result.until is not None:
-                ends.append(result.until)
-            if isinstance(result, EffectStimulus):
-                felt[result.is_short] = play, result
-                if not result.is_short and True in felt and felt[True][1].is_absolute:
-                    del felt[True]  # of an earlier file
-                if result.click is not None:
-                    felt[True] = play, result.click
-        finger.plays = lasting
-        return felt.values()
+        felt_plays: list[_FeltPlay] = []
+        for contact in contacts:
+            felt_plays += _felt_by(self._fingers[contact.key], contact, now, changes)
+        felt_plays.sort(key=_number_of)
+        return felt_plays
+
+
+def _remaining(
+    fingers: Mapping[ContactKey, _Finger], landed_at: Mapping[ContactKey, float]
+) -> dict[ContactKey, _Finger]:
+    """Return the fingers still down; a finger that landed again with its former id is new."""
+    return {key: finger for key, finger in fingers.items() if landed_at.get(key) == finger.since}
+
+
+def _felt_by(
+    finger: _Finger, contact: Contact, now: float, changes: list[float]
+) -> Collection[_FeltPlay]:
+    """Return the newest continuous play and the newest short pulse of a finger.
+
+    Calls all plays, because motion effects follow the finger, and removes plays that have ended.
+    """
+    felt: dict[bool, _FeltPlay] = {}  # by whether it is a short pulse
+    active: list[_Play] = []
+    for play in finger.plays:
+        stimulus = play.run.feel(contact, now)
+        if stimulus is None:
+            finger.ended = play.name
+            continue
+        if not isinstance(stimulus, EffectStimulus | NoStimulus):
+            raise WrongResultError(play.run, stimulus, EffectStimulus)
+        active.append(play)
+        if stimulus.until is not None:
+            changes.append(stimulus.until)
+        if isinstance(stimulus, NoStimulus):
+            continue
+        pulse = felt.get(True)
+        if pulse is not None and not stimulus.is_short and pulse.stimulus.is_absolute:
+            del felt[True]  # of an earlier file
+        felt[stimulus.is_short] = _FeltPlay(contact.key, play, stimulus)
+        if stimulus.click is not None:
+            felt[True] = _FeltPlay(contact.key, play, stimulus.click)
+    finger.plays = active
+    return felt.values()
+
+
+def _number_of(felt: _FeltPlay) -> int:
+    return felt.play.number
+
+
+def _with_newest_elsewhere(felt_plays: Sequence[_FeltPlay]) -> list[_FeltPlay]:
+    """Leave out effects outside all regions, except the newest one."""
+    newest = max([felt.play.number for felt in felt_plays if felt.play.is_elsewhere], default=0)
+    return [felt for felt in felt_plays if not felt.play.is_elsewhere or felt.play.number == newest]
+
+
+def _target(felt: _FeltPlay, *, is_alone: bool) -> Target:
+    """Return the target of a play; is_alone: whether no other finger is on the plate."""
+    key, play, stimulus = felt
+    if not is_alone and stimulus.among_others is not None:
+        stimulus = stimulus.among_others
+    return stimulus.target(
+        key,
+        play.name,
+        play.region,
+        band=play.band,
+        priority=play.priority,
+        above_db=play.above_db,
+    )

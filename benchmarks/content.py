@@ -37,7 +37,7 @@ from controller.content.formats import named_content, named_contents, read_conte
 from controller.content.pattern import Pattern
 from controller.content.rendition import rendered
 from controller.effects.effect import Region
-from controller.effects.kinds import File
+from controller.effects.file_effect import File
 from controller.effects.layout import SurfaceLayout
 from controller.effects.player import EffectPlayer
 from controller.play.intent import CLICK

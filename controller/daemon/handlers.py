@@ -44,7 +44,7 @@ from controller.daemon.layouts import LayoutChoice
 from controller.daemon.messages import EventPublisher, effects_result, hello_result
 from controller.daemon.plate_view import playing_of
 from controller.effects.effect import MIN_DB_SL, Effect
-from controller.effects.kinds import File
+from controller.effects.file_effect import File
 from controller.operation.operation_states import (
     ENERGISED,
     DaemonEvent,

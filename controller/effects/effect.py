@@ -16,7 +16,9 @@ from model.config.fields import Quantity, RegionShape, Section
 from model.config.units import FREQUENCY, LEVEL
 from model.finger import STRONG_DB_SL
 
-ON_PRESS, ON_MOVE, ON_RELEASE = USES = ("on_press", "on_move", "on_release")
+ON_MOVE = "on_move"
+ON_RELEASE = "on_release"
+USES = ("on_press", ON_MOVE, ON_RELEASE)
 """Keys of a region's effects."""
 
 
@@ -65,8 +67,11 @@ class Region:
 NEIGHBOURS: Literal["neighbours"] = "neighbours"
 """Level name: as strong as the neighbours allow."""
 
-MIN_DB_SL, DEFAULT_MAX_DB_SL = -20.0, 40.0
-"""Lowest level of an effect, and default maximum of a layout [dB SL]."""
+MIN_DB_SL = -20.0
+"""Lowest level of an effect [dB SL]."""
+
+DEFAULT_MAX_DB_SL = 40.0
+"""Default of a layout for the highest level of its effects [dB SL]."""
 
 DB_SL = Quantity(LEVEL, at_least=MIN_DB_SL, at_most=MAX_LEVEL_DB_SL)
 """A level of an effect."""
@@ -196,8 +201,8 @@ class TunedSection(Section):
             return self
         if self.frequency is not None:
             raise ValueError("must have frequency or band, got both; remove one")
-        if self.band[0] >= self.band[1]:
-            low, high = self.band
+        low, high = self.band
+        if low >= high:
             raise ValueError(
                 f"band must be a lower and a higher frequency, got {low:g} Hz and {high:g} Hz"
             )
@@ -205,8 +210,10 @@ class TunedSection(Section):
 
     @property
     def tuned_band(self) -> Band | None:
-        """The band, also that of a frequency; None if unrestricted."""
-        return self.band if self.frequency is None else (self.frequency, self.frequency)
+        """The band, or a band of the frequency alone; None if unrestricted."""
+        if self.frequency is None:
+            return self.band
+        return self.frequency, self.frequency
 
 
 class Effect(TunedSection, ABC):
@@ -249,12 +256,14 @@ class Effect(TunedSection, ABC):
 
     def gives_level_in(self, region: Region | None) -> bool:
         """Whether its layout sets its level, in a region or outside all."""
-        is_given = region is not None and region.has_level
-        return is_given or "level" in self.model_fields_set
+        has_region_level = region is not None and region.has_level
+        return has_region_level or "level" in self.model_fields_set
 
     def band_in(self, region: Region | None) -> Band | None:
         """Return its band [Hz] in a region, or outside all; None: any."""
-        return self.tuned_band if region is None or region.band is None else region.band
+        if region is None or region.band is None:
+            return self.tuned_band
+        return region.band
 
     @property
     def has_end(self) -> bool:

@@ -24,7 +24,8 @@ from controller.effects.effect import (
     Region,
     TunedSection,
 )
-from controller.effects.kinds import BUILT_IN_EFFECTS, effect_kind, effect_kinds, named_effects
+from controller.effects.file_effect import named_effects
+from controller.effects.kinds import BUILT_IN_EFFECTS, effect_kind, effect_kinds
 from controller.play.intent import band_problem
 from model.answer.stimulus import MAX_LEVEL_DB_SL
 from model.arrays import FloatArray
@@ -46,9 +47,11 @@ ELSEWHERE = "elsewhere"
 
 def default_effects(level_db_sl: float = STRONG_DB_SL) -> dict[str, Effect]:
     """Return the default effects of every layout, at a level."""
-    effects = [each for each in BUILT_IN_EFFECTS if not each.needs_entry]
-    plain = {each.kind: each.model_construct(set(), level=level_db_sl) for each in effects}
-    return {**named_effects(level_db_sl), **plain}
+    effects: dict[str, Effect] = {**named_effects(level_db_sl)}
+    for kind in BUILT_IN_EFFECTS:
+        if not kind.needs_entry:
+            effects[kind.kind] = kind.model_construct(set(), level=level_db_sl)
+    return effects
 
 
 @dataclass(frozen=True)
@@ -70,17 +73,18 @@ class SurfaceLayout:
     def uses(self) -> Iterator[tuple[Region | None, str, str]]:
         """Yield every effect of every region: the region (None outside all), key and name."""
         for region in self.regions:
-            for on in USES:
-                if (name := getattr(region, on)) is not None:
-                    yield region, on, name
+            for key in USES:
+                name = getattr(region, key)
+                if name is not None:
+                    yield region, key, name
         if self.elsewhere is not None:
             yield None, ELSEWHERE, self.elsewhere
 
     def for_table(self, frequencies: FloatArray) -> Self:
         """Return the layout for the frequencies of a table [Hz], with its effects prepared."""
-        effects = {name: each.for_table(frequencies) for name, each in self.effects.items()}
-        for each in effects.values():
-            each.prepare(each.level_db_sl)
+        effects = {name: effect.for_table(frequencies) for name, effect in self.effects.items()}
+        for effect in effects.values():
+            effect.prepare(effect.level_db_sl)
         for region, _, name in self.uses():
             effects[name].prepare(self.level_of(name, region))
         return replace(self, effects=effects)
@@ -88,13 +92,13 @@ class SurfaceLayout:
     @property
     def max_db_sl(self) -> float:
         """Highest level of all effects; infinite for a level that the neighbours limit."""
-        levels = [effect.max_db_sl(effect.level_db_sl) for effect in self.effects.values()]
-        levels += [
-            self.effects[name].max_db_sl(self.level_of(name, region))
-            for region, _, name in self.uses()
-            if region is not None
-        ]
-        return max(levels, default=-math.inf)
+        highest = -math.inf
+        for effect in self.effects.values():
+            highest = max(highest, effect.max_db_sl(effect.level_db_sl))
+        for region, _, name in self.uses():
+            level_db_sl = self.level_of(name, region)
+            highest = max(highest, self.effects[name].max_db_sl(level_db_sl))
+        return highest
 
     def level_of(self, name: str, region: Region | None) -> float | None:
         """Return the level [dB SL] of an effect, by name, in a region or outside all.
@@ -107,13 +111,14 @@ class SurfaceLayout:
 
     def band_problems(self, frequencies: FloatArray) -> list[str]:
         """Describe the table frequencies [Hz] played for bands without a table frequency."""
-        problems = [
-            f"{ELSEWHERE if region is None else region.name}: {problem}"
-            for region, _, name in self.uses()
-            if (band := self.effects[name].band_in(region)) is not None
-            and (problem := band_problem(band, frequencies)) is not None
-        ]
-        return [*dict.fromkeys(problems)]
+        problems: dict[str, None] = {}  # in order, each once
+        for region, _, name in self.uses():
+            band = self.effects[name].band_in(region)
+            problem = None if band is None else band_problem(band, frequencies)
+            if problem is not None:
+                area = ELSEWHERE if region is None else region.name
+                problems[f"{area}: {problem}"] = None
+        return list(problems)
 
     def as_json(self) -> dict[str, Any]:
         """Return the layout in the format of the API."""
@@ -123,12 +128,16 @@ class SurfaceLayout:
         }
 
 
-_MAX_REGIONS, _MAX_EFFECTS = 256, 64  # any further ones are one problem, and not checked
+# Regions and effects beyond these numbers are reported as one problem, and not checked.
+_MAX_REGIONS = 256
+_MAX_EFFECTS = 64
+
+_KEYS_OF_OTHERS = {"plate", "surface", "rig"}
+"""Keys of rigs and daemon files."""
 
 _HighestLevel = Annotated[
     float, Quantity(LEVEL, at_least=DEFAULT_MAX_DB_SL, at_most=MAX_LEVEL_DB_SL)
 ]
-
 
 EffectName = Annotated[
     Identifier | None, BeforeValidator(lambda value: None if is_null_word(value) else value)
@@ -176,7 +185,7 @@ def layout_of(
     document: Document, plate: Plate | None, *, level_db_sl: float = STRONG_DB_SL
 ) -> SurfaceLayout:
     """Make the layout of a document; arguments and errors: see `load_layout`."""
-    if not is_layout_document(document) and document.data.keys() & {"plate", "surface", "rig"}:
+    if not is_layout_document(document) and document.data.keys() & _KEYS_OF_OTHERS:
         kind = "a daemon file" if "rig" in document.data else "a rig"
         raise InputError(
             f"{document.source}: must be a surface layout, got {kind}; "
@@ -191,34 +200,35 @@ def layout_of(
     _check_levels(validation, effects)
     section = validation.finish()
     return SurfaceLayout(
-        regions=tuple(
-            Region(
-                name=name,
-                shape=region.shape,
-                on_press=region.on_press,
-                on_move=region.on_move,
-                on_release=region.on_release,
-                level_db_sl=region.level if isinstance(region.level, float) else None,
-                has_level=region.level is not None,
-                priority=region.priority,
-                band=region.tuned_band,
-                is_own=region.own,
-                may_share=region.may_share,
-                is_protected=region.protected,
-            )
-            for name, region in section.regions.items()
-        ),
+        regions=tuple(_region(name, region) for name, region in section.regions.items()),
         effects={name: effect for name, effect in effects.items() if effect is not None},
         elsewhere=section.elsewhere,
     )
 
 
+def _region(name: str, section: RegionSection) -> Region:
+    """Return the region of a section."""
+    return Region(
+        name=name,
+        shape=section.shape,
+        on_press=section.on_press,
+        on_move=section.on_move,
+        on_release=section.on_release,
+        level_db_sl=section.level if isinstance(section.level, float) else None,
+        has_level=section.level is not None,
+        priority=section.priority,
+        band=section.tuned_band,
+        is_own=section.own,
+        may_share=section.may_share,
+        is_protected=section.protected,
+    )
+
+
 def is_layout_document(document: Document) -> bool:
     """Whether a configuration file is a surface layout."""
-    own = LayoutSection.model_fields.keys()
-    return bool(document.data.keys() & own) and document.data.keys().isdisjoint(
-        {"plate", "surface", "rig"}
-    )
+    keys = document.data.keys()
+    has_layout_key = bool(keys & LayoutSection.model_fields.keys())
+    return has_layout_key and keys.isdisjoint(_KEYS_OF_OTHERS)
 
 
 def _effects(
@@ -226,30 +236,42 @@ def _effects(
 ) -> dict[str, Effect | None]:
     """Return effects by name, with the default ones; None for an invalid one."""
     effects: dict[str, Effect | None] = {**default_effects(level_db_sl)}
-    own = validation.mapping(("effects",))
-    effects |= dict.fromkeys(own)
-    for name, parameters in islice(own.items(), _MAX_EFFECTS):
+    sections = validation.mapping(("effects",))
+    effects |= dict.fromkeys(sections)
+    for name, parameters in islice(sections.items(), _MAX_EFFECTS):
         path = ("effects", name)
         if not isinstance(parameters, dict):
             continue  # reported with the section of the layout
         if is_null_word(name):
             validation.add(path, "means no effect where an effect is named; choose another name")
             continue
-        kind = parameters.get("kind", name)
-        try:
-            section = effect_kind(kind if isinstance(kind, str) else repr(kind))
-        except InputError as error:
-            where = (*path, "kind") if "kind" in parameters else path
-            is_named = "kind" in parameters or name in effect_kinds()
-            validation.add(where, f"{error}" if is_named else f"needs a kind; {error}")
+        kind = _kind_of(validation, name, parameters)
+        effect = None if kind is None else validation.nested(path, kind, without="kind")
+        effects[name] = effect
+        if effect is None:
             continue
-        effects[name] = effect = validation.nested(path, section, without="kind")
         try:
-            if effect is not None:
-                effect.read(document.beside(""))
+            effect.read(document.beside(""))
         except InputError as error:
             validation.add((*path, "file"), f"{error}")
     return effects
+
+
+def _kind_of(
+    validation: Validation[LayoutSection], name: str, parameters: Mapping[str, Any]
+) -> type[Effect] | None:
+    """Return the kind of an effect with a name and parameters; report an unknown one."""
+    kind = parameters.get("kind", name)
+    try:
+        return effect_kind(kind if isinstance(kind, str) else repr(kind))
+    except InputError as error:
+        if "kind" in parameters:
+            validation.add(("effects", name, "kind"), f"{error}")
+        elif name in effect_kinds():
+            validation.add(("effects", name), f"{error}")
+        else:
+            validation.add(("effects", name), f"needs a kind; {error}")
+        return None
 
 
 def _check_region(
@@ -263,12 +285,14 @@ def _check_region(
     if region is None:
         return
     sides = None if plate is None else (plate.length, plate.width)
-    if problem := region.shape_problem(sides):
-        validation.add((*path, *problem[0]), problem[1])
+    problem = region.shape_problem(sides)
+    if problem:
+        keys, message = problem
+        validation.add((*path, *keys), message)
     if not any(getattr(region, key) for key in USES):
         for key in ("level", "band", "frequency", "own", "may_share"):
-            given = getattr(region, key)
-            if given is not None and given is not False:  # a level may be 0
+            value = getattr(region, key)
+            if value is not None and value is not False:  # a level can be 0
                 validation.add(
                     (*path, key), f"has no effect to apply to; add an effect or remove the {key}"
                 )
@@ -285,23 +309,24 @@ def _check_region(
 def _check_levels(validation: Validation[LayoutSection], effects: dict[str, Effect | None]) -> None:
     """Check that no level is above the highest one of the layout."""
     highest = validation.field(("max_level_db_sl",), LayoutSection)
-    levels: dict[KeyPath, float] = {
-        ("effects", name): effect.max_db_sl(effect.level_db_sl)
-        for name, effect in effects.items()
-        if effect is not None and effect.level_db_sl is not None
-    }
+    levels: dict[KeyPath, float] = {}
+    for name, effect in effects.items():
+        if effect is not None and effect.level_db_sl is not None:
+            levels["effects", name] = effect.max_db_sl(effect.level_db_sl)
     for name in islice(validation.mapping(("regions",)), _MAX_REGIONS):
         region = validation.part(("regions", name), RegionSection)
         if region is not None and isinstance(region.level, float):
             levels["regions", name, "level"] = region.level
     for path, level in levels.items():
-        if problem := level_problem(level, highest):
+        problem = level_problem(level, highest)
+        if problem:
             validation.add(path, problem)
 
 
 def level_problem(level_db_sl: float, highest: float | None = None) -> str | None:
     """Return why a level [dB SL] is too high for a layout; highest: None for the default."""
-    highest = DEFAULT_MAX_DB_SL if highest is None else highest
+    if highest is None:
+        highest = DEFAULT_MAX_DB_SL
     if level_db_sl <= highest:
         return None
     return (
@@ -322,13 +347,11 @@ def _check_use(
     if name is None:
         return
     if name not in effects:
-        validation.add(
-            path,
-            f"unknown effect {name!r}; {did_you_mean(name, effects)}"
-            f"choose one of {', '.join(effects)}"
-            + f"; or define it, as `{name}: {{}}` under effects"
-            * (name in effect_kinds()),
-        )
+        suggestion = did_you_mean(name, effects)
+        message = f"unknown effect {name!r}; {suggestion}choose one of {', '.join(effects)}"
+        if name in effect_kinds():
+            message += f"; or define it, as `{name}: {{}}` under effects"
+        validation.add(path, message)
         return
     effect = effects[name]
     if effect is None:
@@ -350,10 +373,12 @@ def _check_use(
 def _checked(document: Document) -> CheckedFile:
     """Read a layout; raises ConfigError. Only a daemon file shows whether it fits a plate."""
     layout = layout_of(document, None)
+    region_names = [region.name for region in layout.regions]
     unused = default_effects().keys() - {name for _, _, name in layout.uses()}
+    effect_names = [name for name in layout.effects if name not in unused]
     return CheckedFile(
-        f"good: regions {', '.join(region.name for region in layout.regions) or 'none'}; "
-        f"effects {', '.join(name for name in layout.effects if name not in unused) or 'none'}; "
+        f"good: regions {', '.join(region_names) or 'none'}; "
+        f"effects {', '.join(effect_names) or 'none'}; "
         f"elsewhere {layout.elsewhere or 'nothing'}. "
         "Check the daemon's file that names it to see whether it fits the plate",
     )

@@ -22,7 +22,8 @@ import numpy as np
 from controller.api.jsonrpc import RpcError
 from controller.content.pattern import Pattern, Transient
 from controller.effects.effect import Region
-from controller.effects.kinds import Buzz, File, Texture
+from controller.effects.file_effect import File
+from controller.effects.kinds import Buzz, Texture
 from controller.effects.layout import SurfaceLayout, default_effects
 from controller.effects.player import EffectPlayer
 from controller.operation.operation_states import DaemonEvent, DaemonState, Trigger

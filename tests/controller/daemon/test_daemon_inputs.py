@@ -31,7 +31,7 @@ from controller.api.methods import METHODS, TOPICS, InputsEvent
 from controller.cli.status_text import show_status
 from controller.daemon.config import TouchInput
 from controller.daemon.layouts import TouchInputs
-from controller.effects.kinds import File
+from controller.effects.file_effect import File
 from controller.gateway.metrics import exposition
 from controller.play.selection import Chooser
 from controller.sources import udp_source

@@ -16,7 +16,8 @@ import pytest
 from controller.content.formats import named_contents
 from controller.content.pattern import Pattern, Transient
 from controller.effects.effect import Effect, EffectStimulus, NoStimulus, Region, TunedSection
-from controller.effects.kinds import Buzz, Click, Detents, Dial, File
+from controller.effects.file_effect import File
+from controller.effects.kinds import Buzz, Click, Detents, Dial
 from controller.effects.layout import LayoutSection, RegionSection, SurfaceLayout, load_layout
 from controller.effects.player import EffectPlayer
 from controller.play.intent import Target

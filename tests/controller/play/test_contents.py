@@ -19,7 +19,7 @@ import pytest
 from cases import read_yaml, shortly
 from controller.content.pattern import Pattern, Transient
 from controller.daemon.plate_view import PlateView
-from controller.effects.kinds import File
+from controller.effects.file_effect import File
 from controller.effects.layout import SurfaceLayout, layout_of
 from controller.play.intent import CLICK, Content, HapticIntent, Pulse, Selection, Target
 from controller.play.routing import PlaybackCapabilities

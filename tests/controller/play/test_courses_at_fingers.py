@@ -16,7 +16,8 @@ import pytest
 from controller.content.pattern import Curve, Pattern, Transient, sharpness_of
 from controller.daemon.plate_view import PlateView
 from controller.effects.effect import Effect, Region
-from controller.effects.kinds import Buzz, File
+from controller.effects.file_effect import File
+from controller.effects.kinds import Buzz
 from controller.effects.layout import SurfaceLayout
 from controller.effects.player import EffectPlayer
 from controller.play.routing import RAMPS_ONLY, PlaybackCapabilities

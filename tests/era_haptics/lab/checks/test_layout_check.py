@@ -23,12 +23,12 @@ from controller.cli.config_cli import config_kinds
 from controller.content.formats import named_content, read_content
 from controller.content.pattern import Pattern, Transient
 from controller.effects.effect import Effect, Region
+from controller.effects.file_effect import File
 from controller.effects.kinds import (
     Buzz,
     Click,
     Detents,
     Dial,
-    File,
     Ramp,
 )
 from controller.effects.layout import SurfaceLayout

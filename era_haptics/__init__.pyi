@@ -56,10 +56,10 @@ from model.table.table_file import save_table as save_table
 from model.vibration import PlateMap as PlateMap
 from model.vibration import Tone as Tone
 from registry.limits import GuardLimits as GuardLimits
-from sim.plant.excited_plate import FeltFinger as FeltFinger
-from sim.plant.excited_plate import PlatePlayback
-from sim.plant.excited_plate import Vibration as Vibration
 from sim.plant.fingers import FingerRecord
+from sim.plant.plate_playback import FeltFinger as FeltFinger
+from sim.plant.plate_playback import PlatePlayback
+from sim.plant.plate_playback import Vibration as Vibration
 
 Era = EraKeys
 Exciter = ExciterKeys

@@ -41,9 +41,10 @@ from model.structure.attachments import check_loads, footprints_of
 from model.study.contrast_maps import ContrastMap
 from model.table.table import LocalizationTable, default_drive_frequencies
 from model.vibration import PlateMap, Tone, plate_map
-from sim.plant.excited_plate import LEVEL_WINDOW, PlatePlayback, play, play_signals
+from sim.plant.excited_plate import play, play_signals
 from sim.plant.fingers import FingerRecord
 from sim.plant.imperfections import Imperfections, draw_of_ensemble
+from sim.plant.plate_playback import LEVEL_WINDOW, PlatePlayback
 
 if TYPE_CHECKING:  # slow to import, like all drawing modules
     from matplotlib.figure import Figure

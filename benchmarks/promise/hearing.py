@@ -19,9 +19,9 @@ from model.finger import detection_threshold
 from model.rig.rig import Rig
 from sim.amplifier.readings import StraightClock
 from sim.bench.bench import Bench
-from sim.plant import imperfections
-from sim.plant.imperfections import Imperfections, motion_of, realised
-from sim.plant.plant import FingerPlacement
+from sim.plant.era_motions import harmonics_of_voices, motion_of, realised
+from sim.plant.finger_placement import FingerPlacement
+from sim.plant.imperfections import Imperfections
 
 STRONGEST = 0.040  # s; of the strongest part of a span
 EARLY = 0.020  # s; by which amplifiers may start before another
@@ -52,7 +52,7 @@ class _PartialBench(Bench):
         errors = self._errors[index]
         stroke = self.rig.eras[index].full_level
         terms: list[Any] = []
-        for voice in (*playing, *imperfections.of_voices(playing, errors.harmonic)):
+        for voice in (*playing, *harmonics_of_voices(playing, errors.harmonic)):
             if not self._is_played(self.owners.get(voice.layer)):
                 continue
             threshold = float(detection_threshold(np.array([voice.frequency]), self._thresholds)[0])

@@ -38,7 +38,8 @@ from model.transients.base_motion import Motion
 from registry import limits, threads
 from sim.amplifier.readings import AmplifierClock, StraightClock
 from sim.amplifier.simulated_amplifier import SimulatedAmplifier
-from sim.plant import imperfections
+from sim.plant.era_motions import harmonics_of_voices, motion_of, realised
+from sim.plant.finger_placement import FingerPlacement
 from sim.plant.fingers import (
     HISTORY_DURATION,
     FeltVibration,
@@ -46,8 +47,9 @@ from sim.plant.fingers import (
     PlateFingers,
     measure_vibration,
 )
-from sim.plant.imperfections import Imperfections, motion_of, realised
-from sim.plant.plant import PLANT_SAMPLE_RATE, FingerPlacement, LoadedPlate, Plant
+from sim.plant.imperfections import Imperfections
+from sim.plant.loaded_plate import LoadedPlate
+from sim.plant.plant import PLANT_SAMPLE_RATE, Plant
 
 WRONG = 0.5e-6
 """Largest error of a clock of the plate [s], 0.1 degrees at 500 Hz; then it is replaced."""
@@ -370,7 +372,7 @@ class Bench:
         """The base motion of an ERA by the output of its channel, imperfections included."""
         stroke, delay = self.rig.eras[index].full_level, self._delays[index]
         errors = self._errors[index]
-        moving = [*playing, *imperfections.of_voices(playing, errors.harmonic)]
+        moving = [*playing, *harmonics_of_voices(playing, errors.harmonic)]
         return realised(motion_of(moving, clock, stroke=stroke, delay=delay), errors)
 
 

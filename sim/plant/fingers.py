@@ -1,6 +1,6 @@
 """Fingertips on the plate, with samples of the last ten seconds.
 
-The load of a finger on the plate is in `sim.plant.plant`.
+The load of a finger on the plate is in `sim.plant.loaded_plate`.
 """
 
 from collections import deque
@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from model.answer.stimulus import check_on_plate
-from model.arrays import ComplexArray, FloatArray, Point
+from model.arrays import ComplexArray, Float32Array, FloatArray, Point
 from model.errors import InputError
 from model.finger import felt_part, fingertip_points, fingertip_weights
 from model.reduction.reduced_plate import ReducedPlate
@@ -48,12 +48,21 @@ class FingerRecord:
     accelerations: FloatArray
 
 
+@dataclass(frozen=True, eq=False)
+class _Piece:
+    """Accelerations (n, p) [m/s²] at times (n,) [s] while all fingers stayed at their positions."""
+
+    layout: FingerPositions
+    times: FloatArray
+    accelerations: Float32Array
+
+
 class PlateFingers:
     """Fingers on a reduced plate by id, and their accelerations in the last ten seconds."""
 
     def __init__(self, reduced: ReducedPlate) -> None:
         self._reduced = reduced
-        self._pieces: deque[tuple[FingerPositions, FloatArray, FloatArray]] = deque()
+        self._pieces: deque[_Piece] = deque()
         self.layout = self._lay_out({})
 
     def place(self, positions: Mapping[str, Point], *, reduced: ReducedPlate | None = None) -> None:
@@ -79,59 +88,74 @@ class PlateFingers:
     def record(self, times: FloatArray, accelerations: FloatArray) -> None:
         """Keep samples at the points of the layout: times (n,) [s], accelerations (n, p) [m/s²]."""
         if accelerations.shape[1]:
-            self._pieces.append((self.layout, times, accelerations.astype(np.float32, copy=False)))
-        while self._pieces and self._pieces[0][1][-1] < times[-1] - HISTORY_DURATION:
+            single = accelerations.astype(np.float32, copy=False)
+            self._pieces.append(_Piece(self.layout, times, single))
+        oldest = times[-1] - HISTORY_DURATION
+        while self._pieces and self._pieces[0].times[-1] < oldest:
             self._pieces.popleft()
 
     def felt(self, since: float, until: float) -> dict[str, FingerRecord]:
         """The record of each finger in since <= t <= until [s], at its last position.
 
-        Of a finger that moved only the part after the last move is included.
+        The record of a finger that moved begins with its last move.
         """
-        pieces = [piece for piece in self._pieces if piece[1][-1] >= since and piece[1][0] <= until]
-        last = {name: layout for layout, _, _ in pieces for name in layout.positions}
-        return {
-            name: _join(name, layout, pieces, since=since, until=until)
-            for name, layout in last.items()
-        }
+        pieces = []
+        last_layouts: dict[str, FingerPositions] = {}
+        for piece in self._pieces:
+            if piece.times[-1] >= since and piece.times[0] <= until:
+                pieces.append(piece)
+                for name in piece.layout.positions:
+                    last_layouts[name] = piece.layout
+        records = {}
+        for name, layout in last_layouts.items():
+            records[name] = _join(name, layout, pieces, since=since, until=until)
+        return records
 
     def _lay_out(self, positions: Mapping[str, Point]) -> FingerPositions:
-        plate, columns = self._reduced.plate, {}
-        points, weights = [np.zeros((0, 2))], [np.zeros(0)]
+        plate = self._reduced.plate
+        columns = {}
+        points_by_finger = [np.zeros((0, 2))]
+        weights_by_finger = [np.zeros(0)]
         start = 0
-        for name, at in positions.items():
-            points.append(fingertip_points(*at, plate))
-            weights.append(fingertip_weights(*at, plate))
-            columns[name] = slice(start, start + len(points[-1]))
-            start += len(points[-1])
-        together = np.concatenate(points)
-        shapes = self._reduced.at(together)
-        return FingerPositions(dict(positions), together, np.concatenate(weights), shapes, columns)
+        for name, position in positions.items():
+            fingertip = fingertip_points(*position, plate)
+            points_by_finger.append(fingertip)
+            weights_by_finger.append(fingertip_weights(*position, plate))
+            columns[name] = slice(start, start + len(fingertip))
+            start += len(fingertip)
+        points = np.concatenate(points_by_finger)
+        weights = np.concatenate(weights_by_finger)
+        shapes = self._reduced.at(points)
+        return FingerPositions(dict(positions), points, weights, shapes, columns)
 
 
 def _join(
     name: str,
     last: FingerPositions,
-    pieces: list[tuple[FingerPositions, FloatArray, FloatArray]],
+    pieces: Sequence[_Piece],
     *,
     since: float,
     until: float,
 ) -> FingerRecord:
     """Join the pieces at a finger's last position to its record."""
-    stay: list[tuple[FloatArray, FloatArray]] = []
-    for layout, times, accelerations in reversed(pieces):
-        if not stay and name not in layout.positions:
+    times: list[FloatArray] = []
+    accelerations: list[Float32Array] = []
+    for piece in reversed(pieces):
+        if not times and name not in piece.layout.positions:
             continue  # lifted before the end of the window
-        if layout.positions.get(name) != last.positions[name]:
+        if piece.layout.positions.get(name) != last.positions[name]:
             break
-        inside = (times >= since) & (times <= until)
-        stay.append((times[inside], accelerations[inside, layout.columns[name]]))
-    stay.reverse()
+        is_inside = (piece.times >= since) & (piece.times <= until)
+        times.append(piece.times[is_inside])
+        accelerations.append(piece.accelerations[is_inside, piece.layout.columns[name]])
+    times.reverse()
+    accelerations.reverse()
+    columns = last.columns[name]
     return FingerRecord(
-        points=last.points[last.columns[name]],
-        weights=last.weights[last.columns[name]],
-        times=np.concatenate([times for times, _ in stay]),
-        accelerations=np.concatenate([part for _, part in stay]).astype(np.float64),
+        points=last.points[columns],
+        weights=last.weights[columns],
+        times=np.concatenate(times),
+        accelerations=np.concatenate(accelerations).astype(np.float64),
     )
 
 
@@ -156,22 +180,24 @@ def measure_vibration(record: FingerRecord, frequencies: Sequence[float]) -> Fel
     be longer than the inverse of the smallest frequency difference. With fewer samples than
     unknowns the result is the minimum-norm solution.
     """
-    times, samples = record.times, record.accelerations
-    count, points = len(frequencies), len(record.points)
-    if not len(times):
-        amplitude, peak = np.zeros((count, points)), np.zeros(points)
-    else:
+    times = record.times
+    samples = record.accelerations
+    if len(times):
         amplitude = np.abs(fit_tones(times - times[0], samples, frequencies))
         peak = felt_peaks(times, samples)
+    else:
+        amplitude = np.zeros((len(frequencies), len(record.points)))
+        peak = np.zeros(len(record.points))
     return FeltVibration(record.points, record.weights, tuple(frequencies), amplitude, peak)
 
 
 def felt_peaks(times: FloatArray, samples: FloatArray) -> FloatArray:
-    """Peaks (p,) of what skin can feel of evenly spaced samples (n, p) at times (n,) [s]."""
+    """Peaks (p,) of the part of samples (n, p) that skin can feel, at even times (n,) [s]."""
     if len(times) < 2:
         return np.asarray(np.abs(samples).max(axis=0))
     rate = (len(times) - 1) / (times[-1] - times[0])
-    return np.asarray(np.abs(felt_part(samples, round(rate, 3))).max(axis=0))
+    felt = felt_part(samples, round(rate, 3))
+    return np.asarray(np.abs(felt).max(axis=0))
 
 
 def fit_tones(times: FloatArray, samples: FloatArray, frequencies: Sequence[float]) -> ComplexArray:

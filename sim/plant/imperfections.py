@@ -1,10 +1,8 @@
 """Imperfections of a bench: of its amplifiers, its plate and ERAs, and the fingers on it.
 
 Amplifiers have gain and phase errors, delays, and inexact crystals; plate and ERAs differ from the
-rig's, ERAs are displaced, and finger loads vary. Each ERA adds a second harmonic: a share of each
-tone's amplitude at twice its frequency and phase, with its own angle. Not modelled: sums and
-differences of several tones, harmonics of signals, other distortion, and drifting errors of
-channels.
+rig's, ERAs are displaced, and finger loads vary. Each ERA adds a second harmonic
+(`sim.plant.era_motions`). Channel errors do not drift.
 """
 
 import cmath
@@ -15,9 +13,7 @@ from zlib import crc32
 
 import numpy as np
 
-from drivers.playing import Voice
 from drivers.protocol.definition import CLOCK_TURN
-from model.answer.answer import Layer
 from model.answer.stimulus import Finger
 from model.arrays import ComplexArray, FloatArray, Point
 from model.errors import InputError
@@ -26,21 +22,22 @@ from model.rig.rig_file import mesh_of
 from model.spectral.modes import PlateMesh
 from model.structure.attachments import Fingertip, FingertipLoad, fingertip_loads
 from model.structure.exciter import Actuator
-from model.study.exact_plates import draw_plates
-from model.transients.base_motion import BaseEnvelope, Motion, Term, along_lines, raised_cosine
-from model.vibration import Tone, finer_mesh
-from sim.amplifier.readings import Crystal, StraightClock
+from model.structure.plate import Plate
+from model.study.exact_plates import Plates, draw_plates
+from model.vibration import finer_mesh
+from sim.amplifier.readings import Crystal
 
 _MAX_LOSS_FACTOR = 0.99
 _MIN_FACTOR = 0.05  # of a normal draw about 1, which may be negative
-_CRYSTAL, _WARM_UP = 50e-6, 1e-6  # 50 ppm, and 1 ppm/s either way
+_MAX_CRYSTAL_ERROR = 50e-6  # 50 ppm
+_WARM_UP = 1e-6  # 1/s; a crystal drifts by 1 ppm/s up or down
 
 
 @dataclass(frozen=True)
 class ChannelErrors:
     """Errors of a channel: gain factor, phase [rad].
 
-    harmonic: second harmonic of its ERA's motion, relative to it (`sim.plant.imperfections`).
+    harmonic: second harmonic of its ERA's motion, relative to it (`sim.plant.era_motions`).
     """
 
     gain: float = 1.0
@@ -81,42 +78,54 @@ class PlateErrors:
 
     def realised(self, rig: Rig) -> Rig:
         """The rig whose plate and ERAs have these errors."""
-
-        def of(era: Actuator) -> Actuator:
-            x, y = np.add((era.x, era.y), self.places.get(era.name, (0.0, 0.0)))
-            varied = era.varied(
-                stiffness=self.stiffness.get(era.name, 1.0), damping=self.era_damping
-            )
-            return replace(
-                varied,
-                x=float(np.clip(x, 0.0, rig.plate.length)),
-                y=float(np.clip(y, 0.0, rig.plate.width)),
-            )
-
-        stated, surface, (squares, sizes) = rig.plate.mode_deviations, rig.plate.surface, self.modes
-        plate = replace(
-            rig.plate.scaled(thickness=self.thickness, modulus=self.modulus),
-            loss_factor=min(self.loss_factor * rig.plate.loss_factor, _MAX_LOSS_FACTOR),
-            mode_deviations=tuple(
-                (a + math.log(square), b)
-                for (a, b), square in zip(
-                    [*stated, *[(0.0, 0.0)] * len(squares)],
-                    [*squares, *[1.0] * len(stated)],
-                    strict=True,
-                )
-            ),
-            surface=surface and replace(surface, sizes=tuple(map(math.sqrt, sizes))),
-        )
+        eras = tuple([self._realised_era(era, rig.plate) for era in rig.eras])
         masses = list(rig.masses)
         for number, factor in self.feet.items():
-            masses[number] = replace(masses[number], stiffness=factor * masses[number].stiffness)
+            foot = masses[number]
+            masses[number] = replace(foot, stiffness=factor * foot.stiffness)
         return replace(
             rig,
-            plate=plate,
-            eras=tuple(map(of, rig.eras)),
+            plate=self._realised_plate(rig.plate),
+            eras=eras,
             masses=tuple(masses),
             mesh=self.mesh or rig.mesh,
         )
+
+    def _realised_era(self, era: Actuator, plate: Plate) -> Actuator:
+        """An ERA with its errors; a displacement ends at the edge of the plate."""
+        stiffness = self.stiffness.get(era.name, 1.0)
+        dx, dy = self.places.get(era.name, (0.0, 0.0))
+        x = float(np.clip(era.x + dx, 0.0, plate.length))
+        y = float(np.clip(era.y + dy, 0.0, plate.width))
+        varied = era.varied(stiffness=stiffness, damping=self.era_damping)
+        return replace(varied, x=x, y=y)
+
+    def _realised_plate(self, plate: Plate) -> Plate:
+        """A plate with its errors."""
+        loss_factor = min(self.loss_factor * plate.loss_factor, _MAX_LOSS_FACTOR)
+        surface = plate.surface
+        if surface:
+            _, squared_sizes = self.modes
+            surface = replace(surface, sizes=tuple(map(math.sqrt, squared_sizes)))
+        return replace(
+            plate.scaled(thickness=self.thickness, modulus=self.modulus),
+            loss_factor=loss_factor,
+            mode_deviations=self._mode_deviations(plate),
+            surface=surface,
+        )
+
+    def _mode_deviations(self, plate: Plate) -> tuple[tuple[float, float], ...]:
+        """The deviations of a plate's modes, with the errors of their eigenvalues added."""
+        eigenvalues, _ = self.modes
+        stated = plate.mode_deviations
+        padded_stated = [*stated, *[(0.0, 0.0)] * len(eigenvalues)]
+        padded_errors = [*eigenvalues, *[1.0] * len(stated)]
+        deviations = []
+        for (log_eigenvalue, log_loss_factor), error in zip(
+            padded_stated, padded_errors, strict=True
+        ):
+            deviations.append((log_eigenvalue + math.log(error), log_loss_factor))
+        return tuple(deviations)
 
 
 @dataclass(frozen=True)
@@ -176,11 +185,14 @@ class Imperfections:
 
     def resting(self, rig: Rig, fingers: Sequence[Finger]) -> list[FingertipLoad]:
         """Fingers as loads of the plate; empty if the rig's fingertips are weightless."""
-        places, loads = [each.at for each in fingers], [each.load for each in fingers]
-        return [
-            replace(each, fingertip=self.load_of(str(number), each.fingertip))
-            for number, each in enumerate(fingertip_loads(rig.fingertip, places, loads))
-        ]
+        positions = [finger.at for finger in fingers]
+        factors = [finger.load for finger in fingers]
+        nominal_loads = fingertip_loads(rig.fingertip, positions, factors)
+        loads = []
+        for number, nominal in enumerate(nominal_loads):
+            fingertip = self.load_of(str(number), nominal.fingertip)
+            loads.append(replace(nominal, fingertip=fingertip))
+        return loads
 
     def factors(self, rig: Rig) -> ComplexArray:
         """Gain and phase of each ERA's channel, (eras,)."""
@@ -188,56 +200,47 @@ class Imperfections:
 
 
 def draw_imperfections(rig: Rig, *, seed: int = 0) -> Imperfections:
-    """Draw the plate, ERAs, channels and fingers of a rig within its uncertainty, all normal.
+    """Draw the plate, ERAs, channels and fingers of a rig from its tolerances.
 
-    Feet log-normal. Crystals are within 50 ppm, and drift by 1 ppm/s at first. The plate is solved
-    on another mesh than the rig's, as accurate as `mesh: auto`.
+    Feet, loss factor and damping are log-normal, all other errors normal. Crystals are within
+    50 ppm and initially drift by 1 ppm/s. The plate is solved on another mesh than the rig's, as
+    accurate as `mesh: auto`.
     """
+    # One generator for each group of errors: a new kind of error leaves the draws of a seed as
+    # they are. The order of the draws is part of the result.
     rng = np.random.default_rng(seed)
     std = rig.uncertainty
-
-    def relative(deviation: float) -> float:
-        return max(_MIN_FACTOR, 1 + deviation * rng.standard_normal())
-
-    channels = {
+    gains_and_phases = {
         channel: ChannelErrors(
-            relative(std.gain), math.radians(std.phase_deg) * rng.standard_normal()
+            _factor(rng, std.gain), math.radians(std.phase_deg) * rng.standard_normal()
         )
         for channel in rig.wiring.values()
     }
+    thickness = _factor(rng, std.thickness)
+    loss_factor = std.damping ** rng.standard_normal()
+    era_damping = std.damping ** rng.standard_normal()
+    stiffness = {era.name: _factor(rng, std.stiffness) for era in rig.eras}
+
+    rng_of_details = np.random.default_rng([seed, crc32(b"modulus, places, harmonics")])
+    modulus = _factor(rng_of_details, std.elasticity)
+    displacements = std.place * rng_of_details.standard_normal((len(rig.eras), 2))
+    channels = _with_harmonics(gains_and_phases, std.harmonic, rng_of_details)
+
+    rng_of_feet = np.random.default_rng([seed, crc32(b"feet")])
+    feet = np.exp(std.supports * rng_of_feet.standard_normal(len(rig.feet)))
+    drawn_modes = draw_plates(rng_of_feet, std, of=rig, count=1, contact_count=0).modes[0]
     plate = PlateErrors(
-        thickness=relative(std.thickness),
-        loss_factor=std.damping ** rng.standard_normal(),
-        era_damping=std.damping ** rng.standard_normal(),
-        stiffness={era.name: relative(std.stiffness) for era in rig.eras},
+        thickness=thickness,
+        modulus=modulus,
+        loss_factor=loss_factor,
+        era_damping=era_damping,
+        stiffness=stiffness,
+        places=_places_by_era(rig, displacements),
+        feet=_factors_by_foot(rig, feet),
         mesh=_other_mesh(rig),
+        modes=drawn_modes.tolist(),
     )
-    # A separate generator, so that other draws of a seed do not change.
-    rng = np.random.default_rng([seed, crc32(b"modulus, places, harmonics")])
-    of_feet = np.random.default_rng([seed, crc32(b"feet")])
-    plate = replace(
-        plate,
-        modulus=relative(std.elasticity),
-        places=_places(rig, std.place * rng.standard_normal((len(rig.eras), 2))),
-        feet=_feet(rig, np.exp(std.supports * of_feet.standard_normal(len(rig.feet)))),
-        modes=draw_plates(of_feet, std, of=rig, count=1, contact_count=0).modes[0].tolist(),
-    )
-    real, imaginary = rng.standard_normal((2, len(channels))) * (std.harmonic * math.sqrt(0.5))
-    channels = {
-        channel: replace(errors, harmonic=complex(*both))
-        for (channel, errors), both in zip(
-            channels.items(), zip(real, imaginary, strict=True), strict=True
-        )
-    }
-    return _drawn(rig, channels, plate, seed)
-
-
-def _places(rig: Rig, off: FloatArray) -> dict[str, Point]:
-    return {era.name: (x, y) for era, (x, y) in zip(rig.eras, off.tolist(), strict=True)}
-
-
-def _feet(rig: Rig, factors: FloatArray) -> dict[int, float]:
-    return dict(zip(rig.feet, factors.tolist(), strict=True))
+    return _with_crystals_and_fingers(rig, channels, plate, seed)
 
 
 def draw_of_ensemble(rig: Rig, *, seed: int) -> Imperfections:
@@ -245,128 +248,87 @@ def draw_of_ensemble(rig: Rig, *, seed: int) -> Imperfections:
 
     Like `draw_imperfections`, plus a common gain error of all channels.
     """
-    drawn = draw_plates(
-        np.random.default_rng(seed),
-        rig.uncertainty,
-        of=rig,
-        count=1,
-        contact_count=0,
-    )
+    rng = np.random.default_rng(seed)
+    drawn = draw_plates(rng, rig.uncertainty, of=rig, count=1, contact_count=0)
+    stiffness = {}
+    for era, factor in zip(rig.eras, drawn.stiffness[0].tolist(), strict=True):
+        stiffness[era.name] = max(factor, _MIN_FACTOR)
     plate = PlateErrors(
         thickness=max(float(drawn.thickness[0]), _MIN_FACTOR),
         modulus=max(float(drawn.modulus[0]), _MIN_FACTOR),
-        places=_places(rig, drawn.places[0]),
         loss_factor=float(drawn.loss[0]),
         era_damping=float(drawn.damping[0]),
-        stiffness={
-            era.name: max(factor, _MIN_FACTOR)
-            for era, factor in zip(rig.eras, drawn.stiffness[0].tolist(), strict=True)
-        },
-        feet=_feet(rig, drawn.feet[0]),
+        stiffness=stiffness,
+        places=_places_by_era(rig, drawn.places[0]),
+        feet=_factors_by_foot(rig, drawn.feet[0]),
         mesh=_other_mesh(rig),
         modes=drawn.modes[0].tolist(),
     )
-    channels = {
-        rig.wiring[era.name]: ChannelErrors(*cmath.polar(gain), harmonic)
-        for era, gain, harmonic in zip(
-            rig.eras, drawn.gain[0].tolist(), drawn.harmonic[0].tolist(), strict=True
-        )
-    }
-    return _drawn(rig, channels, plate, seed)
+    return _with_crystals_and_fingers(rig, _channels_of(drawn, rig), plate, seed)
 
 
-def _drawn(
+def _factor(rng: np.random.Generator, deviation: float) -> float:
+    """Draw a factor about 1 with a standard deviation."""
+    return max(_MIN_FACTOR, 1 + deviation * rng.standard_normal())
+
+
+def _with_harmonics(
+    channels: Mapping[Channel, ChannelErrors], deviation: float, rng: np.random.Generator
+) -> dict[Channel, ChannelErrors]:
+    """Channels with second harmonics drawn from a complex normal distribution."""
+    parts = rng.standard_normal((2, len(channels))) * (deviation * math.sqrt(0.5))
+    real_parts, imaginary_parts = parts.tolist()
+    with_harmonics = {}
+    for (channel, errors), real, imaginary in zip(
+        channels.items(), real_parts, imaginary_parts, strict=True
+    ):
+        with_harmonics[channel] = replace(errors, harmonic=complex(real, imaginary))
+    return with_harmonics
+
+
+def _channels_of(drawn: Plates, rig: Rig) -> dict[Channel, ChannelErrors]:
+    """The errors of all channels on the first of the drawn plates."""
+    gains = drawn.gain[0].tolist()
+    harmonics = drawn.harmonic[0].tolist()
+    channels = {}
+    for era, factor, harmonic in zip(rig.eras, gains, harmonics, strict=True):
+        gain, phase = cmath.polar(factor)
+        channels[rig.wiring[era.name]] = ChannelErrors(gain, phase, harmonic)
+    return channels
+
+
+def _places_by_era(rig: Rig, displacements: FloatArray) -> dict[str, Point]:
+    places = {}
+    for era, (dx, dy) in zip(rig.eras, displacements.tolist(), strict=True):
+        places[era.name] = (dx, dy)
+    return places
+
+
+def _factors_by_foot(rig: Rig, factors: FloatArray) -> dict[int, float]:
+    return dict(zip(rig.feet, factors.tolist(), strict=True))
+
+
+def _with_crystals_and_fingers(
     rig: Rig, channels: Mapping[Channel, ChannelErrors], plate: PlateErrors, seed: int
 ) -> Imperfections:
-    """Imperfections with the amplifiers' crystals, switched on at arbitrary times."""
+    """Imperfections with fingers, and with crystals of amplifiers switched on at random times."""
     rng = np.random.default_rng([seed, crc32(b"crystals")])
-    crystals = {
-        name: Crystal(
-            error=rng.uniform(-_CRYSTAL, _CRYSTAL),
-            warm_up=rng.choice((-_WARM_UP, _WARM_UP)),
-            ahead=rng.uniform(0, CLOCK_TURN),
-        )
-        for name in rig.amplifiers
-    }
-    return Imperfections(
-        channels, crystals=crystals, plate=plate, fingertip=rig.uncertainty.fingertip, seed=seed
-    )
+    crystals = {}
+    for name in rig.amplifiers:
+        error = rng.uniform(-_MAX_CRYSTAL_ERROR, _MAX_CRYSTAL_ERROR)
+        warm_up = rng.choice((-_WARM_UP, _WARM_UP))
+        ahead = rng.uniform(0, CLOCK_TURN)
+        crystals[name] = Crystal(error=error, warm_up=warm_up, ahead=ahead)
+    fingertip = rig.uncertainty.fingertip
+    return Imperfections(channels, crystals=crystals, plate=plate, fingertip=fingertip, seed=seed)
 
 
 def _other_mesh(rig: Rig) -> PlateMesh:
-    """A mesh as accurate as `mesh: auto` or more, and not the rig's."""
-    highest = rig.limits.frequency_max
-    mesh = finer_mesh(
-        rig.plate,
-        mesh_of("auto", rig.plate, frequency_max=highest, stiffness=rig.largest_stiffness),
-        frequency_max=highest,
-    )
-    return mesh if mesh != rig.mesh else finer_mesh(rig.plate, mesh, frequency_max=highest)
-
-
-def realised(motion: Motion, errors: ChannelErrors) -> list[Term]:
-    """Base motion with the gain and phase errors of its channel."""
-    return [
-        term._replace(c0=errors.factor * term.c0, c1=errors.factor * term.c1) for term in motion
-    ]
-
-
-def of_voices(voices: Sequence[Voice], share: complex) -> list[Voice]:
-    """Second harmonics of the voices of a channel; empty for share 0."""
-    if not share:
-        return []
-    found = []
-    for voice in voices:
-        way = voice.transition
-        first, last, *knots = (_doubled(each, share) for each in (way.first, way.last, *way.knots))
-        doubled = replace(way, first=first, last=last, knots=tuple(knots))
-        found.append(replace(voice, frequency=2 * voice.frequency, transition=doubled))
-    return found
-
-
-def of_layer(layer: Layer, shares: Mapping[str, complex]) -> list[Layer]:
-    """Second harmonics of a starting layer; shares: by ERA, empty if all are 0."""
-    if not any(shares.values()):
-        return []
-    return [
-        replace(
-            voice,
-            excitation={
-                name: Tone.from_phasor(2 * tone.frequency, _doubled(tone.phasor, shares[name]))
-                for name, tone in voice.excitation.items()
-            },
-            onset=voice.onset
-            and {name: _of_envelope(each, shares[name]) for name, each in voice.onset.items()},
-        )
-        for voice in layer.voices
-    ]
-
-
-def _of_envelope(envelope: BaseEnvelope, share: complex) -> BaseEnvelope:
-    start, *knots = (_doubled(value, share) for value in (envelope.start, *envelope.knots))
-    return BaseEnvelope(2 * envelope.frequency, start, tuple(knots), envelope.step)
-
-
-def _doubled(amplitude: complex, share: complex) -> complex:
-    """Amplitude of a second harmonic."""
-    return share * amplitude * amplitude / abs(amplitude) if amplitude else 0j
-
-
-def motion_of(
-    voices: Sequence[Voice], clock: StraightClock, *, stroke: float, delay: float = 0.0
-) -> list[Term]:
-    """Return the motion of a base due to its channel's voices; level 1 is the stroke [m].
-
-    clock: amplifier clock for the angles; delay: of the base behind its voices [s].
-    """
-    return [term for voice in voices for term in _terms(voice, clock, stroke, delay)]
-
-
-def _terms(voice: Voice, clock: StraightClock, stroke: float, delay: float) -> tuple[Term, ...]:
-    way, omega = voice.transition, 2 * math.pi * voice.frequency
-    factor = stroke * cmath.exp(1j * omega * clock.at(way.start))
-    start, omega = way.start + delay, omega * clock.pace
-    if not way.knots:
-        return raised_cosine(start, way.step, omega, factor * way.first, factor * way.last)
-    values = [factor * value for value in (way.first, *way.knots, way.last)]
-    return along_lines(start, way.step, omega, values)
+    """A mesh at least as accurate as `mesh: auto` that differs from the rig's."""
+    frequency_max = rig.limits.frequency_max
+    stiffness = rig.largest_stiffness
+    auto_mesh = mesh_of("auto", rig.plate, frequency_max=frequency_max, stiffness=stiffness)
+    mesh = finer_mesh(rig.plate, auto_mesh, frequency_max=frequency_max)
+    if mesh == rig.mesh:
+        mesh = finer_mesh(rig.plate, mesh, frequency_max=frequency_max)
+    return mesh

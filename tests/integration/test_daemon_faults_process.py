@@ -82,8 +82,8 @@ from processes.daemons import (
 )
 from sim.far_ends.wire_assignment import FAR_ENDS
 from sim.faults import FaultWindow
-from sim.plant import imperfections
-from sim.plant.imperfections import Imperfections, draw_imperfections, realised
+from sim.plant.era_motions import harmonics_of_layer, realised
+from sim.plant.imperfections import Imperfections, draw_imperfections
 from sim.plant.plant import PLANT_SAMPLE_RATE, Plant
 
 
@@ -525,7 +525,7 @@ def onset_matches_prediction(played: Played, truth: Truth) -> None:
     plant.set_contacts(truth.resting(situation))
     errors = {name: truth.drawn.channels[channel] for name, channel in truth.rig.wiring.items()}
     shares = {name: each.harmonic for name, each in errors.items()}
-    onsets = [each.onset or {} for each in (pattern, *imperfections.of_layer(pattern, shares))]
+    onsets = [each.onset or {} for each in (pattern, *harmonics_of_layer(pattern, shares))]
     every = zip(*[shaped(onset, real.eras) for onset in onsets], strict=True)
     for number, (era, parts) in enumerate(zip(real.eras, every, strict=True)):
         terms = [term for part in parts for term in part]

@@ -29,8 +29,9 @@ from registry.limits import HAND_LOAD
 from sim.amplifier.readings import AmplifierClock, Crystal
 from sim.bench.bench import Bench
 from sim.control import SimulationContext, execute
-from sim.plant.imperfections import Imperfections, motion_of
-from sim.plant.plant import FingerPlacement
+from sim.plant.era_motions import motion_of
+from sim.plant.finger_placement import FingerPlacement
+from sim.plant.imperfections import Imperfections
 
 AT = (0.08, 0.06)
 

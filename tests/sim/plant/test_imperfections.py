@@ -31,6 +31,7 @@ from model.vibration import Tone as VibrationTone
 from processes.firmware_machine import arm_bench, keep_alive, play
 from sim.amplifier.readings import StraightClock
 from sim.bench.bench import Bench
+from sim.plant.era_motions import motion_of
 from sim.plant.excited_plate import play as play_excitation
 from sim.plant.fingers import FingerRecord, PlateFingers, measure_vibration
 from sim.plant.imperfections import (
@@ -38,7 +39,6 @@ from sim.plant.imperfections import (
     Imperfections,
     PlateErrors,
     draw_imperfections,
-    motion_of,
 )
 
 AT = (0.08, 0.06)

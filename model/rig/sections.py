@@ -744,7 +744,7 @@ class UncertaintySection(Section):
 
     foreign_mass: Annotated[float, _within("foreign_mass", MASS)] = Uncertainty.foreign_mass
     """Mass of an object that can be anywhere on the plate, such as a 200 g cup; see [what lies on
-    the plate](../concepts/people.md#what-lies-on-the-plate).
+    the plate](../concepts/people.md#objects-on-the-plate).
     """
 
     mode_frequency: Annotated[float, _within("mode_frequency")] = Uncertainty.mode_frequency

@@ -78,8 +78,9 @@ def _of_the_plate(sets: int) -> tuple[list[str], bool]:
     own = build_table(rig, drive_mode="phased")
     size = rig.plate.length, rig.plate.width
     rows = [
-        "| modes up to | field differs, most | mean | stated, mean | promised by the plate / dB "
-        "| by the surface / dB | kept of the plate's | kept of the surface's |",
+        "| modes up to | largest field error | mean | mean of the stated error "
+        "| promised by the plate / dB | promised by the surface / dB "
+        "| plate: promises kept | surface: promises kept |",
         "|---|---|---|---|---|---|---|---|",
     ]
     print(*rows, sep="\n")
@@ -120,8 +121,8 @@ def _of_the_plate(sets: int) -> tuple[list[str], bool]:
 def _of_the_glass(sets: int) -> tuple[list[str], bool]:
     """Rows of the curved glass, and whether they are good."""
     rows = [
-        "| modes up to | drive | field differs, most | mean | stated, mean | nominal / dB "
-        "| promised / dB | median of the glasses / dB | kept |",
+        "| modes up to | drive | largest field error | mean | mean of the stated error "
+        "| nominal / dB | promised / dB | median of the panels / dB | promises kept |",
         "|---|---|---|---|---|---|---|---|---|",
     ]
     print(*rows, sep="\n")
@@ -169,9 +170,9 @@ def _of_the_glass(sets: int) -> tuple[list[str], bool]:
                 *typical, _ = np.median(found, axis=0)
                 kept = float(np.mean(found, axis=0)[-1])
                 is_good = is_good and 80 <= kept <= 98
+                sampled = ", each mode sampled" * bool(own)
                 rows.append(
-                    f"| {multiple:g} times the highest frequency{', each mode drawn' * bool(own)} "
-                    f"| {drive_mode} "
+                    f"| {multiple:g} times the highest frequency{sampled} | {drive_mode} "
                     f"| {100 * off.max():.0f} % | {100 * off.mean():.1f} % "
                     f"| {100 * table.discretisation_error.mean():.1f} % | "
                     f"{' | '.join(f'{each:.1f}' for each in typical)} | {kept:.0f} % |"
@@ -185,7 +186,7 @@ def _through_the_wire(sets: int) -> tuple[list[str], bool]:
     found = {}
     with tempfile.TemporaryDirectory() as folder:
         CurvedGlass(Path(folder))
-        for name, own in (("", {}), (", each mode drawn", OF_MODES)):
+        for name, own in (("", {}), (", each mode sampled", OF_MODES)):
             file = Path(folder) / f"glass{len(name)}.yaml"
             file.write_text(f"{GLASS.read_text('utf-8')}uncertainty: {own}\n", "utf-8")
             case = Case(f"three contents{name}", str(file.with_suffix("")), contents=3)

@@ -36,7 +36,7 @@ from model.rig.rig_summary import (
 from model.rig.sections import LimitsSection
 from model.structure.attachments import support_problem
 from model.structure.surface import centre_of_surface
-from model.study.overview import clock_cost, uncertainty_cost
+from model.study.promise_cost import clock_cost, uncertainty_cost
 from model.transients.excursions import excursion_notes
 
 _LOST_DB = 0.1

@@ -47,8 +47,9 @@ from model.finger import (
 from model.rig.rig import Rig
 from model.structure.attachments import Source
 from model.structure.plate import Plate
-from model.study.contrast_maps import WANTED_CONTRAST_DB, ContrastMap, WeakCells
+from model.study.contrast_maps import ContrastMap
 from model.study.overview import Overview
+from model.study.weak_cells import WANTED_CONTRAST_DB, WeakCells
 from model.table.table import LocalizationTable
 from model.vibration import NULL_SHARE, Excitation, G, PlateMap
 

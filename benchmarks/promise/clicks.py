@@ -22,7 +22,7 @@ from model.finger import fingertip_points, fingertip_weights
 from model.rig.rig import Rig
 from model.rig.rig_file import load_rig
 from model.structure.attachments import footprints_of
-from model.study.contrast_maps import random_contacts
+from model.study.contact_sets import random_contacts
 from model.study.exact_plates import draw_plates
 from model.table.table import LocalizationTable
 from model.table.table_file import build_table

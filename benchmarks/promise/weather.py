@@ -20,7 +20,7 @@ from model.arrays import FloatArray
 from model.rig.rig import Rig, Uncertainty
 from model.rig.rig_file import load_rig
 from model.rig.rig_writing import change_rig
-from model.study.contrast_maps import random_contacts
+from model.study.contact_sets import random_contacts
 from model.study.exact_plates import Plates, draw_plates, harmonics_on, powers_on
 from model.table.table import LocalizationTable, read_fingertips
 from model.table.table_file import build_table

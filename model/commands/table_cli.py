@@ -518,7 +518,7 @@ def export(
 
     docs/reference/table-file.md describes the content.
     """
-    from model.study.overview import export_csv, export_mat
+    from model.study.table_export import export_csv, export_mat
     from model.table.table_file import load_table
 
     if content is not None and to == "mat":

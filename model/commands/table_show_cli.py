@@ -18,8 +18,8 @@ from model.errors import InputError
 from model.files.output_paths import begins_with
 
 if TYPE_CHECKING:
-    from model.study.contrast_maps import WeakCells
     from model.study.verification import Verification
+    from model.study.weak_cells import WeakCells
 
 
 def show(
@@ -50,7 +50,7 @@ def show(
 def _summary_rows(summary: dict[str, Any], *, mapped: str) -> list[str]:
     """Format the summary of a table; mapped: cells of the map that the shares are of."""
     from model.finger import FELT_DB_SL
-    from model.study.contrast_maps import WANTED_CONTRAST_DB as WANTED_DB
+    from model.study.weak_cells import WANTED_CONTRAST_DB as WANTED_DB
 
     def percent(key: str) -> str:
         return "-" if summary[key] is None else f"{100 * summary[key]:.3g} %"
@@ -111,7 +111,7 @@ def _map_rows(cells: "WeakCells", *, listed: bool) -> Iterator[str]:
     """Yield the map of a table; listed: with every weak cell."""
     import numpy as np
 
-    from model.study.contrast_maps import text_map
+    from model.study.weak_cells import text_map
 
     yield "promised felt contrast, dB, to the median other finger; * marks weak cells"
     if np.isfinite(cells.errors_db).any():

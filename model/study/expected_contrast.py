@@ -11,7 +11,7 @@ from model.ensemble.draws import PERCENTILE
 from model.errors import InputError
 from model.finger import decibels
 from model.rig.rig import Rig, Uncertainty
-from model.study.contrast_maps import MIN_DISTANCE, random_contacts
+from model.study.contact_sets import MIN_DISTANCE, random_contacts
 from model.study.exact_plates import draw_plates, felt_on
 from model.table.table import LocalizationTable
 from model.table.table_file import build_table

@@ -41,7 +41,7 @@ from model.rig.rig import Rig
 from model.spectral.direct_solution import Responder, direct_spectral_acceleration
 from model.spectral.modes import SpectralMesh
 from model.structure.attachments import FingertipLoad, fingertip_loads, footprints_of
-from model.study.contrast_maps import random_contacts
+from model.study.contact_sets import random_contacts
 from model.study.exact_plates import draw_plates, felt_on
 from model.table.table import LocalizationTable
 from model.transients.base_motion import ramped_onset

@@ -103,8 +103,8 @@ WRITING = {
     "table build rig.yaml -o out.npz --frequencies 60:90:30 --grid 4x3": (
         "model.table.table_file.solve_table"
     ),
-    "table export table.npz --format csv -o out.csv": "model.study.overview.export_csv",
-    "table export table.npz --format mat -o out.mat": "model.study.overview.export_mat",
+    "table export table.npz --format csv -o out.csv": "model.study.table_export.export_csv",
+    "table export table.npz --format mat -o out.mat": "model.study.table_export.export_mat",
     "plate map rig.yaml --drive SW=110 -o out.png": "model.vibration.plate_map",
     "calibrate rig.yaml measured.csv -o out.yaml": "model.estimate.calibrate.calibrate",
     "design rig.yaml -o design --layouts random:2": (

@@ -24,22 +24,11 @@ from model.finger import Grid
 from model.rig.rig import Channel, Uncertainty
 from model.structure.attachments import PointLoad
 from model.structure.plate import AirGap, Laminate, LaminateLayer
-from model.study import overview
-from model.study.contrast_maps import (
-    WeakCells,
-    find_weak_cells,
-    map_grid,
-    pair_questions,
-    text_map,
-)
-from model.study.overview import (
-    PromiseCost,
-    clock_cost,
-    export_csv,
-    export_mat,
-    find_overview,
-    summarize,
-)
+from model.study import table_export
+from model.study.overview import find_overview, summarize
+from model.study.promise_cost import PromiseCost, clock_cost
+from model.study.table_export import export_csv, export_mat
+from model.study.weak_cells import WeakCells, find_weak_cells, map_grid, pair_questions, text_map
 from model.table.table_file import build_table
 
 IDENTIFIED = Uncertainty(0.015, 1.5, 0.002, 0.01, 1.1, 0.5, modulus=0.0, place=0.0, harmonic=0.0)
@@ -180,7 +169,7 @@ def test_export_mat_holds_what_some_tables_have(table, tmp_path, changes, read, 
 
 def test_export_mat_refuses_a_table_too_large(table, tmp_path, monkeypatch):
     """Before anything is written; the error names a remedy."""
-    monkeypatch.setattr(overview, "MAX_MAT_BYTES", 1000)
+    monkeypatch.setattr(table_export, "MAX_MAT_BYTES", 1000)
     with pytest.raises(InputError, match="numpy"):
         export_mat(table, tmp_path / "t.mat")
     assert list(tmp_path.iterdir()) == []

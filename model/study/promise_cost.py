@@ -1,0 +1,87 @@
+"""What errors cost: the contrast that two contents keep with a kind of error, and without it.
+
+From answers at a few positions and frequencies of the nominal plate, in a second: with clock errors
+of amplifiers, in the rig's weather, or with an object on the plate.
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from model.answer.plan import answer, worst_of
+from model.answer.stimulus import Finger, Stimulus
+from model.arrays import FloatArray
+from model.drive_modes import UNRESTRICTED
+from model.ensemble.draws import ClockErrors
+from model.finger import FINGERTIP_RADIUS
+from model.rig.rig import Rig
+from model.study.contact_sets import random_contacts
+from model.table.table import PAPER_GRID, LocalizationTable
+from model.table.table_file import TableProblem, solve_table
+
+_PAIRS = 16
+_SEED = 14
+_LEVEL_DB_SL = 14.0
+_FREQUENCY_STEP = 20.0  # Hz
+_HIGHEST_FREQUENCY = 250.0  # Hz: fingers are most sensitive there, and more would take longer
+
+
+@dataclass(frozen=True)
+class PromiseCost:
+    """Contrast [dB] promised to the worst of two fingers: without a kind of error, and with it."""
+
+    exact_db: float
+    kept_db: float
+
+
+def clock_cost(rig: Rig, errors: Mapping[str, float]) -> PromiseCost:
+    """Compute the contrast of two contents with exact clocks, and with rms errors [s] by amplifier.
+
+    Median over positions. Raises InputError for a plate too small for two fingers, or without a
+    table.
+    """
+    table = _coarse_table(rig)
+    clocks = ClockErrors.of([era.name for era in table.eras], rig.wiring, errors)
+    exact = _promised_db(table)
+    # Built only now: the copy shares what the answers above have computed.
+    with_errors = table.with_clocks(clocks)
+    return _cost(exact, _promised_db(with_errors))
+
+
+def uncertainty_cost(rig: Rig, key: str) -> PromiseCost:
+    """Compute the contrast of two contents as if a key of the uncertainty were 0, and as it is.
+
+    Median over positions; raises the errors of `clock_cost`.
+    """
+    table = _coarse_table(rig)
+    without_key = replace(rig.uncertainty, **{key: 0.0})
+    exact_table = replace(table, uncertainty=without_key)
+    return _cost(_promised_db(exact_table), _promised_db(table))
+
+
+def _coarse_table(rig: Rig) -> LocalizationTable:
+    low, high = rig.limits.frequency_min, rig.limits.frequency_max
+    highest = max(min(high, _HIGHEST_FREQUENCY), low)
+    frequencies = np.arange(low, highest + 1e-9, _FREQUENCY_STEP)
+    problem = TableProblem(rig, frequencies, PAPER_GRID)
+    return solve_table(problem, drive_mode=UNRESTRICTED, is_estimated=False)
+
+
+def _promised_db(table: LocalizationTable) -> FloatArray:
+    """Return the contrast (pairs,) promised to the worst of two fingers at random positions."""
+    rng = np.random.default_rng(_SEED)
+    contrasts = []
+    for _ in range(_PAIRS):
+        contacts = random_contacts(rng, 2, table.plate, margin=FINGERTIP_RADIUS)
+        fingers = [Finger(contact, Stimulus(_LEVEL_DB_SL)) for contact in contacts]
+        contrasts.append(worst_of(answer(table, fingers, min_contrast_db=-math.inf)))
+    return np.array(contrasts)
+
+
+def _cost(exact: FloatArray, kept: FloatArray) -> PromiseCost:
+    # The loss is computed per position, since positions differ far more.
+    loss = max(float(np.median(exact - kept)), 0.0)
+    median = float(np.median(exact))
+    return PromiseCost(median, median - loss)

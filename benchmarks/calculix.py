@@ -50,7 +50,7 @@ class CurvedGlass:
         """Displacement along the normals at places (p, 2) [m] on the face of a layer, (p, dof)."""
         mesh, found = curved_glass, sparse.lil_array((len(places), len(self._column)))
         for row, (u, v) in enumerate(places):
-            along, across = u, v / mesh.edge(u)
+            along, across = u, v / mesh.width_at(u)
             i, j = (
                 int(np.clip(np.searchsorted(lines, at, side="right") - 1, 0, len(lines) - 2))
                 for lines, at in ((mesh.U, along), (mesh.V, across))

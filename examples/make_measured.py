@@ -1,8 +1,9 @@
-"""Write measured.uff and measured.csv: responses of a plate slightly different from the paper's.
+"""Simulate a modal test of a plate that differs slightly from the paper's; write its responses.
 
-A modal test on the simulated plate: twelve accelerometers, each ERA driven alone at a tenth of its
-stroke, frequency after frequency. The true values that `era calibrate` must find are below, and so
-are the faults of the measurement: noise, one sensor with a wrong scale, one dead sensor.
+Twelve accelerometers measure while each ERA is driven alone at a tenth of its amplitude, in a
+stepped-sine sweep. The true parameters that `era calibrate` must recover are below, together with
+the measurement errors: noise, one sensor with a wrong sensitivity, and one dead sensor. Writes
+measured.uff and measured.csv.
 
     python examples/make_measured.py
     era calibrate examples/paper_plate.yaml examples/measured.uff -o calibrated.yaml
@@ -33,10 +34,10 @@ from sim.plant.plant import Plant
 
 @dataclass(frozen=True)
 class Accelerometer:
-    """A sensor at x, y [m].
+    """An accelerometer at x, y [m].
 
-    noise_density [m/s²/sqrt(Hz)]; reach: range, plus or minus [m/s²]; resolution: step [m/s²], 0
-    for none; scale: reading per acceleration.
+    noise_density [m/s²/sqrt(Hz)]; reach: measuring range, plus or minus [m/s²]; resolution: step
+    size [m/s²], 0 for unlimited; scale: reading divided by true acceleration.
     """
 
     name: str
@@ -61,14 +62,14 @@ ERAS = {
 MODULUS = 74e9
 LOSS_FACTOR = 0.013
 SENSOR = Accelerometer("", 0, 0, noise_density=5e-3, reach=200.0, resolution=1e-3)
-WRONG, DEAD = "P3", "P8"
-SETTLE = 1.5  # s: the slowest mode of the paper's plate, T60 1 s, is then down by 90 dB
+SCALES = {"P3": 1.25, "P8": 0.0}  # the sensor with a wrong sensitivity, and the dead one
+SETTLE = 1.5  # s; by then the slowest mode of the paper's plate (T60 1 s) has decayed by 90 dB
 RECORD = 0.2  # s
 RATE = 5000.0  # Hz
 
 
 def true_rig(rig: Rig) -> Rig:
-    """The plate that was measured, with gains of its own at every frequency."""
+    """Return the rig with the true parameters, and random ERA gains at every frequency."""
     rng = np.random.default_rng(SEED)
     material = replace(rig.plate.material, E=MODULUS)
     eras = []
@@ -92,7 +93,7 @@ def true_rig(rig: Rig) -> Rig:
 def readings(
     sensors: Sequence[Accelerometer], accelerations: FloatArray, rng: np.random.Generator
 ) -> FloatArray:
-    """Readings (n, s) [m/s²] of sensors for accelerations (n, s) [m/s²]."""
+    """Return sensor readings (n, s) [m/s²] of true accelerations (n, s) [m/s²]."""
     noise = rng.standard_normal(accelerations.shape)
     columns = []
     for number, sensor in enumerate(sensors):
@@ -107,7 +108,7 @@ def readings(
 
 
 def fit_tone(times: FloatArray, samples: FloatArray, frequency: float) -> ComplexArray:
-    """Complex amplitudes a (s,) of Im[a exp(i omega t)] in samples (n, s), with an offset."""
+    """Fit Im[a exp(i omega t)] plus an offset to samples (n, s); return the amplitudes a (s,)."""
     angle = 2 * np.pi * frequency * times
     basis = np.column_stack([np.sin(angle), np.cos(angle), np.ones(len(times))])
     sine, cosine, _ = np.linalg.lstsq(basis, samples, rcond=None)[0]
@@ -115,25 +116,23 @@ def fit_tone(times: FloatArray, samples: FloatArray, frequency: float) -> Comple
 
 
 def scanning_grid(plate: Plate, nx: int, ny: int, *, like: Accelerometer) -> list[Accelerometer]:
-    """nx by ny equal sensors in the centres of as many cells; P1 is nearest the origin, x first."""
-    return [
-        replace(
-            like,
-            name=f"P{row * nx + column + 1}",
-            x=(column + 0.5) / nx * plate.length,
-            y=(row + 0.5) / ny * plate.width,
-        )
-        for row in range(ny)
-        for column in range(nx)
-    ]
+    """Return equal sensors at the centres of nx by ny cells, numbered along x from the origin."""
+    sensors = []
+    for row in range(ny):
+        for column in range(nx):
+            x = (column + 0.5) / nx * plate.length
+            y = (row + 0.5) / ny * plate.width
+            sensors.append(replace(like, name=f"P{len(sensors) + 1}", x=x, y=y))
+    return sensors
 
 
 def record_responses(
     rig: Rig, sensors: Sequence[Accelerometer], frequencies: FloatArray, *, seed: int = 0
 ) -> Measurement:
-    """Measure a rig's plate in time: each ERA at each frequency [Hz], once it has settled.
+    """Measure the steady response of a simulated plate to each ERA at each frequency [Hz].
 
-    Structural damping is the viscous equivalent of `model.reduction.reduced_plate`.
+    The simulation runs in the time domain; structural damping is the viscous equivalent of
+    `model.reduction.reduced_plate`.
     """
     reduced = reduce_plate(
         rig.plate,
@@ -148,33 +147,34 @@ def record_responses(
     values = np.empty((len(frequencies), len(sensors), len(rig.eras)), dtype=complex)
     for number, era in enumerate(rig.eras):
         for row, frequency in enumerate(frequencies.tolist()):
-            start, omega, base = plant.time, 2 * math.pi * frequency, 0.1 * era.stroke
-            # The phase refers to the plate's clock.
-            tone = Term(start, math.inf, omega, base * np.exp(1j * omega * start))
+            start = plant.time
+            settled = start + SETTLE
+            omega = 2 * math.pi * frequency
+            amplitude = 0.1 * era.stroke
+            # The phase refers to the simulation's clock.
+            tone = Term(start, math.inf, omega, amplitude * np.exp(1j * omega * start))
             plant.set_input(number, [tone])
-            plant.skip(start + SETTLE)
-            times, truth = plant.advance(start + SETTLE + RECORD, sample_rate=RATE, shapes=shapes)
-            read = readings(sensors, truth, rng)
-            values[row, :, number] = fit_tone(times, read, frequency) / base
+            plant.skip(settled)
+            times, accelerations = plant.advance(settled + RECORD, sample_rate=RATE, shapes=shapes)
+            samples = readings(sensors, accelerations, rng)
+            values[row, :, number] = fit_tone(times, samples, frequency) / amplitude
         plant.set_input(number, [])
-    names = tuple(sensor.name for sensor in sensors)
-    places = sensors_at(points, names)
-    return Measurement(places, np.asarray(frequencies, dtype=float), values)
+    positions = sensors_at(points, tuple(sensor.name for sensor in sensors))
+    return Measurement(positions, np.asarray(frequencies, dtype=float), values)
 
 
 def main() -> None:
-    """Measure, and write both files to this folder."""
-    here = Path(__file__).parent
-    rig = load_rig(here / "paper_plate.yaml")
-    scales = {WRONG: 1.25, DEAD: 0.0}
+    """Measure, and write both files next to this program."""
+    folder = Path(__file__).parent
+    rig = load_rig(folder / "paper_plate.yaml")
     sensors = [
-        replace(sensor, scale=scales.get(sensor.name, 1.0))
+        replace(sensor, scale=SCALES.get(sensor.name, 1.0))
         for sensor in scanning_grid(rig.plate, 4, 3, like=SENSOR)
     ]
     responses = record_responses(true_rig(rig), sensors, FREQUENCIES, seed=SEED)
-    write_responses_uff(here / "measured.uff", responses, rig)
-    write_responses_csv(here / "measured.csv", responses, rig)
-    print(f"wrote measured.uff and measured.csv in {here}: {responses.count} values")
+    write_responses_uff(folder / "measured.uff", responses, rig)
+    write_responses_csv(folder / "measured.csv", responses, rig)
+    print(f"wrote measured.uff and measured.csv in {folder}: {responses.count} values")
 
 
 if __name__ == "__main__":

@@ -1,9 +1,11 @@
-"""Write recordings of touches in the format of a TUIO 1.1 tracker; schedules simulate people.
+"""Write touch recordings as a TUIO 1.1 tracker would send them.
 
-In touches.tuio, one to three fingers come and go at random positions (fixed seed), at least 6 cm
-apart. In the other files each person stays in a vertical strip of the plate: two_people.tuio, and
-three_people.tuio, in which one person slides and one leaves before the others. Run it again after a
-change; it requires python-osc:
+- touches.tuio: one to three fingers at random positions (fixed seed), at least 6 cm apart.
+- two_people.tuio: each person stays on one side of the plate.
+- three_people.tuio: each person stays in a vertical strip; one person slides a finger, and one
+  leaves before the others.
+
+Requires python-osc. Run it again after changing it:
 
     python examples/make_touches.py
 """
@@ -18,18 +20,19 @@ from pythonosc.osc_message_builder import OscMessageBuilder
 from controller.sources.touch import Touch, TouchFrame
 from controller.sources.tuio import CURSORS, HEADER, RecordedDatagram
 
-PLATE = np.array([0.3048, 0.2286])  # metres
-MARGIN, APART = 0.015, 0.06  # metres
+PLATE = np.array([0.3048, 0.2286])  # m
+MARGIN = 0.015  # m; from the edges
+MIN_DISTANCE = 0.06  # m; between fingers
 FINGERS_PER_GROUP = (1, 2, 3, 2, 3, 1, 3, 2)
-AT_ONCE = (3, 7)  # groups whose fingers all come down at one moment
-HOLD = 0.55  # seconds from one finger to the next, and after the last one
-PAUSE = 0.15  # seconds with no finger down
-REST = 0.75  # the same before simultaneous touches: the plate has stopped ringing
-FRAME = 1 / 60  # seconds between the frames of a tracker
-SETTLING = 0.08  # seconds over which a fingertip rolls into its place
-ROLL = 0.0015  # metres that it rolls
+SIMULTANEOUS_GROUPS = (3, 7)  # groups whose fingers land simultaneously
+HOLD = 0.55  # s; from one finger to the next, and after the last one
+PAUSE = 0.15  # s; without fingers
+REST = 0.75  # s; pause before simultaneous touches, until the plate has stopped ringing
+FRAME = 1 / 60  # s; frame interval of the tracker
+SETTLING = 0.08  # s; time in which a fingertip rolls into position
+ROLL = 0.0015  # m; standard deviation of the rolling distance
 
-# Times [s] from down to up, and where the finger is at each, in shares of the plate
+# Times [s] from touch to lift, and the position at each time, relative to the plate's size
 TWO_PEOPLE = [
     ((0.3, 1.6), [(0.20, 0.35)] * 2),
     ((0.7, 1.6), [(0.80, 0.60)] * 2),
@@ -44,29 +47,31 @@ THREE_PEOPLE = [
 
 
 def draw_positions(count: int, rng: np.random.Generator) -> np.ndarray:
-    """Places [m] (count, 2), each at least APART from the others."""
+    """Return random positions [m] (count, 2), more than MIN_DISTANCE apart."""
     while True:
-        places = rng.uniform(MARGIN, PLATE - MARGIN, (count, 2))
-        gaps = np.linalg.norm(places[:, None] - places[None], axis=-1)
-        if count == 1 or gaps[np.triu_indices(count, 1)].min() > APART:
-            return places
+        positions = rng.uniform(MARGIN, PLATE - MARGIN, (count, 2))
+        distances = np.linalg.norm(positions[:, None] - positions[None], axis=-1)
+        if count == 1 or distances[np.triu_indices(count, 1)].min() > MIN_DISTANCE:
+            return positions
 
 
 def one_person(rng: np.random.Generator) -> list[tuple]:
-    """Groups of fingers, one group after another."""
+    """Return the paths of several groups of fingers, one group after another."""
     paths = []
-    up = 0.15
+    lift = 0.15
     for group, count in enumerate(FINGERS_PER_GROUP):
-        start = up + (REST if group in AT_ONCE else PAUSE)
-        apart = 0.0 if group in AT_ONCE else HOLD
-        up = start + (count - 1) * apart + HOLD
-        for number, place in enumerate(draw_positions(count, rng) / PLATE):
-            paths.append(((start + number * apart, up), [place, place]))
+        is_simultaneous = group in SIMULTANEOUS_GROUPS
+        start = lift + (REST if is_simultaneous else PAUSE)
+        interval = 0.0 if is_simultaneous else HOLD
+        lift = start + (count - 1) * interval + HOLD
+        for number, position in enumerate(draw_positions(count, rng) / PLATE):
+            landing = start + number * interval
+            paths.append(((landing, lift), [position, position]))
     return paths
 
 
 def tuio_datagram(frame: TouchFrame, sequence: int) -> bytes:
-    """Encode a frame as a sender with the name of its source would, with all positions."""
+    """Encode all touches of a frame; the frame's source is the sender's name."""
     bundle = OscBundleBuilder(IMMEDIATELY)
     messages: list[tuple[str | int | float, ...]] = [
         ("source", frame.source),
@@ -84,22 +89,23 @@ def tuio_datagram(frame: TouchFrame, sequence: int) -> bytes:
 
 
 def write_capture(path: Path | str, datagrams: Sequence[RecordedDatagram]) -> None:
-    """Write datagrams in order of time, to a microsecond; `read_capture` checks them."""
-    lines = [f"{each.time:.6f} {each.payload.hex()}" for each in datagrams]
+    """Write datagrams sorted by time [s] with a resolution of 1 µs, for `read_capture`."""
+    lines = [f"{datagram.time:.6f} {datagram.payload.hex()}" for datagram in datagrams]
     Path(path).write_text("\n".join([HEADER, *lines]) + "\n", encoding="ascii")
 
 
 def record(name: str, paths: Sequence[tuple], rng: np.random.Generator) -> None:
-    """Write the recording of some fingers to this folder, until shortly after the last lift."""
+    """Write a recording to this folder that ends shortly after the last finger lifts."""
     rolls = rng.normal(scale=ROLL, size=(len(paths), 2)) / PLATE
     datagrams = []
     end = max(times[-1] for times, _ in paths) + PAUSE
     for number, time in enumerate(np.arange(0.0, end, FRAME), start=1):
         alive = []
-        for id, ((times, places), roll) in enumerate(zip(paths, rolls, strict=True), start=1):
+        for id, ((times, positions), roll) in enumerate(zip(paths, rolls, strict=True), start=1):
             if times[0] <= time < times[-1]:
-                place = [np.interp(time, times, along) for along in zip(*places, strict=True)]
-                x, y = place + roll * max(0.0, 1 - (time - times[0]) / SETTLING)
+                position = [np.interp(time, times, axis) for axis in zip(*positions, strict=True)]
+                remaining = max(0.0, 1 - (time - times[0]) / SETTLING)
+                x, y = position + remaining * roll
                 alive.append(Touch(id, float(x), float(1 - y)))
         frame = TouchFrame("demo", float(time), tuple(alive))
         datagrams.append(RecordedDatagram(float(time), tuio_datagram(frame, number)))

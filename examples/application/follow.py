@@ -2,9 +2,9 @@
 
     python follow.py 0.40,0.23 0.13,0.23      # metres from the south-west corner
 
-The last finger is the target. The daemon must be ready (`era status`). A lost connection is made
-again, subscriptions included; `armed` renews its lease over it, and raises LeaseLost if that is
-too late.
+The last finger is the target. The daemon must be ready (`era status`). The client reconnects and
+resubscribes automatically. `armed` then renews its lease, and raises LeaseLost if the lease has
+expired.
 """
 
 import asyncio
@@ -12,15 +12,15 @@ import sys
 
 import era_haptics as era
 
-HELD = 1.0  # s
-REPEATED = 0.05  # s; a finger that is not repeated for 150 ms is lifted
+HOLD_TIME = 1.0  # s
+REPEAT_INTERVAL = 0.05  # s; a finger expires 150 ms after its last report
 
 
-async def hold(client: era.AsyncClient, places: list[tuple[float, float]]) -> None:
-    """Hold fingers at places for a while."""
-    for _ in range(round(HELD / REPEATED)):
-        await client.touch(places)
-        await asyncio.sleep(REPEATED)
+async def hold(client: era.AsyncClient, positions: list[tuple[float, float]]) -> None:
+    """Hold fingers at some positions [m] for HOLD_TIME."""
+    for _ in range(round(HOLD_TIME / REPEAT_INTERVAL)):
+        await client.touch(positions)
+        await asyncio.sleep(REPEAT_INTERVAL)
     await client.touch([])
 
 
@@ -38,11 +38,14 @@ async def follow(client: era.AsyncClient) -> None:
 
 async def main(*arguments: str) -> None:
     """Arm, hold the fingers and disarm."""
-    places = [(float(x), float(y)) for x, y in (each.split(",") for each in arguments)]
+    positions = []
+    for argument in arguments:
+        x, y = argument.split(",")
+        positions.append((float(x), float(y)))
     async with await era.AsyncClient.connect(name="follow") as client:
         following = asyncio.create_task(follow(client))
         async with client.armed("follow"):
-            await hold(client, places)
+            await hold(client, positions)
         following.cancel()
 
 

@@ -22,16 +22,16 @@ from PySide6.QtNetwork import (
 from PySide6.QtWebSockets import QWebSocket, QWebSocketHandshakeOptions
 from PySide6.QtWidgets import QApplication, QLabel, QPushButton, QVBoxLayout, QWidget
 
-LEASE = 5.0  # s
-NO_LEASE = 1002  # code of the API
-MAX_SILENT = 4  # s
+LEASE = 5.0  # s; lifetime of a lease
+NO_LEASE = 1002  # error code of the API
+MAX_SILENT = 4  # s; without a message or pong from the gateway
 
 
 class Plate(QObject):
     """The plate over a gateway; reconnects and resubscribes automatically.
 
-    Calls that are pending at a loss fail and are never sent again: whether to arm, play or clear
-    then is for the caller to decide. url: of the gateway.
+    Calls that are pending when the connection is lost fail and are not repeated: the caller decides
+    whether to arm, play or clear again. url: base URL of the gateway.
     """
 
     opened = Signal(dict)  # the daemon's hello
@@ -51,9 +51,8 @@ class Plate(QObject):
         self._options.setSubprotocols(["era-haptics.v1"])
         self._topics = topics
         self._ids = itertools.count(1)
-        self._pending: dict[
-            int, tuple[Callable[[Any], None], object]
-        ] = {}  # with the lease renewed
+        self._pending: dict[int, tuple[Callable[[Any], None], object]] = {}
+        """Callback and lease of each call that awaits its response, by request id."""
         self._lease: str | None = None
         self._lease_ends = 0.0  # s
         self._touches: list[dict[str, Any]] = []
@@ -87,29 +86,29 @@ class Plate(QObject):
     def disarm(self) -> None:
         """Ramp to silence and switch the high voltage off."""
         self._lease = None
-        self._call_anyhow("disarm")
+        self._call_with_fallback("disarm")
 
     def stop(self) -> None:
         """Stop all amplifiers; `refused` names the amplifiers without confirmed silence."""
         self._lease = None
-        self._call_anyhow("stop")
+        self._call_with_fallback("stop")
 
     def leave(self) -> None:
-        """Lift all fingers, and disarm if it armed or arms: who does not see it cannot stop."""
+        """Lift all fingers, and disarm if armed or arming: a hidden window offers no Stop."""
         self.touch([])
         is_arming = self._armed in (done for done, _ in self._pending.values())
         if is_arming or self._lease is not None:
             self.disarm()
             self.socket.flush()  # the application may end now
 
-    def touch(self, places: list[tuple[float, float]]) -> None:
-        """Report all fingers, at x, y [m], the newest last; repeated until the next call."""
-        self._touches = [{"id": id, "x_m": x, "y_m": y} for id, (x, y) in enumerate(places)]
+    def touch(self, positions: list[tuple[float, float]]) -> None:
+        """Report all fingers at x, y [m], the newest last; repeated until the next call."""
+        self._touches = [{"id": id, "x_m": x, "y_m": y} for id, (x, y) in enumerate(positions)]
         if self._is_open:
             self._send("touch", {"source": "qt", "touches": self._touches})
 
-    def _call_anyhow(self, method: str) -> None:
-        """Call a method without parameters, over HTTP while there is no WebSocket."""
+    def _call_with_fallback(self, method: str) -> None:
+        """Call a method without parameters, over HTTP if the WebSocket is not connected."""
         if self._is_open:
             self.call(method)
             return
@@ -165,7 +164,7 @@ class Plate(QObject):
         self._silent = 0
 
     def _check(self) -> None:
-        """Leave a gateway that is silent: a lost network closes nothing."""
+        """Drop a silent connection: a network failure does not close the socket."""
         self._silent += 1
         if self._silent > MAX_SILENT:
             self.socket.abort()
@@ -177,7 +176,7 @@ class Plate(QObject):
         self._lease_ends = time.monotonic() + LEASE
 
     def _renew(self) -> None:
-        """Renew the lease, after a loss too; nothing arms again."""
+        """Renew the lease, also after a reconnect; never arm again."""
         now = time.monotonic()
         if self._lease is not None and now >= self._lease_ends:
             self._lease = None
@@ -194,17 +193,21 @@ class Plate(QObject):
 
 
 class Window(QWidget):
-    """Buttons, the state in a word with its cause, and the plate, which a mouse touches."""
+    """Buttons, the daemon's state with its cause, and a surface to touch with the mouse."""
 
     def __init__(self, plate: Plate) -> None:
         super().__init__()
         self.setWindowTitle("My application")
         self.plate = plate
-        self.arm, self.disarm, self.stop = map(QPushButton, ("Arm", "Disarm", "Stop"))
-        self.state, self.felt, self.surface = QLabel("connecting"), QLabel(), Surface(plate)
+        self.arm = QPushButton("Arm")
+        self.disarm = QPushButton("Disarm")
+        self.stop = QPushButton("Stop")
+        self.state = QLabel("connecting")
+        self.felt = QLabel()
+        self.surface = Surface(plate)
         column = QVBoxLayout(self)
-        for each in (self.arm, self.disarm, self.stop, self.state, self.felt, self.surface):
-            column.addWidget(each)
+        for widget in (self.arm, self.disarm, self.stop, self.state, self.felt, self.surface):
+            column.addWidget(widget)
         self.arm.clicked.connect(lambda: plate.arm("my application"))
         self.disarm.clicked.connect(plate.disarm)
         self.stop.clicked.connect(plate.stop)
@@ -213,7 +216,7 @@ class Window(QWidget):
         plate.event.connect(self._show)
 
     def hideEvent(self, event: QHideEvent) -> None:  # noqa: N802 (Qt's name)
-        """Leave the plate; a window that is closed is hidden too."""
+        """Leave the plate; closing a window also hides it."""
         self.plate.leave()
 
     def _show(self, topic: str, data: dict[str, Any]) -> None:
@@ -226,17 +229,19 @@ class Window(QWidget):
 
 
 class Surface(QWidget):
-    """The plate's surface: a pressed mouse is a finger."""
+    """The plate's surface; the pressed mouse button is a finger."""
 
     def __init__(self, plate: Plate) -> None:
         super().__init__()
-        self._plate, self._size = plate, (0.0, 0.0)
+        self._plate = plate
+        self._size = (0.0, 0.0)  # m; length and width
         self.setFixedSize(400, 300)
         plate.opened.connect(self._measure)
 
     def mousePressEvent(self, event: QMouseEvent) -> None:  # noqa: N802 (Qt's name)
-        """Put the finger down, or move it."""
-        x, y = event.position().x() / self.width(), 1 - event.position().y() / self.height()
+        """Touch with the finger, or move it."""
+        x = event.position().x() / self.width()
+        y = 1 - event.position().y() / self.height()
         length, width = self._size
         self._plate.touch([(x * length, y * width)])
 

@@ -1,8 +1,8 @@
-"""Writes glass.inp: a curved glass with a cut-out and ribs as a model for CalculiX.
+"""Write a CalculiX model of a curved glass with a cut-out and ribs, glass.inp.
 
-600 x 300 x 3 mm, bent about y to a radius of 1.5 m, one long edge a parabola (300 mm in the middle,
-260 mm at the ends), a cut-out of 80 x 60 mm, and two ribs of aluminium below. The nodes of the face
-that fingers touch are the set TOUCH. Units are m, kg and s.
+The glass is 600 x 300 x 3 mm, bent about y to a radius of 1.5 m. One long edge is a parabola
+(300 mm wide in the middle, 260 mm at the ends). It has a cut-out of 80 x 60 mm and two aluminium
+ribs below. The node set TOUCH is the touched face. Units are m, kg and s.
 
     python examples/calculix/curved_glass.py
     ccx glass
@@ -12,6 +12,7 @@ that fingers touch are the set TOUCH. Units are m, kg and s.
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from typing import TypeAlias
 
 import numpy as np
 
@@ -19,37 +20,41 @@ LENGTH, WIDTH, NARROW, RADIUS = 0.6, 0.3, 0.26, 1.5  # m; the length is along th
 GLASS, RIB = 3e-3, 8e-3  # m, thickness and height
 MODES = 70
 
-# Lines of the mesh: places along the arc [m], and shares of the width.
+# Mesh lines: positions along the arc [m], and positions across it relative to the width.
 U = np.array([0, 22, 44, 66, 88, 114, 140, 160, 180, 200, 220, 240, 260, 280, 297, 303, 320, 340])
 U = np.concatenate([U, [360, 380, 400, 422, 444, 466, 488, 510, 532, 554, 577, 600]]) * 1e-3
 V = np.array([0, 6, 24, 42, 60, 78, 96, 115, 135, 155, 175, 195, 215, 236, 257, 279, 300]) / 300
 CUT_OUT = slice(5, 9), slice(10, 13)  # elements along the arc and across it
 RIBS = (slice(14, 15), slice(0, 16)), (slice(0, 29), slice(0, 1))
 
-# Corners of a hexahedron, then the middles of its edges, in halves of an element (C3D20R).
+# Corners and edge midpoints of a hexahedron (C3D20R), in half elements.
 _CORNERS = [(0, 0, 0), (2, 0, 0), (2, 2, 0), (0, 2, 0), (0, 0, 2), (2, 0, 2), (2, 2, 2), (0, 2, 2)]
 _EDGES = [(0, 1), (1, 2), (2, 3), (3, 0), (4, 5), (5, 6), (6, 7), (7, 4)]
 _EDGES += [(0, 4), (1, 5), (2, 6), (3, 7)]
 HEXAHEDRON = np.array(
     [*_CORNERS, *(np.add(_CORNERS[a], _CORNERS[b]) // 2 for a, b in _EDGES)], dtype=int
 )
+GridPoint: TypeAlias = tuple[int, int, int]
+"""Half line along the arc, half line across it, and layer of a node."""
+
 TOP = 2
-"""Layer of the touch face, in halves of an element; the bottom of the glass is 0, of ribs -2."""
+"""Layer of the touched face in half elements; 0: bottom of the glass, -2: bottom of the ribs."""
 
 
-def place(i: np.ndarray, j: np.ndarray) -> np.ndarray:
-    """Return places (n, 2) [m] along and across the arc of half lines i, j (n,) of the mesh."""
-    u, share = np.interp(i / 2, range(len(U)), U), np.interp(j / 2, range(len(V)), V)
-    return np.column_stack([u, share * edge(u)])
+def position(i: np.ndarray, j: np.ndarray) -> np.ndarray:
+    """Return positions (n, 2) [m] along and across the arc, for mesh half lines i, j (n,)."""
+    along = np.interp(i / 2, range(len(U)), U)
+    relative = np.interp(j / 2, range(len(V)), V)
+    return np.column_stack([along, relative * width_at(along)])
 
 
-def edge(u: np.ndarray) -> np.ndarray:
-    """Return how wide the glass is at u [m] along its arc."""
+def width_at(u: np.ndarray) -> np.ndarray:
+    """Return the width of the glass [m] at u [m] along its arc."""
     return WIDTH - (WIDTH - NARROW) * (2 * u / LENGTH - 1) ** 2
 
 
 def elements() -> Iterator[tuple[str, np.ndarray]]:
-    """Yield each element with its material, first half lines and layer."""
+    """Yield the material of each element, and its first half lines and layer."""
     solid = np.ones((len(U) - 1, len(V) - 1), dtype=bool)
     solid[CUT_OUT] = False
     for i, j in np.argwhere(solid):
@@ -61,42 +66,75 @@ def elements() -> Iterator[tuple[str, np.ndarray]]:
         yield "RIB", np.array([2 * i, 2 * j, -2])
 
 
-def write_model(path: Path, *, solver: str = "") -> dict[tuple[int, int, int], int]:
-    """Write the model; return its nodes by half lines and layer.
+def write_model(path: Path, *, solver: str = "") -> dict[GridPoint, int]:
+    """Write the model; return its node numbers by half lines and layer.
 
-    solver: further words of its *FREQUENCY.
+    solver: additional parameters of *FREQUENCY.
     """
-    found: dict[tuple[int, int, int], int] = {}
-    rows: dict[str, list[list[int]]] = {"GLASS": [], "RIB": []}
+    numbers: dict[GridPoint, int] = {}
+    element_nodes: dict[str, list[list[int]]] = {"GLASS": [], "RIB": []}
     for material, first in elements():
-        at = [tuple(int(each) for each in first + own) for own in HEXAHEDRON]
-        rows[material].append([found.setdefault(each, len(found) + 1) for each in at])
-    at = np.array(list(found))
-    u, v = place(at[:, 0], at[:, 1]).T
-    depth = np.interp(at[:, 2], [-2, 0, TOP], [-GLASS - RIB, -GLASS, 0])
-    angle = (u - LENGTH / 2) / RADIUS
-    r = RADIUS + depth
-    xyz = np.column_stack([r * np.sin(angle), v, r * np.cos(angle) - RADIUS])
-    lines = ["*NODE, NSET=ALL"]
-    lines += [f"{n}, " + ", ".join(f"{each:.12g}" for each in p) for n, p in enumerate(xyz, 1)]
-    number = 0
-    for name, nodes in rows.items():
-        lines.append(f"*ELEMENT, TYPE=C3D20R, ELSET={name}")
-        for each in nodes:
-            number += 1
-            whole = [str(entry) for entry in (number, *each)]
-            lines += [", ".join(whole[:11]) + ",", ", ".join(whole[11:])]
-    touch = [str(n) for at, n in found.items() if at[2] == TOP]
-    lines += ["*NSET, NSET=TOUCH", *(", ".join(touch[n : n + 8]) for n in range(0, len(touch), 8))]
-    for name, modulus, poisson, density in (
-        ("GLASS", 72e9, 0.22, 2500),
-        ("RIB", 70e9, 0.33, 2700),
-    ):
-        lines += [f"*MATERIAL, NAME={name}", "*ELASTIC", f"{modulus:g}, {poisson:g}"]
-        lines += ["*DENSITY", f"{density:g}", f"*SOLID SECTION, ELSET={name}, MATERIAL={name}"]
+        nodes = []
+        for offset in HEXAHEDRON:
+            i, j, layer = (first + offset).tolist()
+            nodes.append(numbers.setdefault((i, j, layer), len(numbers) + 1))
+        element_nodes[material].append(nodes)
+    lines = [
+        *node_lines(numbers),
+        *element_lines(element_nodes),
+        *touch_lines(numbers),
+        *material_lines("GLASS", modulus=72e9, poisson=0.22, density=2500),
+        *material_lines("RIB", modulus=70e9, poisson=0.33, density=2700),
+    ]
     lines += ["*STEP", f"*FREQUENCY{solver}", f"{MODES}", "*NODE FILE", "U", "*END STEP", ""]
     path.write_text("\n".join(lines), encoding="ascii")
-    return found
+    return numbers
+
+
+def node_lines(numbers: dict[GridPoint, int]) -> Iterator[str]:
+    """Yield the nodes with their coordinates [m]."""
+    points = np.array(list(numbers))
+    along, across = position(points[:, 0], points[:, 1]).T
+    depth = np.interp(points[:, 2], [-2, 0, TOP], [-GLASS - RIB, -GLASS, 0])
+    angle = (along - LENGTH / 2) / RADIUS
+    radius = RADIUS + depth
+    x = radius * np.sin(angle)
+    z = radius * np.cos(angle) - RADIUS
+    yield "*NODE, NSET=ALL"
+    for number, coordinates in enumerate(np.column_stack([x, across, z]), start=1):
+        yield f"{number}, " + ", ".join(f"{value:.12g}" for value in coordinates)
+
+
+def element_lines(element_nodes: dict[str, list[list[int]]]) -> Iterator[str]:
+    """Yield the elements of each material; an element takes two lines."""
+    number = 0
+    for material, elements_of_material in element_nodes.items():
+        yield f"*ELEMENT, TYPE=C3D20R, ELSET={material}"
+        for nodes in elements_of_material:
+            number += 1
+            entries = [str(entry) for entry in (number, *nodes)]
+            yield ", ".join(entries[:11]) + ","
+            yield ", ".join(entries[11:])
+
+
+def touch_lines(numbers: dict[GridPoint, int]) -> Iterator[str]:
+    """Yield the node set of the touched face, eight nodes per line."""
+    touch = [str(number) for point, number in numbers.items() if point[2] == TOP]
+    yield "*NSET, NSET=TOUCH"
+    for start in range(0, len(touch), 8):
+        yield ", ".join(touch[start : start + 8])
+
+
+def material_lines(name: str, *, modulus: float, poisson: float, density: float) -> tuple[str, ...]:
+    """Return a material (SI units), and the section that assigns it to its elements."""
+    return (
+        f"*MATERIAL, NAME={name}",
+        "*ELASTIC",
+        f"{modulus:g}, {poisson:g}",
+        "*DENSITY",
+        f"{density:g}",
+        f"*SOLID SECTION, ELSET={name}, MATERIAL={name}",
+    )
 
 
 if __name__ == "__main__":

@@ -1,17 +1,17 @@
-"""Writes modes that CalculiX computed as a file for `surface`, MODEL.npz.
+"""Convert the modes of a CalculiX model for the key `surface` of a rig: write MODEL.npz.
 
     python examples/calculix/from_calculix.py MODEL [--set TOUCH] [--unroll]
 
-MODEL.inp has the nodes that fingers touch as a set (*NSET), MODEL.frd the results of one *FREQUENCY
-step with *NODE FILE and U in ASCII, both in m, kg and s. Of elements whose faces have all of their
-corners in the set the outline is taken. With --unroll places count along the arc of a surface that
-is bent about y, as those of a touch panel.
+MODEL.inp contains the touched nodes as a node set (*NSET). MODEL.frd contains the results of a
+*FREQUENCY step with *NODE FILE and U, in ASCII. Both are in m, kg and s. The outline is taken from
+the element faces with all corners in the set. With --unroll, positions are measured along the arc
+of a surface that is bent about y, as a touch panel reports them.
 """
 
 import argparse
 import re
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -34,32 +34,32 @@ FACES = {
 }
 """Corners of every element face, for each element type in a .frd file."""
 
-# A value has 12 characters (E12.5). With three digits in the exponent, as on Windows, it has up to
-# 13 and touches the next one. Fortran leaves out the letter of such an exponent. One digit before
-# the point shows where the next number begins.
+# A value has 12 characters (E12.5). With a three-digit exponent, as on Windows, it has up to 13 and
+# touches the next value; Fortran also omits the letter of such an exponent. The single digit before
+# the decimal point shows where the next number begins.
 _NUMBER = r"\s*([-+]?(?:\d\.\d+(?:[ED][-+]?\d{2,3}|[-+]\d{3})|\d+\.\d*))"
 _NO_LETTER = re.compile(r"(?<=\d)(?=[-+])")
 _NODE_NUMBER = {0: 5, 1: 10}
-"""Characters of a node number, by the format of a block: short or long ASCII."""
+"""Width of a node number in characters, by block format (short or long ASCII)."""
 
-_MODAL = 2  # type of analysis of a block of results
+_MODAL = 2  # analysis type of a result block
 _MAX_INCLUDES = 10
 
 
 @dataclass(frozen=True)
 class Mode:
-    """A mode of a .frd."""
+    """A mode in a .frd file."""
 
     frequency: float
     """Natural frequency [Hz]."""
 
     shape: dict[int, list[float]] = field(default_factory=dict)
-    """Displacement of each node."""
+    """Displacement by node number."""
 
 
 @dataclass(frozen=True)
 class Results:
-    """Mesh and modes of a .frd."""
+    """Mesh and modes in a .frd file."""
 
     nodes: dict[int, list[float]]
     """Positions by node number."""
@@ -71,7 +71,7 @@ class Results:
 
 
 def read_set(path: Path, name: str) -> list[int]:
-    """Return the nodes of a set in an input file; raises ValueError with file and line."""
+    """Return the node numbers of a set; raises ValueError with file and line."""
     sets: dict[str, dict[int, None]] = {}
     instances: dict[str, set[str]] = {}
     target: dict[int, None] | None = None
@@ -90,23 +90,24 @@ def read_set(path: Path, name: str) -> list[int]:
                 entries = entries[:1]
             target.update(dict.fromkeys(_numbers_of(entries, parameters, sets, place)))
     requested = name.upper()
-    of_set = sorted(instances.get(requested, ()))
-    if len(of_set) > 1:
+    instance_names = sorted(instances.get(requested, ()))
+    if len(instance_names) > 1:
         raise ValueError(
-            f"{path}: node set {name} must be of one instance, got {', '.join(of_set)}; CalculiX "
-            "ignores instance=, so write a model without instances, whose node numbers are unique"
+            f"{path}: node set {name} must belong to one instance, got "
+            f"{', '.join(instance_names)}; CalculiX ignores instance=, so export the model without "
+            "instances to make node numbers unique"
         )
     if not sets.get(requested):
-        known = ", ".join(sorted(sets)) or "no sets"
+        set_names = ", ".join(sorted(sets)) or "no sets"
         raise ValueError(
-            f"{path}: must have the node set {name}, got {known}; add a line *NSET, NSET={name}, "
-            "or name another set with --set"
+            f"{path}: must have the node set {name}, got {set_names}; add a line "
+            f"*NSET, NSET={name}, or name another set with --set"
         )
     return list(sets[requested])
 
 
 def _input_lines(path: Path, depth: int = 0) -> Iterator[tuple[str, str]]:
-    """Yield the lines of an input file and its included files, with file and line number."""
+    """Yield location (file:line) and text of each line; *INCLUDE inserts a file."""
     text = path.read_text(encoding="utf-8", errors="replace")
     for number, line in enumerate(text.splitlines(), start=1):
         stripped = line.strip()
@@ -122,7 +123,7 @@ def _input_lines(path: Path, depth: int = 0) -> Iterator[tuple[str, str]]:
 
 
 def _keyword(line: str) -> tuple[str, dict[str, str]]:
-    """Return keyword and parameters of a line in capitals, without the asterisk."""
+    """Return keyword and parameters of a line in upper case, without the asterisk."""
     keyword, *rest = (word.strip() for word in line.upper().lstrip("*").split(","))
     parameters = {}
     for word in rest:
@@ -134,14 +135,14 @@ def _keyword(line: str) -> tuple[str, dict[str, str]]:
 def _numbers_of(
     entries: list[str], parameters: dict[str, str], sets: dict[str, dict[int, None]], place: str
 ) -> list[int]:
-    """Return the node numbers of a data line with numbers, set names or a range (GENERATE)."""
+    """Return the node numbers of a data line: numbers, set names or a range (GENERATE)."""
     if "GENERATE" in parameters:
         try:
             first, last, *step = (int(entry) for entry in entries)
             return list(range(first, last + 1, step[0] if step else 1))
         except ValueError:
             raise ValueError(
-                f"{place}: line of GENERATE must have a first and a last number and perhaps a "
+                f"{place}: GENERATE line must have a first number, a last number and optionally a "
                 f"step, got {', '.join(entries)}"
             ) from None
     numbers: list[int] = []
@@ -153,37 +154,37 @@ def _numbers_of(
             numbers.append(int(entry))
         except ValueError:
             raise ValueError(
-                f"{place}: node set must have whole numbers or names of sets above it, got {entry}"
+                f"{place}: node set must have whole numbers or names of earlier sets, got {entry}"
             ) from None
     return numbers
 
 
 @dataclass(frozen=True)
 class _Block:
-    """A block of a .frd: nodes (2C), elements (3C) or results (100C)."""
+    """A block of a .frd file: nodes (2C), elements (3C) or results (100C)."""
 
     kind: str
     place: str
-    """File and line of its header."""
+    """Location of the header, file:line."""
 
     header: str
     step: int
-    """Step number of the analysis."""
+    """Number of the analysis step."""
 
     rows: list[tuple[str, str]] = field(default_factory=list)
-    """Lines after the header: file with line number, and text."""
+    """Lines after the header: location and text."""
 
     @property
     def width(self) -> int:
-        """Characters of a node number; raises ValueError for binary blocks."""
+        """Width of a node number in characters; raises ValueError for binary blocks."""
         code = _whole(self.header[73:75], self.place)
         if code not in _NODE_NUMBER:
-            raise ValueError(f"{self.place}: .frd must be in ASCII, got a binary one")
+            raise ValueError(f"{self.place}: .frd file must be ASCII, got binary data")
         return _NODE_NUMBER[code]
 
 
 def read_frd(path: Path) -> Results:
-    """Return mesh and modes of a file; raises ValueError with file and line."""
+    """Return mesh and modes; raises ValueError with file and line."""
     results = Results({}, [], [])
     steps: set[int] = set()
     for block in _blocks(path):
@@ -197,18 +198,19 @@ def read_frd(path: Path) -> Results:
             results.modes.append(Mode(frequency, _values(block)))
     if not results.modes:
         raise ValueError(
-            f"{path}: must have modes, got none; write *FREQUENCY and *NODE FILE with U in one step"
+            f"{path}: must contain modes, got none; use *FREQUENCY, and *NODE FILE with U, in one "
+            "step"
         )
     if len(steps) > 1:
         raise ValueError(
-            f"{path}: modes must be of one *FREQUENCY step, got those of steps "
-            f"{', '.join(map(str, sorted(steps)))}; remove *NODE FILE from all others"
+            f"{path}: modes must come from one *FREQUENCY step, got steps "
+            f"{', '.join(map(str, sorted(steps)))}; remove *NODE FILE from the other steps"
         )
     return results
 
 
 def _blocks(path: Path) -> Iterator[_Block]:
-    """Yield the blocks of nodes, elements and results of a file."""
+    """Yield the blocks with nodes, elements and results."""
     block: _Block | None = None
     step = 0
     lines = path.read_text(encoding="ascii", errors="replace").splitlines()
@@ -229,17 +231,17 @@ def _blocks(path: Path) -> Iterator[_Block]:
 
 
 def _is_mode(block: _Block) -> bool:
-    """Whether results are the displacements of a mode; raises ValueError for complex ones."""
+    """Whether a block is the displacements of a mode; raises ValueError for complex modes."""
     names = [line.split()[1:2] for _, line in block.rows if line.startswith(" -4")]
     if names == [["DISPI"]]:
         raise ValueError(
-            f"{block.place}: modes must be real, got complex or cyclic ones; use *FREQUENCY alone"
+            f"{block.place}: modes must be real, got complex or cyclic modes; use *FREQUENCY alone"
         )
     return names == [["DISP"]] and _whole(block.header[56:58], block.place) == _MODAL
 
 
 def _values(block: _Block) -> dict[int, list[float]]:
-    """Return the three numbers of each node of a block."""
+    """Return the three values of each node in a block."""
     end = 3 + block.width
     return {
         _whole(line[3:end], place): _numbers(line[end:], 3, place)
@@ -249,7 +251,7 @@ def _values(block: _Block) -> dict[int, list[float]]:
 
 
 def _elements(block: _Block) -> list[tuple[int, list[int]]]:
-    """Return the type and the nodes of each element of a block."""
+    """Return type and nodes of each element in a block."""
     width = block.width
     elements: list[tuple[int, list[int]]] = []
     for place, line in block.rows:
@@ -273,10 +275,10 @@ def _whole(text: str, place: str) -> int:
 
 
 def _numbers(text: str, count: int, place: str) -> list[float]:
-    """Return so many numbers of a line; raises ValueError for other text."""
+    """Return a line's numbers, exactly `count` of them; raises ValueError for other text."""
     if "," in text:
         raise ValueError(
-            f"{place}: numbers must have decimal points, got {text.strip()!r} with commas; run "
+            f"{place}: numbers must have decimal points, got commas in {text.strip()!r}; run "
             "CalculiX with the locale C"
         )
     match = re.fullmatch(_NUMBER * count + r"\s*", text)
@@ -295,34 +297,22 @@ def _numbers(text: str, count: int, place: str) -> list[float]:
 
 
 def unrolled(nodes: np.ndarray) -> np.ndarray:
-    """Return places (n, 2) [m] of nodes (n, 3) along the arc of their profile z(x), and along y."""
+    """Return positions (n, 2) [m] of nodes (n, 3): along the arc z(x), and along y."""
     x, first = np.unique(nodes[:, 0].round(7), return_index=True)
-    along = np.hypot(np.diff(x), np.diff(nodes[first, 2]))
-    arc = np.concatenate([[0.0], np.cumsum(along)])
+    lengths = np.hypot(np.diff(x), np.diff(nodes[first, 2]))
+    arc = np.concatenate([[0.0], np.cumsum(lengths)])
     return np.column_stack([np.interp(nodes[:, 0], x, arc), nodes[:, 1]])
 
 
 def convert(model: Path, name: str = "TOUCH", *, unroll: bool = False) -> Path:
-    """Write MODEL.npz; return its path. Raises ValueError and OSError."""
+    """Write MODEL.npz and return its path; raises ValueError and OSError."""
     results_file = model.with_suffix(".frd")
     touch = read_set(model.with_suffix(".inp"), name)
     results = read_frd(results_file)
-    for what, known in (("mesh", results.nodes), *(("mode", mode.shape) for mode in results.modes)):
-        missing = [number for number in touch if number not in known]
-        if missing:
-            raise ValueError(
-                f"{results_file}: {what} must have all nodes of {name}, got none with number "
-                f"{missing[0]} and {len(missing) - 1} others; of shells write *NODE FILE, "
-                "OUTPUT=2D"
-            )
-    row = {number: at for at, number in enumerate(touch)}
-    faces = [
-        [row[corners[corner]] for corner in face]
-        for kind, corners in results.elements
-        for face in FACES.get(kind, [])
-        if all(corners[corner] in row for corner in face)
-    ]
-    corner_count = max(map(len, faces), default=3)
+    _check_nodes(f"{results_file}: mesh", results.nodes, touch, name)
+    for mode in results.modes:
+        _check_nodes(f"{results_file}: mode", mode.shape, touch, name)
+    faces = _touched_faces(results.elements, touch)
     nodes = np.array([results.nodes[number] for number in touch])
     arrays = {
         "nodes": nodes,
@@ -330,13 +320,37 @@ def convert(model: Path, name: str = "TOUCH", *, unroll: bool = False) -> Path:
         "shapes": np.array([[mode.shape[number] for number in touch] for mode in results.modes]),
     }
     if faces:
-        # A triangle among quadrilaterals has its last corner twice.
+        # A triangle among quadrilaterals repeats its last corner.
+        corner_count = max(map(len, faces))
         padded = [[*face, *face[-1:] * (corner_count - len(face))] for face in faces]
         arrays["faces"] = np.array(padded, dtype=int)
     if unroll:
         arrays["places"] = unrolled(nodes)
     np.savez(model.with_suffix(".npz"), **arrays)
     return model.with_suffix(".npz")
+
+
+def _check_nodes(what: str, values: Mapping[int, object], touch: list[int], name: str) -> None:
+    """Raise ValueError unless there is a value for each touched node."""
+    missing = [number for number in touch if number not in values]
+    if missing:
+        raise ValueError(
+            f"{what} must have all {len(touch)} nodes of {name}, got "
+            f"{len(touch) - len(missing)} without node {missing[0]}; for shells use *NODE FILE, "
+            "OUTPUT=2D"
+        )
+
+
+def _touched_faces(elements: list[tuple[int, list[int]]], touch: list[int]) -> list[list[int]]:
+    """Return the element faces with all corners touched, as rows of the touched nodes."""
+    rows = {number: row for row, number in enumerate(touch)}
+    faces = []
+    for kind, nodes in elements:
+        for face in FACES.get(kind, []):
+            corners = [nodes[corner] for corner in face]
+            if all(corner in rows for corner in corners):
+                faces.append([rows[corner] for corner in corners])
+    return faces
 
 
 def main() -> None:
@@ -347,12 +361,12 @@ def main() -> None:
     parser.add_argument("--unroll", action="store_true")
     options = parser.parse_args()
     try:
-        written = convert(options.model, options.set, unroll=options.unroll)
+        modes_file = convert(options.model, options.set, unroll=options.unroll)
     except OSError as error:
         sys.exit(f"from_calculix: {error.filename or options.model}: {error.strerror}")
     except ValueError as error:
         sys.exit(f"from_calculix: {error}")
-    print("wrote", written)
+    print("wrote", modes_file)
 
 
 if __name__ == "__main__":

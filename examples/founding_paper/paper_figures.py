@@ -1,9 +1,9 @@
-"""Draw the figures of the founding paper for any rig, each with a CSV file of its numbers.
+"""Draw the figures of the founding paper for any rig, and write their data as CSV.
 
     python examples/founding_paper/paper_figures.py RIG DIR
 
-Frequencies, layouts and stiffnesses are the paper's; `tables.py` compares the numbers with the
-paper's claims.
+Frequencies, layouts and stiffnesses are the paper's. `tables.py` compares the results with
+the paper's claims.
 """
 
 import math
@@ -31,7 +31,7 @@ from model.structure.plate import Plate
 from model.vibration import G, Tone, natural_modes, plate_map
 
 SWEEP = np.arange(60.0, 321.0, 10.0)
-"""The 27 frequencies [Hz] of figures 10 and 11: they hold every one the paper names."""
+"""The 27 frequencies [Hz] of Figures 10 and 11; they include every one in the paper's text."""
 
 FIGURE_12_FREQUENCIES = (
     (320.0, 320.0),
@@ -47,14 +47,14 @@ FIGURE_13_STIFFNESS = (8_000.0, 16_000.0)
 """ERA stiffness [N/m] of the two maps in Figure 13."""
 
 STATISTICS = ("minimum", "lower_quartile", "median", "upper_quartile", "maximum")
-"""Of the cumulative peak acceleration over the plate [m/s²]."""
+"""Statistics of the cumulative peak acceleration over the plate [m/s²]."""
 
 _MODES = (1, 5)
 
 
 @dataclass(frozen=True)
 class PaperFigure:
-    """A figure: name of its file without suffix, and numbers by the end of their file's name."""
+    """A figure, its file name without suffix, and its tables by file name suffix."""
 
     name: str
     figure: Figure
@@ -64,8 +64,8 @@ class PaperFigure:
 def paper_figures(rig: Rig, number: str) -> Iterator[PaperFigure]:
     """Draw the figures with one number, or `all`, for a rig's plate and mesh.
 
-    Raises InputError for a number without results in the paper, for a mesh too coarse for 320 Hz,
-    and for a rig with fewer than two ERAs where a pair is driven.
+    Raises InputError for the number of a figure without results, for a mesh too coarse for 320 Hz,
+    and for a rig with one ERA if the figure needs a pair.
     """
     if number not in (*_FIGURES, "all"):
         raise InputError(f"figure must be one of {', '.join(_FIGURES)} or all, got {number!r}")
@@ -76,14 +76,14 @@ def paper_figures(rig: Rig, number: str) -> Iterator[PaperFigure]:
 
 
 def _modes(rig: Rig, free: FreePlate, *, name: str, support: str) -> PaperFigure:
-    """Mode shapes 1 and 5, and natural frequencies."""
+    """Draw mode shapes 1 and 5; list the natural frequencies."""
     solved = natural_modes(rig, max(_MODES), support=support)
     columns, rows = raster(rig.plate)
     x, y = np.linspace(0, rig.plate.length, columns), np.linspace(0, rig.plate.width, rows)
     points = lattice(x, y)
-    drawn = solved.at(points)[:, np.array(_MODES) - 1]
-    # The largest deflection at +1: sign and size of a mode are free.
-    shapes = [shape / shape[best_of(np.abs(shape))] for shape in drawn.T]
+    displacements = solved.at(points)[:, np.array(_MODES) - 1]
+    # Scaled to a largest deflection of +1, since the sign and size of a mode are arbitrary.
+    shapes = [shape / shape[best_of(np.abs(shape))] for shape in displacements.T]
     figure = Figure(figsize=(9, 4.2), layout="constrained")
     grid = figure.subplots(1, len(shapes), sharey=True)
     for axes, mode, shape in zip(grid, _MODES, shapes, strict=True):
@@ -96,19 +96,19 @@ def _modes(rig: Rig, free: FreePlate, *, name: str, support: str) -> PaperFigure
         axes.label_outer()
     figure.colorbar(image, ax=grid, label="deflection relative to the maximum")
     figure.suptitle(f"On {len(rig.eras)} ERAs" if support == "eras" else "Simply supported")
-    of_shapes = {f"mode_{mode}": shape for mode, shape in zip(_MODES, shapes, strict=True)}
+    shape_columns = {f"mode_{mode}": shape for mode, shape in zip(_MODES, shapes, strict=True)}
     tables: dict[str, Columns] = {
         "": {"mode": range(1, max(_MODES) + 1), "model_hz": solved.frequencies},
-        "_shapes": {"x_m": points[:, 0], "y_m": points[:, 1], **of_shapes},
+        "_shapes": {"x_m": points[:, 0], "y_m": points[:, 1], **shape_columns},
     }
     return PaperFigure(name, figure, tables)
 
 
 def _box_plots(rig: Rig, free: FreePlate, *, name: str, active_count: int) -> PaperFigure:
-    """Peak acceleration summed over the sweep, of the layouts with a number of driven ERAs.
+    """Draw box plots of the peak acceleration summed over the sweep, for each layout.
 
-    ERAs are like the rig's first, at full stroke and in phase; each box is that of the highest
-    median of its layout.
+    active_count: number of driven ERAs, all like the rig's first one, at full amplitude and in
+    phase. The box of a layout shows the drive with the highest median.
     """
     points = equal_area_points(rig.plate)
     figure = Figure(figsize=(max(6, 1.4 * len(FOUR_ERA_LAYOUTS)), 6), layout="constrained")
@@ -126,10 +126,10 @@ def _box_plots(rig: Rig, free: FreePlate, *, name: str, active_count: int) -> Pa
             drives.append((active, np.percentile(total, [0, 25, 50, 75, 100])))
             names = "+".join(str(era + 1) for era in active)
             rows.append((layout.name, names, places, *drives[-1][1]))
-        # Drives that are equal by symmetry have the same median to six digits.
+        # Symmetric drives have equal medians to six digits; the first one is taken.
         best, statistics = best_by(drives, lambda drive: float(f"{drive[1][2]:.6g}"))
-        of_box = zip(("whislo", "q1", "med", "q3", "whishi"), statistics / G, strict=True)
-        boxes.append({"label": layout.name.replace(" ", "\n"), "fliers": [], **dict(of_box)})
+        box = dict(zip(("whislo", "q1", "med", "q3", "whishi"), statistics / G, strict=True))
+        boxes.append({"label": layout.name.replace(" ", "\n"), "fliers": [], **box})
         axes.add_patch(
             Rectangle((0, 0), 100 * rig.plate.length, 100 * rig.plate.width, fc="0.93", ec="0.4")
         )
@@ -158,21 +158,21 @@ def _box_plots(rig: Rig, free: FreePlate, *, name: str, active_count: int) -> Pa
 
 
 def equal_area_points(plate: Plate) -> FloatArray:
-    """Points [m] (p, 2) that represent equal areas of a plate: centres of nearly square cells.
+    """Return points [m] (p, 2) that represent equal areas: the centres of nearly square cells.
 
-    24 of them along the longer side, or as many as put twelve into a bending wave of the highest
-    frequency. On the paper's plate, against cells a quarter as long: medians within 3 %, quartiles
-    within 8 %; the maximum, which lies on the edge, is up to 12 % low, and the minimum, which lies
-    at a null, is just that of these points.
+    The longer side has 24 cells, or more if the shortest bending wavelength needs them (12 cells).
+    Compared with cells of a quarter of the size on the paper's plate, medians differ by up to 3 %,
+    quartiles by up to 8 %, and the maximum, which is on the edge, is up to 12 % too low. The
+    minimum, which is at a null, depends on the points.
     """
-    wave = plate.bending_wavelength(float(SWEEP[-1]))
-    size = min(max(plate.length, plate.width) / 24, wave / 12)
+    wavelength = plate.bending_wavelength(float(SWEEP[-1]))
+    size = min(max(plate.length, plate.width) / 24, wavelength / 12)
     grid = Grid(max(1, round(plate.length / size)), max(1, round(plate.width / size)))
     return grid.centres(plate)
 
 
 def _same_frequency(rig: Rig, free: FreePlate) -> PaperFigure:
-    """Two ERAs on an edge and two on a diagonal, both at 110 Hz."""
+    """Draw the maps of an edge pair and a diagonal pair at 110 Hz."""
     pairs = {"edge": edge_pair(rig.eras), "diagonal": diagonal_pair(rig.eras)}
     titles = "(a) same edge: {names}", "(b) diagonal: {names}"
     panels = {
@@ -183,18 +183,18 @@ def _same_frequency(rig: Rig, free: FreePlate) -> PaperFigure:
 
 
 def _switched(rig: Rig, free: FreePlate) -> PaperFigure:
-    """The diagonal pair at six switched pairs of frequencies."""
+    """Draw the maps of the diagonal pair at six pairs of frequencies."""
     pair = diagonal_pair(rig.eras)
     panels = {
-        f"{both[0]:g}_{both[1]:g}_hz": pair_map(rig, free, pair, both, f"({letter}) {{tones}}")
-        for letter, both in zip("abcdef", FIGURE_12_FREQUENCIES, strict=True)
+        f"{tones[0]:g}_{tones[1]:g}_hz": pair_map(rig, free, pair, tones, f"({letter}) {{tones}}")
+        for letter, tones in zip("abcdef", FIGURE_12_FREQUENCIES, strict=True)
     }
     caption = "Frequencies switched between two diagonal ERAs"
     return _maps("figure_12", panels, columns=3, caption=caption)
 
 
 def _stiffnesses(rig: Rig, free: FreePlate) -> PaperFigure:
-    """The diagonal pair at 250 Hz on ERAs of 8 and of 16 kN/m."""
+    """Draw the maps of the diagonal pair at 250 Hz, for ERA stiffnesses of 8 and 16 kN/m."""
     pair = diagonal_pair(rig.eras)
     panels = {
         f"{stiffness / 1000:g}_kn_m": pair_map(
@@ -211,39 +211,39 @@ def _stiffnesses(rig: Rig, free: FreePlate) -> PaperFigure:
 
 
 def edge_pair(eras: Sequence[Actuator]) -> tuple[int, int]:
-    """Two ERAs side by side along the plate's x axis: most alike in y, then furthest apart in x."""
+    """Return the two ERAs on an edge along x: closest in y, then furthest apart in x."""
 
     def order(pair: tuple[int, int]) -> tuple[float, float]:
-        across, along = abs(_apart(eras, pair))[::-1]
+        along, across = abs(_distance(eras, pair))
         return _rounded(across), -_rounded(along)
 
     return min(_pairs(eras), key=order)
 
 
 def diagonal_pair(eras: Sequence[Actuator]) -> tuple[int, int]:
-    """The two ERAs that are furthest apart; the first of several such pairs."""
+    """Return the two ERAs that are furthest apart; of equal pairs, the first one."""
     pairs = _pairs(eras)
-    return pairs[best_of([np.hypot(*_apart(eras, pair)) for pair in pairs])]
+    return pairs[best_of([np.hypot(*_distance(eras, pair)) for pair in pairs])]
 
 
 def _pairs(eras: Sequence[Actuator]) -> list[tuple[int, int]]:
     if len(eras) < 2:
-        raise InputError(f"ERAs of the rig must be at least two to drive a pair, got {len(eras)}")
+        raise InputError(f"number of ERAs in the rig must be >= 2 to drive a pair, got {len(eras)}")
     return list(combinations(range(len(eras)), 2))
 
 
-def _apart(eras: Sequence[Actuator], pair: tuple[int, int]) -> FloatArray:
+def _distance(eras: Sequence[Actuator], pair: tuple[int, int]) -> FloatArray:
     first, second = (eras[index] for index in pair)
     return np.array([second.x - first.x, second.y - first.y])
 
 
 def _rounded(distance: float) -> float:
-    """A distance [m] without the rounding errors that would decide between equal pairs."""
+    """Round a distance [m], so that numerical errors do not decide between equal pairs."""
     return round(float(distance), 9)
 
 
 def with_stiffness(eras: Sequence[Actuator], stiffness: float) -> tuple[Actuator, ...]:
-    """The same ERAs with another stiffness [N/m]; each keeps its damping ratio, c / sqrt(k_b)."""
+    """Return ERAs with another stiffness [N/m] and the same damping ratio, c / sqrt(k_b)."""
     factors = [stiffness / era.stiffness for era in eras]
     return tuple(
         era.varied(stiffness=factor, damping=math.sqrt(factor))
@@ -258,7 +258,7 @@ def pair_map(
     frequencies: tuple[float, float],
     title: str,
 ) -> MapPanel:
-    """The map of a pair of ERAs at full stroke; the title may contain {names} and {tones}."""
+    """Return the map of two ERAs at full amplitude; title: can contain {names} and {tones}."""
     excitation = {
         rig.eras[number].name: Tone(frequency, rig.eras[number].full_level)
         for number, frequency in zip(pair, frequencies, strict=True)
@@ -270,18 +270,19 @@ def pair_map(
 
 
 def _maps(name: str, panels: dict[str, MapPanel], *, columns: int, caption: str) -> PaperFigure:
-    shown = list(panels.values())
-    x, y = np.meshgrid(shown[0].plate_map.x, shown[0].plate_map.y)
-    peaks = {f"peak_{key}_m_s2": each.plate_map.peak.ravel() for key, each in panels.items()}
+    panel_list = list(panels.values())
+    x, y = np.meshgrid(panel_list[0].plate_map.x, panel_list[0].plate_map.y)
+    peaks = {f"peak_{key}_m_s2": panel.plate_map.peak.ravel() for key, panel in panels.items()}
     table: Columns = {"x_m": x.ravel(), "y_m": y.ravel(), **peaks}
-    return PaperFigure(name, maps_figure(shown, columns=columns, caption=caption), {"": table})
+    figure = maps_figure(panel_list, columns=columns, caption=caption)
+    return PaperFigure(name, figure, {"": table})
 
 
 _FIGURES: dict[str, tuple[Callable[[Rig, FreePlate], PaperFigure], ...]] = {
     "6": (partial(_modes, name="figure_6", support="simply-supported"),),
     "7": (partial(_modes, name="figure_7", support="eras"),),
     "10": (partial(_box_plots, name="figure_10", active_count=1),),
-    "11": (  # the paper gives this number twice
+    "11": (  # the paper has two figures with this number
         partial(_box_plots, name="figure_11_boxplots", active_count=2),
         _same_frequency,
     ),
@@ -294,11 +295,12 @@ def main() -> None:
     """Draw all figures of a rig into a folder."""
     rig_file, folder = map(Path, sys.argv[1:])
     folder.mkdir(parents=True, exist_ok=True)
-    for made in paper_figures(load_rig(rig_file), "all"):
-        save_figure(made.figure, folder / f"{made.name}.png")
-        for suffix, columns in made.tables.items():
-            write_columns(folder / f"{made.name}{suffix}.csv", columns)
-        print(f"wrote {folder / made.name}.png")
+    for paper_figure in paper_figures(load_rig(rig_file), "all"):
+        name = paper_figure.name
+        save_figure(paper_figure.figure, folder / f"{name}.png")
+        for suffix, columns in paper_figure.tables.items():
+            write_columns(folder / f"{name}{suffix}.csv", columns)
+        print(f"wrote {folder / name}.png")
 
 
 if __name__ == "__main__":

@@ -251,17 +251,22 @@ def test_researcher_example_reproduces_the_paper(
     monkeypatch.setenv("ERA_PICTURES", str(tmp_path))
     ran: dict[str, Any] = runpy.run_path(str(EXAMPLES / "researcher.py"))
     assert [f"{frequency:.2f}" for frequency in ran["paper_frequencies"]] == TABLE_2
-    assert all(felt.promised_contrast_db > 12 for felt in ran["both"].fingers)
-    for answer, felt in ran["played"].values():
-        predicted, more = answer.fingers[0], era.measures(ran["table"], answer)
+    assert all(finger.promised_contrast_db > 12 for finger in ran["joint"].fingers)
+    playbacks = ran["playbacks"]
+    for name, answer in ran["answers"].items():
+        predicted = answer.fingers[0]
+        onset = era.measures(ran["table"], answer)
+        felt = playbacks[name]
         assert felt.contrast_db == pytest.approx(predicted.contrast_db, abs=0.2)
-        assert felt.transient_contrast_db == pytest.approx(more.transient_contrast_db, abs=0.4)
+        assert felt.transient_contrast_db == pytest.approx(onset.transient_contrast_db, abs=0.4)
         assert felt.level_db_sl == pytest.approx(predicted.level_db_sl, abs=0.05)
     ramp, shaped = (
-        felt.contrast_db - felt.transient_contrast_db for _, felt in ran["played"].values()
+        playbacks[name].contrast_db - playbacks[name].transient_contrast_db
+        for name in ("ramp", "shaped")
     )
     assert shaped < 0.75 * ramp  # of the steady contrast is lost while it starts
-    assert sum(felt >= ran["promised"] for felt in ran["drawn"]) >= 7
+    assert ran["kept"] == sum(felt >= ran["promised_db"] for felt in ran["contrasts_db"])
+    assert ran["kept"] >= 7
     assert (ran["study"]["phased"] >= ran["study"]["switched"] - 0.5).all()
     assert np.diff(ran["study"]["phased"]).min() > 0  # the farther, the easier
     pictures = sorted(path.name for path in tmp_path.iterdir())

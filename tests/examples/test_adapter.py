@@ -158,7 +158,7 @@ from processes.patient_daemon import allow_long_watchdogs
 allow_long_watchdogs(pytest.MonkeyPatch())
 sys.path[:0] = [{str(SCRIPT.parent)!r}]
 import adapter
-adapter.REPLY, adapter.STALLED = 5.0, 10.0
+adapter.REPLY_TIMEOUT, adapter.STALL_TIMEOUT = 5.0, 10.0
 runpy.run_path({str(SCRIPT)!r}, run_name="__main__")
 """
 """The adapter, which waits longer for its instrument, its host and its watcher for it."""

@@ -112,18 +112,18 @@ TOUCH = "*NSET, NSET=TOUCH\n0, 1, 2\n"
         (
             [row.replace(".0", ",0") for row in _results(SHAPES)],
             TOUCH,
-            "model.frd:18: numbers must have decimal points, got '1,00000E+02' with commas",
+            "model.frd:18: numbers must have decimal points, got commas in '1,00000E+02'",
         ),
         (
             _results(SHAPES) + _results(SHAPES, step=2),
             TOUCH,
-            "modes must be of one *FREQUENCY step, got those of steps 1, 2",
+            "modes must come from one *FREQUENCY step, got steps 1, 2",
         ),
-        (_results(SHAPES, analysis=0), TOUCH, "model.frd: must have modes, got none"),
+        (_results(SHAPES, analysis=0), TOUCH, "model.frd: must contain modes, got none"),
         (
             [row.replace("DISP ", "DISPI") for row in _results(SHAPES)],
             TOUCH,
-            "modes must be real, got complex or cyclic ones",
+            "modes must be real, got complex or cyclic modes",
         ),
         (
             [row.replace(" 1.00000E+00", "         NaN") for row in _results(SHAPES)],
@@ -134,28 +134,28 @@ TOUCH = "*NSET, NSET=TOUCH\n0, 1, 2\n"
         (
             _results(SHAPES)[:4] + _results(SHAPES)[5:],
             TOUCH,
-            "mode must have all nodes of TOUCH, got none with number 1 and 0 others",
+            "mode must have all 3 nodes of TOUCH, got 2 without node 1",
         ),
         (
             [row[:-1] + "2" if "100C" in row else row for row in _results(SHAPES)],
             TOUCH,
-            "model.frd:18: .frd must be in ASCII, got a binary one",
+            "model.frd:18: .frd file must be ASCII, got binary data",
         ),
         (_results(SHAPES), "*NSET, NSET=FACE\n1\n", "must have the node set TOUCH, got FACE"),
         (
             _results(SHAPES),
             "*NSET, NSET=TOUCH\n1, EDGE\n",
-            "model.inp:2: node set must have whole numbers or names of sets above it, got EDGE",
+            "model.inp:2: node set must have whole numbers or names of earlier sets, got EDGE",
         ),
         (
             _results(SHAPES),
             "*NSET, NSET=TOUCH, GENERATE\n1\n",
-            "model.inp:2: line of GENERATE must have a first and a last number",
+            "model.inp:2: GENERATE line must have a first number, a last number",
         ),
         (
             _results(SHAPES),
             "*NSET, NSET=TOUCH, INSTANCE=A\n1\n*NSET, NSET=TOUCH, INSTANCE=B\n1\n",
-            "node set TOUCH must be of one instance, got A, B",
+            "node set TOUCH must belong to one instance, got A, B",
         ),
         (_results(SHAPES), "*INCLUDE, INPUT=gone.inp\n", "gone.inp: No such file or directory"),
     ],

@@ -1,4 +1,4 @@
-"""Content as XR_FB_haptic_amplitude_envelope has it, as JSON: a duration and even amplitudes."""
+"""Content format for amplitudes at equal intervals, like XR_FB_haptic_amplitude_envelope."""
 
 from typing import Annotated
 
@@ -15,22 +15,24 @@ from era_haptics.plugins.content_formats import (
 
 
 class EnvelopeFile(ContentSection):
-    """The keys of a file; what is not as they say is refused with its line."""
+    """The keys of a file; invalid values are rejected with their line number."""
 
     duration_ns: Annotated[float, Field(gt=0, le=60e9)]
     amplitudes: Annotated[Entries[Annotated[float, Field(ge=0, le=1)]], Field(min_length=1)]
 
 
 class AmplitudeEnvelope(ContentFormat):
-    """One amplitude after another, each as long as the others."""
+    """JSON file with a duration and a list of amplitudes of equal length."""
 
     ending = "example.json"
 
     def read(self, content: bytes, source: str, channel: int) -> Pattern:
-        """Return a pattern whose intensity is each amplitude in the middle of its time."""
+        """Return a pattern that reaches each amplitude in the middle of its interval."""
         file = Validation(read_json(content, source), EnvelopeFile).finish()
         duration = file.duration_ns * 1e-9
         step = duration / len(file.amplitudes)
-        points = [((n + 0.5) * step, each) for n, each in enumerate(file.amplitudes)]
-        ends = (0.0, file.amplitudes[0]), (duration, file.amplitudes[-1])
-        return Pattern(duration, (ends[0], *points, ends[1]))
+        points = [(0.0, file.amplitudes[0])]
+        for number, amplitude in enumerate(file.amplitudes):
+            points.append(((number + 0.5) * step, amplitude))
+        points.append((duration, file.amplitudes[-1]))
+        return Pattern(duration, tuple(points))

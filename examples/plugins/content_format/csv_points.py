@@ -1,4 +1,4 @@
-"""Content as a spreadsheet saves it: a line `time [s],intensity,sharpness` for each point."""
+"""Content format for spreadsheets: CSV with a line `time [s],intensity,sharpness` per point."""
 
 from era_haptics.plugins.content_formats import (
     ContentFormat,
@@ -9,16 +9,19 @@ from era_haptics.plugins.content_formats import (
 
 
 class CsvPoints(ContentFormat):
-    """Points with commas between their values."""
+    """CSV file of points."""
 
     ending = "example.csv"
 
     def read(self, content: bytes, source: str, channel: int) -> Pattern:
-        """Return the pattern in a file; empty lines are skipped."""
+        """Return the pattern of a file; empty lines are skipped."""
         points = []
-        for number, line in enumerate(content.decode("utf-8", "replace").splitlines(), start=1):
+        lines = content.decode("utf-8", "replace").splitlines()
+        for number, line in enumerate(lines, start=1):
+            if not line.strip():
+                continue
             try:
-                points += [[float(value) for value in line.split(",")]] if line.strip() else []
+                points.append([float(value) for value in line.split(",")])
             except ValueError:
                 raise InputError(
                     f"{source}:{number}: must be time,intensity,sharpness, got {line[:40]!r}"

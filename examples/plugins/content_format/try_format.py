@@ -14,7 +14,7 @@ try:
     pattern = read_content(Path(sys.argv[1]))
 except InputError as error:
     sys.exit(f"error: {error}")
-print(f"lasts {pattern.duration:g} s")
+print(f"duration: {pattern.duration:g} s")
 for name, curve in (("intensity", pattern.intensity), ("sharpness", pattern.sharpness)):
     print(f"{name}:", ", ".join(f"{value:g} at {time:g} s" for time, value in curve))
 print(f"transients: {len(pattern.transients)}")

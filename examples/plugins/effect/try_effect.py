@@ -1,4 +1,4 @@
-"""Print the vibration that an effect gives a finger resting for two seconds.
+"""Print how an effect vibrates at a finger that rests for two seconds.
 
 python try_effect.py KIND
 """
@@ -15,24 +15,23 @@ try:
 except era.InputError as error:
     sys.exit(f"error: {error}")
 finger = Contact(ContactKey("try", 1), x=0.1, y=0.1, since=0.0)
-course = effect.start(finger, 0.0, level_db_sl=effect.level_db_sl)
+run = effect.start(finger, 0.0, level_db_sl=effect.level_db_sl)
 now: float | None = 0.0
 while now is not None and now < 2.0:
-    felt = course.feel(finger, now)
-    if (
-        isinstance(felt, EffectStimulus)
-        and felt.pulse is not None
-        and felt.pulse.started_at is None
-    ):
-        felt.pulse.started_at = now  # as by the amplifiers: it ends a duration later
-        felt = course.feel(finger, now)
-    if felt is None:
-        print(f"{now:5.2f} s  over")
+    stimulus = run.feel(finger, now)
+    if isinstance(stimulus, EffectStimulus):
+        pulse = stimulus.pulse
+        if pulse is not None and pulse.started_at is None:
+            pulse.started_at = now  # like the daemon when the amplifiers start
+            stimulus = run.feel(finger, now)
+    if stimulus is None:
+        print(f"{now:5.2f} s  ended")
         break
     level = "nothing"
-    if isinstance(felt, EffectStimulus):
-        level = "all that can be" if felt.level_db_sl is None else f"{felt.level_db_sl:g} dB SL"
+    if isinstance(stimulus, EffectStimulus):
+        level_db_sl = stimulus.level_db_sl
+        level = "highest possible level" if level_db_sl is None else f"{level_db_sl:g} dB SL"
     print(f"{now:5.2f} s  {level}")
-    if felt.until is not None and felt.until <= now:
-        sys.exit(f"its `until` is {felt.until}, which is not after {now}: it would never go on")
-    now = felt.until
+    if stimulus.until is not None and stimulus.until <= now:
+        sys.exit(f"`until` must be after {now:g} s, got {stimulus.until:g} s")
+    now = stimulus.until

@@ -1,4 +1,4 @@
-"""A material that rig files can use by name. The numbers are an example: measure yours."""
+"""A material that rig files can name. The values are an example; measure your own board."""
 
 from era_haptics.plugins.materials import KnownMaterial, Material
 

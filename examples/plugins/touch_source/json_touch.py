@@ -1,7 +1,8 @@
-"""Touches as JSON over UDP: [[1, 0.25, 0.5], ...], id, x and y of each finger that is down.
+"""Touch source for JSON over UDP: [[id, x, y], ...] with all fingers on the plate.
 
-x and y are 0 to 1 from the top left corner. The sender repeats its datagram every 50 ms while a
-finger is down, and sends [] when the last one lifts; after 150 ms without one all fingers lift.
+x and y are 0 to 1 from the top left corner. The sender repeats its datagram every 50 ms while any
+finger is down, and sends [] when the last finger lifts. After 150 ms without a datagram all fingers
+are lifted.
 """
 
 import json
@@ -10,14 +11,15 @@ from era_haptics.plugins.touch_sources import Touch, TouchFrame, UdpSource
 
 
 class JsonTouch(UdpSource):
-    """A source that listens at example-json:HOST:PORT."""
+    """Source at the URL example-json:HOST:PORT."""
 
-    max_size = 4096  # bytes of a datagram; ten fingers need 400
+    max_size = 4096  # bytes per datagram; ten fingers need 400
 
     def read(self, datagram: bytes, peer: tuple[str, int], arrived: float) -> TouchFrame | None:
-        """Return the frame of a datagram; a malformed one is counted."""
+        """Return the touches in a datagram; count malformed datagrams."""
         try:
-            touches = tuple(Touch(int(id), float(x), float(y)) for id, x, y in json.loads(datagram))
+            rows = json.loads(datagram)
+            touches = tuple(Touch(int(id), float(x), float(y)) for id, x, y in rows)
         except (ValueError, TypeError, OverflowError, RecursionError) as error:
             self.rejects.count("malformed", f"datagram from {peer[0]}: {error}")
             return None

@@ -1,4 +1,4 @@
-"""Send a finger over UDP that comes down, slides to the right for a second and lifts.
+"""Send a finger over UDP that touches the plate, slides to the right for a second and lifts.
 
 python send.py PORT
 """
@@ -10,10 +10,11 @@ import time
 
 if len(sys.argv) != 2:
     sys.exit(__doc__)
-with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as line:
-    place = ("127.0.0.1", int(sys.argv[1]))
+with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+    address = ("127.0.0.1", int(sys.argv[1]))
     for step in range(21):
-        line.sendto(json.dumps([[1, 0.25 + 0.025 * step, 0.5]]).encode(), place)
+        finger = [1, 0.25 + 0.025 * step, 0.5]
+        sender.sendto(json.dumps([finger]).encode(), address)
         time.sleep(0.05)
-    line.sendto(b"this is no touch", place)
-    line.sendto(b"[]", place)
+    sender.sendto(b"not a touch", address)  # malformed, to be counted
+    sender.sendto(b"[]", address)

@@ -19,7 +19,7 @@ EXPIRY_INTERVAL = 0.015  # s
 
 
 async def main(url: str) -> None:
-    """Follow contacts; fingers that are not repeated in time are lifted, as in the daemon."""
+    """Track contacts; like the daemon, lift fingers whose reports stop."""
     tracker = ContactTracker(era.load_rig(era.example_rig_path()).plate)
     source = open_source(url)
     ended = asyncio.Event()
@@ -27,9 +27,9 @@ async def main(url: str) -> None:
 
     def show(change: Change) -> None:
         counts["moves"] += len(change.moved)
-        for word, contacts in (("down", change.down), ("up  ", change.up)):
+        for event, contacts in (("down", change.down), ("up  ", change.up)):
             for contact in contacts:
-                print(f"{word} at {100 * contact.x:.1f}, {100 * contact.y:.1f} cm")
+                print(f"{event} at {100 * contact.x:.1f}, {100 * contact.y:.1f} cm")
         for reason in change.rejected:
             print(f"rejected: {reason}")
         if change.up and not tracker.contacts:
@@ -44,8 +44,9 @@ async def main(url: str) -> None:
             await asyncio.sleep(EXPIRY_INTERVAL)
             show(tracker.expire(now()))
 
-    tasks = [asyncio.create_task(work) for work in (source.run(deliver), expire(), ended.wait())]
-    await asyncio.sleep(0.1)  # until it is open or has failed
+    jobs = (source.run(deliver), expire(), ended.wait())
+    tasks = [asyncio.create_task(job) for job in jobs]
+    await asyncio.sleep(0.1)  # the source opens or fails
     print(f"listening to {url}", flush=True)
     done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
     for task in tasks:

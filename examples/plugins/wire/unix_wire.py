@@ -1,6 +1,7 @@
-"""A wire for amplifiers behind a Unix socket, with the frames of a serial line.
+"""Wire for amplifiers behind a Unix socket, with the frames of a serial line.
 
-example-unix:///run/amplifier.sock#ADDRESS, as a program serves that has the real line.
+URL: example-unix:///run/amplifier.sock#ADDRESS. The program that serves the socket owns the real
+line.
 """
 
 import asyncio
@@ -11,12 +12,12 @@ from urllib.parse import unquote, urlsplit
 
 from era_haptics.plugins.wires import CommandError, LinkError, SerialWire, WireAddress
 
-MAX_UNSENT = 4096  # bytes; more mean that the program does not read
+MAX_UNSENT = 4096  # bytes; beyond that, the program has stopped reading
 ADDRESSES = range(1, 248)
 
 
 class UnixAddress(WireAddress):
-    """The amplifier at a URL; amplifiers on one socket share a line."""
+    """Address of an amplifier; amplifiers on one socket share a line."""
 
     def __init__(self, url: str) -> None:
         parts = urlsplit(url)
@@ -24,11 +25,15 @@ class UnixAddress(WireAddress):
         is_number = number.isascii() and number.isdigit() and int(number) in ADDRESSES
         if not parts.path.strip("/") or parts.netloc or parts.query or not is_number:
             raise CommandError(f"URL must be example-unix:///PATH#ADDRESS, got {url!r}")
-        self.line, self.number = unquote(parts.path), int(number)
+        self.line = unquote(parts.path)
+        self.number = int(number)
         self.settings = {"protocol": "serial"}
 
     def make_wire(self) -> SerialWire:
-        """Make the wire with a random number, so that a reply to an earlier host does not match."""
+        """Make a wire with a random first sequence number.
+
+        Late replies to an earlier host do not match it.
+        """
         return SerialWire(0, sequence=random.getrandbits(16))
 
     async def open_port(
@@ -49,12 +54,14 @@ class UnixAddress(WireAddress):
 
 
 class UnixPort(asyncio.Protocol):
-    """A connection to a socket of this name, as a port."""
+    """Port on a connected Unix socket; name: for messages."""
 
     def __init__(
         self, name: str, on_data: Callable[[bytes], None], on_loss: Callable[[str], None]
     ) -> None:
-        self._name, self._on_data, self._on_loss = name, on_data, on_loss
+        self._name = name
+        self._on_data = on_data
+        self._on_loss = on_loss
         self._is_closed = False
         self._transport: asyncio.Transport  # set when connected
 
@@ -63,19 +70,19 @@ class UnixPort(asyncio.Protocol):
         self._transport = cast(asyncio.Transport, transport)
 
     def data_received(self, data: bytes) -> None:
-        """Hand bytes over."""
+        """Pass on received bytes."""
         if not self._is_closed:
             self._on_data(data)
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Report the loss, unless it was closed here."""
+        """Report the loss, unless this side has closed the port."""
         if not self._is_closed:
             self._is_closed = True
             self._on_loss(f"{self._name} was lost: check the program behind it, then open it again")
 
     @property
     def is_blocked(self) -> bool:
-        """Whether it has not taken all bytes yet."""
+        """Whether bytes are still waiting to be sent."""
         return self._transport.get_write_buffer_size() > 0
 
     def write(self, data: bytes) -> None:
@@ -88,7 +95,7 @@ class UnixPort(asyncio.Protocol):
         """Do nothing: the event loop has already read the received bytes."""
 
     def close(self) -> None:
-        """Close it; no callback is called afterwards."""
+        """Close the port; no callback is called afterwards."""
         self._is_closed = True
         self._transport.abort()
 

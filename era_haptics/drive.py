@@ -73,7 +73,7 @@ def as_points(positions: Positions, *, what: str) -> tuple[Point, ...]:
     if found.ndim > 2 or found.shape[-1:] != (2,):
         raise InputError(
             f"{what} must be x, y in metres from the corner SW, such as (0.08, 0.06), or a list of "
-            f"these, got {positions!r}"
+            f"such pairs, got {positions!r}"
         )
     return tuple((float(x), float(y)) for x, y in found.reshape(-1, 2))
 

@@ -277,7 +277,7 @@ def _simply_supported(rig: Rig, count: int, mesh: PlateMesh) -> NaturalModes:
     if rig.plate.is_layered:
         raise InputError(
             "support must be free or eras for a plate of layers or with an air gap, got "
-            "simply-supported: finite elements of it are not solved"
+            "simply-supported, for which there is no finite element solver"
         )
     if not isinstance(mesh, Mesh):
         mesh = Mesh.accurate(rig.plate, frequency_max=rig.limits.frequency_max)

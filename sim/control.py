@@ -191,7 +191,7 @@ async def _fingers(
     loads: Annotated[dict[str, FiniteFloat], Field(default_factory=dict)],
 ) -> _Response:
     if not {*observers, *loads} <= fingers.keys():
-        raise InputError("observers and loads must be of these fingers")
+        raise InputError("observers and loads must name fingers of this request")
     return _placed(context, fingers, now, observers=observers, loads=loads)
 
 

@@ -305,7 +305,7 @@ def _print_lease(granted: "ArmResult", how_long: str, *, as_json: bool) -> None:
     if as_json:
         typer.echo(granted.model_dump_json())
     else:
-        typer.echo(f"on: armed {how_long}; era stop stops everything at once")
+        typer.echo(f"on: armed {how_long}; era stop stops all amplifiers")
 
 
 layout_app = typer.Typer(no_args_is_help=True, help="Check or choose surface layouts.")

@@ -34,7 +34,7 @@ _NOT_EXPLAINED = (
 _NOT_KNOWN = (
     "modes must match the rig's plate within 2 standard deviations; no rig is written. The fields "
     "between the sensors are unknown: remove parts bonded to the plate, such as a frame along its "
-    "edges, or use the rig as it is; sensors inside the plate show where it differs"
+    "edges, or use the rig unchanged; sensors inside the plate locate the difference"
 )
 
 
@@ -276,10 +276,10 @@ def show(
     fitted: Annotated[Path, typer.Argument(metavar="FITTED", help="File of a fitted rig.")],
     as_json: JsonOption = False,
 ) -> None:
-    """Show the values of a fit next to those of its base.
+    """Compare fitted values with the base rig file.
 
-    The base is the rig file that the fit started from. Values are in SI units, with standard errors
-    for the fitted ones.
+    The base is the rig file that the fit started from. Values are in SI units. Fitted values have
+    standard errors.
     """
     from model.rig.rig_file import load_rig
     from model.rig.rig_writing import fitted_rows
@@ -365,9 +365,9 @@ def check(
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Check whether a rig is wired and built as its file says.
+    """Check the wiring and construction of a rig against its file.
 
-    Compare a file of responses with the rig. Exit status 1 if the check fails.
+    Compares measured responses with the rig. Exits with status 1 if the check fails.
     """
     import time
 

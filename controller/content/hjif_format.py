@@ -326,7 +326,7 @@ class _HjifReading:
         if self._moved_count:
             frequencies = counted(self._moved_count, "frequency", plural="frequencies")
             limits = f"{MIN_HZ:g} to {MAX_HZ:g} Hz"
-            remarks += (f"{frequencies} outside {limits} moved to the nearest of these",)
+            remarks += (f"{frequencies} outside {limits} moved to the nearest limit",)
         transients = tuple(sorted(self._transients, key=attrgetter("time")))
         return Pattern(self._end, intensity, sharpness, transients, (*remarks, *self._remarks))
 

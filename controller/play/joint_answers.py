@@ -418,15 +418,15 @@ def _why_held_back(sensation: Sensation) -> str:
     required = max(MIN_CONTRAST_DB, sensation.finger.min_contrast_db)
     if contrast is not None and contrast >= required:
         return (
-            "too many contents for this plate: beside it another finger would not have had the "
-            f"{MIN_CONTRAST_DB:g} dB of contrast, or more, that it requires; lift a finger, move "
-            "it away, or widen its band"
+            "too many contents for this plate: with this one, another finger would have less than "
+            f"its required contrast of {MIN_CONTRAST_DB:g} dB or more; lift a finger, move it "
+            "away, or widen its band"
         )
     figure = ""
     if contrast is not None and math.isfinite(contrast):
         figure = f", only {contrast:.1f} dB"
     return (
-        f"too many contents for this plate: beside the others it would not have had {required:g} "
+        f"too many contents for this plate: with the others it would have less than {required:g} "
         f"dB of contrast{figure}; lift a finger, move it away, or widen its band"
     )
 

@@ -263,8 +263,8 @@ def fit_touch_calibration(
     if distances[worst] > MAX_RESIDUAL:
         raise InputError(
             f"residual of touch calibration point {worst + 1} must be at most "
-            f"{MAX_RESIDUAL * 1e3:g} mm, got {distances[worst] * 1e3:.1f} mm; check where it was "
-            "touched, and whether the panel is curved"
+            f"{MAX_RESIDUAL * 1e3:g} mm, got {distances[worst] * 1e3:.1f} mm; check its position "
+            "and whether the panel is curved"
         )
     (a, d), (b, e), (c, f) = solution.tolist()
     return TouchCalibration(((a, b, c), (d, e, f)))

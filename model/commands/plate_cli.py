@@ -335,7 +335,7 @@ def convergence(
     wider = f"has a foot with {1000 * FOOT:g} mm more radius"
     rows += [
         "",
-        "for comparison, what the same response changes by if every ERA",
+        "for comparison, the change of the same response if every ERA",
         f"    {nearer:<42}{_percents(study.by_place)}",
         f"    {wider:<42}{_percents(study.by_foot)}",
     ]
@@ -549,7 +549,7 @@ def _exciter_rows(
             f"{1e3 * each['excursion_at_lowest_m']:.2g}{of} mm"
         )
     level, start = f"{reach['level_db_sl']:g} dB SL ({threshold})", reach["from_hz"]
-    everywhere = "everywhere but 2 cm at the edges, under a finger, by the board of the file"
+    everywhere = "under a finger everywhere except 2 cm at the edges, nominal board"
     from_where = "at no frequency" if start is None else f"from {start:g} Hz"
     yield f"    {level} {everywhere}: {from_where}"
     rows = zip(reach["frequencies_hz"], reach["share_of_places"], strict=True)

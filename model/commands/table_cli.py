@@ -123,13 +123,13 @@ def build(
     }
     print_report(rows, answer, as_json=as_json)
     coarse = (
-        f"mesh {table.mesh} is coarse: its fields are wrong by {error:.3g} %; what is promised "
-        "takes this error into account and is lower for it; `mesh: auto` chooses one for about 1 %"
+        f"mesh {table.mesh} is coarse: its fields have errors of {error:.3g} %, which lower the "
+        "promises; `mesh: auto` chooses a mesh for about 1 %"
     )
     if rig.plate.surface is not None:
         coarse = (
-            f"surface: fields by {table.mesh} are wrong by {error:.3g} %; what is promised takes "
-            "this error into account and is lower for it; export modes up to "
+            f"surface: fields from {table.mesh} have errors of {error:.3g} %, which lower the "
+            "promises; export modes up to "
             f"{max(WELL_KNOWN * chosen[-1], 2 * table.mesh.highest_frequency(rig.plate)):.0f} Hz"
         )
     shown_if_coarse = coarse if error >= _COARSE_ERROR else None
@@ -415,7 +415,7 @@ def contrast_map(
         if is_csv:
             check_place(output, example="map.csv")
         else:
-            check_picture(output, instead=", or that of a table in .csv")
+            check_picture(output, instead=", or .csv for a table")
     fingers = [parse_point(text, what="--quiet") for text in quiet]
     places = Grid(*parse_pair(grid, what="--grid")) if grid else None
     table = load_table(table_file)

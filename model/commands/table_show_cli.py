@@ -68,7 +68,7 @@ def _summary_rows(summary: dict[str, Any], *, mapped: str) -> list[str]:
     contrast = [
         (
             f"contrast to {others} other{'s' if others > 1 else ''}",
-            f"median {with_error(f'promised_contrast_{others}_quiet_median')}, one in ten "
+            f"median {with_error(f'promised_contrast_{others}_quiet_median')}, 10 % "
             f"below {with_error(f'promised_contrast_{others}_quiet_tenth_percentile')}; "
             f"nominal {with_error(f'contrast_{others}_quiet_median')}",
         )
@@ -116,10 +116,10 @@ def _map_rows(cells: "WeakCells", *, listed: bool) -> Iterator[str]:
     yield "promised felt contrast, dB, to the median other finger; * marks weak cells"
     if np.isfinite(cells.errors_db).any():
         median, tenth = np.sqrt(np.nanmean(cells.errors_db**2, axis=1))
-        yield f"± {median:.1f} dB by the choice of other fingers, to one in ten ± {tenth:.1f} dB"
+        yield f"± {median:.1f} dB from the sampled other fingers; 10th percentile ± {tenth:.1f} dB"
     yield from text_map(cells)
     if listed:
-        yield "\nweak cells: centre, contrast to the median other finger, to one in ten"
+        yield "\nweak cells: centre, contrast to the other finger: median, 10th percentile"
         for (x, y), median, tenth in zip(
             cells.centres[cells.weak],
             cells.median_db[cells.weak],

@@ -762,15 +762,15 @@ def _check_suspensions(found: Calibration) -> None:
 
     if exciters:
         raise InputError(
-            f"stiffness of {', '.join(one.era for one in exciters)} must be close to that of the "
-            f"rig, got {factors(exciters)} times it, the bound of the fit; check "
+            f"stiffness of {', '.join(one.era for one in exciters)} must be close to the rig's "
+            f"value, got {factors(exciters)} times it, the bound of the fit; check "
             "their resonance and resonance_is (free or mounted; era plate show prints "
             "where the glued magnets resonate), and check with era rig check that they are glued"
         )
     if feet:
         raise InputError(
-            f"stiffness of feet {', '.join(one.foot for one in feet)} must be close to that of the "
-            f"rig, got {factors(feet)} times it, the bound of the fit; check their "
+            f"stiffness of feet {', '.join(one.foot for one in feet)} must be close to the rig's "
+            f"value, got {factors(feet)} times it, the bound of the fit; check their "
             "kind, their positions and whether all touch the plate"
         )
 

@@ -159,7 +159,7 @@ FINDING_KINDS = {
         "WEAK: {wiring} plays {value:.2f} of the commanded amplitude: check its voltage, "
         "volume and mounting, or measure its gain with `era calibrate`",
         "the gain is below 0.8 of the rig's, or beyond 3.5 standard deviations of the `gain` "
-        "(for exciters also `stiffness`) in the rig's `uncertainty`, whichever limit is wider",
+        "(for exciters also `stiffness`) in the rig's `uncertainty`, if that limit is wider",
     ),
     "strong": FindingKind(
         "STRONG: {wiring} plays {value:.2f} of the commanded amplitude: lower its voltage or "
@@ -244,7 +244,7 @@ FINDING_KINDS = {
     ),
     "unnamed": FindingKind(
         "UNNAMED: values match the rig, but something else differs: {said}; "
-        "check its thickness, what is bonded to it and the sensors' scales, and measure for `era "
+        "check its thickness, parts bonded to it and the sensors' scales, and measure for `era "
         "calibrate`",
         "form errors larger than on 99 % of plates, such as modes shifted by a bonded "
         "frame, or more than 5 % unexplained",

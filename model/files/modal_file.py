@@ -196,9 +196,9 @@ def _from_universal(path: Path, content: bytes) -> ModeShapes:
     for mode in modes:
         if mode.nodes != numbers:
             raise InputError(
-                f"{mode.place}: all modes must be at the same nodes, got {len(mode.nodes)} of "
-                f"which {len(set(mode.nodes) & set(numbers))} are among the {len(numbers)} of the "
-                "first mode; export one component"
+                f"{mode.place}: all modes must have the nodes of the first mode ({len(numbers)}), "
+                f"got {len(mode.nodes)} nodes, {len(set(mode.nodes) & set(numbers))} of them in "
+                "common; export one component"
             )
     missing = [each for each in numbers if each not in nodes]
     if missing:
@@ -344,8 +344,8 @@ def _complex_mode(place: str, kind: int, analysis: int, reals: Sequence[float]) 
     """
     if kind == 55 and analysis == _SECOND_ORDER:
         raise InputError(
-            f"{place}: analysis type of a mode must be 2 or 3, got 7, for which dataset 55 defines "
-            "no scale; export normal modes (2), or complex ones with their modal A (3)"
+            f"{place}: analysis type of a mode must be 2 or 3, got 7 (dataset 55 defines no "
+            "scale for it); export normal modes (2), or complex ones with their modal A (3)"
         )
     # Behind two counts dataset 2414 has a row for normal modes, then one for complex ones.
     pole_real, pole_imaginary, *scale = reals[:4] if kind == 55 else reals[8:12]

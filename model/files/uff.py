@@ -316,7 +316,7 @@ def _function(path: Path, block: DatasetBlock) -> Function:
     values = read(path, block, found, math.prod(shape))
     if len(values) < math.prod(shape):
         raise InputError(
-            f"{place}: record must have {math.prod(shape)} numbers, as its header says, got "
+            f"{place}: record must have {math.prod(shape)} numbers according to its header, got "
             f"{len(values)}; the file is damaged, export it again"
         )
     values = values.reshape(shape)
@@ -355,8 +355,9 @@ def _bytes_of(path: Path, block: DatasetBlock, found: Mapping[str, Any], count: 
     size = 8 if found["ord_data_type"] in (4, 6) else 4
     if data[count * size :].strip(b"\0 \t\r\n"):
         raise InputError(
-            f"{path}:{block.line}: record must end behind {count} numbers, as its header says, got "
-            f"{len(data) - count * size} bytes more; export it again, and copy it as a binary file"
+            f"{path}:{block.line}: record must end after {count} numbers according to its header, "
+            f"got {len(data) - count * size} bytes more; export it again, and copy it as a binary "
+            "file"
         )
     whole = min(count, len(data) // size) * size
     return np.frombuffer(data[:whole], dtype=f"{block.byte_order}f{size}").astype(float)
@@ -411,11 +412,11 @@ def units_of(path: Path, block: DatasetBlock) -> tuple[float, float]:
     length, force = factors[:2]
     if not 0 < length < math.inf or (length == 1 and int(code[0]) in _NOT_METRES):
         raise InputError(
-            f"{place}: factor of lengths (dataset 164) must be positive and that of units code "
+            f"{place}: length factor (dataset 164) must be positive and match units code "
             f"{int(code[0])} {label!r}, got {length:g}; export it in SI"
         )
     if not 0 < force < math.inf:
-        raise InputError(f"{place}: factor of forces must be positive, got {force:g}")
+        raise InputError(f"{place}: force factor must be positive, got {force:g}")
     return length, force
 
 

@@ -443,8 +443,8 @@ _NEEDED = ("coil_mass", "weight", "force_factor", "resistance", "power", "resona
 _INSTEAD = {"resonance": "stiffness", "q": "damping"}
 
 _EITHER = (
-    "free for that of the light coil against the magnet, as on most data sheets, or mounted for "
-    "that of the magnet behind the coil that is glued to the plate, several times lower"
+    "free (the light coil moves against the magnet, as on most data sheets) or mounted (the magnet "
+    "moves behind the coil that is glued to the plate; several times lower)"
 )
 
 

@@ -100,9 +100,9 @@ def _misread_resonance(section: ExciterSection) -> str | None:
     if f <= _HIGH or coil >= _LIGHT * weight:
         return None
     return (
-        f"{f:g} Hz is high for a magnet of {1e3 * weight:.3g} g, and probably that of the coil of "
-        f"{1e3 * coil:.3g} g on a data sheet; with resonance_is: free the glued magnet resonates "
-        f"at {f * math.sqrt(coil / weight):.0f} Hz"
+        f"{f:g} Hz is high for a magnet of {1e3 * weight:.3g} g, and probably refers to the coil "
+        f"of {1e3 * coil:.3g} g, as on most data sheets; with resonance_is: free the glued magnet "
+        f"resonates at {f * math.sqrt(coil / weight):.0f} Hz"
     )
 
 

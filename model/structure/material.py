@@ -250,8 +250,8 @@ _KNOWN = (
         "and 1000 Hz, assumed: as its beta relaxation has it near room temperature; the sheet's "
         "3.3 GPa is from a slow tensile test (ISO 527)",
         variation="20 % in E and in loss, assumed; falling as it warms",
-        loss_factor="0.075, 0.06 and 0.045 at 10, 100 and 1000 Hz, assumed; taken as its own, "
-        "beside that of the plate",
+        loss_factor="0.075, 0.06 and 0.045 at 10, 100 and 1000 Hz, assumed; in "
+        "addition to the plate's loss factor",
         by_frequency=((10.0, 4.2 / 4.6, 0.075), (100.0, 1.0, 0.06), (1000.0, 5.0 / 4.6, 0.045)),
         by_kelvin=-0.004,
         weather="from its modulus over frequency, a decade for 21 K: activation energy of the beta "
@@ -268,9 +268,9 @@ _KNOWN = (
     ),
     KnownMaterial(
         plywood(6.4e-3),
-        source="birch, by its thickness of 3 plies (3.6 mm), 5 (6.4), 7 (9.2), 9 (12) and so on; "
+        source="birch, by thickness: 3 plies (3.6 mm), 5 (6.4), 7 (9.2), 9 (12) and so on; "
         "E1, E2, G12, nu12 and rho Handbook of Finnish Plywood, from memory: veneers of 17.5 GPa, "
-        "crosswise counted 0; G13 and G23, of which the cross plies roll, assumed",
+        "cross plies counted as 0; G13 and G23 (rolling shear of the cross plies) assumed",
         variation="E1 10 %, E1 : E2 falls from 16 at 3 plies to 2.7 at 5 and 1.6 at 9; E2 up to "
         "73 % more at 3 plies and 12 % at 5 if crosswise veneers count 0.8 GPa; G12 0.6 to "
         "0.75 GPa, G13 and G23 30 %; 6.5 mm by name are 6.1 to 6.9 (a trade sheet, 670 kg/m³); "
@@ -335,7 +335,7 @@ _MATERIALS: PluginRegistry[KnownMaterial] = PluginRegistry(
     is_instance=True,
     own=KNOWN_MATERIALS,
     called=lambda known: known.material.name,
-    hint="; any other can be given by its numbers, {E: 70 GPa, rho: 2700, nu: 0.33}",
+    hint="; for any other, state its properties: {E: 70 GPa, rho: 2700, nu: 0.33}",
 )
 
 

@@ -338,7 +338,7 @@ def _check_rigid_motion(shapes: SurfaceShapes, motion: _Motion) -> Iterator[str]
     if 0 < shapes.rigid < 3 and len(shapes.points) >= _NODES_FOR_ROTATIONS:
         carried = min(carried, float(np.linalg.eigvalsh(shares)[0]))
     missing = (
-        f"modes must include rigid-body motion, got {100 * carried:.0f} % of it: {shapes.rigid} "
+        f"modes must include rigid-body motion, got {100 * carried:.0f} %: {shapes.rigid} "
         f"modes below {RIGID_FREQUENCY:g} Hz move along the normal, and in the others the surface "
         "does not move as a whole, as in elastic modes of a free part"
     )
@@ -360,6 +360,6 @@ def _check_rigid_motion(shapes: SurfaceShapes, motion: _Motion) -> Iterator[str]
     if has_even_mass and mixed > _MAX_MIXED:
         raise InputError(
             "elastic modes of a free part must be orthogonal to rigid-body motion, got modes that "
-            f"move as a whole ({100 * mixed:.0f} % of a rigid-body motion); export free modes or "
-            "those of the held part, not both"
+            f"move as a whole ({100 * mixed:.0f} % of a rigid-body motion); export the modes "
+            "of the free part or of the held part, not both"
         )

@@ -432,9 +432,9 @@ def excursion_notes(rig: Rig) -> Iterator[str]:
     )
     yield (
         f"limits.frequency: from {limits.frequency_min:g} Hz on limits.level {limits.level:g} can "
-        f"move the magnets of {', '.join(names)} beyond their excursion, that of "
-        f"{exciters[worst].name} by {1e3 * found.largest[worst]:.2g} mm of "
-        f"{1e3 * exciters[worst].excursion:.2g} mm ({lowest}); answers play less there, tones by "
-        "hand do not: a level of at most "
+        f"move the magnets of {', '.join(names)} beyond their excursion ("
+        f"{exciters[worst].name} to {1e3 * found.largest[worst]:.2g} mm of "
+        f"{1e3 * exciters[worst].excursion:.2g} mm; {lowest}). Answers play less there, manual "
+        "tones do not: a level of at most "
         f"{math.floor(1e3 * limits.level / shares[worst]) / 1e3:g} is safe"
     )

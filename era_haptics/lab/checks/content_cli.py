@@ -221,7 +221,7 @@ def check(
     is kept while the level at the skin, averaged over 20 ms, is within 3 dB of the file's; times at
     which the file is more than 20 dB below its peak do not count. Sharpness is kept while the
     continuous part plays at about the file's frequency. Percentages are rounded down. Amplifiers
-    are assumed to be phased, whichever mode the table was built for.
+    are assumed to be phased, even if the table was built for switched drives.
 
     Without --table, the founding paper's plate is used. Without --at, five positions (including the
     centre) are simulated and the median one is shown. Several files, or a folder with its

@@ -33,8 +33,8 @@ def check(
 
     Touches are simulated in the time domain over each region, alone and with a resting second
     finger. Pairs and triples of regions are then touched simultaneously, at the positions with the
-    lowest promised contrast. Amplifiers are assumed to be phased, whichever mode the table was
-    built for. Exits with status 1 if it finds a problem in a region.
+    lowest promised contrast. Amplifiers are assumed to be phased, even if the table was built
+    for switched drives. Exits with status 1 if it finds a problem in a region.
     """
     import time
 
@@ -102,7 +102,7 @@ def _lines(each: "CheckedEffect") -> list[str]:
         lines.append(f"  felt {_span(each.felt)} dB SL at {tones}")
     if each.contrasts:
         lines.append(
-            f"  {_span(each.promised_contrasts)} dB above what a resting second finger feels, on "
+            f"  {_span(each.promised_contrasts)} dB above the level at a resting second finger, on "
             "90 % of plates"
         )
         lines.append(f"  {_span(each.contrasts)} dB nominal")

@@ -143,7 +143,7 @@ def test_bands_of_one_channel(read: Read) -> None:
     assert pattern.remarks == (
         "channel 2 of 2 read",
         "perceptions of 'Temperature' left out",
-        "1 frequency outside 65 to 300 Hz moved to the nearest of these",
+        "1 frequency outside 65 to 300 Hz moved to the nearest limit",
     )
 
 

@@ -196,7 +196,7 @@ BOTH_WAYS = f"{OWN}, resonance: 224 Hz, resonance_is: free, stiffness: 3 kN/m"
 @pytest.mark.parametrize(
     ("keys", "key", "said"),
     [
-        (f"{OWN}, resonance: 224 Hz", "resonance_is", "free for that of the light coil"),
+        (f"{OWN}, resonance: 224 Hz", "resonance_is", "free (the light coil moves"),
         ("type: DAEX25CT-4, resonance: 60", "resonance_is", ""),
         (OWN, "resonance", "missing; add it, or a type that has it"),
         (BOTH_WAYS, "stiffness", ""),
@@ -363,8 +363,8 @@ def test_show_prints_exciters_and_what_they_reach(
     assert found["exciters"][0].keys() >= {"magnet_resonance_hz", "q", "force_at_1_w_n"}
     show(str(path), as_json=False)
     text = capsys.readouterr().out
-    everywhere = "20 dB SL (vibrotactile-probe) everywhere but 2 cm at the edges, under a finger"
-    assert f"{everywhere}, by the board of the file: from {lowest} Hz" in text
+    level = "20 dB SL (vibrotactile-probe) under a finger everywhere except 2 cm at the edges"
+    assert f"{level}, nominal board: from {lowest} Hz" in text
 
 
 @pytest.mark.parametrize(

@@ -38,6 +38,18 @@ class Pattern(NamedTuple):
     suggestion: str
 
 
+QUANTIFIER = "".join(
+    rf"(?<!{word}\s)"
+    for word in (
+        *("all", "any", "both", "each", "either", "half", "many", "more", "most", "much"),
+        *("none", "one", "part", "some", "thirds", "two"),
+    )
+)
+"""Not after a quantity: "half of it" and "one of these" are correct."""
+
+PASSIVE = r"(?<!ed\s)"
+"""Not after a participle: "limited by its power" is correct."""
+
 PATTERNS = {
     "clause for a noun": Pattern(
         r"what (?:is|are|was|were|plays|lasts|comes|has|it|they|people|nobody|a|the|each|of|may"
@@ -49,11 +61,16 @@ PATTERNS = {
         "repeat the noun",
     ),
     "of it": Pattern(
-        r"of (?:it|them|which|whom|these|those|one)", "use a possessive or a compound noun"
+        rf"{QUANTIFIER}of (?:it|them|these|those)|of (?:which|whom)"
+        r"|of one(?= (?:of|that|which|who|at|in|on|with|is|are|has)|[,.;:)])",
+        "use a possessive or a compound noun",
     ),
-    "as of": Pattern(r"as (?:of|in|by|at|with|on)", "same as for, according to, for instance in"),
+    "as of": Pattern(
+        r"as (?:of|by)|as (?:in|at|with|on) (?:it|its|that|those|these)",
+        "same as for, according to, for instance in",
+    ),
     "by its": Pattern(
-        r"by (?:its|their|the rig|the board|now|far|that|it|them|which)",
+        rf"{PASSIVE}by (?:its|their|the rig|the board|it|them|which)|by (?:far|that)",
         "according to, from, in, per",
     ),
     "where for if": Pattern(
@@ -75,9 +92,12 @@ PATTERNS = {
     ),
     "deviate": Pattern(r"deviat\w+", "differ, vary; tolerances"),
     "is none": Pattern(
-        r"(?:is|are|has|have) (?:none|no other|nothing)", "is missing, does not exist"
+        r"(?<!there\s)(?:is|are|has|have) (?:(?-i:none)|no other|nothing)",
+        "is missing, does not exist",
     ),
-    "stands": Pattern(r"(?:stands?|stood|lies|bears?|borne)", "is"),
+    "stands": Pattern(
+        r"(?:stands?|stood|bears?|borne)|lies(?! (?:above|below|between|on|outside|within))", "is"
+    ),
     "is to be": Pattern(
         r"(?:is|are) to (?:be|feel|play|have|do|get|give)|shall", "must, should, or the imperative"
     ),

@@ -8,11 +8,12 @@ contacts. A layer with a course gets a set for each piece, half a piece ahead.
 
 import logging
 import math
-from collections.abc import Callable, Mapping, Sequence, Set
+from collections.abc import Callable, Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import NamedTuple
 
-from controller.play.intent import CLICK, FADED_AFTER, Content, Pulse
+from controller.play.intent import CLICK, FADED_AFTER, Content, Pulse, Targets
 from controller.play.routing import (
     BESIDE_CLICK,
     HELD,
@@ -30,14 +31,15 @@ from controller.play.routing import (
 from controller.sources.touch import MAX_CONTACT_TIMEOUT, ContactKey
 from drivers.errors import CommandRefused
 from drivers.host.joint_sets import PlayedSet
-from drivers.playing import AmplifierLayer
+from drivers.playing import AmplifierLayer, AmplifierTone
 from drivers.protocol.definition import QUANTITIES
 from drivers.protocol.sets import is_vibrating
 from model.answer import answer
 from model.answer.answer_report import Timing
-from model.answer.stimulus import FADE_RAMP
+from model.answer.stimulus import FADE_RAMP, Placement
 from model.rig.rig import Rig
 from model.transients.base_motion import BaseEnvelope
+from model.vibration import Tone
 
 MIN_LEFT = 0.001
 """Shortest remaining time [s] of a pulse."""
@@ -145,8 +147,26 @@ class Slot:
     @property
     def due(self) -> float:
         """When [s] its ending, its renewal or its end is due."""
-        ends_at = self.ends_at if self.drive else math.inf
-        return min(self.ending_due, self.renewal_due, ends_at)
+        due = min(self.ending_due, self.renewal_due)
+        if not self.drive:  # it starts, or has ended
+            return due
+        return min(due, self.ends_at)
+
+
+class _Identity(NamedTuple):
+    """The values that identify a content independently of its strength."""
+
+    key: tuple[ContactKey, int]
+    targets: Targets
+    placement: Placement
+
+
+class _Voice(NamedTuple):
+    """The values that are equal for contents that can fade from one to the other."""
+
+    key: tuple[ContactKey, int]
+    frequency: float | None
+    pulse: Pulse | None
 
 
 class Slots:
@@ -174,10 +194,12 @@ class Slots:
         self._expiry_of = expiry_of
         has_endings = self._support.ending_knots > 0
         self._may_follow = has_endings and rig.limits.rate >= _MIN_RATE
-        has_slew_limit = not math.isinf(rig.limits.slew)  # which lengthens ramps
-        self._course_knots = 0 if has_slew_limit else capabilities.course_knots  # 0 for ramps
+        self._course_knots = capabilities.course_knots  # of a piece; 0 for ramps
+        cause = "without envelopes"
+        if not math.isinf(rig.limits.slew):  # which lengthens ramps
+            self._course_knots = 0
+            cause = "with a limit of slew"
         if not self._course_knots:
-            cause = "with a limit of slew" if has_slew_limit else "without envelopes"
             _logger.debug("loop: files follow in ramps of %g s, %s", PLAIN_STEP, cause)
         self.by_layer: dict[int, Slot] = {}
         """Slots by layer."""
@@ -215,11 +237,12 @@ class Slots:
             if refusal is None:
                 break
             reason = str(refusal)
-            retry_at = self._faded_by(contents, now) if refusal.until is None else refusal.until
+            retry_at = self._retry_at(refusal, contents, now)
             newest = max([slots[number] for number in sets.started], key=_requested_at)
-            voices = [content for content in remaining if content.targets == newest.content.targets]
-            skipped += voices
-            remaining = [content for content in remaining if content not in voices]
+            for content in [*remaining]:
+                if content.targets == newest.content.targets:  # a voice of the newest content
+                    skipped.append(content)
+                    remaining.remove(content)
         if sets.layers:
             self._take(slots, sets.started)
         if skipped:
@@ -233,7 +256,9 @@ class Slots:
         for is_shaped in (True, False):
             sets, slots = self._sets(contents, now, is_shaped=is_shaped)
             self._note_ends(sets, now)
-            refusal = self.check(sets.by_amplifier) if sets.started else None
+            if not sets.started:
+                return sets, slots, None
+            refusal = self.check(sets.by_amplifier)
             if refusal is None:
                 break
             form = "shaped" if is_shaped else "plain"
@@ -251,9 +276,11 @@ class Slots:
         """Take these slots as the playback from now on."""
         self.by_layer = slots
         self.is_silent = False
-        self._layer_of = {
-            slot.content.key: number for number, slot in slots.items() if not slot.is_falling
-        }
+        layers = dict[tuple[ContactKey, int], int]()
+        for number, slot in slots.items():
+            if not slot.is_falling:
+                layers[slot.content.key] = number
+        self._layer_of = layers
         self.may_play |= started
 
     def may_lead(self, contents: Sequence[Content], now: float) -> bool:
@@ -263,14 +290,13 @@ class Slots:
         and the ledgers must admit both contents together.
         """
         playing_keys = {slot.content.key for slot in self.by_layer.values()}
-        if not {content.key for content in contents} <= playing_keys:
-            return False
-        tuned_count = 0
+        second_layers = 0
         for content in contents:
-            slot = self._led_from(content)
-            if slot is not None and slot.content.frequency != content.frequency:
-                tuned_count += 1
-        if len(self.may_play) + tuned_count > self.layer_count:
+            if content.key not in playing_keys:
+                return False
+            if self._needs_second_layer(content):
+                second_layers += 1
+        if len(self.may_play) + second_layers > self.layer_count:
             return False
         sets, _ = self._sets(contents, now, is_shaped=True)
         return self.check(sets.by_amplifier) is None
@@ -292,23 +318,24 @@ class Slots:
         ending of a content, the content will end along a plain ramp. The next piece of a course is
         sent while sources confirm its contacts.
         """
-        due_slots = {
-            number: slot for number, slot in self.by_layer.items() if slot.ending_due <= now
-        }
         layers = dict[int, PlateLayer]()
         endings = dict[int, answer.Layer]()
         first_piece_end = math.inf
-        for number, slot in due_slots.items():
-            if slot.content.course is not None:
-                first_piece_end = min(first_piece_end, slot.course_until)
-                if now < self._confirmed_until(slot.content):
-                    layers[number], endings[number] = self._piece(
-                        number, slot.content, now, among=len(due_slots), slot=slot
-                    )
-            elif slot.is_falling:
-                layers[number], endings[number] = self._fall(number, slot)
+        due = [number for number, slot in self.by_layer.items() if slot.ending_due <= now]
+        for number in due:
+            slot = self.by_layer[number]
+            content = slot.content
+            if content.course is None and slot.is_falling:
+                plate_layer, layer = self._fall(number, slot)
+            elif content.course is None:
+                plate_layer, layer = self._ending(number, slot, now)
             else:
-                layers[number], endings[number] = self._ending(number, slot, now)
+                first_piece_end = min(first_piece_end, slot.course_until)
+                if now >= self._confirmed_until(content):
+                    continue
+                plate_layer, layer = self._piece(number, content, now, among=len(due), slot=slot)
+            layers[number] = plate_layer
+            endings[number] = layer
         preempted_until = first_piece_end - HELD / 2
         return self._admitted(Sets(layers, endings=endings, preempted_until=preempted_until))
 
@@ -335,7 +362,9 @@ class Slots:
 
     def _admitted(self, sets: Sets) -> Sets:
         """Return sets that start nothing, or empty sets if a ledger refuses them."""
-        refusal = self.check(sets.by_amplifier) if sets.layers else None
+        if not sets.layers:
+            return sets
+        refusal = self.check(sets.by_amplifier)
         if refusal is None:
             return sets
         self.not_renewed(sets, refusal)
@@ -343,7 +372,9 @@ class Slots:
 
     def not_renewed(self, renewal: Sets, refusal: CommandRefused) -> None:
         """Note that layers are not prolonged; after a final refusal they end."""
-        retry_at = math.inf if refusal.until is None else refusal.until
+        retry_at = math.inf
+        if refusal.until is not None:
+            retry_at = refusal.until
         for number in renewal.layers:
             slot = self.by_layer[number]
             if number not in renewal.endings:
@@ -383,8 +414,9 @@ class Slots:
             elif number in sets.endings:
                 slot.layer = replace(slot.layer, ending=sets.endings[number].ending)
                 slot.ending_due = math.inf
-            is_renewable = valid_for >= _MIN_VALID_FOR
-            slot.renewal_due = now + valid_for / 2 if is_renewable else math.inf
+            slot.renewal_due = math.inf
+            if valid_for >= _MIN_VALID_FOR:
+                slot.renewal_due = now + valid_for / 2
             slot.confirmed_until = self._confirmed_until(slot.content)
             slot.ends_at = sent_from + valid_for
 
@@ -392,7 +424,9 @@ class Slots:
         """Return when [s] a slot gets its ending once its onset has ended; infinite for never."""
         due = slot.settled_at + _SURELY_SETTLED
         has_ending = self._may_follow and slot.is_shaped and due < ends_at
-        return due if has_ending else math.inf
+        if not has_ending:
+            return math.inf
+        return due
 
     def _confirm_piece(
         self, slot: Slot, piece: answer.Layer, starts_at: float, now: float, *, is_first: bool
@@ -456,35 +490,45 @@ class Slots:
         A content that replaces one of another frequency gets a free layer. So does a short pulse if
         possible, since a content that ends in its layer would fade along its short ramp.
         """
-        numbers = {
-            number: contents[contents.index(slot.content)]  # equal, but its sensations may differ
-            for number, slot in self.by_layer.items()
-            if slot.content in contents
-        }
+        numbers = dict[int, Content]()
+        for number, slot in self.by_layer.items():
+            if slot.content in contents:  # an equal content, whose sensations may differ
+                numbers[number] = contents[contents.index(slot.content)]
         continuing = [*numbers.values()]
         without_layer = list[Content]()
         for content in contents:
             if content in continuing:
                 continue
-            number = self._layer_of.get(content.key)
+            last_layer = self._layer_of.get(content.key)
             if self._needs_second_layer(content):
                 free = self._layers_not_in(self.may_play | numbers.keys())
-                number = free[0] if free else number
-            if number is None:
+                if free:
+                    last_layer = free[0]
+            if last_layer is None:
                 without_layer.append(content)
             else:
-                numbers[number] = content
-        falling_layers = {number for number, slot in self.by_layer.items() if slot.is_falling}
-        falling = sorted(falling_layers & self.may_play - numbers.keys())
-        ending = sorted(self.may_play - numbers.keys() - falling_layers)
-        free = self._layers_not_in(self.may_play | numbers.keys())
-        for content in without_layer:
-            is_click = content.key[1] == CLICK
-            candidates = (free or ending) if is_click else (ending or free)
-            candidates = candidates or falling
-            if candidates:
-                numbers[candidates.pop(0)] = content
+                numbers[last_layer] = content
+        self._number_others(without_layer, numbers)
         return numbers
+
+    def _number_others(self, contents: Sequence[Content], numbers: dict[int, Content]) -> None:
+        """Add contents whose fingers have no layer to contents by layer, as long as layers last."""
+        free = self._layers_not_in(self.may_play | numbers.keys())
+        falling = list[int]()
+        ending = list[int]()
+        for number in sorted(self.may_play - numbers.keys()):
+            slot = self.by_layer.get(number)
+            if slot is not None and slot.is_falling:
+                falling.append(number)
+            else:
+                ending.append(number)
+        for content in contents:
+            is_click = content.key[1] == CLICK
+            preference = (free, ending, falling) if is_click else (ending, free, falling)
+            for layers in preference:
+                if layers:
+                    numbers[layers.pop(0)] = content
+                    break
 
     def _needs_second_layer(self, content: Content) -> bool:
         """Whether a content replaces one of another frequency, so that both sound for a while."""
@@ -500,41 +544,67 @@ class Slots:
     ) -> tuple[Sets, dict[int, Slot]]:
         """Return the sets for these contents, and the slots of all layers then."""
         numbers = self.numbered(contents)
-        slots = dict[int, Slot]()
-        for number, slot in self.by_layer.items():
-            if number in numbers and slot.content == numbers[number]:
-                slots[number] = replace(slot, content=numbers[number])
+        slots = self._continuing_slots(numbers)
         # Side bands can start while their carrier plays: phases count on one clock.
         starting = [number for number in numbers if number not in slots]
         layers = dict[int, PlateLayer]()
-        settling_times = [0.0]
+        settled_after = 0.0
         for number in starting:
             content = numbers[number]
-            has_course = content.course is not None
-            has_envelopes = is_shaped and not has_course and not content.target.is_short
-            if has_course:
-                layers[number], layer = self._piece(number, content, now, among=len(starting))
-            else:
-                layers[number], layer = self._pattern(
-                    number, content, now, among=len(starting), is_shaped=has_envelopes
-                )
-            slots[number] = Slot(content, layer, is_shaped=has_envelopes)
-            settling_times.append(_settled_after(layer))
-        has_click = any(content.target.is_short for content in contents)
-        ramp = min(BESIDE_CLICK if has_click else FADE_RAMP, self._ramp_max)
+            plate_layer, slot = self._start(
+                number, content, now, among=len(starting), is_shaped=is_shaped
+            )
+            layers[number] = plate_layer
+            slots[number] = slot
+            settled_after = max(settled_after, _settled_after(slot.layer))
+        ramp = self._end_ramp(contents)
         for number in self.may_play - numbers.keys():
-            falling = self._falling(number, contents, now) if is_shaped else None
-            if falling is not None:
+            falling = self._falling(number, contents, now)
+            if is_shaped and falling is not None:
                 slots[number] = falling
-                continue
-            if is_shaped and self._may_end_shaped(number, now):
-                end = AmplifierLayer(number, ramp=ramp)
-                layers[number] = dict.fromkeys(self._rig.amplifiers, end)
             else:
-                layers[number] = route({}, self._rig, ramp=ramp, number=number)
-            settling_times.append(ramp)
-        sets = Sets(layers, frozenset(starting), settled_after=max(settling_times))
+                layers[number] = self._end(number, now, ramp=ramp, is_shaped=is_shaped)
+                settled_after = max(settled_after, ramp)
+        sets = Sets(layers, frozenset(starting), settled_after=settled_after)
         return sets, slots
+
+    def _continuing_slots(self, numbers: Mapping[int, Content]) -> dict[int, Slot]:
+        """Return the slots whose contents play on, with the present sensations."""
+        slots = dict[int, Slot]()
+        for number, slot in self.by_layer.items():
+            content = numbers.get(number)
+            if content is not None and slot.content == content:
+                slots[number] = replace(slot, content=content)
+        return slots
+
+    def _start(
+        self, number: int, content: Content, now: float, *, among: int, is_shaped: bool
+    ) -> tuple[PlateLayer, Slot]:
+        """Return the set that starts a content in a layer, and its slot.
+
+        among: number of layers that start simultaneously; is_shaped: whether envelopes are allowed.
+        """
+        if content.course is not None:
+            plate_layer, layer = self._piece(number, content, now, among=among)
+            return plate_layer, Slot(content, layer)
+        has_envelopes = is_shaped and not content.target.is_short
+        plate_layer, layer = self._pattern(
+            number, content, now, among=among, is_shaped=has_envelopes
+        )
+        return plate_layer, Slot(content, layer, is_shaped=has_envelopes)
+
+    def _end_ramp(self, contents: Iterable[Content]) -> float:
+        """Return the ramp [s] along which layers end while these contents play."""
+        has_click = any(content.target.is_short for content in contents)
+        ramp = BESIDE_CLICK if has_click else FADE_RAMP
+        return min(ramp, self._ramp_max)
+
+    def _end(self, number: int, now: float, *, ramp: float, is_shaped: bool) -> PlateLayer:
+        """Return the set that ends a layer: along its ending if it has one, else along a ramp."""
+        if is_shaped and self._may_end_shaped(number, now):
+            end = AmplifierLayer(number, ramp=ramp)
+            return dict.fromkeys(self._rig.amplifiers, end)
+        return route({}, self._rig, ramp=ramp, number=number)
 
     def _pattern(
         self, number: int, content: Content, now: float, *, among: int, is_shaped: bool
@@ -598,10 +668,9 @@ class Slots:
         """
         lowest_level = _LEVEL.from_wire(1)
         ramp = min(CROSSFADE, self._ramp_max)
-        faint = {
-            name: replace(tone, amplitude=lowest_level * self._rig.full_levels[name])
-            for name, tone in slot.layer.excitation.items()
-        }
+        faint = dict[str, Tone]()
+        for name, tone in slot.layer.excitation.items():
+            faint[name] = replace(tone, amplitude=lowest_level * self._rig.full_levels[name])
         layers = route(
             faint,
             self._rig,
@@ -632,28 +701,27 @@ class Slots:
             raise ValueError("content must have a course")
         course, pulse = content.course
         playing = self._drive_of(number)
-        knots = self._course_knots
         starts_at = now
         follows_piece = False
-        if slot is None:
-            knots = min(knots, self._support.onset_knots)
-        else:
+        if slot is not None:
             follows_piece = now < slot.course_until
             starts_at = max(now, slot.course_until)
             if now >= slot.ends_at:
                 playing = {}
-        knots = max(knots // among, 1) if knots else 0
-        elapsed = 0.0 if pulse.started_at is None else starts_at - pulse.started_at
+        elapsed = 0.0
+        if pulse.started_at is not None:
+            elapsed = starts_at - pulse.started_at
+        knots = self._knots_of_piece(is_first=slot is None, among=among)
         step, shares = piece_of(course, pulse, elapsed, knots=knots, is_first=slot is None)
         onset = _course_onset(content.layer, shares, step)
-        last_tones = {
-            name: replace(tone, amplitude=shares[-1] * tone.amplitude)
-            for name, tone in content.layer.excitation.items()
-        }
+        last_tones = dict[str, Tone]()
+        for name, tone in content.layer.excitation.items():
+            last_tones[name] = replace(tone, amplitude=shares[-1] * tone.amplitude)
+        ramp = FADE_RAMP if onset else step
         layers = route(
             last_tones,
             self._rig,
-            ramp=min(FADE_RAMP if onset else step, self._ramp_max),
+            ramp=min(ramp, self._ramp_max),
             number=number,
             playing=playing,
             restarted=frozenset(),
@@ -661,26 +729,39 @@ class Slots:
             onset=onset,
         )
         ramp = next(iter(layers.values())).ramp
-        waits = follows_piece and onset is not None
-        scheduled = {name: replace(layer, after=waits) for name, layer in layers.items()}
-        return scheduled, replace(content.layer, ramp=ramp, onset=onset, ending=None)
+        if follows_piece and onset is not None:
+            layers = {name: replace(layer, after=True) for name, layer in layers.items()}
+        return layers, replace(content.layer, ramp=ramp, onset=onset, ending=None)
+
+    def _knots_of_piece(self, *, is_first: bool, among: int) -> int:
+        """Return the number of knots of a piece that is sent among others; 0 for a ramp."""
+        knots = self._course_knots
+        if is_first:
+            knots = min(knots, self._support.onset_knots)
+        if not knots:
+            return 0
+        return max(knots // among, 1)
 
     def _fade_of(self, number: int, content: Content) -> float:
         """Return the time [s] in which a content replaces another; 0 if it starts from silence."""
         slot = self.by_layer.get(number)
-        is_same_voice = slot is None or _voice_of(slot.content) == _voice_of(content)
+        if slot is not None and _voice_of(slot.content) != _voice_of(content):
+            return 0.0
         if slot is not None and slot.content.gain_db != content.gain_db:
-            return STRENGTH_FADE if is_same_voice else 0.0
-        is_led = self._led_from(content) is not None
-        return CROSSFADE if is_led and is_same_voice else 0.0
+            return STRENGTH_FADE
+        if self._led_from(content) is not None:
+            return CROSSFADE
+        return 0.0
 
     def _led_from(self, content: Content) -> Slot | None:
         """Return the slot that a content replaces in a cross-fade, if any."""
         number = self._layer_of.get(content.key)
-        slot = None if number is None else self.by_layer.get(number)
-        if slot is None or not content.is_led or slot.content == content:
+        if number is None or not content.is_led:
             return None
-        return None if slot.content.target.is_short else slot
+        slot = self.by_layer.get(number)
+        if slot is None or slot.content == content or slot.content.target.is_short:
+            return None
+        return slot
 
     def _falling(self, number: int, contents: Sequence[Content], now: float) -> Slot | None:
         """Return a layer's slot while one of these contents replaces it; None if it just ends."""
@@ -695,10 +776,19 @@ class Slots:
                 return replace(slot, is_falling=True, ending_due=fall_due, renewal_due=math.inf)
         return None
 
-    def _faded_by(self, contents: Sequence[Content], now: float) -> float:
-        """Return when [s] active pulses and ended contents have faded; without any, after RETRY."""
-        pulses = [pulse for content in contents for pulse in content.pulses]
-        ends = [pulse.end for pulse in pulses if pulse.started_at is not None and pulse.end > now]
+    def _retry_at(self, refusal: CommandRefused, contents: Sequence[Content], now: float) -> float:
+        """Return when [s] to plan refused contents again.
+
+        If the refusal has no end: when active pulses and ended contents have faded, or without any
+        after RETRY.
+        """
+        if refusal.until is not None:
+            return refusal.until
+        ends = list[float]()
+        for content in contents:
+            for pulse in content.pulses:
+                if pulse.started_at is not None and pulse.end > now:
+                    ends.append(pulse.end)
         if now < self._fades_until:
             ends.append(now)
         return max(ends, default=now + RETRY) + FADED_AFTER
@@ -729,22 +819,20 @@ class Slots:
         slot = self.by_layer.get(number)
         if slot is None:
             return {}
+        drive = dict[str, AmplifierTone]()
         tones = slot.layer.excitation
-        return {
-            name: replace(tone, frequency=tones[name].frequency)
-            for name, tone in slot.drive.items()
-            if name in tones
-        }
+        for name, driven in slot.drive.items():
+            if name in tones:
+                drive[name] = replace(driven, frequency=tones[name].frequency)
+        return drive
 
 
-def _identity(content: Content) -> tuple[object, ...]:
-    """Return values that identify a content independently of its strength."""
-    return content.key, content.targets, content.placement
+def _identity(content: Content) -> _Identity:
+    return _Identity(content.key, content.targets, content.placement)
 
 
-def _voice_of(content: Content) -> tuple[object, ...]:
-    """Return values that are equal for contents that can fade from one to the other."""
-    return content.key, content.frequency, content.target.pulse
+def _voice_of(content: Content) -> _Voice:
+    return _Voice(content.key, content.frequency, content.target.pulse)
 
 
 def _course_onset(
@@ -762,15 +850,19 @@ def _course_onset(
 
 def _requested_at(slot: Slot) -> float:
     """When [s] a content was requested, by its pulse or its contact."""
-    pulse = slot.content.target.pulse
-    return slot.content.contact.since if pulse is None else pulse.requested_at
+    content = slot.content
+    if content.target.pulse is None:
+        return content.contact.since
+    return content.target.pulse.requested_at
 
 
 def _remaining(pulse: Pulse | None, now: float) -> float:
     """Return how long [s] a target is driven after a time [s]; infinite without a pulse."""
     if pulse is None:
         return math.inf
-    return pulse.duration if pulse.started_at is None else max(pulse.end - now, MIN_LEFT)
+    if pulse.started_at is None:
+        return pulse.duration
+    return max(pulse.end - now, MIN_LEFT)
 
 
 def _settled_after(layer: answer.Layer) -> float:
@@ -786,10 +878,9 @@ def _shortest(played: PlayedSet, number: int) -> float:
 
     Infinite if none does.
     """
-    times = [
-        _VALID_FOR.from_wire(layer.valid_for)
-        for layers in played.layers.values()
-        for layer in layers
-        if layer.layer == number and layer.valid_for and is_vibrating(layer)
-    ]
-    return min(times, default=math.inf)
+    shortest = math.inf
+    for layers in played.layers.values():
+        for layer in layers:
+            if layer.layer == number and layer.valid_for and is_vibrating(layer):
+                shortest = min(shortest, _VALID_FOR.from_wire(layer.valid_for))
+    return shortest

@@ -197,7 +197,7 @@ async def _run(pattern: Pattern, level_db_sl: float, pair: int, seed: int) -> tu
         for applied in on.applied:
             for one in applied.contents.values():
                 contrast = one.content.sensations[0].promised_contrast_db
-                promises.setdefault(one.content.key[1], contrast)
+                promises.setdefault(one.content.key.voice, contrast)
         on.far.bench.advance(threads.now())
         voice = 0 if 0 in promises else CLICK
         played = log.replayed(partial(operator.eq, ~0 if voice == CLICK else 0), threads.now())

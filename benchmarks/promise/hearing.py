@@ -33,8 +33,8 @@ Owners = Callable[[int | None], bool]
 
 def owner_of(layer: Any) -> int:
     """Return the finger that a layer plays for, its complement for a click."""
-    finger = int(layer.content.targets[0][0].key.id)
-    return ~finger if layer.content.key[1] == CLICK else finger
+    finger = int(layer.content.contact.key.id)
+    return ~finger if layer.content.key.voice == CLICK else finger
 
 
 class _PartialBench(Bench):

@@ -583,9 +583,7 @@ async def _played(touch: _Touch, row: TouchRow) -> TouchRow:
     applied = main_part.applied
     predicted = next(felt for felt in applied.targets if felt.contact.key == key)
     played = next(  # its own content, or the content it shares
-        each
-        for each in applied.contents.values()
-        if any(contact.key == key for contact, _ in each.content.targets)
+        each for each in applied.contents.values() if key in each.content.contact_keys
     )
     pattern = played.layer
     vibration = await main_part.steady if main_part.steady else {}

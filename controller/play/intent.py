@@ -10,7 +10,7 @@ import math
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Protocol, TypeAlias
+from typing import NamedTuple, Protocol, TypeAlias
 
 import numpy as np
 
@@ -184,7 +184,24 @@ def band_problem(band: Band, frequencies: FloatArray) -> str | None:
     return f"frequency {band_text} is not in the table, which plays {nearest:g} Hz instead"
 
 
-Targets = tuple[tuple[Contact, Target], ...]
+class FingerTarget(NamedTuple):
+    """A contact on the plate, and the vibration intended for it."""
+
+    contact: Contact
+    target: Target
+
+
+Targets = tuple[FingerTarget, ...]
+
+
+class ContentKey(NamedTuple):
+    """The finger that owns a content, and the content's voice at that finger."""
+
+    finger: ContactKey
+    voice: int
+    """CLICK for a short pulse, 0 for a lasting content, or the number of a side band of a lasting
+    content."""
+
 
 BEING_CHOSEN = "its content is being selected; wait a moment"
 
@@ -280,9 +297,7 @@ def _amplified(level: float | None, gain_db: float) -> float | None:
 class Content:
     """The content of one layer, with the contacts as they were when it was chosen."""
 
-    key: tuple[ContactKey, int]
-    """Its contact and its voice: CLICK for a short pulse, 0 for a lasting content, or the number of
-    a side band of a lasting content."""
+    key: ContentKey
     targets: Targets
     """The finger that owns it, followed by the fingers that share it."""
     placement: Placement
@@ -302,17 +317,17 @@ class Content:
     @property
     def contact(self) -> Contact:
         """The contact that owns it."""
-        return self.targets[0][0]
+        return self.targets[0].contact
 
     @property
     def target(self) -> Target:
         """The target of the contact that owns it."""
-        return self.targets[0][1]
+        return self.targets[0].target
 
     @property
     def contact_keys(self) -> list[ContactKey]:
         """Keys of all contacts that feel it."""
-        return [contact.key for contact, _ in self.targets]
+        return [finger.contact.key for finger in self.targets]
 
     @property
     def frequency(self) -> float | None:
@@ -322,7 +337,7 @@ class Content:
     @property
     def pulses(self) -> list[Pulse]:
         """The pulses of its targets."""
-        return [target.pulse for _, target in self.targets if target.pulse is not None]
+        return [finger.target.pulse for finger in self.targets if finger.target.pulse is not None]
 
     @property
     def course(self) -> tuple[Course, Pulse] | None:
@@ -337,7 +352,7 @@ class Content:
         """The sensation of each of its fingers; none for a side band."""
         if not self.sensations:
             return []
-        contacts = [contact for contact, _ in self.targets]
+        contacts = [finger.contact for finger in self.targets]
         return [
             FingerSensation(contact, sensation, self, self._why_held_back(contact, sensation))
             for contact, sensation in zip(contacts, self.sensations, strict=True)
@@ -424,19 +439,19 @@ class Selection:
     def contacts(self) -> dict[ContactKey, Contact]:
         """All contacts as they were then."""
         contacts = {contact.key: contact for contact in self.quiet}
-        for contact, _ in self.targets:
-            contacts[contact.key] = contact
+        for finger in self.targets:
+            contacts[finger.contact.key] = finger.contact
         return contacts
 
     @cached_property
     def target_keys(self) -> set[ContactKey]:
         """Keys of the contacts with a target."""
-        return {contact.key for contact, _ in self.targets}
+        return {finger.contact.key for finger in self.targets}
 
     @property
     def pulses(self) -> list[Pulse]:
         """The pulses of the targets."""
-        return [target.pulse for _, target in self.targets if target.pulse is not None]
+        return [finger.target.pulse for finger in self.targets if finger.target.pulse is not None]
 
     @cached_property
     def is_whole(self) -> bool:
@@ -490,8 +505,8 @@ class Selection:
         remaining = tuple([content for content in self.contents if content not in contents])
         unserved = dict[ContactKey, FingerSensation]()
         for content in contents:
-            for contact, _ in content.targets:
-                unserved[contact.key] = not_served(contact, reason)
+            for finger in content.targets:
+                unserved[finger.contact.key] = not_served(finger.contact, reason)
         return replace(
             self,
             contents=remaining,
@@ -560,7 +575,7 @@ class Question:
     """Targets of short pulses."""
     protected: frozenset[ContactKey] = frozenset()
     """Contacts that must not notice the contents of others."""
-    playing: Mapping[tuple[ContactKey, int], Content] = field(default_factory=dict)
+    playing: Mapping[ContentKey, Content] = field(default_factory=dict)
     """Contents that are felt now, by finger and voice."""
     kept: tuple[Selection, ...] = ()
     """Selections that continue to play next to the new ones."""
@@ -584,14 +599,16 @@ class Question:
         """Whether the answer for lasting targets takes longer than the control loop can wait."""
         if self.lasting and not self.is_alone:
             return True
-        courses = [target.course for _, target in self.lasting if target.course is not None]
+        courses = [
+            finger.target.course for finger in self.lasting if finger.target.course is not None
+        ]
         return any(course.duration > _SOON for course in courses)
 
     def quiet_beside(self, targets: Targets) -> tuple[Contact, ...]:
         """Return the contacts that are not among some targets."""
         quiet = [*self.contacts]
-        for contact, _ in targets:
-            quiet.remove(contact)
+        for finger in targets:
+            quiet.remove(finger.contact)
         return tuple(quiet)
 
     def silent(self, targets: Targets, reason: str) -> Selection:
@@ -600,7 +617,7 @@ class Question:
             targets,
             self.quiet_beside(targets),
             reason=reason,
-            unserved=tuple([not_served(contact, reason) for contact, _ in targets]),
+            unserved=tuple([not_served(finger.contact, reason) for finger in targets]),
             protected=self.protected,
         )
 
@@ -608,7 +625,7 @@ class Question:
         """Return silence in place of the missing selections; nothing if all fingers are served."""
         if self.is_rested:
             return ()
-        parts = [self.lasting, *[(pair,) for pair in self.short]]
+        parts = [self.lasting, *[(finger,) for finger in self.short]]
         return tuple([self.silent(targets, reason) for targets in parts])
 
 

@@ -28,7 +28,9 @@ import numpy as np
 from controller.play.intent import (
     MAX_DB_SL,
     Content,
+    ContentKey,
     FingerSensation,
+    FingerTarget,
     Question,
     Selection,
     Target,
@@ -109,11 +111,11 @@ def answered(
     close.
     """
     quiet = question.quiet_beside(targets)
-    first_target = targets[0][1]
+    first_target = targets[0].target
     fingers = fingers_of(table, targets, quiet, capabilities, question.protected)
     if len(targets) > 1 or first_target.modulation_hz is not None:
         fingers = _as_layers_allow(fingers, len(targets), capabilities)
-    contacts = [*[contact for contact, _ in targets], *quiet]
+    contacts = [*[finger.contact for finger in targets], *quiet]
     fingers = with_paths(fingers, contacts, now, table.plate)
     has_onsets = capabilities.envelope_support.onset_knots > 0
     request = partial(
@@ -148,7 +150,7 @@ def _serves_better(solution: Answer, kept: Answer) -> bool:
 
 def fingers_of(
     table: LocalizationTable,
-    targets: Sequence[tuple[Contact, Target]],
+    targets: Sequence[FingerTarget],
     quiet: Sequence[Contact],
     capabilities: PlaybackCapabilities,
     protected: frozenset[ContactKey] = frozenset(),
@@ -253,12 +255,12 @@ def _as_layers_allow(
 def _tuned_as_played(
     fingers: Sequence[Finger],
     targets: Targets,
-    playing: Mapping[tuple[ContactKey, int], Content],
+    playing: Mapping[ContentKey, Content],
 ) -> list[Finger]:
     """Return fingers tuned to the frequencies that they feel now, if their bands allow it."""
     tuned_fingers = [*fingers]
     for number, (contact, target) in enumerate(targets):
-        content = playing.get((contact.key, target.voice))
+        content = playing.get(ContentKey(contact.key, target.voice))
         stimulus = fingers[number].stimulus
         if content is None or stimulus is None:
             continue
@@ -294,25 +296,25 @@ def selection_of(
     phases = _Phases(table, tuple([finger.at for finger in solution.asked[: len(targets)]]))
     contents = list[Content]()
     for layer in solution.layers:
-        own_targets = list[tuple[Contact, Target]]()
+        own_targets = list[FingerTarget]()
         sensations = list[Sensation]()
         for number in layer.fingers:
-            contact, target = targets[number]
-            if contact.key not in unserved_keys:
-                own_targets.append((contact, target))
-                sensations.append(_within_pulse(solution.fingers[number], target))
+            finger = targets[number]
+            if finger.contact.key not in unserved_keys:
+                own_targets.append(finger)
+                sensations.append(_within_pulse(solution.fingers[number], finger.target))
         if not own_targets:
             continue
         first_contact, first_target = own_targets[0]
         carrier = Content(
-            key=(first_contact.key, first_target.voice),
+            key=ContentKey(first_contact.key, first_target.voice),
             targets=tuple(own_targets),
             placement=solution.placement(layer),
             layer=layer,
             sensations=tuple(sensations),
         )
         contents += _voices_of(carrier, question.playing, phases, shape, is_in_phase=is_in_phase)
-    contacts = [*[contact for contact, _ in targets], *quiet]
+    contacts = [*[finger.contact for finger in targets], *quiet]
     return Selection(
         targets,
         quiet,
@@ -347,7 +349,7 @@ def _within_pulse(sensation: Sensation, target: Target) -> Sensation:
 
 def _voices_of(
     carrier: Content,
-    playing: Mapping[tuple[ContactKey, int], Content],
+    playing: Mapping[ContentKey, Content],
     phases: "_Phases",
     shape: Shape | None,
     *,
@@ -371,18 +373,18 @@ def _voices_of(
             layer = phases.turned(layer, reference, owner)
         if shape is not None and carrier.target.course is None:
             layer = shape(carrier.placement, layer, is_continued)
-        key = (contact_key, first_voice + voice)
+        key = ContentKey(contact_key, first_voice + voice)
         sensations = () if voice else carrier.sensations
         voices.append(replace(carrier, key=key, layer=layer, sensations=sensations))
     return voices
 
 
 def _are_played(
-    layers: Sequence[Layer], key: ContactKey, playing: Mapping[tuple[ContactKey, int], Content]
+    layers: Sequence[Layer], key: ContactKey, playing: Mapping[ContentKey, Content]
 ) -> bool:
     """Whether a finger feels the frequencies of all these layers now."""
     for voice, layer in enumerate(layers):
-        content = playing.get((key, voice))
+        content = playing.get(ContentKey(key, voice))
         if content is None or content.frequency != layer.frequency:
             return False
     return True
@@ -709,8 +711,8 @@ class Crossfades:
 def _by_finger(contents: Iterable[Content]) -> _Voices:
     """Return contents by finger, each followed by its side bands."""
     voices = dict[ContactKey, tuple[Content, ...]]()
-    for content in sorted(contents, key=lambda content: content.key[1]):
-        key = content.key[0]
+    for content in sorted(contents, key=lambda content: content.key.voice):
+        key = content.key.finger
         voices[key] = (*voices.get(key, ()), content)
     return voices
 

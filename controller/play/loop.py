@@ -600,7 +600,7 @@ def play_report(
 def _silent_targets(selection: Selection, reason: str) -> tuple[FingerSensation, ...]:
     """Return the targets of a selection that is not played, with their own reasons or this one."""
     unserved = {finger.contact.key: finger for finger in selection.unserved}
-    contacts = dict.fromkeys([contact for contact, _ in selection.targets])
+    contacts = dict.fromkeys([finger.contact for finger in selection.targets])
     return tuple([unserved.get(contact.key) or not_served(contact, reason) for contact in contacts])
 
 

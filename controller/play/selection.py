@@ -23,7 +23,9 @@ from controller.play.intent import (
     FADED_AFTER,
     NOTHING,
     Content,
+    ContentKey,
     FingerSensation,
+    FingerTarget,
     HapticIntent,
     Question,
     Selection,
@@ -85,8 +87,8 @@ class Chooser:
             lasting = self._choose_lasting(question, capabilities)
             selections.append(lasting)
             active.append(lasting)
-        for contact, target in question.short:
-            pulse = self._choose_pulse(question, contact, target, capabilities, active)
+        for finger in question.short:
+            pulse = self._choose_pulse(question, finger, capabilities, active)
             active.append(pulse)
             selections.append(pulse.beside([question.fading], self.table))
         return tuple(selections)
@@ -117,20 +119,19 @@ class Chooser:
     def _choose_pulse(
         self,
         question: Question,
-        contact: Contact,
-        target: Target,
+        finger: FingerTarget,
         capabilities: PlaybackCapabilities,
         active: Sequence[Selection],
     ) -> Selection:
         """Choose for a short pulse, while active selections play and other contents fade."""
         others = _contents_of([*active, question.fading])
         remaining = self._left_by(others, capabilities)
-        raised = ((contact, _raised(target, contact, others)),)
+        raised = (_raised(finger, others),)
         frequencies = set[float]()
         for content in others:
             frequencies.update([tone.frequency for tone in content.layer.excitation.values()])
         return self._choose(
-            question, ((contact, target),), remaining, raised=raised, avoided_hz=[*frequencies]
+            question, (finger,), remaining, raised=raised, avoided_hz=[*frequencies]
         )
 
     def _left_by(
@@ -173,7 +174,7 @@ class Chooser:
         avoided_hz: Sequence[float],
     ) -> Selection:
         """Return the contents for targets, of the table's answer to their requested levels."""
-        is_joint = question.takes_long and not targets[0][1].is_short
+        is_joint = question.takes_long and not targets[0].target.is_short
         solution = answered(
             self.table,
             question,
@@ -184,7 +185,7 @@ class Chooser:
             avoided_hz=avoided_hz,
         )
         if not is_joint:
-            solution = _even_level(solution, requested[0][1])
+            solution = _even_level(solution, requested[0].target)
         selection = selection_of(
             self.table,
             question,
@@ -196,10 +197,10 @@ class Chooser:
         return _among(question, selection, avoided_hz) if avoided_hz else selection
 
 
-def _is_level_change(targets: Targets, playing: Mapping[tuple[ContactKey, int], Content]) -> bool:
+def _is_level_change(targets: Targets, playing: Mapping[ContentKey, Content]) -> bool:
     """Whether only the level of a single target changes, and that level is not raised."""
     ((contact, target),) = targets
-    content = playing.get((contact.key, target.voice))
+    content = playing.get(ContentKey(contact.key, target.voice))
     if content is None or target.level_db_sl is None:
         return False
     if target.pulse is not None and target.pulse.is_raised:
@@ -221,16 +222,17 @@ def _even_level(solution: Answer, target: Target) -> Answer:
     return scaled(solution, -excess) if excess > 0 else solution
 
 
-def _raised(target: Target, contact: Contact, others: Iterable[Content]) -> Target:
+def _raised(finger: FingerTarget, others: Iterable[Content]) -> FingerTarget:
     """Return the target of a short pulse, raised to its minimum above other contents there."""
+    contact, target = finger
     level = target.level_db_sl
     if level is None or target.above_db is None:
-        return target
+        return finger
     for content in others:
         for felt in content.finger_sensations:
             if felt.contact.key == contact.key:
                 level = max(level, felt.sensation.level_db_sl + target.above_db)
-    return replace(target, level_db_sl=level)
+    return FingerTarget(contact, replace(target, level_db_sl=level))
 
 
 def _among(question: Question, selection: Selection, frequencies: Sequence[float]) -> Selection:
@@ -331,14 +333,14 @@ def _has_set_out(contact: Contact, former: Contact) -> bool:
 
 
 def _targets_of(targets: Targets) -> frozenset[Target]:
-    return frozenset([target for _, target in targets])
+    return frozenset([finger.target for finger in targets])
 
 
 def _at_any_level(targets: Targets) -> set[Target]:
     """Return targets without the values that may differ in a late choice."""
     return {
-        replace(target, level_db_sl=None, pulse=None, modulation_hz=None, course=None)
-        for _, target in targets
+        replace(finger.target, level_db_sl=None, pulse=None, modulation_hz=None, course=None)
+        for finger in targets
     }
 
 
@@ -426,8 +428,8 @@ class Selector:
         """
         targets = _targets_on_plate(contacts, intent)
         served, skipped = _within_layers(targets, capabilities)
-        short = tuple([pair for pair in served if pair[1].is_short])
-        lasting = tuple([pair for pair in served if not pair[1].is_short])
+        short = tuple([finger for finger in served if finger.target.is_short])
+        lasting = tuple([finger for finger in served if not finger.target.is_short])
         intended = Question(tuple(contacts), lasting, short, intent.protected)
         self._follow_fingers(intended)
         self._follow_situation(intended, capabilities, now)
@@ -453,7 +455,9 @@ class Selector:
     def _follow_fingers(self, intended: Question) -> None:
         """Drop the lasting content of fingers that have left and come back elsewhere."""
         former_fingers = self._lasting_fingers
-        self._lasting_fingers = {contact.key: contact.since for contact, _ in intended.lasting}
+        self._lasting_fingers = {
+            finger.contact.key: finger.contact.since for finger in intended.lasting
+        }
         new_fingers = dict(self._lasting_fingers.items() - former_fingers.items())
         returned = new_fingers.keys() & self._lasting.target_keys
         if returned and not _is_met_by(intended, self._lasting):
@@ -508,7 +512,9 @@ class Selector:
         be late.
         """
         is_served = not intended.lasting or _is_met_by(intended, self._lasting)
-        new_pulses = tuple([pair for pair in intended.short if pair[0].key not in self._pulses])
+        new_pulses = tuple(
+            [finger for finger in intended.short if finger.contact.key not in self._pulses]
+        )
         is_rested = False
         if self.due < math.inf and self.due <= now:
             self.due = math.inf
@@ -570,9 +576,7 @@ class Selector:
             now=now,
         )
 
-    def _felt_contents(
-        self, pulses: Mapping[ContactKey, Selection]
-    ) -> dict[tuple[ContactKey, int], Content]:
+    def _felt_contents(self, pulses: Mapping[ContactKey, Selection]) -> dict[ContentKey, Content]:
         """Return the lasting contents and those of some pulses, by finger and voice."""
         selections = [self._felt_lasting(), *pulses.values()]
         return {content.key: content for content in _contents_of(selections)}
@@ -731,7 +735,11 @@ def _targets_on_plate(contacts: Sequence[Contact], intent: HapticIntent) -> Targ
     for target in intent.targets:
         by_key[target.key].append(target)
     return tuple(
-        [(contact, target) for contact in contacts for target in by_key.get(contact.key, ())]
+        [
+            FingerTarget(contact, target)
+            for contact in contacts
+            for target in by_key.get(contact.key, ())
+        ]
     )
 
 
@@ -742,14 +750,14 @@ def _still_requested(
     requested = dict[ContactKey, Selection]()
     for contact, target in short:
         selection = pulses.get(contact.key)
-        if selection is not None and selection.targets[0][1] == target:
+        if selection is not None and selection.targets[0].target == target:
             requested[contact.key] = selection
     return requested
 
 
 def _may_crossfade(intended: Question) -> bool:
     """Whether lasting contents can cross-fade to a better answer; courses have no cross-fades."""
-    has_course = any(target.course is not None for _, target in intended.lasting)
+    has_course = any(finger.target.course is not None for finger in intended.lasting)
     return intended.takes_long and not has_course
 
 
@@ -775,9 +783,10 @@ def _joined(
     for part in chosen:
         former_contacts |= part.contacts
     former_targets = [
-        (former_contacts.get(contact.key, contact), target) for contact, target in targets
+        FingerTarget(former_contacts.get(contact.key, contact), target)
+        for contact, target in targets
     ]
-    target_keys = {contact.key for contact, _ in targets}
+    target_keys = {finger.contact.key for finger in targets}
     quiet = [contact for contact in contacts if contact.key not in target_keys]
     unserved = [finger for part in restated for finger in part.unserved]
     reasons = [part.reason for part in chosen if part.reason is not None]
@@ -796,8 +805,10 @@ def _restricted(selection: Selection, keys: Set[ContactKey]) -> Selection:
     """Return a selection with the contents of some fingers alone, by key; the others are quiet."""
     if selection.target_keys <= keys:
         return selection
-    targets = [(contact, target) for contact, target in selection.targets if contact.key in keys]
-    other_contacts = [contact for contact, _ in selection.targets if contact.key not in keys]
+    targets = [finger for finger in selection.targets if finger.contact.key in keys]
+    other_contacts = [
+        finger.contact for finger in selection.targets if finger.contact.key not in keys
+    ]
     contents = [
         content for content in selection.contents if not keys.isdisjoint(content.contact_keys)
     ]
@@ -827,11 +838,11 @@ def _within_layers(
     reason = f"the drive mode {mode} plays only one content; lift a finger"
     if has_layers:
         reason = no_layer_free(layer_count)
-    group_sizes = Counter([target.shared_as for _, target in targets])
+    group_sizes = Counter([finger.target.shared_as for finger in targets])
     layer_groups = list[str | bool | None]()  # of each layer, what its targets share
     served = set[int]()
     for number in _by_rank(targets):
-        group = targets[number][1].shared_as
+        group = targets[number].target.shared_as
         is_joint = has_layers and group is not None and group_sizes[group] > MAX_SEPARATE
         if is_joint and group in layer_groups:
             served.add(number)
@@ -839,8 +850,8 @@ def _within_layers(
             layer_groups.append(group)
             served.add(number)
     skipped = [
-        not_served(contact, reason)
-        for number, (contact, _) in enumerate(targets)
+        not_served(finger.contact, reason)
+        for number, finger in enumerate(targets)
         if number not in served
     ]
     return tuple([targets[number] for number in sorted(served)]), tuple(skipped)
@@ -848,9 +859,10 @@ def _within_layers(
 
 def _by_rank(targets: Targets) -> list[int]:
     """Return the numbers of targets, in the order in which they get a layer."""
-    lasting_keys = {target.key for _, target in targets if not target.is_short}
+    lasting_keys = {finger.target.key for finger in targets if not finger.target.is_short}
     ranks = list[tuple[bool, int, int]]()
-    for number, (_, target) in enumerate(targets):
+    for number, finger in enumerate(targets):
+        target = finger.target
         is_extra = target.is_short and target.key in lasting_keys
         ranks.append((not is_extra, target.priority, number))
     return [number for _, _, number in sorted(ranks, reverse=True)]

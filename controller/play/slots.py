@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import NamedTuple
 
-from controller.play.intent import CLICK, FADED_AFTER, Content, Pulse, Targets
+from controller.play.intent import CLICK, FADED_AFTER, Content, ContentKey, Pulse, Targets
 from controller.play.routing import (
     BESIDE_CLICK,
     HELD,
@@ -156,7 +156,7 @@ class Slot:
 class _Identity(NamedTuple):
     """The values that identify a content independently of its strength."""
 
-    key: tuple[ContactKey, int]
+    key: ContentKey
     targets: Targets
     placement: Placement
 
@@ -164,7 +164,7 @@ class _Identity(NamedTuple):
 class _Voice(NamedTuple):
     """The values that are equal for contents that can fade from one to the other."""
 
-    key: tuple[ContactKey, int]
+    key: ContentKey
     frequency: float | None
     pulse: Pulse | None
 
@@ -210,7 +210,7 @@ class Slots:
         self._fades_until = -math.inf  # s; for contents that were ended or replaced
         self._ended_contents: tuple[Content, ...] = ()  # by themselves
         # By finger and voice, also while the playback is unknown.
-        self._layer_of: Mapping[tuple[ContactKey, int], int] = {}
+        self._layer_of: Mapping[ContentKey, int] = {}
 
     @property
     def due(self) -> float:
@@ -276,7 +276,7 @@ class Slots:
         """Take these slots as the playback from now on."""
         self.by_layer = slots
         self.is_silent = False
-        layers = dict[tuple[ContactKey, int], int]()
+        layers = dict[ContentKey, int]()
         for number, slot in slots.items():
             if not slot.is_falling:
                 layers[slot.content.key] = number
@@ -523,7 +523,7 @@ class Slots:
             else:
                 ending.append(number)
         for content in contents:
-            is_click = content.key[1] == CLICK
+            is_click = content.key.voice == CLICK
             preference = (free, ending, falling) if is_click else (ending, free, falling)
             for layers in preference:
                 if layers:
@@ -795,7 +795,7 @@ class Slots:
 
     def _confirmed_until(self, content: Content) -> float:
         """Return when [s] the first target of a content is lifted unless a frame arrives."""
-        return min([self._expiry_of(contact.key) for contact, _ in content.targets])
+        return min([self._expiry_of(finger.contact.key) for finger in content.targets])
 
     def _valid_for(self, content: Content, now: float) -> float:
         """Return how long [s] a content can last from a time [s] on without a renewal.
@@ -804,7 +804,7 @@ class Slots:
         """
         unconfirmed_in = self._confirmed_until(content) - now + _MARGIN
         without_pulse = min(max(unconfirmed_in, _MIN_VALID_FOR), MAX_CONTACT_TIMEOUT)
-        pulse_times = [_remaining(target.pulse, now) for _, target in content.targets]
+        pulse_times = [_remaining(finger.target.pulse, now) for finger in content.targets]
         return min(without_pulse, max(pulse_times))
 
     def _may_end_shaped(self, number: int, now: float) -> bool:

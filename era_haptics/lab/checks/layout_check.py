@@ -10,7 +10,7 @@ import numpy as np
 from controller.effects.effect import ON_RELEASE, Effect, EffectStimulus, Region
 from controller.effects.layout import ELSEWHERE, SurfaceLayout
 from controller.effects.player import CLICK_ABOVE_DB, NOTICED_ABOVE_DB
-from controller.play.intent import Question, Target, band_problem
+from controller.play.intent import FingerTarget, Question, Target, band_problem
 from controller.play.joint_answers import answered
 from controller.play.routing import RAMPS_ONLY, PlaybackCapabilities
 from controller.play.selection import Chooser
@@ -96,7 +96,7 @@ class TouchSimulator:
             Contact(ContactKey("quiet", number), *place, since=0.0)
             for number, place in enumerate(quiet)
         ]
-        question = Question((finger, *others), ((finger, target),), ())
+        question = Question((finger, *others), (FingerTarget(finger, target),), ())
         return answered(self.table, question, question.lasting, self.capabilities)
 
     def touch(self, target: Target, at: Point, resting: Point | None) -> SimulatedTouch:

@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import combinations, product
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 from matplotlib import colormaps
@@ -17,7 +17,7 @@ from matplotlib.patches import Polygon as Outline
 
 from controller.effects.effect import Region
 from controller.effects.layout import SurfaceLayout
-from controller.play.intent import Question, Selection, Target
+from controller.play.intent import FingerTarget, Question, Selection, Target
 from controller.play.joint_answers import fingers_of, selection_of
 from controller.sources.touch import Contact, ContactKey
 from era_haptics.lab.checks.layout_check import (
@@ -41,8 +41,6 @@ MAX_PAIRS, MAX_TRIPLES = 150, 150
 _POSITIONS = 4  # per region: the centre, then points farthest from it and from each other
 _NAMED = 4  # pairs that are close
 _NEAREST = 0.02  # m; two fingertips next to each other
-
-_Finger: TypeAlias = tuple[Contact, Target]
 
 
 @dataclass(frozen=True)
@@ -212,48 +210,51 @@ def _worst(
     )
 
 
-def _placed(targets: Sequence[Target], at: Sequence[Point]) -> list[_Finger]:
+def _placed(targets: Sequence[Target], at: Sequence[Point]) -> list[FingerTarget]:
     """Return targets with their contacts."""
     return [
-        (Contact(target.key, x, y, since=0.0), target)
+        FingerTarget(Contact(target.key, x, y, since=0.0), target)
         for target, (x, y) in zip(targets, at, strict=True)
     ]
 
 
 def _felt(
-    simulator: TouchSimulator, fingers: Sequence[_Finger], protected: frozenset[ContactKey] | None
+    simulator: TouchSimulator,
+    fingers: Sequence[FingerTarget],
+    protected: frozenset[ContactKey] | None,
 ) -> tuple[float, list[tuple[float, str]]]:
     """Return the contrast of the worst finger, and the contrast and verdict of each finger.
 
     Short effects play on top of continuous ones, one at a time, with all other fingers quiet. If
     protected is None, all contents play, whatever their contrast.
     """
-    lasting = tuple(each for each in fingers if not each[1].is_short)
-    short = tuple(each for each in fingers if each[1].is_short)
+    lasting = tuple(finger for finger in fingers if not finger.target.is_short)
+    short = tuple(finger for finger in fingers if finger.target.is_short)
     found: dict[ContactKey, tuple[float, str]] = {}
     worst, beside = math.inf, list[Selection]()
     if lasting:
-        quiet = [contact for contact, _ in short]
+        quiet = [finger.contact for finger in short]
         together = _answered(simulator, lasting, quiet, protected)
-        question = Question((*[one for one, _ in lasting], *quiet), lasting, short)
+        contacts = [finger.contact for finger in lasting]
+        question = Question((*contacts, *quiet), lasting, short)
         worst = math.inf if together.promised_worst_db is None else together.promised_worst_db
         beside = [selection_of(simulator.table, question, together, lasting)]
-        for (contact, _), each in zip(lasting, together.fingers, strict=False):
+        for contact, each in zip(contacts, together.fingers, strict=False):
             found[contact.key] = each.promised_contrast_db or 0.0, each.verdict
-    contacts = tuple(contact for contact, _ in fingers)
-    for one in short:
-        key = one[0].key
-        question = Question(contacts, (), (one,), protected or frozenset(), kept=tuple(beside))
+    down = tuple(finger.contact for finger in fingers)
+    for finger in short:
+        key = finger.contact.key
+        question = Question(down, (), (finger,), protected or frozenset(), kept=tuple(beside))
         (chosen,) = simulator.chooser.choose(question, simulator.capabilities)
         (felt,) = chosen.beside(beside, simulator.table).finger_sensations
         found[key] = felt.sensation.promised_contrast_db or 0.0, felt.sensation.verdict
         worst = min(worst, found[key][0])
-    return worst, [found[contact.key] for contact, _ in fingers]
+    return worst, [found[finger.contact.key] for finger in fingers]
 
 
 def _answered(
     simulator: TouchSimulator,
-    fingers: Sequence[_Finger],
+    fingers: Sequence[FingerTarget],
     quiet: Sequence[Contact],
     protected: frozenset[ContactKey] | None = None,
 ) -> Answer:

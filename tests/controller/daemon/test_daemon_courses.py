@@ -491,7 +491,9 @@ async def test_gain_of_a_source_is_felt_at_its_finger_alone_along_a_fade() -> No
         tones = {each.effect: each.frequency_hz for each in (await era.status()).contacts}
         planner = bench.daemon.controller.cycle.planner
         (sent,) = [
-            n for n, one in planner.slots.by_layer.items() if "right" in one.content.key[0].source
+            n
+            for n, one in planner.slots.by_layer.items()
+            if "right" in one.content.key.finger.source
         ]
         settled_at = planner.slots.by_layer[sent].settled_at
         for gain, first, last in ((-6.0, 1.0, LOWER), (0.0, LOWER, 1.0)):

@@ -21,7 +21,16 @@ from controller.content.pattern import Pattern, Transient
 from controller.daemon.plate_view import PlateView
 from controller.effects.file_effect import File
 from controller.effects.layout import SurfaceLayout, layout_of
-from controller.play.intent import CLICK, Content, HapticIntent, Pulse, Selection, Target
+from controller.play.intent import (
+    CLICK,
+    Content,
+    ContentKey,
+    FingerTarget,
+    HapticIntent,
+    Pulse,
+    Selection,
+    Target,
+)
 from controller.play.routing import PlaybackCapabilities
 from controller.play.selection import Chooser, Selector
 from controller.play.slots import Slot, Slots
@@ -93,11 +102,12 @@ def test_fingers_keep_to_their_course(name: str) -> None:
 
 def test_a_shared_content_that_changes_beside_a_click_of_its_finger_keeps_its_layer() -> None:
     """The click has begun first: what is decided next restarts neither of the two."""
-    shared = tuple((each, Target(each.key, 14.0)) for each in CONTACTS)
+    shared = tuple(FingerTarget(each, Target(each.key, 14.0)) for each in CONTACTS)
     click = Target(CONTACTS[0].key, 14.0, pulse=Pulse(0.04, requested_at=0.0))
     pattern = Layer({"SW": Tone(100.0, 1e-6)})
-    lasting = Content((shared[0][0].key, 0), shared, Placement((LEFT,)), pattern)
-    clicking = Content((CONTACTS[0].key, 0), ((CONTACTS[0], click),), Placement((LEFT,)), pattern)
+    lasting = Content(ContentKey(CONTACTS[0].key, 0), shared, Placement((LEFT,)), pattern)
+    clicked = (FingerTarget(CONTACTS[0], click),)
+    clicking = Content(ContentKey(CONTACTS[0].key, 0), clicked, Placement((LEFT,)), pattern)
     playing = Slots(smooth_rig(), playable(4), Timing(table()), expiry_of=lambda key: 0.0)
     playing.by_layer = {
         number: Slot(one, pattern, drive={}) for number, one in ((1, clicking), (0, lasting))
@@ -406,10 +416,10 @@ async def test_a_click_of_a_file_is_felt_beside_what_lasts_of_it() -> None:
     async with fingers_on(table(), layout, at={1: LEFT}, held=1.2) as fingers:
         began = fingers.applied[0].time
         (short,) = {
-            one.content.targets[0][1].pulse
+            one.content.target.pulse
             for report in fingers.applied
             for one in report.contents.values()
-            if one.content.key[1] == CLICK
+            if one.content.key.voice == CLICK
         }
         assert short.started_at - began == pytest.approx(0.3, abs=0.01)
         (lasting,) = {
@@ -490,7 +500,7 @@ def test_a_kept_frequency_keeps_its_phase_at_the_finger() -> None:
     for content in second.contents:
         then = before.get(content.key)
         if then is not None and then.frequency == content.frequency:
-            at = places.index((content.targets[0][0].x, content.targets[0][0].y))
+            at = places.index((content.contact.x, content.contact.y))
             (row,) = np.flatnonzero(table().frequencies == content.frequency)
             now, old = [
                 sum(

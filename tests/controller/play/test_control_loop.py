@@ -630,7 +630,7 @@ def test_a_pulse_is_held_back_where_others_use_the_whole_stroke(recorder: Any) -
     intent = HapticIntent((Target(ContactKey("a", 1), 12.0), pulse))
     full = replace(CAPABILITIES, limits=Limits((45.0, 300.0), {"SW": 1e-6}), layers=2)
     selection = Selector(Chooser(recorder)).select((at(1, 0.1), at(2, 0.2)), intent, full)
-    assert [each.targets[0][0].key.id for each in selection.contents] == [1]
+    assert [each.contact.key.id for each in selection.contents] == [1]
     (held,) = selection.unserved
     assert held.held_back == "the contents of other fingers use the whole stroke; lift a finger"
 

@@ -372,7 +372,7 @@ def test_every_step_keeps_30_hz_between_all_that_sounds() -> None:
         landed = chosen_for(targets, playable(), before=playing)
         resting = tuple(targets) if number % 2 else tuple(targets[:2])
         keys = {contact.key for contact, _ in resting}
-        felt = {each.key: each for each in landed.contents if each.key[0] in keys}
+        felt = {each.key: each for each in landed.contents if each.key.finger in keys}
         if {key for key, _ in felt} != keys:
             continue
         beside = {each.contact.key: each.frequency or 0.0 for each in landed.finger_sensations}

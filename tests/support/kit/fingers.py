@@ -29,12 +29,21 @@ from controller.effects.layout import SurfaceLayout
 from controller.effects.player import EffectPlayer
 from controller.operation.operation_states import DaemonEvent, DaemonState, Lease, Trigger
 from controller.operation.supervisor import Supervisor
-from controller.play.intent import CLICK, Content, FingerSensation, Question, Selection, Target
+from controller.play.intent import (
+    CLICK,
+    Content,
+    ContentKey,
+    FingerSensation,
+    FingerTarget,
+    Question,
+    Selection,
+    Target,
+)
 from controller.play.joint_answers import answered, selection_of
 from controller.play.loop import PlayReport
 from controller.play.routing import RAMPS_ONLY, PlaybackCapabilities
 from controller.play.slots import Sets, Slots
-from controller.sources.touch import Contact, ContactKey, Touch, TouchFrame
+from controller.sources.touch import Contact, Touch, TouchFrame
 from controller.sources.tuio import RecordedDatagram
 from drivers.errors import CommandRefused, LinkError
 from drivers.playing import AmplifierLayer
@@ -73,17 +82,18 @@ LAYOUT = SurfaceLayout(
 
 def asked(
     targets: Sequence[tuple[Contact, Target]],
-    before: Mapping[tuple[ContactKey, int], Content] = MappingProxyType({}),
+    before: Mapping[ContentKey, Content] = MappingProxyType({}),
 ) -> Question:
     """A question for fingers that feel what lasts, among no others."""
-    return Question(tuple([contact for contact, _ in targets]), tuple(targets), (), playing=before)
+    fingers = tuple([FingerTarget(contact, target) for contact, target in targets])
+    return Question(tuple([finger.contact for finger in fingers]), fingers, (), playing=before)
 
 
 def chosen_for(
     targets: Sequence[tuple[Contact, Target]],
     capabilities: PlaybackCapabilities,
     *,
-    before: Mapping[tuple[ContactKey, int], Content] = MappingProxyType({}),
+    before: Mapping[ContentKey, Content] = MappingProxyType({}),
 ) -> Selection:
     """What is chosen for fingers that feel what lasts, among no others."""
     question = asked(targets, before)
@@ -433,7 +443,7 @@ class Hands(Acted, Fingers):
     @property
     def layers(self) -> dict[int, list[int]]:
         """Layers that play, by finger."""
-        playing = [(each.content.key[0].id, n) for n, each in self.applied[-1].contents.items()]
+        playing = [(each.content.key.finger.id, n) for n, each in self.applied[-1].contents.items()]
         return {id: [n for other, n in playing if other == id] for id, _ in playing}
 
     @property
@@ -445,7 +455,7 @@ class Hands(Acted, Fingers):
     def frequency_of_clicks(self) -> list[float | None]:
         """Frequencies of clicks that play [Hz]."""
         contents = [one.content for one in self.applied[-1].contents.values()]
-        return [each.frequency for each in contents if each.key[1] == CLICK]
+        return [each.frequency for each in contents if each.key.voice == CLICK]
 
     @property
     def least_apart(self) -> float:
@@ -512,7 +522,7 @@ class Hands(Acted, Fingers):
     def beyond_nominal_db(self) -> dict[int, float]:
         """By how much contrasts at fingertips are beyond those of contents, as modelled [dB]."""
         contents = [one.content for one in self.applied[-1].contents.values()]
-        said = {each.key[0].id: each.sensations[0].contrast_db or 0.0 for each in contents}
+        said = {each.key.finger.id: each.sensations[0].contrast_db or 0.0 for each in contents}
         return {id: contrast - said[id] for id, contrast in self.contrasts().items()}
 
     @property
@@ -532,7 +542,7 @@ class Hands(Acted, Fingers):
     def effects_played(self) -> list[str | None]:
         """Names of what new reports play."""
         contents = [one.content for each in self.new for one in each.contents.values()]
-        return [each.targets[0][1].content for each in contents]
+        return [each.target.content for each in contents]
 
     @property
     def depths(self) -> dict[int, float]:
@@ -568,7 +578,7 @@ def verdicts(report: PlayReport) -> dict[int, str]:
 
 def _lasting(report: PlayReport | None) -> dict[int, Content]:
     contents = [one.content for one in report.contents.values()] if report else []
-    return {each.key[0].id: each for each in contents if each.key[1] == 0}
+    return {each.key.finger.id: each for each in contents if each.key.voice == 0}
 
 
 def _worst(report: PlayReport | None) -> float:

@@ -15,6 +15,7 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import ParamSpec
 
+from controller.play.chooser import Chooser
 from controller.play.intent import (
     Content,
     FingerSensation,
@@ -25,7 +26,7 @@ from controller.play.intent import (
     not_served,
 )
 from controller.play.routing import CountedClocks, Drive, PlaybackCapabilities
-from controller.play.selection import Chooser, PendingChoice, Selector
+from controller.play.selection import PendingChoice, Selector
 from controller.play.slots import RELEASE_RAMP, RETRY, Check, Sets, Slot, Slots
 from controller.sources.touch import (
     Change,

@@ -1,12 +1,8 @@
-"""Selection: choose the contents that realise a haptic intent, and decide when to choose again.
+"""Selector: keep the contents that realise a haptic intent, and decide when to choose again.
 
-All lasting contents are chosen together by one answer of the table. Each short pulse is chosen
-alone, with the stroke and the power that the lasting contents leave: all other fingers are quiet,
-and its frequency is 30 Hz from all sounding frequencies if its band allows it. The lasting content
-of its own finger continues. A pulse would be over before a joint answer could help, so it is never
-changed. While a pulse plays, lasting contents are confined to the stroke and power that it leaves.
-
-One choice is made at a time, for the fingers as they are once the previous choice has been made.
+Lasting contents are chosen together, and each short pulse alone (`controller.play.chooser`). A
+pulse would be over before a joint answer could help, so it is never changed. One choice is made at
+a time, for the fingers as they are once the previous choice has been made.
 """
 
 import asyncio
@@ -18,6 +14,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import NamedTuple, TypeAlias
 
+from controller.play.chooser import Chooser, contents_of
 from controller.play.intent import (
     BEING_CHOSEN,
     FADED_AFTER,
@@ -35,226 +32,14 @@ from controller.play.intent import (
     no_layer_free,
     not_served,
 )
-from controller.play.joint_answers import (
-    LIMITS_LEAVE_NOTHING,
-    STRETCH,
-    Crossfades,
-    Shape,
-    answered,
-    selection_of,
-)
+from controller.play.joint_answers import STRETCH
 from controller.play.routing import PlaybackCapabilities
 from controller.play.slots import CROSSFADE, FALL_AFTER
 from controller.sources.touch import Contact, ContactKey
-from model.answer.answer import APART_HZ, Answer
-from model.answer.plan import MAX_SEPARATE, scaled
-from model.arrays import NEARLY
+from model.answer.plan import MAX_SEPARATE
 from model.drive_modes import UNRESTRICTED
-from model.errors import InputError
-from model.table.table import SAME_FREQUENCY, LocalizationTable
-from registry.plugins import failure_text
+from model.table.table import LocalizationTable
 from registry.threads import DaemonThreads
-
-_USED_UP = "the contents of other fingers use the whole stroke; lift a finger"
-
-_logger = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True)
-class Chooser:
-    """Chooses contents from a table; shape: adds envelopes to the contents of joint answers."""
-
-    table: LocalizationTable
-    shape: Shape | None = None
-
-    def choose(
-        self, question: Question, capabilities: PlaybackCapabilities
-    ) -> tuple[Selection, ...]:
-        """Return the selection of the lasting targets of a question, then one for each short pulse.
-
-        For fingers at rest, return the selections on the way from the present contents to a better
-        answer, step by step; nothing on any failure.
-        """
-        if question.is_rested:
-            try:
-                return Crossfades(self.table, question, capabilities, self.shape).steps()
-            except Exception as error:
-                _logger.error("loop: table failed, contents continue", exc_info=error)
-                return ()
-        selections = list[Selection]()
-        active = [*question.kept]
-        if question.lasting:
-            lasting = self._choose_lasting(question, capabilities)
-            selections.append(lasting)
-            active.append(lasting)
-        for finger in question.short:
-            pulse = self._choose_pulse(question, finger, capabilities, active)
-            active.append(pulse)
-            selections.append(pulse.beside([question.fading], self.table))
-        return tuple(selections)
-
-    def _choose_lasting(self, question: Question, capabilities: PlaybackCapabilities) -> Selection:
-        """Choose lasting contents, within the limits that active pulses leave.
-
-        Contents that they replace fade at the same time, and use the limits like the pulses.
-        """
-        unlimited = self._choose(question, question.lasting, capabilities)
-        pulses = _contents_of(question.kept)
-        if not pulses:
-            return unlimited
-        fading = [
-            content
-            for (key, _), content in question.playing.items()
-            if key in unlimited.target_keys and content not in pulses
-        ]
-        remaining = self._left_by([*pulses, *fading], capabilities)
-        layers = [content.layer for content in unlimited.contents]
-        if remaining.limits.factor_within(layers, self.table) >= 1 - NEARLY:
-            return unlimited
-        limited = self._choose(question, question.lasting, remaining)
-        if not limited.contents:
-            limited = question.silent(question.lasting, _USED_UP)
-        return replace(limited, is_limited=True)
-
-    def _choose_pulse(
-        self,
-        question: Question,
-        finger: FingerTarget,
-        capabilities: PlaybackCapabilities,
-        active: Sequence[Selection],
-    ) -> Selection:
-        """Choose for a short pulse, while active selections play and other contents fade."""
-        others = _contents_of([*active, question.fading])
-        remaining = self._left_by(others, capabilities)
-        raised = (_raised(finger, others),)
-        frequencies = set[float]()
-        for content in others:
-            frequencies.update([tone.frequency for tone in content.layer.excitation.values()])
-        return self._choose(
-            question, (finger,), remaining, raised=raised, avoided_hz=[*frequencies]
-        )
-
-    def _left_by(
-        self, contents: Sequence[Content], capabilities: PlaybackCapabilities
-    ) -> PlaybackCapabilities:
-        """Return the amplifiers' capabilities with the limits that contents leave."""
-        if not contents:
-            return capabilities
-        return capabilities.left_by([content.layer for content in contents], self.table)
-
-    def _choose(
-        self,
-        question: Question,
-        targets: Targets,
-        capabilities: PlaybackCapabilities,
-        *,
-        raised: Targets | None = None,
-        avoided_hz: Sequence[float] = (),
-    ) -> Selection:
-        """Choose for targets within capabilities; any failure is their reason for silence.
-
-        raised: the targets with the levels to request, if these differ; avoided_hz: frequencies
-        that play at the same time.
-        """
-        try:
-            return self._solve(question, targets, raised or targets, capabilities, avoided_hz)
-        except InputError as error:
-            reason = str(error)
-        except Exception as error:
-            _logger.error("loop: table failed, silencing its targets", exc_info=error)
-            reason = failure_text(error)
-        return question.silent(targets, reason)
-
-    def _solve(
-        self,
-        question: Question,
-        targets: Targets,
-        requested: Targets,
-        capabilities: PlaybackCapabilities,
-        avoided_hz: Sequence[float],
-    ) -> Selection:
-        """Return the contents for targets, of the table's answer to their requested levels."""
-        is_joint = question.takes_long and not targets[0].target.is_short
-        solution = answered(
-            self.table,
-            question,
-            requested,
-            capabilities,
-            keeps=is_joint or _is_level_change(targets, question.playing),
-            now=question.now if is_joint else math.inf,
-            avoided_hz=avoided_hz,
-        )
-        if not is_joint:
-            solution = _even_level(solution, requested[0].target)
-        selection = selection_of(
-            self.table,
-            question,
-            solution,
-            targets,
-            shape=self.shape if is_joint else None,
-            is_in_phase=is_joint,
-        )
-        return _among(question, selection, avoided_hz) if avoided_hz else selection
-
-
-def _is_level_change(targets: Targets, playing: Mapping[ContentKey, Content]) -> bool:
-    """Whether only the level of a single target changes, and that level is not raised."""
-    ((contact, target),) = targets
-    content = playing.get(ContentKey(contact.key, target.voice))
-    if content is None or target.level_db_sl is None:
-        return False
-    if target.pulse is not None and target.pulse.is_raised:
-        return False
-    former_target = content.target
-    with_new_level = replace(former_target, level_db_sl=target.level_db_sl)
-    return target == with_new_level and target != former_target
-
-
-def _even_level(solution: Answer, target: Target) -> Answer:
-    """Return an answer whose level within a band is the same at every position of the finger.
-
-    The level exceeds the promise by a margin for other plates, which differs between positions.
-    """
-    is_raised = target.pulse is not None and target.pulse.is_raised
-    if target.level_db_sl is None or target.band is None or is_raised or not solution.layers:
-        return solution
-    excess = solution.fingers[0].level_db_sl - target.level_db_sl
-    return scaled(solution, -excess) if excess > 0 else solution
-
-
-def _raised(finger: FingerTarget, others: Iterable[Content]) -> FingerTarget:
-    """Return the target of a short pulse, raised to its minimum above other contents there."""
-    contact, target = finger
-    level = target.level_db_sl
-    if level is None or target.above_db is None:
-        return finger
-    for content in others:
-        for felt in content.finger_sensations:
-            if felt.contact.key == contact.key:
-                level = max(level, felt.sensation.level_db_sl + target.above_db)
-    return FingerTarget(contact, replace(target, level_db_sl=level))
-
-
-def _among(question: Question, selection: Selection, frequencies: Sequence[float]) -> Selection:
-    """Return the selection for a pulse among vibrations of some frequencies [Hz].
-
-    The pulse is mixed if it is nearer than 30 Hz to one of them.
-    """
-    if not selection.contents:
-        if selection.reason == LIMITS_LEAVE_NOTHING:
-            return question.silent(selection.targets, _USED_UP)
-        return selection
-    (content,) = selection.contents
-    distances = [abs((content.frequency or 0.0) - frequency) for frequency in frequencies]
-    if min(distances) >= APART_HZ - SAME_FREQUENCY:
-        return selection
-    mixed = replace(content, is_apart=False).with_sensations(content.sensations)
-    return replace(selection, contents=(mixed,))
-
-
-def _contents_of(selections: Iterable[Selection]) -> list[Content]:
-    return [content for selection in selections for content in selection.contents]
-
 
 TIME_LIMIT = 1.0
 """Time [s] after which a choice is given up; it takes some tens of milliseconds."""
@@ -286,6 +71,8 @@ _UNANSWERED = (GIVEN_UP, BLOCKED)
 
 _FADES_FOR = FALL_AFTER + CROSSFADE + FADED_AFTER  # s; contents that a step replaces
 
+_logger = logging.getLogger(__name__)
+
 
 def _is_met_by(intended: Question, chosen: Selection) -> bool:
     """Whether a selection also serves the lasting targets that are intended now."""
@@ -296,27 +83,30 @@ def _is_met_by(intended: Question, chosen: Selection) -> bool:
     # If a target ends, the others gain only if fingers share or are not served.
     if requested != served and not chosen.is_whole:
         return False
-    present_contacts = {contact.key: contact for contact in intended.contacts}
-    if not _are_same_fingers(present_contacts, chosen):
+    if not _are_same_fingers(intended.contacts, chosen):
         return False
-    for key, contact in present_contacts.items():
-        former_contact = chosen.contacts[key]
+    for contact in intended.contacts:
+        former_contact = chosen.contacts[contact.key]
         if not _feels_alike(contact, former_contact):
             return False
-        if (key in intended.protected) != (key in chosen.protected):
+        if (contact.key in intended.protected) != (contact.key in chosen.protected):
             return False
         if not intended.is_alone and _has_set_out(contact, former_contact):
             return False
     return True
 
 
-def _are_same_fingers(contacts: Mapping[ContactKey, Contact], chosen: Selection) -> bool:
+def _are_same_fingers(contacts: Iterable[Contact], chosen: Selection) -> bool:
     """Whether contacts are the same as in a selection; fingers may have left a whole one."""
-    former_contacts = chosen.contacts
+    keys = {contact.key for contact in contacts}
     if not chosen.is_whole:
-        return contacts.keys() == former_contacts.keys()
-    hands = {key for key, contact in former_contacts.items() if contact.is_hand}
-    return hands <= contacts.keys() <= former_contacts.keys()
+        return keys == chosen.contacts.keys()
+    if not keys <= chosen.contacts.keys():
+        return False
+    for key, former_contact in chosen.contacts.items():
+        if former_contact.is_hand and key not in keys:
+            return False
+    return True
 
 
 def _feels_alike(contact: Contact, former: Contact) -> bool:
@@ -338,10 +128,12 @@ def _targets_of(targets: Targets) -> frozenset[Target]:
 
 def _at_any_level(targets: Targets) -> set[Target]:
     """Return targets without the values that may differ in a late choice."""
-    return {
-        replace(finger.target, level_db_sl=None, pulse=None, modulation_hz=None, course=None)
-        for finger in targets
-    }
+    steady_targets = set[Target]()
+    for _, target in targets:
+        steady_targets.add(
+            replace(target, level_db_sl=None, pulse=None, modulation_hz=None, course=None)
+        )
+    return steady_targets
 
 
 _Future: TypeAlias = "asyncio.Future[tuple[Selection, ...]]"
@@ -404,9 +196,8 @@ class Selector:
         self._pulses: dict[ContactKey, Selection] = {}  # active, or not started yet
         self._lasting_fingers: dict[ContactKey, float] = {}  # of lasting targets, down since [s]
         self._situation: _Situation | None = None
-        self._requested_situation: _Situation | None = (
-            None  # of the last question with lasting targets
-        )
+        # Of the last question with lasting targets.
+        self._requested_situation: _Situation | None = None
         self._steps: Sequence[Selection] = ()  # to a better answer
         self._led_at = -math.inf  # s; time of the last step
         self._fading = NOTHING  # contents that the last step replaced
@@ -428,14 +219,19 @@ class Selector:
         """
         targets = _targets_on_plate(contacts, intent)
         served, skipped = _within_layers(targets, capabilities)
-        short = tuple([finger for finger in served if finger.target.is_short])
-        lasting = tuple([finger for finger in served if not finger.target.is_short])
-        intended = Question(tuple(contacts), lasting, short, intent.protected)
+        lasting = list[FingerTarget]()
+        short = list[FingerTarget]()
+        for finger in served:
+            if finger.target.is_short:
+                short.append(finger)
+            else:
+                lasting.append(finger)
+        intended = Question(tuple(contacts), tuple(lasting), tuple(short), intent.protected)
         self._follow_fingers(intended)
         self._follow_situation(intended, capabilities, now)
         has_arrived = self._take_arrived(intended, now)
         former_pulses = self._pulses
-        self._pulses = _still_requested(former_pulses, short)
+        self._pulses = _still_requested(former_pulses, intended.short)
         if not contacts:
             self._lasting = NOTHING
         if self.pending is None:
@@ -447,19 +243,21 @@ class Selector:
         target_keys = {target.key for target in intent.targets}
         if self.pending is None or len(selection.finger_sensations) >= len(target_keys):
             return selection
-        reason = selection.reason
-        if reason is None and not selection.contents:
-            reason = BEING_CHOSEN
-        return replace(selection, is_pending=True, reason=reason)
+        pending = replace(selection, is_pending=True)
+        if pending.reason is None and not pending.contents:
+            return replace(pending, reason=BEING_CHOSEN)
+        return pending
 
     def _follow_fingers(self, intended: Question) -> None:
         """Drop the lasting content of fingers that have left and come back elsewhere."""
         former_fingers = self._lasting_fingers
-        self._lasting_fingers = {
-            finger.contact.key: finger.contact.since for finger in intended.lasting
-        }
-        new_fingers = dict(self._lasting_fingers.items() - former_fingers.items())
-        returned = new_fingers.keys() & self._lasting.target_keys
+        self._lasting_fingers = {}
+        returned = set[ContactKey]()
+        for contact, _ in intended.lasting:
+            self._lasting_fingers[contact.key] = contact.since
+            is_new = former_fingers.get(contact.key) != contact.since
+            if is_new and contact.key in self._lasting.target_keys:
+                returned.add(contact.key)
         if returned and not _is_met_by(intended, self._lasting):
             self._lasting = _restricted(self._lasting, self._lasting.target_keys - returned)
 
@@ -554,14 +352,16 @@ class Selector:
         now: float,
     ) -> Question:
         """Return the question for new pulses, while all other contents continue."""
-        is_fading = now < self._led_at + _FADES_FOR
+        fading = NOTHING
+        if now < self._led_at + _FADES_FOR:
+            fading = self._fading
         return replace(
             intended,
             lasting=(),
             short=new_pulses,
             playing=self._felt_contents(former_pulses),
             kept=(self._felt_lasting(), *self._active_pulses(now)),
-            fading=self._fading if is_fading else NOTHING,
+            fading=fading,
         )
 
     def _question_of_lasting(
@@ -579,7 +379,7 @@ class Selector:
     def _felt_contents(self, pulses: Mapping[ContactKey, Selection]) -> dict[ContentKey, Content]:
         """Return the lasting contents and those of some pulses, by finger and voice."""
         selections = [self._felt_lasting(), *pulses.values()]
-        return {content.key: content for content in _contents_of(selections)}
+        return {content.key: content for content in contents_of(selections)}
 
     def _choose_lasting(
         self, question: Question, capabilities: PlaybackCapabilities, now: float
@@ -598,8 +398,7 @@ class Selector:
             return True
         if self._requested_situation == self._situation:
             return False
-        unserved_keys = [finger.contact.key for finger in self._lasting.unserved]
-        return any(key in self._lasting_fingers for key in unserved_keys)
+        return any(finger.contact.key in self._lasting_fingers for finger in self._lasting.unserved)
 
     def _choose(self, question: Question, capabilities: PlaybackCapabilities, now: float) -> None:
         """Choose for a question at a time [s]: immediately, or in the thread if it takes long.
@@ -657,26 +456,26 @@ class Selector:
             self._steps = ()
             return
         if step.contents != self._lasting.contents:
-            step_tones = {(content.key, content.frequency) for content in step.contents}
-            fading = [
-                content
-                for content in self._lasting.contents
-                if (content.key, content.frequency) not in step_tones
-            ]
+            frequencies = {content.key: content.frequency for content in step.contents}
+            fading = list[Content]()
+            for content in self._lasting.contents:
+                is_tuned = frequencies.get(content.key) != content.frequency
+                if is_tuned or content.key not in frequencies:
+                    fading.append(content)
             self._fading = replace(self._lasting, contents=tuple(fading))
             self._led_at = now
         self._lasting = step
-        self.due = now + CROSSFADE_INTERVAL if self._steps else math.inf
+        self.due = math.inf
+        if self._steps:
+            self.due = now + CROSSFADE_INTERVAL
 
     def _active_pulses(self, now: float) -> tuple[Selection, ...]:
         """Return the short pulses that have not ended at a time [s]."""
-        return tuple(
-            [
-                selection
-                for selection in self._pulses.values()
-                if any(now < pulse.end for pulse in selection.pulses)
-            ]
-        )
+        active = list[Selection]()
+        for selection in self._pulses.values():
+            if any(now < pulse.end for pulse in selection.pulses):
+                active.append(selection)
+        return tuple(active)
 
     def _still_serves(self, selections: Sequence[Selection], intended: Question) -> bool:
         """Whether a late choice of lasting contents still serves the contacts on the plate.
@@ -686,15 +485,17 @@ class Selector:
         otherwise; the layout may not. The choice is dropped if present contents serve again,
         because a finger that came has lifted.
         """
-        selection = selections[0] if selections else NOTHING
+        selection = next(iter(selections), NOTHING)
         if selection.reason in _UNANSWERED:
             return True  # it silences
         may_improve = self._lasting.is_limited or self._requested_situation == self._situation
         if not may_improve and _is_met_by(intended, self._lasting):
             return False
-        present = {(contact.key, contact.since) for contact in intended.contacts}
-        answered_for = {(contact.key, contact.since) for contact in selection.contacts.values()}
-        if not present <= answered_for or not intended.protected <= selection.protected:
+        for contact in intended.contacts:
+            former_contact = selection.contacts.get(contact.key)
+            if former_contact is None or former_contact.since != contact.since:
+                return False
+        if not intended.protected <= selection.protected:
             return False
         return _at_any_level(intended.lasting) <= _at_any_level(selection.targets)
 
@@ -725,8 +526,11 @@ class Selector:
         if selection.reason in _UNANSWERED:
             self.due = math.inf
         if selection.is_limited:
-            pulses = [pulse for kept in question.kept for pulse in kept.pulses]
-            self.due = max([pulse.end for pulse in pulses]) + FADED_AFTER
+            last_end = -math.inf
+            for kept in question.kept:
+                for pulse in kept.pulses:
+                    last_end = max(last_end, pulse.end)
+            self.due = last_end + FADED_AFTER
 
 
 def _targets_on_plate(contacts: Sequence[Contact], intent: HapticIntent) -> Targets:
@@ -734,13 +538,11 @@ def _targets_on_plate(contacts: Sequence[Contact], intent: HapticIntent) -> Targ
     by_key = defaultdict[ContactKey, list[Target]](list)
     for target in intent.targets:
         by_key[target.key].append(target)
-    return tuple(
-        [
-            FingerTarget(contact, target)
-            for contact in contacts
-            for target in by_key.get(contact.key, ())
-        ]
-    )
+    targets = list[FingerTarget]()
+    for contact in contacts:
+        for target in by_key.get(contact.key, ()):
+            targets.append(FingerTarget(contact, target))
+    return tuple(targets)
 
 
 def _still_requested(
@@ -776,28 +578,35 @@ def _joined(
     chosen = [part for part in parts if part.targets]
     if len(chosen) == 1 and len(chosen[0].targets) == len(targets):
         return chosen[0]
-    restated = [
-        part.beside([other for other in chosen if other is not part], table) for part in chosen
-    ]
     former_contacts = dict[ContactKey, Contact]()
+    contents = list[Content]()
+    unserved = list[FingerSensation]()
+    first_reason = None
     for part in chosen:
         former_contacts |= part.contacts
-    former_targets = [
-        FingerTarget(former_contacts.get(contact.key, contact), target)
-        for contact, target in targets
-    ]
-    target_keys = {finger.contact.key for finger in targets}
-    quiet = [contact for contact in contacts if contact.key not in target_keys]
-    unserved = [finger for part in restated for finger in part.unserved]
-    reasons = [part.reason for part in chosen if part.reason is not None]
-    first_reason = reasons[0] if reasons else None
+        if first_reason is None:
+            first_reason = part.reason
+        restated = part.beside([other for other in chosen if other is not part], table)
+        contents += restated.contents
+        unserved += restated.unserved
+    former_targets = list[FingerTarget]()
+    for contact, target in targets:
+        former_contact = former_contacts.get(contact.key, contact)
+        former_targets.append(FingerTarget(former_contact, target))
+    target_keys = {contact.key for contact, _ in targets}
+    quiet = list[Contact]()
+    foreign_levels = dict[ContactKey, Sequence[float]]()
+    for contact in contacts:
+        foreign_levels[contact.key] = foreign_at(contact.key, chosen)
+        if contact.key not in target_keys:
+            quiet.append(former_contacts.get(contact.key, contact))
     return Selection(
         tuple(former_targets),
-        tuple([former_contacts.get(contact.key, contact) for contact in quiet]),
-        tuple(_contents_of(restated)),
+        tuple(quiet),
+        tuple(contents),
         first_reason if targets else reason,
         (*unserved, *skipped),
-        foreign_levels={contact.key: foreign_at(contact.key, chosen) for contact in contacts},
+        foreign_levels=foreign_levels,
     )
 
 
@@ -805,10 +614,13 @@ def _restricted(selection: Selection, keys: Set[ContactKey]) -> Selection:
     """Return a selection with the contents of some fingers alone, by key; the others are quiet."""
     if selection.target_keys <= keys:
         return selection
-    targets = [finger for finger in selection.targets if finger.contact.key in keys]
-    other_contacts = [
-        finger.contact for finger in selection.targets if finger.contact.key not in keys
-    ]
+    targets = list[FingerTarget]()
+    quiet = [*selection.quiet]
+    for finger in selection.targets:
+        if finger.contact.key in keys:
+            targets.append(finger)
+        else:
+            quiet.append(finger.contact)
     contents = [
         content for content in selection.contents if not keys.isdisjoint(content.contact_keys)
     ]
@@ -816,7 +628,7 @@ def _restricted(selection: Selection, keys: Set[ContactKey]) -> Selection:
     return replace(
         selection,
         targets=tuple(targets),
-        quiet=(*selection.quiet, *other_contacts),
+        quiet=tuple(quiet),
         contents=tuple(contents),
         unserved=tuple(unserved),
     )
@@ -832,29 +644,32 @@ def _within_layers(
     """
     mode = capabilities.drive_mode
     has_layers = mode == UNRESTRICTED
-    layer_count = capabilities.layers if has_layers else 1
-    if len(targets) <= layer_count:
-        return targets, ()
+    layer_count = 1
     reason = f"the drive mode {mode} plays only one content; lift a finger"
     if has_layers:
+        layer_count = capabilities.layers
         reason = no_layer_free(layer_count)
+    if len(targets) <= layer_count:
+        return targets, ()
     group_sizes = Counter([finger.target.shared_as for finger in targets])
     layer_groups = list[str | bool | None]()  # of each layer, what its targets share
-    served = set[int]()
+    served_numbers = set[int]()
     for number in _by_rank(targets):
         group = targets[number].target.shared_as
         is_joint = has_layers and group is not None and group_sizes[group] > MAX_SEPARATE
         if is_joint and group in layer_groups:
-            served.add(number)
+            served_numbers.add(number)
         elif len(layer_groups) < layer_count:
             layer_groups.append(group)
-            served.add(number)
-    skipped = [
-        not_served(finger.contact, reason)
-        for number, finger in enumerate(targets)
-        if number not in served
-    ]
-    return tuple([targets[number] for number in sorted(served)]), tuple(skipped)
+            served_numbers.add(number)
+    served = list[FingerTarget]()
+    skipped = list[FingerSensation]()
+    for number, finger in enumerate(targets):
+        if number in served_numbers:
+            served.append(finger)
+        else:
+            skipped.append(not_served(finger.contact, reason))
+    return tuple(served), tuple(skipped)
 
 
 def _by_rank(targets: Targets) -> list[int]:

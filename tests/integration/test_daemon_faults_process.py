@@ -116,7 +116,7 @@ async def test_start_that_is_stuck_ends_by_sigterm(tmp_path: Path) -> None:
 async def test_daemon_ends_while_an_answer_hangs(tmp_path: Path) -> None:
     """It has said so at both fingers by then, and one of them feels its own without an answer."""
     hangs = (
-        "import runpy, threading\nfrom controller.play.selection import Chooser\n"
+        "import runpy, threading\nfrom controller.play.chooser import Chooser\n"
         "choose = Chooser.choose\n"
         "def hang(chooser, requested, *more):\n"
         "    requested.takes_long and threading.Event().wait()\n"

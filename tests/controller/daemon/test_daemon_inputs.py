@@ -33,7 +33,7 @@ from controller.daemon.config import TouchInput
 from controller.daemon.layouts import TouchInputs
 from controller.effects.file_effect import File
 from controller.gateway.metrics import exposition
-from controller.play.selection import Chooser
+from controller.play.chooser import Chooser
 from controller.sources import udp_source
 from controller.sources.touch import (
     Change,

@@ -21,6 +21,7 @@ from controller.content.pattern import Pattern, Transient
 from controller.daemon.plate_view import PlateView
 from controller.effects.file_effect import File
 from controller.effects.layout import SurfaceLayout, layout_of
+from controller.play.chooser import Chooser
 from controller.play.intent import (
     CLICK,
     Content,
@@ -32,7 +33,7 @@ from controller.play.intent import (
     Target,
 )
 from controller.play.routing import PlaybackCapabilities
-from controller.play.selection import Chooser, Selector
+from controller.play.selection import Selector
 from controller.play.slots import Slot, Slots
 from controller.sources.touch import Contact, ContactKey
 from kit.chain import FINGER, set_running

@@ -26,6 +26,7 @@ from controller.effects.kinds import Click
 from controller.effects.layout import SurfaceLayout, default_effects
 from controller.effects.player import EffectPlayer
 from controller.operation.plate_controller import Controller
+from controller.play.chooser import Chooser
 from controller.play.intent import (
     HapticIntent,
     Pulse,
@@ -38,7 +39,7 @@ from controller.play.intent import (
 )
 from controller.play.loop import PlayReport
 from controller.play.routing import RAMPS_ONLY, PlaybackCapabilities
-from controller.play.selection import Chooser, Selector
+from controller.play.selection import Selector
 from controller.sources.touch import Change, Contact, ContactKey, ContactTracker, Touch, TouchFrame
 from drivers.host.group import GroupState
 from drivers.opening import Lines

@@ -308,7 +308,7 @@ class Hands(Acted, Fingers):
             self.failures.append(text)
             raise InputError(text) if is_refused else Planted(text)
 
-        self.patch.setattr("controller.play.selection.answered", fail)
+        self.patch.setattr("controller.play.chooser.answered", fail)
 
     def threads_fail(self) -> None:
         """Let the system have no thread left until all works again."""

@@ -33,7 +33,8 @@ from controller.effects.kinds import (
 )
 from controller.effects.layout import SurfaceLayout
 from controller.effects.player import EffectPlayer
-from controller.play.selection import Chooser, Selector
+from controller.play.chooser import Chooser
+from controller.play.selection import Selector
 from controller.sources.touch import Contact, ContactKey
 from era_haptics.command import run_era
 from era_haptics.lab.checks import layout_check, layout_picture

@@ -118,7 +118,9 @@ class Target:
     @property
     def voice(self) -> int:
         """Its first voice; voices distinguish the contents of one finger."""
-        return CLICK if self.is_short else 0
+        if self.is_short:
+            return CLICK
+        return 0
 
     @property
     def shared_as(self) -> str | bool | None:
@@ -151,7 +153,9 @@ class HapticIntent:
 
     def due(self, now: float) -> float:
         """Return when [s] to query again, at least a millisecond from now; infinite for never."""
-        return self.until if self.until > now else now + _MIN_WAIT
+        if self.until > now:
+            return self.until
+        return now + _MIN_WAIT
 
 
 class IntentSource(Protocol):
@@ -170,7 +174,8 @@ def band_of_table(band: Band, frequencies: FloatArray) -> Band:
     if low < high and ((frequencies >= low) & (frequencies <= high)).any():
         return band
     middle = np.sqrt(low * high)
-    nearest = float(frequencies[best_of(-np.abs(np.log(frequencies / middle)))])
+    distances = np.abs(np.log(frequencies / middle))
+    nearest = float(frequencies[best_of(-distances)])
     return nearest, nearest
 
 
@@ -180,7 +185,9 @@ def band_problem(band: Band, frequencies: FloatArray) -> str | None:
     nearest = band_of_table(band, frequencies)[0]
     if low * (1 - _TOLERANCE) <= nearest <= high * (1 + _TOLERANCE):
         return None
-    band_text = f"{low:g} Hz" if low == high else f"{low:g} to {high:g} Hz"
+    band_text = f"{low:g} to {high:g} Hz"
+    if low == high:
+        band_text = f"{low:g} Hz"
     return f"frequency {band_text} is not in the table, which plays {nearest:g} Hz instead"
 
 
@@ -192,6 +199,16 @@ class FingerTarget(NamedTuple):
 
 
 Targets = tuple[FingerTarget, ...]
+
+
+def contacts_of(targets: Targets) -> list[Contact]:
+    """Return the contacts of targets."""
+    return [finger.contact for finger in targets]
+
+
+def pulses_of(targets: Targets) -> list[Pulse]:
+    """Return the pulses of those targets that have one."""
+    return [target.pulse for _, target in targets if target.pulse is not None]
 
 
 class ContentKey(NamedTuple):
@@ -253,19 +270,19 @@ def beside_others(
     )
     if sensation.layer is None:
         return beside
-    nominal_level = own_level_db_sl(sensation)
-    own_levels = [nominal_level + offset for offset in offsets_db]
+    own_level = own_level_db_sl(sensation)
     promised = sensation.promised_contrast_db
     masking_levels = foreign_levels
     if promised is not None and sensation.foreign_level_db_sl is not None:
         # The promised contrast is to foreign contents here, not to quiet fingers.
-        promised_background = [level - promised for level in own_levels]
+        promised_background = [own_level + offset - promised for offset in offsets_db]
         masking_levels = sums_db([promised_background, other_levels])
-    level_pairs = zip(own_levels, masking_levels, strict=True)
-    contrasts = [own - masking for own, masking in level_pairs]
+    worst_contrast = math.inf
     if promised is not None:
-        contrasts.append(promised)
-    return replace(beside, promised_contrast_db=min(contrasts))
+        worst_contrast = promised
+    for offset, masking_level in zip(offsets_db, masking_levels, strict=True):
+        worst_contrast = min(worst_contrast, own_level + offset - masking_level)
+    return replace(beside, promised_contrast_db=worst_contrast)
 
 
 def weakened(sensation: Sensation, gain_db: float, others_gain_db: float) -> Sensation:
@@ -290,7 +307,9 @@ def weakened(sensation: Sensation, gain_db: float, others_gain_db: float) -> Sen
 
 
 def _amplified(level: float | None, gain_db: float) -> float | None:
-    return None if level is None else level + gain_db
+    if level is None:
+        return None
+    return level + gain_db
 
 
 @dataclass(frozen=True)
@@ -337,7 +356,7 @@ class Content:
     @property
     def pulses(self) -> list[Pulse]:
         """The pulses of its targets."""
-        return [finger.target.pulse for finger in self.targets if finger.target.pulse is not None]
+        return pulses_of(self.targets)
 
     @property
     def course(self) -> tuple[Course, Pulse] | None:
@@ -350,13 +369,13 @@ class Content:
     @property
     def finger_sensations(self) -> list["FingerSensation"]:
         """The sensation of each of its fingers; none for a side band."""
+        finger_sensations = list[FingerSensation]()
         if not self.sensations:
-            return []
-        contacts = [finger.contact for finger in self.targets]
-        return [
-            FingerSensation(contact, sensation, self, self._why_held_back(contact, sensation))
-            for contact, sensation in zip(contacts, self.sensations, strict=True)
-        ]
+            return finger_sensations
+        for finger, sensation in zip(self.targets, self.sensations, strict=True):
+            held_back = self._why_held_back(finger.contact, sensation)
+            finger_sensations.append(FingerSensation(finger.contact, sensation, self, held_back))
+        return finger_sensations
 
     def _why_held_back(self, contact: Contact, sensation: Sensation) -> str | None:
         """Return why a finger does not feel a content of its own; None if it does."""
@@ -378,9 +397,8 @@ class Content:
     def weakened(self, gain_db: float, others_gain_db: float) -> "Content":
         """Return the content with a gain [dB]; others_gain_db: the largest gain of the others."""
         quieter = replace(self, layer=self.layer.scaled(gain_db), gain_db=gain_db)
-        return quieter.with_sensations(
-            [weakened(sensation, gain_db, others_gain_db) for sensation in self.sensations]
-        )
+        sensations = [weakened(sensation, gain_db, others_gain_db) for sensation in self.sensations]
+        return quieter.with_sensations(sensations)
 
 
 @dataclass(frozen=True)
@@ -399,17 +417,23 @@ class FingerSensation:
     @property
     def level_db_sl(self) -> float | None:
         """Level of the content: promised if it lasts, otherwise nominal; None without a content."""
-        return None if self.content is None else own_level_db_sl(self.sensation)
+        if self.content is None:
+            return None
+        return own_level_db_sl(self.sensation)
 
     @property
     def frequency(self) -> float | None:
         """Frequency of the content [Hz]; None if it has several, or without a content."""
-        return None if self.content is None else self.content.frequency
+        if self.content is None:
+            return None
+        return self.content.frequency
 
     @property
     def content_name(self) -> str | None:
         """Name of the content."""
-        return None if self.content is None else self.content.target.content
+        if self.content is None:
+            return None
+        return self.content.target.content
 
 
 @dataclass(frozen=True)
@@ -451,7 +475,7 @@ class Selection:
     @property
     def pulses(self) -> list[Pulse]:
         """The pulses of the targets."""
-        return [finger.target.pulse for finger in self.targets if finger.target.pulse is not None]
+        return pulses_of(self.targets)
 
     @cached_property
     def is_whole(self) -> bool:
@@ -486,9 +510,9 @@ class Selection:
         """
         if not self.contents or not any(gains_db.values()):
             return self
-        gains = {
-            content.targets: _lowest_gain(content.targets, gains_db) for content in self.contents
-        }
+        gains = dict[Targets, float]()
+        for content in self.contents:
+            gains[content.targets] = _lowest_gain(content.targets, gains_db)
         contents = list[Content]()
         for content in self.contents:
             gain = gains[content.targets]
@@ -505,14 +529,12 @@ class Selection:
         remaining = tuple([content for content in self.contents if content not in contents])
         unserved = dict[ContactKey, FingerSensation]()
         for content in contents:
-            for finger in content.targets:
-                unserved[finger.contact.key] = not_served(finger.contact, reason)
-        return replace(
-            self,
-            contents=remaining,
-            reason=self.reason if remaining else reason,
-            unserved=(*self.unserved, *unserved.values()),
-        )
+            for contact, _ in content.targets:
+                unserved[contact.key] = not_served(contact, reason)
+        selection = replace(self, contents=remaining, unserved=(*self.unserved, *unserved.values()))
+        if remaining:
+            return selection
+        return replace(selection, reason=reason)
 
     def beside(self, others: Sequence["Selection"], table: LocalizationTable) -> "Selection":
         """Return the selection while other selections play, too, with their foreign levels.
@@ -520,27 +542,28 @@ class Selection:
         table: has the threshold sets.
         """
         other_levels = dict[ContactKey, Sequence[float]]()
+        foreign_levels = {**self.foreign_levels}
         for key in self.target_keys:
             levels = foreign_at(key, others)
             if max(levels, default=-math.inf) > -math.inf:
                 other_levels[key] = levels
+                foreign_levels[key] = foreign_at(key, (self, *others))
         if not other_levels:
             return self
-        foreign_levels = {**self.foreign_levels}
-        for key in other_levels:
-            foreign_levels[key] = foreign_at(key, (self, *others))
 
-        def restated(finger: FingerSensation, offsets: Sequence[float] = (0.0,)) -> Sensation:
+        def restated(finger: FingerSensation, offsets_db: Sequence[float] = (0.0,)) -> Sensation:
             key = finger.contact.key
             if key not in other_levels:
                 return finger.sensation
-            return beside_others(finger.sensation, other_levels[key], foreign_levels[key], offsets)
+            return beside_others(
+                finger.sensation, other_levels[key], foreign_levels[key], offsets_db
+            )
 
         contents = list[Content]()
         for content in self.contents:
             levels_by_set = table.levels_by_set(0.0, content.layer.excitation)
-            offsets = [float(level) for level in levels_by_set]
-            sensations = [restated(finger, offsets) for finger in content.finger_sensations]
+            offsets_db = [float(level) for level in levels_by_set]
+            sensations = [restated(finger, offsets_db) for finger in content.finger_sensations]
             contents.append(content.with_sensations(sensations))
         unserved = [replace(finger, sensation=restated(finger)) for finger in self.unserved]
         return replace(
@@ -553,8 +576,10 @@ class Selection:
 
 def _lowest_gain(targets: Targets, gains_db: Gains) -> float:
     """Return the lowest gain [dB] of some targets, 0 at most."""
-    gains = [gains_db.get((contact.key, target.is_short), 0.0) for contact, target in targets]
-    return min(0.0, *gains)
+    lowest = 0.0
+    for contact, target in targets:
+        lowest = min(lowest, gains_db.get((contact.key, target.is_short), 0.0))
+    return lowest
 
 
 NOTHING = Selection((), ())
@@ -599,10 +624,10 @@ class Question:
         """Whether the answer for lasting targets takes longer than the control loop can wait."""
         if self.lasting and not self.is_alone:
             return True
-        courses = [
-            finger.target.course for finger in self.lasting if finger.target.course is not None
-        ]
-        return any(course.duration > _SOON for course in courses)
+        for _, target in self.lasting:
+            if target.course is not None and target.course.duration > _SOON:
+                return True
+        return False
 
     def quiet_beside(self, targets: Targets) -> tuple[Contact, ...]:
         """Return the contacts that are not among some targets."""
@@ -613,11 +638,12 @@ class Question:
 
     def silent(self, targets: Targets, reason: str) -> Selection:
         """Return the selection of targets that feel nothing, for a reason."""
+        unserved = [not_served(contact, reason) for contact, _ in targets]
         return Selection(
             targets,
             self.quiet_beside(targets),
             reason=reason,
-            unserved=tuple([not_served(finger.contact, reason) for finger in targets]),
+            unserved=tuple(unserved),
             protected=self.protected,
         )
 
@@ -625,26 +651,35 @@ class Question:
         """Return silence in place of the missing selections; nothing if all fingers are served."""
         if self.is_rested:
             return ()
-        parts = [self.lasting, *[(finger,) for finger in self.short]]
-        return tuple([self.silent(targets, reason) for targets in parts])
+        selections = [self.silent(self.lasting, reason)]
+        for finger in self.short:
+            selections.append(self.silent((finger,), reason))
+        return tuple(selections)
 
 
 def foreign_at(key: ContactKey, selections: Sequence[Selection]) -> list[float]:
     """Return the foreign levels [dB SL] of several selections at a contact, by threshold set."""
-    levels = [selection.foreign_levels.get(key) for selection in selections]
-    return sums_db([levels_by_set for levels_by_set in levels if levels_by_set])
+    levels = list[Sequence[float]]()
+    for selection in selections:
+        levels_by_set = selection.foreign_levels.get(key)
+        if levels_by_set:
+            levels.append(levels_by_set)
+    return sums_db(levels)
 
 
 def sums_db(levels: Sequence[Sequence[float]]) -> list[float]:
     """Return the levels [dB] of the sums of powers, by threshold set."""
-    powers = list[float]()
+    sums = list[float]()
     for levels_of_set in zip(*levels, strict=True):
-        powers.append(sum([10 ** (level / 10) for level in levels_of_set]))
-    return [_power_db(power) for power in powers]
+        power = sum([10 ** (level / 10) for level in levels_of_set])
+        sums.append(_power_db(power))
+    return sums
 
 
 def _power_db(power: float) -> float:
-    return 10 * math.log10(power) if power else -math.inf
+    if not power:
+        return -math.inf
+    return 10 * math.log10(power)
 
 
 def no_layer_free(count: int) -> str:
@@ -684,8 +719,8 @@ def leaks_db_sl(
         own_keys = content.contact_keys
         is_foreign = np.array([contact.key not in own_keys for contact in contacts])
         foreign_power += power * is_foreign[:, None]
+    levels = dict[ContactKey, float]()
     loudest_powers = foreign_power.max(axis=1).tolist()
-    return {
-        contact.key: _power_db(power)
-        for contact, power in zip(contacts, loudest_powers, strict=True)
-    }
+    for contact, power in zip(contacts, loudest_powers, strict=True):
+        levels[contact.key] = _power_db(power)
+    return levels

@@ -11,6 +11,7 @@ import logging
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
+from controller.play.crossfades import Crossfades
 from controller.play.intent import (
     Content,
     ContentKey,
@@ -22,7 +23,6 @@ from controller.play.intent import (
 )
 from controller.play.joint_answers import (
     LIMITS_LEAVE_NOTHING,
-    Crossfades,
     Shape,
     answered,
     selection_of,

@@ -1,4 +1,4 @@
-"""Joint answers: choose the contents of all targets with one query of the table, and improve them.
+"""Joint answers: choose the contents of all targets with one query of the table.
 
 The frequency that a finger already feels is part of its content. It is kept, as is its phase at
 that finger, unless another frequency serves more fingers.
@@ -9,17 +9,13 @@ positions: where the change of weights to this answer is half complete, and wher
 next answer will be. The promise is the mean power there over sampled plates, plus an allowance for
 side bands that changing weights cause in other fingers' contents (`model.answer.promise`).
 
-Because frequencies are kept, the result depends on the order of arrival. Once all fingers rest,
-playback cross-fades (`Crossfades`) to the answer without kept frequencies. One content changes at a
-time, so that other fingers feel little of the change. If only weights change, for instance after a
-finger has left, the layer itself follows the same ramp. Every step keeps all sounding frequencies,
-including the outgoing one, 30 Hz apart; if no order of steps can, playback does not change. Between
-steps the promise is computed for the contents that play at the time.
+Because frequencies are kept, the result depends on the order of arrival, until all fingers rest
+(`controller.play.crossfades`).
 """
 
 import cmath
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 
@@ -36,6 +32,7 @@ from controller.play.intent import (
     Target,
     Targets,
     band_of_table,
+    contacts_of,
     judged,
     not_served,
     own_level_db_sl,
@@ -43,36 +40,30 @@ from controller.play.intent import (
 from controller.play.routing import PlaybackCapabilities
 from controller.sources.touch import Contact, ContactKey
 from model.answer.answer import (
-    APART_HZ,
     HELD_BACK,
     IMPERCEPTIBLE_DB_SL,
     MIN_CONTRAST_DB,
     OWN_CONTRAST_DB,
-    SAME_LEVEL,
     Answer,
     Layer,
     Sensation,
 )
-from model.answer.plan import answer, worst_of
+from model.answer.plan import answer
 from model.answer.promise import with_tones
 from model.answer.stimulus import ANY, BY_NAME, MUST, NEVER, ONSET_RAMP, Finger, Placement, Stimulus
-from model.arrays import NEARLY, Complex64Array, FloatArray, Point
-from model.drive_modes import UNRESTRICTED
+from model.arrays import Complex64Array, FloatArray, Point
 from model.finger import FINGERTIP_RADIUS
 from model.structure.attachments import MIN_LOAD
 from model.structure.plate import Plate
 from model.table.table import LocalizationTable
-from model.vibration import Excitation, base_amplitudes
+from model.vibration import Excitation, Tone
 from registry.limits import MAX_CONTACTS
 
 STRETCH = 0.008
 """Distance [m] after which a moving finger gets a new answer, which covers twice that distance."""
 
-WORTH = 2.0
-"""Gain in promised contrast [dB] of the worst finger that justifies other frequencies."""
-
-WORTH_OF_WEIGHTS = 0.5
-"""Gain in promised contrast [dB] of the worst finger that justifies other weights alone."""
+SHORT_OF = 1.0
+"""Tolerated loss of level [dB] for a kept frequency."""
 
 LIMITS_LEAVE_NOTHING = "the limits of the amplifiers allow nothing that is felt; raise them"
 
@@ -82,15 +73,10 @@ NEIGHBOURS_LEAVE_NOTHING = (
 )
 
 _ANSWER_TIME = 0.020  # s; from a question until its answer begins to play
-_SHORT_OF = 1.0  # dB; tolerated loss of level for a kept frequency
 _SIDE_BANDS = 2
-_SAME = 0.01  # difference between two drives that is not felt, relative to the largest amplitude
 
 Shape = Callable[[Placement, Layer, bool], Layer]
 """Adds the envelopes of a layer, without an onset if the last argument is true."""
-
-_Voices = Mapping[ContactKey, tuple[Content, ...]]
-"""A content and its side bands, by the finger that owns it."""
 
 
 def answered(
@@ -115,7 +101,7 @@ def answered(
     fingers = fingers_of(table, targets, quiet, capabilities, question.protected)
     if len(targets) > 1 or first_target.modulation_hz is not None:
         fingers = _as_layers_allow(fingers, len(targets), capabilities)
-    contacts = [*[finger.contact for finger in targets], *quiet]
+    contacts = [*contacts_of(targets), *quiet]
     fingers = with_paths(fingers, contacts, now, table.plate)
     has_onsets = capabilities.envelope_support.onset_knots > 0
     request = partial(
@@ -126,7 +112,9 @@ def answered(
         limits=capabilities.limits,
         avoided_hz=avoided_hz,
     )
-    tuned_fingers = _tuned_as_played(fingers, targets, question.playing) if keeps else fingers
+    tuned_fingers = fingers
+    if keeps:
+        tuned_fingers = _tuned_as_played(fingers, targets, question.playing)
     solution = request(tuned_fingers)
     if tuned_fingers != fingers and _may_be_improved(solution, len(targets)):
         free_solution = request(fingers)
@@ -137,7 +125,7 @@ def answered(
 
 def _may_be_improved(solution: Answer, count: int) -> bool:
     """Whether an answer leaves out a target, or is weaker than requested."""
-    return len(solution.layers) < count or _lowered_db(solution) >= _SHORT_OF
+    return len(solution.layers) < count or _lowered_db(solution) >= SHORT_OF
 
 
 def _serves_better(solution: Answer, kept: Answer) -> bool:
@@ -145,7 +133,7 @@ def _serves_better(solution: Answer, kept: Answer) -> bool:
     if len(solution.layers) != len(kept.layers):
         return len(solution.layers) > len(kept.layers)
     shortfall = _lowered_db(kept)
-    return shortfall >= _SHORT_OF and _lowered_db(solution) < shortfall
+    return shortfall >= SHORT_OF and _lowered_db(solution) < shortfall
 
 
 def fingers_of(
@@ -163,13 +151,14 @@ def fingers_of(
     fingers = list[Finger]()
     for contact, target in targets:
         band = playable_band(target.band, table.frequencies, capabilities.limits.frequencies)
+        min_contrast = OWN_CONTRAST_DB if target.is_own else -math.inf
         finger = Finger(
             (contact.x, contact.y),
             _stimulus_of(target, band, is_single=len(targets) == 1),
             contact.load,
             target.priority,
             _sharing_of(target),
-            min_contrast_db=OWN_CONTRAST_DB if target.is_own else -math.inf,
+            min_contrast_db=min_contrast,
             max_foreign_db_sl=_max_foreign_db_sl(contact, protected),
         )
         fingers.append(finger)
@@ -190,13 +179,18 @@ def _stimulus_of(target: Target, band: tuple[float, float], *, is_single: bool) 
     duration = None
     if has_duration and target.pulse is not None and target.pulse.is_raised:
         duration = target.pulse.duration
-    is_limit = target.level_db_sl is None
+    modulation_hz = None
+    if duration is None:
+        modulation_hz = target.modulation_hz
+    level = target.level_db_sl
+    if level is None:
+        level = MAX_DB_SL
     return Stimulus(
-        MAX_DB_SL if target.level_db_sl is None else target.level_db_sl,
+        level,
         band,
         duration,
-        target.modulation_hz if duration is None else None,
-        is_limit=is_limit,
+        modulation_hz,
+        is_limit=target.level_db_sl is None,
         name=target.content,
         course=target.course,
     )
@@ -206,7 +200,9 @@ def _sharing_of(target: Target) -> str:
     """Return which vibrations of other fingers a target can share."""
     if target.is_own or target.course is not None:  # courses begin at different times
         return NEVER
-    return ANY if target.may_share else BY_NAME
+    if target.may_share:
+        return ANY
+    return BY_NAME
 
 
 def _max_foreign_db_sl(contact: Contact, protected: frozenset[ContactKey]) -> float:
@@ -227,7 +223,9 @@ def playable_band(
     low = max(playable[0], table_low)
     high = min(playable[1], table_high)
     is_in_band = (frequencies >= low) & (frequencies <= high)
-    return (low, high) if is_in_band.any() else playable
+    if not is_in_band.any():
+        return playable
+    return low, high
 
 
 def _as_layers_allow(
@@ -274,7 +272,10 @@ def _tuned_as_played(
 
 def _lowered_db(solution: Answer) -> float:
     """Return the largest difference [dB] between a requested level and the level of the answer."""
-    return max([sensation.lowered_db for sensation in solution.fingers], default=0.0)
+    lowered = 0.0
+    for sensation in solution.fingers:
+        lowered = max(lowered, sensation.lowered_db)
+    return lowered
 
 
 def selection_of(
@@ -293,7 +294,8 @@ def selection_of(
     quiet = question.quiet_beside(targets)
     unserved = _unserved(targets, solution)
     unserved_keys = {finger.contact.key for finger in unserved}
-    phases = _Phases(table, tuple([finger.at for finger in solution.asked[: len(targets)]]))
+    positions = [finger.at for finger in solution.asked[: len(targets)]]
+    phases = _Phases(table, tuple(positions))
     contents = list[Content]()
     for layer in solution.layers:
         own_targets = list[FingerTarget]()
@@ -305,23 +307,25 @@ def selection_of(
                 sensations.append(_within_pulse(solution.fingers[number], finger.target))
         if not own_targets:
             continue
-        first_contact, first_target = own_targets[0]
+        owner, target = own_targets[0]
         carrier = Content(
-            key=ContentKey(first_contact.key, first_target.voice),
+            key=ContentKey(owner.key, target.voice),
             targets=tuple(own_targets),
             placement=solution.placement(layer),
             layer=layer,
             sensations=tuple(sensations),
         )
         contents += _voices_of(carrier, question.playing, phases, shape, is_in_phase=is_in_phase)
-    contacts = [*[finger.contact for finger in targets], *quiet]
+    reason = None
+    if not contents:
+        reason = unserved[0].held_back
     return Selection(
         targets,
         quiet,
         tuple(contents),
-        None if contents else unserved[0].held_back,
+        reason,
         tuple(unserved),
-        foreign_levels=_foreign_levels(solution, contacts),
+        foreign_levels=_foreign_levels(solution, [*contacts_of(targets), *quiet]),
         protected=question.protected,
     )
 
@@ -361,30 +365,35 @@ def _voices_of(
     shape: adds envelopes.
     """
     layers = carrier.layer.voices
-    contact_key, first_voice = carrier.key
     felt_now = playing.get(carrier.key)
-    is_continued = felt_now is not None and _are_played(layers, contact_key, playing)
+    reference = None
+    if _are_played(layers, carrier.key, playing):
+        reference = felt_now
+    is_continued = reference is not None
     is_turned = len(layers) > 1 or (is_in_phase and felt_now is not None)
-    reference = felt_now if is_continued else None
     owner = carrier.layer.fingers[0]
     voices = list[Content]()
-    for voice, layer in enumerate(layers):
+    for number, layer in enumerate(layers):
         if is_turned:
             layer = phases.turned(layer, reference, owner)
         if shape is not None and carrier.target.course is None:
             layer = shape(carrier.placement, layer, is_continued)
-        key = ContentKey(contact_key, first_voice + voice)
-        sensations = () if voice else carrier.sensations
-        voices.append(replace(carrier, key=key, layer=layer, sensations=sensations))
+        if number == 0:
+            voices.append(replace(carrier, layer=layer))
+        else:
+            key = ContentKey(carrier.key.finger, carrier.key.voice + number)
+            voices.append(replace(carrier, key=key, layer=layer, sensations=()))
     return voices
 
 
 def _are_played(
-    layers: Sequence[Layer], key: ContactKey, playing: Mapping[ContentKey, Content]
+    layers: Sequence[Layer], key: ContentKey, playing: Mapping[ContentKey, Content]
 ) -> bool:
-    """Whether a finger feels the frequencies of all these layers now."""
+    """Whether a finger feels the content of a key now, with the frequencies of all these layers."""
+    if key not in playing:
+        return False
     for voice, layer in enumerate(layers):
-        content = playing.get(ContentKey(key, voice))
+        content = playing.get(ContentKey(key.finger, voice))
         if content is None or content.frequency != layer.frequency:
             return False
     return True
@@ -457,11 +466,11 @@ class _Phases:
         """
         reference: complex = 1.0
         if content is not None:
-            accelerations = self._accelerations(content.layer.excitation, finger)
-            if len(accelerations) == 1:
-                (reference,) = accelerations.values()
+            felt_now = self._accelerations(content.layer.excitation, finger)
+            if len(felt_now) == 1:
+                (reference,) = felt_now.values()
         accelerations = self._accelerations(layer.excitation, finger)
-        tones = {}
+        tones = dict[str, Tone]()
         for name, tone in layer.excitation.items():
             acceleration = accelerations[tone.frequency]
             change = 0.0
@@ -472,7 +481,8 @@ class _Phases:
 
     def _accelerations(self, excitation: Excitation, finger: int) -> dict[float, complex]:
         """Return the complex acceleration at a finger, by frequency [Hz]."""
-        frequencies, accelerations = self.table.driven(excitation, self._fields[:, :, [finger]])
+        fields = self._fields[:, :, [finger]]
+        frequencies, accelerations = self.table.driven(excitation, fields)
         at_finger = accelerations[:, 0].tolist()
         return dict(zip(frequencies.tolist(), at_finger, strict=True))
 
@@ -492,15 +502,18 @@ def with_paths(
         path = _path_of(contact, now, plate)
         if path is None:
             continue
-        start, middle, end = path
-        others = [other for other in (*moved, *ends) if other is not finger]
-        if _comes_near(path, others):
+        neighbours = [neighbour for neighbour in (*moved, *ends) if neighbour is not finger]
+        if _comes_near(path, neighbours):
             continue
+        start, middle, end = path
         moved[number] = replace(finger, at=middle)
         has_room = len(moved) + len(ends) + 2 <= MAX_CONTACTS
-        if has_room and len(set(path)) == len(path) and _is_steady_and_alone(finger, others):
-            at_end = replace(finger, load=MIN_LOAD, sharing=MUST, stimulus=_named(finger, number))
-            ends += [replace(at_end, at=start), replace(at_end, at=end)]
+        is_long = len({start, middle, end}) == len(path)  # not at the plate's edge
+        if has_room and is_long and _is_steady_and_alone(finger, neighbours):
+            stimulus = _named(finger, number)
+            at_end = replace(finger, load=MIN_LOAD, sharing=MUST, stimulus=stimulus)
+            ends.append(replace(at_end, at=start))
+            ends.append(replace(at_end, at=end))
             moved[number] = replace(at_end, at=middle, load=finger.load - 2 * MIN_LOAD)
     return [*moved, *ends]
 
@@ -516,7 +529,9 @@ def _path_of(contact: Contact, now: float, plate: Plate) -> tuple[Point, Point, 
     stretch_time = STRETCH / speed
 
     def position_after(delay: float) -> Point:
-        return _on_plate((contact.x + vx * delay, contact.y + vy * delay), plate)
+        x = contact.x + vx * delay
+        y = contact.y + vy * delay
+        return _on_plate((x, y), plate)
 
     start = position_after(answer_delay - stretch_time / 2)
     middle = position_after(answer_delay + stretch_time / 2)
@@ -526,14 +541,17 @@ def _path_of(contact: Contact, now: float, plate: Plate) -> tuple[Point, Point, 
 
 def _on_plate(position: Point, plate: Plate) -> Point:
     x, y = position
-    return min(max(x, 0.0), plate.length), min(max(y, 0.0), plate.width)
+    x_on_plate = min(max(x, 0.0), plate.length)
+    y_on_plate = min(max(y, 0.0), plate.width)
+    return x_on_plate, y_on_plate
 
 
-def _comes_near(path: Sequence[Point], others: Sequence[Finger]) -> bool:
+def _comes_near(path: Sequence[Point], neighbours: Sequence[Finger]) -> bool:
     """Whether a path comes within a fingertip's radius of another finger."""
     for point in path:
-        if any(math.dist(point, other.at) < FINGERTIP_RADIUS for other in others):
-            return True
+        for neighbour in neighbours:
+            if math.dist(point, neighbour.at) < FINGERTIP_RADIUS:
+                return True
     return False
 
 
@@ -544,13 +562,13 @@ def _named(finger: Finger, number: int) -> Stimulus | None:
     return replace(finger.stimulus, name=finger.name or f"finger {number}")
 
 
-def _is_steady_and_alone(finger: Finger, others: Sequence[Finger]) -> bool:
+def _is_steady_and_alone(finger: Finger, neighbours: Sequence[Finger]) -> bool:
     """Whether a finger feels nothing, or a steady content that no other finger may share."""
     if finger.stimulus is None:
         return True
     if finger.stimulus.modulation_hz is not None:
         return False
-    return not any(finger.may_feel_one_with(other) for other in others)
+    return not any(finger.may_feel_one_with(neighbour) for neighbour in neighbours)
 
 
 def _on_paths(table: LocalizationTable, solution: Answer, count: int) -> Answer:
@@ -561,220 +579,18 @@ def _on_paths(table: LocalizationTable, solution: Answer, count: int) -> Answer:
     paths = [[number] for number in range(count)]
     for end in range(count, len(positions)):
         distances = [math.dist(middle, positions[end]) for middle in positions[:count]]
-        paths[distances.index(min(distances))].append(end)
+        nearest = distances.index(min(distances))
+        paths[nearest].append(end)
     if solution.layers:
         tones = solution.tones
         rows = np.array(tones.rows)
         owners = np.array(tones.owners)
         gains = np.array(tones.gains)
         solution = with_tones(table, solution, rows, tones.weights, owners, gains, paths)
+    held = [vibration for vibration in solution.held if vibration[0] < count]
     return replace(
         solution,
         asked=solution.asked[:count],
         contents=solution.contents.of_first(count),
-        held=tuple([vibration for vibration in solution.held if vibration[0] < count]),
+        held=tuple(held),
     )
-
-
-@dataclass(frozen=True)
-class Crossfades:
-    """Finds the way from the contents that play to a better answer for the same fingers.
-
-    question: has the lasting targets, whose fingers rest; shape: adds envelopes.
-    """
-
-    table: LocalizationTable
-    question: Question
-    capabilities: PlaybackCapabilities
-    shape: Shape | None = None
-
-    def steps(self) -> tuple[Selection, ...]:
-        """Return the selection after each step; new contents are marked as cross-faded (`is_led`).
-
-        Other frequencies must promise the worst finger 2 dB more, other weights alone 0.5 dB more,
-        in both cases to the same fingers and at no lower level. The way ends with the last step
-        that promises more. Without a better answer the only step is the present selection, if its
-        promised contrast differs by 0.5 dB from the promise made while fingers moved. There is no
-        step if no content plays.
-        """
-        if self.capabilities.drive_mode != UNRESTRICTED or not self.question.playing:
-            return ()
-        playing = _by_finger(self.question.playing.values())
-        restated = tuple[Selection, ...]()
-        for keeps in (False, True):
-            goal = answered(
-                self.table, self.question, self.question.lasting, self.capabilities, keeps=keeps
-            )
-            goal_voices = _by_finger(self._selection(goal, shape=self.shape).contents)
-            is_same_service = _served(goal_voices) == _served(playing)
-            if not is_same_service or len(goal.layers) != len(playing):
-                continue
-            present = self._answer_of(goal, playing)
-            restated = self._restated(present, playing)
-            changes = {
-                key: voices for key, voices in goal_voices.items() if _differ(voices, playing[key])
-            }
-            if not _is_worth_it(goal, present, playing, changes):
-                continue
-            steps = self._in_order(goal, playing, changes)
-            if steps:
-                return steps
-        return restated
-
-    def _restated(self, present: Answer, playing: _Voices) -> tuple[Selection, ...]:
-        """Return the present selection with its present promises; nothing if they are known."""
-        known_promises = dict[ContactKey, float]()
-        for content in self.question.playing.values():
-            for felt in content.finger_sensations:
-                known_promises[felt.contact.key] = felt.sensation.promised_contrast_db or 0.0
-        selection = self._selection_of_playing(present, playing)
-        for felt in selection.finger_sensations:
-            promise = felt.sensation.promised_contrast_db or 0.0
-            known_promise = known_promises.get(felt.contact.key, promise)
-            if abs(promise - known_promise) >= WORTH_OF_WEIGHTS:
-                return (selection,)
-        return ()
-
-    def _in_order(self, goal: Answer, playing: _Voices, changes: _Voices) -> tuple[Selection, ...]:
-        """Return the selection after each step, the best content first; empty without an order.
-
-        A content that can follow now never prevents a later one, so no other order gets further
-        than this one.
-        """
-        remaining = {**changes}
-        steps = list[Selection]()
-        promised_worst = -math.inf
-        while remaining:
-            options = list[tuple[float, ContactKey]]()
-            answers = dict[ContactKey, Answer]()
-            for key, voices in remaining.items():
-                if self._may_follow(playing, key, voices):
-                    answers[key] = self._answer_of(goal, {**playing, key: voices})
-                    options.append((worst_of(answers[key]), key))
-            if not options:
-                return ()
-            worst, best_key = max(options, key=lambda option: option[0])
-            playing = {**playing, best_key: remaining.pop(best_key)}
-            if remaining or not steps or worst >= promised_worst + SAME_LEVEL:
-                steps.append(self._selection_of_playing(answers[best_key], playing))
-            promised_worst = worst
-        return tuple(steps)
-
-    def _may_follow(self, playing: _Voices, key: ContactKey, voices: tuple[Content, ...]) -> bool:
-        """Whether a finger's content can be cross-faded to another one while all contents play.
-
-        While both sound, they must be 30 Hz from all other contents and from each other, and within
-        the limits of the amplifiers.
-        """
-        if not _is_tuned(playing[key], voices):
-            contents = _all_of({**playing, key: voices})
-        elif _is_apart(voices[0], [contents[0] for contents in playing.values()]):
-            contents = [*_all_of(playing), *voices]
-        else:
-            return False
-        layers = [content.layer for content in contents]
-        return self.capabilities.limits.factor_within(layers, self.table) >= 1 - NEARLY
-
-    def _answer_of(self, goal: Answer, voices: _Voices) -> Answer:
-        """Return an answer with the tones of contents that play together, and its promises."""
-        rows = list[int]()
-        drives = list[list[complex]]()
-        owners = list[int]()
-        for number, stream in enumerate(goal.contents.streams):
-            owner, _ = self.question.lasting[stream.targets[0]]
-            for content in voices[owner.key]:
-                frequencies, bases = base_amplitudes(content.layer.excitation, self.table.eras)
-                content_rows = self.table.rows_of(frequencies)
-                rows += content_rows.tolist()
-                drives += (bases / self.table.highest_drives[content_rows]).tolist()
-                owners += [number] * len(frequencies)
-        gains = np.ones(len(rows))
-        return with_tones(self.table, goal, np.array(rows), drives, np.array(owners), gains)
-
-    def _selection_of_playing(self, present: Answer, voices: _Voices) -> Selection:
-        """Return the selection of contents that play together, with their sensations."""
-        selection = self._selection(present)
-        contents = list[Content]()
-        for key, answered_voices in _by_finger(selection.contents).items():
-            for content, answered_voice in zip(voices[key], answered_voices, strict=True):
-                contents.append(replace(content, sensations=answered_voice.sensations))
-        return replace(selection, contents=tuple(contents))
-
-    def _selection(self, solution: Answer, *, shape: Shape | None = None) -> Selection:
-        """Return the selection of an answer; its contents are marked as cross-faded."""
-        targets = self.question.lasting
-        selection = selection_of(self.table, self.question, solution, targets, shape=shape)
-        contents = [replace(content, is_led=True) for content in selection.contents]
-        return replace(selection, contents=tuple(contents))
-
-
-def _by_finger(contents: Iterable[Content]) -> _Voices:
-    """Return contents by finger, each followed by its side bands."""
-    voices = dict[ContactKey, tuple[Content, ...]]()
-    for content in sorted(contents, key=lambda content: content.key.voice):
-        key = content.key.finger
-        voices[key] = (*voices.get(key, ()), content)
-    return voices
-
-
-def _all_of(voices: _Voices) -> list[Content]:
-    """Return all contents and side bands."""
-    return [content for contents in voices.values() for content in contents]
-
-
-def _served(voices: _Voices) -> dict[ContactKey, tuple[int, set[ContactKey]]]:
-    """Return the number of voices and the contacts of each finger's content."""
-    served = {}
-    for key, contents in voices.items():
-        served[key] = (len(contents), {*contents[0].contact_keys})
-    return served
-
-
-def _is_worth_it(goal: Answer, present: Answer, playing: _Voices, changes: _Voices) -> bool:
-    """Whether an answer promises the worst finger clearly more, and no finger a lower level."""
-    is_tuned = any(_is_tuned(playing[key], voices) for key, voices in changes.items())
-    gain = worst_of(goal) - worst_of(present)
-    required_gain = WORTH if is_tuned else WORTH_OF_WEIGHTS
-    return gain >= required_gain and not _is_weaker(goal, present)
-
-
-def _is_apart(content: Content, others: Iterable[Content]) -> bool:
-    """Whether a content is at least 30 Hz from all others."""
-    frequency = content.frequency or 0.0
-    return all(abs(frequency - (other.frequency or 0.0)) >= APART_HZ for other in others)
-
-
-def _is_tuned(playing: Sequence[Content], goal: Sequence[Content]) -> bool:
-    """Whether the frequencies of two contents and their side bands differ."""
-    playing_frequencies = [content.frequency for content in playing]
-    return playing_frequencies != [content.frequency for content in goal]
-
-
-def _differ(goal: Sequence[Content], playing: Sequence[Content]) -> bool:
-    """Whether a finger feels a difference between two contents and their side bands."""
-    if _is_tuned(playing, goal):
-        return True
-    for new_content, old_content in zip(goal, playing, strict=True):
-        new_phasors = _phasors(new_content)
-        old_phasors = _phasors(old_content)
-        amplitudes = [abs(phasor) for phasor in (*new_phasors.values(), *old_phasors.values())]
-        tolerance = _SAME * max(amplitudes)
-        for name in {*new_phasors, *old_phasors}:
-            change = new_phasors.get(name, 0) - old_phasors.get(name, 0)
-            if abs(change) > tolerance:
-                return True
-    return False
-
-
-def _phasors(content: Content) -> dict[str, complex]:
-    """Return the complex amplitude of each ERA [m]."""
-    return {name: tone.phasor for name, tone in content.layer.excitation.items()}
-
-
-def _is_weaker(goal: Answer, present: Answer) -> bool:
-    """Whether a finger with a content feels a clearly lower level."""
-    for new, old in zip(goal.fingers, present.fingers, strict=True):
-        loss = old.promised_level_db_sl - new.promised_level_db_sl
-        if new.layer is not None and loss > _SHORT_OF:
-            return True
-    return False

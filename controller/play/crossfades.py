@@ -1,0 +1,261 @@
+"""Cross-fades: improve the contents of fingers at rest, step by step.
+
+Joint answers keep the frequencies that fingers feel, so the result depends on the order of arrival.
+Once all fingers rest, playback cross-fades to the answer without kept frequencies. One content
+changes at a time, so that other fingers feel little of the change. If only weights change, for
+instance after a finger has left, the layer itself follows the same ramp. Every step keeps all
+sounding frequencies, including the outgoing one, 30 Hz apart; if no order of steps can, playback
+does not change. Between steps the promise is computed for the contents that play at the time.
+"""
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from controller.play.intent import Content, Question, Selection
+from controller.play.joint_answers import SHORT_OF, Shape, answered, selection_of
+from controller.play.routing import PlaybackCapabilities
+from controller.sources.touch import ContactKey
+from model.answer.answer import APART_HZ, SAME_LEVEL, Answer
+from model.answer.plan import worst_of
+from model.answer.promise import with_tones
+from model.arrays import NEARLY
+from model.drive_modes import UNRESTRICTED
+from model.table.table import LocalizationTable
+from model.vibration import base_amplitudes
+
+WORTH = 2.0
+"""Gain in promised contrast [dB] of the worst finger that justifies other frequencies."""
+
+WORTH_OF_WEIGHTS = 0.5
+"""Gain in promised contrast [dB] of the worst finger that justifies other weights alone."""
+
+_SAME = 0.01  # difference between two drives that is not felt, relative to the largest amplitude
+
+_Voices = Mapping[ContactKey, tuple[Content, ...]]
+"""A content and its side bands, by the finger that owns it."""
+
+
+@dataclass(frozen=True)
+class Crossfades:
+    """Finds the way from the contents that play to a better answer for the same fingers.
+
+    question: has the lasting targets, whose fingers rest; shape: adds envelopes.
+    """
+
+    table: LocalizationTable
+    question: Question
+    capabilities: PlaybackCapabilities
+    shape: Shape | None = None
+
+    def steps(self) -> tuple[Selection, ...]:
+        """Return the selection after each step; new contents are marked as cross-faded (`is_led`).
+
+        Other frequencies must promise the worst finger 2 dB more, other weights alone 0.5 dB more,
+        in both cases to the same fingers and at no lower level. The way ends with the last step
+        that promises more. Without a better answer the only step is the present selection, if its
+        promised contrast differs by 0.5 dB from the promise made while fingers moved. There is no
+        step if no content plays.
+        """
+        if self.capabilities.drive_mode != UNRESTRICTED or not self.question.playing:
+            return ()
+        playing = _by_finger(self.question.playing.values())
+        restated = tuple[Selection, ...]()
+        for keeps in (False, True):
+            goal = answered(
+                self.table, self.question, self.question.lasting, self.capabilities, keeps=keeps
+            )
+            goal_voices = _by_finger(self._selection(goal, shape=self.shape).contents)
+            is_same_service = _served(goal_voices) == _served(playing)
+            if not is_same_service or len(goal.layers) != len(playing):
+                continue
+            present = self._answer_of(goal, playing)
+            restated = self._restated(present, playing)
+            changes = _changes(goal_voices, playing)
+            if not _is_worth_it(goal, present, playing, changes):
+                continue
+            steps = self._in_order(goal, playing, changes)
+            if steps:
+                return steps
+        return restated
+
+    def _restated(self, present: Answer, playing: _Voices) -> tuple[Selection, ...]:
+        """Return the present selection with its present promises; nothing if they are known."""
+        known_promises = dict[ContactKey, float]()
+        for content in self.question.playing.values():
+            for felt in content.finger_sensations:
+                known_promises[felt.contact.key] = felt.sensation.promised_contrast_db or 0.0
+        selection = self._selection_of_playing(present, playing)
+        for felt in selection.finger_sensations:
+            promise = felt.sensation.promised_contrast_db or 0.0
+            known_promise = known_promises.get(felt.contact.key, promise)
+            if abs(promise - known_promise) >= WORTH_OF_WEIGHTS:
+                return (selection,)
+        return ()
+
+    def _in_order(self, goal: Answer, playing: _Voices, changes: _Voices) -> tuple[Selection, ...]:
+        """Return the selection after each step, the best content first; empty without an order.
+
+        A content that can follow now never prevents a later one, so no other order gets further
+        than this one.
+        """
+        remaining = {**changes}
+        steps = list[Selection]()
+        promised_worst = -math.inf
+        while remaining:
+            answers = dict[ContactKey, Answer]()
+            for key, voices in remaining.items():
+                if self._may_follow(playing, key, voices):
+                    answers[key] = self._answer_of(goal, {**playing, key: voices})
+            if not answers:
+                return ()
+            contrasts = {key: worst_of(solution) for key, solution in answers.items()}
+            best_key = max(contrasts, key=contrasts.__getitem__)
+            playing = {**playing, best_key: remaining.pop(best_key)}
+            worst = contrasts[best_key]
+            if remaining or not steps or worst >= promised_worst + SAME_LEVEL:
+                steps.append(self._selection_of_playing(answers[best_key], playing))
+            promised_worst = worst
+        return tuple(steps)
+
+    def _may_follow(self, playing: _Voices, key: ContactKey, voices: tuple[Content, ...]) -> bool:
+        """Whether a finger's content can be cross-faded to another one while all contents play.
+
+        While both sound, they must be 30 Hz from all other contents and from each other, and within
+        the limits of the amplifiers.
+        """
+        if not _is_tuned(playing[key], voices):
+            contents = _all_of({**playing, key: voices})
+        else:
+            carriers = [contents[0] for contents in playing.values()]
+            if not _is_apart(voices[0], carriers):
+                return False
+            contents = [*_all_of(playing), *voices]
+        layers = [content.layer for content in contents]
+        return self.capabilities.limits.factor_within(layers, self.table) >= 1 - NEARLY
+
+    def _answer_of(self, goal: Answer, voices: _Voices) -> Answer:
+        """Return an answer with the tones of contents that play together, and its promises."""
+        rows = list[int]()
+        drives = list[list[complex]]()
+        owners = list[int]()
+        for number, stream in enumerate(goal.contents.streams):
+            owner, _ = self.question.lasting[stream.targets[0]]
+            for content in voices[owner.key]:
+                frequencies, bases = base_amplitudes(content.layer.excitation, self.table.eras)
+                content_rows = self.table.rows_of(frequencies)
+                relative_drives = bases / self.table.highest_drives[content_rows]
+                rows += content_rows.tolist()
+                drives += relative_drives.tolist()
+                owners += [number] * len(frequencies)
+        gains = np.ones(len(rows))
+        return with_tones(self.table, goal, np.array(rows), drives, np.array(owners), gains)
+
+    def _selection_of_playing(self, present: Answer, voices: _Voices) -> Selection:
+        """Return the selection of contents that play together, with their sensations."""
+        selection = self._selection(present)
+        contents = list[Content]()
+        for key, answered_voices in _by_finger(selection.contents).items():
+            for content, answered_voice in zip(voices[key], answered_voices, strict=True):
+                contents.append(replace(content, sensations=answered_voice.sensations))
+        return replace(selection, contents=tuple(contents))
+
+    def _selection(self, solution: Answer, *, shape: Shape | None = None) -> Selection:
+        """Return the selection of an answer; its contents are marked as cross-faded."""
+        targets = self.question.lasting
+        selection = selection_of(self.table, self.question, solution, targets, shape=shape)
+        contents = [replace(content, is_led=True) for content in selection.contents]
+        return replace(selection, contents=tuple(contents))
+
+
+def _by_finger(contents: Iterable[Content]) -> _Voices:
+    """Return contents by finger, each followed by its side bands."""
+    voices = dict[ContactKey, tuple[Content, ...]]()
+    for content in sorted(contents, key=lambda content: content.key.voice):
+        key = content.key.finger
+        voices[key] = (*voices.get(key, ()), content)
+    return voices
+
+
+def _all_of(voices: _Voices) -> list[Content]:
+    """Return all contents and side bands."""
+    all_contents = list[Content]()
+    for contents in voices.values():
+        all_contents += contents
+    return all_contents
+
+
+def _changes(goal: _Voices, playing: _Voices) -> _Voices:
+    """Return the contents of a goal that feel different from those that play."""
+    changes = dict[ContactKey, tuple[Content, ...]]()
+    for key, voices in goal.items():
+        if _differ(voices, playing[key]):
+            changes[key] = voices
+    return changes
+
+
+def _served(voices: _Voices) -> dict[ContactKey, tuple[int, set[ContactKey]]]:
+    """Return the number of voices and the contacts of each finger's content."""
+    served = {}
+    for key, contents in voices.items():
+        served[key] = (len(contents), {*contents[0].contact_keys})
+    return served
+
+
+def _is_worth_it(goal: Answer, present: Answer, playing: _Voices, changes: _Voices) -> bool:
+    """Whether an answer promises the worst finger clearly more, and no finger a lower level."""
+    required_gain = WORTH_OF_WEIGHTS
+    for key, voices in changes.items():
+        if _is_tuned(playing[key], voices):
+            required_gain = WORTH
+    gain = worst_of(goal) - worst_of(present)
+    return gain >= required_gain and not _is_weaker(goal, present)
+
+
+def _is_apart(content: Content, neighbours: Iterable[Content]) -> bool:
+    """Whether a content is at least 30 Hz from all others."""
+    frequency = content.frequency or 0.0
+    for neighbour in neighbours:
+        distance = abs(frequency - (neighbour.frequency or 0.0))
+        if distance < APART_HZ:
+            return False
+    return True
+
+
+def _is_tuned(playing: Sequence[Content], goal: Sequence[Content]) -> bool:
+    """Whether the frequencies of two contents and their side bands differ."""
+    playing_frequencies = [content.frequency for content in playing]
+    goal_frequencies = [content.frequency for content in goal]
+    return playing_frequencies != goal_frequencies
+
+
+def _differ(goal: Sequence[Content], playing: Sequence[Content]) -> bool:
+    """Whether a finger feels a difference between two contents and their side bands."""
+    if _is_tuned(playing, goal):
+        return True
+    for new_content, old_content in zip(goal, playing, strict=True):
+        new_phasors = _phasors(new_content)
+        old_phasors = _phasors(old_content)
+        phasors = [*new_phasors.values(), *old_phasors.values()]
+        tolerance = _SAME * max(map(abs, phasors))
+        for name in {*new_phasors, *old_phasors}:
+            change = new_phasors.get(name, 0) - old_phasors.get(name, 0)
+            if abs(change) > tolerance:
+                return True
+    return False
+
+
+def _phasors(content: Content) -> dict[str, complex]:
+    """Return the complex amplitude of each ERA [m]."""
+    return {name: tone.phasor for name, tone in content.layer.excitation.items()}
+
+
+def _is_weaker(goal: Answer, present: Answer) -> bool:
+    """Whether a finger with a content feels a clearly lower level."""
+    for new, old in zip(goal.fingers, present.fingers, strict=True):
+        loss = old.promised_level_db_sl - new.promised_level_db_sl
+        if new.layer is not None and loss > SHORT_OF:
+            return True
+    return False

@@ -474,6 +474,7 @@ def route(
     strokes = rig.full_levels
     onsets, endings = on_wire(strokes, onset, ending)
     wired: dict[str, list[AmplifierTone]] = {name: [] for name in rig.amplifiers}
+    largest_rise = 0.0
     for name, channel in rig.wiring.items():
         driven = excitation.get(name)
         shape = onsets.get(name)
@@ -499,12 +500,16 @@ def route(
                 ending=endings.get(name),
             )
         wired[channel.amplifier].append(tone)
-        shortest_ramp = _rise(tone, drive.get(name)) / rig.limits.slew
-        if shortest_ramp > ramp:  # false for NaN, which the ledgers reject
-            ramp = shortest_ramp
-    return {
-        name: AmplifierLayer(number, tuple(tones), ramp, valid_for) for name, tones in wired.items()
-    }
+        rise = _rise(tone, drive.get(name))
+        if rise > largest_rise:  # false for NaN, which the ledgers reject
+            largest_rise = rise
+    shortest_ramp = largest_rise / rig.limits.slew
+    if shortest_ramp > ramp:
+        ramp = shortest_ramp
+    layers = dict[str, AmplifierLayer]()
+    for name, tones in wired.items():
+        layers[name] = AmplifierLayer(number, tuple(tones), ramp, valid_for)
+    return layers
 
 
 def _rise(tone: AmplifierTone, former_tone: AmplifierTone | None) -> float:
@@ -552,6 +557,8 @@ def thinned(envelopes: Envelopes, *, knots: int) -> Envelopes:
 
 def on_wire(strokes: Mapping[str, float], *groups: Envelopes | None) -> list[dict[str, Envelope]]:
     """Return groups of envelopes in integers of the wire; strokes [m] and envelopes are by ERA."""
+    if not any(groups):
+        return [{} for _ in groups]
     motions = list[complex]()
     units = list[float]()
     for envelopes in groups:

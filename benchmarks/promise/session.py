@@ -33,7 +33,7 @@ from benchmarks.promise.hearing import Heard, Log, Span, owner_of
 from benchmarks.setting import random_contacts
 from controller.effects.player import CLICK_ABOVE_DB
 from controller.play.intent import FingerSensation, HapticIntent, Pulse, Target
-from controller.play.loop import PlayReport
+from controller.play.reports import PlayReport
 from controller.sources.touch import ContactKey
 from kit.chain import Chain
 from kit.clock import run_virtual

@@ -31,7 +31,7 @@ from controller.gateway.gateway_settings import require_gateway
 from controller.operation.operation_states import ENERGISED
 from controller.operation.plate_controller import Controller
 from controller.operation.supervisor import Supervisor
-from controller.play.loop import Observers
+from controller.play.reports import Observers
 from controller.process.daemon_process import (
     MIN_DESCRIPTORS,
     SocketLock,

@@ -45,7 +45,7 @@ from controller.effects.layout import SurfaceLayout
 from controller.effects.strengths import UNNAMED
 from controller.operation.operation_states import DaemonState, Operation
 from controller.operation.supervisor import LinkChange
-from controller.play.loop import Observers, PlayReport
+from controller.play.reports import Observers, PlayReport
 from controller.sources.touch import Change, Contact, ContactKey
 from drivers.host.amplifier import Amplifier
 from drivers.protocol.definition import READINGS

@@ -25,7 +25,7 @@ import numpy as np
 from pydantic import BaseModel, ValidationError
 
 from controller.play.intent import FingerSensation
-from controller.play.loop import Observers, PlayReport
+from controller.play.reports import Observers, PlayReport
 from controller.process.child import ended
 from controller.sources.touch import Change, Contact, ContactKey
 from drivers.errors import LinkError

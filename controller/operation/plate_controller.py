@@ -5,7 +5,8 @@ from collections.abc import Awaitable, Callable, Coroutine, Mapping, Sequence
 from typing import Any
 
 from controller.play.intent import IntentSource
-from controller.play.loop import Cycle, Planner
+from controller.play.loop import Cycle
+from controller.play.planner import Planner
 from controller.play.routing import limits_of, playback_capabilities
 from drivers.errors import LinkError
 from drivers.host.amplifier import CONFIRM_TIMEOUT, WATCHDOG, Amplifier

@@ -35,7 +35,7 @@ from controller.operation.operation_states import (
     step,
 )
 from controller.operation.plate_controller import Controller
-from controller.play.loop import Observers
+from controller.play.reports import Observers
 from drivers.errors import (
     CommandRefused,
     DriverError,

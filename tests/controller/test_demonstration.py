@@ -34,7 +34,7 @@ from controller.demo.recorder import (
     steady_contrast_db,
 )
 from controller.play.intent import not_served
-from controller.play.loop import Observers, PlayReport
+from controller.play.reports import Observers, PlayReport
 from controller.sources.touch import Change, Contact, ContactKey, TouchFrame
 from controller.sources.tuio import TuioSource
 from drivers.errors import LinkError

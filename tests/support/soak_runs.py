@@ -29,7 +29,7 @@ from controller.effects.player import EffectPlayer
 from controller.operation.operation_states import DaemonEvent, DaemonState, Trigger
 from controller.operation.supervisor import Supervisor
 from controller.play.intent import IntentSource
-from controller.play.loop import PlayReport
+from controller.play.reports import PlayReport
 from controller.sources.touch import Touch, TouchFrame
 from drivers.errors import DriverError
 from kit.chain import Chain

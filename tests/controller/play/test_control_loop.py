@@ -37,7 +37,7 @@ from controller.play.intent import (
     sums_db,
     weakened,
 )
-from controller.play.loop import PlayReport
+from controller.play.reports import PlayReport
 from controller.play.routing import RAMPS_ONLY, PlaybackCapabilities
 from controller.play.selection import Selector
 from controller.sources.touch import Change, Contact, ContactKey, ContactTracker, Touch, TouchFrame

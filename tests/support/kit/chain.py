@@ -25,7 +25,7 @@ from controller.daemon.plate_view import PlateView
 from controller.effects.layout import SurfaceLayout, default_effects
 from controller.effects.player import EffectPlayer
 from controller.operation.plate_controller import Controller
-from controller.play.loop import Observers, PlayReport
+from controller.play.reports import Observers, PlayReport
 from controller.sources.touch import Touch, TouchFrame
 from drivers.opening import Lines
 from drivers.protocol.records import Values

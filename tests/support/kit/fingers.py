@@ -40,7 +40,7 @@ from controller.play.intent import (
     Target,
 )
 from controller.play.joint_answers import answered, selection_of
-from controller.play.loop import PlayReport
+from controller.play.reports import PlayReport
 from controller.play.routing import RAMPS_ONLY, PlaybackCapabilities
 from controller.play.slots import Sets, Slots
 from controller.sources.touch import Contact, Touch, TouchFrame

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from controller.play import joint_answers, loop
+from controller.play import joint_answers, planner
 from model.answer.answer import NO_LIMITS, Answer, Contents, Layer, Limits, Sensation, Stream, Tones
 from model.answer.plan import answer, prepare_answers, query, scaled
 from model.answer.stimulus import ANY, ANY_BAND, BY_NAME, Finger, Placement, Stimulus, together
@@ -204,7 +204,7 @@ def _prepare(table: Any, drive_mode: str | None) -> None:
 
 
 joint_answers.answer = _answer
-loop.prepare_answers, loop.query = _prepare, _query
+planner.prepare_answers, planner.query = _prepare, _query
 
 
 class SetTiming:

@@ -44,9 +44,6 @@ from registry.threads import DaemonThreads
 TIME_LIMIT = 1.0
 """Time [s] after which a choice is given up; it takes some tens of milliseconds."""
 
-MAX_LATE = 2
-"""Number of given-up choices that can still run; while so many run, no other choice begins."""
-
 # Bending wavelengths are at least 17 cm below 500 Hz, so a fingertip that has moved by about its
 # own radius is still within the disc that the pattern was chosen for. The answer for a moving
 # finger covers this distance ahead.
@@ -61,13 +58,10 @@ CROSSFADE_INTERVAL = 0.4
 MIN_INTERVAL = 1.0
 """Time [s] from the last step on such a way to the first on the next."""
 
-GIVEN_UP = f"no answer within {TIME_LIMIT:g} s for these fingers; lift or move one to ask again"
-BLOCKED = (
-    f"{MAX_LATE} answers are still computed that took more than {TIME_LIMIT:g} s; touch with one "
-    "finger, and restart the daemon if it lasts"
+GIVEN_UP = (
+    f"no answer within {TIME_LIMIT:g} s: several fingers feel nothing until it is computed; touch "
+    "with one finger, and restart the daemon if it lasts"
 )
-
-_UNANSWERED = (GIVEN_UP, BLOCKED)
 
 _FADES_FOR = FALL_AFTER + CROSSFADE + FADED_AFTER  # s; contents that a step replaces
 
@@ -170,8 +164,8 @@ class Selector:
     Once all fingers rest, contents are cross-faded to a better answer, if there is one, step by
     step until anything changes: fingers, the table with its clocks, or the limits of the
     amplifiers. If a finger was held back before that change, all contents are chosen again. A
-    choice that takes too long is given up: all lasting contents are silent until their fingers
-    change or that choice has ended.
+    choice that takes too long is given up: the lasting contents of several fingers are silent until
+    it has ended.
 
     chooser: makes the next choice, while the thread finishes with the former chooser; arrived:
     called when the thread is done; may_lead: whether present contents can be cross-faded to these
@@ -191,7 +185,7 @@ class Selector:
         self._threads = DaemonThreads()
         self.pending: PendingChoice | None = None
         """The choice in the thread; there is one at a time."""
-        self._given_up = set[_Future]()  # still computed
+        self._given_up: _Future | None = None  # still computed
         self._lasting = NOTHING  # as chosen, also for fingers that have left
         self._pulses: dict[ContactKey, Selection] = {}  # active, or not started yet
         self._lasting_fingers: dict[ContactKey, float] = {}  # of lasting targets, down since [s]
@@ -403,13 +397,13 @@ class Selector:
     def _choose(self, question: Question, capabilities: PlaybackCapabilities, now: float) -> None:
         """Choose for a question at a time [s]: immediately, or in the thread if it takes long.
 
-        A choice in the thread that hangs cannot be ended, only given up. Its thread delays neither
-        the next choice nor the end of the process, and its result is dropped.
+        A choice in the thread that hangs cannot be ended, only given up. No other choice in the
+        thread begins before it has ended; its result is dropped.
         """
         if not question.takes_long:
             self._take(question, self.chooser.choose(question, capabilities), now)
-        elif len(self._given_up) >= MAX_LATE:
-            self._take(question, question.unanswered(BLOCKED), now)
+        elif self._given_up is not None:
+            self._take(question, question.unanswered(GIVEN_UP), now)
         else:
             loop = asyncio.get_running_loop()
             choose = partial(self.chooser.choose, question, capabilities)
@@ -423,7 +417,7 @@ class Selector:
         if future.done():
             return
         _logger.warning("loop: answer given up, still computed after %g s", TIME_LIMIT)
-        self._given_up.add(future)
+        self._given_up = future
         silence: _Future = asyncio.get_running_loop().create_future()
         silence.set_result(question.unanswered(GIVEN_UP))
         self.pending = PendingChoice(question, silence)
@@ -431,10 +425,10 @@ class Selector:
 
     def _note_done(self, future: _Future) -> None:
         """Note that the thread is done with a choice."""
-        if future in self._given_up:
-            self._given_up.remove(future)
+        if future is self._given_up:
+            self._given_up = None
             future.exception()  # retrieved, so that asyncio does not log it
-            if self._lasting.reason in _UNANSWERED:  # so that the next cycle chooses again
+            if self._lasting.reason == GIVEN_UP:  # so that the next cycle chooses again
                 self._lasting = NOTHING
         self._arrived()
 
@@ -486,7 +480,7 @@ class Selector:
         because a finger that came has lifted.
         """
         selection = next(iter(selections), NOTHING)
-        if selection.reason in _UNANSWERED:
+        if selection.reason == GIVEN_UP:
             return True  # it silences
         may_improve = self._lasting.is_limited or self._requested_situation == self._situation
         if not may_improve and _is_met_by(intended, self._lasting):
@@ -523,7 +517,7 @@ class Selector:
     def _take_lasting(self, question: Question, selection: Selection) -> None:
         """Take the lasting contents chosen for a question."""
         self._lasting = selection
-        if selection.reason in _UNANSWERED:
+        if selection.reason == GIVEN_UP:
             self.due = math.inf
         if selection.is_limited:
             last_end = -math.inf

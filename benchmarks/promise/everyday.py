@@ -18,7 +18,7 @@ import numpy as np
 
 from benchmarks.promise.cases import LEVEL_DB_SL, RIGS, Case, Point
 from benchmarks.setting import random_contacts
-from controller.sources.touch import HAND_MAJOR, IN_MM, LIGHT_FORCE
+from controller.sources.contact_load import HAND_MAJOR, IN_MM, LIGHT_FORCE
 from model.answer.answer import Answer
 from model.answer.plan import answer
 from model.answer.stimulus import Finger, Stimulus

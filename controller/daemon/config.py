@@ -24,13 +24,8 @@ from controller.effects.layout import (
 from controller.effects.strengths import read_strengths
 from controller.process.daemon_process import check_socket_path
 from controller.rig_file_check import clock_costs, whole_url
-from controller.sources.touch import (
-    TouchCalibration,
-    TouchSource,
-    fit_touch_calibration,
-    open_source,
-    turned,
-)
+from controller.sources.touch import TouchSource, open_source
+from controller.sources.touch_calibration import TouchCalibration, fit_touch_calibration, turned
 from drivers.by_hand.reaching import check_links
 from model.arrays import FloatArray
 from model.config.document import ConfigError, Document, is_file_name, read_document

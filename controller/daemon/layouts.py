@@ -21,7 +21,8 @@ from controller.effects.effect import Effect
 from controller.effects.layout import SurfaceLayout
 from controller.effects.player import EffectPlayer
 from controller.effects.strengths import Strengths, read_strengths
-from controller.sources.touch import ALIGNED, RejectCounter, TouchFrame, TouchSource
+from controller.sources.touch import RejectCounter, TouchFrame, TouchSource
+from controller.sources.touch_calibration import ALIGNED
 from model.arrays import FloatArray
 from model.errors import InputError
 from registry import threads

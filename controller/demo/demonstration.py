@@ -41,7 +41,8 @@ from controller.effects.layout import BUZZ
 from controller.operation.operation_states import DaemonState
 from controller.process.daemon_process import SocketLock
 from controller.process.log import LogThread, start_log
-from controller.sources.touch import ALIGNED, TouchFrame, TouchSource
+from controller.sources.touch import TouchFrame, TouchSource
+from controller.sources.touch_calibration import ALIGNED
 from controller.sources.tuio import RecordedDatagram, TuioSource, read_capture
 from drivers.errors import LinkError
 from model.answer.answer import Sensation

@@ -14,7 +14,8 @@ from typing import ParamSpec
 from controller.play.planner import Plan, Planner
 from controller.play.reports import Observers, play_report
 from controller.play.slots import RELEASE_RAMP
-from controller.sources.touch import Change, ContactTracker, RejectCounter, TouchFrame
+from controller.sources.contact_tracker import ContactTracker
+from controller.sources.touch import Change, RejectCounter, TouchFrame
 from drivers.errors import (
     CommandError,
     CommandRefused,

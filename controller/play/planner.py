@@ -16,7 +16,8 @@ from controller.play.intent import Content, IntentSource, Pulse, Selection, no_l
 from controller.play.routing import CountedClocks, PlaybackCapabilities
 from controller.play.selection import PendingChoice, Selector
 from controller.play.slots import RELEASE_RAMP, RETRY, Check, Sets, Slot, Slots
-from controller.sources.touch import Contact, ContactKey, ContactTracker
+from controller.sources.contact_tracker import ContactTracker
+from controller.sources.touch import Contact, ContactKey
 from drivers.errors import CommandRefused
 from drivers.host.joint_sets import PlayedSet
 from drivers.protocol.definition import HEARTBEAT

@@ -20,16 +20,8 @@ from dataclasses import dataclass, replace
 from typing import TypeAlias
 from urllib.parse import parse_qsl
 
-from controller.sources.touch import (
-    LIGHT_FORCE,
-    LIGHT_MAJOR,
-    LightPress,
-    Touch,
-    TouchFrame,
-    TouchSource,
-    frame_moment,
-    number_option,
-)
+from controller.sources.contact_load import LIGHT_FORCE, LIGHT_MAJOR, LightPress
+from controller.sources.touch import Touch, TouchFrame, TouchSource, frame_moment, number_option
 from model.errors import InputError
 from registry.limits import HAND_LOAD
 

@@ -3,11 +3,11 @@
 Use `open_source` and `ContactTracker` to try a source and see its contacts on a plate.
 """
 
+from controller.sources.contact_tracker import ContactTracker
 from controller.sources.touch import (
     Change,
     Contact,
     ContactKey,
-    ContactTracker,
     RejectCounter,
     Touch,
     TouchFrame,

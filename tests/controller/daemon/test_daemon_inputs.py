@@ -35,15 +35,8 @@ from controller.effects.file_effect import File
 from controller.gateway.metrics import exposition
 from controller.play.chooser import Chooser
 from controller.sources import udp_source
-from controller.sources.touch import (
-    Change,
-    RejectCounter,
-    Touch,
-    TouchCalibration,
-    TouchFrame,
-    TouchSource,
-    turned,
-)
+from controller.sources.touch import Change, RejectCounter, Touch, TouchFrame, TouchSource
+from controller.sources.touch_calibration import TouchCalibration, turned
 from examples.make_touches import tuio_datagram
 from kit.clock import MemoryMachine, VirtualLoop, in_virtual_time
 from kit.fingers import bundle, frame, free_port, message, panel

@@ -40,7 +40,8 @@ from controller.play.intent import (
 from controller.play.reports import PlayReport
 from controller.play.routing import RAMPS_ONLY, PlaybackCapabilities
 from controller.play.selection import Selector
-from controller.sources.touch import Change, Contact, ContactKey, ContactTracker, Touch, TouchFrame
+from controller.sources.contact_tracker import ContactTracker
+from controller.sources.touch import Change, Contact, ContactKey, Touch, TouchFrame
 from drivers.host.group import GroupState
 from drivers.opening import Lines
 from drivers.protocol.definition import QUANTITIES

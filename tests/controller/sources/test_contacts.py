@@ -15,17 +15,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from controller.sources.contact_tracker import ContactTracker
 from controller.sources.touch import (
     CONTACT_TIMEOUT,
     OVER,
     ContactKey,
-    ContactTracker,
     FingerMotion,
     RejectCounter,
     Touch,
     TouchFrame,
-    turned,
 )
+from controller.sources.touch_calibration import turned
 from model.structure.material import Material
 from model.structure.plate import Plate
 from registry.limits import HAND_LOAD, MAX_CONTACTS

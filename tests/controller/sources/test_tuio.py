@@ -21,7 +21,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pythonosc.osc_message_builder import OscMessageBuilder
 
-from controller.sources.touch import ContactTracker, Touch, TouchFrame
+from controller.sources.contact_tracker import ContactTracker
+from controller.sources.touch import Touch, TouchFrame
 from controller.sources.tuio import (
     HEADER,
     MAX_BYTES,

@@ -14,7 +14,8 @@ from benchmarks.promise.contents import share_kept
 from benchmarks.setting import random_contacts
 from benchmarks.surface import exported_modes
 from cases import read_yaml
-from controller.sources.touch import ContactTracker, Touch, TouchFrame
+from controller.sources.contact_tracker import ContactTracker
+from controller.sources.touch import Touch, TouchFrame
 from era_haptics.command import run_era
 from era_haptics.lab.design.problem import area_of
 from model.answer.plan import answer

@@ -132,7 +132,7 @@ class AmplifierUrl:
         unknown = sorted(self.options.keys() - set(known))
         self.require(
             not unknown,
-            f"option {', '.join(unknown)} is unknown; known are {', '.join(known)}",
+            f"option {', '.join(unknown)} is unknown; known: {', '.join(known)}",
         )
         self.require(len(pairs) == len(self.options), "an option must not be repeated")
         kind = self.options.get("line", "prompt")

@@ -51,7 +51,7 @@ def __getattr__(name: str) -> Any:
     from registry.files import posix_needed
 
     if name not in _HOMES:
-        raise AttributeError(f"unknown name era_haptics.{name}; known are {', '.join(__all__)}")
+        raise AttributeError(f"unknown name era_haptics.{name}; known: {', '.join(__all__)}")
     try:
         module, name_there = _HOMES[name]
         value = getattr(import_module(module), name_there)

@@ -125,8 +125,8 @@ class PluginRegistry(Generic[_T]):
     def _known(self) -> str:
         spelled = ", ".join(name + self.ending for name in self.names())
         return (
-            f"known are {spelled}{self.hint}; one of a package needs an entry point in "
-            f"{self.group}, which is read when that package is installed"
+            f"known: {spelled}{self.hint}; a plug-in needs an entry point in {self.group}, "
+            "which is found once its package is installed"
         )
 
     def _loaded(self, point: EntryPoint, within: str) -> _T:

@@ -103,7 +103,7 @@ def sim(
         typer.Option("--until-eof", help="Exit at the end of standard input."),
     ] = False,
 ) -> None:
-    """Simulate the amplifiers of a rig on real wires. Print a URL for each; Ctrl-C ends.
+    """Simulate the amplifiers of a rig on real wires. Print a URL for each, and run until Ctrl-C.
 
     The simulated plate is drawn at random from the rig's tolerances (repeatable with --seed).
     """

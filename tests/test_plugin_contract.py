@@ -385,14 +385,14 @@ def test_unknown_name_suggests_a_known_one(kind: Kind, install: Install) -> None
     install("good", kind, "pigeonry", kind.works)
     with pytest.raises(kind.error) as caught:
         kind.look_up("pigeonri")
-    unknown, _, known = str(caught.value).partition("? known are ")
+    unknown, _, known = str(caught.value).partition("? known: ")
     ending = kind.ending
     assert f"'pigeonri{ending}'" in unknown
     assert unknown.endswith(f"did you mean pigeonry{ending}")
     assert {f"pigeonry{ending}", f"{kind.own[0]}{ending}"} <= set(re.split("[,;] ", known))
     group = f"era_haptics.{kind.group}"
-    assert known.endswith(f"entry point in {group}, which is read when that package is installed")
-    with pytest.raises(kind.error, match=f"'x{{40}}{ending}'; known are "):
+    assert known.endswith(f"entry point in {group}, which is found once its package is installed")
+    with pytest.raises(kind.error, match=f"'x{{40}}{ending}'; known: "):
         kind.look_up("x" * 500)
 
 
@@ -430,5 +430,5 @@ def test_scheme_is_case_insensitive_and_required(kind: Kind, install: Install) -
     module = install("good", kind, "fine", kind.works)
     assert is_made_by(kind.look_up("FINE"), sys.modules[module].THING)
     for url in ("", "fine", "/dev/fine"):
-        with pytest.raises(kind.error, match=rf"{kind.ending}.*known are .*fine:"):
+        with pytest.raises(kind.error, match=rf"{kind.ending}.*known: .*fine:"):
             kind.find(url)

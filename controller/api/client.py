@@ -174,7 +174,7 @@ class AsyncClient(AbstractAsyncContextManager["AsyncClient"]):
         return await self._call(HelloResult, "hello", client=client)
 
     async def status(self) -> StatusResult:
-        """Show the state of daemon, amplifiers and contacts."""
+        """Show the state of the daemon, the amplifiers and the contacts."""
         return await self._call(StatusResult, "status")
 
     async def arm(self, owner: str, *, lease_s: float = 10.0) -> ArmResult:
@@ -198,17 +198,17 @@ class AsyncClient(AbstractAsyncContextManager["AsyncClient"]):
 
     @lenient
     async def stop(self, *, client: str | None = None) -> StopResult:
-        """Quick-stop all amplifiers, latched until clear.
+        """Quick-stop all amplifiers.
 
-        Not an emergency stop. Any client can stop at any time. Error 1006 unless every amplifier is
-        confirmed silent.
+        The stop is latched until `clear`. Not an emergency stop. Every client can stop the plate at
+        any time. Fails with error 1006 if an amplifier is not confirmed silent.
         """
         return await self._call(StopResult, "stop", client=client)
 
     async def clear(self, *, client: str | None = None, epoch: int | None = None) -> None:
         """Clear a stop, or a fault that no longer exists.
 
-        Stays disarmed.
+        The plate stays disarmed.
         """
         await self._call(Empty, "clear", client=client, epoch=epoch)
 

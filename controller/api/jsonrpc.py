@@ -43,14 +43,14 @@ class ErrorCode(IntEnum):
 
 
 ERROR_MEANINGS = {
-    ErrorCode.PARSE: "the line is not valid JSON, too long, or has too many keys",
+    ErrorCode.PARSE: "the line is not valid JSON, is too long, or has too many keys",
     ErrorCode.INVALID_REQUEST: "the JSON is not a JSON-RPC 2.0 request",
     ErrorCode.UNKNOWN_METHOD: "the method does not exist",
     ErrorCode.INVALID_PARAMS: "a parameter is missing, unknown or out of range",
     ErrorCode.INTERNAL: "a bug in the daemon; its log has the details",
-    ErrorCode.WRONG_STATE: "the daemon's state does not allow it, such as not being armed",
+    ErrorCode.WRONG_STATE: "the daemon's state does not allow the request",
     ErrorCode.LEASE: "the lease has expired, or belongs to another client",
-    ErrorCode.REFUSED: "a limit or an amplifier refused",
+    ErrorCode.REFUSED: "a limit or an amplifier rejected the request",
     ErrorCode.LINK: "the link to an amplifier failed",
     ErrorCode.BUSY: "too many requests or connections",
     ErrorCode.NOT_SILENT: "after a stop, an amplifier is not confirmed silent",

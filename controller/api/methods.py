@@ -62,7 +62,8 @@ class HelloResult(ApiMessage):
     layout: dict[str, Any] | None = Field(description="the surface layout; null without one")
     readings: dict[str, tuple[str, str, Count]] = Field(
         {},
-        description="amplifier readings that a page shows: label, unit and decimals by status key",
+        description="label, unit and decimals of the amplifier readings to show, by key of the "
+        "status",
     )
 
 
@@ -100,7 +101,7 @@ class StatusResult(StrengthResult, PatternFields, CauseAndRemedy):
     silence_reason: str | None = Field(None, description="why nothing plays while armed")
     amplifiers: list[AmplifierStatus]
     latency_ms: LatencySummary = Field(
-        description="after a finger came, moved or changed its pressure"
+        description="after a finger landed, moved or changed its pressure"
     )
     lift_latency_ms: LatencySummary | None = Field(
         None, description="after a lift, or a change without a touch, such as the end of an effect"
@@ -237,7 +238,7 @@ class PlayParams(ApiMessage):
     level_db_sl: float | None = Field(
         None,
         description="-20 or more. For an effect, default and maximum are its own level; for "
-        "points, the default is 20 and the layout has the maximum",
+        "points, the default is 20 and the maximum is the layout's `max_level_db_sl`",
     )
     points: _Points = Field(
         [],

@@ -176,9 +176,9 @@ class ContactStatus(ApiMessage):
     y_m: float
     role: Literal["target", "quiet", "hand", "surplus"] | None = Field(
         None,
-        description="target: feels the pattern; quiet: kept quiet; hand (a resting hand) and "
-        "surplus (a finger beyond max_fingers): counts only as a load; null before "
-        "the first decision",
+        description="target: feels the pattern; quiet: kept quiet; hand: a resting hand, and "
+        "surplus: a finger beyond max_fingers, which count only as loads; null before the first "
+        "decision",
     )
     level_db_sl: float | None = Field(
         None,
@@ -282,7 +282,7 @@ class LinkCounters(ApiMessage):
 
 
 class AmplifierSilence(ApiMessage):
-    """Whether an amplifier is silent, after a stop or without its reply."""
+    """Whether an amplifier is silent, after a stop or while it does not reply."""
 
     silence: Literal["confirmed_silent", "may_play", "watchdog_elapsed"] = Field(
         description="confirmed_silent: confirmed by a status after the stop; watchdog_elapsed: "
@@ -348,7 +348,7 @@ class AmplifierStatus(ApiMessage):
     )
     reports: list[AmplifierReport] = Field([], description="reports from the last 10 s")
     silence: AmplifierSilence | None = Field(
-        None, description="whether it is silent, while it does not reply; null while it replies"
+        None, description="while it does not reply: whether it is silent; null while it replies"
     )
     statistics: LinkCounters
 

@@ -100,7 +100,7 @@ def kind_called(name: str) -> "ConfigKind":
     if name not in kinds:
         raise InputError(
             f"unknown kind of configuration {name[:40]!r}; {did_you_mean(name, kinds)}"
-            f"known are {', '.join(kinds)}"
+            f"known: {', '.join(kinds)}"
         )
     return kinds[name]
 

@@ -62,7 +62,7 @@ def daemon(
     config: Annotated[
         Path,
         typer.Argument(
-            metavar="CONFIG", help="Daemon file; create one by era config init FILE --kind daemon."
+            metavar="CONFIG", help="Daemon file; era config init FILE --kind daemon creates one."
         ),
     ],
     check: Annotated[
@@ -73,7 +73,7 @@ def daemon(
         str | None,
         typer.Option(
             metavar="[HOST:PORT]",
-            help=f"Serve the page from a separate process; default: {DASHBOARD}.",
+            help=f"Serve the dashboard from a separate process; default: {DASHBOARD}.",
         ),
     ] = None,
     trace: Annotated[
@@ -166,7 +166,7 @@ def strength(
     socket: Socket = None,
     as_json: JsonOption = False,
 ) -> None:
-    """The strength is stored under this name. 0 dB is the level that layout and limits allow."""
+    """0 dB is the level that layout and limits allow."""
     with connected(socket) as era:
         strengths = (era.status() if name is None else era.strength(name, gain_db)).strengths
     print_report(

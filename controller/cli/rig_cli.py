@@ -107,7 +107,7 @@ def identify(
     ] = 0,
     as_json: JsonOption = False,
 ) -> None:
-    """Identify the plate in place and write its rig.
+    """Identify the mounted plate, and write a fitted rig.
 
     The new rig file states the remaining uncertainty. With --device, a sound card plays multisines
     and records accelerometers, with the same loop-back cable as for era measure. With --measured,

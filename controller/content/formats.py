@@ -96,6 +96,6 @@ def named_content(name: str) -> Path:
             return file
     names = named_contents()
     raise InputError(
-        f"unknown content {name[:40]!a}; {did_you_mean(name, names)}known are {', '.join(names)}; "
+        f"unknown content {name[:40]!a}; {did_you_mean(name, names)}known: {', '.join(names)}; "
         "the name of a file needs its ending"
     )

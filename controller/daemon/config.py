@@ -226,7 +226,7 @@ def _check_kind(document: Document) -> None:
     if is_layout or not {"plate", "surface"}.isdisjoint(document.data):
         raise InputError(
             f"{document.source}: must be a daemon's file, got a "
-            f"{'surface layout' if is_layout else 'rig'}; name it in one with "
+            f"{'surface layout' if is_layout else 'rig'}; write a daemon's file that contains "
             f"{'layouts: {NAME: FILE}' if is_layout else 'rig: FILE'} "
             "(era config init daemon.yaml --kind daemon)"
         )

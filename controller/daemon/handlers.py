@@ -145,7 +145,7 @@ class ApiService:
 
     @api_method(in_reserve=True)
     def status(self, client: Connection, params: Empty) -> StatusResult:
-        """Show the state of daemon, amplifiers and contacts."""
+        """Show the state of the daemon, the amplifiers and the contacts."""
         operation, view, now = self._supervisor.operation, self._publisher.view, threads.now()
         lease = operation.lease_at(now)
         return StatusResult(
@@ -232,10 +232,10 @@ class ApiService:
 
     @api_method(is_limited=False, silences=True, in_reserve=True)
     def stop(self, client: Connection, params: RequestedBy) -> Awaitable[StopResult]:
-        """Quick-stop all amplifiers, latched until clear.
+        """Quick-stop all amplifiers. The stop is latched until `clear`.
 
-        Not an emergency stop. Any client can stop at any time. Error 1006 unless every amplifier is
-        confirmed silent.
+        Not an emergency stop. Every client can stop the plate at any time. Fails with error 1006 if
+        an amplifier is not confirmed silent.
         """
         # The requests to the amplifiers are queued when this returns.
         cause = f"stopped by {params.client or client.name!a}"
@@ -244,7 +244,7 @@ class ApiService:
 
     @api_method(is_repeated=False)  # a repetition would acknowledge a stop that came meanwhile
     async def clear(self, client: Connection, params: ClearParams) -> Empty:
-        """Clear a stop, or a fault that no longer exists. Stays disarmed."""
+        """Clear a stop, or a fault that no longer exists. The plate stays disarmed."""
         operation = self._supervisor.operation
         if operation.state is DaemonState.COMM_LOST:
             raise _wrong_state(operation, ErrorCode.LINK)
@@ -484,7 +484,7 @@ def check_lease(lease: Lease | None, token: str, now: float) -> Lease:
         raise RpcError(
             ErrorCode.LEASE,
             f"lease belongs to {lease.owner!a}",
-            remedy="wait until it expires, or disarm first: any client can",
+            remedy="wait until it expires, or disarm first (any client can disarm)",
         )
     return lease
 
@@ -499,7 +499,7 @@ def _armed_already(operation: Operation) -> RpcError:
     what, lease = "another client is arming", operation.lease
     if operation.state is _ENABLED and lease is not None:
         what = f"armed by {lease.owner!a} for {lease.expires_at - threads.now():.1f} s more"
-    return RpcError(ErrorCode.LEASE, what, remedy="wait, or disarm first: any client can")
+    return RpcError(ErrorCode.LEASE, what, remedy="wait, or disarm first (any client can disarm)")
 
 
 async def _silence(stopping: Awaitable[Mapping[str, StopOutcome]], epoch: int) -> StopResult:

@@ -165,7 +165,7 @@ def _amplifier_gauges() -> dict[str, str]:
         meanings[reading.metric] = f"{reading.label.capitalize()} {reading.meaning}."
     meanings["reply_age_seconds"] = "Time since the last reply."
     meanings["clock_skew_seconds"] = "RMS error of the amplifier's clock relative to the others."
-    meanings["round_trip_seconds"] = "From the last request to its reply."
+    meanings["round_trip_seconds"] = "Time from the last request to its reply."
     return meanings
 
 
@@ -223,11 +223,11 @@ def _add_latencies(families: _Families, status: StatusResult) -> None:
     """Add the histograms of latencies."""
     families.histogram(
         "touch_to_wire_seconds",
-        "From a touch to the last byte of the command.",
+        "Time from a touch to the last byte of the command.",
         status.latency_ms,
     )
     families.histogram(
         "lift_to_wire_seconds",
-        "From a lift, or an end without a touch, to the last byte of the command.",
+        "Time from a lift, or from the end of an effect, to the last byte of the command.",
         status.lift_latency_ms,
     )

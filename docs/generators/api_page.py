@@ -16,8 +16,8 @@ def api_reference() -> str:
     lines = [
         "### Methods",
         "",
-        "→ parameters, ← results. A method without parameters or results has an empty object, "
-        "`{}`.",
+        "→ parameters, ← results. For a method without parameters or results, the object is empty "
+        "(`{}`).",
     ]
     for name, method in METHODS.items():
         rows = [*_rows("→ ", method.params, models), *_rows("← ", method.result, models)]
@@ -41,15 +41,15 @@ def _notes(method: Method) -> Iterator[str]:
     """Who may call a method, and how its requests are treated."""
     lease = method.params.model_fields.get("lease")
     if lease is not None and lease.is_required():
-        yield "Only with the lease of the client that has armed."
+        yield "Needs the current lease."
     if method.in_reserve:
         yield "Served to clients in reserve, too."
     if method.needs_reply:
-        yield "Only with an `id`."
+        yield "Needs an `id`."
     if not method.is_repeated:
         yield "The Python clients do not repeat it if the reply is lost."
     if not method.over_http:
-        yield "Needs a lasting connection; not available over HTTP."
+        yield "Needs a persistent connection; not available over HTTP."
 
 
 def _rows(prefix: str, model: type[ApiMessage], models: Models) -> Iterator[str]:
@@ -73,46 +73,59 @@ def _data(model: type[ApiMessage], models: Models) -> Iterator[str]:
     yield from (row for row in rows if len(same) < 2 or row not in status)
 
 
-_SIGNS = {
-    "ge": "at least {}",
-    "gt": "above {}",
-    "le": "at most {}",
-    "lt": "below {}",
-    "min_length": "of at least {}",
-    "max_length": "of at most {}",
-}
+_SIGNS = ("ge", "le", "lt", "min_length", "max_length")
 
 
-def _bounds(metadata: Iterable[object]) -> Iterator[str]:
+def _limits(metadata: Iterable[object]) -> dict[str, str]:
+    """Return the limits in the metadata of an annotated type, by sign."""
+    limits: dict[str, str] = {}
     for part in metadata:
         for bound in getattr(part, "metadata", [part]):
-            for sign, words in _SIGNS.items():
+            for sign in _SIGNS:
                 value = getattr(bound, sign, None)
                 if value is not None:
-                    yield words.format(f"{value:g}" if isinstance(value, float) else value)
+                    limits[sign] = f"{value:g}" if isinstance(value, float) else str(value)
+    return limits
 
 
 def _bounded(metadata: tuple[object, ...]) -> str:
-    bounds = ", ".join(_bounds(metadata))
-    return bounds and f" {bounds}"
+    limits = _limits(metadata)
+    below = f" and below {limits['lt']}" if "lt" in limits else ""
+    return (
+        _range(limits.get("ge"), limits.get("le"), "of", "from")
+        + below
+        + _range(limits.get("min_length"), limits.get("max_length"), "of length", "of length")
+    )
+
+
+def _range(lowest: str | None, highest: str | None, alone: str, both: str) -> str:
+    """Return limits as text, empty without any; alone, both: words before one limit, or two."""
+    if lowest is None and highest is None:
+        return ""
+    if lowest is None:
+        return f" {alone} at most {highest}"
+    if highest is None:
+        return f" {alone} at least {lowest}"
+    return f" {both} {lowest}" if lowest == highest else f" {both} {lowest} to {highest}"
 
 
 _TYPES = Notation(
     plain={
-        str: "text",
-        int: "whole number",
+        str: "string",
+        int: "integer",
         float: "number",
-        bool: "true or false",
+        bool: "boolean",
         type(None): "null",
-        Any: "anything",
-        object: "anything",
+        Any: "any value",
+        object: "any value",
     },
     union=" or ",
     literal="`{}`",
     literals=", ",
     items=", ",
-    array="list of {}",
+    array="array of {}",
     mapping="object with values: {}",
+    nested="({})",
     model=lambda name: f"[{name}](#{name.lower()})",
     bounds=_bounded,
 )

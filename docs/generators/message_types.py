@@ -14,8 +14,9 @@ Models = dict[str, type[ApiMessage]]
 class Notation:
     """How types are written: formats have `{}` for what is in them.
 
-    plain: names of types that are no messages; union, literals, items: between alternatives, values
-    and the members of a tuple; bounds: of the metadata of an annotated type, appended.
+    plain: names of types that are not messages; union, literals, items: between alternatives,
+    values and the members of a tuple; nested: an array or object inside an array or object;
+    bounds: of the metadata of an annotated type, appended.
     """
 
     plain: Mapping[Any, str]
@@ -26,6 +27,7 @@ class Notation:
     array: str
     mapping: str
     model: Callable[[str], str]
+    nested: str = "{}"
     bounds: Callable[[tuple[object, ...]], str] = lambda metadata: ""
 
     def type_of(self, annotation: Any, models: Models) -> str:
@@ -40,12 +42,20 @@ class Notation:
             return self.type_of(arguments[0], models) + self.bounds(arguments[1:])
         if origin in (list, dict):
             form = self.array if origin is list else self.mapping
-            return form.format(self.type_of(arguments[-1], models))
+            item = self.type_of(arguments[-1], models)
+            return form.format(self.nested.format(item) if _is_nested(arguments[-1]) else item)
         if origin in (tuple, Union, types.UnionType):
             written = [self.type_of(argument, models) for argument in arguments]
             is_tuple = origin is tuple
             return f"[{self.items.join(written)}]" if is_tuple else self.union.join(written)
         return self.plain[annotation]
+
+
+def _is_nested(annotation: Any) -> bool:
+    """Return whether the items of an array or object are arrays or objects themselves."""
+    if get_origin(annotation) is Annotated:
+        return _is_nested(get_args(annotation)[0])
+    return get_origin(annotation) in (list, dict)
 
 
 def each_model(models: Models) -> Iterator[tuple[str, type[ApiMessage]]]:

@@ -111,7 +111,7 @@ def _show_discovered(result: dict[str, Any], problems: dict[str, DriverError]) -
 
 @amp.command()
 def identify(url: Url, trace: Trace = None, json_: Json = False) -> None:
-    """Show identity, capabilities and wire times."""
+    """Show identity, capabilities and round-trip time."""
     from drivers.by_hand.actions import identify_amplifier
 
     _act(identify_amplifier(url), trace=trace, json_=json_)
@@ -144,7 +144,7 @@ def drive(
 
 @amp.command()
 def stop(url: Url, trace: Trace = None, json_: Json = False) -> None:
-    """Stop all channels immediately. Latched until cleared.
+    """Stop all channels immediately. The stop is latched until it is cleared.
 
     Exit status 0 only if the amplifier confirms that it is silent, else 3.
     """

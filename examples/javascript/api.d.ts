@@ -4,7 +4,7 @@
 export interface Methods {
   /** Introduce the client; returns the daemon's rig, table and layout. */
   hello: { params: HelloParams; result: HelloResult };
-  /** Show the state of daemon, amplifiers and contacts. */
+  /** Show the state of the daemon, the amplifiers and the contacts. */
   status: { params: Empty; result: StatusResult };
   /** Switch the high voltage on. Touches are felt until the lease expires. */
   arm: { params: ArmParams; result: ArmResult };
@@ -12,9 +12,9 @@ export interface Methods {
   renew: { params: RenewParams; result: RenewResult };
   /** Ramp to silence, then switch the high voltage off. Any client can disarm. While a link is lost, this stops all amplifiers. */
   disarm: { params: DisarmParams; result: Empty };
-  /** Quick-stop all amplifiers, latched until clear. Not an emergency stop. Any client can stop at any time. Error 1006 unless every amplifier is confirmed silent. */
+  /** Quick-stop all amplifiers. The stop is latched until `clear`. Not an emergency stop. Every client can stop the plate at any time. Fails with error 1006 if an amplifier is not confirmed silent. */
   stop: { params: RequestedBy; result: StopResult };
-  /** Clear a stop, or a fault that no longer exists. Stays disarmed. */
+  /** Clear a stop, or a fault that no longer exists. The plate stays disarmed. */
   clear: { params: ClearParams; result: Empty };
   /** Report all fingers of a touch source. */
   touch: { params: TouchParams; result: Empty };
@@ -88,7 +88,7 @@ export interface HelloResult {
   rig_text: string;
   /** the surface layout; null without one */
   layout: Record<string, unknown> | null;
-  /** amplifier readings that a page shows: label, unit and decimals by status key */
+  /** label, unit and decimals of the amplifier readings to show, by key of the status */
   readings?: Record<string, [string, string, number]>;
 }
 
@@ -135,7 +135,7 @@ export interface StatusResult {
   /** why nothing plays while armed */
   silence_reason?: string | null;
   amplifiers: Array<AmplifierStatus>;
-  /** after a finger came, moved or changed its pressure */
+  /** after a finger landed, moved or changed its pressure */
   latency_ms: LatencySummary;
   /** after a lift, or a change without a touch, such as the end of an effect */
   lift_latency_ms?: LatencySummary | null;
@@ -247,7 +247,7 @@ export interface PlayParams {
   /** a finger must be within 20 mm of the position */
   x_m: number;
   y_m: number;
-  /** -20 or more. For an effect, default and maximum are its own level; for points, the default is 20 and the layout has the maximum */
+  /** -20 or more. For an effect, default and maximum are its own level; for points, the default is 20 and the maximum is the layout's `max_level_db_sl` */
   level_db_sl?: number | null;
   /** continuous event: `[time_s, intensity, sharpness]` in order of time; 0 to 60 s, 0 to 1, 0 to 1 */
   points?: Array<Array<number>>;
@@ -398,7 +398,7 @@ export interface ContactStatus {
   id: number;
   x_m: number;
   y_m: number;
-  /** target: feels the pattern; quiet: kept quiet; hand (a resting hand) and surplus (a finger beyond max_fingers): counts only as a load; null before the first decision */
+  /** target: feels the pattern; quiet: kept quiet; hand: a resting hand, and surplus: a finger beyond max_fingers, which count only as loads; null before the first decision */
   role?: "target" | "quiet" | "hand" | "surplus" | null;
   /** predicted level of a target relative to the rig's threshold set (`threshold` of `status`); null if unknown */
   level_db_sl?: number | null;
@@ -461,7 +461,7 @@ export interface AmplifierStatus {
   closed_with_lost: boolean;
   /** reports from the last 10 s */
   reports?: Array<AmplifierReport>;
-  /** whether it is silent, while it does not reply; null while it replies */
+  /** while it does not reply: whether it is silent; null while it replies */
   silence?: AmplifierSilence | null;
   statistics: LinkCounters;
   /** of the amplifier */
@@ -490,7 +490,7 @@ export interface TouchInputStatus {
   problem?: string | null;
 }
 
-/** Whether an amplifier is silent, after a stop or without its reply. */
+/** Whether an amplifier is silent, after a stop or while it does not reply. */
 export interface AmplifierSilence {
   /** confirmed_silent: confirmed by a status after the stop; watchdog_elapsed: unconfirmed, but the watchdog should have silenced it by now */
   silence: "confirmed_silent" | "may_play" | "watchdog_elapsed";

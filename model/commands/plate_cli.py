@@ -397,7 +397,7 @@ def materials(as_json: JsonOption = False) -> None:
 def show(rig_file: RigArgument, as_json: JsonOption = False) -> None:
     """Show material, rigidity and exciters of a rig's plate.
 
-    Levels are for the nominal board; real parts vary, so yours can reach more or less.
+    Levels that exciters reach are for the nominal board; real parts vary.
     """
     from model.quantities import in_display_unit
     from model.rig.rig_file import load_rig
@@ -549,17 +549,17 @@ def _exciter_rows(
             f"{1e3 * each['excursion_at_lowest_m']:.2g}{of} mm"
         )
     level, start = f"{reach['level_db_sl']:g} dB SL ({threshold})", reach["from_hz"]
-    everywhere = "under a finger everywhere except 2 cm at the edges, nominal board"
+    where = "under a finger everywhere except within 2 cm of the edges (nominal board)"
     from_where = "at no frequency" if start is None else f"from {start:g} Hz"
-    yield f"    {level} {everywhere}: {from_where}"
+    yield f"    {level} {where}: {from_where}"
     rows = zip(reach["frequencies_hz"], reach["share_of_places"], strict=True)
     short = [
-        f"{frequency:g} Hz on {100 * (1 - share):.1f} %"
+        f"{100 * (1 - share):.1f} % at {frequency:g} Hz"
         for frequency, share in rows
         if share < 1 and (start is None or frequency > start)
     ]
     if short:
-        yield f"    falls short at {', '.join(short)} of the places"
+        yield f"    positions below this level: {', '.join(short)}"
 
 
 def _type_rows(types: dict[str, Any]) -> Iterator[str]:

@@ -475,7 +475,7 @@ def plot(
     size: SizeOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Draw a table's weak cells, levels and contrast, and one answer."""
+    """Draw a table's weak cells, levels, contrast and a sample answer."""
     from model.figures import save_figure, table_figures
     from model.study.overview import find_overview
     from model.table.table_file import load_table
@@ -509,7 +509,7 @@ def export(
     content: Annotated[
         Literal["patterns", "fields"] | None,
         typer.Option(
-            help="Rows of a CSV file: patterns of the map, or fields on the sampling grid."
+            help="Rows of a CSV file: patterns by finger positions, or fields on the sampling grid."
         ),
     ] = None,
     as_json: JsonOption = False,

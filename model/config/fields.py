@@ -271,9 +271,7 @@ def _problem(
     match details["type"]:
         case "extra_forbidden":
             known = [*_section_at(root, path[:-1], document).model_fields]
-            message = (
-                f"unknown key; {did_you_mean(str(path[-1]), known)}known are {', '.join(known)}"
-            )
+            message = f"unknown key; {did_you_mean(str(path[-1]), known)}known: {', '.join(known)}"
         case "literal_error" | "enum":
             message = _no_choice(details, context["expected"])
         case kind if kind in _MESSAGES:

@@ -162,11 +162,11 @@ def unit_scale(text: str, unit: str, dimension: Dimension) -> tuple[Decimal, Dec
             for each in (given, own)
         )
     except pint.UndefinedUnitError as error:
-        raise _refusal(text, dimension, f"has the unknown unit {unit}") from error
+        raise _refusal(text, dimension, f"has an unknown unit, {unit}") from error
     except TypeError as error:  # of Decimal, for a logarithm
         raise _refusal(text, dimension, f"is not {dimension.name}") from error
     except (pint.PintError, ArithmeticError, AttributeError, ValueError) as error:
-        raise _refusal(text, dimension, f"has the invalid unit {unit}") from error
+        raise _refusal(text, dimension, f"has an invalid unit, {unit}") from error
     if base != expected or (zero and not start):
         raise _refusal(text, dimension, f"is not {dimension.name}")
     return Decimal(str(factor)), zero - start

@@ -428,7 +428,7 @@ def check_enough_sensors(alive: NDArray[np.bool_], measurement: Measurement) -> 
         dead = ", ".join(compress(measurement.names, ~alive))
         without = f" ({dead} without a signal)" if dead else ""
         raise InputError(
-            f"at least {LEAST_SENSORS} sensors must have a signal, better eight or more, got "
+            f"at least {LEAST_SENSORS} sensors must have a signal (eight or more are better), got "
             f"{alive.sum()}{without}"
         )
 

@@ -91,7 +91,7 @@ def _one_of(known: Collection[str], what: str, remedy: str = "") -> AfterValidat
     def checked(name: str) -> str:
         if name not in known:
             raise ValueError(
-                f"unknown {what} {name}; {did_you_mean(name, known)}known are {', '.join(known)}"
+                f"unknown {what} {name}; {did_you_mean(name, known)}known: {', '.join(known)}"
                 f"{remedy}"
             )
         return name

@@ -356,7 +356,7 @@ def _check_wiring(
             validation.add(
                 ("eras", name, "amplifier"),
                 f"unknown amplifier {amplifier}; {did_you_mean(amplifier, amplifiers)}"
-                f"known are {known}",
+                f"known: {known}",
             )
         if amplifier is None or channel is None:
             continue

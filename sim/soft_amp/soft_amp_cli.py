@@ -62,7 +62,8 @@ def soft_amp(
     law: Annotated[
         Law,
         typer.Option(
-            help="linear: play the force; square: play the root of a bias plus half the force."
+            help="Output for a force from -1 to 1. linear: the force itself; square: its voltage, "
+            "sqrt((1 + force) / 2)."
         ),
     ] = Law.LINEAR,
     limit: Annotated[
@@ -72,7 +73,7 @@ def soft_amp(
         int,
         typer.Option(
             metavar="N",
-            help="Number of gaps per second in the sound above which a fault is latched.",
+            help="A fault is latched if the sound has more than this number of gaps per second.",
             min=0,
             max=63,
         ),
@@ -94,8 +95,8 @@ def soft_amp(
     """Run a software amplifier on a sound card. Print its URL and play until Ctrl-C.
 
     Level 1 is the device's full scale, and silence is zero samples. Exits with status 3 if the
-    device is missing or lost. On Linux the kernel kills the process if its sound stalls for 0.1 s;
-    the sound stops with the process. In a systemd unit, use Type=notify.
+    device is missing or lost. On Linux the kernel kills the process, and so ends its sound, if the
+    sound stalls for 0.1 s. In a systemd unit, use Type=notify.
     """
     from model.commands.options import print_report
     from sim.soft_amp.output import listed_devices

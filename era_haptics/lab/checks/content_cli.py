@@ -72,8 +72,8 @@ def play(
     """Play content at a finger, or write it as sound.
 
     Plays the content once at the finger within 20 mm of --at. With --simulate, writes the simulated
-    acceleration at a single finger there as a WAV file (16 bits, 48 kHz) instead, to listen to or
-    to plot. The full scale is fixed, so the loudness of several files can be compared by ear.
+    acceleration at a single finger there to a WAV file (16 bits, 48 kHz) instead, for listening or
+    plotting. The full scale is fixed, so the loudness of several files can be compared by ear.
     """
     place = parse_point(at, what="--at")
     if (simulate is None) != (output is None):
@@ -217,16 +217,18 @@ def check(
 ) -> None:
     """Simulate how haptic files feel at a finger.
 
-    The simulation is in the time domain, for a single finger or with quiet fingers present. A level
-    is kept while the level at the skin, averaged over 20 ms, is within 3 dB of the file's; times at
-    which the file is more than 20 dB below its peak do not count. Sharpness is kept while the
-    continuous part plays at about the file's frequency. Percentages are rounded down. Amplifiers
-    are assumed to be phased, even if the table was built for switched drives.
+    The simulation is in the time domain, for a single finger or with quiet fingers present. The
+    command prints the percentage of time in which the level is kept: the level at the skin,
+    averaged over 20 ms, is within 3 dB of the file's. Times at which the file is more than 20 dB
+    below its peak do not count. Sharpness is kept while the frequency of the continuous part is
+    close to the file's. Percentages are rounded down. Amplifiers are assumed to be phased, even if
+    the table was built for switched drives.
 
     Without --table, the founding paper's plate is used. Without --at, five positions (including the
     centre) are simulated and the median one is shown. Several files, or a folder with its
-    subfolders, are listed with one line each. Exits with status 1 if a file keeps less of its level
-    than --least, or one of several files cannot be read; sharpness has no limit.
+    subfolders, are listed with one line each. Exits with status 1 if the kept share of a file's
+    level is below --least, or if one of several files cannot be read. Sharpness does not change the
+    exit status.
     """
     from model.files.output_paths import check_picture
 

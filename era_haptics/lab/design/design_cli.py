@@ -38,16 +38,16 @@ def design(
         str,
         typer.Option(
             metavar="N|LO-HI",
-            help="Number of ERAs, including kept ones; ERAs and other mounts together must be at "
-            "least 3. Default: the rig's.",
+            help="Number of ERAs, including kept ones. The plate needs at least 3 mounts in total "
+            "(ERAs and supports). Default: the rig's.",
         ),
     ] = "",
     layouts: Annotated[
         str,
         typer.Option(
             metavar="random:N|FILE",
-            help="Rank layouts instead of searching: N layouts (named, then random ones), or the "
-            "layouts in a file.",
+            help="Rank layouts instead of searching: the first N of the named and then random "
+            "layouts, or the layouts in a file.",
         ),
     ] = "",
     finalists: Annotated[

@@ -207,7 +207,7 @@ def outputs(
     Plays a soft tone on each output in turn and prompts for the actuator that moved. With --beside,
     an accelerometer (of any sensitivity) detects the actuator instead, and also detects dead, loose
     or reversed actuators. Exits with status 1 if there are any, or if channels differ from the
-    rig's and are not written.
+    rig's and --output is missing.
     """
     from era_haptics.lab.measuring.outputs import find_outputs
 

@@ -559,7 +559,7 @@ def test_named_contents_are_felt(tmp_path: Path) -> None:
     [
         ("vij", "", "version 0 of the .haptic format"),
         ("hmpg", "", "binary form of HJIF; .* `Decoder -f .* `Synthesizer -b"),
-        ("mp3", "", "unknown format of content 'mp3'; known are ahap, haptic, hjif, wav"),
+        ("mp3", "", "unknown format of content 'mp3'; known: ahap, haptic, hjif, wav"),
         ("ahap", b" " * (4 << 20) + b"{}", "must be up to 4 MiB long; shorten the content"),
         ("ahap", "[]", ":1: must be an object in braces"),
         (

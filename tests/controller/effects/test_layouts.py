@@ -419,7 +419,7 @@ def test_a_layout_names_files_beside_it_and_contents_that_come_along(tmp_path: P
         ("{kind: file, file: broken.ahap}", "broken.ahap:1"),
         ("{kind: file, file: door.ahap, channel: 2}", "channel must be left out"),
         ("{kind: file, file: door.txt}", "txt"),
-        ("{kind: file, file: succes}", "unknown content 'succes'; did you mean success? known are"),
+        ("{kind: file, file: succes}", "unknown content 'succes'; did you mean success? known:"),
     ],
     ids=[
         "missing",

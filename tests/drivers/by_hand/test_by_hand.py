@@ -501,8 +501,8 @@ def test_check_links_warns_of_limits_beyond_the_ceilings(frequencies: tuple[floa
 @pytest.mark.parametrize(
     ("url", "message"),
     [
-        ("serail:///dev/ttyUSB0", r"unknown wire 'serail://'; did you mean serial://\? known are"),
-        ("carrier+pigeon://coop", "known are .*modbus.tcp://, serial://, .*sim://"),
+        ("serail:///dev/ttyUSB0", r"unknown wire 'serail://'; did you mean serial://\? known:"),
+        ("carrier+pigeon://coop", "known: .*modbus.tcp://, serial://, .*sim://"),
         ("serial:///dev/ttyUSB0?baud=fast", "baud must be.*'fast'"),
         ("modbus+tcp://host/999", "unit must be.*'999'"),
         (f"{BUS}#300", "node must be.*'300'"),

@@ -202,7 +202,7 @@ BOTH_WAYS = f"{OWN}, resonance: 224 Hz, resonance_is: free, stiffness: 3 kN/m"
         (BOTH_WAYS, "stiffness", ""),
         (BOTH_WAYS, "resonance_is", ""),
         ("type: DAEX25CT-5", "type", "did you mean DAEX25CT-4"),
-        ("type: DAEX25CT-4, stroke: 1 mm", "stroke", "known are at"),
+        ("type: DAEX25CT-4, stroke: 1 mm", "stroke", "known: at"),
         ("type: DAEX25CT-4, power: 20 W", "power", "at most 10 W"),
     ],
     ids=[
@@ -363,8 +363,8 @@ def test_show_prints_exciters_and_what_they_reach(
     assert found["exciters"][0].keys() >= {"magnet_resonance_hz", "q", "force_at_1_w_n"}
     show(str(path), as_json=False)
     text = capsys.readouterr().out
-    level = "20 dB SL (vibrotactile-probe) under a finger everywhere except 2 cm at the edges"
-    assert f"{level}, nominal board: from {lowest} Hz" in text
+    where = "under a finger everywhere except within 2 cm of the edges (nominal board)"
+    assert f"20 dB SL (vibrotactile-probe) {where}: from {lowest} Hz" in text
 
 
 @pytest.mark.parametrize(

@@ -53,8 +53,8 @@ if TYPE_CHECKING:  # slow to import, like all drawing modules
 class SolvedPlate:
     """A rig's plate on its ERAs, solved once at first use, up to the rig's highest frequency.
 
-    seed: draws plate, ERAs, channels and fingers at random from the rig's tolerances, as `era table
-    verify` does, on another mesh; None for the nominal rig.
+    seed: of a plate, ERAs, channels and fingers drawn at random from the rig's tolerances and
+    solved on another mesh, as in `era table verify`; None for the nominal rig.
 
     Example:
         >>> plate = era.SolvedPlate(rig)
@@ -82,8 +82,8 @@ class SolvedPlate:
     def modes(self) -> SupportedModes:
         """Natural frequencies (n,) [Hz], damping ratios (n,), and mode shapes at any point (`at`).
 
-        Up to the highest frequency of the rig's limits, like `era plate modes`. Raises InputError
-        for a plate without supports.
+        The modes extend to the highest frequency of the rig's limits, as in `era plate modes`.
+        Raises InputError for a plate without supports.
         """
         rig = self._real
         return supported_modes(
@@ -102,8 +102,9 @@ class SolvedPlate:
 
         - points (p, 2) [m].
         - frequencies (f,) [Hz]: default: the frequencies of a table.
-        - fingers: resting on the plate, as positions [m] or with their loads.
-        - seed: of another plate, as in `SolvedPlate(rig, seed=seed)`.
+        - fingers: fingers that rest on the plate, as positions [m] or as `Finger`s with their
+          loads.
+        - seed: for a plate drawn at random, as in `SolvedPlate(rig, seed=seed)`.
 
         Returns complex peak amplitudes h (f, ERAs, p), with ERAs in the order of `rig.eras`:
         weights w (1 = full stroke) give a(t) = Im[h w exp(i omega t)], which without fingers is the
@@ -135,9 +136,10 @@ class SolvedPlate:
         """Compute the steady peak acceleration [m/s²] over the plate, and its nulls.
 
         raster: number of points along x and y; default: as many as the mesh resolves. All layers of
-        an answer play, without the load of fingers, which moves nulls (`responses` and `play`
-        include it). ERAs at one frequency add as complex amplitudes; the magnitudes of different
-        frequencies add (paper Eq. 28). Raises InputError for a drive that the rig cannot play.
+        an answer are included. Fingers do not load the plate here, although their load moves nulls
+        (`responses` and `play` include it). ERAs at one frequency add as complex amplitudes; the
+        magnitudes of different frequencies add (paper Eq. 28). Raises InputError for a drive that
+        the rig cannot play.
 
         Example:
             >>> field = plate.map({"SW": 110, "NE": era.Drive(110, level=0.5, phase_deg=90)})
@@ -174,16 +176,16 @@ class SolvedPlate:
         """Compute the vibration that fingers feel for a duration [s], starting at rest; default:
         until steady.
 
-        - target: positions [m] of fingers that the whole drive is meant for; default: the fingers
-          of an answer, each with its own layer and load.
+        - target: positions [m] of the fingers that should feel the whole drive; default: the
+          fingers of an answer, each with its own layer and load.
         - loads: relative to the rig's fingertip, targets first; default 1.
         - sample_rate [Hz]: if given, drive is an array (ERAs, samples) of band-limited signals (1 =
           full stroke), which determines the duration and the sampling of the records.
 
-        A layer starts with its onset or its ramp, drives with a 40 ms ramp. The plate is solved
-        exactly in time, without time steps (`docs/concepts/plate-model.md`). Raises InputError for
-        fingers off the plate, a duration in which the slowest vibration does not decay to 5 %, and
-        drives that an ERA cannot play.
+        A layer of an answer starts with its onset or its ramp; any other drive starts with a 40 ms
+        ramp. The plate is solved exactly in time, without time steps
+        (`docs/concepts/plate-model.md`). Raises InputError for fingers off the plate, a duration in
+        which the slowest vibration does not decay to 5 %, and drives that an ERA cannot play.
 
         Example:
             >>> felt = plate.play({"SW": 110}, target=(0.08, 0.06), quiet=(0.22, 0.16))
@@ -237,7 +239,8 @@ class SolvedPlate:
 
 
 def draw_map(plate: SolvedPlate, drive: Played, *, title: str = "") -> "Figure":
-    """Draw the peak acceleration over the plate in g (1 g = 9.8 m/s²), ERAs, nulls as red crosses.
+    """Draw the peak acceleration over the plate in g (1 g = 9.8 m/s²), with ERAs and nulls (red
+    crosses).
 
     Same picture as `era plate map`. Raises InputError for a drive that the rig cannot play.
 
@@ -317,9 +320,9 @@ def draw_contrast_map(table: LocalizationTable, found: ContrastMap) -> "Figure":
 def draw_playback(playback: PlatePlayback) -> "Figure":
     """Draw the acceleration at each finger over time [m/s²], on a logarithmic scale.
 
-    The curves are peaks within a period of the lowest frequency (within 30 ms for signals): mean
-    over the fingertip at a target, loudest point at a quiet finger, as in the definition of
-    contrast.
+    Each curve shows the peak within a period of the lowest frequency (within 30 ms for signals). As
+    in the definition of contrast, it is the mean over the fingertip at a target, and the loudest
+    point at a quiet finger.
 
     Example:
         >>> era.draw_playback(plate.play(only)).savefig("playback.png")

@@ -56,8 +56,9 @@ def open_amplifier(
     """Return an amplifier of the rig, open within a `with` block and disarmed after it.
 
     name: optional if the rig has only one; url: replaces the rig's. Commands beyond the rig's
-    limits are rejected. Raises InputError for an unknown name; in the block CommandError for an
-    invalid URL, LinkError without a reply, CommandRefused.
+    limits are rejected. Raises InputError for an unknown name. Entering the block raises
+    CommandError for an invalid URL, LinkError if there is no reply, and CommandRefused if the
+    amplifier rejects a request.
 
     Example:
         >>> url = "sim://examples/paper_plate.yaml"

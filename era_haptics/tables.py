@@ -78,7 +78,7 @@ def query(
 
     - target: one position or several.
     - level_db_sl: above the detection threshold; 20 dB is strong.
-    - duration [s]: of a short effect, over which the level is averaged.
+    - duration [s]: duration of a short effect, over which the level is averaged.
 
     Example:
         >>> only = era.query(table, one, quiet=other)
@@ -104,14 +104,14 @@ def answer(
 
     - quiet: fingers that should feel nothing, as positions [m] or as fingers.
     - drive_mode: default the table's; must be `phased` for more than one vibration.
-    - shaped: for amplifiers that play shaped onsets and endings.
+    - shaped: use shaped onsets and endings, which the amplifiers must support.
     - apart_hz: minimum distance between frequencies.
     - bands_may_swap: allow bands to be swapped between fingers.
 
     If the worst finger would have less than 6 dB, vibrations are shared or held back as the fingers
-    allow. Levels are lowered to the ERAs' full stroke (`Answer.applied`). Raises InputError for
-    fingers off the plate or at the same position, and for a band without frequencies. Same as `era
-    table query --own`.
+    allow. Levels that exceed the ERAs' full stroke are lowered (`Answer.applied`). Raises
+    InputError for fingers off the plate or at the same position, and for a band without
+    frequencies. Same as `era table query --own`.
 
     Example:
         >>> one, other = (0.08, 0.06), (0.22, 0.16)

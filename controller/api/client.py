@@ -555,7 +555,7 @@ def _blocking(
 
 
 class Client(AbstractContextManager["Client"]):
-    """A client of the daemon, made by `connect`, for any thread; see `AsyncClient`."""
+    """A client of the daemon, returned by `connect`; its methods are thread-safe."""
 
     def __init__(self, client: AsyncClient, loop: LoopThread) -> None:
         self.path = client.path

@@ -241,10 +241,10 @@ async def drive(
 
 
 class BlockingAmplifier:
-    """The amplifier at a URL within limits, open while the context lasts.
+    """The amplifier at a URL, opened by a `with` block and disarmed at its end.
 
-    is_output: what full level must be, the output of a linear amplifier or the motion of a stiff
-    source; None for either. Leaving the context disarms it. Raises what `Amplifier` raises.
+    Commands beyond the limits are rejected. is_output: whether full level must be the output of a
+    linear amplifier (True) or the motion of a stiff source (False); None for either.
     """
 
     def __init__(self, url: str, *, limits: GuardLimits, is_output: bool | None = None) -> None:
@@ -295,7 +295,7 @@ class BlockingAmplifier:
         self._wait(self._amplifier.disarm())
 
     def stop(self) -> None:
-        """Quick stop, latched until `clear`; CommandRefused where silence is not confirmed."""
+        """Quick stop, latched until `clear`; raises CommandRefused if silence is not confirmed."""
         stopped = self._wait(self._stopped())
         if not stopped.is_confirmed:
             raise CommandRefused(f"the amplifier may play: {stopped.cause}")
@@ -318,10 +318,10 @@ class BlockingAmplifier:
         return status_rows(self._wait(self._amplifier.request("Ping", values, Priority.HEARTBEAT)))
 
     def apply(self, layers: Sequence[AmplifierLayer]) -> StagedSet:
-        """Play only these layers from now on; returns them as on the wire.
+        """Play only these layers from now on; returns them as rounded for the wire.
 
-        Raises CommandError for levels or phases between coarse steps of the amplifier: full level
-        or nothing, or phases that would be off by more than 5 degrees.
+        Raises CommandError if the amplifier's steps are too coarse: its only levels are zero and
+        full level, or a phase would be off by more than 5 degrees.
         """
         return self._wait(self._applied(layers))
 

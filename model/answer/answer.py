@@ -291,14 +291,14 @@ class Sensation:
     layer: int | None = None
     """Number of the layer that plays the finger's vibration, None if no layer does."""
     level_db_sl: float = -math.inf
-    """Level of the finger's stimulus, averaged over the duration, if limited."""
+    """Level of the finger's stimulus; averaged over the duration if it has one."""
     promised_level_db_sl: float = -math.inf
     contrast_db: float | None = None
     """Level relative to all other vibrations here, None without other vibrations.
 
     For a single vibration: relative to its own level at the loudest quiet finger. For a quiet
-    finger: the weakest vibration at its own finger, relative to all vibrations here. The lowest
-    over the rig's threshold sets, like all contrasts.
+    finger: the weakest vibration at its own finger, relative to all vibrations here. Every contrast
+    is the lowest over the rig's threshold sets.
     """
     median_contrast_db: float | None = None
     """Median of the same contrast over the plates."""
@@ -327,7 +327,7 @@ class Sensation:
 
 @dataclass(frozen=True)
 class Layer:
-    """Excitations that play simultaneously for the fingers of a vibration."""
+    """Excitations that play simultaneously and form one vibration for its fingers."""
 
     excitation: Excitation
     """Tones of all ERAs."""
@@ -424,7 +424,7 @@ NO_LIMITS = Limits()
 
 @dataclass(frozen=True, eq=False)
 class Answer:
-    """Layers to play for fingers, and the resulting sensations."""
+    """Layers to play, and the resulting sensation of each finger."""
 
     asked: tuple[Finger, ...]
     """Fingers with their requests."""
@@ -628,7 +628,7 @@ class Answer:
 
     @property
     def stroke_factor(self) -> float:
-        """Fraction of the requested levels that the ERAs' stroke allows, 1 for all."""
+        """Fraction of the requested levels that the ERAs' stroke allows; 1 if it allows all."""
         return self.tones.stroke_factor
 
     @property

@@ -154,7 +154,7 @@ class Measures:
     residual_db: float
     """Residual vibration in the 100 ms after the end, relative to the steady vibration."""
     concentration: Concentration | None
-    """None with other fingers."""
+    """How well the vibration is confined to a single finger; None with other fingers."""
     is_imperceptible_to_quiet: bool | None
     """Whether quiet fingers stay 10 dB below all threshold sets, on 90 % of plates."""
 

@@ -64,13 +64,13 @@ class Stimulus:
     level_db_sl: float = STRONG_DB_SL
     """Level over its duration, onset included, on the nominal plate.
 
-    For a continuous stimulus: the level that 90 % of plates reach. With an envelope: at its
-    maximum, 1.
+    For a continuous stimulus, this is the level that 90 % of plates reach. With an envelope, it is
+    the level at the envelope's maximum, 1.
     """
     band_hz: tuple[float, float] = ANY_BAND
     """Lowest and highest frequency."""
     duration: float | None = None
-    """Duration [s], None for a continuous stimulus; a click has 0.04 s."""
+    """Duration [s], None for a continuous stimulus; a click lasts 0.04 s."""
     modulation_hz: float | None = None
     """Modulation frequency of its strength [Hz], None for a steady one.
 
@@ -148,25 +148,23 @@ class Finger:
     priority: int = 0
     """Vibrations of lower priority give way or are lowered first."""
     sharing: str = BY_NAME
-    """Whether it can feel the vibration of another finger.
+    """Whether the finger can feel the vibration of another finger.
 
-    `never`; that of a finger with the same name (`by name`); that of the nearest finger that also
-    allows `any`; or it `must` feel one vibration with all fingers of its name. Except for `never`,
-    it can also feel the vibration of a finger so close that the two cannot be separated.
+    `never`: it cannot. `by name`: of a finger with the same name. `any`: of the nearest finger that
+    also allows `any`. `must`: it feels one vibration with all fingers of its name. Except with
+    `never`, it can also feel the vibration of a finger so close that the two cannot be separated.
     """
     is_protected: bool = True
     """Whether others' vibrations are kept from it even if its own is given up.
 
-    Without a stimulus and without protection only its load counts, wherever it is.
+    A finger with neither a stimulus nor protection counts only as a load.
     """
     min_contrast_db: float = -math.inf
     """Minimum promised contrast to others' vibrations; below it, others' vibrations or the finger's
     own are given up."""
     max_foreign_db_sl: float = math.inf
-    """Maximum level of others' vibrations here; louder ones are held back.
-
-    Relative to the rig's own thresholds, on 90 % of plates.
-    """
+    """Maximum level of others' vibrations here, relative to the rig's own thresholds, on 90 % of
+    plates; louder ones are held back."""
 
     def __post_init__(self) -> None:
         """Check everything that does not depend on the table; raises InputError."""

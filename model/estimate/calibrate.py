@@ -173,12 +173,15 @@ class HeldOutSensors:
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """A rig fitted to a measurement, with the diagnostics of both."""
+    """A rig fitted to a measurement, with diagnostics of the fit and the measurement."""
 
     plate: SensedPlate
-    """Plate of the original rig, at the sensors of the fit."""
+    """Plate of the original rig, with the sensors of the fit."""
     fit: Fit
-    """Fit with form errors, to the sensors with a signal."""
+    """Fit to the sensors with a signal, including form errors.
+
+    Form errors are deviations that no rig file describes, such as inaccurate cutting.
+    """
     prior: tuple[FloatArray, FloatArray]
     """Prior of the parameters: mean (p,) and covariance (p, p)."""
     dead_sensors: tuple[str, ...]
@@ -277,7 +280,7 @@ class Calibration:
     def scales(self) -> dict[str, tuple[float, float]]:
         """Scale and standard error of sensors whose scale is wrong, or of all sensors on request.
 
-        Relative to the median of the others.
+        Scales are relative to the median of the other sensors.
         """
         errors = self.plate.model.space.values(self.fit.errors, "sensor_scale").tolist()
         rows = zip(
@@ -306,7 +309,7 @@ class Calibration:
 
     @property
     def chi2(self) -> float:
-        """chi² per degree of freedom of the fit, about 1."""
+        """chi² per degree of freedom; about 1 for a good fit."""
         return self.fit.chi2
 
     @property
@@ -332,10 +335,10 @@ class Calibration:
 
     @cached_property
     def held_out(self) -> HeldOutSensors | None:
-        """Fit without some sensors of known scale, and predict their responses.
+        """Prediction of the responses of some sensors by a fit without them.
 
-        The prediction uses the rig as written to its file, without other form errors. None if too
-        few sensors remain for a fit.
+        These sensors have a known scale. The prediction uses the rig as written to its file,
+        without other form errors. None if too few sensors remain for a fit.
         """
         count, space = len(self.measurement.names), self.plate.model.space
         candidates = np.flatnonzero(~self.is_rescaled | self.is_rescaled.all())

@@ -304,7 +304,7 @@ def _under_fingertips(
 
 @dataclass(frozen=True, eq=False)
 class SupportedModes:
-    """Natural frequencies (n,) [Hz], ascending, damping ratios (n,), and shapes by `at`.
+    """Natural frequencies (n,) [Hz], ascending, and damping ratios (n,); `at` returns mode shapes.
 
     coordinates (r, n): the modes in the coordinates of the plate `reduced`.
     """
@@ -325,7 +325,7 @@ class SupportedModes:
         )
 
     def at(self, points: FloatArray) -> FloatArray:
-        """Mode shapes at points [m] (p, 2), (p, n), scaled to modal mass 1 [1/sqrt(kg)].
+        """Return mode shapes (p, n) at points (p, 2) [m], scaled to modal mass 1 [1/sqrt(kg)].
 
         Raises InputError for points off the plate, and invalid points.
         """

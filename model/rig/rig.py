@@ -222,11 +222,12 @@ class Rig:
     supports: tuple[str, ...] = ()
     """Names of the ERAs without an amplifier."""
     outputs: frozenset[str] = frozenset()
-    """Amplifiers with an electrical output: a gain relates it to the motion of bases."""
+    """Amplifiers whose level is an electrical output; gains relate this output to the bases'
+    motion."""
     clock_errors: Mapping[str, float] = field(default_factory=dict)
     """Assumed clock error of each amplifier [s]; infinite if its clock cannot be steered."""
     document: Document | None = field(default=None, compare=False, repr=False)
-    """Its keys."""
+    """Keys of the rig file, if the rig was read from one."""
 
     def __post_init__(self) -> None:
         """Check that ERAs and masses are on the plate, with unique positions and names of ERAs."""

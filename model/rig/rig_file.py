@@ -476,7 +476,7 @@ def merged_keys(base: Value, over: Value, *, is_final: bool = True) -> Any:
 
 
 def load_rig(path: Path | str, *, mesh: str | None = None) -> Rig:
-    """Read a rig file; mesh: `auto` or NXxNY, replaces the file's mesh.
+    """Read a rig file; mesh: replaces the file's mesh, `auto` or NXxNY.
 
     Raises ConfigError with all problems of the file; InputError for an invalid mesh. The mesh can
     be coarser than a rig file allows, to study its error.

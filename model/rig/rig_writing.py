@@ -293,9 +293,9 @@ def rig(
     """Build a rig from a `Plate` and an `Era` per name, like a file with these sections.
 
     amplifiers: default `{"main": {"url": "sim://"}}`, a simulated one, with the ERAs on its
-    channels in order; uncertainty, fingertip: also an `Uncertainty` and a `Fingertip`, "none" for
-    massless fingers. Omitted arguments, and None, have the defaults of a file. Raises ConfigError
-    with all problems, by argument and key.
+    channels in order; uncertainty, fingertip: mappings, or an `Uncertainty` and a `Fingertip`;
+    fingertip="none" for massless fingers. An argument that is omitted or None stands for the
+    default of a file. Raises ConfigError with all problems, by argument and key.
 
     Example:
         >>> sheet = era.Plate(length=0.4, width=0.3, thickness="3 mm", material="aluminium")
@@ -328,9 +328,10 @@ def rig(
 
 
 def save_rig(rig: Rig, path: Path | str) -> None:
-    """Write a rig file that reads back as this rig: the text of its file, or all its keys.
+    """Write a rig file from which `load_rig` returns the same rig.
 
-    Raises InputError for a rig that a file cannot express, OSError if the file cannot be written.
+    It contains the text of the rig's original file, or all keys if there is none. Raises InputError
+    for a rig that a file cannot express, OSError if the file cannot be written.
 
     Example:
         >>> era.save_rig(mine, "mine.yaml")
@@ -356,11 +357,11 @@ def change_rig(rig: Rig, **changes: Any) -> Rig:
     """Return a rig with changed keys of the plate (thickness=0.002) or changed sections.
 
     `plate` and `eras` change only the given keys: eras={"SW": {"stiffness": 2e4}}. Dependent values
-    are computed again: damping from `damping_ratio`, a mesh `auto`, the equivalent plate of a
-    laminate. If the plate changes size, ERAs and masses keep their relative positions. None removes
-    a key or an ERA, which restores the default; this includes `fingertip`: use fingertip="none" for
-    a massless finger. Raises ConfigError with all problems, InputError for `modes` identified on
-    another plate.
+    are computed again: damping from `damping_ratio`, the mesh if it is `auto`, the equivalent plate
+    of a laminate. If the plate changes size, ERAs and masses keep their relative positions. None
+    removes an ERA, or a key, whose default then applies. So fingertip=None restores the default
+    fingertip; fingertip="none" stands for a massless finger. Raises ConfigError with all problems,
+    InputError for `modes` identified on another plate.
 
     Example:
         >>> thick = era.change_rig(rig, thickness=0.002, eras={"SW": {"stiffness": 2e4}})

@@ -255,7 +255,7 @@ def default_drive_frequencies(limits: GuardLimits) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class LocalizationTable:
-    """Modes of a plate on its ERAs, and all other data for patterns."""
+    """Modes of a plate on its ERAs, and all other data that answers need."""
 
     plate: Plate
     eras: tuple[Actuator, ...]
@@ -271,13 +271,13 @@ class LocalizationTable:
     """Default drive mode of a query."""
     code_version: str
     frequencies: FloatArray
-    """(f,) [Hz]."""
+    """Frequencies (f,) of the table [Hz]."""
     omega: FloatArray
-    """(r,) [rad/s], of the reduced free plate (`model.reduction.reduced_plate`)."""
+    """Natural frequencies (r,) [rad/s] of the reduced free plate."""
     losses: FloatArray
-    """(r,) [rad²/s²], in addition to the plate's loss factor."""
+    """Losses (r,) [rad²/s²] of each mode, in addition to the plate's loss factor."""
     dispersion_frequencies: FloatArray
-    """(k,) [Hz], of `dispersion`; k = 0 for none."""
+    """Frequencies (k,) [Hz] of `dispersion`; k = 0 for none."""
     dispersion: ComplexArray
     """Change (k, r) [rad²/s²] of the plate's omega² with frequency
     (`model.structure.modal_elasticity`)."""
@@ -342,8 +342,8 @@ class LocalizationTable:
     ) -> tuple[FloatArray, FloatArray]:
         """Frequencies (f,) [Hz] and peak acceleration at points (p, 2) [m] of the plate, (f, p).
 
-        The excitation's frequencies must be the table's own. contacts [m]: of the fingers that load
-        the plate; loads: of each relative to the rig's fingertip, empty for 1.
+        The excitation's frequencies must be the table's own. contacts: positions [m] of the fingers
+        that load the plate; loads: their loads relative to the rig's fingertip, empty if all are 1.
         """
         frequencies, modal = self.driven(excitation, self._modal_fields(contacts, loads))
         shapes = self.raster.at(self.shapes, points)

@@ -131,8 +131,10 @@ def save_table(table: LocalizationTable, path: Path | str) -> None:
 def load_table(path: Path | str, *, rig: Rig | None = None) -> LocalizationTable:
     """Read a table.
 
-    rig: must match the table, except for `model.rig.rig.MAY_DIFFER`. Raises InputError for a
-    missing, damaged or foreign file, and for another rig, with the keys that differ.
+    rig: must match the table, except for mesh, amplifiers, limits, wiring and names
+    (docs/reference/table-file.md).
+    Raises InputError for a missing, damaged or foreign file, and for another rig, with the keys
+    that differ.
 
     Example:
         >>> era.save_table(table, "table.npz")

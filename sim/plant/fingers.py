@@ -38,8 +38,8 @@ class FingerPositions:
 class FingerRecord:
     """Accelerations under one finger while it stayed at one position.
 
-    points (p, 2) [m], the centre first, weights (p,) in the mean over the tip; times (n,) [s];
-    accelerations (n, p) [m/s²].
+    points (p, 2) [m], the centre first; weights (p,) of the points in the mean over the fingertip;
+    times (n,) [s]; accelerations (n, p) [m/s²].
     """
 
     points: FloatArray

@@ -38,11 +38,11 @@ LEVEL_STEP = 0.005
 
 @dataclass(frozen=True, eq=False)
 class FeltFinger:
-    """Vibration felt by a finger during playback, steady and over time; without promises.
+    """Steady level and level over time that a finger feels during playback; contains no promises.
 
     level_db_sl: level of its own layers, mean over the fingertip; foreign_level_db_sl: level of all
     other layers at its loudest point; both -inf without layers. levels_db_sl, foreign_levels_db_sl
-    (w,): RMS levels under a Hann window of 30 ms, at times (w,) [s]. All levels are relative to the
+    (w,): RMS levels over a Hann window of 30 ms, at times (w,) [s]. All levels are relative to the
     threshold set of the playback. An answer's foreign_level_db_sl is the maximum over several sets:
     compare this one with its rig_foreign_level_db_sl.
     """
@@ -69,8 +69,9 @@ class FeltFinger:
 class Vibration:
     """Vibration at all fingers, from one layer alone or from the signals of all ERAs.
 
-    frequencies (f,) [Hz], empty for signals; fingers: indices of its targets; records: of all
-    fingers in order; harmonics (f,) [Hz]: of ERAs with harmonics.
+    frequencies (f,) [Hz]: driven frequencies, empty for signals; fingers: indices of the targets;
+    records: one per finger, in order; harmonics (f,) [Hz]: frequencies added by ERAs with
+    harmonics.
     """
 
     frequencies: tuple[float, ...]
@@ -86,7 +87,7 @@ class Vibration:
 
 @dataclass(frozen=True, eq=False)
 class PlatePlayback:
-    """Records of fingertips while layers played, from rest at time 0.
+    """Recorded vibration of all fingertips during the playback of layers, from rest at time 0.
 
     vibrations: each layer alone; a finger without a layer is quiet; settled [s]: end of the onsets;
     threshold: the threshold set of levels and contrasts (answers have the minimum over several
@@ -213,8 +214,8 @@ class PlatePlayback:
 
     @property
     def transient_contrast_db(self) -> float | None:
-        """Contrast [dB] of the peaks over the first 100 ms to quiet fingers; None without quiet
-        fingers."""
+        """Contrast [dB] between the peaks at targets and at quiet fingers over the first 100 ms;
+        None without quiet fingers."""
         if not self.quiet or self.contrast_db is None:
             return None
         is_onset = self.records[0].times <= ONSET_WINDOW

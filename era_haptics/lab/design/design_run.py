@@ -92,7 +92,7 @@ MAX_STIFFNESSES, MAX_ERAS = 9, 32
 
 @dataclass(frozen=True, eq=False)
 class Assessment:
-    """Answers at contact sets (s,): promised felt contrast [dB] of the worst finger.
+    """Answers for contact sets (s,), with the promised felt contrast [dB] of the worst finger.
 
     quiet (s,): number of quiet fingers; level_db_sl (s,): promised level of the weakest content.
     """
@@ -133,8 +133,8 @@ class Assessment:
 class RankedLayout:
     """Layout of a design, with its answers at new contact sets if it was evaluated in full.
 
-    name: of a given layout, or the number of its start; judged: its answers, comparable with `own`
-    of the design.
+    name: name of a given layout, or number of the search's start; judged: the answers, comparable
+    with `Design.own`.
     """
 
     problem: DesignProblem
@@ -194,8 +194,8 @@ class Design:
     """Result of a design.
 
     - layouts: fully evaluated ones by mean contrast, then the others by score.
-    - starts: final layouts of the best problem's searches.
-    - by_count: best evaluated layout for each number of ERAs of that problem.
+    - starts: final layouts of the searches with the best stiffness.
+    - by_count: best evaluated layout for each number of ERAs, with the best stiffness.
     - by_stiffness: best layout for each stiffness [N/m] tried.
     - sensitivities (n,): change of the score [dB/m] with the position of each ERA of the best
       layout.
@@ -320,10 +320,10 @@ def design(
     - lowest [Hz]: minimum rigid-body frequency of a supported plate.
     - stiffness [N/m]: candidates for new ERAs; the best is used. Empty: the rig's stiffness.
     - finalists: number of given layouts that are evaluated in full.
-    - starts: of a search.
+    - starts: number of starting layouts of a search.
     - workers: number of processes; None: one.
     - cluster: address of a Dask scheduler, instead of workers.
-    - progress: called with the number of tasks done and the total, for one stage after the other.
+    - progress: called with the number of tasks done and the total, separately for each stage.
     - on_layout: called with every layout as soon as it is scored, and again once it is evaluated in
       full.
 

@@ -1,16 +1,15 @@
-"""The group `era rig`: `check` compares a rig with its file; `identify` fits the plate's
-parameters; `show` and `merge` use the result of a fit.
+"""The group `era rig`: check and identify a rig.
 
-`era rig identify` finds the parameters of the plate in place, through a sound card that plays and
-records accelerometers, or from a file of responses. `era rig check` reads such a file.
+`identify` fits the plate's parameters to responses that a sound card records, or that a file
+contains. `show` and `merge` use the result of a fit. `check` compares responses with the rig file.
 """
 
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from itertools import compress
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -20,8 +19,10 @@ from model.errors import InputError
 from model.quantities import counted
 
 if TYPE_CHECKING:
+    from model.estimate.identify import Identification
     from model.estimate.measurement import MeasuredPlate, Measurement
     from model.rig.rig import Rig
+    from model.study.expected_contrast import ExpectedContrast
 
 measure_by_card: "Callable[..., MeasuredPlate] | None" = None
 """Measures a plate through a sound card; set by the lab, which implements sound cards."""
@@ -114,25 +115,18 @@ def identify(
     nothing is played. Exits with status 1 and writes no rig if the model does not explain the
     responses.
     """
-    import time
-
     from model.config.units import parse_frequencies
-    from model.estimate import fit_report
-    from model.estimate.identify import identification_errors
-    from model.estimate.identify import identify as fit
-    from model.estimate.rig_check import check_meaning
     from model.rig.rig_file import load_rig
     from model.structure.modal_elasticity import check_measurable
-    from model.study.expected_contrast import expected_contrast
 
     if measured_file is not None:
         played = {"--level": level, "--device": device}
-        _refuse(played, rule="plays; leave it out with --measured")
+        _reject(played, rule="plays; leave it out with --measured")
     elif device is None:
         raise InputError("give --device, a sound card, or --measured, a file of responses")
     if device is None:
-        only = {"--sensors": sensors_file, "--frequencies": frequencies, "--periods": periods}
-        _refuse(only, rule="needs --device")
+        recorded = {"--sensors": sensors_file, "--frequencies": frequencies, "--periods": periods}
+        _reject(recorded, rule="needs --device")
     elif sensors_file is None:
         raise InputError("--device needs --sensors, a file of the accelerometers")
     tones = parse_frequencies(frequencies) if frequencies else None
@@ -142,7 +136,7 @@ def identify(
     if measured_file is not None:
         measured = _read_measured_plate(measured_file, rig)
     else:
-        require_untouched(is_known=untouched, has_terminal=not as_json)
+        _require_untouched(is_confirmed=untouched, has_terminal=not as_json)
         assert measure_by_card is not None  # noqa: S101  the lab is loaded
         with progress_bar("runs") as progress:
             measured = measure_by_card(
@@ -155,42 +149,71 @@ def identify(
                 seed=seed,
                 progress=progress,
             )
+    _identify_measured(rig, rig_file, measured, output=output, seed=seed, as_json=as_json)
+
+
+def _identify_measured(
+    rig: "Rig",
+    rig_file: Path,
+    measured: "MeasuredPlate",
+    *,
+    output: Path,
+    seed: int,
+    as_json: bool,
+) -> None:
+    """Fit a rig to a measurement, write the fitted rig if it explains it, and print the report."""
+    import time
+
+    from model.estimate import fit_report
+    from model.estimate.identify import identification_errors
+    from model.study.expected_contrast import expected_contrast
+
     started = time.perf_counter()
+    identification = _fitted(rig, measured.measurement)
+    expected: list[ExpectedContrast] = []
+    if identification.can_promise:
+        expected = expected_contrast(rig, identification.rig, seed=seed)
+    rows = [
+        _measured_line(rig, measured),
+        *measured.notes,
+        *fit_report.parameter_rows(identification),
+        *fit_report.fit_rows(identification),
+        *fit_report.contrast_rows(expected),
+    ]
+    files: list[str] = []
+    refusal: str | None = None
+    if identification.is_explained:
+        comment = [f"{rig_file.name} identified in place by `era rig identify`:", *rows]
+        errors = identification_errors(identification)
+        files = write_fitted_rig(output, (rig, identification.rig), comment, errors)
+    elif identification.is_known_well:
+        refusal = _NOT_EXPLAINED
+    else:
+        refusal = _NOT_KNOWN
+    report: dict[str, Any] | None = None
+    if as_json:
+        report = fit_report.identification_json(identification, expected) | _measured_json(measured)
+    elapsed = time.perf_counter() - started
+    finish(rows, report, files=files, elapsed=elapsed, refusal=refusal)
+
+
+def _fitted(rig: "Rig", measurement: "Measurement") -> "Identification":
+    """Fit a rig to a measurement; exit with `NO_FIT` if that fails."""
+    from model.estimate.identify import identify as fit
+    from model.estimate.rig_check import check_meaning
+
     try:
-        check_meaning(rig, measured.measurement)
+        check_meaning(rig, measurement)
         with progress_bar("fits") as progress:
-            found = fit(rig, measured.measurement, progress=progress)
+            return fit(rig, measurement, progress=progress)
     except InputError as error:
         typer.echo(f"era: {error}; no rig is written", err=True)
         raise typer.Exit(NO_FIT) from error
-    expected = expected_contrast(rig, found.rig, seed=seed) if found.can_promise else []
-    rows = [
-        measured_line(rig, measured),
-        *measured.notes,
-        *fit_report.parameter_rows(found),
-        *fit_report.fit_rows(found),
-        *fit_report.contrast_rows(expected),
-    ]
-    made = f"{rig_file.name} identified in place by `era rig identify`:"
-    files = (
-        write_fitted_rig(output, (rig, found.rig), [made, *rows], identification_errors(found))
-        if found.is_explained
-        else []
-    )
-    report = fit_report.identification_json(found, expected) | measured_json(measured)
-    reason = _NOT_EXPLAINED if found.is_known_well else _NOT_KNOWN
-    finish(
-        rows,
-        report if as_json else None,
-        files=files,
-        elapsed=time.perf_counter() - started,
-        refusal=None if found.is_explained else reason,
-    )
 
 
-def _refuse(given: Mapping[str, object], *, rule: str) -> None:
-    """Raise InputError for given options that do not apply."""
-    for name, value in given.items():
+def _reject(options: Mapping[str, object], *, rule: str) -> None:
+    """Raise InputError if one of some options was given, since none applies."""
+    for name, value in options.items():
         if value is not None:
             raise InputError(f"{name} {rule}")
 
@@ -205,29 +228,25 @@ def _read_measured_plate(path: Path, rig: "Rig") -> "MeasuredPlate":
 
     measurement = measurement_of(read_measured(path), rig)
     screened = check_consistency(rig, measurement)
-    dead_sensors = compress(measurement.names, screened.dead_sensors)
     live = screened.live(measurement)
+    sensors: list[dict[str, Any]] = []
+    for sensor in live.sensors:
+        mass_g = 1e3 * sensor.mass
+        sensors.append({"sensor": sensor.name, "x_m": sensor.x, "y_m": sensor.y, "mass_g": mass_g})
+    dead_sensors = compress(measurement.names, screened.dead_sensors)
     return MeasuredPlate(
         live,
         level=None,
         duration=None,
-        sensors=tuple(
-            {
-                "sensor": sensor.name,
-                "x_m": sensor.x,
-                "y_m": sensor.y,
-                "mass_g": 1e3 * sensor.mass,
-            }
-            for sensor in live.sensors
-        ),
+        sensors=tuple(sensors),
         notes=tuple(f"{name} has no signal, left out" for name in dead_sensors),
         details={"values_beyond_limits": live.skipped},
     )
 
 
-def require_untouched(*, is_known: bool, has_terminal: bool) -> None:
+def _require_untouched(*, is_confirmed: bool, has_terminal: bool) -> None:
     """Raise InputError, or typer.Abort, unless the user confirms that nothing touches the plate."""
-    if is_known:
+    if is_confirmed:
         return
     if not (has_terminal and sys.stdin.isatty()):
         raise InputError(
@@ -236,22 +255,24 @@ def require_untouched(*, is_known: bool, has_terminal: bool) -> None:
     typer.confirm("Will the plate be free of contact for the next minute?", abort=True, err=True)
 
 
-def measured_line(rig: "Rig", measured: "MeasuredPlate") -> str:
+def _measured_line(rig: "Rig", measured: "MeasuredPlate") -> str:
     """Return a summary of the measurement in one line."""
-    from model.quantities import counted
-
     measurement = measured.measurement
-    low, high = measurement.frequencies[0], measurement.frequencies[-1]
-    level = "" if measured.level is None else f" at a level of {measured.level:.3g}"
-    duration = "" if measured.duration is None else f" in {measured.duration:.1f} s"
-    return (
-        f"{counted(len(rig.eras), 'ERA')}, {counted(len(measurement.sensors), 'sensor')}, "
-        f"{counted(len(measurement.frequencies), 'tone')} from {low:g} to {high:g} Hz{level}, "
-        f"{counted(measurement.count, 'response')}{duration}"
-    )
+    eras = counted(len(rig.eras), "ERA")
+    sensors = counted(len(measurement.sensors), "sensor")
+    tones = counted(len(measurement.frequencies), "tone")
+    low = measurement.frequencies[0]
+    high = measurement.frequencies[-1]
+    line = f"{eras}, {sensors}, {tones} from {low:g} to {high:g} Hz"
+    if measured.level is not None:
+        line += f" at a level of {measured.level:.3g}"
+    line += f", {counted(measurement.count, 'response')}"
+    if measured.duration is not None:
+        line += f" in {measured.duration:.1f} s"
+    return line
 
 
-def measured_json(measured: "MeasuredPlate") -> dict[str, object]:
+def _measured_json(measured: "MeasuredPlate") -> dict[str, object]:
     """Return the measurement settings for JSON output."""
     measurement = measured.measurement
     return {
@@ -266,8 +287,6 @@ def measured_json(measured: "MeasuredPlate") -> dict[str, object]:
 
 
 rig_app = typer.Typer(no_args_is_help=True, help="Check and identify a rig.")
-
-
 rig_app.command()(identify)
 
 
@@ -285,33 +304,39 @@ def show(
     from model.rig.rig_writing import fitted_rows
 
     rig = load_rig(fitted)
-    changes = fitted_rows(rig)
+    fitted_values = fitted_rows(rig)
     assert rig.document is not None  # noqa: S101  it was read from a file
     assert rig.document.over is not None  # noqa: S101  there are rows
     base = str(rig.document.over.data["base"])
-    table = [
-        (
-            key,
-            "-" if before is None else _value_text(before),
-            "left out" if after is None else _value_text(after),
-            "" if error is None else f"± {error:.3g}",
-        )
-        for key, before, after, error in changes
-    ]
-    heading = ("", base, fitted.name, "standard error")
-    widths = [max(map(len, column)) for column in zip(heading, *table, strict=True)]
-    rows = [
-        "  ".join(f"{cell:{width}}" for cell, width in zip(row, widths, strict=True)).rstrip()
-        for row in (heading, *table)
-    ]
-    names = ("key", "base", "fitted", "standard_error")
-    answer = {"base": base, "changes": [dict(zip(names, each, strict=True)) for each in changes]}
-    print_report(rows, answer, as_json=as_json)
+    table = [("", base, fitted.name, "standard error")]
+    changes: list[dict[str, Any]] = []
+    for key, base_value, value, error in fitted_values:
+        error_text = "" if error is None else f"± {error:.3g}"
+        base_text = _value_text(base_value, default="-")
+        table.append((key, base_text, _value_text(value, default="left out"), error_text))
+        changes.append({"key": key, "base": base_value, "fitted": value, "standard_error": error})
+    print_report(_aligned(table), {"base": base, "changes": changes}, as_json=as_json)
 
 
-def _value_text(value: object) -> str:
-    """Format a value of a rig file: numbers with five digits, tables as their row count."""
+def _aligned(table: Sequence[Sequence[str]]) -> list[str]:
+    """Return the lines of a table, with each column as wide as its widest cell."""
+    columns = zip(*table, strict=True)
+    widths = [max(map(len, column)) for column in columns]
+    lines: list[str] = []
+    for row in table:
+        cells = [cell.ljust(width) for cell, width in zip(row, widths, strict=True)]
+        lines.append("  ".join(cells).rstrip())
+    return lines
+
+
+def _value_text(value: object, *, default: str = "None") -> str:
+    """Format a value of a rig file: numbers with five digits, tables as their row count.
+
+    default: text of a missing value.
+    """
     match value:
+        case None:
+            return default
         case float():
             return f"{value:.5g}"
         case [[*_], *_]:
@@ -380,11 +405,12 @@ def check(
     started = time.perf_counter()
     verdict = judged_by_promises(diagnose(rig, observation, has_form=True), rig)
     elapsed = time.perf_counter() - started
-    low, high = verdict.frequencies.min(), verdict.frequencies.max()
+    low = verdict.frequencies.min()
+    high = verdict.frequencies.max()
+    sensors = counted(len(verdict.sensors), "sensor")
+    frequencies = counted(len(verdict.frequencies), "frequency", plural="frequencies")
     rows: list[str | None] = [
-        f"{rig_file}: {counted(len(verdict.sensors), 'sensor')}, "
-        f"{counted(len(verdict.frequencies), 'frequency', plural='frequencies')} "
-        f"from {low:g} to {high:g} Hz, {elapsed:.1f} s",
+        f"{rig_file}: {sensors}, {frequencies} from {low:g} to {high:g} Hz, {elapsed:.1f} s",
         rig.uncertainty_note,
         "",
         *rig_check.channel_table(verdict),
@@ -392,8 +418,12 @@ def check(
         *rig_check.verdict_rows(verdict),
         *rig_check.difference_rows(verdict),
     ]
-    answer = {"exactly_known": [*rig.exactly_known], "elapsed_s": elapsed}
-    print_report(rows, {**rig_check.as_json(verdict), **answer}, as_json=as_json)
+    report = {
+        **rig_check.as_json(verdict),
+        "exactly_known": [*rig.exactly_known],
+        "elapsed_s": elapsed,
+    }
+    print_report(rows, report, as_json=as_json)
     if not verdict.is_well:
         raise typer.Exit(FAILED)
 

@@ -78,7 +78,7 @@ def demo(
     so results do not depend on the machine. With --real-time, --dashboard or a wire other than sim,
     time is real; if the machine is too slow, the run is void and the exit status is 1.
     """
-    from controller.demo.demonstration import SIM, WIRES, check_page, write_pictures
+    from controller.demo.demonstration import SIM, WIRES, check_page
     from model.rig.rig_file import example_rig_path, load_rig
 
     if wire is not None and wire not in WIRES:
@@ -86,49 +86,60 @@ def demo(
     if dashboard is not None and (touches is not None or as_json):
         raise InputError("--dashboard takes its touches from the page; omit --touches and --json")
     is_real_time = real_time or dashboard is not None or wire not in (None, SIM)
-    wire = wire or ("serial" if is_real_time else SIM)
-    drawn = seed_of_plate(exact=exact, seed=seed)
+    if wire is None:
+        wire = "serial" if is_real_time else SIM
+    plate_seed = seed_of_plate(exact=exact, seed=seed)
     recording = None if touches is None else _read_touches(touches)
-    own_rig, rig_file = rig_file, (rig_file or example_rig_path()).absolute()
-    rig = load_rig(rig_file)
-    table = _table_of(rig, rig_file, is_quiet=as_json or dashboard is not None)
+    played_rig = rig_file or example_rig_path()
+    played_rig = played_rig.absolute()
+    rig = load_rig(played_rig)
+    table = _table_of(rig, played_rig, is_quiet=as_json or dashboard is not None)
     if dashboard is not None:
         from controller.gateway.gateway_settings import require_gateway
 
         require_gateway()
         check_page(dashboard)
-        _serve_page(rig_file, table, wire, dashboard, drawn)
+        _serve_page(played_rig, table, wire, dashboard, plate_seed)
         return
     run = _play(
-        rig_file,
+        played_rig,
         table,
         wire,
         recording,
-        seed=drawn,
+        seed=plate_seed,
         is_real_time=is_real_time,
         is_quiet=as_json,
     )
-    pictures = None if run.why_void is not None else write_pictures(table, run.rows, out)
-    answer = {
-        "wire": wire,
-        "clock": "real" if is_real_time else "virtual",
-        "void": run.why_void,
-        "touches": [row.as_json() for row in run.rows],
-        "files": [] if pictures is None else [str(file) for file in pictures.files],
-    }
-    if pictures is None:
-        print_report(_void_report(run), answer, as_json=as_json)
+    clock = "real" if is_real_time else "virtual"
+    report: dict[str, object] = {"wire": wire, "clock": clock, "void": run.why_void}
+    _print_result(run, report, table, out=out, own_rig=rig_file, as_json=as_json)
+
+
+def _print_result(
+    run: "DemoRun",
+    report: dict[str, object],
+    table: "LocalizationTable",
+    *,
+    out: Path,
+    own_rig: Path | None,
+    as_json: bool,
+) -> None:
+    """Draw the pictures of a run and print its result; exit with status 1 if it is void."""
+    from controller.demo.demonstration import write_pictures
+
+    report["touches"] = [row.as_json() for row in run.rows]
+    if run.why_void is not None:
+        print_report(_void_report(run), {**report, "files": []}, as_json=as_json)
         raise typer.Exit(1)
-    further: tuple[str | Path, ...] = ("config", "init", "my_rig.yaml")
-    if own_rig is not None:
-        further = ("table", "build", own_rig, "-o", "table.npz")
-    lines = [
-        _summary(run.rows),
-        *pictures.omitted,
-        *(f"wrote {file}" for file in pictures.files),
-        next_line("era", *further),
-    ]
-    print_report(lines, answer, as_json=as_json)
+    pictures = write_pictures(table, run.rows, out)
+    files = [str(file) for file in pictures.files]
+    lines = [_summary(run.rows), *pictures.omitted]
+    lines += [f"wrote {file}" for file in files]
+    if own_rig is None:
+        lines.append(next_line("era", "config", "init", "my_rig.yaml"))
+    else:
+        lines.append(next_line("era", "table", "build", own_rig, "-o", "table.npz"))
+    print_report(lines, {**report, "files": files}, as_json=as_json)
 
 
 def _read_touches(file: Path) -> "Scene":
@@ -148,10 +159,11 @@ def _table_of(rig: "Rig", rig_file: Path, *, is_quiet: bool) -> "LocalizationTab
     ):
         table, _ = cached_table(rig, progress=progress)
     if not is_quiet:
+        eras = counted(len(rig.eras), "ERA")
+        solver = "on a mesh of" if rig.plate.surface is None else "by"
         print(
-            f"{rig_file.name}: table of {counted(len(rig.eras), 'ERA')} "
-            f"{'on a mesh of' if rig.plate.surface is None else 'by'} {table.mesh}, "
-            f"ready in {timed.elapsed:.1f} s"
+            f"{rig_file.name}: table of {eras} {solver} {table.mesh}, ready in "
+            f"{timed.elapsed:.1f} s"
         )
     return table
 
@@ -209,13 +221,14 @@ def _heading(threshold: str, *, has_latency: bool) -> str:
     """Return the heading of the rows: groups, units and columns."""
     from model.finger import scale_in_words
 
-    pair = f"{'prom.':>6} {'meas.':>6}"
-    columns = f" time  target / cm  others  {'ERAs':22} {pair}  {pair}"
-    groups = f"{'':51}{'felt contrast':^13}  {'level':^13}"
-    units = f"{'':51}{'/ dB':^13}  {'/ dB SL':^13}"
+    indent = 51 * " "
+    groups = f"{indent}{'felt contrast':^13}  {'level':^13}"
+    units = f"{indent}{'/ dB':^13}  {'/ dB SL':^13}"
     if has_latency:
         groups += f" {'latency':>7}"
         units += f" {'/ ms':>7}"
+    pair = " prom.  meas."
+    columns = f" time  target / cm  others  {'ERAs':22} {pair}  {pair}"
     scale = f"{scale_in_words(threshold)}; contrasts are the lowest of all sets"
     return "\n".join([scale, groups.rstrip(), units.rstrip(), columns, ""])
 
@@ -224,29 +237,42 @@ _MAX_NAMES = 4  # ERA names per row
 
 
 def _line(row: "TouchRow", *, has_latency: bool) -> str:
-    x, y = (100 * value for value in row.targets_m[0])
+    """Return the row of a touch: position, tones, promised and measured figures, and notes."""
+    x, y = row.targets_m[0]
     others = len(row.fingers) - 1 if row.fingers else len(row.quiet)
-    start = f"{row.time_s:5.1f}  {x:5.1f},{y:5.1f}  {others:6d}  "
+    start = f"{row.time_s:5.1f}  {100 * x:5.1f},{100 * y:5.1f}  {others:6d}  "
     if row.reason is not None:
         return f"{start}silent: {row.reason}"
-    by_frequency: dict[float, list[str]] = {}
+    contrasts = f"{_number(row.promised_contrast_db):>6s} {_number(row.measured_contrast_db):>6s}"
+    levels = f"{_number(row.predicted_level_db_sl):>6s} {_number(row.measured_level_db_sl):>6s}"
+    line = f"{start}{_tones_text(row):22s} {contrasts}  {levels}"
+    if has_latency:
+        line += f" {_number(row.latency_ms):>7s}"
+    return line + _notes(row)
+
+
+def _tones_text(row: "TouchRow") -> str:
+    """Return the frequencies of a touch, each with its ERAs."""
+    eras_by_frequency: dict[float, list[str]] = {}
     for era, tone in row.drive.items():
-        by_frequency.setdefault(tone["frequency_hz"], []).append(era)
-    eras = ", ".join(f"{_named(some)} {hertz:g} Hz" for hertz, some in by_frequency.items())
-    pairs = (
-        (row.promised_contrast_db, row.measured_contrast_db),
-        (row.predicted_level_db_sl, row.measured_level_db_sl),
-    )
-    figures = "  ".join(f"{_number(one):>6s} {_number(other):>6s}" for one, other in pairs)
-    note = "" if row.steady else "  still ringing"
+        eras_by_frequency.setdefault(tone["frequency_hz"], []).append(era)
+    tones = [f"{_named(eras)} {frequency:g} Hz" for frequency, eras in eras_by_frequency.items()]
+    return ", ".join(tones)
+
+
+def _notes(row: "TouchRow") -> str:
+    """Return what is missing in a measurement, and the verdict of the finger."""
+    note = ""
     if row.measured_level_db_sl is None:
-        short = "" if row.steady else f": it played for {row.played_s:.2f} s"
-        note = f"  not measured{short}"
+        note = "  not measured"
+        if not row.steady:
+            note += f": it played for {row.played_s:.2f} s"
+    elif not row.steady:
+        note = "  still ringing"
     for finger in row.fingers:
         if finger.at_m == row.targets_m[0]:
             note += f"  {finger.verdict}, of {counted(len(row.contents), 'content')}"
-    latency = f" {_number(row.latency_ms):>7s}" if has_latency else ""
-    return f"{start}{eras:22s} {figures}{latency}{note}"
+    return note
 
 
 def _named(eras: list[str]) -> str:
@@ -259,13 +285,15 @@ def _number(value: float | None) -> str:
 
 def _summary(rows: "list[TouchRow]") -> str:
     """Count touches that kept the promise, among those that reached the steady state."""
-    kept = [row.keeps_promise for row in rows if row.keeps_promise is not None]
+    judged = [row for row in rows if row.keeps_promise is not None]
     touches = counted(len(rows), "touch", plural="touches")
-    if not kept:
+    if not judged:
         return touches
+    kept_count = sum(bool(row.keeps_promise) for row in judged)
+    share = kept_count / len(judged)
     return (
-        f"{touches}; of {len(kept)} with other fingers on the plate {sum(kept)} "
-        f"({sum(kept) / len(kept):.0%}) felt at least the promised contrast\n"
+        f"{touches}; of {len(judged)} with other fingers on the plate {kept_count} "
+        f"({share:.0%}) felt at least the promised contrast\n"
         "(90 % of plates within the rig's tolerances reach a promise; --seed draws another plate)"
     )
 

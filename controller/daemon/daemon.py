@@ -12,13 +12,13 @@ import resource
 import signal
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Awaitable, Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
 
 from controller.api.methods import ReloadResult
-from controller.api.schema import headline
+from controller.api.schema import AmplifierStatus, headline
 from controller.api.server import ApiServer
 from controller.daemon.amplifier_messages import amplifier_statuses
 from controller.daemon.children import gateway_options, keep_gateway
@@ -28,7 +28,7 @@ from controller.daemon.layouts import ConfigChange, LayoutChoice, TouchInputs, r
 from controller.daemon.messages import EventPublisher
 from controller.effects.effect import Effect
 from controller.gateway.gateway_settings import require_gateway
-from controller.operation.operation_states import ENERGISED
+from controller.operation.operation_states import ENERGISED, Operation
 from controller.operation.plate_controller import Controller
 from controller.operation.supervisor import Supervisor
 from controller.play.reports import Observers
@@ -54,6 +54,9 @@ from registry.service_manager import ServiceManager
 from registry.threads import DaemonThreads, in_thread, leave_work, no_long_collections
 
 _CLOSE_TIMEOUT = 0.2  # s; for the control loop to end after all reachable amplifiers are silent
+_IGNORED = (signal.SIGHUP, signal.SIGUSR1, signal.SIGUSR2)
+_MIN_ADDRESS_SPACE = 512  # MB; with less, libraries that it needs wait for memory for ever
+_SWITCH_INTERVAL = 0.001  # s; bounds how long another thread can delay the control loop
 
 _logger = logging.getLogger(__name__)
 
@@ -91,38 +94,26 @@ class Daemon:
         self._manager = manager
         self._dashboard = dashboard
         self._shows_token = shows_token
+        self._gateway: asyncio.Task[None] | None = None
         self._reload_requested = asyncio.Event()
         self._next_reload = asyncio.get_running_loop().create_future()
         self._shutdown = asyncio.Event()
         self._shutdown_cause = "the daemon is shutting down"
         self.supervisor = Supervisor(
-            state_changed=(
-                lambda old, new: self.publisher.state_changed(old, new),
-                lambda old, new: manager.notify(f"STATUS={headline(new.state.value, new.cause)}"),
-            ),
+            state_changed=(self._publish_state, self._notify_manager),
             link_changed=lambda *change: self.publisher.link_changed(*change),
             alive=lambda: manager.alive(threads.now()),
         )
         self.started = self.supervisor.started
         """Set once it serves, and its amplifiers are open or searched for."""
         self.layouts = LayoutChoice(self.config, table.frequencies, changed=self._layout_changed)
-        # All others get no layouts, so that these can be freed once they are replaced.
-        config = replace(config, layouts={})
         self.publisher = EventPublisher(
             operation=lambda: self.supervisor.operation,
-            amplifiers=lambda: amplifier_statuses(
-                self.controller.amplifiers,
-                config.urls,
-                are_open=self.controller.group.is_open,
-                lost=self.supervisor.operation.lost,
-                what_may_play=self.supervisor.what_may_play,
-                clock_errors=self.controller.group.clock_errors,
-                targets=self.publisher.view.targets,
-            ),
+            amplifiers=self._amplifier_statuses,
             layouts=self.layouts,
             inputs=lambda: self.inputs.event,
         )
-        self.controller = self.supervisor.controller = Controller(
+        self.controller = Controller(
             config.rig,
             table,
             lines=lines,
@@ -134,19 +125,18 @@ class Daemon:
             drive_mode=config.section.mode,
             watchdog=watchdog,
         )
+        self.supervisor.controller = self.controller
         cycle = self.controller.cycle
         cycle.tracker.max_fingers = config.section.max_fingers
         self.supervisor.observe(cycle.observers)
         self.publisher.observe(cycle.observers)
         observe(cycle.observers)
         self.inputs = TouchInputs(
-            cycle.deliver,
-            cycle.lift,
-            rejects=cycle.rejects,
-            changed=lambda: self.publisher.hub.publish("inputs", self.publisher.inputs),
+            cycle.deliver, cycle.lift, rejects=cycle.rejects, changed=self._inputs_changed
         )
         self.api = ApiService(
-            config,
+            # Without layouts, so that these can be freed once they are replaced.
+            replace(config, layouts={}),
             table,
             self.controller,
             self.supervisor,
@@ -162,7 +152,27 @@ class Daemon:
             stop_all=self.supervisor.stop_anyhow,
             clock=threads.now,
         )
-        self._gateway: asyncio.Task[None] | None = None
+
+    def _publish_state(self, old: Operation, new: Operation) -> None:
+        self.publisher.state_changed(old, new)
+
+    def _notify_manager(self, old: Operation, new: Operation) -> None:
+        self._manager.notify(f"STATUS={headline(new.state.value, new.cause)}")
+
+    def _amplifier_statuses(self) -> list[AmplifierStatus]:
+        group = self.controller.group
+        return amplifier_statuses(
+            self.controller.amplifiers,
+            self.config.urls,
+            are_open=group.is_open,
+            lost=self.supervisor.operation.lost,
+            what_may_play=self.supervisor.what_may_play,
+            clock_errors=group.clock_errors,
+            targets=self.publisher.view.targets,
+        )
+
+    def _inputs_changed(self) -> None:
+        self.publisher.hub.publish("inputs", self.publisher.inputs)
 
     async def run(self, lock: SocketLock) -> None:
         """Open, serve until terminated, silence the amplifiers and close.
@@ -220,7 +230,8 @@ class Daemon:
         while True:
             await self._reload_requested.wait()
             self._reload_requested.clear()
-            verdict, self._next_reload = self._next_reload, loop.create_future()
+            verdict = self._next_reload
+            self._next_reload = loop.create_future()
             self._manager.notify("RELOADING=1", f"MONOTONIC_USEC={time.monotonic_ns() // 1000}")
             result = await self._reload_now()
             reasons = "; ".join(result.reasons)
@@ -280,23 +291,22 @@ class Daemon:
                     task.cancel()
                     await asyncio.wait({task})
             self._log.subscriber = None
-            gateway = () if self._gateway is None else (self._gateway,)
-            for task in gateway:
-                task.cancel()
-            closing = (self.inputs.close(), self.server.close(), self.api.close())
-            for found in await asyncio.gather(*closing, *gateway, return_exceptions=True):
-                if isinstance(found, Exception) and not isinstance(found, OSError):
-                    _logger.error("closing failed", exc_info=found)
+            closing: list[Awaitable[None]] = [
+                self.inputs.close(),
+                self.server.close(),
+                self.api.close(),
+            ]
+            if self._gateway is not None:
+                self._gateway.cancel()
+                closing.append(self._gateway)
+            for result in await asyncio.gather(*closing, return_exceptions=True):
+                if isinstance(result, Exception) and not isinstance(result, OSError):
+                    _logger.error("closing failed", exc_info=result)
             self.publisher.hub.close()
 
     def _status_line(self) -> str:
         operation = self.supervisor.operation
         return headline(operation.state.value, operation.cause)
-
-
-_IGNORED = (signal.SIGHUP, signal.SIGUSR1, signal.SIGUSR2)
-_MIN_ADDRESS_SPACE = 512  # MB; with less, libraries that it needs wait for memory for ever
-_SWITCH_INTERVAL = 0.001  # s; bounds how long another thread can delay the control loop
 
 
 def check_daemon(path: Path) -> str:
@@ -311,7 +321,8 @@ def check_daemon(path: Path) -> str:
         loaded = _load_table(config, config.table)
         frequencies = counted(len(loaded.frequencies), "frequency", plural="frequencies")
         table = f"table with {frequencies}"
-    eras, amplifiers = counted(len(config.rig.eras), "ERA"), counted(len(config.urls), "amplifier")
+    eras = counted(len(config.rig.eras), "ERA")
+    amplifiers = counted(len(config.urls), "amplifier")
     return f"{path}: good: {eras}, {amplifiers}; {table}"
 
 
@@ -346,7 +357,7 @@ def page_address(text: str) -> str:
 
 
 def _page_of_file(config: DaemonConfig) -> str | None:
-    """Where the file wants the page; None, and a warning, where its libraries are missing."""
+    """Return the page's address in the file; warn and return None if libraries are missing."""
     try:
         if config.section.dashboard is not None:
             require_gateway()
@@ -357,7 +368,7 @@ def _page_of_file(config: DaemonConfig) -> str | None:
 
 
 def _check_limits() -> None:
-    """Refuse to start where files or memory would run out."""
+    """Refuse to start if files or memory would run out."""
     descriptors = allow_many_descriptors()
     if descriptors < MIN_DESCRIPTORS:
         raise InputError(
@@ -378,12 +389,12 @@ def _ignored_signals() -> Iterator[None]:
 
     SIGTERM ends it immediately until it serves: nothing is open yet, and a library could be stuck.
     """
-    before = {number: signal.signal(number, signal.SIG_IGN) for number in _IGNORED}
-    before[signal.SIGTERM] = signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    handlers = {number: signal.signal(number, signal.SIG_IGN) for number in _IGNORED}
+    handlers[signal.SIGTERM] = signal.signal(signal.SIGTERM, signal.SIG_DFL)
     try:
         yield
     finally:
-        for number, handler in before.items():
+        for number, handler in handlers.items():
             signal.signal(number, handler)
 
 

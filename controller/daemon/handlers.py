@@ -9,6 +9,7 @@ import time
 from collections.abc import Awaitable, Callable, Mapping
 from contextlib import suppress
 from functools import partial
+from typing import NamedTuple
 
 from controller.api.jsonrpc import ErrorCode, NotSilent, RpcError
 from controller.api.methods import (
@@ -36,7 +37,7 @@ from controller.api.methods import (
     UnsubscribeParams,
     api_method,
 )
-from controller.api.schema import AmplifierSilence, Empty, headline
+from controller.api.schema import AmplifierSilence, Empty, TouchPoint, headline
 from controller.api.server import Connection, Handler
 from controller.content.points import pattern_of_points
 from controller.daemon.config import API_SOURCES, DaemonConfig
@@ -45,6 +46,7 @@ from controller.daemon.messages import EventPublisher, effects_result, hello_res
 from controller.daemon.plate_view import playing_of
 from controller.effects.effect import MIN_DB_SL, Effect
 from controller.effects.file_effect import File
+from controller.effects.layout import SurfaceLayout
 from controller.operation.operation_states import (
     ENERGISED,
     DaemonEvent,
@@ -61,6 +63,7 @@ from drivers.host.ledger import StopOutcome
 from model.compiled.kernels import why_slow
 from model.errors import InputError
 from model.finger import STRONG_DB_SL
+from model.structure.plate import Plate
 from model.table.table import LocalizationTable
 from registry import threads
 from registry.plugins import did_you_mean
@@ -119,8 +122,7 @@ class ApiService:
 
     def _clients_changed(self) -> None:
         """Pass the names of all clients to the strengths, which the control loop reads."""
-        names = [(_origin(client), client.name) for client in self._clients]
-        self._strengths.clients = tuple(names)
+        self._strengths.clients = [(_origin(client), client.name) for client in self._clients]
 
     def holds_lease(self, client: Connection) -> bool:
         """Whether a client armed or renewed the current lease: it is never evicted."""
@@ -146,8 +148,12 @@ class ApiService:
     @api_method(in_reserve=True)
     def status(self, client: Connection, params: Empty) -> StatusResult:
         """Show the state of the daemon, the amplifiers and the contacts."""
-        operation, view, now = self._supervisor.operation, self._publisher.view, threads.now()
+        now = threads.now()
+        operation = self._supervisor.operation
         lease = operation.lease_at(now)
+        view = self._publisher.view
+        is_enabled = operation.state is _ENABLED
+        cycle = self._controller.cycle
         return StatusResult(
             time_s=now,
             unix_time_s=time.time(),
@@ -161,16 +167,16 @@ class ApiService:
             armed_by=lease.owner if lease else None,
             lease_left_s=lease.expires_at - now if lease else None,
             contacts=view.statuses_now(self._controller.table),
-            silence_reason=view.silence_reason if operation.state is _ENABLED else None,
-            **playing_of(view.applied if operation.state is _ENABLED else None),
+            silence_reason=view.silence_reason if is_enabled else None,
+            **playing_of(view.applied if is_enabled else None),
             amplifiers=self._publisher.amplifiers(),
             latency_ms=self._publisher.latencies.summary(),
             lift_latency_ms=self._publisher.lift_latencies.summary(),
             lost_events=dict(self._publisher.hub.lost),
-            rejected_touches=dict(self._controller.cycle.rejects.counts),
-            rejected_examples=dict(self._controller.cycle.rejects.examples),
+            rejected_touches=dict(cycle.rejects.counts),
+            rejected_examples=dict(cycle.rejects.examples),
             inputs=self._publisher.inputs().inputs,
-            clicks_too_late=self._controller.cycle.clicks_too_late,
+            clicks_too_late=cycle.clicks_too_late,
             layout=self._layouts.name,
             layouts=self._layouts.names,
             strengths=self._publisher.strengths().strengths,
@@ -207,9 +213,8 @@ class ApiService:
     @api_method()
     def renew(self, client: Connection, params: RenewParams) -> RenewResult:
         """Extend the lease."""
-        lease = self._supervisor.renew(
-            check_lease(self._supervisor.operation.lease, params.lease, threads.now())
-        )
+        lease = check_lease(self._supervisor.operation.lease, params.lease, threads.now())
+        self._supervisor.renew(lease)
         client.lease = lease.token
         return RenewResult(lease_s=lease.duration)
 
@@ -257,9 +262,8 @@ class ApiService:
                     where="epoch",
                     remedy="check the status, then clear again",
                 )
-            await self._supervisor.handle(
-                DaemonEvent(Trigger.CLEAR, f"acknowledged by {params.client or client.name!a}")
-            )
+            cause = f"acknowledged by {params.client or client.name!a}"
+            await self._supervisor.handle(DaemonEvent(Trigger.CLEAR, cause))
             operation = self._supervisor.operation
         if operation.state is not DaemonState.READY_TO_SWITCH_ON:
             raise _wrong_state(operation)
@@ -272,21 +276,12 @@ class ApiService:
             client.number = next(self._next_number)
             self._clients.add(client)
             self._clients_changed()
-        plate, origin = self._config.rig.plate, _origin(client)
-        touches = tuple(
-            Touch(
-                point.id,
-                point.x_m / plate.length,
-                1 - point.y_m / plate.width,
-                size=None
-                if (radius := point.radius_m) is None
-                else (2 * radius / plate.length, 2 * radius / plate.width),
-            )
-            for point in params.touches
-        )
+        touches = [_touch_at(point, self._config.rig.plate) for point in params.touches]
         # Two clients with the same source name are two sources.
-        name = f"{origin}:{params.source}"
-        self._controller.cycle.deliver(TouchFrame(name, client.received_at, touches, origin=origin))
+        origin = _origin(client)
+        source = f"{origin}:{params.source}"
+        frame = TouchFrame(source, client.received_at, tuple(touches), origin=origin)
+        self._controller.cycle.deliver(frame)
         return Empty()
 
     @api_method()
@@ -316,31 +311,23 @@ class ApiService:
     async def play(self, client: Connection, params: PlayParams) -> Empty:
         """Play an effect, or points and taps, at a finger; only while armed."""
         # At the contact nearest to the position, at most at the effect's own level.
-        name, effect, level_max = self._played(params)
+        requested = self._requested_effect(params)
+        effect = requested.effect
         level = params.level_db_sl
-        if level is not None and not MIN_DB_SL <= level <= level_max:
-            whose = "" if params.effect is None else f" of effect {name!a}"
-            raise RpcError(
-                ErrorCode.REFUSED,
-                f"level{whose} must be from {MIN_DB_SL:g} to {level_max:g} dB SL, got {level:g}",
-                where="level_db_sl",
-                remedy="choose a level in this range, or change the level in the surface layout",
-            )
+        if level is not None:
+            requested.check_level(level, is_named=params.effect is not None)
         contact = self._nearest(params)
-        if not effect.is_prepared(effect.level_db_sl if level is None else level):
-            epoch = self._supervisor.operation.epoch  # read first, to detect a stop meanwhile
-            made = effect.for_table(self._table.frequencies)  # a copy with its own renditions
-            work = partial(made.prepare, made.level_db_sl if level is None else level)
-            async with self._preparing:
-                await in_thread(work, name="content")
-            effect = made
+        played_level = effect.level_db_sl if level is None else level
+        if not effect.is_prepared(played_level):
+            epoch = self._supervisor.operation.epoch
+            effect = await self._prepared(effect, level)
             contact = self._nearest(params)
             if self._supervisor.operation.epoch != epoch:
                 raise RpcError(
                     ErrorCode.WRONG_STATE, "stopped or disarmed meanwhile", remedy="play it again"
                 )
         self._layouts.player.play(
-            name,
+            requested.name,
             contact,
             threads.now(),
             level_db_sl=level,
@@ -349,6 +336,14 @@ class ApiService:
         )
         self._controller.cycle.request_update()
         return Empty()
+
+    async def _prepared(self, effect: Effect, level: float | None) -> Effect:
+        """Return a copy of an effect, rendered in a thread for a level [dB SL] or its own."""
+        rendered = effect.for_table(self._table.frequencies)  # a copy with its own renditions
+        rendered_level = rendered.level_db_sl if level is None else level
+        async with self._preparing:
+            await in_thread(partial(rendered.prepare, rendered_level), name="content")
+        return rendered
 
     def _nearest(self, params: PlayParams) -> Contact:
         """Return the contact to play at; raises RpcError without one, or if disarmed."""
@@ -359,10 +354,12 @@ class ApiService:
         def distance(contact: Contact) -> float:
             return math.dist((contact.x, contact.y), (params.x_m, params.y_m))
 
-        near = [each for each in self._publisher.view.contacts if distance(each) <= PLAY_RADIUS]
-        nearest = min(
-            near, key=lambda each: (bool(each.why_load_alone), distance(each)), default=None
-        )
+        def precedence(contact: Contact) -> tuple[bool, float]:
+            return bool(contact.why_load_alone), distance(contact)
+
+        contacts = self._publisher.view.contacts
+        candidates = [contact for contact in contacts if distance(contact) <= PLAY_RADIUS]
+        nearest = min(candidates, key=precedence, default=None)
         if nearest is None:
             raise RpcError(
                 ErrorCode.REFUSED,
@@ -374,43 +371,20 @@ class ApiService:
             raise RpcError(ErrorCode.REFUSED, nearest.why_load_alone, where="x_m")
         return nearest
 
-    def _played(self, params: PlayParams) -> tuple[str, Effect, float]:
-        """Return name, effect and highest level to play; raises RpcError."""
-        layout, is_made = self._layouts.player.layout, bool(params.points or params.taps)
-        if (params.effect is None) != is_made:
+    def _requested_effect(self, params: PlayParams) -> "_RequestedEffect":
+        """Return the effect to play; raises RpcError."""
+        has_points = bool(params.points or params.taps)
+        if (params.effect is None) != has_points:
             raise RpcError(
                 ErrorCode.INVALID_PARAMS,
                 "play must have either an effect, or points and taps, got both or neither",
                 where="effect",
                 remedy="leave one of them out",
             )
-        if is_made:
-            try:
-                pattern = pattern_of_points(params.points, params.taps)
-            except InputError as error:
-                raise RpcError(ErrorCode.INVALID_PARAMS, f"{error}", where="points") from error
-            highest = min(layout.max_db_sl, MAX_DB_SL)
-            level = min(STRONG_DB_SL, highest)
-            made = File.of(pattern, name="points", level_db_sl=level, loop=params.loop)
-            return "points", made, highest
-        name = params.effect or ""
-        if (effect := layout.effects.get(name)) is None:
-            raise RpcError(
-                ErrorCode.REFUSED,
-                f"unknown effect {name!a}",
-                where="effect",
-                remedy=f"choose one of {', '.join(sorted(layout.effects))}",
-            )
-        level = MAX_DB_SL if effect.level_db_sl is None else effect.level_db_sl
-        if not params.loop:
-            return name, effect, level
-        if not isinstance(effect, File):
-            raise RpcError(
-                ErrorCode.REFUSED,
-                f"loop must be left out for effect {name!a}, which is not a file",
-                where="loop",
-            )
-        return name, effect.model_copy(update={"loop": True}), level
+        layout = self._layouts.player.layout
+        if params.effect is None:
+            return _effect_of_points(params, layout)
+        return _effect_of_layout(params.effect, layout, loop=params.loop)
 
     @api_method()
     def strength(self, client: Connection, params: StrengthParams) -> StrengthResult:
@@ -418,13 +392,14 @@ class ApiService:
 
         The status shows all strengths. Active effects fade to the new strength within 100 ms.
         """
-        known, name = self._publisher.strengths().strengths, params.name
-        if name not in known:
+        name = params.name
+        names = [*self._publisher.strengths().strengths]
+        if name not in names:
             raise RpcError(
                 ErrorCode.REFUSED,
                 f"name must be a touch source, client or region, got {name!a}",
                 where="name",
-                remedy=f"{did_you_mean(name, known)}choose one of {', '.join(known) or 'none'}",
+                remedy=f"{did_you_mean(name, names)}choose one of {', '.join(names) or 'none'}",
             )
         if params.gain_db is not None:
             self._strengths.set(name, params.gain_db)
@@ -435,9 +410,10 @@ class ApiService:
 
     async def _save_strengths(self) -> None:
         """Save the strengths; no request waits for the disk."""
-        saved: Mapping[str, float] | None = None
-        while (file := self._config.strengths) and saved is not self._strengths.gains_db:
-            saved = self._strengths.gains_db
+        file = self._config.strengths
+        saved_gains: Mapping[str, float] | None = None
+        while file is not None and saved_gains is not self._strengths.gains_db:
+            saved_gains = self._strengths.gains_db
             try:
                 await asyncio.to_thread(self._strengths.save, file)
             except (OSError, RuntimeError) as error:  # no thread available
@@ -476,6 +452,70 @@ class ApiService:
             self._supervisor.withdraw(token, "the arming client disconnected")
 
 
+class _RequestedEffect(NamedTuple):
+    """An effect that a client wants to play."""
+
+    name: str
+    effect: Effect
+    max_db_sl: float
+    """Highest level that the client can request [dB SL]."""
+
+    def check_level(self, level: float, *, is_named: bool) -> None:
+        """Raise RpcError for a level [dB SL] out of range; is_named: whether a layout names it."""
+        if not MIN_DB_SL <= level <= self.max_db_sl:
+            owner = f" of effect {self.name!a}" if is_named else ""
+            raise RpcError(
+                ErrorCode.REFUSED,
+                f"level{owner} must be from {MIN_DB_SL:g} to {self.max_db_sl:g} dB SL, got "
+                f"{level:g}",
+                where="level_db_sl",
+                remedy="choose a level in this range, or change the level in the surface layout",
+            )
+
+
+def _effect_of_points(params: PlayParams, layout: SurfaceLayout) -> _RequestedEffect:
+    """Return the effect of the points and taps of a request; raises RpcError."""
+    try:
+        pattern = pattern_of_points(params.points, params.taps)
+    except InputError as error:
+        raise RpcError(ErrorCode.INVALID_PARAMS, f"{error}", where="points") from error
+    max_db_sl = min(layout.max_db_sl, MAX_DB_SL)
+    level = min(STRONG_DB_SL, max_db_sl)
+    effect = File.of(pattern, name="points", level_db_sl=level, loop=params.loop)
+    return _RequestedEffect("points", effect, max_db_sl)
+
+
+def _effect_of_layout(name: str, layout: SurfaceLayout, *, loop: bool) -> _RequestedEffect:
+    """Return the effect of a layout with a name, repeated on request; raises RpcError."""
+    effect = layout.effects.get(name)
+    if effect is None:
+        raise RpcError(
+            ErrorCode.REFUSED,
+            f"unknown effect {name!a}",
+            where="effect",
+            remedy=f"choose one of {', '.join(sorted(layout.effects))}",
+        )
+    max_db_sl = MAX_DB_SL if effect.level_db_sl is None else effect.level_db_sl
+    if not loop:
+        return _RequestedEffect(name, effect, max_db_sl)
+    if not isinstance(effect, File):
+        raise RpcError(
+            ErrorCode.REFUSED,
+            f"loop must be left out for effect {name!a}, which is not a file",
+            where="loop",
+        )
+    return _RequestedEffect(name, effect.model_copy(update={"loop": True}), max_db_sl)
+
+
+def _touch_at(point: TouchPoint, plate: Plate) -> Touch:
+    """Return a touch of a client in the coordinates of touch frames: 0 to 1, down from the top."""
+    size: tuple[float, float] | None = None
+    if point.radius_m is not None:
+        diameter = 2 * point.radius_m
+        size = (diameter / plate.length, diameter / plate.width)
+    return Touch(point.id, point.x_m / plate.length, 1 - point.y_m / plate.width, size=size)
+
+
 def check_lease(lease: Lease | None, token: str, now: float) -> Lease:
     """Return the lease; raises RpcError if it has expired, or has another token."""
     if lease is None or now >= lease.expires_at:
@@ -496,18 +536,25 @@ def _origin(client: Connection) -> str:
 
 def _armed_already(operation: Operation) -> RpcError:
     """Return the error for arming while another client has armed, or is arming."""
-    what, lease = "another client is arming", operation.lease
+    lease = operation.lease
+    problem = "another client is arming"
     if operation.state is _ENABLED and lease is not None:
-        what = f"armed by {lease.owner!a} for {lease.expires_at - threads.now():.1f} s more"
-    return RpcError(ErrorCode.LEASE, what, remedy="wait, or disarm first (any client can disarm)")
+        remaining = lease.expires_at - threads.now()
+        problem = f"armed by {lease.owner!a} for {remaining:.1f} s more"
+    remedy = "wait, or disarm first (any client can disarm)"
+    return RpcError(ErrorCode.LEASE, problem, remedy=remedy)
 
 
 async def _silence(stopping: Awaitable[Mapping[str, StopOutcome]], epoch: int) -> StopResult:
     """Await a stop of an epoch; raises NotSilent unless every amplifier is confirmed silent."""
     outcomes = await stopping
     now = threads.now()
-    amplifiers = {name: AmplifierSilence(**each.rows(now)) for name, each in outcomes.items()}
-    if not (outcomes and all(outcome.is_confirmed for outcome in outcomes.values())):
+    amplifiers: dict[str, AmplifierSilence] = {}
+    is_silent = len(outcomes) > 0
+    for name, outcome in outcomes.items():
+        amplifiers[name] = AmplifierSilence(**outcome.rows(now))
+        is_silent = is_silent and outcome.is_confirmed
+    if not is_silent:
         raise NotSilent(amplifiers)
     return StopResult(epoch=epoch, amplifiers=amplifiers)
 

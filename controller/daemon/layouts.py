@@ -32,6 +32,10 @@ from registry.threads import Backoff, in_thread, without_collections
 _logger = logging.getLogger(__name__)
 
 _APPLIED = ("layouts", "level_db_sl")  # keys that a running daemon can apply
+_MIN_PAUSE = 1.0  # s; before a failed source is restarted
+_MAX_PAUSE = 30.0  # s
+SOURCE_CLOSE_TIMEOUT = 0.2  # s
+WATCH_INTERVAL = 1.0  # s; between checks of all inputs
 
 
 @dataclass(frozen=True)
@@ -69,46 +73,61 @@ def read_again(old: DaemonConfig, frequencies: FloatArray) -> ConfigChange:
     """
     with without_collections():  # large layouts would take long
         change = config_change(old, read_in_child(old.source, frequencies))
-        warn_of_bands(
-            {name: change.config.layouts.get(name) for name in change.layouts}, frequencies
-        )
+        layouts = change.config.layouts
+        changed_layouts = {name: layouts[name] for name in layouts if name in change.layouts}
+        warn_of_bands(changed_layouts, frequencies)
         return change
 
 
-def warn_of_bands(
-    layouts: Mapping[str | None, SurfaceLayout | None], frequencies: FloatArray
-) -> None:
+def warn_of_bands(layouts: Mapping[str | None, SurfaceLayout], frequencies: FloatArray) -> None:
     """Log the frequencies played for bands that contain no frequency of the table [Hz]."""
     for name, layout in layouts.items():
-        for problem in layout.band_problems(frequencies) if layout else ():
+        for problem in layout.band_problems(frequencies):
             _logger.warning("layout %s: %s", name, problem)
 
 
 def config_change(old: DaemonConfig, new: DaemonConfig) -> ConfigChange:
     """Compare all keys and layouts, and the content of the rig's file."""
-    before, after = old.section.model_dump(), new.section.model_dump()
-    restart = [key for key in before if before[key] != after[key] and key not in _APPLIED]
+    old_values = old.section.model_dump()
+    new_values = new.section.model_dump()
+    restart = [key for key in old_values if _needs_restart(key, old_values, new_values)]
     if old.rig_text != new.rig_text and "rig" not in restart:
         restart.append("rig")
-    was, now = old.layouts, new.layouts
-    differ = [name for name in {**was, **now} if was.get(name) != now.get(name)]
-    changes = [
-        f"layouts.{name}: {'added' if name not in was else 'changed' if name in now else 'removed'}"
-        for name in differ
-        if name is not None
-    ]
-    if before["level_db_sl"] != after["level_db_sl"]:
-        changes.append(f"level_db_sl: from {before['level_db_sl']:g} to {after['level_db_sl']:g}")
-    kept = {name: now[name] if name in differ else was[name] for name in now}
+    changed: set[str | None] = set()
+    changes: list[str] = []
+    for name in {**old.layouts, **new.layouts}:
+        if old.layouts.get(name) == new.layouts.get(name):
+            continue
+        changed.add(name)
+        if name is None:
+            continue
+        if name not in old.layouts:
+            changes.append(f"layouts.{name}: added")
+        elif name in new.layouts:
+            changes.append(f"layouts.{name}: changed")
+        else:
+            changes.append(f"layouts.{name}: removed")
+    old_level = old_values["level_db_sl"]
+    new_level = new_values["level_db_sl"]
+    if old_level != new_level:
+        changes.append(f"level_db_sl: from {old_level:g} to {new_level:g}")
+    layouts = dict(new.layouts)
+    for name in layouts.keys() - changed:
+        layouts[name] = old.layouts[name]
     return ConfigChange(
-        config=replace(new, layouts=kept),
+        config=replace(new, layouts=layouts),
         restart=restart,
         changes=changes,
-        layouts=frozenset(differ),
-        old_max_db_sl=max([layout.max_db_sl for layout in was.values()]),
-        max_db_sl=max([layout.max_db_sl for layout in now.values()]),
+        layouts=frozenset(changed),
+        old_max_db_sl=max([layout.max_db_sl for layout in old.layouts.values()]),
+        max_db_sl=max([layout.max_db_sl for layout in new.layouts.values()]),
         effects=[*_effects_of(old), *_effects_of(new)],
     )
+
+
+def _needs_restart(key: str, old: Mapping[str, object], new: Mapping[str, object]) -> bool:
+    """Whether a key of the configuration has changed that a running daemon cannot apply."""
+    return key not in _APPLIED and old[key] != new[key]
 
 
 def _effects_of(config: DaemonConfig) -> list[Effect]:
@@ -155,12 +174,11 @@ class LayoutChoice:
     def use(self, name: str) -> None:
         """Switch to a layout; raises RpcError for an unknown name."""
         if name not in self._layouts:
-            remedy = f"{did_you_mean(name, self.names)}choose one of {', '.join(self.names)}"
+            remedy = "add layouts to the daemon's file"
+            if self.names:
+                remedy = f"{did_you_mean(name, self.names)}choose one of {', '.join(self.names)}"
             raise RpcError(
-                ErrorCode.INVALID_PARAMS,
-                f"unknown layout {name!a}",
-                where="name",
-                remedy=remedy if self.names else "add layouts to the daemon's file",
+                ErrorCode.INVALID_PARAMS, f"unknown layout {name!a}", where="name", remedy=remedy
             )
         if name != self.name:
             self._play(name)
@@ -170,11 +188,13 @@ class LayoutChoice:
 
         If the current layout was removed, switches to the first and returns a note, otherwise [].
         """
-        before, self._layouts = self.name, change.config.layouts
-        name = before if before in self._layouts else next(iter(self._layouts))
-        if name != before or name in change.layouts:
-            self._play(name)
-        return [] if name == before else [f"current layout: {name or 'none'}"]
+        self._layouts = change.config.layouts
+        if self.name not in self._layouts:
+            self._play(next(iter(self._layouts)))
+            return [f"current layout: {self.name or 'none'}"]
+        if self.name in change.layouts:
+            self._play(self.name)
+        return []
 
     def event(self) -> LayoutEvent:
         """Return the current layout as an event."""
@@ -186,11 +206,6 @@ class LayoutChoice:
         self.player.replace(self._layouts[name])
         _logger.info("layout: using %s", name or "none")
         self._changed()
-
-
-_MIN_PAUSE, _MAX_PAUSE = 1.0, 30.0  # s; before a failed source is restarted
-SOURCE_CLOSE_TIMEOUT = 0.2  # s
-WATCH_INTERVAL = 1.0  # s; between checks of all inputs
 
 
 class TouchInputs:
@@ -224,9 +239,9 @@ class TouchInputs:
     def start(self, inputs: Sequence[TouchInput]) -> None:
         """Run these sources until `close`."""
         self._sources = dict.fromkeys(inputs, "being opened")
-        self._running += [
-            asyncio.create_task(self._run(each), name=f"touch {each.name}") for each in inputs
-        ]
+        for touch_input in inputs:
+            running = asyncio.create_task(self._run(touch_input), name=f"touch {touch_input.name}")
+            self._running.append(running)
         self._running.append(asyncio.create_task(self._watch(), name="touch inputs"))
 
     async def close(self) -> None:
@@ -245,11 +260,13 @@ class TouchInputs:
         await asyncio.wait([ends], timeout=SOURCE_CLOSE_TIMEOUT)
 
     async def _run(self, touch_input: TouchInput) -> None:
-        prefix, calibration = f"{touch_input.name}:", touch_input.calibration
+        prefix = f"{touch_input.name}:"
+        calibration = touch_input.calibration
 
         def deliver(frame: TouchFrame) -> None:
-            # The sender chooses the name, and terminals print it.
-            source = frame.source if frame.source.isprintable() else ascii(frame.source)
+            source = frame.source
+            if not source.isprintable():  # the sender chooses it, and terminals print it
+                source = ascii(source)
             touches = frame.touches
             if calibration != ALIGNED:
                 touches = tuple(map(calibration.apply, touches))
@@ -266,22 +283,23 @@ class TouchInputs:
                 await source.run(deliver)
             except Exception as error:
                 is_expected = isinstance(error, InputError | OSError)
-                text = str(error) if is_expected else failure_text(error)
-                _logger.error("touch source %s: failed, restarting: %s", touch_input.name, text)
-                self._look((touch_input, text))
+                problem = str(error) if is_expected else failure_text(error)
+                _logger.error("touch source %s: failed, restarting: %s", touch_input.name, problem)
+                self._sources[touch_input] = problem
+                self._update()
             else:
                 _logger.info("touch source %s: finished", touch_input.name)
-                self._look((touch_input, None))
+                self._sources[touch_input] = None
+                self._update()
                 return
             finally:
                 self._lift(prefix)
             # A panel can be plugged in later, or a port released.
             await asyncio.sleep(backoff.pause(ran_for=threads.now() - started_at))
 
-    def _look(self, *changed: tuple[TouchInput, TouchSource | str | None]) -> None:
-        """Update the state of all inputs after some have changed."""
-        self._sources.update(changed)
-        statuses = [_status(*each) for each in self._sources.items()]
+    def _update(self) -> None:
+        """Update the state of all inputs."""
+        statuses = [_status(touch_input, source) for touch_input, source in self._sources.items()]
         event = InputsEvent(inputs=statuses, rejected_touches=dict(self._rejects.counts))
         if event != self.event:
             self.event = event
@@ -291,19 +309,30 @@ class TouchInputs:
         """Update the state of all inputs periodically."""
         while True:
             await asyncio.sleep(WATCH_INTERVAL)
-            self._look()
+            self._update()
 
 
 def _status(touch_input: TouchInput, source: TouchSource | str | None) -> TouchInputStatus:
     """Describe an input by its source, or by the reason for its missing source."""
-    try:
-        problem = source.problem if isinstance(source, TouchSource) else source
-    except Exception as error:  # of a plug-in
-        problem = failure_text(error)
-    lacking: Literal["mute", "missing"] = "missing" if isinstance(source, str) else "mute"
+    state: Literal["open", "mute", "missing", "ended"]
+    problem: str | None
+    if source is None:
+        state = "ended"
+        problem = None
+    elif isinstance(source, str):
+        state = "missing"
+        problem = source
+    else:
+        problem = _problem_of(source)
+        state = "open" if problem is None else "mute"
     return TouchInputStatus(
-        name=touch_input.name,
-        url=touch_input.url,
-        state="ended" if source is None else "open" if problem is None else lacking,
-        problem=problem,
+        name=touch_input.name, url=touch_input.url, state=state, problem=problem
     )
+
+
+def _problem_of(source: TouchSource) -> str | None:
+    """Return why an open source is mute; None if it works."""
+    try:
+        return source.problem
+    except Exception as error:  # of a plug-in
+        return failure_text(error)

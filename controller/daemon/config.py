@@ -157,7 +157,9 @@ class DaemonConfig:
 
     def for_table(self, frequencies: FloatArray) -> Self:
         """Return a copy whose layouts are rendered for the frequencies of a table [Hz]."""
-        layouts = {name: each.for_table(frequencies) for name, each in self.layouts.items()}
+        layouts: dict[str | None, SurfaceLayout] = {}
+        for name, layout in self.layouts.items():
+            layouts[name] = layout.for_table(frequencies)
         return replace(self, layouts=layouts)
 
 
@@ -219,17 +221,21 @@ def is_daemon_document(document: Document) -> bool:
 
 
 def _check_kind(document: Document) -> None:
-    """Refuse another kind of file as a whole instead of reporting each unknown key."""
+    """Reject another kind of file as a whole instead of reporting each unknown key."""
     if "rig" in document.data:
         return
-    is_layout = is_layout_document(document)
-    if is_layout or not {"plate", "surface"}.isdisjoint(document.data):
-        raise InputError(
-            f"{document.source}: must be a daemon's file, got a "
-            f"{'surface layout' if is_layout else 'rig'}; write a daemon's file that contains "
-            f"{'layouts: {NAME: FILE}' if is_layout else 'rig: FILE'} "
-            "(era config init daemon.yaml --kind daemon)"
-        )
+    if is_layout_document(document):
+        kind = "surface layout"
+        entry = "layouts: {NAME: FILE}"
+    elif not {"plate", "surface"}.isdisjoint(document.data):
+        kind = "rig"
+        entry = "rig: FILE"
+    else:
+        return
+    raise InputError(
+        f"{document.source}: must be a daemon's file, got a {kind}; write a daemon's file that "
+        f"contains {entry} (era config init daemon.yaml --kind daemon)"
+    )
 
 
 def file_of(document: Document, *keys: str) -> Path | None:
@@ -262,20 +268,24 @@ def _layouts(
 ) -> dict[str | None, SurfaceLayout]:
     """Load the surface layouts; problems are reported at the keys that name them."""
     level = validation.field(("level_db_sl",), DaemonSection)
-    level = STRONG_DB_SL if level is None else level
+    if level is None:
+        level = STRONG_DB_SL
+    plate = None if rig is None else rig.plate
     layouts: dict[str | None, SurfaceLayout] = {}
     for name in islice(validation.mapping(("layouts",)), MAX_LAYOUTS):
         file = file_of(document, "layouts", name)
         try:
             if file is not None:
-                plate = None if rig is None else rig.plate
                 layouts[name] = load_layout(file, plate, level_db_sl=level)
         except InputError as error:
             indented = str(error).replace("\n", "\n  ")
             validation.add(("layouts", name), f"invalid layout:\n    {indented}")
-    if not layouts and (problem := level_problem(level)):
+    if layouts:
+        return layouts
+    problem = level_problem(level)
+    if problem:
         validation.add(("level_db_sl",), problem)
-    return layouts or {None: SurfaceLayout(effects=default_effects(level))}
+    return {None: SurfaceLayout(effects=default_effects(level))}
 
 
 def _urls(
@@ -288,7 +298,8 @@ def _urls(
     errors, _ = check_links(urls, channels=rig.channel_counts, limits=rig.limits)
     for name, error in errors.items():
         validation.add(("rig",), f"invalid amplifiers.{name}.url of the rig: {error}")
-    if len({url.startswith("sim://") for url in urls.values()}) > 1:
+    simulated = [name for name, url in urls.items() if url.startswith("sim://")]
+    if 0 < len(simulated) < len(urls):
         validation.add(
             ("rig",),
             "sim:// must be the URL of all amplifiers or of none; run era sim RIG --serial and put "
@@ -300,32 +311,36 @@ def _urls(
 def _touch(
     validation: Validation[DaemonSection], document: Document, rig: Rig | None
 ) -> tuple[TouchInput, ...]:
-    """The valid touch sources; each is created once to check its URL."""
-    listed = document.data.get("touch")
-    inputs: list[TouchInput] = []
-    for number, entry in enumerate(listed if isinstance(listed, list) else []):
+    """Return the valid touch sources; each is created once to check its URL."""
+    entries = document.data.get("touch")
+    if not isinstance(entries, list):
+        return ()
+    inputs: dict[str, TouchInput] = {}
+    for number, entry in enumerate(entries):
         try:
             section = TouchSection.model_validate(entry)
         except ValueError:
             continue  # reported by the validation
-        location = ("touch", number)
-        if any(section.name == other.name for other in inputs):
-            validation.add((*location, "name"), f"name must be unique, got {section.name} twice")
+        name = section.name
+        if name in inputs:
+            validation.add(("touch", number, "name"), f"name must be unique, got {name} twice")
             continue
-        if section.name == API_SOURCES:
+        if name == API_SOURCES:
             validation.add(
-                (*location, "name"),
+                ("touch", number, "name"),
                 f"name must not be {API_SOURCES}, which is reserved for API clients",
             )
-        key = "calibration"
         try:
             calibration = _calibration(section.calibration, rig)
-            inputs.append(TouchInput(section.name, section.url, calibration))
-            key = "url"
-            inputs[-1].make()
         except InputError as error:
-            validation.add((*location, key), str(error))
-    return tuple(inputs)
+            validation.add(("touch", number, "calibration"), str(error))
+            continue
+        inputs[name] = TouchInput(name, section.url, calibration)
+        try:
+            inputs[name].make()
+        except InputError as error:
+            validation.add(("touch", number, "url"), str(error))
+    return tuple(inputs.values())
 
 
 def _calibration(section: CalibrationSection, rig: Rig | None) -> TouchCalibration:
@@ -334,14 +349,12 @@ def _calibration(section: CalibrationSection, rig: Rig | None) -> TouchCalibrati
     if section.points is None or rig is None:  # an invalid rig is already reported
         return turned(section.turned, mirror=section.mirror)
     plate = rig.plate
-    return fit_touch_calibration(
-        [
-            (x / plate.length, 1 - y / plate.width)
-            for x, y in (each.shown for each in section.points)
-        ],
-        [each.at for each in section.points],
-        plate,
-    )
+    shown_positions: list[tuple[float, float]] = []
+    for point in section.points:
+        x, y = point.shown
+        shown_positions.append((x / plate.length, 1 - y / plate.width))
+    true_positions = [point.at for point in section.points]
+    return fit_touch_calibration(shown_positions, true_positions, plate)
 
 
 def _check_log(validation: Validation[DaemonSection], log: Path | None) -> None:
@@ -354,17 +367,17 @@ def _check_log(validation: Validation[DaemonSection], log: Path | None) -> None:
         _check_folder_of(validation, log, "log", "file")
 
 
-def _check_folder_of(validation: Validation[DaemonSection], file: Path, *place: str) -> bool:
-    """Whether the folder of a file that is written later exists; if not, it is a problem."""
-    is_there = file.parent.is_dir()
-    if not is_there:
-        validation.add(place, f"folder not found: {file.parent}; create it")
-    return is_there
+def _check_folder_of(validation: Validation[DaemonSection], file: Path, *keys: str) -> None:
+    """Check that the folder of a file that is written later exists."""
+    if not file.parent.is_dir():
+        validation.add(keys, f"folder not found: {file.parent}; create it")
 
 
 def _check_serial_numbers(validation: Validation[DaemonSection], rig: Rig | None) -> None:
+    if rig is None:
+        return
     for name in validation.mapping(("serial_numbers",)):
-        if rig is not None and name not in rig.amplifiers:
+        if name not in rig.amplifiers:
             validation.add(
                 ("serial_numbers", name),
                 f"unknown amplifier; the rig has {', '.join(rig.amplifiers)}",
@@ -376,18 +389,17 @@ def _checked(document: Document) -> CheckedFile:
     config = daemon_config_of(document)
     rig = config.rig
     _, warnings = check_links(config.urls, channels=rig.channel_counts, limits=rig.limits)
-    daemon = f"era daemon {document.source}"
-    hint = "" if config.table is None else f". {daemon} --check also reads its table"
-    line = (
-        f"good: ERAs {', '.join(era.name for era in config.rig.eras)} on "
-        f"{', '.join(f'{name} ({url})' for name, url in config.urls.items())}; touches from "
-        f"{', '.join(source.name for source in config.touch) or 'the API only'}; "
-        f"socket {config.socket}{hint}"
-    )
-    note = rig.uncertainty_note
-    held, lost, more = clock_costs(rig, config.urls)
-    notes = [*lost, *gain_notes(rig), *rig.surface_notes, *([note] if note else [])]
-    return CheckedFile(line + held, [*warnings, *notes], more)
+    eras = ", ".join(era.name for era in rig.eras)
+    amplifiers = ", ".join(f"{name} ({url})" for name, url in config.urls.items())
+    sources = ", ".join(source.name for source in config.touch) or "the API only"
+    line = f"good: ERAs {eras} on {amplifiers}; touches from {sources}; socket {config.socket}"
+    if config.table is not None:
+        line += f". era daemon {document.source} --check also reads its table"
+    clock_line, clock_warnings, clock_data = clock_costs(rig, config.urls)
+    notes = [*warnings, *clock_warnings, *gain_notes(rig), *rig.surface_notes]
+    if rig.uncertainty_note:
+        notes.append(rig.uncertainty_note)
+    return CheckedFile(line + clock_line, notes, clock_data)
 
 
 DAEMON = ConfigKind(

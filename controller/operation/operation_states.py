@@ -10,23 +10,16 @@ States have the names of CiA 402.
   it leads to FAULT if anything was latched or energised before.
 - An event without an entry in the table changes nothing.
 
-Observers are called after the actions of a transition have begun (`DeferredCalls`).
+Observers are called after the actions of a transition have begun (`deferred_calls`).
 """
 
-import asyncio
-import logging
 import math
 import re
 import secrets
-from collections import deque
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from enum import Enum, StrEnum, auto
 from typing import NamedTuple, Self
-
-from drivers.host.amplifier import Amplifier
-from drivers.protocol.definition import FAULTS, STATES, name_of
-from drivers.protocol.records import Values
 
 _REMEDIES = {
     "WATCHDOG": "end programs that take the processor, or check the wire: it received nothing in "
@@ -44,8 +37,12 @@ _REMEDIES = {
 
 def fault_remedy(cause: str) -> str:
     """Return the remedy of a fault, by the names of faults in its cause."""
-    named = (_REMEDIES[name] for name in re.findall("[A-Z_]+", cause) if name in _REMEDIES)
-    return f"{next(named, 'find the cause')}, then clear (era clear) and arm again"
+    remedy = "find the cause"
+    for word in re.findall("[A-Z_]+", cause):
+        if word in _REMEDIES:
+            remedy = _REMEDIES[word]
+            break
+    return f"{remedy}, then clear (era clear) and arm again"
 
 
 class DaemonState(StrEnum):
@@ -113,7 +110,7 @@ class Lease:
     """[s]"""
 
     def renewed(self, now: float) -> Self:
-        """Return it for its duration from now [s] on."""
+        """Return the lease, renewed for its duration from now [s] on."""
         return replace(self, expires_at=now + self.duration)
 
 
@@ -170,8 +167,9 @@ class Operation:
 
     def is_lease_over(self, now: float) -> bool:
         """Whether amplifiers are armed for a client whose lease has expired at a time [s]."""
-        is_armed = self.state is DaemonState.OPERATION_ENABLED and self.lease is not None
-        return is_armed and self.lease_at(now) is None
+        if self.state is not DaemonState.OPERATION_ENABLED or self.lease is None:
+            return False
+        return self.lease_at(now) is None
 
 
 class Transition(NamedTuple):
@@ -301,15 +299,15 @@ def _with_event(operation: Operation, event: DaemonEvent, now: float) -> Operati
 def _enter(before: Operation, updated: Operation, to: DaemonState, event: DaemonEvent) -> Operation:
     """Enter the next state of a transition with its cause and remedy."""
     cause = event.cause or before.cause
-    is_back = to in (DaemonState.FAULT, DaemonState.SWITCH_ON_DISABLED)
-    if before.lost is not None and is_back:
+    if before.lost is not None and to in (DaemonState.FAULT, DaemonState.SWITCH_ON_DISABLED):
         cause = f"all amplifiers reply again and are disarmed; before: {before.lost.cause}"
-    is_fault = to in (DaemonState.FAULT_REACTION_ACTIVE, DaemonState.FAULT)
-    remedy = fault_remedy(cause) if is_fault else event.remedy
+    remedy = event.remedy
+    if to in (DaemonState.FAULT_REACTION_ACTIVE, DaemonState.FAULT):
+        remedy = fault_remedy(cause)
     if to is before.state:
         # A persisting fault may have a new cause.
-        is_new_cause = event.trigger in (Trigger.FAULT, Trigger.LINK_CHANGED) and bool(event.cause)
-        return replace(updated, cause=cause, remedy=remedy) if is_new_cause else updated
+        has_new_cause = event.trigger in (Trigger.FAULT, Trigger.LINK_CHANGED) and event.cause
+        return replace(updated, cause=cause, remedy=remedy) if has_new_cause else updated
     is_latched = to in _LATCHING or (to is DaemonState.COMM_LOST and updated.is_latched)
     return replace(
         updated,
@@ -322,81 +320,3 @@ def _enter(before: Operation, updated: Operation, to: DaemonState, event: Daemon
         degraded=(),
         lease=updated.lease if to in ENERGISED else None,
     )
-
-
-_DELAY = 0.001  # s; the actions of a transition have begun by then
-_MAX_PENDING = 256
-
-_logger = logging.getLogger(__name__)
-
-
-class DeferredCalls:
-    """Calls callbacks in order, one per iteration of the event loop.
-
-    An exception in a callback is logged and does not affect others. Above 256 pending calls, the
-    oldest are dropped.
-    """
-
-    def __init__(self) -> None:
-        self._pending: deque[Callable[[], object]] = deque(maxlen=_MAX_PENDING)
-        self._handle: asyncio.Handle | None = None
-
-    def add(self, callback: Callable[[], object]) -> None:
-        """Call back a moment later."""
-        self._pending.append(callback)
-        if self._handle is None:
-            self._handle = asyncio.get_running_loop().call_later(_DELAY, self._call_next)
-
-    def flush(self) -> None:
-        """Make all pending calls now."""
-        while self._pending:
-            call_guarded(self._pending.popleft())
-        if self._handle is not None:
-            self._handle.cancel()
-            self._handle = None
-
-    def _call_next(self) -> None:
-        callback, self._handle = self._pending.popleft(), None
-        if self._pending:
-            self._handle = asyncio.get_running_loop().call_soon(self._call_next)
-        call_guarded(callback)
-
-
-def call_guarded(callback: Callable[[], object]) -> None:
-    """Call an observer; log its exception instead of raising it."""
-    try:
-        callback()
-    except Exception:
-        _logger.exception("observer failed")
-
-
-READ_BACK_INTERVAL = 0.02  # s
-
-_ENABLED = STATES["OPERATION_ENABLED"]
-_DISARMED = STATES["SWITCH_ON_DISABLED"]
-
-
-def are_silent(statuses: Mapping[str, Values], amplifiers: Mapping[str, Amplifier]) -> bool:
-    """Whether all amplifiers report that they are disarmed and silent."""
-    return not is_any_armed(statuses) and all(
-        amplifiers[name].is_silent(status) for name, status in statuses.items()
-    )
-
-
-def is_any_armed(statuses: Mapping[str, Values]) -> bool:
-    """Whether an amplifier reports that it is armed."""
-    return any(each["state"] == _ENABLED for each in statuses.values())
-
-
-def find_problem(statuses: Mapping[str, Values], amplifiers: Mapping[str, Amplifier]) -> str | None:
-    """Describe the first amplifier that is armed, in a fault or not silent; None without one."""
-    for name, status in statuses.items():
-        if status["state"] != _DISARMED or status["fault"]:
-            fault = f", fault {name_of(FAULTS, status['fault'])}" if status["fault"] else ""
-            return f"amplifier {name} is in {name_of(STATES, status['state'])}{fault}"
-        if not amplifiers[name].is_silent(status):
-            return (
-                f"amplifier {name}: levels of all channels must be 0 while it is disarmed, got "
-                f"{status['levels']}"
-            )
-    return None

@@ -2,7 +2,7 @@
 
 import asyncio
 from collections.abc import Awaitable, Callable, Coroutine, Mapping, Sequence
-from typing import Any
+from typing import Any, TypeAlias
 
 from controller.play.intent import IntentSource
 from controller.play.loop import Cycle
@@ -21,6 +21,9 @@ from model.rig.rig import Rig
 from model.table.table import LocalizationTable
 
 CLOSING_RAMP = 0.050  # s; not urgent, so longer than a normal release
+
+_Stopping: TypeAlias = Awaitable[Mapping[str, StopOutcome]]
+"""A stop in progress, with its outcome by the amplifier's name."""
 
 
 class Controller:
@@ -55,7 +58,9 @@ class Controller:
     ) -> None:
         self.cycle = Cycle(rig.plate, Group({}, watchdog=watchdog))
         """The control loop."""
-        self._rig, self.intent_source, self._timing = rig, intent_source, timing
+        self._rig = rig
+        self.intent_source = intent_source
+        self._timing = timing
         self.table = table
         """The localization table to query."""
         self.urls = dict(rig.amplifiers if urls is None else urls)
@@ -66,9 +71,10 @@ class Controller:
             )
         self.make_lines = lines
         self._lines: Lines | None = None  # also set after a failed attempt to open
-        self._before: Lines | None = None  # the previous lines, kept after closing
+        self._last_lines: Lines | None = None  # the same, kept after closing
         self._opened: dict[str, Amplifier] = {}  # latest ones, identified or not
-        self._owed: dict[str, asyncio.Future[Awaitable[Mapping[str, StopOutcome]]]] = {}  # stops
+        self._pending_stops: dict[str, asyncio.Future[_Stopping]] = {}
+        """Stops that wait for the line of an amplifier; each gets its result when it opens."""
         self._serial_numbers = dict(serial_numbers or {})
         self._connected = connected
         self.watchdog = watchdog
@@ -106,35 +112,16 @@ class Controller:
         cycle = self.cycle
         cycle.is_closed = False
         if self._lines is None or self._lines.is_closing:
-            self._lines = self._before = self.make_lines(self._before)
-        lines = self._lines
+            self._lines = self.make_lines(self._last_lines)
+            self._last_lines = self._lines
         try:
-            async with cycle.sending:  # to the previous amplifiers
-                cycle.group = Group(
-                    self._opened, watchdog=self.watchdog, restored=cycle.feed_at_once
-                )
-            opening = [self._amplifier(lines, name) for name in self.urls]
-            results = await asyncio.gather(*opening, return_exceptions=True)
-            by_name = zip(self.urls, results, strict=True)
-            lost = {name: each for name, each in by_name if isinstance(each, LinkError)}
-            for error in lost.values():
-                error.lost = tuple(lost)
-            opened = self.group.members.checked(results)
-            amplifiers = dict(zip(self.urls, opened, strict=True))
-            self._connected(amplifiers)
-            await self.group.open()
-            for name, amplifier in amplifiers.items():
-                self._serial_numbers[name] = amplifier.identity["serial_number"]
-                if name in self.amplifiers:
-                    amplifier.ledger.go_on_from(self.amplifiers[name].ledger)
-                self.amplifiers[name] = amplifier
+            amplifiers = await self._open_amplifiers(self._lines)
+            capabilities = playback_capabilities(self._rig, amplifiers, drive_mode=self._drive_mode)
             planner = Planner(
                 self._rig,
                 self.table,
                 tracker=cycle.tracker,
-                capabilities=playback_capabilities(
-                    self._rig, amplifiers, drive_mode=self._drive_mode
-                ),
+                capabilities=capabilities,
                 intent_source=self.intent_source,
                 timing=self._timing,
                 check=self.group.sets.refusal_of,
@@ -149,13 +136,38 @@ class Controller:
             raise
         cycle.planner = planner
 
+    async def _open_amplifiers(self, lines: Lines) -> dict[str, Amplifier]:
+        """Open a new group of all amplifiers; raises the errors of `open`."""
+        cycle = self.cycle
+        async with cycle.sending:  # to the previous amplifiers
+            cycle.group = Group(self._opened, watchdog=self.watchdog, restored=cycle.feed_at_once)
+        opening = [self._amplifier(lines, name) for name in self.urls]
+        results = await asyncio.gather(*opening, return_exceptions=True)
+        errors: dict[str, LinkError] = {}
+        for name, result in zip(self.urls, results, strict=True):
+            if isinstance(result, LinkError):
+                errors[name] = result
+        for error in errors.values():
+            error.lost = tuple(errors)
+        opened = self.group.members.checked(results)
+        amplifiers = dict(zip(self.urls, opened, strict=True))
+        self._connected(amplifiers)
+        await self.group.open()
+        for name, amplifier in amplifiers.items():
+            self._serial_numbers[name] = amplifier.identity["serial_number"]
+            if name in self.amplifiers:
+                amplifier.ledger.go_on_from(self.amplifiers[name].ledger)
+            self.amplifiers[name] = amplifier
+        return amplifiers
+
     async def _amplifier(self, lines: Lines, name: str) -> Amplifier:
         """Open the line of an amplifier, and send its pending stop, if any.
 
         Keeps an amplifier whose line is still open from an earlier attempt, with any stop in
         progress. Raises LinkError, CommandError.
         """
-        before = amplifier = self._opened.get(name)
+        last_amplifier = self._opened.get(name)
+        amplifier = last_amplifier
         if amplifier is None or amplifier.line.loss is not None:
             amplifier = await lines.amplifier(
                 self.urls[name],
@@ -164,12 +176,13 @@ class Controller:
                 serial_number=self._serial_numbers.get(name),
                 is_output=name in self._rig.outputs,
             )
-            if before is not None:
-                amplifier.go_on_from(before)
-        self._opened[name] = self.group.amplifiers[name] = amplifier
-        if name in self._owed:
+            if last_amplifier is not None:
+                amplifier.go_on_from(last_amplifier)
+        self._opened[name] = amplifier
+        self.group.amplifiers[name] = amplifier
+        if name in self._pending_stops:
             stopping = _identified([amplifier], self.group.stop(waits_for=[name]))
-            self._owed.pop(name).set_result(asyncio.ensure_future(stopping))
+            self._pending_stops.pop(name).set_result(asyncio.ensure_future(stopping))
         return amplifier
 
     async def arm(self) -> None:
@@ -193,33 +206,32 @@ class Controller:
         by amplifier name; it includes replies on lines that are opened within 0.3 s.
         """
         stopping = self.group.stop()
-        if (
-            self.group.state is GroupState.CLOSED
-        ):  # the amplifiers on open lines are not identified yet
-            opened = [each for each in self.group.amplifiers.values() if each.line.loss is None]
+        if self.group.state is GroupState.CLOSED:  # amplifiers on open lines are not identified yet
+            amplifiers = self.group.amplifiers.values()
+            opened = [amplifier for amplifier in amplifiers if amplifier.line.loss is None]
             stopping = _identified(opened, stopping)
-        self._owe()
-        return self._stopped(asyncio.ensure_future(stopping), {**self._owed})
+        self._note_closed_lines()
+        return self._stopped(asyncio.ensure_future(stopping), dict(self._pending_stops))
 
-    def _owe(self) -> None:
+    def _note_closed_lines(self) -> None:
         """Register a pending stop for each amplifier with a closed line."""
         for name in self.urls:
             amplifier = self.group.amplifiers.get(name)
-            if amplifier is None or amplifier.line.loss is not None:
-                self._owed.setdefault(name, asyncio.get_running_loop().create_future())
+            is_closed = amplifier is None or amplifier.line.loss is not None
+            if is_closed and name not in self._pending_stops:
+                self._pending_stops[name] = asyncio.get_running_loop().create_future()
 
     async def _stopped(
-        self,
-        stopping: Awaitable[Mapping[str, StopOutcome]],
-        owed: Mapping[str, asyncio.Future[Awaitable[Mapping[str, StopOutcome]]]],
+        self, stopping: _Stopping, pending_stops: Mapping[str, asyncio.Future[_Stopping]]
     ) -> Mapping[str, StopOutcome]:
-        if owed:
-            await asyncio.wait(owed.values(), timeout=CONFIRM_TIMEOUT)
-        outcomes = {**await stopping}
-        self._owe()  # for amplifiers lost meanwhile
-        for opened in owed.values():
-            if opened.done():
-                outcomes |= await opened.result()
+        """Await a stop and the stops on lines that open soon; return the outcomes by name."""
+        if pending_stops:
+            await asyncio.wait(pending_stops.values(), timeout=CONFIRM_TIMEOUT)
+        outcomes = dict(await stopping)
+        self._note_closed_lines()  # of amplifiers lost meanwhile
+        for pending_stop in pending_stops.values():
+            if pending_stop.done():
+                outcomes |= await pending_stop.result()
         return {name: outcomes.get(name, self.what_may_play(name)) for name in self.urls}
 
     def what_may_play(self, name: str, cause: str = "") -> StopOutcome:
@@ -254,12 +266,12 @@ class Controller:
 
 
 async def _identified(
-    amplifiers: Sequence[Amplifier], stopping: Awaitable[Mapping[str, StopOutcome]]
+    amplifiers: Sequence[Amplifier], stopping: _Stopping
 ) -> Mapping[str, StopOutcome]:
     """Await a stop while identifying amplifiers: unknown amplifiers confirm nothing."""
-    for each in amplifiers:
-        each.capabilities = {}
-    requests = [each.identify(timeout=REPLY_TIMEOUT) for each in amplifiers]
+    for amplifier in amplifiers:
+        amplifier.capabilities = {}
+    requests = [amplifier.identify(timeout=REPLY_TIMEOUT) for amplifier in amplifiers]
     identifying = asyncio.gather(*requests, return_exceptions=True)
     try:
         return await stopping

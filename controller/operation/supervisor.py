@@ -4,6 +4,11 @@ Only the supervisor changes the operation. An event changes it (`step`), the con
 the resulting actions, and the outcome of each action at the amplifiers is the next event. Actions
 come before observers, which are called a moment later, each guarded (`DeferredCalls`).
 
+Actions run in tasks (`_spawn`), which nothing cancels: a caller that is cancelled, such as the
+request of a client that has left, stops waiting, and the task goes on to its end. `run` waits for
+all tasks before it returns. A stop waits for none of them: its requests to the amplifiers are
+queued before the operation changes and before any task begins.
+
 The supervisor also runs the control loop, polls disarmed amplifiers, and opens lost ones again.
 """
 
@@ -16,25 +21,21 @@ from dataclasses import replace
 from functools import partial
 from typing import Any, Literal, TypeVar
 
+from controller.operation.deferred_calls import DeferredCalls, call_guarded
 from controller.operation.operation_states import (
     ENERGISED,
-    READ_BACK_INTERVAL,
     Action,
     DaemonEvent,
     DaemonState,
-    DeferredCalls,
     Lease,
     Operation,
     Trigger,
-    are_silent,
-    call_guarded,
     failed,
     fault_remedy,
-    find_problem,
-    is_any_armed,
     step,
 )
 from controller.operation.plate_controller import Controller
+from controller.operation.read_back import are_silent, find_problem, is_any_armed
 from controller.play.reports import Observers
 from drivers.errors import (
     CommandRefused,
@@ -57,6 +58,7 @@ from registry.threads import pauses
 
 STATUS_INTERVAL = 0.5  # s; between status requests to disarmed amplifiers
 _RECHECK = 0.05  # s; between checks of the watchdog of a lost amplifier
+_READ_BACK_INTERVAL = 0.02  # s
 _MAX_READ_BACKS = 15
 _EPOCHS = 2**31  # a daemon starts at a random one; all are exact as JSON numbers
 
@@ -105,9 +107,10 @@ class Supervisor:
         self.closing = asyncio.Event()
         self._changed = asyncio.Event()  # to another state, since `run` has looked at it
         self._state_observers = (_log_transition, *state_changed)
-        self._link_observer, self._alive = link_changed, alive
+        self._link_observer = link_changed
+        self._alive = alive
         self._reports = DeferredCalls()
-        self.tasks: set[asyncio.Task[Any]] = set()
+        self.tasks: set[asyncio.Task[Any]] = set()  # actions in progress
         self._loss_lock = asyncio.Lock()  # held until the lost amplifiers are closed
         self._clears: list[int] = []  # epochs of clears in progress
         self._lease_timer: asyncio.TimerHandle | None = None
@@ -219,21 +222,22 @@ class Supervisor:
 
     def step(self, event: DaemonEvent) -> tuple[Action, ...]:
         """Apply one transition; return its actions."""
-        before, now = self.operation, threads.now()
+        last_operation = self.operation
         try:
-            self.operation, actions = step(before, event, now)
+            self.operation, actions = step(last_operation, event, threads.now())
         except Exception as error:
-            self.operation, actions = failed(before, failure_text(error)), (Action.STOP,)
-        self._report_transition(before)
+            self.operation = failed(last_operation, failure_text(error))
+            actions = (Action.STOP,)
+        self._report_transition(last_operation)
         return actions
 
-    def _report_transition(self, before: Operation) -> None:
+    def _report_transition(self, last_operation: Operation) -> None:
         """Notify the observers of a new epoch, deferred; watch a lease that has begun."""
-        if self.operation.epoch == before.epoch:
+        if self.operation.epoch == last_operation.epoch:
             return
         self._changed.set()
         for observer in self._state_observers:
-            call_guarded(partial(self._reports.add, partial(observer, before, self.operation)))
+            self._reports.add(partial(observer, last_operation, self.operation))
         if self._lease_timer is not None:
             self._lease_timer.cancel()
         if self.operation.state is DaemonState.OPERATION_ENABLED:
@@ -241,23 +245,25 @@ class Supervisor:
 
     def check_lease(self) -> None:
         """Disarm if the lease has expired, else check again when it will have."""
-        operation, now = self.operation, threads.now()
-        if operation.is_lease_over(now):
+        now = threads.now()
+        lease = self.operation.lease
+        if self.operation.is_lease_over(now):
             self.post(LEASE_OVER)
-        elif operation.lease is not None:
-            pause = operation.lease.expires_at - now
+        elif lease is not None:
+            pause = lease.expires_at - now
             self._lease_timer = asyncio.get_running_loop().call_later(pause, self.check_lease)
 
     async def _fail(self, error: Exception) -> None:
         """Stop all amplifiers after an unexpected exception, which is a fault."""
-        before, self.operation = self.operation, failed(self.operation, failure_text(error))
-        self._report_transition(before)
+        last_operation = self.operation
+        self.operation = failed(last_operation, failure_text(error))
+        self._report_transition(last_operation)
         await asyncio.shield(self._spawn(self._stop()))
         if self.operation.state is DaemonState.COMM_LOST:  # what should have closed them has failed
             await self._carry_out([Action.RECONNECT], self.operation.epoch)
 
     def _spawn(self, work: Coroutine[Any, Any, _T]) -> "asyncio.Task[_T]":
-        """Run work in a task that `run` waits for."""
+        """Run work in a task that nothing cancels, and that `run` waits for."""
         task = asyncio.ensure_future(work)
         self.tasks.add(task)
         task.add_done_callback(self.tasks.discard)
@@ -380,7 +386,7 @@ class Supervisor:
             problem = find_problem(await group.statuses(), group.amplifiers)
             if problem is None or epoch != self.operation.epoch:
                 break
-            await asyncio.sleep(READ_BACK_INTERVAL)
+            await asyncio.sleep(_READ_BACK_INTERVAL)
         return problem
 
     async def _open(self) -> None:
@@ -437,7 +443,8 @@ class Supervisor:
             await self.controller.open()
             await self.controller.disarm()  # a short loss may not have expired the watchdog
         except (DriverError, InputError) as error:
-            names, lost = self._not_opened(error), self.operation.lost
+            names = self._not_opened(error)
+            lost = self.operation.lost
             if lost is not None:
                 self.operation = replace(
                     self.operation,
@@ -468,7 +475,7 @@ class Supervisor:
         """Handle a loss; concurrent reports of the same loss wait until it is handled."""
         async with self._loss_lock:
             group = self.controller.group
-            lost = *group.members.lost_by, *group.members.degraded
+            lost = (*group.members.lost_by, *group.members.degraded)
             if self.operation.state is not DaemonState.COMM_LOST:
                 self._link_changed("lost", lost, str(error))
             cause = f"amplifier {', '.join(lost)}: {error}" if lost else str(error)
@@ -490,8 +497,7 @@ class Supervisor:
         return self.operation.state in (DaemonState.COMM_LOST, DaemonState.NOT_READY)
 
     def _link_changed(self, change: LinkChange, lost: Sequence[str], message: str) -> None:
-        report = partial(self._link_observer, change, lost, message)
-        call_guarded(partial(self._reports.add, report))
+        self._reports.add(partial(self._link_observer, change, lost, message))
 
     async def _run_control_loop(self) -> None:
         """Run the control loop; an unforeseen exception is a fault, which can be cleared."""
@@ -531,19 +537,26 @@ class Supervisor:
 
     def _check_degraded(self) -> None:
         """Report that armed amplifiers have stopped replying, or that all reply again."""
-        group, operation = self.controller.group, self.operation
+        group = self.controller.group
         degraded = group.members.degraded
-        is_said = bool(degraded) is bool(operation.degraded)
-        if operation.state is not DaemonState.OPERATION_ENABLED or is_said or group.members.lost_by:
+        is_reported = bool(degraded) is bool(self.operation.degraded)
+        if self.operation.state is not DaemonState.OPERATION_ENABLED or is_reported:
+            return
+        if group.members.lost_by:
             return  # the next heartbeat reports a lost amplifier
         change: LinkChange = "restored"
-        remedy: str | None
-        level, remedy = logging.INFO, None
+        level = logging.INFO
         cause = "all amplifiers reply again and play correctly"
+        remedy: str | None = None
         if degraded:
-            change, level, remedy = "degraded", logging.WARNING, "check cables and supply"
-            why = group.amplifiers[degraded[0]].silence_cause
-            cause = f"amplifier {', '.join(degraded)} does not reply; nothing new is played: {why}"
+            change = "degraded"
+            level = logging.WARNING
+            silence_cause = group.amplifiers[degraded[0]].silence_cause
+            cause = (
+                f"amplifier {', '.join(degraded)} does not reply; nothing new is played: "
+                f"{silence_cause}"
+            )
+            remedy = "check cables and supply"
         self.post(DaemonEvent(Trigger.LINK_CHANGED, cause, remedy, amplifiers=degraded))
         _logger.log(level, "link: %s: %s", change, cause, extra={"topic": "link"})
         self._link_changed(change, degraded, cause)
@@ -552,8 +565,9 @@ class Supervisor:
         """Post a fault that an amplifier reports unsolicited, ahead of the next heartbeat."""
         if not event["fault"] or self.operation.state not in ENERGISED:
             return
-        channel = "" if event["channel"] == NO_CHANNEL else f", channel {event['channel']}"
-        cause = f"amplifier {name} reports {name_of(FAULTS, event['fault'])}{channel}"
+        cause = f"amplifier {name} reports {name_of(FAULTS, event['fault'])}"
+        if event["channel"] != NO_CHANNEL:
+            cause += f", channel {event['channel']}"
         self.post(DaemonEvent(Trigger.FAULT, cause))
 
     async def _poll(self) -> None:
@@ -581,39 +595,37 @@ class Supervisor:
 
     async def _check_disarmed(self) -> None:
         """Read all statuses; post a fault, or repeat a stop that has not silenced all."""
-        epoch, group = self.operation.epoch, self.controller.group
+        epoch = self.operation.epoch
+        group = self.controller.group
         statuses = await group.statuses()
         if epoch != self.operation.epoch or group.members.silencing:
             return  # they may have been read before, or during a ramp
-        problem, state = find_problem(statuses, group.amplifiers), self.operation.state
-        if problem is not None and state is DaemonState.READY_TO_SWITCH_ON:
-            await self._in_background(self.handle(DaemonEvent(Trigger.FAULT, problem)))
-        elif (
-            not are_silent(statuses, group.amplifiers)
-            and state in (DaemonState.QUICK_STOP_ACTIVE, DaemonState.FAULT)
-            and self.operation.epoch not in self._clears  # a clear reads back for itself
-        ):
-            _logger.error("stop repeated: %s", problem)
-            await self._stop()
+        problem = find_problem(statuses, group.amplifiers)
+        match self.operation.state:
+            case DaemonState.READY_TO_SWITCH_ON if problem is not None:
+                await self._in_background(self.handle(DaemonEvent(Trigger.FAULT, problem)))
+            case DaemonState.QUICK_STOP_ACTIVE | DaemonState.FAULT:
+                is_cleared = epoch in self._clears  # a clear reads back for itself
+                if not is_cleared and not are_silent(statuses, group.amplifiers):
+                    _logger.error("stop repeated: %s", problem)
+                    await self._stop()
 
 
 def _remedy_of(error: Exception) -> str:
     """Return the remedy for amplifiers that cannot be opened."""
-    return (
-        _REOPENING
-        if isinstance(error, WrongAmplifier)
-        else f"check cables and supply; {_REOPENING}"
-    )
+    if isinstance(error, WrongAmplifier):
+        return _REOPENING
+    return f"check cables and supply; {_REOPENING}"
 
 
-def _log_transition(before: Operation, after: Operation) -> None:
-    if after.state is before.state:
+def _log_transition(old: Operation, new: Operation) -> None:
+    if new.state is old.state:
         return
     _logger.log(
-        _LOG_LEVELS.get(after.state, logging.INFO),
+        _LOG_LEVELS.get(new.state, logging.INFO),
         "%s -> %s: %s",
-        before.state,
-        after.state,
-        after.cause,
-        extra={"topic": "state", "cause": after.cause, "remedy": after.remedy},
+        old.state,
+        new.state,
+        new.cause,
+        extra={"topic": "state", "cause": new.cause, "remedy": new.remedy},
     )

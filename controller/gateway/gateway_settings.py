@@ -53,42 +53,33 @@ class GatewaySettings:
                 f"the address to listen on must be an IP address, such as 127.0.0.1 or ::1, got "
                 f"{self.host!r}; give host names with --allow-host"
             ) from error
-        for is_wrong, text in (
-            (not 0 <= self.port < 65536, f"port must be 0 to 65535, got {self.port}"),
-            (
-                not _TOKEN.fullmatch(self.token),
-                _RULE,
-            ),
-            (
-                not is_loopback and not self.is_token_user_supplied,
+        if not 0 <= self.port < 65536:
+            raise InputError(f"port must be 0 to 65535, got {self.port}")
+        if not _TOKEN.fullmatch(self.token):
+            raise InputError(_RULE)
+        if not is_loopback and not self.is_token_user_supplied:
+            raise InputError(
                 f"listening on {self.host}, outside the loopback, needs your own token: give "
-                "--token-file, or listen on 127.0.0.1 behind a reverse proxy with TLS",
-            ),
-            (
-                not is_loopback and not self.extra_hosts,
+                "--token-file, or listen on 127.0.0.1 behind a reverse proxy with TLS"
+            )
+        if not is_loopback and not self.extra_hosts:
+            raise InputError(
                 f"listening on {self.host}, outside the loopback, needs --allow-host with the name "
-                "or address that browsers use",
-            ),
-            *(
-                (
-                    not sent_host(name),
+                "or address that browsers use"
+            )
+        for name in self.extra_hosts:
+            if not sent_host(name):
+                raise InputError(
                     "--allow-host must be a host name without port and without *, such as "
-                    f"panel.local, 192.0.2.7 or [2001:db8::7], got {name!r}",
+                    f"panel.local, 192.0.2.7 or [2001:db8::7], got {name!r}"
                 )
-                for name in self.extra_hosts
-            ),
-            *(
-                (
-                    not sent_origin(origin),
+        for origin in self.origins:
+            if not sent_origin(origin):
+                raise InputError(
                     "--allow-origin must be scheme, host and perhaps port, such as "
                     "https://panel.example:8443, with neither path nor slash behind them, "
-                    f"got {origin!r}",
+                    f"got {origin!r}"
                 )
-                for origin in self.origins
-            ),
-        ):
-            if is_wrong:
-                raise InputError(text)
 
     @property
     def is_loopback(self) -> bool:
@@ -98,8 +89,10 @@ class GatewaySettings:
     @property
     def allowed_names(self) -> frozenset[str]:
         """Allowed Hosts as browsers send them, without port."""
-        own = () if ipaddress.ip_address(self.host).is_unspecified else (self.shown_host,)
-        return frozenset(map(sent_host, (*_LOOPBACK_NAMES, *own, *self.extra_hosts)))
+        names = [*_LOOPBACK_NAMES, *self.extra_hosts]
+        if not ipaddress.ip_address(self.host).is_unspecified:
+            names.append(self.shown_host)
+        return frozenset(map(sent_host, names))
 
     @property
     def allowed_origins(self) -> frozenset[str]:
@@ -134,39 +127,37 @@ def sent_host(name: str) -> str:
 def sent_origin(text: str) -> str:
     """Return an origin as browsers send it, without a default port; "" if it is invalid."""
     match = _ORIGIN.fullmatch(text)
-    host = sent_host(match[2]) if match else ""
-    if match is None or not host:
+    if match is None:
         return ""
+    host = sent_host(match[2])
     scheme = match[1].lower()
-    port = int(match[3] or _DEFAULT_PORTS[scheme])
-    is_default = port == _DEFAULT_PORTS[scheme]
-    return f"{scheme}://{host}{'' if is_default else f':{port}'}" if 0 < port < 65536 else ""
+    default_port = _DEFAULT_PORTS[scheme]
+    port = int(match[3] or default_port)
+    if not host or not 0 < port < 65536:
+        return ""
+    origin = f"{scheme}://{host}"
+    return origin if port == default_port else f"{origin}:{port}"
 
 
 def read_token(path: Path) -> str:
     """Read the token from a file that only its owner may read; raises InputError."""
     try:
         with open(path, "rb", opener=regular_file) as file:
-            status, content = os.fstat(file.fileno()), file.read(_MAX_TOKEN_FILE)
+            status = os.fstat(file.fileno())
+            content = file.read(_MAX_TOKEN_FILE)
     except OSError as error:
         raise InputError(
             f"{path}: cannot be read ({error.strerror}); --token-file must be a file with the "
             "token that only you may read"
         ) from error
-    for is_wrong, text in (
-        (status.st_mode & 0o077, f"readable by other users; restrict it with chmod 600 {path}"),
-        (
-            status.st_uid not in (0, os.geteuid()),
-            "belongs to another user; give a file of your own",
-        ),
-        (
-            not _TOKEN.fullmatch(content.decode("ascii", "replace").strip()),
-            f"--token-file must be a file with the token; {_RULE}",
-        ),
-    ):
-        if is_wrong:
-            raise InputError(f"{path}: {text}")
-    return content.decode().strip()
+    if status.st_mode & 0o077:
+        raise InputError(f"{path}: readable by other users; restrict it with chmod 600 {path}")
+    if status.st_uid not in (0, os.geteuid()):
+        raise InputError(f"{path}: belongs to another user; give a file of your own")
+    token = content.decode("ascii", "replace").strip()
+    if not _TOKEN.fullmatch(token):
+        raise InputError(f"{path}: --token-file must be a file with the token; {_RULE}")
+    return token
 
 
 def require_gateway() -> None:

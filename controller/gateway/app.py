@@ -15,7 +15,7 @@ import socket
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from aiohttp import HttpVersion11, WSCloseCode, web
 from aiohttp.http import HttpProcessingError
@@ -55,6 +55,23 @@ from controller.process.daemon_process import allow_many_descriptors
 from model.errors import InputError
 from registry.threads import no_long_collections, stop_accepting
 
+MAX_BODY = 1 << 16  # bytes
+MAX_REQUESTS = 256  # simultaneous, to the daemon
+MAX_SESSIONS = 24  # WebSockets; the daemon has 32 connections, and some for stops
+METRICS_INTERVAL = 0.5  # s; for which metrics are cached
+_MAX_DISARMS = 8  # simultaneous, so that the daemon always reads a stop that follows
+_STOP_DELAY = 0.01  # s; maximum wait for a body with the name of the stopping client
+_HEARTBEAT = 10.0  # s; without a frame from a browser, until a ping is sent
+_CLOSE_TIMEOUT = 0.3  # s; for a browser to close its side
+_PAGE = Path(__file__).parent / "page"
+
+_MAX_LINE = 1 << 13  # bytes; of the head of a request
+_MAX_LINES = 64
+_QUEUE = 512  # connections that wait to be accepted
+_ACCEPTED = 4  # connections per iteration of the event loop
+_NICENESS = 10  # added, so that the daemon's control loop has priority
+_SHUTDOWN_TIMEOUT = 0.3  # s; for requests to finish
+
 HTTP_METHODS = {name: method for name, method in METHODS.items() if method.over_http}
 """Methods available over HTTP: notifications need a WebSocket."""
 
@@ -93,13 +110,20 @@ class ErrorBody(ApiMessage):
 
 def openapi() -> dict[str, Any]:
     """The description, OpenAPI 3.1."""
-    params = {method.params for method in HTTP_METHODS.values()}
-    results = {method.result for method in HTTP_METHODS.values()} | {ErrorBody}
+    params: set[type[ApiMessage]] = set()
+    results: set[type[ApiMessage]] = {ErrorBody}
+    for method in HTTP_METHODS.values():
+        params.add(method.params)
+        results.add(method.result)
+    models: list[tuple[type[ApiMessage], Literal["validation", "serialization"]]] = []
+    models += [(model, "validation") for model in sorted(params, key=repr)]
+    models += [(model, "serialization") for model in sorted(results, key=repr)]
     references, definitions = models_json_schema(
-        [(model, "validation") for model in sorted(params, key=repr)]
-        + [(model, "serialization") for model in sorted(results, key=repr)],
-        ref_template="#/components/schemas/{model}",
+        models, ref_template="#/components/schemas/{model}"
     )
+    paths: dict[str, Any] = {}
+    for name, method in HTTP_METHODS.items():
+        paths[f"/api/v1/{name}"] = {"post": _operation(name, method, references)}
     return {
         "openapi": "3.1.0",
         "info": {
@@ -112,10 +136,7 @@ def openapi() -> dict[str, Any]:
             ),
         },
         "security": [{"token": []}],
-        "paths": {
-            f"/api/v1/{name}": {"post": _operation(name, method, references)}
-            for name, method in HTTP_METHODS.items()
-        },
+        "paths": paths,
         "components": {
             "securitySchemes": {"token": {"type": "http", "scheme": "bearer"}},
             "schemas": definitions["$defs"],
@@ -127,35 +148,28 @@ def _operation(name: str, method: Method, references: Any) -> dict[str, Any]:
     """Return the request and responses of a method."""
     errors = dict(_GATEWAY_ERRORS)
     for code, status in HTTP_STATUS.items():
-        errors[status] = "; ".join(filter(None, (errors.get(status), ERROR_MEANINGS[code])))
-    failure = {"application/json": {"schema": references[ErrorBody, "serialization"]}}
-    success = {"application/json": {"schema": references[method.result, "serialization"]}}
+        meaning = ERROR_MEANINGS[code]
+        errors[status] = f"{errors[status]}; {meaning}" if status in errors else meaning
+    success = _json_content(references[method.result, "serialization"])
+    failure = _json_content(references[ErrorBody, "serialization"])
+    responses: dict[str, Any] = {"200": {"description": "done", "content": success}}
+    for status, meaning in sorted(errors.items()):
+        responses[str(status)] = {"description": meaning, "content": failure}
+    fields = method.params.model_fields.values()
     return {
         "operationId": name,
         "summary": SUMMARIES[name],
         "requestBody": {
-            "required": any(field.is_required() for field in method.params.model_fields.values()),
-            "content": {"application/json": {"schema": references[method.params, "validation"]}},
+            "required": any(field.is_required() for field in fields),
+            "content": _json_content(references[method.params, "validation"]),
         },
-        "responses": {
-            "200": {"description": "done", "content": success},
-            **{
-                str(status): {"description": meaning, "content": failure}
-                for status, meaning in sorted(errors.items())
-            },
-        },
+        "responses": responses,
     }
 
 
-MAX_BODY = 1 << 16  # bytes
-MAX_REQUESTS = 256  # simultaneous, to the daemon
-MAX_SESSIONS = 24  # WebSockets; the daemon has 32 connections, and some for stops
-METRICS_INTERVAL = 0.5  # s; for which metrics are cached
-_MAX_DISARMS = 8  # simultaneous, so that the daemon always reads a stop that follows
-_STOP_DELAY = 0.01  # s; maximum wait for a body with the name of the stopping client
-_HEARTBEAT = 10.0  # s; without a frame from a browser, until a ping is sent
-_CLOSE_TIMEOUT = 0.3  # s; for a browser to close its side
-_PAGE = Path(__file__).parent / "page"
+def _json_content(schema: Any) -> dict[str, Any]:
+    """Return the description of a body in JSON."""
+    return {"application/json": {"schema": schema}}
 
 
 class Gateway:
@@ -218,11 +232,10 @@ class Gateway:
             self._access.check(request)
             return await handler(request)
         except web.HTTPException as error:
-            return web.json_response(
-                {"error": error.text},
-                status=403 if "Upgrade" in request.headers else error.status,
-                headers=[each for each in error.headers.items() if each[0] == "Allow"],
-            )
+            status = 403 if "Upgrade" in request.headers else error.status
+            allowed = error.headers.getall("Allow", [])
+            headers = [("Allow", methods) for methods in allowed]
+            return web.json_response({"error": error.text}, status=status, headers=headers)
         finally:
             connection.finish()
 
@@ -231,9 +244,8 @@ class Gateway:
         name = request.match_info["file"] or "index.html"
         if name not in self._files:
             raise web.HTTPNotFound
-        return web.Response(
-            body=self._files[name], content_type=mimetypes.guess_type(name)[0], charset="utf-8"
-        )
+        media, _ = mimetypes.guess_type(name)
+        return web.Response(body=self._files[name], content_type=media, charset="utf-8")
 
     async def _metrics(self, _: web.Request) -> web.Response:
         """Return the daemon's status for Prometheus, cached because it needs no token."""
@@ -273,8 +285,9 @@ class Gateway:
         try:
             # A stop does not wait for its body, which only names the client. The body of a disarm
             # can restrict it to a lease.
-            await asyncio.wait({reading}, timeout=_STOP_DELAY if method == "stop" else None)
-            result = await self._request_silence(method, _given(reading))
+            timeout = _STOP_DELAY if method == "stop" else None
+            await asyncio.wait({reading}, timeout=timeout)
+            result = await self._request_silence(method, _body_read(reading))
             if request.method != "POST":
                 raise web.HTTPMethodNotAllowed(request.method, ["POST"])
             _check_media(request)
@@ -290,9 +303,9 @@ class Gateway:
         self._access.check_form(request)
         return await _read_body(request)
 
-    async def _request_silence(self, method: str, given: object) -> Any:
-        """Return the daemon's result, for the readable parameters."""
-        params = readable_params(method, given)
+    async def _request_silence(self, method: str, body: object) -> Any:
+        """Return the daemon's result, for the readable parameters of a body."""
+        params = readable_params(method, body)
         if getattr(params, "client", None) is None:
             params = params.model_copy(update={"client": f"http {CONNECTION.get().address}"})
         async with contextlib.nullcontext() if method == "stop" else self._disarms:
@@ -312,11 +325,12 @@ class Gateway:
         )
         if len(self._sessions) >= MAX_SESSIONS:
             raise web.HTTPForbidden(text="too many clients")
+        subprotocols = request.headers.get("Sec-WebSocket-Protocol", "").split(",")
+        key = request.headers.get("Sec-WebSocket-Key", "")
         if not (
             request.version == HttpVersion11
-            and SUBPROTOCOL
-            in map(str.strip, request.headers.get("Sec-WebSocket-Protocol", "").split(","))
-            and request.headers.get("Sec-WebSocket-Key", "").isascii()
+            and SUBPROTOCOL in map(str.strip, subprotocols)
+            and key.isascii()
             and socket.can_prepare(request)
             and not request.can_read_body
         ):
@@ -338,12 +352,10 @@ class Gateway:
         return socket
 
     async def _end_sessions(self, _: web.Application) -> None:
+        closing = [socket.close(code=WSCloseCode.SERVICE_RESTART) for socket in self._sessions]
         with contextlib.suppress(TimeoutError):  # a client may not read
             async with asyncio.timeout(_CLOSE_TIMEOUT):
-                await asyncio.gather(
-                    *(each.close(code=WSCloseCode.SERVICE_RESTART) for each in self._sessions),
-                    return_exceptions=True,
-                )
+                await asyncio.gather(*closing, return_exceptions=True)
 
 
 async def _continue_later(_: web.Request) -> None:
@@ -383,8 +395,8 @@ def _read_params(method: str, body: bytes) -> ApiMessage:
     return read_params(METHODS[method].params, request_of(document))
 
 
-def _given(reading: "asyncio.Task[bytes]") -> object:
-    """The parameters in a body, as JSON; None if it was not read."""
+def _body_read(reading: "asyncio.Task[bytes]") -> object:
+    """Return a request's body as parsed JSON; None if it was not read."""
     if not reading.done():
         return None
     try:
@@ -401,14 +413,6 @@ def _failure(problem: RpcError | Unreachable) -> web.Response:
         {"error": failed["message"], "code": failed["code"], "data": failed["data"]},
         status=HTTP_STATUS[error.code],
     )
-
-
-_MAX_LINE = 1 << 13  # bytes; of the head of a request
-_MAX_LINES = 64
-_QUEUE = 512  # connections that wait to be accepted
-_ACCEPTED = 4  # connections per iteration of the event loop
-_NICENESS = 10  # added, so that the daemon's control loop has priority
-_SHUTDOWN_TIMEOUT = 0.3  # s; for requests to finish
 
 
 async def serve(settings: GatewaySettings, *, announce: Callable[[int], None]) -> None:

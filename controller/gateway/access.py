@@ -112,17 +112,14 @@ class Access:
         return (is_method or is_remote) and request.method != "OPTIONS"
 
     def _has_token(self, request: web.Request) -> bool:
-        tokens = [
-            value.removeprefix("Bearer ")
-            for value in request.headers.getall("Authorization", [])
-            if value.startswith("Bearer ")
-        ]
-        tokens += [
-            name.strip().removeprefix(_TOKEN_SUBPROTOCOL)
-            for value in request.headers.getall("Sec-WebSocket-Protocol", [])
-            for name in value.split(",")
-            if name.strip().startswith(_TOKEN_SUBPROTOCOL)
-        ]
+        tokens: list[str] = []
+        for value in request.headers.getall("Authorization", []):
+            if value.startswith("Bearer "):
+                tokens.append(value.removeprefix("Bearer "))
+        subprotocols = ",".join(request.headers.getall("Sec-WebSocket-Protocol", []))
+        for subprotocol in map(str.strip, subprotocols.split(",")):
+            if subprotocol.startswith(_TOKEN_SUBPROTOCOL):
+                tokens.append(subprotocol.removeprefix(_TOKEN_SUBPROTOCOL))
         return len(tokens) == 1 and hmac.compare_digest(  # in constant time
             tokens[0].encode(errors="surrogateescape"), self._settings.token.encode()
         )

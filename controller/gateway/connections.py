@@ -99,9 +99,9 @@ class RequestInput:
         return self._take(len(self._bytes))
 
     def _take(self, size: int) -> bytes:
-        taken = bytes(self._bytes[:size])
+        part = bytes(self._bytes[:size])
         del self._bytes[:size]
-        return taken
+        return part
 
 
 class Connections:
@@ -149,7 +149,10 @@ class Connections:
 class ClientConnection(asyncio.BufferedProtocol):
     """A client's connection, which hands one request at a time on to the web server's protocol.
 
-    make_server: makes that protocol, for the first request.
+    A request is received (`_input`), waits for its turn (`_permit`), and is served
+    (`_is_serving`), from `start_request` to `finish`. Only then does the next one take a turn.
+
+    make_server: makes the web server's protocol, for the first request.
     """
 
     _transport: asyncio.Transport
@@ -270,14 +273,14 @@ class ClientConnection(asyncio.BufferedProtocol):
 
         Raises RpcError and Unreachable.
         """
-        kept = self._shared.kept
-        if self not in kept:
-            if self.is_closing or len(kept) >= MAX_KEPT:
+        clients = self._shared.kept
+        if self not in clients:
+            if self.is_closing or len(clients) >= MAX_KEPT:
                 raise RpcError(ErrorCode.BUSY, "too many connections", remedy="keep one open")
             name = f"http {self.address}"
-            kept[self] = AsyncClient(self._shared.daemon, name=name, timeout=RESPONSE_TIMEOUT)
+            clients[self] = AsyncClient(self._shared.daemon, name=name, timeout=RESPONSE_TIMEOUT)
         async with self._requesting:
-            return await kept[self].request(method, params)
+            return await clients[self].request(method, params)
 
     def finish(self) -> None:
         """Wait for the next request; the client has the same time to read the response."""

@@ -40,10 +40,9 @@ class FieldSolver:
     def __init__(self, rig: Rig) -> None:
         self._rig = rig
         self._free = solve_free_plate(rig.plate, rig.mesh, frequency_max=rig.limits.frequency_max)
-        sides = rig.plate.length, rig.plate.width
-        self.columns, self.rows = (
-            max(2, math.ceil(_COLUMNS * each / max(sides))) for each in sides
-        )
+        longer_side = max(rig.plate.length, rig.plate.width)
+        self.columns = max(2, math.ceil(_COLUMNS * rig.plate.length / longer_side))
+        self.rows = max(2, math.ceil(_COLUMNS * rig.plate.width / longer_side))
         self._points = lattice(
             np.linspace(0, rig.plate.length, self.columns),
             np.linspace(0, rig.plate.width, self.rows),
@@ -70,19 +69,14 @@ class FieldSolver:
                 fields[number, tone.frequency_hz] += weight * response
         parts = np.array([*fields.values()], complex).view(float)  # real, imaginary, real, ...
         scale = float(np.abs(parts).max(initial=0.0))
+        numbers = [number for number, _ in fields]
         frequencies = np.array([frequency for _, frequency in fields])
-        return b"".join(
-            np.array(numbers).astype(type_).tobytes()
-            for numbers, type_ in (
-                ([self.columns, self.rows, len(fields), 0], "<u2"),
-                (
-                    [scale, *frequencies, *detection_threshold(frequencies, self._rig.threshold)],
-                    "<f4",
-                ),
-                ([number for number, _ in fields], "<u2"),
-                (np.rint(parts / (scale or 1.0) * _FULL_SCALE), "<i2"),
-            )
-        )
+        thresholds = detection_threshold(frequencies, self._rig.threshold)
+        sizes = np.array([self.columns, self.rows, len(fields), 0], "<u2")
+        figures = np.array([scale, *frequencies, *thresholds], "<f4")
+        vibration = np.rint(parts / (scale or 1.0) * _FULL_SCALE).astype("<i2")
+        blocks = [sizes, figures, np.array(numbers).astype("<u2"), vibration]
+        return b"".join([block.tobytes() for block in blocks])
 
     def _solve(self, frequency: float) -> ComplexArray:
         """Acceleration [m/s²] (eras, points) per ERA at full stroke."""
@@ -148,7 +142,8 @@ class DrawnField:
 
     async def _draw(self) -> None:
         """Draw the playback after each change, in a thread because the first time takes a while."""
-        loop, thread = asyncio.get_running_loop(), ThreadPoolExecutor(1)
+        loop = asyncio.get_running_loop()
+        thread = ThreadPoolExecutor(1)
         while True:
             await self._due.wait()
             self._due.clear()
@@ -166,10 +161,10 @@ class DrawnField:
         """Return the playback as a frame, ignoring additions of a later daemon."""
         return self._solver(rig_text).frame(_LAYERS.validate_python(layers, extra="ignore"))
 
-    def _note(self, what: str, error: Exception) -> None:
+    def _note(self, failure: str, error: Exception) -> None:
         """Log a problem, once while it lasts."""
         reason, _, _ = str(error).partition("\n")
-        problem = f"{what}: {reason or type(error).__name__}"
+        problem = f"{failure}: {reason or type(error).__name__}"
         if problem != self._problem:
             self._problem = problem
             _logger.warning("%s", problem)

@@ -10,7 +10,7 @@ The number of clients is bounded. Additional clients get reserve connections, wh
 that silence are served, so that another client can always connect and `stop`. Slow methods, such as
 arming, run as tasks. `TOPICS` (`controller/api/methods.py`) defines how often each topic is sent.
 
-A request that silences is carried out before the rest of it is checked, and counts towards no
+A request that silences is carried out before its other parts are checked, and counts towards no
 limit (`controller/api/silencing.py`). Its errors are reported afterwards.
 """
 
@@ -57,9 +57,10 @@ _MAX_READ = 1 << 14  # bytes per iteration of the event loop
 _MAX_READ_AHEAD = 1 << 16  # bytes waiting to be served
 UNREAD_TIMEOUT = 5.0  # s; of dropped notifications, before the connection is closed
 MAX_REQUEST_RATE = 2000.0  # 1/s, and as many in a burst
-MAX_PENDING = 8  # slow requests of one client; requests that silence are always accepted
+MAX_PENDING = 8  # slow requests per client; requests that silence are always accepted
 MAX_PENDING_STOPS = 64  # requests without responses; above it no further line is read
 STOP = b'"stop"'
+DEFAULT_RATE = 10.0  # Hz; of periodic notifications
 
 MAX_CONNECTIONS = 32  # for all methods
 RESERVE = 8  # additional connections, for the reserve methods only
@@ -139,11 +140,13 @@ class Connection(asyncio.BufferedProtocol):
     def buffer_updated(self, nbytes: int) -> None:
         """Append the bytes received; pause reading while too much waits to be served."""
         self.received_at = self._server.clock()
-        before = len(self._input)
+        old_length = len(self._input)
         self._input += self._received[:nbytes]
-        self._stop_at = max(self._stop_at, self._input.rfind(STOP, max(0, before - len(STOP) + 1)))
+        # The beginning of a stop may have been received before.
+        last_stop = self._input.rfind(STOP, max(0, old_length - len(STOP) + 1))
+        self._stop_at = max(self._stop_at, last_stop)
         if self._line_end < 0:
-            self._line_end = self._input.find(b"\n", before)
+            self._line_end = self._input.find(b"\n", old_length)
         if len(self._input) > _MAX_READ_AHEAD:
             self._transport.pause_reading()
         self._server.add(self)
@@ -177,14 +180,15 @@ class Connection(asyncio.BufferedProtocol):
             self._transport.resume_reading()
         return line
 
-    def take_rest(self) -> bytes:
+    def take_lines(self) -> bytes:
         """Take all waiting lines, and stop reading."""
-        rest = bytes(self._input)
+        lines = bytes(self._input)
         self._input.clear()
-        self._line_end = self._stop_at = -1
+        self._line_end = -1
+        self._stop_at = -1
         self.is_at_end = True
         self._transport.pause_reading()
-        return rest
+        return lines
 
     def close_if_finished(self) -> None:
         """Close after the last response, if no further line is read from the client."""
@@ -208,10 +212,12 @@ class Connection(asyncio.BufferedProtocol):
             return False
         if self._transport.get_write_buffer_size() < MAX_UNREAD_BYTES // 2:
             self._transport.write(make_line(self._lost))
-            self._lost, self._losing_since = 0, math.inf
+            self._lost = 0
+            self._losing_since = math.inf
             return False
         now = self._server.clock()
-        self._lost, self._losing_since = self._lost + 1, min(self._losing_since, now)
+        self._lost += 1
+        self._losing_since = min(self._losing_since, now)
         if now - self._losing_since > UNREAD_TIMEOUT:
             self.abort()
         return True
@@ -255,16 +261,18 @@ class _Call:
         try:
             self._read()
         except InvalidRequest as error:
-            self.id, self.error = error.id, error
+            self.id = error.id
+            self.error = error
         except Exception as error:  # invalid parameters, or a bug
             self.error = error
 
     def _read(self) -> None:
         if len(self._line) >= MAX_LINE_LENGTH:
-            what = f"line longer than {MAX_LINE_LENGTH} bytes"
-            raise InvalidRequest(ErrorCode.PARSE, what, remedy="send less")
+            problem = f"line longer than {MAX_LINE_LENGTH} bytes"
+            raise InvalidRequest(ErrorCode.PARSE, problem, remedy="send less")
         request = read_request(self._line)
-        self.id, self.expects_response = request.id, request.expects_response
+        self.id = request.id
+        self.expects_response = request.expects_response
         if request.method not in METHODS:
             raise unknown_method(request.method, METHODS)
         self.params = read_params(METHODS[request.method].params, request)
@@ -333,26 +341,34 @@ class ApiServer:
     def admit(self, new: Connection) -> None:
         """Admit a new client, if necessary in place of another, or close it."""
         new.is_reserve = not self._has_room()
-        reserve = [new, *(each for each in self.clients if each.is_reserve)]
-        if new.is_reserve and len(reserve) > RESERVE:
-            # Evict from the process with the most connections, so that other processes keep theirs.
-            counts = Counter(each.process for each in reserve)
-            evicted = min(
-                (each for each in reserve if not each.pending),
-                key=lambda each: (-counts[each.process], each.received_at),
-            )
-            self.clients.pop(evicted, None)
-            evicted.abort()
+        if new.is_reserve:
+            reserve = [client for client in self.clients if client.is_reserve]
+            if len(reserve) >= RESERVE:
+                self._evict_from([new, *reserve])
         if new.is_open:
             self.clients[new] = None
 
+    def _evict_from(self, reserve: Sequence[Connection]) -> None:
+        """Close the longest idle connection of the process with the most reserve connections.
+
+        Other processes keep theirs.
+        """
+        counts = Counter(client.process for client in reserve)
+
+        def precedence(client: Connection) -> tuple[int, float]:
+            return -counts[client.process], client.received_at
+
+        evicted = min([client for client in reserve if not client.pending], key=precedence)
+        self.clients.pop(evicted, None)
+        evicted.abort()
+
     def _has_room(self) -> bool:
         """Whether a full connection is free, if necessary by evicting the longest idle client."""
-        full = [each for each in self.clients if not each.is_reserve]
+        full = [client for client in self.clients if not client.is_reserve]
         if len(full) < MAX_CONNECTIONS:
             return True
-        idle = [each for each in full if not each.pending and not self._holds_lease(each)]
-        evicted = min(idle, key=lambda each: each.received_at, default=None)
+        idle = [client for client in full if not client.pending and not self._holds_lease(client)]
+        evicted = min(idle, key=lambda client: client.received_at, default=None)
         if evicted is None or self.clock() - evicted.received_at < IDLE_TIMEOUT:
             return False
         del self.clients[evicted]
@@ -393,23 +409,28 @@ class ApiServer:
             return
         self._scheduled.discard(is_urgent)
         end = time.perf_counter() + MAX_TURN
+        ranks = (0,) if is_urgent else (1, 2)
         try:
-            for rank in (0,) if is_urgent else (1, 2):
-                clients = deque(each for each in self._waiting if self._rank(each) == rank)
-                while clients:
-                    client = clients.popleft()
-                    self._waiting.pop(client, None)
-                    if client.has_lines:
-                        self._serve(client, client.next_line())
-                    if client.has_lines:  # to the end of the queue
-                        self._waiting[client] = None
-                        clients.append(client)
-                    client.close_if_finished()
-                    if time.perf_counter() >= end:
-                        break
+            for rank in ranks:
+                self._serve_rank(rank, end)
         finally:  # after any failure: others are waiting, perhaps with a stop
-            for each in [*self._waiting]:
-                self.add(each)
+            for client in list(self._waiting):
+                self.add(client)
+
+    def _serve_rank(self, rank: int, end: float) -> None:
+        """Serve the clients of a rank in rotation until a time of the performance counter [s]."""
+        clients = deque(client for client in self._waiting if self._rank(client) == rank)
+        while clients:
+            client = clients.popleft()
+            self._waiting.pop(client, None)
+            if client.has_lines:
+                self._serve(client, client.next_line())
+            if client.has_lines:  # to the end of the queue
+                self._waiting[client] = None
+                clients.append(client)
+            client.close_if_finished()
+            if time.perf_counter() >= end:
+                break
 
     def _is_deferred(self) -> bool:
         """Whether a turn waits for a touch on its way to the wire."""
@@ -424,9 +445,11 @@ class ApiServer:
 
     def _rank(self, client: Connection) -> int:
         """Return a client's rank: 0 for a possible stop, 1 if it touches or holds the lease."""
+        if client.is_urgent:
+            return 0
         # Fingers that the client no longer reports count as lifted.
         touches = self.clock() - client.touched_at <= CONTACT_TIMEOUT
-        return 0 if client.is_urgent else 1 if touches or self._holds_lease(client) else 2
+        return 1 if touches or self._holds_lease(client) else 2
 
     def _serve(self, client: Connection, line: bytes) -> None:
         """Carry out a line of a client, or start a task for it; respond if it is finished."""
@@ -457,9 +480,9 @@ class ApiServer:
 
     def _end_input(self, client: Connection) -> None:
         """Serve no further line of a client, except remaining requests that silence."""
-        rest = client.take_rest()
-        if read_silencing(rest) is not None:
-            self._serve(client, rest)
+        lines = client.take_lines()
+        if read_silencing(lines) is not None:
+            self._serve(client, lines)
 
     def _note(self, client: Connection, call: _Call) -> None:
         """Record that a client silences or touches."""
@@ -477,7 +500,7 @@ class ApiServer:
             return handle
         if not call.expects_response:
             return Empty
-        return partial(_for_one_who_stays, client, client.silenced, handle)
+        return partial(_handle_unless_withdrawn, client, client.silenced, handle)
 
     def _check(self, client: Connection, call: _Call) -> None:
         """Raise an error if a call must not be carried out; calls that silence always are."""
@@ -520,7 +543,7 @@ class ApiServer:
             client.respond(response)
 
 
-async def _for_one_who_stays(
+async def _handle_unless_withdrawn(
     client: Connection, silenced: int, handle: Callable[[], ApiMessage | Awaitable[ApiMessage]]
 ) -> ApiMessage:
     """Handle a request, unless the client leaves or silences all amplifiers in the same bytes.
@@ -561,11 +584,8 @@ def _rpc_error(error: Exception) -> RpcError:
 def _carried_out_despite(error: RpcError, method: str) -> RpcError:
     """Return the error of a request that silences and was carried out."""
     data = error.data
-    what = f"{data.what} ({method} was carried out nevertheless)"
-    return RpcError(error.code, what, where=data.where, remedy=data.remedy)
-
-
-DEFAULT_RATE = 10.0  # Hz
+    problem = f"{data.what} ({method} was carried out nevertheless)"
+    return RpcError(error.code, problem, where=data.where, remedy=data.remedy)
 
 
 class Hub:
@@ -642,12 +662,13 @@ class Hub:
     def _flush_now(self) -> None:
         self._flush = None
         self._flushed_at = self._clock()
-        newest, self._newest = self._newest, {}
+        newest = self._newest
+        self._newest = {}
         for topic, make_data in newest.items():
             self._send(self._of(topic), topic, make_data)
 
     def _of(self, topic: Topic) -> list[Connection]:
-        return [each for each in self._subscribers if topic in each.topics]
+        return [connection for connection in self._subscribers if topic in connection.topics]
 
     def _send(
         self,

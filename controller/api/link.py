@@ -15,7 +15,7 @@ import pwd
 import socket
 import struct
 import tempfile
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -31,6 +31,18 @@ from model.errors import InputError, expect_path, shown
 from registry.wording import first_problem
 
 RESPONSE_TIMEOUT = 5.0  # s; arming takes the longest, some tenths of a second
+_QUEUE_INTERVAL = 0.002  # s
+_READ = 1 << 16  # bytes; read-ahead, and the rest of an incomplete line
+
+SYSTEM_SOCKET = Path("/run/era-haptics/daemon.sock")
+"""The socket of the system service."""
+
+SOCKET_VARIABLE = "ERA_HAPTICS_SOCKET"
+"""Environment variable with the socket path, for the daemon and its clients."""
+
+SERVICE_USER_VARIABLE = "ERA_HAPTICS_USER"
+_SERVICE_USER = "era-haptics"  # default of the system service
+_CREDENTIALS = struct.Struct("3i")  # process, user, group
 
 _MessageT = TypeVar("_MessageT", bound=ApiMessage)
 
@@ -65,8 +77,8 @@ class ConnectionLost(Unreachable):
 class LeaseLost(RpcError):
     """The lease of `armed` ended within its block: vibration has stopped."""
 
-    def __init__(self, what: str) -> None:
-        super().__init__(ErrorCode.LEASE, f"lease lost: {what}", remedy="arm again")
+    def __init__(self, cause: str) -> None:
+        super().__init__(ErrorCode.LEASE, f"lease lost: {cause}", remedy="arm again")
 
 
 @dataclass(frozen=True)
@@ -143,17 +155,18 @@ def touches_at(positions: Iterable[tuple[float, float]]) -> list[TouchPoint]:
         raise InputError(
             f"touch: positions must be a list of x, y in metres, got {shown(positions)}"
         )
-    return [
-        TouchPoint(id=id, x_m=x, y_m=y, radius_m=None)
-        for id, (x, y) in enumerate(map(as_position, positions), start=1)
-    ]
+    points: list[TouchPoint] = []
+    for number, position in enumerate(positions, start=1):
+        x, y = as_position(position)
+        points.append(TouchPoint(id=number, x_m=x, y_m=y, radius_m=None))
+    return points
 
 
 def as_position(position: object) -> tuple[float, float]:
     """Convert a position to x, y [m]; raises InputError."""
     got = shown(position)
     with suppress(TypeError, ValueError, OverflowError):
-        x, y = (float(each) for each in cast("Iterable[float]", position))
+        x, y = map(float, cast("Iterable[float]", position))
         if math.isfinite(x) and math.isfinite(y):
             return x, y
         got = f"({x:g}, {y:g})"
@@ -163,44 +176,32 @@ def as_position(position: object) -> tuple[float, float]:
     )
 
 
-SYSTEM_SOCKET = Path("/run/era-haptics/daemon.sock")
-"""The socket of the system service."""
-
-SOCKET_VARIABLE = "ERA_HAPTICS_SOCKET"
-"""Environment variable with the socket path, for the daemon and its clients."""
-
-
 def default_socket(environment: Mapping[str, str] = os.environ) -> Path:
     """Return the default socket of this user's daemon."""
-    named = environment.get(SOCKET_VARIABLE)
-    if named:
-        return Path(named)
-    given = environment.get("XDG_RUNTIME_DIR")
-    runtime = Path(given or f"/run/user/{os.getuid()}")
-    if given or runtime.is_dir():
-        return runtime / "era-haptics" / "daemon.sock"
+    socket_name = environment.get(SOCKET_VARIABLE)
+    if socket_name:
+        return Path(socket_name)
+    folder_name = environment.get("XDG_RUNTIME_DIR")
+    folder = Path(folder_name or f"/run/user/{os.getuid()}")
+    if folder_name or folder.is_dir():
+        return folder / "era-haptics" / "daemon.sock"
     return Path(tempfile.gettempdir()) / f"era-haptics-{os.getuid()}" / "daemon.sock"
 
 
-def find_socket(given: Path | str | None) -> Path:
-    """Find the socket: as given, from the environment, this user's, or the service's."""
-    if given is not None:
-        return expect_path(given, what="path")
-    own = default_socket()
-    if os.environ.get(SOCKET_VARIABLE) or own.exists():
-        return own
+def find_socket(path: Path | str | None) -> Path:
+    """Find the socket: at a path, from the environment, of this user, or of the service."""
+    if path is not None:
+        return expect_path(path, what="path")
+    user_socket = default_socket()
+    if os.environ.get(SOCKET_VARIABLE) or user_socket.exists():
+        return user_socket
     try:
         SYSTEM_SOCKET.stat()
     except PermissionError:
         pass  # the folder belongs to another user: connecting reports the owner
     except OSError:
-        return own
+        return user_socket
     return SYSTEM_SOCKET
-
-
-SERVICE_USER_VARIABLE = "ERA_HAPTICS_USER"
-_SERVICE_USER = "era-haptics"  # default of the system service
-_CREDENTIALS = struct.Struct("3i")  # process, user, group
 
 
 def check_peer(
@@ -217,22 +218,19 @@ def check_peer(
     credentials = credentials_of(connected)
     if credentials is not None:
         owners["process"] = credentials[1]
-    trusted = {0, os.geteuid(), getattr(_account(pwd.getpwnam, service), "pw_uid", None)}
+    trusted = {0, os.geteuid(), _user_id(service)}
     if len(set(owners.values())) == 1 and set(owners.values()) <= trusted:
         return
-    found = ", ".join(
-        f"its {what} belongs to {getattr(_account(pwd.getpwuid, uid), 'pw_name', f'user {uid}')}"
-        for what, uid in owners.items()
-    )
+    owned = [f"its {part} belongs to {_user_name(uid)}" for part, uid in owners.items()]
     raise Unreachable(
         f"{path} must belong, with its folder and process, to root, to you, or to the service's "
-        f"user {service}, but {found}; give another socket, or name the service's user in "
-        f"{SERVICE_USER_VARIABLE}"
+        f"user {service}, but {', '.join(owned)}; give another socket, or name the service's user "
+        f"in {SERVICE_USER_VARIABLE}"
     )
 
 
 def credentials_of(connected: socket.socket) -> tuple[int, int] | None:
-    """Return process and user ids of the peer of a socket; None if the system has none."""
+    """Return process and user ids of the peer of a socket; None if the system lacks them."""
     option = getattr(socket, "SO_PEERCRED", None)  # Linux only
     if option is None:
         return None
@@ -241,16 +239,20 @@ def credentials_of(connected: socket.socket) -> tuple[int, int] | None:
     return process, user
 
 
-def _account(find: Callable[[Any], pwd.struct_passwd], user: str | int) -> Any:
-    """Return the account of a user by name or id, or None."""
+def _user_id(name: str) -> int | None:
+    """Return the id of a user; None if there is no such user."""
     try:
-        return find(user)
+        return pwd.getpwnam(name).pw_uid
     except KeyError:
         return None
 
 
-_QUEUE_INTERVAL = 0.002  # s
-_READ = 1 << 16  # bytes; read-ahead, and the rest of an incomplete line
+def _user_name(uid: int) -> str:
+    """Return the name of a user, or the id without one."""
+    try:
+        return pwd.getpwuid(uid).pw_name
+    except KeyError:
+        return f"user {uid}"
 
 
 class DaemonLink:

@@ -96,8 +96,9 @@ def lenient(method: _MethodT) -> _MethodT:
         try:
             signature.bind(self, *args, **options)
         except TypeError:
-            known = {name: options[name] for name in options if name in signature.parameters}
-            await method(self, **known)
+            parameters = signature.parameters
+            valid_options = {name: options[name] for name in options if name in parameters}
+            await method(self, **valid_options)
             raise
         return await method(self, *args, **options)
 
@@ -261,9 +262,13 @@ class AsyncClient(AbstractAsyncContextManager["AsyncClient"]):
         1. taps: transients, in the same format.
         """
         x, y = as_position(position)
-        played = {"effect": effect} if isinstance(effect, str) else {"points": [*map(list, effect)]}
-        more = {"level_db_sl": level_db_sl, "taps": [*map(list, taps)], "loop": loop}
-        await self._call(Empty, "play", **played, x_m=x, y_m=y, **more)
+        params: dict[str, Any] = {"x_m": x, "y_m": y, "level_db_sl": level_db_sl, "loop": loop}
+        params["taps"] = [*map(list, taps)]
+        if isinstance(effect, str):
+            params["effect"] = effect
+        else:
+            params["points"] = [*map(list, effect)]
+        await self._call(Empty, "play", **params)
 
     async def subscribe(self, *topics: Topic, rate_hz: float | None = None) -> None:
         """Subscribe to topics; see `events`."""
@@ -273,7 +278,8 @@ class AsyncClient(AbstractAsyncContextManager["AsyncClient"]):
     async def unsubscribe(self, *topics: Topic) -> None:
         """Receive no more notifications of topics."""
         await self._call(Empty, "unsubscribe", topics=list(topics))
-        self._rates = {each: rate for each, rate in self._rates.items() if each not in topics}
+        for topic in topics:
+            self._rates.pop(topic, None)
 
     @asynccontextmanager
     async def armed(
@@ -302,8 +308,10 @@ class AsyncClient(AbstractAsyncContextManager["AsyncClient"]):
 
     async def events(self) -> AsyncIterator[Notification]:
         """Yield notifications as they arrive, until `close`; raises Unreachable."""
-        while (event := await self.next_event()) is not None:
+        event = await self.next_event()
+        while event is not None:
             yield event
+            event = await self.next_event()
 
     async def next_event(self, *, timeout: float | None = None) -> Notification | None:
         """Wait for a notification; None after a timeout [s] or `close`; raises Unreachable.
@@ -325,8 +333,9 @@ class AsyncClient(AbstractAsyncContextManager["AsyncClient"]):
             return None
         connection, event = self._events.popleft()
         self._see(connection, event.data.get("epoch"))
-        lost, self._lost = self._lost, 0
-        return replace(event, lost=event.lost + lost)
+        lost = event.lost + self._lost
+        self._lost = 0
+        return replace(event, lost=lost)
 
     async def _call(self, result: type[_ResultT], method: str, **values: Any) -> _ResultT:
         """Call a method with these parameters and return its result.
@@ -381,8 +390,10 @@ class AsyncClient(AbstractAsyncContextManager["AsyncClient"]):
 
     async def _exchange(self, link: DaemonLink, method: str, params: ApiMessage) -> Any:
         """Send a request over the current connection; raises RpcError and Unreachable."""
-        id, pending = next(self._ids), self._pending
-        response = pending[id] = asyncio.get_running_loop().create_future()
+        id = next(self._ids)
+        pending = self._pending
+        response = asyncio.get_running_loop().create_future()
+        pending[id] = response
         try:
             content = params.model_dump_json(exclude_none=True)
             link.write(request_line(id, method, content.encode()))
@@ -433,10 +444,11 @@ class AsyncClient(AbstractAsyncContextManager["AsyncClient"]):
             if self._is_closed:
                 raise Unreachable(f"this client of the daemon at {self.path} is closed")
             if self._link is None or not self._link.is_open:
-                link = self._link = await DaemonLink.open(self.path, self._name)
-                self._pending, self._ids = {}, itertools.count(1)
+                self._link = await DaemonLink.open(self.path, self._name)
+                self._pending = {}
+                self._ids = itertools.count(1)
                 self._connections += 1
-                reading = self._read(link, self._pending, self._connections)
+                reading = self._read(self._link, self._pending, self._connections)
                 self._reading = asyncio.create_task(reading, name="API")
             return self._link
 
@@ -460,7 +472,8 @@ class AsyncClient(AbstractAsyncContextManager["AsyncClient"]):
                 received = read_line(await link.next_line())
                 if isinstance(received, Notification):
                     if len(self._events) == MAX_QUEUED_EVENTS:
-                        self._lost += 1 + self._events.popleft()[1].lost
+                        _, dropped = self._events.popleft()
+                        self._lost += 1 + dropped.lost
                     self._events.append((connection, received))
                     self._changed.set()
                     continue
@@ -492,7 +505,8 @@ class AsyncClient(AbstractAsyncContextManager["AsyncClient"]):
 
     async def _disarmed(self, lease: ArmResult) -> None:
         """End `armed`: disarm unless already done; raises LeaseLost if the lease was lost."""
-        renewing, self._renewing = self._renewing, None
+        renewing = self._renewing
+        self._renewing = None
         if renewing is None:
             return
         if renewing.done():
@@ -515,13 +529,14 @@ class AsyncClient(AbstractAsyncContextManager["AsyncClient"]):
         params = make_params("renew", lease=lease.lease)
         expires_at = loop.time() + lease.lease_s
         reason: RpcError | Unreachable | None = None
-        while (left := expires_at - loop.time()) > 0:
-            await asyncio.sleep(min(_RENEWAL_INTERVAL, left))
+        while loop.time() < expires_at:
+            await asyncio.sleep(min(_RENEWAL_INTERVAL, expires_at - loop.time()))
             sent_at = loop.time()
             try:
                 async with asyncio.timeout_at(expires_at):
                     await self.request("renew", params)
-                expires_at, reason = sent_at + lease.lease_s, None
+                expires_at = sent_at + lease.lease_s
+                reason = None
             except TimeoutError:
                 break
             except (RpcError, Unreachable) as error:
@@ -626,8 +641,10 @@ class Client(AbstractContextManager["Client"]):
 
     def events(self, *, timeout: float | None = None) -> Iterator[Notification]:
         """Yield notifications as they arrive; end when none arrives within a timeout [s]."""
-        while (event := self._run(self._client.next_event(timeout=timeout))) is not None:
+        event = self._run(self._client.next_event(timeout=timeout))
+        while event is not None:
             yield event
+            event = self._run(self._client.next_event(timeout=timeout))
 
     def _run(self, work: Coroutine[Any, Any, _T]) -> _T:
         if not self._loop.is_open:

@@ -15,7 +15,7 @@ from controller.api.methods import METHODS
 from controller.api.schema import ApiMessage
 
 _PRECEDENCE = ("stop", "disarm")  # if a line names both methods
-_MARKS = (*(name.encode() for name in _PRECEDENCE), b"\\u")  # every line that silences contains one
+_MARKS = (b"stop", b"disarm", b"\\u")  # every line that silences contains one
 _NAMED = re.compile(rb'"method"\s*:\s*"(%s)"' % "|".join(_PRECEDENCE).encode())
 
 
@@ -49,19 +49,19 @@ def read_silencing(line: bytes) -> SilencingRequest | None:
 
 def _search(text: bytes) -> SilencingRequest | None:
     """Search text for a method that silences; its parameters cannot be read."""
-    named = _NAMED.findall(text)
+    methods = _NAMED.findall(text)
     for method in _PRECEDENCE:
-        if method.encode() in named:
+        if method.encode() in methods:
             return SilencingRequest(method, readable_params(method, {}))
     return None
 
 
-def readable_params(method: str, given: object) -> ApiMessage:
+def readable_params(method: str, content: object) -> ApiMessage:
     """Return the parameters of a method that silences, with defaults for invalid ones."""
     model = METHODS[method].params
     params: dict[str, Any] = {}
-    if isinstance(given, Mapping):
-        for name in model.model_fields.keys() & given.keys():
+    if isinstance(content, Mapping):
+        for name in model.model_fields.keys() & content.keys():
             with suppress(Exception):  # any error: use the default
-                params[name] = getattr(model(**{name: given[name]}), name)
+                params[name] = getattr(model(**{name: content[name]}), name)
     return model(**params)

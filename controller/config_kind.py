@@ -13,11 +13,11 @@ class CheckedFile:
     """A valid configuration file."""
 
     line: str
-    """One line about it."""
+    """Summary in one line."""
 
     warnings: Sequence[str] = ()
-    more: Mapping[str, Any] = field(default_factory=dict)
-    """Further entries of its report as data."""
+    data: Mapping[str, Any] = field(default_factory=dict)
+    """Further entries of the report as JSON."""
 
 
 @dataclass(frozen=True)
@@ -38,10 +38,10 @@ class ConfigKind:
     """JSON schema of its keys, without the title."""
 
     def example(self) -> str:
-        """A commented file to start from."""
+        """Return the text of a commented file to start from."""
         return self.example_file.read_text(encoding="utf-8")
 
     def schema(self) -> dict[str, Any]:
-        """The JSON schema for editors."""
+        """Return the JSON schema for editors."""
         draft = "https://json-schema.org/draft/2020-12/schema"
         return {"$schema": draft, **self.keys(), "title": self.title}

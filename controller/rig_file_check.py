@@ -52,55 +52,66 @@ def check_rig(document: Document) -> CheckedFile:
     """Check a rig and its amplifiers; raises ConfigError with all problems."""
     document = with_base(document)
     problems: list[ConfigProblem] = []
-    rig = None
+    rig: Rig | None = None
+    channels = Counter[str]()
+    limits = LimitsSection().made()
     try:
         rig = rig_of(document)
     except ConfigError as error:
         problems += error.problems
-    urls = _urls(document)
-    link_errors, link_warnings = check_links(
-        urls,
-        channels=rig.channel_counts if rig else Counter[str](),
-        limits=rig.limits if rig else LimitsSection().made(),
-    )
-    if rig is not None:
+    else:
+        channels = rig.channel_counts
+        limits = rig.limits
         problems += _support_problems(document, rig)
-    reported = {problem.key for problem in problems}
-    for name, message in link_errors.items():
-        problem = document.problem(("amplifiers", name, "url"), message)
-        if problem.key not in reported:
-            problems.append(problem)
+    urls = _urls(document)
+    link_errors, link_warnings = check_links(urls, channels=channels, limits=limits)
+    reported_keys = [problem.key for problem in problems]
+    link_problems = _link_problems(document, link_errors)
+    problems += [problem for problem in link_problems if problem.key not in reported_keys]
     if rig is None or problems:
         raise ConfigError(document.source, problems)
-    balance = _balance(rig)
     clock_line, clock_warnings, clock_data = clock_costs(rig, urls)
+    summary = summary_line(rig)
+    data: dict[str, Any] = {}
+    balance = _balance(rig)
+    if balance is not None:
+        data["balance"] = balance.as_json()
+        if balance.tips_over:
+            summary = summary_line(rig, verdict="tips over")
+        else:
+            summary += f", {balance.phrase}"
+    warnings = _rig_warnings(rig, balance, [*link_warnings, *clock_warnings])
+    return CheckedFile(summary + clock_line, warnings, data | clock_data)
+
+
+def _link_problems(document: Document, errors: Mapping[str, str]) -> Iterator[ConfigProblem]:
+    """Yield the problems of amplifier URLs; errors: by the amplifier's name."""
+    for name, message in errors.items():
+        yield document.problem(("amplifiers", name, "url"), message)
+
+
+def _rig_warnings(rig: Rig, balance: RigBalance | None, link_warnings: list[str]) -> list[str]:
+    """Return all warnings about a rig; link_warnings: about its wires and clocks."""
     warnings = [
         *exciter_notes(rig),
         *excursion_notes(rig),
         *resonance_notes(rig),
         *link_warnings,
-        *clock_warnings,
         *gain_notes(rig),
         *plate_notes(rig),
         *_cost_notes(rig),
         *mount_notes(rig),
-        *(() if balance is None else balance.notes()),
-        *_span_notes(rig),
     ]
+    if balance is not None:
+        warnings += balance.notes()
+    warnings += _span_notes(rig)
     if rig.uncertainty_note:
         warnings.append(rig.uncertainty_note)
-    if balance is None:
-        return CheckedFile(summary_line(rig) + clock_line, warnings, clock_data)
-    if balance.tips_over:
-        summary = summary_line(rig, verdict="tips over")
-    else:
-        summary = f"{summary_line(rig)}, {balance.phrase}"
-    data = {"balance": balance.as_json(), **clock_data}
-    return CheckedFile(summary + clock_line, warnings, data)
+    return warnings
 
 
 def _balance(rig: Rig) -> RigBalance | None:
-    """How the plate rests on its supports; None for a surface that its modes hold."""
+    """Return how the plate rests on its supports; None for a surface that its modes hold."""
     surface = rig.plate.surface
     if surface is not None and centre_of_surface(surface) is None:
         return None
@@ -108,32 +119,30 @@ def _balance(rig: Rig) -> RigBalance | None:
 
 
 def _support_problems(document: Document, rig: Rig) -> list[ConfigProblem]:
-    """Problems of ERAs and feet that let the plate tip over."""
+    """Return the problem of ERAs and feet that let the plate tip over, if any."""
     message = support_problem(rig.plate, rig.eras, loads=rig.masses)
     return [] if message is None else [document.problem(("eras",), message)]
 
 
 def _cost_notes(rig: Rig) -> Iterator[str]:
-    """Yield what objects on the plate and the weather cost, where the rig states them."""
-    known = rig.uncertainty
-    if known.foreign_mass:
-        yield from _uncertainty_note(
-            rig,
-            "foreign_mass",
-            what=f"uncertainty.foreign_mass: with {1e3 * known.foreign_mass:.3g} g anywhere on the "
-            "plate",
-            remedy="list permanent loads under masses",
+    """Yield the contrast that loads and weather cost if the rig states them."""
+    foreign_mass = rig.uncertainty.foreign_mass
+    if foreign_mass:
+        cause = f"uncertainty.foreign_mass: with {1e3 * foreign_mass:.3g} g anywhere on the plate"
+        remedy = "list permanent loads under masses"
+        yield from _uncertainty_note(rig, "foreign_mass", cause=cause, remedy=remedy)
+    weather = rig.uncertainty.weather
+    if weather:
+        cause = (
+            f"plate: temperature and humidity change its modulus by {100 * weather:.2g} %, one "
+            "standard deviation;"
         )
-    if known.weather:
-        yield from _uncertainty_note(
-            rig,
-            "weather",
-            what="plate: temperature and humidity change its modulus by "
-            f"{100 * known.weather:.2g} %, one standard deviation;",
-            remedy="narrow the range, or measure again when the season changes",
-        )
+        remedy = "narrow the range, or measure again when the season changes"
+        yield from _uncertainty_note(rig, "weather", cause=cause, remedy=remedy)
         return
-    plate_keys: Any = rig.document.data.get("plate", {}) if rig.document else {}
+    plate_keys: Any = {}
+    if rig.document is not None:
+        plate_keys = rig.document.data.get("plate", {})
     if not plate_keys.keys().isdisjoint(_WEATHER_KEYS):
         yield (
             f"plate.{' and plate.'.join(_WEATHER_KEYS)}: nothing is known of how "
@@ -142,18 +151,18 @@ def _cost_notes(rig: Rig) -> Iterator[str]:
         )
 
 
-def _uncertainty_note(rig: Rig, key: str, *, what: str, remedy: str) -> Iterator[str]:
-    """Yield the contrast that is left with one uncertainty of a rig."""
-    with contextlib.suppress(InputError):  # no place for two fingers
+def _uncertainty_note(rig: Rig, key: str, *, cause: str, remedy: str) -> Iterator[str]:
+    """Yield the contrast that remains with one uncertainty of a rig."""
+    with contextlib.suppress(InputError):  # the plate is too small for two fingers
         cost = uncertainty_cost(rig, key)
-        yield f"{what} two contents keep {cost.kept_db:.1f} of {cost.exact_db:.1f} dB; {remedy}"
+        yield f"{cause} two contents keep {cost.kept_db:.1f} of {cost.exact_db:.1f} dB; {remedy}"
 
 
 def _span_notes(rig: Rig) -> Iterator[str]:
-    """Yield a warning where ERAs span a small part of the plate.
+    """Yield a warning if ERAs span a small part of the plate.
 
-    Compares the promised contrast with that of ERAs in the corners. No warning for ERAs in one line
-    along a side.
+    Compares the promised contrast with the contrast of ERAs in the corners. ERAs in one line along
+    a side give no warning.
     """
     positions = np.array([[era.x, era.y] for era in rig.eras])
     sides = np.array([rig.plate.length, rig.plate.width])
@@ -161,14 +170,14 @@ def _span_notes(rig: Rig) -> Iterator[str]:
     share = float((span / sides).prod())
     if not 0 < share < _SMALL_SPAN:
         return
-    in_corners = (sides * (positions - positions.min(axis=0)) / span).tolist()
-    corner_eras = tuple(
-        replace(era, x=x, y=y) for era, (x, y) in zip(rig.eras, in_corners, strict=True)
-    )
+    corner_positions = sides * (positions - positions.min(axis=0)) / span
+    positioned = zip(rig.eras, corner_positions.tolist(), strict=True)
+    corner_eras = tuple(replace(era, x=x, y=y) for era, (x, y) in positioned)
+    corner_rig = replace(rig, eras=corner_eras)
     exact_clocks = dict.fromkeys(rig.channel_counts, 0.0)
-    with contextlib.suppress(InputError):  # no place for two fingers
+    with contextlib.suppress(InputError):  # the plate is too small for two fingers
         contrast_db = clock_cost(rig, exact_clocks).exact_db
-        corner_db = clock_cost(replace(rig, eras=corner_eras), exact_clocks).exact_db
+        corner_db = clock_cost(corner_rig, exact_clocks).exact_db
         yield (
             f"eras: they span {percent(share)} of the plate; two contents are promised "
             f"{contrast_db:.1f} dB, with ERAs spread to its corners {corner_db:.1f} dB: check `at` "
@@ -177,10 +186,10 @@ def _span_notes(rig: Rig) -> Iterator[str]:
 
 
 def clock_costs(rig: Rig, urls: Mapping[str, str]) -> tuple[str, list[str], dict[str, Any]]:
-    """Contrast that is left with the clocks of several amplifiers: summary, warnings and data.
+    """Contrast that remains with the clocks of several amplifiers: summary, warnings and data.
 
     urls: by the amplifier's name. All three are empty for one amplifier, and for a plate without
-    room for two fingers. The summary is empty where contrast is lost.
+    room for two fingers. The summary is empty if contrast is lost, which the warnings report.
     """
     arrangement = arrangement_of(urls, channels=rig.channel_counts, stated=rig.clock_errors)
     if arrangement is None:
@@ -188,18 +197,23 @@ def clock_costs(rig: Rig, urls: Mapping[str, str]) -> tuple[str, list[str], dict
     errors = {**dict.fromkeys(rig.channel_counts, 0.0), **arrangement.errors}
     try:
         cost = clock_cost(rig, errors)
-    except InputError:  # no place for two fingers
+    except InputError:  # the plate is too small for two fingers
         return "", [], {}
-    unsteered = [name for name, error in errors.items() if math.isinf(error)]
-    largest_us = 1e6 * max((e for e in errors.values() if math.isfinite(e)), default=0.0)
+    unsteered: list[str] = []
+    error_us: dict[str, float | None] = {}
+    largest_error = 0.0
+    for name, error in errors.items():
+        if math.isinf(error):
+            unsteered.append(name)
+            error_us[name] = None
+        else:
+            largest_error = max(largest_error, error)
+            error_us[name] = round(1e6 * error, 1)
     summary = (
         f"{len(rig.eras)} ERAs on {len(errors)} amplifiers over {arrangement.lines}: clocks held "
-        f"together to {largest_us:.0f} us; two contents keep {cost.kept_db:.1f} of "
+        f"together to {1e6 * largest_error:.0f} us; two contents keep {cost.kept_db:.1f} of "
         f"{cost.exact_db:.1f} dB"
     )
-    error_us: dict[str, float | None] = {}
-    for name, error in errors.items():
-        error_us[name] = None if name in unsteered else round(1e6 * error, 1)
     data = {
         "lines": arrangement.lines,
         "error_us": error_us,

@@ -69,7 +69,7 @@ def gateway(
     from controller.gateway.app import serve
 
     host, port = _host_and_port(listen)
-    chosen = {} if token_file is None else {"token": read_token(token_file)}
+    token = {} if token_file is None else {"token": read_token(token_file)}
     settings = GatewaySettings(
         socket=find_socket(socket),
         host=host,
@@ -77,12 +77,14 @@ def gateway(
         extra_hosts=tuple(allow_host or ()),
         origins=tuple(allow_origin or ()),
         is_token_user_supplied=token_file is not None,
-        **chosen,
+        **token,
     )
 
     def announce(port: int) -> None:
-        token = f"#token={settings.token}" if token_file is None else f" (token in {token_file})"
-        print(f"dashboard: http://{settings.shown_host}:{port}/{token}", flush=True)
+        fragment = f"#token={settings.token}"
+        if token_file is not None:
+            fragment = f" (token in {token_file})"
+        print(f"dashboard: http://{settings.shown_host}:{port}/{fragment}", flush=True)
 
     asyncio.run(serve(settings, announce=announce))
     os._exit(0)  # Python would abort in the thread that draws the field
@@ -107,8 +109,8 @@ for _command in (gateway, touch, watch):
     app.command()(_command)
 for _name in ("disarm", "stop", "clear"):
     app.command(_name, help=SUMMARIES[_name])(of_method(_name))
-for _more in (arm, reload, status, strength):
+for _method in (arm, reload, status, strength):
     app.command(
-        help=f"{SUMMARIES[_more.__name__]} {_more.__doc__}",
-        context_settings={"ignore_unknown_options": _more is strength},  # -6 is a number
-    )(_more)
+        help=f"{SUMMARIES[_method.__name__]} {_method.__doc__}",
+        context_settings={"ignore_unknown_options": _method is strength},  # -6 is a number
+    )(_method)

@@ -168,12 +168,12 @@ def strength(
 ) -> None:
     """0 dB is the level that layout and limits allow."""
     with connected(socket) as era:
-        strengths = (era.status() if name is None else era.strength(name, gain_db)).strengths
-    print_report(
-        [f"{each}: {gain:g} dB" for each, gain in strengths.items()],
-        {"strengths": strengths},
-        as_json=as_json,
-    )
+        if name is None:
+            strengths = era.status().strengths
+        else:
+            strengths = era.strength(name, gain_db).strengths
+    lines = [f"{gain_name}: {gain:g} dB" for gain_name, gain in strengths.items()]
+    print_report(lines, {"strengths": strengths}, as_json=as_json)
 
 
 def touch(
@@ -200,9 +200,10 @@ def touch(
         for x, y in positions:  # the daemon would only count fingers outside the plate as rejected
             if not (0 <= x <= length and 0 <= y <= width):
                 remedy = in_metres(x, y, length=length, width=width)
+                remedy = remedy or "; coordinates start at its south-west corner"
                 raise InputError(
                     f"era touch must be on the plate of {length:g} m by {width:g} m, "
-                    f"got {x:g},{y:g}" + (remedy or "; coordinates start at its south-west corner")
+                    f"got {x:g},{y:g}{remedy}"
                 )
         started_at = time.monotonic()
         _hold(era, positions, started_at + duration / 2)
@@ -218,10 +219,10 @@ def _hold(era: "Client", positions: list[tuple[float, float]], end: float) -> No
     """Repeat fingers until a time of time.monotonic() [s], and once more at that time."""
     while True:
         era.touch(positions, source="era touch")
-        left = end - time.monotonic()
-        if left <= 0:
+        remaining = end - time.monotonic()
+        if remaining <= 0:
             return
-        time.sleep(min(left, _REPEAT_INTERVAL))
+        time.sleep(min(remaining, _REPEAT_INTERVAL))
 
 
 def watch(

@@ -261,7 +261,7 @@ def _tones_text(row: "TouchRow") -> str:
 
 
 def _notes(row: "TouchRow") -> str:
-    """Return what is missing in a measurement, and the verdict of the finger."""
+    """Return notes on an incomplete measurement and on the verdict of the finger."""
     note = ""
     if row.measured_level_db_sl is None:
         note = "  not measured"
@@ -284,7 +284,7 @@ def _number(value: float | None) -> str:
 
 
 def _summary(rows: "list[TouchRow]") -> str:
-    """Count touches that kept the promise, among those that reached the steady state."""
+    """Count touches that kept the promise, among touches that reached the steady state."""
     judged = [row for row in rows if row.keeps_promise is not None]
     touches = counted(len(rows), "touch", plural="touches")
     if not judged:

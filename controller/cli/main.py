@@ -128,8 +128,9 @@ def run(
     on_loaded: called once the modules are loaded.
     """
     end = arguments.index("--") if "--" in arguments else len(arguments)
-    kept = [argument for argument in arguments[:end] if argument != "--debug"]
-    debug, arguments = len(kept) < end, [*kept, *arguments[end:]]
+    options = [argument for argument in arguments[:end] if argument != "--debug"]
+    debug = len(options) < end
+    arguments = [*options, *arguments[end:]]
     group, statuses = join_commands(load())
     try:
         on_loaded()
@@ -157,12 +158,13 @@ class _Commands(TyperGroup):
 
     def sections(self) -> dict[str, list[str]]:
         """Names by the title of their section."""
-        listed = {
-            title: [name for name in names if name in self.commands]
-            for title, names in SECTIONS.items()
-        }
-        others = set(self.commands).difference(*listed.values())
-        return {**listed, "Others": sorted(others)}
+        remaining = set(self.commands)
+        sections: dict[str, list[str]] = {}
+        for title, names in SECTIONS.items():
+            sections[title] = [name for name in names if name in self.commands]
+            remaining.difference_update(names)
+        sections["Others"] = sorted(remaining)
+        return sections
 
     def resolve_command(self, ctx: Any, args: list[str]) -> tuple[str | None, Any, list[str]]:
         """Find a command; for the name of an option, such as `era version`, suggest the option."""
@@ -176,9 +178,10 @@ class _Commands(TyperGroup):
         width = max(len(name) for name in self.commands)
         limit = formatter.width - width - 6
         for title, names in self.sections().items():
-            rows = [
-                (name.ljust(width), self.commands[name].get_short_help_str(limit)) for name in names
-            ]
+            rows: list[tuple[str, str]] = []
+            for name in names:
+                summary = self.commands[name].get_short_help_str(limit)
+                rows.append((name.ljust(width), summary))
             if rows:
                 with formatter.section(title):
                     formatter.write_dl(rows)
@@ -194,9 +197,9 @@ def join_commands(modules: Iterable[CommandModule]) -> tuple[TyperGroup, ExitSta
     for module in modules:
         statuses.update(module.EXIT_STATUS)
         for word, command in _group(module.app).commands.items():
-            known = group.commands.setdefault(word, command)
-            if isinstance(known, TyperGroup) and isinstance(command, TyperGroup):
-                known.commands.update(command.commands)
+            present = group.commands.setdefault(word, command)
+            if isinstance(present, TyperGroup) and isinstance(command, TyperGroup):
+                present.commands.update(command.commands)
     return group, statuses
 
 
@@ -257,8 +260,9 @@ def _report(error: Exception, statuses: ExitStatus) -> int:
     if failed_plugin(error) is not None:
         _print_error(f"error: {failure_text(error)}")
         return BAD_INPUT
-    if needed := posix_needed(error):
-        _print_error(f"error: {needed}")
+    platform_problem = posix_needed(error)
+    if platform_problem:
+        _print_error(f"error: {platform_problem}")
         return BAD_INPUT
     _print_error(
         f"error: this is a bug in era-haptics, please report it ({type(error).__name__}: {error}). "

@@ -45,11 +45,11 @@ def end_with_parent(parent: int, number: int = signal.SIGTERM) -> None:
 
 
 def _main() -> None:
-    parent, module = int(sys.argv[1]), sys.argv[2]
-    end_with_parent(parent)
+    _, parent, module, *arguments = sys.argv
+    end_with_parent(int(parent))
     for number in (signal.SIGHUP, signal.SIGUSR1):
         signal.signal(number, signal.SIG_IGN)
-    sys.argv[:] = [module, *sys.argv[3:]]
+    sys.argv[:] = [module, *arguments]
     runpy.run_module(module, run_name="__main__", alter_sys=True)
 
 

@@ -40,9 +40,10 @@ class SocketLock:
         try:
             path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
             # In a folder of another user, the socket could be replaced, or a link to it redirected.
-            status, link = path.parent.stat(), path.parent.lstat()
-            is_foreign = not {status.st_uid, link.st_uid} <= {0, os.getuid()}
-            if is_foreign or status.st_mode & stat.S_IWOTH:
+            folder = path.parent.stat()
+            owners = {folder.st_uid, path.parent.lstat().st_uid}
+            is_foreign = not owners <= {0, os.getuid()}
+            if is_foreign or folder.st_mode & stat.S_IWOTH:
                 raise InputError(f"{path.parent}: other users can write to this folder; {_REMEDY}")
             self._lock = _open_lock(path.with_name(f"{path.name}.lock"))
         except OSError as error:
@@ -81,7 +82,7 @@ class SocketLock:
         # systemd's RuntimeDirectoryMode=0750 shares the folder with the service's group.
         folder = self.path.parent.stat().st_mode
         is_shared = folder & stat.S_IXGRP and not folder & stat.S_IRWXO
-        before = os.umask(0o117 if is_shared else 0o177)
+        umask = os.umask(0o117 if is_shared else 0o177)
         try:
             _remove(staged)  # left behind by a killed daemon
             bound.bind(str(staged))
@@ -92,7 +93,7 @@ class SocketLock:
             _remove(staged)
             raise InputError(f"{staged}: bind failed: {error.strerror}; {_REMEDY}") from error
         finally:
-            os.umask(before)
+            os.umask(umask)
         return bound
 
     def release(self) -> None:

@@ -34,22 +34,23 @@ class RateLimiter:
         self._per_second = per_second
         self._burst = per_second if burst is None else burst
         self._clock = clock
-        self._left = self._burst
+        self._allowed = self._burst
         self._counted_at = clock()
 
     def take(self) -> bool:
         """Whether another action is allowed now; counts it."""
         now = self._clock()
-        saved = self._left + self._per_second * (now - self._counted_at)
-        self._left, self._counted_at = min(self._burst, saved), now
-        if self._left < 1:
+        allowed = self._allowed + self._per_second * (now - self._counted_at)
+        self._allowed = min(self._burst, allowed)
+        self._counted_at = now
+        if self._allowed < 1:
             return False
-        self._left -= 1
+        self._allowed -= 1
         return True
 
 
 _MAX_QUEUED = 2000  # lines
-_BURST = 5  # lines of one logging call in a burst
+_BURST = 5  # lines per logging call in a burst
 _RATE = 1.0  # 1/s after a burst
 _MAX_MESSAGE = 2000  # characters
 _CLOSE_TIMEOUT = 0.3  # s; a hanging disk must not delay the exit
@@ -72,10 +73,11 @@ class LogFormatter(JsonFormatter):
 
     def process_log_record(self, log_data: dict[str, Any]) -> dict[str, Any]:
         """Bound the lengths, and write the level in small letters."""
-        level, message = log_data["level"].lower(), log_data["message"][:_MAX_MESSAGE]
+        log_data["level"] = log_data["level"].lower()
+        log_data["message"] = log_data["message"][:_MAX_MESSAGE]
         if "traceback" in log_data:
             log_data["traceback"] = log_data["traceback"][-4 * _MAX_MESSAGE :]
-        return log_data | {"level": level, "message": message}
+        return log_data
 
 
 def open_log_file(file: Path) -> FileIO:
@@ -134,9 +136,10 @@ class LineWriter(logging.Handler):
                 sys.stderr.write(line)
                 sys.stderr.flush()
             else:
+                content = line.encode()
                 with open_log_file(self._file) as stream:
-                    written = stream.write(data := line.encode())
-                    if written < len(data):
+                    written = stream.write(content)
+                    if written < len(content):
                         stream.truncate(stream.tell() - written)
 
 

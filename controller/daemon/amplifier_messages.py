@@ -34,7 +34,7 @@ def amplifier_statuses(
     clock_errors: Mapping[str, float],
     targets: Sequence[str] = (),
 ) -> list[AmplifierStatus]:
-    """Describe all amplifiers by their last statuses, without sending a request.
+    """Describe all amplifiers from their last statuses, without sending a request.
 
     are_open: whether all are open together; otherwise their last statuses are outdated.
     lost: the loss after which the other amplifiers were closed.
@@ -77,7 +77,7 @@ def amplifier_statuses(
 
 
 def _readings(status: Values | None) -> dict[str, Any]:
-    """Return the state and readings of an amplifier's status, by their keys in the API."""
+    """Return the state and readings of an amplifier's status, by API key."""
     readings: dict[str, Any] = {"state": None, "fault": None, "levels": [], "high_voltage": None}
     for reading in READINGS:
         readings[reading.key] = None
@@ -93,7 +93,7 @@ def _readings(status: Values | None) -> dict[str, Any]:
 
 
 def _history(amplifier: Amplifier | None, targets: Sequence[str], now: float) -> dict[str, Any]:
-    """Return identity, reports and statistics of an amplifier, by their keys in the API."""
+    """Return identity, reports and statistics of an amplifier, by API key."""
     serial_number: str | None = None
     reply_age: float | None = None
     reports: list[AmplifierReport] = []

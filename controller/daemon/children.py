@@ -81,7 +81,7 @@ async def keep_gateway(options: list[str]) -> None:
 
 
 _TIMEOUT = 60.0  # s; a plug-in or a lost network folder can hang
-_NICE = 10  # added to that of the daemon, whose loop has priority
+_NICE = 10  # added to the daemon's niceness, so that its loop has priority
 
 
 def read_in_child(file: Path, frequencies: FloatArray) -> DaemonConfig:

@@ -231,7 +231,7 @@ class TouchInputs:
         self._rejects = rejects
         self._changed = changed
         self._sources: dict[TouchInput, TouchSource | str | None] = {}
-        """Source of each input; a text with the reason if it has none; None after its end."""
+        """Source of each input; a text with the reason while it is missing; None after its end."""
         self._running: list[asyncio.Task[None]] = []
         self.event = InputsEvent(inputs=[], rejected_touches={})
         """State of all inputs and rejected touches, at most one second old."""
@@ -313,7 +313,7 @@ class TouchInputs:
 
 
 def _status(touch_input: TouchInput, source: TouchSource | str | None) -> TouchInputStatus:
-    """Describe an input by its source, or by the reason for its missing source."""
+    """Describe an input with its source, or with the reason why the source is missing."""
     state: Literal["open", "mute", "missing", "ended"]
     problem: str | None
     if source is None:

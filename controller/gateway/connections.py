@@ -74,7 +74,7 @@ class RequestInput:
         self._bytes = self._bytes.lstrip(b"\r\n")
 
     def take_head(self) -> bytes:
-        """Take the head of the next request, or the part of it that was received."""
+        """Take the received part of the next request's head."""
         searched = self._head_tail + self._bytes
         end = searched.find(_HEAD_END)
         if end < 0:
@@ -322,7 +322,7 @@ class ClientConnection(asyncio.BufferedProtocol):
             self._hand_on_head()
 
     def _hand_on_head(self) -> None:
-        """Hand on the head of the next request, or the part of it that was received."""
+        """Hand on the received part of the next request's head."""
         head = self._input.take_head()
         self._is_serving = not self._input.is_amid_head
         if self._server is None:

@@ -52,7 +52,7 @@ class FieldSolver:
     def frame(self, layers: Mapping[int, Mapping[str, PlayedTone]]) -> bytes:
         """The complex acceleration of each layer under its drive by ERA, as a frame.
 
-        A field is the vibration of one layer at one frequency. Little-endian: u16 columns, u16
+        A field is the vibration of a layer at a frequency. Little-endian: u16 columns, u16
         rows, u16 fields, u16 zero; f32 scale [m/s²]; per field f32 frequency [Hz]; per field f32
         detection threshold [m/s²]; per field u16 layer; then, per field, row from the south and
         column from the west, real and imaginary part as i16, where 32767 is the scale. Raises

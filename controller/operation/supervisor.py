@@ -6,8 +6,8 @@ come before observers, which are called a moment later, each guarded (`DeferredC
 
 Actions run in tasks (`_spawn`), which nothing cancels: a caller that is cancelled, such as the
 request of a client that has left, stops waiting, and the task goes on to its end. `run` waits for
-all tasks before it returns. A stop waits for none of them: its requests to the amplifiers are
-queued before the operation changes and before any task begins.
+all tasks before it returns. A stop does not wait for these tasks: its requests to the amplifiers
+are queued before the operation changes and before any task begins.
 
 The supervisor also runs the control loop, polls disarmed amplifiers, and opens lost ones again.
 """
@@ -430,7 +430,7 @@ class Supervisor:
             await self._pause(pause)
         while self.assume_energised(threads.now()) and not self.closing.is_set():
             await self._pause(_RECHECK)
-            await self.controller.group.statuses()  # loud amplifiers can be silent by now
+            await self.controller.group.statuses()  # a loud amplifier can have become silent
         if self.controller.group.is_open:  # no further loss
             await self.handle(DaemonEvent(Trigger.RECONNECTED))
 

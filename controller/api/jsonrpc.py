@@ -93,7 +93,7 @@ class NotSilent(RpcError):
     """A stop after which an amplifier is not confirmed silent; amplifiers: all, by name."""
 
     def __init__(self, amplifiers: Mapping[str, AmplifierSilence]) -> None:
-        unconfirmed: list[str] = []
+        unconfirmed = []
         for name, amplifier in amplifiers.items():
             if amplifier.silence != "confirmed_silent":
                 unconfirmed.append(f"{name} ({amplifier.words}: {amplifier.cause})")
@@ -231,7 +231,7 @@ def read_error(error: Mapping[str, Any]) -> RpcError:
     data = error.get("data") or {}
     code = ErrorCode(error["code"])
     if code is ErrorCode.NOT_SILENT:
-        amplifiers: dict[str, AmplifierSilence] = {}
+        amplifiers = {}
         for name, silence in data["amplifiers"].items():
             amplifiers[name] = AmplifierSilence.model_validate(silence, extra="ignore")
         return NotSilent(amplifiers)
@@ -258,7 +258,7 @@ def parse_json(line: bytes) -> Any:
         raise InvalidRequest(
             ErrorCode.PARSE, "too many keys or values", remedy="send fewer touches per frame"
         )
-    problems: list[str] = []
+    problems = []
 
     def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
         content = dict(pairs)

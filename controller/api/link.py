@@ -155,7 +155,7 @@ def touches_at(positions: Iterable[tuple[float, float]]) -> list[TouchPoint]:
         raise InputError(
             f"touch: positions must be a list of x, y in metres, got {shown(positions)}"
         )
-    points: list[TouchPoint] = []
+    points = []
     for number, position in enumerate(positions, start=1):
         x, y = as_position(position)
         points.append(TouchPoint(id=number, x_m=x, y_m=y, radius_m=None))

@@ -8,7 +8,7 @@ error; the error is reported afterwards.
 import re
 from collections.abc import Mapping
 from contextlib import suppress
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from controller.api.jsonrpc import parse_json
 from controller.api.methods import METHODS
@@ -59,7 +59,7 @@ def _search(text: bytes) -> SilencingRequest | None:
 def readable_params(method: str, content: object) -> ApiMessage:
     """Return the parameters of a method that silences, with defaults for invalid ones."""
     model = METHODS[method].params
-    params: dict[str, Any] = {}
+    params = {}
     if isinstance(content, Mapping):
         for name in model.model_fields.keys() & content.keys():
             with suppress(Exception):  # any error: use the default

@@ -159,7 +159,7 @@ class _Commands(TyperGroup):
     def sections(self) -> dict[str, list[str]]:
         """Names by the title of their section."""
         remaining = set(self.commands)
-        sections: dict[str, list[str]] = {}
+        sections = {}
         for title, names in SECTIONS.items():
             sections[title] = [name for name in names if name in self.commands]
             remaining.difference_update(names)
@@ -178,7 +178,7 @@ class _Commands(TyperGroup):
         width = max(len(name) for name in self.commands)
         limit = formatter.width - width - 6
         for title, names in self.sections().items():
-            rows: list[tuple[str, str]] = []
+            rows = []
             for name in names:
                 summary = self.commands[name].get_short_help_str(limit)
                 rows.append((name.ljust(width), summary))

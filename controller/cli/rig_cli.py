@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from model.estimate.identify import Identification
     from model.estimate.measurement import MeasuredPlate, Measurement
     from model.rig.rig import Rig
-    from model.study.expected_contrast import ExpectedContrast
 
 measure_by_card: "Callable[..., MeasuredPlate] | None" = None
 """Measures a plate through a sound card; set by the lab, which implements sound cards."""
@@ -170,7 +169,7 @@ def _identify_measured(
 
     started = time.perf_counter()
     identification = _fitted(rig, measured.measurement)
-    expected: list[ExpectedContrast] = []
+    expected = []
     if identification.can_promise:
         expected = expected_contrast(rig, identification.rig, seed=seed)
     rows = [
@@ -180,7 +179,7 @@ def _identify_measured(
         *fit_report.fit_rows(identification),
         *fit_report.contrast_rows(expected),
     ]
-    files: list[str] = []
+    files = []
     refusal: str | None = None
     if identification.is_explained:
         comment = [f"{rig_file.name} identified in place by `era rig identify`:", *rows]
@@ -229,7 +228,7 @@ def _read_measured_plate(path: Path, rig: "Rig") -> "MeasuredPlate":
     measurement = measurement_of(read_measured(path), rig)
     screened = check_consistency(rig, measurement)
     live = screened.live(measurement)
-    sensors: list[dict[str, Any]] = []
+    sensors = []
     for sensor in live.sensors:
         mass_g = 1e3 * sensor.mass
         sensors.append({"sensor": sensor.name, "x_m": sensor.x, "y_m": sensor.y, "mass_g": mass_g})
@@ -309,7 +308,7 @@ def show(
     assert rig.document.over is not None  # noqa: S101  there are rows
     base = str(rig.document.over.data["base"])
     table = [("", base, fitted.name, "standard error")]
-    changes: list[dict[str, Any]] = []
+    changes = []
     for key, base_value, value, error in fitted_values:
         error_text = "" if error is None else f"± {error:.3g}"
         base_text = _value_text(base_value, default="-")
@@ -322,7 +321,7 @@ def _aligned(table: Sequence[Sequence[str]]) -> list[str]:
     """Return the lines of a table, with each column as wide as its widest cell."""
     columns = zip(*table, strict=True)
     widths = [max(map(len, column)) for column in columns]
-    lines: list[str] = []
+    lines = []
     for row in table:
         cells = [cell.ljust(width) for cell, width in zip(row, widths, strict=True)]
         lines.append("  ".join(cells).rstrip())

@@ -43,7 +43,7 @@ def amplifier_statuses(
     targets: the fingers that currently feel something.
     """
     now = threads.now()
-    statuses: list[AmplifierStatus] = []
+    statuses = []
     for name, url in urls.items():
         amplifier = amplifiers.get(name)
         status: Values | None = None
@@ -96,7 +96,7 @@ def _history(amplifier: Amplifier | None, targets: Sequence[str], now: float) ->
     """Return identity, reports and statistics of an amplifier, by API key."""
     serial_number: str | None = None
     reply_age: float | None = None
-    reports: list[AmplifierReport] = []
+    reports = []
     statistics = LinkStatistics()
     if amplifier is not None:
         serial_number = amplifier.identity.get("serial_number")
@@ -106,7 +106,7 @@ def _history(amplifier: Amplifier | None, targets: Sequence[str], now: float) ->
         for kind, reported_at in amplifier.reported_at.items():
             if reported_at > now - REPORT_LIFE:
                 reports.append(_report(kind, targets))
-    counts: dict[str, Any] = {}
+    counts = {}
     for key in LinkCounters.model_fields.keys() - {"round_trip_ms"}:
         counts[key] = getattr(statistics, key)
     round_trip_ms = in_milliseconds(statistics.last_round_trip)

@@ -157,7 +157,7 @@ class DaemonConfig:
 
     def for_table(self, frequencies: FloatArray) -> Self:
         """Return a copy whose layouts are rendered for the frequencies of a table [Hz]."""
-        layouts: dict[str | None, SurfaceLayout] = {}
+        layouts = {}
         for name, layout in self.layouts.items():
             layouts[name] = layout.for_table(frequencies)
         return replace(self, layouts=layouts)
@@ -315,7 +315,7 @@ def _touch(
     entries = document.data.get("touch")
     if not isinstance(entries, list):
         return ()
-    inputs: dict[str, TouchInput] = {}
+    inputs = {}
     for number, entry in enumerate(entries):
         try:
             section = TouchSection.model_validate(entry)
@@ -349,7 +349,7 @@ def _calibration(section: CalibrationSection, rig: Rig | None) -> TouchCalibrati
     if section.points is None or rig is None:  # an invalid rig is already reported
         return turned(section.turned, mirror=section.mirror)
     plate = rig.plate
-    shown_positions: list[tuple[float, float]] = []
+    shown_positions = []
     for point in section.points:
         x, y = point.shown
         shown_positions.append((x / plate.length, 1 - y / plate.width))

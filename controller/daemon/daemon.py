@@ -266,7 +266,7 @@ class Daemon:
 
     async def _read_again(self) -> ConfigChange:
         """Read the configuration again in a thread, which keeps no reference to either one."""
-        changes: list[ConfigChange] = []
+        changes = []
 
         def read() -> None:
             changes.append(read_again(self.config, self._frequencies))

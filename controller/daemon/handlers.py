@@ -549,7 +549,7 @@ async def _silence(stopping: Awaitable[Mapping[str, StopOutcome]], epoch: int) -
     """Await a stop of an epoch; raises NotSilent unless every amplifier is confirmed silent."""
     outcomes = await stopping
     now = threads.now()
-    amplifiers: dict[str, AmplifierSilence] = {}
+    amplifiers = {}
     is_silent = len(outcomes) > 0
     for name, outcome in outcomes.items():
         amplifiers[name] = AmplifierSilence(**outcome.rows(now))

@@ -94,7 +94,7 @@ def config_change(old: DaemonConfig, new: DaemonConfig) -> ConfigChange:
     if old.rig_text != new.rig_text and "rig" not in restart:
         restart.append("rig")
     changed: set[str | None] = set()
-    changes: list[str] = []
+    changes = []
     for name in {**old.layouts, **new.layouts}:
         if old.layouts.get(name) == new.layouts.get(name):
             continue

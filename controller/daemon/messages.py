@@ -225,7 +225,7 @@ def hello_result(
 ) -> HelloResult:
     """Describe rig, table and layout of the daemon."""
     rig = config.rig
-    eras: list[EraPosition] = []
+    eras = []
     for era in rig.eras:
         channel = rig.wiring[era.name]
         eras.append(
@@ -238,7 +238,7 @@ def hello_result(
             )
         )
     products = [amplifier.identity.get("product", "") for amplifier in amplifiers.values()]
-    readings: dict[str, tuple[str, str, int]] = {}
+    readings = {}
     for reading in READINGS:
         if "page" in reading.views:
             label = reading.label.capitalize()
@@ -268,7 +268,7 @@ def hello_result(
 
 def effects_result(layout: SurfaceLayout) -> EffectsResult:
     """Describe the effects of a layout that can be requested by name."""
-    descriptions: list[EffectDescription] = []
+    descriptions = []
     for name, effect in sorted(layout.effects.items()):
         summary, _, _ = (type(effect).__doc__ or "").partition("\n")
         descriptions.append(

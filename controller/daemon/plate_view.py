@@ -45,7 +45,7 @@ class PlateView:
         """Why nothing plays for the current contacts; None while a pattern plays."""
         if self.applied is not None:
             return None
-        reasons: list[str] = []
+        reasons = []
         for contact in self.contact_statuses():
             if contact.held_back and contact.held_back not in reasons:
                 reasons.append(contact.held_back)
@@ -58,7 +58,7 @@ class PlateView:
             return statuses
         contents = [slot.content for slot in self.applied.contents.values() if slot.drive]
         leaks = leaks_db_sl(table, contents, self.contacts)
-        current_statuses: list[ContactStatus] = []
+        current_statuses = []
         for status, contact in zip(statuses, self.contacts, strict=True):
             leak = {"leak_db_sl": _finite(leaks[contact.key])}
             current_statuses.append(status.model_copy(update=leak))
@@ -141,7 +141,7 @@ def _is_same(reported: Contact, contact: Contact) -> bool:
 
 def _sensation_of(contact: Contact, report: PlayReport) -> dict[str, object]:
     """Return the role and figures of a contact in a report, by the keys of its status."""
-    figures: dict[str, object] = {}
+    figures = {}
     for target in report.targets:
         if _is_same(target.contact, contact):
             figures = {"role": "target", **_figures(target)}
@@ -198,7 +198,7 @@ def playing_of(applied: PlayReport | None) -> dict[str, Any]:
 
 def _played_tones(drive: Drive) -> dict[str, PlayedTone]:
     """Describe the tones of a layer by ERA."""
-    tones: dict[str, PlayedTone] = {}
+    tones = {}
     for era, tone in drive.items():
         tones[era] = PlayedTone(frequency_hz=tone.frequency, level=tone.level, phase_deg=tone.phase)
     return tones

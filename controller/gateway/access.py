@@ -112,7 +112,7 @@ class Access:
         return (is_method or is_remote) and request.method != "OPTIONS"
 
     def _has_token(self, request: web.Request) -> bool:
-        tokens: list[str] = []
+        tokens = []
         for value in request.headers.getall("Authorization", []):
             if value.startswith("Bearer "):
                 tokens.append(value.removeprefix("Bearer "))

@@ -15,7 +15,7 @@ import socket
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from aiohttp import HttpVersion11, WSCloseCode, web
 from aiohttp.http import HttpProcessingError
@@ -115,13 +115,13 @@ def openapi() -> dict[str, Any]:
     for method in HTTP_METHODS.values():
         params.add(method.params)
         results.add(method.result)
-    models: list[tuple[type[ApiMessage], Literal["validation", "serialization"]]] = []
+    models = []
     models += [(model, "validation") for model in sorted(params, key=repr)]
     models += [(model, "serialization") for model in sorted(results, key=repr)]
     references, definitions = models_json_schema(
         models, ref_template="#/components/schemas/{model}"
     )
-    paths: dict[str, Any] = {}
+    paths = {}
     for name, method in HTTP_METHODS.items():
         paths[f"/api/v1/{name}"] = {"post": _operation(name, method, references)}
     return {

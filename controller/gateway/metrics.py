@@ -78,7 +78,7 @@ class _Families(Collector):
         """Add a histogram in seconds, without its unknown sum."""
         if latency is None:
             return
-        buckets: list[tuple[str, float]] = []
+        buckets = []
         total = 0
         for edge_ms, count in latency.histogram:
             total += count

@@ -143,7 +143,7 @@ class Controller:
             cycle.group = Group(self._opened, watchdog=self.watchdog, restored=cycle.feed_at_once)
         opening = [self._amplifier(lines, name) for name in self.urls]
         results = await asyncio.gather(*opening, return_exceptions=True)
-        errors: dict[str, LinkError] = {}
+        errors = {}
         for name, result in zip(self.urls, results, strict=True):
             if isinstance(result, LinkError):
                 errors[name] = result

@@ -5,7 +5,7 @@ A metric without a known value is left out.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from typing import TypeAlias, get_args
+from typing import Any, TypeAlias, get_args
 
 from prometheus_client import generate_latest
 from prometheus_client.core import (
@@ -36,8 +36,19 @@ _LINK_COUNTERS = {
     "refusals": "Requests refused by an amplifier.",
 }
 
-_Labelled: TypeAlias = Mapping[tuple[str, ...], float | None]
-"""Values of a metric by label values."""
+_AMPLIFIER_GAUGES = {
+    "degraded": "Whether the amplifier does not reply but may still play.",
+    "lost": "Whether the link to the amplifier is lost.",
+    "fault": "Whether the amplifier reports a fault.",
+    "high_voltage": "Whether high voltage is on.",
+    **{item.metric: f"{item.label.capitalize()} {item.meaning}." for item in READINGS},
+    "reply_age_seconds": "Time since the last reply.",
+    "clock_skew_seconds": "RMS error of the amplifier's clock relative to the others.",
+    "round_trip_seconds": "Time from the last request to its reply.",
+}
+
+_Labelled: TypeAlias = Mapping[Any, float | None]
+"""Values of a metric, by the tuple of its label values."""
 
 
 def exposition(status: StatusResult | None) -> bytes:
@@ -98,7 +109,7 @@ class _Families(Collector):
 
 def _add_state(families: _Families, status: StatusResult) -> None:
     """Add the state of the daemon, its fingers, layouts and touch inputs."""
-    states: _Labelled = {(state,): state == status.state for state in get_args(DaemonStateName)}
+    states = {(state,): state == status.state for state in get_args(DaemonStateName)}
     families.gauges("state", "1 for the current state.", ("state",), states)
     is_armed = status.armed_by is not None
     families.gauge("armed", "Whether a client holds the lease.", is_armed)
@@ -124,9 +135,9 @@ def _add_state(families: _Families, status: StatusResult) -> None:
         "Predicted level at the target.",
         status.predicted_level_db_sl,
     )
-    layouts: _Labelled = {(name,): name == status.layout for name in status.layouts}
+    layouts = {(name,): name == status.layout for name in status.layouts}
     families.gauges("layout", "1 for the layout in use.", ("layout",), layouts)
-    open_inputs: _Labelled = {(source.name,): source.state == "open" for source in status.inputs}
+    open_inputs = {(source.name,): source.state == "open" for source in status.inputs}
     families.gauges(
         "touch_input_open", "Whether the input can deliver touches.", ("input",), open_inputs
     )
@@ -134,7 +145,7 @@ def _add_state(families: _Families, status: StatusResult) -> None:
 
 def _add_amplifiers(families: _Families, amplifiers: Sequence[AmplifierStatus]) -> None:
     """Add the reports and readings of amplifiers."""
-    reports: dict[tuple[str, ...], float] = {}
+    reports = {}
     for amplifier in amplifiers:
         reported = [report.kind for report in amplifier.reports]
         for kind in get_args(ReportKind):
@@ -146,50 +157,29 @@ def _add_amplifiers(families: _Families, amplifiers: Sequence[AmplifierStatus]) 
         reports,
     )
     values = {amplifier.name: _amplifier_values(amplifier) for amplifier in amplifiers}
-    for name, meaning in _amplifier_gauges().items():
-        by_amplifier: dict[tuple[str, ...], float | None] = {}
-        for amplifier_name in values:
-            by_amplifier[amplifier_name,] = values[amplifier_name][name]
+    for name, meaning in _AMPLIFIER_GAUGES.items():
+        by_amplifier = {(amplifier,): values[amplifier][name] for amplifier in values}
         families.gauges(f"amplifier_{name}", meaning, ("amplifier",), by_amplifier)
-
-
-def _amplifier_gauges() -> dict[str, str]:
-    """Return the meanings of the gauges of an amplifier, by name."""
-    meanings = {
-        "degraded": "Whether the amplifier does not reply but may still play.",
-        "lost": "Whether the link to the amplifier is lost.",
-        "fault": "Whether the amplifier reports a fault.",
-        "high_voltage": "Whether high voltage is on.",
-    }
-    for reading in READINGS:
-        meanings[reading.metric] = f"{reading.label.capitalize()} {reading.meaning}."
-    meanings["reply_age_seconds"] = "Time since the last reply."
-    meanings["clock_skew_seconds"] = "RMS error of the amplifier's clock relative to the others."
-    meanings["round_trip_seconds"] = "Time from the last request to its reply."
-    return meanings
 
 
 def _amplifier_values(amplifier: AmplifierStatus) -> dict[str, float | None]:
     """Return the values of the gauges of an amplifier, by name."""
-    values = {
+    values: dict[str, float | None] = {
         "degraded": amplifier.degraded,
         "lost": amplifier.lost,
-        "fault": None,
+        "fault": None if amplifier.fault is None else amplifier.fault != "NONE",
         "high_voltage": amplifier.high_voltage,
         "reply_age_seconds": amplifier.reply_age_s,
-        "clock_skew_seconds": None,
-        "round_trip_seconds": None,
+        "clock_skew_seconds": _divided(amplifier.clock_skew_us, 1e6),
+        "round_trip_seconds": _divided(amplifier.statistics.round_trip_ms, 1e3),
     }
-    if amplifier.fault is not None:
-        values["fault"] = amplifier.fault != "NONE"
     for reading in READINGS:
         values[reading.metric] = getattr(amplifier, reading.key)
-    if amplifier.clock_skew_us is not None:
-        values["clock_skew_seconds"] = amplifier.clock_skew_us / 1e6
-    round_trip_ms = amplifier.statistics.round_trip_ms
-    if round_trip_ms is not None:
-        values["round_trip_seconds"] = round_trip_ms / 1e3
     return values
+
+
+def _divided(value: float | None, divisor: float) -> float | None:
+    return None if value is None else value / divisor
 
 
 def _add_counters(families: _Families, status: StatusResult) -> None:
@@ -213,10 +203,11 @@ def _add_counters(families: _Families, status: StatusResult) -> None:
         {(topic,): count for topic, count in status.lost_events.items()},
     )
     for name, meaning in _LINK_COUNTERS.items():
-        by_amplifier: dict[tuple[str, ...], float] = {}
-        for amplifier in status.amplifiers:
-            by_amplifier[amplifier.name,] = getattr(amplifier.statistics, name)
-        families.counters(f"link_{name}", meaning, ("amplifier",), by_amplifier)
+        counts = {
+            (amplifier.name,): getattr(amplifier.statistics, name)
+            for amplifier in status.amplifiers
+        }
+        families.counters(f"link_{name}", meaning, ("amplifier",), counts)
 
 
 def _add_latencies(families: _Families, status: StatusResult) -> None:

@@ -37,8 +37,6 @@ def gateway(
         Path | None,
         typer.Option(help="File (mode 600) with the token (default: a random one)."),
     ] = None,
-    certificate: Annotated[Path | None, typer.Option(hidden=True)] = None,
-    key: Annotated[Path | None, typer.Option(hidden=True)] = None,
     allow_host: Annotated[
         list[str] | None,
         typer.Option(metavar="NAME", help="Additional host name to accept (repeatable)."),
@@ -60,11 +58,6 @@ def gateway(
     from controller.gateway.gateway_settings import GatewaySettings, read_token, require_gateway
 
     require_gateway()
-    if certificate or key:
-        raise InputError(
-            "--certificate and --key are not supported; terminate TLS in a reverse proxy in front "
-            "of a gateway on 127.0.0.1 (docs/how-to/deployment.md)"
-        )
     from controller.api.link import find_socket
     from controller.gateway.app import serve
 

@@ -27,6 +27,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Rectangle
 from matplotlib.patheffects import withStroke
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from model.answer.answer import OWN_CONTRAST_DB, Answer, Layer, Sensation, verdict_shown
 from model.answer.plan import query
@@ -41,7 +42,6 @@ from model.finger import (
     FELT_DB_SL,
     FINGERTIP_RADIUS,
     Grid,
-    scale_in_words,
     sensation_level,
 )
 from model.rig.rig import Rig
@@ -58,6 +58,12 @@ ACTIVE_COLOR = "#d55e00"
 RESTING_COLOR = "white"
 """Colours of ERAs that are driven and of others, which differ in brightness, too."""
 
+PAGE_WIDTH = 8.0
+"""Width of figures with several panels [in]. A page shows it in 700 pixels: 8 pt are 10 pixels."""
+
+SMALL_TEXT, TITLE_TEXT = 8.0, 10.0
+"""Font sizes [pt] of labels and of panel titles."""
+
 POINTS_ALONG = 97
 """Points of a raster along the longer side: on the paper's plate 60 per shortest wave."""
 
@@ -69,9 +75,9 @@ def raster(plate: Plate) -> tuple[int, int]:
 
 
 def draw_eras(
-    axes: Axes, eras: Sequence[Source], *, active: Collection[str], size: float = 9
+    axes: Axes, eras: Sequence[Source], *, active: Collection[str], size: float = 8
 ) -> None:
-    """Mark ERAs: orange with a white rim if driven, white with a black rim if not.
+    """Mark ERAs by squares: orange with a white rim if driven, white with a black rim if not.
 
     The axes are in centimetres, the size is in points.
     """
@@ -80,7 +86,7 @@ def draw_eras(
         color = ACTIVE_COLOR if is_active else RESTING_COLOR
         rim = "white" if is_active else "black"
         position = (100 * era.x, 100 * era.y)
-        axes.plot(*position, "o", ms=size, color=color, mec=rim, mew=1.5, clip_on=False)
+        axes.plot(*position, "s", ms=size, color=color, mec=rim, mew=1.2, clip_on=False)
 
 
 @dataclass(frozen=True)
@@ -93,15 +99,19 @@ class MapPanel:
     active: Collection[str]
 
 
+_MARKS = "Squares: ERAs (orange: driven). White lines: a tenth of the map's maximum."
+
+
 def maps_figure(panels: Sequence[MapPanel], *, columns: int, caption: str | None = None) -> Figure:
     """Draw maps side by side on one colour scale in g (1 g = 9.8 m/s²), with ERAs.
 
     White lines surround nulls: there the plate moves a tenth of the map's maximum.
     """
     rows = -(-len(panels) // columns)
-    width = 7.0 if columns == 1 else 3.6 * columns + 1
+    width = 6.6 if columns == 1 else PAGE_WIDTH
+    panel_width = (width - 1.6) / columns
     ratio = panels[0].plate_map.y[-1] / panels[0].plate_map.x[-1]
-    height = rows * (0.8 * width / columns * ratio + 0.8) + (0.5 if caption else 0.1)
+    height = rows * (panel_width * ratio + 0.32) + (0.9 if caption else 0.8)
     # A constrained layout would leave gaps between maps of fixed aspect.
     figure = Figure(figsize=(width, height), layout="compressed")
     grid = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
@@ -113,10 +123,10 @@ def maps_figure(panels: Sequence[MapPanel], *, columns: int, caption: str | None
         label_plate(axes)
         _draw_nulls(axes, solved)
         draw_eras(axes, panel.eras, active=panel.active)
-        axes.set_title(panel.title)
+        axes.set_title(panel.title, fontsize=TITLE_TEXT, wrap=True)
         axes.label_outer()
-    label = "peak acceleration / g\nwhite lines: a tenth of the map's maximum"
-    figure.colorbar(image, ax=grid, label=label)
+    figure.colorbar(image, ax=grid, label="peak acceleration / g")
+    figure.supxlabel(_MARKS, fontsize=SMALL_TEXT, wrap=True)
     if caption:
         figure.suptitle(caption)
     return figure
@@ -137,11 +147,37 @@ def map_figure(rig: Rig, plate_map: PlateMap, *, active: Collection[str], title:
     return maps_figure([MapPanel(title, plate_map, rig.eras, active)], columns=1)
 
 
+_MAX_NAMED = 4  # ERAs named in a title
+
+
+def drive_title(excitation: Excitation, rig: Rig) -> str:
+    """Describe the tones of up to four ERAs, or the number of ERAs and their frequencies.
+
+    Full amplitude and phase zero are not mentioned.
+    """
+    frequencies = sorted({tone.frequency for tone in excitation.values()})
+    if len(excitation) > _MAX_NAMED:
+        band = " to ".join(f"{end:g}" for end in dict.fromkeys((frequencies[0], frequencies[-1])))
+        return f"{len(excitation)} ERAs at {band} Hz"
+    full_levels = {era.name: era.full_level for era in rig.eras}
+    tones = []
+    for name, tone in excitation.items():
+        words = f"{name} at {tone.frequency:g} Hz"
+        level = tone.amplitude / full_levels[name]
+        if not math.isclose(level, 1.0, rel_tol=1e-6):
+            words += f", {100 * level:.3g} % amplitude"
+        if tone.phase:
+            words += f", phase {math.degrees(tone.phase):.3g}°"
+        tones.append(words)
+    return "; ".join(tones)
+
+
 def label_plate(axes: Axes) -> None:
     """Label axes in centimetres, of equal scale."""
     axes.set_aspect("equal")
-    axes.set_xlabel("x / cm")
-    axes.set_ylabel("y / cm")
+    axes.tick_params(labelsize=SMALL_TEXT)
+    axes.set_xlabel("x / cm", fontsize=SMALL_TEXT)
+    axes.set_ylabel("y / cm", fontsize=SMALL_TEXT)
 
 
 DPI = 150
@@ -160,47 +196,57 @@ def save_figure(figure: Figure, path: Path, *, inches: tuple[float, float] | Non
     if inches is not None:
         figure.set_size_inches(inches)
     ending = path.suffix.lower()
+    options: dict[str, Any] = {"metadata": _UNDATED.get(ending)}
+    if ending == ".png":
+        options["pil_kwargs"] = {"optimize": True}  # smaller files
     with whole_or_nothing(path) as stream, rc_context({"svg.hashsalt": "era"}):
-        figure.savefig(stream, dpi=DPI, format=ending[1:], metadata=_UNDATED.get(ending))
+        figure.savefig(stream, dpi=DPI, format=ending[1:], **options)
 
 
-_ROWS = 2  # of sensors
+_ROWS, _MAX_COLUMNS = 2, 4  # of panels: sensors and ERAs
 
 
 def calibration_figure(calibration: Calibration) -> Figure:
     """Draw magnitudes over frequency, a panel for each of up to eight pairs of ERA and sensor."""
-    eras = [
+    measured_eras = [
         number
         for number, era in enumerate(calibration.rig.eras)
         if era.name not in calibration.dead_eras
         and np.isfinite(calibration.measured[:, :, number]).any()
-    ][:4]
-    sensors = np.linspace(0, len(calibration.measurement.names) - 1, _ROWS).round().astype(int)
-    figure = Figure(figsize=(3.2 * len(eras), 2.6 * _ROWS + 0.6), layout="constrained")
-    axes = figure.subplots(_ROWS, len(eras), sharex=True, sharey=True, squeeze=False)
-    size = 1e-6  # m, base displacement
+    ]
+    eras = measured_eras[:_MAX_COLUMNS]
+    last_sensor = len(calibration.measurement.names) - 1
+    sensors = np.linspace(0, last_sensor, _ROWS).round().astype(int)
+    width = max(PAGE_WIDTH * len(eras) / _MAX_COLUMNS, PAGE_WIDTH / 2)
+    figure = Figure(figsize=(width, 4.4), layout="constrained")
+    grid = figure.subplots(_ROWS, len(eras), sharex=True, sharey=True, squeeze=False)
     for row, sensor in enumerate(sensors):
         for column, era in enumerate(eras):
-            axis = axes[row, column]
-            for label, values, style in (
-                ("rig file", calibration.before, {"color": "0.6", "linewidth": 1.2}),
-                ("calibrated", calibration.after, {"color": "C0", "linewidth": 1.4}),
-                ("measured", calibration.measured, {"color": "C3", "marker": ".", "ls": "none"}),
-            ):
-                magnitude = size * np.abs(values[:, sensor, era])
-                axis.semilogy(calibration.measurement.frequencies, magnitude, label=label, **style)
-            axis.set_title(
-                f"{calibration.rig.eras[era].name} to {calibration.measurement.names[sensor]}",
-                fontsize=9,
-            )
-            axis.grid(True, which="both", alpha=0.2)
-    for axis in axes[-1]:
-        axis.set_xlabel("frequency / Hz")
-    for axis in axes[:, 0]:
-        axis.set_ylabel("response / (m/s² per µm)")
-    handles, labels = axes[0, 0].get_legend_handles_labels()
+            _draw_responses(grid[row, column], calibration, sensor=sensor, era=era)
+    figure.supxlabel("frequency / Hz", fontsize=TITLE_TEXT)
+    figure.supylabel("response / (m/s² per µm)", fontsize=TITLE_TEXT)
+    handles, labels = grid[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside upper center", ncols=3, fontsize=9)
     return figure
+
+
+def _draw_responses(axes: Axes, calibration: Calibration, *, sensor: int, era: int) -> None:
+    """Draw the responses of one sensor to one ERA: rig file, calibrated rig and measurement."""
+    base_displacement = 1e-6  # m
+    curves: tuple[tuple[str, NDArray[Any], dict[str, Any]], ...] = (
+        ("rig file", calibration.before, {"color": "0.55", "lw": 1.0, "ls": "--"}),
+        ("calibrated rig", calibration.after, {"color": "#0072b2", "lw": 1.2}),
+        ("measured", calibration.measured, {"color": "#d55e00", "marker": ".", "ls": "none"}),
+    )
+    frequencies = calibration.measurement.frequencies
+    for label, responses, style in curves:
+        magnitude = base_displacement * np.abs(responses[:, sensor, era])
+        axes.semilogy(frequencies, magnitude, label=label, ms=4, **style)
+    era_name = calibration.rig.eras[era].name
+    sensor_name = calibration.measurement.names[sensor]
+    axes.set_title(f"ERA {era_name}, sensor {sensor_name}", fontsize=9)
+    axes.tick_params(labelsize=SMALL_TEXT)
+    axes.grid(True, which="both", alpha=0.2)
 
 
 MM_PER_INCH = 25.4
@@ -211,7 +257,8 @@ RULER = 100  # mm
 A4 = (210.0, 297.0), (297.0, 210.0)  # mm; upright and across
 NOT_PRINTED = 8.0  # mm; edges of a page that printers leave white
 CROSS = 6.0  # mm; half its size
-LETTER, LINE = 1.6, 3.2  # mm, of labels
+LABEL = 8.0  # pt; font size on A4, larger on larger sheets
+LETTER, LINE = 1.8, 3.6  # mm; width of a letter and height of a line of this size
 GRAIN = 40.0  # mm; length of the arrow
 
 Box = tuple[float, float, float, float]
@@ -251,7 +298,7 @@ class Template:
         """Description of the view."""
         length, width = self.board
         side = "below, for the underside" if self.is_below else "above, for the touched side"
-        return f"{length:g} x {width:g} mm, seen from {side}; places x, y in mm"
+        return f"{length:g} x {width:g} mm, seen from {side}; positions x, y in mm"
 
     def label(self, name: str, at: tuple[float, float]) -> list[str]:
         """Return the lines next to a position: name, output of an actuator, and coordinates."""
@@ -282,7 +329,9 @@ def write_template(path: Path, template: Template) -> int:
     Raises InputError for an ending that no picture has, and OSError.
     """
     if path.suffix.lower() != ".pdf":
-        save_figure(_page(template, template.paper, name="", edge=0.0), path)
+        left, right, _, _ = template.paper
+        scale = max(1.0, (right - left) / A4[0][0])
+        save_figure(_page(template, template.paper, name="", edge=0.0, scale=scale), path)
         return 1
     pages = [*template_pages(template)]
     # Without a date, so that equal rigs make equal bytes.
@@ -313,28 +362,46 @@ def template_pages(template: Template) -> Iterator[Figure]:
         yield _page(template, box, name=name, edge=NOT_PRINTED)
 
 
-def _page(template: Template, box: Box, *, name: str, edge: float) -> Figure:
-    """Draw a box of the board and the strip below it, within a white edge [mm]."""
+def _page(template: Template, box: Box, *, name: str, edge: float, scale: float = 1.0) -> Figure:
+    """Draw a box of the board and the strip below it, within a white edge [mm].
+
+    scale: of the text; that of a large sheet is also read on a screen.
+    """
     low, high, bottom, top = box
-    width, height = high - low + 2 * edge, top - bottom + edge + STRIP
+    strip_height = STRIP * scale
+    width, height = high - low + 2 * edge, top - bottom + edge + strip_height
     figure = Figure(figsize=(width / MM_PER_INCH, height / MM_PER_INCH))
-    area = edge / width, STRIP / height, (high - low) / width, (top - bottom) / height
+    area = edge / width, strip_height / height, (high - low) / width, (top - bottom) / height
     axes = figure.add_axes(area)
-    _draw(axes, template, box)
+    _draw(axes, template, box, scale=scale)
     if name:
         axes.add_patch(Rectangle((0, 0), 1, 1, transform=axes.transAxes, fill=False, lw=0.3))
-    strip = figure.add_axes((0, 0, 1, STRIP / height), xlim=(0, width), ylim=(0, STRIP))
-    strip.set_axis_off()
-    for tick in range(0, RULER + 1, 10):
-        strip.plot([BORDER + tick] * 2, [12, 17 if tick % 50 == 0 else 15], c="black", lw=0.5)
-    strip.plot([BORDER, BORDER + RULER], [12, 12], c="black", lw=0.5, gid="ruler")
-    strip.text(BORDER, 7, template.title, size=8)
-    strip.text(BORDER, 3, f"{RULER} mm on paper, or print again at 100 %{name}", size=8)
+    _draw_strip(figure, template, (width, height), name=name, scale=scale)
     return figure
 
 
-def _draw(axes: Axes, template: Template, box: Box) -> None:
-    """Draw the part of the board in a box, which fills the axes."""
+def _draw_strip(
+    figure: Figure, template: Template, size: tuple[float, float], *, name: str, scale: float
+) -> None:
+    """Draw the ruler and two lines of text below the board; size: of the paper [mm]."""
+    width, height = size
+    strip_height = STRIP * scale
+    strip = figure.add_axes(
+        (0, 0, 1, strip_height / height), xlim=(0, width), ylim=(0, strip_height)
+    )
+    strip.set_axis_off()
+    ruler = 12 * scale
+    for tick in range(0, RULER + 1, 10):
+        length = 5 if tick % 50 == 0 else 3
+        strip.plot([BORDER + tick] * 2, [ruler, ruler + length], c="black", lw=0.5)
+    strip.plot([BORDER, BORDER + RULER], [ruler, ruler], c="black", lw=0.5, gid="ruler")
+    strip.text(BORDER, 7 * scale, template.title, size=LABEL * scale)
+    print_again = f"{RULER} mm on paper, or print again at 100 %{name}"
+    strip.text(BORDER, 3 * scale, print_again, size=LABEL * scale)
+
+
+def _draw(axes: Axes, template: Template, box: Box, *, scale: float) -> None:
+    """Draw the part of the board in a box, which fills the axes; scale: of the text."""
     low, high, bottom, top = box
     length, width = template.board
     axes.set(xlim=(high, low) if template.is_below else (low, high), ylim=(bottom, top))
@@ -347,41 +414,64 @@ def _draw(axes: Axes, template: Template, box: Box) -> None:
         if radius:
             axes.add_patch(Circle((x, y), radius, fill=False, lw=0.7, ls=style, gid=name))
         lines = template.label(name, (x, y))
-        (right, up), away = _beside((x, y), radius, lines, template, box)
+        (right, up), away = _beside((x, y), radius, lines, template, box, scale=scale)
         axes.annotate(
             "\n".join(lines),
             (x, y),
             (right * away / POINT, up * away / POINT),
             textcoords="offset points",
-            size=7,
+            size=LABEL * scale,
             ha="left" if right > 0 else "right",
             va="bottom" if up > 0 else "top",
             annotation_clip=True,
         )
-    if template.grain:  # arrow at the lower end of the visible part of the board
-        dx, dy = (GRAIN / 2 * each for each in template.grain)
-        x, y = (max(low, 0) + min(high, length)) / 2, max(bottom, 0) + CROSS + dy
-        arrow = {"arrowstyle": "<->", "lw": 0.7, "color": "0.6"}
-        axes.annotate("", (x - dx, y - dy), (x + dx, y + dy), arrowprops=arrow)
-        axes.annotate("grain", (x, y), (3, 3), textcoords="offset points", size=8, color="0.6")
-    axes.text(-5, -8, "0, 0", size=8, ha="center", clip_on=True)
+    if template.grain:
+        _draw_grain(axes, template, box, scale=scale)
+    axes.text(-5, -8, "0, 0", size=LABEL * scale, ha="center", va="center", clip_on=True)
     pointing: dict[str, Any] = {"arrowprops": {"arrowstyle": "<-", "lw": 0.5}}
     for name, start, end in (("x", (0, -4), (16, -4)), ("y", (-4, 0), (-4, 16))):
         axes.annotate(
-            name, start, end, size=8, va="center", ha="center", annotation_clip=True, **pointing
+            name,
+            start,
+            end,
+            size=LABEL * scale,
+            va="center",
+            ha="center",
+            annotation_clip=True,
+            **pointing,
         )
 
 
-def _beside(
-    at: tuple[float, float], radius: float, lines: Sequence[str], template: Template, box: Box
-) -> tuple[tuple[int, int], float]:
-    """Where a label is: rightwards and upwards on paper, 1 or -1; its distance [mm].
+def _draw_grain(axes: Axes, template: Template, box: Box, *, scale: float) -> None:
+    """Draw an arrow along the grain at the lower end of the visible part of the board."""
+    assert template.grain is not None  # noqa: S101  the caller has checked
+    low, high, bottom, _ = box
+    dx, dy = (GRAIN / 2 * direction for direction in template.grain)
+    x = (max(low, 0) + min(high, template.board[0])) / 2
+    y = max(bottom, 0) + CROSS + dy
+    arrow = {"arrowstyle": "<->", "lw": 0.7, "color": "0.4"}
+    axes.annotate("", (x - dx, y - dy), (x + dx, y + dy), arrowprops=arrow)
+    axes.annotate(
+        "grain", (x, y), (3, 3), textcoords="offset points", size=LABEL * scale, color="0.4"
+    )
 
-    On the side of the board's middle, unless a frame is there.
+
+def _beside(
+    at: tuple[float, float],
+    radius: float,
+    lines: Sequence[str],
+    template: Template,
+    box: Box,
+    *,
+    scale: float,
+) -> tuple[tuple[int, int], float]:
+    """Return a label's direction, rightwards and upwards on paper (1 or -1), and distance [mm].
+
+    The label is on the side of the board's middle, unless a frame is there.
     """
     (x, y), (low, high, bottom, top) = at, box
     across = -1 if template.is_below else 1
-    wide, tall = LETTER * max(map(len, lines)), LINE * len(lines)
+    wide, tall = scale * LETTER * max(map(len, lines)), scale * LINE * len(lines)
     away = 2 + 0.75 * radius  # mm, beyond the circle
     right = across if x < template.board[0] / 2 else -across
     ways = [*product((right, -right), (1, -1))]
@@ -394,14 +484,15 @@ def _beside(
     return (free or ways)[0], away
 
 
-CONTENT_COLORS = ("#35e07a", "#4f9dff", "#ffa62b", "#ff5fa2")
-"""Colours of contents, in order."""
+CONTENT_COLORS = ("#ffa62b", "#4f9dff", "#35e07a", "#ff5fa2")
+"""Colours of contents, in order; the first two differ most to colour-blind readers."""
 
 BRIGHTEST_DB_SL = 30.0
 """Level from which a colour is at its brightest; the detection threshold is black."""
 
 _GREY = 0.62
 _RADIUS = 100 * FINGERTIP_RADIUS  # cm
+_MIN_PATCH_SHARE = 0.015  # of the plate; smaller patches have no label
 
 
 def contents_figure(
@@ -409,33 +500,36 @@ def contents_figure(
 ) -> Figure:
     """Draw a panel with all contents and one for each, as the table predicts them.
 
-    Verdict, level and contrast are printed next to every finger.
+    Verdict, level and contrast are printed next to every finger, and frequencies in every large
+    patch without its own finger, since colours alone are not enough for every reader.
     """
     count = len(contents)
-    levels = np.array([_levels(table, each) for each in contents])
-    width = 8.4 * (1 + 1 / count)
-    height = 8.4 * table.plate.width / table.plate.length + 1.0
-    figure = Figure(figsize=(width, height), layout="constrained")
+    levels = np.array([_levels(table, layer) for layer in contents])
+    main_width = PAGE_WIDTH / (1 + 1 / count) - 0.4
+    height = main_width * table.plate.width / table.plate.length + 1.1
+    figure = Figure(figsize=(PAGE_WIDTH, height), layout="constrained")
     panels = figure.subplot_mosaic(
         [["all", f"{number}"] for number in range(count)], width_ratios=[count, 1]
     )
-    _draw_contents(panels["all"], table, levels, CONTENT_COLORS, fingers)
-    panels["all"].set_title(
-        "Coloured where a finger feels its own content, grey where contents mix", fontsize=13
+    main = panels["all"]
+    _draw_contents(main, table, levels, CONTENT_COLORS, fingers)
+    main.set_title(
+        "Colour: a finger feels its own content. Grey: contents mix.", fontsize=TITLE_TEXT
     )
     for finger in fingers:
-        _label_finger(panels["all"], finger, contents)
+        _label_finger(main, finger, contents)
+    _label_patches(main, table, levels, contents, fingers)
     for number, layer in enumerate(contents):
         axes = panels[f"{number}"]
-        _draw_contents(
-            axes,
-            table,
-            levels[[number]],
-            [CONTENT_COLORS[number % len(CONTENT_COLORS)]],
-            fingers,
-        )
-        axes.set_title(f"{_frequency(layer)} alone", fontsize=11)
+        color = CONTENT_COLORS[number % len(CONTENT_COLORS)]
+        _draw_contents(axes, table, levels[[number]], [color], fingers)
+        axes.set_title(f"{_frequency(layer)} alone", fontsize=TITLE_TEXT)
         axes.set_axis_off()
+    figure.supxlabel(
+        f"Dotted outlines: {OWN_CONTRAST_DB:g} dB above the others. Black: below the detection "
+        "threshold. Squares: ERAs.",
+        fontsize=SMALL_TEXT,
+    )
     return figure
 
 
@@ -453,6 +547,15 @@ def _levels(table: LocalizationTable, content: Layer) -> FloatArray:
     return sensation_level(*amplitudes, table.threshold).reshape(ny, nx)
 
 
+def _contrasts(levels: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the loudest content's level [dB SL] and its contrast to all others [dB] (ny, nx)."""
+    powers = 10 ** (levels / 10)
+    loudest = powers.max(axis=0)
+    with np.errstate(divide="ignore"):
+        contrast = 10 * np.log10(loudest / (powers.sum(axis=0) - loudest))
+    return 10 * np.log10(loudest), contrast
+
+
 def _draw_contents(
     axes: Axes,
     table: LocalizationTable,
@@ -462,26 +565,73 @@ def _draw_contents(
 ) -> None:
     """Draw fingers, and the loudest content in its colour, which fades to grey near others."""
     plate = table.plate
-    powers = 10 ** (levels / 10)
-    own = powers.max(axis=0)
-    with np.errstate(divide="ignore"):
-        contrast = 10 * np.log10(own / (powers.sum(axis=0) - own))
+    loudest, contrast = _contrasts(levels)
     purity = np.clip(contrast / OWN_CONTRAST_DB, 0, 1)[:, :, None]
-    light = np.clip(10 * np.log10(own) / BRIGHTEST_DB_SL, 0, 1)[:, :, None]
-    color = np.array([to_rgb(each) for each in colors])[powers.argmax(axis=0) % len(colors)]
+    light = np.clip(loudest / BRIGHTEST_DB_SL, 0, 1)[:, :, None]
+    palette = np.array([to_rgb(color) for color in colors])
+    color = palette[levels.argmax(axis=0) % len(colors)]
     axes.imshow(
         light * (purity * color + (1 - purity) * _GREY),
         origin="lower",
         extent=(0.0, 100 * plate.length, 0.0, 100 * plate.width),
         interpolation="bilinear",
     )
-    places = [(100 * era.x, 100 * era.y) for era in table.eras]
-    axes.plot(*zip(*places, strict=True), "o", ms=8, color="0.9", mec="black", clip_on=False)
     label_plate(axes)
+    draw_eras(axes, table.eras, active=(), size=6)
     for finger in fingers:
-        place = 100 * finger.finger.at[0], 100 * finger.finger.at[1]
+        position = _centimetres(finger)
         for width, hue in ((5.5, "white"), (2.6, _color_of(finger))):
-            axes.add_patch(Circle(place, _RADIUS, fill=False, ec=hue, lw=width, clip_on=False))
+            axes.add_patch(Circle(position, _RADIUS, fill=False, ec=hue, lw=width, clip_on=False))
+
+
+def _label_patches(
+    axes: Axes,
+    table: LocalizationTable,
+    levels: FloatArray,
+    contents: Sequence[Layer],
+    fingers: Sequence[Sensation],
+) -> None:
+    """Outline the patches that feel like one content, and write frequencies into large ones.
+
+    A patch with its own finger is not labelled again.
+    """
+    _, rows, columns = levels.shape
+    step_x = 100 * table.plate.length / (columns - 1)
+    step_y = 100 * table.plate.width / (rows - 1)
+    loudest, contrast = _contrasts(levels)
+    extent = (0.0, 100 * table.plate.length, 0.0, 100 * table.plate.width)
+    margin = np.minimum(contrast - OWN_CONTRAST_DB, loudest - FELT_DB_SL)
+    axes.contour(margin, [0.0], extent=extent, colors="white", linewidths=0.9, linestyles=":")
+    is_own = margin >= 0
+    for number, layer in enumerate(contents):
+        patches, count = ndimage.label(is_own & (levels.argmax(axis=0) == number))
+        labelled = {
+            int(patches[round(y / step_y), round(x / step_x)])
+            for x, y in (_centimetres(finger) for finger in fingers if finger.layer == number)
+        }
+        for patch in range(1, count + 1):
+            inside = patches == patch
+            if patch in labelled or inside.mean() < _MIN_PATCH_SHARE:
+                continue
+            # The edge of the plate counts as an edge of the patch.
+            depth = ndimage.distance_transform_edt(np.pad(inside, 1))[1:-1, 1:-1]
+            row, column = np.unravel_index(depth.argmax(), depth.shape)
+            axes.text(
+                column * step_x,
+                row * step_y,
+                _frequency(layer),
+                ha="center",
+                va="center",
+                fontsize=SMALL_TEXT,
+                color="white",
+                path_effects=[withStroke(linewidth=2, foreground="black")],
+            )
+
+
+def _centimetres(finger: Sensation) -> tuple[float, float]:
+    """Return a finger's position in centimetres."""
+    x, y = finger.finger.at
+    return 100 * x, 100 * y
 
 
 def _label_finger(axes: Axes, finger: Sensation, contents: Sequence[Layer]) -> None:
@@ -492,20 +642,20 @@ def _label_finger(axes: Axes, finger: Sensation, contents: Sequence[Layer]) -> N
         lines = [f"{_frequency(contents[finger.layer])}, {words}"]
         figures = {"SL": finger.level_db_sl, "above the others": finger.contrast_db}
         lines += [
-            f"{each:.0f} dB {what}"
-            for what, each in figures.items()
-            if each is not None and math.isfinite(each)
+            f"{level:.0f} dB {reference}"
+            for reference, level in figures.items()
+            if level is not None and math.isfinite(level)
         ]
-    x, y = (100 * value for value in finger.finger.at)
+    x, y = _centimetres(finger)
     is_high = y > sum(axes.get_ylim()) / 2
     axes.annotate(
         "\n".join(lines),
         (x, y - _RADIUS if is_high else y + _RADIUS),
-        xytext=(0, -10 if is_high else 10),
+        xytext=(0, -8 if is_high else 8),
         textcoords="offset points",
         ha="center",
         va="top" if is_high else "bottom",
-        fontsize=11,
+        fontsize=SMALL_TEXT,
         color=_color_of(finger),
         bbox={"fc": "black", "ec": "none", "alpha": 0.75, "boxstyle": "round"},
     )
@@ -533,15 +683,16 @@ def table_figures(table: LocalizationTable, overview: Overview) -> Iterator[tupl
 def weak_cells_figure(table: LocalizationTable, weak: WeakCells) -> Figure:
     """Draw the contrast from each cell to the median other finger, and the tenth percentile."""
     panels = {
-        "median other finger": weak.median_db,
-        "10th percentile of other fingers": weak.tenth_db,
+        "other finger: median position": weak.median_db,
+        "other finger: 10th percentile": weak.tenth_db,
     }
     figure = _cells_figure(
         table, weak.grid, panels, label=_CONTRAST, crossed=(~weak.feasible, weak.weak)
     )
     figure.suptitle(
-        f"Mode {table.drive_mode}: felt contrast from each cell to one other finger\n"
-        f"(crosses: below {WANTED_CONTRAST_DB:g} dB; dots: ERAs)"
+        f"Drive mode {table.drive_mode}: contrast of a target in each cell to one other finger\n"
+        f"(crosses: below {WANTED_CONTRAST_DB:g} dB; squares: ERAs)",
+        fontsize=TITLE_TEXT,
     )
     return figure
 
@@ -550,33 +701,38 @@ def levels_figure(table: LocalizationTable) -> Figure:
     """Draw the highest level at each cell that one or two ERAs can reach."""
     levels = table.available_level_db_sl
     title = (
-        f"Highest level of one or two ERAs at full stroke\n(crosses: dead, below {FELT_DB_SL:g} "
-        "dB SL)"
+        "Highest level of one or two ERAs at full amplitude\n"
+        f"(crosses: below {FELT_DB_SL:g} dB SL; squares: ERAs)"
     )
     dead = levels < FELT_DB_SL
-    label = f"{scale_in_words(table.threshold)} / dB SL"
+    label = level_label(table.threshold)
     return _cells_figure(table, table.grid, {title: levels}, label=label, crossed=(dead,))
+
+
+_LINE_STYLES = ("-", "--", "-.")
 
 
 def contrast_figure(table: LocalizationTable, overview: Overview) -> Figure:
     """Draw the distribution of contrast over contact sets of 1, 2 and 3 other fingers."""
-    figure = Figure(figsize=(7, 4.5), layout="constrained")
+    figure = Figure(figsize=(5.9, 3.8), layout="constrained")
     axes = figure.subplots()
     for others, (promised, _) in enumerate(overview.contrasts, start=1):
         contrasts = np.sort(promised)
         share = 1 - np.arange(len(contrasts)) / max(1, len(contrasts))
-        label = f"{others} other{'s' if others > 1 else ''}"
+        label = f"{others} other finger{'s' if others > 1 else ''}"
         if len(contrasts):
             label += f": median {np.median(contrasts):.1f} dB"
-        axes.step(contrasts, 100 * share, where="pre", label=label)
-    axes.axvline(WANTED_CONTRAST_DB, color="0.5", ls=":", lw=1)
+        style = _LINE_STYLES[(others - 1) % len(_LINE_STYLES)]
+        axes.step(contrasts, 100 * share, where="pre", ls=style, lw=1.8, label=label)
+    axes.axvline(WANTED_CONTRAST_DB, color="0.4", ls=":", lw=1.2)
+    axes.text(WANTED_CONTRAST_DB + 0.2, 96, f"{WANTED_CONTRAST_DB:g} dB", color="0.3", fontsize=9)
     axes.set_xlim(left=0)
     axes.set_ylim(0, 100)
     axes.set_xlabel(_CONTRAST)
     axes.set_ylabel("contact sets with at least this contrast / %")
     axes.grid(color="0.9")
-    figure.legend(loc="outside lower center", ncols=3, fontsize=9, frameon=False)
-    axes.set_title(f"Mode {table.drive_mode}: contacts at least 5 cm apart")
+    axes.legend(loc="upper right", fontsize=9)
+    axes.set_title(f"Drive mode {table.drive_mode}: contacts at least 5 cm apart", fontsize=11)
     return figure
 
 
@@ -603,7 +759,9 @@ def _cells_figure(
     crossed: of each panel the cells with crosses.
     """
     count = len(panels)
-    figure = Figure(figsize=(5.2 * count + 1.5, 4.8), layout="compressed")
+    width = 6.2 if count == 1 else 7.2
+    ratio = table.plate.width / table.plate.length
+    figure = Figure(figsize=(width, (width - 1.6) / count * ratio + 1.2), layout="compressed")
     known = np.concatenate([values[np.isfinite(values)] for values in panels.values()])
     limits = (float(known.min()), float(known.max())) if len(known) else (0.0, 1.0)
     x = np.linspace(0, 100 * table.plate.length, grid.nx + 1)
@@ -615,11 +773,12 @@ def _cells_figure(
         axes.add_patch(Rectangle((0, 0), x[-1], y[-1], fill=False, ec="0.4", clip_on=False))
         draw_eras(axes, table.eras, active=[era.name for era in table.eras])
         label_plate(axes)
-        axes.set_title(title)
+        axes.set_title(title, fontsize=TITLE_TEXT)
         axes.label_outer()
+    rim = [withStroke(linewidth=3, foreground="black")]  # white alone is lost on yellow
     for axes, cells in zip(drawn, crossed, strict=False):
         marked = 100 * grid.centres(table.plate)[cells]
-        axes.plot(*marked.T, "x", color="white", ms=6, mew=1.5)
+        axes.plot(*marked.T, "x", color="white", ms=6, mew=1.5, path_effects=rim)
     figure.colorbar(image, ax=list(drawn), label=label)
     return figure
 
@@ -633,7 +792,7 @@ def answer_figure(table: LocalizationTable) -> Figure:
         answer = query(table, Placement((target,), tuple(quiet)))
     if answer is None or not answer.is_reached:  # weak rig
         figure = Figure(figsize=(6.6, 5))
-        figure.suptitle("The table has no answer to the three fingers of this picture")
+        figure.suptitle("The table has no answer for the three fingers of this picture")
         return figure
     figure, felt = layer_figure(table, answer, 0), answer.fingers[0]
     figure.axes[0].set_title(
@@ -646,20 +805,23 @@ def answer_figure(table: LocalizationTable) -> Figure:
     return figure
 
 
-def layer_figure(table: LocalizationTable, answer: Answer, number: int) -> Figure:
+def layer_figure(table: LocalizationTable, answer: Answer, layer_number: int) -> Figure:
     """Draw the level of an answer's layer over the plate, the fingers and the promises."""
     figure = Figure(figsize=(6.4, 4.6), layout="constrained")
-    axes, layer = figure.subplots(), answer.layers[number]
+    axes = figure.subplots()
+    layer = answer.layers[layer_number]
     axes.set_axis_off()
     draw_levels(axes, table, layer.excitation)
-    for finger, each in enumerate(answer.fingers):
-        is_felt = finger in layer.fingers
-        level = each.level_db_sl if is_felt else None
-        draw_fingertip(axes, each.finger.at, felt=is_felt, level_db_sl=level)
+    positions = [sensation.finger.at for sensation in answer.fingers]
+    for number, sensation in enumerate(answer.fingers):
+        is_felt = number in layer.fingers
+        level = sensation.level_db_sl if is_felt else None
+        others = [*positions[:number], *positions[number + 1 :]]
+        draw_fingertip(axes, positions[number], felt=is_felt, level_db_sl=level, others=others)
     promised = answer.fingers[layer.fingers[0]].promised_contrast_db
     if promised is not None:
         axes.set_title(
-            f"contrast at least {promised:.0f} dB on 90 % of plates", fontsize=11, pad=20
+            f"contrast of at least {promised:.0f} dB on 90 % of plates", fontsize=11, pad=20
         )
     draw_level_scale(figure, [axes], table.threshold, shrink=0.8)
     return figure
@@ -668,7 +830,7 @@ def layer_figure(table: LocalizationTable, answer: Answer, number: int) -> Figur
 def _in_words(table: LocalizationTable, layer: Layer) -> str:
     """Format up to twelve tones, two per line."""
     tones = [
-        f"{name} {tone['frequency_hz']:g} Hz, level {tone['level']:.3f} at {tone['phase_deg']:.0f}°"
+        f"{name} {tone['frequency_hz']:g} Hz, level {tone['level']:.3f}, {tone['phase_deg']:.0f}°"
         for name, tone in table.drive_of(layer.excitation).items()
     ]
     return "\n".join("; ".join(tones[start : start + 2]) for start in range(0, 12, 2)).strip()
@@ -713,6 +875,11 @@ def draw_levels(axes: Axes, table: LocalizationTable, excitation: Excitation) ->
         )
 
 
+def level_label(threshold: str) -> str:
+    """Return the label of a scale of levels, with the threshold set that they are relative to."""
+    return f"level / dB SL (thresholds: {threshold})"
+
+
 def draw_level_scale(
     figure: Figure, axes: Iterable[Axes], threshold: str, *, shrink: float
 ) -> None:
@@ -723,41 +890,68 @@ def draw_level_scale(
     figure.colorbar(
         ScalarMappable(_SCALE, _LEVEL_COLORS),
         ax=list(axes),
-        label=f"{scale_in_words(threshold)} / dB SL",
+        label=level_label(threshold),
         extend="both",
         shrink=shrink,
     )
 
 
 def draw_fingertip(
-    axes: Axes, place: Point, *, felt: bool, level_db_sl: float | None = None
+    axes: Axes,
+    place: Point,
+    *,
+    felt: bool,
+    level_db_sl: float | None = None,
+    others: Sequence[Point] = (),
 ) -> None:
-    """Draw a target or quiet fingertip at x, y [m], with its level [dB SL]."""
+    """Draw a fingertip at x, y [m], with its level [dB SL]: solid if felt, dashed if quiet.
+
+    others [m]: further fingertips, which the label avoids.
+    """
     x, y = 100 * place[0], 100 * place[1]
     outline = [withStroke(linewidth=2.5, foreground="black", alpha=0.75)]
     color = FELT_COLOR if felt else QUIET_COLOR
-    axes.add_patch(
-        Circle(
-            (x, y),
-            100 * FINGERTIP_RADIUS,
-            fill=False,
-            color=color,
-            lw=2.4 if felt else 1.6,
-            path_effects=outline,
-        )
+    circle = Circle(
+        (x, y),
+        100 * FINGERTIP_RADIUS,
+        fill=False,
+        color=color,
+        lw=2.4 if felt else 1.6,
+        ls="-" if felt else "--",
+        path_effects=outline,
     )
+    axes.add_patch(circle)
     text = "felt" if felt else "quiet"
     if level_db_sl is not None:
         text += f"\n{round(level_db_sl)} dB SL"
+    side = _label_side(axes, place, others)
     axes.annotate(
         text,
-        (x, y),
-        xytext=(0, -25 if y > 5 else 25),
+        (x, y + side * 100 * FINGERTIP_RADIUS),
+        xytext=(0, 2 * side),
         textcoords="offset points",
         ha="center",
-        va="center",
-        fontsize=8.5,
+        va="bottom" if side > 0 else "top",
+        fontsize=SMALL_TEXT,
         color=color,
         fontweight="bold" if felt else "normal",
         path_effects=outline,
     )
+
+
+_LABEL_SHARE = 0.3  # of the plate's width; room for a label
+
+
+def _label_side(axes: Axes, place: Point, others: Sequence[Point]) -> int:
+    """Return whether a fingertip's label is above (1) or below (-1) it.
+
+    Away from the nearest other fingertip, but on the plate.
+    """
+    low, high = axes.get_ylim()  # cm
+    height = (100 * place[1] - low) / (high - low)
+    if height < _LABEL_SHARE:
+        return 1
+    if height > 1 - _LABEL_SHARE:
+        return -1
+    nearest = min(others, key=lambda other: math.dist(place, other), default=None)
+    return 1 if nearest is not None and nearest[1] < place[1] else -1

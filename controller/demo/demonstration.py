@@ -50,6 +50,8 @@ from model.answer.stimulus import Finger
 from model.arrays import ranked_by
 from model.errors import InputError
 from model.figures import (
+    PAGE_WIDTH,
+    SMALL_TEXT,
     contents_figure,
     draw_fingertip,
     draw_level_scale,
@@ -499,8 +501,10 @@ def touches_figure(table: LocalizationTable, rows: Sequence[TouchRow]) -> Figure
     """Draw a panel per touch: level over the plate, fingers and driven ERAs."""
     columns = min(3, len(rows))
     lines = -(-len(rows) // columns)
-    height = 4.4 * table.plate.width / table.plate.length + 0.8
-    figure = Figure(figsize=(4.4 * columns + 0.8, height * lines), layout="constrained")
+    panel_width = (PAGE_WIDTH - 1.0) / 3
+    height = panel_width * table.plate.width / table.plate.length + 0.7
+    size = (panel_width * columns + 1.0, height * lines + 0.2)
+    figure = Figure(figsize=size, layout="constrained")
     panels = figure.subplots(lines, columns, squeeze=False).ravel()
     for axes in panels:
         axes.set_axis_off()
@@ -508,9 +512,10 @@ def touches_figure(table: LocalizationTable, rows: Sequence[TouchRow]) -> Figure
         _draw_touch(axes, table, row)
     draw_level_scale(figure, panels, table.threshold, shrink=0.7)
     figure.supxlabel(
-        "felt: mean over the fingertip; quiet: loudest point of the fingertip; "
-        "felt contrast: felt level minus the highest quiet level",
-        fontsize=10,
+        "Level: mean over a felt fingertip, loudest point of a quiet one. Contrast: felt minus "
+        "highest quiet level. Orange: driven ERAs.",
+        fontsize=SMALL_TEXT,
+        wrap=True,
     )
     return figure
 
@@ -523,12 +528,16 @@ def _contrast(row: TouchRow) -> float:
 def _draw_touch(axes: Axes, table: LocalizationTable, row: TouchRow) -> None:
     if row.pattern is not None:
         draw_levels(axes, table, row.pattern.excitation)
+    target = row.targets_m[0]
+    quiet = [*row.quiet.values()]
     level = row.levels_db_sl.get(row.target_id)
-    draw_fingertip(axes, row.targets_m[0], felt=True, level_db_sl=level)
+    draw_fingertip(axes, target, felt=True, level_db_sl=level, others=quiet)
     for id, position in row.quiet.items():
-        draw_fingertip(axes, position, felt=False, level_db_sl=row.levels_db_sl.get(id))
+        others = [target, *(other for other in quiet if other != position)]
+        level = row.levels_db_sl.get(id)
+        draw_fingertip(axes, position, felt=False, level_db_sl=level, others=others)
     contrast, promised = row.measured_contrast_db, row.promised_contrast_db
-    title = "single finger" if contrast is None else f"felt contrast {contrast:.1f} dB"
+    title = "single finger" if contrast is None else f"contrast {contrast:.1f} dB"
     if promised is not None:
-        title += f", promised {promised:.1f}"
-    axes.set_title(title, fontsize=11, pad=20)
+        title += f"\n(promised {promised:.1f} dB)"
+    axes.set_title(title, fontsize=9)

@@ -47,9 +47,10 @@ def _text(at: Point, text: str, *, anchor: str = "start", color: str = BLACK) ->
     return f'<text x="{at[0]}" y="{at[1]}" text-anchor="{anchor}" fill="{color}">{text}</text>'
 
 
-def _line(points: Sequence[Point], color: str, *, width: float = 2) -> str:
+def _line(points: Sequence[Point], color: str, *, width: float = 2, dashes: str = "none") -> str:
     path = " ".join(f"{x},{y}" for x, y in points)
-    return f'<polyline points="{path}" fill="none" stroke="{color}" stroke-width="{width}"/>'
+    stroke = f'stroke="{color}" stroke-width="{width}" stroke-dasharray="{dashes}"'
+    return f'<polyline points="{path}" fill="none" {stroke}/>'
 
 
 def _computer_and_card() -> Iterator[str]:
@@ -75,7 +76,7 @@ def _amplifier() -> Iterator[str]:
         yield _line(ends, RED)
         yield _text((590, y - 1), "+", color=RED) + _text((590, y + 12), "−")
     yield _line([(525, 238), (525, 262)], GREY, width=4)
-    yield _box(465, 262, 120, 26, "its power supply")
+    yield _box(465, 262, 120, 26, "power supply")
 
 
 def _beside(way: Sequence[Point]) -> list[Point]:
@@ -94,16 +95,17 @@ def _board() -> Iterator[str]:
     for name, (at, down) in PLACES.items():
         yield f'<circle cx="{at}" cy="{down}" r="12" fill="#d98c3f" stroke="{GREY}"/>'
         yield _text((at - 26, down + 5) if at > 800 else (at, down + 26), name, anchor="middle")
-    yield _text((x, 258), "exciters below it, + to + of its output", color=RED)
+    yield _text((x, 258), "exciters underneath, + to +", color=RED)
 
 
 def _sensor_and_loop() -> Iterator[str]:
     yield _box(778, 121, 14, 14, fill="#c8e6c9")
-    yield _line([(360, 288), (440, 288), (440, 306), (670, 306), (670, 128), (778, 128)], GREEN)
-    yield _text((676, 300), "accelerometer with its supply,", color=GREEN)
-    yield _text((676, 316), "moved from place to place, arrow upwards", color=GREEN)
+    cable = [(360, 288), (440, 288), (440, 306), (670, 306), (670, 128), (778, 128)]
+    yield _line(cable, GREEN, dashes="7 4")  # told from red wires without colours
+    yield _text((676, 300), "accelerometer and its supply: move it", color=GREEN)
+    yield _text((676, 316), "to each position, arrow upwards", color=GREEN)
     yield _line([(400, 212), (400, 324), (360, 324)], BLUE)
     yield '<circle cx="400" cy="212" r="4" fill="#1565c0"/>'
     yield _text((408, 342), "Y-cable: output 4 back to input 2, the delay reference", color=BLUE)
-    text = "red +, black −: an exciter whose pair is exchanged pushes where the others pull"
+    text = "Red: +. Black: −. An exciter with swapped wires moves against the others."
     yield _text((16, 376), text)

@@ -50,6 +50,7 @@ STATISTICS = ("minimum", "lower_quartile", "median", "upper_quartile", "maximum"
 """Statistics of the cumulative peak acceleration over the plate [m/s²]."""
 
 _MODES = (1, 5)
+_CONTOURS = (-0.75, -0.5, -0.25, 0.25, 0.5, 0.75)
 
 
 @dataclass(frozen=True)
@@ -84,17 +85,22 @@ def _modes(rig: Rig, free: FreePlate, *, name: str, support: str) -> PaperFigure
     displacements = solved.at(points)[:, np.array(_MODES) - 1]
     # Scaled to a largest deflection of +1, since the sign and size of a mode are arbitrary.
     shapes = [shape / shape[best_of(np.abs(shape))] for shape in displacements.T]
-    figure = Figure(figsize=(9, 4.2), layout="constrained")
+    figure = Figure(figsize=(8, 3.7), layout="constrained")
     grid = figure.subplots(1, len(shapes), sharey=True)
     for axes, mode, shape in zip(grid, _MODES, shapes, strict=True):
         colours = {"cmap": "RdBu_r", "shading": "gouraud", "vmin": -1, "vmax": 1}
-        image = axes.pcolormesh(100 * x, 100 * y, shape.reshape(rows, columns), **colours)
+        deflection = shape.reshape(rows, columns)
+        image = axes.pcolormesh(100 * x, 100 * y, deflection, **colours)
+        # Dashed where negative, so that the sign needs no colours.
+        axes.contour(100 * x, 100 * y, deflection, _CONTOURS, colors="black", linewidths=0.7)
         label_plate(axes)
         if support == "eras":
             draw_eras(axes, rig.eras, active=())
         axes.set_title(f"mode {mode}: {solved.frequencies[mode - 1]:.2f} Hz")
         axes.label_outer()
-    figure.colorbar(image, ax=grid, label="deflection relative to the maximum")
+    figure.colorbar(
+        image, ax=grid, label="deflection relative to the maximum\n(dashed contours: negative)"
+    )
     figure.suptitle(f"On {len(rig.eras)} ERAs" if support == "eras" else "Simply supported")
     shape_columns = {f"mode_{mode}": shape for mode, shape in zip(_MODES, shapes, strict=True)}
     tables: dict[str, Columns] = {
@@ -151,7 +157,8 @@ def _box_plots(rig: Rig, free: FreePlate, *, name: str, active_count: int) -> Pa
     axes.set_ylim(bottom=0)
     axes.set_title("boxes: quartiles over the plate; whiskers: minimum and maximum", fontsize=10)
     drive = "One active ERA" if active_count == 1 else "Two active ERAs"
-    figure.suptitle(f"{drive} (orange): peak acceleration summed over {len(SWEEP)} frequencies")
+    squares = "orange square" if active_count == 1 else "orange squares"
+    figure.suptitle(f"{drive} ({squares}): peak acceleration summed over {len(SWEEP)} frequencies")
     headers = ("layout", "active_eras", "era_fractions", *(f"{key}_m_s2" for key in STATISTICS))
     table: Columns = dict(zip(headers, zip(*rows, strict=True), strict=True))
     return PaperFigure(name, figure, {"": table})

@@ -132,9 +132,11 @@ def plate_map(
         if warning:
             typer.echo(f"era: warning: {warning}", err=True)
     if output is not None:
-        from model.figures import map_figure, save_figure
+        from model.figures import drive_title, map_figure, save_figure
 
-        title = ", ".join([*drive, *(["not supported"] if unsupported else [])])
+        title = drive_title(excitation, rig)
+        if unsupported:
+            title += " (ERAs do not support the plate)"
         figure = map_figure(rig, solved, active=excitation.keys(), title=title)
         save_figure(figure, output, inches=inches)
     row, column = divmod(best_of(solved.peak.ravel()), len(solved.x))

@@ -3,7 +3,6 @@
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from itertools import combinations, product
 from typing import Any
 
@@ -14,6 +13,7 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import BoundaryNorm, LogNorm, Normalize
 from matplotlib.figure import Figure
 from matplotlib.patches import Polygon as Outline
+from matplotlib.patheffects import withStroke
 
 from controller.effects.effect import Region
 from controller.effects.layout import SurfaceLayout
@@ -30,7 +30,7 @@ from era_haptics.lab.checks.layout_check import (
 from model.answer.answer import MIN_CONTRAST_DB, OWN_CONTRAST_DB, Answer
 from model.answer.plan import answer
 from model.arrays import FloatArray, Point, best_of
-from model.figures import draw_eras, label_plate
+from model.figures import PAGE_WIDTH, SMALL_TEXT, TITLE_TEXT, draw_eras, label_plate
 from model.processes import Progress, unseen
 from model.quantities import counted
 from model.table.table import LocalizationTable
@@ -271,13 +271,14 @@ def _answered(
     )
 
 
+_LEVEL_TOLERANCE_DB = 2.0
 _LEVEL_EDGES = [-12.0, -6.0, -4.0, -2.0, 2.0, 4.0, 6.0, 12.0]  # dB
 _MAX_CONTRAST = 30.0  # dB
 _FREQUENCY_TICKS = (40, 60, 100, 150, 250, 400, 600)  # Hz
 _NO_PROMISE = "#bbbbbb"
 _MAX_JOINED = 12  # simultaneous fingers drawn connected, for each count
 _BRIGHT = 0.6  # position on a colour scale above which black text is readable
-_SIZES = (90.0, 36.0, 10.0)  # of marks; smaller marks are a region's further effects
+_SIZES = (44.0, 16.0, 5.0)  # of marks; smaller marks are a region's further effects
 
 
 @dataclass(frozen=True)
@@ -291,6 +292,19 @@ class _TouchPanel:
     """Value shown by a mark's colour; None without a value."""
     norm: Normalize
     colors: str
+    marker: Callable[[float], str] = lambda _: "o"
+    """Shape of a value's mark."""
+
+    def color(self, value: float) -> tuple[float, float, float, float]:
+        """Return the colour of a value on the panel's scale."""
+        return colormaps[self.colors](self.norm(value))
+
+
+def _level_marker(difference_db: float) -> str:
+    """Return a triangle that points up above the promised level and down below it."""
+    if abs(difference_db) <= _LEVEL_TOLERANCE_DB:
+        return "o"
+    return "^" if difference_db > 0 else "v"
 
 
 def _touch_panels(frequencies: FloatArray) -> list[_TouchPanel]:
@@ -298,22 +312,23 @@ def _touch_panels(frequencies: FloatArray) -> list[_TouchPanel]:
     low, high = float(frequencies[0]), float(frequencies[-1])
     return [
         _TouchPanel(
-            "level: felt compared with promised",
-            "felt minus promised / dB",
+            "level: felt minus promised",
+            "felt minus promised level / dB\n(triangles: outside ±2 dB)",
             _off_level,
             BoundaryNorm(_LEVEL_EDGES, 256, extend="both"),
             "RdBu_r",
+            _level_marker,
         ),
         _TouchPanel(
-            "frequency that plays",
+            "frequency",
             "frequency / Hz",
             lambda _, touch: touch.frequencies[0] if touch.frequencies else None,
             LogNorm(low, max(high, 1.01 * low)),
             "viridis",
         ),
         _TouchPanel(
-            "promised contrast to a resting second finger",
-            "above a resting second finger\npromised / dB",
+            "contrast with a resting second finger",
+            "promised contrast / dB",
             lambda _, touch: touch.promised_contrast_db,
             Normalize(0.0, _MAX_CONTRAST),
             "viridis",
@@ -330,29 +345,51 @@ def check_figure(
     """Draw three panels with one mark per touch, and crosses where nothing is felt.
 
     The panels show the felt minus the promised level (the worse of alone and with a resting
-    finger), the frequency, and the promised contrast with the resting finger. Below, simultaneous
+    finger), the frequency, and the promised contrast with the resting finger. Then simultaneous
     fingers in two and three regions at their worst positions, and the promised contrast of the
     worst finger.
     """
-    ratio = table.plate.width / table.plate.length
-    rows = 2 if together else 1
-    figure = Figure(figsize=(18.0, rows * (5.0 * ratio + 1.6)), layout="constrained")
     panels = _touch_panels(table.frequencies)
-    subplots = figure.subplots(rows, len(panels), squeeze=False)
+    rows = 3 if together else 2
+    panel_height = (PAGE_WIDTH / 2 - 1.1) * table.plate.width / table.plate.length + 0.8
+    figure = Figure(figsize=(PAGE_WIDTH, rows * panel_height + 0.3), layout="constrained")
+    subplots = figure.subplots(rows, 2).ravel()
+    for axes, panel in zip(subplots, panels, strict=False):
+        _draw_touch_panel(figure, axes, panel, layout, table, checked)
     if together:
-        _draw_together(figure, [*subplots[1]], layout, table, together)
-    for axes, panel in zip(subplots[0], panels, strict=True):
-        axes.set_title(panel.title, fontsize=9)
-        _draw_layout(axes, layout, table)
-        _draw_touches(axes, checked, panel.value, panel.norm, panel.colors)
-        scale = ScalarMappable(panel.norm, panel.colors)
-        bar = figure.colorbar(scale, ax=axes, label=panel.label, shrink=0.85)
-        if isinstance(panel.norm, LogNorm):
-            low, high = panel.norm.vmin or 0.0, panel.norm.vmax or 0.0
-            ticks = [hertz for hertz in _FREQUENCY_TICKS if low <= hertz <= high]
-            bar.set_ticks(ticks, labels=[str(hertz) for hertz in ticks], minor=False)
-            bar.minorticks_off()
+        _draw_together(figure, [*subplots[len(panels) :]], layout, table, together)
+    else:
+        subplots[-1].set_axis_off()
+    figure.supxlabel(
+        "Crosses: nothing is felt. Grey marks: no promise. Small marks: a region's other effects. "
+        "Squares at the edges: ERAs.",
+        fontsize=SMALL_TEXT,
+        wrap=True,
+    )
     return figure
+
+
+def _draw_touch_panel(
+    figure: Figure,
+    axes: Axes,
+    panel: _TouchPanel,
+    layout: SurfaceLayout,
+    table: LocalizationTable,
+    checked: Sequence[CheckedEffect],
+) -> None:
+    """Draw the layout, the values of all touches, and their scale."""
+    axes.set_title(panel.title, fontsize=TITLE_TEXT)
+    _draw_layout(axes, layout, table)
+    _draw_touches(axes, checked, panel)
+    scale = ScalarMappable(panel.norm, panel.colors)
+    bar = figure.colorbar(scale, ax=axes, shrink=0.85)
+    bar.set_label(panel.label, fontsize=SMALL_TEXT)
+    if isinstance(panel.norm, LogNorm):
+        low, high = panel.norm.vmin or 0.0, panel.norm.vmax or 0.0
+        ticks = [hertz for hertz in _FREQUENCY_TICKS if low <= hertz <= high]
+        bar.set_ticks(ticks, labels=[str(hertz) for hertz in ticks], minor=False)
+        bar.minorticks_off()
+    bar.ax.tick_params(labelsize=SMALL_TEXT)
 
 
 def _draw_together(
@@ -366,26 +403,29 @@ def _draw_together(
     colors, norm = colormaps["viridis"], Normalize(0.0, 2 * OWN_CONTRAST_DB)
     for axes, count in zip(panels, (2, 3), strict=False):
         _draw_layout(axes, layout, table)
-        of_count = [each for each in together if len(each.regions) == count]
-        shown = sorted(of_count, key=lambda each: each.worst_db)[:_MAX_JOINED]
-        title = f"fingers in {count} regions, at their worst positions"
+        of_count = [touch for touch in together if len(touch.regions) == count]
+        shown = sorted(of_count, key=lambda touch: touch.worst_db)[:_MAX_JOINED]
+        title = f"worst positions of fingers in {count} regions"
         if len(shown) < len(of_count):
-            title += f": the worst {len(shown)} of {len(of_count)}"
-        axes.set_title(title, fontsize=9)
-        for each in reversed(shown):
-            x, y = _columns([*each.at, each.at[0]])
-            axes.plot(x, y, "o-", color=colors(norm(each.worst_db)), lw=1.2, ms=4)
-    axes, (names, promised) = panels[-1], matrix_of(together)
+            title += f"\n(the worst {len(shown)} of {len(of_count)})"
+        axes.set_title(title, fontsize=TITLE_TEXT)
+        for touch in reversed(shown):
+            x, y = _columns([*touch.at, touch.at[0]])
+            axes.plot(x, y, "o-", color=colors(norm(touch.worst_db)), lw=1.2, ms=4)
+    axes = panels[-1]
+    names, promised = matrix_of(together)
     axes.imshow(promised, cmap=colors, norm=norm)
     for (row, column), value in np.ndenumerate(promised):
         if not math.isnan(value):
             ink = "black" if norm(value) > _BRIGHT else "white"
             axes.text(column, row, f"{value:.0f}", ha="center", va="center", color=ink, fontsize=8)
-    axes.set_xticks(range(len(names)), names, rotation=90, fontsize=8)
-    axes.set_yticks(range(len(names)), names, fontsize=8)
-    axes.set_title("pairs below the diagonal, triples above", fontsize=9)
-    label = "promised contrast of the worst finger / dB"
-    figure.colorbar(ScalarMappable(norm, colors), ax=axes, label=label, shrink=0.85)
+    axes.set_xticks(range(len(names)), names, rotation=90, fontsize=SMALL_TEXT)
+    axes.set_yticks(range(len(names)), names, fontsize=SMALL_TEXT)
+    axes.set_title("pairs below the diagonal, triples above", fontsize=TITLE_TEXT)
+    bar = figure.colorbar(ScalarMappable(norm, colors), ax=axes, shrink=0.85)
+    label = "promised contrast of the worst finger / dB\n(also colours the lines)"
+    bar.set_label(label, fontsize=SMALL_TEXT)
+    bar.ax.tick_params(labelsize=SMALL_TEXT)
 
 
 def _off_level(each: CheckedEffect, touch: SimulatedTouch) -> float | None:
@@ -398,57 +438,71 @@ def _draw_layout(axes: Axes, layout: SurfaceLayout, table: LocalizationTable) ->
     """Draw the plate, its ERAs, and the regions with their names."""
     length, width = 100 * table.plate.length, 100 * table.plate.width
     axes.add_patch(Outline([(0, 0), (length, 0), (length, width), (0, width)], fill=False))
+    axes.set_xlim(-0.5, length + 0.5)
+    axes.set_ylim(-0.5, width + 0.5)
     for region in layout.regions:
         corners = 100 * np.array(region.shape.corners())
         axes.add_patch(Outline(corners, facecolor="#f2f2f2", edgecolor="#555555", lw=1))
         _label_region(axes, region.name, corners)
     label_plate(axes)
-    axes.set_xlim(-0.5, length + 0.5)
-    axes.set_ylim(-0.5, width + 0.5)
-    draw_eras(axes, table.eras, active=())
+    draw_eras(axes, table.eras, active=(), size=6)
+
+
+_NAME_HEIGHT = 1.4  # cm
 
 
 def _label_region(axes: Axes, name: str, corners: FloatArray) -> None:
-    """Write the name above a region, or rotated next to a region that is much taller than wide."""
+    """Write the name above a region, or below it if there is no room on the plate.
+
+    The name of a region that is much taller than wide is rotated and next to it.
+    """
     length, width = np.ptp(corners, axis=0)
-    is_beside = width > 2 * length
-    across = corners[:, 0 if is_beside else 1]
+    is_tall = width > 2 * length
+    is_high = corners[:, 1].max() + _NAME_HEIGHT > axes.get_ylim()[1]
+    if is_tall:
+        edge, offset, alignment, across = corners[:, 0].max(), (2, 0), ("left", "center"), 0
+    elif is_high:
+        edge, offset, alignment, across = corners[:, 1].min(), (0, -2), ("center", "top"), 1
+    else:
+        edge, offset, alignment, across = corners[:, 1].max(), (0, 2), ("center", "baseline"), 1
+    on_edge = np.isclose(corners[:, across], edge, atol=1e-6)
     axes.annotate(
         name,
-        corners[across >= across.max() - 1e-6].mean(axis=0),
-        xytext=(2, 0) if is_beside else (0, 2),
+        corners[on_edge].mean(axis=0),
+        xytext=offset,
         textcoords="offset points",
-        ha="left" if is_beside else "center",
-        va="center" if is_beside else "baseline",
-        rotation=90 if is_beside else 0,
-        fontsize=8,
+        ha=alignment[0],
+        va=alignment[1],
+        rotation=90 if is_tall else 0,
+        fontsize=SMALL_TEXT,
+        path_effects=[withStroke(linewidth=2, foreground="white")],
+        zorder=3,
     )
 
 
-def _draw_touches(
-    axes: Axes,
-    checked: Sequence[CheckedEffect],
-    value: Callable[[CheckedEffect, SimulatedTouch], float | None],
-    norm: Normalize,
-    colors: str,
-) -> None:
+def _draw_touches(axes: Axes, checked: Sequence[CheckedEffect], panel: _TouchPanel) -> None:
     """Draw for every touch the value farthest from zero, or the lowest contrast."""
-    drawn: dict[str, int] = {}
-    for each in checked:
-        size = _SIZES[min(drawn.get(each.region, 0), len(_SIZES) - 1)]
-        drawn[each.region] = drawn.get(each.region, 0) + 1
-        found: dict[Point, float | None] = {}
-        for touch in each.touches:
-            new, before = value(each, touch), found.get(touch.at)
-            if before is None or (new is not None and abs(new) > abs(before)):
-                found[touch.at] = new
-        silent = {touch.at for touch in each.touches if touch.felt_db_sl is None}
-        unpromised = [at for at, one in found.items() if one is None and at not in silent]
-        felt = {at: one for at, one in found.items() if one is not None and at not in silent}
-        mark = partial(axes.scatter, s=size, edgecolors="#555555", lw=0.5)
-        axes.plot(*_columns(silent), "x", color="black", ms=6)
-        mark(*_columns(unpromised), c=_NO_PROMISE)
-        mark(*_columns(felt), c=[*felt.values()], cmap=colors, norm=norm)
+    drawn: dict[str, int] = {}  # effects per region
+    for effect in checked:
+        number = drawn.get(effect.region, 0)
+        drawn[effect.region] = number + 1
+        values: dict[Point, float | None] = {}
+        for touch in effect.touches:
+            value, largest = panel.value(effect, touch), values.get(touch.at)
+            if largest is None or (value is not None and abs(value) > abs(largest)):
+                values[touch.at] = value
+        silent = {touch.at for touch in effect.touches if touch.felt_db_sl is None}
+        axes.plot(*_columns(silent), "x", color="black", ms=5)
+        size = _SIZES[min(number, len(_SIZES) - 1)]
+        for at, value in values.items():
+            if at in silent:
+                continue
+            x, y = 100 * at[0], 100 * at[1]
+            color = _NO_PROMISE if value is None else panel.color(value)
+            marker = "o" if value is None else panel.marker(value)
+            axes.scatter(
+                x, y, size, marker=marker, facecolors=[color], edgecolors="#555555", lw=0.5
+            )
 
 
 def _columns(places: Iterable[Point]) -> FloatArray:

@@ -43,7 +43,16 @@ from model.errors import (
     is_whole,
     shown,
 )
-from model.figures import COLORS, Template, draw_eras, label_plate, save_figure, write_template
+from model.figures import (
+    COLORS,
+    PAGE_WIDTH,
+    SMALL_TEXT,
+    Template,
+    draw_eras,
+    label_plate,
+    save_figure,
+    write_template,
+)
 from model.files.array_file import whole_or_nothing
 from model.files.csv_file import write_columns
 from model.finger import STRONG_DB_SL
@@ -778,45 +787,54 @@ def _contrast_figure(design: Design) -> Figure:
     contents = design.problem.contacts.contents
     plate, judged = design.problem.rig.plate, design.best.answers
     eras = design.best.eras
-    ratio = plate.width / plate.length
     kinds = judged.kinds
-    figure = Figure(figsize=(3.4 * len(kinds) + 1, 3.0 * ratio + 1.2), layout="compressed")
-    grid = figure.subplots(1, len(kinds), squeeze=False, sharey=True)[0]
-    places = np.array([contacts[:contents] for contacts in design.sets])  # (sets, contents, 2)
+    width = PAGE_WIDTH if len(kinds) > 1 else PAGE_WIDTH / 2
+    panel_width = (width - 1.4) / len(kinds)
+    height = panel_width * plate.width / plate.length + 1.1
+    figure = Figure(figsize=(width, height), layout="compressed")
+    panels = figure.subplots(1, len(kinds), squeeze=False, sharey=True)[0]
+    targets = np.array([contacts[:contents] for contacts in design.sets])  # (sets, contents, 2)
     ends = np.percentile(judged.contrast_db, [2, 98])
-    for axes, quiet in zip(grid, kinds, strict=True):
+    for axes, quiet in zip(panels, kinds, strict=True):
         chosen = judged.quiet == quiet
         image = axes.scatter(
-            *(100 * places[chosen].reshape(-1, 2).T),
+            *(100 * targets[chosen].reshape(-1, 2).T),
             c=np.repeat(judged.contrast_db[chosen], contents),
             cmap=COLORS,
             vmin=ends[0],
             vmax=ends[1],
-            s=26,
+            s=20,
         )
         draw_eras(axes, eras, active=[era.name for era in eras])
         label_plate(axes)
         axes.set_xlim(0, 100 * plate.length)
         axes.set_ylim(0, 100 * plate.width)
-        axes.set_title(f"quiet fingers: {quiet}, median {judged.median_db(quiet):.1f} dB")
+        fingers = counted(int(quiet), "quiet finger")
+        axes.set_title(f"{fingers}: median {judged.median_db(quiet):.1f} dB", fontsize=9)
         axes.label_outer()
-    figure.colorbar(image, ax=grid, label="promised contrast / dB")
+    figure.colorbar(image, ax=panels, label="promised contrast / dB")
+    figure.supxlabel("Circles: target fingers. Squares: ERAs.", fontsize=SMALL_TEXT)
     return figure
+
+
+_COUNT_STYLES = (("--", "s"), ("-.", "^"), (":", "D"))  # line and marker
 
 
 def count_figure(design: Design) -> Figure:
     """Draw contrast against the number of ERAs, and the gain of each."""
     counts = list(design.by_count)
-    means = [each.mean_db for each in design.by_count.values()]
+    means = [layout.mean_db for layout in design.by_count.values()]
     figure = Figure(figsize=(5.2, 3.6), layout="constrained")
     axes = figure.subplots()
     axes.plot(counts, means, "o-", color="black", label="mean")
-    for quiet in design.best.answers.kinds:
-        medians = [each.answers.median_db(quiet) for each in design.by_count.values()]
-        axes.plot(counts, medians, "--", marker=".", label=f"{quiet} quiet, median")
+    for number, quiet in enumerate(design.best.answers.kinds):
+        medians = [layout.answers.median_db(quiet) for layout in design.by_count.values()]
+        line, marker = _COUNT_STYLES[number % len(_COUNT_STYLES)]
+        label = f"{counted(int(quiet), 'quiet finger')}, median"
+        axes.plot(counts, medians, line, marker=marker, ms=4, label=label)
     for count, low, high in zip(counts[1:], means, means[1:], strict=False):
         axes.annotate(f"{high - low:+.1f}", (count, high), (0, 7), textcoords="offset points")
-    axes.set_xlabel("ERAs")
+    axes.set_xlabel("number of ERAs")
     axes.set_ylabel("promised contrast / dB")
     axes.set_xticks(counts)
     axes.margins(x=0.1)  # room for the last number next to its point

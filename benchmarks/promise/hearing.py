@@ -17,7 +17,7 @@ from drivers.playing import Voice
 from model.arrays import FloatArray
 from model.finger import detection_threshold
 from model.rig.rig import Rig
-from sim.amplifier.readings import StraightClock
+from sim.amplifier.amplifier_clock import StraightClock
 from sim.bench.bench import Bench
 from sim.plant.era_motions import harmonics_of_voices, motion_of, realised
 from sim.plant.finger_placement import FingerPlacement

@@ -2,23 +2,22 @@
 
 Requests and replies are the values of their records (`drivers.protocol.definition`), integers of
 the wire. Events happen at their own time: a watchdog that expired between two calls expired when it
-was due, and playback is a description in time (`drivers.playing`), not samples.
+was due. Playback is a description in time (`drivers.playing`), not samples.
 
-`AMPLIFIER_TRANSITIONS` has the requests that are allowed in each state, and the state that follows;
-any other request is refused (WRONG_STATE). Transitions without a request: OPERATION_ENABLED to
+`AMPLIFIER_TRANSITIONS` lists the requests that are allowed in each state, and the next state;
+any other request is rejected (WRONG_STATE). Transitions without a request: OPERATION_ENABLED to
 FAULT_REACTION_ACTIVE when the watchdog expires, from there to FAULT once silent; SWITCHED_ON,
 entered by Disarm, to SWITCH_ON_DISABLED once silent. Clear needs silence. Arm passes through
-READY_TO_SWITCH_ON and SWITCHED_ON at once.
+READY_TO_SWITCH_ON and SWITCHED_ON immediately.
 
-Not modelled: the rise time of high voltage, the voltage waveform of a tone, and the distortion
-where the sum of layers is limited.
+Not modelled: the rise time of high voltage, the voltage waveform of a tone, and the distortion of
+a limited sum of layers.
 """
 
 import math
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
-from typing import TypeAlias
+from dataclasses import dataclass
 
 from drivers.playing import Voice, playback_of
 from drivers.protocol.definition import (
@@ -34,25 +33,12 @@ from drivers.protocol.definition import (
     high_word,
 )
 from drivers.protocol.records import Refusal, Values
-from drivers.protocol.sets import (
-    Assembly,
-    Command,
-    LayerSet,
-    is_last,
-    is_newer_token,
-    token_after,
-    unpack_layers,
-)
+from drivers.protocol.sets import is_last, token_after
+from sim.amplifier.amplifier_clock import AmplifierClock
 from sim.amplifier.readings import (
-    DERATE_ABOVE,
-    DERATED,
-    FAULT_ABOVE,
-    GOOD_BELOW,
     LIMITED,
-    AmplifierClock,
     AmplifierSummary,
     FaultRecord,
-    ThermalState,
     achieved,
     capabilities,
     exceeds_full,
@@ -60,7 +46,23 @@ from sim.amplifier.readings import (
     measured,
     with_readings,
 )
+from sim.amplifier.set_intake import Layers, SetIntake, derated
+from sim.amplifier.thermal_state import (
+    DERATE_ABOVE,
+    DERATED,
+    FAULT_ABOVE,
+    GOOD_BELOW,
+    ThermalState,
+)
 
+SILENCING_RAMP = 0.005  # s; a fault must be silent 5 ms after the watchdog expires
+_FAULTS_KEPT = 16
+_DISCHARGE = 0.02  # s; time constant of the supply once it is off
+_DERATING_RAMP = 0.02  # s; no click
+_ENABLED = "OPERATION_ENABLED"
+_ENDING = ("SWITCHED_ON", "FAULT_REACTION_ACTIVE")
+_LATCHED = ("QUICK_STOP_ACTIVE", "FAULT")
+_Q = QUANTITIES
 _OFF = ("SWITCH_ON_DISABLED", "READY_TO_SWITCH_ON")
 _KEPT_BY_STOP = ("NOT_READY", "FAULT_REACTION_ACTIVE", "FAULT")
 _PLAYING = ("Set", "Commit", "Silence")
@@ -84,133 +86,22 @@ AMPLIFIER_TRANSITIONS: Mapping[tuple[str, str], str] = {
 }
 """The state after a request, by state and name of the request."""
 
-Layers: TypeAlias = tuple[LayerSet, ...]
 
+@dataclass(frozen=True)
+class _WaitingSet:
+    """A committed set that plays at a moment [s]; commit: values of its Commit."""
 
-class SetIntake:
-    """Takes the parts of sets, and stores a complete set until it is committed.
-
-    capabilities: values of its record. committed: token of the set committed last, 0 for none.
-    One set is under way at most: collected, or staged.
-    """
-
-    def __init__(self, capabilities: Values) -> None:
-        self.capabilities = capabilities
-        self.committed = 0
-        self._parts = Assembly()  # of the set under way
-        self._staged: Layers | None = None  # of the same, once it is whole
-
-    def keep(self, part: Values, now: float) -> bool:
-        """Take a part but the last at a time [s]; returns whether it is kept."""
-        token, under_way = part["token"], self._under_way(now)
-        is_newer = token != under_way and is_newer_token(token, under_way)
-        is_under_way = token == under_way and self._staged is None
-        if not (is_newer_token(token, self.committed) and (is_newer or is_under_way)):
-            return False
-        if is_newer:
-            self._staged = None
-        return self._parts.keep(part, now)
-
-    def take(self, part: Values, now: float) -> Layers | int:
-        """Take the last part of a set that was not committed, at a time [s].
-
-        Returns the layers that are staged now, or the number of the first part that is missing.
-        Raises Refusal; this drops only the parts of this set, and only if it is complete.
-        """
-        token, under_way = part["token"], self._under_way(now)
-        is_under_way = token == under_way
-        if is_under_way and self._staged is not None:  # it came again
-            return self._staged
-        for other in (self.committed, 0 if is_under_way else under_way):
-            if not is_newer_token(token, other):
-                raise Refusal(f"token must be newer than {other}, got {token}", "BAD_TOKEN")
-        if part["index"] >= part["parts"]:
-            raise Refusal(f"index must be below {part['parts']}, got {part['index']}")
-        if is_under_way and part["parts"] != self._parts.count:
-            raise Refusal(f"parts must be {self._parts.count} as before, got {part['parts']}")
-        stream = self._parts.whole(part)
-        if isinstance(stream, int):
-            return stream
-        try:
-            layers = self._checked(stream)
-        except Refusal:
-            if is_under_way:
-                self.drop()
-            raise
-        if not is_under_way:
-            self._parts = Assembly(token, part["parts"], now)
-        self._staged = layers
-        return layers
-
-    def commit(self, token: int, now: float) -> Layers | None:
-        """Return the layers of the staged set; None if it was already committed.
-
-        Raises Refusal if none is staged under this token.
-        """
-        if token == self.committed:
-            return None
-        if token != self._under_way(now):
-            raise Refusal(f"no set is staged under token {token}", "BAD_TOKEN")
-        if self._staged is None:
-            raise Refusal(f"all parts of set {token} must come first", "INCOMPLETE")
-        layers, self.committed = self._staged, token
-        self.drop()
-        return layers
-
-    def drop(self) -> None:
-        """Discard everything not committed."""
-        self._parts, self._staged = Assembly(), None
-
-    def forget(self) -> None:
-        """Discard all, with the token committed last."""
-        self.drop()
-        self.committed = 0
-
-    def _under_way(self, now: float) -> int:
-        """Return the token of the set that is collected or staged, 0 for none."""
-        if self._parts.is_expired(now):
-            self.drop()
-        return self._parts.token
-
-    def _checked(self, stream: Sequence[int]) -> Layers:
-        if len(stream) > self.capabilities["set_words"]:
-            room = self.capabilities["set_words"]
-            raise Refusal(f"a set must have at most {room} words", "BAD_LENGTH")
-        return unpack_layers(stream, self.capabilities)
-
-
-def derated(layers: Sequence[LayerSet], factor: float) -> tuple[LayerSet, ...]:
-    """Return the layers with all levels, also of knots, times a factor."""
-
-    def command_of(command: Command) -> Command:
-        return replace(
-            command,
-            level=round(command.level * factor),
-            onset=command.onset and command.onset.scaled(factor),
-            ending=command.ending and command.ending.scaled(factor),
-        )
-
-    return tuple(
-        replace(layer, commands=tuple(map(command_of, layer.commands))) for layer in layers
-    )
-
-
-SILENCING_RAMP = 0.005  # s; a fault must be silent 5 ms after the watchdog expires
-_FAULTS_KEPT = 16
-_DISCHARGE = 0.02  # s; time constant of the supply once it is off
-_DERATING_RAMP = 0.02  # s; no click
-_ENABLED = "OPERATION_ENABLED"
-_ENDING = ("SWITCHED_ON", "FAULT_REACTION_ACTIVE")
-_LATCHED = ("QUICK_STOP_ACTIVE", "FAULT")
-_Q = QUANTITIES
+    moment: float
+    commit: Values
+    layers: Layers
 
 
 class SimulatedAmplifier:
     """An amplifier with a name and a number of channels; times [s] of any one clock.
 
-    listeners: called with the values of every Event, and its time [s]. capabilities: others hold
-    from the next restart. session: held while armed, or the last one. clock: reference of
-    phases, by default without errors.
+    listeners: called with the values of every Event, and its time [s]. capabilities: changes take
+    effect at the next restart. session: the current session while armed, or the last one. clock:
+    reference of phases, by default without errors.
     """
 
     is_answering = True
@@ -243,22 +134,22 @@ class SimulatedAmplifier:
 
     def _start(self) -> None:
         """Reset all but the temperature and the fault history."""
-        can = self.capabilities
-        self.playback = playback_of(can)
+        self.playback = playback_of(self.capabilities)
         self._channels = range(self.playback.channels)
-        self._intake = SetIntake(can)
+        self._intake = SetIntake(self.capabilities)
         self.session = 0
-        self._waiting: tuple[float, Values, Layers] | None = None  # moment [s], Commit
+        self._waiting: _WaitingSet | None = None
         self._marked: int | None = None  # clock of a Mark that no status has shown
-        # By the last status: this, and whether a sum was limited.
-        self._shown_once: tuple[int | None, bool] = None, False
+        self._is_limited = False  # a sum was limited since the last status
+        # The mark and the limited sum that the last status has shown.
+        self._shown_mark: int | None = None
+        self._has_shown_limited = False
         self._watchdog = 0.0
         self._last_fed = 0.0
         self.token = 0
         """Token of the last set since arming that changed the playback; 0: none."""
         self.silent_from = -math.inf  # end of the last silencing ramp
         self._discharged_from = -math.inf  # of the last one while high voltage was on
-        self._is_limited = False
         self.is_derated = False
 
     @property
@@ -271,16 +162,18 @@ class SimulatedAmplifier:
         """Time of the next event [s]; playback is known until then."""
         due = self.playback.next_due
         if self._waiting is not None:
-            due = min(due, self._waiting[0])
+            due = min(due, self._waiting.moment)
+        if self.state in _ENDING:
+            return min(due, self.silent_from)
         if self.state != _ENABLED:
-            return min(due, self.silent_from if self.state in _ENDING else math.inf)
+            return due
         hot = self._heat.when(FAULT_ABOVE if self.is_derated else DERATE_ABOVE)
         return min(due, self._last_fed + self._watchdog, hot)
 
     def tick(self, now: float) -> None:
         """Process the events due at now, in order."""
         while (moment := self.next_event) <= now:
-            if self._waiting is not None and moment == self._waiting[0]:
+            if self._waiting is not None and moment == self._waiting.moment:
                 self._start_waiting(moment)
             elif moment == self.playback.next_due:
                 self.playback.advance(moment)
@@ -297,9 +190,10 @@ class SimulatedAmplifier:
             self.is_derated = False
 
     def handle(self, name: str, values: Values, now: float) -> Values:
-        """Return the values of the reply to a request at a time [s]; none to a part but the last.
+        """Return the values of the reply to a request at a time [s]; none to a part of a
+        set other than the last.
 
-        Raises Refusal, which means that nothing was applied.
+        Raises Refusal; the request is then not applied.
         """
         self.tick(now)
         if name == "Set" and not is_last(values):
@@ -307,7 +201,8 @@ class SimulatedAmplifier:
             if is_held and self._intake.keep(values, now):
                 self.feed(now)
             return {}
-        message, following = MESSAGES[name], AMPLIFIER_TRANSITIONS.get((self.state, name))
+        message = MESSAGES[name]
+        following = AMPLIFIER_TRANSITIONS.get((self.state, name))
         if following is None or (name == "Arm" and self._is_interlock_open):
             raise Refusal(f"{name} must not come in state {self.state}", "WRONG_STATE")
         if message.feeds and self._is_foreign(values["session"], name):
@@ -324,60 +219,84 @@ class SimulatedAmplifier:
 
     def status(self, now: float) -> Values:
         """Return the values of the status at a time [s] up to which it has been ticked."""
-        levels, is_on = self._levels(now)
-        left = self._last_fed + self._watchdog - now if self.state == _ENABLED else 0.0
-        # A sum that lasts is limited again and again.
-        self._is_limited |= any(self.playback.level(each, now) > LIMITED for each in self._channels)
+        levels = self._levels(now)
+        is_on = self._is_high_voltage(levels)
+        # A lasting sum is limited again in each status.
+        self._is_limited |= self._is_sum_limited(now)
         flags = {
             "high_voltage": is_on,
             "interlock_open": self._is_interlock_open,
             "limited": self._is_limited,
         }
-        self._shown_once = self._marked, self._is_limited
-        self._is_limited = False
         clock = self.clock.reading(now) if self._marked is None else self._marked
+        self._shown_mark = self._marked
+        self._has_shown_limited = self._is_limited
         self._marked = None
-        tokens = self.playback.tokens
+        self._is_limited = False
+        watchdog_left = 0.0
+        if self.state == _ENABLED:
+            watchdog_left = max(self._last_fed + self._watchdog - now, 0.0)
         layers = self.capabilities["layers"]
-        return with_readings(
-            {
-                "state": STATES[self.state],
-                "fault": FAULTS[self.fault],
-                "flags": sum(1 << STATUS_FLAGS[each] for each, is_set in flags.items() if is_set),
-                "latch": self.latch,
-                "watchdog_left": _Q["watchdog_left"].to_wire(max(left, 0.0)),
-                "clock": clock,
-                "token": self._intake.committed,
-                "channels": len(levels),
-                "layers": layers,
-                "levels": [_Q["level"].to_wire(level) for level in levels],
-                "tokens": [tokens.get(layer, 0) for layer in range(layers)],
-            },
-            temperature=self._heat.at(now),
-            supply=1.0 if is_on else math.exp(min(0.0, (self._discharged_from - now) / _DISCHARGE)),
-        )
+        tokens = self.playback.tokens
+        status = {
+            "state": STATES[self.state],
+            "fault": FAULTS[self.fault],
+            "flags": sum(1 << STATUS_FLAGS[flag] for flag, is_set in flags.items() if is_set),
+            "latch": self.latch,
+            "watchdog_left": _Q["watchdog_left"].to_wire(watchdog_left),
+            "clock": clock,
+            "token": self._intake.committed,
+            "channels": len(levels),
+            "layers": layers,
+            "levels": [_Q["level"].to_wire(level) for level in levels],
+            "tokens": [tokens.get(layer, 0) for layer in range(layers)],
+        }
+        supply = 1.0 if is_on else self._discharging_supply(now)
+        return with_readings(status, temperature=self._heat.at(now), supply=supply)
+
+    def _is_sum_limited(self, now: float) -> bool:
+        """Whether the sum of layers exceeds full level on a channel at a time [s]."""
+        return any(self.playback.level(channel, now) > LIMITED for channel in self._channels)
+
+    def _discharging_supply(self, now: float) -> float:
+        """Supply voltage relative to its nominal value at a time [s] while it is off."""
+        elapsed = max(0.0, now - self._discharged_from)
+        return math.exp(-elapsed / _DISCHARGE)
 
     def withdraw_status(self) -> None:
         """Withdraw the last status, as after a broadcast: the next one shows the same."""
-        self._marked, self._is_limited = self._shown_once
+        self._marked = self._shown_mark
+        self._is_limited = self._has_shown_limited
 
     def summary(self, now: float) -> AmplifierSummary:
         """Return its state at the time [s] of the last tick, without the effects of a status."""
-        levels, is_on = self._levels(now)
-        return AmplifierSummary(self.state, self.fault, self._intake.committed, is_on, levels)
+        levels = self._levels(now)
+        return AmplifierSummary(
+            state=self.state,
+            fault=self.fault,
+            token=self._intake.committed,
+            is_high_voltage=self._is_high_voltage(levels),
+            levels=levels,
+        )
 
-    def _levels(self, now: float) -> tuple[tuple[float, ...], bool]:
-        """Return the level of each channel, to its step, and whether high voltage is on."""
-        level = _Q["level"].quantise
-        levels = tuple([level(min(self.playback.level(each, now), 1.0)) for each in self._channels])
-        return levels, self.state in ("SWITCHED_ON", _ENABLED) or any(levels)
+    def _levels(self, now: float) -> tuple[float, ...]:
+        """Return the level of each channel, rounded to its step."""
+        quantise = _Q["level"].quantise
+        levels = []
+        for channel in self._channels:
+            levels.append(quantise(min(self.playback.level(channel, now), 1.0)))
+        return tuple(levels)
+
+    def _is_high_voltage(self, levels: Sequence[float]) -> bool:
+        """Whether high voltage is on at these levels of all channels."""
+        return self.state in ("SWITCHED_ON", _ENABLED) or any(levels)
 
     def trip(self, fault: str, moment: float, *, channel: int | None = None) -> None:
         """Enter a fault: silent within the shortest ramp, then high voltage off, latched.
 
-        While disarmed it is only added to the fault history.
+        While disarmed the fault is only added to the fault history.
         """
-        self._faults.appendleft((fault, channel, moment))
+        self._faults.appendleft(FaultRecord(fault, channel, moment))
         if self.state in (_ENABLED, "SWITCHED_ON", "QUICK_STOP_ACTIVE"):
             self.silence(moment, ramp=SILENCING_RAMP)
             self.fault = fault
@@ -407,7 +326,7 @@ class SimulatedAmplifier:
         self._enter("SWITCH_ON_DISABLED", moment)
 
     def _carry_out(self, name: str, values: Values, following: str, now: float) -> Values | None:
-        """Execute an allowed request; None where the reply is the status."""
+        """Execute an allowed request; None if the reply is the status."""
         match name:
             case "GetCaps":
                 return self.capabilities
@@ -416,38 +335,21 @@ class SimulatedAmplifier:
             case "Arm":
                 self._arm(values, now)
             case "Disarm" | "Stop":
-                if name == "Stop":
-                    self.latch = token_after(self.latch)
-                ramp = min(values["ramp"], self.capabilities["ramp_max"])
-                self.silence(now, ramp=_Q["ramp"].from_wire(ramp))
-                self._enter(following, now)
-                self.tick(now)
+                self._disarm_or_stop(name, values, following, now)
             case "Silence":
-                if values["ramp"] > self.capabilities["ramp_max"]:
-                    limit = self.capabilities["ramp_max"]
-                    raise Refusal(f"ramp must be at most {limit}, got {values['ramp']}")
-                self.silence(now, ramp=_Q["ramp"].from_wire(values["ramp"]))
+                self._silence_channels(values, now)
             case "Ping" if self.state == _ENABLED:
-                self.clock.steer(values["rate"], now)
-                if self._waiting is not None:
-                    _, commit, waiting = self._waiting
-                    self._play_when(waiting, commit, now)
+                self._steer_clock(values["rate"], now)
             case "Clear":
                 self._clear(values["latch"], following, now)
             case "Set":
                 return self.take_part(values, now)
             case "Commit":
-                layers = self._intake.commit(values["token"], now)
-                if layers is not None:
-                    self._start_waiting(now)
-                    self._play_when(layers, values, now)
+                self._commit(values, now)
             case "Mark":
                 self._marked = self.clock.reading(now)
             case "GetAchieved":
-                layer, count = values["layer"], self.capabilities["layers"]
-                if layer >= count:
-                    raise Refusal(f"layer must be 0 to {count - 1}, got {layer}")
-                return achieved(self.playback, layer)
+                return self._achieved(values["layer"])
             case "GetMeasured":
                 channels = list(measured(self.playback, now))
                 return {"count": len(channels), "channels": channels}
@@ -456,6 +358,42 @@ class SimulatedAmplifier:
                     raise Refusal("serial number must be this amplifier's")
         return None
 
+    def _disarm_or_stop(self, name: str, values: Values, following: str, now: float) -> None:
+        """Silence all channels, and enter the state that follows; a stop is latched."""
+        if name == "Stop":
+            self.latch = token_after(self.latch)
+        ramp = min(values["ramp"], self.capabilities["ramp_max"])
+        self.silence(now, ramp=_Q["ramp"].from_wire(ramp))
+        self._enter(following, now)
+        self.tick(now)
+
+    def _silence_channels(self, values: Values, now: float) -> None:
+        """Silence all channels; unlike Disarm and Stop, reject a ramp that is too long."""
+        limit = self.capabilities["ramp_max"]
+        if values["ramp"] > limit:
+            raise Refusal(f"ramp must be at most {limit}, got {values['ramp']}")
+        self.silence(now, ramp=_Q["ramp"].from_wire(values["ramp"]))
+
+    def _steer_clock(self, rate: int, now: float) -> None:
+        """Set the rate of the clock, which can change the moment of a waiting set."""
+        self.clock.steer(rate, now)
+        if self._waiting is not None:
+            self._play_when(self._waiting.layers, self._waiting.commit, now)
+
+    def _commit(self, commit: Values, now: float) -> None:
+        """Play the staged set at the moment that its Commit names."""
+        layers = self._intake.commit(commit["token"], now)
+        if layers is not None:
+            self._start_waiting(now)
+            self._play_when(layers, commit, now)
+
+    def _achieved(self, layer: int) -> Values:
+        """Return the values of GetAchieved for a layer; raises Refusal for an unknown layer."""
+        count = self.capabilities["layers"]
+        if layer >= count:
+            raise Refusal(f"layer must be 0 to {count - 1}, got {layer}")
+        return achieved(self.playback, layer)
+
     def _is_foreign(self, session: int, name: str) -> bool:
         """Whether a session is not the current one or, for arming, has ended."""
         if self.state == _ENABLED:
@@ -463,12 +401,13 @@ class SimulatedAmplifier:
         return name == "Arm" and session == self.session
 
     def _arm(self, values: Values, now: float) -> None:
+        """Arm for a session, with a watchdog; raises Refusal."""
         watchdog = values["watchdog"]
         low, high = self.capabilities["watchdog_min"], self.capabilities["watchdog_max"]
         if not low <= watchdog <= high:
             raise Refusal(f"watchdog must be {low} to {high}, got {watchdog}")
         self._watchdog = _Q["watchdog"].from_wire(watchdog)
-        if self.state == _ENABLED:  # the same again: its reply was lost
+        if self.state == _ENABLED:  # repeated, because its reply was lost
             return
         # Arming starts at level zero, even if the last session left a fade.
         self.silence(now, ramp=SILENCING_RAMP)
@@ -480,6 +419,7 @@ class SimulatedAmplifier:
         self._enter(_ENABLED, now)
 
     def _clear(self, latch: int, following: str, now: float) -> None:
+        """Clear a stop or a fault with this latch, if its cause is gone; raises Refusal."""
         if self.state in _LATCHED and latch != self.latch:
             raise Refusal(f"latch must be {self.latch}, got {latch}", "WRONG_LATCH")
         if self.silent_from <= now and self.is_cause_gone(now):
@@ -487,42 +427,46 @@ class SimulatedAmplifier:
             self._enter(following, now)
 
     def take_part(self, part: Values, now: float) -> Values:
-        """Take the last part of a set, and play the set if it is complete and so requests."""
+        """Take the last part of a set, and play the set if it is complete and to play now."""
         token = part["token"]
-        taken = None if token == self._intake.committed else self._intake.take(part, now)
-        is_missing = isinstance(taken, int)
-        is_staged = not (taken is None or is_missing or part["now"])
-        if isinstance(taken, tuple) and part["now"]:
+        # Layers of a complete set, number of a missing part, or None for a set committed before.
+        intake: Layers | int | None = None
+        if token != self._intake.committed:
+            intake = self._intake.take(part, now)
+        is_missing = isinstance(intake, int)
+        is_staged = not (intake is None or is_missing or part["now"])
+        if isinstance(intake, tuple) and part["now"]:
             self._intake.commit(token, now)
             self._start_waiting(now)
-            self.play(taken, token, now)
+            self.play(intake, token, now)
         return {
             "token": token,
             "exact": not (is_missing or self.is_derated),
             "staged": is_staged,
             "played": not (is_missing or is_staged),
-            "missing": taken if is_missing else 0,
+            "missing": intake if is_missing else 0,
         }
 
     def _play_when(self, layers: Layers, commit: Values, now: float) -> None:
         """Play a committed set at the moment that its Commit names, if that is shortly ahead."""
-        at, self._waiting = commit["at"], None
+        at = commit["at"]
+        self._waiting = None
         if 1 <= (at - high_word(self.clock.reading(now))) % HIGH_WORDS <= AHEAD_MAX:
-            self._waiting = self.clock.reaches(at, now), commit, layers
+            self._waiting = _WaitingSet(self.clock.reaches(at, now), commit, layers)
         else:
             self.play(layers, commit["token"], now)
 
     def _start_waiting(self, moment: float) -> None:
         """Play the set that waits for a moment, if there is one."""
-        if self._waiting is not None:
-            _, commit, layers = self._waiting
+        waiting = self._waiting
+        if waiting is not None:
             self._waiting = None
-            self.play(layers, commit["token"], moment)
+            self.play(waiting.layers, waiting.commit["token"], moment)
 
     def play(self, layers: Layers, token: int, now: float) -> None:
         """Start the layers of a set at a time [s]."""
-        wanted = derated(layers, DERATED) if self.is_derated else layers
-        self.playback.commit(wanted, token, now)
+        allowed_layers = derated(layers, DERATED) if self.is_derated else layers
+        self.playback.commit(allowed_layers, token, now)
         if all(layer.renew for layer in layers):
             return
         self.token = token
@@ -559,8 +503,9 @@ class SimulatedAmplifier:
 
     def _changed(self, moment: float) -> None:
         """Record a change of playback."""
-        squares = (self.playback.settled(channel) ** 2 for channel in self._channels)
-        self._heat = self._heat.driven(moment, load=sum(squares) / len(self._channels))
+        levels = [self.playback.settled(channel) for channel in self._channels]
+        mean_square = sum([level**2 for level in levels]) / len(levels)
+        self._heat = self._heat.driven(moment, load=mean_square)
 
     def _handle_overtemperature(self, moment: float) -> None:
         """Derate at the lower threshold, trip at the higher."""

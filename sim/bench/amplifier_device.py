@@ -8,7 +8,7 @@ from typing import Literal, TypeAlias
 from drivers.protocol.records import Refusal, Values
 from drivers.protocol.sets import is_last
 from registry import threads
-from sim.amplifier.readings import AMBIENT, DERATE_ABOVE, FAULT_ABOVE
+from sim.amplifier.thermal_state import AMBIENT, DERATE_ABOVE, FAULT_ABOVE
 from sim.bench.bench import Bench
 from sim.faults import Faults, FaultWindow
 

@@ -36,7 +36,7 @@ from model.structure.attachments import (
 from model.structure.plate import Plate
 from model.transients.base_motion import Motion
 from registry import limits, threads
-from sim.amplifier.readings import AmplifierClock, StraightClock
+from sim.amplifier.amplifier_clock import AmplifierClock, StraightClock
 from sim.amplifier.simulated_amplifier import SimulatedAmplifier
 from sim.plant.era_motions import harmonics_of_voices, motion_of, realised
 from sim.plant.finger_placement import FingerPlacement

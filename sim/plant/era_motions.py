@@ -14,7 +14,7 @@ from drivers.playing import Voice
 from model.answer.answer import Layer
 from model.transients.base_motion import BaseEnvelope, Motion, Term, along_lines, raised_cosine
 from model.vibration import Excitation, Tone
-from sim.amplifier.readings import StraightClock
+from sim.amplifier.amplifier_clock import StraightClock
 from sim.plant.imperfections import ChannelErrors
 
 

@@ -25,7 +25,7 @@ from model.structure.exciter import Actuator
 from model.structure.plate import Plate
 from model.study.exact_plates import Plates, draw_plates
 from model.vibration import finer_mesh
-from sim.amplifier.readings import Crystal
+from sim.amplifier.amplifier_clock import Crystal
 
 _MAX_LOSS_FACTOR = 0.99
 _MIN_FACTOR = 0.05  # of a normal draw about 1, which may be negative

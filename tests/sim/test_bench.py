@@ -26,7 +26,7 @@ from processes.firmware_machine import SESSION as BENCH_SESSION
 from processes.firmware_machine import arm_bench, keep_alive
 from processes.firmware_machine import play as play_at_once
 from registry.limits import HAND_LOAD
-from sim.amplifier.readings import AmplifierClock, Crystal
+from sim.amplifier.amplifier_clock import AmplifierClock, Crystal
 from sim.bench.bench import Bench
 from sim.control import SimulationContext, execute
 from sim.plant.era_motions import motion_of

@@ -50,7 +50,8 @@ from model.transients.base_motion import BaseEnvelope
 from model.vibration import Excitation, Tone
 from registry import threads
 from registry.limits import GuardLimits
-from sim.amplifier.readings import Crystal, capabilities
+from sim.amplifier.amplifier_clock import Crystal
+from sim.amplifier.readings import capabilities
 from sim.far_ends.wire_assignment import SimulatedWire as WireAssignmentWire
 from sim.plant.imperfections import draw_imperfections
 

@@ -28,7 +28,7 @@ from kit.clock import (
     in_virtual_time,
     unaltered,
 )
-from sim.amplifier.readings import AmplifierClock, Crystal
+from sim.amplifier.amplifier_clock import AmplifierClock, Crystal
 from sim.far_ends import serial_amplifiers
 from sim.transport.simulated_line import LINE_KINDS, LineDelays
 

@@ -36,7 +36,7 @@ from drivers.wires.wire import BrokenReply
 from kit.clock import KINDS, MemoryLine, delayed, group_of, losing, of_parts, unaltered
 from kit.courses import Taken, courses, follow
 from registry import threads
-from sim.amplifier.readings import AmplifierClock, Crystal
+from sim.amplifier.amplifier_clock import AmplifierClock, Crystal
 from sim.amplifier.simulated_amplifier import SimulatedAmplifier as FarEnd
 
 

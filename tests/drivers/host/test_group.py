@@ -53,7 +53,7 @@ from kit.courses import Acted
 from late_taps import AMPLIFIERS
 from late_taps import WIRES as LATE_WIRES
 from late_taps import play as play_late_taps
-from sim.amplifier.readings import AmplifierClock, Crystal
+from sim.amplifier.amplifier_clock import AmplifierClock, Crystal
 
 
 class Paced:

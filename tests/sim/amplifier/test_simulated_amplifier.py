@@ -34,7 +34,7 @@ from kit.courses import Step, Taken, courses, fits, follow
 from kit.plates import make_paper_rig
 from kit.wires import MASTERS, drive, far_side, make_bench, on_amplifiers, until
 from model.rig.rig import Rig
-from sim.amplifier.readings import AmplifierClock, Crystal
+from sim.amplifier.amplifier_clock import AmplifierClock, Crystal
 from sim.amplifier.simulated_amplifier import SimulatedAmplifier
 from sim.bench.bench import Bench
 from sim.far_ends.can_amplifiers import CanAmplifiers, CanBus, SlcanAdapter, SocketcandClient

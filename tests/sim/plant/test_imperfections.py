@@ -29,7 +29,7 @@ from model.transients.shaping import Transients
 from model.transients.time_response import plate_in_time
 from model.vibration import Tone as VibrationTone
 from processes.firmware_machine import arm_bench, keep_alive, play
-from sim.amplifier.readings import StraightClock
+from sim.amplifier.amplifier_clock import StraightClock
 from sim.bench.bench import Bench
 from sim.plant.era_motions import motion_of
 from sim.plant.excited_plate import play as play_excitation

@@ -1,7 +1,7 @@
 """Control of a running simulation: its context, and JSON lines over a Unix socket, version 3.
 
-Only the owner of the socket may open it. One JSON object per line in each direction; keys that a
-request does not know are ignored.
+Only the owner of the socket may open it. One JSON object per line in each direction; unknown keys
+of a request are ignored.
 
     {"op": "hello"}                            {"protocol": "era-sim-control", "version": 3,
                                                 "clock": "wall" or "virtual", "ops": [...],
@@ -12,8 +12,8 @@ request does not know are ignored.
 
     fingers, positions [x, y] in metres
     {"op": "fingers", "fingers": {ID: [x, y]}, "observers": [ID, ...], "loads": {ID: factor}}
-                                               replace all fingers; observers load nothing, others
-                                               as the rig's fingertip times their load:
+                                               replace all fingers; observers load nothing, other
+                                               fingers load as the rig's fingertip times "load":
                                                {"ok": true, "time_s"}
     {"op": "touch", "finger": ID, "at_m": [x, y], "load": factor}      add one; "move": move one
     {"op": "lift", "finger": ID}                       remove one
@@ -39,9 +39,9 @@ import json
 import math
 import os
 import socket
+from abc import abstractmethod
 from collections.abc import (
     AsyncIterator,
-    Awaitable,
     Callable,
     Collection,
     Coroutine,
@@ -50,9 +50,8 @@ from collections.abc import (
 )
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
-from inspect import signature
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeAlias
+from typing import Annotated, Any, ClassVar, TypeAlias
 
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError
 
@@ -68,9 +67,8 @@ from sim.plant.fingers import measure_vibration
 
 _MAX_STEP = 3600.0  # s of virtual time in one request
 _MAX_KEY = 60  # characters of a key in an error
-_At = Annotated[tuple[FiniteFloat, FiniteFloat], Field(strict=False)]  # [x, y] in m
-_Positive = Annotated[FiniteFloat, Field(gt=0)]
-_Finger = Annotated[str, Field(min_length=1, max_length=40)]  # its id
+_Position = Annotated[tuple[FiniteFloat, FiniteFloat], Field(strict=False)]  # [x, y] in m
+_FingerId = Annotated[str, Field(min_length=1, max_length=40)]
 
 
 @dataclass
@@ -89,21 +87,21 @@ class SimulationContext:
     def start_solving(self) -> None:
         """Solve the plate under the newest fingers in a thread, so that amplifiers go on replying.
 
-        At once in virtual time.
+        In virtual time the first reader of the plate solves it.
         """
         if self.step is not None:
-            return  # the first who reads the plate solves it
+            return
         if self._solving is None or self._solving.done():
             self._solving = asyncio.create_task(self.solved(math.inf), name="solve the plate")
 
     async def solved(self, until: float) -> None:
         """Solve the plate under the fingers up to a time [s], or wait until it is."""
         while (placement := self.bench.unsolved) is not None and placement.time <= until:
-            # An error is raised once more where the plate is read.
+            # An error is raised again when the plate is read.
             await asyncio.gather(asyncio.to_thread(placement.solved), return_exceptions=True)
 
     async def stop_solving(self) -> None:
-        """Leave what is unsolved."""
+        """Stop solving; the current solution is abandoned."""
         if self._solving is not None:
             self._solving.cancel()
             await asyncio.wait({self._solving})
@@ -118,116 +116,107 @@ class SimulationContext:
         return (self.devices[amplifier],)
 
 
+_VERSION = 3
 _Response: TypeAlias = dict[str, Any]
-_Function: TypeAlias = Callable[..., Awaitable[_Response]]
-
-OPERATIONS: dict[str, tuple[type[BaseModel], _Function]] = {}
-"""The operations by name, in the order of `hello`: keys of a request, and what carries it out."""
 
 
-def operation(
-    *names: str, extra: Literal["allow", "ignore"] = "ignore"
-) -> Callable[[_Function], _Function]:
-    """Register a function as the operations with these names; extra: type of further keys.
+class _Request(BaseModel):
+    """A request. A subclass for each operation declares its keys, and carries it out.
 
-    It is called with the context, the time [s] and the keys of a request, which are its further
-    parameters. It returns the response, or raises InputError and changes nothing.
+    names: of the operation.
     """
 
-    def register(function: _Function) -> _Function:
-        _, _, *keys = signature(function).parameters.values()
-        keys = [each for each in keys if each.kind is each.KEYWORD_ONLY]
-        form: dict[str, Any] = {
-            "__module__": __name__,
-            "__annotations__": {each.name: each.annotation for each in keys},
-            "model_config": ConfigDict(frozen=True, strict=True, extra=extra),
-            **{each.name: each.default for each in keys if each.default is not each.empty},
+    model_config = ConfigDict(frozen=True, strict=True, extra="ignore")
+    names: ClassVar[tuple[str, ...]]
+
+    @abstractmethod
+    async def carry_out(self, context: SimulationContext, now: float) -> _Response:
+        """Return the response at a time [s]; an InputError changes nothing."""
+
+
+class _HelloRequest(_Request):
+    names = ("hello",)
+
+    async def carry_out(self, context: SimulationContext, now: float) -> _Response:
+        return {
+            "protocol": "era-sim-control",
+            "version": _VERSION,
+            "clock": "wall" if context.step is None else "virtual",
+            "ops": list(OPERATIONS),
+            "urls": dict(context.urls),
         }
-        OPERATIONS.update(dict.fromkeys(names, (type(names[0], (BaseModel,), form), function)))
-        return function
-
-    return register
 
 
-_VERSION = 3
+class _StateRequest(_Request):
+    names = ("state",)
+
+    async def carry_out(self, context: SimulationContext, now: float) -> _Response:
+        bench = context.bench
+        bench.advance(now)
+        amplifiers = {}
+        for name, amplifier in bench.amplifiers.items():
+            summary = amplifier.summary(bench.time)
+            amplifiers[name] = {
+                "state": summary.state,
+                "fault": summary.fault,
+                "token": summary.token,
+                "high_voltage": summary.is_high_voltage,
+                "levels": list(summary.levels),
+            }
+        fingers = {finger: list(position) for finger, position in bench.positions.items()}
+        return {"time_s": bench.time, "fingers": fingers, "amplifiers": amplifiers}
 
 
-@operation("hello")
-async def _hello(context: SimulationContext, now: float) -> _Response:
-    return {
-        "protocol": "era-sim-control",
-        "version": _VERSION,
-        "clock": "wall" if context.step is None else "virtual",
-        "ops": list(OPERATIONS),
-        "urls": dict(context.urls),
-    }
+class _FingersRequest(_Request):
+    names = ("fingers",)
+    fingers: dict[str, _Position]
+    observers: list[str] = Field(default_factory=list)
+    loads: dict[str, FiniteFloat] = Field(default_factory=dict)
+
+    async def carry_out(self, context: SimulationContext, now: float) -> _Response:
+        if not {*self.observers, *self.loads} <= self.fingers.keys():
+            raise InputError("observers and loads must name fingers of this request")
+        return _place_fingers(
+            context, self.fingers, now, observers=self.observers, loads=self.loads
+        )
 
 
-@operation("state")
-async def _state(context: SimulationContext, now: float) -> _Response:
-    bench = context.bench
-    bench.advance(now)
-    amplifiers = {}
-    for name, amplifier in bench.amplifiers.items():
-        summary = amplifier.summary(bench.time)
-        amplifiers[name] = {
-            "state": summary.state,
-            "fault": summary.fault,
-            "token": summary.token,
-            "high_voltage": summary.is_high_voltage,
-            "levels": list(summary.levels),
-        }
-    resting = {name: list(position) for name, position in bench.positions.items()}
-    return {"time_s": bench.time, "fingers": resting, "amplifiers": amplifiers}
+class _TouchOrMoveRequest(_Request):
+    names = ("touch", "move")
+    op: str
+    finger: _FingerId
+    at_m: _Position | None = None
+    load: FiniteFloat | None = None
+
+    async def carry_out(self, context: SimulationContext, now: float) -> _Response:
+        bench = context.bench
+        is_present = self.finger in bench.positions
+        if is_present != (self.op == "move"):
+            state = "already" if is_present else "not"
+            raise InputError(f"finger {self.finger!r} is {state} on the plate")
+        if self.at_m is None:
+            raise InputError("at_m: missing")
+        loads = dict(bench.loads)
+        if self.load is not None:
+            loads[self.finger] = self.load
+        positions = {**bench.positions, self.finger: self.at_m}
+        return _place_fingers(context, positions, now, observers=bench.observers, loads=loads)
 
 
-@operation("fingers")
-async def _fingers(
-    context: SimulationContext,
-    now: float,
-    *,
-    fingers: dict[str, _At],
-    observers: Annotated[list[str], Field(default_factory=list)],
-    loads: Annotated[dict[str, FiniteFloat], Field(default_factory=dict)],
-) -> _Response:
-    if not {*observers, *loads} <= fingers.keys():
-        raise InputError("observers and loads must name fingers of this request")
-    return _placed(context, fingers, now, observers=observers, loads=loads)
+class _LiftRequest(_Request):
+    names = ("lift",)
+    finger: _FingerId
+
+    async def carry_out(self, context: SimulationContext, now: float) -> _Response:
+        bench = context.bench
+        if self.finger not in bench.positions:
+            raise InputError(f"finger {self.finger!r} is not on the plate")
+        positions = dict(bench.positions)
+        del positions[self.finger]
+        return _place_fingers(context, positions, now, observers=bench.observers, loads=bench.loads)
 
 
-@operation("touch", "move")
-async def _touch_or_move(
-    context: SimulationContext,
-    now: float,
-    *,
-    op: str,
-    finger: _Finger,
-    at_m: _At | None = None,
-    load: FiniteFloat | None = None,
-) -> _Response:
-    bench = context.bench
-    if (finger in bench.positions) != (op == "move"):
-        state = "already" if finger in bench.positions else "not"
-        raise InputError(f"finger {finger!r} is {state} on the plate")
-    if at_m is None:
-        raise InputError("at_m: missing")
-    loads = dict(bench.loads)
-    if load is not None:
-        loads[finger] = load
-    positions = {**bench.positions, finger: at_m}
-    return _placed(context, positions, now, observers=bench.observers, loads=loads)
-
-
-@operation("lift")
-async def _lift(context: SimulationContext, now: float, *, finger: _Finger) -> _Response:
-    present = context.bench.positions
-    if finger not in present:
-        raise InputError(f"finger {finger!r} is not on the plate")
-    rest = {id: at for id, at in present.items() if id != finger}
-    return _placed(context, rest, now, observers=context.bench.observers, loads=context.bench.loads)
-
-
-def _placed(
+def _place_fingers(
     context: SimulationContext,
     positions: Mapping[str, Point],
     now: float,
@@ -240,77 +229,103 @@ def _placed(
     return {"ok": True, "time_s": context.bench.time}
 
 
-@operation("felt")
-async def _felt(
-    context: SimulationContext, now: float, *, since_s: FiniteFloat, until_s: FiniteFloat
-) -> _Response:
-    if since_s >= until_s:
-        raise InputError("since_s must be less than until_s")
-    # The fits run in threads, so that amplifiers go on replying.
-    await context.solved(until_s)
-    context.bench.advance(now)
-    records, frequencies = context.bench.records(since_s, until_s)
-    felt = {
-        id: await asyncio.to_thread(measure_vibration, record, frequencies)
-        for id, record in records.items()
-    }
-    return {
-        "fingers": {
-            id: {
-                "points_m": one.points.tolist(),
-                "weights": one.weights.tolist(),
-                "frequencies_hz": list(one.frequencies),
-                "amplitude_m_s2": one.amplitude.tolist(),
-                "peak_m_s2": one.peak.tolist(),
+class _FeltRequest(_Request):
+    names = ("felt",)
+    since_s: FiniteFloat
+    until_s: FiniteFloat
+
+    async def carry_out(self, context: SimulationContext, now: float) -> _Response:
+        if self.since_s >= self.until_s:
+            raise InputError("since_s must be less than until_s")
+        await context.solved(self.until_s)
+        context.bench.advance(now)
+        records, frequencies = context.bench.records(self.since_s, self.until_s)
+        fingers = {}
+        for finger, record in records.items():
+            # The fits run in threads, so that amplifiers go on replying.
+            vibration = await asyncio.to_thread(measure_vibration, record, frequencies)
+            fingers[finger] = {
+                "points_m": vibration.points.tolist(),
+                "weights": vibration.weights.tolist(),
+                "frequencies_hz": list(vibration.frequencies),
+                "amplitude_m_s2": vibration.amplitude.tolist(),
+                "peak_m_s2": vibration.peak.tolist(),
             }
-            for id, one in felt.items()
-        }
-    }
+        return {"fingers": fingers}
 
 
-@operation("inject_fault", extra="allow")
-async def _inject_fault(
-    context: SimulationContext, now: float, *, op: str, **given: Any
-) -> _Response:
-    window = parse_fault(given)
-    for device in context.devices_of(window.amplifier):
-        device.inject_fault(window)
-    return {"ok": True, "time_s": now}
+class _InjectFaultRequest(_Request):
+    model_config = ConfigDict(frozen=True, strict=True, extra="allow")
+    names = ("inject_fault",)
+    op: str
+
+    async def carry_out(self, context: SimulationContext, now: float) -> _Response:
+        window = parse_fault(self.model_extra or {})
+        for device in context.devices_of(window.amplifier):
+            device.inject_fault(window)
+        return {"ok": True, "time_s": now}
 
 
-@operation("faults")
-async def _faults(context: SimulationContext, now: float) -> _Response:
-    listed = {}
-    for name, device in context.devices.items():
-        begin = device.faults.begin
-        listed[name] = [
-            {
-                "fault": window.fault,
-                "begin_s": begin + window.at,
-                "end_s": begin + window.end if math.isfinite(window.end) else None,
-                "is_on": window.at <= now - begin < window.end,
-            }
-            for window in device.faults.windows
-        ]
-    return {"faults": listed}
+class _FaultsRequest(_Request):
+    names = ("faults",)
+
+    async def carry_out(self, context: SimulationContext, now: float) -> _Response:
+        faults = {}
+        for name, device in context.devices.items():
+            begin = device.faults.begin
+            windows = []
+            for window in device.faults.windows:
+                end = begin + window.end
+                entry = {
+                    "fault": window.fault,
+                    "begin_s": begin + window.at,
+                    "end_s": end if math.isfinite(end) else None,
+                    "is_on": window.at <= now - begin < window.end,
+                }
+                windows.append(entry)
+            faults[name] = windows
+        return {"faults": faults}
 
 
-@operation("recover")
-async def _recover(context: SimulationContext, now: float, *, amplifier: Any = None) -> _Response:
-    for device in context.devices_of(amplifier):
-        device.recover()
-    return {"ok": True, "time_s": now}
+class _RecoverRequest(_Request):
+    names = ("recover",)
+    amplifier: Any = None
+
+    async def carry_out(self, context: SimulationContext, now: float) -> _Response:
+        for device in context.devices_of(self.amplifier):
+            device.recover()
+        return {"ok": True, "time_s": now}
 
 
-@operation("step")
-async def _step(
-    context: SimulationContext, now: float, *, seconds: Annotated[_Positive, Field(le=_MAX_STEP)]
-) -> _Response:
-    if context.step is None:
-        raise InputError("step needs virtual time: start era sim with --virtual-time")
-    await context.step(seconds)
-    context.bench.advance(now + seconds)
-    return {"ok": True, "time_s": context.bench.time}
+class _StepRequest(_Request):
+    names = ("step",)
+    seconds: Annotated[FiniteFloat, Field(gt=0, le=_MAX_STEP)]
+
+    async def carry_out(self, context: SimulationContext, now: float) -> _Response:
+        if context.step is None:
+            raise InputError("step needs virtual time: start era sim with --virtual-time")
+        await context.step(self.seconds)
+        context.bench.advance(now + self.seconds)
+        return {"ok": True, "time_s": context.bench.time}
+
+
+_REQUESTS: tuple[type[_Request], ...] = (
+    _HelloRequest,
+    _StateRequest,
+    _FingersRequest,
+    _TouchOrMoveRequest,
+    _LiftRequest,
+    _FeltRequest,
+    _InjectFaultRequest,
+    _FaultsRequest,
+    _RecoverRequest,
+    _StepRequest,
+)
+
+OPERATIONS: Mapping[str, type[_Request]] = {
+    name: request for request in _REQUESTS for name in request.names
+}
+"""The operations by name, in the order of `hello`."""
 
 
 async def execute(context: SimulationContext, line: bytes, *, now: float) -> _Response:
@@ -322,8 +337,7 @@ async def execute(context: SimulationContext, line: bytes, *, now: float) -> _Re
         op = request.get("op")
         if not isinstance(op, str) or op not in OPERATIONS:
             raise InputError(f"op must be one of {', '.join(OPERATIONS)}, got {str(op)[:40]!r}")
-        form, function = OPERATIONS[op]
-        return await function(context, now, **dict(form.model_validate(request)))
+        return await OPERATIONS[op].model_validate(request).carry_out(context, now)
     except ValidationError as error:
         key, problem = first_problem(error)
         return {"error": f"{key[:_MAX_KEY]}: {problem}".removeprefix(": ")}
@@ -332,8 +346,9 @@ async def execute(context: SimulationContext, line: bytes, *, now: float) -> _Re
     except InputError as error:
         return {"error": str(error)}
     except OSError as error:
-        problem = f"{error.filename or 'file'}: cannot be written: {error.strerror}"
-        return {"error": problem if error.strerror else str(error)}
+        if not error.strerror:
+            return {"error": str(error)}
+        return {"error": f"{error.filename or 'file'}: cannot be written: {error.strerror}"}
 
 
 @asynccontextmanager
@@ -356,7 +371,7 @@ LINE_MAX = 64 * 1024  # bytes; thirty fingers take a tenth of it
 
 @asynccontextmanager
 async def control_socket(context: SimulationContext, path: Path) -> AsyncIterator[None]:
-    """Serve control at a path; raises LinkError where no socket can be created."""
+    """Serve control at a path; raises LinkError if no socket can be created."""
     sock = _bind(path)
     loop = asyncio.get_running_loop()
     clients: dict[asyncio.Task[None], socket.socket] = {}
@@ -390,14 +405,14 @@ async def control_socket(context: SimulationContext, path: Path) -> AsyncIterato
 async def _serve_client(context: SimulationContext, connection: socket.socket) -> None:
     """Serve a client line by line until it disconnects."""
     loop = asyncio.get_running_loop()
-    rest = b""
+    unfinished = b""
     with contextlib.suppress(ConnectionError):
         while data := await loop.sock_recv(connection, LINE_MAX):
-            *lines, rest = (rest + data).split(b"\n")
+            *lines, unfinished = (unfinished + data).split(b"\n")
             for line in lines:
                 response = await execute(context, line, now=threads.now())
                 await loop.sock_sendall(connection, await asyncio.to_thread(_encode, response))
-            if len(rest) > LINE_MAX:  # the next line cannot be found
+            if len(unfinished) > LINE_MAX:  # the next line cannot be found
                 error = {"error": f"line must be at most {LINE_MAX} bytes"}
                 await loop.sock_sendall(connection, _encode(error))
                 return
@@ -408,7 +423,7 @@ def _encode(reply: dict[str, Any]) -> bytes:
 
 
 def _bind(path: Path) -> socket.socket:
-    """Create a listening socket for the owner only; a stale one is replaced."""
+    """Create a listening socket for the owner only; a stale socket is replaced."""
     sock = socket.socket(socket.AF_UNIX)
     mask = os.umask(0o177)
     try:

@@ -1,4 +1,4 @@
-"""Assign a wire to each amplifier, and open the far end of each kind of wire.
+"""Wires of simulated amplifiers: a wire for each amplifier, and the far end of each wire.
 
 A far end is an asynchronous context in which devices reply on a real wire; it yields the URL of
 each amplifier by name. A new kind is a row of `FAR_ENDS`.
@@ -68,14 +68,17 @@ class SimulatedWire:
 
 @asynccontextmanager
 async def open_wire(wire: SimulatedWire, devices: Devices) -> Urls:
-    """The far end of a wire with these devices; entering it may raise LinkError.
+    """The far end of a wire with these devices; raises LinkError.
 
     Amplifiers that do not share a serial wire have a line each.
     """
+    lines: list[Devices] = [devices]
+    if not wire.is_one_line:
+        lines = [[device] for device in devices]
+    urls: dict[str, str] = {}
     async with AsyncExitStack() as stack:
-        urls: dict[str, str] = {}
-        for line in [devices] if wire.is_one_line else [[device] for device in devices]:
-            urls |= await stack.enter_async_context(_open_line(wire, line))
+        for line in lines:
+            urls.update(await stack.enter_async_context(_open_line(wire, line)))
         yield urls
 
 
@@ -89,25 +92,43 @@ async def open_wires(wires: Mapping[str, SimulatedWire], devices: Devices) -> Ur
     for device in devices:
         wire = wires[device.name]
         if len(devices) > 1 and wire.line_kind is None:
-            port = Path(wire.line).name.rstrip("0123456789")
-            wire = replace(wire, line_kind=KIND_OF_PORT.get(port, FAR_ENDS[wire.kind].line_kind))
+            wire = replace(wire, line_kind=_default_line_kind(wire))
         lines.setdefault(wire, []).append(device)
     urls: dict[str, str] = {}
     async with AsyncExitStack() as stack:
-        for wire, together in lines.items():
-            urls.update(await stack.enter_async_context(open_wire(wire, together)))
+        for wire, devices_of_wire in lines.items():
+            urls.update(await stack.enter_async_context(open_wire(wire, devices_of_wire)))
         yield {device.name: urls[device.name] for device in devices}
+
+
+def _default_line_kind(wire: SimulatedWire) -> str:
+    """The kind of line of a wire with several amplifiers, from its port or its kind."""
+    port = Path(wire.line).name.rstrip("0123456789")
+    return KIND_OF_PORT.get(port, FAR_ENDS[wire.kind].line_kind)
 
 
 @contextmanager
 def _on_bus(
     make_adapter: Callable[[CanBus, SendBytes], FarEnd], speed: int | None, numbered: Numbered
 ) -> Iterator[MakeEnd]:
-    with (
-        closing(CanBus(speed)) as bus,
-        closing(BusNodes(bus, [*numbered.values()])),
-    ):
+    """Amplifiers on a CAN bus behind an adapter."""
+    devices = [*numbered.values()]
+    with closing(CanBus(speed)) as bus, closing(BusNodes(bus, devices)):
         yield partial(make_adapter, bus)
+
+
+def _on_serial_line(speed: int | None, numbered: Numbered) -> AbstractContextManager[MakeEnd]:
+    return nullcontext(partial(SerialAmplifiers, numbered))
+
+
+def _on_modbus_tcp(speed: int | None, numbered: Numbered) -> AbstractContextManager[MakeEnd]:
+    """Amplifiers whose units are shared by all connections."""
+    units = ModbusAmplifiers(numbered, lambda data: None, is_rtu=False)
+    return nullcontext(units.of_connection)
+
+
+def _on_modbus_rtu(speed: int | None, numbered: Numbered) -> AbstractContextManager[MakeEnd]:
+    return nullcontext(partial(ModbusAmplifiers, numbered, is_rtu=True))
 
 
 @dataclass(frozen=True)
@@ -135,28 +156,37 @@ class FarEndKind:
         """Whether it is a TCP port."""
         return "{host}" in self.url
 
+    @property
+    def is_can(self) -> bool:
+        """Whether it is a CAN bus."""
+        return self.url.startswith("can")
+
+    def url_of(self, *, port: int | str, speed: int, address: int) -> str:
+        """The URL of an amplifier, without options that have their default values."""
+        url = self.url.format(host=HOST, port=port, speed=speed, address=address)
+        url = url.removesuffix(f"&address={ADDRESS}")
+        return url.replace(f"{BUS_NAME}?bitrate={BITRATE}#", f"{BUS_NAME}#")
+
 
 FAR_ENDS: Mapping[str, FarEndKind] = {
     "serial": FarEndKind(
         "serial://{port}?baud={speed}&address={address}",
         BAUD,
         "usb-high-speed",
-        lambda speed, numbered: nullcontext(partial(SerialAmplifiers, numbered)),
+        _on_serial_line,
         bits=10,
     ),
     "modbus-tcp": FarEndKind(
         "modbus+tcp://{host}:{port}/{address}",
         RTU_BAUD,
         "ethernet",
-        lambda speed, numbered: nullcontext(
-            ModbusAmplifiers(numbered, lambda data: None, is_rtu=False).of_connection
-        ),
+        _on_modbus_tcp,
     ),
     "modbus-rtu": FarEndKind(
         "modbus+rtu://{port}?baud={speed}#{address}",
         RTU_BAUD,
         "usb-high-speed",
-        lambda speed, numbered: nullcontext(partial(ModbusAmplifiers, numbered, is_rtu=True)),
+        _on_modbus_rtu,
         bits=11,
     ),
     "socketcand": FarEndKind(
@@ -179,16 +209,19 @@ _EXAMPLE = ", such as --wire main=serial"
 
 @asynccontextmanager
 async def _open_line(wire: SimulatedWire, devices: Devices) -> Urls:
-    kind, first = FAR_ENDS[wire.kind], devices[0]
+    """The far end of one line; yields the URL of each amplifier by name."""
+    kind = FAR_ENDS[wire.kind]
+    first = devices[0]
     numbered = {device.address: device for device in devices}
     if wire.kind == "serial" and len(devices) == 1:
         numbered = {ADDRESS: first}
-    # The speed of the kind if its line has delays, else none.
-    speed = wire.speed or (None if wire.line_kind in (None, PROMPT) else kind.speed)
+    speed = wire.speed
+    if speed is None and wire.line_kind not in (None, PROMPT):
+        speed = kind.speed
     delays = delays_of(wire.line_kind, wire.seed, first.name)
-    faults = (
-        Faults() if kind.url.startswith("can") else None
-    )  # frame faults are injected on the bus
+    faults = None
+    if kind.is_can:  # frame faults are injected on the bus
+        faults = Faults()
     with kind.open_end(speed, numbered) as make_end:
         end: TcpEnd | TerminalEnd
         if kind.is_ported:
@@ -203,13 +236,11 @@ async def _open_line(wire: SimulatedWire, devices: Devices) -> Urls:
                 unpluggable=wire.unpluggable,
             )
         async with end:
-            url = partial(kind.url.format, host=HOST, port=end.port, speed=wire.speed or kind.speed)
-            yield {
-                device.name: url(address=address)
-                .removesuffix(f"&address={ADDRESS}")
-                .replace(f"{BUS_NAME}?bitrate={BITRATE}#", f"{BUS_NAME}#")
-                for address, device in numbered.items()
-            }
+            urls = {}
+            url_speed = wire.speed or kind.speed
+            for address, device in numbered.items():
+                urls[device.name] = kind.url_of(port=end.port, speed=url_speed, address=address)
+            yield urls
 
 
 def assign_wires(
@@ -221,9 +252,9 @@ def assign_wires(
 ) -> dict[str, SimulatedWire]:
     """The wire of each amplifier, by name.
 
-    amplifiers: URLs by name; options: texts like `main=modbus-tcp:5020`; common: wire of all other
-    amplifiers, None to follow their URLs; defaults: speed and sharing of these wires. Equal wires
-    are shared. Raises InputError.
+    amplifiers: URLs by name; options: texts like `main=modbus-tcp:5020`; common: wire of the other
+    amplifiers, None for the wires that their URLs name; defaults: speed and sharing of these wires.
+    Equal wires are shared. Raises InputError.
     """
     assigned: dict[str, SimulatedWire] = {}
     for text in options:
@@ -231,15 +262,15 @@ def assign_wires(
         if not equals:
             raise InputError(f"--wire {text}: must be NAME=WIRE{_EXAMPLE}")
         if name not in amplifiers:
-            known = ", ".join(amplifiers)
-            raise InputError(f"--wire {text}: amplifier must be one of {known}{_EXAMPLE}")
+            names = ", ".join(amplifiers)
+            raise InputError(f"--wire {text}: amplifier must be one of {names}{_EXAMPLE}")
         if name in assigned:
             raise InputError(f"--wire {text}: must be given once per amplifier{_EXAMPLE}")
         assigned[name] = _wire_of_option(kind, text, defaults)
-    return {
-        name: assigned.get(name) or common or _wire_of_url(name, url, defaults)
-        for name, url in amplifiers.items()
-    }
+    wires = {}
+    for name, url in amplifiers.items():
+        wires[name] = assigned.get(name) or common or _wire_of_url(name, url, defaults)
+    return wires
 
 
 def choose_lines(
@@ -247,67 +278,83 @@ def choose_lines(
 ) -> dict[str, SimulatedWire]:
     """Wires by amplifier with the kinds of line that options name: `KIND` or `NAME=KIND`.
 
-    A name means all amplifiers of its line, and overrides the option for all lines. Raises
+    A name stands for all amplifiers of its line, and overrides the option for all lines. Raises
     InputError.
     """
-    kinds: dict[str, str] = {}
+    chosen = dict(wires)
     for text in sorted(options, key=lambda text: "=" in text):
         name, equals, kind = text.rpartition("=")
         if equals and name not in wires:
             raise InputError(f"--line {text}: amplifier must be one of {', '.join(wires)}")
         if kind not in LINE_NAMES:
-            known = ", ".join(LINE_NAMES)
-            raise InputError(f"--line {text}: must be KIND or NAME=KIND, KIND one of {known}")
-        for each, wire in wires.items():
-            if not equals or each == name or (wire.is_one_line and wire == wires[name]):
-                kinds[each] = kind
-    return {
-        name: replace(wire, line_kind=kinds.get(name, wire.line_kind))
-        for name, wire in wires.items()
-    }
+            kinds = ", ".join(LINE_NAMES)
+            raise InputError(f"--line {text}: must be KIND or NAME=KIND, KIND one of {kinds}")
+        for amplifier in _on_line_of(name, wires) if equals else wires:
+            chosen[amplifier] = replace(wires[amplifier], line_kind=kind)
+    return chosen
+
+
+def _on_line_of(name: str, wires: Mapping[str, SimulatedWire]) -> list[str]:
+    """The amplifiers on the line of an amplifier, including itself."""
+    line = wires[name]
+    if not line.is_one_line:
+        return [name]
+    return [amplifier for amplifier, wire in wires.items() if wire == line]
 
 
 def links_of(wires: Mapping[str, SimulatedWire]) -> dict[str, Path]:
-    """Paths of the rig's URLs at which terminals are placed, by one of the amplifiers on each.
+    """Paths at which the rig's URLs expect terminals, by the last amplifier on each.
 
-    Those in /dev are of real ports.
+    Paths in /dev belong to real ports.
     """
-    names = {
-        wire.line: name
-        for name, wire in wires.items()
-        if wire.line.startswith("/") and not wire.line.startswith("/dev/")
-    }
-    return {name: Path(path) for path, name in names.items()}
+    amplifiers_by_path: dict[str, str] = {}
+    for name, wire in wires.items():
+        if wire.line.startswith("/") and not wire.line.startswith("/dev/"):
+            amplifiers_by_path[wire.line] = name
+    return {name: Path(path) for path, name in amplifiers_by_path.items()}
 
 
 def _wire_of_option(text: str, option: str, defaults: SimulatedWire) -> SimulatedWire:
+    """The wire in an option: `KIND` or, over TCP, `KIND:PORT`; raises InputError."""
     kind, colon, port = text.partition(":")
-    if kind in FAR_ENDS and bool(colon) <= FAR_ENDS[kind].is_ported:
-        if not colon:
-            return replace(defaults, kind=kind)
-        if port.isascii() and port.isdigit() and int(port) <= 65535:
-            return replace(defaults, kind=kind, port=int(port))
-    known = ", ".join(f"{name}:PORT" if kind.is_ported else name for name, kind in FAR_ENDS.items())
-    raise InputError(f"--wire {option}: wire must be one of {known}, got {text!r}")
+    if kind in FAR_ENDS and not colon:
+        return replace(defaults, kind=kind)
+    if kind in FAR_ENDS and FAR_ENDS[kind].is_ported and _is_tcp_port(port):
+        return replace(defaults, kind=kind, port=int(port))
+    forms = []
+    for name, far_end in FAR_ENDS.items():
+        forms.append(f"{name}:PORT" if far_end.is_ported else name)
+    raise InputError(f"--wire {option}: wire must be one of {', '.join(forms)}, got {text!r}")
+
+
+def _is_tcp_port(text: str) -> bool:
+    return text.isascii() and text.isdigit() and int(text) <= 65535
 
 
 def _wire_of_url(name: str, url: str, defaults: SimulatedWire) -> SimulatedWire:
-    """The wire that a URL names; amplifiers whose URLs name one line share it."""
-    kind, place = _KIND_OF_SCHEME.get(url.partition("://")[0].lower()), Endpoint()
-    if kind is not None:
-        try:
-            address = address_of(url)
-        except CommandError as problem:
-            raise InputError(f"amplifier {name}: {problem}") from problem
-        place = getattr(address, "place", place)
-    is_ported = kind is not None and FAR_ENDS[kind].is_ported
-    if kind is None or (is_ported and place.name not in url):
-        schemes = ", ".join(_KIND_OF_SCHEME)
-        raise InputError(
-            f"amplifier {name}: scheme must be one of {schemes}, with a port over TCP, got {url}; "
-            "add --serial (a pseudo-terminal each), --modbus-tcp PORT, --modbus-rtu, --socketcand "
-            f"PORT or --slcan for all, or --wire {name}=serial"
-        )
-    if is_ported:
-        return replace(defaults, kind=kind, port=place.port, address=address.number)
-    return replace(defaults, kind=kind, address=address.number, line=place.name, shared=True)
+    """The wire that a URL names, shared by all URLs of the same line; raises InputError."""
+    scheme = url.partition("://")[0].lower()
+    if scheme not in _KIND_OF_SCHEME:
+        raise _bad_url(name, url)
+    kind = _KIND_OF_SCHEME[scheme]
+    try:
+        address = address_of(url)
+    except CommandError as problem:
+        raise InputError(f"amplifier {name}: {problem}") from problem
+    endpoint = getattr(address, "place", Endpoint())
+    number = address.number
+    if not FAR_ENDS[kind].is_ported:
+        return replace(defaults, kind=kind, address=number, line=endpoint.name, shared=True)
+    if endpoint.name not in url:
+        raise _bad_url(name, url)
+    return replace(defaults, kind=kind, port=endpoint.port, address=number)
+
+
+def _bad_url(name: str, url: str) -> InputError:
+    """The error for a URL that names no wire of a simulation."""
+    schemes = ", ".join(_KIND_OF_SCHEME)
+    return InputError(
+        f"amplifier {name}: scheme must be one of {schemes}, with a port over TCP, got {url}; "
+        "add --serial (a pseudo-terminal each), --modbus-tcp PORT, --modbus-rtu, --socketcand "
+        f"PORT or --slcan for all, or --wire {name}=serial"
+    )

@@ -1,7 +1,7 @@
 """`era sim`: simulated amplifiers on real wires over one plate."""
 
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -13,7 +13,11 @@ from model.errors import InputError
 from sim.soft_amp.soft_amp_cli import port_option, soft_amp
 
 if TYPE_CHECKING:
+    from model.arrays import Point
+    from model.rig.rig import Rig
     from sim.far_ends.wire_assignment import SimulatedWire
+    from sim.faults import FaultFile
+    from sim.plant.imperfections import Imperfections
     from sim.simulation import Simulation
 
 app = typer.Typer(pretty_exceptions_enable=False)
@@ -110,63 +114,53 @@ def sim(
     from sim.early_exit import exit_on_signal
 
     with exit_on_signal():
-        from model.config.units import parse_point
         from model.rig.rig_file import load_rig
         from sim.far_ends.wire_assignment import SimulatedWire, assign_wires, choose_lines, links_of
-        from sim.faults import FaultFile, load_faults
-        from sim.plant.imperfections import Imperfections, draw_imperfections
         from sim.simulation import Simulation, find_firmware
         from sim.transport.far_end import links_by_amplifier
         from sim.transport.simulated_line import PROMPT
 
-        drawn = seed_of_plate(exact=exact, seed=seed)
+        plate_seed = seed_of_plate(exact=exact, seed=seed)
         defaults = SimulatedWire(
             "serial",
             speed=speed,
             shared=shared,
             unpluggable=faults is not None,
             line_kind=PROMPT if virtual_time else None,  # a host's time never stops
-            seed=drawn or 0,
+            seed=plate_seed or 0,
         )
-        common = _common_wire(
-            defaults,
-            {
-                "serial": 0 if serial else None,
-                "modbus-tcp": modbus_tcp,
-                "modbus-rtu": 0 if modbus_rtu else None,
-                "socketcand": socketcand,
-                "slcan": 0 if slcan else None,
-            },
-        )
+        ports: dict[str, int | None] = {
+            "serial": 0 if serial else None,
+            "modbus-tcp": modbus_tcp,
+            "modbus-rtu": 0 if modbus_rtu else None,
+            "socketcand": socketcand,
+            "slcan": 0 if slcan else None,
+        }
+        common_wire = _common_wire(defaults, ports)
         if virtual_time and control is None:
             raise InputError("--virtual-time needs --control PATH, which advances the time")
-        loaded = load_rig(rig)
-        if firmware and (common is not None or wire or line or faults or virtual_time):
+        loaded_rig = load_rig(rig)
+        if firmware and (common_wire is not None or wire or line or faults or virtual_time):
             raise InputError(
                 "--firmware has a serial line, real time and a plate that does not move; omit the "
                 "other options"
             )
-        programs = find_firmware() if firmware else None
-        to_wire = {} if firmware else loaded.amplifiers
-        wires = assign_wires(to_wire, common=common, options=wire or [], defaults=defaults)
+        program = find_firmware() if firmware else None
+        urls_to_wire = {} if firmware else loaded_rig.amplifiers
+        wires = assign_wires(
+            urls_to_wire, common=common_wire, options=wire or [], defaults=defaults
+        )
         wires = choose_lines(wires, line or [])
-        links = links_by_amplifier(link or [], amplifiers=list(loaded.amplifiers))
+        links = links_by_amplifier(link or [], amplifiers=list(loaded_rig.amplifiers))
         simulation = Simulation(
-            loaded,
+            loaded_rig,
             wires,
-            faults=load_faults(faults, amplifiers=loaded.amplifiers)
-            if faults
-            else FaultFile(faults=[]),
-            fingers={
-                str(number): parse_point(text, what="--finger")
-                for number, text in enumerate(finger or [], start=1)
-            },
-            imperfections=(
-                Imperfections() if drawn is None else draw_imperfections(loaded, seed=drawn)
-            ),
+            faults=_fault_file(faults, loaded_rig),
+            fingers=_finger_positions(finger or []),
+            imperfections=_imperfections(loaded_rig, plate_seed),
             control=control,
             until_eof=until_eof,
-            firmware=programs,
+            firmware=program,
             links={**links_of(wires), **links},
         )
         _run(simulation, virtual_time=virtual_time)
@@ -175,17 +169,48 @@ def sim(
 def _common_wire(
     defaults: "SimulatedWire", ports: Mapping[str, int | None]
 ) -> "SimulatedWire | None":
-    """The wire of all amplifiers, by the one option given; ports: None for options not given."""
+    """The wire of all amplifiers if one option is set; ports: by kind, None for unset options."""
     from dataclasses import replace
 
-    given = {kind: port for kind, port in ports.items() if port is not None}
-    if len(given) > 1:
-        named = " and ".join(f"--{kind}" for kind in given)
+    kinds = [kind for kind, port in ports.items() if port is not None]
+    if len(kinds) > 1:
+        options = " and ".join([f"--{kind}" for kind in kinds])
         raise InputError(
-            f"{named} exclude each other; give one, or the wire of each amplifier, as in "
+            f"{options} exclude each other; give one, or the wire of each amplifier, as in "
             "--wire main=serial --wire side=slcan"
         )
-    return next((replace(defaults, kind=kind, port=port) for kind, port in given.items()), None)
+    if not kinds:
+        return None
+    (kind,) = kinds
+    return replace(defaults, kind=kind, port=ports[kind] or 0)
+
+
+def _fault_file(path: Path | None, rig: "Rig") -> "FaultFile":
+    """The faults that a file lists, none without a file; raises ConfigError."""
+    from sim.faults import FaultFile, load_faults
+
+    if path is None:
+        return FaultFile(faults=[])
+    return load_faults(path, amplifiers=rig.amplifiers)
+
+
+def _finger_positions(options: Sequence[str]) -> dict[str, "Point"]:
+    """Positions [m] of fingers by id, numbered from 1; raises InputError."""
+    from model.config.units import parse_point
+
+    fingers = {}
+    for number, text in enumerate(options, start=1):
+        fingers[str(number)] = parse_point(text, what="--finger")
+    return fingers
+
+
+def _imperfections(rig: "Rig", seed: int | None) -> "Imperfections":
+    """The imperfections of the plate with a seed; none for None."""
+    from sim.plant.imperfections import Imperfections, draw_imperfections
+
+    if seed is None:
+        return Imperfections()
+    return draw_imperfections(rig, seed=seed)
 
 
 def _run(simulation: "Simulation", *, virtual_time: bool) -> None:

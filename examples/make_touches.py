@@ -18,7 +18,8 @@ from pythonosc.osc_bundle_builder import IMMEDIATELY, OscBundleBuilder
 from pythonosc.osc_message_builder import OscMessageBuilder
 
 from controller.sources.touch import Touch, TouchFrame
-from controller.sources.tuio import CURSORS, HEADER, RecordedDatagram
+from controller.sources.tuio import CURSORS
+from controller.sources.tuio_capture import HEADER, RecordedDatagram
 
 PLATE = np.array([0.3048, 0.2286])  # m
 MARGIN = 0.015  # m; from the edges

@@ -144,7 +144,7 @@ def _print_result(
 
 def _read_touches(file: Path) -> "Scene":
     from controller.demo.demonstration import Scene
-    from controller.sources.tuio import read_capture
+    from controller.sources.tuio_capture import read_capture
 
     return Scene(read_capture(file))
 

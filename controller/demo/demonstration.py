@@ -43,7 +43,8 @@ from controller.process.daemon_process import SocketLock
 from controller.process.log import LogThread, start_log
 from controller.sources.touch import TouchFrame, TouchSource
 from controller.sources.touch_calibration import ALIGNED
-from controller.sources.tuio import RecordedDatagram, TuioSource, read_capture
+from controller.sources.tuio import TuioSource
+from controller.sources.tuio_capture import RecordedDatagram, read_capture
 from drivers.errors import LinkError
 from model.answer.answer import Sensation
 from model.answer.stimulus import Finger

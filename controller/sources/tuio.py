@@ -4,114 +4,28 @@ A bundle contains the name of its sender (source), the active session ids (alive
 positions (set) and a sequence number (fseq), each for one profile; see tuio.org, "TUIO 1.1 Protocol
 Specification". A blob also has a width and a height, relative to the sensor, which distinguish a
 hand from a finger. Numbers of any type are accepted, and additional arguments are ignored. A
-malformed message is counted, and the rest of its bundle is read. Messages use Open Sound Control
-1.0 (opensoundcontrol.stanford.edu/spec-1_0.html) and come in untrusted datagrams.
-
-A capture is a text file with the datagrams of a sender and their times, for replay:
-
-    # era-haptics TUIO capture 1
-    0.000000 2362756e646c6500...
-    0.016667 2362756e646c6500...
-
-Each line has the seconds from the start and the datagram in hexadecimal; other lines starting
-with # are comments. Malformed datagrams are kept as received.
+malformed message is counted, and the other messages of its bundle are read.
 """
 
 import math
 import re
-import struct
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
-from io import TextIOWrapper
 from itertools import islice, product
-from pathlib import Path
-from typing import TextIO, TypeAlias
+from typing import TypeAlias
 
+from controller.sources.osc import Argument, osc_messages, read_message
 from controller.sources.touch import Touch, TouchFrame
-from controller.sources.udp_source import MAX_DATAGRAM, Datagram, Peer, UdpSource
+from controller.sources.udp_source import Datagram, Peer, UdpSource
 from model.errors import InputError
 from registry import threads
-from registry.files import LineTooLong, lines_of, open_regular
 from registry.limits import MAX_CONTACTS
 
-Argument: TypeAlias = str | int | float | None
-"""Argument of a message; None for a blob, true, false, nil and impulse."""
-
-_BUNDLE = b"#bundle\0"
-_BUNDLE_HEADER = len(_BUNDLE) + 8  # the time tag is ignored: touches are current
-_MAX_DEPTH = 8  # of nested bundles
-_ADDRESS = re.compile(rb"/[!-~]*")
-_RUNS = re.compile(rb"[sS]|b|[TFNI]+|[ifdhtcrm]+")
-_CODES = bytes.maketrans(b"htcrm", b"qQiII")  # codes of `struct`, which already has i, f and d
-
-
-def osc_messages(datagram: bytes, *, limit: int) -> list[bytes]:
-    """Return the encoded messages of a datagram in order, for `read_message`; up to a limit.
-
-    Elements that are neither message nor bundle are included; after an element whose size exceeds
-    its bundle, the rest is one such element.
-    """
-    found, ends = list[bytes](), list[int]()  # of the bundles around an element
-    at, end, is_whole = 0, len(datagram), True
-    while len(found) < limit:
-        is_bundle = end - at >= _BUNDLE_HEADER and datagram.startswith(_BUNDLE, at)
-        if is_whole and is_bundle and len(ends) < _MAX_DEPTH:
-            ends.append(end)
-            at += _BUNDLE_HEADER
-        else:
-            found.append(datagram[at:end])
-            at = end
-        while ends and at == ends[-1]:
-            ends.pop()
-        if not ends:
-            break
-        size = int.from_bytes(datagram[at : at + 4], "big", signed=True)
-        is_whole = 0 < size <= ends[-1] - at - 4
-        at, end = (at + 4, at + 4 + size) if is_whole else (at, ends[-1])
-    return found
-
-
-# Most messages of a panel repeat: its name, active contacts, resting fingers.
-@lru_cache(maxsize=256)
-def read_message(message: bytes) -> tuple[str, tuple[Argument, ...]]:
-    """Return the address and the arguments of an encoded message; raises InputError.
-
-    Bytes of a text that are not valid UTF-8 are written as \\xNN.
-    """
-    address = message.partition(b"\0")[0]
-    at = len(address) // 4 * 4 + 4  # strings are padded with one to four zeros
-    tags = message[at:].partition(b"\0")[0]
-    runs = _RUNS.findall(tags)
-    if not (_ADDRESS.fullmatch(address) and tags.startswith(b",")):
-        raise InputError(f"element must be a message with argument types, got {message[:24]!r}")
-    if b"".join(runs) != tags.translate(None, b",[]"):
-        raise InputError(f"argument types must be letters of OSC 1.0, got {tags[:32]!r}")
-    arguments: list[Argument] = []
-    at += len(tags) // 4 * 4 + 4
-    try:
-        for run in runs:  # consecutive numbers in one step
-            if run in (b"s", b"S"):
-                end = message.index(b"\0", at)
-                arguments.append(message[at:end].decode(errors="backslashreplace"))
-                at += (end - at) // 4 * 4 + 4
-            elif run == b"b":
-                (size,) = struct.unpack_from(">I", message, at)
-                arguments.append(None)
-                at += 4 + (size + 3) // 4 * 4
-            elif run[0] in b"TFNI":
-                arguments += [None] * len(run)
-            else:
-                layout = ">" + run.translate(_CODES).decode()
-                arguments += struct.unpack_from(layout, message, at)
-                at += struct.calcsize(layout)
-    except (struct.error, ValueError) as error:
-        raise InputError(f"invalid message: {error}") from error
-    return address.decode(), tuple(arguments)
-
-
-CURSORS, BLOBS = SERVED = "/tuio/2Dcur", "/tuio/2Dblb"
+CURSORS = "/tuio/2Dcur"
+BLOBS = "/tuio/2Dblb"
+SERVED = (CURSORS, BLOBS)
+"""Addresses of the supported profiles."""
 
 _Key: TypeAlias = tuple[str, int]
 """Profile and session id of a contact."""
@@ -160,10 +74,21 @@ class _Bundle:
 
     source: str | None = None
     profiles: dict[str, _Profile] = field(default_factory=dict)  # by address
-    malformed: list[str] = field(default_factory=list)  # reasons of rejected messages
-    others: dict[str, bool] = field(
-        default_factory=dict
-    )  # unsupported addresses; whether they carry touches
+    malformed: list[str] = field(default_factory=list)  # reasons for rejecting messages
+    # Whether messages at unsupported addresses carry touches, by address.
+    unsupported: dict[str, bool] = field(default_factory=dict)
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether it has all active contacts of its profiles, with their positions."""
+        for profile in self.profiles.values():
+            if profile.alive is None or not profile.touches.keys() >= {*profile.alive}:
+                return False
+        return bool(self.profiles)
+
+
+_BundleKind: TypeAlias = tuple[Peer, bytes, bool, bool]
+"""Sender, its name, and whether a bundle has cursors and blobs."""
 
 
 @dataclass
@@ -172,10 +97,20 @@ class _Sender:
 
     last_heard: float
     peer: Peer  # its host and port
-    former: Peer | None = None  # its previous address
+    former: Peer | None = None  # its previous host and port
     profiles: dict[str, _Profile] = field(default_factory=dict)  # by address
     ids: dict[_Key, int] = field(default_factory=dict)  # of its contacts, if it sends blobs
     resting: int = 0  # consecutive frames without contacts
+
+    def continues_with(self, bundle: _Bundle) -> bool:
+        """Whether the frame numbers of a bundle, if any, follow the latest ones."""
+        for address, profile in bundle.profiles.items():
+            last_profile = self.profiles.get(address)
+            if profile.sequence >= 0 and last_profile is not None:
+                advance = profile.sequence - last_profile.sequence
+                if not 0 < advance <= _LATE_FRAMES:
+                    return False
+        return True
 
     def touches(self, *, since: float) -> tuple[Touch, ...]:
         """Return the contacts of profiles received since a time [s].
@@ -183,45 +118,57 @@ class _Sender:
         A contact that is both a cursor and a blob is a cursor with the blob's size, and keeps its
         id as long as either of them is alive.
         """
-        known = {
-            (address, number): touch
-            for address, each in self.profiles.items()
-            for number, touch in each.touches.items()
-            if each.last_heard > since
-        }
+        received: dict[_Key, Touch] = {}
+        for address, profile in self.profiles.items():
+            if profile.last_heard > since:
+                for number, touch in profile.touches.items():
+                    received[address, number] = touch
         if BLOBS not in self.profiles:
-            return tuple(known.values())
-        before, self.ids, found = self.ids, {}, dict[int, Touch]()
-        pairs = _paired(known, before)
-        alone = [each for each in known if each not in pairs.values()]
-        for one in sorted(alone, key=lambda each: each not in before):
-            two = pairs.get(one, one)
-            id = before.get(one, before.get(two, known[one].id))
-            while id in found:
+            return tuple(received.values())
+        former_ids = self.ids
+        self.ids = {}
+        touches: dict[int, Touch] = {}
+        blobs = _blobs_of_cursors(received, former_ids)
+        unpaired = [key for key in received if key not in blobs.values()]
+        unpaired.sort(key=lambda key: key not in former_ids)
+        for key in unpaired:
+            blob_key = blobs.get(key, key)
+            touch = received[key]
+            id = former_ids.get(key, former_ids.get(blob_key, touch.id))
+            while id in touches:
                 id += _APART_IDS
-            self.ids[one] = self.ids[two] = id
-            found[id] = replace(known[one], id=id, size=known[two].size)
-        return tuple(found.values())
+            self.ids[key] = id
+            self.ids[blob_key] = id
+            touches[id] = replace(touch, id=id, size=received[blob_key].size)
+        return tuple(touches.values())
 
 
-def _paired(known: Mapping[_Key, Touch], before: Mapping[_Key, int]) -> dict[_Key, _Key]:
+def _blobs_of_cursors(
+    touches: Mapping[_Key, Touch], former_ids: Mapping[_Key, int]
+) -> dict[_Key, _Key]:
     """Match blobs to cursors: first the previous matches, then the nearest ones.
 
-    before: ids of contacts. Compares at most the maximum number of contacts.
+    former_ids: ids of contacts. Compares at most the maximum number of contacts.
     """
-    near, pairs = list[tuple[bool, float, _Key, _Key]](), dict[_Key, _Key]()
-    few = [[each for each in known if each[0] == of][:MAX_CONTACTS] for of in SERVED]
-    for one, two in product(*few):
-        cursor, blob = known[one], known[two]
-        was_one = before.get(one, math.nan) == before.get(two, math.nan)
-        radius = max(_NEAR, min(blob.size or (0.0,)) / 2)
-        gap = math.dist((cursor.x, cursor.y), (blob.x, blob.y)) / radius
-        if gap <= (_PARTED if was_one else 1.0):
-            near.append((not was_one, gap, one, two))
-    for _, _, one, two in sorted(near):
-        if one not in pairs and two not in pairs.values():
-            pairs[one] = two
+    cursors = [key for key in touches if key[0] == CURSORS][:MAX_CONTACTS]
+    blobs = [key for key in touches if key[0] == BLOBS][:MAX_CONTACTS]
+    candidates = []
+    for cursor, blob in product(cursors, blobs):
+        were_paired = cursor in former_ids and former_ids[cursor] == former_ids.get(blob)
+        distance = _relative_distance(touches[cursor], touches[blob])
+        if distance <= (_PARTED if were_paired else 1.0):
+            candidates.append((not were_paired, distance, cursor, blob))
+    pairs: dict[_Key, _Key] = {}
+    for _, _, cursor, blob in sorted(candidates):
+        if cursor not in pairs and blob not in pairs.values():
+            pairs[cursor] = blob
     return pairs
+
+
+def _relative_distance(cursor: Touch, blob: Touch) -> float:
+    """Return the distance of a cursor from the centre of a blob, relative to the blob's radius."""
+    radius = max(_NEAR, min(blob.size or (0.0,)) / 2)
+    return math.dist((cursor.x, cursor.y), (blob.x, blob.y)) / radius
 
 
 class TuioSource(UdpSource):
@@ -240,7 +187,7 @@ class TuioSource(UdpSource):
 
     def __init__(self, url: str) -> None:
         super().__init__(url)
-        self._others: set[str] = set()  # unsupported profiles received
+        self._unsupported: set[str] = set()  # profiles received
         self._senders: dict[str, _Sender] = {}
 
     @property
@@ -248,10 +195,12 @@ class TuioSource(UdpSource):
         """Why no contacts arrive although the port is bound, and the remedy."""
         if not self.is_mute(since=self.opened, now=threads.now()):
             return None
-        others = ", ".join(sorted(self._others))
+        instead = ""
+        if self._unsupported:
+            instead = f" ({', '.join(sorted(self._unsupported))} arrives instead)"
         return (
             f"no {' or '.join(SERVED)} on UDP {self.host}:{self.port} for {MUTE_AFTER:g} s"
-            f"{f' ({others} arrives instead)' if others else ''}; start the sender, and "
+            f"{instead}; start the sender, and "
             "configure it to send TUIO 1.1 cursors or blobs to this address"
         )
 
@@ -261,24 +210,26 @@ class TuioSource(UdpSource):
         A contact that is alive but was never set is omitted; positions can be NaN.
         """
         bundle = _read_bundle(datagram)
-        self._count(bundle, f"{peer[0]}:{peer[1]}")
+        self._count(bundle, peer)
         if not bundle.profiles:
             return None
         name = self._name(bundle, peer, arrived)
         sender = self._sender(name, peer, arrived)
         if sender is None:
             return None
-        changed = dict[str, _Profile]()
-        for address, new in bundle.profiles.items():
-            known = sender.profiles.get(address, _Profile())
-            if (added := self._added(new, known, name, arrived)) is not None:
-                changed[address] = added
+        changed: dict[str, _Profile] = {}
+        for address, update in bundle.profiles.items():
+            profile = sender.profiles.get(address, _Profile())
+            updated = self._updated(profile, update, name, arrived)
+            if updated is not None:
+                changed[address] = updated
         if not changed:
             return None
         sender.profiles |= changed
         if sender.peer != peer:
             sender.former = sender.peer
-        sender.last_heard, sender.peer = arrived, peer
+            sender.peer = peer
+        sender.last_heard = arrived
         touches = sender.touches(since=arrived - self.timeout)
         sender.resting = 0 if touches else sender.resting + 1
         origin = f"tuio:{peer[0]}:{peer[1]}"
@@ -290,25 +241,17 @@ class TuioSource(UdpSource):
         Bundles of one sender with the same profiles are of the same kind. A bundle supersedes older
         ones if it is complete: it has all active contacts, with their positions.
         """
-        is_complete: dict[tuple[object, ...], bool] = {}
-        kept = []
-        for each in reversed(waiting):
-            _, found, rest = each.data.partition(_SOURCE)
-            profiles = [address.encode() in each.data for address in SERVED]
-            kind = (each.peer, rest.partition(b"\0")[0] if found else b"", *profiles)
-            if kind not in is_complete:
-                stated = (
-                    _read_bundle(each.data).profiles.values()
-                    if len(is_complete) < _MAX_SENDERS
-                    else ()
-                )
-                is_complete[kind] = bool(stated) and all(
-                    one.alive is not None and one.touches.keys() >= {*one.alive} for one in stated
-                )
-            elif is_complete[kind]:
+        current = []  # newest first
+        is_complete: dict[_BundleKind, bool] = {}  # whether the newest bundle of a kind is
+        for datagram in reversed(waiting):
+            kind = _kind_of(datagram)
+            if is_complete.get(kind, False):
                 continue
-            kept.append(each)
-        return kept[::-1]
+            current.append(datagram)
+            if kind not in is_complete:
+                is_known = len(is_complete) < _MAX_SENDERS
+                is_complete[kind] = is_known and _read_bundle(datagram.data).is_complete
+        return current[::-1]
 
     def is_mute(self, *, since: float, now: float) -> bool:
         """Whether nothing was received since a time [s] although it should have been.
@@ -320,17 +263,18 @@ class TuioSource(UdpSource):
         last = max(self._senders.values(), key=lambda sender: sender.last_heard)
         return last.resting >= _MIN_REPEATS and now - last.last_heard >= MUTE_AFTER
 
-    def _count(self, bundle: _Bundle, place: str) -> None:
-        """Count the unusable messages of a bundle from a sender: other profiles, malformed ones."""
-        for address, has_touches in bundle.others.items():
+    def _count(self, bundle: _Bundle, peer: Peer) -> None:
+        """Count the unusable messages of a bundle: unsupported profiles and malformed messages."""
+        place = f"{peer[0]}:{peer[1]}"
+        for address, has_touches in bundle.unsupported.items():
+            reason = "other_address"
             profile = _PROFILE.match(address)
             if profile:
-                self._others.add(profile[0])
+                reason = f"profile_{profile[1]}"
+                self._unsupported.add(profile[0])
             if has_touches:
-                self.rejects.count(
-                    f"profile_{profile[1]}" if profile else "other_address",
-                    f"{address:.80} of {place} arrives, {' and '.join(SERVED)} are served",
-                )
+                detail = f"{address:.80} of {place} arrives, {' and '.join(SERVED)} are served"
+                self.rejects.count(reason, detail)
         for problem in bundle.malformed:
             self.rejects.count("malformed", f"message from {place}: {problem}")
 
@@ -341,26 +285,22 @@ class TuioSource(UdpSource):
         for each datagram and continues its frame numbers. It is a second program if its frame
         numbers do not continue the latest ones, or if the former port is heard again.
         """
-        own = f"tuio:{peer[0]}:{peer[1]}"
+        host, port = peer
         if bundle.source is None:
-            return own
-        shared, own = f"tuio:{peer[0]}/{bundle.source}", f"{own}/{bundle.source}"
-        if own in self._senders:
-            return own
-        known = self._senders.get(shared)
-        if known is None or known.peer == peer:
-            return shared
-        follows = all(
-            new.sequence < 0
-            or (former := known.profiles.get(address)) is None
-            or 0 < new.sequence - former.sequence <= _LATE_FRAMES
-            for address, new in bundle.profiles.items()
-        )
-        if known.former != peer and (follows or now - known.last_heard >= RESTART_PAUSE):
-            return shared
-        ports = f"ports {known.peer[1]} and {peer[1]}"
-        self.rejects.count("same_name", f"{shared} comes from {ports}; rename one of the programs")
-        return own
+            return f"tuio:{host}:{port}"
+        name_with_port = f"tuio:{host}:{port}/{bundle.source}"
+        if name_with_port in self._senders:
+            return name_with_port
+        name = f"tuio:{host}/{bundle.source}"
+        sender = self._senders.get(name)
+        if sender is None or sender.peer == peer:
+            return name
+        has_paused = now - sender.last_heard >= RESTART_PAUSE
+        if sender.former != peer and (has_paused or sender.continues_with(bundle)):
+            return name
+        ports = f"ports {sender.peer[1]} and {port}"
+        self.rejects.count("same_name", f"{name} comes from {ports}; rename one of the programs")
+        return name_with_port
 
     def _sender(self, name: str, peer: Peer, now: float) -> _Sender | None:
         """Return the state of a sender, a new one if it is unknown, None if there are too many."""
@@ -392,25 +332,45 @@ class TuioSource(UdpSource):
             return None
         return oldest(name for name, sender in self._senders.items() if sender.peer == busiest)
 
-    def _added(self, new: _Profile, known: _Profile, name: str, now: float) -> _Profile | None:
+    def _updated(
+        self, profile: _Profile, update: _Profile, name: str, now: float
+    ) -> _Profile | None:
         """Update a profile of a sender from a bundle; None if a newer frame came before.
 
         Bundles without a number and redundant bundles (-1) are never late; a frame split over
         several bundles repeats its number.
         """
-        sequence, numbered_at = known.sequence, known.numbered_at
-        if new.sequence >= 0:
-            if new.sequence < sequence:
-                if sequence - new.sequence <= _LATE_FRAMES and now - numbered_at < RESTART_PAUSE:
-                    self.rejects.count("late", f"frame {new.sequence} of {name} after {sequence}")
-                    return None
-                known = _Profile()  # the sender was restarted
-            sequence, numbered_at = new.sequence, now
-        alive = known.alive if new.alive is None else tuple(dict.fromkeys(new.alive))
-        touches = known.touches | new.touches
-        left = new.touches if alive is None else [id for id in alive if id in touches]
-        few = {id: touches[id] for id in islice(left, _MAX_MESSAGES)}
-        return _Profile(alive, few, sequence, numbered_at, now)
+        last_sequence = profile.sequence
+        last_numbered_at = profile.numbered_at
+        if update.sequence >= 0:
+            has_paused = now - last_numbered_at >= RESTART_PAUSE
+            drop = last_sequence - update.sequence
+            if 0 < drop <= _LATE_FRAMES and not has_paused:
+                detail = f"frame {update.sequence} of {name} after {last_sequence}"
+                self.rejects.count("late", detail)
+                return None
+            if drop > 0:
+                profile = _Profile()  # the sender was restarted
+            last_sequence = update.sequence
+            last_numbered_at = now
+        alive = profile.alive
+        if update.alive is not None:
+            alive = tuple(dict.fromkeys(update.alive))
+        touches = profile.touches | update.touches
+        ids: Iterable[int] = update.touches
+        if alive is not None:
+            ids = [id for id in alive if id in touches]
+        active_touches = {id: touches[id] for id in islice(ids, _MAX_MESSAGES)}
+        return _Profile(alive, active_touches, last_sequence, last_numbered_at, now)
+
+
+def _kind_of(datagram: Datagram) -> _BundleKind:
+    """Return the kind of a bundle without decoding it."""
+    _, _, after_source = datagram.data.partition(_SOURCE)
+    name = after_source.partition(b"\0")[0]
+    has_cursors = CURSORS.encode() in datagram.data
+    has_blobs = BLOBS.encode() in datagram.data
+    return datagram.peer, name, has_cursors, has_blobs
 
 
 def _read_bundle(datagram: bytes) -> _Bundle:
@@ -429,10 +389,11 @@ def _read_bundle(datagram: bytes) -> _Bundle:
             bundle.malformed.append(str(error))
             continue
         is_idle = arguments[:1] in (("source",), ("fseq",)) or arguments == ("alive",)
-        is_idle |= address in _IDLE_ADDRESSES
-        bundle.others[address] = not is_idle or bundle.others.get(address, False)
-    stated = bundle.profiles.items()
-    bundle.profiles = {key: each for key, each in stated if each.alive is not None or each.touches}
+        has_touches = not is_idle and address not in _IDLE_ADDRESSES
+        bundle.unsupported[address] = has_touches or bundle.unsupported.get(address, False)
+    for address, profile in tuple(bundle.profiles.items()):
+        if profile.alive is None and not profile.touches:
+            del bundle.profiles[address]
     return bundle
 
 
@@ -469,66 +430,3 @@ def _whole(value: Argument) -> int:
     if not isinstance(value, int | float) or value % 1 != 0:  # NaN and infinity are not
         raise InputError(f"session ids and frame numbers must be whole, got {value!r:.40}")
     return int(value)
-
-
-HEADER = "# era-haptics TUIO capture 1"
-_LINE = re.compile(r"(\d{1,9}(?:\.\d{1,9})?) ((?:[0-9a-f]{2})+)", re.ASCII | re.IGNORECASE)
-_MAX_LINE = 1 << 18  # characters; a datagram has up to 64 KiB, two digits per byte
-MAX_BYTES = 16 << 20  # 100 s of ten fingers at 100 Hz; a quarter of an hour of one finger
-
-
-@dataclass(frozen=True, slots=True)
-class RecordedDatagram:
-    """A datagram of a capture."""
-
-    time: float
-    """Time sent [s] from the start."""
-    payload: bytes
-
-
-def read_capture(path: Path | str) -> list[RecordedDatagram]:
-    """Read a capture; raises InputError with file and line."""
-    path = Path(path)
-    try:
-        with (
-            open_regular(path, MAX_BYTES) as file,
-            TextIOWrapper(file, "utf-8-sig", newline=None) as stream,
-        ):
-            return _datagrams_in(path, stream)
-    except OSError as error:
-        raise InputError(
-            f"{path}: cannot be read ({error.strerror}); check the path, which is relative to the "
-            "working directory, and its permissions"
-        ) from error
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path}: must be a TUIO capture, got a binary file") from error
-    except LineTooLong as error:
-        raise InputError(f"{path}, line {error.line}: {error} of a TUIO capture") from error
-
-
-def _datagrams_in(path: Path, stream: TextIO) -> list[RecordedDatagram]:
-    lines = lines_of(stream, _MAX_LINE)
-    if next(lines, "") != HEADER:
-        raise InputError(f"{path}, line 1: must be {HEADER!r} for a TUIO capture")
-    datagrams: list[RecordedDatagram] = []
-    for number, line in enumerate(lines, start=2):
-        if line.startswith("#") or not line.strip():
-            continue
-        match = _LINE.fullmatch(line)
-        if match is None:
-            raise InputError(
-                f"{path}, line {number}: must be seconds, a space and the datagram in "
-                f"hexadecimal, got {line[:60]!r}"
-            )
-        datagram = RecordedDatagram(float(match.group(1)), bytes.fromhex(match.group(2)))
-        if len(datagram.payload) > MAX_DATAGRAM:
-            raise InputError(
-                f"{path}, line {number}: datagram must have at most {MAX_DATAGRAM} bytes, got "
-                f"{len(datagram.payload)}"
-            )
-        if datagrams and datagram.time < datagrams[-1].time:
-            raise InputError(f"{path}, line {number}: times must not decrease")
-        datagrams.append(datagram)
-    if not datagrams:
-        raise InputError(f"{path}: capture must contain datagrams")
-    return datagrams

@@ -34,7 +34,7 @@ from controller.api.link import Unreachable
 from controller.daemon.daemon import check_daemon
 from controller.demo.demonstration import Scene, example_scenes, run_demo
 from controller.effects.layout import load_layout
-from controller.sources.tuio import read_capture
+from controller.sources.tuio_capture import read_capture
 from kit.clock import in_virtual_time, run_virtual
 from kit.fingers import write_schedule
 from model.errors import InputError

@@ -23,13 +23,8 @@ from pythonosc.osc_message_builder import OscMessageBuilder
 
 from controller.sources.contact_tracker import ContactTracker
 from controller.sources.touch import Touch, TouchFrame
-from controller.sources.tuio import (
-    HEADER,
-    MAX_BYTES,
-    RecordedDatagram,
-    TuioSource,
-    read_capture,
-)
+from controller.sources.tuio import TuioSource
+from controller.sources.tuio_capture import HEADER, MAX_BYTES, RecordedDatagram, read_capture
 from controller.sources.udp_source import BACKLOG_THRESHOLD, Datagram, Datagrams, Peer, listen
 from examples.make_touches import tuio_datagram, write_capture
 from kit.clock import in_virtual_time

@@ -44,7 +44,7 @@ from controller.play.reports import PlayReport
 from controller.play.routing import RAMPS_ONLY, PlaybackCapabilities
 from controller.play.slots import Sets, Slots
 from controller.sources.touch import Contact, Touch, TouchFrame
-from controller.sources.tuio import RecordedDatagram
+from controller.sources.tuio_capture import RecordedDatagram
 from drivers.errors import CommandRefused, LinkError
 from drivers.playing import AmplifierLayer
 from drivers.protocol.sets import LayerSet

@@ -19,7 +19,7 @@ from controller.daemon.config import load_daemon_config
 from controller.effects.layout import load_layout
 from controller.effects.strengths import read_strengths
 from controller.gateway.gateway_settings import read_token
-from controller.sources.tuio import read_capture
+from controller.sources.tuio_capture import read_capture
 from era_haptics.command import run_era
 from era_haptics.lab.design.problem import (
     DesignProblem,
